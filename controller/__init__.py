@@ -1,0 +1,1 @@
+"""From touches to drive commands: touch sources, contacts, selection, routing, control loop."""

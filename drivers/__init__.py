@@ -1,0 +1,1 @@
+"""Amplifiers: drive commands, the guard, the wire protocol and its backends."""

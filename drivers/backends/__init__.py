@@ -1,0 +1,1 @@
+"""Backends: an amplifier over one kind of wire, a file each."""

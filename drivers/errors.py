@@ -1,0 +1,35 @@
+"""What can go wrong between the controller and an amplifier.
+
+    DriverError
+    ├── LinkError (ConnectionError)       the wire or the far end is gone, or not what it was
+    │   └── LinkTimeout (TimeoutError)    no answer in time
+    ├── FrameError                        bytes that are no valid message; the far end's fault
+    ├── CommandRefused                    the amplifier or the guard said no
+    └── CommandError (ValueError)         a request that makes no sense; the caller's fault
+
+Third-party exceptions are translated into these where a backend meets its library, cause kept.
+"""
+
+
+class DriverError(Exception):
+    """Anything that the driver layer raises on purpose."""
+
+
+class LinkError(DriverError, ConnectionError):
+    """The wire, the adapter or the amplifier on it cannot be reached."""
+
+
+class LinkTimeout(LinkError, TimeoutError):
+    """The amplifier did not answer in time."""
+
+
+class FrameError(DriverError):
+    """Bytes that do not make a valid message."""
+
+
+class CommandRefused(DriverError):
+    """The guard or the amplifier refused a request; nothing of it was applied."""
+
+
+class CommandError(DriverError, ValueError):
+    """A request that makes no sense: bad URL, unknown channel, value out of range."""

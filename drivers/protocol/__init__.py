@@ -1,0 +1,1 @@
+"""The amplifier protocol without I/O: bytes in, messages out."""

@@ -1,0 +1,1 @@
+"""The plate in physics: finite elements, actuators, response, localization. No I/O but files."""

@@ -1,4 +1,4 @@
-"""The electrostatic resonant actuator (ERA): a spring, a damper and a bolt between plate and base."""
+"""The electrostatic resonant actuator (ERA): spring, damper and bolt between plate and base."""
 
 import math
 from dataclasses import dataclass

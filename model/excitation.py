@@ -7,7 +7,7 @@ from typing import TypeAlias
 
 @dataclass(frozen=True)
 class Tone:
-    """One frequency [Hz] at a base amplitude [m] and phase [rad]: y(t) = a sin(2 pi f t + phase)."""
+    """One frequency [Hz], base amplitude a [m] and phase [rad]: y(t) = a sin(2 pi f t + phase)."""
 
     frequency: float
     amplitude: float

@@ -71,7 +71,7 @@ class Plate:
         omega = 2 * math.pi * frequency
         surface_density = self.material.rho * self.thickness
         wavenumber = (surface_density * omega**2 / self.flexural_rigidity) ** 0.25
-        return 2 * math.pi / wavenumber
+        return float(2 * math.pi / wavenumber)
 
     def contains(self, x: float, y: float) -> bool:
         """Whether a point [m] lies on the plate, its edges included."""

@@ -66,6 +66,16 @@ class Plate:
         """Flexural rigidity D = E h³ / 12 (1 - nu²) [N m], paper Eq. 7."""
         return self.material.E * self.thickness**3 / (12 * (1 - self.material.nu**2))
 
+    @property
+    def lowest_bending_frequency(self) -> float:
+        """Lowest frequency [Hz] of a strip of the plate's longer side on two simple supports.
+
+        The order of magnitude of the plate's own lowest modes, whatever holds it.
+        """
+        surface_density = self.material.rho * self.thickness
+        side = max(self.length, self.width)
+        return math.pi / 2 * math.sqrt(self.flexural_rigidity / surface_density) / side**2
+
     def bending_wavelength(self, frequency: float) -> float:
         """Wavelength [m] of a bending wave at a frequency [Hz] in the thin-plate limit."""
         omega = 2 * math.pi * frequency

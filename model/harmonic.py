@@ -20,10 +20,11 @@ from model.reduction import ReducedPlate
 
 def _hold_and_drive(eras: Sequence[Era], omega: float) -> tuple[ComplexArray, ComplexArray]:
     """Per ERA: its dynamic stiffness [N/m], and the force on the plate at full stroke [N]."""
-    spring = np.array([era.stiffness + 1j * omega * era.damping for era in eras])
-    hold: ComplexArray = spring - omega**2 * np.array([era.bolt_mass for era in eras])
-    drive: ComplexArray = spring * np.array([era.stroke for era in eras])
-    return hold, drive
+    spring: ComplexArray = np.array([era.stiffness + 1j * omega * era.damping for era in eras])
+    bolt = np.array([era.bolt_mass for era in eras])
+    stroke = np.array([era.stroke for era in eras])
+    hold: ComplexArray = spring - (omega**2 * bolt).astype(complex)
+    return hold, spring * stroke
 
 
 def direct_acceleration(

@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 
 from model.actuator import Era
@@ -50,14 +50,15 @@ class Rig:
 
     @property
     def fingerprint(self) -> str:
-        """SHA-256 over what the plate's response depends on: plate, mesh and ERAs, not the wiring.
+        """Fingerprint of the plate on its ERAs; see `physics_fingerprint`."""
+        return physics_fingerprint(self.plate, self.eras)
 
-        Two rigs with the same fingerprint can use the same localization table.
-        """
-        physics = {
-            "plate": asdict(self.plate),
-            "mesh": asdict(self.mesh),
-            "eras": [asdict(era) for era in self.eras],
-        }
-        text = json.dumps(physics, sort_keys=True, separators=(",", ":"))
-        return hashlib.sha256(text.encode()).hexdigest()
+
+def physics_fingerprint(plate: Plate, eras: Sequence[Era]) -> str:
+    """SHA-256 over what the plate's response depends on: plate and ERAs, not mesh or wiring.
+
+    Rigs with the same fingerprint can use the same localization table.
+    """
+    physics = {"plate": asdict(plate), "eras": [asdict(era) for era in eras]}
+    text = json.dumps(physics, sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(text.encode()).hexdigest()

@@ -2,8 +2,8 @@
 
 Bathe and Dvorkin, Int. J. Num. Meth. Eng. 21 (1985) 367-383. Degrees of freedom per node: the
 deflection w and the rotations beta_x, beta_y of paper Eq. 1; nodes counter-clockwise from the lower
-left. Full integration of the shear would lock; one point would leave spurious modes where ERAs hold the
-plate. The assumed strain does neither.
+left. Full integration of the shear would lock; one point would leave spurious modes where ERAs hold
+the plate. The assumed strain does neither.
 """
 
 import numpy as np

@@ -1,0 +1,224 @@
+"""The table as a file: an uncompressed .npz that any researcher opens with numpy.
+
+Members: `header` (JSON as bytes), `frequencies`, `acceleration`, `patterns`, `cell_response`. The
+header carries the format version, the plate's fingerprint, everything that made the table, and a
+SHA-256 over the content, so that a damaged or foreign file is refused before any of it is used.
+"""
+
+import hashlib
+import json
+import os
+import tempfile
+import zipfile
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from model.actuator import Era
+from model.errors import InputError
+from model.localization import Grid
+from model.mesh import Mesh
+from model.plate import Material, Plate
+from model.table import MODES, LocalizationTable
+
+FORMAT = "era-haptics localization table"
+FORMAT_VERSION = 1
+
+# A table of the paper's plate has 4 MB, one of eight ERAs and a fine grid some hundred; what is
+# larger than this is not a table.
+MAX_BYTES = 2 << 30
+
+_DTYPES = {
+    "header": "|u1",
+    "frequencies": "<f8",
+    "acceleration": "<c8",
+    "patterns": "<i2",
+    "cell_response": "<f4",
+}
+
+
+class _Header(BaseModel):
+    """What the JSON header must hold."""
+
+    model_config = ConfigDict(extra="forbid", strict=True)
+
+    format: str
+    format_version: int
+    code_version: str
+    fingerprint: str
+    sha256: str
+    mode: str
+    plate: dict[str, Any]
+    eras: list[dict[str, Any]]
+    mesh: dict[str, Any]
+    grid: dict[str, Any]
+
+
+def save_table(table: LocalizationTable, path: Path) -> None:
+    """Write a table so that the file is either the old one or the whole new one, never between.
+
+    Raises OSError where the folder cannot be written.
+    """
+    arrays = _arrays(table)
+    header = {
+        "format": FORMAT,
+        "format_version": FORMAT_VERSION,
+        "code_version": table.code_version,
+        "fingerprint": table.fingerprint,
+        "mode": table.mode,
+        "plate": asdict(table.plate),
+        "eras": [asdict(era) for era in table.eras],
+        "mesh": asdict(table.mesh),
+        "grid": asdict(table.grid),
+    }
+    header["sha256"] = _digest(header, arrays)
+    encoded = np.frombuffer(json.dumps(header).encode(), dtype=np.uint8)
+    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    try:
+        with os.fdopen(handle, "wb") as stream:
+            np.savez(
+                stream,
+                header=encoded,
+                frequencies=arrays["frequencies"],
+                acceleration=arrays["acceleration"],
+                patterns=arrays["patterns"],
+                cell_response=arrays["cell_response"],
+            )
+            stream.flush()
+            os.fsync(stream.fileno())
+        Path(temporary).replace(path)
+    except BaseException:
+        Path(temporary).unlink(missing_ok=True)
+        raise
+
+
+def load_table(path: Path, *, fingerprint: str | None = None) -> LocalizationTable:
+    """Read a table, whole or not at all.
+
+    fingerprint: of the rig that the table shall serve; a table of another plate is refused. Raises
+    InputError for a missing, damaged or foreign file.
+    """
+    rebuild = f"build it again: era table build RIG -o {path}"
+    try:
+        content = _read_members(path)
+    except FileNotFoundError:
+        raise InputError(
+            f"there is no table {path}; build one: era table build RIG -o {path}"
+        ) from None
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile, NotImplementedError) as error:
+        raise InputError(f"{path} is not a readable localization table ({error}); {rebuild}") from (
+            error
+        )
+    try:
+        header = _Header.model_validate_json(content.pop("header").tobytes())
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"]) or "header"
+        raise InputError(f"{path}: bad header ({where}: {first['msg']}); {rebuild}") from error
+    if header.format != FORMAT or header.format_version != FORMAT_VERSION:
+        raise InputError(
+            f"{path} has format {header.format!r} version {header.format_version}; this program "
+            f"reads version {FORMAT_VERSION}; {rebuild}"
+        )
+    if _digest(header.model_dump(exclude={"sha256"}), content) != header.sha256:
+        raise InputError(f"{path} is damaged: its content does not match its checksum; {rebuild}")
+    table = _assemble(header, content, path)
+    if table.fingerprint != header.fingerprint:
+        raise InputError(f"{path}: the fingerprint is not that of the plate in it; {rebuild}")
+    if fingerprint is not None and fingerprint != table.fingerprint:
+        raise InputError(
+            f"{path} was built for another plate (fingerprint {table.fingerprint[:12]}, the rig's "
+            f"is {fingerprint[:12]}); {rebuild}"
+        )
+    return table
+
+
+def _arrays(table: LocalizationTable) -> dict[str, NDArray[Any]]:
+    return {
+        name: np.ascontiguousarray(getattr(table, name), dtype=dtype)
+        for name, dtype in _DTYPES.items()
+        if name != "header"
+    }
+
+
+def _digest(header: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> str:
+    """SHA-256 over the header without its checksum, and over every array with its shape."""
+    digest = hashlib.sha256(json.dumps(header, sort_keys=True).encode())
+    for name in sorted(arrays):
+        digest.update(f"{name}{arrays[name].dtype.str}{arrays[name].shape}".encode())
+        digest.update(arrays[name].tobytes())
+    return digest.hexdigest()
+
+
+def _read_members(path: Path) -> dict[str, NDArray[Any]]:
+    """The arrays of the file; ValueError where members, types or sizes are not a table's."""
+    with zipfile.ZipFile(path) as archive:
+        members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
+        if sorted(members) != sorted(_DTYPES) or len(archive.infolist()) != len(_DTYPES):
+            raise ValueError(f"it holds {', '.join(sorted(members)) or 'nothing'}")
+        if any(info.compress_type != zipfile.ZIP_STORED for info in members.values()):
+            raise ValueError("it is compressed")
+        declared = sum(info.file_size for info in members.values())
+        if declared > min(path.stat().st_size, MAX_BYTES):
+            raise ValueError(f"it declares {declared} bytes")
+        arrays = {}
+        for name, info in members.items():
+            with archive.open(info) as stream:
+                _check_npy_header(stream, name=name, member_bytes=info.file_size)
+            with archive.open(info) as stream:
+                arrays[name] = np.lib.format.read_array(stream, allow_pickle=False)
+        return arrays
+
+
+def _check_npy_header(stream: Any, *, name: str, member_bytes: int) -> None:
+    """Refuse an array whose declared type or size is not what the member can hold."""
+    version = np.lib.format.read_magic(stream)
+    if version != (1, 0):
+        raise ValueError(f"{name} has .npy version {version}")
+    shape, _, dtype = np.lib.format.read_array_header_1_0(stream)
+    if dtype.str != _DTYPES[name]:
+        raise ValueError(f"{name} holds {dtype.str}")
+    size = dtype.itemsize
+    for length in shape:
+        size *= length  # Python integers: no overflow
+    if size + stream.tell() != member_bytes:
+        raise ValueError(f"{name} declares {size} bytes")
+
+
+def _assemble(header: _Header, arrays: dict[str, NDArray[Any]], path: Path) -> LocalizationTable:
+    """A table from checked parts; sizes must fit each other and every number must be one."""
+    try:
+        material = header.plate.pop("material")
+        table = LocalizationTable(
+            plate=Plate(**header.plate, material=Material(**material)),
+            eras=tuple(Era(**era) for era in header.eras),
+            mesh=Mesh(**header.mesh),
+            grid=Grid(**header.grid),
+            mode=header.mode,
+            code_version=header.code_version,
+            **arrays,
+        )
+    except (TypeError, KeyError, ValueError) as error:
+        raise InputError(f"{path}: the header does not describe a plate ({error})") from error
+    if table.mode not in MODES:
+        raise InputError(f"{path}: unknown drive mode {table.mode!r}")
+    count, era_count = len(table.frequencies), len(table.eras)
+    expected = {
+        "frequencies": (count,),
+        "acceleration": (count, era_count, table.mesh.node_count),
+        "patterns": (len(table.patterns), era_count),
+        "cell_response": (len(table.patterns), table.grid.cell_count),
+    }
+    for name, shape in expected.items():
+        values = getattr(table, name)
+        if values.shape != shape:
+            raise InputError(f"{path}: {name} has shape {values.shape}, expected {shape}")
+        if not np.isfinite(values).all():
+            raise InputError(f"{path}: {name} holds values that are not numbers")
+    if not ((table.patterns >= -1) & (table.patterns < count)).all():
+        raise InputError(f"{path}: a pattern names a frequency that the table does not hold")
+    return table

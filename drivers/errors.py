@@ -28,7 +28,14 @@ class FrameError(DriverError):
 
 
 class CommandRefused(DriverError):
-    """The guard or the amplifier refused a request; nothing of it was applied."""
+    """The guard or the amplifier refused a request; nothing of it was applied.
+
+    channel: the one to blame, where one is.
+    """
+
+    def __init__(self, reason: str, *, channel: int | None = None) -> None:
+        super().__init__(reason)
+        self.channel = channel
 
 
 class CommandError(DriverError, ValueError):

@@ -1,0 +1,133 @@
+"""The pieces that payloads are made of: numbers in range, flags, short texts.
+
+Everything is little-endian. Reading is total: bytes in range, or `Malformed` with the code that an
+amplifier answers with.
+"""
+
+import struct
+from enum import IntEnum
+from typing import TypeVar
+
+from drivers.errors import FrameError
+from drivers.protocol.definition import PROTOCOL, Quantity
+from drivers.protocol.messages import NakCode
+
+_CHANNEL = PROTOCOL.quantities.channel
+_NO_CHANNEL = 255
+_TEXT_MAX = 32
+
+EnumT = TypeVar("EnumT", bound=IntEnum)
+
+
+class Malformed(FrameError):
+    """A payload that makes no message; code and channel are what an amplifier's Nak says."""
+
+    def __init__(self, text: str, *, code: NakCode, channel: int | None = None) -> None:
+        super().__init__(text)
+        self.code = code
+        self.channel = channel
+
+
+class Cursor:
+    """Reads a payload from front to back; raises Malformed for what is missing or out of range."""
+
+    def __init__(self, payload: bytes) -> None:
+        self._payload = payload
+        self._at = 0
+
+    def integer(self, quantity: Quantity) -> int:
+        """A whole number."""
+        value = self._raw(quantity.struct_code)
+        if not quantity.holds(value):
+            code = {
+                "channel": NakCode.BAD_CHANNEL,
+                "token": NakCode.BAD_TOKEN,
+            }.get(quantity.name, NakCode.BAD_VALUE)
+            raise Malformed(
+                f"{quantity.name} {value} is not within {quantity.minimum}..{quantity.maximum}",
+                code=code,
+                channel=value if code is NakCode.BAD_CHANNEL else None,
+            )
+        return value
+
+    def number(self, quantity: Quantity) -> float:
+        """A value in its unit."""
+        return quantity.from_wire(self.integer(quantity))
+
+    def one_of(self, kind: type[EnumT]) -> EnumT:
+        """A member of an enumeration, one byte."""
+        value = self._raw("B")
+        try:
+            return kind(value)
+        except ValueError:
+            raise Malformed(
+                f"{value} is no {kind.__name__.lower()}", code=NakCode.BAD_VALUE
+            ) from None
+
+    def flags(self, known: int) -> int:
+        """A byte in which only the known bits may be set."""
+        value = self._raw("B")
+        if value & ~known:
+            raise Malformed(f"reserved flags set: {value:#04x}", code=NakCode.BAD_VALUE)
+        return value
+
+    def optional_channel(self) -> int | None:
+        """A channel, or None for 255."""
+        value = self._raw("B")
+        if value == _NO_CHANNEL:
+            return None
+        if not _CHANNEL.holds(value):
+            raise Malformed(f"channel {value} does not exist", code=NakCode.BAD_VALUE)
+        return value
+
+    def text(self) -> str:
+        """A text: its length in bytes, then UTF-8 without control characters."""
+        length = self._raw("B")
+        if length > _TEXT_MAX:
+            raise Malformed(f"a text of {length} bytes is too long", code=NakCode.BAD_VALUE)
+        try:
+            text = self._take(length).decode("utf-8")
+        except UnicodeDecodeError:
+            raise Malformed("a text that is not UTF-8", code=NakCode.BAD_VALUE) from None
+        if not text.isprintable():
+            raise Malformed("a text with control characters", code=NakCode.BAD_VALUE)
+        return text
+
+    def byte(self) -> int:
+        """Any byte."""
+        return self._raw("B")
+
+    def end(self) -> None:
+        """Nothing must be left."""
+        if self._at != len(self._payload):
+            extra = len(self._payload) - self._at
+            raise Malformed(f"{extra} bytes too many", code=NakCode.BAD_LENGTH)
+
+    def _raw(self, struct_code: str) -> int:
+        layout = struct.Struct("<" + struct_code)
+        (value,) = layout.unpack(self._take(layout.size))
+        return int(value)
+
+    def _take(self, length: int) -> bytes:
+        piece = self._payload[self._at : self._at + length]
+        if len(piece) < length:
+            raise Malformed("the payload ends too early", code=NakCode.BAD_LENGTH)
+        self._at += length
+        return piece
+
+
+def pack(*pairs: tuple[Quantity, float]) -> bytes:
+    """Values in their units, one after the other; CommandError for one out of range."""
+    layout = "<" + "".join(quantity.struct_code for quantity, _ in pairs)
+    return struct.pack(layout, *(quantity.to_wire(value) for quantity, value in pairs))
+
+
+def pack_text(text: str) -> bytes:
+    """A text, cut to what fits; see `Cursor.text`."""
+    raw = text.encode()[:_TEXT_MAX].decode(errors="ignore").encode()
+    return bytes([len(raw)]) + raw
+
+
+def pack_optional_channel(channel: int | None) -> bytes:
+    """A channel, or 255 for none."""
+    return bytes([_NO_CHANNEL]) if channel is None else pack((_CHANNEL, channel))

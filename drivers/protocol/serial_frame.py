@@ -1,0 +1,140 @@
+"""Frames on a serial line: bytes in, checked frames out.
+
+    0x00  COBS( version/type u8 · address u8 · sequence u16 · payload · CRC-32 u32 )  0x00
+
+Every integer is little-endian. The first byte holds the reply bit (7), the version (6, 5) and the
+message type (4..0). The CRC is that of zlib and Ethernet, over everything before it. COBS leaves no
+zero inside a frame, so a reader that lost its place finds it again at the next zero. The zero in
+front ends whatever noise came before; empty frames are nothing.
+"""
+
+import struct
+import zlib
+from dataclasses import dataclass
+
+from cobs import cobs
+
+from drivers.protocol.definition import PROTOCOL
+
+REPLY = 0x80
+_TYPE_MASK = 0x1F
+_VERSION_SHIFT = 5
+_VERSION_MASK = 0x60
+_HEADER = struct.Struct("<BBH")
+_CRC = struct.Struct("<I")
+_OVERHEAD = _HEADER.size + _CRC.size
+_STUFFED_MAX = _OVERHEAD + PROTOCOL.serial.payload_max + 1
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """A delimited and checked piece of the stream, its payload not yet understood.
+
+    kind: message type, with the bit REPLY in replies; address 0..255; sequence 0..65535, which a
+    reply repeats from its request.
+    """
+
+    kind: int
+    address: int
+    sequence: int
+    payload: bytes
+
+    @property
+    def type(self) -> int:
+        """The message type without the reply bit."""
+        return self.kind & _TYPE_MASK
+
+    @property
+    def is_reply(self) -> bool:
+        """Whether it answers a request."""
+        return bool(self.kind & REPLY)
+
+
+@dataclass
+class FrameCounters:
+    """What a reader has seen: frames by their fate."""
+
+    good: int = 0
+    bad_crc: int = 0
+    too_long: int = 0
+    truncated: int = 0
+    bad_version: int = 0
+
+
+def encode_frame(frame: Frame) -> bytes:
+    """The bytes of a frame, delimiters included; ValueError for a payload that is too long."""
+    if len(frame.payload) > PROTOCOL.serial.payload_max:
+        raise ValueError(f"a payload of {len(frame.payload)} bytes does not fit into a frame")
+    first = frame.kind | PROTOCOL.version << _VERSION_SHIFT
+    body = _HEADER.pack(first, frame.address, frame.sequence) + frame.payload
+    stuffed: bytes = cobs.encode(body + _CRC.pack(zlib.crc32(body)))
+    return b"\0" + stuffed + b"\0"
+
+
+def frame_length(payload_length: int) -> int:
+    """Bytes on the line for a frame with a payload of this length, delimiters included."""
+    return payload_length + _OVERHEAD + 1 + 2
+
+
+class FrameReader:
+    """Cuts a stream of bytes into frames; what is no frame is counted and skipped.
+
+    Never holds more than one frame's bytes, whatever it is fed.
+    """
+
+    def __init__(self) -> None:
+        self.counters = FrameCounters()
+        self._stuffed = bytearray()
+        self._skipping = False
+
+    def feed(self, data: bytes) -> list[Frame]:
+        """The frames that these bytes complete, in order; any bytes at all may come."""
+        frames = []
+        *ended, rest = bytes(data).split(b"\0")
+        for piece in ended:
+            self._append(piece)
+            frame = self._finish()
+            if frame is not None:
+                frames.append(frame)
+        self._append(rest)
+        return frames
+
+    def _append(self, piece: bytes) -> None:
+        if self._skipping:
+            return
+        if len(self._stuffed) + len(piece) > _STUFFED_MAX:
+            self.counters.too_long += 1
+            self._skipping = True
+            self._stuffed.clear()
+            return
+        self._stuffed += piece
+
+    def _finish(self) -> Frame | None:
+        stuffed = bytes(self._stuffed)
+        self._stuffed.clear()
+        skipped, self._skipping = self._skipping, False
+        if skipped or not stuffed:
+            return None
+        try:
+            content = cobs.decode(stuffed)
+        except cobs.DecodeError:
+            self.counters.truncated += 1
+            return None
+        if len(content) < _OVERHEAD:
+            self.counters.truncated += 1
+            return None
+        body, crc = content[: -_CRC.size], content[-_CRC.size :]
+        if _CRC.unpack(crc) != (zlib.crc32(body),):
+            self.counters.bad_crc += 1
+            return None
+        first, address, sequence = _HEADER.unpack_from(body)
+        if (first & _VERSION_MASK) >> _VERSION_SHIFT != PROTOCOL.version:
+            self.counters.bad_version += 1
+            return None
+        self.counters.good += 1
+        return Frame(
+            kind=first & (REPLY | _TYPE_MASK),
+            address=address,
+            sequence=sequence,
+            payload=body[_HEADER.size :],
+        )

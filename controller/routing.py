@@ -1,0 +1,67 @@
+"""From physics to electricity: which amplifier channel plays what, by the rig's wiring.
+
+`sim/plant.py` translates the other way by the same wiring.
+"""
+
+import math
+
+from drivers.command import CommandSet, DriveCommand
+from model.errors import InputError
+from model.excitation import Excitation
+from model.rig import Rig
+
+
+def route(
+    excitation: Excitation, rig: Rig, *, token: int, ramp: float, valid_for: float = 0.0
+) -> dict[str, CommandSet]:
+    """One command set per amplifier of the rig, by its name, all under the same token.
+
+    Every wired channel is named: level = amplitude / stroke, phase in degrees within (-180, 180];
+    level 0 where the ERA is not driven. ramp, valid_for [s] as in `CommandSet`. Nothing is limited
+    here, that is the guard's; raises InputError if the excitation names an ERA the rig has not.
+    """
+    unknown = sorted(excitation.keys() - rig.wiring.keys())
+    if unknown:
+        raise InputError(
+            f"the pattern drives {', '.join(unknown)}, which the rig does not have; "
+            "build a table for this rig"
+        )
+    commands: dict[str, list[DriveCommand]] = {name: [] for name in rig.amplifiers}
+    for name, channel in rig.wiring.items():
+        commands[channel.amplifier].append(_drive(excitation, rig, name))
+    return {
+        name: CommandSet(
+            token=token,
+            commands=tuple(sorted(wired, key=lambda command: command.channel)),
+            ramp=ramp,
+            valid_for=valid_for,
+        )
+        for name, wired in commands.items()
+    }
+
+
+def silence(rig: Rig, *, token: int, ramp: float) -> dict[str, CommandSet]:
+    """Command sets that bring every channel to level 0 along a ramp [s]."""
+    return route({}, rig, token=token, ramp=ramp)
+
+
+def _drive(excitation: Excitation, rig: Rig, name: str) -> DriveCommand:
+    """What one ERA's channel shall play."""
+    number = rig.wiring[name].number
+    tone = excitation.get(name)
+    if tone is None:
+        # A silent channel has a frequency too, on every wire; this one is always allowed.
+        return DriveCommand(channel=number, frequency=rig.limits.frequency_min, level=0.0)
+    return DriveCommand(
+        channel=number,
+        frequency=tone.frequency,
+        level=tone.amplitude / rig.era(name).stroke,
+        phase=_wrapped_degrees(tone.phase),
+    )
+
+
+def _wrapped_degrees(phase: float) -> float:
+    """A phase [rad] in degrees within (-180, 180]."""
+    # Not finite stays so, for the guard to refuse.
+    degrees = math.degrees(math.remainder(phase, math.tau)) if math.isfinite(phase) else phase
+    return 180.0 if degrees == -180.0 else degrees

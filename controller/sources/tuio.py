@@ -1,0 +1,251 @@
+"""TUIO 1.1 cursors (/tuio/2Dcur) over UDP: what touch tables and their simulators send.
+
+A bundle says who sends (source), which session ids are down (alive), where those are that changed
+(set) and its number (fseq); see tuio.org, "TUIO 1.1 Protocol Specification". A bundle counts as a
+whole or, if anything in it is malformed, not at all.
+"""
+
+import asyncio
+import logging
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+from pythonosc.osc_bundle_builder import IMMEDIATELY, OscBundleBuilder
+from pythonosc.osc_message_builder import OscMessageBuilder
+
+from controller.sources.osc import OscError, osc_messages
+from controller.tally import Tally
+from controller.touch import Touch, TouchFrame, TouchSource
+from model.errors import InputError
+
+ADDRESS = "/tuio/2Dcur"
+DEFAULT_HOST = "127.0.0.1"
+DEFAULT_PORT = 3333  # registered for TUIO
+
+# Room for some 140 cursors; senders keep below 4 KiB so that a datagram is not fragmented.
+_LARGEST_DATAGRAM = 8 * 1024
+_LONGEST_NAME = 100
+_MOST_SENDERS = 16
+# The reference client takes a number that fell by more than 100 for a sender that began anew. One
+# that began anew within its first 100 frames is known by the pause: reordering is never this late.
+_LATE_FRAMES = 100
+_LATE_SECONDS = 0.5
+
+_logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class _Bundle:
+    """What one bundle says; None where it does not say it."""
+
+    source: str | None = None
+    alive: tuple[int, ...] | None = None
+    positions: dict[int, tuple[float, float]] = field(default_factory=dict)
+    sequence: int | None = None
+
+
+@dataclass
+class _Sender:
+    """What one sender has said so far."""
+
+    heard: float
+    sequence: int = 0
+    numbered: float = -math.inf  # when that sequence number came
+    alive: tuple[int, ...] = ()
+    positions: dict[int, tuple[float, float]] = field(default_factory=dict)
+
+
+class TuioReader:
+    """Datagrams in, touch frames out; no socket, no clock.
+
+    Several senders are kept apart: by the name in their source message and their host, or without
+    one by host and port. Nothing is ever raised: what cannot be used is counted in `tally`.
+    """
+
+    def __init__(self, tally: Tally) -> None:
+        self._tally = tally
+        self._senders: dict[str, _Sender] = {}
+
+    def read(self, datagram: bytes, peer: tuple[str, int], *, now: float) -> TouchFrame | None:
+        """The frame that a datagram of a peer completes at time now [s], or None.
+
+        A cursor that is alive but was never set is left out; positions may be NaN.
+        """
+        if len(datagram) > _LARGEST_DATAGRAM:
+            self._tally.count("oversized", f"{len(datagram)} bytes from {peer[0]}:{peer[1]}")
+            return None
+        try:
+            bundle = _read_bundle(datagram)
+        except OscError as error:
+            self._tally.count("malformed", f"datagram from {peer[0]}:{peer[1]}: {error}")
+            return None
+        if bundle == _Bundle(source=bundle.source):
+            return None  # other TUIO profiles, or a bundle that says nothing
+        name = f"tuio:{peer[0]}:{peer[1]}"
+        if bundle.source is not None:
+            name = f"tuio:{peer[0]}/{bundle.source}"
+        sender = self._sender(name, now)
+        if sender is None or self._is_late(bundle.sequence, sender, name, now=now):
+            return None
+        for x, y in bundle.positions.values():
+            if not (math.isfinite(x) and math.isfinite(y)):
+                self._tally.count("not_finite", f"{name} sent a cursor at ({x}, {y})")
+        sender.heard = now
+        if bundle.alive is not None:
+            sender.alive = tuple(dict.fromkeys(bundle.alive))
+        known = sender.positions | bundle.positions
+        sender.positions = {id: known[id] for id in sender.alive if id in known}
+        touches = tuple(Touch(id, x, y) for id, (x, y) in sender.positions.items())
+        return TouchFrame(name, now, touches)
+
+    def _sender(self, name: str, now: float) -> _Sender | None:
+        """The state of a sender, a new one if it is unknown, None if there are too many."""
+        if name not in self._senders:
+            if len(self._senders) >= _MOST_SENDERS:
+                oldest = min(self._senders, key=lambda known: self._senders[known].heard)
+                if now - self._senders[oldest].heard < _LATE_SECONDS:
+                    self._tally.count("too_many_senders", f"{name} is not listened to")
+                    return None
+                del self._senders[oldest]
+            self._senders[name] = _Sender(heard=now)
+        return self._senders[name]
+
+    def _is_late(self, sequence: int | None, sender: _Sender, name: str, *, now: float) -> bool:
+        """Whether a frame was overtaken by a newer one; notes the number of one that was not.
+
+        Bundles without a number and redundant ones (-1) are never late; a frame split over
+        several bundles repeats its number.
+        """
+        if sequence is None or sequence < 0:
+            return False
+        behind = sender.sequence - sequence
+        if behind > 0:
+            if behind <= _LATE_FRAMES and now - sender.numbered < _LATE_SECONDS:
+                self._tally.count("late", f"frame {sequence} of {name} after {sender.sequence}")
+                return True
+            sender.alive, sender.positions = (), {}  # a sender that began anew
+        sender.sequence, sender.numbered = sequence, now
+        return False
+
+
+def _read_bundle(datagram: bytes) -> _Bundle:
+    """Read the cursor messages of a datagram; raises OscError."""
+    bundle = _Bundle()
+    for arguments in osc_messages(datagram, address=ADDRESS):
+        match arguments:
+            case ("source", str(name)) if len(name) <= _LONGEST_NAME:
+                bundle = replace(bundle, source=name)
+            case ("alive", *ids) if all(isinstance(id, int) for id in ids):
+                bundle = replace(bundle, alive=tuple(int(id) for id in ids))
+            case ("set", int(id), float(x), float(y), float(), float(), float()):
+                bundle.positions[id] = (x, y)
+            case ("fseq", int(number)):
+                bundle = replace(bundle, sequence=number)
+            case _:
+                raise OscError(f"arguments that TUIO 1.1 does not know: {arguments!s:.80}")
+    return bundle
+
+
+def tuio_datagram(frame: TouchFrame, sequence: int) -> bytes:
+    """A frame as a sender of the frame's source name would put it on the wire, fully repeated."""
+    bundle = OscBundleBuilder(IMMEDIATELY)
+    messages: list[tuple[str | int | float, ...]] = [
+        ("source", frame.source),
+        ("alive", *(touch.id for touch in frame.touches)),
+        *(("set", touch.id, touch.x, touch.y, 0.0, 0.0, 0.0) for touch in frame.touches),
+        ("fseq", sequence),
+    ]
+    types = {str: "s", int: "i", float: "f"}
+    for arguments in messages:
+        message = OscMessageBuilder(ADDRESS)
+        for argument in arguments:
+            message.add_arg(argument, types[type(argument)])
+        bundle.add_content(message.build())
+    return bytes(bundle.build().dgram)
+
+
+class TuioSource(TouchSource):
+    """Listens for TUIO at `tuio:HOST:PORT`, `tuio:PORT` or `tuio:` (127.0.0.1:3333).
+
+    Port 0 takes any free one. A touch table on another machine reaches it only if HOST is written
+    out: TUIO knows no password. Raises InputError on a URL that says something else.
+    """
+
+    def __init__(self, url: str) -> None:
+        self.host, self._port = _host_and_port(url)
+        self.tally = Tally(_logger)
+        self._url = url
+        self._transport: asyncio.DatagramTransport | None = None
+        self._reader = TuioReader(self.tally)
+        self._deliver: Callable[[TouchFrame], None] | None = None
+
+    @property
+    def port(self) -> int:
+        """The UDP port that is bound; before `open` the one that was asked for."""
+        if self._transport is None:
+            return self._port
+        return int(self._transport.get_extra_info("sockname")[1])
+
+    async def open(self) -> None:
+        """Bind the port, unless it is; `run` does it by itself. Raises InputError if it is taken.
+
+        What arrives before `run` is dropped.
+        """
+        if self._transport is not None:
+            return
+        try:
+            self._transport, _ = await asyncio.get_running_loop().create_datagram_endpoint(
+                lambda: _Listener(self._received), local_addr=(self.host, self._port)
+            )
+        except OSError as error:
+            raise InputError(
+                f"touch source {self._url}: cannot listen on UDP {self.host}:{self._port} "
+                f"({error.strerror}); another program may use it: stop that or name another port"
+            ) from error
+
+    async def run(self, deliver: Callable[[TouchFrame], None]) -> None:
+        """Deliver a frame per bundle until cancelled."""
+        await self.open()
+        self._deliver = deliver
+        try:
+            await asyncio.get_running_loop().create_future()
+        finally:
+            self._deliver = None
+            if self._transport is not None:
+                self._transport.close()
+                self._transport = None
+
+    def _received(self, datagram: bytes, peer: tuple[str, int]) -> None:
+        """Read one datagram; the frame's time is that of its arrival here."""
+        if self._deliver is None:
+            return
+        frame = self._reader.read(datagram, peer, now=asyncio.get_running_loop().time())
+        if frame is not None:
+            self._deliver(frame)
+
+
+class _Listener(asyncio.DatagramProtocol):
+    """The UDP end."""
+
+    def __init__(self, received: Callable[[bytes, tuple[str, int]], None]) -> None:
+        self._received = received
+
+    def datagram_received(self, data: bytes, addr: tuple[str, int]) -> None:
+        """Hand one datagram on with the host and port that it came from."""
+        self._received(data, (addr[0], addr[1]))
+
+
+def _host_and_port(url: str) -> tuple[str, int]:
+    """Host and port of `tuio:HOST:PORT`; raises InputError."""
+    rest = url.removeprefix("tuio:").removeprefix("//")
+    host, _, port = rest.rpartition(":")
+    number = int(port) if port.isascii() and port.isdecimal() and len(port) < 6 else -1
+    if not port:
+        number = DEFAULT_PORT
+    if not url.startswith("tuio:") or not 0 <= number < 65536:
+        raise InputError(
+            f"touch source {url}: expected tuio:HOST:PORT with a port from 0 to 65535, "
+            "such as tuio:127.0.0.1:3333"
+        )
+    return host.strip("[]") or DEFAULT_HOST, number

@@ -1,0 +1,52 @@
+"""Touch sources by the scheme of their URL, our own and those of installed plug-ins alike."""
+
+import difflib
+from importlib.metadata import EntryPoint, entry_points
+
+from controller.touch import TouchSource
+from model.errors import InputError
+
+GROUP = "era_haptics.touch_sources"
+
+
+def touch_schemes() -> list[str]:
+    """Schemes of all installed touch sources, without loading any."""
+    return sorted(_plugins())
+
+
+def open_source(url: str) -> TouchSource:
+    """Make the touch source of a URL such as `tuio:127.0.0.1:3333` or `evemu:taps.events`.
+
+    Only the plug-in that the scheme names is loaded, so a broken one disturbs no other. Raises
+    InputError on an unknown scheme, a plug-in that does not work or a URL that it refuses.
+    """
+    plugins = _plugins()
+    scheme, colon, _ = url.partition(":")
+    if not colon or scheme not in plugins:
+        close = difflib.get_close_matches(scheme, plugins, n=1)
+        hint = f"did you mean {close[0]}:? " if close else ""
+        raise InputError(
+            f"touch source {url}: unknown kind {scheme!r}; {hint}"
+            f"known are {', '.join(f'{name}:' for name in sorted(plugins))}"
+        )
+    plugin = plugins[scheme]
+    try:
+        source = plugin.load()(url)
+    except InputError:
+        raise
+    except Exception as error:
+        package = plugin.dist.name if plugin.dist else "an unknown package"
+        raise InputError(
+            f"touch source {url}: the plug-in {plugin.value} of {package} does not work "
+            f"({type(error).__name__}: {error}); repair or remove that package"
+        ) from error
+    if not isinstance(source, TouchSource):
+        raise InputError(
+            f"touch source {url}: the plug-in {plugin.value} does not make a TouchSource"
+        )
+    return source
+
+
+def _plugins() -> dict[str, EntryPoint]:
+    """Entry points by scheme."""
+    return {point.name: point for point in entry_points(group=GROUP)}

@@ -46,7 +46,6 @@ class Cursor:
             raise Malformed(
                 f"{quantity.name} {value} is not within {quantity.minimum}..{quantity.maximum}",
                 code=code,
-                channel=value if code is NakCode.BAD_CHANNEL else None,
             )
         return value
 

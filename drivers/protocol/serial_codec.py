@@ -1,8 +1,9 @@
 """Messages to frames and back, for both ends of a serial line.
 
 Each message has its layout written down once as a pair of functions, pack and unpack. Decoding is
-total: any payload becomes a message with every value in range, or `Malformed`. Encoding a set asks for a `SafeCommand`; decoding gives a plain CommandSet,
-which must pass a guard before it can be sent on.
+total: any payload becomes a message with every value in range, or `Malformed`. Encoding a set asks
+for a `SafeCommand`; decoding gives a plain CommandSet, which must pass a guard before it can be
+sent on.
 """
 
 from collections.abc import Callable
@@ -215,10 +216,6 @@ def _unpack_faults(cursor: Cursor) -> FaultList:
     )
 
 
-def _no_fields(_: Any) -> bytes:
-    return b""
-
-
 @dataclass(frozen=True)
 class _Layout:
     """How one message and its payload become each other."""
@@ -228,65 +225,61 @@ class _Layout:
     unpack: Callable[[Cursor], Any]
 
 
+def _empty(message: type[Any]) -> _Layout:
+    return _Layout(message, lambda _: b"", lambda _: message())
+
+
 _IDENTITY = _Layout(Identity, _pack_identity, _unpack_identity)
 _CAPABILITIES = _Layout(Capabilities, _pack_capabilities, _unpack_capabilities)
 _STATUS = _Layout(Status, _pack_status, _unpack_status)
 _ACHIEVED = _Layout(Achieved, _pack_achieved, _unpack_achieved)
 _FAULTS = _Layout(FaultList, _pack_faults, _unpack_faults)
 
+_ARM = _Layout(
+    Arm,
+    lambda arm: pack((_Q.watchdog, arm.watchdog)),
+    lambda cursor: Arm(watchdog=cursor.number(_Q.watchdog)),
+)
+_DISARM = _Layout(
+    Disarm,
+    lambda disarm: pack((_Q.ramp, disarm.ramp)),
+    lambda cursor: Disarm(ramp=cursor.number(_Q.ramp)),
+)
+_STAGE = _Layout(
+    Stage,
+    lambda stage: _pack_set(stage.command_set),
+    lambda cursor: Stage(_unpack_set(cursor)),
+)
+_COMMIT = _Layout(
+    Commit,
+    lambda commit: pack((_Q.token, commit.token)),
+    lambda cursor: Commit(token=cursor.integer(_Q.token)),
+)
+_APPLY = _Layout(
+    Apply,
+    lambda apply: _pack_set(apply.command_set),
+    lambda cursor: Apply(_unpack_set(cursor)),
+)
+_STOP = _Layout(
+    Stop,
+    lambda stop: pack((_Q.ramp, stop.ramp)),
+    lambda cursor: Stop(ramp=cursor.number(_Q.ramp)),
+)
+
 # Request and reply of every message type.
 _EXCHANGES: dict[int, tuple[_Layout, _Layout]] = {
-    PROTOCOL.types[name]: (_Layout(message, pack, unpack), reply)
-    for name, message, pack, unpack, reply in (
-        ("hello", Hello, _no_fields, lambda _: Hello(), _IDENTITY),
-        ("get_caps", GetCaps, _no_fields, lambda _: GetCaps(), _CAPABILITIES),
-        (
-            "arm",
-            Arm,
-            lambda arm: pack((_Q.watchdog, arm.watchdog)),
-            lambda cursor: Arm(watchdog=cursor.number(_Q.watchdog)),
-            _STATUS,
-        ),
-        (
-            "disarm",
-            Disarm,
-            lambda disarm: pack((_Q.ramp, disarm.ramp)),
-            lambda cursor: Disarm(ramp=cursor.number(_Q.ramp)),
-            _STATUS,
-        ),
-        (
-            "stage",
-            Stage,
-            lambda stage: _pack_set(stage.command_set),
-            lambda cursor: Stage(_unpack_set(cursor)),
-            _ACHIEVED,
-        ),
-        (
-            "commit",
-            Commit,
-            lambda commit: pack((_Q.token, commit.token)),
-            lambda cursor: Commit(token=cursor.integer(_Q.token)),
-            _ACHIEVED,
-        ),
-        (
-            "apply",
-            Apply,
-            lambda apply: _pack_set(apply.command_set),
-            lambda cursor: Apply(_unpack_set(cursor)),
-            _ACHIEVED,
-        ),
-        (
-            "stop",
-            Stop,
-            lambda stop: pack((_Q.ramp, stop.ramp)),
-            lambda cursor: Stop(ramp=cursor.number(_Q.ramp)),
-            _STATUS,
-        ),
-        ("get_status", GetStatus, _no_fields, lambda _: GetStatus(), _STATUS),
-        ("get_faults", GetFaults, _no_fields, lambda _: GetFaults(), _FAULTS),
-        ("clear", Clear, _no_fields, lambda _: Clear(), _STATUS),
-        ("ping", Ping, _no_fields, lambda _: Ping(), _STATUS),
-    )
+    PROTOCOL.types["hello"]: (_empty(Hello), _IDENTITY),
+    PROTOCOL.types["get_caps"]: (_empty(GetCaps), _CAPABILITIES),
+    PROTOCOL.types["arm"]: (_ARM, _STATUS),
+    PROTOCOL.types["disarm"]: (_DISARM, _STATUS),
+    PROTOCOL.types["stage"]: (_STAGE, _ACHIEVED),
+    PROTOCOL.types["commit"]: (_COMMIT, _ACHIEVED),
+    PROTOCOL.types["apply"]: (_APPLY, _ACHIEVED),
+    PROTOCOL.types["stop"]: (_STOP, _STATUS),
+    PROTOCOL.types["get_status"]: (_empty(GetStatus), _STATUS),
+    PROTOCOL.types["get_faults"]: (_empty(GetFaults), _FAULTS),
+    PROTOCOL.types["clear"]: (_empty(Clear), _STATUS),
+    PROTOCOL.types["ping"]: (_empty(Ping), _STATUS),
 }
 _TYPE_OF = {request.message: code for code, (request, _) in _EXCHANGES.items()}
 

@@ -11,8 +11,9 @@ from model.arrays import FloatArray, IntArray
 from model.errors import InputError
 from model.plate import Plate
 
-# With MITC4 the accelerations of the paper's plate are then about 2 % (relative L2) from converged.
-ELEMENTS_PER_WAVELENGTH = 26
+# With MITC4 the accelerations of the paper's plate are then about 1 % (relative L2 over the plate)
+# and its lowest twelve natural frequencies within 0.2 % of converged.
+ELEMENTS_PER_WAVELENGTH = 52
 
 
 @dataclass(frozen=True)

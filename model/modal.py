@@ -5,12 +5,13 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy import sparse
-from scipy.sparse.linalg import eigsh
+from scipy.sparse.linalg import LinearOperator, SuperLU, eigsh
 
 from model.actuator import Era
 from model.arrays import FloatArray, IntArray
 from model.assembly import PlateMatrices, era_positions
 from model.errors import InputError
+from model.factorisation import factorise
 
 RIGID_BODY_MODES = 3  # of a free plate: up and down, and two tilts
 
@@ -27,12 +28,13 @@ class Modes:
 
 
 def shift_invert_modes(
-    stiffness: sparse.csc_array, mass: sparse.csc_array, count: int, *, frequency_scale: float
-) -> tuple[FloatArray, FloatArray]:
+    stiffness: sparse.csc_array, mass: sparse.csc_array, count: int, *, shift: float
+) -> tuple[FloatArray, FloatArray, SuperLU]:
     """The lowest eigenpairs: omega² ascending (count,) and mass-normalised vectors (dof, count).
 
-    frequency_scale [Hz]: order of the lowest frequencies wanted. The shift lies below zero, where
-    the free plate's rigid-body modes leave stiffness alone singular.
+    shift [rad²/s²]: above zero, of the order of the lowest omega² wanted; stiffness + shift * mass
+    is then positive definite even where the free plate's rigid-body modes leave stiffness alone
+    singular. Its factors come with the answer, for whoever needs them next.
     """
     size = stiffness.shape[0]
     if count >= size:
@@ -40,13 +42,18 @@ def shift_invert_modes(
             f"{count} modes asked of a mesh with {size} free degrees of freedom; "
             "ask for fewer modes or use a finer mesh"
         )
-    shift = -((2 * np.pi * frequency_scale) ** 2)
-    start = np.random.default_rng(0).standard_normal(size)  # ARPACK's own start is random
+    factor = factorise(stiffness + shift * mass)
     squared, vectors = eigsh(
-        stiffness, count, M=mass, sigma=shift, which="LM", v0=start, mode="normal"
+        stiffness,
+        count,
+        M=mass,
+        sigma=-shift,
+        which="LM",
+        OPinv=LinearOperator(stiffness.shape, matvec=factor.solve, dtype=float),
+        v0=np.random.default_rng(0).standard_normal(size),  # ARPACK's own start is random
     )
     order = np.argsort(squared)
-    return squared[order], vectors[:, order]
+    return squared[order], vectors[:, order], factor
 
 
 def _nothing_held(matrices: PlateMatrices) -> IntArray:
@@ -87,11 +94,11 @@ def modes(matrices: PlateMatrices, count: int, *, support: str, eras: Sequence[E
     held = SUPPORTS[support](matrices)
     free = np.setdiff1d(np.arange(matrices.dof), held)
     rigid = RIGID_BODY_MODES if support == "free" else 0
-    squared, vectors = shift_invert_modes(
+    squared, vectors, _ = shift_invert_modes(
         sparse.csc_array(stiffness[free][:, free]),
         sparse.csc_array(mass[free][:, free]),
         count + rigid,
-        frequency_scale=matrices.plate.lowest_bending_frequency,
+        shift=(2 * np.pi * matrices.plate.lowest_bending_frequency) ** 2,
     )
     whole = np.zeros((matrices.dof, count))
     whole[free] = vectors[:, rigid:]

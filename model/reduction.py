@@ -7,6 +7,7 @@ modes already carry taken out, brings the error from percents to a few 1e-4 of t
 test against the direct solve says how few).
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,13 +15,12 @@ from scipy import linalg
 
 from model.arrays import FloatArray
 from model.assembly import assemble
-from model.factorisation import factorise
 from model.mesh import Mesh
 from model.modal import RIGID_BODY_MODES, shift_invert_modes
 from model.plate import Plate
 
-# Forty modes of the paper's plate reach to about 1.9 kHz, well above any frequency a finger feels.
-MODE_COUNT = 40
+# Modes are kept up to this multiple of the highest frequency asked for.
+FREQUENCY_MARGIN = 4.0
 
 
 @dataclass(frozen=True)
@@ -42,28 +42,41 @@ class ReducedPlate:
 
 
 def reduce_plate(
-    plate: Plate, mesh: Mesh, attachments: FloatArray, *, mode_count: int = MODE_COUNT
+    plate: Plate, mesh: Mesh, attachments: FloatArray, *, frequency_max: float = 500.0
 ) -> ReducedPlate:
-    """Solve the free plate once, for forces at the attachments [m] (n, 2)."""
+    """Solve the free plate once, for forces at the attachments [m] (n, 2).
+
+    frequency_max [Hz]: up to where the response shall hold; modes well above it are kept.
+    """
     matrices = assemble(plate, mesh)
     stiffness, mass = matrices.stiffness, matrices.mass
-    mode_count = min(mode_count, matrices.dof - len(attachments) - 1)
-    squared, vectors = shift_invert_modes(
-        stiffness, mass, mode_count, frequency_scale=plate.lowest_bending_frequency
+    squared, vectors, factor = shift_invert_modes(
+        stiffness,
+        mass,
+        min(_mode_count(plate, frequency_max), matrices.dof - 1),
+        shift=(2 * np.pi * plate.lowest_bending_frequency) ** 2,
     )
     squared[:RIGID_BODY_MODES] = 0.0
 
-    # A free plate has no static answer, but a slightly heavier dynamic one serves as well: with the
-    # shift below zero the matrix is positive definite, and what the modes hold is taken out anyway.
-    shift = (2 * np.pi * plate.lowest_bending_frequency) ** 2
-    factor = factorise(stiffness + shift * mass)
+    # A free plate has no static answer, but the shifted one serves as well: what the modes already
+    # carry is taken out anyway.
     forces = matrices.deflection_at(attachments).toarray()
     corrections = factor.solve(np.ascontiguousarray(forces.T))
-    corrections -= vectors @ (vectors.T @ (mass @ corrections))
-    corrections -= vectors @ (vectors.T @ (mass @ corrections))  # twice is enough (Kahan)
+    for _ in range(2):  # once leaves rounding behind, twice is enough (Kahan)
+        corrections -= vectors @ (vectors.T @ (mass @ corrections))
 
     small_mass = corrections.T @ (mass @ corrections)
     small_stiffness = corrections.T @ (stiffness @ corrections)
     extra_squared, mix = linalg.eigh(small_stiffness, small_mass)
     shapes = np.hstack([vectors[0::3], (corrections @ mix)[0::3]])
     return ReducedPlate(plate, mesh, np.sqrt(np.concatenate([squared, extra_squared])), shapes)
+
+
+def _mode_count(plate: Plate, frequency_max: float) -> int:
+    """How many modes a free plate has up to FREQUENCY_MARGIN times a frequency [Hz], about.
+
+    Area term of the mode count of a thin plate, pi S / wavelength², and by half more for its edges.
+    """
+    wavelength = plate.bending_wavelength(FREQUENCY_MARGIN * frequency_max)
+    area_term = math.pi * plate.length * plate.width / wavelength**2
+    return math.ceil(1.5 * area_term) + RIGID_BODY_MODES

@@ -5,6 +5,7 @@ of fingertips anywhere on the plate can be asked for at run time, and the respon
 at every cell of a grid, which says what lone fingers get and what the whole table can do.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -128,6 +129,24 @@ class LocalizationTable:
             quiet_level_db_sl=quiet_level,
         )
 
+    def drive_of(self, excitation: Excitation) -> dict[str, dict[str, float]]:
+        """An excitation as people read it: frequency, level 0..1 of the stroke, phase, by ERA."""
+        strokes = {era.name: era.stroke for era in self.eras}
+        return {
+            name: {
+                "frequency_hz": tone.frequency,
+                "level": tone.amplitude / strokes[name],
+                "phase_deg": math.degrees(tone.phase),
+            }
+            for name, tone in excitation.items()
+        }
+
+    @cached_property
+    def available_level_db_sl(self) -> FloatArray:
+        """Highest level [dB SL] that any pattern reaches at the centre of each cell, (cells,)."""
+        at_centres = _at_points(self.mesh, self.acceleration, self._cell_centres)
+        return decibels(sensation_of_patterns(at_centres, self._threshold).max(axis=0))
+
     @cached_property
     def _threshold(self) -> FloatArray:
         return detection_threshold(self.frequencies)
@@ -189,7 +208,9 @@ def build_table(
     if mode not in MODES:
         raise InputError(f"unknown drive mode {mode!r}; known: {', '.join(MODES)}")
     _check_frequencies(frequencies, rig)
-    reduced = reduce_plate(rig.plate, rig.mesh, era_positions(rig.eras))
+    reduced = reduce_plate(
+        rig.plate, rig.mesh, era_positions(rig.eras), frequency_max=float(frequencies[-1])
+    )
     nodes = reduced_acceleration(reduced, rig.eras, frequencies, rig.mesh.nodes)
     peak = peak_of_patterns(_at_points(rig.mesh, nodes, grid.samples(rig.plate)))
     return LocalizationTable(

@@ -1,0 +1,16 @@
+"""The model's share of the `era` command: config, plate, table."""
+
+import typer
+
+from model.config_cli import config_app
+from model.errors import InputError
+from model.plate_cli import plate_app
+from model.table_cli import table_app
+
+app = typer.Typer()
+app.add_typer(config_app, name="config")
+app.add_typer(plate_app, name="plate")
+app.add_typer(table_app, name="table")
+
+EXIT_STATUS: dict[type[BaseException], int] = {InputError: 2}
+"""Exit status of the errors that these commands raise on purpose."""

@@ -1,0 +1,129 @@
+"""`era plate`: natural frequencies and maps."""
+
+import json
+import time
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+plate_app = typer.Typer(help="The plate: natural frequencies and vibration maps.")
+
+RigArgument = Annotated[Path, typer.Argument(metavar="RIG", help="Rig file, e.g. RIG.yaml.")]
+MeshOption = Annotated[
+    str | None, typer.Option(metavar="NXxNY", help="Elements along x and y, in place of the rig's.")
+]
+JsonOption = Annotated[bool, typer.Option("--json", help="One JSON object, nothing else.")]
+
+
+class Support(StrEnum):
+    """What holds the plate."""
+
+    ERAS = "eras"
+    SIMPLY_SUPPORTED = "simply-supported"
+    FREE = "free"
+
+
+@plate_app.command()
+def modes(
+    rig_file: RigArgument,
+    mesh: MeshOption = None,
+    support: Annotated[Support, typer.Option(help="What holds the plate.")] = Support.ERAS,
+    count: Annotated[int, typer.Option("-n", min=1, help="How many modes.")] = 12,
+    as_json: JsonOption = False,
+) -> None:
+    """Natural frequencies of the undamped plate; elastic modes only where it is free."""
+    from model import modal
+    from model.assembly import assemble
+    from model.elements import mitc4
+    from model.rig_file import load_rig
+
+    rig = load_rig(rig_file, mesh=mesh)
+    started = time.perf_counter()
+    matrices = assemble(rig.plate, rig.mesh)
+    solved = modal.modes(matrices, count, support=support.value, eras=rig.eras)
+    elapsed = time.perf_counter() - started
+    if as_json:
+        print(
+            json.dumps(
+                {
+                    "frequencies_hz": solved.natural_frequencies.tolist(),
+                    "support": support.value,
+                    "mesh": [rig.mesh.nx, rig.mesh.ny],
+                    "dof": matrices.dof,
+                    "element": mitc4.NAME,
+                    "solve_time_s": elapsed,
+                }
+            )
+        )
+        return
+    print(f"{rig_file}: {mitc4.NAME} {rig.mesh}, {matrices.dof} dof, support: {support.value}")
+    for number, frequency in enumerate(solved.natural_frequencies, start=1):
+        print(f"mode {number:3d}  {frequency:9.2f} Hz")
+    print(f"solved in {elapsed:.2f} s")
+
+
+@plate_app.command("map")
+def plate_map(
+    rig_file: RigArgument,
+    drive: Annotated[
+        list[str],
+        typer.Option(metavar="ERA=HZ[@LEVEL[:PHASE_DEG]]", help="A tone of one ERA; repeatable."),
+    ],
+    mesh: MeshOption = None,
+    points: Annotated[
+        str | None, typer.Option(metavar="XxY", help="Raster of the answer; default: the mesh's.")
+    ] = None,
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", metavar="MAP.png", help="Draw it.")
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Peak acceleration all over the plate for any drive."""
+    import numpy as np
+
+    from model.drive_option import parse_drives
+    from model.maps import plate_map as solve
+    from model.points import parse_pair
+    from model.rig_file import load_rig
+    from model.vibration import G
+
+    rig = load_rig(rig_file, mesh=mesh)
+    excitation = parse_drives(drive, rig)
+    started = time.perf_counter()
+    solved = solve(rig, excitation, raster=parse_pair(points, what="--points") if points else None)
+    elapsed = time.perf_counter() - started
+    if output is not None:
+        from model.figures import map_figure, save_figure
+
+        figure = map_figure(rig, solved, active=excitation.keys(), title=", ".join(drive))
+        save_figure(figure, output)
+    row, column = divmod(int(solved.peak.argmax()), len(solved.x))
+    if as_json:
+        print(
+            json.dumps(
+                {
+                    "x_m": solved.x.tolist(),
+                    "y_m": solved.y.tolist(),
+                    "peak_acceleration_m_s2": solved.peak.tolist(),
+                    "max_m_s2": float(solved.peak.max()),
+                    "max_at_m": [float(solved.x[column]), float(solved.y[row])],
+                    "nulls_m": solved.nulls.tolist(),
+                    "mesh": [rig.mesh.nx, rig.mesh.ny],
+                    "solve_time_s": elapsed,
+                    "files": [str(output)] if output else [],
+                }
+            )
+        )
+        return
+    print(f"{rig_file}: {', '.join(drive)} on a {rig.mesh} mesh, solved in {elapsed:.2f} s")
+    print(
+        f"largest  {solved.peak.max() / G:8.2f} g  ({solved.peak.max():.1f} m/s²) "
+        f"at ({solved.x[column]:.4f}, {solved.y[row]:.4f}) m"
+    )
+    print(f"median   {float(np.median(solved.peak)) / G:8.2f} g")
+    print(f"nulls    {len(solved.nulls):5d}")
+    if output is not None:
+        print(f"wrote {output}")
+        print(f"Next: era table build {rig_file} -o table.npz")

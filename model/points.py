@@ -1,0 +1,52 @@
+"""Positions and frequency ranges as a user types them."""
+
+import math
+import re
+
+import numpy as np
+
+from model.arrays import FloatArray
+from model.errors import InputError
+
+# More than this many frequencies is a typing error, not a table.
+MOST_FREQUENCIES = 2000
+
+
+def parse_point(text: str, *, what: str) -> tuple[float, float]:
+    """Position [m] from `X,Y`; what names the option in the error."""
+    parts = text.split(",")
+    try:
+        x, y = (float(part) for part in parts)
+    except ValueError:
+        raise InputError(
+            f"{what} {text!r} is not X,Y in metres, for instance {what} 0.10,0.08"
+        ) from None
+    if not (math.isfinite(x) and math.isfinite(y)):
+        raise InputError(f"{what} {text!r}: both coordinates must be finite numbers")
+    return x, y
+
+
+def parse_pair(text: str, *, what: str) -> tuple[int, int]:
+    """Two counts from `12x9`."""
+    match = re.fullmatch(r"\s*(\d{1,6})\s*[x×]\s*(\d{1,6})\s*", text)
+    if match is None:
+        raise InputError(f"{what} {text!r} is not two numbers such as 12x9")
+    return int(match[1]), int(match[2])
+
+
+def parse_frequencies(text: str) -> FloatArray:
+    """Frequencies [Hz] from `LO:HI:STEP`, both ends included, or from a list `60,110,250`."""
+    try:
+        if ":" in text:
+            low, high, step = (float(part) for part in text.split(":"))
+            count = int((high - low) / step + 1e-9) + 1
+            if not (0 < low <= high and step > 0 and count <= MOST_FREQUENCIES):
+                raise ValueError
+            return np.asarray(low + step * np.arange(count))
+        values = np.array([float(part) for part in text.split(",")])
+    except (ValueError, OverflowError, ZeroDivisionError):
+        raise InputError(
+            f"--frequencies {text!r} is not LO:HI:STEP in Hz with LO above zero, for instance "
+            f"60:320:10, at most {MOST_FREQUENCIES} of them"
+        ) from None
+    return values

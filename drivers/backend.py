@@ -9,6 +9,10 @@ class Backend(ABC):
     """An amplifier over one kind of wire; retries, tokens and state belong to `Amplifier`."""
 
     @abstractmethod
+    def __init__(self, url: str) -> None:
+        """Take the URL apart without touching the wire; raises CommandError."""
+
+    @abstractmethod
     async def open(self) -> None:
         """Open the wire, exclusively where it can be; raises LinkError with what to do about it."""
 

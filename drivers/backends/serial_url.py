@@ -1,0 +1,65 @@
+"""Serial amplifier URLs: serial:///dev/ttyUSB0?baud=921600&address=1, or serial://HOST:PORT."""
+
+import re
+from dataclasses import dataclass
+from urllib.parse import parse_qsl, unquote, urlsplit
+
+from drivers.errors import CommandError
+from drivers.protocol.definition import PROTOCOL
+
+_FORM = "serial:///dev/ttyUSB0?baud=921600 (or serial://HOST:PORT for a serial server)"
+_BAUD_MAX = 12_000_000  # the fastest USB adapters
+
+
+@dataclass(frozen=True)
+class SerialUrl:
+    """Where a serial amplifier is: port as pyserial names it, speed [baud], address on the line."""
+
+    port: str
+    baud: int
+    address: int
+
+    @classmethod
+    def parse(cls, url: str) -> "SerialUrl":
+        """Take a URL apart; CommandError says which part is wrong and what it should be."""
+        try:
+            parts = urlsplit(url)
+            number = parts.port
+        except ValueError as problem:
+            raise CommandError(f"{url!r} is no serial URL: {problem}; use {_FORM}") from None
+        options = dict(parse_qsl(parts.query, keep_blank_values=True))
+        unknown = sorted(options.keys() - {"baud", "address"})
+        if unknown:
+            raise CommandError(
+                f"{url!r}: unknown option {', '.join(unknown)}; a serial URL has baud and address"
+            )
+        path = unquote(parts.path)
+        if parts.netloc:
+            if parts.hostname is None or number is None or path.strip("/"):
+                raise CommandError(f"{url!r} names no host and port; use {_FORM}")
+            port = f"socket://{parts.netloc}"
+        elif re.fullmatch(r"/COM\d+", path, re.IGNORECASE):
+            port = path[1:]
+        elif path.strip("/"):
+            port = path
+        else:
+            raise CommandError(f"{url!r} names no port; use {_FORM}")
+        line = PROTOCOL.serial
+        return cls(
+            port=port,
+            baud=_whole(options, "baud", default=line.baud, high=_BAUD_MAX, url=url),
+            address=_whole(
+                options, "address", default=line.address, high=line.address_max, url=url
+            ),
+        )
+
+
+def _whole(options: dict[str, str], name: str, *, default: int, high: int, url: str) -> int:
+    text = options.get(name)
+    if text is None:
+        return default
+    if not (text.isascii() and text.isdigit() and 1 <= int(text) <= high):
+        raise CommandError(
+            f"{url!r}: {name} is {text!r}; it must be a whole number from 1 to {high}"
+        )
+    return int(text)

@@ -1,0 +1,20 @@
+"""What serial frames cost in time, by arithmetic."""
+
+from drivers.protocol.definition import PROTOCOL
+from drivers.protocol.serial_frame import frame_length
+
+_BITS_PER_BYTE = 10  # start, eight data, stop
+_SET_HEAD = 7  # token, ramp, valid_for, count
+_ACHIEVED_HEAD = 3  # token, count
+_COMMAND = 8  # channel, flags, frequency, level, phase
+
+
+def wire_time(channels: int, *, baud: int = PROTOCOL.serial.baud) -> float:
+    """Time [s] that an apply of so many channels takes on the line."""
+    return frame_length(_SET_HEAD + _COMMAND * channels) * _BITS_PER_BYTE / baud
+
+
+def round_trip_time(channels: int, *, baud: int = PROTOCOL.serial.baud) -> float:
+    """Time [s] on the line of an apply and its answer, the amplifier's own delay not counted."""
+    answer = frame_length(_ACHIEVED_HEAD + _COMMAND * channels)
+    return wire_time(channels, baud=baud) + answer * _BITS_PER_BYTE / baud

@@ -18,8 +18,10 @@ _EV_SYN, _EV_ABS = 0x00, 0x03
 _SYN_REPORT, _SYN_MT_REPORT, _SYN_DROPPED = 0, 2, 3
 _SLOT, _POSITION_X, _POSITION_Y, _TRACKING_ID = 0x2F, 0x35, 0x36, 0x39
 
-_EVENT = re.compile(r"E: (\d{1,10}\.\d{1,6}) ([0-9a-f]{1,4}) ([0-9a-f]{1,4}) (-?\d{1,10})\s*(#.*)?")
-_AXIS = re.compile(r"A: ([0-9a-f]{1,2}) (-?\d{1,10}) (-?\d{1,10})( -?\d+)*\s*")
+_EVENT = re.compile(
+    r"E: (\d{1,10}\.\d{1,6}) ([0-9a-fA-F]{1,4}) ([0-9a-fA-F]{1,4}) (-?\d{1,10})\s*(#.*)?"
+)
+_AXIS = re.compile(r"A: ([0-9a-fA-F]{1,2}) (-?\d{1,10}) (-?\d{1,10})( -?\d+)*\s*")
 _COMMENT_CODE = re.compile(r"#\s+Event (?:code|type) (\d+) \((\w+)\)")
 _COMMENT_VALUE = re.compile(r"#\s+(Value|Min|Max)\s+(-?\d{1,10})\s*")
 _OTHER = re.compile(r"[A-Z]: .*|#.*|\s*")
@@ -123,7 +125,11 @@ def read_evemu(path: Path | str) -> list[TouchFrame]:
     header, events = _parse(path)
     for description in (path.with_suffix(".desc"), path.with_suffix("").with_suffix(".desc")):
         if description != path and description.is_file():
-            header = {**_parse(description)[0], **header}
+            # Its values are those of another moment than the recording's first.
+            ranges = {
+                key: limit for key, limit in _parse(description)[0].items() if key[1] != "Value"
+            }
+            header = ranges | header
     panel = _Panel(
         _axis(path, header, _POSITION_X, "ABS_MT_POSITION_X"),
         _axis(path, header, _POSITION_Y, "ABS_MT_POSITION_Y"),

@@ -64,7 +64,7 @@ class TuioReader:
     """
 
     def __init__(self, tally: Tally) -> None:
-        self._tally = tally
+        self.tally = tally
         self._senders: dict[str, _Sender] = {}
 
     def read(self, datagram: bytes, peer: tuple[str, int], *, now: float) -> TouchFrame | None:
@@ -73,12 +73,12 @@ class TuioReader:
         A cursor that is alive but was never set is left out; positions may be NaN.
         """
         if len(datagram) > _LARGEST_DATAGRAM:
-            self._tally.count("oversized", f"{len(datagram)} bytes from {peer[0]}:{peer[1]}")
+            self.tally.count("oversized", f"{len(datagram)} bytes from {peer[0]}:{peer[1]}")
             return None
         try:
             bundle = _read_bundle(datagram)
         except OscError as error:
-            self._tally.count("malformed", f"datagram from {peer[0]}:{peer[1]}: {error}")
+            self.tally.count("malformed", f"datagram from {peer[0]}:{peer[1]}: {error}")
             return None
         if bundle == _Bundle(source=bundle.source):
             return None  # other TUIO profiles, or a bundle that says nothing
@@ -90,7 +90,7 @@ class TuioReader:
             return None
         for x, y in bundle.positions.values():
             if not (math.isfinite(x) and math.isfinite(y)):
-                self._tally.count("not_finite", f"{name} sent a cursor at ({x}, {y})")
+                self.tally.count("not_finite", f"{name} sent a cursor at ({x}, {y})")
         sender.heard = now
         if bundle.alive is not None:
             sender.alive = tuple(dict.fromkeys(bundle.alive))
@@ -105,7 +105,7 @@ class TuioReader:
             if len(self._senders) >= _MOST_SENDERS:
                 oldest = min(self._senders, key=lambda known: self._senders[known].heard)
                 if now - self._senders[oldest].heard < _LATE_SECONDS:
-                    self._tally.count("too_many_senders", f"{name} is not listened to")
+                    self.tally.count("too_many_senders", f"{name} is not listened to")
                     return None
                 del self._senders[oldest]
             self._senders[name] = _Sender(heard=now)
@@ -122,7 +122,7 @@ class TuioReader:
         behind = sender.sequence - sequence
         if behind > 0:
             if behind <= _LATE_FRAMES and now - sender.numbered < _LATE_SECONDS:
-                self._tally.count("late", f"frame {sequence} of {name} after {sender.sequence}")
+                self.tally.count("late", f"frame {sequence} of {name} after {sender.sequence}")
                 return True
             sender.alive, sender.positions = (), {}  # a sender that began anew
         sender.sequence, sender.numbered = sequence, now

@@ -1,0 +1,127 @@
+"""Recorded TUIO streams."""
+
+import asyncio
+import socket
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from controller.sources.capture import (
+    HEADER,
+    Datagram,
+    read_capture,
+    replay_capture,
+    write_capture,
+)
+from drivers.errors import LinkError
+from model.errors import InputError
+
+
+@given(
+    st.lists(
+        st.tuples(st.integers(0, 10**8), st.binary(min_size=1, max_size=40)), min_size=1, max_size=9
+    )
+)
+def test_round_trip(
+    tmp_path_factory: pytest.TempPathFactory, sent: list[tuple[int, bytes]]
+) -> None:
+    """What was written to a microsecond comes back, malformed datagrams too."""
+    path = tmp_path_factory.mktemp("capture") / "stream.tuio"
+    datagrams = [Datagram(micros / 1e6, payload) for micros, payload in sorted(sent)]
+    write_capture(path, datagrams)
+    assert read_capture(path) == datagrams
+
+
+def test_golden_file(tmp_path: Path) -> None:
+    """The format as documented, comments included, is read."""
+    path = tmp_path / "golden.tuio"
+    path.write_text(f"{HEADER}\n# two fingers\n0 2f00ff\n1.5 0a\n", encoding="ascii")
+    assert read_capture(path) == [Datagram(0.0, b"\x2f\x00\xff"), Datagram(1.5, b"\n")]
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        ("", "line 1: no TUIO capture"),
+        ("# era-haptics TUIO capture 2\n0 00\n", "line 1: no TUIO capture"),
+        (f"{HEADER}\n", "the capture is empty"),
+        (f"{HEADER}\n0 00\n\n", "line 3"),
+        (f"{HEADER}\n0 0\n", "line 2"),
+        (f"{HEADER}\n0 zz\n", "line 2"),
+        (f"{HEADER}\n0\n", "line 2"),
+        (f"{HEADER}\n-1 00\n", "line 2"),
+        (f"{HEADER}\nnan 00\n", "line 2"),
+        (f"{HEADER}\n1e3 00\n", "line 2"),
+        (f"{HEADER}\n0 00 00\n", "line 2"),
+        (f"{HEADER}\n1 00\n0.5 00\n", "line 3: time runs backwards"),
+        (f"{HEADER}\n1 {'00' * 65508}\n", "line 2: 65508 bytes"),
+        (f"{HEADER}\n0 é\n", "not a text file"),
+    ],
+)
+def test_bad_captures(tmp_path: Path, text: str, complaint: str) -> None:
+    """Each error names the file and the line."""
+    path = tmp_path / "bad.tuio"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(InputError, match=complaint) as caught:
+        read_capture(path)
+    assert str(caught.value).startswith(str(path))
+
+
+def test_missing_capture(tmp_path: Path) -> None:
+    """A missing file is an input error."""
+    with pytest.raises(InputError, match="cannot be read: No such file"):
+        read_capture(tmp_path / "missing.tuio")
+
+
+@pytest.mark.parametrize(
+    "datagrams",
+    [
+        [Datagram(1.0, b"a"), Datagram(0.5, b"b")],
+        [Datagram(-1.0, b"a")],
+        [Datagram(float("nan"), b"a")],
+        [Datagram(0.0, b"")],
+    ],
+)
+def test_only_readable_captures_are_written(tmp_path: Path, datagrams: list[Datagram]) -> None:
+    """What the reader would refuse is refused when it is written, and no file is left."""
+    path = tmp_path / "bad.tuio"
+    with pytest.raises(InputError, match="datagram"):
+        write_capture(path, datagrams)
+    assert not path.exists()
+
+
+def test_replay_over_udp(run_virtual: Callable[..., None]) -> None:
+    """Datagrams arrive unchanged, each at its own time."""
+
+    async def scenario() -> None:
+        loop = asyncio.get_running_loop()
+        start = loop.time()
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
+            receiver.bind(("127.0.0.1", 0))
+            receiver.setblocking(False)
+            datagrams = [Datagram(0.0, b"one"), Datagram(0.25, b"two"), Datagram(1.0, b"three")]
+            port = receiver.getsockname()[1]
+            replay = asyncio.create_task(replay_capture(datagrams, "127.0.0.1", port))
+            received = [
+                (await loop.sock_recv(receiver, 100), loop.time() - start) for _ in datagrams
+            ]
+            await replay
+        assert received == [(b"one", 0.0), (b"two", 0.25), (b"three", 1.0)]
+
+    run_virtual(scenario())
+
+
+def test_replay_to_nobody(run_virtual: Callable[..., None]) -> None:
+    """A port where nobody listens is told at the next datagram."""
+
+    async def scenario() -> None:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as closed:
+            closed.bind(("127.0.0.1", 0))
+            port = closed.getsockname()[1]
+        with pytest.raises(LinkError, match=f"nobody listens on UDP 127.0.0.1:{port}"):
+            await replay_capture([Datagram(t, b"x") for t in (0.0, 0.1, 0.2)], "127.0.0.1", port)
+
+    run_virtual(scenario())

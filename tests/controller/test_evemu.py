@@ -1,0 +1,291 @@
+"""Recordings of touch panels in evemu's text format."""
+
+import asyncio
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from controller.sources.evemu import EvemuSource, read_evemu
+from controller.touch import TouchFrame
+from model.errors import InputError
+
+RANGES = """\
+# EVEMU 1.3
+#     Event code 47 (ABS_MT_SLOT)
+#       Value      {slot}
+#       Min        0
+#       Max        9
+#     Event code 53 (ABS_MT_POSITION_X)
+#       Value      0
+#       Min        0
+#       Max      1000
+#     Event code 54 (ABS_MT_POSITION_Y)
+#       Value      0
+#       Min      -100
+#       Max       100
+#     Event code 57 (ABS_MT_TRACKING_ID)
+#       Min        0
+#       Max    65535
+N: A panel
+A: 35 0 1000 0 0 0
+################################
+#      Waiting for events      #
+################################
+"""
+CODES = {
+    "slot": "0003 002f",
+    "id": "0003 0039",
+    "x": "0003 0035",
+    "y": "0003 0036",
+    "touch": "0001 014a",
+    "report": "0000 0000",
+    "dropped": "0000 0003",
+}
+
+
+def events(*reports: tuple[float, str]) -> str:
+    """Reports such as `(0.5, "slot 0 id 7 x 100 y 50")` as evemu writes them."""
+    lines = []
+    for time, words in reports:
+        pairs = words.split()
+        for code, value in zip(pairs[::2], pairs[1::2], strict=True):
+            lines.append(f"E: {time:.6f} {CODES[code]} {int(value):04d}\t# a comment")
+        lines.append(f"E: {time:.6f} {CODES['report']} 0000\t# ------------ SYN_REPORT (0) -----")
+    return "\n".join(lines) + "\n"
+
+
+def write(folder: Path, *reports: tuple[float, str], header: str = RANGES.format(slot=0)) -> Path:
+    """A recording in a file."""
+    path = folder / "panel.taps.events"
+    path.write_text(header + events(*reports), encoding="utf-8")
+    return path
+
+
+def shown(frames: list[TouchFrame]) -> list[tuple[float, dict[int, tuple[float, float]]]]:
+    """Frames, to compare."""
+    return [
+        (round(frame.time, 6), {touch.id: (touch.x, touch.y) for touch in frame.touches})
+        for frame in frames
+    ]
+
+
+def test_two_fingers(tmp_path: Path) -> None:
+    """Slots are followed from down to up; values left out have not changed; times start at 0 s."""
+    path = write(
+        tmp_path,
+        (3.25, "id 7 x 100 y 0"),
+        (3.50, "slot 1 id 8 x 900 y 50"),
+        (3.75, "x 800 slot 0 y -50"),
+        (4.00, "id -1"),
+        (4.25, "slot 1 id -1"),
+    )
+    assert shown(read_evemu(path)) == [
+        (0.0, {7: (0.1, 0.5)}),
+        (0.25, {7: (0.1, 0.5), 8: (0.9, 0.75)}),
+        (0.5, {7: (0.1, 0.25), 8: (0.8, 0.75)}),
+        (0.75, {8: (0.8, 0.75)}),
+        (1.0, {}),
+    ]
+
+
+def test_a_second_tap_at_the_same_place(tmp_path: Path) -> None:
+    """The kernel leaves out a coordinate that did not change since the slot's last contact."""
+    path = write(tmp_path, (0, "id 1 x 100 y 0"), (1, "id -1"), (2, "id 2 y 50"))
+    assert shown(read_evemu(path))[-1] == (2.0, {2: (0.1, 0.75)})
+
+
+def test_the_slot_at_the_start_is_in_the_header(tmp_path: Path) -> None:
+    """Events before the first slot event belong to the slot that the header says is current."""
+    path = write(
+        tmp_path,
+        (0, "id 5 x 100 y 0"),
+        (1, "slot 0 id 6 x 200 y 0"),
+        (2, "slot 3 id -1"),
+        header=RANGES.format(slot=3),
+    )
+    assert shown(read_evemu(path))[-1] == (2.0, {6: (0.2, 0.5)})
+
+
+def test_a_contact_that_was_already_down(tmp_path: Path) -> None:
+    """A slot that moves without having begun is followed once its place is known, and lifted."""
+    path = write(
+        tmp_path, (0, "x 100"), (1, "y 0"), (2, "slot 1 id 4 x 500 y 0"), (3, "slot 0 id -1")
+    )
+    frames = shown(read_evemu(path))
+    assert frames[0] == (0.0, {})
+    (early,) = frames[1][1]
+    assert early < 0
+    assert frames[1][1] == {early: (0.1, 0.5)}
+    assert frames[2][1] == {early: (0.1, 0.5), 4: (0.5, 0.5)}
+    assert frames[3][1] == {4: (0.5, 0.5)}
+
+
+def test_position_after_the_lift_is_no_contact(tmp_path: Path) -> None:
+    """A slot that says where its lifted finger was stays empty."""
+    path = write(tmp_path, (0, "id 1 x 100 y 0"), (1, "id -1"), (2, "x 200"))
+    assert shown(read_evemu(path))[-1] == (2.0, {})
+
+
+def test_a_tap_within_one_report(tmp_path: Path) -> None:
+    """A contact that came and went within one report is seen down and up."""
+    path = write(tmp_path, (0, "id 1 x 100 y 0 id -1"), (1, "id 2 x 300 y 0 id -1 id 3 x 400"))
+    assert shown(read_evemu(path)) == [
+        (0.0, {1: (0.1, 0.5)}),
+        (0.0, {}),
+        (1.0, {2: (0.3, 0.5)}),
+        (1.0, {}),
+        (1.0, {3: (0.4, 0.5)}),
+    ]
+
+
+def test_lifted_and_back_under_the_same_id(tmp_path: Path) -> None:
+    """A lift within one report is seen even if the same id comes back in it."""
+    path = write(tmp_path, (0, "id 1 x 100 y 0"), (1, "id -1 id 1"))
+    assert shown(read_evemu(path)) == [
+        (0.0, {1: (0.1, 0.5)}),
+        (1.0, {}),
+        (1.0, {1: (0.1, 0.5)}),
+    ]
+
+
+def test_replaced_without_a_lift(tmp_path: Path) -> None:
+    """A tracking id that follows another without -1 is another contact."""
+    path = write(tmp_path, (0, "id 1 x 100 y 0"), (1, "id 2 x 200"))
+    assert shown(read_evemu(path))[-1] == (1.0, {2: (0.2, 0.5)})
+
+
+def test_lost_events(tmp_path: Path) -> None:
+    """After SYN_DROPPED nothing is believed to be down until it moves, then under a new id."""
+    path = write(
+        tmp_path,
+        (0, "id 1 x 100 y 0"),
+        (1, "x 200 dropped 0 id -1 id 9 x 300"),
+        (2, "x 400"),
+        (3, "y 50"),
+        (4, "id -1"),
+    )
+    frames = shown(read_evemu(path))
+    assert frames[1:3] == [(1.0, {}), (2.0, {})]
+    (again,) = frames[3][1].items()
+    assert again[0] not in (1, 9)
+    assert again[1] == (0.4, 0.75)
+    assert frames[4] == (4.0, {})
+
+
+@given(
+    st.lists(
+        st.lists(
+            st.one_of(
+                st.tuples(st.just("slot"), st.integers(0, 2)),
+                st.tuples(st.just("id"), st.integers(-1, 3)),
+                st.tuples(st.sampled_from(["x", "y"]), st.integers(0, 100)),
+                st.tuples(st.just("dropped"), st.just(0)),
+            ),
+            max_size=6,
+        ),
+        min_size=1,
+        max_size=8,
+    )
+)
+def test_any_sequence_of_events(
+    tmp_path_factory: pytest.TempPathFactory, reports: list[list[tuple[str, int]]]
+) -> None:
+    """Whatever a panel reports, a frame holds no slot without its place and time never runs back.
+
+    A slot holds one contact at most, so there are never more touches than slots were named.
+    """
+    words = [" ".join(f"{code} {value}" for code, value in report) for report in reports]
+    path = write(tmp_path_factory.mktemp("any"), *enumerate(words))
+    frames = read_evemu(path)
+    times = [frame.time for frame in frames]
+    assert times == sorted(times)
+    slots = {value for report in reports for code, value in report if code == "slot"} | {0}
+    assert all(len(frame.touches) <= len(slots) for frame in frames)
+    assert len(frames) >= len(reports)
+
+
+def test_ranges_from_the_desc_beside_it(tmp_path: Path) -> None:
+    """A recording without ranges takes them from DEVICE.desc; the slot's value there is stale."""
+    header = "# EVEMU 1.0\n"
+    path = write(tmp_path, (0, "id 1 x 100 y 30"), (1, "slot 0 x 200"), header=header)
+    with pytest.raises(InputError, match=r"ABS_MT_POSITION_X is not in its header.*\.desc"):
+        read_evemu(path)
+    (tmp_path / "panel.desc").write_text(
+        "N: A panel\n#     Event code 47 (ABS_MT_SLOT)\n#       Value   4\n"
+        "A: 2f 0 9 0 0 0\nA: 35 0 400 0 0 0\nA: 36 0 40 0 0 0\n",
+        encoding="utf-8",
+    )
+    assert shown(read_evemu(path)) == [(0.0, {1: (0.25, 0.75)}), (1.0, {1: (0.5, 0.75)})]
+
+
+GOOD = RANGES.format(slot=0)
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        (GOOD + "E: 0.0 0003\n", r"line 22: not an event"),
+        (GOOD + "E: nan 0003 0035 0001\n", r"line 22: not an event"),
+        (GOOD + events((2, "x 1"), (1, "x 2")), r"line 24: time runs backwards"),
+        (GOOD + "E: 0.0 0003 002f -001\n", r"line 22: slot -1 is below zero"),
+        (GOOD + "E: 0.0 0000 0002 0000\n", r"line 22: multi-touch protocol type A"),
+        (GOOD + "hello\n", r"line 22: 'hello' does not belong"),
+        (GOOD, r"no touch report"),
+        (GOOD.replace("Max       100", "Max      -100"), r"ABS_MT_POSITION_Y is -100 to -100"),
+        ("\x00\x01\x02", r"line 1: .* does not belong"),
+        ("", r"ABS_MT_POSITION_X is not in its header"),
+    ],
+)
+def test_bad_recordings(tmp_path: Path, text: str, complaint: str) -> None:
+    """Each error names the file and, where there is one, the line."""
+    path = tmp_path / "bad.events"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(InputError, match=complaint) as caught:
+        read_evemu(path)
+    assert str(caught.value).startswith(str(path))
+
+
+def test_files_that_cannot_be_read(tmp_path: Path) -> None:
+    """A missing file and one that is no text are input errors."""
+    with pytest.raises(InputError, match="cannot be read: No such file"):
+        read_evemu(tmp_path / "missing.events")
+    binary = tmp_path / "binary.events"
+    binary.write_bytes(b"\xff\xfe\x00\x81")
+    with pytest.raises(InputError, match="not a text file"):
+        read_evemu(binary)
+
+
+def test_replay_at_its_own_pace(tmp_path: Path, run_virtual: Callable[..., None]) -> None:
+    """Frames come at their times; a touched panel at rest repeats itself at most 50 ms apart."""
+    path = write(tmp_path, (0, "id 1 x 100 y 0"), (0.12, "x 200"), (0.14, "id -1"), (0.5, "id 2"))
+
+    async def scenario() -> None:
+        start = asyncio.get_running_loop().time()
+        delivered: list[TouchFrame] = []
+        await EvemuSource(f"evemu:{path}").run(delivered.append)
+        assert [
+            (round(frame.time - start, 6), [touch.id for touch in frame.touches])
+            for frame in delivered
+        ] == [
+            (0.0, [1]),
+            (0.05, [1]),
+            (0.1, [1]),
+            (0.12, [1]),
+            (0.14, []),
+            (0.5, [2]),
+            (0.55, []),  # never lifted in the recording
+        ]
+        assert {frame.source for frame in delivered} == {"evemu:panel.taps.events"}
+
+    run_virtual(scenario())
+
+
+def test_url(tmp_path: Path) -> None:
+    """A source needs a path, and refuses a bad recording before anything is replayed."""
+    with pytest.raises(InputError, match="expected evemu:PATH"):
+        EvemuSource("evemu:")
+    with pytest.raises(InputError, match="cannot be read"):
+        EvemuSource(f"evemu:{tmp_path / 'missing.events'}")

@@ -1,0 +1,326 @@
+"""TUIO 1.1 cursors over UDP."""
+
+import asyncio
+import logging
+import math
+import socket
+import struct
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pythonosc.osc_bundle_builder import IMMEDIATELY, OscBundleBuilder
+from pythonosc.osc_message_builder import OscMessageBuilder
+
+from controller.sources.tuio import TuioReader, TuioSource, tuio_datagram
+from controller.tally import Tally
+from controller.touch import Touch, TouchFrame
+from model.errors import InputError
+
+PEER = ("192.0.2.7", 50000)
+
+
+def message(*arguments: Any, address: str = "/tuio/2Dcur") -> Any:
+    """An OSC message with python-osc's own choice of types."""
+    builder = OscMessageBuilder(address)
+    for argument in arguments:
+        builder.add_arg(argument)
+    return builder.build()
+
+
+def bundle(*messages: Any) -> bytes:
+    """A bundle as a TUIO sender makes it."""
+    builder = OscBundleBuilder(IMMEDIATELY)
+    for part in messages:
+        builder.add_content(part)
+    return builder.build().dgram
+
+
+def cursor(id: int, x: float, y: float) -> Any:
+    """A set message of a cursor at rest."""
+    return message("set", id, x, y, 0.0, 0.0, 0.0)
+
+
+def frame(*touches: tuple[int, float, float], fseq: int = -1, source: str = "table@a") -> bytes:
+    """A complete bundle."""
+    return bundle(
+        message("source", source),
+        message("alive", *(id for id, _, _ in touches)),
+        *(cursor(*touch) for touch in touches),
+        message("fseq", fseq),
+    )
+
+
+@pytest.fixture
+def reader() -> TuioReader:
+    """A reader whose log line does not matter."""
+    return TuioReader(Tally(logging.getLogger("test")))
+
+
+def touches(frame: TouchFrame | None) -> list[tuple[int, float, float]]:
+    """What is on the plate, to compare."""
+    assert frame is not None
+    return [(touch.id, touch.x, touch.y) for touch in frame.touches]
+
+
+def counts(reader: TuioReader) -> dict[str, int]:
+    """What the reader has counted."""
+    return dict(reader.tally.counts)
+
+
+def test_golden_bundle(reader: TuioReader) -> None:
+    """The bytes of a bundle, written out from the OSC 1.0 and TUIO 1.1 specifications, are read."""
+
+    def element(raw: bytes) -> bytes:
+        return struct.pack(">i", len(raw)) + raw
+
+    golden = (
+        b"#bundle\0"
+        + b"\0\0\0\0\0\0\0\1"
+        + element(b"/tuio/2Dcur\0,si\0alive\0\0\0" + b"\0\0\0\x2a")
+        + element(
+            b"/tuio/2Dcur\0,sifffff\0\0\0\0set\0\0\0\0\x2a"
+            b"\x3f\x00\x00\x00\x3e\x80\x00\x00" + bytes(12)
+        )
+        + element(b"/tuio/2Dcur\0,si\0fseq\0\0\0\0\0\0\0\1")
+    )
+    result = reader.read(golden, PEER, now=5.0)
+    assert result == TouchFrame("tuio:192.0.2.7:50000", 5.0, (Touch(42, 0.5, 0.25),))
+
+
+def test_only_changes_are_set(reader: TuioReader) -> None:
+    """A cursor that is alive but not set again stays where it was; one not alive is gone."""
+    reader.read(frame((1, 0.25, 0.5), (2, 0.75, 0.5), fseq=1), PEER, now=0)
+    source = message("source", "table@a")
+    moved = bundle(source, message("alive", 1, 2), cursor(2, 0.5, 0.5), message("fseq", 2))
+    assert touches(reader.read(moved, PEER, now=0.01)) == [(1, 0.25, 0.5), (2, 0.5, 0.5)]
+    lifted = bundle(source, message("alive", 2), message("fseq", 3))
+    assert touches(reader.read(lifted, PEER, now=0.02)) == [(2, 0.5, 0.5)]
+    none = bundle(source, message("alive"), message("fseq", 4))
+    assert touches(reader.read(none, PEER, now=0.03)) == []
+
+
+def test_alive_without_a_position_is_left_out(reader: TuioReader) -> None:
+    """A cursor whose set message was lost appears once its place is known, not at the origin."""
+    assert touches(reader.read(bundle(message("alive", 5)), PEER, now=0)) == []
+    late = bundle(message("alive", 5), cursor(5, 0.5, 0.5))
+    assert touches(reader.read(late, PEER, now=0)) == [(5, 0.5, 0.5)]
+
+
+def test_frame_at_the_end_of_a_bundle_without_fseq(reader: TuioReader) -> None:
+    """A bundle without a number is a frame all the same."""
+    assert touches(reader.read(bundle(message("alive", 1), cursor(1, 0.5, 1.0)), PEER, now=0)) == [
+        (1, 0.5, 1.0)
+    ]
+
+
+def test_late_frames_are_dropped(reader: TuioReader) -> None:
+    """A reordered frame changes nothing, neither positions nor what is alive."""
+    reader.read(frame((1, 0.25, 0.5), fseq=10), PEER, now=0)
+    assert reader.read(frame((1, 0.75, 0.5), (2, 0.5, 0.5), fseq=9), PEER, now=0.01) is None
+    again = bundle(message("source", "table@a"), message("alive", 1), message("fseq", 11))
+    assert touches(reader.read(again, PEER, now=0.02)) == [(1, 0.25, 0.5)]
+    assert counts(reader) == {"late": 1}
+
+
+def test_redundant_frames_are_accepted(reader: TuioReader) -> None:
+    """A frame numbered -1 is news whatever came before, and does not make the next one late."""
+    reader.read(frame((1, 0.25, 0.5), fseq=10), PEER, now=0)
+    assert touches(reader.read(frame((1, 0.5, 0.5), fseq=-1), PEER, now=0.01)) == [(1, 0.5, 0.5)]
+    assert touches(reader.read(frame((1, 0.75, 0.5), fseq=11), PEER, now=0.02)) == [(1, 0.75, 0.5)]
+
+
+@pytest.mark.parametrize(("before", "pause"), [(5000, 0.001), (50, 0.6)])
+def test_a_sender_that_began_anew(reader: TuioReader, before: int, pause: float) -> None:
+    """Counting from 1 again is a restart after a fall by over 100 or after a pause; all is new."""
+    reader.read(frame((1, 0.25, 0.5), fseq=before), PEER, now=0)
+    first = bundle(message("source", "table@a"), message("alive", 1), message("fseq", 1))
+    assert touches(reader.read(first, PEER, now=pause)) == []
+    assert touches(reader.read(frame((1, 0.5, 0.5), fseq=2), PEER, now=pause)) == [(1, 0.5, 0.5)]
+
+
+def test_sources_are_kept_apart(reader: TuioReader) -> None:
+    """Two senders may use the same ids and numbers, behind one address or behind two."""
+    for name, peer in (("a", PEER), ("b", PEER), ("a", ("192.0.2.8", 50000))):
+        reader.read(frame((1, 0.25, 0.5), fseq=100, source=name), peer, now=0)
+    other = frame((1, 0.75, 0.5), fseq=99, source="c")
+    assert touches(reader.read(other, PEER, now=0)) == [(1, 0.75, 0.5)]
+    still = bundle(message("source", "a"), message("alive", 1), message("fseq", 101))
+    result = reader.read(still, PEER, now=0)
+    assert touches(result) == [(1, 0.25, 0.5)]
+    names = {
+        result.source
+        for result in (
+            reader.read(frame(fseq=102, source=name), peer, now=0)
+            for name in ("a", "b")
+            for peer in (PEER, ("192.0.2.8", 50000))
+        )
+        if result
+    }
+    assert len(names) == 4
+
+
+def test_number_of_senders_is_bounded(reader: TuioReader) -> None:
+    """The seventeenth sender is refused and counted until one has been quiet for a while."""
+    for number in range(16):
+        assert reader.read(frame(source=f"s{number}"), PEER, now=number / 100) is not None
+    assert reader.read(frame(source="s16"), PEER, now=0.2) is None
+    assert counts(reader) == {"too_many_senders": 1}
+    assert reader.read(frame(source="s16"), PEER, now=0.51) is not None
+
+
+def test_positions_are_passed_on_unchecked(reader: TuioReader) -> None:
+    """Not a number and off the sensor are the tracker's to judge; the former is counted."""
+    result = touches(reader.read(frame((1, math.nan, 0.5), (2, 1.5, -3.0)), PEER, now=0))
+    assert math.isnan(result[0][1])
+    assert result[1] == (2, 1.5, -3.0)
+    assert counts(reader) == {"not_finite": 1}
+
+
+def test_other_profiles_are_passed_over(reader: TuioReader) -> None:
+    """Objects and blobs on the same port are neither frames nor errors."""
+    objects = bundle(
+        message("alive", 3, address="/tuio/2Dobj"), message("fseq", 7, address="/tuio/2Dobj")
+    )
+    assert reader.read(objects, PEER, now=0) is None
+    assert counts(reader) == {}
+
+
+def _raw(*sizes_and_parts: tuple[int, bytes]) -> bytes:
+    """A bundle whose element sizes are what one likes."""
+    return b"#bundle\0" + bytes(8) + b"".join(struct.pack(">i", n) + b for n, b in sizes_and_parts)
+
+
+MALFORMED = {
+    "empty": b"",
+    "noise": b"\xff\x00\x13hello",
+    "bundle without a time tag": b"#bundle\0\0",
+    "element of negative size": _raw((-4, b"")),
+    "element of size zero": _raw((0, b"")),
+    "element longer than the datagram": _raw((400, bytes(message("alive", 1).dgram))),
+    "bundle in a bundle": _raw((16, b"#bundle\0" + bytes(8))),
+    "no type tags": b"/tuio/2Dcur\0",
+    "no arguments": bytes(message().dgram),
+    "text that is not UTF-8": b"/tuio/2Dcur\0,s\0\0\xff\xfe\0\0",
+    "types nobody expects": bytes(message("alive", True).dgram),
+    "an id that is a float": bytes(message("alive", 1.0).dgram),
+    "a position that is text": bytes(message("set", 1, "0.5", 0.5, 0.0, 0.0, 0.0).dgram),
+    "positions that are integers": bytes(message("set", 1, 0, 1, 0.0, 0.0, 0.0).dgram),
+    "too few arguments": bytes(message("set", 1, 0.5, 0.5).dgram),
+    "floats cut off": bytes(message("set", 1, 0.5, 0.5, 0.0, 0.0, 0.0).dgram)[:-20],
+    "unknown command": bytes(message("wave", 1).dgram),
+    "a name of 4000 letters": bytes(message("source", "x" * 4000).dgram),
+}
+
+
+@pytest.mark.parametrize("datagram", MALFORMED.values(), ids=MALFORMED.keys())
+def test_malformed_datagrams(
+    reader: TuioReader, datagram: bytes, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Each is counted and logged, none raises or makes a touch, and python-osc stays silent."""
+    reader.read(frame((1, 0.25, 0.5), fseq=1), PEER, now=0)
+    assert reader.read(datagram, PEER, now=0) is None
+    assert counts(reader) == {"malformed": 1}
+    assert [record.name for record in caplog.records] == ["test"]
+
+
+def test_a_bad_message_spoils_its_whole_bundle(reader: TuioReader) -> None:
+    """A bundle with one malformed message changes nothing at all."""
+    reader.read(frame((1, 0.25, 0.5), fseq=1), PEER, now=0)
+    source = message("source", "table@a")
+    bad = bundle(source, message("alive", 1, 2), cursor(1, 0.5, 0.5), message("set", 2, "x"))
+    assert reader.read(bad, PEER, now=0) is None
+    fine = bundle(source, message("alive", 1), message("fseq", 2))
+    assert touches(reader.read(fine, PEER, now=0)) == [(1, 0.25, 0.5)]
+
+
+def test_huge_bundles_are_not_read(reader: TuioReader) -> None:
+    """More than eight kilobytes are no touch frame; a hundred cursors are."""
+    many = [(id, 0.5, 0.5) for id in range(200)]
+    assert reader.read(frame(*many[:100]), PEER, now=0) is not None
+    assert reader.read(frame(*many), PEER, now=0) is None
+    assert counts(reader) == {"oversized": 1}
+
+
+@given(st.binary(max_size=200), st.integers(0, 300))
+def test_any_bytes(noise: bytes, cut: int) -> None:
+    """Whatever bytes come, alone or in the middle of a good bundle, nothing is raised."""
+    reader = TuioReader(Tally(logging.getLogger("test")))
+    good = frame((1, 0.25, 0.5), fseq=1)
+    for datagram in (noise, good[:cut], good[:cut] + noise, good[:cut] + noise + good[cut:]):
+        reader.read(datagram, PEER, now=0)
+
+
+@given(
+    st.dictionaries(
+        st.integers(-(2**31), 2**31 - 1),
+        st.tuples(st.floats(0, 1, width=32), st.floats(0, 1, width=32)),
+        max_size=10,
+    )
+)
+def test_tuio_datagram_is_the_inverse(places: dict[int, tuple[float, float]]) -> None:
+    """What tuio_datagram writes, the reader reads: ids and positions of single precision."""
+    wanted = tuple(Touch(id, x, y) for id, (x, y) in places.items())
+    datagram = tuio_datagram(TouchFrame("table@a", 0.0, wanted), 7)
+    result = TuioReader(Tally(logging.getLogger("test"))).read(datagram, PEER, now=2.0)
+    assert result == TouchFrame("tuio:192.0.2.7/table@a", 2.0, wanted)
+
+
+def test_over_udp(run_virtual: Callable[..., list[TouchFrame]]) -> None:
+    """A datagram to the bound port becomes a frame at the loop's time; port 0 takes a free one."""
+
+    async def scenario() -> list[TouchFrame]:
+        source = TuioSource("tuio:127.0.0.1:0")
+        await source.open()
+        assert source.port > 0
+        delivered: asyncio.Queue[TouchFrame] = asyncio.Queue()
+        running = asyncio.create_task(source.run(delivered.put_nowait))
+        await asyncio.sleep(0)
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+            sender.sendto(b"noise", ("127.0.0.1", source.port))
+            sender.sendto(frame((1, 0.25, 0.5)), ("127.0.0.1", source.port))
+            received = [await delivered.get()]
+        running.cancel()
+        await asyncio.gather(running, return_exceptions=True)
+        assert source.tally.counts == {"malformed": 1}
+        assert received[0].time == asyncio.get_running_loop().time()
+        return received
+
+    assert touches(run_virtual(scenario())[0]) == [(1, 0.25, 0.5)]
+
+
+def test_a_port_that_is_taken(run_virtual: Callable[..., None]) -> None:
+    """The error names the port and what to do."""
+
+    async def scenario() -> None:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+            other.bind(("127.0.0.1", 0))
+            port = other.getsockname()[1]
+            with pytest.raises(InputError, match=f"127.0.0.1:{port}.*another port"):
+                await TuioSource(f"tuio:127.0.0.1:{port}").open()
+
+    run_virtual(scenario())
+
+
+@pytest.mark.parametrize(
+    ("url", "host", "port"),
+    [
+        ("tuio:", "127.0.0.1", 3333),
+        ("tuio:4000", "127.0.0.1", 4000),
+        ("tuio:192.0.2.1:4000", "192.0.2.1", 4000),
+        ("tuio:[::1]:4000", "::1", 4000),
+    ],
+)
+def test_urls(url: str, host: str, port: int) -> None:
+    """What is left out of a URL is loopback and the registered port."""
+    source = TuioSource(url)
+    assert (source.host, source.port) == (host, port)
+
+
+@pytest.mark.parametrize("url", ["tuio:host", "tuio:host:65536", "tuio:host:-1", "udp:1:2"])
+def test_bad_urls(url: str) -> None:
+    """A URL that names no port is refused with an example."""
+    with pytest.raises(InputError, match=r"tuio:127\.0\.0\.1:3333"):
+        TuioSource(url)

@@ -63,14 +63,14 @@ def _take_debug(arguments: Sequence[str]) -> tuple[bool, list[str]]:
 
 def _put_together(modules: Iterable[EntryPoint], *, debug: bool) -> tuple[TyperGroup, ExitStatus]:
     """One group with the commands of all modules; one that cannot be loaded is left out."""
-    group = get_group(_plain(callback=True))
+    app = typer.Typer(no_args_is_help=True)
+    app.callback()(_root)
+    group = _group(app)
     statuses: ExitStatus = {}
     for entry in modules:
         try:
             module = entry.load()
-            app = _plain(callback=False)
-            app.add_typer(module.app)
-            commands = get_group(app).commands
+            commands = _group(module.app).commands
             repeated = ", ".join(sorted(commands.keys() & group.commands.keys()))
             if repeated:
                 raise RuntimeError(f"another package has these commands too: {repeated}")
@@ -86,12 +86,10 @@ def _put_together(modules: Iterable[EntryPoint], *, debug: bool) -> tuple[TyperG
     return group, statuses
 
 
-def _plain(*, callback: bool) -> typer.Typer:
-    """An empty application. Without rich, which alone would double the time `era --help` takes."""
-    app = typer.Typer(rich_markup_mode=None, no_args_is_help=True)
-    if callback:
-        app.callback()(_root)
-    return app
+def _group(app: typer.Typer) -> TyperGroup:
+    """The commands of an application; their help without rich, which would double its time."""
+    app.rich_markup_mode = None
+    return get_group(app)
 
 
 def _show_version(wanted: bool) -> None:
@@ -149,7 +147,8 @@ def _report_usage(error: typer.TyperException) -> int:
     elif message == context.get_help():
         typer.echo(message, err=True)
     else:
-        _say(f"error: {message.rstrip('.')}. See  {context.command_path} --help")
+        stop = "" if message.endswith((".", "?")) else "."
+        _say(f"error: {message}{stop} See  {context.command_path} --help")
     return BAD_INPUT
 
 

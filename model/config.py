@@ -135,7 +135,7 @@ def _problem(document: Document, root: type[Section], details: ErrorDetails) -> 
         case "int_type" | "int_from_float":
             message = f"must be a whole number, not {_shown(details)}"
         case "string_type":
-            message = f"must be a text, not {_shown(details)}; put it in quotes"
+            message = f"must be a text, not {_shown(details)}"
         case "too_short" | "too_long":
             bound = f"at least {context['min_length']}" if "min_length" in context else ""
             bound = bound or f"at most {context['max_length']}"

@@ -57,8 +57,11 @@ class Rig:
 def physics_fingerprint(plate: Plate, eras: Sequence[Era]) -> str:
     """SHA-256 over what the plate's response depends on: plate and ERAs, not mesh or wiring.
 
-    Rigs with the same fingerprint can use the same localization table.
+    Rigs with the same fingerprint can use the same localization table, whatever their material is
+    called.
     """
-    physics = {"plate": asdict(plate), "eras": [asdict(era) for era in eras]}
+    numbers = asdict(plate)
+    del numbers["material"]["name"]
+    physics = {"plate": numbers, "eras": [asdict(era) for era in eras]}
     text = json.dumps(physics, sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(text.encode()).hexdigest()

@@ -1,0 +1,22 @@
+"""`python -m sim RIG --serial`: the far end without the rest of the `era` command."""
+
+import os
+import sys
+
+
+def main() -> int:
+    """Run the command line; returns the exit status."""
+    for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ.setdefault(variable, "1")  # before numpy loads: two are slower here, and erratic
+    from sim.cli import EXIT_STATUS, app
+
+    try:
+        app(prog_name="python -m sim")
+    except tuple(EXIT_STATUS) as error:
+        sys.stderr.write(f"sim: error: {error}\n")
+        return next(status for kind, status in EXIT_STATUS.items() if isinstance(error, kind))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

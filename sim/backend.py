@@ -1,0 +1,103 @@
+"""The simulated amplifier inside this process, behind the same interface as one on a wire.
+
+Each backend has a plate of its own, at rest when it is opened. A rig with several amplifiers under
+one plate needs the far end as a process (`era sim`). Not modelled: the time a wire takes.
+"""
+
+import asyncio
+import contextlib
+import time
+from pathlib import Path
+from urllib.parse import parse_qsl, unquote
+
+from drivers.backend import Backend
+from drivers.errors import CommandError, LinkError
+from drivers.guard import SafeCommand
+from drivers.protocol.messages import Apply, Reply, Request, Stage
+from model.errors import InputError
+from model.rig_file import load_rig
+from sim.bench import Bench
+from sim.control import control_socket
+from sim.real_time import Exchange, exchange_with, keep_time
+
+_FORM = "sim://RIG.yaml, with ?control=PATH and &amplifier=NAME where they are wanted"
+
+
+class SimulatedBackend(Backend):
+    """An amplifier of the rig file in a URL `sim://RIG.yaml[?control=PATH][&amplifier=NAME]`.
+
+    The plate behind it moves with the clock while it is open.
+    """
+
+    def __init__(self, url: str) -> None:
+        self._url = url
+        path, _, query = url.removeprefix("sim://").partition("?")
+        options = dict(parse_qsl(query, keep_blank_values=True))
+        unknown = sorted(options.keys() - {"control", "amplifier"})
+        if not url.startswith("sim://") or not path or unknown:
+            what = f"unknown option {', '.join(unknown)}" if unknown else "it names no rig file"
+            raise CommandError(f"{url!r}: {what}; use {_FORM}")
+        self._rig = Path(unquote(path))
+        self._control = Path(options["control"]) if options.get("control") else None
+        self._amplifier = options.get("amplifier")
+        self._open: contextlib.AsyncExitStack | None = None
+        self._exchange: Exchange | None = None
+        self._last_sent = 0.0
+
+    @property
+    def last_sent(self) -> float:
+        """When the last request was handed over, on time.monotonic() [s]."""
+        return self._last_sent
+
+    async def open(self) -> None:
+        """Read the rig and set its plate up at rest; CommandError for a rig that cannot be used."""
+        if self._open is not None:
+            return
+        try:
+            rig = load_rig(self._rig)
+            name = self._name(tuple(rig.amplifiers))
+            bench = await asyncio.to_thread(Bench, rig, now=time.monotonic())
+        except (InputError, OSError) as error:
+            raise CommandError(f"{self._url}: {error}") from error
+        async with contextlib.AsyncExitStack() as stack:
+            if self._control is not None:
+                await stack.enter_async_context(control_socket(bench, self._control))
+            task = asyncio.create_task(keep_time(bench), name=f"simulated plate of {self._url}")
+            stack.push_async_callback(_cancel, task)
+            self._exchange = exchange_with(bench, name)
+            self._open = stack.pop_all()
+
+    async def close(self) -> None:
+        """Stop simulating; the plate and its amplifiers are gone."""
+        stack, self._open = self._open, None
+        self._exchange = None
+        if stack is not None:
+            await stack.aclose()
+
+    async def exchange(self, request: Request, *, timeout: float) -> Reply:
+        """Hand a request over; the answer is there at once. LinkError if it is not open."""
+        if isinstance(request, Stage | Apply) and type(request.command_set) is not SafeCommand:
+            raise TypeError(
+                f"only a SafeCommand is played, not a {type(request.command_set).__name__}: "
+                "let Guard.check make one"
+            )
+        if self._exchange is None:
+            raise LinkError(f"{self._url} is not open")
+        self._last_sent = time.monotonic()
+        return self._exchange(request)
+
+    def _name(self, names: tuple[str, ...]) -> str:
+        if self._amplifier is None and len(names) == 1:
+            return names[0]
+        if self._amplifier in names:
+            return self._amplifier
+        raise CommandError(
+            f"{self._url}: the rig has the amplifiers {', '.join(names)}; name one of them with "
+            "amplifier=NAME"
+        )
+
+
+async def _cancel(task: "asyncio.Task[None]") -> None:
+    task.cancel()
+    with contextlib.suppress(asyncio.CancelledError):
+        await task

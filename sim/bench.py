@@ -1,0 +1,123 @@
+"""A rig that exists in numbers only: its amplifiers, its plate in time, and fingers on it.
+
+It moves when it is told the time and never reads a clock itself. Amplifier channels reach the ERAs
+through the rig's wiring, level 1 being the ERA's full stroke.
+"""
+
+from collections import deque
+from collections.abc import Mapping
+
+from drivers.protocol.messages import Reply, Request
+from model.assembly import era_positions
+from model.reduction import reduce_plate
+from model.rig import Rig
+from sim.amplifier import SimulatedAmplifier
+from sim.base_motion import terms_of
+from sim.felt import Felt, feel
+from sim.finger import KEPT, Fingers, Position
+from sim.plant import Plant
+from sim.waveform import FadingTone, Output
+
+SAMPLE_RATE = 10_000.0  # Hz; the peak of 500 Hz is then seen to 1.3 %
+
+
+class Bench:
+    """A simulated rig that is at rest at time now [s]."""
+
+    def __init__(self, rig: Rig, *, now: float) -> None:
+        self.rig = rig
+        reduced = reduce_plate(
+            rig.plate,
+            rig.mesh,
+            era_positions(rig.eras),
+            frequency_max=rig.limits.frequency_max,
+        )
+        self.fingers = Fingers(reduced)
+        self._plant = Plant(reduced, rig.eras, time=now)
+        self.amplifiers: Mapping[str, SimulatedAmplifier] = {
+            name: SimulatedAmplifier(name, channels=_channel_count(rig, name))
+            for name in rig.amplifiers
+        }
+        # By ERA: what its channel plays, as the plant has been told.
+        self._told: list[Output] = [()] * len(rig.eras)
+        self._played: deque[tuple[FadingTone, float]] = deque()  # and when it was replaced [s]
+
+    @property
+    def time(self) -> float:
+        """How far the plate has been moved [s]."""
+        return self._plant.time
+
+    def advance(self, now: float) -> None:
+        """Let everything happen that happens until now [s], each thing at its own moment."""
+        if now - self.time > KEPT:  # what nobody could ask for need not be sampled
+            self._advance_amplifiers(now - KEPT, watched=False)
+        self._advance_amplifiers(now, watched=True)
+
+    def exchange(self, amplifier: str, request: Request, *, now: float) -> Reply:
+        """What an amplifier answers to a request that arrives now [s]."""
+        now = max(now, self.time)
+        self.advance(now)
+        reply = self.amplifiers[amplifier].handle(request, now)
+        self._tell_plant()
+        return reply
+
+    def place_fingers(self, positions: Mapping[str, Position], *, now: float) -> None:
+        """Fingers rest here [m] from now [s] on, and no others; InputError changes nothing."""
+        self.advance(now)
+        self.fingers.place(positions)
+
+    def felt(self, since: float, until: float) -> dict[str, Felt]:
+        """What each finger felt in a window of the last ten seconds [s], by its id."""
+        frequencies = self._frequencies(since, until)
+        records = self.fingers.felt(since, until)
+        return {name: feel(record, frequencies) for name, record in records.items()}
+
+    def _advance_amplifiers(self, to_time: float, *, watched: bool) -> None:
+        while True:
+            moment = min((a.next_event for a in self.amplifiers.values()), default=to_time)
+            moment = min(moment, to_time)
+            self._move_plant(moment, watched=watched)
+            for amplifier in self.amplifiers.values():
+                amplifier.tick(moment)
+            self._tell_plant()
+            if moment >= to_time:
+                return
+
+    def _move_plant(self, to_time: float, *, watched: bool) -> None:
+        if to_time <= self.time:
+            return
+        if not (watched and self.fingers.layout.positions):
+            self._plant.skip(to_time)
+            return
+        layout = self.fingers.layout
+        self.fingers.record(
+            *self._plant.advance(to_time, sample_rate=SAMPLE_RATE, shapes=layout.shapes)
+        )
+
+    def _tell_plant(self) -> None:
+        """Pass on what the channels play, where it is not what the plant knows already."""
+        for index, era in enumerate(self.rig.eras):
+            channel = self.rig.wiring[era.name]
+            playing = self.amplifiers[channel.amplifier].outputs[channel.number]
+            told = self._told[index]
+            if playing is told:
+                continue
+            terms = [term for tone in playing for term in terms_of(tone, stroke=era.stroke)]
+            self._plant.set_input(index, terms)
+            self._played.extend((tone, self.time) for tone in told if tone not in playing)
+            self._told[index] = playing
+        while self._played and self._played[0][1] < self.time - KEPT:
+            self._played.popleft()
+
+    def _frequencies(self, since: float, until: float) -> list[float]:
+        """Every frequency [Hz] that some channel was asked to play at some time in a window."""
+        ended = [(tone, min(end, tone.silent_from)) for tone, end in self._played]
+        present = [(tone, tone.silent_from) for output in self._told for tone in output]
+        return sorted(
+            {tone.frequency for tone, end in ended + present if tone.start < until and end > since}
+        )
+
+
+def _channel_count(rig: Rig, amplifier: str) -> int:
+    numbers = [channel.number for channel in rig.wiring.values() if channel.amplifier == amplifier]
+    return max(numbers, default=0) + 1

@@ -1,0 +1,82 @@
+"""`era sim`: simulated amplifiers on real wires over one plate."""
+
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from drivers.errors import LinkError
+from model.errors import InputError
+
+if TYPE_CHECKING:
+    from sim.bench import Bench
+
+app = typer.Typer(pretty_exceptions_enable=False)
+
+EXIT_STATUS: dict[type[BaseException], int] = {InputError: 2, LinkError: 3}
+"""Exit status of the errors that this command raises on purpose."""
+
+
+@app.command()
+def sim(
+    rig: Annotated[Path, typer.Argument(metavar="RIG", help="Rig file, e.g. RIG.yaml.")],
+    serial: Annotated[
+        bool, typer.Option("--serial", help="Put every amplifier on a pseudo-terminal.")
+    ] = False,
+    finger: Annotated[
+        list[str] | None,
+        typer.Option(metavar="X,Y", help="A finger that rests here [m]; may be repeated."),
+    ] = None,
+    control: Annotated[
+        Path | None, typer.Option(metavar="PATH", help="Serve a control socket at this path.")
+    ] = None,
+) -> None:
+    """Simulate a rig behind real wires until SIGTERM or Ctrl-C; prints a URL per amplifier."""
+    import asyncio
+
+    from model.points import parse_point
+    from model.rig_file import load_rig
+    from sim.process import run_far_end
+
+    if not serial:
+        raise InputError("which wire? add --serial to put the amplifiers on pseudo-terminals")
+    positions = {
+        str(number): parse_point(text, what="--finger")
+        for number, text in enumerate(finger or [], start=1)
+    }
+    view = _LiveView() if sys.stdout.isatty() else None
+    try:
+        asyncio.run(
+            run_far_end(
+                load_rig(rig), fingers=positions, control=control, ready=_announce, view=view
+            )
+        )
+    finally:
+        if view is not None:
+            view.close()
+
+
+def _announce(urls: Mapping[str, str]) -> None:
+    for name, url in urls.items():
+        print(f"{name}: {url}")
+    sys.stdout.flush()
+
+
+class _LiveView:
+    """A picture that is drawn over again in place, from the first call on."""
+
+    def __init__(self) -> None:
+        from rich.live import Live
+
+        self._live = Live(auto_refresh=False)
+
+    def __call__(self, bench: "Bench") -> None:
+        from sim.view import draw
+
+        self._live.start()
+        self._live.update(draw(bench), refresh=True)
+
+    def close(self) -> None:
+        self._live.stop()

@@ -1,0 +1,194 @@
+"""Control of a running far end: JSON, a line each way, over a Unix socket for its owner only.
+
+    {"op": "fingers", "fingers": {ID: [x, y], ...}}         these fingers rest here [m], no others
+        {"ok": true, "time_s": t}
+    {"op": "felt", "since_s": t0, "until_s": t1}            at most the last ten seconds
+        {"fingers": {ID: {"points_m": [[x, y], ...], "frequencies_hz": [f, ...],
+                          "amplitude_m_s2": [[one per point], one row per frequency],
+                          "peak_m_s2": [one per point]}, ...}}
+    {"op": "state"}
+        {"time_s": t, "fingers": {ID: [x, y]}, "amplifiers": {NAME: {"state", "fault", "token",
+         "high_voltage", "levels"}}}
+
+Times are those of time.monotonic() [s]. What is wrong gets {"error": TEXT} and changes nothing.
+"""
+
+import asyncio
+import contextlib
+import json
+import math
+import os
+import socket
+import time
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any, TypeGuard
+
+from drivers.errors import LinkError
+from model.errors import InputError
+from sim.bench import Bench
+from sim.felt import Felt
+
+LINE_MAX = 64 * 1024  # bytes; thirty fingers take a tenth of it
+
+
+def answer(bench: Bench, line: bytes, *, now: float) -> dict[str, Any]:
+    """The answer to one line of control that comes now [s]."""
+    try:
+        request = json.loads(line)
+        if not isinstance(request, dict):
+            raise InputError("a line must be a JSON object")
+        match request.get("op"):
+            case "fingers":
+                positions = _positions(request)
+                bench.place_fingers(positions, now=now)
+                return {"ok": True, "time_s": bench.time}
+            case "felt":
+                since, until = _number(request, "since_s"), _number(request, "until_s")
+                if since >= until:
+                    raise InputError(f"since_s {since} must come before until_s {until}")
+                bench.advance(now)
+                felt = bench.felt(since, until)
+                return {"fingers": {name: _felt(one) for name, one in felt.items()}}
+            case "state":
+                bench.advance(now)
+                return _state(bench)
+            case other:
+                raise InputError(f"op is {str(other)[:40]!r}; it must be fingers, felt or state")
+    except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
+        return {"error": f"not a line of JSON: {error}"}
+    except InputError as error:
+        return {"error": str(error)}
+
+
+@asynccontextmanager
+async def control_socket(bench: Bench, path: Path) -> AsyncIterator[None]:
+    """Serve control of a bench at a path; raises LinkError where no socket can be made."""
+    sock = _bind(path)
+    clients: set[asyncio.StreamWriter] = set()
+
+    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        clients.add(writer)
+        try:
+            with contextlib.suppress(ConnectionError):
+                await _converse(bench, reader, writer)
+        finally:
+            clients.discard(writer)
+            writer.close()
+
+    server = await asyncio.start_unix_server(serve, sock=sock, limit=LINE_MAX)
+    try:
+        yield
+    finally:
+        server.close()
+        for writer in clients:
+            writer.transport.abort()
+        await server.wait_closed()
+        _remove(path)
+
+
+async def _converse(
+    bench: Bench, reader: asyncio.StreamReader, writer: asyncio.StreamWriter
+) -> None:
+    while True:
+        try:
+            line = await reader.readuntil(b"\n")
+        except asyncio.IncompleteReadError:
+            return
+        except asyncio.LimitOverrunError:
+            # Where the next line starts is not known any more: say so and hang up.
+            writer.write(_encode({"error": f"a line is longer than {LINE_MAX} bytes"}))
+            await writer.drain()
+            return
+        writer.write(_encode(answer(bench, line, now=time.monotonic())))
+        await writer.drain()
+
+
+def _encode(reply: dict[str, Any]) -> bytes:
+    return json.dumps(reply, separators=(",", ":")).encode() + b"\n"
+
+
+def _bind(path: Path) -> socket.socket:
+    """A listening socket that only its owner may use; takes the place of one that is dead."""
+    sock = socket.socket(socket.AF_UNIX)
+    mask = os.umask(0o177)  # from its first moment on
+    try:
+        if path.is_socket() and _is_dead(path):
+            path.unlink()
+        sock.bind(str(path))
+    except OSError as error:
+        sock.close()
+        raise LinkError(
+            f"no control socket can be made at {path} ({error.strerror or error}): give a path "
+            "of under 100 characters in a folder of yours that no other program serves at"
+        ) from error
+    finally:
+        os.umask(mask)
+    return sock
+
+
+def _remove(path: Path) -> None:
+    path.unlink(missing_ok=True)
+
+
+def _is_dead(path: Path) -> bool:
+    with socket.socket(socket.AF_UNIX) as probe:
+        try:
+            probe.connect(str(path))
+        except ConnectionRefusedError:
+            return True
+    return False
+
+
+def _number(request: dict[str, Any], key: str) -> float:
+    value = request.get(key)
+    if not _is_number(value):
+        raise InputError(f"{key} is {str(value)[:40]!r}; it must be a number of seconds")
+    return float(value)
+
+
+def _is_number(value: object) -> TypeGuard[int | float]:
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return False
+    try:
+        return math.isfinite(value)
+    except OverflowError:  # JSON allows integers of any length
+        return False
+
+
+def _positions(request: dict[str, Any]) -> dict[str, tuple[float, float]]:
+    fingers = request.get("fingers")
+    if not isinstance(fingers, dict):
+        raise InputError('fingers must be an object of positions, as in {"1": [0.10, 0.08]}')
+    positions = {}
+    for name, position in fingers.items():
+        pair = isinstance(position, list) and len(position) == 2
+        if not (pair and all(_is_number(part) for part in position)):
+            raise InputError(f"finger {name[:40]!r} needs a position [x, y] in metres")
+        positions[name] = (float(position[0]), float(position[1]))
+    return positions
+
+
+def _felt(felt: Felt) -> dict[str, Any]:
+    return {
+        "points_m": felt.points.tolist(),
+        "frequencies_hz": list(felt.frequencies),
+        "amplitude_m_s2": felt.amplitude.tolist(),
+        "peak_m_s2": felt.peak.tolist(),
+    }
+
+
+def _state(bench: Bench) -> dict[str, Any]:
+    amplifiers = {}
+    for name, amplifier in bench.amplifiers.items():
+        status = amplifier.status(bench.time)
+        amplifiers[name] = {
+            "state": status.state.name,
+            "fault": status.fault.name,
+            "token": status.token,
+            "high_voltage": status.high_voltage,
+            "levels": list(status.levels),
+        }
+    fingers = {name: list(place) for name, place in bench.fingers.layout.positions.items()}
+    return {"time_s": bench.time, "fingers": fingers, "amplifiers": amplifiers}

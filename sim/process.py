@@ -1,0 +1,75 @@
+"""The far end as a process: a bench in real time behind its wires, until it is told to end."""
+
+import asyncio
+import contextlib
+import signal
+import time
+from collections.abc import AsyncIterator, Callable, Coroutine, Mapping
+from contextlib import asynccontextmanager
+from pathlib import Path
+
+from model.rig import Rig
+from sim.bench import Bench
+from sim.control import control_socket
+from sim.finger import Position
+from sim.real_time import exchange_with, keep_time
+from sim.serial_end import SerialEnd
+
+_VIEW_EVERY = 0.2  # s; a person reads no faster
+
+
+async def run_far_end(
+    rig: Rig,
+    *,
+    fingers: Mapping[str, Position],
+    control: Path | None,
+    ready: Callable[[Mapping[str, str]], None],
+    view: Callable[[Bench], None] | None,
+) -> None:
+    """Simulate a rig on pseudo-terminals until SIGTERM or SIGINT.
+
+    fingers rest where they are told [m]; control: where the control socket is served, if anywhere;
+    ready is called once with the URL of each amplifier by its name, view a few times a second.
+    Raises InputError, LinkError.
+    """
+    ended = asyncio.Event()
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        loop.add_signal_handler(number, ended.set)
+    bench = await asyncio.to_thread(Bench, rig, now=time.monotonic())
+    bench.place_fingers(fingers, now=time.monotonic())
+    async with contextlib.AsyncExitStack() as stack:
+        if control is not None:
+            await stack.enter_async_context(control_socket(bench, control))
+        urls = {}
+        for name in bench.amplifiers:
+            end = SerialEnd(exchange_with(bench, name))
+            stack.callback(end.close)
+            end.start()
+            urls[name] = end.url
+        await stack.enter_async_context(_in_background(keep_time(bench), ended))
+        if view is not None:
+            await stack.enter_async_context(_in_background(_keep_viewing(bench, view), ended))
+        ready(urls)
+        await ended.wait()
+
+
+async def _keep_viewing(bench: Bench, view: Callable[[Bench], None]) -> None:
+    while True:
+        view(bench)
+        await asyncio.sleep(_VIEW_EVERY)
+
+
+@asynccontextmanager
+async def _in_background(
+    work: Coroutine[None, None, None], ended: asyncio.Event
+) -> AsyncIterator[None]:
+    """Work beside everything else; where it fails, the far end ends with that failure."""
+    task = asyncio.create_task(work)
+    task.add_done_callback(lambda _: ended.set())
+    try:
+        yield
+    finally:
+        task.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await task

@@ -1,8 +1,14 @@
 # Everything runs in .venv; nothing else on the machine is touched.
-PYTHON ?= python3
+# The first of these that is new enough; another one: make PYTHON=/path/to/python3.11
+PYTHONS := python3 python3.14 python3.13 python3.12 python3.11
+NEW_ENOUGH := import sys; sys.exit(sys.version_info < (3, 11))
+PYTHON ?= $(shell for python in $(PYTHONS); do \
+	$$python -c '$(NEW_ENOUGH)' 2>/dev/null && echo $$python && break; done)
 BIN := .venv/bin
+PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet --editable
 
-.PHONY: demo test lint format bench clean
+.PHONY: demo test lint format clean
+.NOTPARALLEL:
 
 demo: .venv/installed
 	$(BIN)/era demo
@@ -23,14 +29,18 @@ format: .venv/installed-test
 clean:
 	rm -rf .venv .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache out
 
+# A half-made environment is taken away, or the next run would take it for a whole one.
 $(BIN)/python:
-	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "era-haptics needs Python 3.11 or newer; try: make PYTHON=python3.11")'
-	$(PYTHON) -m venv .venv
+	@python="$(PYTHON)"; $${python:-false} -c '$(NEW_ENOUGH)' || { \
+		echo "era-haptics needs Python 3.11 or newer, and $${python:-none found} is not." >&2; \
+		echo "Install one, then: make PYTHON=/path/to/python3.11" >&2; exit 1; }
+	$(PYTHON) -m venv .venv || { rm -rf .venv; \
+		echo "No environment could be made; Debian and Ubuntu: apt install python3-venv" >&2; exit 1; }
 
 .venv/installed: $(BIN)/python pyproject.toml
-	$(BIN)/python -m pip install --quiet --editable .
+	$(PIP) .
 	touch $@
 
 .venv/installed-test: $(BIN)/python pyproject.toml
-	$(BIN)/python -m pip install --quiet --editable '.[test]'
+	$(PIP) '.[test]'
 	touch $@ .venv/installed

@@ -119,7 +119,7 @@ def read_document(path: Path) -> Document:
     if len(content) > SIZE_LIMIT:
         raise _whole(source, "is larger than 1 MiB; a configuration has a few lines")
     try:
-        text = content.decode("utf-8-sig")
+        text = content.decode("utf-8")
     except UnicodeDecodeError as error:
         line = content.count(b"\n", 0, error.start) + 1
         message = f"byte 0x{content[error.start]:02x} is no UTF-8; save the file as UTF-8"

@@ -109,7 +109,7 @@ class ContactTracker:
     def expire(self, now: float) -> Change:
         """Lift all contacts of sources that were not heard for the lease; now [s]."""
         for source, heard in list(self._heard.items()):
-            if now - heard >= LEASE:
+            if heard + LEASE <= now:  # as next_expiry puts it, to the last bit
                 del self._heard[source]
             else:  # news from the future is news from now
                 self._heard[source] = min(heard, now)

@@ -4,6 +4,7 @@
 """
 
 import math
+from collections.abc import Mapping, Sequence
 
 from drivers.command import CommandSet, DriveCommand
 from model.errors import InputError
@@ -40,9 +41,21 @@ def route(
     }
 
 
-def silence(rig: Rig, *, token: int, ramp: float) -> dict[str, CommandSet]:
-    """Command sets that bring every channel to level 0 along a ramp [s]."""
-    return route({}, rig, token=token, ramp=ramp)
+def drive_of_eras(
+    commands: Mapping[str, Sequence[DriveCommand]], rig: Rig
+) -> dict[str, DriveCommand]:
+    """Which ERA plays what, by its name, from commands by amplifier; silent ones are left out."""
+    playing = {
+        (amplifier, command.channel): command
+        for amplifier, several in commands.items()
+        for command in several
+        if command.level > 0
+    }
+    return {
+        name: playing[channel.amplifier, channel.number]
+        for name, channel in rig.wiring.items()
+        if (channel.amplifier, channel.number) in playing
+    }
 
 
 def _drive(excitation: Excitation, rig: Rig, name: str) -> DriveCommand:

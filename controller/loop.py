@@ -1,0 +1,247 @@
+"""The control loop: from touch frames to the amplifiers, and a heartbeat while it is alive."""
+
+import asyncio
+import contextlib
+import logging
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import ParamSpec
+
+from controller.amplifiers import AmplifierGroup, Phase
+from controller.decision import Decider, Decision
+from controller.observer import Applied, Observer, Silenced
+from controller.routing import drive_of_eras
+from controller.selection import PatternTable
+from controller.tally import Tally
+from controller.touch import TouchFrame, TouchSource
+from drivers.amplifier import Amplifier
+from drivers.errors import CommandError, DriverError, LinkError
+from drivers.guard import Guard, GuardLimits
+from drivers.watchdog import HEARTBEAT
+from model.errors import InputError
+from model.perception import STRONG_DB_SL
+from model.rig import Rig
+
+# On an orderly end nobody waits, so the end is soft.
+CLOSING_RAMP = 0.050
+
+_logger = logging.getLogger(__name__)
+_P = ParamSpec("_P")
+
+
+class Controller:
+    """Drives the amplifiers of a rig by what touch sources say: open, arm, run, close.
+
+    table must be for this rig; amplifiers by their names in it, not yet open. Starts disarmed: then
+    contacts are followed but nothing is sent. The heartbeat is sent by the loop itself after it has
+    run, so that a loop that hangs lets the amplifiers' watchdogs trip. clock [s] is the sources'.
+    """
+
+    def __init__(
+        self,
+        rig: Rig,
+        table: PatternTable,
+        *,
+        amplifiers: Mapping[str, Amplifier],
+        sources: Sequence[TouchSource] = (),
+        observer: Observer | None = None,
+        level_db_sl: float = STRONG_DB_SL,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        if amplifiers.keys() != rig.amplifiers.keys():
+            raise InputError(
+                f"the rig names the amplifiers {', '.join(sorted(rig.amplifiers))}, but given are "
+                f"{', '.join(sorted(amplifiers)) or 'none'}"
+            )
+        self._rig = rig
+        self._table = table
+        self._amplifiers = amplifiers
+        self._group = AmplifierGroup(amplifiers)
+        self._sources = sources
+        self._observer = observer or Observer()
+        self._level = level_db_sl
+        self._clock = clock
+        self._tally = Tally(_logger, clock=clock)
+        self._opened_decider: Decider | None = None
+        self._wake = asyncio.Event()
+        self._heartbeat_due = 0.0
+
+    @property
+    def phase(self) -> Phase:
+        """How the amplifiers stand."""
+        return self._group.phase
+
+    @property
+    def rejected_touches(self) -> Mapping[str, int]:
+        """How many touches could not be contacts, by the reason."""
+        return self._tally.counts
+
+    async def open(self) -> None:
+        """Open every amplifier; all stay disarmed.
+
+        Raises LinkError, CommandError, and InputError if the rig wires a channel that an amplifier
+        has not; then none stays open.
+        """
+        await self._group.open()
+        try:
+            guards = self._guards()
+        except BaseException:
+            await self._group.close({})
+            raise
+        self._opened_decider = Decider(
+            self._rig, self._table, guards=guards, level_db_sl=self._level
+        )
+
+    async def arm(self) -> None:
+        """High voltage on; from now on touches are felt. `run` must be running or start at once."""
+        decider = self._decider
+        await self._group.arm()
+        decider.forget()
+        self._heartbeat_due = self._clock()
+        self._wake.set()
+
+    async def disarm(self) -> None:
+        """Silent along a short ramp, then high voltage off."""
+        await self._group.disarm()
+
+    async def stop(self) -> None:
+        """Quick stop of every amplifier that can be reached; latched until `clear`."""
+        await self._group.stop()
+
+    async def clear(self) -> None:
+        """Acknowledge stops, and faults whose cause is gone; nothing arms by itself."""
+        await self._group.clear()
+
+    async def close(self) -> None:
+        """Ramp to zero in 50 ms, confirm it by reading back, disarm and close; ends `run`."""
+        silence = self._opened_decider.silence(ramp=CLOSING_RAMP) if self._opened_decider else {}
+        self._wake.set()
+        await self._group.close(silence)
+
+    async def run(self) -> None:
+        """Run the loop until `close` or cancellation; raises LinkError when an amplifier is lost.
+
+        By then all others have been stopped. A source that fails or ends does not end the loop.
+        """
+        listening = [asyncio.create_task(self._listen(source)) for source in self._sources]
+        try:
+            while self.phase is not Phase.CLOSED:
+                await self.step()
+                await self._next_cause()
+        finally:
+            for task in listening:
+                task.cancel()
+            await asyncio.gather(*listening, return_exceptions=True)
+
+    async def step(self) -> None:
+        """One turn of the loop: decide, send what is new, then the heartbeat if it is due."""
+        self._wake.clear()
+        decision = self._decider.decide(self._clock())
+        for change in decision.changes:
+            self._tell(self._observer.contacts_changed, decision.contacts, change)
+        try:
+            if self.phase is Phase.ARMED and decision.is_new:
+                await self._carry_out(decision)
+            if self.phase is Phase.ARMED and self._clock() >= self._heartbeat_due:
+                await self._group.heartbeat()
+                self._heartbeat_due = self._clock() + HEARTBEAT
+        except LinkError as error:
+            self._tell(self._observer.link_lost, str(error))
+            raise
+        except DriverError as error:
+            self._tell(self._observer.refused, str(error))
+
+    def deliver(self, frame: TouchFrame) -> None:
+        """Take over a touch frame; to be called in the loop's thread."""
+        # A time in the future would outlive the lease.
+        frame = replace(frame, time=min(frame.time, self._clock()))
+        change = self._decider.take(frame)
+        for reason in change.rejected:
+            self._tally.count(reason, f"touch of {frame.source}")
+        if change:
+            self._wake.set()
+
+    @property
+    def _decider(self) -> Decider:
+        """What decides; raises CommandError before `open`."""
+        if self._opened_decider is None:
+            raise CommandError("the controller is not open yet; call open() first")
+        return self._opened_decider
+
+    async def _carry_out(self, decision: Decision) -> None:
+        """Send the commands of a decision and tell what came of them; raises DriverError."""
+        latency = None
+        drive = {}
+        if decision.commands is not None:
+            achieved = await self._group.play(decision.commands)
+            if achieved is None:
+                return
+            commands = {name: several.commands for name, several in achieved.items()}
+            drive = drive_of_eras(commands, self._rig)
+            latency = self._group.last_sent - decision.since
+        if decision.problem is not None:
+            self._tell(self._observer.refused, decision.problem)
+        selection = decision.selection
+        if decision.problem or selection.target is None or selection.pattern is None:
+            silenced = Silenced(
+                contacts=decision.contacts,
+                selection=selection,
+                reason=decision.problem or selection.reason or "",
+                latency=latency,
+                time=self._clock(),
+            )
+            self._tell(self._observer.silenced, silenced)
+        elif latency is not None:
+            applied = Applied(
+                contacts=decision.contacts,
+                target=selection.target,
+                quiet=selection.quiet,
+                pattern=selection.pattern,
+                drive=drive,
+                latency=latency,
+                time=decision.since + latency,
+            )
+            self._tell(self._observer.pattern_applied, applied)
+
+    async def _listen(self, source: TouchSource) -> None:
+        """Take what a source says; one that fails is told, and leaves its contacts to expire."""
+        try:
+            await source.run(self.deliver)
+        except Exception as error:
+            _logger.exception("a touch source failed")
+            self._tell(self._observer.source_failed, f"{type(error).__name__}: {error}")
+
+    async def _next_cause(self) -> None:
+        """Wait until there is a reason to run: news, a heartbeat, or a source that is overdue."""
+        moments = [self._decider.next_expiry]
+        if self.phase is Phase.ARMED:
+            moments.append(self._heartbeat_due)
+        due = min((moment for moment in moments if moment is not None), default=None)
+        pause = None if due is None else max(0.0, due - self._clock())
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(pause):
+                await self._wake.wait()
+
+    def _guards(self) -> dict[str, Guard]:
+        """A guard per amplifier; raises InputError for a channel that an amplifier has not."""
+        for era, wired in self._rig.wiring.items():
+            channels = self._amplifiers[wired.amplifier].capabilities.channels
+            if wired.number >= channels:
+                raise InputError(
+                    f"ERA {era} is wired to channel {wired.number} of amplifier "
+                    f"{wired.amplifier}, which has channels 0 to {channels - 1}; change the rig"
+                )
+        limits = self._rig.limits
+        configured = GuardLimits(limits.frequency_min, limits.frequency_max, limits.level)
+        return {
+            name: Guard(configured, amplifier.capabilities)
+            for name, amplifier in self._amplifiers.items()
+        }
+
+    def _tell(self, callback: Callable[_P, None], *args: _P.args, **kwargs: _P.kwargs) -> None:
+        """Call an observer; whatever it raises stays here."""
+        try:
+            callback(*args, **kwargs)
+        except Exception:
+            _logger.exception("an observer of the control loop failed")

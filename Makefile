@@ -32,7 +32,7 @@ clean:
 # A half-made environment is taken away, or the next run would take it for a whole one.
 $(BIN)/python:
 	@python="$(PYTHON)"; $${python:-false} -c '$(NEW_ENOUGH)' || { \
-		echo "era-haptics needs Python 3.11 or newer, and $${python:-none found} is not." >&2; \
+		echo "era-haptics needs Python 3.11 or newer; tried: $${python:-$(PYTHONS)}." >&2; \
 		echo "Install one, then: make PYTHON=/path/to/python3.11" >&2; exit 1; }
 	$(PYTHON) -m venv .venv || { rm -rf .venv; \
 		echo "No environment could be made; Debian and Ubuntu: apt install python3-venv" >&2; exit 1; }

@@ -66,43 +66,48 @@ def answer(bench: Bench, line: bytes, *, now: float) -> dict[str, Any]:
 async def control_socket(bench: Bench, path: Path) -> AsyncIterator[None]:
     """Serve control of a bench at a path; raises LinkError where no socket can be made."""
     sock = _bind(path)
-    clients: set[asyncio.StreamWriter] = set()
+    loop = asyncio.get_running_loop()
+    clients: dict[asyncio.Task[None], socket.socket] = {}
 
-    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        clients.add(writer)
+    def forget(client: asyncio.Task[None]) -> None:
+        clients.pop(client).close()
+
+    def accept() -> None:
         try:
-            with contextlib.suppress(ConnectionError):
-                await _converse(bench, reader, writer)
-        finally:
-            clients.discard(writer)
-            writer.close()
+            connection, _ = sock.accept()
+        except OSError:  # the client has left again already
+            return
+        connection.setblocking(False)
+        client = loop.create_task(_converse(bench, connection), name=f"control at {path}")
+        clients[client] = connection
+        client.add_done_callback(forget)
 
-    server = await asyncio.start_unix_server(serve, sock=sock, limit=LINE_MAX)
+    loop.add_reader(sock, accept)
     try:
         yield
     finally:
-        server.close()
-        for writer in clients:
-            writer.transport.abort()
-        await server.wait_closed()
+        loop.remove_reader(sock)
+        sock.close()
         _remove(path)
+        for client in clients:
+            client.cancel()
+        await asyncio.gather(*clients, return_exceptions=True)
 
 
-async def _converse(
-    bench: Bench, reader: asyncio.StreamReader, writer: asyncio.StreamWriter
-) -> None:
-    while True:
-        try:
-            line = await reader.readuntil(b"\n")
-        except asyncio.IncompleteReadError:
-            return
-        except asyncio.LimitOverrunError:
-            # Where the next line starts is not known any more: say so and hang up.
-            writer.write(_encode({"error": f"a line is longer than {LINE_MAX} bytes"}))
-            await writer.drain()
-            return
-        writer.write(_encode(answer(bench, line, now=time.monotonic())))
-        await writer.drain()
+async def _converse(bench: Bench, connection: socket.socket) -> None:
+    """Answer a client line by line until it leaves. Plain sockets: no transport to outlive us."""
+    loop = asyncio.get_running_loop()
+    rest = b""
+    with contextlib.suppress(ConnectionError):
+        while data := await loop.sock_recv(connection, LINE_MAX):
+            *lines, rest = (rest + data).split(b"\n")
+            for line in lines:
+                reply = answer(bench, line, now=time.monotonic())
+                await loop.sock_sendall(connection, _encode(reply))
+            if len(rest) > LINE_MAX:  # where the next line starts will never be known: hang up
+                error = {"error": f"a line is longer than {LINE_MAX} bytes"}
+                await loop.sock_sendall(connection, _encode(error))
+                return
 
 
 def _encode(reply: dict[str, Any]) -> bytes:
@@ -117,6 +122,8 @@ def _bind(path: Path) -> socket.socket:
         if path.is_socket() and _is_dead(path):
             path.unlink()
         sock.bind(str(path))
+        sock.listen()
+        sock.setblocking(False)
     except OSError as error:
         sock.close()
         raise LinkError(

@@ -1,0 +1,87 @@
+"""The in-process amplifier behind the backend interface."""
+
+import asyncio
+import json
+import os
+import tempfile
+
+import pytest
+
+from drivers.command import CommandSet, DriveCommand
+from drivers.errors import CommandError, LinkError
+from drivers.guard import Guard, GuardLimits
+from drivers.protocol.messages import Achieved, Apply, Arm, Capabilities, GetCaps, Stage, Status
+from model.rig_file import example_rig_path
+from sim.backend import SimulatedBackend
+
+URL = f"sim://{example_rig_path()}"
+SET = CommandSet(1, (DriveCommand(0, 110.004, 0.5),), ramp=0.0, valid_for=0.0)
+
+
+async def test_plays_what_the_guard_let_through() -> None:
+    """Armed, a safe set is achieved as quantised, and felt by a finger through the control."""
+    with tempfile.TemporaryDirectory() as folder:
+        backend = SimulatedBackend(f"{URL}?control={folder}/control&amplifier=main")
+        await backend.open()
+        try:
+            capabilities = await backend.exchange(GetCaps(), timeout=1)
+            assert isinstance(capabilities, Capabilities)
+            assert capabilities.channels == 4
+            assert isinstance(await backend.exchange(Arm(1.0), timeout=1), Status)
+            safe = Guard(GuardLimits(40, 500, 1), capabilities).check(SET)
+            achieved = await backend.exchange(Apply(safe), timeout=1)
+            assert achieved == Achieved(1, (DriveCommand(0, 110.0, 0.5),))
+            reader, writer = await asyncio.open_unix_connection(f"{folder}/control")
+            writer.write(b'{"op": "state"}\n')
+            state = json.loads(await reader.readline())
+            assert state["amplifiers"]["main"]["levels"] == [0.5, 0, 0, 0]
+            assert state["time_s"] >= backend.last_sent
+            writer.close()
+            await writer.wait_closed()
+        finally:
+            await backend.close()
+        assert os.listdir(folder) == []  # noqa: PTH208 - a string is what there is
+
+
+async def test_the_plate_moves_while_it_is_open() -> None:
+    """Simulated time follows the clock without being asked, and the backend closes twice."""
+    backend = SimulatedBackend(URL)
+    await backend.open()
+    try:
+        await backend.exchange(Arm(0.1), timeout=1)
+        task = next(t for t in asyncio.all_tasks() if "simulated plate" in t.get_name())
+        assert not task.done()
+    finally:
+        await backend.close()
+        await backend.close()
+    assert task.done()
+
+
+async def test_sets_that_no_guard_has_seen_are_refused() -> None:
+    """A plain CommandSet is a mistake of the program, not of the user."""
+    backend = SimulatedBackend(URL)
+    for request in (Apply(SET), Stage(SET)):
+        with pytest.raises(TypeError, match="SafeCommand"):
+            await backend.exchange(request, timeout=1)
+
+
+async def test_a_closed_backend_is_a_lost_link() -> None:
+    """Before open and after close there is nobody to ask."""
+    backend = SimulatedBackend(URL)
+    with pytest.raises(LinkError, match="not open"):
+        await backend.exchange(GetCaps(), timeout=1)
+
+
+@pytest.mark.parametrize("url", ["sim://", "sim://?control=x", "sim://rig.yaml?speed=2"])
+def test_urls_that_make_no_sense_are_refused(url: str) -> None:
+    """No rig, or an unknown option: the error says what a good URL looks like."""
+    with pytest.raises(CommandError, match=r"sim://RIG\.yaml"):
+        SimulatedBackend(url)
+
+
+@pytest.mark.parametrize("rest", ["/no/such/rig.yaml", f"{example_rig_path()}?amplifier=aux"])
+async def test_a_rig_that_cannot_be_used_is_refused(rest: str) -> None:
+    """A missing file and an amplifier that the rig has not are named with the URL."""
+    backend = SimulatedBackend(f"sim://{rest}")
+    with pytest.raises(CommandError, match="sim://"):
+        await backend.open()

@@ -1,0 +1,86 @@
+"""The far end as a process of its own: its first lines, its end, its errors."""
+
+import asyncio
+import signal
+import sys
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+
+from drivers.amplifier import Amplifier
+from drivers.backends.serial_amplifier import SerialBackend
+from drivers.command import CommandSet, DriveCommand
+from drivers.guard import Guard, GuardLimits
+from drivers.protocol.messages import State
+from model.rig_file import example_rig_path
+
+ROOT = example_rig_path().parent.parent
+PATIENCE = 30  # s; for a loaded machine, not an expectation
+
+
+async def start(arguments: Sequence[str]) -> asyncio.subprocess.Process:
+    """A far end as users start it."""
+    return await asyncio.create_subprocess_exec(
+        *(sys.executable, "-P", "-m", "sim", *arguments),
+        stdout=asyncio.subprocess.PIPE,
+        stderr=asyncio.subprocess.PIPE,
+        cwd=ROOT,
+    )
+
+
+async def wait(process: asyncio.subprocess.Process) -> tuple[int, str, str]:
+    """Exit status and what is left of both outputs."""
+    out, err = await asyncio.wait_for(process.communicate(), PATIENCE)
+    assert process.returncode is not None
+    return process.returncode, out.decode(), err.decode()
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+async def test_serves_until_it_is_told_to_end(number: signal.Signals) -> None:
+    """It says where the amplifier is, drives it as told, and ends with 0 and nothing left."""
+    with tempfile.TemporaryDirectory() as folder:
+        control = Path(folder) / "control"
+        process = await start(
+            [str(example_rig_path()), "--serial", "--control", str(control), "--finger", "0.1,0.1"]
+        )
+        try:
+            assert process.stdout is not None
+            line = (await asyncio.wait_for(process.stdout.readline(), PATIENCE)).decode()
+            assert line.startswith("main: serial:///dev/")
+            assert line.endswith("?baud=921600\n")
+            assert control.is_socket()
+            amplifier = Amplifier(SerialBackend(line.split()[1]), reply_timeout=5.0)
+            await amplifier.open()
+            await amplifier.arm(2.0)
+            guard = Guard(GuardLimits(40, 500, 1), amplifier.capabilities)
+            wanted = CommandSet(1, (DriveCommand(2, 110.0, 0.25),), ramp=0.0, valid_for=0.0)
+            await amplifier.apply(guard.check(wanted))
+            status = await amplifier.status()
+            assert (status.state, status.token) == (State.OPERATION_ENABLED, 1)
+            assert status.levels == (0, 0, 0.25, 0)
+            await amplifier.close()
+        finally:
+            process.send_signal(number)
+            ending = await wait(process)
+        assert ending == (0, "", "")
+        assert not control.exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "status", "words"),
+    [
+        ([str(example_rig_path())], 2, "--serial"),
+        (["no_such_rig.yaml", "--serial"], 2, "no_such_rig.yaml"),
+        ([str(example_rig_path()), "--serial", "--finger", "0.1"], 2, "--finger"),
+        ([str(example_rig_path()), "--serial", "--finger", "9,9"], 2, "not on the plate"),
+        ([str(example_rig_path()), "--serial", "--control", "/no/where"], 3, "/no/where"),
+    ],
+)
+async def test_bad_usage_is_one_paragraph(arguments: list[str], status: int, words: str) -> None:
+    """Exit status 2 for input, 3 for the link; a line that names what is wrong; no traceback."""
+    returned, out, err = await wait(await start(arguments))
+    assert (returned, out) == (status, "")
+    assert words in err
+    assert err.count("\n") == 1

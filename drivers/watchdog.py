@@ -13,7 +13,7 @@ def check_watchdog(watchdog: float, round_trip: float, *, heartbeat: float = HEA
     process. Raises CommandError that says what the wire allows.
     """
     shortest = HEARTBEATS_BORNE * heartbeat + round_trip
-    if not watchdog >= shortest:
+    if not watchdog >= shortest - 1e-9:  # sums of floats
         raise CommandError(
             f"a watchdog of {watchdog * 1e3:g} ms is too short: {HEARTBEATS_BORNE} heartbeats of "
             f"{heartbeat * 1e3:g} ms and a round trip of {round_trip * 1e3:.1f} ms need at least "

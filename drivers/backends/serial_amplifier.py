@@ -65,7 +65,7 @@ class SerialBackend(Backend):
             return
         try:
             self._port = await asyncio.to_thread(self._open_port)
-        except (serial.SerialException, OSError, ValueError) as problem:
+        except (OSError, ValueError) as problem:
             raise LinkError(_why_not_open(self._url.port, problem)) from problem
         self._closing.clear()
         self._loss = None
@@ -87,11 +87,10 @@ class SerialBackend(Backend):
         if port is None or thread is None:
             return
         if hasattr(port, "cancel_read"):
-            with contextlib.suppress(OSError, serial.SerialException):
+            with contextlib.suppress(OSError):
                 port.cancel_read()
         await asyncio.to_thread(thread.join)
-        with contextlib.suppress(OSError, serial.SerialException):
-            port.close()
+        await asyncio.to_thread(_close_port, port)
 
     async def exchange(self, request: Request, *, timeout: float) -> Reply:
         """Send a request and wait [s] for its reply; LinkTimeout, LinkError or FrameError."""
@@ -136,7 +135,7 @@ class SerialBackend(Backend):
             raise LinkTimeout(
                 f"{self._url.port} takes no more bytes; check flow control and the adapter"
             ) from None
-        except (serial.SerialException, OSError) as problem:
+        except OSError as problem:
             self._lose(self._what_was_lost(problem))
             raise LinkError(self._loss) from problem
         self._last_sent = time.monotonic()
@@ -182,6 +181,15 @@ class SerialBackend(Backend):
             f"serial line {self._url.port} was lost ({problem}): check the cable and the adapter, "
             "then open the amplifier again"
         )
+
+
+def _close_port(port: serial.Serial) -> None:
+    # pyserial does not close the socket of a server that hung up first, so that is done here.
+    connection = getattr(port, "_socket", None)
+    if connection is not None:
+        connection.close()
+    with contextlib.suppress(OSError):
+        port.close()
 
 
 def _why_not_open(port: str, problem: Exception) -> str:

@@ -1,0 +1,158 @@
+import asyncio
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Coroutine, Iterator
+from typing import Any, TypeVar
+
+import pytest
+from typer.testing import CliRunner
+
+from drivers.cli import EXIT_STATUS, app
+from drivers.errors import CommandError, CommandRefused, FrameError, LinkError, LinkTimeout
+from drivers.protocol.messages import Apply, Arm, Disarm, Nak, NakCode, Ping, Stop
+from scripted_amplifier import FarEnd
+
+T = TypeVar("T")
+
+
+class BackgroundFarEnd:
+    """A scripted far end in an event loop of its own, for commands that run one themselves."""
+
+    def __init__(self) -> None:
+        self.loop = asyncio.new_event_loop()
+        self._thread = threading.Thread(target=self.loop.run_forever)
+        self._thread.start()
+        self.end = self.run(self._make())
+
+    async def _make(self) -> FarEnd:
+        return FarEnd()
+
+    def run(self, coroutine: Coroutine[Any, Any, T]) -> T:
+        """The result of a coroutine in the far end's loop."""
+        return asyncio.run_coroutine_threadsafe(coroutine, self.loop).result(10)
+
+    def close(self) -> None:
+        """Close the far end and end the loop."""
+
+        async def close() -> None:
+            self.end.close()
+
+        self.run(close())
+        self.loop.call_soon_threadsafe(self.loop.stop)
+        self._thread.join()
+        self.loop.close()
+
+
+@pytest.fixture
+def background() -> Iterator[BackgroundFarEnd]:
+    """A far end that answers while a command runs."""
+    background = BackgroundFarEnd()
+    yield background
+    background.close()
+
+
+def test_identify_in_json(background: BackgroundFarEnd) -> None:
+    """One JSON object whose keys carry the units."""
+    result = CliRunner().invoke(app, ["amp", "identify", background.end.url, "--json"])
+    assert result.exit_code == 0, result.output
+    answer = json.loads(result.stdout)
+    assert answer["serial_number"] == "A-17"
+    assert answer["channels"] == 4
+    assert (answer["frequency_min_hz"], answer["frequency_max_hz"]) == (20.0, 600.0)
+    assert answer["watchdog_min_s"] == 0.1
+
+
+def test_status_and_stop(background: BackgroundFarEnd) -> None:
+    """Status tells state, levels and faults; stop sends a quick stop."""
+    result = CliRunner().invoke(app, ["amp", "status", background.end.url, "--json"])
+    answer = json.loads(result.stdout)
+    assert (answer["state"], answer["levels"]) == ("OPERATION_ENABLED", [0.0] * 4)
+    assert (answer["temperature_c"], answer["faults"]) == (25.0, [])
+    result = CliRunner().invoke(app, ["amp", "stop", background.end.url])
+    assert result.exit_code == 0
+    assert "OPERATION_ENABLED" in result.stdout
+    assert isinstance(background.end.requests[-1], Stop)
+
+
+def test_drive_plays_and_ends_silent(background: BackgroundFarEnd) -> None:
+    """Arm, one set on one channel, heartbeats, and a disarm at the end."""
+    options = ["--channel", "2", "--frequency", "123.45", "--level", "0.3", "--for", "0.12"]
+    result = CliRunner().invoke(app, ["amp", "drive", background.end.url, *options, "--json"])
+    assert result.exit_code == 0, result.output
+    (achieved,) = json.loads(result.stdout)["achieved"]
+    assert achieved == {"channel": 2, "frequency_hz": 123.45, "level": 0.3, "phase_deg": 0.0}
+    kinds = [type(request) for request in background.end.requests[2:]]
+    assert kinds[:2] == [Arm, Apply]
+    assert Ping in kinds
+    assert kinds[-2] is Disarm
+    apply = background.end.requests[3]
+    assert apply.command_set.valid_for == 0.12
+
+
+def test_a_refused_drive_is_disarmed(background: BackgroundFarEnd) -> None:
+    """Where the set is refused the amplifier does not stay armed."""
+    usual = background.end.answer
+    background.end.answer = lambda request, frame: (
+        Nak(NakCode.BAD_VALUE) if isinstance(request, Apply) else usual(request, frame)
+    )
+    result = CliRunner().invoke(app, ["amp", "drive", background.end.url])
+    assert isinstance(result.exception, CommandRefused)
+    assert isinstance(background.end.requests[-1], Disarm)
+
+
+@pytest.mark.parametrize(
+    ("options", "error"),
+    [
+        (["--level", "1.1"], CommandRefused),
+        (["--frequency", "nan"], CommandRefused),
+        (["--channel", "4"], CommandRefused),
+        (["--for", "0"], CommandError),
+        (["--for", "nan"], CommandError),
+    ],
+)
+def test_a_bad_drive_never_arms(
+    background: BackgroundFarEnd, options: list[str], error: type[Exception]
+) -> None:
+    """What the guard refuses leaves the amplifier as it was."""
+    result = CliRunner().invoke(app, ["amp", "drive", background.end.url, *options])
+    assert isinstance(result.exception, error)
+    assert not any(isinstance(request, Arm) for request in background.end.requests)
+
+
+def test_ctrl_c_ends_silent(background: BackgroundFarEnd) -> None:
+    """An interrupt in the middle of a drive disarms before the process ends."""
+    command = [sys.executable, "-P", "-c", "from drivers.cli import app; app()"]
+    process = subprocess.Popen(
+        [*command, "amp", "drive", background.end.url, "--for", "30"],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        env={**os.environ, "NO_COLOR": "1"},
+    )
+
+    async def driven() -> None:
+        async with asyncio.timeout(10):
+            while not any(isinstance(request, Ping) for request in background.end.requests):
+                await background.end.count(len(background.end.requests) + 1)
+
+    try:
+        background.run(driven())
+        process.send_signal(signal.SIGINT)
+        assert process.wait(timeout=10) != 0
+    finally:
+        process.kill()
+        process.wait()
+    assert isinstance(background.end.requests[-1], Disarm)
+
+
+@pytest.mark.parametrize(
+    ("error", "status"),
+    [(CommandError, 2), (CommandRefused, 1), (LinkError, 3), (LinkTimeout, 3), (FrameError, 3)],
+)
+def test_every_error_has_its_exit_status(error: type[Exception], status: int) -> None:
+    """1 the answer is no, 2 bad input, 3 hardware or link."""
+    found = {code for kind, code in EXIT_STATUS.items() if issubclass(error, kind)}
+    assert found == {status}

@@ -1,0 +1,355 @@
+import asyncio
+from collections import deque
+from collections.abc import Callable
+from dataclasses import replace
+
+import pytest
+
+from drivers.amplifier import Amplifier
+from drivers.backend import Backend
+from drivers.command import CommandSet
+from drivers.errors import CommandError, CommandRefused, FrameError, LinkError, LinkTimeout
+from drivers.guard import SafeCommand
+from drivers.protocol.messages import (
+    Achieved,
+    Apply,
+    Arm,
+    Capabilities,
+    Commit,
+    Disarm,
+    Fault,
+    GetCaps,
+    Hello,
+    Identity,
+    Nak,
+    NakCode,
+    Ping,
+    Reply,
+    Request,
+    State,
+    Status,
+    Stop,
+)
+from drivers.watchdog import check_watchdog
+
+IDENTITY = Identity("Acme", "Quad", "A-17", "1.2", 1)
+STATUS = Status(State.OPERATION_ENABLED, Fault.NONE, 0, True, 25.0, 0.25, (0.0,) * 4)
+MakeSafe = Callable[..., SafeCommand]
+
+
+class ScriptedBackend(Backend):
+    """Answers at once and well, except where `script` holds what to do next.
+
+    In the script an exception is raised, a reply is given, and a future is waited for.
+    """
+
+    def __init__(self, capabilities: Capabilities) -> None:
+        self.capabilities = capabilities
+        self.identity = IDENTITY
+        self.script: deque[Exception | Reply | asyncio.Future[Reply]] = deque()
+        self.requests: list[Request] = []
+        self.at_once = 0
+        self.closed = 0
+
+    async def open(self) -> None:
+        """Nothing to open."""
+
+    async def close(self) -> None:
+        """Counts."""
+        self.closed += 1
+
+    async def exchange(self, request: Request, *, timeout: float) -> Reply:
+        """The next of the script, or what a good amplifier says."""
+        self.requests.append(request)
+        self.at_once += 1
+        assert self.at_once == 1, "two requests on the wire at once"
+        try:
+            await asyncio.sleep(0)
+            if not self.script:
+                return self._usual(request)
+            step = self.script.popleft()
+            if isinstance(step, Exception):
+                raise step
+            return await step if isinstance(step, asyncio.Future) else step
+        finally:
+            self.at_once -= 1
+
+    def _usual(self, request: Request) -> Reply:
+        match request:
+            case Hello():
+                return self.identity
+            case GetCaps():
+                return self.capabilities
+            case Apply(command_set=wanted):
+                return Achieved(wanted.token, wanted.commands)
+            case Commit(token=token):
+                return Achieved(token, ())
+            case _:
+                return STATUS
+
+    @property
+    def last_sent(self) -> float:
+        """Not of interest here."""
+        return 0.0
+
+
+@pytest.fixture
+def backend(capabilities: Capabilities) -> ScriptedBackend:
+    """A backend that does as it is told."""
+    return ScriptedBackend(capabilities)
+
+
+@pytest.fixture
+async def amplifier(backend: ScriptedBackend) -> Amplifier:
+    """An open amplifier over it, the requests of opening forgotten."""
+    amplifier = Amplifier(backend)
+    await amplifier.open()
+    backend.requests.clear()
+    return amplifier
+
+
+async def settle() -> None:
+    """Let every task run until it waits for something that only the test brings about."""
+    for _ in range(20):
+        await asyncio.sleep(0)
+
+
+async def test_opening_asks_and_arms_nothing(backend: ScriptedBackend) -> None:
+    """Opening sends Hello and GetCaps only; identity and capabilities are then known."""
+    amplifier = Amplifier(backend)
+    with pytest.raises(LinkError, match="not open"):
+        await amplifier.status()
+    with pytest.raises(CommandError, match="not open"):
+        _ = amplifier.capabilities
+    await amplifier.open()
+    assert backend.requests == [Hello(), GetCaps()]
+    assert amplifier.identity == IDENTITY
+    assert amplifier.capabilities == backend.capabilities
+
+
+async def test_another_version_is_refused_and_closed(backend: ScriptedBackend) -> None:
+    """An amplifier of another protocol version is not used, and the wire is given back."""
+    backend.identity = replace(IDENTITY, protocol_version=2)
+    with pytest.raises(LinkError, match="version 2"):
+        await Amplifier(backend).open()
+    assert backend.closed == 1
+
+
+async def test_two_lost_replies_are_asked_for_again(
+    amplifier: Amplifier, backend: ScriptedBackend, safe: MakeSafe
+) -> None:
+    """The same request, token and all, is repeated twice at most."""
+    backend.script += [LinkTimeout("silence"), LinkTimeout("silence")]
+    wanted = safe(5)
+    achieved = await amplifier.apply(wanted)
+    assert achieved.token == 5
+    assert backend.requests == [Apply(wanted)] * 3
+
+
+async def test_three_lost_replies_lose_the_amplifier(
+    amplifier: Amplifier, backend: ScriptedBackend
+) -> None:
+    """After the third timeout every call fails at once, with what happened and what to do."""
+    backend.script += [LinkTimeout("no answer")] * 3
+    with pytest.raises(LinkTimeout, match="3 requests in a row"):
+        await amplifier.heartbeat()
+    assert amplifier.lost
+    for call in (amplifier.arm, amplifier.stop, amplifier.status, amplifier.heartbeat):
+        with pytest.raises(LinkError, match=r"no answer.*opened again it is disarmed"):
+            await call()
+    assert len(backend.requests) == 3
+
+
+async def test_a_lost_link_is_not_retried(amplifier: Amplifier, backend: ScriptedBackend) -> None:
+    """A LinkError that is no timeout is final at the first."""
+    backend.script.append(LinkError("unplugged"))
+    with pytest.raises(LinkError, match="unplugged"):
+        await amplifier.heartbeat()
+    with pytest.raises(LinkError, match="unplugged"):
+        await amplifier.heartbeat()
+    assert len(backend.requests) == 1
+
+
+async def test_timeouts_are_counted_in_a_row(
+    amplifier: Amplifier, backend: ScriptedBackend
+) -> None:
+    """Any answer starts the count anew: a noisy line is not a dead one."""
+    for _ in range(3):
+        backend.script += [LinkTimeout("noise"), LinkTimeout("noise"), STATUS]
+        await amplifier.heartbeat()
+    assert not amplifier.lost
+
+
+@pytest.mark.parametrize("code", NakCode)
+async def test_a_refusal_is_readable(
+    amplifier: Amplifier, backend: ScriptedBackend, code: NakCode
+) -> None:
+    """Every refusal becomes a sentence that names the request and the channel."""
+    backend.script.append(Nak(code, 2))
+    with pytest.raises(CommandRefused, match=r"refused Arm \(channel 2\): \w+ \w+") as caught:
+        await amplifier.arm()
+    assert caught.value.channel == 2
+    assert not amplifier.lost
+
+
+async def test_a_reply_of_the_wrong_type_is_no_reply(
+    amplifier: Amplifier, backend: ScriptedBackend, safe: MakeSafe
+) -> None:
+    """A Status in answer to an apply, or another set's token, is the far end's fault."""
+    backend.script += [STATUS, Achieved(6, ())]
+    with pytest.raises(FrameError, match="Status"):
+        await amplifier.apply(safe(5))
+    with pytest.raises(FrameError, match="token 6 instead of 5"):
+        await amplifier.apply(safe(5))
+
+
+async def test_only_safe_commands_are_taken(amplifier: Amplifier) -> None:
+    """A set that no guard has seen does not reach the backend."""
+    plain = CommandSet(token=1, commands=(), ramp=0.0, valid_for=0.0)
+    for call in (amplifier.apply, amplifier.stage):
+        with pytest.raises(TypeError, match="SafeCommand"):
+            await call(plain)
+
+
+async def test_tokens_count_round_and_are_never_zero(amplifier: Amplifier) -> None:
+    """After 65535 comes 1."""
+    tokens = [amplifier.next_token() for _ in range(65536)]
+    assert tokens[0] == 1
+    assert tokens[-2:] == [65535, 1]
+
+
+async def test_the_latest_apply_wins(
+    amplifier: Amplifier, backend: ScriptedBackend, safe: MakeSafe
+) -> None:
+    """Of the applies that wait, only the newest is sent; the others are told so."""
+    answer: asyncio.Future[Reply] = asyncio.get_running_loop().create_future()
+    backend.script.append(answer)
+    first, second, third = (asyncio.create_task(amplifier.apply(safe(i))) for i in (1, 2, 3))
+    await settle()
+    assert second.done()
+    answer.set_result(Achieved(1, ()))
+    assert (await first).token == 1
+    assert (await third).token == 3
+    with pytest.raises(CommandRefused, match="superseded"):
+        await second
+    assert backend.requests == [Apply(safe(1)), Apply(safe(3))]
+
+
+@pytest.mark.parametrize("silencing", [Stop(0.005), Disarm(0.05)])
+async def test_falling_silent_overtakes(
+    amplifier: Amplifier, backend: ScriptedBackend, safe: MakeSafe, silencing: Request
+) -> None:
+    """Stop and disarm go before all that waits, and the apply that waited is never sent."""
+    answer: asyncio.Future[Reply] = asyncio.get_running_loop().create_future()
+    backend.script.append(answer)
+    beat = asyncio.create_task(amplifier.heartbeat())
+    await settle()
+    status = asyncio.create_task(amplifier.status())
+    apply = asyncio.create_task(amplifier.apply(safe(1)))
+    await settle()
+    call = amplifier.stop if isinstance(silencing, Stop) else amplifier.disarm
+    silent = asyncio.create_task(call())
+    await settle()
+    with pytest.raises(CommandRefused, match="superseded"):
+        await apply
+    answer.set_result(STATUS)
+    await asyncio.gather(beat, status, silent)
+    assert backend.requests[:2] == [Ping(), silencing]
+    assert len(backend.requests) == 3
+
+
+async def test_an_apply_is_not_repeated_before_a_stop(
+    amplifier: Amplifier, backend: ScriptedBackend, safe: MakeSafe
+) -> None:
+    """While a stop waits, an apply whose answer is lost is given up instead of repeated."""
+    answer: asyncio.Future[Reply] = asyncio.get_running_loop().create_future()
+    backend.script.append(answer)
+    apply = asyncio.create_task(amplifier.apply(safe(1)))
+    await settle()
+    stop = asyncio.create_task(amplifier.stop())
+    await settle()
+    answer.set_exception(LinkTimeout("late"))
+    with pytest.raises(CommandRefused, match="superseded"):
+        await apply
+    await stop
+    assert backend.requests == [Apply(safe(1)), Stop(0.005)]
+
+
+async def test_cancelling_leaves_the_link_usable(
+    amplifier: Amplifier, backend: ScriptedBackend, safe: MakeSafe
+) -> None:
+    """Whoever is cancelled, on the wire or waiting, hands the turn on, and is told so."""
+    answer: asyncio.Future[Reply] = asyncio.get_running_loop().create_future()
+    backend.script.append(answer)
+    on_wire = asyncio.create_task(amplifier.heartbeat())
+    await settle()
+    waiting = asyncio.create_task(amplifier.apply(safe(1)))
+    last = asyncio.create_task(amplifier.status())
+    await settle()
+    waiting.cancel()
+    on_wire.cancel()
+    for task in (waiting, on_wire):
+        with pytest.raises(asyncio.CancelledError):
+            await task
+    assert await last == STATUS
+    assert (await amplifier.apply(safe(2))).token == 2
+    assert Apply(safe(1)) not in backend.requests
+
+
+async def test_cancelled_in_the_moment_of_its_turn(
+    amplifier: Amplifier, backend: ScriptedBackend
+) -> None:
+    """A request cancelled when it has just been given the turn gives it to the next."""
+    answer: asyncio.Future[Reply] = asyncio.get_running_loop().create_future()
+    backend.script.append(answer)
+    first = asyncio.create_task(amplifier.heartbeat())
+    await settle()
+    second = asyncio.create_task(amplifier.heartbeat())
+    third = asyncio.create_task(amplifier.status())
+    await settle()
+    answer.set_result(STATUS)
+    # At the end of the first its turn is handed over; the second has not run since.
+    first.add_done_callback(lambda _: second.cancel())
+    assert await third == STATUS
+    with pytest.raises(asyncio.CancelledError):
+        await second
+
+
+async def test_ramps_of_silence_are_never_refused(
+    amplifier: Amplifier, backend: ScriptedBackend
+) -> None:
+    """A stop with an impossible ramp is sent with the nearest that can be."""
+    await amplifier.stop(float("nan"))
+    await amplifier.stop(-1)
+    await amplifier.stop(99)
+    assert backend.requests == [Stop(0.0), Stop(0.0), Stop(1.0)]
+
+
+async def test_a_watchdog_out_of_range_is_not_sent(
+    amplifier: Amplifier, backend: ScriptedBackend
+) -> None:
+    """The amplifier's own range holds, NaN included."""
+    for watchdog in (0.05, 3.0, float("nan")):
+        with pytest.raises(CommandError, match="watchdog"):
+            await amplifier.arm(watchdog)
+    await amplifier.arm()
+    assert backend.requests == [Arm(0.25)]
+
+
+@pytest.mark.parametrize(
+    ("watchdog", "round_trip", "fits"),
+    [
+        (0.25, 0.0083, True),
+        (0.15, 0.0, True),
+        (0.15, 0.001, False),
+        (0.16, 0.02, False),
+        (float("nan"), 0.0, False),
+    ],
+)
+def test_watchdog_bears_three_heartbeats(watchdog: float, round_trip: float, fits: bool) -> None:
+    """Three heartbeats of 50 ms and a round trip must fit, else the message says what would."""
+    if fits:
+        check_watchdog(watchdog, round_trip)
+        return
+    with pytest.raises(CommandError, match="need at least"):
+        check_watchdog(watchdog, round_trip)

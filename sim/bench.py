@@ -14,7 +14,7 @@ from model.rig import Rig
 from sim.amplifier import SimulatedAmplifier
 from sim.base_motion import terms_of
 from sim.felt import Felt, feel
-from sim.finger import KEPT, Fingers, Position
+from sim.finger import KEPT, Fingers, Position, Record
 from sim.plant import Plant
 from sim.waveform import FadingTone, Output
 
@@ -66,10 +66,16 @@ class Bench:
         self.advance(now)
         self.fingers.place(positions)
 
+    def records(self, since: float, until: float) -> tuple[dict[str, Record], list[float]]:
+        """What each finger went through in a window of the last ten seconds [s], by its id.
+
+        Also the frequencies [Hz] that were driven in it, ascending.
+        """
+        return self.fingers.felt(since, until), self._frequencies(since, until)
+
     def felt(self, since: float, until: float) -> dict[str, Felt]:
-        """What each finger felt in a window of the last ten seconds [s], by its id."""
-        frequencies = self._frequencies(since, until)
-        records = self.fingers.felt(since, until)
+        """What each finger felt in such a window, by its id."""
+        records, frequencies = self.records(since, until)
         return {name: feel(record, frequencies) for name, record in records.items()}
 
     def _advance_amplifiers(self, to_time: float, *, watched: bool) -> None:

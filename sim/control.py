@@ -20,7 +20,7 @@ import math
 import os
 import socket
 import time
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any, TypeGuard
@@ -28,13 +28,17 @@ from typing import Any, TypeGuard
 from drivers.errors import LinkError
 from model.errors import InputError
 from sim.bench import Bench
-from sim.felt import Felt
+from sim.felt import feel
+from sim.finger import Record
 
 LINE_MAX = 64 * 1024  # bytes; thirty fingers take a tenth of it
 
 
-def answer(bench: Bench, line: bytes, *, now: float) -> dict[str, Any]:
-    """The answer to one line of control that comes now [s]."""
+def carry_out(bench: Bench, line: bytes, *, now: float) -> Callable[[], dict[str, Any]]:
+    """Do what one line of control asks now [s]; returns what makes the answer to it.
+
+    Making it may take long and touches nothing of the bench any more: any thread may do it.
+    """
     try:
         request = json.loads(line)
         if not isinstance(request, dict):
@@ -43,23 +47,23 @@ def answer(bench: Bench, line: bytes, *, now: float) -> dict[str, Any]:
             case "fingers":
                 positions = _positions(request)
                 bench.place_fingers(positions, now=now)
-                return {"ok": True, "time_s": bench.time}
+                return _already({"ok": True, "time_s": bench.time})
             case "felt":
                 since, until = _number(request, "since_s"), _number(request, "until_s")
                 if since >= until:
                     raise InputError(f"since_s {since} must come before until_s {until}")
                 bench.advance(now)
-                felt = bench.felt(since, until)
-                return {"fingers": {name: _felt(one) for name, one in felt.items()}}
+                records, frequencies = bench.records(since, until)
+                return lambda: _felt(records, frequencies)
             case "state":
                 bench.advance(now)
-                return _state(bench)
+                return _already(_state(bench))
             case other:
                 raise InputError(f"op is {str(other)[:40]!r}; it must be fingers, felt or state")
     except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
-        return {"error": f"not a line of JSON: {error}"}
+        return _already({"error": f"not a line of JSON: {error}"})
     except InputError as error:
-        return {"error": str(error)}
+        return _already({"error": str(error)})
 
 
 @asynccontextmanager
@@ -102,12 +106,18 @@ async def _converse(bench: Bench, connection: socket.socket) -> None:
         while data := await loop.sock_recv(connection, LINE_MAX):
             *lines, rest = (rest + data).split(b"\n")
             for line in lines:
-                reply = answer(bench, line, now=time.monotonic())
-                await loop.sock_sendall(connection, _encode(reply))
+                make_answer = carry_out(bench, line, now=time.monotonic())
+                # A long fit must not hold up the amplifiers, whose hosts wait for 50 ms at most.
+                reply = await asyncio.to_thread(_encode_made, make_answer)
+                await loop.sock_sendall(connection, reply)
             if len(rest) > LINE_MAX:  # where the next line starts will never be known: hang up
                 error = {"error": f"a line is longer than {LINE_MAX} bytes"}
                 await loop.sock_sendall(connection, _encode(error))
                 return
+
+
+def _encode_made(make_answer: Callable[[], dict[str, Any]]) -> bytes:
+    return _encode(make_answer())
 
 
 def _encode(reply: dict[str, Any]) -> bytes:
@@ -177,13 +187,21 @@ def _positions(request: dict[str, Any]) -> dict[str, tuple[float, float]]:
     return positions
 
 
-def _felt(felt: Felt) -> dict[str, Any]:
-    return {
-        "points_m": felt.points.tolist(),
-        "frequencies_hz": list(felt.frequencies),
-        "amplitude_m_s2": felt.amplitude.tolist(),
-        "peak_m_s2": felt.peak.tolist(),
-    }
+def _already(reply: dict[str, Any]) -> Callable[[], dict[str, Any]]:
+    return lambda: reply
+
+
+def _felt(records: Mapping[str, Record], frequencies: Sequence[float]) -> dict[str, Any]:
+    fingers = {}
+    for name, record in records.items():
+        felt = feel(record, frequencies)
+        fingers[name] = {
+            "points_m": felt.points.tolist(),
+            "frequencies_hz": list(felt.frequencies),
+            "amplitude_m_s2": felt.amplitude.tolist(),
+            "peak_m_s2": felt.peak.tolist(),
+        }
+    return {"fingers": fingers}
 
 
 def _state(bench: Bench) -> dict[str, Any]:

@@ -17,7 +17,7 @@ from drivers.errors import LinkError
 from drivers.protocol.messages import Apply, Arm
 from model.rig import Rig
 from sim.bench import Bench
-from sim.control import LINE_MAX, answer, control_socket
+from sim.control import LINE_MAX, carry_out, control_socket
 
 
 @pytest.fixture
@@ -34,7 +34,7 @@ def mode(path: Path) -> int | None:
 
 def ask(bench: Bench, now: float, **request: Any) -> dict[str, Any]:
     """One line of control."""
-    return answer(bench, json.dumps(request).encode(), now=now)
+    return carry_out(bench, json.dumps(request).encode(), now=now)()
 
 
 def test_place_play_and_feel(coarse_rig: Rig) -> None:
@@ -96,7 +96,7 @@ def test_malformed_lines_get_an_error_and_change_nothing(coarse_rig: Rig, line: 
     """Whatever the line, there is an answer, it says what is wrong, and no finger moves."""
     bench = Bench(coarse_rig, now=1.0)
     ask(bench, 1.0, op="fingers", fingers={"a": [0.1, 0.1]})
-    reply = answer(bench, line, now=1.0)
+    reply = carry_out(bench, line, now=1.0)()
     assert reply.keys() == {"error"}
     assert len(reply["error"]) < 300
     assert bench.fingers.layout.positions == {"a": (0.1, 0.1)}

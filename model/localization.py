@@ -6,6 +6,7 @@ import numpy as np
 
 from model.arrays import FloatArray
 from model.errors import InputError
+from model.perception import sensation_level
 from model.plate import Plate
 
 # A lone finger is told from the rest of the plate beyond this distance [m] (about two fingertips).
@@ -72,3 +73,12 @@ def decibels(ratio: FloatArray) -> FloatArray:
     """20 log10 of an amplitude ratio; -inf for zero."""
     with np.errstate(divide="ignore"):
         return np.asarray(20 * np.log10(ratio))
+
+
+def mean_level_db_sl(frequencies: FloatArray, amplitudes: FloatArray) -> float:
+    """Level [dB SL] over a region: mean over its points of how far above threshold each is felt.
+
+    frequencies (f,) [Hz], amplitudes (f, p) [m/s²].
+    """
+    above = 10 ** (sensation_level(frequencies, amplitudes) / 20)
+    return float(decibels(above.mean()))

@@ -33,6 +33,7 @@ from model.switched import (
     peak_of_patterns,
     sensation_of_patterns,
 )
+from model.vibration import tone_amplitudes
 
 PAPER_FREQUENCIES = np.arange(60.0, 321.0, 10.0)
 """The 27 excitation frequencies [Hz]: 60 to 320 in steps of 10 holds every one the paper names."""
@@ -127,6 +128,17 @@ class LocalizationTable:
             level_db_sl=level_db_sl,
             contrast_db=float(contrast[best]) if quiet else None,
             quiet_level_db_sl=quiet_level,
+        )
+
+    def amplitudes(self, excitation: Excitation) -> tuple[FloatArray, FloatArray]:
+        """Frequencies (f,) [Hz] and peak acceleration at the mesh's nodes (f, nodes) [m/s²].
+
+        The excitation's frequencies must be the table's own.
+        """
+        return tone_amplitudes(
+            excitation,
+            self.eras,
+            lambda f: self.acceleration[np.searchsorted(self.frequencies, f)].astype(complex),
         )
 
     def drive_of(self, excitation: Excitation) -> dict[str, dict[str, float]]:

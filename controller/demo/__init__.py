@@ -1,0 +1,1 @@
+"""The demonstration: recorded touches in, what each fingertip felt out, over a real wire."""

@@ -1,0 +1,182 @@
+"""The far end of the demonstration: simulated amplifiers and the plate that they drive.
+
+The controller reaches them over their wire. Here the control socket is used: to say where
+fingers rest, and to ask what they felt.
+"""
+
+import asyncio
+import contextlib
+import json
+import sys
+import tempfile
+from collections.abc import AsyncIterator, Collection, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast
+from urllib.parse import quote
+
+import numpy as np
+
+from drivers.errors import LinkError
+from model.arrays import FloatArray
+
+LINE_MAX = 1 << 20  # bytes of one answer; what ten fingers felt takes a fiftieth of it
+STARTUP_TIMEOUT = 30.0  # seconds; a machine at work on something else solves the plate slowly
+EXIT_TIMEOUT = 3.0
+
+
+@dataclass(frozen=True)
+class FingerFelt:
+    """What one fingertip felt over a window.
+
+    frequencies (f,) [Hz]; amplitudes (f, p) [m/s²] of the steady part at each point of the tip;
+    peaks (p,) [m/s²], the largest acceleration seen there, transients included.
+    """
+
+    frequencies: FloatArray
+    amplitudes: FloatArray
+    peaks: FloatArray
+
+
+class BenchControl:
+    """The control socket of a simulated plate: JSON objects, one a line, answered in order.
+
+    It connects when it is first asked something, for a plate within this process is there only once
+    its amplifier is open.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._streams: tuple[asyncio.StreamReader, asyncio.StreamWriter] | None = None
+        self._turn = asyncio.Lock()
+
+    async def close(self) -> None:
+        """Hang up."""
+        if self._streams is not None:
+            self._streams[1].close()
+            with contextlib.suppress(OSError):
+                await self._streams[1].wait_closed()
+
+    async def place_fingers(self, positions: Mapping[str, tuple[float, float]]) -> None:
+        """Let fingers rest at these positions [m], by id, and at no others."""
+        await self._ask(
+            {"op": "fingers", "fingers": {id: list(at) for id, at in positions.items()}}
+        )
+
+    async def felt(self, since: float, until: float) -> dict[str, FingerFelt]:
+        """What each finger felt between two times [s] of time.monotonic(), by id."""
+        answer = await self._ask({"op": "felt", "since_s": since, "until_s": until})
+        return {
+            id: FingerFelt(
+                frequencies=np.array(felt["frequencies_hz"], dtype=float),
+                amplitudes=np.array(felt["amplitude_m_s2"], dtype=float).reshape(
+                    len(felt["frequencies_hz"]), -1
+                ),
+                peaks=np.array(felt["peak_m_s2"], dtype=float),
+            )
+            for id, felt in answer["fingers"].items()
+        }
+
+    async def _ask(self, question: dict[str, Any]) -> dict[str, Any]:
+        async with self._turn:
+            if self._streams is None:
+                self._streams = await self._connect()
+            reader, writer = self._streams
+            writer.write(json.dumps(question).encode() + b"\n")
+            await writer.drain()
+            line = await reader.readline()
+        if not line:
+            raise LinkError("the simulated plate is gone: its process closed the control socket")
+        answer: dict[str, Any] = json.loads(line)
+        if "error" in answer:
+            raise LinkError(f"the simulated plate refused {question['op']}: {answer['error']}")
+        return answer
+
+    async def _connect(self) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
+        try:
+            return await asyncio.open_unix_connection(str(self._path), limit=LINE_MAX)
+        except OSError as error:
+            raise LinkError(f"the simulated plate does not listen on {self._path}: {error}") from (
+                error
+            )
+
+
+@dataclass(frozen=True)
+class FarEnd:
+    """What the controller needs of it: a URL by amplifier name, and the control of the bench."""
+
+    urls: Mapping[str, str]
+    bench: BenchControl
+
+
+@contextlib.asynccontextmanager
+async def open_far_end(
+    rig_file: Path, amplifiers: Collection[str], *, wire: str
+) -> AsyncIterator[FarEnd]:
+    """The simulated amplifiers of a rig file on a wire; they end with the context.
+
+    amplifiers: their names; wire: "sim" for one within this process, otherwise an option of
+    `era sim` without its dashes, in a process of its own. Raises LinkError if that does not start.
+    """
+    with tempfile.TemporaryDirectory(prefix="era-") as folder:
+        control = Path(folder) / "control"
+        async with contextlib.AsyncExitStack() as stack:
+            bench = BenchControl(control)
+            stack.push_async_callback(bench.close)
+            if wire == "sim":
+                query = f"?control={quote(str(control))}&amplifier="
+                base = f"sim://{quote(str(rig_file))}{query}"
+                urls = {name: base + quote(name) for name in amplifiers}
+            else:
+                process, said = await _start(rig_file, wire=wire, control=control)
+                stack.push_async_callback(_end, process)
+                urls = await _read_urls(process, said, count=len(amplifiers))
+            yield FarEnd(urls, bench)
+
+
+async def _start(
+    rig_file: Path, *, wire: str, control: Path
+) -> tuple[asyncio.subprocess.Process, asyncio.StreamReader]:
+    """The process, and what it says."""
+    process = await asyncio.create_subprocess_exec(
+        # -P: a folder named sim where the user stands must not be taken for ours
+        *(sys.executable, "-P", "-m", "sim", str(rig_file), f"--{wire}", "--control", str(control)),
+        stdin=asyncio.subprocess.DEVNULL,
+        stdout=asyncio.subprocess.PIPE,
+    )
+    return process, cast(asyncio.StreamReader, process.stdout)  # there is one: it was asked for
+
+
+async def _read_urls(
+    process: asyncio.subprocess.Process, said: asyncio.StreamReader, *, count: int
+) -> dict[str, str]:
+    """The lines `NAME: URL` that the process prints when it is ready, one per amplifier."""
+    urls: dict[str, str] = {}
+    try:
+        async with asyncio.timeout(STARTUP_TIMEOUT):
+            while len(urls) < count and (line := (await said.readline()).decode()):
+                name, _, url = line.strip().partition(": ")
+                urls[name] = url
+    except TimeoutError:
+        raise LinkError(
+            f"the simulated amplifiers did not start within {STARTUP_TIMEOUT:g} s"
+        ) from None
+    if len(urls) < count:
+        raise LinkError(
+            f"the simulated amplifiers did not start (exit status {await process.wait()}); "
+            "what they said stands above"
+        )
+    return urls
+
+
+async def _end(process: asyncio.subprocess.Process) -> None:
+    if process.returncode is not None:
+        return
+    with contextlib.suppress(ProcessLookupError):
+        process.terminate()
+    try:
+        async with asyncio.timeout(EXIT_TIMEOUT):
+            await process.wait()
+    except TimeoutError:
+        process.kill()
+        await process.wait()

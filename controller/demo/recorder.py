@@ -1,0 +1,195 @@
+"""Watches the control loop and the simulated plate, and makes a row of every touch."""
+
+import asyncio
+import math
+import time
+from collections.abc import Callable, Coroutine, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from controller.contacts import Change, Contact, ContactKey
+from controller.demo.far_end import BenchControl, FingerFelt
+from controller.demo.measure import finger_level, measure
+from controller.demo.rows import Place, PlayedPattern, TouchRow
+from controller.observer import Applied, Observer, Silenced
+
+# The last part of a pattern is judged: by then the plate has settled, if the pattern was held long
+# enough, and a quarter of a second tells frequencies 10 Hz apart from each other.
+WINDOW = 0.25
+# From the last byte on the wire to the plate, and before the next command.
+MARGIN = 0.005
+# A finger that moves less than this [m] stays in one place for the plate's sensors; a trembling one
+# would never be measured otherwise.
+TREMBLE = 0.004
+
+
+@dataclass
+class _Touch:
+    """A touch, with every pattern that was played for it."""
+
+    contact: Contact
+    quiet: Mapping[str, Place]
+    until: float = math.inf
+    patterns: list["_Playing"] = field(default_factory=list)
+    reason: str = "another finger came down at the same moment and was the target"
+
+    @property
+    def is_lifted(self) -> bool:
+        return self.until < math.inf
+
+
+@dataclass
+class _Playing:
+    """A pattern from its commit to the next command [s], and what was felt meanwhile."""
+
+    applied: Applied
+    touch: _Touch | None
+    until: float = math.inf
+    felt: asyncio.Task[dict[str, FingerFelt]] | None = None
+
+    @property
+    def duration(self) -> float:
+        return self.until - self.applied.time
+
+
+class TouchRecorder:
+    """Collects a row per touch: hand `observer` to the controller, await `finish` at the end.
+
+    on_row is called with every row as soon as the touch was lifted and its pattern measured.
+    """
+
+    def __init__(self, bench: BenchControl, *, on_row: Callable[[TouchRow], None]) -> None:
+        self.rows: list[TouchRow] = []
+        self.problems: list[str] = []
+        self._bench = bench
+        self._on_row = on_row
+        self._start = time.monotonic()
+        self._touches: dict[ContactKey, _Touch] = {}
+        self._playing: _Playing | None = None
+        self._resting: dict[str, Place] = {}
+        self._tasks: set[asyncio.Task[Any]] = set()
+
+    @property
+    def observer(self) -> Observer:
+        """The callbacks for the control loop."""
+        return Observer(
+            contacts_changed=self._contacts_changed,
+            pattern_applied=self._pattern_applied,
+            silenced=self._silenced,
+            refused=self._failed,
+            link_lost=self._failed,
+            source_failed=self._failed,
+        )
+
+    async def finish(self) -> None:
+        """Wait until every touch that was lifted has its row."""
+        while self._tasks:
+            await asyncio.gather(*self._tasks)
+        self.rows.sort(key=lambda row: row.time)
+
+    def _contacts_changed(self, contacts: tuple[Contact, ...], change: Change) -> None:
+        self._rest(contacts)
+        for contact in change.down:
+            others = [other for other in contacts if other.key != contact.key]
+            self._touches[contact.key] = _Touch(contact, {_id(o): (o.x, o.y) for o in others})
+        for contact in change.up:
+            touch = self._touches.pop(contact.key)
+            touch.until = time.monotonic()
+            if self._playing is None or self._playing.touch is not touch:
+                self._run(self._complete(touch))
+
+    def _pattern_applied(self, applied: Applied) -> None:
+        self._end_pattern(applied.time)
+        touch = self._touches.get(applied.target.key)
+        self._playing = _Playing(applied, touch)
+        if touch is not None:
+            touch.patterns.append(self._playing)
+
+    def _silenced(self, silenced: Silenced) -> None:
+        self._end_pattern(silenced.time)
+        target = silenced.selection.target
+        if target is not None and (touch := self._touches.get(target.key)):
+            touch.reason = silenced.reason
+
+    def _failed(self, problem: str) -> None:
+        self._end_pattern(time.monotonic())
+        self.problems.append(problem)
+
+    def _end_pattern(self, now: float) -> None:
+        """Close the pattern that is played and have its last part measured."""
+        ended, self._playing = self._playing, None
+        if ended is None:
+            return
+        ended.until = now
+        settled = ended.applied.time + ended.applied.pattern.ramp
+        since, until = max(settled, now - WINDOW) + MARGIN, now - MARGIN
+        if since < until:
+            ended.felt = self._run(self._bench.felt(since, until))
+        if ended.touch is not None and ended.touch.is_lifted:
+            self._run(self._complete(ended.touch))
+
+    def _rest(self, contacts: tuple[Contact, ...]) -> None:
+        """Let the plate's sensors follow the fingers."""
+        resting = {}
+        for contact in contacts:
+            place = (contact.x, contact.y)
+            before = self._resting.get(_id(contact))
+            resting[_id(contact)] = (
+                before if before and math.dist(before, place) < TREMBLE else place
+            )
+        if resting != self._resting:
+            self._resting = resting
+            self._run(self._bench.place_fingers(resting))
+
+    async def _complete(self, touch: _Touch) -> None:
+        """Make the row of a lifted touch from the pattern that was played longest for it."""
+        longest = max(touch.patterns, key=lambda playing: playing.duration, default=None)
+        contact, quiet = touch.contact, touch.quiet
+        if longest is not None:
+            contact = longest.applied.target
+            quiet = {_id(other): (other.x, other.y) for other in longest.applied.quiet}
+        row = TouchRow(
+            target_id=_id(contact),
+            time=contact.since - self._start,
+            until=touch.until - self._start,
+            target=(contact.x, contact.y),
+            quiet=quiet,
+            played=await _played(longest, first=touch.patterns[0]) if longest else None,
+            reason=None if longest else touch.reason,
+        )
+        self.rows.append(row)
+        self._on_row(row)
+
+    def _run(self, work: Coroutine[Any, Any, Any]) -> asyncio.Task[Any]:
+        task = asyncio.create_task(work)
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+        return task
+
+
+async def _played(longest: _Playing, *, first: _Playing) -> PlayedPattern:
+    """The longest pattern of a touch as it was felt; latency is that of the touch's first."""
+    applied = longest.applied
+    felt = await longest.felt if longest.felt else {}
+    target = felt.get(_id(applied.target))
+    others = [felt[_id(contact)] for contact in applied.quiet if _id(contact) in felt]
+    return PlayedPattern(
+        pattern=applied.pattern,
+        drive={
+            era: {
+                "frequency_hz": command.frequency,
+                "level": command.level,
+                "phase_deg": command.phase,
+            }
+            for era, command in applied.drive.items()
+        },
+        latency=first.applied.latency,
+        duration=longest.duration,
+        measured=measure(target, others) if target and len(others) == len(applied.quiet) else None,
+        levels={id: finger_level(finger) for id, finger in felt.items()},
+    )
+
+
+def _id(contact: Contact) -> str:
+    """A contact's id on the bench."""
+    return f"{contact.key.source}#{contact.key.id}"

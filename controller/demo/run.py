@@ -1,0 +1,105 @@
+"""The whole demonstration: table, far end, controller, touches, rows, picture."""
+
+import asyncio
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+
+from controller.contacts import LEASE
+from controller.demo.far_end import open_far_end
+from controller.demo.picture import choose_rows, touches_figure
+from controller.demo.recorder import TouchRecorder
+from controller.demo.rows import TouchRow
+from controller.loop import Controller
+from controller.sources.capture import read_capture, replay_capture
+from controller.sources.evemu import EvemuSource
+from controller.sources.tuio import TuioSource
+from controller.touch import TouchSource
+from drivers.amplifier import Amplifier
+from drivers.errors import LinkError
+from drivers.registry import open_backend
+from model.figures import save_figure
+from model.rig_file import load_rig
+from model.table import LocalizationTable
+
+WIRES = ("serial", "sim")
+
+# The plate rings on for a moment after the last touch.
+AFTERGLOW = 0.1
+
+
+def example_touches_path() -> Path:
+    """Where the recorded touches lie that the demonstration plays by itself.
+
+    A wheel carries them beside this package; a checkout has them in its examples only.
+    """
+    package = Path(__file__).parents[1]
+    installed = package / "data" / "touches.tuio"
+    return installed if installed.exists() else package.parent / "examples" / "touches.tuio"
+
+
+async def run_demo(
+    rig_file: Path,
+    table: LocalizationTable,
+    *,
+    wire: str,
+    touches: Path,
+    on_row: Callable[[TouchRow], None],
+) -> list[TouchRow]:
+    """Play recorded touches into a controller, over a wire, onto a simulated plate.
+
+    wire: one of WIRES; touches: a TUIO capture, or an evemu recording (.events). on_row is called
+    with every row as it is complete; all are returned in order of time. Raises InputError for a
+    recording that is none, LinkError if the far end is lost.
+    """
+    rig = load_rig(rig_file)
+    source, play = await _touch_stream(touches)
+    async with open_far_end(rig_file, rig.amplifiers, wire=wire) as far_end:
+        recorder = TouchRecorder(far_end.bench, on_row=on_row)
+        controller = Controller(
+            rig,
+            table,
+            amplifiers={name: Amplifier(open_backend(url)) for name, url in far_end.urls.items()},
+            sources=[source],
+            observer=recorder.observer,
+        )
+        await controller.open()
+        try:
+            await _drive(controller, play)
+            await recorder.finish()
+        finally:
+            await controller.close()
+    if recorder.problems:
+        raise LinkError(f"the demonstration did not run through: {recorder.problems[0]}")
+    return recorder.rows
+
+
+def write_picture(table: LocalizationTable, rows: list[TouchRow], folder: Path) -> list[Path]:
+    """Draw some of the touches into a folder; no file where none was played."""
+    chosen = choose_rows(rows)
+    if not chosen:
+        return []
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / "touches.png"
+    save_figure(touches_figure(table, chosen), path)
+    return [path]
+
+
+async def _touch_stream(path: Path) -> tuple[TouchSource, Callable[[], Awaitable[None]]]:
+    """A source for a recording, and what to await while it plays."""
+    if path.suffix == ".events":
+        recording = EvemuSource(f"evemu:{path}")
+        return recording, lambda: asyncio.sleep(recording.frames[-1].time)
+    datagrams = read_capture(path)
+    tuio = TuioSource("tuio:127.0.0.1:0")
+    await tuio.open()
+    return tuio, lambda: replay_capture(datagrams, tuio.host, tuio.port)
+
+
+async def _drive(controller: Controller, play: Callable[[], Awaitable[None]]) -> None:
+    """Arm, let the touches come, and wait until the last one has been noticed as lifted."""
+    async with asyncio.TaskGroup() as tasks:
+        running = tasks.create_task(controller.run())
+        await controller.arm()
+        await play()
+        await asyncio.sleep(LEASE + AFTERGLOW)
+        running.cancel()

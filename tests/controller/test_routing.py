@@ -1,0 +1,101 @@
+"""From an excitation to drive commands."""
+
+import math
+
+import pytest
+
+from controller.routing import drive_of_eras, route
+from drivers.command import CommandSet, DriveCommand
+from model.actuator import Era
+from model.errors import InputError
+from model.excitation import Tone
+from model.mesh import Mesh
+from model.plate import Material, Plate
+from model.rig import Channel, Limits, Rig
+
+PLATE = Plate(0.3, 0.2, 0.0015, Material("aluminium", 70e9, 2700.0, 0.33))
+RIG = Rig(
+    plate=PLATE,
+    mesh=Mesh(4, 4, 0.3, 0.2),
+    eras=tuple(
+        Era(name, 0.0, 0.0, 17_000.0, 1.0, 0.0, stroke)
+        for name, stroke in (("SW", 100e-6), ("SE", 50e-6), ("NE", 100e-6))
+    ),
+    wiring={"SW": Channel("left", 1), "SE": Channel("right", 0), "NE": Channel("left", 0)},
+    amplifiers={"left": "sim://", "right": "sim://"},
+    limits=Limits(40.0, 500.0, 1.0),
+)
+
+
+def test_by_hand() -> None:
+    """20 of 100 µm is level 0.2, 20 of 50 is 0.4; pi/2 is 90°; what is not driven is silent."""
+    sets = route(
+        {"SW": Tone(110.0, 20e-6, math.pi / 2), "SE": Tone(250.0, 20e-6)}, RIG, token=7, ramp=0.02
+    )
+    assert sets == {
+        "left": CommandSet(
+            token=7,
+            commands=(
+                DriveCommand(channel=0, frequency=40.0, level=0.0),
+                DriveCommand(
+                    channel=1,
+                    frequency=110.0,
+                    level=pytest.approx(0.2),
+                    phase=pytest.approx(90.0),
+                ),
+            ),
+            ramp=0.02,
+            valid_for=0.0,
+        ),
+        "right": CommandSet(
+            token=7,
+            commands=(DriveCommand(channel=0, frequency=250.0, level=pytest.approx(0.4)),),
+            ramp=0.02,
+            valid_for=0.0,
+        ),
+    }
+
+
+@pytest.mark.parametrize(
+    ("radians", "degrees"),
+    [
+        (0.0, 0.0),
+        (math.pi, 180.0),
+        (-math.pi, 180.0),
+        (1.5 * math.pi, -90.0),
+        (-1.5 * math.pi, 90.0),
+        (5 * math.pi, 180.0),
+        (20 * math.pi + 0.1, math.degrees(0.1)),
+    ],
+)
+def test_phase_is_wrapped(radians: float, degrees: float) -> None:
+    """Phases lie above -180° and up to 180°."""
+    command = route({"SE": Tone(100.0, 1e-6, radians)}, RIG, token=1, ramp=0)["right"].commands[0]
+    assert command.phase == pytest.approx(degrees)
+    assert -180 < command.phase <= 180
+
+
+def test_nothing_is_limited_here() -> None:
+    """More than full stroke and numbers that are none go on to the guard as they are."""
+    over = route({"SE": Tone(1e9, 1e-4, math.nan)}, RIG, token=1, ramp=0)["right"].commands[0]
+    assert over.frequency == 1e9
+    assert over.level == pytest.approx(2.0)
+    assert math.isnan(over.phase)
+
+
+def test_an_era_that_the_rig_has_not() -> None:
+    """A pattern of another rig is refused as a whole."""
+    with pytest.raises(InputError, match="drives NW, which the rig does not have"):
+        route({"SW": Tone(100.0, 1e-6), "NW": Tone(100.0, 1e-6)}, RIG, token=1, ramp=0)
+
+
+def test_back_to_eras() -> None:
+    """What the amplifiers play is told by ERA, without the silent ones."""
+    achieved = {
+        "left": (DriveCommand(0, 40.0, 0.0), DriveCommand(1, 110.01, 0.1999)),
+        "right": (DriveCommand(0, 250.0, 0.4),),
+    }
+    assert drive_of_eras(achieved, RIG) == {
+        "SW": DriveCommand(1, 110.01, 0.1999),
+        "SE": DriveCommand(0, 250.0, 0.4),
+    }

@@ -18,16 +18,26 @@ from drivers.guard import Guard, GuardLimits, SafeCommand
 from drivers.protocol.messages import Fault, State, Status
 from drivers.registry import open_backend
 
-RIG = Path(drivers.__file__).parent.parent / "examples" / "paper_plate.yaml"
+PAPER_PLATE = Path(drivers.__file__).parent.parent / "examples" / "paper_plate.yaml"
 REPLY_TIMEOUT = 2.0  # s; on a busy machine a far end may be late, and is not wrong for it
 CALM = 2.0  # s; a watchdog that does not trip while a test goes on
 
 
 @pytest.fixture(scope="module")
-def serial_url() -> Iterator[str]:
+def rig(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The paper's rig on a coarse mesh: the plate takes no part in this contract."""
+    text = PAPER_PLATE.read_text(encoding="utf-8")
+    assert "mesh: auto" in text
+    path = tmp_path_factory.mktemp("rig") / "coarse.yaml"
+    path.write_text(text.replace("mesh: auto", "mesh: 12x9"), encoding="utf-8")
+    return path
+
+
+@pytest.fixture(scope="module")
+def serial_url(rig: Path) -> Iterator[str]:
     """The far end of a serial line as a process of its own."""
     with subprocess.Popen(
-        [sys.executable, "-P", "-m", "sim", str(RIG), "--serial"],
+        [sys.executable, "-P", "-m", "sim", str(rig), "--serial"],
         stdout=subprocess.PIPE,
         text=True,
     ) as process:
@@ -39,9 +49,9 @@ def serial_url() -> Iterator[str]:
 
 
 @pytest.fixture(params=["sim", "serial"])
-def url(request: pytest.FixtureRequest) -> str:
+def url(request: pytest.FixtureRequest, rig: Path) -> str:
     """An amplifier of the paper's rig behind each kind of wire."""
-    return f"sim://{RIG}" if request.param == "sim" else request.getfixturevalue("serial_url")
+    return f"sim://{rig}" if request.param == "sim" else request.getfixturevalue("serial_url")
 
 
 @pytest.fixture

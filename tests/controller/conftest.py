@@ -1,11 +1,49 @@
-"""An event loop whose time passes only when nothing else is left to do."""
+"""An event loop on a virtual clock, and a controller between a table and amplifiers of our own."""
 
 import asyncio
+import math
 import selectors
-from collections.abc import Callable, Coroutine
+from collections.abc import AsyncIterator, Callable, Coroutine, Sequence
+from contextlib import AbstractAsyncContextManager, asynccontextmanager
+from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
 import pytest
+
+from controller.loop import Controller
+from controller.observer import Applied, Observer, Silenced
+from controller.touch import Touch, TouchFrame, TouchSource
+from drivers.amplifier import Amplifier
+from drivers.backend import Backend
+from drivers.command import CommandSet
+from drivers.protocol.definition import PROTOCOL
+from drivers.protocol.messages import (
+    Achieved,
+    Apply,
+    Arm,
+    Capabilities,
+    Clear,
+    Commit,
+    Disarm,
+    Fault,
+    GetCaps,
+    Hello,
+    Identity,
+    Nak,
+    NakCode,
+    Reply,
+    Request,
+    Stage,
+    State,
+    Status,
+    Stop,
+)
+from model.actuator import Era
+from model.excitation import Excitation, Tone
+from model.mesh import Mesh
+from model.plate import Material, Plate
+from model.rig import Channel, Limits, Rig
+from model.table import Pattern
 
 T = TypeVar("T")
 
@@ -44,3 +82,237 @@ def run_virtual() -> Callable[[Coroutine[Any, Any, T]], T]:
             return runner.run(coroutine)
 
     return run
+
+
+class FarEnd(Backend):
+    """An amplifier that obeys and remembers everything it was asked, and when.
+
+    The last byte leaves at once, the reply takes `delay` [s]. `answer` may override any reply.
+    """
+
+    def __init__(self, channels: int = 2) -> None:
+        self.asked: list[tuple[float, Request]] = []
+        self.delay = 0.0
+        self.channels = channels
+        self.state = State.SWITCH_ON_DISABLED
+        self.levels = (0.0,) * channels
+        self.token = 0
+        self.staged: CommandSet | None = None
+        self.answer: Callable[[Request], Reply | None] = lambda request: None
+        self.is_open = False
+        self._last_sent = 0.0
+
+    async def open(self) -> None:
+        """Always succeeds."""
+        self.is_open = True
+
+    async def close(self) -> None:
+        """As asked."""
+        self.is_open = False
+
+    @property
+    def last_sent(self) -> float:
+        """On the loop's clock [s]."""
+        return self._last_sent
+
+    async def exchange(self, request: Request, *, timeout: float) -> Reply:
+        """Remember, wait, answer."""
+        self._last_sent = asyncio.get_running_loop().time()
+        self.asked.append((self._last_sent, request))
+        await asyncio.sleep(self.delay)
+        return self.answer(request) or self.obey(request)
+
+    def obey(self, request: Request) -> Reply:
+        """What an amplifier without faults answers."""
+        match request:
+            case Hello():
+                return Identity("maker", "box", "1", "1", PROTOCOL.version)
+            case GetCaps():
+                return Capabilities(
+                    channels=self.channels,
+                    frequency_min=10.0,
+                    frequency_max=600.0,
+                    frequency_step=0.01,
+                    level_max=1.0,
+                    level_step=1e-4,
+                    phase_step=0.01,
+                    ramp_max=1.0,
+                    watchdog_min=0.1,
+                    watchdog_max=1.0,
+                    envelope_knots=0,
+                )
+            case Arm() if self.state is State.SWITCH_ON_DISABLED:
+                self.state = State.OPERATION_ENABLED
+            case Arm():
+                return Nak(NakCode.WRONG_STATE)
+            case Disarm() | Clear():
+                self.state = State.SWITCH_ON_DISABLED
+                self.levels = (0.0,) * self.channels
+            case Stop():
+                self.state = State.QUICK_STOP_ACTIVE
+                self.levels = (0.0,) * self.channels
+            case Stage(command_set=staged):
+                self.staged = staged
+                return Achieved(staged.token, staged.commands)
+            case Commit():
+                assert self.staged is not None
+                return self._play(self.staged)
+            case Apply(command_set=wanted):
+                return self._play(wanted)
+            case _:
+                pass
+        return Status(self.state, Fault.NONE, self.token, True, 25.0, 0.25, self.levels)
+
+    def _play(self, wanted: CommandSet) -> Achieved:
+        levels = {command.channel: command.level for command in wanted.commands}
+        self.levels = tuple(levels.get(channel, 0.0) for channel in range(self.channels))
+        self.token = wanted.token
+        return Achieved(wanted.token, wanted.commands)
+
+    def sets(self) -> list[CommandSet]:
+        """All sets that were to be applied."""
+        return [request.command_set for _, request in self.asked if isinstance(request, Apply)]
+
+    def requests(self, *kinds: type[Request]) -> list[Request]:
+        """What was asked, of some kinds."""
+        return [request for _, request in self.asked if isinstance(request, kinds)]
+
+    def times(self, kind: type[Request]) -> list[float]:
+        """When something was asked [s]."""
+        return [time for time, request in self.asked if isinstance(request, kind)]
+
+
+class Table:
+    """A table whose answer is set by the test, or an exception to raise."""
+
+    def __init__(self, excitation: Excitation | Exception) -> None:
+        self.excitation = excitation
+
+    def answer(
+        self,
+        target: tuple[float, float],
+        *,
+        quiet: Sequence[tuple[float, float]] = (),
+        level_db_sl: float = 0.0,
+    ) -> Pattern:
+        """The same for every target."""
+        if isinstance(self.excitation, Exception):
+            raise self.excitation
+        return Pattern(self.excitation, 0.015, 20.0, 12.0 if quiet else None, None)
+
+
+@dataclass
+class Told:
+    """What an observer was told."""
+
+    applied: list[Applied] = field(default_factory=list)
+    silenced: list[Silenced] = field(default_factory=list)
+    refused: list[str] = field(default_factory=list)
+    lost: list[str] = field(default_factory=list)
+    failed: list[str] = field(default_factory=list)
+    contacts: list[int] = field(default_factory=list)
+
+    def observer(self) -> Observer:
+        """The observer that writes it down."""
+        return Observer(
+            contacts_changed=lambda contacts, change: self.contacts.append(len(contacts)),
+            pattern_applied=self.applied.append,
+            silenced=self.silenced.append,
+            refused=self.refused.append,
+            link_lost=self.lost.append,
+            source_failed=self.failed.append,
+        )
+
+
+def _rig(*amplifiers: str) -> Rig:
+    """A rig with two ERAs, both on the first amplifier or one on each."""
+    return Rig(
+        plate=Plate(0.3, 0.2, 0.0015, Material("aluminium", 70e9, 2700.0, 0.33)),
+        mesh=Mesh(4, 4, 0.3, 0.2),
+        eras=(
+            Era("SW", 0.0, 0.0, 17_000.0, 1.0, 0.0, 100e-6),
+            Era("NE", 0.3, 0.2, 17_000.0, 1.0, 0.0, 100e-6),
+        ),
+        wiring={"SW": Channel(amplifiers[0], 0), "NE": Channel(amplifiers[-1], 1)},
+        amplifiers=dict.fromkeys(amplifiers, "fake://"),
+        limits=Limits(40.0, 500.0, 1.0),
+    )
+
+
+@dataclass
+class Bench:
+    """A controller with its far ends, its table and what it told."""
+
+    controller: Controller
+    rig: Rig
+    far_ends: list[FarEnd]
+    table: Table
+    told: Told
+
+    @property
+    def far_end(self) -> FarEnd:
+        """The first amplifier."""
+        return self.far_ends[0]
+
+    def touch(self, *touches: tuple[int, float, float], ago: float = 0.0) -> None:
+        """Deliver a frame that arrived some time ago [s]."""
+        now = asyncio.get_running_loop().time()
+        self.controller.deliver(
+            TouchFrame("test", now - ago, tuple(Touch(*touch) for touch in touches))
+        )
+
+    async def hold(self, *touches: tuple[int, float, float], seconds: float) -> None:
+        """Repeat a frame every 50 ms, as a source must."""
+        for _ in range(round(seconds / 0.05)):
+            self.touch(*touches)
+            await asyncio.sleep(0.05)
+
+
+def _make_bench(
+    *amplifiers: str,
+    sources: Sequence[TouchSource] = (),
+    observer: Observer | None = None,
+    channels: int = 2,
+) -> Bench:
+    """A bench within a running loop; one amplifier unless more are named."""
+    names = amplifiers or ("main",)
+    far_ends = [FarEnd(channels) for _ in names]
+    table = Table({"SW": Tone(110.0, 20e-6, math.pi / 2)})
+    told = Told()
+    rig = _rig(*names)
+    controller = Controller(
+        rig,
+        table,
+        amplifiers={n: Amplifier(far_end) for n, far_end in zip(names, far_ends, strict=True)},
+        sources=sources,
+        observer=observer or told.observer(),
+        clock=asyncio.get_running_loop().time,
+    )
+    return Bench(controller, rig, far_ends, table, told)
+
+
+@asynccontextmanager
+async def _running(*amplifiers: str, **options: Any) -> AsyncIterator[Bench]:
+    """A bench that is open, armed and runs; closed at the end, and its loop must have survived."""
+    bench = _make_bench(*amplifiers, **options)
+    await bench.controller.open()
+    await bench.controller.arm()
+    task = asyncio.create_task(bench.controller.run())
+    await asyncio.sleep(0.001)
+    try:
+        yield bench
+    finally:
+        await bench.controller.close()
+        await task
+
+
+@pytest.fixture
+def make_bench() -> Callable[..., Bench]:
+    """Make a bench: names of amplifiers, and sources, observer, channels."""
+    return _make_bench
+
+
+@pytest.fixture
+def running() -> Callable[..., AbstractAsyncContextManager[Bench]]:
+    """A bench that is open, armed and runs, as a context; arguments as for make_bench."""
+    return _running

@@ -1,0 +1,250 @@
+"""Arming, stopping, closing, and what several amplifiers must do together."""
+
+import asyncio
+from collections.abc import Callable
+from contextlib import AbstractAsyncContextManager
+from typing import Any
+
+import pytest
+
+from controller.amplifiers import Phase
+from controller.loop import Controller
+from drivers.amplifier import Amplifier
+from drivers.errors import CommandError, CommandRefused, LinkError
+from drivers.protocol.messages import (
+    Apply,
+    Arm,
+    Commit,
+    Disarm,
+    Fault,
+    GetStatus,
+    Nak,
+    NakCode,
+    Ping,
+    Reply,
+    Request,
+    Stage,
+    State,
+    Status,
+    Stop,
+)
+from model.errors import InputError
+
+Run = Callable[..., Any]
+Running = Callable[..., AbstractAsyncContextManager[Any]]
+MakeBench = Callable[..., Any]
+
+FINGER = (1, 0.5, 0.5)
+OTHER = (2, 0.9, 0.9)
+
+
+def test_disarmed_at_first(run_virtual: Run, make_bench: MakeBench) -> None:
+    """Until armed, contacts are followed and nothing is sent; then fingers already there feel."""
+
+    async def scenario() -> None:
+        bench = make_bench()
+        with pytest.raises(CommandError, match="not open yet"):
+            await bench.controller.arm()
+        await bench.controller.open()
+        assert bench.controller.phase is Phase.DISARMED
+        task = asyncio.create_task(bench.controller.run())
+        await bench.hold(FINGER, seconds=0.3)
+        assert bench.told.contacts == [1]
+        assert bench.far_end.requests(Apply, Ping, Arm) == []
+        await bench.controller.arm()
+        await bench.hold(FINGER, seconds=0.1)
+        assert [each.is_silent for each in bench.far_end.sets()] == [False]
+        await bench.controller.disarm()
+        await bench.hold(OTHER, seconds=0.3)
+        assert len(bench.far_end.sets()) == 1
+        assert isinstance(bench.far_end.asked[-1][1], Disarm)
+        await bench.controller.close()
+        await task
+
+    run_virtual(scenario())
+
+
+def test_link_lost(run_virtual: Run, make_bench: MakeBench) -> None:
+    """A link that breaks stops the other amplifier, is told, and ends the loop with the error."""
+
+    async def scenario() -> None:
+        bench = make_bench("a", "b")
+        await bench.controller.open()
+        await bench.controller.arm()
+        task = asyncio.create_task(bench.controller.run())
+        await bench.hold(FINGER, seconds=0.1)
+
+        def break_off(request: Request) -> Reply | None:
+            raise LinkError("the cable was pulled")
+
+        bench.far_ends[0].answer = break_off
+        await asyncio.sleep(0.1)
+        assert bench.controller.phase is Phase.LOST
+        assert len(bench.far_ends[1].requests(Stop)) == 1
+        assert len(bench.told.lost) == 1
+        assert "the cable was pulled" in bench.told.lost[0]
+        with pytest.raises(LinkError, match="the cable was pulled"):
+            await task
+        with pytest.raises(CommandError, match="open all again"):
+            await bench.controller.arm()
+        await bench.controller.close()
+        assert not bench.far_ends[1].is_open
+
+    run_virtual(scenario())
+
+
+def test_together_or_not_at_all(run_virtual: Run, running: Running) -> None:
+    """Several amplifiers stage under one token, all before any commits, and are read back."""
+
+    async def scenario() -> None:
+        async with running("a", "b") as bench:
+            bench.far_ends[0].delay = 0.004
+            before = len(bench.far_ends[1].asked)
+            bench.touch(FINGER)
+            await asyncio.sleep(0.03)
+            first, second = bench.far_ends
+            kinds = [type(request) for _, request in second.asked[before:]]
+            assert kinds == [Stage, Commit, GetStatus]
+            assert second.times(Commit)[-1] >= first.times(Stage)[-1] + 0.004
+            tokens = {
+                request.command_set.token
+                for far_end in bench.far_ends
+                for request in [far_end.requests(Stage)[-1]]
+                if isinstance(request, Stage)
+            }
+            assert tokens == {first.token} == {second.token}
+            assert bench.told.applied[-1].drive.keys() == {"SW"}
+
+    run_virtual(scenario())
+
+
+@pytest.mark.parametrize(
+    ("kind", "reply"),
+    [
+        (Stage, Nak(NakCode.BAD_VALUE, 1)),
+        (Commit, Nak(NakCode.BAD_TOKEN)),
+        (
+            GetStatus,
+            Status(State.OPERATION_ENABLED, Fault.NONE, 9999, True, 25.0, 0.2, (0.0, 0.0)),
+        ),
+        (Ping, Status(State.FAULT, Fault.ARC, 1, False, 25.0, 0.0, (0.0, 0.0))),
+    ],
+)
+def test_one_of_several_fails(
+    run_virtual: Run, kind: type[Request], reply: Reply, running: Running
+) -> None:
+    """Whatever one amplifier does not do, all are stopped, disarmed and stay so; it is told."""
+
+    async def scenario() -> None:
+        async with running("a", "b") as bench:
+            bench.far_ends[1].answer = lambda request: reply if isinstance(request, kind) else None
+            await bench.hold(FINGER, seconds=0.2)
+            assert [len(far_end.requests(Stop)) for far_end in bench.far_ends] == [1, 1]
+            assert bench.controller.phase is Phase.DISARMED
+            assert len(bench.told.refused) == 1
+            assert bench.told.applied == [] or kind is Ping
+            asked = len(bench.far_ends[0].asked)
+            await bench.hold(FINGER, OTHER, seconds=0.2)
+            assert len(bench.far_ends[0].asked) == asked
+
+    run_virtual(scenario())
+
+
+def test_stop_is_latched(run_virtual: Run, running: Running) -> None:
+    """After a stop nothing arms before it was acknowledged, and touches are not felt."""
+
+    async def scenario() -> None:
+        async with running() as bench:
+            await bench.controller.stop()
+            with pytest.raises(CommandRefused, match="stopped"):
+                await bench.controller.arm()
+            assert bench.controller.phase is Phase.DISARMED
+            await bench.controller.clear()
+            await bench.controller.arm()
+            bench.touch(FINGER)
+            await asyncio.sleep(0.01)
+            assert not bench.far_end.sets()[-1].is_silent
+
+    run_virtual(scenario())
+
+
+def test_stop_between_stage_and_commit(run_virtual: Run, running: Running) -> None:
+    """A set that was staged when the stop came is never committed, and no error is made of it."""
+
+    async def scenario() -> None:
+        async with running("a", "b") as bench:
+            bench.far_ends[0].delay = 0.01
+            commits = len(bench.far_ends[1].requests(Commit))
+            bench.touch(FINGER)
+            await asyncio.sleep(0.005)
+            await bench.controller.stop()
+            await asyncio.sleep(0.1)
+            assert len(bench.far_ends[1].requests(Commit)) == commits
+            assert bench.told.refused == []
+
+    run_virtual(scenario())
+
+
+def test_close(run_virtual: Run, make_bench: MakeBench) -> None:
+    """Closing ramps to zero in 50 ms, reads zero back, disarms, closes and ends the loop."""
+
+    async def scenario() -> None:
+        bench = make_bench()
+        await bench.controller.open()
+        await bench.controller.arm()
+        task = asyncio.create_task(bench.controller.run())
+        bench.touch(FINGER)
+        await asyncio.sleep(0.01)
+        before = len(bench.far_end.asked)
+        start = asyncio.get_running_loop().time()
+        await bench.controller.close()
+        await task
+        (zero_at, zero), (read_at, _), _ = bench.far_end.asked[before:]
+        assert isinstance(zero, Apply)
+        assert zero.command_set.is_silent
+        assert zero.command_set.ramp == 0.05
+        assert zero_at == start
+        assert read_at >= start + 0.05
+        assert [type(request) for _, request in bench.far_end.asked[before:]] == [
+            Apply,
+            GetStatus,
+            Disarm,
+        ]
+        assert not bench.far_end.is_open
+        await bench.controller.close()
+
+    run_virtual(scenario())
+
+
+def test_close_without_proof_of_silence(
+    run_virtual: Run, caplog: pytest.LogCaptureFixture, running: Running
+) -> None:
+    """An amplifier that goes on reporting a level is stopped, and that is logged."""
+
+    async def scenario() -> None:
+        async with running() as bench:
+            bench.far_end.answer = lambda request: (
+                Status(State.OPERATION_ENABLED, Fault.NONE, 1, True, 25.0, 0.2, (0.3, 0.0))
+                if isinstance(request, GetStatus)
+                else None
+            )
+        assert isinstance(bench.far_end.asked[-1][1], Stop)
+        assert not bench.far_end.is_open
+
+    run_virtual(scenario())
+    assert "reports a level after it was told to be silent" in caplog.text
+
+
+def test_a_rig_that_does_not_fit(run_virtual: Run, make_bench: MakeBench) -> None:
+    """Amplifiers the rig does not name, and channels an amplifier has not, are refused at once."""
+
+    async def scenario() -> None:
+        bench = make_bench(channels=1)
+        other = {"other": Amplifier(bench.far_end)}
+        with pytest.raises(InputError, match="names the amplifiers main, but given are other"):
+            Controller(bench.rig, bench.table, amplifiers=other)
+        with pytest.raises(InputError, match="ERA NE is wired to channel 1 of amplifier main"):
+            await bench.controller.open()
+        assert not bench.far_end.is_open
+
+    run_virtual(scenario())

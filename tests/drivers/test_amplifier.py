@@ -30,7 +30,7 @@ from drivers.protocol.messages import (
     Status,
     Stop,
 )
-from drivers.watchdog import check_watchdog
+from drivers.watchdog import check_watchdog, round_trip_of
 
 IDENTITY = Identity("Acme", "Quad", "A-17", "1.2", 1)
 STATUS = Status(State.OPERATION_ENABLED, Fault.NONE, 0, True, 25.0, 0.25, (0.0,) * 4)
@@ -353,3 +353,17 @@ def test_watchdog_bears_three_heartbeats(watchdog: float, round_trip: float, fit
         return
     with pytest.raises(CommandError, match="need at least"):
         check_watchdog(watchdog, round_trip)
+
+
+@pytest.mark.parametrize(
+    ("url", "milliseconds"),
+    [
+        ("serial:///dev/ttyUSB0?baud=115200", 8.33),  # 50 + 46 bytes of ten bits
+        ("serial:///dev/ttyUSB0?baud=9600", 100.0),
+        ("serial://box:4001", 0.0),
+        ("sim://rig.yaml", 0.0),
+    ],
+)
+def test_the_round_trip_follows_from_the_url(url: str, milliseconds: float) -> None:
+    """Four channels at the speed in the URL; what is not known there counts as nothing."""
+    assert round_trip_of(url, channels=4) * 1e3 == pytest.approx(milliseconds, abs=0.01)

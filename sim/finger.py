@@ -119,6 +119,8 @@ def _join(
     """One finger's record from the pieces in which it rested in its last place."""
     stay = []
     for layout, times, accelerations in reversed(pieces):
+        if not stay and name not in layout.positions:
+            continue  # it was lifted before the window ended
         if layout.positions.get(name) != last.positions[name]:
             break
         inside = (times >= since) & (times <= until)

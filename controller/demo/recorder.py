@@ -20,7 +20,7 @@ WINDOW = 0.25
 MARGIN = 0.005
 # A finger that moves less than this [m] stays in one place for the plate's sensors; a trembling one
 # would never be measured otherwise.
-TREMBLE = 0.004
+TREMBLE = 0.001
 
 
 @dataclass
@@ -55,7 +55,8 @@ class _Playing:
 class TouchRecorder:
     """Collects a row per touch: hand `observer` to the controller, await `finish` at the end.
 
-    on_row is called with every row as soon as the touch was lifted and its pattern measured.
+    problems: whatever went wrong meanwhile, a sentence each. on_row is called with every row as
+    soon as the touch was lifted and its pattern measured.
     """
 
     def __init__(self, bench: BenchControl, *, on_row: Callable[[TouchRow], None]) -> None:
@@ -84,7 +85,7 @@ class TouchRecorder:
     async def finish(self) -> None:
         """Wait until every touch that was lifted has its row."""
         while self._tasks:
-            await asyncio.gather(*self._tasks)
+            await asyncio.wait(self._tasks)
         self.rows.sort(key=lambda row: row.time)
 
     def _contacts_changed(self, contacts: tuple[Contact, ...], change: Change) -> None:
@@ -163,8 +164,13 @@ class TouchRecorder:
     def _run(self, work: Coroutine[Any, Any, Any]) -> asyncio.Task[Any]:
         task = asyncio.create_task(work)
         self._tasks.add(task)
-        task.add_done_callback(self._tasks.discard)
+        task.add_done_callback(self._finished)
         return task
+
+    def _finished(self, task: asyncio.Task[Any]) -> None:
+        self._tasks.discard(task)
+        if not task.cancelled() and (error := task.exception()) is not None:
+            self.problems.append(str(error))
 
 
 async def _played(longest: _Playing, *, first: _Playing) -> PlayedPattern:

@@ -97,9 +97,18 @@ async def _touch_stream(path: Path) -> tuple[TouchSource, Callable[[], Awaitable
 
 async def _drive(controller: Controller, play: Callable[[], Awaitable[None]]) -> None:
     """Arm, let the touches come, and wait until the last one has been noticed as lifted."""
-    async with asyncio.TaskGroup() as tasks:
-        running = tasks.create_task(controller.run())
-        await controller.arm()
-        await play()
-        await asyncio.sleep(LEASE + AFTERGLOW)
-        running.cancel()
+    await controller.arm()
+    tasks = [asyncio.create_task(controller.run()), asyncio.create_task(_play_out(play))]
+    try:
+        done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+        for task in done:
+            task.result()
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+
+
+async def _play_out(play: Callable[[], Awaitable[None]]) -> None:
+    await play()
+    await asyncio.sleep(LEASE + AFTERGLOW)

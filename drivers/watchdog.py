@@ -23,7 +23,8 @@ def round_trip_of(url: str, *, channels: int) -> float:
 def check_watchdog(watchdog: float, round_trip: float, *, heartbeat: float = HEARTBEAT) -> None:
     """Refuse a watchdog [s] shorter than three heartbeats and one round trip [s] on the wire.
 
-    round_trip: of the longest exchange on the link (see `round_trip_of`). Raises CommandError that says what the wire allows.
+    round_trip: of the longest exchange on the link (see `round_trip_of`). Raises CommandError that
+    says what the wire allows.
     """
     shortest = HEARTBEATS_BORNE * heartbeat + round_trip
     if not watchdog >= shortest - 1e-9:  # sums of floats

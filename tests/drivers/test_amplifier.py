@@ -296,23 +296,50 @@ async def test_cancelling_leaves_the_link_usable(
     assert Apply(safe(1)) not in backend.requests
 
 
+@pytest.mark.parametrize("handed_over", [False, True])
 async def test_cancelled_in_the_moment_of_its_turn(
-    amplifier: Amplifier, backend: ScriptedBackend
+    amplifier: Amplifier, backend: ScriptedBackend, handed_over: bool
 ) -> None:
-    """A request cancelled when it has just been given the turn gives it to the next."""
+    """A request cancelled just before or just after it is given the turn passes it on."""
     answer: asyncio.Future[Reply] = asyncio.get_running_loop().create_future()
     backend.script.append(answer)
-    first = asyncio.create_task(amplifier.heartbeat())
+
+    async def beat_then_cancel() -> None:
+        await amplifier.heartbeat()
+        if handed_over:
+            second.cancel()
+
+    first = asyncio.create_task(beat_then_cancel())
     await settle()
     second = asyncio.create_task(amplifier.heartbeat())
     third = asyncio.create_task(amplifier.status())
     await settle()
     answer.set_result(STATUS)
-    # At the end of the first its turn is handed over; the second has not run since.
-    first.add_done_callback(lambda _: second.cancel())
-    assert await third == STATUS
-    with pytest.raises(asyncio.CancelledError):
-        await second
+    if not handed_over:
+        second.cancel()
+    async with asyncio.timeout(5):
+        await first
+        assert await third == STATUS
+        with pytest.raises(asyncio.CancelledError):
+            await second
+    assert (await amplifier.status()) == STATUS
+
+
+async def test_a_cancelled_stop_overtakes_nothing(
+    amplifier: Amplifier, backend: ScriptedBackend, safe: MakeSafe
+) -> None:
+    """An apply whose answer is lost is repeated again once the stop that waited is withdrawn."""
+    answer: asyncio.Future[Reply] = asyncio.get_running_loop().create_future()
+    backend.script.append(answer)
+    apply = asyncio.create_task(amplifier.apply(safe(1)))
+    await settle()
+    stop = asyncio.create_task(amplifier.stop())
+    await settle()
+    stop.cancel()
+    await settle()
+    answer.set_exception(LinkTimeout("late"))
+    assert (await apply).token == 1
+    assert backend.requests == [Apply(safe(1))] * 2
 
 
 async def test_ramps_of_silence_are_never_refused(

@@ -4,6 +4,7 @@ import errno
 import socket
 import threading
 from collections.abc import AsyncIterator, Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -82,7 +83,7 @@ async def test_late_and_foreign_replies_are_dropped(
             encode_frame(one)
             for one in (
                 encode_reply(STATUS, late),
-                encode_reply(IDENTITY, other),
+                encode_reply(replace(IDENTITY, serial_number="B-1"), other),
                 frame,
                 encode_reply(IDENTITY, frame),
                 encode_reply(IDENTITY, frame),

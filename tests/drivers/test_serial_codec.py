@@ -331,13 +331,15 @@ def test_only_guarded_sets_are_encoded(wrap: Callable[[CommandSet], Request]) ->
     assert type(GUARD.check(SET)) is SafeCommand
 
 
-@pytest.mark.parametrize("text", ["a\x1b[31m", "tab\there"])
-def test_texts_with_control_characters_are_malformed(text: str) -> None:
-    """A far end cannot write escape sequences to the user's terminal."""
-    raw = text.encode()
+@pytest.mark.parametrize(
+    ("raw", "problem"),
+    [(b"a\x1b[31m", "control"), (b"tab\there", "control"), (b"\xff\xfe", "UTF-8")],
+)
+def test_texts_that_harm_a_terminal_are_malformed(raw: bytes, problem: str) -> None:
+    """A far end cannot write escape sequences to the user's terminal, nor break its decoding."""
     payload = b"\x01" + bytes([len(raw)]) + raw + b"\0\0\0"
     request = Frame(kind=1, address=1, sequence=1, payload=b"")
-    with pytest.raises(Malformed, match="control"):
+    with pytest.raises(Malformed, match=problem):
         decode_reply(Frame(kind=0x81, address=1, sequence=1, payload=payload), request)
 
 
@@ -358,6 +360,13 @@ def test_quantities_refuse_what_the_wire_cannot_say(value: float) -> None:
     """NaN, infinities and values out of range are refused, never clipped."""
     with pytest.raises(CommandError, match="frequency"):
         Q.frequency.to_wire(value)
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+def test_angles_must_be_finite(value: float) -> None:
+    """An angle wraps, but what is no angle is refused."""
+    with pytest.raises(CommandError, match="phase"):
+        Q.phase.to_wire(value)
 
 
 def test_quantities_round_and_wrap() -> None:

@@ -5,7 +5,6 @@ import contextlib
 import logging
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from typing import ParamSpec
 
 from controller.amplifiers import AmplifierGroup, Phase
@@ -154,8 +153,6 @@ class Controller:
 
     def deliver(self, frame: TouchFrame) -> None:
         """Take over a touch frame; to be called in the loop's thread."""
-        # A time in the future would outlive the lease.
-        frame = replace(frame, time=min(frame.time, self._clock()))
         change = self._decider.take(frame)
         for reason in change.rejected:
             self._tally.count(reason, f"touch of {frame.source}")

@@ -155,7 +155,6 @@ def _frames(path: Path, events: list[_Event], panel: _Panel) -> list[TouchFrame]
             )
         if (event.type, event.code) == (_EV_SYN, _SYN_DROPPED):
             dropped = True
-            pending = []
         elif (event.type, event.code) == (_EV_SYN, _SYN_REPORT):
             if dropped:  # what came since is a part of a report
                 panel.forget()

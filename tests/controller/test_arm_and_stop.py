@@ -29,6 +29,7 @@ from drivers.protocol.messages import (
     Stop,
 )
 from model.errors import InputError
+from model.excitation import Tone
 
 Run = Callable[..., Any]
 Running = Callable[..., AbstractAsyncContextManager[Any]]
@@ -146,6 +147,24 @@ def test_one_of_several_fails(
             asked = len(bench.far_ends[0].asked)
             await bench.hold(FINGER, OTHER, seconds=0.2)
             assert len(bench.far_ends[0].asked) == asked
+
+    run_virtual(scenario())
+
+
+def test_one_guard_refuses(running: Running, run_virtual: Run) -> None:
+    """What one amplifier's guard refuses, none plays: both are told to be silent."""
+
+    async def scenario() -> None:
+        async with running("a", "b") as bench:
+            await bench.hold(FINGER, seconds=0.1)
+            bench.table.excitation = {"SW": Tone(110.0, 20e-6), "NE": Tone(110.0, 101e-6)}
+            await bench.hold(FINGER, OTHER, seconds=0.1)
+            for far_end in bench.far_ends:
+                *_, played, silent = far_end.requests(Stage)
+                assert silent.command_set.is_silent
+                assert played.command_set.is_silent == (far_end is bench.far_ends[1])
+            assert bench.told.refused[0].startswith("b: CommandRefused: level of channel 1")
+            assert bench.controller.phase is Phase.ARMED
 
     run_virtual(scenario())
 

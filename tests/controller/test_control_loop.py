@@ -248,6 +248,20 @@ def test_an_era_that_the_rig_has_not(run_virtual: Run, running: Running) -> None
     run_virtual(scenario())
 
 
+def test_silence_is_not_sent_twice(running: Running, run_virtual: Run) -> None:
+    """From one silence to another, for another reason, costs nothing but the telling."""
+
+    async def scenario() -> None:
+        async with running() as bench:
+            bench.table.excitation = InputError("nothing is felt there")
+            await bench.hold(FINGER, seconds=0.1)
+            assert [each.is_silent for each in bench.far_end.sets()] == [True]
+            told = [(silenced.reason, silenced.latency is None) for silenced in bench.told.silenced]
+            assert told == [("nobody touches the plate", False), ("nothing is felt there", True)]
+
+    run_virtual(scenario())
+
+
 def test_nan_touch(run_virtual: Run, running: Running) -> None:
     """A touch that is nowhere sends nothing and is counted."""
 

@@ -106,7 +106,10 @@ def test_the_slot_at_the_start_is_in_the_header(tmp_path: Path) -> None:
         (2, "slot 3 id -1"),
         header=RANGES.format(slot=3),
     )
-    assert shown(read_evemu(path))[-1] == (2.0, {6: (0.2, 0.5)})
+    assert shown(read_evemu(path))[1:] == [
+        (1.0, {5: (0.1, 0.5), 6: (0.2, 0.5)}),
+        (2.0, {6: (0.2, 0.5)}),
+    ]
 
 
 def test_a_contact_that_was_already_down(tmp_path: Path) -> None:

@@ -205,6 +205,7 @@ MALFORMED = {
     "no arguments": bytes(message().dgram),
     "text that is not UTF-8": b"/tuio/2Dcur\0,s\0\0\xff\xfe\0\0",
     "types nobody expects": bytes(message("alive", True).dgram),
+    "types python-osc would log about": b"/tuio/2Dcur\0,sXi\0\0\0\0alive\0\0\0\0\0\0\1",
     "an id that is a float": bytes(message("alive", 1.0).dgram),
     "a position that is text": bytes(message("set", 1, "0.5", 0.5, 0.0, 0.0, 0.0).dgram),
     "positions that are integers": bytes(message("set", 1, 0, 1, 0.0, 0.0, 0.0).dgram),

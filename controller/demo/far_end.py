@@ -70,7 +70,7 @@ class BenchControl:
             id: FingerFelt(
                 frequencies=np.array(felt["frequencies_hz"], dtype=float),
                 amplitudes=np.array(felt["amplitude_m_s2"], dtype=float).reshape(
-                    len(felt["frequencies_hz"]), -1
+                    len(felt["frequencies_hz"]), len(felt["peak_m_s2"])
                 ),
                 peaks=np.array(felt["peak_m_s2"], dtype=float),
             )

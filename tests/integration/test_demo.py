@@ -1,0 +1,163 @@
+"""The whole chain as a user starts it: touches in over UDP, amplifier on a wire, fingertips out."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from controller.sources.capture import Datagram, write_capture
+from controller.sources.tuio import tuio_datagram
+from controller.touch import Touch, TouchFrame
+
+ERA = Path(sys.executable).with_name("era")
+FRAME = 1 / 50
+ERA_NAMES = {"SW", "SE", "NE", "NW"}
+
+# (id, down [s], up [s], x, y in TUIO's coordinates): one finger, then a second beside it, a pause,
+# and a third one alone.
+SCHEDULE = [
+    (1, 0.1, 1.7, 0.30, 0.35),
+    (2, 0.9, 1.7, 0.80, 0.70),
+    (3, 1.9, 2.6, 0.55, 0.20),
+]
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory):
+    """A TUIO capture of the schedule."""
+    datagrams = []
+    for number in range(int(2.8 / FRAME)):
+        now = number * FRAME
+        touches = tuple(Touch(i, x, y) for i, down, up, x, y in SCHEDULE if down <= now < up)
+        frame = TouchFrame("test", now, touches)
+        datagrams.append(Datagram(now, tuio_datagram(frame, number + 1)))
+    path = tmp_path_factory.mktemp("touches") / "touches.tuio"
+    write_capture(path, datagrams)
+    return path
+
+
+@pytest.fixture(scope="module")
+def environment(tmp_path_factory):
+    """The test's own cache folder, so that the table is built once for this module."""
+    return os.environ | {"XDG_CACHE_HOME": str(tmp_path_factory.mktemp("cache"))}
+
+
+def run_era(arguments, environment, cwd):
+    """Run the installed command."""
+    return subprocess.run(
+        [str(ERA), *map(str, arguments)],
+        env=environment,
+        cwd=cwd,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+
+
+@pytest.mark.parametrize("wire", ["serial", "sim"])
+def test_every_touch_is_felt_as_predicted(wire, capture, environment, tmp_path):
+    """Each touch has its row; measured contrast and level are the predicted ones within 3 dB."""
+    done = run_era(
+        ["demo", "--wire", wire, "--touches", capture, "--out", tmp_path, "--json"],
+        environment,
+        tmp_path,
+    )
+    assert done.returncode == 0, done.stderr
+    result = json.loads(done.stdout)
+    assert result["wire"] == wire
+    rows = result["touches"]
+    assert len(rows) == len(SCHEDULE)
+    for row, (_, _, _, x, y) in zip(rows, SCHEDULE, strict=True):
+        assert row["targets_m"] == [[pytest.approx(x * 0.3048), pytest.approx((1 - y) * 0.2286)]]
+        assert 1 <= len(row["drive"]) <= 2
+        assert row["drive"].keys() <= ERA_NAMES
+        for tone in row["drive"].values():
+            assert tone["frequency_hz"] in range(60, 321, 10)
+            assert 0 < tone["level"] <= 1
+        assert row["steady"]
+        assert row["measured_level_db_sl"] == pytest.approx(row["predicted_level_db_sl"], abs=3)
+        assert row["latency_ms"] > 0
+    alone, beside, last = rows
+    assert (alone["quiet_m"], last["quiet_m"]) == ([], [])
+    assert alone["predicted_contrast_db"] is None
+    assert beside["quiet_m"] == alone["targets_m"]
+    assert beside["predicted_contrast_db"] > 5
+    assert beside["measured_contrast_db"] == pytest.approx(beside["predicted_contrast_db"], abs=3)
+    (picture,) = map(Path, result["files"])
+    assert picture.read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_panels_recording_is_followed_too(environment, tmp_path):
+    """An evemu recording of two fingers gives a row for each contact, from down to up."""
+    recording = tmp_path / "panel.events"
+    recording.write_text(
+        "# EVEMU 1.3\n"
+        "A: 35 0 800 0 0\nA: 36 0 480 0 0\nA: 2f 0 9 0 0\nA: 39 0 65535 0 0\n"
+        "E: 0.100000 0003 002f 0\nE: 0.100000 0003 0039 7\n"
+        "E: 0.100000 0003 0035 200\nE: 0.100000 0003 0036 300\nE: 0.100000 0000 0000 0\n"
+        "E: 0.800000 0003 002f 1\nE: 0.800000 0003 0039 8\n"
+        "E: 0.800000 0003 0035 600\nE: 0.800000 0003 0036 100\nE: 0.800000 0000 0000 0\n"
+        "E: 1.500000 0003 0039 -1\nE: 1.500000 0000 0000 0\n"
+        "E: 1.700000 0003 002f 0\nE: 1.700000 0003 0039 -1\nE: 1.700000 0000 0000 0\n"
+    )
+    done = run_era(
+        ["demo", "--touches", recording, "--out", tmp_path, "--json"], environment, tmp_path
+    )
+    assert done.returncode == 0, done.stderr
+    first, second = json.loads(done.stdout)["touches"]
+    assert first["targets_m"][0] == [pytest.approx(0.0762), pytest.approx(0.2286 * 180 / 480)]
+    assert first["until_s"] - first["time_s"] == pytest.approx(1.6, abs=0.15)
+    assert second["until_s"] - second["time_s"] == pytest.approx(0.7, abs=0.15)
+    assert second["quiet_m"] == first["targets_m"]
+
+
+def test_a_far_end_that_dies_is_reported_in_a_paragraph(capture, environment, tmp_path):
+    """Killing the amplifiers' process midway ends the run with status 3 and one paragraph."""
+    process = subprocess.Popen(
+        [str(ERA), "demo", "--touches", str(capture), "--out", str(tmp_path)],
+        env=environment,
+        cwd=tmp_path,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    first_row = next(line for line in process.stdout if " Hz" in line)
+    os.kill(far_end_of(process.pid), signal.SIGKILL)
+    rest, said = process.communicate(timeout=30)
+    assert process.returncode == 3, said
+    assert "Traceback" not in said
+    assert "lost" in said or "gone" in said
+    assert "Next:" not in first_row + rest
+
+
+def far_end_of(pid):
+    """The process that a running demonstration started for its amplifiers."""
+    for _ in range(100):
+        children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
+        if children:
+            return int(children[0])
+        time.sleep(0.05)
+    raise AssertionError("the demonstration started no process")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["--wire", "modem"], "choose serial or sim"),
+        (["--touches", "none.tuio"], "none.tuio"),
+        (["--touches", "none.events"], "none.events"),
+    ],
+)
+def test_bad_options_are_refused_with_status_2(arguments, says, environment, tmp_path):
+    """An unknown wire or a missing recording: one paragraph, nothing written."""
+    done = run_era(["demo", *arguments], environment, tmp_path)
+    assert done.returncode == 2
+    assert says in done.stderr
+    assert "Traceback" not in done.stderr
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,74 @@
+"""Tables are kept between runs, and never the wrong one."""
+
+from dataclasses import replace
+
+import pytest
+
+from model import table_cache
+from model.table_cache import cached_table
+from paper_plate import make_paper_rig
+
+
+@pytest.fixture
+def rig():
+    """A mesh that is quick to solve."""
+    return make_paper_rig(12, 9)
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path, monkeypatch):
+    """A cache folder of the test's own."""
+    monkeypatch.setattr(
+        table_cache.platformdirs, "user_cache_path", lambda *_, **__: tmp_path / "cache"
+    )
+    return tmp_path / "cache"
+
+
+@pytest.fixture
+def builds(monkeypatch):
+    """Counts how often a table is really built."""
+    counted = []
+    build = table_cache.build_table
+
+    def counting(rig, **options):
+        counted.append(rig)
+        return build(rig, **options)
+
+    monkeypatch.setattr(table_cache, "build_table", counting)
+    return counted
+
+
+def test_the_second_time_it_is_read(rig, builds):
+    """The same rig is solved once."""
+    first, path = cached_table(rig)
+    second, again = cached_table(rig)
+    assert len(builds) == 1
+    assert path == again
+    assert second.fingerprint == first.fingerprint
+
+
+def test_another_plate_or_mesh_is_another_table(rig, builds):
+    """A stiffer ERA, and a finer mesh, each get a table of their own."""
+    stiffer = replace(rig, eras=(replace(rig.eras[0], stiffness=18000.0), *rig.eras[1:]))
+    paths = {cached_table(r)[1] for r in (rig, stiffer, make_paper_rig(16, 12))}
+    assert len(builds) == len(paths) == 3
+
+
+def test_a_damaged_cache_is_built_anew(rig, builds):
+    """A flipped byte costs a rebuild, not a wrong answer."""
+    _, path = cached_table(rig)
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    path.write_bytes(data)
+    cached_table(rig)
+    assert len(builds) == 2
+    assert cached_table(rig)[1] == path
+    assert len(builds) == 2
+
+
+def test_without_a_place_to_keep_it_the_table_is_built_all_the_same(rig, cache, builds):
+    """A cache folder that cannot be made is no reason to fail."""
+    cache.write_text("a file where the folder should be")
+    table, path = cached_table(rig)
+    assert path is None
+    assert len(table.patterns) == 4482

@@ -44,7 +44,8 @@ _REASONS = {
     NakCode.BAD_LENGTH: "it read a request of another length; its firmware may be too old or new",
     NakCode.BAD_VALUE: "a value is out of the range that it can play",
     NakCode.BAD_CHANNEL: "it has no such channel, or the channel was named twice",
-    NakCode.WRONG_STATE: "it is not armed, or stopped, or in a fault; ask for its status",
+    NakCode.WRONG_STATE: "it is not armed, or it is stopped or in a fault until that is cleared; "
+    "ask for its status",
     NakCode.BAD_TOKEN: "no set is staged under this token",
     NakCode.BUSY: "it is busy; try again",
     NakCode.UNSUPPORTED_VERSION: "it speaks another version of the protocol",

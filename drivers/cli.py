@@ -74,6 +74,12 @@ def stop(url: Url, json_: Json = False) -> None:
     _show(_run(_stop(url)), as_json=json_)
 
 
+@amp.command()
+def clear(url: Url, json_: Json = False) -> None:
+    """Acknowledge a stop, or a fault whose cause is gone; the amplifier stays disarmed."""
+    _show(_run(_clear(url)), as_json=json_)
+
+
 def _run(result: Coroutine[Any, Any, dict[str, Any]]) -> dict[str, Any]:
     return asyncio.run(result)
 
@@ -141,6 +147,11 @@ async def _status(url: str) -> dict[str, Any]:
 async def _stop(url: str) -> dict[str, Any]:
     async with _opened(url) as amplifier:
         return {"url": url, **_status_row(await amplifier.stop())}
+
+
+async def _clear(url: str) -> dict[str, Any]:
+    async with _opened(url) as amplifier:
+        return {"url": url, **_status_row(await amplifier.clear())}
 
 
 async def _drive(

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 
 from drivers.cli import EXIT_STATUS, app
 from drivers.errors import CommandError, CommandRefused, FrameError, LinkError, LinkTimeout
-from drivers.protocol.messages import Apply, Arm, Disarm, Nak, NakCode, Ping, Stop
+from drivers.protocol.messages import Apply, Arm, Clear, Disarm, Nak, NakCode, Ping, Stop
 from scripted_amplifier import FarEnd
 
 T = TypeVar("T")
@@ -66,8 +66,8 @@ def test_identify_in_json(background: BackgroundFarEnd) -> None:
     assert answer["watchdog_min_s"] == 0.1
 
 
-def test_status_and_stop(background: BackgroundFarEnd) -> None:
-    """Status tells state, levels and faults; stop sends a quick stop."""
+def test_status_stop_and_clear(background: BackgroundFarEnd) -> None:
+    """Status tells state, levels and faults; stop and clear are sent as such."""
     result = CliRunner().invoke(app, ["amp", "status", background.end.url, "--json"])
     answer = json.loads(result.stdout)
     assert (answer["state"], answer["levels"]) == ("OPERATION_ENABLED", [0.0] * 4)
@@ -76,6 +76,9 @@ def test_status_and_stop(background: BackgroundFarEnd) -> None:
     assert result.exit_code == 0
     assert "OPERATION_ENABLED" in result.stdout
     assert isinstance(background.end.requests[-1], Stop)
+    result = CliRunner().invoke(app, ["amp", "clear", background.end.url])
+    assert result.exit_code == 0
+    assert isinstance(background.end.requests[-1], Clear)
 
 
 def test_drive_plays_and_ends_silent(background: BackgroundFarEnd) -> None:

@@ -117,7 +117,7 @@ def _join(
     until: float,
 ) -> Record:
     """One finger's record from the pieces in which it rested in its last place."""
-    stay = []
+    stay: list[tuple[FloatArray, FloatArray]] = []
     for layout, times, accelerations in reversed(pieces):
         if not stay and name not in layout.positions:
             continue  # it was lifted before the window ended

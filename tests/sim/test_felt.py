@@ -60,6 +60,18 @@ def test_a_window_takes_the_last_place_of_each_finger(coarse_rig: Rig) -> None:
     assert fingers.felt(4.5, 5.0) == {}
 
 
+def test_a_finger_lifted_within_the_window_is_judged_until_then(coarse_rig: Rig) -> None:
+    """One finger goes while another stays: both have their samples, each from its own time."""
+    fingers = Fingers(flat_plate(coarse_rig))
+    fingers.place({"a": (0.1, 0.1), "b": (0.2, 0.1)})
+    fingers.record(np.array([1.0, 2.0]), np.ones((2, 38)))
+    fingers.place({"b": (0.2, 0.1)})
+    fingers.record(np.array([3.0]), np.ones((1, 19)))
+    felt = fingers.felt(0.0, 4.0)
+    assert felt["a"].times.tolist() == [1.0, 2.0]
+    assert felt["b"].times.tolist() == [1.0, 2.0, 3.0]
+
+
 def test_old_records_are_forgotten(coarse_rig: Rig) -> None:
     """Ten seconds are kept, also of fingers that were lifted since."""
     fingers = Fingers(flat_plate(coarse_rig))

@@ -1,0 +1,5 @@
+"""Pictures of the plate, as matplotlib figures; saving them is the caller's."""
+
+from model.figures.drawing import draw_eras, draw_field, map_figure, save_figure
+
+__all__ = ["draw_eras", "draw_field", "map_figure", "save_figure"]

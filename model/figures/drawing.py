@@ -1,0 +1,144 @@
+"""What the pictures share: fields over the plate, marks for ERAs and nulls, boxes of statistics."""
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.cm import ScalarMappable
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+
+from model.actuator import Era
+from model.arrays import FloatArray
+from model.maps import PlateMap
+from model.plate import Plate
+from model.rig import Rig
+from model.vibration import G
+
+COLORS = "viridis"
+ACTIVE_COLOR = "#d62728"
+RESTING_COLOR = "#2ca02c"
+BOX_COLOR = "#9ecae1"
+
+
+def draw_field(
+    axes: Axes, x: FloatArray, y: FloatArray, peak: FloatArray, *, maximum: float | None = None
+) -> ScalarMappable:
+    """Draw peak acceleration (len(y), len(x)) [m/s²] over the plate in g; axes in centimetres.
+
+    maximum: upper end of the colour scale [g].
+    """
+    image = axes.pcolormesh(
+        100 * x, 100 * y, peak / G, cmap=COLORS, shading="gouraud", vmin=0, vmax=maximum
+    )
+    _label_plate(axes)
+    return image
+
+
+def draw_shape(axes: Axes, x: FloatArray, y: FloatArray, shape: FloatArray) -> ScalarMappable:
+    """Draw a mode shape (len(y), len(x)) scaled to 1, white where nothing moves; axes in cm."""
+    image = axes.pcolormesh(
+        100 * x, 100 * y, shape, cmap="RdBu_r", shading="gouraud", vmin=-1, vmax=1
+    )
+    _label_plate(axes)
+    return image
+
+
+def draw_eras(axes: Axes, eras: Sequence[Era], *, active: Collection[str]) -> None:
+    """Mark where ERAs hold the plate: filled and red where driven, green where only holding."""
+    for era in eras:
+        color = ACTIVE_COLOR if era.name in active else RESTING_COLOR
+        axes.plot(
+            100 * era.x, 100 * era.y, "o", ms=9, color=color, mec="white", mew=1.5, clip_on=False
+        )
+
+
+def draw_nulls(axes: Axes, nulls: FloatArray) -> None:
+    """Mark nulls [m] (n, 2) by red crosses, as the paper does."""
+    axes.plot(*(100 * nulls.T), "x", color="red", ms=5, mew=1.2, clip_on=False)
+
+
+def draw_layout(
+    axes: Axes, plate: Plate, positions: FloatArray, *, active: Collection[int]
+) -> None:
+    """Draw a small plate with ERAs at positions [m] (n, 2); the active ones, by number, in red."""
+    axes.add_patch(Rectangle((0, 0), plate.length, plate.width, fc="0.93", ec="0.4"))
+    colors = [ACTIVE_COLOR if era in active else RESTING_COLOR for era in range(len(positions))]
+    axes.scatter(*positions.T, s=36, c=colors, edgecolors="white", clip_on=False, zorder=3)
+    axes.set_aspect("equal")
+    axes.set_xlim(-0.05 * plate.length, 1.05 * plate.length)
+    axes.set_ylim(-0.05 * plate.width, 1.05 * plate.width)
+    axes.axis("off")
+
+
+def draw_boxes(axes: Axes, labels: Sequence[str], five: FloatArray) -> None:
+    """Draw boxes of quartiles with whiskers to minimum and maximum, (boxes, 5) [m/s²], in g."""
+    keys = ("whislo", "q1", "med", "q3", "whishi")
+    stats = [
+        {"label": label, "fliers": [], **dict(zip(keys, row / G, strict=True))}
+        for label, row in zip(labels, five, strict=True)
+    ]
+    axes.bxp(
+        stats,
+        widths=0.6,
+        patch_artist=True,
+        showfliers=False,
+        boxprops={"facecolor": BOX_COLOR},
+        medianprops={"color": "black", "linewidth": 1.5},
+    )
+    axes.set_ylim(bottom=0)
+    axes.grid(axis="y", color="0.9")
+    axes.set_axisbelow(True)
+    axes.set_ylabel("cumulative peak acceleration / g")
+
+
+@dataclass(frozen=True)
+class MapPanel:
+    """One map of a figure: its title, and which of the ERAs under it are driven."""
+
+    title: str
+    plate_map: PlateMap
+    eras: Sequence[Era]
+    active: Collection[str]
+
+
+def maps_figure(panels: Sequence[MapPanel], *, columns: int, caption: str | None = None) -> Figure:
+    """Maps side by side on one colour scale in g (1 g = 9.8 m/s²), with ERAs and nulls marked."""
+    rows = -(-len(panels) // columns)
+    width = 7.0 if columns == 1 else 3.6 * columns + 1
+    ratio = panels[0].plate_map.y[-1] / panels[0].plate_map.x[-1]
+    figure = Figure(
+        figsize=(width, rows * (0.8 * width / columns * ratio + 0.7)), layout="constrained"
+    )
+    grid = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
+    maximum = max(float(panel.plate_map.peak.max()) for panel in panels) / G
+    for axes, panel in zip(grid.flat, panels, strict=True):
+        solved = panel.plate_map
+        image = draw_field(axes, solved.x, solved.y, solved.peak, maximum=maximum)
+        draw_nulls(axes, solved.nulls)
+        draw_eras(axes, panel.eras, active=panel.active)
+        axes.set_title(panel.title)
+        axes.label_outer()
+    figure.colorbar(image, ax=grid, label="peak acceleration / g")
+    if caption:
+        figure.suptitle(caption)
+    return figure
+
+
+def map_figure(rig: Rig, plate_map: PlateMap, *, active: Collection[str], title: str) -> Figure:
+    """One map with its ERAs, nulls as red crosses and a colour bar in g."""
+    return maps_figure([MapPanel(title, plate_map, rig.eras, active)], columns=1)
+
+
+def save_figure(figure: Figure, path: Path, *, dpi: int = 150) -> None:
+    """Write a figure as PNG; needs no display."""
+    FigureCanvasAgg(figure)
+    figure.savefig(path, dpi=dpi)
+
+
+def _label_plate(axes: Axes) -> None:
+    axes.set_aspect("equal")
+    axes.set_xlabel("x / cm")
+    axes.set_ylabel("y / cm")

@@ -7,8 +7,8 @@ import numpy as np
 from scipy import sparse
 
 from model.actuator import Era
-from model.arrays import FloatArray
-from model.elements import mitc4
+from model.arrays import FloatArray, IntArray
+from model.elements import DOF_PER_NODE
 from model.mesh import Mesh
 from model.plate import Plate
 
@@ -28,7 +28,7 @@ class PlateMatrices:
     @property
     def dof(self) -> int:
         """Number of degrees of freedom."""
-        return mitc4.DOF_PER_NODE * self.mesh.node_count
+        return DOF_PER_NODE * self.mesh.node_count
 
     def deflection_at(self, points: FloatArray) -> sparse.csr_array:
         """Maps the degrees of freedom to deflections at points [m] (n, 2): sparse (n, dof)."""
@@ -36,21 +36,49 @@ class PlateMatrices:
         return sparse.csr_array(sparse.kron(self.mesh.interpolation(points), pick, format="csr"))
 
 
-def assemble(plate: Plate, mesh: Mesh) -> PlateMatrices:
-    """Assemble the free plate; all elements of a structured mesh share one element matrix."""
-    dx, dy = mesh.element_size
-    dofs = (3 * mesh.connectivity[:, :, None] + np.arange(3)).reshape(-1, 12)
-    rows = np.repeat(dofs, 12, axis=1).ravel()
-    columns = np.tile(dofs, (1, 12)).ravel()
-    size = 3 * mesh.node_count
+@dataclass(frozen=True)
+class ElementMatrices:
+    """Stiffness and mass of every element of a mesh, as few as there are sizes of elements.
 
-    def whole(element: FloatArray) -> sparse.csc_array:
-        values = np.tile(element.ravel(), len(dofs))
-        return sparse.csc_array(sparse.coo_array((values, (rows, columns)), shape=(size, size)))
+    stiffness, mass: (sizes, n, n); size: which of them an element has, (elements,).
+    """
 
-    return PlateMatrices(
-        plate, mesh, whole(mitc4.stiffness(plate, dx, dy)), whole(mitc4.mass(plate, dx, dy))
+    stiffness: FloatArray
+    mass: FloatArray
+    size: IntArray
+
+
+def element_matrices(plate: Plate, mesh: Mesh) -> ElementMatrices:
+    """One matrix for the elements of a plain mesh, four where it has strips along its edges."""
+    widths = [(size, mesh.strip) if mesh.strip else (size,) for size in mesh.element_size]
+    sizes = [(dx, dy) for dy in widths[1] for dx in widths[0]]
+    side_x, side_y = mesh.element_sides
+    return ElementMatrices(
+        stiffness=np.array([mesh.kind.stiffness(plate, dx, dy) for dx, dy in sizes]),
+        mass=np.array([mesh.kind.mass(plate, dx, dy) for dx, dy in sizes]),
+        size=(len(widths[0]) * side_y[:, None] + side_x).ravel(),
     )
+
+
+def element_dofs(mesh: Mesh) -> IntArray:
+    """Degrees of freedom of each element, node by node, (elements, 3 (order + 1)²)."""
+    dofs = DOF_PER_NODE * mesh.connectivity[:, :, None] + np.arange(DOF_PER_NODE)
+    return np.asarray(dofs.reshape(len(mesh.connectivity), -1))
+
+
+def assemble(plate: Plate, mesh: Mesh) -> PlateMatrices:
+    """Assemble the free plate."""
+    elements = element_matrices(plate, mesh)
+    dofs = element_dofs(mesh)
+    size = DOF_PER_NODE * mesh.node_count
+
+    def whole(matrices: FloatArray) -> sparse.csc_array:
+        row, column = np.nonzero(matrices.any(axis=0))
+        values = matrices[:, row, column][elements.size]
+        places = (dofs[:, row].ravel(), dofs[:, column].ravel())
+        return sparse.csc_array(sparse.coo_array((values.ravel(), places), shape=(size, size)))
+
+    return PlateMatrices(plate, mesh, whole(elements.stiffness), whole(elements.mass))
 
 
 def era_positions(eras: Sequence[Era]) -> FloatArray:

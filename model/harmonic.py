@@ -6,6 +6,7 @@ holds it with k_b + i omega c - omega² m_b (paper Eq. 21 and 25). The plate's o
 hysteretic: (1 + i eta) K.
 """
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -14,8 +15,27 @@ from scipy import sparse
 from model.actuator import Era
 from model.arrays import ComplexArray, FloatArray
 from model.assembly import PlateMatrices, era_positions
+from model.errors import InputError
 from model.factorisation import factorise
+from model.mesh import LEAST_NODES_PER_WAVELENGTH, Mesh
+from model.plate import Plate
 from model.reduction import ReducedPlate
+
+
+def check_frequencies(plate: Plate, mesh: Mesh, frequencies: FloatArray) -> None:
+    """Raise InputError for a frequency [Hz] that is none or that the mesh cannot carry."""
+    for frequency in frequencies:
+        if not (np.isfinite(frequency) and frequency > 0):
+            raise InputError(f"frequency is {frequency} Hz, must be above zero")
+        wavelength = plate.bending_wavelength(frequency)
+        if wavelength < mesh.shortest_wavelength:
+            need = 1.001 * mesh.shortest_wavelength / wavelength
+            raise InputError(
+                f"the {mesh} mesh has {wavelength / max(mesh.element_size):.1f} elements in a "
+                f"bending wavelength at {frequency:g} Hz, too few to answer: "
+                f"{LEAST_NODES_PER_WAVELENGTH / mesh.kind.order:g} of {mesh.element} are the "
+                f"least; use {math.ceil(mesh.nx * need)}x{math.ceil(mesh.ny * need)} or finer"
+            )
 
 
 def _hold_and_drive(eras: Sequence[Era], omega: float) -> tuple[ComplexArray, ComplexArray]:
@@ -33,8 +53,10 @@ def direct_acceleration(
     """Acceleration [m/s²] at points (p, 2) per frequency [Hz] (f,) and driven ERA: (f, eras, p).
 
     Each ERA alone at full stroke and phase zero, the others holding. One sparse factorisation per
-    frequency: the reference that the reduced answer is compared with.
+    frequency: the reference that the reduced answer is compared with. Raises InputError for a
+    frequency that is none or that the mesh cannot carry, and for points off the plate.
     """
+    check_frequencies(matrices.plate, matrices.mesh, frequencies)
     touch = matrices.deflection_at(era_positions(eras))
     observe = matrices.deflection_at(points)
     result = np.empty((len(frequencies), len(eras), observe.shape[0]), dtype=complex)

@@ -8,6 +8,7 @@ import numpy as np
 from scipy import sparse
 
 from model.arrays import FloatArray, IntArray
+from model.elements import ELEMENTS, Element
 from model.errors import InputError
 from model.plate import Plate
 
@@ -15,23 +16,39 @@ from model.plate import Plate
 # and its lowest twelve natural frequencies within 0.2 % of converged.
 ELEMENTS_PER_WAVELENGTH = 52
 
+# Fewer nodes to a wavelength than this and an answer is not worth having.
+LEAST_NODES_PER_WAVELENGTH = 6
+
 
 @dataclass(frozen=True)
 class Mesh:
-    """nx by ny equal rectangles over length by width [m].
+    """nx by ny equal rectangles over length by width [m], and if wanted a strip along every edge.
 
-    Node j * (nx + 1) + i lies at (i * length / nx, j * width / ny).
+    element: a name in ELEMENTS. strip [m]: the width of one more row of elements along every edge,
+    for the layer at a free edge; the nx by ny elements then share what is left. The nodes form a
+    lattice: node j * columns + i lies at (node_x[i], node_y[j]).
     """
 
     nx: int
     ny: int
     length: float
     width: float
+    element: str = "MITC4"
+    strip: float = 0.0
 
     def __post_init__(self) -> None:
-        """Refuse a mesh without elements."""
+        """Refuse a mesh without elements, of unknown ones, or with strips that fill the plate."""
         if self.nx < 1 or self.ny < 1:
             raise InputError(f"mesh: {self.nx}x{self.ny} has no elements; at least 1x1 is needed")
+        if self.element not in ELEMENTS:
+            raise InputError(
+                f"mesh: unknown element {self.element!r}; known are: {', '.join(ELEMENTS)}"
+            )
+        if not 0 <= 2 * self.strip < min(self.length, self.width):
+            raise InputError(
+                f"mesh: strips of {self.strip:g} m along the edges leave nothing of a plate of "
+                f"{self.length:g} x {self.width:g} m; make them narrower, or 0 for none"
+            )
 
     @classmethod
     def auto(cls, plate: Plate, *, frequency_max: float) -> "Mesh":
@@ -45,35 +62,111 @@ class Mesh:
         )
 
     def __str__(self) -> str:
-        return f"{self.nx}x{self.ny}"
+        text = f"{self.nx}x{self.ny}"
+        if self.kind.order > 1:
+            text += f" {self.element}"
+        if self.strip:
+            text += f" with strips of {1000 * self.strip:g} mm"
+        return text
+
+    @property
+    def kind(self) -> Element:
+        """The element that the mesh is made of."""
+        return ELEMENTS[self.element]
+
+    @property
+    def element_size(self) -> tuple[float, float]:
+        """Side lengths (dx, dy) of the nx by ny elements, the largest ones [m]."""
+        return (self.length - 2 * self.strip) / self.nx, (self.width - 2 * self.strip) / self.ny
+
+    @property
+    def element_counts(self) -> tuple[int, int]:
+        """How many elements lie along x and y, strips included."""
+        strips = 2 if self.strip else 0
+        return self.nx + strips, self.ny + strips
+
+    @cached_property
+    def element_sides(self) -> tuple[IntArray, IntArray]:
+        """Which elements along x and y are as wide as a strip (1) and which are not (0)."""
+        sides = tuple(np.zeros(count, dtype=int) for count in self.element_counts)
+        if self.strip:
+            for side in sides:
+                side[[0, -1]] = 1
+        return sides[0], sides[1]
+
+    @property
+    def columns(self) -> int:
+        """Number of nodes along x."""
+        return self.kind.order * self.element_counts[0] + 1
+
+    @property
+    def rows(self) -> int:
+        """Number of nodes along y."""
+        return self.kind.order * self.element_counts[1] + 1
 
     @property
     def node_count(self) -> int:
         """Number of nodes."""
-        return (self.nx + 1) * (self.ny + 1)
+        return self.columns * self.rows
 
-    @property
-    def element_size(self) -> tuple[float, float]:
-        """Side lengths (dx, dy) of an element [m]."""
-        return self.length / self.nx, self.width / self.ny
+    @cached_property
+    def lines(self) -> tuple[FloatArray, FloatArray]:
+        """Where elements meet along x and along y [m], the plate's edges included."""
+        lines = []
+        for length, count in ((self.length, self.nx), (self.width, self.ny)):
+            inner = np.linspace(self.strip, length - self.strip, count + 1)
+            lines.append(np.concatenate([[0.0], inner, [length]]) if self.strip else inner)
+        return lines[0], lines[1]
+
+    @cached_property
+    def node_x(self) -> FloatArray:
+        """Positions of the columns of nodes [m]."""
+        return self._along(self.lines[0])
+
+    @cached_property
+    def node_y(self) -> FloatArray:
+        """Positions of the rows of nodes [m]."""
+        return self._along(self.lines[1])
+
+    def _along(self, lines: FloatArray) -> FloatArray:
+        share = (1 + np.array(self.kind.side[:-1])) / 2
+        inner = lines[:-1, None] + share * np.diff(lines)[:, None]
+        return np.append(inner.ravel(), lines[-1])
 
     @cached_property
     def nodes(self) -> FloatArray:
         """Positions of the nodes [m], (node_count, 2)."""
-        x = np.linspace(0.0, self.length, self.nx + 1)
-        y = np.linspace(0.0, self.width, self.ny + 1)
-        xx, yy = np.meshgrid(x, y)
+        xx, yy = np.meshgrid(self.node_x, self.node_y)
         return np.column_stack([xx.ravel(), yy.ravel()])
 
     @cached_property
     def connectivity(self) -> IntArray:
-        """Nodes of each element, counter-clockwise from its lower left corner, (nx * ny, 4)."""
-        i, j = np.meshgrid(np.arange(self.nx), np.arange(self.ny))
-        corner = (j * (self.nx + 1) + i).ravel()
-        return np.column_stack([corner, corner + 1, corner + self.nx + 2, corner + self.nx + 1])
+        """Nodes of each element, row by row from its lower left, (elements, (order + 1)²).
+
+        Elements are numbered row by row as well, x running first.
+        """
+        order = self.kind.order
+        along_x, along_y = (order * np.arange(count) for count in self.element_counts)
+        corner = (along_y[:, None] * self.columns + along_x).ravel()
+        step = np.arange(order + 1)
+        return np.asarray(corner[:, None] + (step[:, None] * self.columns + step).ravel())
+
+    @property
+    def raster(self) -> tuple[int, int]:
+        """How many evenly spaced points along x and y show what the mesh can carry.
+
+        The nodes themselves where elements are of the first order and without strips.
+        """
+        per_element = 1 if self.kind.order == 1 else 2 * self.kind.order
+        return per_element * self.nx + 1, per_element * self.ny + 1
+
+    @property
+    def shortest_wavelength(self) -> float:
+        """The shortest bending wave [m] that it can carry: six elements of the first order."""
+        return LEAST_NODES_PER_WAVELENGTH * max(self.element_size) / self.kind.order
 
     def interpolation(self, points: FloatArray) -> sparse.csr_array:
-        """Bilinear shape functions at points [m] (n, 2): sparse (n, node_count), rows sum to 1.
+        """Shape functions at points [m] (n, 2): sparse (n, node_count), rows sum to 1.
 
         These are the element's own shape functions for the deflection, so nothing is lost.
         Points must lie on the plate; raises InputError for one that does not.
@@ -88,12 +181,16 @@ class Mesh:
                 f"point ({x:g}, {y:g}) m is not on the plate, which reaches from (0, 0) to "
                 f"({self.length:g}, {self.width:g}) m"
             )
-        count = np.array([self.nx, self.ny])
-        scaled = points / upper * count
-        cell = np.clip(np.floor(scaled).astype(int), 0, count - 1)
-        s, t = (scaled - cell).T
-        weights = np.column_stack([(1 - s) * (1 - t), s * (1 - t), s * t, (1 - s) * t])
-        columns = self.connectivity[cell[:, 1] * self.nx + cell[:, 0]]
-        rows = np.repeat(np.arange(len(points)), 4)
+        cell_x, weight_x = self._locate(points[:, 0], self.lines[0])
+        cell_y, weight_y = self._locate(points[:, 1], self.lines[1])
+        weights = weight_y[:, :, None] * weight_x[:, None, :]
+        columns = self.connectivity[cell_y * self.element_counts[0] + cell_x]
+        rows = np.repeat(np.arange(len(points)), columns.shape[1])
         shape = (len(points), self.node_count)
         return sparse.csr_array((weights.ravel(), (rows, columns.ravel())), shape=shape)
+
+    def _locate(self, position: FloatArray, lines: FloatArray) -> tuple[IntArray, FloatArray]:
+        """In which element along one direction each position [m] lies, and its shape functions."""
+        cell = np.clip(np.searchsorted(lines, position, side="right") - 1, 0, len(lines) - 2)
+        start, end = lines[cell], lines[cell + 1]
+        return cell, self.kind.shape((2 * position - start - end) / (end - start))

@@ -63,7 +63,7 @@ def _nothing_held(matrices: PlateMatrices) -> IntArray:
 def _edges_held(matrices: PlateMatrices) -> IntArray:
     """Deflection on all four edges; rotations stay free (soft simple support)."""
     mesh = matrices.mesh
-    node = np.arange(mesh.node_count).reshape(mesh.ny + 1, mesh.nx + 1)
+    node = np.arange(mesh.node_count).reshape(mesh.rows, mesh.columns)
     edge = np.concatenate([node[0], node[-1], node[1:-1, 0], node[1:-1, -1]])
     return 3 * edge
 

@@ -36,7 +36,6 @@ def modes(
     """Natural frequencies of the undamped plate; elastic modes only where it is free."""
     from model import modal
     from model.assembly import assemble
-    from model.elements import mitc4
     from model.rig_file import load_rig
 
     rig = load_rig(rig_file, mesh=mesh)
@@ -52,13 +51,14 @@ def modes(
                     "support": support.value,
                     "mesh": [rig.mesh.nx, rig.mesh.ny],
                     "dof": matrices.dof,
-                    "element": mitc4.NAME,
+                    "element": rig.mesh.element,
                     "solve_time_s": elapsed,
                 }
             )
         )
         return
-    print(f"{rig_file}: {mitc4.NAME} {rig.mesh}, {matrices.dof} dof, support: {support.value}")
+    mesh_text = f"{rig.mesh} of {rig.mesh.element}, {matrices.dof} dof"
+    print(f"{rig_file}: {mesh_text}, support: {support.value}")
     for number, frequency in enumerate(solved.natural_frequencies, start=1):
         print(f"mode {number:3d}  {frequency:9.2f} Hz")
     print(f"solved in {elapsed:.2f} s")

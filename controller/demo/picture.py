@@ -69,10 +69,10 @@ def _draw_touch(
     excitation = played.pattern.excitation
     frequencies, amplitudes = table.amplitudes(excitation)
     mesh = table.mesh
-    level = sensation_level(frequencies, amplitudes).reshape(mesh.ny + 1, mesh.nx + 1)
-    x = 100 * mesh.nodes[: mesh.nx + 1, 0]
-    y = 100 * mesh.nodes[:: mesh.nx + 1, 1]
-    axes.pcolormesh(x, y, level, cmap=COLORS, shading="gouraud", norm=scale)
+    level = sensation_level(frequencies, amplitudes).reshape(mesh.rows, mesh.columns)
+    axes.pcolormesh(
+        100 * mesh.node_x, 100 * mesh.node_y, level, cmap=COLORS, shading="gouraud", norm=scale
+    )
     axes.set_aspect("equal")
     draw_eras(axes, table.eras, active=excitation.keys())
     for era in table.eras:

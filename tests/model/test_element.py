@@ -8,7 +8,7 @@ from model.plate import Plate
 from paper_plate import ALUMINIUM
 
 DX, DY = 0.03, 0.02
-CORNERS = np.array([[0, 0], [DX, 0], [DX, DY], [0, DY]])
+CORNERS = np.array([[0, 0], [DX, 0], [0, DY], [DX, DY]])
 PLATE = Plate(1.0, 1.0, 0.002, ALUMINIUM)
 
 

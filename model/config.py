@@ -4,7 +4,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from difflib import get_close_matches
 from functools import cache
-from typing import Any, TypeVar, get_args, get_origin
+from types import UnionType
+from typing import Annotated, Any, TypeVar, Union, get_args, get_origin
 
 from pydantic import BaseModel, ConfigDict, GetCoreSchemaHandler, TypeAdapter, ValidationError
 from pydantic_core import CoreSchema, ErrorDetails, core_schema
@@ -161,7 +162,13 @@ def _section_at(root: type[Section], path: KeyPath) -> type[Section]:
     """The section whose keys stand below a path."""
     kind: Any = root
     for part in path:
-        is_mapping = get_origin(kind) is dict
-        kind = get_args(kind)[1] if is_mapping else kind.model_fields[part].annotation
+        if get_origin(kind) in (dict, list):
+            kind = get_args(kind)[-1]
+        else:
+            kind = kind.model_fields[part].annotation
+        if get_origin(kind) in (Union, UnionType):  # of a field that may be left out
+            kind = get_args(kind)[0]
+        if get_origin(kind) is Annotated:
+            kind = get_args(kind)[0]
     section: type[Section] = kind
     return section

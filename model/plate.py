@@ -29,6 +29,11 @@ class Material:
                 "(most solids: 0.2 to 0.45)"
             )
 
+    @property
+    def shear_modulus(self) -> float:
+        """G = E / 2 (1 + nu) [Pa]."""
+        return self.E / (2 * (1 + self.nu))
+
 
 @dataclass(frozen=True)
 class Plate:

@@ -2,12 +2,19 @@
 
 import hashlib
 import json
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 
 from model.actuator import Era
+from model.errors import InputError
+from model.laminate import Laminate
 from model.mesh import Mesh
 from model.plate import Plate
+from model.point_mass import PointMass
+
+# Two bolts cannot be closer [m].
+SAME_POINT = 1e-6
 
 
 @dataclass(frozen=True)
@@ -31,7 +38,8 @@ class Limits:
 class Rig:
     """Everything that is fixed once the hardware is built.
 
-    wiring: a channel per ERA, by the ERA's name; amplifiers: URL by name.
+    wiring: a channel per ERA, by the ERA's name; amplifiers: URL by name; masses: what the plate
+    carries; laminate: what the plate, then an equivalent one, is made of, for showing.
     """
 
     plate: Plate
@@ -40,6 +48,29 @@ class Rig:
     wiring: Mapping[str, Channel]
     amplifiers: Mapping[str, str]
     limits: Limits
+    masses: tuple[PointMass, ...] = ()
+    laminate: Laminate | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse ERAs and masses off the plate, and two ERAs at one point or of one name."""
+        for what, place in (
+            *((f"ERA {era.name}", (era.x, era.y)) for era in self.eras),
+            *(("point mass", (mass.x, mass.y)) for mass in self.masses),
+        ):
+            if not self.plate.contains(*place):
+                raise InputError(
+                    f"{what} at ({place[0]:g}, {place[1]:g}) m is off the plate, which reaches "
+                    f"from (0, 0) to ({self.plate.length:g}, {self.plate.width:g}) m"
+                )
+        for number, era in enumerate(self.eras):
+            for other in self.eras[:number]:
+                if era.name == other.name:
+                    raise InputError(f"two ERAs have the name {era.name}; rename one")
+                if math.dist((era.x, era.y), (other.x, other.y)) < SAME_POINT:
+                    raise InputError(
+                        f"ERAs {other.name} and {era.name} are both at ({era.x:g}, {era.y:g}) m; "
+                        "move one of them"
+                    )
 
     def era(self, name: str) -> Era:
         """The ERA of this name; KeyError if the rig has none."""
@@ -51,17 +82,23 @@ class Rig:
     @property
     def fingerprint(self) -> str:
         """Fingerprint of the plate on its ERAs; see `physics_fingerprint`."""
-        return physics_fingerprint(self.plate, self.eras)
+        return physics_fingerprint(self.plate, self.eras, masses=self.masses)
 
 
-def physics_fingerprint(plate: Plate, eras: Sequence[Era]) -> str:
-    """SHA-256 over what the plate's response depends on: plate and ERAs, not mesh or wiring.
+def physics_fingerprint(
+    plate: Plate, eras: Sequence[Era], *, masses: Sequence[PointMass] = ()
+) -> str:
+    """SHA-256 over what the plate's response depends on: plate, ERAs, masses, not mesh or wiring.
 
     Rigs with the same fingerprint can use the same localization table, whatever their material is
     called.
     """
     numbers = asdict(plate)
     del numbers["material"]["name"]
-    physics = {"plate": numbers, "eras": [asdict(era) for era in eras]}
+    physics = {
+        "plate": numbers,
+        "eras": [asdict(era) for era in eras],
+        "masses": sorted((mass.x, mass.y, mass.mass) for mass in masses),
+    }
     text = json.dumps(physics, sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(text.encode()).hexdigest()

@@ -10,7 +10,8 @@ from pydantic import AfterValidator, Field, GetCoreSchemaHandler, GetJsonSchemaH
 from pydantic_core import CoreSchema, core_schema
 
 from model.config import Quantity, Section
-from model.materials import MATERIALS, material
+from model.laminate import Bond
+from model.materials import KNOWN_MATERIALS, material
 from model.units import DAMPING, DENSITY, FREQUENCY, LENGTH, MASS, MODULUS, RATIO, STIFFNESS
 
 
@@ -32,7 +33,7 @@ class _MaterialByName:
     def __get_pydantic_json_schema__(
         self, schema: CoreSchema, handler: GetJsonSchemaHandler
     ) -> dict[str, Any]:
-        return {"anyOf": [{"enum": list(MATERIALS)}, handler(schema)]}
+        return {"anyOf": [{"enum": list(KNOWN_MATERIALS)}, handler(schema)]}
 
 
 def _identifier(text: str) -> str:
@@ -59,6 +60,8 @@ def _ascending(bounds: tuple[float, float]) -> tuple[float, float]:
 Identifier = Annotated[str, AfterValidator(_identifier)]
 Side = Annotated[float, Quantity(LENGTH, above=0, most=100)]
 Coordinate = Annotated[float, Quantity(LENGTH, least=-100, most=100)]
+Place = Annotated[tuple[Coordinate, Coordinate], Strict(strict=False)]  # a list in the file
+Thickness = Annotated[float, Quantity(LENGTH, least=1e-6, most=1)]
 Frequency = Annotated[float, Quantity(FREQUENCY, least=1, most=2000)]
 
 
@@ -71,20 +74,36 @@ class MaterialSection(Section):
     nu: Annotated[float, Quantity(RATIO, above=-1, below=0.5)]
 
 
+MaterialOrName = Annotated[MaterialSection, _MaterialByName()]
+
+
+class LayerSection(Section):
+    """One layer of a laminate."""
+
+    material: MaterialOrName
+    thickness: Thickness
+
+
 class PlateSection(Section):
-    """The plate. loss_factor: the paper prints none; 1 % is the usual order of a metal panel."""
+    """The plate: thickness and material, or in their place layers from one face to the other.
+
+    loss_factor: the paper prints none; 1 % is the usual order of a metal panel.
+    """
 
     length: Side
     width: Side
-    thickness: Annotated[float, Quantity(LENGTH, least=1e-6, most=1)]
-    material: Annotated[MaterialSection, _MaterialByName()]
+    thickness: Thickness | None = None
+    material: MaterialOrName | None = None
+    layers: Annotated[list[LayerSection], Field(min_length=1, max_length=20)] | None = None
+    bond: Annotated[Bond, Strict(strict=False)] = Bond.FULL
+    bond_frequency: Frequency | None = None
     loss_factor: Annotated[float, Quantity(RATIO, least=0, below=1)] = 0.01
 
 
 class EraSection(Section):
     """One ERA. The paper prints neither damping nor stroke; the defaults are our assumptions."""
 
-    at: Annotated[tuple[Coordinate, Coordinate], Strict(strict=False)]  # a list in the file
+    at: Place
     stiffness: Annotated[float, Quantity(STIFFNESS, above=0, most=1e12)]
     damping_ratio: Annotated[float, Quantity(RATIO, least=0, most=2)] = 0.05
     damping: Annotated[float, Quantity(DAMPING, least=0, most=1e6)] | None = None
@@ -92,6 +111,13 @@ class EraSection(Section):
     stroke: Annotated[float, Quantity(LENGTH, above=0, most=0.01)] = 100e-6
     amplifier: Identifier
     channel: Annotated[int, Field(ge=0, le=255)]
+
+
+class MassSection(Section):
+    """Something small that the plate carries."""
+
+    at: Place
+    mass: Annotated[float, Quantity(MASS, least=0, most=10)]
 
 
 class AmplifierSection(Section):
@@ -115,5 +141,6 @@ class RigSection(Section):
     plate: PlateSection
     mesh: str = "auto"
     eras: Annotated[dict[Identifier, EraSection], Field(min_length=1, max_length=64)]
+    masses: Annotated[dict[Identifier, MassSection], Field(max_length=64, default_factory=dict)]
     amplifiers: Annotated[dict[Identifier, AmplifierSection], Field(min_length=1)]
     limits: LimitsSection = LimitsSection()

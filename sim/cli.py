@@ -32,6 +32,10 @@ def sim(
     control: Annotated[
         Path | None, typer.Option(metavar="PATH", help="Serve a control socket at this path.")
     ] = None,
+    until_eof: Annotated[
+        bool,
+        typer.Option("--until-eof", help="End with standard input, as when its writer dies."),
+    ] = False,
 ) -> None:
     """Simulate a rig behind real wires until SIGTERM or Ctrl-C; prints a URL per amplifier."""
     import asyncio
@@ -50,7 +54,12 @@ def sim(
     try:
         asyncio.run(
             run_far_end(
-                load_rig(rig), fingers=positions, control=control, ready=_announce, view=view
+                load_rig(rig),
+                fingers=positions,
+                control=control,
+                ready=_announce,
+                view=view,
+                until_eof=until_eof,
             )
         )
     finally:

@@ -2,7 +2,9 @@
 
 import asyncio
 import contextlib
+import os
 import signal
+import threading
 import time
 from collections.abc import AsyncIterator, Callable, Coroutine, Mapping
 from contextlib import asynccontextmanager
@@ -25,17 +27,21 @@ async def run_far_end(
     control: Path | None,
     ready: Callable[[Mapping[str, str]], None],
     view: Callable[[Bench], None] | None,
+    until_eof: bool = False,
 ) -> None:
-    """Simulate a rig on pseudo-terminals until SIGTERM or SIGINT.
+    """Simulate a rig on pseudo-terminals until SIGTERM or SIGINT, or the end of standard input.
 
     fingers rest where they are told [m]; control: where the control socket is served, if anywhere;
     ready is called once with the URL of each amplifier by its name, view a few times a second.
-    Raises InputError, LinkError.
+    until_eof: whether standard input counts. Raises InputError, LinkError.
     """
     ended = asyncio.Event()
     loop = asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT):
         loop.add_signal_handler(number, ended.set)
+    if until_eof:
+        # A thread, for a loop cannot wait for every kind of standard input.
+        threading.Thread(target=_await_eof, args=(loop, ended), daemon=True).start()
     bench = await asyncio.to_thread(Bench, rig, now=time.monotonic())
     bench.place_fingers(fingers, now=time.monotonic())
     async with contextlib.AsyncExitStack() as stack:
@@ -52,6 +58,15 @@ async def run_far_end(
             await stack.enter_async_context(_in_background(_keep_viewing(bench, view), ended))
         ready(urls)
         await ended.wait()
+
+
+def _await_eof(loop: asyncio.AbstractEventLoop, ended: asyncio.Event) -> None:
+    """Read standard input to its end, which the system brings about when a parent dies."""
+    with contextlib.suppress(OSError):  # closed from the first is at its end, too
+        while os.read(0, 4096):
+            pass
+    with contextlib.suppress(RuntimeError):  # the loop has closed for another reason
+        loop.call_soon_threadsafe(ended.set)
 
 
 async def _keep_viewing(bench: Bench, view: Callable[[Bench], None]) -> None:

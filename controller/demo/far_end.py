@@ -141,7 +141,9 @@ async def _start(
     process = await asyncio.create_subprocess_exec(
         # -P: a folder named sim where the user stands must not be taken for ours
         *(sys.executable, "-P", "-m", "sim", str(rig_file), f"--{wire}", "--control", str(control)),
-        stdin=asyncio.subprocess.DEVNULL,
+        # A pipe that nobody writes to: it closes when we die, however that is, and ends the process
+        "--until-eof",
+        stdin=asyncio.subprocess.PIPE,
         stdout=asyncio.subprocess.PIPE,
     )
     return process, cast(asyncio.StreamReader, process.stdout)  # there is one: it was asked for

@@ -136,6 +136,35 @@ def test_a_far_end_that_dies_is_reported_in_a_paragraph(capture, environment, tm
     assert "Next:" not in first_row + rest
 
 
+def test_no_far_end_outlives_a_demonstration_that_is_killed(capture, environment, tmp_path):
+    """After SIGKILL, which nobody can handle, the amplifiers' process ends by itself."""
+    with subprocess.Popen(
+        [str(ERA), "demo", "--touches", str(capture), "--out", str(tmp_path)],
+        env=environment,
+        cwd=tmp_path,
+        stdout=subprocess.PIPE,
+        text=True,
+    ) as process:
+        next(line for line in process.stdout if " Hz" in line)
+        far_end = far_end_of(process.pid)
+        process.kill()
+        process.stdout.read()
+    for _ in range(200):
+        if not is_running(far_end):
+            return
+        time.sleep(0.05)
+    os.kill(far_end, signal.SIGKILL)
+    raise AssertionError("the far end was still there after ten seconds")
+
+
+def is_running(pid):
+    """Whether a process is there and is more than an entry that nobody has collected."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
+
+
 def far_end_of(pid):
     """The process that a running demonstration started for its amplifiers."""
     for _ in range(100):

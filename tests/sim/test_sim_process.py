@@ -24,6 +24,7 @@ async def start(arguments: Sequence[str]) -> asyncio.subprocess.Process:
     """A far end as users start it."""
     return await asyncio.create_subprocess_exec(
         *(sys.executable, "-P", "-m", "sim", *arguments),
+        stdin=asyncio.subprocess.PIPE,
         stdout=asyncio.subprocess.PIPE,
         stderr=asyncio.subprocess.PIPE,
         cwd=ROOT,
@@ -66,6 +67,20 @@ async def test_serves_until_it_is_told_to_end(number: signal.Signals) -> None:
             ending = await wait(process)
         assert ending == (0, "", "")
         assert not control.exists()
+
+
+async def test_ends_with_its_standard_input_where_that_was_asked_for() -> None:
+    """A parent that dies closes its end of the pipe; that alone ends the far end in order."""
+    process = await start([str(example_rig_path()), "--serial", "--until-eof"])
+    assert process.stdin is not None
+    assert process.stdout is not None
+    line = await asyncio.wait_for(process.stdout.readline(), PATIENCE)
+    assert line.startswith(b"main: serial://")
+    amplifier = Amplifier(SerialBackend(line.decode().split()[1]), reply_timeout=5.0)
+    await amplifier.open()
+    await amplifier.close()
+    process.stdin.close()
+    assert await wait(process) == (0, "", "")
 
 
 @pytest.mark.parametrize(

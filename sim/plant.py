@@ -1,57 +1,22 @@
-"""The plate in time: modal equations of motion, solved exactly between changes of the drive.
+"""The plate in time, from one change of the drive to the next.
 
-    M q'' + C q' + K q = sum over ERAs of phi (k_b y + c y')
-
-q are the coordinates of the reduced free plate, phi its shapes at an ERA, y the motion of the
-ERA's base. M = I + sum m_b phi phi^T, K = diag(omega²) + sum k_b phi phi^T, C = C_s + sum c phi
-phi^T. The first-order system is diagonalised once; the base moves in terms with closed-form
-particular solutions (`sim.base_motion`), so no step size enters and no error grows with time.
-
-Structural damping. The frequency domain uses a hysteretic stiffness (1 + i eta) diag(omega²),
-which no causal equation in time has. C_s is its viscous equivalent: in the modes psi_j, omega_j of
-the plate *on its ERAs*, C_s,jk = eta psi_j^T diag(omega²) psi_k / sqrt(omega_j omega_k). That is
-positive semidefinite, and at every resonance of the supported plate it takes exactly the power that
-the hysteretic one takes; a ratio eta/2 on the modes of the *free* plate would not, because the
-springs' share of a mode's energy has no loss. What is left differs off resonance: with eta = 1 %
-the steady accelerations of the paper's plate differ by at most 0.5 % (relative L2 over the plate,
-40 to 500 Hz), in proportion to eta; deep nulls are moved a little, not filled.
-
-Not modelled: large deflections, air, the ERAs' own dynamics beyond spring, damper and bolt mass,
-rocking and drag at the bolts, and the impulse c times the jump that the damper would pass on if a
-base jumped (ramp 0): displacement and velocity of the plate are continuous through every change.
+The equations of motion and their exact solutions are the model's (`model.time_response`, which says
+what is not modelled); here is what a running plant adds: its clock, what the bases do now, and the
+free vibration that every change leaves behind.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
-from scipy import linalg
 
 from model.actuator import Era
-from model.arrays import ComplexArray, FloatArray
-from model.assembly import era_positions
-from model.errors import InputError
+from model.arrays import FloatArray
+from model.base_motion import Term
 from model.reduction import ReducedPlate
-from sim.base_motion import Term
+from model.time_response import Answer, plate_in_time
 
 _BLOCK = 256  # samples; the table of exponentials for one block is computed once
 _NEGLIGIBLE = 1e-60  # modal amplitude far below anything measurable, above slow subnormal numbers
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Answer:
-    """The particular solution q(t) = Im[(b0 + b1 tau) exp(i omega tau)], tau = t - term.start."""
-
-    term: Term
-    b0: ComplexArray
-    b1: ComplexArray
-
-    def state(self, time: float) -> FloatArray:
-        """Displacement and velocity (2 r,) at a time [s]."""
-        tau = time - self.term.start
-        turn = np.exp(1j * self.term.omega * tau)
-        q = self.b0 + self.b1 * tau
-        return np.concatenate([q * turn, (self.b1 + 1j * self.term.omega * q) * turn]).imag
 
 
 class Plant:
@@ -63,40 +28,16 @@ class Plant:
 
     def __init__(self, reduced: ReducedPlate, eras: Sequence[Era], *, time: float = 0.0) -> None:
         self.time = time
-        self._eras = tuple(eras)
-        M, C, K = modal_matrices(reduced, eras)
-        r = len(K)
-        inverse = linalg.inv(M)
-        A = np.block([[np.zeros((r, r)), np.eye(r)], [-inverse @ K, -inverse @ C]])
-        eigenvalues, vectors = linalg.eig(A)
-        inverse_vectors = linalg.inv(vectors)
-        residual = np.abs((vectors * eigenvalues) @ inverse_vectors - A).max()
-        if not residual < 1e-6 * np.abs(A).max():
-            raise InputError(
-                "the plate's equations of motion cannot be separated into modes: a mode is damped "
-                "critically; change an ERA's damping by a per mille"
-            )
-        self._eigenvalues = eigenvalues
-        self._vectors = vectors[:r]
-        # (2r, n_eras): how a unit force at each ERA drives each eigenvector
-        push = np.vstack([np.zeros((r, len(eras))), inverse @ reduced.at(era_positions(eras)).T])
-        self._participation = inverse_vectors @ push
-        # Eigenvectors come in conjugate pairs: one of a pair, twice, is both.
-        half = eigenvalues.imag >= 0
-        weight = np.where(eigenvalues[half].imag > 0, 2.0, 1.0)
-        self._decay = eigenvalues[half]
-        self._free_state = vectors[:, half] * weight
-        self._free_acceleration = self._free_state[:r] * self._decay**2
-        self._to_free = inverse_vectors[half]
-        self._free = np.zeros(len(self._decay), dtype=complex)
-        self._answers: list[list[_Answer]] = [[] for _ in eras]
+        self._plate = plate_in_time(reduced, eras)
+        self._free = np.zeros(len(self._plate.decay), dtype=complex)
+        self._answers: list[list[Answer]] = [[] for _ in eras]
         self._table_rate = 0.0
         self._table = np.zeros((0, 0))
 
     @property
     def state(self) -> tuple[FloatArray, FloatArray]:
         """Modal displacement and velocity (r,) each, now."""
-        x = (self._free_state @ self._free).real
+        x = (self._plate.free_state @ self._free).real
         for answer in self._active():
             x = x + answer.state(self.time)
         r = len(x) // 2
@@ -105,7 +46,9 @@ class Plant:
     def set_input(self, era: int, terms: Sequence[Term]) -> None:
         """From now on the base of this ERA moves as these terms say; terms may start later."""
         before = [answer for answer in self._active() if answer in self._answers[era]]
-        self._answers[era] = [self._solve(era, term) for term in terms if term.end > self.time]
+        self._answers[era] = [
+            self._plate.answer(era, term) for term in terms if term.end > self.time
+        ]
         after = [answer for answer in self._active() if answer in self._answers[era]]
         self._exchange(before, after)
 
@@ -137,7 +80,7 @@ class Plant:
             self._pass(boundary)
         self._coast(to_time)
 
-    def _active(self) -> list[_Answer]:
+    def _active(self) -> list[Answer]:
         return [
             answer
             for answers in self._answers
@@ -154,29 +97,18 @@ class Plant:
         }
         return sorted(moment for moment in moments if self.time < moment <= to_time)
 
-    def _solve(self, era: int, term: Term) -> _Answer:
-        """The particular solution for one term, by the eigenvectors."""
-        k, c = self._eras[era].stiffness, self._eras[era].damping
-        s = 1j * term.omega
-        force0 = k * term.c0 + c * (term.c1 + s * term.c0)
-        force1 = (k + c * s) * term.c1
-        gap = s - self._eigenvalues
-        a1 = self._participation[:, era] * force1 / gap
-        a0 = (self._participation[:, era] * force0 - a1) / gap
-        return _Answer(term, self._vectors @ a0, self._vectors @ a1)
-
-    def _exchange(self, before: Sequence[_Answer], after: Sequence[_Answer]) -> None:
+    def _exchange(self, before: Sequence[Answer], after: Sequence[Answer]) -> None:
         """Replace particular solutions, and keep displacement and velocity as they are."""
         if before or after:
-            jump = np.zeros(self._free_state.shape[0])
+            jump = np.zeros(self._plate.free_state.shape[0])
             for answer in before:
                 jump += answer.state(self.time)
             for answer in after:
                 jump -= answer.state(self.time)
-            self._free = self._free + self._to_free @ jump
+            self._free = self._free + self._plate.to_free @ jump
 
     def _coast(self, to_time: float) -> None:
-        self._free = self._free * np.exp(self._decay * (to_time - self.time))
+        self._free = self._free * np.exp(self._plate.decay * (to_time - self.time))
         self._free[np.abs(self._free) < _NEGLIGIBLE] = 0
         self.time = to_time
 
@@ -203,8 +135,8 @@ class Plant:
             table = self._exponentials(sample_rate)
             for start in range(0, len(times), _BLOCK):
                 block = times[start : start + _BLOCK]
-                free = self._free * np.exp(self._decay * (block[0] - self.time))
-                shapes = (self._free_acceleration * free).T
+                free = self._free * np.exp(self._plate.decay * (block[0] - self.time))
+                shapes = (self._plate.free_acceleration * free).T
                 out[start : start + _BLOCK] += table[: len(block)] @ np.vstack(
                     [shapes.real, shapes.imag]
                 )
@@ -226,28 +158,7 @@ class Plant:
     def _exponentials(self, sample_rate: float) -> FloatArray:
         """Re and -Im of exp(eigenvalue k / sample_rate) for k up to a block, (block, 2 m)."""
         if sample_rate != self._table_rate:
-            grid = np.exp(np.outer(np.arange(_BLOCK) / sample_rate, self._decay))
+            grid = np.exp(np.outer(np.arange(_BLOCK) / sample_rate, self._plate.decay))
             self._table = np.hstack([grid.real, -grid.imag])
             self._table_rate = sample_rate
         return self._table
-
-
-def modal_matrices(
-    reduced: ReducedPlate, eras: Sequence[Era]
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """M, C, K (r, r) of the plate on its ERAs, in the coordinates of the reduced free plate."""
-    phi = reduced.at(era_positions(eras))
-    elastic = np.diag(reduced.omega**2)
-    M = np.eye(len(reduced.omega)) + (phi.T * [era.bolt_mass for era in eras]) @ phi
-    K = elastic + (phi.T * [era.stiffness for era in eras]) @ phi
-    squares, psi = linalg.eigh(K, M)
-    if squares[0] < 1.0:  # (rad/s)²: slower than one sway in six seconds is not held at all
-        raise InputError(
-            f"the plate does not stand on its {len(eras)} ERAs and would tip over; put at least "
-            "three under it that do not lie in one line"
-        )
-    omega = np.sqrt(squares)
-    viscous = reduced.plate.loss_factor * (psi.T @ elastic @ psi) / np.sqrt(np.outer(omega, omega))
-    back = M @ psi
-    C = back @ viscous @ back.T + (phi.T * [era.damping for era in eras]) @ phi
-    return M, C, K

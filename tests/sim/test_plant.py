@@ -8,13 +8,14 @@ from scipy.integrate import solve_ivp
 
 from model.actuator import Era
 from model.arrays import ComplexArray, FloatArray
+from model.base_motion import Term
 from model.errors import InputError
 from model.fingertip import fingertip_points
 from model.mesh import Mesh
 from model.plate import Material, Plate
 from model.reduction import ReducedPlate, reduce_plate
-from sim.base_motion import Term
-from sim.plant import Plant, modal_matrices
+from model.time_response import modal_matrices
+from sim.plant import Plant
 
 PLATE = Plate(0.3048, 0.2286, 0.0015, Material("aluminium", 70e9, 2700.0, 0.33), loss_factor=0.01)
 CORNERS = [(0.0, 0.0), (0.3048, 0.0), (0.3048, 0.2286), (0.0, 0.2286)]

@@ -4,7 +4,8 @@ import math
 
 import pytest
 
-from sim.base_motion import Term, terms_of
+from model.base_motion import Term
+from sim.base_motion import terms_of
 from sim.waveform import FadingTone, Output, fade_to, level_of
 
 

@@ -12,6 +12,7 @@ from controller.contacts import Change, Contact, ContactTracker
 from controller.routing import route
 from controller.selection import PatternTable, Selection, Selector
 from controller.touch import TouchFrame
+from drivers.command import DriveCommand
 from drivers.guard import Guard, SafeCommand
 from model.perception import STRONG_DB_SL
 from model.rig import Rig
@@ -66,6 +67,7 @@ class Decider:
         self._selector = Selector(table, level_db_sl=level_db_sl)
         self._decided: Selection | None = None
         self._is_silent = False
+        self._playing: Mapping[str, DriveCommand] = {}
         self._token = 0
         self._changes: list[Change] = []
         self._since: float | None = None
@@ -85,6 +87,11 @@ class Decider:
         """What the amplifiers play is not known any more: the next decision has commands."""
         self._decided = None
         self._is_silent = False
+        self._playing = {}
+
+    def confirm(self, drive: Mapping[str, DriveCommand]) -> None:
+        """This is what the amplifiers made of the last commands, by ERA without the silent ones."""
+        self._playing = drive
 
     def decide(self, now: float) -> Decision:
         """Decide at a time [s]."""
@@ -106,6 +113,7 @@ class Decider:
             commands = self.silence(ramp=FADE_RAMP if contacts else RELEASE_RAMP)
         if commands is not None:
             self._is_silent = all(command.is_silent for command in commands.values())
+            self._playing = {}  # until the amplifiers have confirmed
         self._decided = selection
         decision = Decision(
             contacts=contacts,
@@ -138,6 +146,7 @@ class Decider:
             self._rig,
             token=self._next_token(),
             ramp=pattern.ramp,
+            playing=self._playing,
         )
         checked = {
             name: guard.check_or_silence(sets[name], ramp=FADE_RAMP)

@@ -176,6 +176,7 @@ class Controller:
                 return
             commands = {name: several.commands for name, several in achieved.items()}
             drive = drive_of_eras(commands, self._rig)
+            self._decider.confirm(drive)
             latency = self._group.last_sent - decision.since
         if decision.problem is not None:
             self._tell(self._observer.refused, decision.problem)

@@ -13,13 +13,21 @@ from model.rig import Rig
 
 
 def route(
-    excitation: Excitation, rig: Rig, *, token: int, ramp: float, valid_for: float = 0.0
+    excitation: Excitation,
+    rig: Rig,
+    *,
+    token: int,
+    ramp: float,
+    valid_for: float = 0.0,
+    playing: Mapping[str, DriveCommand] | None = None,
 ) -> dict[str, CommandSet]:
     """One command set per amplifier of the rig, by its name, all under the same token.
 
     Every wired channel is named: level = amplitude / stroke, phase in degrees within (-180, 180];
-    level 0 where the ERA is not driven. ramp, valid_for [s] as in `CommandSet`. Nothing is limited
-    here, that is the guard's; raises InputError if the excitation names an ERA the rig has not.
+    level 0 where the ERA is not driven. ramp, valid_for [s] as in `CommandSet`. playing: what ERAs
+    play now, as `drive_of_eras` tells it; a frequency that only ERAs play which play it already
+    runs on undisturbed in time. Nothing is limited here, that is the guard's; raises InputError if
+    the excitation names an ERA the rig has not.
     """
     unknown = sorted(excitation.keys() - rig.wiring.keys())
     if unknown:
@@ -28,8 +36,9 @@ def route(
             "build a table for this rig"
         )
     commands: dict[str, list[DriveCommand]] = {name: [] for name in rig.amplifiers}
+    restarted = _restarted(excitation, playing or {})
     for name, channel in rig.wiring.items():
-        commands[channel.amplifier].append(_drive(excitation, rig, name))
+        commands[channel.amplifier].append(_drive(excitation, rig, name, restarted=restarted))
     return {
         name: CommandSet(
             token=token,
@@ -58,7 +67,19 @@ def drive_of_eras(
     }
 
 
-def _drive(excitation: Excitation, rig: Rig, name: str) -> DriveCommand:
+def _restarted(excitation: Excitation, playing: Mapping[str, DriveCommand]) -> set[float]:
+    """Frequencies [Hz] whose phases must count from the commit, for an ERA joins in with them.
+
+    ERAs that play one frequency count its phase from one moment, else their field is another.
+    """
+    return {
+        tone.frequency
+        for name, tone in excitation.items()
+        if name not in playing or playing[name].frequency != tone.frequency
+    }
+
+
+def _drive(excitation: Excitation, rig: Rig, name: str, *, restarted: set[float]) -> DriveCommand:
     """What one ERA's channel shall play."""
     number = rig.wiring[name].number
     tone = excitation.get(name)
@@ -70,6 +91,7 @@ def _drive(excitation: Excitation, rig: Rig, name: str) -> DriveCommand:
         frequency=tone.frequency,
         level=tone.amplitude / rig.era(name).stroke,
         phase=_wrapped_degrees(tone.phase),
+        keep_phase=tone.frequency not in restarted,
     )
 
 

@@ -60,6 +60,50 @@ def test_touch_to_wire(run_virtual: Run, running: Running) -> None:
     run_virtual(scenario())
 
 
+def test_a_moved_finger_does_not_restart_the_vibration(run_virtual: Run, running: Running) -> None:
+    """The same ERA at the same frequency runs on, another level or not; after silence it starts."""
+
+    async def scenario() -> None:
+        async with running() as bench:
+            await bench.hold(FINGER, seconds=0.1)
+            bench.table.excitation = {"SW": Tone(110.0, 30e-6)}
+            await bench.hold((1, 0.6, 0.5), seconds=0.1)
+            bench.table.excitation = {"SW": Tone(110.0, 30e-6), "NE": Tone(110.0, 30e-6)}
+            await bench.hold((1, 0.7, 0.5), seconds=0.1)
+            bench.touch()
+            await asyncio.sleep(0.01)
+            await bench.hold((2, 0.7, 0.5), seconds=0.1)
+            played = [each for each in bench.far_end.sets() if not each.is_silent]
+            assert [[c.keep_phase for c in each.commands] for each in played] == [
+                [False, False],
+                [True, False],
+                [False, False],
+                [False, False],
+            ]
+
+    run_virtual(scenario())
+
+
+def test_phase_is_not_kept_of_what_was_never_confirmed(
+    run_virtual: Run, make_bench: MakeBench
+) -> None:
+    """After a disarm nobody knows what plays: the next pattern counts from its commit."""
+
+    async def scenario() -> None:
+        bench = make_bench()
+        await bench.controller.open()
+        await bench.controller.arm()
+        bench.touch(FINGER)
+        await bench.controller.step()
+        await bench.controller.disarm()
+        await bench.controller.arm()
+        await bench.controller.step()
+        assert [each.commands[0].keep_phase for each in bench.far_end.sets()] == [False, False]
+        await bench.controller.close()
+
+    run_virtual(scenario())
+
+
 def test_last_finger_up(run_virtual: Run, running: Running) -> None:
     """When the last finger lifts, every channel is at zero within 20 ms, ramp included."""
 

@@ -8,7 +8,7 @@ from controller.routing import drive_of_eras, route
 from drivers.command import CommandSet, DriveCommand
 from model.actuator import Era
 from model.errors import InputError
-from model.excitation import Tone
+from model.excitation import Excitation, Tone
 from model.mesh import Mesh
 from model.plate import Material, Plate
 from model.rig import Channel, Limits, Rig
@@ -18,8 +18,12 @@ RIG = Rig(
     plate=PLATE,
     mesh=Mesh(4, 4, 0.3, 0.2),
     eras=tuple(
-        Era(name, 0.0, 0.0, 17_000.0, 1.0, 0.0, stroke)
-        for name, stroke in (("SW", 100e-6), ("SE", 50e-6), ("NE", 100e-6))
+        Era(name, x, y, 17_000.0, 1.0, 0.0, stroke)
+        for name, x, y, stroke in (
+            ("SW", 0.0, 0.0, 100e-6),
+            ("SE", 0.3, 0.0, 50e-6),
+            ("NE", 0.3, 0.2, 100e-6),
+        )
     ),
     wiring={"SW": Channel("left", 1), "SE": Channel("right", 0), "NE": Channel("left", 0)},
     amplifiers={"left": "sim://", "right": "sim://"},
@@ -87,6 +91,28 @@ def test_an_era_that_the_rig_has_not() -> None:
     """A pattern of another rig is refused as a whole."""
     with pytest.raises(InputError, match="drives NW, which the rig does not have"):
         route({"SW": Tone(100.0, 1e-6), "NW": Tone(100.0, 1e-6)}, RIG, token=1, ramp=0)
+
+
+@pytest.mark.parametrize(
+    ("wanted", "kept"),
+    [
+        ({"SW": Tone(110.0, 5e-6), "SE": Tone(110.0, 9e-6)}, {"SW", "SE"}),
+        ({"SW": Tone(110.0, 5e-6, 1.0), "SE": Tone(110.0, 9e-6)}, {"SW", "SE"}),
+        ({"SE": Tone(110.0, 9e-6)}, {"SE"}),
+        ({"SW": Tone(110.0, 5e-6), "SE": Tone(250.0, 9e-6)}, {"SW"}),
+        ({"SW": Tone(110.0, 5e-6), "NE": Tone(110.0, 9e-6)}, set()),
+        ({"SW": Tone(110.01, 5e-6), "SE": Tone(110.01, 9e-6)}, set()),
+        ({"SW": Tone(250.0, 5e-6), "SE": Tone(250.0, 9e-6)}, set()),
+    ],
+)
+def test_what_may_run_on_in_time(wanted: Excitation, kept: set[str]) -> None:
+    """A frequency runs on if only ERAs play it that do already; one that joins in restarts all."""
+    playing = {name: DriveCommand(0, 110.0, 0.5) for name in ("SW", "SE")}
+    sets = route(wanted, RIG, token=1, ramp=0, playing=playing)
+    drive = drive_of_eras({name: each.commands for name, each in sets.items()}, RIG)
+    assert {name for name, command in drive.items() if command.keep_phase} == kept
+    first = route(wanted, RIG, token=1, ramp=0)
+    assert not any(command.keep_phase for each in first.values() for command in each.commands)
 
 
 def test_back_to_eras() -> None:

@@ -5,7 +5,11 @@ import typer
 from model.config_cli import config_app
 from model.errors import InputError
 from model.plate_cli import plate_app
+from model.plate_show_cli import materials, show
 from model.table_cli import table_app
+
+plate_app.command()(materials)
+plate_app.command()(show)
 
 app = typer.Typer()
 app.add_typer(config_app, name="config")

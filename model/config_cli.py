@@ -54,10 +54,20 @@ def check(
 
 def _summary(rig: "Rig") -> str:
     """A good rig in one line, so that a value that is only unlikely catches the eye."""
-    plate = rig.plate
-    sizes = " x ".join(f"{1e3 * size:g}" for size in (plate.length, plate.width, plate.thickness))
-    names = ", ".join(era.name for era in rig.eras)
-    return f"good: {sizes} mm of {plate.material.name}, mesh {rig.mesh}, ERAs {names}"
+    plate, laminate = rig.plate, rig.laminate
+    thickness = plate.thickness if laminate is None else laminate.thickness
+    sizes = " x ".join(f"{1e3 * size:g}" for size in (plate.length, plate.width, thickness))
+    made_of = plate.material.name
+    if laminate is not None:
+        made_of = f"laminate ({', '.join(layer.material.name for layer in laminate.layers)})"
+    parts = [
+        f"{sizes} mm of {made_of}",
+        f"mesh {rig.mesh}",
+        f"ERAs {', '.join(era.name for era in rig.eras)}",
+    ]
+    if rig.masses:
+        parts.append(f"carries {1e3 * sum(mass.mass for mass in rig.masses):g} g")
+    return f"good: {', '.join(parts)}"
 
 
 def _write_new(path: Path, text: str) -> None:

@@ -237,5 +237,5 @@ def _rotary_inertia(laminate: Laminate) -> float:
 
 
 def _rounded(value: float) -> float:
-    """Ten digits, so that rounding does not make another plate, with another fingerprint, of it."""
-    return float(f"{value:.10g}")
+    """Twelve digits, so that rounding does not make another fingerprint of the same plate."""
+    return float(f"{value:.12g}")

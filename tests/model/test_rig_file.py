@@ -10,6 +10,7 @@ from model.document import ConfigError
 from model.errors import InputError
 from model.materials import material
 from model.plate import Plate
+from model.point_mass import PointMass
 from model.rig import Channel
 from model.rig_file import example_rig_path, load_rig, rig_schema
 from model.rig_parts import parse_mesh
@@ -117,8 +118,8 @@ def test_mesh_and_limits_may_be_left_out(tmp_path: Path) -> None:
     assert (rig.limits.frequency_min, rig.limits.frequency_max, rig.limits.level) == (40, 500, 1)
     with_them = GOOD.replace("mesh: 48x36", "mesh: auto")
     assert rig.mesh == load_rig(write(tmp_path, with_them)).mesh
-    # D = E h^3 / 12 (1 - nu^2) = 22.094 N m; wavelength = 2 pi (D / rho h w^2)^(1/4) = 0.1704 m
-    assert np.diff(np.unique(rig.mesh.nodes[:, 0])).max() < 0.1704 / 6
+    # D = E h^3 / 12 (1 - nu^2) = 22.0935 N m; wavelength = 2 pi (D / rho h w^2)^(1/4) = 0.1713 m
+    assert np.diff(np.unique(rig.mesh.nodes[:, 0])).max() < 0.1713 / 6
 
 
 def test_a_mesh_asked_for_stands_in_place_of_the_files(tmp_path: Path) -> None:
@@ -142,11 +143,22 @@ def test_a_mesh_asked_for_stands_in_place_of_the_files(tmp_path: Path) -> None:
         (2, "", (1, "plate.length"), "is missing"),
         (2, "  length: 12 in\n  colour: red", (3, "plate.colour"), "unknown key; known here are"),
         (3, "  width: .inf", (3, "plate.width"), "is not a finite number"),
+        (3, "  width: 0 mm", (3, "plate.width"), "must be above 0 m"),
+        (4, "  thickness: 0", (4, "plate.thickness"), "must be at least"),
+        (4, "  thickness: .nan", (4, "plate.thickness"), "is not a finite number"),
+        (4, "  thickness:", (4, "plate.thickness"), "is missing; add it, or layers"),
+        (4, "", (1, "plate.thickness"), "is missing; add it, or layers"),
+        (5, "", (1, "plate.material"), "is missing; add it, or layers"),
         (4, "  thickness: -1.5 mm", (4, "plate.thickness"), "must be at least"),
         (4, "  thickness: 0.4", (4, "plate.thickness"), "is it in mm"),
         (4, "  thicknes: 1.5 mm\n  thickness: 1.5 mm", (4, "plate.thicknes"), "mean thickness"),
         (5, "  material: aluminum", (5, "plate.material"), "did you mean aluminium"),
         (5, "  material: 7", (5, "plate.material"), "must be a mapping"),
+        (5, "  material: glas", (5, "plate.material"), "known are: aluminium, steel, soda-lime"),
+        (5, "  material: soda glass", (5, "plate.material"), "did you mean soda-lime-glass"),
+        (5, "  material: {E: .nan, rho: 2700, nu: 0.3}", (5, "plate.material.E"), "not a finite"),
+        (5, "  material: {E: 70 GPa, rho: 0, nu: 0.3}", (5, "plate.material.rho"), "at least 1"),
+        (5, "  material: aluminium\n  bond: none", (6, "plate.bond"), "goes with layers only"),
         (5, "  material: {E: 70 GPa, rho: 2700, nu: 0.5}", (5, "plate.material.nu"), "below 0.5"),
         (5, "  material: {E: 70 GPa, rho: 2700, nu: -1}", (5, "plate.material.nu"), "above -1"),
         (5, "  material: {E: 70, rho: 2700, nu: 0.3}", (5, "plate.material.E"), "out of range"),
@@ -157,7 +169,7 @@ def test_a_mesh_asked_for_stands_in_place_of_the_files(tmp_path: Path) -> None:
         (6, "mesh: fine", (6, "mesh"), "for example 48x36"),
         (6, "mesh: 0x36", (6, "mesh"), "1 to 1000 elements"),
         (6, "mesh: 1001x36", (6, "mesh"), "1 to 1000 elements"),
-        # 0.3048 m / (0.1704 m / 6) = 10.7 and 0.2286 m / (0.1704 m / 6) = 8.05
+        # 0.3048 m / (0.17132 m / 6) = 10.67 and 0.2286 m / (0.17132 m / 6) = 8.01
         (6, "mesh: 10x9", (6, "mesh"), "at least 11x9 is needed"),
         (6, "mesh: 11x8", (6, "mesh"), "at least 11x9 is needed"),
         (6, "mehs: 48x36", (6, "mehs"), "did you mean mesh"),
@@ -165,10 +177,12 @@ def test_a_mesh_asked_for_stands_in_place_of_the_files(tmp_path: Path) -> None:
         (9, "    at: [0]", (9, "eras.SW.at[1]"), "is missing"),
         (9, "    at: 0", (9, "eras.SW.at"), "must be a list"),
         (9, "    at: [0, 1 kg]", (9, "eras.SW.at[1]"), "is not a length"),
+        (9, "    at: [.nan, 0]", (9, "eras.SW.at[0]"), "is not a finite number"),
         (9, "    at: [0, 9.1 in]", (9, "eras.SW.at"), "off the plate, which reaches"),
         (9, "    at: [-1 mm, 0]", (9, "eras.SW.at"), "off the plate, which reaches"),
         (9, "    at: [12 in, 9 in]", (15, "eras.NE.at"), "where ERA SW is already"),
         (10, "    stiffness: 17 N", (10, "eras.SW.stiffness"), "for example 17 kN/m"),
+        (10, "    stiffness: .inf", (10, "eras.SW.stiffness"), "is not a finite number"),
         (10, "    stiffness: 0", (10, "eras.SW.stiffness"), "must be above 0 N/m"),
         (10, "", (8, "eras.SW.stiffness"), "is missing"),
         (11, "    damping: -1", (11, "eras.SW.damping"), "must be at least 0"),
@@ -199,6 +213,38 @@ def test_a_mesh_asked_for_stands_in_place_of_the_files(tmp_path: Path) -> None:
         (22, "  frequency: [40, 500 rpm]", (22, "limits.frequency[1]"), "is not a frequency"),
         (23, "  level: 1.1", (23, "limits.level"), "at most 1"),
         (23, "  level: -0.1", (23, "limits.level"), "at least 0"),
+        (23, "  level: .nan", (23, "limits.level"), "is not a finite number"),
+        (23, "  level: 0.5\nmasses: 2", (24, "masses"), "must be a mapping"),
+        (
+            23,
+            "  level: 0.5\nmasses:\n  cam:\n    at: [1, 0]\n    mass: 5 g",
+            (26, "masses.cam.at"),
+            "move the mass onto it",
+        ),
+        (
+            23,
+            "  level: 0.5\nmasses:\n  cam:\n    at: [0, 0]\n    mass: -5 g",
+            (27, "masses.cam.mass"),
+            "must be at least 0 kg",
+        ),
+        (
+            23,
+            "  level: 0.5\nmasses:\n  cam:\n    at: [0, 0]\n    mass: .nan",
+            (27, "masses.cam.mass"),
+            "is not a finite number",
+        ),
+        (
+            23,
+            "  level: 0.5\nmasses:\n  cam:\n    at: [0, 0]",
+            (25, "masses.cam.mass"),
+            "is missing",
+        ),
+        (
+            23,
+            "  level: 0.5\nmasses:\n  2nd: {at: [0, 0], mass: 5 g}",
+            (25, "masses.2nd"),
+            "is no name",
+        ),
         (23, "  level: 0.5\nplates: 2", (24, "plates"), "did you mean plate"),
     ],
 )
@@ -208,6 +254,100 @@ def test_a_bad_value_is_refused_with_its_line_and_key(
     """Whatever cannot work is refused; the problem names its line and key and what to do."""
     problems = refused(tmp_path, changed(line, text))
     assert any(where == (line, key) and message in said for line, key, said in problems)
+
+
+LAMINATE = GOOD.replace(
+    """\
+  thickness: 1.5 mm
+  material: aluminium
+""",
+    """\
+  layers:
+    - material: aluminium
+      thickness: 1 mm
+    - material: {E: 1 MPa, rho: 1000, nu: 0.49}
+      thickness: 0.2 mm
+    - {material: acrylic, thickness: 2 mm}
+  bond: shear
+  bond_frequency: 150
+""",
+)
+
+
+@pytest.mark.parametrize(
+    ("first", "last", "text", "where", "message"),
+    [
+        (4, 9, "  layers: []", (4, "plate.layers"), "has 0 entries"),
+        (4, 9, "  layers:\n    - 7", (5, "plate.layers[0]"), "must be a mapping"),
+        (4, 9, "  layers: {a: 1}", (4, "plate.layers"), "must be a list"),
+        (4, 4, "  thickness: 1 mm\n  layers:", (4, "plate.thickness"), "stands beside layers"),
+        (4, 4, "  material: steel\n  layers:", (4, "plate.material"), "stands beside layers"),
+        (5, 5, "    - material: aluminum", (5, "plate.layers[0].material"), "mean aluminium"),
+        (6, 6, "      thicknes: 1 mm", (6, "plate.layers[0].thicknes"), "did you mean thickness"),
+        (6, 6, "      thickness: 0", (6, "plate.layers[0].thickness"), "must be at least"),
+        (6, 6, "      thickness: .nan", (6, "plate.layers[0].thickness"), "not a finite number"),
+        (6, 6, "      thickness: 300 mm", (4, "plate.layers"), "more than the plate is wide"),
+        (
+            7,
+            7,
+            "    - material: {E: 1 MPa, rho: 1000, nu: 0.49, tan: 1}",
+            (7, "plate.layers[1].material.tan"),
+            "unknown key; known here are: name, E, rho, nu",
+        ),
+        (8, 8, "", (7, "plate.layers[1].thickness"), "is missing"),
+        (9, 9, "", (9, "plate.bond"), "needs 3, 5, 7, ... layers"),
+        (10, 10, "  bond: glue", (10, "plate.bond"), "'full', 'none' or 'shear'"),
+        (10, 10, "  bond: full", (10, "plate.bond"), "bond_frequency goes with bond shear only"),
+        (11, 11, "", (10, "plate.bond"), "needs a bond_frequency"),
+        (11, 11, "  bond_frequency: 0", (11, "plate.bond_frequency"), "must be at least 1 Hz"),
+        (11, 11, "  bond_frequency: .nan", (11, "plate.bond_frequency"), "not a finite number"),
+    ],
+)
+def test_a_bad_laminate_is_refused_with_its_line_and_key(
+    tmp_path: Path, first: int, last: int, text: str, where: tuple[int, str], message: str
+) -> None:
+    """Whatever cannot be a laminate is refused, down to the layer that is wrong."""
+    lines = LAMINATE.splitlines()
+    lines[first - 1 : last] = text.splitlines()
+    problems = refused(tmp_path, "\n".join(lines))
+    assert any(where == (number, key) and message in said for number, key, said in problems)
+
+
+def test_a_laminate_is_its_equivalent_plate(tmp_path: Path) -> None:
+    """The plate has the stack's mass, by hand 2.7 + 0.2 + 2.38 kg/m², and the bond is read."""
+    rig = load_rig(write(tmp_path, LAMINATE))
+    assert rig.plate.mass == pytest.approx(5.28 * 0.3048 * 0.2286, rel=1e-9)
+    assert rig.laminate is not None
+    assert [layer.thickness for layer in rig.laminate.layers] == [1e-3, 0.2e-3, 2e-3]
+    assert (rig.laminate.bond, rig.laminate.bond_frequency) == ("shear", 150.0)
+    firmer = load_rig(write(tmp_path, LAMINATE.replace("1 MPa", "10 MPa")))
+    assert firmer.plate.flexural_rigidity > rig.plate.flexural_rigidity
+    assert firmer.fingerprint != rig.fingerprint
+
+
+def test_one_layer_is_the_same_plate_as_no_layers(tmp_path: Path) -> None:
+    """A laminate of one layer has the numbers of that plate, and so its fingerprint."""
+    one = GOOD.replace(
+        "  thickness: 1.5 mm\n  material: aluminium",
+        "  layers: [{material: aluminium, thickness: 1.5 mm}]",
+    )
+    assert load_rig(write(tmp_path, one)).fingerprint == load_rig(write(tmp_path, GOOD)).fingerprint
+
+
+def test_masses_are_on_the_rig_and_in_its_fingerprint(tmp_path: Path) -> None:
+    """A mass is read with its unit; its name and order are no physics, its weight and place are."""
+    bare = load_rig(write(tmp_path, GOOD))
+    assert bare.masses == ()
+    camera = "  camera: {at: [50 mm, 9 in], mass: 20 g}\n"
+    plug = "  plug: {at: [0, 0], mass: 5 g}\n"
+    rig = load_rig(write(tmp_path, GOOD + "masses:\n" + camera + plug))
+    assert rig.masses == (PointMass(0.05, 0.2286, 0.02), PointMass(0.0, 0.0, 0.005))
+    turned = (GOOD + "masses:\n" + plug + camera).replace("camera", "eye")
+    assert load_rig(write(tmp_path, turned)).fingerprint == rig.fingerprint
+    heavier = load_rig(
+        write(tmp_path, (GOOD + "masses:\n" + camera + plug).replace("20 g", "21 g"))
+    )
+    assert len({bare.fingerprint, rig.fingerprint, heavier.fingerprint}) == 3
 
 
 @pytest.mark.parametrize(

@@ -19,7 +19,7 @@ from model.errors import InputError
 from model.factorisation import factorise
 from model.mesh import LEAST_NODES_PER_WAVELENGTH, Mesh
 from model.plate import Plate
-from model.reduction import ReducedPlate
+from model.point_load import PointLoad, load_positions
 
 
 def check_frequencies(plate: Plate, mesh: Mesh, frequencies: FloatArray) -> None:
@@ -38,60 +38,51 @@ def check_frequencies(plate: Plate, mesh: Mesh, frequencies: FloatArray) -> None
             )
 
 
-def _hold_and_drive(eras: Sequence[Era], omega: float) -> tuple[ComplexArray, ComplexArray]:
-    """Per ERA: its dynamic stiffness [N/m], and the force on the plate at full stroke [N]."""
-    spring: ComplexArray = np.array([era.stiffness + 1j * omega * era.damping for era in eras])
-    bolt = np.array([era.bolt_mass for era in eras])
+def hold_and_drive(
+    eras: Sequence[Era], loads: Sequence[PointLoad], omega: FloatArray
+) -> tuple[ComplexArray, ComplexArray]:
+    """Dynamic stiffness (f, eras + loads) [N/m], and each ERA's force at full stroke (f, eras) [N].
+
+    omega: (f,) [rad/s].
+    """
+    held = np.array(
+        [(era.stiffness, era.damping, era.bolt_mass) for era in eras]
+        + [(load.stiffness, load.damping, load.mass) for load in loads],
+        dtype=float,
+    ).reshape(-1, 3)
+    spring = held[:, 0] + 1j * omega[:, None] * held[:, 1]
     stroke = np.array([era.stroke for era in eras])
-    hold: ComplexArray = spring - (omega**2 * bolt).astype(complex)
-    return hold, spring * stroke
+    return spring - (omega**2)[:, None] * held[:, 2], spring[:, : len(eras)] * stroke
 
 
 def direct_acceleration(
-    matrices: PlateMatrices, eras: Sequence[Era], frequencies: FloatArray, points: FloatArray
+    matrices: PlateMatrices,
+    eras: Sequence[Era],
+    frequencies: FloatArray,
+    points: FloatArray,
+    *,
+    loads: Sequence[PointLoad] = (),
 ) -> ComplexArray:
     """Acceleration [m/s²] at points (p, 2) per frequency [Hz] (f,) and driven ERA: (f, eras, p).
 
-    Each ERA alone at full stroke and phase zero, the others holding. One sparse factorisation per
-    frequency: the reference that the reduced answer is compared with. Raises InputError for a
-    frequency that is none or that the mesh cannot carry, and for points off the plate.
+    Each ERA alone at full stroke and phase zero, the others and the loads holding. One sparse
+    factorisation per frequency: the reference that the free plate's answer is compared with. Raises
+    InputError for a frequency that is none or that the mesh cannot carry, and for points off the
+    plate.
     """
     check_frequencies(matrices.plate, matrices.mesh, frequencies)
-    touch = matrices.deflection_at(era_positions(eras))
+    touch = matrices.deflection_at(np.vstack([era_positions(eras), load_positions(loads)]))
     observe = matrices.deflection_at(points)
     result = np.empty((len(frequencies), len(eras), observe.shape[0]), dtype=complex)
-    for row, frequency in enumerate(frequencies):
-        omega = 2 * np.pi * frequency
-        hold, drive = _hold_and_drive(eras, omega)
+    omegas = 2 * np.pi * np.asarray(frequencies, dtype=float)
+    holds, drives = hold_and_drive(eras, loads, omegas)
+    for row, (omega, hold, drive) in enumerate(zip(omegas, holds, drives, strict=True)):
         dynamic = (
             (1 + 1j * matrices.plate.loss_factor) * matrices.stiffness
             - omega**2 * matrices.mass
             + touch.T @ sparse.diags_array(hold) @ touch
         )
         factor = factorise(dynamic)
-        displacement = factor.solve((touch.T @ sparse.diags_array(drive)).toarray())
+        displacement = factor.solve((touch[: len(eras)].T @ sparse.diags_array(drive)).toarray())
         result[row] = -(omega**2) * (observe @ displacement).T
-    return result
-
-
-def reduced_acceleration(
-    reduced: ReducedPlate, eras: Sequence[Era], frequencies: FloatArray, points: FloatArray
-) -> ComplexArray:
-    """The same from the reduced plate: a solve as small as the number of ERAs per frequency.
-
-    The free plate's receptance is diagonal in its modes; ERAs are a correction of low rank
-    (Woodbury identity). Shapes and units as in `direct_acceleration`.
-    """
-    touch = reduced.at(era_positions(eras))
-    observe = reduced.at(points)
-    modal_stiffness = (1 + 1j * reduced.plate.loss_factor) * reduced.omega**2
-    result = np.empty((len(frequencies), len(eras), len(observe)), dtype=complex)
-    for row, frequency in enumerate(frequencies):
-        omega = 2 * np.pi * frequency
-        hold, drive = _hold_and_drive(eras, omega)
-        receptance = touch / (modal_stiffness - omega**2)
-        at_eras = receptance @ touch.T
-        # Force on the plate per ERA driven: what its base pushes less what all ERAs hold back.
-        force = np.linalg.solve(np.eye(len(eras)) + hold[:, None] * at_eras, np.diag(drive))
-        result[row] = -(omega**2) * force.T @ (receptance @ observe.T)
     return result

@@ -16,16 +16,14 @@ from numpy.typing import NDArray
 
 from model.actuator import Era
 from model.arrays import ComplexArray, FloatArray
-from model.assembly import era_positions
 from model.errors import InputError
 from model.excitation import Excitation, Tone
 from model.fingertip import FINGERTIP_RADIUS, fingertip_points
-from model.harmonic import reduced_acceleration
+from model.free_plate import solve_free_plate
 from model.localization import CELL_SAMPLES, SURROUNDINGS_RADIUS, Grid, contrast_db, decibels
 from model.mesh import Mesh
 from model.perception import STRONG_DB_SL, detection_threshold
 from model.plate import Plate
-from model.reduction import reduce_plate
 from model.rig import Rig, physics_fingerprint
 from model.switched import (
     SILENT,
@@ -220,10 +218,8 @@ def build_table(
     if mode not in MODES:
         raise InputError(f"unknown drive mode {mode!r}; known: {', '.join(MODES)}")
     _check_frequencies(frequencies, rig)
-    reduced = reduce_plate(
-        rig.plate, rig.mesh, era_positions(rig.eras), frequency_max=float(frequencies[-1])
-    )
-    nodes = reduced_acceleration(reduced, rig.eras, frequencies, rig.mesh.nodes)
+    free = solve_free_plate(rig.plate, rig.mesh, frequency_max=float(frequencies[-1]))
+    nodes = free.acceleration(rig.eras, frequencies, rig.mesh.nodes)
     peak = peak_of_patterns(_at_points(rig.mesh, nodes, grid.samples(rig.plate)))
     return LocalizationTable(
         plate=rig.plate,

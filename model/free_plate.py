@@ -1,0 +1,316 @@
+"""The free plate, solved once, answering for everything that is attached to it at points.
+
+Modes of the free plate up to twice the highest frequency, found in each symmetry class by one
+factorisation; what the truncated modes add (`model.truncation`) takes a few more solves with the
+same factors for each point that a force acts at, done when a point is first asked for and kept.
+ERAs, bolts, point masses and fingers are then a correction of low rank (Woodbury identity): a solve
+as small as their number for each frequency, whatever the mesh.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy import linalg, sparse
+from scipy.sparse.linalg import LinearOperator, eigsh
+
+from model.actuator import Era
+from model.arrays import ComplexArray, FloatArray
+from model.assembly import ElementMatrices, element_matrices, era_positions
+from model.errors import InputError
+from model.factorisation import BandCholesky
+from model.harmonic import check_frequencies, hold_and_drive
+from model.mesh import Mesh
+from model.plate import Plate
+from model.point_load import PointLoad, load_positions
+from model.symmetry import CLASSES, SymmetryClass, symmetry_class
+from model.truncation import truncation_error, truncation_weights
+
+# Modes are kept up to this multiple of the highest frequency asked for.
+FREQUENCY_MARGIN = 2.0
+
+# Solves for each point. A field then converges with their number, a receptance between attachments
+# with twice that, since it can be had from inner products of what was solved.
+TERMS = 4
+
+# Memory for solved points [bytes]; beyond it the oldest are forgotten.
+KEPT_BYTES = 512 << 20
+
+
+@dataclass(frozen=True, eq=False)
+class ClassModes:
+    """One symmetry class: its factors, and its modes up to the cut-off.
+
+    factor: of stiffness + shift * mass; mass (n, n); squared (r,) [rad²/s²], vectors (n, r) of unit
+    modal mass; next_squared: of the lowest mode left out.
+    """
+
+    symmetry: SymmetryClass
+    factor: BandCholesky
+    mass: sparse.csr_array
+    squared: FloatArray
+    vectors: FloatArray
+    next_squared: float
+
+
+@dataclass(frozen=True, eq=False)
+class Attachments:
+    """Points where forces act on a free plate, with what has been solved for them.
+
+    shapes: (n, r) of the modes; residuals: by symmetry class, (size, TERMS, n); moments: (2 TERMS,
+    n, n) receptances of all truncated modes together with their u / u_c to the power 1, 2, ...
+    """
+
+    shapes: FloatArray
+    residuals: tuple[FloatArray, ...]
+    moments: FloatArray
+
+
+@dataclass(frozen=True)
+class Response:
+    """Acceleration [m/s²] per frequency, driven ERA and point (f, eras, p), and how wrong it is.
+
+    error: (f, eras), an upper estimate of the error relative to the response, both root mean
+    square over the plate; against the exact answer of the same mesh, not of a finer one.
+    """
+
+    acceleration: ComplexArray
+    error: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class FreePlate:
+    """Modes and factors of one plate on one mesh; see `solve_free_plate`.
+
+    frequency_max [Hz]: up to where it answers; shift [rad²/s²]: of the factors.
+    """
+
+    plate: Plate
+    mesh: Mesh
+    frequency_max: float
+    shift: float
+    classes: tuple[ClassModes, ...]
+    _solved: dict[tuple[float, float], tuple[FloatArray, ...]] = field(default_factory=dict)
+
+    @property
+    def squared(self) -> FloatArray:
+        """omega² of the modes (r,) [rad²/s²], class by class; the first of a class may be 0."""
+        return np.concatenate([part.squared for part in self.classes])
+
+    @property
+    def largest_truncated(self) -> float:
+        """1 / (lambda + shift) of the lowest mode left out [s²/rad²]."""
+        return 1 / (min(part.next_squared for part in self.classes) + self.shift)
+
+    def shapes_at(self, points: FloatArray) -> FloatArray:
+        """Mode shapes at points [m] (p, 2) of the plate, (p, r) [1/sqrt(kg)]."""
+        return np.hstack([part.symmetry.at(points) @ part.vectors for part in self.classes])
+
+    def attach(self, points: FloatArray) -> Attachments:
+        """Solve for forces at points [m] (n, 2), as far as they have not been solved for."""
+        points = np.asarray(points, dtype=float).reshape(-1, 2)
+        keys = [(float(x), float(y)) for x, y in points]
+        unknown = [key for key in dict.fromkeys(keys) if key not in self._solved]
+        if unknown:
+            self._solve_for(unknown)
+        known = [self._solved[key] for key in keys]
+        residuals = tuple(
+            np.stack([each[number] for each in known], axis=-1)
+            for number in range(len(self.classes))
+        )
+        count = len(points)
+        moments = np.zeros((2 * TERMS, count, count))
+        for part, residual in zip(self.classes, residuals, strict=True):
+            moments[0] += part.symmetry.at(points) @ residual[:, 0]
+            flat = residual.reshape(len(residual), -1)
+            inner = (flat.T @ (part.mass @ flat)).reshape(TERMS, count, TERMS, count)
+            for power in range(2, 2 * TERMS + 1):
+                moments[power - 1] += inner[power // 2 - 1, :, (power + 1) // 2 - 1]
+        return Attachments(self.shapes_at(points), residuals, moments)
+
+    def acceleration(
+        self,
+        eras: Sequence[Era],
+        frequencies: FloatArray,
+        points: FloatArray,
+        *,
+        loads: Sequence[PointLoad] = (),
+    ) -> ComplexArray:
+        """Acceleration [m/s²] at points (p, 2) per frequency [Hz] (f,) and ERA: (f, eras, p).
+
+        As `direct_acceleration`: each ERA alone at full stroke, the others holding.
+        """
+        return self.respond(eras, frequencies, points, loads=loads).acceleration
+
+    def respond(
+        self,
+        eras: Sequence[Era],
+        frequencies: FloatArray,
+        points: FloatArray,
+        *,
+        loads: Sequence[PointLoad] = (),
+    ) -> Response:
+        """The same with its error; any ERAs and loads, at any points [m] of the plate.
+
+        Raises InputError for a frequency that is none, above frequency_max or above what the mesh
+        carries, and for points off the plate.
+        """
+        frequencies = np.asarray(frequencies, dtype=float)
+        self._check(frequencies)
+        omega = 2 * np.pi * frequencies
+        hold, drive = hold_and_drive(eras, loads, omega)
+        attached = self.attach(np.vstack([era_positions(eras), load_positions(loads)]))
+        count, terms = len(hold[0]), TERMS
+
+        loss = 1 + 1j * self.plate.loss_factor
+        answers = 1 / (loss * self.squared - (omega**2)[:, None])
+        zeta = np.asarray(omega**2 / loss + self.shift, dtype=complex)
+        largest = self.largest_truncated
+        receptance = (answers[:, None, :] * attached.shapes) @ attached.shapes.T
+        weights = truncation_weights(zeta, largest, 2 * terms)
+        receptance += np.tensordot(weights / loss, attached.moments, axes=1)
+
+        # Forces on the plate for a unit force put in at each attachment, all of them holding back.
+        unit = np.linalg.inv(np.eye(count) + hold[:, :, None] * receptance)
+        modal = np.asarray(answers[:, :, None] * (attached.shapes.T @ unit), dtype=complex)
+        weights = truncation_weights(zeta, largest, terms) / loss
+        residual = weights[:, :, None, None] * unit[:, None]
+        coordinates = np.concatenate([modal, residual.reshape(len(omega), -1, count)], axis=1)
+        driven = coordinates[:, :, : len(eras)] * drive[:, None, :]
+        displacement = _apply(self.basis(attached, points), driven)
+        acceleration = -(omega**2)[:, None, None] * displacement
+
+        size = _field_size(modal, residual, attached.moments)
+        # Of any two truncated answers none is larger than that of the lowest truncated mode.
+        most = largest / (1 - np.abs(zeta) * largest)
+        off_receptance = truncation_error(zeta, largest, 2 * terms) * most
+        off_field = truncation_error(zeta, largest, terms) * most
+        strength, spread = (np.sqrt(np.diagonal(attached.moments[power])) for power in (0, 1))
+        force = np.abs(unit)
+        wrong_force = np.abs(hold) * off_receptance[:, None] * strength * size
+        error = wrong_force.sum(axis=1)[:, None] * (strength[:, None] * force).sum(axis=1)
+        error += off_field[:, None] * (spread[:, None] * force).sum(axis=1)
+        return Response(acceleration, (error / size)[:, : len(eras)])
+
+    def _check(self, frequencies: FloatArray) -> None:
+        check_frequencies(self.plate, self.mesh, frequencies)
+        if len(frequencies) and frequencies.max() > self.frequency_max * (1 + 1e-9):
+            raise InputError(
+                f"the plate was solved up to {self.frequency_max:g} Hz and cannot answer at "
+                f"{frequencies.max():g} Hz; solve it with a higher frequency_max"
+            )
+
+    def basis(self, attached: Attachments, points: FloatArray) -> FloatArray:
+        """Deflection at points by modes and by residual vectors, (p, r + TERMS n)."""
+        shapes = []
+        extra = np.zeros((len(points), TERMS * len(attached.shapes)))
+        for part, residual in zip(self.classes, attached.residuals, strict=True):
+            observe = part.symmetry.at(points)
+            shapes.append(observe @ part.vectors)
+            extra += observe @ residual.reshape(len(residual), -1)
+        return np.hstack([*shapes, extra])
+
+    def _solve_for(self, points: list[tuple[float, float]]) -> None:
+        """Residual vectors (size, TERMS) of every class for each point: sum of phi (u / u_c)^j."""
+        solved = []
+        for part in self.classes:
+            terms = []
+            force = part.symmetry.at(np.array(points)).toarray().T
+            for _ in range(TERMS):
+                field_ = part.factor.solve(force) / self.largest_truncated
+                # The modes' share is taken out; once leaves rounding behind, twice is enough.
+                for _ in range(2):
+                    field_ -= part.vectors @ (part.vectors.T @ (part.mass @ field_))
+                terms.append(field_)
+                force = part.mass @ field_
+            solved.append(np.stack(terms, axis=1))
+        for number, point in enumerate(points):
+            self._solved[point] = tuple(each[:, :, number].copy() for each in solved)
+        most = max(len(points), KEPT_BYTES // sum(each[:, :, 0].nbytes for each in solved))
+        while len(self._solved) > most:
+            del self._solved[next(iter(self._solved))]
+
+
+def _apply(basis: FloatArray, coordinates: ComplexArray) -> ComplexArray:
+    """A real basis (p, r) times complex coordinates (f, r, n): (f, n, p), in one real product."""
+    f, r, n = coordinates.shape
+    stacked = np.ascontiguousarray(coordinates.transpose(0, 2, 1)).view(float)
+    parts = stacked.reshape(f, n, r, 2).transpose(0, 1, 3, 2).reshape(-1, r)
+    product = (parts @ basis.T).reshape(f, n, 2, len(basis))
+    result = np.empty((f, n, len(basis)), dtype=complex)
+    result.real, result.imag = product[:, :, 0], product[:, :, 1]
+    return result
+
+
+def _field_size(modal: ComplexArray, residual: ComplexArray, moments: FloatArray) -> FloatArray:
+    """Root of the plate's mass times its mean square deflection, for each column: (f, n)."""
+    square = (np.abs(modal) ** 2).sum(axis=1)
+    for a in range(residual.shape[1]):
+        for b in range(residual.shape[1]):
+            share = residual[:, a].conj() * (moments[a + b + 1] @ residual[:, b])
+            square += share.sum(axis=1).real
+    return np.asarray(np.sqrt(square))
+
+
+def solve_free_plate(plate: Plate, mesh: Mesh, *, frequency_max: float = 500.0) -> FreePlate:
+    """Solve the free plate once on a mesh, for answers up to a frequency [Hz]."""
+    if not (math.isfinite(frequency_max) and frequency_max > 0):
+        raise InputError(f"frequency_max is {frequency_max} Hz, must be above zero")
+    shift = (2 * math.pi * plate.lowest_bending_frequency) ** 2
+    cut = (2 * math.pi * FREQUENCY_MARGIN * frequency_max) ** 2
+    elements = element_matrices(plate, mesh)
+    classes = tuple(
+        _class_modes(symmetry_class(mesh, parity), elements, shift=shift, cut=cut)
+        for parity in CLASSES
+    )
+    return FreePlate(plate, mesh, frequency_max, shift, classes)
+
+
+def _class_modes(
+    symmetry: SymmetryClass, elements: ElementMatrices, *, shift: float, cut: float
+) -> ClassModes:
+    """All modes of a class below the cut [rad²/s²], which is met by asking for ever more."""
+    band, mass = symmetry.assemble(elements, shift)
+    factor = BandCholesky.of(band)
+    count = 8
+    while True:
+        squared, vectors = _lowest(factor, mass, count, shift=shift)
+        if squared[-1] >= cut or len(squared) == symmetry.size:
+            break
+        count *= 2
+    kept = int(np.searchsorted(squared, cut))
+    squared[np.abs(squared) < 1e-6 * shift] = 0.0
+    return ClassModes(
+        symmetry,
+        factor,
+        mass,
+        squared[:kept],
+        vectors[:, :kept],
+        float(squared[min(kept, len(squared) - 1)]),
+    )
+
+
+def _lowest(
+    factor: BandCholesky, mass: sparse.csr_array, count: int, *, shift: float
+) -> tuple[FloatArray, FloatArray]:
+    """The lowest eigenpairs; all of them where that is no more work."""
+    size = mass.shape[0]
+    if count >= size / 2:
+        inverse = factor.solve(np.eye(size))
+        # u phi = (K + shift M)^-1 M phi, made symmetric with the mass's own root.
+        root = linalg.cholesky(mass.toarray(), lower=True)
+        u, vectors = linalg.eigh(root.T @ inverse @ root)
+        vectors = linalg.solve_triangular(root.T, vectors)
+    else:
+        squared, vectors = eigsh(
+            mass,  # only its shape is used
+            count,
+            M=mass,
+            sigma=-shift,
+            OPinv=LinearOperator(mass.shape, matvec=factor.solve, dtype=float),
+            v0=np.random.default_rng(0).standard_normal(size),  # ARPACK's own start is random
+        )
+        u = 1 / (squared + shift)
+    order = np.argsort(-u)
+    return 1 / u[order] - shift, vectors[:, order]

@@ -30,6 +30,7 @@ from drivers.protocol.messages import (
     Status,
     Stop,
 )
+from drivers.turns import PATIENCE
 from drivers.watchdog import check_watchdog, round_trip_of
 
 IDENTITY = Identity("Acme", "Quad", "A-17", "1.2", 1)
@@ -275,6 +276,55 @@ async def test_an_apply_is_not_repeated_before_a_stop(
     assert backend.requests == [Apply(safe(1)), Stop(0.005)]
 
 
+@pytest.mark.parametrize("call", ["heartbeat", "commit"])
+async def test_nothing_is_repeated_before_a_stop(
+    amplifier: Amplifier, backend: ScriptedBackend, call: str
+) -> None:
+    """While a stop waits, whatever lost its answer gives way, be it no apply."""
+    answer: asyncio.Future[Reply] = asyncio.get_running_loop().create_future()
+    backend.script.append(answer)
+    first = asyncio.create_task(amplifier.commit(1) if call == "commit" else amplifier.heartbeat())
+    await settle()
+    stop = asyncio.create_task(amplifier.stop())
+    await settle()
+    answer.set_exception(LinkTimeout("late"))
+    with pytest.raises(CommandRefused, match="superseded"):
+        await first
+    await stop
+    assert [type(request) for request in backend.requests[1:]] == [Stop]
+
+
+async def test_a_stop_waits_for_no_answer_that_does_not_come(
+    amplifier: Amplifier, backend: ScriptedBackend, safe: MakeSafe
+) -> None:
+    """A stop gives what is on the wire a moment, and goes out although that has no answer yet."""
+    backend.script.append(asyncio.get_running_loop().create_future())  # never done
+    apply = asyncio.create_task(amplifier.apply(safe(1)))
+    await settle()
+    async with asyncio.timeout(5):
+        await amplifier.stop()
+    with pytest.raises(CommandRefused, match="superseded"):
+        await apply
+    assert backend.requests == [Apply(safe(1)), Stop(0.005)]
+    assert not amplifier.lost
+    assert (await amplifier.status()) == STATUS
+
+
+async def test_a_stop_is_not_cut_short_by_another(
+    amplifier: Amplifier, backend: ScriptedBackend
+) -> None:
+    """A disarm that waits for a stop leaves it all its time: a stop latches, a disarm does not."""
+    answer: asyncio.Future[Reply] = asyncio.get_running_loop().create_future()
+    backend.script.append(answer)
+    stop = asyncio.create_task(amplifier.stop())
+    await settle()
+    disarm = asyncio.create_task(amplifier.disarm())
+    await asyncio.sleep(2 * PATIENCE)
+    answer.set_exception(LinkTimeout("late"))
+    await asyncio.gather(stop, disarm)
+    assert backend.requests == [Stop(0.005), Stop(0.005), Disarm(0.05)]
+
+
 async def test_cancelling_leaves_the_link_usable(
     amplifier: Amplifier, backend: ScriptedBackend, safe: MakeSafe
 ) -> None:
@@ -336,7 +386,7 @@ async def test_a_cancelled_stop_overtakes_nothing(
     stop = asyncio.create_task(amplifier.stop())
     await settle()
     stop.cancel()
-    await settle()
+    await asyncio.sleep(2 * PATIENCE)
     answer.set_exception(LinkTimeout("late"))
     assert (await apply).token == 1
     assert backend.requests == [Apply(safe(1))] * 2

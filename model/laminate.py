@@ -23,7 +23,6 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 import numpy as np
-from scipy.optimize import brentq
 
 from model.arrays import FloatArray
 from model.errors import InputError
@@ -204,6 +203,8 @@ def _share_in_shear(layers: Sequence[Layer], frequency: float) -> float:
     Under w = sin(k x) the stiff layers' in-plane movements take the least energy of extension and
     adhesive shear together; what they add to the rigidity is arms . (slip + k² shear)⁻¹ . arms.
     """
+    from scipy.optimize import brentq  # a fifth of a second that other rigs need not wait for
+
     stiff, adhesives = layers[0::2], layers[1::2]
     arms = np.diff(_centres(layers)[0::2])
     neighbours = np.diff(np.eye(len(stiff)), axis=0)

@@ -6,7 +6,14 @@ Bounds are wide: they are there to catch a value in the wrong unit, not to teach
 import re
 from typing import Annotated, Any
 
-from pydantic import AfterValidator, Field, GetCoreSchemaHandler, GetJsonSchemaHandler, Strict
+from pydantic import (
+    AfterValidator,
+    ConfigDict,
+    Field,
+    GetCoreSchemaHandler,
+    GetJsonSchemaHandler,
+    Strict,
+)
 from pydantic_core import CoreSchema, core_schema
 
 from model.config import Quantity, Section
@@ -89,6 +96,12 @@ class PlateSection(Section):
 
     loss_factor: the paper prints none; 1 % is the usual order of a metal panel.
     """
+
+    model_config = ConfigDict(
+        json_schema_extra={
+            "oneOf": [{"required": ["thickness", "material"]}, {"required": ["layers"]}]
+        }
+    )
 
     length: Side
     width: Side

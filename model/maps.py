@@ -42,7 +42,9 @@ def plate_map(
     points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
     matrices = assemble(rig.plate, mesh)
     _, amplitudes = tone_amplitudes(
-        excitation, rig.eras, lambda f: direct_acceleration(matrices, rig.eras, f, points)
+        excitation,
+        rig.eras,
+        lambda f: direct_acceleration(matrices, rig.eras, f, points, loads=rig.loads),
     )
     peak = peak_acceleration(amplitudes).reshape(rows, columns)
     return PlateMap(x, y, peak, find_nulls(x, y, peak))

@@ -9,9 +9,10 @@ from scipy.sparse.linalg import LinearOperator, SuperLU, eigsh
 
 from model.actuator import Era
 from model.arrays import FloatArray, IntArray
-from model.assembly import PlateMatrices, era_positions
+from model.assembly import PlateMatrices
 from model.errors import InputError
 from model.factorisation import factorise
+from model.point_load import PointLoad, load_positions
 
 RIGID_BODY_MODES = 3  # of a free plate: up and down, and two tilts
 
@@ -76,21 +77,31 @@ SUPPORTS: dict[str, Callable[[PlateMatrices], IntArray]] = {
 """Degrees of freedom held at zero, by the name of the support; "eras" adds springs and bolts."""
 
 
-def modes(matrices: PlateMatrices, count: int, *, support: str, eras: Sequence[Era] = ()) -> Modes:
+def modes(
+    matrices: PlateMatrices,
+    count: int,
+    *,
+    support: str,
+    eras: Sequence[Era] = (),
+    loads: Sequence[PointLoad] = (),
+) -> Modes:
     """The lowest `count` modes without damping; only the elastic ones where the plate is free.
 
     support: a name in SUPPORTS; with "eras" each ERA adds its stiffness and bolt mass where it
-    holds the plate.
+    holds the plate. loads are there whatever holds it.
     """
     if count < 1:
         raise InputError(f"{count} modes asked for; at least one is needed")
     stiffness, mass = matrices.stiffness, matrices.mass
-    if support == "eras" and eras:
-        touch = matrices.deflection_at(era_positions(eras))
-        springs = sparse.diags_array(np.array([era.stiffness for era in eras], dtype=float))
-        bolts = sparse.diags_array(np.array([era.bolt_mass for era in eras], dtype=float))
+    attached = [*loads]
+    if support == "eras":
+        attached += [PointLoad(era.x, era.y, era.stiffness, mass=era.bolt_mass) for era in eras]
+    if attached:
+        touch = matrices.deflection_at(load_positions(attached))
+        springs = sparse.diags_array(np.array([load.stiffness for load in attached]))
+        masses = sparse.diags_array(np.array([load.mass for load in attached]))
         stiffness = sparse.csc_array(stiffness + touch.T @ springs @ touch)
-        mass = sparse.csc_array(mass + touch.T @ bolts @ touch)
+        mass = sparse.csc_array(mass + touch.T @ masses @ touch)
     held = SUPPORTS[support](matrices)
     free = np.setdiff1d(np.arange(matrices.dof), held)
     rigid = RIGID_BODY_MODES if support == "free" else 0

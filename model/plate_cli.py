@@ -41,7 +41,7 @@ def modes(
     rig = load_rig(rig_file, mesh=mesh)
     started = time.perf_counter()
     matrices = assemble(rig.plate, rig.mesh)
-    solved = modal.modes(matrices, count, support=support.value, eras=rig.eras)
+    solved = modal.modes(matrices, count, support=support.value, eras=rig.eras, loads=rig.loads)
     elapsed = time.perf_counter() - started
     if as_json:
         print(

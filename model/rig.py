@@ -11,6 +11,7 @@ from model.errors import InputError
 from model.laminate import Laminate
 from model.mesh import Mesh
 from model.plate import Plate
+from model.point_load import PointLoad
 from model.point_mass import PointMass
 
 # Two bolts cannot be closer [m].
@@ -78,6 +79,11 @@ class Rig:
             if era.name == name:
                 return era
         raise KeyError(name)
+
+    @property
+    def loads(self) -> tuple[PointLoad, ...]:
+        """What the plate carries, as what is attached to it."""
+        return tuple(PointLoad(mass.x, mass.y, mass=mass.mass) for mass in self.masses)
 
     @property
     def fingerprint(self) -> str:

@@ -219,7 +219,7 @@ def build_table(
         raise InputError(f"unknown drive mode {mode!r}; known: {', '.join(MODES)}")
     _check_frequencies(frequencies, rig)
     free = solve_free_plate(rig.plate, rig.mesh, frequency_max=float(frequencies[-1]))
-    nodes = free.acceleration(rig.eras, frequencies, rig.mesh.nodes)
+    nodes = free.acceleration(rig.eras, frequencies, rig.mesh.nodes, loads=rig.loads)
     peak = peak_of_patterns(_at_points(rig.mesh, nodes, grid.samples(rig.plate)))
     return LocalizationTable(
         plate=rig.plate,

@@ -4,8 +4,9 @@
 
 q are the coordinates of the reduced free plate, phi its shapes at an ERA, y the motion of the
 ERA's base. M = I + sum m_b phi phi^T, K = diag(omega²) + sum k_b phi phi^T, C = C_s + sum c phi
-phi^T. The first-order system is diagonalised once; the base moves in terms with closed-form
-particular solutions (`model.base_motion`), so no step size enters and no error grows with time.
+phi^T; what else the plate carries adds to M in the same way. The first-order system is diagonalised
+once; the base moves in terms with closed-form particular solutions (`model.base_motion`), so no
+step size enters and no error grows with time.
 
 Structural damping. The frequency domain uses a hysteretic stiffness (1 + i eta) diag(omega²),
 which no causal equation in time has. C_s is its viscous equivalent: in the modes psi_j, omega_j of
@@ -34,6 +35,7 @@ from model.arrays import ComplexArray, FloatArray
 from model.assembly import era_positions
 from model.base_motion import Term
 from model.errors import InputError
+from model.point_load import PointLoad, load_positions
 from model.reduction import ReducedPlate
 
 
@@ -124,13 +126,15 @@ class PlateInTime:
         return self.inverse[self._half]
 
 
-def plate_in_time(reduced: ReducedPlate, eras: Sequence[Era]) -> PlateInTime:
-    """Diagonalise the equations of motion of a reduced plate on its ERAs.
+def plate_in_time(
+    reduced: ReducedPlate, eras: Sequence[Era], *, loads: Sequence[PointLoad] = ()
+) -> PlateInTime:
+    """Diagonalise the equations of motion of a reduced plate on its ERAs, with what it carries.
 
     Raises InputError for ERAs that do not hold the plate (fewer than three, or all in one line),
     and for a mode that is damped critically.
     """
-    M, C, K = modal_matrices(reduced, eras)
+    M, C, K = modal_matrices(reduced, eras, loads=loads)
     r = len(K)
     inverse = linalg.inv(M)
     A = np.block([[np.zeros((r, r)), np.eye(r)], [-inverse @ K, -inverse @ C]])
@@ -147,13 +151,15 @@ def plate_in_time(reduced: ReducedPlate, eras: Sequence[Era]) -> PlateInTime:
 
 
 def modal_matrices(
-    reduced: ReducedPlate, eras: Sequence[Era]
+    reduced: ReducedPlate, eras: Sequence[Era], *, loads: Sequence[PointLoad] = ()
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """M, C, K (r, r) of the plate on its ERAs, in the coordinates of the reduced free plate."""
-    phi = reduced.at(era_positions(eras))
+    attached = [PointLoad(e.x, e.y, e.stiffness, e.damping, e.bolt_mass) for e in eras]
+    attached += loads
+    phi = reduced.at(load_positions(attached))
     elastic = np.diag(reduced.omega**2)
-    M = np.eye(len(reduced.omega)) + (phi.T * [era.bolt_mass for era in eras]) @ phi
-    K = elastic + (phi.T * [era.stiffness for era in eras]) @ phi
+    M = np.eye(len(reduced.omega)) + (phi.T * [load.mass for load in attached]) @ phi
+    K = elastic + (phi.T * [load.stiffness for load in attached]) @ phi
     squares, psi = linalg.eigh(K, M)
     if squares[0] < 1.0:  # (rad/s)²: slower than one sway in six seconds is not held at all
         raise InputError(
@@ -163,5 +169,5 @@ def modal_matrices(
     omega = np.sqrt(squares)
     viscous = reduced.plate.loss_factor * (psi.T @ elastic @ psi) / np.sqrt(np.outer(omega, omega))
     back = M @ psi
-    C = back @ viscous @ back.T + (phi.T * [era.damping for era in eras]) @ phi
+    C = back @ viscous @ back.T + (phi.T * [load.damping for load in attached]) @ phi
     return M, C, K

@@ -7,8 +7,11 @@ through the rig's wiring, level 1 being the ERA's full stroke.
 from collections import deque
 from collections.abc import Mapping
 
+import numpy as np
+
 from drivers.protocol.messages import Reply, Request
 from model.assembly import era_positions
+from model.point_load import load_positions
 from model.reduction import reduce_plate
 from model.rig import Rig
 from sim.amplifier import SimulatedAmplifier
@@ -29,11 +32,11 @@ class Bench:
         reduced = reduce_plate(
             rig.plate,
             rig.mesh,
-            era_positions(rig.eras),
+            np.vstack([era_positions(rig.eras), load_positions(rig.loads)]),
             frequency_max=rig.limits.frequency_max,
         )
         self.fingers = Fingers(reduced)
-        self._plant = Plant(reduced, rig.eras, time=now)
+        self._plant = Plant(reduced, rig.eras, loads=rig.loads, time=now)
         self.amplifiers: Mapping[str, SimulatedAmplifier] = {
             name: SimulatedAmplifier(name, channels=_channel_count(rig, name))
             for name in rig.amplifiers

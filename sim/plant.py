@@ -12,6 +12,7 @@ import numpy as np
 from model.actuator import Era
 from model.arrays import FloatArray
 from model.base_motion import Term
+from model.point_load import PointLoad
 from model.reduction import ReducedPlate
 from model.time_response import Answer, plate_in_time
 
@@ -20,15 +21,22 @@ _NEGLIGIBLE = 1e-60  # modal amplitude far below anything measurable, above slow
 
 
 class Plant:
-    """A reduced plate on its ERAs, vibrating in time.
+    """A reduced plate on its ERAs, with what it carries, vibrating in time.
 
     time [s] starts at rest where it is told to. Raises InputError for ERAs that do not hold the
     plate (fewer than three, or all in one line).
     """
 
-    def __init__(self, reduced: ReducedPlate, eras: Sequence[Era], *, time: float = 0.0) -> None:
+    def __init__(
+        self,
+        reduced: ReducedPlate,
+        eras: Sequence[Era],
+        *,
+        loads: Sequence[PointLoad] = (),
+        time: float = 0.0,
+    ) -> None:
         self.time = time
-        self._plate = plate_in_time(reduced, eras)
+        self._plate = plate_in_time(reduced, eras, loads=loads)
         self._free = np.zeros(len(self._plate.decay), dtype=complex)
         self._answers: list[list[Answer]] = [[] for _ in eras]
         self._table_rate = 0.0

@@ -1,5 +1,7 @@
 """A whole rig in numbers: from a request to what a finger feels, on a virtual clock."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -8,6 +10,8 @@ from drivers.protocol.messages import Achieved, Apply, Arm, Fault, Ping
 from model.assembly import assemble
 from model.fingertip import fingertip_points
 from model.harmonic import direct_acceleration
+from model.point_load import PointLoad
+from model.point_mass import PointMass
 from model.rig import Rig
 from sim.bench import Bench
 
@@ -51,6 +55,25 @@ def test_what_a_finger_feels_is_what_the_model_predicts(coarse_rig: Rig) -> None
         error = np.linalg.norm(felt[name].amplitude - expected) / np.linalg.norm(expected)
         assert error < 0.01
         np.testing.assert_array_equal(felt[name].points, points)
+
+
+def test_what_the_plate_carries_moves_with_it(coarse_rig: Rig) -> None:
+    """With 80 g on it, fingers feel what the sparse direct solve says, and not what they did."""
+    heavy = replace(coarse_rig, masses=(PointMass(0.1, 0.15, 0.05), PointMass(0.3048, 0.1, 0.03)))
+    points = fingertip_points(0.08, 0.06, heavy.plate)
+    matrices = assemble(heavy.plate, heavy.mesh)
+    frequency = np.array([210.0])
+    bare = direct_acceleration(matrices, heavy.eras, frequency, points)[0, 1]
+    loads = [PointLoad(0.1, 0.15, mass=0.05), PointLoad(0.3048, 0.1, mass=0.03)]
+    laden = direct_acceleration(matrices, heavy.eras, frequency, points, loads=loads)[0, 1]
+    bench = Bench(heavy, now=START)
+    bench.place_fingers({"a": (0.08, 0.06)}, now=START)
+    bench.exchange("main", Arm(0.25), now=START)
+    play(bench, 1, DriveCommand(1, 210.0, 1.0), now=START + 0.01)
+    keep_alive(bench, START + 0.05, START + 4.0)
+    (felt,) = bench.felt(START + 3.5, START + 4.0)["a"].amplitude
+    assert np.linalg.norm(felt - np.abs(laden)) < 0.01 * np.linalg.norm(felt)
+    assert np.linalg.norm(felt - np.abs(bare)) > 0.3 * np.linalg.norm(felt)
 
 
 def test_the_watchdog_silences_the_plate_at_its_own_time(coarse_rig: Rig) -> None:

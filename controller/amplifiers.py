@@ -10,6 +10,7 @@ from drivers.amplifier import Amplifier
 from drivers.errors import CommandError, CommandRefused, DriverError, LinkError
 from drivers.guard import SafeCommand
 from drivers.protocol.messages import Achieved, State, Status
+from drivers.turns import PATIENCE
 
 # How often, and how far apart [s], zero is looked for after the closing ramp has ended.
 _READ_BACKS = 5
@@ -32,22 +33,29 @@ class AmplifierGroup:
     """Amplifiers by their names in the rig, not yet open.
 
     A pattern with one ERA missing is another pattern: whatever goes wrong with one amplifier, all
-    are stopped, before the error is raised. Nothing arms again by itself.
+    are stopped, before the error is raised. Nothing arms again by itself. Stopping is seen through
+    to its end, also where the caller is cancelled meanwhile.
     """
 
     def __init__(self, amplifiers: Mapping[str, Amplifier]) -> None:
         self.phase = Phase.CLOSED
         self._amplifiers = dict(amplifiers)
+        self._silencings = 0  # how often they were disarmed, stopped or closed
+        self._limit: asyncio.Timeout | None = None  # of a play or heartbeat that is under way
 
     @property
     def last_sent(self) -> float:
         """When the last byte went out to any of them, on time.monotonic() [s]."""
-        return max(amplifier.last_sent for amplifier in self._amplifiers.values())
+        return max(amplifier.last_sent for amplifier in self._all)
+
+    @property
+    def _all(self) -> Iterable[Amplifier]:
+        return self._amplifiers.values()
 
     async def open(self) -> None:
         """Open all; raises LinkError, and then none stays open."""
         try:
-            await _all(amplifier.open() for amplifier in self._amplifiers.values())
+            await _gathered(amplifier.open() for amplifier in self._all)
         except BaseException:
             await self._close_wires()
             raise
@@ -60,71 +68,85 @@ class AmplifierGroup:
                 "the amplifiers cannot be armed: they are closed, or one of them was lost; "
                 "close what is left and open all again"
             )
+        before = self._silencings
         try:
-            await self._together(amplifier.arm() for amplifier in self._amplifiers.values())
+            await self._together(amplifier.arm() for amplifier in self._all)
+            if self._silencings != before:
+                raise CommandRefused(
+                    "the amplifiers were disarmed, stopped or closed while they were being armed, "
+                    "and stay disarmed; arm again if that is still wanted"
+                )
         except BaseException:
-            await self._each(amplifier.disarm() for amplifier in self._amplifiers.values())
+            self._leave_armed()
+            await _to_the_end(self._each(amplifier.disarm() for amplifier in self._all))
             raise
         self.phase = Phase.ARMED
 
     async def play(self, commands: Mapping[str, SafeCommand]) -> dict[str, Achieved] | None:
         """Have every amplifier play its set; what they make of it, by name.
 
-        None if they were disarmed, stopped or closed meanwhile. Raises DriverError.
+        None if they were disarmed, stopped or closed meanwhile, or `hurry` ended it. Raises
+        DriverError.
         """
-        try:
-            return await self._play(commands)
-        except DriverError as error:
-            await self._stop_unless_over(error)
-            return None
+        return await self._or_stop(self._play(commands))
 
-    async def heartbeat(self) -> None:
-        """Feed the watchdogs and see that every amplifier still is enabled; raises DriverError."""
-        try:
-            replies = await self._together(
-                amplifier.heartbeat() for amplifier in self._amplifiers.values()
-            )
-            for name, status in zip(self._amplifiers, replies, strict=True):
-                if status.state is not State.OPERATION_ENABLED:
-                    raise CommandRefused(
-                        f"amplifier {name} is in {status.state.name}, fault {status.fault.name}; "
-                        "all were stopped: clear and arm again"
-                    )
-        except DriverError as error:
-            await self._stop_unless_over(error)
+    async def heartbeat(self) -> bool:
+        """Feed the watchdogs and see that every amplifier still is enabled; raises DriverError.
+
+        False where `play` would give None.
+        """
+        return await self._or_stop(self._beat()) is not None
+
+    def hurry(self) -> None:
+        """Let a `play` or `heartbeat` that is under way end within 8 ms, answered or not."""
+        if self._limit is not None and self._limit.when() is None:
+            self._limit.reschedule(asyncio.get_running_loop().time() + PATIENCE)
 
     async def disarm(self) -> None:
         """Silent along a short ramp, then high voltage off."""
         self._leave_armed()
-        await self._together(amplifier.disarm() for amplifier in self._amplifiers.values())
+        try:
+            await self._together(amplifier.disarm() for amplifier in self._all)
+        except BaseException:
+            await self.stop()
+            raise
 
     async def stop(self) -> None:
         """Quick stop of every amplifier that can be reached; latched until `clear`."""
         self._leave_armed()
-        await self._each(amplifier.stop() for amplifier in self._amplifiers.values())
+        await _to_the_end(self._each(amplifier.stop() for amplifier in self._all))
 
     async def clear(self) -> None:
         """Acknowledge stops, and faults whose cause is gone."""
-        await self._together(amplifier.clear() for amplifier in self._amplifiers.values())
+        try:
+            await self._together(amplifier.clear() for amplifier in self._all)
+        except LinkError:
+            await self.stop()
+            raise
 
     async def close(self, silence: Mapping[str, SafeCommand]) -> None:
         """Play silence, confirm it by reading back, disarm and close; safe to call twice."""
         armed = self.phase is Phase.ARMED
+        self._leave_armed()
         self.phase = Phase.CLOSED
         try:
             if armed:
                 await self._wind_down(silence)
-        except DriverError as error:
+        except BaseException as error:
+            await self.stop()
+            if not isinstance(error, DriverError):
+                raise
             _logger.error("the amplifiers could not be silenced in order: %s", error)
-            await self._each(amplifier.stop() for amplifier in self._amplifiers.values())
         finally:
             await self._close_wires()
 
     async def _play(self, commands: Mapping[str, SafeCommand]) -> dict[str, Achieved] | None:
-        if len(commands) == 1:
-            ((name, safe),) = commands.items()
-            (single,) = await self._together([self._amplifiers[name].apply(safe)])
-            return {name: single}
+        if len(commands) == 1 or all(safe.is_silent for safe in commands.values()):
+            # One has nobody to wait for, and silence waits for nobody.
+            applied = await self._together(
+                self._amplifiers[name].apply(safe) for name, safe in commands.items()
+            )
+            return dict(zip(commands, applied, strict=True))
         await self._together(self._amplifiers[name].stage(safe) for name, safe in commands.items())
         if self.phase is not Phase.ARMED:
             return None  # a commit now would undo the silence that came in between
@@ -140,7 +162,7 @@ class AmplifierGroup:
 
     async def _wind_down(self, silence: Mapping[str, SafeCommand]) -> None:
         """Silence, proof of it, and high voltage off."""
-        await _all(self._amplifiers[name].apply(safe) for name, safe in silence.items())
+        await _gathered(self._amplifiers[name].apply(safe) for name, safe in silence.items())
         await asyncio.sleep(max(safe.ramp for safe in silence.values()))
         for _ in range(_READ_BACKS):
             statuses = await self._statuses()
@@ -149,31 +171,50 @@ class AmplifierGroup:
             await asyncio.sleep(_READ_BACK_PAUSE)
         else:
             raise CommandRefused("an amplifier reports a level after it was told to be silent")
-        await _all(amplifier.disarm() for amplifier in self._amplifiers.values())
+        await _gathered(amplifier.disarm() for amplifier in self._all)
 
-    async def _stop_unless_over(self, error: DriverError) -> None:
-        """Stop all for an error and raise it, unless it comes of having stopped already."""
-        if self.phase is Phase.ARMED:
+    async def _beat(self) -> bool:
+        """A heartbeat to every amplifier; True, or CommandRefused from one that is not enabled."""
+        replies = await self._together(amplifier.heartbeat() for amplifier in self._all)
+        for name, status in zip(self._amplifiers, replies, strict=True):
+            if status.state is not State.OPERATION_ENABLED:
+                raise CommandRefused(
+                    f"amplifier {name} is in {status.state.name}, fault {status.fault.name}; "
+                    "all were stopped: clear and arm again"
+                )
+        return True
+
+    async def _or_stop(self, exchange: Coroutine[Any, Any, _T]) -> _T | None:
+        """What the control loop wants of the amplifiers; if anything goes wrong, stop all of them.
+
+        None if `hurry` ended it, or if it failed for they were disarmed, stopped or closed.
+        """
+        limit = asyncio.timeout(None)
+        try:
+            async with limit as self._limit:
+                return await exchange
+        except Exception as error:
+            if type(error) is TimeoutError and limit.expired():  # no LinkTimeout, which is one too
+                return None
+            if isinstance(error, DriverError) and self.phase not in (Phase.ARMED, Phase.LOST):
+                return None
             await self.stop()
-            raise error
-        if self.phase is Phase.LOST:
-            raise error
+            raise
+        finally:
+            self._limit = None
 
     async def _statuses(self) -> dict[str, Status]:
         """The status of every amplifier, by name."""
-        statuses = await self._together(
-            amplifier.status() for amplifier in self._amplifiers.values()
-        )
+        statuses = await self._together(amplifier.status() for amplifier in self._all)
         return dict(zip(self._amplifiers, statuses, strict=True))
 
     async def _together(self, requests: Iterable[Coroutine[Any, Any, _T]]) -> list[_T]:
-        """Wait for the replies of all; a lost link stops the others before it is raised."""
+        """Wait for the replies of all; after a lost link nothing is played any more."""
         try:
-            return await _all(requests)
+            return await _gathered(requests)
         except LinkError:
             if self.phase is not Phase.CLOSED:
                 self.phase = Phase.LOST
-            await self._each(amplifier.stop() for amplifier in self._amplifiers.values())
             raise
 
     async def _each(self, requests: Iterable[Coroutine[Any, Any, object]]) -> None:
@@ -184,18 +225,29 @@ class AmplifierGroup:
 
     async def _close_wires(self) -> None:
         """Close every wire, whatever the others say."""
-        await self._each(amplifier.close() for amplifier in self._amplifiers.values())
+        await _to_the_end(self._each(amplifier.close() for amplifier in self._all))
 
     def _leave_armed(self) -> None:
         """Nothing more is played from here on; lost or closed amplifiers stay that."""
+        self._silencings += 1
         if self.phase is Phase.ARMED:
             self.phase = Phase.DISARMED
 
 
-async def _all(requests: Iterable[Coroutine[Any, Any, _T]]) -> list[_T]:
+async def _gathered(requests: Iterable[Coroutine[Any, Any, _T]]) -> list[_T]:
     """Wait for all, then raise the gravest of what they raised: a lost link before a refusal."""
     results = await asyncio.gather(*requests, return_exceptions=True)
     failures = [result for result in results if isinstance(result, BaseException)]
     if failures:
         raise next((error for error in failures if isinstance(error, LinkError)), failures[0])
     return [result for result in results if not isinstance(result, BaseException)]
+
+
+async def _to_the_end(work: Coroutine[Any, Any, None]) -> None:
+    """See work through, also where the caller is cancelled meanwhile; that is raised afterwards."""
+    task = asyncio.ensure_future(work)
+    try:
+        await asyncio.shield(task)
+    except asyncio.CancelledError:
+        await task
+        raise

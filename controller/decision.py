@@ -77,6 +77,11 @@ class Decider:
         """When [s] the next source is overdue unless it is heard; a decision is due then."""
         return self._tracker.next_expiry
 
+    @property
+    def owes_silence(self) -> bool:
+        """Whether nobody touches the plate any more, but what was decided last is no silence."""
+        return not self._tracker.contacts and not self._is_silent
+
     def take(self, frame: TouchFrame) -> Change:
         """Take over a touch frame; a decision is due if anything changed."""
         change = self._tracker.update(frame)

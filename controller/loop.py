@@ -142,8 +142,7 @@ class Controller:
         try:
             if self.phase is Phase.ARMED and decision.is_new:
                 await self._carry_out(decision)
-            if self.phase is Phase.ARMED and self._clock() >= self._heartbeat_due:
-                await self._group.heartbeat()
+            if self._is_heartbeat_due and await self._group.heartbeat():
                 self._heartbeat_due = self._clock() + HEARTBEAT
         except LinkError as error:
             self._tell(self._observer.link_lost, str(error))
@@ -158,6 +157,14 @@ class Controller:
             self._tally.count(reason, f"touch of {frame.source}")
         if change:
             self._wake.set()
+        if self._decider.owes_silence:
+            self._group.hurry()
+
+    @property
+    def _is_heartbeat_due(self) -> bool:
+        """Whether the amplifiers are to be told that the loop has run; silence goes before that."""
+        is_time = self.phase is Phase.ARMED and self._clock() >= self._heartbeat_due
+        return is_time and not self._decider.owes_silence
 
     @property
     def _decider(self) -> Decider:

@@ -160,9 +160,8 @@ def test_one_guard_refuses(running: Running, run_virtual: Run) -> None:
             bench.table.excitation = {"SW": Tone(110.0, 20e-6), "NE": Tone(110.0, 101e-6)}
             await bench.hold(FINGER, OTHER, seconds=0.1)
             for far_end in bench.far_ends:
-                *_, played, silent = far_end.requests(Stage)
-                assert silent.command_set.is_silent
-                assert played.command_set.is_silent == (far_end is bench.far_ends[1])
+                assert len(far_end.requests(Stage)) == 1
+                assert [each.is_silent for each in far_end.sets()] == [True, True]
             assert bench.told.refused[0].startswith("b: CommandRefused: level of channel 1")
             assert bench.controller.phase is Phase.ARMED
 
@@ -200,6 +199,112 @@ def test_stop_between_stage_and_commit(run_virtual: Run, running: Running) -> No
             await asyncio.sleep(0.1)
             assert len(bench.far_ends[1].requests(Commit)) == commits
             assert bench.told.refused == []
+
+    run_virtual(scenario())
+
+
+@pytest.mark.parametrize("silencing", ["disarm", "stop", "close"])
+def test_silence_asked_for_while_arming(
+    run_virtual: Run, make_bench: MakeBench, silencing: str
+) -> None:
+    """Whoever silences while another arms is the one who wins, and the other is told."""
+
+    async def scenario() -> None:
+        bench = make_bench("a", "b")
+        await bench.controller.open()
+        for far_end in bench.far_ends:
+            far_end.delay = 0.005
+        arming = asyncio.create_task(bench.controller.arm())
+        await asyncio.sleep(0.001)
+        await getattr(bench.controller, silencing)()
+        with pytest.raises(CommandRefused, match="while they were being armed"):
+            await arming
+        assert bench.controller.phase is (Phase.CLOSED if silencing == "close" else Phase.DISARMED)
+        if silencing != "close":
+            states = {far_end.state for far_end in bench.far_ends}
+            assert State.OPERATION_ENABLED not in states
+
+    run_virtual(scenario())
+
+
+def test_arming_again_that_is_refused(run_virtual: Run, running: Running) -> None:
+    """Amplifiers that were armed and cannot be armed anew are disarmed, and nothing is played."""
+
+    async def scenario() -> None:
+        async with running("a", "b") as bench:
+            bench.far_ends[0].state = State.SWITCH_ON_DISABLED  # the other one refuses
+            with pytest.raises(CommandRefused):
+                await bench.controller.arm()
+            assert bench.controller.phase is Phase.DISARMED
+            assert {far_end.state for far_end in bench.far_ends} == {State.SWITCH_ON_DISABLED}
+
+    run_virtual(scenario())
+
+
+def test_a_disarm_that_fails(run_virtual: Run, running: Running) -> None:
+    """If one amplifier does not disarm, all are stopped, and the error is raised."""
+
+    async def scenario() -> None:
+        async with running("a", "b") as bench:
+            bench.far_ends[1].answer = lambda request: (
+                Nak(NakCode.BUSY) if isinstance(request, Disarm) else None
+            )
+            with pytest.raises(CommandRefused, match="busy"):
+                await bench.controller.disarm()
+            assert {far_end.state for far_end in bench.far_ends} == {State.QUICK_STOP_ACTIVE}
+
+    run_virtual(scenario())
+
+
+def test_a_stop_is_seen_through(run_virtual: Run, make_bench: MakeBench) -> None:
+    """A loop that is cancelled while it stops the amplifiers ends when they are stopped."""
+
+    async def scenario() -> None:
+        bench = make_bench("a", "b")
+        await bench.controller.open()
+        await bench.controller.arm()
+        task = asyncio.create_task(bench.controller.run())
+        await asyncio.sleep(0.001)
+        for far_end in bench.far_ends:
+            far_end.delay = 0.01
+        bench.far_ends[0].answer = lambda request: (
+            Nak(NakCode.WRONG_STATE) if isinstance(request, Ping) else None
+        )
+        await asyncio.sleep(0.065)  # the next heartbeat goes out after 50 ms
+        assert [len(far_end.requests(Stop)) for far_end in bench.far_ends] == [1, 1]
+        assert {far_end.state for far_end in bench.far_ends} == {State.OPERATION_ENABLED}
+        task.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await task
+        assert {far_end.state for far_end in bench.far_ends} == {State.QUICK_STOP_ACTIVE}
+        await bench.controller.close()
+
+    run_virtual(scenario())
+
+
+@pytest.mark.parametrize("kind", [Stage, Commit, GetStatus, Ping])
+def test_a_bug_stops_all(run_virtual: Run, make_bench: MakeBench, kind: type[Request]) -> None:
+    """An exception that nobody foresaw, between stage and commit too, leaves nothing vibrating."""
+
+    async def scenario() -> None:
+        bench = make_bench("a", "b")
+        await bench.controller.open()
+        await bench.controller.arm()
+        task = asyncio.create_task(bench.controller.run())
+        await asyncio.sleep(0.01)
+
+        def fail(request: Request) -> Reply | None:
+            if isinstance(request, kind):
+                raise ZeroDivisionError("a bug")
+            return None
+
+        bench.far_ends[1].answer = fail
+        await bench.hold(FINGER, seconds=0.1)
+        with pytest.raises(ZeroDivisionError):
+            await task
+        assert {far_end.state for far_end in bench.far_ends} == {State.QUICK_STOP_ACTIVE}
+        assert bench.controller.phase is Phase.DISARMED
+        await bench.controller.close()
 
     run_virtual(scenario())
 

@@ -20,7 +20,9 @@ from drivers.protocol.messages import (
     GetCaps,
     Hello,
     Ping,
+    Request,
 )
+from drivers.watchdog import HEARTBEAT
 from model.errors import InputError
 from model.excitation import Excitation, Tone
 
@@ -120,6 +122,59 @@ def test_last_finger_up(run_virtual: Run, running: Running) -> None:
             assert bench.far_end.times(Apply)[-1] + zero.ramp - lifted <= 0.020
             assert bench.told.silenced[-1].reason == "nobody touches the plate"
             assert bench.told.silenced[-1].latency == 0.0
+
+    run_virtual(scenario())
+
+
+@pytest.mark.parametrize("kind", [Apply, Ping])
+def test_last_finger_up_while_an_answer_is_awaited(
+    run_virtual: Run, running: Running, kind: type[Request]
+) -> None:
+    """Zero is reached within 20 ms also where the answer to something else does not come."""
+
+    async def scenario() -> None:
+        async with running() as bench:
+            due = asyncio.get_running_loop().time()
+            if kind is Ping:
+                await bench.hold(FINGER, seconds=0.1)
+                due = bench.far_end.times(Ping)[-1] + HEARTBEAT
+            bench.far_end.delay = 0.045
+            bench.touch(FINGER)
+            await asyncio.sleep(due + 0.001 - asyncio.get_running_loop().time())
+            assert isinstance(bench.far_end.asked[-1][1], kind)
+            lifted = asyncio.get_running_loop().time()
+            bench.touch()
+            await asyncio.sleep(0.02)
+            zero = bench.far_end.sets()[-1]
+            assert zero.is_silent
+            assert bench.far_end.times(Apply)[-1] + zero.ramp - lifted <= 0.020
+            bench.far_end.delay = 0.0
+            beats = len(bench.far_end.times(Ping))
+            await asyncio.sleep(0.06)
+            assert len(bench.far_end.times(Ping)) > beats
+            assert bench.controller.phase is Phase.ARMED
+
+    run_virtual(scenario())
+
+
+def test_last_finger_up_before_a_heartbeat(run_virtual: Run, running: Running) -> None:
+    """Silence goes before a heartbeat that is due, and several amplifiers fall silent at once."""
+
+    async def scenario() -> None:
+        async with running("a", "b") as bench:
+            await asyncio.sleep(0.045)
+            for far_end in bench.far_ends:
+                far_end.delay = 0.004
+            bench.touch(FINGER)
+            await asyncio.sleep(0.002)
+            lifted = asyncio.get_running_loop().time()
+            bench.touch()
+            await asyncio.sleep(0.02)
+            for far_end in bench.far_ends:
+                assert far_end.sets()[-1].is_silent
+                assert far_end.times(Apply)[-1] + 0.010 - lifted <= 0.020
+                silent, beat = far_end.times(Apply)[-1], far_end.times(Ping)[-1]
+                assert lifted < silent < beat
 
     run_virtual(scenario())
 

@@ -1,11 +1,13 @@
-"""The model's share of the `era` command: config, plate, table."""
+"""The model's share of the `era` command: config, plate, figure, study, table."""
 
 import typer
 
 from model.config_cli import config_app
 from model.errors import InputError
+from model.figure_cli import figure_app
 from model.plate_cli import plate_app
 from model.plate_show_cli import materials, show
+from model.study_cli import study_app
 from model.table_cli import table_app
 
 plate_app.command()(materials)
@@ -14,6 +16,8 @@ plate_app.command()(show)
 app = typer.Typer()
 app.add_typer(config_app, name="config")
 app.add_typer(plate_app, name="plate")
+app.add_typer(figure_app)
+app.add_typer(study_app)
 app.add_typer(table_app, name="table")
 
 EXIT_STATUS: dict[type[BaseException], int] = {InputError: 2}

@@ -8,7 +8,9 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-Columns: TypeAlias = Mapping[str, Sequence[object] | NDArray[np.generic]]
+Column: TypeAlias = Sequence[object] | NDArray[np.generic]
+
+Columns: TypeAlias = Mapping[str, Column]
 """Columns of equal length by their name, which ends in their unit."""
 
 

@@ -1,4 +1,4 @@
-"""What the pictures share: fields over the plate, marks for ERAs and nulls, boxes of statistics."""
+"""What the pictures share: fields over the plate, marks for ERAs and nulls."""
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
@@ -8,7 +8,6 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
 from matplotlib.figure import Figure
-from matplotlib.patches import Rectangle
 
 from model.actuator import Era
 from model.arrays import FloatArray
@@ -20,7 +19,17 @@ from model.vibration import G
 COLORS = "viridis"
 ACTIVE_COLOR = "#d62728"
 RESTING_COLOR = "#2ca02c"
-BOX_COLOR = "#9ecae1"
+
+POINTS_ALONG = 97
+
+
+def raster(plate: Plate) -> tuple[int, int]:
+    """How many points along x and y a field of the plate is drawn with, evenly spaced.
+
+    POINTS_ALONG the longer side: on the paper's plate 60 in the shortest wave of its figures.
+    """
+    step = max(plate.length, plate.width) / (POINTS_ALONG - 1)
+    return max(2, round(plate.length / step) + 1), max(2, round(plate.width / step) + 1)
 
 
 def draw_field(
@@ -58,40 +67,6 @@ def draw_eras(axes: Axes, eras: Sequence[Era], *, active: Collection[str]) -> No
 def draw_nulls(axes: Axes, nulls: FloatArray) -> None:
     """Mark nulls [m] (n, 2) by red crosses, as the paper does."""
     axes.plot(*(100 * nulls.T), "x", color="red", ms=5, mew=1.2, clip_on=False)
-
-
-def draw_layout(
-    axes: Axes, plate: Plate, positions: FloatArray, *, active: Collection[int]
-) -> None:
-    """Draw a small plate with ERAs at positions [m] (n, 2); the active ones, by number, in red."""
-    axes.add_patch(Rectangle((0, 0), plate.length, plate.width, fc="0.93", ec="0.4"))
-    colors = [ACTIVE_COLOR if era in active else RESTING_COLOR for era in range(len(positions))]
-    axes.scatter(*positions.T, s=36, c=colors, edgecolors="white", clip_on=False, zorder=3)
-    axes.set_aspect("equal")
-    axes.set_xlim(-0.05 * plate.length, 1.05 * plate.length)
-    axes.set_ylim(-0.05 * plate.width, 1.05 * plate.width)
-    axes.axis("off")
-
-
-def draw_boxes(axes: Axes, labels: Sequence[str], five: FloatArray) -> None:
-    """Draw boxes of quartiles with whiskers to minimum and maximum, (boxes, 5) [m/s²], in g."""
-    keys = ("whislo", "q1", "med", "q3", "whishi")
-    stats = [
-        {"label": label, "fliers": [], **dict(zip(keys, row / G, strict=True))}
-        for label, row in zip(labels, five, strict=True)
-    ]
-    axes.bxp(
-        stats,
-        widths=0.6,
-        patch_artist=True,
-        showfliers=False,
-        boxprops={"facecolor": BOX_COLOR},
-        medianprops={"color": "black", "linewidth": 1.5},
-    )
-    axes.set_ylim(bottom=0)
-    axes.grid(axis="y", color="0.9")
-    axes.set_axisbelow(True)
-    axes.set_ylabel("cumulative peak acceleration / g")
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,97 @@
+"""What a study leaves behind: its files, and its summary."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from model.activation import STATISTICS
+from model.csv_file import Columns, write_columns
+from model.document import Value
+from model.figures import save_figure
+from model.rig import Rig
+from model.studies.cases import Cases
+from model.studies.pictures import PICTURES
+from model.studies.ranking import Ranking
+from model.studies.solve import DRIVE_NAMES, DRIVES, CaseResults
+from model.studies.wording import in_words, rig_yaml
+
+SHOWN = 10
+"""So many cases of the ranking are in a summary; all are in the CSV file."""
+
+
+def write_outcome(
+    folder: Path, study: str, rig: Rig, *, data: Mapping[str, Value], ranking: Ranking
+) -> list[Path]:
+    """Write the recommended rig, the CSV of all cases and the box plots; the rig comes first.
+
+    data: what the rig's file says. Raises OSError where the folder cannot be written.
+    """
+    recommended = folder / "recommended.yaml"
+    text = rig_yaml(data, rig, ranking, ranking.recommended)
+    recommended.write_text(text, encoding="utf-8")
+    table = folder / f"{study}.csv"
+    write_columns(table, all_columns(ranking.cases, ranking.results))
+    for name, figure in PICTURES[study].items():
+        save_figure(figure(rig, ranking), folder / name)
+    return [recommended, table, *(folder / name for name in PICTURES[study])]
+
+
+def ranking_summary(rig: Rig, ranking: Ranking) -> dict[str, Any]:
+    """How cases were ranked, the head of the ranking, the rig as it is, and what to build."""
+    ranks = {int(case): rank for rank, case in enumerate(ranking.order, start=1)}
+    shown = [int(case) for case in ranking.order[:SHOWN]]
+    if ranking.own is not None and ranking.own not in shown:
+        shown.append(ranking.own)
+    best = ranking.recommended
+    return {
+        "ranked_by": "median_m_s2",
+        "driven": DRIVE_NAMES[DRIVES[ranking.drive]],
+        "ranking": [{"rank": ranks[case], **case_summary(rig, ranking, case)} for case in shown],
+        "recommended": {
+            "words": in_words(rig, ranking, best),
+            "rank": ranks[best],
+            **case_summary(rig, ranking, best),
+        },
+    }
+
+
+def case_summary(rig: Rig, ranking: Ranking, case: int) -> dict[str, object]:
+    """One case as JSON takes it: where its ERAs are, which are driven, and its statistics."""
+    eras = ranking.cases.eras_of(case, rig.eras)
+    driven = ranking.results.active_eras(case, ranking.drive)
+    statistics = ranking.results.statistics[case, ranking.drive]
+    return {
+        "layout": ranking.cases.names[case],
+        "at_m": {era.name: [era.x, era.y] for era in eras},
+        "stiffness_n_m": {era.name: era.stiffness for era in eras},
+        "active": [eras[era].name for era in driven],
+        **{
+            f"{name.replace(' ', '_')}_m_s2": float(value)
+            for name, value in zip(STATISTICS[:-1], statistics[:-1], strict=True)
+        },
+        "unfelt_share": float(statistics[-1]),
+    }
+
+
+def all_columns(cases: Cases, results: CaseResults) -> Columns:
+    """Every case and drive, one a row."""
+    columns: dict[str, list[object]] = {
+        name: [] for name in ("layout", "eras", "stiffness_factor", "at_m", "driven", "active")
+    }
+    rows, drives = np.nonzero(~np.isnan(results.statistics[..., 0]))
+    for case, drive in zip(rows.tolist(), drives.tolist(), strict=True):
+        positions = cases.positions_of(case)
+        columns["layout"].append(cases.names[case])
+        columns["eras"].append(len(positions))
+        columns["stiffness_factor"].append(float(cases.stiffness_factors[case]))
+        columns["at_m"].append(" ".join(f"({x:.6g};{y:.6g})" for x, y in positions))
+        columns["driven"].append(DRIVES[drive])
+        active = results.active_eras(case, drive)
+        columns["active"].append("+".join(str(era + 1) for era in active))
+    statistics = results.statistics[rows, drives]
+    return columns | {
+        f"{name.replace(' ', '_')}{'' if name == STATISTICS[-1] else '_m_s2'}": statistics[:, k]
+        for k, name in enumerate(STATISTICS)
+    }

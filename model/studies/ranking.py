@@ -1,0 +1,89 @@
+"""Which case is best, and which to recommend."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from model.activation import MEDIAN
+from model.arrays import FloatArray, IntArray
+from model.studies.cases import OWN, VACANT, Cases
+from model.studies.solve import CaseResults
+
+GOOD_ENOUGH = 0.9
+"""Fewer or softer ERAs are recommended where they reach this share of the best median."""
+
+
+@dataclass(frozen=True)
+class Ranking:
+    """Cases by the median over the plate of what a drive makes of them, the best first.
+
+    drive: number in DRIVES; order (n,) numbers of the cases that can be driven so.
+    """
+
+    cases: Cases
+    results: CaseResults
+    drive: int
+    order: IntArray
+
+    @property
+    def medians(self) -> FloatArray:
+        """Median cumulative peak acceleration [m/s²] of every case, NaN where it has none."""
+        return np.asarray(self.results.statistics[:, self.drive, MEDIAN])
+
+    @property
+    def best(self) -> int:
+        """The case of rank one."""
+        return int(self.order[0])
+
+    @property
+    def middle(self) -> int:
+        """The case in the middle of the ranking."""
+        return int(self.order[len(self.order) // 2])
+
+    @property
+    def worst(self) -> int:
+        """The last case."""
+        return int(self.order[-1])
+
+    @property
+    def own(self) -> int | None:
+        """The rig as it is, if it is among the ranked cases."""
+        for case in self.order:
+            if self.cases.names[case] == OWN and self.cases.stiffness_factors[case] == 1:
+                return int(case)
+        return None
+
+    @property
+    def recommended(self) -> int:
+        """Of the cases that reach GOOD_ENOUGH of the best, the best with fewest and softest ERAs.
+
+        In a study of placement that is the best case.
+        """
+        counts = era_counts(self.cases)
+        good = [
+            int(case)
+            for case in self.order
+            if self.medians[case] >= GOOD_ENOUGH * self.medians[self.best]
+        ]
+        return min(good, key=lambda case: (counts[case], self.cases.stiffness_factors[case]))
+
+    def best_by(self, values: FloatArray | IntArray) -> dict[float, int]:
+        """The best case for each distinct value (n,), such as the number of ERAs; ascending."""
+        best: dict[float, int] = {}
+        for case in self.order:
+            best.setdefault(float(values[case]), int(case))
+        return dict(sorted(best.items()))
+
+
+def rank(cases: Cases, results: CaseResults, *, drive: int) -> Ranking:
+    """Rank cases by the median; those with too few ERAs for the drive are left out."""
+    medians = results.statistics[:, drive, MEDIAN]
+    ranked = np.flatnonzero(~np.isnan(medians))
+    # Equal by symmetry is equal: then in the order of the cases, whatever rounding says.
+    rounded = np.array([float(f"{median:.9g}") for median in medians[ranked]])
+    return Ranking(cases, results, drive, ranked[np.argsort(-rounded, kind="stable")])
+
+
+def era_counts(cases: Cases) -> IntArray:
+    """How many ERAs each case has, (n,)."""
+    return np.asarray((cases.places != VACANT).sum(axis=1))

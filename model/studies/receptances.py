@@ -1,0 +1,82 @@
+"""The free plate seen from all places where ERAs may stand: what a study of layouts solves once.
+
+With the receptance between these places, and from them to the points that are looked at, every
+layout is a system of equations as small as its number of ERAs for each frequency.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from model.actuator import Era
+from model.arrays import ComplexArray, FloatArray, IntArray
+from model.errors import InputError
+from model.free_plate import solve_free_plate
+from model.harmonic import hold_and_drive
+from model.layouts import carried_loads
+from model.rig import Rig
+
+# More than this [bytes] and the machine is likely to run out of memory.
+_MOST_BYTES = 2 << 30
+
+# ERAs so soft [N/m] that they drive the plate and do not hold it: receptance times stiffness, about
+# 1e-11, is below the rounding of a double.
+_SOFT = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class Receptances:
+    """Receptance [m/N] of a plate without ERAs, with the point masses that it carries.
+
+    frequencies (f,) [Hz]; between (f, c, c), from place to place; to_points (f, c, p).
+    """
+
+    frequencies: FloatArray
+    between: ComplexArray
+    to_points: ComplexArray
+
+    def acceleration(self, places: IntArray, eras: tuple[Era, ...]) -> ComplexArray:
+        """Acceleration [m/s²] of each ERA alone at full stroke, the others holding: (f, eras, p).
+
+        places: at which of the c places each ERA stands; its own position is not looked at.
+        """
+        omega = 2 * np.pi * self.frequencies
+        hold, drive = hold_and_drive(eras, (), omega)
+        at_eras = self.between[:, places[:, None], places]
+        one = np.eye(len(eras))
+        # Force on the plate by ERA driven: what its base pushes less what all ERAs hold back.
+        force = np.linalg.solve(one + hold[:, :, None] * at_eras, drive[:, :, None] * one)
+        scaled = -(omega**2)[:, None, None] * force.transpose(0, 2, 1)
+        return np.asarray(scaled @ self.to_points[:, places])
+
+
+def solve_receptances(
+    rig: Rig, positions: FloatArray, points: FloatArray, frequencies: FloatArray
+) -> Receptances:
+    """Solve a rig's plate, without its ERAs, for places (c, 2) and points (p, 2) [m].
+
+    Raises InputError for frequencies [Hz] that the mesh cannot carry, and where the result would
+    not fit into memory.
+    """
+    count = len(positions)
+    size = 16 * len(frequencies) * count * (count + len(points))
+    if size > _MOST_BYTES:
+        raise InputError(
+            f"{count} places, {len(points)} points and {len(frequencies)} frequencies take "
+            f"{size / 1e9:.1f} GB; take fewer --candidates or fewer --frequencies"
+        )
+    free_plate = solve_free_plate(rig.plate, rig.mesh, frequency_max=float(frequencies.max()))
+    drivers = [
+        Era(f"E{number}", x, y, _SOFT, damping=0.0, bolt_mass=0.0, stroke=1.0)
+        for number, (x, y) in enumerate(positions.tolist())
+    ]
+    acceleration = free_plate.acceleration(
+        drivers, frequencies, np.vstack([positions, points]), loads=carried_loads(rig)
+    )
+    omega = 2 * np.pi * frequencies
+    receptance = acceleration / (-(omega**2) * _SOFT)[:, None, None]
+    return Receptances(
+        frequencies,
+        np.ascontiguousarray(receptance[:, :, :count]),
+        np.ascontiguousarray(receptance[:, :, count:]),
+    )

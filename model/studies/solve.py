@@ -1,0 +1,125 @@
+"""From cases to statistics: the part of a study that workers share out among them."""
+
+import hashlib
+import json
+from dataclasses import asdict, dataclass
+from functools import cache
+from importlib import metadata, resources
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model.activation import (
+    MEDIAN,
+    STATISTICS,
+    activation_sets,
+    cumulative_statistics,
+    equal_area_points,
+    felt_acceleration,
+)
+from model.actuator import Era
+from model.arrays import FloatArray
+from model.errors import InputError
+from model.harmonic import check_frequencies
+from model.rig import Rig
+from model.studies.cases import Cases
+from model.studies.receptances import Receptances, solve_receptances
+
+DRIVES = ("1", "2", "all")
+"""How many ERAs are active: of each case the best single one and the best pair, and all of them."""
+
+
+DRIVE_NAMES = {"1": "best single ERA", "2": "best pair of ERAs", "all": "all ERAs"}
+
+
+@dataclass(frozen=True)
+class StudyProblem:
+    """All that the statistics of a case depend on but the case itself.
+
+    positions (c, 2) [m]: where ERAs may stand; frequencies (f,) [Hz]; code_version: of the code
+    that made the problem.
+    """
+
+    rig: Rig
+    positions: FloatArray
+    frequencies: FloatArray
+    code_version: str
+
+    @property
+    def points(self) -> FloatArray:
+        """Points [m] (p, 2) over which the statistics are taken."""
+        highest = float(self.frequencies.max())
+        return equal_area_points(self.rig.plate, frequency_max=highest)
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 over everything in it but the positions, of which a case names its own."""
+        digest = hashlib.sha256()
+        mesh = json.dumps(asdict(self.rig.mesh), sort_keys=True)
+        for text in (self.rig.fingerprint, mesh, self.code_version):
+            digest.update(f"{text}\n".encode())
+        digest.update(self.frequencies.tobytes())
+        return digest.hexdigest()
+
+    def solve(self) -> Receptances:
+        """Solve the plate, once for all cases; raises InputError as `solve_receptances` does."""
+        return solve_receptances(self.rig, self.positions, self.points, self.frequencies)
+
+
+@dataclass(frozen=True)
+class CaseResults:
+    """What came out: statistics (n, 3, 6), a row for each of DRIVES; NaN where it has too few ERAs.
+
+    active: (n, 3), bit k set where ERA k of the case is driven.
+    """
+
+    statistics: FloatArray
+    active: NDArray[np.uint64]
+
+    def active_eras(self, case: int, drive: int) -> tuple[int, ...]:
+        """Numbers of the ERAs that are driven."""
+        bits = int(self.active[case, drive])
+        return tuple(era for era in range(bits.bit_length()) if bits >> era & 1)
+
+
+def study_problem(rig: Rig, cases: Cases, frequencies: FloatArray) -> StudyProblem:
+    """The problem of a study; raises InputError for frequencies [Hz] that the mesh cannot carry."""
+    if len(frequencies) == 0:
+        raise InputError("a study needs at least one frequency")
+    check_frequencies(rig.plate, rig.mesh, frequencies)
+    return StudyProblem(rig, cases.positions, frequencies, code_version())
+
+
+def solve_cases(receptances: Receptances, eras: tuple[Era, ...], cases: Cases) -> CaseResults:
+    """Statistics of every case, its ERAs like those of the rig; no case depends on another."""
+    felt = felt_acceleration(receptances.frequencies)
+    statistics = np.full((len(cases), len(DRIVES), len(STATISTICS)), np.nan)
+    active = np.zeros((len(cases), len(DRIVES)), dtype=np.uint64)
+    for case in range(len(cases)):
+        placed = cases.eras_of(case, eras)
+        acceleration = receptances.acceleration(cases.places_of(case), placed)
+        every = cumulative_statistics(acceleration, felt=felt)
+        sets = activation_sets(len(placed))
+        for drive, size in enumerate((1, 2, len(placed))):
+            rows = [row for row, members in enumerate(sets) if len(members) == size]
+            if not rows:
+                continue
+            # Equal by symmetry is equal: the first then, not the one that rounding favours.
+            best = max(rows, key=lambda row: float(f"{every[row, MEDIAN]:.9g}"))
+            statistics[case, drive] = every[best]
+            active[case, drive] = sum(1 << era for era in sets[best])
+    return CaseResults(statistics, active)
+
+
+@cache
+def code_version() -> str:
+    """Version of the distribution, and the beginning of a SHA-256 over the source of the model."""
+    digest = hashlib.sha256()
+    pending = [resources.files("model")]
+    while pending:
+        for entry in sorted(pending.pop().iterdir(), key=lambda entry: entry.name):
+            if entry.is_dir():
+                pending.append(entry)
+            elif entry.name.endswith(".py"):
+                digest.update(entry.read_bytes())
+    return f"{metadata.version('era-haptics')}+{digest.hexdigest()[:12]}"

@@ -1,0 +1,61 @@
+"""A case of a study in words, and as a rig file to paste."""
+
+from collections.abc import Mapping
+
+import yaml
+
+from model.document import Value
+from model.plate import Plate
+from model.rig import Rig
+from model.studies.ranking import Ranking
+
+
+def in_words(rig: Rig, ranking: Ranking, case: int) -> str:
+    """One case in a sentence: where the ERAs stand, how stiff they are, which to drive."""
+    eras = ranking.cases.eras_of(case, rig.eras)
+    places = "; ".join(f"{era.name} {place_in_words(era.x, era.y, rig.plate)}" for era in eras)
+    driven = [eras[era].name for era in ranking.results.active_eras(case, ranking.drive)]
+    stiffness = sorted({era.stiffness for era in eras})
+    of_stiffness = " and ".join(f"{value / 1000:.4g}" for value in stiffness)
+    count = "one ERA" if len(eras) == 1 else f"{len(eras)} ERAs"
+    return f"{count} of {of_stiffness} kN/m: {places}. Strongest driven: {', '.join(driven)}."
+
+
+def place_in_words(x: float, y: float, plate: Plate) -> str:
+    """A place [m] as one would tell it: `at the corner (0, 0)`, `on the edge y = 0, 30 % along`."""
+    along, across = x / plate.length, y / plate.width
+    at_x_end, at_y_end = (min(share, 1 - share) < 1e-6 for share in (along, across))
+    millimetres = f"({1000 * x:.0f}, {1000 * y:.0f}) mm"
+    if at_x_end and at_y_end:
+        return f"at the corner {millimetres}"
+    if at_y_end:
+        return f"on the edge y = {1000 * y:.0f} mm, {100 * along:.0f} % along, {millimetres}"
+    if at_x_end:
+        return f"on the edge x = {1000 * x:.0f} mm, {100 * across:.0f} % up, {millimetres}"
+    return f"inside, {100 * along:.0f} % along and {100 * across:.0f} % up, {millimetres}"
+
+
+def rig_yaml(data: Mapping[str, Value], rig: Rig, ranking: Ranking, case: int) -> str:
+    """A rig file like the one that was studied (its data), with the ERAs of one case.
+
+    ERAs keep the wiring of the rig's; more of them go on with the channels of its first amplifier.
+    """
+    wiring = list(rig.wiring.values())
+    first = wiring[0].amplifier
+    free = 1 + max(channel.number for channel in wiring if channel.amplifier == first)
+    eras: dict[str, Value] = {}
+    for number, era in enumerate(ranking.cases.eras_of(case, rig.eras)):
+        channel = wiring[number] if number < len(wiring) else None
+        eras[era.name] = {
+            "at": [era.x, era.y],
+            "stiffness": era.stiffness,
+            "damping": era.damping,
+            "bolt_mass": era.bolt_mass,
+            "stroke": era.stroke,
+            "amplifier": channel.amplifier if channel else first,
+            "channel": channel.number if channel else free + number - len(wiring),
+        }
+    comment = f"# Recommended by a study. {in_words(rig, ranking, case)}\n"
+    return comment + yaml.safe_dump(
+        {**data, "eras": eras}, sort_keys=False, allow_unicode=True, default_flow_style=None
+    )

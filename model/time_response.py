@@ -66,35 +66,49 @@ class PlateInTime:
     the reduced coordinates are vectors @ z; inverse: of the vectors; participation (2 r, eras).
     """
 
+    reduced: ReducedPlate
     eras: tuple[Era, ...]
     eigenvalues: ComplexArray
     vectors: ComplexArray
     inverse: ComplexArray
     participation: ComplexArray
 
-    @property
+    @cached_property
     def displacement(self) -> ComplexArray:
         """Displacement of the reduced coordinates in each eigenvector, (r, 2 r)."""
         return self.vectors[: len(self.vectors) // 2]
 
     def answer(self, era: int, term: Term) -> Answer:
         """The particular solution for one term of one ERA's base."""
-        a0, a1 = self.particular(era, 1j * term.omega, term.c0, term.c1)
-        return Answer(term, self.displacement @ a0, self.displacement @ a1)
+        a0, a1 = self.particular([era], np.array([1j * term.omega]), [term.c0], [term.c1])
+        return Answer(term, self.displacement @ a0[0], self.displacement @ a1[0])
 
     def particular(
-        self, era: int, s: complex, c0: complex, c1: complex
+        self,
+        eras: Sequence[int],
+        s: ComplexArray,
+        c0: Sequence[complex] | ComplexArray,
+        c1: Sequence[complex] | ComplexArray,
     ) -> tuple[ComplexArray, ComplexArray]:
-        """z(t) = (a0 + a1 t) exp(s t), (2 r,) each, for a base y(t) = (c0 + c1 t) exp(s t) [m].
+        """z(t) = (a0 + a1 t) exp(s t), (n, 2 r) each, for bases y(t) = (c0 + c1 t) exp(s t) [m].
 
-        s [1/s] must not be an eigenvalue, as no imaginary number is where anything damps.
+        eras, s [1/s], c0, c1: (n,), one ERA alone in each row. s must not be an eigenvalue, as no
+        imaginary number is where anything damps.
         """
-        k, c = self.eras[era].stiffness, self.eras[era].damping
-        force0 = k * c0 + c * (c1 + s * c0)
-        force1 = (k + c * s) * c1
-        gap = s - self.eigenvalues
-        a1 = self.participation[:, era] * force1 / gap
-        return (self.participation[:, era] * force0 - a1) / gap, a1
+        k = np.array([self.eras[era].stiffness for era in eras])
+        c = np.array([self.eras[era].damping for era in eras])
+        c0, c1 = np.asarray(c0), np.asarray(c1)
+        push = self.participation.T[list(eras)]
+        force0 = push * (k * c0 + c * (c1 + s * c0))[:, None]
+        force1 = push * ((k + c * s) * c1)[:, None]
+        gap = s[:, None] - self.eigenvalues
+        a1 = force1 / gap
+        return (force0 - a1) / gap, a1
+
+    @cached_property
+    def acceleration(self) -> ComplexArray:
+        """Acceleration of the reduced coordinates in each eigenvector left free, (r, 2 r)."""
+        return self.displacement * self.eigenvalues**2
 
     @cached_property
     def _half(self) -> NDArray[np.bool_]:
@@ -147,7 +161,9 @@ def plate_in_time(
             "critically; change an ERA's damping by a per mille"
         )
     push = np.vstack([np.zeros((r, len(eras))), inverse @ reduced.at(era_positions(eras)).T])
-    return PlateInTime(tuple(eras), eigenvalues, vectors, inverse_vectors, inverse_vectors @ push)
+    return PlateInTime(
+        reduced, tuple(eras), eigenvalues, vectors, inverse_vectors, inverse_vectors @ push
+    )
 
 
 def modal_matrices(

@@ -192,6 +192,8 @@ class SimulatedAmplifier:
         return None
 
     def _stage(self, wanted: CommandSet) -> Reply:
+        if wanted.token in self._tokens:  # a late copy, which must not oust what is staged now
+            return Nak(NakCode.BAD_TOKEN)
         try:
             staged = check_and_quantise(wanted, self.capabilities)
         except RefusedSet as refusal:
@@ -202,7 +204,7 @@ class SimulatedAmplifier:
     def _commit(self, token: int, now: float) -> Reply:
         if self._active is not None and self._active.token == token:
             return Achieved(token, self._active.commands)
-        if self._staged is None or self._staged.token != token or token in self._tokens:
+        if self._staged is None or self._staged.token != token:
             return Nak(NakCode.BAD_TOKEN)
         wanted, self._staged = self._staged, None
         commands = {command.channel: command for command in wanted.commands}

@@ -266,6 +266,18 @@ def test_a_token_is_applied_once() -> None:
     assert status(amplifier, 0.3).token == 1
 
 
+@pytest.mark.parametrize("late", [Stage, Apply])
+def test_a_late_copy_leaves_what_is_staged(late: type[Stage] | type[Apply]) -> None:
+    """A copy of an earlier set is refused, and the set that is staged meanwhile can be played."""
+    amplifier = armed()
+    for token in (1, 2):
+        amplifier.handle(Apply(playing(token, 0.1 * token)), 0.0)
+    amplifier.handle(Stage(playing(3, 0.3)), 0.0)
+    refused(amplifier.handle(late(playing(1, 0.1)), 0.0), NakCode.BAD_TOKEN)
+    assert isinstance(amplifier.handle(Commit(3), 0.0), Achieved)
+    assert status(amplifier, 0.0).levels[0] == pytest.approx(0.3)
+
+
 def test_nothing_moves_before_the_commit() -> None:
     """Stage changes no output; Commit of its token does, of any other does not."""
     amplifier = armed()

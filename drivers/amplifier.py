@@ -59,8 +59,9 @@ class Amplifier:
     """One amplifier over one backend; at most one request is on the wire at any time.
 
     A reply that does not come is asked for twice more; tokens make that safe. After a LinkError
-    the object is lost for good: every later call raises LinkError at once, nothing re-arms.
-    reply_timeout [s]: how long one request may take.
+    it is lost until it is closed and opened anew: every other call raises LinkError at once, and
+    nothing re-arms.
+    reply_timeout [s]: how long it may take over one request.
     """
 
     def __init__(self, backend: Backend, *, reply_timeout: float = REPLY_TIMEOUT) -> None:
@@ -106,6 +107,7 @@ class Amplifier:
         """Open the wire and ask who is there and what it can play; its state is left alone."""
         await self._backend.open()
         self._loss = None
+        self._unanswered = 0
         try:
             identity = await self._ask(Hello(), expect=Identity, timeout=OPEN_TIMEOUT)
             if identity.protocol_version != PROTOCOL.version:

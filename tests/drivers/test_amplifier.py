@@ -161,6 +161,19 @@ async def test_three_lost_replies_lose_the_amplifier(
     assert len(backend.requests) == 3
 
 
+async def test_a_lost_amplifier_that_is_opened_again_has_all_its_retries(
+    amplifier: Amplifier, backend: ScriptedBackend
+) -> None:
+    """What was left unanswered before the loss does not count against the new link."""
+    backend.script += [LinkTimeout("no answer")] * 3
+    with pytest.raises(LinkTimeout):
+        await amplifier.heartbeat()
+    await amplifier.close()
+    backend.script += [LinkTimeout("still starting")] * 2
+    await amplifier.open()
+    assert await amplifier.status() == STATUS
+
+
 async def test_a_lost_link_is_not_retried(amplifier: Amplifier, backend: ScriptedBackend) -> None:
     """A LinkError that is no timeout is final at the first."""
     backend.script.append(LinkError("unplugged"))

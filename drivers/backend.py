@@ -22,9 +22,10 @@ class Backend(ABC):
 
     @abstractmethod
     async def exchange(self, request: Request, *, timeout: float) -> Reply:
-        """Send one request and wait [s] for its own reply; a late reply to another is dropped.
+        """Send one request and wait for its own reply; a late reply to another is dropped.
 
-        Raises LinkTimeout, LinkError. A Nak is returned, not raised.
+        timeout [s]: what the amplifier may take; what a slow wire needs comes on top of it. Raises
+        LinkTimeout, LinkError. A Nak is returned, not raised. Cancelling leaves the wire usable.
         """
 
     @property

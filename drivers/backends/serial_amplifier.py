@@ -20,6 +20,7 @@ from drivers.errors import DriverError, LinkError, LinkTimeout
 from drivers.protocol.messages import Reply, Request
 from drivers.protocol.serial_codec import decode_reply, encode_request
 from drivers.protocol.serial_frame import Frame, FrameCounters, FrameReader, encode_frame
+from drivers.protocol.serial_timing import exchange_time
 
 _READ_TIMEOUT = 0.1  # s; how long the reader of a port that cannot be woken notices its end
 _WRITE_TIMEOUT = 0.02  # s; a frame fits into any driver's buffer unless the line is stuck
@@ -93,17 +94,19 @@ class SerialBackend(Backend):
         await asyncio.to_thread(_close_port, port)
 
     async def exchange(self, request: Request, *, timeout: float) -> Reply:
-        """Send a request and wait [s] for its reply; LinkTimeout, LinkError or FrameError."""
+        """Send a request and wait for its reply; LinkTimeout, LinkError or FrameError.
+
+        timeout [s]: what the amplifier may take; the time on the line comes on top of it.
+        """
         if self._port is None or self._loss is not None:
             raise LinkError(self._loss or f"{self._url.port} is not open")
         self._sequence = (self._sequence + 1) & 0xFFFF
         frame = encode_request(request, address=self._url.address, sequence=self._sequence)
-        pending = _Pending(frame, asyncio.get_running_loop().create_future())
-        self._pending[frame.sequence] = pending
+        data = encode_frame(frame)
         try:
-            async with asyncio.timeout(timeout):
-                self._write(self._port, encode_frame(frame))
-                return await pending.reply
+            async with asyncio.timeout(timeout + exchange_time(len(data), baud=self._url.baud)):
+                self._write(self._port, data)
+                return await self._reply_to(frame)
         except LinkError:
             raise
         except TimeoutError:
@@ -112,6 +115,12 @@ class SerialBackend(Backend):
                 f"{timeout * 1e3:g} ms; check that the amplifier is switched on and set to "
                 f"{self._url.baud} baud"
             ) from None
+
+    async def _reply_to(self, frame: Frame) -> Reply:
+        pending = _Pending(frame, asyncio.get_running_loop().create_future())
+        self._pending[frame.sequence] = pending
+        try:
+            return await pending.reply
         finally:
             del self._pending[frame.sequence]
 

@@ -7,6 +7,7 @@ _BITS_PER_BYTE = 10  # start, eight data, stop
 _SET_HEAD = 7  # token, ramp, valid_for, count
 _ACHIEVED_HEAD = 3  # token, count
 _COMMAND = 8  # channel, flags, frequency, level, phase
+_STATUS_LENGTH = frame_length(10 + 2 * PROTOCOL.quantities.channel_count.maximum)
 
 
 def wire_time(channels: int, *, baud: int = PROTOCOL.serial.baud) -> float:
@@ -18,3 +19,8 @@ def round_trip_time(channels: int, *, baud: int = PROTOCOL.serial.baud) -> float
     """Time [s] on the line of an apply and its answer, the amplifier's own delay not counted."""
     answer = frame_length(_ACHIEVED_HEAD + _COMMAND * channels)
     return wire_time(channels, baud=baud) + answer * _BITS_PER_BYTE / baud
+
+
+def exchange_time(request_length: int, *, baud: int) -> float:
+    """Time [s] on the line of a request of so many bytes and of an answer as long, or a Status."""
+    return (request_length + max(request_length, _STATUS_LENGTH)) * _BITS_PER_BYTE / baud

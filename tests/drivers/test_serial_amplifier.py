@@ -1,6 +1,7 @@
 import asyncio
 import contextlib
 import errno
+import gc
 import socket
 import threading
 from collections.abc import AsyncIterator, Callable
@@ -66,6 +67,19 @@ async def test_no_answer_is_a_timeout(backend: SerialBackend, far_end: FarEnd) -
     far_end.answer = lambda request, frame: None
     with pytest.raises(LinkTimeout, match=r"no answer from address 1.*921600 baud"):
         await backend.exchange(Ping(), timeout=SHORT)
+
+
+async def test_a_slow_line_has_its_time_on_top(far_end: FarEnd) -> None:
+    """At 300 baud a Ping and its answer take 2 s on the line, whatever the amplifier may take."""
+    backend = SerialBackend(f"{far_end.url}?baud=300")
+    await backend.open()
+    far_end.answer = lambda request, frame: None
+    asking = asyncio.create_task(backend.exchange(Ping(), timeout=0.001))
+    await far_end.count(1)
+    await asyncio.sleep(SHORT)
+    far_end.send(STATUS, far_end.frames[0])
+    assert await asking == STATUS
+    await backend.close()
 
 
 async def test_late_and_foreign_replies_are_dropped(
@@ -170,6 +184,20 @@ async def test_closing_ends_the_reader_and_what_waits(far_end: FarEnd) -> None:
         await waiting
     assert reader_threads() == []
     assert open_files() <= before
+
+
+async def test_a_line_lost_while_writing_is_told_once(
+    far_end: FarEnd, caplog: pytest.LogCaptureFixture
+) -> None:
+    """The error reaches the caller, and no future is left behind with a copy of it."""
+    backend = SerialBackend(far_end.url)
+    await backend.open()
+    far_end.unplug()
+    with pytest.raises(LinkError, match="was lost"):
+        await backend.exchange(Ping(), timeout=PATIENCE)
+    gc.collect()
+    assert caplog.text == ""
+    await backend.close()
 
 
 async def test_it_can_be_opened_again(far_end: FarEnd) -> None:

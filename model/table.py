@@ -24,6 +24,7 @@ from model.localization import CELL_SAMPLES, SURROUNDINGS_RADIUS, Grid, contrast
 from model.mesh import Mesh
 from model.perception import STRONG_DB_SL, detection_threshold
 from model.plate import Plate
+from model.point_mass import PointMass
 from model.rig import Rig, physics_fingerprint
 from model.switched import (
     SILENT,
@@ -71,6 +72,7 @@ class LocalizationTable:
 
     plate: Plate
     eras: tuple[Era, ...]
+    masses: tuple[PointMass, ...]
     mesh: Mesh
     grid: Grid
     mode: str
@@ -83,7 +85,7 @@ class LocalizationTable:
     @property
     def fingerprint(self) -> str:
         """Fingerprint of the plate on its ERAs that this table is for."""
-        return physics_fingerprint(self.plate, self.eras)
+        return physics_fingerprint(self.plate, self.eras, masses=self.masses)
 
     def answer(
         self,
@@ -224,6 +226,7 @@ def build_table(
     return LocalizationTable(
         plate=rig.plate,
         eras=rig.eras,
+        masses=rig.masses,
         mesh=rig.mesh,
         grid=grid,
         mode=mode,

@@ -23,6 +23,7 @@ from model.errors import InputError
 from model.localization import Grid
 from model.mesh import Mesh
 from model.plate import Material, Plate
+from model.point_mass import PointMass
 from model.table import MODES, LocalizationTable
 
 FORMAT = "era-haptics localization table"
@@ -54,6 +55,7 @@ class _Header(BaseModel):
     mode: str
     plate: dict[str, Any]
     eras: list[dict[str, Any]]
+    masses: list[dict[str, Any]]
     mesh: dict[str, Any]
     grid: dict[str, Any]
 
@@ -72,6 +74,7 @@ def save_table(table: LocalizationTable, path: Path) -> None:
         "mode": table.mode,
         "plate": asdict(table.plate),
         "eras": [asdict(era) for era in table.eras],
+        "masses": [asdict(mass) for mass in table.masses],
         "mesh": asdict(table.mesh),
         "grid": asdict(table.grid),
     }
@@ -196,6 +199,7 @@ def _assemble(header: _Header, arrays: dict[str, NDArray[Any]], path: Path) -> L
         table = LocalizationTable(
             plate=Plate(**header.plate, material=Material(**material)),
             eras=tuple(Era(**era) for era in header.eras),
+            masses=tuple(PointMass(**mass) for mass in header.masses),
             mesh=Mesh(**header.mesh),
             grid=Grid(**header.grid),
             mode=header.mode,

@@ -13,6 +13,8 @@ from model.fingertip import fingertip_points
 from model.harmonic import direct_acceleration
 from model.localization import Grid
 from model.perception import sensation_level
+from model.point_load import PointLoad
+from model.point_mass import PointMass
 from model.switched import enumerate_patterns, peak_of_patterns
 from model.table import build_table
 from model.table_file import load_table, save_table
@@ -212,6 +214,26 @@ def test_a_table_of_another_plate_is_refused(table, tmp_path):
     thicker = replace(other, plate=replace(other.plate, thickness=0.0016))
     with pytest.raises(InputError, match="another plate"):
         load_table(path, fingerprint=thicker.fingerprint)
+
+
+def test_a_table_knows_what_the_plate_carries(tmp_path):
+    """With 60 g on it the plate answers as the direct solve says; the file keeps it for its rig."""
+    rig = replace(make_paper_rig(12, 9), masses=(PointMass(0.1, 0.15, 0.06),))
+    laden = build_table(rig, frequencies=np.array([110.0, 210.0]))
+    solved = direct_acceleration(
+        assemble(rig.plate, rig.mesh),
+        rig.eras,
+        laden.frequencies,
+        rig.mesh.nodes,
+        loads=[PointLoad(0.1, 0.15, mass=0.06)],
+    )
+    error = np.linalg.norm(laden.acceleration - solved) / np.linalg.norm(solved)
+    assert error < 1e-3
+    save_table(laden, tmp_path / "laden.npz")
+    back = load_table(tmp_path / "laden.npz", fingerprint=rig.fingerprint)
+    assert back.masses == rig.masses
+    with pytest.raises(InputError, match="built for another plate"):
+        load_table(tmp_path / "laden.npz", fingerprint=make_paper_rig(12, 9).fingerprint)
 
 
 def test_the_fingerprint_is_of_the_physics_not_of_the_wiring(rig):

@@ -189,16 +189,22 @@ class AmplifierGroup:
 
         None if `hurry` ended it, or if it failed for they were disarmed, stopped or closed.
         """
+        try:
+            return await self._unless_hurried(exchange)
+        except Exception as error:
+            if isinstance(error, DriverError) and self.phase not in (Phase.ARMED, Phase.LOST):
+                return None
+            await self.stop()
+            raise
+
+    async def _unless_hurried(self, exchange: Coroutine[Any, Any, _T]) -> _T | None:
         limit = asyncio.timeout(None)
         try:
             async with limit as self._limit:
                 return await exchange
-        except Exception as error:
-            if type(error) is TimeoutError and limit.expired():  # no LinkTimeout, which is one too
+        except TimeoutError as error:
+            if limit.expired() and not isinstance(error, LinkError):  # a LinkTimeout is both
                 return None
-            if isinstance(error, DriverError) and self.phase not in (Phase.ARMED, Phase.LOST):
-                return None
-            await self.stop()
             raise
         finally:
             self._limit = None

@@ -282,6 +282,34 @@ def test_a_stop_is_seen_through(run_virtual: Run, make_bench: MakeBench) -> None
     run_virtual(scenario())
 
 
+def test_a_finger_lifted_while_all_are_stopped(run_virtual: Run, make_bench: MakeBench) -> None:
+    """A stop that is under way takes its time, and the touches that come meanwhile are followed."""
+
+    async def scenario() -> None:
+        bench = make_bench()
+        await bench.controller.open()
+        await bench.controller.arm()
+        task = asyncio.create_task(bench.controller.run())
+        bench.touch(FINGER)
+        await asyncio.sleep(0.001)
+        bench.far_end.answer = lambda request: (
+            Nak(NakCode.BUSY) if isinstance(request, Apply) else None
+        )
+        bench.far_end.delay = 0.02
+        bench.touch((1, 0.7, 0.5))
+        await asyncio.sleep(0.03)
+        assert len(bench.far_end.requests(Stop)) == 1
+        bench.touch()
+        await asyncio.sleep(0.03)
+        assert bench.far_end.state is State.QUICK_STOP_ACTIVE
+        assert bench.told.contacts == [1, 1, 0]
+        assert len(bench.told.refused) == 1
+        await bench.controller.close()
+        await task
+
+    run_virtual(scenario())
+
+
 @pytest.mark.parametrize("kind", [Stage, Commit, GetStatus, Ping])
 def test_a_bug_stops_all(run_virtual: Run, make_bench: MakeBench, kind: type[Request]) -> None:
     """An exception that nobody foresaw, between stage and commit too, leaves nothing vibrating."""

@@ -12,7 +12,7 @@ from controller.contacts import Change, Contact, ContactTracker
 from controller.routing import route
 from controller.selection import PatternTable, Selection, Selector
 from controller.touch import TouchFrame
-from drivers.command import DriveCommand
+from drivers.command import DriveCommand, token_after
 from drivers.guard import Guard, SafeCommand
 from model.perception import STRONG_DB_SL
 from model.rig import Rig
@@ -22,8 +22,6 @@ from model.table import Pattern
 # fingers that stay would feel so short an end as a tap.
 RELEASE_RAMP = 0.010
 FADE_RAMP = 0.020
-
-_MOST_TOKENS = 65_535
 
 _logger = logging.getLogger(__name__)
 
@@ -164,7 +162,7 @@ class Decider:
 
     def _next_token(self) -> int:
         """A token that all amplifiers share: 1..65535, then from 1 again."""
-        self._token = self._token % _MOST_TOKENS + 1
+        self._token = token_after(self._token)
         return self._token
 
     def _note(self, change: Change, time: float) -> None:

@@ -3,6 +3,7 @@
 from typing import TypeVar, final
 
 from drivers.backend import Backend
+from drivers.command import token_after
 from drivers.errors import CommandError, CommandRefused, FrameError, LinkError, LinkTimeout
 from drivers.guard import SafeCommand
 from drivers.protocol.definition import PROTOCOL
@@ -100,7 +101,7 @@ class Amplifier:
 
     def next_token(self) -> int:
         """A token for the next command set: 1..65535, then from 1 again."""
-        self._token = self._token % PROTOCOL.quantities.token.maximum + 1
+        self._token = token_after(self._token)
         return self._token
 
     async def open(self) -> None:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from numbers import Integral, Real
 from typing import final
 
-from drivers.command import CommandSet, DriveCommand
+from drivers.command import CommandSet, DriveCommand, token_after
 from drivers.errors import CommandError, CommandRefused
 from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.messages import Capabilities
@@ -226,7 +226,7 @@ class Guard:
         range, and a token that cannot be sent becomes the one after the last.
         """
         if not _is_token(token):
-            token = self._last_token % PROTOCOL.quantities.token.maximum + 1
+            token = token_after(self._last_token)
         commands = tuple(
             DriveCommand(channel=channel, frequency=self._idle_frequency, level=0.0)
             for channel in range(self._bounds.channels)

@@ -57,7 +57,7 @@ def modes(
             )
         )
         return
-    mesh_text = f"{rig.mesh} of {rig.mesh.element}, {matrices.dof} dof"
+    mesh_text = f"{rig.mesh} ({rig.mesh.element}), {matrices.dof} dof"
     print(f"{rig_file}: {mesh_text}, support: {support.value}")
     for number, frequency in enumerate(solved.natural_frequencies, start=1):
         print(f"mode {number:3d}  {frequency:9.2f} Hz")
@@ -127,3 +127,58 @@ def plate_map(
     if output is not None:
         print(f"wrote {output}")
         print(f"Next: era table build {rig_file} -o table.npz")
+
+
+@plate_app.command()
+def convergence(
+    rig_file: RigArgument,
+    mesh: MeshOption = None,
+    frequencies: Annotated[
+        str, typer.Option(metavar="LO:HI:STEP|LIST", help="Where to compare responses, in Hz.")
+    ] = "110,250",
+    as_json: JsonOption = False,
+) -> None:
+    """How wrong meshes are: natural frequencies and response, against a finer mesh."""
+    from model.convergence import meshes_to_compare, study_convergence
+    from model.points import parse_frequencies
+    from model.rig_file import load_rig
+
+    rig = load_rig(rig_file, mesh=mesh)
+    asked = parse_frequencies(frequencies)
+    study = study_convergence(rig, meshes_to_compare(rig), frequencies=asked.tolist())
+    if as_json:
+        rows = [
+            {
+                "mesh": [error.mesh.nx, error.mesh.ny],
+                "element": error.mesh.element,
+                "strip_m": error.mesh.strip,
+                "dof": error.dof,
+                "is_the_rigs": error.mesh == rig.mesh,
+                "natural_frequency_error_percent": (100 * error.frequency).tolist(),
+                "response_error_percent": (100 * error.response).tolist(),
+            }
+            for error in study.errors
+        ]
+        reference = {
+            "mesh": [study.reference.nx, study.reference.ny],
+            "element": study.reference.element,
+            "strip_m": study.reference.strip,
+            "natural_frequencies_hz": study.natural_frequencies.tolist(),
+        }
+        print(
+            json.dumps({"reference": reference, "frequencies_hz": asked.tolist(), "meshes": rows})
+        )
+        return
+    print(f"{rig_file}: errors against {study.reference}")
+    print("natural frequencies: the worst of the lowest twelve, on the ERAs; response: relative L2")
+    print("of the acceleration over the plate, the worst of the ERAs driven alone")
+    print()
+    heads = "".join(f"{f'at {frequency:g} Hz':>12}" for frequency in asked)
+    print(f"{'mesh':>9}{'element':>9}{'strips':>8}{'dof':>8}{'nat. freq.':>12}{heads}")
+    for error in study.errors:
+        mesh_text = f"{error.mesh.nx}x{error.mesh.ny}"
+        strip = f"{1000 * error.mesh.strip:g} mm" if error.mesh.strip else "-"
+        errors = [100 * abs(error.frequency).max(), *(100 * error.response)]
+        columns = "".join(f"{value:10.3f} %" for value in errors)
+        mine = "  <- the rig's" if error.mesh == rig.mesh else ""
+        print(f"{mesh_text:>9}{error.mesh.element:>9}{strip:>8}{error.dof:>8}{columns}{mine}")

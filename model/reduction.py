@@ -1,7 +1,7 @@
 """The plate in a few dozen coordinates, for solving it in time.
 
-Modes of the free plate, and for every attachment two static vectors with what the modes already
-carry taken out: the truncated modes' answer to a force there, and how it grows with omega². Without
+Modes of the free plate, and for every attachment three static vectors with what the modes already
+carry taken out: the truncated modes' answer to a force there, and how it grows with omega. Without
 them the modes converge slowly near a point force.
 """
 
@@ -15,7 +15,7 @@ from model.free_plate import solve_free_plate
 from model.mesh import Mesh
 from model.plate import Plate
 
-STATIC_VECTORS = 2  # for each attachment
+STATIC_VECTORS = 3  # for each attachment
 
 # Static vectors of less than this share (squared) of their own size are another's to rounding.
 _SAME = 1e-9

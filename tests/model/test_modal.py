@@ -6,8 +6,11 @@ import pytest
 from model.actuator import Era
 from model.assembly import assemble
 from model.errors import InputError
+from model.mesh import Mesh
 from model.modal import modes
-from paper_plate import make_paper_rig
+from model.plate import Plate
+from model.point_load import PointLoad
+from paper_plate import ALUMINIUM, LENGTH, WIDTH, make_paper_rig
 
 # Founding paper, in-house columns of Table 1 (simply supported) and Table 2 (four corner ERAs).
 TABLE_1 = ["110.95", "234.16", "337.90", "454.29", "459.69"]
@@ -58,6 +61,39 @@ def test_a_finer_mesh_approaches_the_converged_frequencies(support):
     """Twelve modes come within 0.5 % of converged at 96x72, whatever holds the plate."""
     solved = frequencies(make_paper_rig(96, 72), 12, support)
     np.testing.assert_allclose(solved, CONVERGED[support], rtol=0.005)
+
+
+@pytest.mark.parametrize("support", CONVERGED)
+def test_the_automatic_mesh_is_converged(support):
+    """Twelve modes of its 8x6 elements of order 5 are within 0.02 %, whatever holds the plate."""
+    rig = make_paper_rig(12, 9)
+    matrices = assemble(rig.plate, Mesh.auto(rig.plate, frequency_max=500.0))
+    solved = modes(matrices, 12, support=support, eras=rig.eras).natural_frequencies
+    np.testing.assert_allclose(solved, CONVERGED[support], rtol=2e-4)
+
+
+@pytest.mark.parametrize("thickness", [1e-3, 1e-4])
+def test_high_order_does_not_lock_on_thin_plates(thickness):
+    """Simply supported, 2000 times as long as thick: thin-plate frequencies within 0.1 %."""
+    plate = Plate(LENGTH, WIDTH, thickness, ALUMINIUM)
+    scale = np.sqrt(plate.flexural_rigidity / (2700 * thickness)) / (2 * np.pi)
+    m, n = np.meshgrid(np.arange(1, 9), np.arange(1, 9))
+    # Paper Eq. 29.
+    thin = np.sort((scale * ((m * np.pi / LENGTH) ** 2 + (n * np.pi / WIDTH) ** 2)).ravel())[:8]
+    matrices = assemble(plate, Mesh(6, 5, LENGTH, WIDTH, "Q5"))
+    solved = modes(matrices, 8, support="simply-supported").natural_frequencies
+    np.testing.assert_allclose(solved, thin, rtol=1e-3)
+
+
+def test_a_point_mass_lowers_the_free_plates_modes_as_by_hand():
+    """A small mass m where a mode's shape is phi lowers omega² by the share m phi² (Rayleigh)."""
+    rig = make_paper_rig(12, 9)
+    matrices = assemble(rig.plate, rig.mesh)
+    bare = modes(matrices, 4, support="free")
+    corner = bare.mode_shapes[0]
+    loaded = modes(matrices, 4, support="free", loads=[PointLoad(0.0, 0.0, mass=1e-6)])
+    share = 1 - (loaded.natural_frequencies / bare.natural_frequencies) ** 2
+    np.testing.assert_allclose(share, 1e-6 * corner**2, rtol=1e-3)
 
 
 def test_frequencies_converge_with_the_square_of_the_element_size():

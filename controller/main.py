@@ -6,6 +6,7 @@ for each exception that it raises on purpose. Nothing here knows the packages by
 """
 
 import os
+import signal
 import sys
 import traceback
 from collections.abc import Iterable, Sequence
@@ -31,6 +32,8 @@ def main() -> int:
     """Run the command line that the process was started with; returns the exit status."""
     for variable in _THREAD_COUNTS:
         os.environ.setdefault(variable, "1")
+    # Being told to end is Ctrl-C from somebody else: amplifiers are silenced before the end.
+    signal.signal(signal.SIGTERM, lambda *_: signal.raise_signal(signal.SIGINT))
     return run(sys.argv[1:], entry_points(group="era_haptics.commands"))
 
 

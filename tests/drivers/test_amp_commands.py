@@ -126,9 +126,10 @@ def test_a_bad_drive_never_arms(
     assert not any(isinstance(request, Arm) for request in background.end.requests)
 
 
-def test_ctrl_c_ends_silent(background: BackgroundFarEnd) -> None:
-    """An interrupt in the middle of a drive disarms before the process ends."""
-    command = [sys.executable, "-P", "-c", "from drivers.cli import app; app()"]
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_ctrl_c_ends_silent(background: BackgroundFarEnd, number: signal.Signals) -> None:
+    """An interrupt or an order to end in the middle of a drive disarms before the process ends."""
+    command = [sys.executable, "-P", "-c", "from controller.main import main; exit(main())"]
     process = subprocess.Popen(
         [*command, "amp", "drive", background.end.url, "--for", "30"],
         stdout=subprocess.DEVNULL,
@@ -143,8 +144,8 @@ def test_ctrl_c_ends_silent(background: BackgroundFarEnd) -> None:
 
     try:
         background.run(driven())
-        process.send_signal(signal.SIGINT)
-        assert process.wait(timeout=10) != 0
+        process.send_signal(number)
+        assert process.wait(timeout=10) == 130
     finally:
         process.kill()
         process.wait()

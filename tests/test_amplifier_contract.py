@@ -284,3 +284,27 @@ async def test_a_lost_host_may_come_back(backend: Backend) -> None:
         assert (await amplifier.arm(CALM)).state is State.OPERATION_ENABLED
         await amplifier.disarm(0.0)
         await amplifier.close()
+
+
+async def test_a_late_copy_of_a_set_changes_nothing(amplifier: Amplifier) -> None:
+    """A set that was played before is refused, and what is staged meanwhile is not lost by it."""
+    await amplifier.arm(CALM)
+    old = tones(amplifier, {0: 0.5})
+    await amplifier.apply(old)
+    await amplifier.apply(tones(amplifier, {0: 0.2}))
+    staged = tones(amplifier, {1: 0.4})
+    await amplifier.stage(staged)
+    with pytest.raises(CommandRefused, match="token"):
+        await amplifier.apply(old)
+    await amplifier.commit(staged.token)
+    assert (await amplifier.status()).levels == pytest.approx((0.0, 0.4, 0.0, 0.0), abs=1e-4)
+
+
+async def test_whoever_loses_patience_leaves_the_wire_usable(amplifier: Amplifier) -> None:
+    """After a request that was cancelled, the next one gets its own reply."""
+    for _ in range(3):
+        asking = asyncio.create_task(amplifier.faults())
+        await asyncio.sleep(0)
+        asking.cancel()
+        await asyncio.gather(asking, return_exceptions=True)
+        assert (await amplifier.arm(CALM)).state is State.OPERATION_ENABLED

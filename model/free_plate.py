@@ -12,19 +12,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy import linalg, sparse
-from scipy.sparse.linalg import LinearOperator, eigsh
 
 from model.actuator import Era
 from model.arrays import ComplexArray, FloatArray
-from model.assembly import ElementMatrices, element_matrices, era_positions
+from model.assembly import element_matrices, era_positions
+from model.class_modes import ClassModes, solve_class
 from model.errors import InputError
-from model.factorisation import BandCholesky
 from model.harmonic import check_frequencies, hold_and_drive
 from model.mesh import Mesh
 from model.plate import Plate
 from model.point_load import PointLoad, load_positions
-from model.symmetry import CLASSES, SymmetryClass, symmetry_class
+from model.symmetry import CLASSES, symmetry_class
 from model.truncation import truncation_error, truncation_weights
 
 # Modes are kept up to this multiple of the highest frequency asked for.
@@ -36,22 +34,6 @@ TERMS = 4
 
 # Memory for solved points [bytes]; beyond it the oldest are forgotten.
 KEPT_BYTES = 512 << 20
-
-
-@dataclass(frozen=True, eq=False)
-class ClassModes:
-    """One symmetry class: its factors, and its modes up to the cut-off.
-
-    factor: of stiffness + shift * mass; mass (n, n); squared (r,) [rad²/s²], vectors (n, r) of unit
-    modal mass; next_squared: of the lowest mode left out.
-    """
-
-    symmetry: SymmetryClass
-    factor: BandCholesky
-    mass: sparse.csr_array
-    squared: FloatArray
-    vectors: FloatArray
-    next_squared: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,36 +138,24 @@ class FreePlate:
         Raises InputError for a frequency that is none, above frequency_max or above what the mesh
         carries, and for points off the plate.
         """
-        frequencies = np.asarray(frequencies, dtype=float)
-        self._check(frequencies)
-        omega = 2 * np.pi * frequencies
+        omega = self._omega(frequencies)
         hold, drive = hold_and_drive(eras, loads, omega)
         attached = self.attach(np.vstack([era_positions(eras), load_positions(loads)]))
-        count, terms = len(hold[0]), TERMS
-
-        loss = 1 + 1j * self.plate.loss_factor
-        answers = 1 / (loss * self.squared - (omega**2)[:, None])
-        zeta = np.asarray(omega**2 / loss + self.shift, dtype=complex)
-        largest = self.largest_truncated
-        receptance = (answers[:, None, :] * attached.shapes) @ attached.shapes.T
-        weights = truncation_weights(zeta, largest, 2 * terms)
-        receptance += np.tensordot(weights / loss, attached.moments, axes=1)
+        count = len(hold[0])
+        answers, weights = self._answers(omega, TERMS)
 
         # Forces on the plate for a unit force put in at each attachment, all of them holding back.
+        receptance = self._between(attached, omega)
         unit = np.linalg.inv(np.eye(count) + hold[:, :, None] * receptance)
         modal = np.asarray(answers[:, :, None] * (attached.shapes.T @ unit), dtype=complex)
-        weights = truncation_weights(zeta, largest, terms) / loss
-        residual = weights[:, :, None, None] * unit[:, None]
+        residual = np.asarray(weights[:, :, None, None] * unit[:, None], dtype=complex)
         coordinates = np.concatenate([modal, residual.reshape(len(omega), -1, count)], axis=1)
         driven = coordinates[:, :, : len(eras)] * drive[:, None, :]
         displacement = _apply(self.basis(attached, points), driven)
         acceleration = -(omega**2)[:, None, None] * displacement
 
         size = _field_size(modal, residual, attached.moments)
-        # Of any two truncated answers none is larger than that of the lowest truncated mode.
-        most = largest / (1 - np.abs(zeta) * largest)
-        off_receptance = truncation_error(zeta, largest, 2 * terms) * most
-        off_field = truncation_error(zeta, largest, terms) * most
+        off_receptance, off_field = (self._truncation_error(omega, n) for n in (2 * TERMS, TERMS))
         strength, spread = (np.sqrt(np.diagonal(attached.moments[power])) for power in (0, 1))
         force = np.abs(unit)
         wrong_force = np.abs(hold) * off_receptance[:, None] * strength * size
@@ -193,13 +163,72 @@ class FreePlate:
         error += off_field[:, None] * (spread[:, None] * force).sum(axis=1)
         return Response(acceleration, (error / size)[:, : len(eras)])
 
-    def _check(self, frequencies: FloatArray) -> None:
+    def receptances(
+        self,
+        places: FloatArray,
+        points: FloatArray,
+        frequencies: FloatArray,
+        *,
+        loads: Sequence[PointLoad] = (),
+    ) -> tuple[ComplexArray, ComplexArray]:
+        """Receptances [m/N] between places [m] (c, 2), (f, c, c), and to points (p, 2), (f, c, p).
+
+        Of the free plate under its loads: what a study of many layouts of ERAs at these places
+        needs, each of them then being a solve as small as its number of ERAs. Raises InputError as
+        `respond` does.
+        """
+        omega = self._omega(frequencies)
+        attached = self.attach(np.vstack([places, load_positions(loads)]))
+        count = len(attached.shapes)
+        answers, weights = self._answers(omega, TERMS)
+        basis = self.basis(attached, points)
+        shapes, residual = np.split(basis, [len(self.squared)], axis=1)
+        to_points = _apply(shapes, answers[:, :, None] * attached.shapes.T)
+        to_points += np.tensordot(weights, residual.reshape(-1, TERMS, count).T, axes=(1, 1))
+        between = self._between(attached, omega)
+        if loads:
+            hold, _ = hold_and_drive((), loads, omega)
+            at_loads = between[:, len(places) :, len(places) :]
+            back = np.linalg.inv(np.eye(len(loads)) + hold[:, :, None] * at_loads)
+            back = between[:, : len(places), len(places) :] @ (back * hold[:, None, :])
+            to_points = to_points[:, : len(places)] - back @ to_points[:, len(places) :]
+            between = between[:, : len(places)] - back @ between[:, len(places) :]
+            between = between[:, :, : len(places)]
+        return between, to_points
+
+    def _answers(self, omega: FloatArray, terms: int) -> tuple[ComplexArray, ComplexArray]:
+        """How each mode answers (f, r), and the weights of what the truncated ones add, (f, n)."""
+        loss = 1 + 1j * self.plate.loss_factor
+        zeta = np.asarray(omega**2 / loss + self.shift, dtype=complex)
+        weights = truncation_weights(zeta, self.largest_truncated, terms)
+        answers = 1 / (loss * self.squared - (omega**2)[:, None])
+        return np.asarray(answers, dtype=complex), np.asarray(weights / loss, dtype=complex)
+
+    def _between(self, attached: Attachments, omega: FloatArray) -> ComplexArray:
+        """Receptance between attachments, (f, n, n)."""
+        answers, weights = self._answers(omega, 2 * TERMS)
+        modal = (answers[:, None, :] * attached.shapes) @ attached.shapes.T
+        return np.asarray(modal + np.tensordot(weights, attached.moments, axes=1))
+
+    def _truncation_error(self, omega: FloatArray, terms: int) -> FloatArray:
+        """The most by which the answer of any truncated mode can be wrong, (f,) [s²/rad²]."""
+        largest = self.largest_truncated
+        loss = 1 + 1j * self.plate.loss_factor
+        zeta = np.asarray(omega**2 / loss + self.shift, dtype=complex)
+        # None of them answers more strongly than the lowest would at full reach.
+        most = largest / (1 - np.abs(zeta) * largest)
+        return np.asarray(truncation_error(zeta, largest, terms) * most)
+
+    def _omega(self, frequencies: FloatArray) -> FloatArray:
+        """omega [rad/s] of frequencies [Hz] that can be answered; InputError for others."""
+        frequencies = np.asarray(frequencies, dtype=float)
         check_frequencies(self.plate, self.mesh, frequencies)
         if len(frequencies) and frequencies.max() > self.frequency_max * (1 + 1e-9):
             raise InputError(
                 f"the plate was solved up to {self.frequency_max:g} Hz and cannot answer at "
                 f"{frequencies.max():g} Hz; solve it with a higher frequency_max"
             )
+        return 2 * np.pi * frequencies
 
     def basis(self, attached: Attachments, points: FloatArray) -> FloatArray:
         """Deflection at points by modes and by residual vectors, (p, r + TERMS n)."""
@@ -261,56 +290,7 @@ def solve_free_plate(plate: Plate, mesh: Mesh, *, frequency_max: float = 500.0) 
     cut = (2 * math.pi * FREQUENCY_MARGIN * frequency_max) ** 2
     elements = element_matrices(plate, mesh)
     classes = tuple(
-        _class_modes(symmetry_class(mesh, parity), elements, shift=shift, cut=cut)
+        solve_class(symmetry_class(mesh, parity), elements, shift=shift, cut=cut)
         for parity in CLASSES
     )
     return FreePlate(plate, mesh, frequency_max, shift, classes)
-
-
-def _class_modes(
-    symmetry: SymmetryClass, elements: ElementMatrices, *, shift: float, cut: float
-) -> ClassModes:
-    """All modes of a class below the cut [rad²/s²], which is met by asking for ever more."""
-    band, mass = symmetry.assemble(elements, shift)
-    factor = BandCholesky.of(band)
-    count = 8
-    while True:
-        squared, vectors = _lowest(factor, mass, count, shift=shift)
-        if squared[-1] >= cut or len(squared) == symmetry.size:
-            break
-        count *= 2
-    kept = int(np.searchsorted(squared, cut))
-    squared[np.abs(squared) < 1e-6 * shift] = 0.0
-    return ClassModes(
-        symmetry,
-        factor,
-        mass,
-        squared[:kept],
-        vectors[:, :kept],
-        float(squared[min(kept, len(squared) - 1)]),
-    )
-
-
-def _lowest(
-    factor: BandCholesky, mass: sparse.csr_array, count: int, *, shift: float
-) -> tuple[FloatArray, FloatArray]:
-    """The lowest eigenpairs; all of them where that is no more work."""
-    size = mass.shape[0]
-    if count >= size / 2:
-        inverse = factor.solve(np.eye(size))
-        # u phi = (K + shift M)^-1 M phi, made symmetric with the mass's own root.
-        root = linalg.cholesky(mass.toarray(), lower=True)
-        u, vectors = linalg.eigh(root.T @ inverse @ root)
-        vectors = linalg.solve_triangular(root.T, vectors)
-    else:
-        squared, vectors = eigsh(
-            mass,  # only its shape is used
-            count,
-            M=mass,
-            sigma=-shift,
-            OPinv=LinearOperator(mass.shape, matvec=factor.solve, dtype=float),
-            v0=np.random.default_rng(0).standard_normal(size),  # ARPACK's own start is random
-        )
-        u = 1 / (squared + shift)
-    order = np.argsort(-u)
-    return 1 / u[order] - shift, vectors[:, order]

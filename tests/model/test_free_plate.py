@@ -4,6 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy import sparse
+from scipy.sparse.linalg import splu
 
 from model.actuator import Era
 from model.assembly import assemble
@@ -153,3 +155,25 @@ def test_points_off_the_plate_are_refused(free):
         free.acceleration(eras, np.array([100.0]), beyond)
     with pytest.raises(InputError, match="is not on the plate"):
         free.acceleration((replace(eras[0], x=-0.01),), np.array([100.0]), free.mesh.nodes)
+
+
+def test_receptances_are_what_a_direct_solve_gives(free):
+    """Deflection per unit force between places and to points, a mass and a finger on the plate."""
+    places = np.array([[0.0, 0.0], [0.21, 0.07], [0.11, WIDTH]])
+    points = free.mesh.nodes[::5]
+    loads = (PointLoad(0.2, 0.1, mass=0.02), PointLoad(0.05, 0.2, 1000.0, 2.0, 2e-4))
+    frequencies = np.array([60.0, 155.0, 470.0])
+    between, to_points = free.receptances(places, points, frequencies, loads=loads)
+    matrices = assemble(free.plate, free.mesh)
+    touch = matrices.deflection_at(places)
+    carry = matrices.deflection_at(np.array([[load.x, load.y] for load in loads]))
+    for row, omega in enumerate(2 * np.pi * frequencies):
+        hold = [-(omega**2) * 0.02, 1000.0 + 2j * omega - omega**2 * 2e-4]
+        dynamic = (1 + 0.01j) * matrices.stiffness - omega**2 * matrices.mass
+        dynamic = dynamic + carry.T @ sparse.diags_array(hold) @ carry
+        field = splu(dynamic.tocsc()).solve(touch.T.toarray().astype(complex))
+        for quick, exact in (
+            (between[row], touch @ field),
+            (to_points[row], (matrices.deflection_at(points) @ field).T),
+        ):
+            assert np.linalg.norm(quick - exact) < 2e-6 * np.linalg.norm(exact)

@@ -1,0 +1,80 @@
+"""The modes of one symmetry class of the free plate, with the factors that they were found by."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import linalg, sparse
+from scipy.sparse.linalg import LinearOperator, eigsh
+
+from model.arrays import FloatArray
+from model.assembly import ElementMatrices
+from model.factorisation import BandCholesky
+from model.symmetry import SymmetryClass
+
+# How many modes of a class are asked for at first; twice as many if they do not reach the cut-off.
+_FIRST_COUNT = 8
+
+
+@dataclass(frozen=True, eq=False)
+class ClassModes:
+    """One symmetry class: its factors, and its modes up to the cut-off.
+
+    factor: of stiffness + shift * mass; mass (n, n); squared (r,) [rad²/s²], vectors (n, r) of unit
+    modal mass; next_squared: of the lowest mode left out.
+    """
+
+    symmetry: SymmetryClass
+    factor: BandCholesky
+    mass: sparse.csr_array
+    squared: FloatArray
+    vectors: FloatArray
+    next_squared: float
+
+
+def solve_class(
+    symmetry: SymmetryClass, elements: ElementMatrices, *, shift: float, cut: float
+) -> ClassModes:
+    """All modes of a class below the cut [rad²/s²], which is met by asking for ever more."""
+    band, mass = symmetry.assemble(elements, shift)
+    factor = BandCholesky.of(band)
+    count = _FIRST_COUNT
+    while True:
+        squared, vectors = _lowest(factor, mass, count, shift=shift)
+        if squared[-1] >= cut or len(squared) == symmetry.size:
+            break
+        count *= 2
+    kept = int(np.searchsorted(squared, cut))
+    squared[np.abs(squared) < 1e-6 * shift] = 0.0
+    return ClassModes(
+        symmetry,
+        factor,
+        mass,
+        squared[:kept],
+        vectors[:, :kept],
+        float(squared[min(kept, len(squared) - 1)]),
+    )
+
+
+def _lowest(
+    factor: BandCholesky, mass: sparse.csr_array, count: int, *, shift: float
+) -> tuple[FloatArray, FloatArray]:
+    """The lowest eigenpairs; all of them where that is no more work."""
+    size = mass.shape[0]
+    if count >= size / 2:
+        inverse = factor.solve(np.eye(size))
+        # u phi = (K + shift M)^-1 M phi, made symmetric with the mass's own root.
+        root = linalg.cholesky(mass.toarray(), lower=True)
+        u, vectors = linalg.eigh(root.T @ inverse @ root)
+        vectors = linalg.solve_triangular(root.T, vectors)
+    else:
+        squared, vectors = eigsh(
+            mass,  # only its shape is used
+            count,
+            M=mass,
+            sigma=-shift,
+            OPinv=LinearOperator(mass.shape, matvec=factor.solve, dtype=float),
+            v0=np.random.default_rng(0).standard_normal(size),  # ARPACK's own start is random
+        )
+        u = 1 / (squared + shift)
+    order = np.argsort(-u)
+    return 1 / u[order] - shift, vectors[:, order]

@@ -19,10 +19,6 @@ from model.rig import Rig
 # More than this [bytes] and the machine is likely to run out of memory.
 _MOST_BYTES = 2 << 30
 
-# ERAs so soft [N/m] that they drive the plate and do not hold it: receptance times stiffness, about
-# 1e-11, is below the rounding of a double.
-_SOFT = 1e-9
-
 
 @dataclass(frozen=True, eq=False)
 class Receptances:
@@ -66,17 +62,7 @@ def solve_receptances(
             f"{size / 1e9:.1f} GB; take fewer --candidates or fewer --frequencies"
         )
     free_plate = solve_free_plate(rig.plate, rig.mesh, frequency_max=float(frequencies.max()))
-    drivers = [
-        Era(f"E{number}", x, y, _SOFT, damping=0.0, bolt_mass=0.0, stroke=1.0)
-        for number, (x, y) in enumerate(positions.tolist())
-    ]
-    acceleration = free_plate.acceleration(
-        drivers, frequencies, np.vstack([positions, points]), loads=carried_loads(rig)
+    between, to_points = free_plate.receptances(
+        positions, points, frequencies, loads=carried_loads(rig)
     )
-    omega = 2 * np.pi * frequencies
-    receptance = acceleration / (-(omega**2) * _SOFT)[:, None, None]
-    return Receptances(
-        frequencies,
-        np.ascontiguousarray(receptance[:, :, :count]),
-        np.ascontiguousarray(receptance[:, :, count:]),
-    )
+    return Receptances(frequencies, between, to_points)

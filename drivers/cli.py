@@ -192,12 +192,22 @@ async def _drive(
 
 
 async def _keep_alive(amplifier: "Amplifier", duration: float, *, beat: float) -> None:
-    """Feed the watchdog for a while [s], a heartbeat every `beat` [s]."""
+    """Feed the watchdog for a while [s], a heartbeat every `beat` [s]; raises CommandRefused.
+
+    That is where the amplifier has stopped by itself meanwhile.
+    """
+    from drivers.protocol.messages import State
+
     loop = asyncio.get_running_loop()
     end = loop.time() + duration
     while (left := end - loop.time()) > 0:
         await asyncio.sleep(min(beat, left))
-        await amplifier.heartbeat()
+        status = await amplifier.heartbeat()
+        if status.state is not State.OPERATION_ENABLED:
+            raise CommandRefused(
+                f"the amplifier ended the drive by itself: it is in {status.state.name}, fault "
+                f"{status.fault.name}; see era amp status, and era amp clear once the cause is gone"
+            )
 
 
 def _achieved_row(achieved: "Achieved") -> dict[str, Any]:

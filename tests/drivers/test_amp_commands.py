@@ -6,6 +6,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Coroutine, Iterator
+from dataclasses import replace
 from typing import Any, TypeVar
 
 import pytest
@@ -13,8 +14,19 @@ from typer.testing import CliRunner
 
 from drivers.cli import EXIT_STATUS, app
 from drivers.errors import CommandError, CommandRefused, FrameError, LinkError, LinkTimeout
-from drivers.protocol.messages import Apply, Arm, Clear, Disarm, Nak, NakCode, Ping, Stop
-from scripted_amplifier import FarEnd
+from drivers.protocol.messages import (
+    Apply,
+    Arm,
+    Clear,
+    Disarm,
+    Fault,
+    Nak,
+    NakCode,
+    Ping,
+    State,
+    Stop,
+)
+from scripted_amplifier import STATUS, FarEnd
 
 T = TypeVar("T")
 
@@ -104,6 +116,19 @@ def test_a_refused_drive_is_disarmed(background: BackgroundFarEnd) -> None:
     )
     result = CliRunner().invoke(app, ["amp", "drive", background.end.url])
     assert isinstance(result.exception, CommandRefused)
+    assert isinstance(background.end.requests[-1], Disarm)
+
+
+def test_a_drive_that_the_amplifier_ends_is_no_success(background: BackgroundFarEnd) -> None:
+    """A fault in the middle of a drive is told, and the amplifier is disarmed all the same."""
+    usual = background.end.answer
+    arc = replace(STATUS, state=State.FAULT, fault=Fault.ARC)
+    background.end.answer = lambda request, frame: (
+        arc if isinstance(request, Ping) else usual(request, frame)
+    )
+    result = CliRunner().invoke(app, ["amp", "drive", background.end.url, "--for", "5"])
+    assert isinstance(result.exception, CommandRefused)
+    assert "FAULT, fault ARC" in str(result.exception)
     assert isinstance(background.end.requests[-1], Disarm)
 
 

@@ -1,4 +1,5 @@
 import os
+import signal
 import subprocess
 import sys
 from importlib.metadata import EntryPoint, entry_points
@@ -275,6 +276,7 @@ def test_every_package_of_the_project_can_be_loaded(
 ) -> None:
     """The installed command starts without a warning, with the commands of all four packages."""
     monkeypatch.setattr(sys, "argv", ["era", "--help"])
+    monkeypatch.setattr(signal, "signal", lambda *_: None)  # the tests' own ending stays theirs
     for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
         monkeypatch.setenv(variable, "1")  # main sets them; so they are put back after the test
     assert len(entry_points(group=GROUP)) == 4

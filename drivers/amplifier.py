@@ -1,5 +1,6 @@
 """An amplifier as the controller sees it: arm, play, stop, whatever wire it hangs on."""
 
+import asyncio
 from typing import TypeVar, final
 
 from drivers.backend import Backend
@@ -37,6 +38,7 @@ WATCHDOG = 0.25  # s; five heartbeats of 50 ms
 REPLY_TIMEOUT = 0.05  # s; three unanswered requests are three heartbeats
 OPEN_TIMEOUT = 0.5  # s; boards that restart when their port is opened need a moment
 RETRIES = 2
+BUSY_PAUSE = 0.005  # s; before a busy amplifier is asked again: short enough for a touch to be felt
 DISARM_RAMP = 0.05  # s; long enough not to click
 STOP_RAMP = 0.005  # s; the shortest that is no step
 
@@ -48,7 +50,7 @@ _REASONS = {
     NakCode.WRONG_STATE: "it is not armed, or it is stopped or in a fault until that is cleared; "
     "ask for its status",
     NakCode.BAD_TOKEN: "no set is staged under this token",
-    NakCode.BUSY: "it is busy; try again",
+    NakCode.BUSY: "it was busy three times in a row; try again",
     NakCode.UNSUPPORTED_VERSION: "it speaks another version of the protocol",
 }
 
@@ -59,7 +61,8 @@ _ReplyT = TypeVar("_ReplyT", Identity, Capabilities, Status, Achieved, FaultList
 class Amplifier:
     """One amplifier over one backend; at most one request is on the wire at any time.
 
-    A reply that does not come is asked for twice more; tokens make that safe. After a LinkError
+    A reply that does not come is asked for twice more, and so is a busy amplifier; tokens make that
+    safe. After a LinkError
     it is lost until it is closed and opened anew: every other call raises LinkError at once, and
     nothing re-arms.
     reply_timeout [s]: how long it may take over one request.
@@ -151,8 +154,8 @@ class Amplifier:
     async def stop(self, ramp: float = STOP_RAMP) -> Status:
         """Quick stop along a ramp [s], latched until clear; overtakes all that waits.
 
-        It is on the wire within 8 ms, as disarm is, whatever else waits for an answer there; that
-        raises CommandRefused then.
+        It is on the wire within 8 ms, as disarm is: what else waits for an answer there gives way
+        and raises CommandRefused, unless it silences too.
         """
         return await self._ask(Stop(ramp=self._ramp(ramp)), expect=Status, kind=Kind.SILENCE)
 
@@ -220,6 +223,7 @@ class Amplifier:
         return reply
 
     async def _exchange(self, request: Request, kind: Kind, timeout: float) -> Reply:
+        busy = 0
         while True:
             try:
                 reply = await self._backend.exchange(request, timeout=timeout)
@@ -229,12 +233,15 @@ class Amplifier:
                 if self._unanswered > RETRIES:
                     what = f"{problem} ({self._unanswered} requests in a row were left unanswered)"
                     raise LinkTimeout(self._lose(what)) from problem
-                self._turns.raise_if_overtaken(kind)
             except LinkError as problem:
                 raise LinkError(self._lose(str(problem))) from problem
             else:
                 self._unanswered = 0
-                return reply
+                if busy == RETRIES or not _is_busy(reply):
+                    return reply
+                busy += 1
+                await asyncio.sleep(BUSY_PAUSE)
+            self._turns.raise_if_overtaken(kind)
 
     def _lose(self, what: str) -> str:
         self._loss = (
@@ -246,6 +253,10 @@ class Amplifier:
     def _raise_if_lost(self) -> None:
         if self._loss is not None:
             raise LinkError(self._loss)
+
+
+def _is_busy(reply: Reply) -> bool:
+    return isinstance(reply, Nak) and reply.code is NakCode.BUSY
 
 
 def _safe(safe: SafeCommand) -> SafeCommand:

@@ -293,7 +293,7 @@ def test_a_finger_lifted_while_all_are_stopped(run_virtual: Run, make_bench: Mak
         bench.touch(FINGER)
         await asyncio.sleep(0.001)
         bench.far_end.answer = lambda request: (
-            Nak(NakCode.BUSY) if isinstance(request, Apply) else None
+            Nak(NakCode.BAD_VALUE) if isinstance(request, Apply) else None
         )
         bench.far_end.delay = 0.02
         bench.touch((1, 0.7, 0.5))

@@ -199,10 +199,24 @@ async def test_a_refusal_is_readable(
     amplifier: Amplifier, backend: ScriptedBackend, code: NakCode
 ) -> None:
     """Every refusal becomes a sentence that names the request and the channel."""
-    backend.script.append(Nak(code, 2))
+    backend.script += [Nak(code, 2)] * 3  # one that is busy is asked again
     with pytest.raises(CommandRefused, match=r"refused Arm \(channel 2\): \w+ \w+") as caught:
         await amplifier.arm()
     assert caught.value.channel == 2
+    assert not amplifier.lost
+
+
+async def test_a_busy_amplifier_is_asked_again(
+    amplifier: Amplifier, backend: ScriptedBackend, safe: MakeSafe
+) -> None:
+    """Twice at most, with the same set; it costs nothing else and loses nothing."""
+    backend.script += [Nak(NakCode.BUSY), Nak(NakCode.BUSY)]
+    assert (await amplifier.apply(safe(5))).token == 5
+    assert backend.requests == [Apply(safe(5))] * 3
+    backend.script += [Nak(NakCode.BUSY)] * 3
+    with pytest.raises(CommandRefused, match="busy"):
+        await amplifier.apply(safe(6))
+    assert len(backend.requests) == 6
     assert not amplifier.lost
 
 

@@ -178,7 +178,12 @@ class Controller:
         latency = None
         drive = {}
         if decision.commands is not None:
-            achieved = await self._group.play(decision.commands)
+            achieved = None
+            try:
+                achieved = await self._group.play(decision.commands)
+            finally:
+                if achieved is None:  # whoever goes on from here must not count on it
+                    self._decider.forget()
             if achieved is None:
                 return
             commands = {name: several.commands for name, several in achieved.items()}

@@ -179,6 +179,30 @@ def test_last_finger_up_before_a_heartbeat(run_virtual: Run, running: Running) -
     run_virtual(scenario())
 
 
+def test_silence_that_was_cancelled_is_sent_again(run_virtual: Run, make_bench: MakeBench) -> None:
+    """A loop that takes over from one that was cancelled does not count on its last command."""
+
+    async def scenario() -> None:
+        bench = make_bench()
+        await bench.controller.open()
+        await bench.controller.arm()
+        bench.touch(FINGER)
+        await bench.controller.step()
+        bench.far_end.delay = 0.01
+        bench.touch()
+        first = asyncio.create_task(bench.controller.run())
+        await asyncio.sleep(0.001)
+        first.cancel()
+        await asyncio.gather(first, return_exceptions=True)
+        second = asyncio.create_task(bench.controller.run())
+        await asyncio.sleep(0.001)
+        assert [each.is_silent for each in bench.far_end.sets()] == [False, True, True]
+        await bench.controller.close()
+        await second
+
+    run_virtual(scenario())
+
+
 def test_a_source_that_falls_silent(run_virtual: Run, running: Running) -> None:
     """150 ms after the last news the contact counts as lifted, and zero is on the wire."""
 

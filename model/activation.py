@@ -39,8 +39,9 @@ def equal_area_points(plate: Plate, *, frequency_max: float) -> FloatArray:
     """Points [m] (p, 2) that stand for equal areas of a plate: centres of nearly square cells.
 
     24 of them along the longer side, or as many as put twelve into a bending wave of the highest
-    frequency [Hz]. Both keep the quartiles within about a percent of those of a raster twice as
-    fine.
+    frequency [Hz]. On the paper's plate, against cells a quarter as large: medians within 3 %,
+    quartiles within 8 %; the maximum, which lies on the edge, is up to 12 % low, and the minimum,
+    which lies at a null, is just that of these points.
     """
     longer = max(plate.length, plate.width)
     size = min(longer / 24, plate.bending_wavelength(frequency_max) / 12)

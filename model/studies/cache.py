@@ -31,12 +31,12 @@ class ResultCache:
         """Results kept for these cases, or None; a damaged file is told of and taken for none."""
         path = self._path(cases)
         try:
-            with np.load(path, allow_pickle=False) as content:
+            with path.open("rb") as stream, np.load(stream, allow_pickle=False) as content:
                 results = CaseResults(content["statistics"], content["active"])
                 digest = str(content["sha256"])
         except FileNotFoundError:
             return None
-        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
             _logger.warning("%s cannot be read and is computed again: %s", path, error)
             return None
         fits = results.statistics.shape == (len(cases), len(DRIVES), len(STATISTICS))

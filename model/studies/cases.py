@@ -26,6 +26,10 @@ STIFFNESS_FACTORS = 2.0 ** np.arange(-4, 5)
 MOST_ERAS = 6
 """A count study goes from one ERA to so many."""
 
+# So few possible layouts are all listed and shuffled; of more, some are drawn. Not by how many are
+# wanted, so that asking for more keeps those that were solved before.
+_FEW = 100_000
+
 _BLOCK = 4096  # layouts drawn at once
 
 _Numbers = NDArray[np.int32]
@@ -85,6 +89,8 @@ class Cases:
 
 def placement_cases(rig: Rig, *, layouts: int, seed: int, raster: tuple[int, int]) -> Cases:
     """The rig's ERAs in other places: its own layout, those with a name, random ones."""
+    if layouts < 1:
+        raise InputError(f"{layouts} layouts are none to study; ask for one at least")
     pool = _Pool(rig, raster)
     pool.add(len(rig.eras), layouts, np.random.default_rng(seed), own=True)
     return pool.cases()
@@ -192,15 +198,15 @@ class _Pool:
         count = len(self._candidates)
         in_order = not all_alike(self._rig.eras)
         possible = math.perm(count, era_count) if in_order else math.comb(count, era_count)
-        # Known layouts may be among the drawn ones: draw as many more.
-        needed = wanted + len(named_layouts(era_count)) + 1
-        if possible <= 4 * needed:
+        if possible <= _FEW:
             choose = permutations if in_order else combinations
             every = np.array(list(choose(range(count), era_count)), dtype=np.int32)
             return list(rng.permutation(every))
+        # Known layouts may be among the drawn ones: draw as many more.
+        needed = min(wanted + len(named_layouts(era_count)) + 1, possible)
         rows = np.empty((0, era_count), dtype=np.int32)
         while len(rows) < needed:
-            # Blocks of one size, so that the layouts do not depend on how many are wanted.
+            # Whole blocks, for the same reason.
             blocks = [
                 self._block(era_count, rng, in_order=in_order)
                 for _ in range(-(-(needed - len(rows)) // _BLOCK))

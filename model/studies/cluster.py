@@ -1,5 +1,6 @@
 """A study on a Dask cluster."""
 
+import re
 from collections.abc import Mapping
 
 from model.actuator import Era
@@ -11,13 +12,21 @@ from model.studies.workers import Solved, Workers
 
 _CONNECT_TIMEOUT = 10.0  # s
 
+# Dask itself hangs for a while over what is no address.
+_ADDRESS = re.compile(r"(tcp|tls)://[\w.\-\[\]:]+:\d{1,5}")
+
 
 def on_cluster(address: str) -> Workers:
     """The workers of a Dask scheduler, for example tcp://192.168.1.5:8786.
 
-    A worker that is lost in the middle costs its chunks once more. Raises InputError where no
-    scheduler answers, where it has no workers, or where a worker runs other code.
+    A worker that is lost in the middle costs its chunks once more. Raises InputError for what is no
+    address; when used, where no scheduler answers, it has no workers, or one runs other code.
     """
+    if not _ADDRESS.fullmatch(address):
+        raise InputError(
+            f"--cluster {address[:60]!r} is no address of a Dask scheduler; write the one that "
+            "`dask scheduler` prints, for example tcp://192.168.1.5:8786"
+        )
 
     def solve(problem: StudyProblem, chunks: Mapping[int, Cases]) -> Solved:
         try:
@@ -48,7 +57,7 @@ def on_cluster(address: str) -> Workers:
                 for number, cases in chunks.items()
             }
             try:
-                for future in as_completed(numbers):  # type: ignore[no-untyped-call]
+                for future in as_completed(numbers, loop=client.loop):  # type: ignore[no-untyped-call]
                     results: CaseResults = future.result()
                     yield numbers.pop(future), results
             except KilledWorker as error:

@@ -11,6 +11,7 @@ import signal
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from typing import TypeAlias
 
 from model.actuator import Era
@@ -75,11 +76,28 @@ def _solve_in_pool(count: int, shared: _Shared, chunks: Mapping[int, Cases]) -> 
         initargs=(shared,),
     )
     try:
-        numbers = {pool.submit(_solve, cases): number for number, cases in chunks.items()}
+        with _interrupts_held_back():
+            numbers = {pool.submit(_solve, cases): number for number, cases in chunks.items()}
         for future in as_completed(numbers):
             yield numbers[future], future.result()
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
+
+
+@contextmanager
+def _interrupts_held_back() -> Iterator[None]:
+    """Start processes that Ctrl-C does not reach, not even while they are still loading.
+
+    They inherit what is blocked here; a Ctrl-C meanwhile arrives afterwards.
+    """
+    if not hasattr(signal, "pthread_sigmask"):  # Windows
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _begin(shared: _Shared) -> None:

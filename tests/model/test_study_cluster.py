@@ -1,0 +1,88 @@
+"""A study on a real Dask cluster of two worker processes."""
+
+import os
+import signal
+from collections.abc import Iterator
+
+import pytest
+from distributed import Client, LocalCluster
+
+from model.errors import InputError
+from model.studies import cluster
+from model.studies.cluster import on_cluster
+from model.studies.workers import in_process
+from studies import chunks_of, same_to_the_bit, small_study
+
+
+@pytest.fixture(scope="module")
+def address() -> Iterator[str]:
+    """A scheduler with two workers, each a process of its own; no dashboard."""
+    with LocalCluster(
+        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=":0"
+    ) as running:
+        yield running.scheduler_address
+
+
+def worker_pids(address: str) -> list[int]:
+    """Process numbers of the cluster's workers."""
+    with Client(address, set_as_default=False) as client:
+        return list(client.run(os.getpid).values())
+
+
+def test_a_cluster_gives_the_same_to_the_bit(address):
+    """Two worker processes and this process agree in every bit of every chunk."""
+    assert len(set(worker_pids(address)) - {os.getpid()}) == 2
+    problem, cases = small_study(layouts=40)
+    chunks = chunks_of(cases, 8)
+    there = dict(on_cluster(address)(problem, chunks))
+    assert same_to_the_bit(there, dict(in_process(problem, chunks)))
+
+
+def test_killed_workers_are_survived(address):
+    """Both workers killed when the first chunk is there: the rest comes all the same, bit by bit.
+
+    With them goes the solved plate, which the scheduler has solved once more.
+    """
+    problem, cases = small_study(layouts=60)
+    chunks = chunks_of(cases, 2)
+    before = worker_pids(address)
+    solving = on_cluster(address)(problem, chunks)
+    there = dict([next(solving)])
+    for pid in before:
+        os.kill(pid, signal.SIGKILL)
+    there |= dict(solving)
+    assert same_to_the_bit(there, dict(in_process(problem, chunks)))
+    assert not set(before) & set(worker_pids(address))
+
+
+def test_a_worker_with_other_code_is_refused(address):
+    """A study made by other code than the workers have is not mixed with theirs."""
+    problem, cases = small_study(layouts=4)
+    object.__setattr__(problem, "code_version", "0.0.1+123456789abc")
+    with pytest.raises(InputError, match="other code"):
+        dict(on_cluster(address)(problem, chunks_of(cases, 4)))
+
+
+def test_a_cluster_without_workers_is_refused():
+    """Waiting for ever for a worker to come is no answer."""
+    problem, cases = small_study(layouts=4)
+    with (
+        LocalCluster(n_workers=0, dashboard_address=":0") as empty,
+        pytest.raises(InputError, match="has no workers"),
+    ):
+        dict(on_cluster(empty.scheduler_address)(problem, chunks_of(cases, 4)))
+
+
+def test_no_scheduler_is_told(monkeypatch):
+    """Nothing listens at the address: the error says so, and how to start one."""
+    monkeypatch.setattr(cluster, "_CONNECT_TIMEOUT", 0.2)
+    problem, cases = small_study(layouts=4)
+    with pytest.raises(InputError, match=r"no Dask scheduler answers at tcp://127\.0\.0\.1:1 "):
+        dict(on_cluster("tcp://127.0.0.1:1")(problem, chunks_of(cases, 4)))
+
+
+@pytest.mark.parametrize("text", ["", "nonsense", "foo://x:1", "tcp://host", "tcp://host:port"])
+def test_what_is_no_address_is_refused_at_once(text):
+    """An address that Dask would hang over never reaches it."""
+    with pytest.raises(InputError, match="no address of a Dask scheduler"):
+        on_cluster(text)

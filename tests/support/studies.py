@@ -1,0 +1,33 @@
+"""Studies small enough for tests."""
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from model.studies.cases import Cases, placement_cases
+from model.studies.solve import CaseResults, StudyProblem, study_problem
+from paper_plate import make_paper_rig
+
+FREQUENCIES = np.array([60.0, 110.0, 170.0, 250.0])
+
+
+def small_study(*, layouts: int, seed: int = 0) -> tuple[StudyProblem, Cases]:
+    """Placement of four ERAs on the paper's plate, its mesh coarse, at four frequencies."""
+    rig = make_paper_rig(12, 9)
+    cases = placement_cases(rig, layouts=layouts, seed=seed, raster=(7, 5))
+    return study_problem(rig, cases, FREQUENCIES), cases
+
+
+def chunks_of(cases: Cases, size: int) -> dict[int, Cases]:
+    """Cases in chunks, by number."""
+    starts = range(0, len(cases), size)
+    return {number: cases.part(start, start + size) for number, start in enumerate(starts)}
+
+
+def same_to_the_bit(first: Mapping[int, CaseResults], second: Mapping[int, CaseResults]) -> bool:
+    """Whether the results of all chunks agree in every bit."""
+    return first.keys() == second.keys() and all(
+        first[number].statistics.tobytes() == second[number].statistics.tobytes()
+        and first[number].active.tobytes() == second[number].active.tobytes()
+        for number in first
+    )

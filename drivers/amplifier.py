@@ -171,10 +171,12 @@ class Amplifier:
     async def apply(self, safe: SafeCommand) -> Achieved:
         """Play a set now; returns what the amplifier makes of it.
 
-        Raises CommandRefused where a newer set or a stop took its place.
+        A silent set overtakes as a stop does. Raises CommandRefused where a newer set or a stop
+        took its place.
         """
         request = Apply(_safe(safe))
-        return _of_token(await self._ask(request, expect=Achieved, kind=Kind.APPLY), safe.token)
+        kind = Kind.SILENCE if safe.is_silent else Kind.APPLY
+        return _of_token(await self._ask(request, expect=Achieved, kind=kind), safe.token)
 
     async def status(self) -> Status:
         """How it is; does not feed the watchdog."""

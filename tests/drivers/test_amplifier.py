@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import pytest
 
+from drivers import turns
 from drivers.amplifier import Amplifier
 from drivers.backend import Backend
 from drivers.command import CommandSet
@@ -30,7 +31,6 @@ from drivers.protocol.messages import (
     Status,
     Stop,
 )
-from drivers.turns import PATIENCE
 from drivers.watchdog import check_watchdog, round_trip_of
 
 IDENTITY = Identity("Acme", "Quad", "A-17", "1.2", 1)
@@ -107,6 +107,17 @@ async def amplifier(backend: ScriptedBackend) -> Amplifier:
     await amplifier.open()
     backend.requests.clear()
     return amplifier
+
+
+@pytest.fixture(autouse=True)
+def patience(monkeypatch: pytest.MonkeyPatch) -> Callable[[float], None]:
+    """No turn is cut short, however slow the machine, unless a test asks for it by a time [s]."""
+
+    def change(seconds: float) -> None:
+        monkeypatch.setattr(turns, "PATIENCE", seconds)
+
+    change(60.0)
+    return change
 
 
 async def settle() -> None:
@@ -263,11 +274,11 @@ async def test_the_latest_apply_wins(
     assert backend.requests == [Apply(safe(1)), Apply(safe(3))]
 
 
-@pytest.mark.parametrize("silencing", [Stop(0.005), Disarm(0.05)])
+@pytest.mark.parametrize("silencing", ["stop", "disarm", "apply"])
 async def test_falling_silent_overtakes(
-    amplifier: Amplifier, backend: ScriptedBackend, safe: MakeSafe, silencing: Request
+    amplifier: Amplifier, backend: ScriptedBackend, safe: MakeSafe, silencing: str
 ) -> None:
-    """Stop and disarm go before all that waits, and the apply that waited is never sent."""
+    """Stop, disarm and a silent set go before all that waits; the apply that waited never goes."""
     answer: asyncio.Future[Reply] = asyncio.get_running_loop().create_future()
     backend.script.append(answer)
     beat = asyncio.create_task(amplifier.heartbeat())
@@ -275,14 +286,17 @@ async def test_falling_silent_overtakes(
     status = asyncio.create_task(amplifier.status())
     apply = asyncio.create_task(amplifier.apply(safe(1)))
     await settle()
-    call = amplifier.stop if isinstance(silencing, Stop) else amplifier.disarm
-    silent = asyncio.create_task(call())
+    zero = safe(2, level=0.0)
+    silent = asyncio.ensure_future(
+        amplifier.apply(zero) if silencing == "apply" else getattr(amplifier, silencing)()
+    )
+    expected = {"stop": Stop(0.005), "disarm": Disarm(0.05), "apply": Apply(zero)}[silencing]
     await settle()
     with pytest.raises(CommandRefused, match="superseded"):
         await apply
     answer.set_result(STATUS)
     await asyncio.gather(beat, status, silent)
-    assert backend.requests[:2] == [Ping(), silencing]
+    assert backend.requests[:2] == [Ping(), expected]
     assert len(backend.requests) == 3
 
 
@@ -322,9 +336,13 @@ async def test_nothing_is_repeated_before_a_stop(
 
 
 async def test_a_stop_waits_for_no_answer_that_does_not_come(
-    amplifier: Amplifier, backend: ScriptedBackend, safe: MakeSafe
+    amplifier: Amplifier,
+    backend: ScriptedBackend,
+    safe: MakeSafe,
+    patience: Callable[[float], None],
 ) -> None:
     """A stop gives what is on the wire a moment, and goes out although that has no answer yet."""
+    patience(0.001)
     backend.script.append(asyncio.get_running_loop().create_future())  # never done
     apply = asyncio.create_task(amplifier.apply(safe(1)))
     await settle()
@@ -338,15 +356,16 @@ async def test_a_stop_waits_for_no_answer_that_does_not_come(
 
 
 async def test_a_stop_is_not_cut_short_by_another(
-    amplifier: Amplifier, backend: ScriptedBackend
+    amplifier: Amplifier, backend: ScriptedBackend, patience: Callable[[float], None]
 ) -> None:
     """A disarm that waits for a stop leaves it all its time: a stop latches, a disarm does not."""
+    patience(0.001)
     answer: asyncio.Future[Reply] = asyncio.get_running_loop().create_future()
     backend.script.append(answer)
     stop = asyncio.create_task(amplifier.stop())
     await settle()
     disarm = asyncio.create_task(amplifier.disarm())
-    await asyncio.sleep(2 * PATIENCE)
+    await asyncio.sleep(0.01)
     answer.set_exception(LinkTimeout("late"))
     await asyncio.gather(stop, disarm)
     assert backend.requests == [Stop(0.005), Stop(0.005), Disarm(0.05)]
@@ -403,9 +422,13 @@ async def test_cancelled_in_the_moment_of_its_turn(
 
 
 async def test_a_cancelled_stop_overtakes_nothing(
-    amplifier: Amplifier, backend: ScriptedBackend, safe: MakeSafe
+    amplifier: Amplifier,
+    backend: ScriptedBackend,
+    safe: MakeSafe,
+    patience: Callable[[float], None],
 ) -> None:
     """An apply whose answer is lost is repeated again once the stop that waited is withdrawn."""
+    patience(0.2)
     answer: asyncio.Future[Reply] = asyncio.get_running_loop().create_future()
     backend.script.append(answer)
     apply = asyncio.create_task(amplifier.apply(safe(1)))
@@ -413,7 +436,7 @@ async def test_a_cancelled_stop_overtakes_nothing(
     stop = asyncio.create_task(amplifier.stop())
     await settle()
     stop.cancel()
-    await asyncio.sleep(2 * PATIENCE)
+    await asyncio.sleep(0.3)
     answer.set_exception(LinkTimeout("late"))
     assert (await apply).token == 1
     assert backend.requests == [Apply(safe(1))] * 2

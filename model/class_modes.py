@@ -1,6 +1,7 @@
 """The modes of one symmetry class of the free plate, with the factors that they were found by."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy import linalg, sparse
@@ -29,6 +30,28 @@ class ClassModes:
     squared: FloatArray
     vectors: FloatArray
     next_squared: float
+
+    @cached_property
+    def _momenta(self) -> FloatArray:
+        """Mass times the modes, (n, r)."""
+        return np.asarray(self.mass @ self.vectors)
+
+    def residuals(self, forces: FloatArray, *, terms: int, scale: float) -> FloatArray:
+        """Forces (m, n), and after each what the truncated modes make of it, (m, 1 + terms, n).
+
+        The j-th term is their sum of phi (phi . force) (u / scale)^j, u = 1 / (lambda + shift).
+        """
+        result = np.empty((len(forces), terms + 1, forces.shape[1]))
+        result[:, 0] = forces
+        force = forces.T
+        for term in range(1, terms + 1):
+            deflection = self.factor.solve(force) / scale
+            # The kept modes' share is taken out; once leaves rounding behind, twice is enough.
+            for _ in range(2):
+                deflection -= self.vectors @ (self._momenta.T @ deflection)
+            result[:, term] = deflection.T
+            force = self.mass @ deflection
+        return result
 
 
 def solve_class(

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+from scipy import sparse
 
 from model.actuator import Era
 from model.arrays import ComplexArray, FloatArray
@@ -34,13 +35,14 @@ TERMS = 4
 
 # Memory for solved points [bytes]; beyond it the oldest are forgotten.
 KEPT_BYTES = 512 << 20
+KEPT_RASTERS = 4  # and sets of points that answers were asked for
 
 
 @dataclass(frozen=True, eq=False)
 class Attachments:
     """Points where forces act on a free plate, with what has been solved for them.
 
-    shapes: (n, r) of the modes; residuals: by symmetry class, (size, TERMS, n); moments: (2 TERMS,
+    shapes: (n, r) of the modes; residuals: by symmetry class, (n, TERMS, size); moments: (2 TERMS,
     n, n) receptances of all truncated modes together with their u / u_c to the power 1, 2, ...
     """
 
@@ -74,6 +76,9 @@ class FreePlate:
     shift: float
     classes: tuple[ClassModes, ...]
     _solved: dict[tuple[float, float], tuple[FloatArray, ...]] = field(default_factory=dict)
+    _observed: dict[bytes, tuple[FloatArray, tuple[sparse.csr_array, ...]]] = field(
+        default_factory=dict
+    )
 
     @property
     def squared(self) -> FloatArray:
@@ -85,10 +90,6 @@ class FreePlate:
         """1 / (lambda + shift) of the lowest mode left out [s²/rad²]."""
         return 1 / (min(part.next_squared for part in self.classes) + self.shift)
 
-    def shapes_at(self, points: FloatArray) -> FloatArray:
-        """Mode shapes at points [m] (p, 2) of the plate, (p, r) [1/sqrt(kg)]."""
-        return np.hstack([part.symmetry.at(points) @ part.vectors for part in self.classes])
-
     def attach(self, points: FloatArray) -> Attachments:
         """Solve for forces at points [m] (n, 2), as far as they have not been solved for."""
         points = np.asarray(points, dtype=float).reshape(-1, 2)
@@ -97,19 +98,21 @@ class FreePlate:
         if unknown:
             self._solve_for(unknown)
         known = [self._solved[key] for key in keys]
-        residuals = tuple(
-            np.stack([each[number] for each in known], axis=-1)
-            for number in range(len(self.classes))
-        )
         count = len(points)
-        moments = np.zeros((2 * TERMS, count, count))
-        for part, residual in zip(self.classes, residuals, strict=True):
-            moments[0] += part.symmetry.at(points) @ residual[:, 0]
-            flat = residual.reshape(len(residual), -1)
-            inner = (flat.T @ (part.mass @ flat)).reshape(TERMS, count, TERMS, count)
+        shapes, residuals, moments = [], [], np.zeros((2 * TERMS, count, count))
+        for number, part in enumerate(self.classes):
+            size = part.symmetry.size
+            solved = np.array([each[number] for each in known]).reshape(count, TERMS + 1, size)
+            force, residual = solved[:, 0], solved[:, 1:]
+            flat = residual.reshape(-1, size)
+            inner = (flat @ (part.mass @ flat.T)).reshape(count, TERMS, count, TERMS)
+            moments[0] += force @ residual[:, 0].T
             for power in range(2, 2 * TERMS + 1):
-                moments[power - 1] += inner[power // 2 - 1, :, (power + 1) // 2 - 1]
-        return Attachments(self.shapes_at(points), residuals, moments)
+                moments[power - 1] += inner[:, power // 2 - 1, :, (power + 1) // 2 - 1]
+            shapes.append(force @ part.vectors)
+            residuals.append(residual)
+        self._forget()
+        return Attachments(np.hstack(shapes), tuple(residuals), moments)
 
     def acceleration(
         self,
@@ -231,33 +234,49 @@ class FreePlate:
         return 2 * np.pi * frequencies
 
     def basis(self, attached: Attachments, points: FloatArray) -> FloatArray:
-        """Deflection at points by modes and by residual vectors, (p, r + TERMS n)."""
-        shapes = []
-        extra = np.zeros((len(points), TERMS * len(attached.shapes)))
-        for part, residual in zip(self.classes, attached.residuals, strict=True):
-            observe = part.symmetry.at(points)
-            shapes.append(observe @ part.vectors)
-            extra += observe @ residual.reshape(len(residual), -1)
-        return np.hstack([*shapes, extra])
+        """Deflection at points by modes and by residual vectors, (p, r + TERMS n).
+
+        Residual vectors come term by term, each for all attachments.
+        """
+        shapes, maps = self._observe(np.asarray(points, dtype=float))
+        extra = np.zeros((len(shapes), TERMS * len(attached.shapes)))
+        for each, residual in zip(maps, attached.residuals, strict=True):
+            extra += each @ residual.transpose(2, 1, 0).reshape(residual.shape[2], -1)
+        return np.hstack([shapes, extra])
+
+    def _observe(self, points: FloatArray) -> tuple[FloatArray, tuple[sparse.csr_array, ...]]:
+        """Mode shapes at points (p, r), and by class the map to deflections there; kept a while."""
+        key = points.tobytes()
+        if key not in self._observed:
+            interpolation = self.mesh.interpolation(points)
+            maps = tuple(
+                sparse.csr_array(interpolation @ part.symmetry.spread) for part in self.classes
+            )
+            pairs = zip(maps, self.classes, strict=True)
+            shapes = np.hstack([each @ part.vectors for each, part in pairs])
+            if len(self._observed) >= KEPT_RASTERS:
+                self._observed.clear()
+            self._observed[key] = shapes, maps
+        return self._observed[key]
 
     def _solve_for(self, points: list[tuple[float, float]]) -> None:
-        """Residual vectors (size, TERMS) of every class for each point: sum of phi (u / u_c)^j."""
-        solved = []
-        for part in self.classes:
-            terms = []
-            force = part.symmetry.at(np.array(points)).toarray().T
-            for _ in range(TERMS):
-                field_ = part.factor.solve(force) / self.largest_truncated
-                # The modes' share is taken out; once leaves rounding behind, twice is enough.
-                for _ in range(2):
-                    field_ -= part.vectors @ (part.vectors.T @ (part.mass @ field_))
-                terms.append(field_)
-                force = part.mass @ field_
-            solved.append(np.stack(terms, axis=1))
+        """For each point and class its force, then sums of phi (u / u_c)^j: (1 + TERMS, size)."""
+        interpolation = self.mesh.interpolation(np.array(points))
+        solved = [
+            part.residuals(
+                (interpolation @ part.symmetry.spread).toarray(),
+                terms=TERMS,
+                scale=self.largest_truncated,
+            )
+            for part in self.classes
+        ]
         for number, point in enumerate(points):
-            self._solved[point] = tuple(each[:, :, number].copy() for each in solved)
-        most = max(len(points), KEPT_BYTES // sum(each[:, :, 0].nbytes for each in solved))
-        while len(self._solved) > most:
+            self._solved[point] = tuple(each[number].copy() for each in solved)
+
+    def _forget(self) -> None:
+        """Drop the oldest solved points where they take too much memory."""
+        size = 8 * (TERMS + 1) * sum(part.symmetry.size for part in self.classes)
+        while len(self._solved) * size > KEPT_BYTES:
             del self._solved[next(iter(self._solved))]
 
 

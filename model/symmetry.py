@@ -7,6 +7,7 @@ x, the deflection and beta_y keep their sign in an even field and beta_x changes
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import product
 
 import numpy as np
@@ -40,16 +41,13 @@ class SymmetryClass:
     sign: FloatArray
     size: int
 
+    @cached_property
     def spread(self) -> sparse.csr_array:
         """Deflection at every node of the plate from a quarter's field, (node_count, size)."""
         place, sign = self.place[::DOF_PER_NODE], self.sign[::DOF_PER_NODE]
         rows = np.flatnonzero(sign)
         shape = (self.mesh.node_count, self.size)
         return sparse.csr_array((sign[rows] / 2, (rows, place[rows])), shape=shape)
-
-    def at(self, points: FloatArray) -> sparse.csr_array:
-        """Deflection at points [m] (n, 2) from a quarter's field: sparse (n, size)."""
-        return sparse.csr_array(self.mesh.interpolation(points) @ self.spread())
 
     def assemble(
         self, elements: ElementMatrices, shift: float

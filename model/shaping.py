@@ -44,10 +44,11 @@ GAIN_ERROR = 0.05
 PHASE_ERROR = math.radians(5)
 _ERROR_VARIANCE = GAIN_ERROR**2 + PHASE_ERROR**2
 
-# A target that strays from its ramp by ten percent costs as much as a quiet finger at a hundredth
-# of the target: contrast, not the course of the ramp, is what is wanted. Three times as much costs
-# 1 to 2 dB of contrast, a third of it lets some targets wait for 50 ms.
-_TARGET_WEIGHT = 0.1
+# What a target's straying from its ramp costs against a quiet finger's moving, relative to the
+# robust ratio of the two in the steady state: a pattern that leaves the quiet finger 20 dB below
+# the target must not trade the target's ramp for more than that. From a third of it to thrice it
+# contrast changes by 1 dB.
+_TARGET_WEIGHT = 2.0
 
 _SAMPLES = 5  # to a step; a demodulated answer changes little within a millisecond
 _SETTLING_STEPS = 9  # watched after the last knot
@@ -213,7 +214,8 @@ def _onset(
     match = (at_felt.conj().T @ wanted).reshape(steps, eras, steps)
     aim = np.stack([np.trace(match[:, :, knot:], axis1=0, axis2=2) for knot in range(steps)])
 
-    weight = _TARGET_WEIGHT**2
+    steady = amplitudes[active, None] * carrier.steady[active]
+    weight = _TARGET_WEIGHT**2 * _robust_power(still @ steady.T) / _robust_power(felt @ steady.T)
     form = _robust(noise, eras) + weight * loud
     free = (ONSET_KNOTS - 1) * eras
     settled = np.tile(amplitudes[active], steps - ONSET_KNOTS + 1)
@@ -236,6 +238,12 @@ def _ending(carrier: _Carrier, amplitudes: ComplexArray, active: IntArray) -> Co
 def _bounded(form: ComplexArray, right: ComplexArray) -> ComplexArray:
     ridge = _RIDGE * float(np.trace(form).real) / len(form)
     return bounded_solution(form + ridge * np.eye(len(form)), right, np.ones(len(form)))
+
+
+def _robust_power(seen: ComplexArray) -> float:
+    """Mean sum of squares of what all ERAs do together (d, eras) when they are off as they are."""
+    together = np.linalg.norm(seen.sum(axis=1)) ** 2
+    return float(together + _ERROR_VARIANCE * np.linalg.norm(seen) ** 2)
 
 
 def _robust(form: ComplexArray, eras: int) -> ComplexArray:

@@ -1,0 +1,148 @@
+"""Onsets and endings of many patterns on one rig, and how long shaping them takes."""
+
+import time
+from collections import defaultdict
+from collections.abc import Callable
+from functools import partial
+from typing import TypeVar
+
+import numpy as np
+
+from benchmarks.transient_cases import Case, quantised, with_errors, wrong
+from model.assembly import era_positions
+from model.envelope import Bases, ramped_ending, ramped_onset, shaped
+from model.excitation import Excitation
+from model.point_load import load_positions
+from model.reduction import reduce_plate
+from model.rig import Rig
+from model.shaping import Shaper
+from model.time_response import PlateInTime, plate_in_time
+from model.transient import Transients
+
+CHOICE = 3  # patterns among which one may be chosen for its onset
+
+T = TypeVar("T")
+Columns = dict[str, list[float]]
+
+
+class Stopwatch:
+    """Times [s] of calls by what was called."""
+
+    def __init__(self) -> None:
+        self.times: dict[str, list[float]] = defaultdict(list)
+
+    def __call__(self, name: str, call: Callable[[], T]) -> T:
+        started = time.perf_counter()
+        result = call()
+        self.times[name].append(time.perf_counter() - started)
+        return result
+
+    def show(self) -> None:
+        print("\ntime, median and 99th percentile, one thread")
+        for name, times in sorted(self.times.items()):
+            middle, most = 1e3 * np.median(times), 1e3 * np.percentile(times, 99)
+            print(f"  {name:34s} {middle:6.2f} ms {most:6.2f} ms  ({len(times)} calls)")
+
+
+class Bench:
+    """One rig, what shapes for it and what predicts."""
+
+    def __init__(self, rig: Rig, *, draws: int, rng: np.random.Generator) -> None:
+        self.rig = rig
+        self.plate = in_time(rig)
+        self.shaper, self.transients = Shaper(self.plate), Transients(self.plate)
+        self.clock = Stopwatch()
+        self._draws, self._rng = draws, rng
+        self._prepared: set[float] = set()
+
+    def onsets(self, cases: list[list[Case]]) -> Columns:
+        columns: Columns = defaultdict(list)
+        for patterns in cases:
+            case = patterns[0]
+            excitation = case.excitation(self.rig)
+            errors = wrong(self._rng, len(self.rig.eras), self._draws)
+            columns["steady"].append(case.steady_db(case.weights))
+            columns["steady, realised"].append(
+                float(np.median([case.steady_db(case.weights * each) for each in errors]))
+            )
+            for name, ramp in (("abrupt", 0.0), ("20 ms ramp", 0.02), ("40 ms ramp", 0.04)):
+                bases = ramped_onset(excitation, self.rig.eras, ramp=ramp)
+                columns[name].append(self._contrast(case, bases))
+            for ramp in (0.02, 0.04):
+                columns[f"{1e3 * ramp:.0f} ms ramp, best of {CHOICE} patterns"].append(
+                    max(
+                        self._contrast(
+                            each,
+                            ramped_onset(each.excitation(self.rig), self.rig.eras, ramp=ramp),
+                        )
+                        for each in patterns[:CHOICE]
+                    )
+                )
+            if case.frequency not in self._prepared:
+                self._prepared.add(case.frequency)
+                self.clock("a frequency's first use", partial(self.shaper.prepare, case.frequency))
+            envelopes = self.clock(
+                f"onset, {len(case.quiet)} quiet",
+                partial(self.shaper.onset, excitation, targets=case.targets, quiet=case.quiet),
+            )
+            columns["shaped"].append(self._contrast(case, shaped(envelopes, self.rig.eras)))
+            columns["shaped, as a wire carries it"].append(
+                self._contrast(case, shaped(quantised(envelopes, self.rig), self.rig.eras))
+            )
+            realised = [
+                self._contrast(case, shaped(with_errors(envelopes, self.rig, each), self.rig.eras))
+                for each in errors
+            ]
+            columns["shaped, realised"].append(float(np.median(realised)))
+            columns["largest level"].append(
+                max(each.largest / self.rig.era(name).stroke for name, each in envelopes.items())
+            )
+        return columns
+
+    def endings(self, cases: list[Case], *, full: bool) -> Columns:
+        columns: Columns = defaultdict(list)
+        eras = self.rig.eras
+        for case in cases:
+            level = 1.0 if full else case.felt_level
+            excitation = case.excitation(self.rig, level)
+            for name, ramp in (("stopped", 0.0), ("20 ms ramp", 0.02), ("40 ms ramp", 0.04)):
+                bases = ramped_ending(excitation, eras, ramp=ramp)
+                columns[name].append(self.transients.left_db(excitation, bases))
+            envelopes = self.clock("ending", partial(self.shaper.ending, excitation))
+            bases = shaped(envelopes, eras)
+            columns["40 ms brake"].append(self._left(excitation, bases))
+            realised = [
+                self._left(
+                    case.excitation(self.rig, level, each),
+                    shaped(with_errors(envelopes, self.rig, each), eras),
+                )
+                for each in wrong(self._rng, len(eras), self._draws)
+            ]
+            columns["40 ms brake, realised"].append(float(np.median(realised)))
+            columns["largest level"].append(
+                max(each.largest / self.rig.era(name).stroke for name, each in envelopes.items())
+            )
+        return columns
+
+    def _left(self, excitation: Excitation, bases: Bases) -> float:
+        return self.clock("level left", lambda: self.transients.left_db(excitation, bases))
+
+    def _contrast(self, case: Case, bases: Bases) -> float:
+        return self.clock(
+            f"transient contrast, {len(case.quiet)} quiet",
+            lambda: self.transients.contrast_db(bases, targets=case.targets, quiet=case.quiet),
+        )
+
+
+def in_time(rig: Rig) -> PlateInTime:
+    """The rig's plate on its ERAs in time."""
+    attachments = np.vstack([era_positions(rig.eras), load_positions(rig.loads)])
+    reduced = reduce_plate(rig.plate, rig.mesh, attachments, frequency_max=rig.limits.frequency_max)
+    return plate_in_time(reduced, rig.eras, loads=rig.loads)
+
+
+def print_columns(title: str, columns: Columns, *, worse: float) -> None:
+    print(f"\n{title}")
+    for name, values in columns.items():
+        unit = "" if name == "largest level" else " dB"
+        print(f"  {name:34s} {np.median(values):6.1f} ({np.percentile(values, worse):6.1f}){unit}")

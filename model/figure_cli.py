@@ -53,7 +53,7 @@ def figure(
         answer = {"figures": findings, "mesh": [rig.mesh.nx, rig.mesh.ny]}
         print(json.dumps(answer | {"time_s": elapsed, "files": files}))
         return
-    print(f"{rig.mesh} mesh, {elapsed:.1f} s; wrote")
+    print(f"{elapsed:.1f} s, mesh {rig.mesh}; wrote")
     for name in files:
         print(f"  {name}")
     print(f"Next: era study placement {rig_file} -o study")
@@ -62,7 +62,7 @@ def figure(
 def _shown(value: object) -> str:
     match value:
         case float():
-            return f"{value:.4g}"
+            return f"{value:.5g}"
         case list():
             return ", ".join(_shown(one) for one in value)
         case dict():

@@ -84,9 +84,9 @@ def maps_figure(panels: Sequence[MapPanel], *, columns: int, caption: str | None
     rows = -(-len(panels) // columns)
     width = 7.0 if columns == 1 else 3.6 * columns + 1
     ratio = panels[0].plate_map.y[-1] / panels[0].plate_map.x[-1]
-    figure = Figure(
-        figsize=(width, rows * (0.8 * width / columns * ratio + 0.7)), layout="constrained"
-    )
+    height = rows * (0.8 * width / columns * ratio + 0.8) + (0.5 if caption else 0.1)
+    # Constrained, and drawn together: maps keep their shape and would leave gaps otherwise.
+    figure = Figure(figsize=(width, height), layout="compressed")
     grid = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
     maximum = max(float(panel.plate_map.peak.max()) for panel in panels) / G
     for axes, panel in zip(grid.flat, panels, strict=True):

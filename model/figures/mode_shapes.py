@@ -27,6 +27,8 @@ from model.rig import Rig
 MODE_COUNT = 5
 SHOWN_MODES = (1, 5)
 
+_HEADINGS = {"analytical_hz": "Eq. 29", "comsol_hz": "COMSOL, paper", "paper_hz": "MATLAB, paper"}
+
 
 def simply_supported_figure(rig: Rig) -> PaperFigure:
     """Figure 6: simply supported on all edges, without ERAs; paper Eq. 29 beside the model."""
@@ -135,9 +137,9 @@ def _draw_table(axes: Axes, columns: Columns) -> None:
     axes.axis("off")
     drawn = axes.table(
         cellText=[[f"{value:.2f}" for value in row] for row in zip(*columns.values(), strict=True)],
-        rowLabels=[f"  mode {mode}  " for mode in range(1, MODE_COUNT + 1)],
-        colLabels=[key.replace("_hz", " / Hz").replace("_", " ") for key in columns],
-        bbox=Bbox.from_bounds(0.12, 0, 0.86, 1),
+        rowLabels=[f"  mode {mode} / Hz  " for mode in range(1, MODE_COUNT + 1)],
+        colLabels=[_HEADINGS.get(key, key.replace("_hz", "").replace("_", " ")) for key in columns],
+        bbox=Bbox.from_bounds(0.15, 0, 0.83, 1),
     )
     drawn.auto_set_font_size(False)
     drawn.set_fontsize(10)

@@ -10,6 +10,8 @@ from model.rig import Rig
 from model.studies.ranking import Ranking, era_counts
 from model.studies.solve import DRIVE_NAMES, DRIVES
 
+_WIDE = 5.0  # where medians differ by more than this factor, boxes stand on a logarithmic scale
+
 
 def ranking_figure(rig: Rig, ranking: Ranking) -> Figure:
     """Box plots of the rig as it is and of the best, the middle and the worst case."""
@@ -19,7 +21,8 @@ def ranking_figure(rig: Rig, ranking: Ranking) -> Figure:
     if ranking.recommended != ranking.best:
         shown["recommended"] = ranking.recommended
     title = f"{len(ranking.order)} cases, {DRIVE_NAMES[DRIVES[ranking.drive]]} driven"
-    return _boxes(rig, ranking, shown.items(), title=title)
+    wide = ranking.medians[ranking.best] > _WIDE * ranking.medians[ranking.worst]
+    return _boxes(rig, ranking, shown.items(), title=title, logarithmic=wide)
 
 
 def count_figure(rig: Rig, ranking: Ranking) -> Figure:

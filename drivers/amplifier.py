@@ -6,7 +6,7 @@ from typing import TypeVar, final
 from drivers.backend import Backend
 from drivers.command import token_after
 from drivers.errors import CommandError, CommandRefused, FrameError, LinkError, LinkTimeout
-from drivers.guard import SafeCommand
+from drivers.guard import SafeCommand, SafeEnvelope
 from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.messages import (
     Achieved,
@@ -23,6 +23,8 @@ from drivers.protocol.messages import (
     GetStatus,
     Hello,
     Identity,
+    Loaded,
+    LoadEnvelope,
     Nak,
     NakCode,
     Ping,
@@ -51,10 +53,11 @@ _REASONS = {
     "ask for its status",
     NakCode.BAD_TOKEN: "no set is staged under this token",
     NakCode.BUSY: "it was busy three times in a row; try again",
+    NakCode.NO_ENVELOPE: "no envelope is loaded in a slot that the set refers to",
     NakCode.UNSUPPORTED_VERSION: "it speaks another version of the protocol",
 }
 
-_ReplyT = TypeVar("_ReplyT", Identity, Capabilities, Status, Achieved, FaultList)
+_ReplyT = TypeVar("_ReplyT", Identity, Capabilities, Status, Achieved, FaultList, Loaded)
 
 
 @final
@@ -158,6 +161,23 @@ class Amplifier:
         and raises CommandRefused, unless it silences too.
         """
         return await self._ask(Stop(ramp=self._ramp(ramp)), expect=Status, kind=Kind.SILENCE)
+
+    async def load_envelope(self, safe: SafeEnvelope) -> None:
+        """Keep an envelope under its slot, for sets that come after it; at any time, armed or not.
+
+        Raises CommandRefused where the amplifier plays no envelopes.
+        """
+        if type(safe) is not SafeEnvelope:
+            raise TypeError(
+                f"an amplifier takes a SafeEnvelope, not a {type(safe).__name__}: "
+                "let Guard.check_envelope make one"
+            )
+        loaded = await self._ask(LoadEnvelope(safe), expect=Loaded)
+        if (loaded.slot, loaded.knots) != (safe.slot, len(safe.knots)):
+            raise FrameError(
+                f"the amplifier loaded {loaded.knots} knots into slot {loaded.slot} instead of "
+                f"{len(safe.knots)} into slot {safe.slot}"
+            )
 
     async def stage(self, safe: SafeCommand) -> Achieved:
         """Keep a set ready under its token; returns what commit would play."""

@@ -1,8 +1,16 @@
-"""What every backend must do: carry one request to an amplifier and bring its reply back."""
+"""What every backend must do: carry one request to an amplifier and bring its reply back.
+
+Written by whoever adds a wire, registered as an entry point of `era_haptics.backends` under the
+scheme of its URLs, and held to `drivers.conformance`. The first five members are its own; the
+others have answers that suit a wire with one amplifier that only speaks when it is asked.
+"""
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 
-from drivers.protocol.messages import Reply, Request
+from drivers.errors import CommandError
+from drivers.protocol.messages import Broadcast, Event, Reply, Request
+from drivers.statistics import WireCounters
 
 
 class Backend(ABC):
@@ -14,7 +22,10 @@ class Backend(ABC):
 
     @abstractmethod
     async def open(self) -> None:
-        """Open the wire, exclusively where it can be; raises LinkError with what to do about it."""
+        """Open the wire, exclusively where it can be; raises LinkError with what to do about it.
+
+        A wire that several amplifiers share is opened once in a process, for all of them.
+        """
 
     @abstractmethod
     async def close(self) -> None:
@@ -26,9 +37,40 @@ class Backend(ABC):
 
         timeout [s]: what the amplifier may take; what a slow wire needs comes on top of it. Raises
         LinkTimeout, LinkError. A Nak is returned, not raised. Cancelling leaves the wire usable.
+        Sets and envelopes must be a SafeCommand and a SafeEnvelope: TypeError for others.
         """
 
     @property
     @abstractmethod
     def last_sent(self) -> float:
         """When the last byte of the last request went out, on time.monotonic() [s]."""
+
+    @property
+    def counters(self) -> WireCounters:
+        """What was seen on the wire; all zero where nothing is counted."""
+        return WireCounters()
+
+    def listen(self, on_event: Callable[[Event], None], on_loss: Callable[[str], None]) -> None:
+        """Whom to tell, in the event loop, what comes unasked.
+
+        on_event: the amplifier's own events; on_loss: once after each opening, when the wire or the
+        amplifier on it was found to be gone without a request being on its way. To be called before
+        `open`. A wire that notices neither calls nobody.
+        """
+        return
+
+    @property
+    def bus(self) -> str | None:
+        """Names what it shares with others that one broadcast reaches; None without broadcasts."""
+        return None
+
+    async def broadcast(self, request: Broadcast) -> None:
+        """Send a commit or a stop to every amplifier of the bus at once; nobody answers.
+
+        Raises LinkError, and CommandError where there is no bus.
+        """
+        raise CommandError(f"this wire cannot broadcast a {type(request).__name__}")
+
+    def round_trip(self, channels: int) -> float:
+        """Time [s] on the wire of an apply of so many channels and its answer; 0 if unknown."""
+        return 0.0

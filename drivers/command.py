@@ -1,4 +1,9 @@
-"""What is asked of an amplifier: a drive command per channel, several of them as one set."""
+"""What is asked of an amplifier: a drive command per channel, several of them as one set.
+
+An envelope shapes how a channel gets from what it plays to what it shall play: its complex
+amplitude, level and phase, goes along straight lines from where it is through the knots, one every
+step, and reaches what the command says one step after the last knot. So nothing can jump.
+"""
 
 from dataclasses import dataclass
 
@@ -13,6 +18,8 @@ class DriveCommand:
     level * sin(2 pi f t + phase), t counted from the commit for every channel of a set unless
     keep_phase asks that a channel which already plays this frequency runs on undisturbed in time.
     A channel with level 0 falls silent.
+    onset, ending: slots of envelopes, 0 for none; see `Envelope`. skip_ending: a channel that falls
+    silent does so along the ramp, whatever ending it was given.
     """
 
     channel: int
@@ -20,6 +27,33 @@ class DriveCommand:
     level: float
     phase: float = 0.0
     keep_phase: bool = False
+    onset: int = 0
+    ending: int = 0
+    skip_ending: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Knot:
+    """Where a channel is on its way: level 0..1 of full stroke, phase [degrees] as a command's."""
+
+    level: float
+    phase: float
+
+
+@dataclass(frozen=True)
+class Envelope:
+    """How a channel gets to what it shall play, kept by the amplifier under a slot, 1..63.
+
+    step [s] between knots; without knots the slot is empty again. As an onset it begins at the
+    commit: from the present amplitude where the channel plays this frequency and keep_phase is
+    set, else from zero. As an ending it leads to silence: when the next set makes the channel
+    silent, or at the end of valid_for. Stop, disarm and faults know no endings. A set takes
+    its envelopes with it when it is staged: a slot may be loaded anew at any time.
+    """
+
+    slot: int
+    step: float
+    knots: tuple[Knot, ...]
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from numbers import Integral, Real
 from typing import final
 
-from drivers.command import CommandSet, DriveCommand, token_after
+from drivers.command import CommandSet, DriveCommand, Envelope, Knot, token_after
 from drivers.errors import CommandError, CommandRefused
 from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.messages import Capabilities
@@ -46,6 +46,21 @@ class SafeCommand(CommandSet):
         raise TypeError("SafeCommand cannot be subclassed")
 
 
+@final
+class SafeEnvelope(Envelope):
+    """An envelope that a guard has let through; only a `Guard` can make one."""
+
+    def __init__(
+        self, slot: int, step: float, knots: tuple[Knot, ...], *, key: object = None
+    ) -> None:
+        if key is not _KEY:
+            raise TypeError("a SafeEnvelope is made by Guard.check_envelope, by nobody else")
+        super().__init__(slot=slot, step=step, knots=knots)
+
+    def __init_subclass__(cls) -> None:
+        raise TypeError("SafeEnvelope cannot be subclassed")
+
+
 @dataclass(frozen=True)
 class GuardLimits:
     """What the configuration allows: mechanical frequencies [Hz] and level (1 is full stroke)."""
@@ -64,6 +79,10 @@ class _Bounds:
     level: float
     ramp: float
     channels: int
+    envelope_slots: int
+    envelope_knots: int
+    envelope_step_min: float
+    envelope_step_max: float
 
 
 def _tightest(limits: GuardLimits, capabilities: Capabilities) -> _Bounds:
@@ -80,6 +99,10 @@ def _tightest(limits: GuardLimits, capabilities: Capabilities) -> _Bounds:
         level=min(limits.level, capabilities.level_max, LEVEL_CEILING),
         ramp=max(0.0, min(capabilities.ramp_max, PROTOCOL.quantities.ramp.high)),
         channels=min(capabilities.channels, PROTOCOL.quantities.channel_count.maximum),
+        envelope_slots=capabilities.envelope_slots,
+        envelope_knots=capabilities.envelope_knots,
+        envelope_step_min=capabilities.envelope_step_min,
+        envelope_step_max=capabilities.envelope_step_max,
     )
     if bounds.frequency_min > bounds.frequency_max:
         raise CommandError(
@@ -169,6 +192,18 @@ def _check_frequencies(command_set: CommandSet, bounds: _Bounds) -> None:
             )
 
 
+def _check_slots(command_set: CommandSet, bounds: _Bounds) -> None:
+    for command in command_set.commands:
+        for name in ("onset", "ending"):
+            slot = getattr(command, name)
+            if not _is_whole(slot, low=0, high=bounds.envelope_slots):
+                raise CommandRefused(
+                    f"{name} of channel {command.channel} is slot {slot!r}; the amplifier keeps "
+                    f"envelopes in slots 1 to {bounds.envelope_slots} (0 is none)",
+                    channel=command.channel,
+                )
+
+
 # In this order; each raises CommandRefused or lets the set pass, and may rely on those before it.
 _RULES: tuple[Callable[[CommandSet, _Bounds], None], ...] = (
     _check_token,
@@ -177,6 +212,7 @@ _RULES: tuple[Callable[[CommandSet, _Bounds], None], ...] = (
     _check_finite,
     _check_levels,
     _check_frequencies,
+    _check_slots,
 )
 
 
@@ -209,6 +245,9 @@ class Guard:
                 level=float(command.level),
                 phase=float(command.phase),
                 keep_phase=bool(command.keep_phase),
+                onset=int(command.onset),
+                ending=int(command.ending),
+                skip_ending=bool(command.skip_ending),
             )
             for command in command_set.commands
         )
@@ -219,16 +258,48 @@ class Guard:
             valid_for=float(command_set.valid_for),
         )
 
+    def check_envelope(self, envelope: Envelope) -> SafeEnvelope:
+        """The envelope as one that may be loaded; CommandRefused says which knot and why."""
+        bounds = self._bounds
+        if not _is_whole(envelope.slot, low=1, high=bounds.envelope_slots):
+            raise CommandRefused(
+                f"slot is {envelope.slot!r}; the amplifier keeps envelopes in slots 1 to "
+                f"{bounds.envelope_slots}"
+            )
+        low, high = bounds.envelope_step_min, bounds.envelope_step_max
+        if not (_is_number(envelope.step) and low <= envelope.step <= high):
+            raise CommandRefused(
+                f"the step of an envelope is {envelope.step!r} s; it must lie between {low:g} and "
+                f"{high:g} s"
+            )
+        if len(envelope.knots) > bounds.envelope_knots:
+            raise CommandRefused(
+                f"an envelope has {len(envelope.knots)} knots; the amplifier takes "
+                f"{bounds.envelope_knots}"
+            )
+        for number, knot in enumerate(envelope.knots):
+            is_finite = _is_number(knot.level) and _is_number(knot.phase)
+            if not (is_finite and 0 <= knot.level <= bounds.level):
+                raise CommandRefused(
+                    f"knot {number} has level {knot.level!r} and phase {knot.phase!r} degrees; "
+                    f"both must be finite, and the level between 0 and {bounds.level:g}"
+                )
+        knots = tuple(Knot(float(knot.level), float(knot.phase)) for knot in envelope.knots)
+        return SafeEnvelope(int(envelope.slot), float(envelope.step), knots, key=_KEY)
+
     def silence(self, token: int, channels: Collection[int], *, ramp: float) -> SafeCommand:
         """Level zero on these channels (and on all others, as ever); never fails.
 
         A channel that does not exist is left out, a ramp [s] out of range becomes the nearest in
-        range, and a token that cannot be sent becomes the one after the last.
+        range, and a token that cannot be sent becomes the one after the last. Along the ramp, no
+        endings.
         """
         if not _is_token(token):
             token = token_after(self._last_token)
         commands = tuple(
-            DriveCommand(channel=channel, frequency=self._idle_frequency, level=0.0)
+            DriveCommand(
+                channel=channel, frequency=self._idle_frequency, level=0.0, skip_ending=True
+            )
             for channel in range(self._bounds.channels)
             if channel in channels
         )

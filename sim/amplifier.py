@@ -30,6 +30,7 @@ from drivers.protocol.messages import (
     GetStatus,
     Hello,
     Identity,
+    LoadEnvelope,
     Nak,
     NakCode,
     Reply,
@@ -175,6 +176,8 @@ class SimulatedAmplifier:
                     return Achieved(self._active.token, self._active.commands)
                 reply = self._stage(wanted)
                 return reply if isinstance(reply, Nak) else self._commit(wanted.token, now)
+            case LoadEnvelope():  # it has no slots
+                return Nak(NakCode.UNKNOWN_TYPE)
             case _:  # GetStatus and Ping ask for nothing more
                 pass
         return None

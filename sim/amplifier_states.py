@@ -19,6 +19,7 @@ from drivers.protocol.messages import (
     GetFaults,
     GetStatus,
     Hello,
+    LoadEnvelope,
     Ping,
     Request,
     Stage,
@@ -31,7 +32,7 @@ ENABLED = frozenset({State.OPERATION_ENABLED})
 
 Table: TypeAlias = Mapping[tuple[State, type[Request]], State]
 
-_ASKING: tuple[type[Request], ...] = (Hello, GetCaps, GetStatus, GetFaults, Ping)
+_ASKING: tuple[type[Request], ...] = (Hello, GetCaps, GetStatus, GetFaults, Ping, LoadEnvelope)
 _PLAYING: tuple[type[Request], ...] = (Stage, Commit, Apply)
 _OFF = (State.SWITCH_ON_DISABLED, State.READY_TO_SWITCH_ON)
 _STOPPED = (State.QUICK_STOP_ACTIVE, State.FAULT_REACTION_ACTIVE, State.FAULT)

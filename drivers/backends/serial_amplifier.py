@@ -19,8 +19,9 @@ from drivers.backends.serial_url import SerialUrl
 from drivers.errors import DriverError, LinkError, LinkTimeout
 from drivers.protocol.messages import Reply, Request
 from drivers.protocol.serial_codec import decode_reply, encode_request
-from drivers.protocol.serial_frame import Frame, FrameCounters, FrameReader, encode_frame
+from drivers.protocol.serial_frame import Frame, FrameReader, encode_frame
 from drivers.protocol.serial_timing import exchange_time
+from drivers.statistics import WireCounters
 
 _READ_TIMEOUT = 0.1  # s; how long the reader of a port that cannot be woken notices its end
 _WRITE_TIMEOUT = 0.02  # s; a frame fits into any driver's buffer unless the line is stuck
@@ -48,12 +49,12 @@ class SerialBackend(Backend):
         self._sequence = secrets.randbelow(1 << 16)
         self._last_sent = 0.0
         self._loss: str | None = None
-        self.foreign_replies = 0
+        self._counters = WireCounters()
 
     @property
-    def counters(self) -> FrameCounters:
-        """What came in, frames by their fate; `foreign_replies` counts good ones for nobody."""
-        return self._reader.counters
+    def counters(self) -> WireCounters:
+        """What was seen on the line."""
+        return self._counters
 
     @property
     def last_sent(self) -> float:
@@ -148,6 +149,7 @@ class SerialBackend(Backend):
             self._lose(self._what_was_lost(problem))
             raise LinkError(self._loss) from problem
         self._last_sent = time.monotonic()
+        self._counters.frames_out += 1
 
     def _read(self, port: serial.Serial, loop: asyncio.AbstractEventLoop) -> None:
         """Read until the port is closed or lost; runs in the reader thread."""
@@ -163,7 +165,10 @@ class SerialBackend(Backend):
                     loop.call_soon_threadsafe(self._lose, self._what_was_lost(problem))
 
     def _received(self, data: bytes) -> None:
-        for frame in self._reader.feed(data):
+        frames = self._reader.feed(data)
+        self._counters.frames_in += len(frames)
+        self._counters.bad = self._reader.counters.bad
+        for frame in frames:
             pending = self._pending.get(frame.sequence)
             if (
                 pending is None
@@ -171,7 +176,7 @@ class SerialBackend(Backend):
                 or not frame.is_reply
                 or frame.address != self._url.address
             ):
-                self.foreign_replies += 1
+                self._counters.foreign += 1
                 continue
             try:
                 pending.reply.set_result(decode_reply(frame, pending.request))

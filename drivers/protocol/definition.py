@@ -101,7 +101,11 @@ class Quantities:
     channel_count: Quantity
     fault_count: Quantity
     envelope_knots: Quantity
+    envelope_slots: Quantity
+    envelope_slot: Quantity
+    envelope_step: Quantity
     temperature: Quantity
+    voltage: Quantity
     age: Quantity
     protocol_version: Quantity
 
@@ -118,7 +122,10 @@ class SerialLine:
 
 @dataclass(frozen=True)
 class Protocol:
-    """Everything that host and amplifier must agree on, in numbers."""
+    """Everything that host and amplifier must agree on, in numbers.
+
+    modbus, canopen: the sections of these names as they stand in the file.
+    """
 
     version: int
     serial: SerialLine
@@ -127,6 +134,8 @@ class Protocol:
     faults: Mapping[str, int]
     naks: Mapping[str, int]
     quantities: Quantities
+    modbus: Mapping[str, Any]
+    canopen: Mapping[str, Any]
 
 
 def _load() -> Protocol:
@@ -146,6 +155,8 @@ def _load() -> Protocol:
                 for field in fields(Quantities)
             }
         ),
+        modbus=raw["modbus"],
+        canopen=raw["canopen"],
     )
 
 

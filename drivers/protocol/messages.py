@@ -1,7 +1,8 @@
 """What host and amplifier say to each other, whatever the wire.
 
 A request is answered by exactly one reply: the one named beside it here, or a `Nak`.
-Codecs turn these into bytes and back; nothing here knows of bytes.
+An `Event` comes unasked, on wires on which an amplifier may speak first. Codecs turn these into
+bytes and back; nothing here knows of bytes.
 
     Hello       Identity            who is there
     GetCaps     Capabilities        what it can play
@@ -15,13 +16,16 @@ Codecs turn these into bytes and back; nothing here knows of bytes.
     GetFaults   FaultList           what went wrong, newest first
     Clear       Status              acknowledge faults whose cause is gone
     Ping        Status              heartbeat: feeds the watchdog
+    LoadEnvelope  Loaded            keep an envelope under its slot, for sets that refer to it
+
+A Commit or a Stop may be broadcast to all amplifiers of a bus; nobody answers then.
 """
 
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import TypeAlias
 
-from drivers.command import CommandSet, DriveCommand
+from drivers.command import CommandSet, DriveCommand, Envelope
 
 
 class State(IntEnum):
@@ -60,6 +64,7 @@ class NakCode(IntEnum):
     BAD_TOKEN = 6
     BUSY = 7
     UNSUPPORTED_VERSION = 8
+    NO_ENVELOPE = 9
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,6 +140,13 @@ class Ping:
 
 
 @dataclass(frozen=True, slots=True)
+class LoadEnvelope:
+    """Keep this envelope under its slot until another takes its place or the supply is lost."""
+
+    envelope: Envelope
+
+
+@dataclass(frozen=True, slots=True)
 class Identity:
     """Who an amplifier is; the serial number tells two of a kind apart."""
 
@@ -147,7 +159,11 @@ class Identity:
 
 @dataclass(frozen=True, slots=True)
 class Capabilities:
-    """What an amplifier can play: frequencies [Hz], steps, watchdog range [s], longest ramp [s]."""
+    """What an amplifier can play: frequencies [Hz], steps, watchdog range [s], longest ramp [s].
+
+    envelope_knots: how many an envelope may have; envelope_slots: how many envelopes it keeps;
+    their steps [s]; all 0 for an amplifier without envelopes. events: whether it speaks unasked.
+    """
 
     channels: int
     frequency_min: float
@@ -160,13 +176,18 @@ class Capabilities:
     watchdog_min: float
     watchdog_max: float
     envelope_knots: int
+    envelope_slots: int = 0
+    envelope_step_min: float = 0.0
+    envelope_step_max: float = 0.0
+    events: bool = False
 
 
 @dataclass(frozen=True, slots=True)
 class Status:
     """How an amplifier is: state, fault, the token it plays, the level each channel has now.
 
-    token 0: nothing was played since it was armed; temperature [°C]; watchdog_left [s].
+    token 0: nothing was played since it was armed; temperature [°C]; watchdog_left [s]; voltage
+    [V] of the high-voltage supply, 0 where it is not measured.
     """
 
     state: State
@@ -176,6 +197,7 @@ class Status:
     temperature: float
     watchdog_left: float
     levels: tuple[float, ...]
+    voltage: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -203,6 +225,23 @@ class FaultList:
 
 
 @dataclass(frozen=True, slots=True)
+class Loaded:
+    """An envelope of so many knots is kept under this slot."""
+
+    slot: int
+    knots: int
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """The state has changed, or there is a fault; channel: the one to blame, where one is."""
+
+    state: State
+    fault: Fault
+    channel: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
 class Nak:
     """Refused: why, and which channel where one is to blame. Nothing of the request was applied."""
 
@@ -223,5 +262,7 @@ Request: TypeAlias = (
     | GetFaults
     | Clear
     | Ping
+    | LoadEnvelope
 )
-Reply: TypeAlias = Identity | Capabilities | Status | Achieved | FaultList | Nak
+Reply: TypeAlias = Identity | Capabilities | Status | Achieved | FaultList | Loaded | Nak
+Broadcast: TypeAlias = Commit | Stop

@@ -1,17 +1,17 @@
 """Messages to frames and back, for both ends of a serial line.
 
 Each message has its layout written down once as a pair of functions, pack and unpack. Decoding is
-total: any payload becomes a message with every value in range, or `Malformed`. Encoding a set asks
-for a `SafeCommand`; decoding gives a plain CommandSet, which must pass a guard before it can be
-sent on.
+total: any payload becomes a message with every value in range, or `Malformed`. Encoding a set or
+an envelope asks for what a guard made of it; decoding gives the plain one, which must pass a guard
+before it can be sent on.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from drivers.command import CommandSet, DriveCommand
-from drivers.guard import SafeCommand
+from drivers.command import CommandSet, DriveCommand, Envelope, Knot
+from drivers.guard import SafeCommand, SafeEnvelope
 from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.messages import (
     Achieved,
@@ -21,6 +21,7 @@ from drivers.protocol.messages import (
     Clear,
     Commit,
     Disarm,
+    Event,
     Fault,
     FaultList,
     FaultRecord,
@@ -29,6 +30,8 @@ from drivers.protocol.messages import (
     GetStatus,
     Hello,
     Identity,
+    Loaded,
+    LoadEnvelope,
     Nak,
     NakCode,
     Ping,
@@ -43,21 +46,30 @@ from drivers.protocol.payload import Cursor, Malformed, pack, pack_optional_chan
 from drivers.protocol.serial_frame import REPLY, Frame
 
 _NAK = PROTOCOL.types["nak"]
+_EVENT = PROTOCOL.types["event"]
 _Q = PROTOCOL.quantities
 _KEEP_PHASE = 0x01
+_SKIP_ENDING = 0x02
+_ENVELOPES = 0x04  # onset and ending follow the command
 _HIGH_VOLTAGE = 0x01
+_EVENTS = 0x01
 
 
 def _pack_commands(commands: tuple[DriveCommand, ...]) -> bytes:
     packed = pack((_Q.channel_count, len(commands)))
     for command in commands:
         packed += pack((_Q.channel, command.channel))
-        packed += bytes([_KEEP_PHASE if command.keep_phase else 0])
+        is_shaped = command.onset or command.ending
+        flags = _KEEP_PHASE if command.keep_phase else 0
+        flags |= _SKIP_ENDING if command.skip_ending else 0
+        packed += bytes([flags | (_ENVELOPES if is_shaped else 0)])
         packed += pack(
             (_Q.frequency, command.frequency),
             (_Q.level, command.level),
             (_Q.phase, command.phase),
         )
+        if is_shaped:
+            packed += pack((_Q.envelope_slot, command.onset), (_Q.envelope_slot, command.ending))
     return packed
 
 
@@ -71,7 +83,8 @@ def _unpack_commands(cursor: Cursor) -> tuple[DriveCommand, ...]:
                 f"channel {channel} is named twice", code=NakCode.BAD_CHANNEL, channel=channel
             )
         seen.add(channel)
-        flags = cursor.flags(_KEEP_PHASE)
+        flags = cursor.flags(_KEEP_PHASE | _SKIP_ENDING | _ENVELOPES)
+        is_shaped = bool(flags & _ENVELOPES)
         commands.append(
             DriveCommand(
                 channel=channel,
@@ -79,6 +92,9 @@ def _unpack_commands(cursor: Cursor) -> tuple[DriveCommand, ...]:
                 level=cursor.number(_Q.level),
                 phase=cursor.number(_Q.phase),
                 keep_phase=bool(flags & _KEEP_PHASE),
+                onset=cursor.integer(_Q.envelope_slot) if is_shaped else 0,
+                ending=cursor.integer(_Q.envelope_slot) if is_shaped else 0,
+                skip_ending=bool(flags & _SKIP_ENDING),
             )
         )
     return tuple(commands)
@@ -105,6 +121,29 @@ def _unpack_set(cursor: Cursor) -> CommandSet:
     return CommandSet(
         token=token, commands=_unpack_commands(cursor), ramp=ramp, valid_for=valid_for
     )
+
+
+def _pack_envelope(envelope: Envelope) -> bytes:
+    if type(envelope) is not SafeEnvelope:
+        raise TypeError(
+            f"only a SafeEnvelope goes on the wire, not a {type(envelope).__name__}: "
+            "let Guard.check_envelope make one"
+        )
+    head = pack((_Q.envelope_slot, envelope.slot), (_Q.envelope_step, envelope.step))
+    head += pack((_Q.envelope_knots, len(envelope.knots)))
+    return head + b"".join(
+        pack((_Q.level, knot.level), (_Q.phase, knot.phase)) for knot in envelope.knots
+    )
+
+
+def _unpack_envelope(cursor: Cursor) -> Envelope:
+    slot = cursor.integer(_Q.envelope_slot)
+    step = cursor.number(_Q.envelope_step)
+    count = cursor.integer(_Q.envelope_knots)
+    knots = tuple(
+        Knot(level=cursor.number(_Q.level), phase=cursor.number(_Q.phase)) for _ in range(count)
+    )
+    return Envelope(slot=slot, step=step, knots=knots)
 
 
 def _pack_identity(identity: Identity) -> bytes:
@@ -137,7 +176,10 @@ def _pack_capabilities(capabilities: Capabilities) -> bytes:
         (_Q.watchdog, capabilities.watchdog_min),
         (_Q.watchdog, capabilities.watchdog_max),
         (_Q.envelope_knots, capabilities.envelope_knots),
-    )
+        (_Q.envelope_slots, capabilities.envelope_slots),
+        (_Q.envelope_step, capabilities.envelope_step_min),
+        (_Q.envelope_step, capabilities.envelope_step_max),
+    ) + bytes([_EVENTS if capabilities.events else 0])
 
 
 def _unpack_capabilities(cursor: Cursor) -> Capabilities:
@@ -153,6 +195,10 @@ def _unpack_capabilities(cursor: Cursor) -> Capabilities:
         watchdog_min=cursor.number(_Q.watchdog),
         watchdog_max=cursor.number(_Q.watchdog),
         envelope_knots=cursor.integer(_Q.envelope_knots),
+        envelope_slots=cursor.integer(_Q.envelope_slots),
+        envelope_step_min=cursor.number(_Q.envelope_step),
+        envelope_step_max=cursor.number(_Q.envelope_step),
+        events=bool(cursor.flags(_EVENTS)),
     )
 
 
@@ -162,6 +208,7 @@ def _pack_status(status: Status) -> bytes:
     head += pack(
         (_Q.temperature, status.temperature),
         (_Q.watchdog_left, status.watchdog_left),
+        (_Q.voltage, status.voltage),
         (_Q.channel_count, len(status.levels)),
     )
     return head + b"".join(pack((_Q.level, level)) for level in status.levels)
@@ -174,6 +221,7 @@ def _unpack_status(cursor: Cursor) -> Status:
     flags = cursor.flags(_HIGH_VOLTAGE)
     temperature = cursor.number(_Q.temperature)
     watchdog_left = cursor.number(_Q.watchdog_left)
+    voltage = cursor.number(_Q.voltage)
     channels = cursor.integer(_Q.channel_count)
     return Status(
         state=state,
@@ -182,6 +230,7 @@ def _unpack_status(cursor: Cursor) -> Status:
         high_voltage=bool(flags & _HIGH_VOLTAGE),
         temperature=temperature,
         watchdog_left=watchdog_left,
+        voltage=voltage,
         levels=tuple(cursor.number(_Q.level) for _ in range(channels)),
     )
 
@@ -265,6 +314,25 @@ _STOP = _Layout(
     lambda stop: pack((_Q.ramp, stop.ramp)),
     lambda cursor: Stop(ramp=cursor.number(_Q.ramp)),
 )
+_LOAD_ENVELOPE = _Layout(
+    LoadEnvelope,
+    lambda load: _pack_envelope(load.envelope),
+    lambda cursor: LoadEnvelope(_unpack_envelope(cursor)),
+)
+_LOADED = _Layout(
+    Loaded,
+    lambda loaded: pack((_Q.envelope_slot, loaded.slot), (_Q.envelope_knots, loaded.knots)),
+    lambda cursor: Loaded(
+        slot=cursor.integer(_Q.envelope_slot), knots=cursor.integer(_Q.envelope_knots)
+    ),
+)
+_EVENT_LAYOUT = _Layout(
+    Event,
+    lambda event: bytes([event.state, event.fault]) + pack_optional_channel(event.channel),
+    lambda cursor: Event(
+        state=cursor.one_of(State), fault=cursor.one_of(Fault), channel=cursor.optional_channel()
+    ),
+)
 
 # Request and reply of every message type.
 _EXCHANGES: dict[int, tuple[_Layout, _Layout]] = {
@@ -280,6 +348,7 @@ _EXCHANGES: dict[int, tuple[_Layout, _Layout]] = {
     PROTOCOL.types["get_faults"]: (_empty(GetFaults), _FAULTS),
     PROTOCOL.types["clear"]: (_empty(Clear), _STATUS),
     PROTOCOL.types["ping"]: (_empty(Ping), _STATUS),
+    PROTOCOL.types["load_envelope"]: (_LOAD_ENVELOPE, _LOADED),
 }
 _TYPE_OF = {request.message: code for code, (request, _) in _EXCHANGES.items()}
 
@@ -327,6 +396,23 @@ def decode_reply(frame: Frame, to: Frame) -> Reply:
         )
     reply: Reply = _decode(_EXCHANGES[to.type][1], frame.payload)
     return reply
+
+
+def is_event(frame: Frame) -> bool:
+    """Whether a frame is no answer: its sequence number counts the amplifier's events."""
+    return frame.kind == REPLY | _EVENT
+
+
+def encode_event(event: Event, *, address: int, sequence: int) -> Frame:
+    """The frame in which an amplifier speaks unasked."""
+    payload = _EVENT_LAYOUT.pack(event)
+    return Frame(kind=REPLY | _EVENT, address=address, sequence=sequence, payload=payload)
+
+
+def decode_event(frame: Frame) -> Event:
+    """The event in a frame for which `is_event` holds; raises Malformed."""
+    event: Event = _decode(_EVENT_LAYOUT, frame.payload)
+    return event
 
 
 def _decode_nak(payload: bytes, to: Frame) -> Nak:

@@ -60,6 +60,11 @@ class FrameCounters:
     truncated: int = 0
     bad_version: int = 0
 
+    @property
+    def bad(self) -> int:
+        """Everything that was dropped."""
+        return self.bad_crc + self.too_long + self.truncated + self.bad_version
+
 
 def encode_frame(frame: Frame) -> bytes:
     """The bytes of a frame, delimiters included; ValueError for a payload that is too long."""

@@ -6,8 +6,8 @@ from drivers.protocol.serial_frame import frame_length
 _BITS_PER_BYTE = 10  # start, eight data, stop
 _SET_HEAD = 7  # token, ramp, valid_for, count
 _ACHIEVED_HEAD = 3  # token, count
-_COMMAND = 8  # channel, flags, frequency, level, phase
-_STATUS_LENGTH = frame_length(10 + 2 * PROTOCOL.quantities.channel_count.maximum)
+_COMMAND = 8  # channel, flags, frequency, level, phase; two more with envelopes
+_STATUS_LENGTH = frame_length(12 + 2 * PROTOCOL.quantities.channel_count.maximum)
 
 
 def wire_time(channels: int, *, baud: int = PROTOCOL.serial.baud) -> float:

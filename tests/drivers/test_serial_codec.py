@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.command import CommandSet, DriveCommand
+from drivers.command import CommandSet, DriveCommand, Envelope, Knot
 from drivers.errors import CommandError
 from drivers.guard import Guard, GuardLimits, SafeCommand
 from drivers.protocol.definition import PROTOCOL, Quantity
@@ -18,6 +18,7 @@ from drivers.protocol.messages import (
     Clear,
     Commit,
     Disarm,
+    Event,
     Fault,
     FaultList,
     FaultRecord,
@@ -26,6 +27,8 @@ from drivers.protocol.messages import (
     GetStatus,
     Hello,
     Identity,
+    Loaded,
+    LoadEnvelope,
     Nak,
     NakCode,
     Ping,
@@ -38,10 +41,13 @@ from drivers.protocol.messages import (
 )
 from drivers.protocol.payload import Malformed
 from drivers.protocol.serial_codec import (
+    decode_event,
     decode_reply,
     decode_request,
+    encode_event,
     encode_reply,
     encode_request,
+    is_event,
 )
 from drivers.protocol.serial_frame import REPLY, Frame
 
@@ -61,6 +67,9 @@ COMMANDS = st.lists(
         level=values(Q.level),
         phase=values(Q.phase),
         keep_phase=st.booleans(),
+        onset=st.integers(0, 63),
+        ending=st.integers(0, 63),
+        skip_ending=st.booleans(),
     ),
     max_size=16,
     unique_by=lambda command: command.channel,
@@ -72,7 +81,13 @@ SETS = st.builds(
     ramp=values(Q.ramp),
     valid_for=values(Q.valid_for),
 )
-WIDE = Capabilities(16, 20.0, 600.0, 0.01, 1.0, 0.0001, 0.01, 1.0, 0.1, 2.0, 0)
+WIDE = Capabilities(16, 20.0, 600.0, 0.01, 1.0, 0.0001, 0.01, 1.0, 0.1, 2.0, 32, 63, 0.001, 0.1)
+ENVELOPES = st.builds(
+    Envelope,
+    slot=st.integers(1, 63),
+    step=st.integers(10, 1000).map(lambda raw: raw / 10000),
+    knots=st.lists(st.builds(Knot, values(Q.level), values(Q.phase)), max_size=32).map(tuple),
+)
 GUARD = Guard(GuardLimits(20.0, 600.0, 1.0), WIDE)
 TEXTS = st.text(st.characters(codec="ascii", categories=["L", "N", "P"]), max_size=32)
 
@@ -84,6 +99,7 @@ REQUESTS = st.one_of(
     st.builds(Commit, token=st.integers(1, 65535)),
     st.builds(Stage, SETS.map(GUARD.check)),
     st.builds(Apply, SETS.map(GUARD.check)),
+    st.builds(LoadEnvelope, ENVELOPES.map(GUARD.check_envelope)),
 )
 ACHIEVED = st.builds(Achieved, token=st.integers(1, 65535), commands=COMMANDS)
 STATUSES = st.builds(
@@ -95,6 +111,7 @@ STATUSES = st.builds(
     temperature=values(Q.temperature),
     watchdog_left=values(Q.watchdog_left),
     levels=st.lists(values(Q.level), max_size=16).map(tuple),
+    voltage=values(Q.voltage),
 )
 ANSWERS = st.one_of(
     st.tuples(st.just(1), st.builds(Identity, *[TEXTS] * 4, st.integers(0, 255))),
@@ -113,10 +130,15 @@ ANSWERS = st.one_of(
             watchdog_min=values(Q.watchdog),
             watchdog_max=values(Q.watchdog),
             envelope_knots=st.integers(0, 32),
+            envelope_slots=st.integers(0, 63),
+            envelope_step_min=values(Q.envelope_step),
+            envelope_step_max=values(Q.envelope_step),
+            events=st.booleans(),
         ),
     ),
     st.tuples(st.sampled_from([3, 4, 8, 9, 11, 12]), STATUSES),
     st.tuples(st.sampled_from([5, 6, 7]), ACHIEVED),
+    st.tuples(st.just(13), st.builds(Loaded, st.integers(0, 63), st.integers(0, 32))),
     st.tuples(
         st.just(10),
         st.builds(
@@ -133,7 +155,7 @@ ANSWERS = st.one_of(
         ),
     ),
     st.tuples(
-        st.integers(1, 12),
+        st.integers(1, 13),
         st.builds(Nak, st.sampled_from(NakCode), st.none() | st.integers(0, 15)),
     ),
 )
@@ -172,16 +194,18 @@ GOLDEN_REPLIES: list[tuple[Reply, int, int, str]] = [
         "01 04 41636d65 01 51 04 412d3137 03 312e32",
     ),
     (
-        Capabilities(4, 20.0, 600.0, 0.01, 1.0, 0.0001, 0.01, 1.0, 0.1, 2.0, 32),
+        Capabilities(
+            *(4, 20.0, 600.0, 0.01, 1.0, 0.0001, 0.01, 1.0, 0.1, 2.0, 32, 16, 0.001, 0.1, True)
+        ),
         2,
         0x82,
-        "04 d007 60ea 0100 1027 0100 0100 e803 6400 d007 20",
+        "04 d007 60ea 0100 1027 0100 0100 e803 6400 d007 20 10 0a00 e803 01",
     ),
     (
-        Status(State.FAULT, Fault.WATCHDOG, 513, True, -2.5, 0.1, (0.0, 0.5)),
+        Status(State.FAULT, Fault.WATCHDOG, 513, True, -2.5, 0.1, (0.0, 0.5), 1800.0),
         9,
         0x89,
-        "07 01 0102 01 e7ff 6400 02 0000 8813",
+        "07 01 0102 01 e7ff 6400 0807 02 0000 8813",
     ),
     (Achieved(token=513, commands=SET.commands), 7, 0x87, "0102 02" + SET_BYTES[20:]),
     (
@@ -190,6 +214,7 @@ GOLDEN_REPLIES: list[tuple[Reply, int, int, str]] = [
         0x8A,
         "02 04 02 dc050000 01 ff 00000100",
     ),
+    (Loaded(slot=5, knots=2), 13, 0x8D, "05 02"),
     (Nak(NakCode.BAD_CHANNEL, 3), 7, 0x9F, "07 04 03"),
     (Nak(NakCode.WRONG_STATE), 6, 0x9F, "06 05 ff"),
 ]
@@ -213,6 +238,43 @@ def test_sets_are_these_bytes(wrap: Callable[[CommandSet], Request], code: int) 
     assert type(decoded.command_set) is CommandSet
 
 
+def test_a_set_with_envelopes_is_these_bytes() -> None:
+    """Flag 4 stands for two more bytes, the slots of onset and ending; flag 2 skips an ending."""
+    commands = (
+        DriveCommand(channel=0, frequency=110.0, level=0.2, onset=5, ending=6),
+        DriveCommand(channel=1, frequency=20.0, level=0.0, skip_ending=True),
+    )
+    wanted = CommandSet(token=1, commands=commands, ramp=0.0, valid_for=0.0)
+    payload = "0100 0000 0000 02 00 04 f82a d007 0000 05 06 01 02 d007 0000 0000"
+    frame = Frame(kind=7, address=1, sequence=2, payload=bytes.fromhex(payload))
+    assert encode_request(Apply(GUARD.check(wanted)), address=1, sequence=2) == frame
+    assert decode_request(frame) == Apply(wanted)
+
+
+def test_an_envelope_is_these_bytes() -> None:
+    """Slot 5, step 5 ms = 32 00, two knots of level and phase; a plain one is not encoded."""
+    knots = (Knot(0.1, 90.0), Knot(1.0, -0.01))
+    wanted = Envelope(slot=5, step=0.005, knots=knots)
+    payload = bytes.fromhex("05 3200 02 e803 2823 1027 ffff")
+    frame = Frame(kind=13, address=1, sequence=2, payload=payload)
+    load = LoadEnvelope(GUARD.check_envelope(wanted))
+    assert encode_request(load, address=1, sequence=2) == frame
+    assert decode_request(frame) == LoadEnvelope(wanted)
+    with pytest.raises(TypeError, match="SafeEnvelope"):
+        encode_request(LoadEnvelope(wanted), address=1, sequence=2)
+
+
+def test_an_event_is_these_bytes() -> None:
+    """State, fault and channel under type 30 with the reply bit; no request has that type."""
+    event = Event(State.FAULT, Fault.ARC, 2)
+    frame = Frame(kind=0x9E, address=1, sequence=4, payload=bytes.fromhex("07 04 02"))
+    assert encode_event(event, address=1, sequence=4) == frame
+    assert is_event(frame)
+    assert decode_event(frame) == event
+    with pytest.raises(Malformed):
+        decode_request(replace(frame, kind=30))
+
+
 @pytest.mark.parametrize(("reply", "to", "kind", "payload"), GOLDEN_REPLIES)
 def test_replies_are_these_bytes(reply: Reply, to: int, kind: int, payload: str) -> None:
     """Every reply is the bytes counted out by hand, in both directions."""
@@ -232,6 +294,9 @@ def test_every_request_comes_back(request: Request) -> None:
             request,
             command_set=CommandSet(sent.token, sent.commands, sent.ramp, sent.valid_for),
         )
+    if isinstance(request, LoadEnvelope):
+        shape = request.envelope
+        request = LoadEnvelope(Envelope(shape.slot, shape.step, shape.knots))
     assert decoded == request
 
 
@@ -271,11 +336,13 @@ def test_any_payload_is_a_request_or_malformed(code: int, payload: bytes) -> Non
         assert in_range(request.command_set)
         assert 0 <= request.command_set.ramp <= 1
         assert 0 <= request.command_set.valid_for <= 60
+    if isinstance(request, LoadEnvelope):
+        assert all(0 <= knot.level <= 1 for knot in request.envelope.knots)
     if isinstance(request, Arm):
         assert 0.1 <= request.watchdog <= 2
 
 
-@given(st.integers(1, 12), st.booleans(), st.binary(max_size=60))
+@given(st.integers(1, 13), st.booleans(), st.binary(max_size=60))
 def test_any_payload_is_a_reply_or_malformed(code: int, refused: bool, payload: bytes) -> None:
     """Decoding a reply raises only Malformed, a FrameError, and gives nothing out of range."""
     request = Frame(kind=code, address=1, sequence=1, payload=b"")
@@ -293,13 +360,17 @@ def test_any_payload_is_a_reply_or_malformed(code: int, refused: bool, payload: 
 @pytest.mark.parametrize(
     ("code", "payload", "nak"),
     [
-        (13, "", NakCode.UNKNOWN_TYPE),
+        (14, "", NakCode.UNKNOWN_TYPE),
+        (13, "05 32 00 02 e803 0000", NakCode.BAD_LENGTH),
+        (13, "40 32 00 00", NakCode.BAD_VALUE),
+        (13, "05 32 00 01 1127 0000", NakCode.BAD_VALUE),
         (3, "fa", NakCode.BAD_LENGTH),
         (3, "fa 00 00", NakCode.BAD_LENGTH),
         (3, "63 00", NakCode.BAD_VALUE),
         (6, "00 00", NakCode.BAD_TOKEN),
         (7, "0100 0000 0000 01 10 00 f82a d007 0000", NakCode.BAD_CHANNEL),
-        (7, "0100 0000 0000 01 00 02 f82a d007 0000", NakCode.BAD_VALUE),
+        (7, "0100 0000 0000 01 00 08 f82a d007 0000", NakCode.BAD_VALUE),
+        (7, "0100 0000 0000 01 00 04 f82a d007 0000 40 00", NakCode.BAD_VALUE),
         (7, "0100 0000 0000 01 00 00 f82a 1127 0000", NakCode.BAD_VALUE),
         (7, "0100 0000 0000 01 00 00 f82a d007 5046", NakCode.BAD_VALUE),
         (7, "0100 e903 0000 00", NakCode.BAD_VALUE),

@@ -41,6 +41,7 @@ class AmplifierGroup:
         self.phase = Phase.CLOSED
         self._amplifiers = dict(amplifiers)
         self._silencings = 0  # how often they were disarmed, stopped or closed
+        self._may_be_armed = False  # since they were opened
         self._limit: asyncio.Timeout | None = None  # of a play or heartbeat that is under way
 
     @property
@@ -60,6 +61,7 @@ class AmplifierGroup:
             await self._close_wires()
             raise
         self.phase = Phase.DISARMED
+        self._may_be_armed = False
 
     async def arm(self) -> None:
         """High voltage on, level zero: on all, or none stays armed."""
@@ -69,6 +71,7 @@ class AmplifierGroup:
                 "close what is left and open all again"
             )
         before = self._silencings
+        self._may_be_armed = True
         try:
             await self._together(amplifier.arm() for amplifier in self._all)
             if self._silencings != before:
@@ -132,6 +135,9 @@ class AmplifierGroup:
         try:
             if armed:
                 await self._wind_down(silence)
+            elif self._may_be_armed:
+                reachable = [amplifier for amplifier in self._all if not amplifier.lost]
+                await _to_the_end(self._each(amplifier.disarm() for amplifier in reachable))
         except BaseException as error:
             await self.stop()
             if not isinstance(error, DriverError):

@@ -140,7 +140,8 @@ class Amplifier:
     async def arm(self, watchdog: float = WATCHDOG) -> Status:
         """High voltage on, every channel enabled at level zero; watchdog [s].
 
-        Raises CommandError for a watchdog that the amplifier cannot keep.
+        Raises CommandError for a watchdog that the amplifier cannot keep, and CommandRefused where
+        a stop or disarm came before its turn: nothing arms after it was silenced.
         """
         low, high = self.capabilities.watchdog_min, self.capabilities.watchdog_max
         if not low <= watchdog <= high:
@@ -148,7 +149,7 @@ class Amplifier:
                 f"a watchdog of {watchdog:g} s is out of the amplifier's range of {low:g} to "
                 f"{high:g} s"
             )
-        return await self._ask(Arm(watchdog=watchdog), expect=Status)
+        return await self._ask(Arm(watchdog=watchdog), expect=Status, kind=Kind.APPLY)
 
     async def disarm(self, ramp: float = DISARM_RAMP) -> Status:
         """Silent along a ramp [s], then high voltage off; overtakes all that waits."""

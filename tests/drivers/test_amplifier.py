@@ -300,6 +300,25 @@ async def test_falling_silent_overtakes(
     assert len(backend.requests) == 3
 
 
+async def test_nothing_arms_after_it_was_silenced(
+    amplifier: Amplifier, backend: ScriptedBackend
+) -> None:
+    """An arm that still waits when a disarm comes is never sent."""
+    answer: asyncio.Future[Reply] = asyncio.get_running_loop().create_future()
+    backend.script.append(answer)
+    status = asyncio.create_task(amplifier.status())
+    await settle()
+    arm = asyncio.create_task(amplifier.arm())
+    await settle()
+    disarm = asyncio.create_task(amplifier.disarm())
+    await settle()
+    answer.set_result(STATUS)
+    await asyncio.gather(status, disarm)
+    with pytest.raises(CommandRefused, match="superseded"):
+        await arm
+    assert [type(request) for request in backend.requests[1:]] == [Disarm]
+
+
 async def test_an_apply_is_not_repeated_before_a_stop(
     amplifier: Amplifier, backend: ScriptedBackend, safe: MakeSafe
 ) -> None:

@@ -14,9 +14,9 @@ from controller.selection import PatternTable, Selection, Selector
 from controller.touch import TouchFrame
 from drivers.command import DriveCommand, token_after
 from drivers.guard import Guard, SafeCommand
+from model.pattern import Pattern
 from model.perception import STRONG_DB_SL
 from model.rig import Rig
-from model.table import Pattern
 
 # With nobody on the plate the end may be short, so that zero is reached within 20 ms of the lift;
 # fingers that stay would feel so short an end as a tap.

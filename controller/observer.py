@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from controller.contacts import Change, Contact
 from controller.selection import Selection
 from drivers.command import DriveCommand
-from model.table import Pattern
+from model.pattern import Pattern
 
 
 @dataclass(frozen=True)

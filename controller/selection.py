@@ -7,8 +7,8 @@ from typing import Protocol
 
 from controller.contacts import Contact
 from model.errors import InputError
+from model.pattern import Pattern
 from model.perception import STRONG_DB_SL
-from model.table import Pattern
 
 # Fields vary over a good part of a bending wavelength, 17 cm and more below 500 Hz; a fingertip
 # that moved by less than its own radius is still within the disc it was chosen for.

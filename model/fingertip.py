@@ -22,7 +22,7 @@ def _unit_disc() -> FloatArray:
     )
 
 
-_DISC = _unit_disc()
+UNIT_DISC = _unit_disc()
 
 
 def fingertip_points(x: float, y: float, plate: Plate) -> FloatArray:
@@ -30,6 +30,6 @@ def fingertip_points(x: float, y: float, plate: Plate) -> FloatArray:
 
     (n, 2) with n up to 19; at a corner a quarter of the disc remains. The centre must be on it.
     """
-    points = np.array([x, y]) + FINGERTIP_RADIUS * _DISC
+    points = np.array([x, y]) + FINGERTIP_RADIUS * UNIT_DISC
     on_plate = (points >= 0).all(axis=1) & (points <= [plate.length, plate.width]).all(axis=1)
     return points[on_plate]

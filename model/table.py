@@ -1,8 +1,9 @@
 """The localization table: which pattern makes one finger feel it and the others not.
 
-It holds the response of every ERA at every frequency at the nodes of the mesh, so that a quiet zone
-of fingertips anywhere on the plate can be asked for at run time, and the response of every pattern
-at every cell of a grid, which says what lone fingers get and what the whole table can do.
+It holds the field of every ERA at every frequency on a raster over the plate, so that any set of
+fingertips can be asked for at run time in any drive mode; the modes of the plate there, from which
+follows what another stiffness, thickness or finger would change; and the response of every
+`switched` pattern at every cell of a grid.
 """
 
 import math
@@ -10,76 +11,66 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from importlib import metadata
+from itertools import accumulate
 
 import numpy as np
 from numpy.typing import NDArray
 
 from model.actuator import Era
-from model.arrays import ComplexArray, FloatArray
+from model.arrays import FloatArray
+from model.assembly import era_positions
+from model.drive_modes import MODES, best_drive, loudest
+from model.drive_modes.fields import Drive, Fields, Outcome, SingleComplex
+from model.drive_modes.switched import all_patterns, peak_of_patterns, sensation_of_patterns
 from model.errors import InputError
 from model.excitation import Excitation, Tone
-from model.fingertip import FINGERTIP_RADIUS, fingertip_points
+from model.fingertip import UNIT_DISC, fingertip_points
 from model.free_plate import solve_free_plate
-from model.localization import CELL_SAMPLES, SURROUNDINGS_RADIUS, Grid, contrast_db, decibels
+from model.localization import CELL_SAMPLES, SURROUNDINGS_RADIUS, Grid, decibels
 from model.mesh import Mesh
+from model.pattern import ONSET_RAMP, Pattern
 from model.perception import STRONG_DB_SL, detection_threshold
 from model.plate import Plate
+from model.point_load import load_positions
 from model.point_mass import PointMass
+from model.question import Point, Question
+from model.raster import Raster
+from model.reduction import reduce_plate
 from model.rig import Rig, physics_fingerprint
-from model.switched import (
-    SILENT,
-    enumerate_patterns,
-    peak_of_patterns,
-    sensation_of_patterns,
-)
 from model.vibration import tone_amplitudes
 
 PAPER_FREQUENCIES = np.arange(60.0, 321.0, 10.0)
 """The 27 excitation frequencies [Hz]: 60 to 320 in steps of 10 holds every one the paper names."""
 
-MODES = ("switched",)
-"""Drive modes that a table can be built for."""
-
 PAPER_GRID = Grid(12, 9)
 
-# Long enough not to click, short enough to be felt as one with the touch.
-ONSET_RAMP = 0.020
+ROUNDING = 1e-6  # of single precision, in which patterns are found
 
 
-@dataclass(frozen=True)
-class Pattern:
-    """What the table answers: an excitation with its ramp [s] and what it is predicted to do.
-
-    level_db_sl: at the target; contrast_db: target to the loudest quiet point; quiet_level_db_sl:
-    at that point. The last two are None where one finger is alone.
-    """
-
-    excitation: Excitation
-    ramp: float
-    level_db_sl: float
-    contrast_db: float | None
-    quiet_level_db_sl: float | None
-
-
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class LocalizationTable:
-    """Patterns of one plate on its ERAs, with all that is needed to choose among them.
+    """Fields of one plate on its ERAs, with all that is needed to choose among patterns.
 
-    frequencies (f,) [Hz]; acceleration (f, eras, nodes) complex [m/s²], each ERA alone at full
-    stroke; patterns (n, eras) index of a frequency or SILENT; cell_response (n, cells) mean peak
-    acceleration over each cell [m/s²].
+    mode: what questions are answered in unless they say; frequencies (f,) [Hz]; acceleration
+    (points, f, eras) complex [m/s²] on the raster, each ERA alone at full stroke; omega (r,)
+    [rad/s], held (eras + masses, r) and shapes (points, r) [1/sqrt(kg)]: the reduced free plate, at
+    what holds it and on the raster (`model.reduction`); cell_response (n, cells) [m/s²]: mean peak
+    acceleration over each cell of every `switched` pattern, in the order of `patterns`.
     """
 
     plate: Plate
     eras: tuple[Era, ...]
     masses: tuple[PointMass, ...]
     mesh: Mesh
+    raster: Raster
     grid: Grid
     mode: str
     code_version: str
     frequencies: FloatArray
-    acceleration: NDArray[np.complex64]
-    patterns: NDArray[np.int16]
+    acceleration: SingleComplex
+    omega: FloatArray
+    held: FloatArray
+    shapes: NDArray[np.float32]
     cell_response: NDArray[np.float32]
 
     @property
@@ -87,59 +78,88 @@ class LocalizationTable:
         """Fingerprint of the plate on its ERAs that this table is for."""
         return physics_fingerprint(self.plate, self.eras, masses=self.masses)
 
+    @property
+    def patterns(self) -> NDArray[np.int16]:
+        """Every `switched` pattern: index of each ERA's frequency, or SILENT, (n, eras)."""
+        return all_patterns(len(self.eras), len(self.frequencies)).index
+
     def answer(
         self,
-        target: tuple[float, float],
+        target: Point,
         *,
-        quiet: Sequence[tuple[float, float]] = (),
+        quiet: Sequence[Point] = (),
         level_db_sl: float = STRONG_DB_SL,
+        mode: str | None = None,
     ) -> Pattern:
-        """The pattern of highest contrast among those that reach a level at the target.
+        """The pattern for one target; see `ask`."""
+        return self.ask(Question((target,), tuple(quiet), level_db_sl=level_db_sl, mode=mode))
 
-        target, quiet: where fingertips rest [m]. A lone target is told from the plate beyond 50 mm
-        (root mean square). The pattern is then turned down to the level asked for; contrast does
-        not depend on that. Raises InputError for positions off the plate, a target within a quiet
-        fingertip, and a level that no pattern reaches.
+    def ask(self, question: Question) -> Pattern:
+        """The best pattern in a mode among those that reach a level at the targets.
+
+        `switched` goes by contrast, the other modes by their robust score (`model.drive_modes`); a
+        lone finger is told from the plate beyond 50 mm, root mean square. The pattern is then
+        turned down to the level asked for; contrast does not depend on that. Raises InputError for
+        contacts off the plate or on top of each other and a level that cannot be reached.
         """
-        at_target = self._response(self._fingertip(target, what="target"))
-        sensation = sensation_of_patterns(at_target, self._threshold).mean(axis=-1)
-        available = decibels(sensation)
-        reaches = available >= level_db_sl
-        if not reaches.any():
-            raise InputError(
-                f"no pattern reaches {level_db_sl:g} dB SL at ({target[0]:g}, {target[1]:g}) m; "
-                f"the most that can be had there is {available.max():.1f} dB SL"
-            )
-        peak_target = peak_of_patterns(at_target)
-        if quiet:
-            at_quiet = self._response(self._quiet_zone(target, quiet))
-            contrast = contrast_db(peak_target, peak_of_patterns(at_quiet))
+        question.check_on(self.plate)
+        mode = question.mode_on(self.mode)
+        usable, fields = self._usable(question)
+        found = best_drive(fields, mode)
+        if found is None:
+            raise InputError(self._too_loud(question, fields, mode))
+        drive, outcome = found
+        gain = min(1.0, fields.wanted / outcome.sensation)
+        return self._pattern(question, mode, usable, drive, outcome, gain=gain)
+
+    def prepare(self, mode: str | None = None) -> None:
+        """Work out what the first question in a mode would have to wait for."""
+        centre = (self.plate.length / 2, self.plate.width / 2)
+        self.ask(Question((centre,), (), level_db_sl=-100.0, mode=mode))
+        self.ask(Question((centre,), ((0.0, 0.0),), level_db_sl=-100.0, mode=mode))
+
+    def fields(self, question: Question) -> Fields:
+        """What a drive mode needs to know about a question, at all frequencies of the table."""
+        found, ends = self._at_fingertips((*question.targets, *question.quiet))
+        count = len(question.targets)
+        if question.quiet:
+            quiet = found[:, :, ends[count - 1] :]
         else:
-            contrast = decibels(peak_target.mean(axis=-1) / self._surroundings(target))
-        best = int(np.argmax(np.where(reaches, contrast, -np.inf)))
-        gain = 10 ** ((level_db_sl - available[best]) / 20)
-        quiet_level = None
-        if quiet:
-            loudest = sensation_of_patterns(at_quiet, self._threshold)[best].max()
-            quiet_level = float(decibels(gain * loudest))
-        return Pattern(
-            excitation=self._excitation(best, gain=gain),
-            ramp=ONSET_RAMP,
-            level_db_sl=level_db_sl,
-            contrast_db=float(contrast[best]) if quiet else None,
-            quiet_level_db_sl=quiet_level,
+            quiet = self._cell_fields[:, :, self._far_from(question.targets)]
+        return Fields(
+            targets=tuple(
+                np.ascontiguousarray(found[:, :, start:end])
+                for start, end in zip((0, *ends), ends[:count], strict=False)
+            ),
+            quiet=np.ascontiguousarray(quiet),
+            is_alone=not question.quiet,
+            threshold=self._threshold,
+            wanted=10 ** (question.level_db_sl / 20),
         )
 
     def amplitudes(self, excitation: Excitation) -> tuple[FloatArray, FloatArray]:
-        """Frequencies (f,) [Hz] and peak acceleration at the mesh's nodes (f, nodes) [m/s²].
+        """Frequencies (f,) [Hz] and peak acceleration on the raster (f, points) [m/s²].
 
         The excitation's frequencies must be the table's own.
         """
         return tone_amplitudes(
             excitation,
             self.eras,
-            lambda f: self.acceleration[np.searchsorted(self.frequencies, f)].astype(complex),
+            lambda f: (
+                self.acceleration[:, np.searchsorted(self.frequencies, f)]
+                .transpose(1, 2, 0)
+                .astype(complex)
+            ),
         )
+
+    def shapes_at(self, points: Sequence[Point]) -> FloatArray:
+        """Shapes of the reduced plate at points [m] of it, (p, r)."""
+        return self.raster.at(self.shapes, np.array(points)).astype(float)
+
+    def shapes_at_fingertips(self, contacts: Sequence[Point]) -> tuple[FloatArray, list[int]]:
+        """Shapes under fingertips (p, r), and where the points of each one end."""
+        found = self.raster.under_fingertips(self.shapes, np.array(contacts))
+        return found.astype(float), self._ends(contacts, len(found))
 
     def drive_of(self, excitation: Excitation) -> dict[str, dict[str, float]]:
         """An excitation as people read it: frequency, level 0..1 of the stroke, phase, by ERA."""
@@ -155,55 +175,110 @@ class LocalizationTable:
 
     @cached_property
     def available_level_db_sl(self) -> FloatArray:
-        """Highest level [dB SL] that any pattern reaches at the centre of each cell, (cells,)."""
-        at_centres = _at_points(self.mesh, self.acceleration, self._cell_centres)
-        return decibels(sensation_of_patterns(at_centres, self._threshold).max(axis=0))
+        """Highest level [dB SL] of any `switched` pattern at the centre of each cell, (cells,)."""
+        sensation = sensation_of_patterns(self._cell_fields, self._threshold)
+        return decibels(sensation.max(axis=0).astype(float))
 
     @cached_property
-    def _threshold(self) -> FloatArray:
-        return detection_threshold(self.frequencies)
-
-    @cached_property
-    def _cell_centres(self) -> FloatArray:
+    def cell_centres(self) -> FloatArray:
+        """Centres of the grid's cells [m], (cells, 2)."""
         return self.grid.centres(self.plate)
 
-    def _fingertip(self, position: tuple[float, float], *, what: str) -> FloatArray:
-        x, y = position
-        if not self.plate.contains(x, y):  # not true of NaN either
+    @cached_property
+    def _threshold(self) -> NDArray[np.float32]:
+        return detection_threshold(self.frequencies).astype(np.float32)
+
+    @cached_property
+    def _values(self) -> NDArray[np.float32]:
+        """The fields as real numbers, a row for each raster point."""
+        return self.acceleration.reshape(self.raster.point_count, -1).view(np.float32)
+
+    @cached_property
+    def _cell_fields(self) -> SingleComplex:
+        """Fields at the centres of the cells, (f, eras, cells)."""
+        return self._by_frequency(self.raster.at(self._values, self.cell_centres))
+
+    def _at_fingertips(self, contacts: Sequence[Point]) -> tuple[SingleComplex, list[int]]:
+        """Fields under fingertips (f, eras, p), and where the points of each one end."""
+        found = self.raster.under_fingertips(self._values, np.array(contacts))
+        return self._by_frequency(found), self._ends(contacts, len(found))
+
+    def _ends(self, contacts: Sequence[Point], count: int) -> list[int]:
+        """Where the points of each fingertip end among so many of all."""
+        whole = len(UNIT_DISC)
+        if count == len(contacts) * whole:
+            return [whole * (number + 1) for number in range(len(contacts))]
+        return list(accumulate(len(fingertip_points(x, y, self.plate)) for x, y in contacts))
+
+    def _by_frequency(self, values: NDArray[np.float32]) -> SingleComplex:
+        fields = values.view(np.complex64).reshape(len(values), len(self.frequencies), -1)
+        return np.ascontiguousarray(fields.transpose(1, 2, 0))
+
+    def _far_from(self, targets: Sequence[Point]) -> NDArray[np.bool_]:
+        """Which cells are not near any target; all of them where the plate is so small."""
+        apart = np.linalg.norm(self.cell_centres[:, None] - np.array(targets), axis=-1)
+        far: NDArray[np.bool_] = (apart > SURROUNDINGS_RADIUS).all(axis=1)
+        return far if far.any() else np.ones_like(far)
+
+    def _usable(self, question: Question) -> tuple[NDArray[np.int64], Fields]:
+        """Indices of the frequencies that the amplifiers can play, and the fields at them."""
+        low, high = question.frequencies
+        fields = self.fields(question)
+        usable = np.flatnonzero((self.frequencies >= low) & (self.frequencies <= high))
+        if len(usable) == 0:
             raise InputError(
-                f"{what} ({x:g}, {y:g}) m is not on the plate, which reaches from (0, 0) to "
-                f"({self.plate.length:g}, {self.plate.width:g}) m"
+                f"the table's frequencies, {self.frequencies[0]:g} to {self.frequencies[-1]:g} Hz, "
+                f"are none that these amplifiers play ({low:g} to {high:g} Hz); build a table with "
+                "others: era table build --frequencies"
             )
-        return fingertip_points(x, y, self.plate)
+        return usable, fields if len(usable) == len(self.frequencies) else fields.at(usable)
 
-    def _quiet_zone(
-        self, target: tuple[float, float], quiet: Sequence[tuple[float, float]]
-    ) -> FloatArray:
-        for position in quiet:
-            if np.hypot(position[0] - target[0], position[1] - target[1]) < FINGERTIP_RADIUS:
-                raise InputError(
-                    f"target ({target[0]:g}, {target[1]:g}) m lies within the quiet fingertip at "
-                    f"({position[0]:g}, {position[1]:g}) m; keep them "
-                    f"{1000 * FINGERTIP_RADIUS:g} mm apart at least"
-                )
-        return np.concatenate([self._fingertip(position, what="quiet") for position in quiet])
+    def _too_loud(self, question: Question, fields: Fields, mode: str) -> str:
+        where = " and ".join(f"({x:g}, {y:g})" for x, y in question.targets)
+        most = 20 * math.log10(loudest(fields, mode))
+        # Rounded down, so that it can be asked for.
+        return (
+            f"no pattern reaches {question.level_db_sl:g} dB SL at {where} m in mode {mode}; "
+            f"the most that can be had there is {math.floor(10 * most) / 10:.1f} dB SL"
+        )
 
-    def _response(self, points: FloatArray) -> ComplexArray:
-        """Acceleration of each ERA at points (p, 2): (f, eras, p)."""
-        return _at_points(self.mesh, self.acceleration, points)
+    def _pattern(
+        self,
+        question: Question,
+        mode: str,
+        usable: NDArray[np.int64],
+        drive: Drive,
+        outcome: Outcome,
+        *,
+        gain: float,
+    ) -> Pattern:
+        contrast = 20 * math.log10(max(outcome.peak, 1e-30) / max(outcome.quiet_peak, 1e-30))
+        quiet_level = 20 * math.log10(max(gain * outcome.quiet_sensation, 1e-30))
+        return Pattern(
+            excitation=self._excitation(usable, drive, gain=gain),
+            ramp=ONSET_RAMP,
+            level_db_sl=question.level_db_sl,
+            contrast_db=contrast if question.quiet else None,
+            quiet_level_db_sl=quiet_level if question.quiet else None,
+            mode=mode,
+            surroundings_contrast_db=None if question.quiet else contrast,
+        )
 
-    def _surroundings(self, target: tuple[float, float]) -> FloatArray:
-        """Root mean square of every pattern (n,) over the cells that are not near the target."""
-        far = np.hypot(*(self._cell_centres - target).T) > SURROUNDINGS_RADIUS
-        cells = self.cell_response[:, far if far.any() else slice(None)]
-        return np.asarray(np.sqrt((cells.astype(float) ** 2).mean(axis=-1)))
-
-    def _excitation(self, pattern: int, *, gain: float) -> Excitation:
-        return {
-            era.name: Tone(float(self.frequencies[index]), float(gain * era.stroke))
-            for era, index in zip(self.eras, self.patterns[pattern], strict=True)
-            if index != SILENT
-        }
+    def _excitation(self, usable: NDArray[np.int64], drive: Drive, *, gain: float) -> Excitation:
+        """Tones by ERA; at each frequency the strongest has phase zero, since none is absolute."""
+        tones = {}
+        for frequency, weight in drive.tones():
+            strongest = weight[np.argmax(np.abs(weight))]
+            turned = weight * (np.conj(strongest) / np.abs(strongest))
+            for era, w in zip(self.eras, turned, strict=True):
+                if w != 0:
+                    in_phase = w.real > 0 and abs(w.imag) < ROUNDING * w.real
+                    tones[era.name] = Tone(
+                        frequency=float(self.frequencies[usable[frequency]]),
+                        amplitude=float(gain * min(abs(w), 1.0) * era.stroke),
+                        phase=0.0 if in_phase else float(np.angle(w)),
+                    )
+        return tones
 
 
 def build_table(
@@ -220,30 +295,33 @@ def build_table(
     if mode not in MODES:
         raise InputError(f"unknown drive mode {mode!r}; known: {', '.join(MODES)}")
     _check_frequencies(frequencies, rig)
-    free = solve_free_plate(rig.plate, rig.mesh, frequency_max=float(frequencies[-1]))
-    nodes = free.acceleration(rig.eras, frequencies, rig.mesh.nodes, loads=rig.loads)
-    peak = peak_of_patterns(_at_points(rig.mesh, nodes, grid.samples(rig.plate)))
+    highest = float(frequencies[-1])
+    raster = Raster.for_plate(rig.plate, frequency_max=highest)
+    points = np.vstack([raster.points, grid.samples(rig.plate)])
+    free = solve_free_plate(rig.plate, rig.mesh, frequency_max=highest)
+    fields = free.acceleration(rig.eras, frequencies, points, loads=rig.loads)
+
+    attached = np.vstack([era_positions(rig.eras), load_positions(rig.loads)])
+    reduced = reduce_plate(rig.plate, rig.mesh, attached, frequency_max=highest)
+    cells = peak_of_patterns(fields[:, :, raster.point_count :].astype(np.complex64))
     return LocalizationTable(
         plate=rig.plate,
         eras=rig.eras,
         masses=rig.masses,
         mesh=rig.mesh,
+        raster=raster,
         grid=grid,
         mode=mode,
         code_version=metadata.version("era-haptics"),
         frequencies=frequencies,
-        acceleration=nodes.astype(np.complex64),
-        patterns=enumerate_patterns(len(rig.eras), len(frequencies)),
-        cell_response=peak.reshape(len(peak), -1, CELL_SAMPLES**2).mean(axis=-1).astype(np.float32),
+        acceleration=np.ascontiguousarray(
+            fields[:, :, : raster.point_count].transpose(2, 0, 1), dtype=np.complex64
+        ),
+        omega=reduced.omega,
+        held=reduced.at(attached),
+        shapes=reduced.at(raster.points).astype(np.float32),
+        cell_response=cells.reshape(len(cells), -1, CELL_SAMPLES**2).mean(axis=-1),
     )
-
-
-def _at_points(
-    mesh: Mesh, acceleration: NDArray[np.complexfloating], points: FloatArray
-) -> ComplexArray:
-    """Acceleration (f, eras, nodes) at points [m] (p, 2) instead: (f, eras, p)."""
-    flat = acceleration.reshape(-1, mesh.node_count)
-    return np.asarray(mesh.interpolation(points) @ flat.T).T.reshape(*acceleration.shape[:2], -1)
 
 
 def _check_frequencies(frequencies: FloatArray, rig: Rig) -> None:

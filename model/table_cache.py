@@ -11,25 +11,29 @@ from model.errors import InputError
 from model.localization import Grid
 from model.rig import Rig
 from model.table import PAPER_FREQUENCIES, PAPER_GRID, LocalizationTable, build_table
-from model.table_file import load_table, save_table
+from model.table_file import FORMAT_VERSION, load_table, save_table
 
 _logger = logging.getLogger(__name__)
 
 
 def cached_table(
-    rig: Rig, *, frequencies: FloatArray = PAPER_FREQUENCIES, grid: Grid = PAPER_GRID
+    rig: Rig,
+    *,
+    frequencies: FloatArray = PAPER_FREQUENCIES,
+    grid: Grid = PAPER_GRID,
+    mode: str = "switched",
 ) -> tuple[LocalizationTable, Path | None]:
     """The table of a rig, from the user's cache folder or built and kept there; and its file.
 
     A damaged or old cache file is built anew. Where nothing can be written the table is built all
     the same and the file is None.
     """
-    path = _cache_path(rig, frequencies, grid)
+    path = _cache_path(rig, frequencies, grid, mode)
     try:
         return load_table(path, fingerprint=rig.fingerprint), path
     except InputError as reason:
         _logger.info("building the localization table: %s", reason)
-    table = build_table(rig, frequencies=frequencies, grid=grid)
+    table = build_table(rig, frequencies=frequencies, grid=grid, mode=mode)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         save_table(table, path)
@@ -39,7 +43,7 @@ def cached_table(
     return table, path
 
 
-def _cache_path(rig: Rig, frequencies: FloatArray, grid: Grid) -> Path:
-    name = f"{rig.mesh} {grid} switched {frequencies.tolist()}"
+def _cache_path(rig: Rig, frequencies: FloatArray, grid: Grid, mode: str) -> Path:
+    name = f"{FORMAT_VERSION} {rig.mesh} {grid} {mode} {frequencies.tolist()}"
     digest = hashlib.sha256(f"{rig.fingerprint} {name}".encode()).hexdigest()[:16]
     return platformdirs.user_cache_path("era-haptics", appauthor=False) / f"table-{digest}.npz"

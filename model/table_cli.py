@@ -21,7 +21,9 @@ def build(
     frequencies: Annotated[
         str, typer.Option(metavar="LO:HI:STEP", help="Frequencies in Hz, both ends included.")
     ] = "60:320:10",
-    mode: Annotated[str, typer.Option(help="Drive mode: switched.")] = "switched",
+    mode: Annotated[
+        str, typer.Option(help="Drive mode to answer in: switched, graded, signed or phased.")
+    ] = "switched",
     grid: Annotated[
         str, typer.Option(metavar="NXxNY", help="Target cells along x and y.")
     ] = "12x9",
@@ -88,60 +90,88 @@ def show(table_file: TableArgument, as_json: JsonOption = False) -> None:
 @table_app.command()
 def query(
     table_file: TableArgument,
-    target: Annotated[str, typer.Option(metavar="X,Y", help="The finger to feel it, metres.")],
+    target: Annotated[
+        list[str] | None,
+        typer.Option(metavar="X,Y", help="The finger to feel it, metres; repeatable."),
+    ] = None,
     quiet: Annotated[
         list[str] | None, typer.Option(metavar="X,Y", help="A finger not to feel it; repeatable.")
     ] = None,
     mode: Annotated[
-        str | None, typer.Option(help="Drive mode; must be the table's.", show_default=False)
+        str | None,
+        typer.Option(help="switched, graded, signed or phased; the table's own if not given."),
     ] = None,
     level: Annotated[
         float, typer.Option(metavar="DB_SL", help="Wanted level at the target, dB SL.")
     ] = 20.0,
+    eras: Annotated[
+        int, typer.Option(metavar="N", help="How many ERAs mode switched may drive.")
+    ] = 2,
+    batch: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Questions as JSON lines; answers one to a line."),
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Which ERAs, at which frequencies and levels, make one finger feel it and the others not."""
     from model.errors import InputError
     from model.points import parse_point
+    from model.question import Question
     from model.table_file import load_table
+    from model.table_query import answer_as_json
 
-    table = load_table(table_file)
-    if mode is not None and mode != table.mode:
-        raise InputError(
-            f"{table_file} was built for mode {table.mode}, not {mode}; build one with "
-            f"era table build RIG -o TABLE --mode {mode}"
-        )
-    quiet_points = [parse_point(text, what="--quiet") for text in quiet or []]
-    target_point = parse_point(target, what="--target")
-    started = time.perf_counter()
-    pattern = table.answer(target_point, quiet=quiet_points, level_db_sl=level)
-    elapsed = time.perf_counter() - started
-    drive = table.drive_of(pattern.excitation)
-    if as_json:
-        print(
-            json.dumps(
-                {
-                    "drive": drive,
-                    "level_db_sl": pattern.level_db_sl,
-                    "contrast_db": pattern.contrast_db,
-                    "quiet_level_db_sl": pattern.quiet_level_db_sl,
-                    "ramp_s": pattern.ramp,
-                    "mode": table.mode,
-                    "solve_time_s": elapsed,
-                }
-            )
-        )
+    if batch is not None:
+        if target or quiet:
+            raise InputError("--batch holds the contacts already; leave --target and --quiet out")
+        _answer_batch(table_file, batch)
         return
-    for era, tone in drive.items():
+    question = Question(
+        targets=tuple(parse_point(text, what="--target") for text in target or []),
+        quiet=tuple(parse_point(text, what="--quiet") for text in quiet or []),
+        level_db_sl=level,
+        mode=mode,
+        eras_at_most=eras,
+    )
+    table = load_table(table_file)
+    table.prepare(mode)
+    answer = answer_as_json(table, question)
+    if as_json:
+        print(json.dumps(answer))
+        return
+    for era, tone in answer["drive"].items():
         print(
             f"{era:4s} {tone['frequency_hz']:7.2f} Hz  level {tone['level']:.4f}  "
-            f"phase {tone['phase_deg']:g}°"
+            f"phase {tone['phase_deg']:.1f}°"
         )
-    print(f"level at the target      {pattern.level_db_sl:6.1f} dB SL")
-    if pattern.contrast_db is not None:
-        print(f"contrast to the others   {pattern.contrast_db:6.1f} dB")
-        print(f"loudest quiet finger     {pattern.quiet_level_db_sl:6.1f} dB SL")
-    print(f"found in {1000 * elapsed:.1f} ms")
+    print(f"level at the target      {answer['level_db_sl']:6.1f} dB SL")
+    if answer["contrast_db"] is not None:
+        unaware = "unaware" if answer["quiet_is_unaware"] else "may feel it"
+        print(f"contrast to the others   {answer['contrast_db']:6.1f} dB")
+        print(f"  in nine of ten plates  {answer['robust_contrast_db']:6.1f} dB or more")
+        print(f"loudest quiet finger     {answer['quiet_level_db_sl']:6.1f} dB SL, {unaware}")
+        print(f"leaves them unaware up to{answer['usable_level_db_sl']:6.1f} dB SL")
+    else:
+        print(f"to the plate around it   {answer['surroundings_contrast_db']:6.1f} dB")
+    print(f"found in {1000 * answer['solve_time_s']:.1f} ms")
+
+
+def _answer_batch(table_file: Path, batch: Path) -> None:
+    """Answer line by line as they are read; status 1 at the end if any had no answer."""
+    from model.errors import InputError
+    from model.table_file import load_table
+    from model.table_query import answer_lines
+
+    table = load_table(table_file)
+    failed = False
+    try:
+        with batch.open(encoding="utf-8") as lines:
+            for answer in answer_lines(table, lines):
+                failed = failed or "error" in answer
+                print(json.dumps(answer))
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"--batch {batch} cannot be read: {error}") from error
+    if failed:
+        raise typer.Exit(1)
 
 
 def _shown(value: Any) -> str:

@@ -1,8 +1,12 @@
 """The table as a file: an uncompressed .npz that any researcher opens with numpy.
 
-Members: `header` (JSON as bytes), `frequencies`, `acceleration`, `patterns`, `cell_response`. The
+Members: `header` (JSON as bytes) and the arrays of `LocalizationTable` under their own names. The
 header carries the format version, the plate's fingerprint, everything that made the table, and a
 SHA-256 over the content, so that a damaged or foreign file is refused before any of it is used.
+
+Version 1 held the fields at the nodes of the mesh; 2 holds them on a raster, with the plate's modes
+and point masses, and leaves out the list of `switched` patterns, which follows from the counts of
+ERAs and frequencies.
 """
 
 import hashlib
@@ -19,17 +23,19 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from model.actuator import Era
+from model.drive_modes import MODES
 from model.errors import InputError
 from model.localization import Grid
 from model.mesh import Mesh
 from model.plate import Material, Plate
 from model.point_mass import PointMass
-from model.table import MODES, LocalizationTable
+from model.raster import Raster
+from model.table import LocalizationTable
 
 FORMAT = "era-haptics localization table"
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 
-# A table of the paper's plate has 4 MB, one of eight ERAs and a fine grid some hundred; what is
+# A table of the paper's plate has 3 MB, one of eight ERAs and a fine grid some hundred; what is
 # larger than this is not a table.
 MAX_BYTES = 2 << 30
 
@@ -37,7 +43,9 @@ _DTYPES = {
     "header": "|u1",
     "frequencies": "<f8",
     "acceleration": "<c8",
-    "patterns": "<i2",
+    "omega": "<f8",
+    "held": "<f8",
+    "shapes": "<f4",
     "cell_response": "<f4",
 }
 
@@ -57,6 +65,7 @@ class _Header(BaseModel):
     eras: list[dict[str, Any]]
     masses: list[dict[str, Any]]
     mesh: dict[str, Any]
+    raster: dict[str, Any]
     grid: dict[str, Any]
 
 
@@ -76,6 +85,7 @@ def save_table(table: LocalizationTable, path: Path) -> None:
         "eras": [asdict(era) for era in table.eras],
         "masses": [asdict(mass) for mass in table.masses],
         "mesh": asdict(table.mesh),
+        "raster": asdict(table.raster),
         "grid": asdict(table.grid),
     }
     header["sha256"] = _digest(header, arrays)
@@ -83,14 +93,7 @@ def save_table(table: LocalizationTable, path: Path) -> None:
     handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
     try:
         with os.fdopen(handle, "wb") as stream:
-            np.savez(
-                stream,
-                header=encoded,
-                frequencies=arrays["frequencies"],
-                acceleration=arrays["acceleration"],
-                patterns=arrays["patterns"],
-                cell_response=arrays["cell_response"],
-            )
+            np.savez(stream, allow_pickle=False, header=encoded, **arrays)
             stream.flush()
             os.fsync(stream.fileno())
         Path(temporary).replace(path)
@@ -201,6 +204,7 @@ def _assemble(header: _Header, arrays: dict[str, NDArray[Any]], path: Path) -> L
             eras=tuple(Era(**era) for era in header.eras),
             masses=tuple(PointMass(**mass) for mass in header.masses),
             mesh=Mesh(**header.mesh),
+            raster=Raster(**header.raster),
             grid=Grid(**header.grid),
             mode=header.mode,
             code_version=header.code_version,
@@ -210,12 +214,15 @@ def _assemble(header: _Header, arrays: dict[str, NDArray[Any]], path: Path) -> L
         raise InputError(f"{path}: the header does not describe a plate ({error})") from error
     if table.mode not in MODES:
         raise InputError(f"{path}: unknown drive mode {table.mode!r}")
-    count, era_count = len(table.frequencies), len(table.eras)
+    count, era_count, coordinates = len(table.frequencies), len(table.eras), len(table.omega)
+    patterns = era_count * count + era_count * (era_count - 1) // 2 * count**2
     expected = {
         "frequencies": (count,),
-        "acceleration": (count, era_count, table.mesh.node_count),
-        "patterns": (len(table.patterns), era_count),
-        "cell_response": (len(table.patterns), table.grid.cell_count),
+        "acceleration": (table.raster.point_count, count, era_count),
+        "omega": (coordinates,),
+        "held": (era_count + len(table.masses), coordinates),
+        "shapes": (table.raster.point_count, coordinates),
+        "cell_response": (patterns, table.grid.cell_count),
     }
     for name, shape in expected.items():
         values = getattr(table, name)
@@ -223,6 +230,7 @@ def _assemble(header: _Header, arrays: dict[str, NDArray[Any]], path: Path) -> L
             raise InputError(f"{path}: {name} has shape {values.shape}, expected {shape}")
         if not np.isfinite(values).all():
             raise InputError(f"{path}: {name} holds values that are not numbers")
-    if not ((table.patterns >= -1) & (table.patterns < count)).all():
-        raise InputError(f"{path}: a pattern names a frequency that the table does not hold")
+    size = (table.raster.length, table.raster.width)
+    if size != (table.plate.length, table.plate.width):
+        raise InputError(f"{path}: the raster is not of the plate's size")
     return table

@@ -21,6 +21,27 @@ NULL_SHARE = 0.1
 """A null lies below this share of the map's maximum."""
 
 
+def base_amplitudes(
+    excitation: Excitation, eras: Sequence[Era]
+) -> tuple[FloatArray, ComplexArray]:
+    """Distinct frequencies (f,) [Hz], and how each ERA's base moves at them, (f, eras) [m].
+
+    Raises InputError where nothing is driven, or an ERA that is not there.
+    """
+    if not excitation:
+        raise InputError("no ERA is driven; name at least one")
+    names = [era.name for era in eras]
+    unknown = [name for name in excitation if name not in names]
+    if unknown:
+        raise InputError(f"the rig has no ERA {unknown[0]!r}; it has {', '.join(names)}")
+    frequencies = np.array(sorted({tone.frequency for tone in excitation.values()}))
+    amplitudes = np.zeros((len(frequencies), len(eras)), dtype=complex)
+    for name, tone in excitation.items():
+        row = np.searchsorted(frequencies, tone.frequency)
+        amplitudes[row, names.index(name)] = tone.amplitude * np.exp(1j * tone.phase)
+    return frequencies, amplitudes
+
+
 def tone_amplitudes(
     excitation: Excitation,
     eras: Sequence[Era],
@@ -30,18 +51,8 @@ def tone_amplitudes(
 
     response: frequencies (f,) -> acceleration of each ERA at full stroke (f, eras, p).
     """
-    if not excitation:
-        raise InputError("no ERA is driven; name at least one")
-    names = [era.name for era in eras]
-    unknown = [name for name in excitation if name not in names]
-    if unknown:
-        raise InputError(f"the rig has no ERA {unknown[0]!r}; it has {', '.join(names)}")
-    frequencies = np.array(sorted({tone.frequency for tone in excitation.values()}))
-    weights = np.zeros((len(frequencies), len(eras)), dtype=complex)
-    for name, tone in excitation.items():
-        era = names.index(name)
-        row = np.searchsorted(frequencies, tone.frequency)
-        weights[row, era] = tone.amplitude / eras[era].stroke * np.exp(1j * tone.phase)
+    frequencies, amplitudes = base_amplitudes(excitation, eras)
+    weights = amplitudes / np.array([era.stroke for era in eras])
     coherent = np.einsum("fe,fep->fp", weights, response(frequencies))
     return frequencies, np.abs(coherent)
 

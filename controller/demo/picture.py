@@ -68,10 +68,10 @@ def _draw_touch(
 ) -> None:
     excitation = played.pattern.excitation
     frequencies, amplitudes = table.amplitudes(excitation)
-    mesh = table.mesh
-    level = sensation_level(frequencies, amplitudes).reshape(mesh.rows, mesh.columns)
+    raster = table.raster
+    level = sensation_level(frequencies, amplitudes).reshape(raster.ny, raster.nx)
     axes.pcolormesh(
-        100 * mesh.node_x, 100 * mesh.node_y, level, cmap=COLORS, shading="gouraud", norm=scale
+        100 * raster.x, 100 * raster.y, level, cmap=COLORS, shading="gouraud", norm=scale
     )
     axes.set_aspect("equal")
     draw_eras(axes, table.eras, active=excitation.keys())

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 from controller.demo.measure import Measured
-from model.table import Pattern
+from model.pattern import Pattern
 
 Place: TypeAlias = tuple[float, float]
 

@@ -41,9 +41,9 @@ from drivers.protocol.messages import (
 from model.actuator import Era
 from model.excitation import Excitation, Tone
 from model.mesh import Mesh
+from model.pattern import Pattern
 from model.plate import Material, Plate
 from model.rig import Channel, Limits, Rig
-from model.table import Pattern
 
 T = TypeVar("T")
 

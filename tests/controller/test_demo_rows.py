@@ -7,8 +7,8 @@ from controller.demo.far_end import FingerFelt
 from controller.demo.measure import finger_level, measure
 from controller.demo.picture import choose_rows
 from controller.demo.rows import PlayedPattern, TouchRow
+from model.pattern import Pattern
 from model.perception import detection_threshold
-from model.table import Pattern
 
 
 def felt(amplitudes, frequencies=(100.0, 250.0)):

@@ -8,7 +8,7 @@ from controller.contacts import Contact, ContactKey
 from controller.selection import Selection, Selector
 from model.errors import InputError
 from model.excitation import Tone
-from model.table import Pattern
+from model.pattern import Pattern
 
 
 class Table:

@@ -1,0 +1,211 @@
+"""All ERAs at one frequency: the weights that reach the targets past the quiet points, robustly.
+
+At each frequency the quiet points' mean power, errors included, is the quadratic form w^H R w of
+the weights w,
+
+    R = sum_p v_p (conj(h_p) h_p^T + sigma² diag |h_p|²),    sum_p v_p = 1,
+
+and weights that reach the targets with the least of it solve R w = c, where c sums the targets'
+conj(h_t), turned to the phases in which they are reached. Where the loudest quiet point counts, the
+shares v_p are moved towards the loud ones and it is solved again (Lawson's algorithm for minimax
+approximation). Whatever the shares, a mean is no more than the maximum: what is reached per root of
+w^H R w bounds what a frequency can offer from above, and most are left after a round or two.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import product
+
+import numpy as np
+
+from model.arrays import IntArray
+from model.drive_modes.fields import ERROR_SHARE, Drive, Fields, Single, SingleComplex
+
+Solve = Callable[[SingleComplex, SingleComplex], SingleComplex]
+"""Weights (n, eras) for R (n, eras, eras) and c (n, eras), within what a mode allows."""
+
+PROMISING = 8  # frequencies at which shares are moved, at the most
+STEPS = np.array([1.0] + [0.7] * 5, dtype=np.float32)  # how far, round by round, at the most
+CLOSE = 1.03  # a frequency that cannot be better than this times the best is left
+
+# Where nothing reaches the level, quieter fingers are given up for a louder target, step by step:
+# quiet points count less against each ERA's own share, and weights are raised until they are full.
+GIVEN_UP = ((0.1, 3.0), (1.0, 1.0), (1.0, 3.0), (10.0, 1.0), (10.0, 3.0), (1000.0, 1e6))
+
+_TINY = 1e-7
+
+
+@dataclass(frozen=True)
+class Coherent:
+    """How a mode's weights are found.
+
+    solve: see `Solve`; phases: at how many phases of the first target, and of every further one,
+    weights are looked for; ascents: how often the phases are then brought into line with what was
+    reached; where nothing is gained by it, once.
+    """
+
+    solve: Solve
+    phases: tuple[int, int]
+    ascents: int
+
+    def find(self, fields: Fields, least: float) -> Drive | None:
+        """The best of one frequency for all ERAs; None if it does not have this score at least."""
+        found = _Best(fields, least)
+        chosen, some, shares = np.arange(fields.frequency_count), fields, _even_shares(fields)
+        for step in STEPS[:1] if fields.is_alone else STEPS:
+            weights, bound = self._weights(some, shares, sigma=ERROR_SHARE)
+            likely = found.offer(chosen, weights, some)
+            kept = np.flatnonzero(bound > CLOSE * found.score)
+            if found.score == 0 or len(kept) == 0:
+                break
+            if len(kept) > PROMISING:
+                kept = kept[np.argsort(-bound[kept])[:PROMISING]]
+            if len(kept) < len(chosen):
+                chosen = chosen[kept]
+                some = fields.at(chosen)
+            shares = shares[kept] * likely[kept] ** step
+            shares /= shares.sum(axis=-1, keepdims=True)
+        return found.drive if found.score > 0 else self._louder(fields, found)
+
+    def loudest(self, fields: Fields) -> float:
+        """How many times above threshold the targets can be made to feel it."""
+        sigma, gain = GIVEN_UP[-1]
+        weights, _ = self._weights(fields, _even_shares(fields), sigma=sigma)
+        peak = _peak(fields, _raised(weights, gain))
+        return float((peak / fields.threshold).max())
+
+    def _louder(self, fields: Fields, found: "_Best") -> Drive | None:
+        for sigma, gain in GIVEN_UP:
+            weights, _ = self._weights(fields, _even_shares(fields), sigma=sigma)
+            found.offer(np.arange(fields.frequency_count), _raised(weights, gain), fields)
+            if found.score > 0:
+                return found.drive
+        return None
+
+    def _weights(
+        self, fields: Fields, shares: Single, *, sigma: float
+    ) -> tuple[SingleComplex, Single]:
+        """Weights (n, eras), and what they reach per root of w^H R w, (n,)."""
+        R = _quiet_form(fields, shares, sigma=sigma)
+        targets = fields.mean_targets
+        starts = _starts(len(targets), self.phases)
+        ascents = self.ascents if len(starts) > 1 else 1
+        return _ascend(R, targets, self.solve, starts=starts, ascents=ascents)
+
+
+class _Best:
+    """The best of the weights that were offered."""
+
+    def __init__(self, fields: Fields, least: float) -> None:
+        self._frequency = 0
+        self._weights: SingleComplex | None = None
+        self.score = least
+
+    @property
+    def drive(self) -> Drive | None:
+        """What was best so far."""
+        return None if self._weights is None else Drive.at(self._frequency, self._weights)
+
+    def offer(self, frequencies: IntArray, weights: SingleComplex, fields: Fields) -> Single:
+        """Power at the quiet points, errors included (n, q), of weights (n, eras).
+
+        fields: at these frequencies only.
+        """
+        row = weights[:, None, :]
+        reached = (row @ fields.quiet)[:, 0]
+        wrong = ((row.real**2 + row.imag**2) @ fields.quiet_power)[:, 0]
+        likely = reached.real**2 + reached.imag**2 + np.float32(ERROR_SHARE**2) * wrong
+        power = likely.mean(axis=-1) if fields.is_alone else likely.max(axis=-1)
+        peak = _peak(fields, weights)
+        reaches = peak >= fields.wanted * fields.threshold
+        score = np.where(reaches, peak / np.sqrt(power + _TINY * peak**2), 0)
+        best = int(score.argmax())
+        if score[best] > self.score:
+            self.score = float(score[best])
+            self._frequency, self._weights = int(frequencies[best]), weights[best]
+        return np.asarray(likely, dtype=np.float32)
+
+
+def _even_shares(fields: Fields) -> Single:
+    """Every quiet point counts the same, (f, q)."""
+    f, _, q = fields.quiet.shape
+    return np.full((f, q), 1 / q, dtype=np.float32)
+
+
+def _raised(weights: SingleComplex, gain: float) -> SingleComplex:
+    """Weights times a gain, none above full stroke."""
+    return np.asarray(weights / np.maximum(np.abs(weights), 1 / gain), dtype=np.complex64)
+
+
+def _peak(fields: Fields, weights: SingleComplex) -> Single:
+    """Peak acceleration (n,) at the lesser target, mean over its points, for weights (n, eras)."""
+    row = weights[:, None, :]
+    each = [np.abs(row @ field)[:, 0].mean(axis=-1) for field in fields.targets]
+    return each[0] if len(each) == 1 else np.asarray(np.min(each, axis=0))
+
+
+def _quiet_form(fields: Fields, shares: Single, *, sigma: float) -> SingleComplex:
+    """R (n, eras, eras) for shares (n, q) of the quiet points."""
+    weighted = fields.quiet * shares[:, None, :]
+    R = weighted.conj() @ fields.quiet.transpose(0, 2, 1)
+    wrong = (fields.quiet_power @ shares[:, :, None])[:, :, 0]
+    # An ERA that does not move the quiet points must still have a weight that is a number.
+    floor = _TINY * wrong.max(axis=-1, keepdims=True) + np.float32(1e-20)
+    diagonal = np.arange(R.shape[1])
+    R[:, diagonal, diagonal] += sigma**2 * wrong + floor
+    return np.asarray(R)
+
+
+@lru_cache(maxsize=16)
+def _starts(targets: int, phases: tuple[int, int]) -> SingleComplex:
+    """Phases of the targets to start from, as complex numbers (s, targets)."""
+    circles = [
+        np.exp(2j * np.pi * np.arange(count) / count)
+        for count in (phases[0], *[phases[1]] * (targets - 1))
+    ]
+    return np.array(list(product(*circles)), dtype=np.complex64)
+
+
+def _ascend(
+    R: SingleComplex,
+    targets: SingleComplex,
+    solve: Solve,
+    *,
+    starts: SingleComplex,
+    ascents: int,
+) -> tuple[SingleComplex, Single]:
+    """Weights (n, eras), largest magnitude 1, for targets (t, n, eras), the best of all starts.
+
+    With them what they reach per root of w^H R w, (n,). Each round turns the targets to the phases
+    that were reached, which cannot lower what is reached, and gives more weight to a target that
+    gets less.
+    """
+    _, n, eras = targets.shape
+    conjugate = targets.conj()
+    if len(starts) == 1 and ascents == 1:
+        c = conjugate.sum(axis=0)
+        w = solve(R, c)
+        # Of the solution w^H R w is |c^H w|.
+        value = np.sqrt(np.abs((c.conj() * w).sum(axis=-1)))
+    else:
+        s = len(starts)
+        turned = np.repeat(starts[:, :, None], n, axis=2)
+        forms = np.broadcast_to(R, (s, *R.shape)).reshape(-1, eras, eras)
+        tried, values = [], []
+        for _ in range(ascents):
+            c = np.einsum("stn,tne->sne", turned, conjugate)
+            w = solve(forms, c.reshape(-1, eras)).reshape(s, n, eras)
+            reached = np.einsum("tne,sne->stn", targets, w)
+            magnitude = np.maximum(np.abs(reached), 1e-20)
+            cost = np.einsum("sne,nef,snf->sn", w.conj(), R, w).real
+            tried.append(w)
+            values.append(magnitude.min(axis=1) / np.sqrt(np.maximum(cost, 1e-30)))
+            lacking = np.sqrt(magnitude.mean(axis=1, keepdims=True) / magnitude)
+            turned = np.abs(turned) * lacking * reached / magnitude
+        every = np.concatenate(values)
+        best = every.argmax(axis=0)
+        w = np.concatenate(tried)[best, np.arange(n)]
+        value = every[best, np.arange(n)]
+    size = np.abs(w).max(axis=-1, keepdims=True)
+    return np.asarray(w / np.maximum(size, 1e-30), dtype=np.complex64), value

@@ -1,0 +1,137 @@
+"""What a drive mode works on: fields of each ERA at the fingertips, and how a drive is judged.
+
+A drive is a tone for each ERA. It is judged by its robust score: the target's peak acceleration to
+that at the quiet points, where each ERA's share is wrong by 10 % of itself at random (gains by 5 %,
+phases by 5 degrees: 0.05² + 0.087² = 0.1²). A naive optimum cancels to nothing what cannot be
+cancelled, and is 10 dB worse on the real plate than this one.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model.arrays import FloatArray
+
+SILENT = -1
+"""Stands for the frequency of an ERA that is not driven."""
+
+ERROR_SHARE = 0.1
+"""How wrong an ERA's share of a field is, relative to itself, root mean square (sigma)."""
+
+SingleComplex = NDArray[np.complex64]
+Single = NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False)
+class Drive:
+    """A tone for each ERA: index of its frequency, or SILENT, and its weight.
+
+    index (eras,); weight (eras,) complex, 1 is full stroke at phase zero.
+    """
+
+    index: NDArray[np.int64]
+    weight: SingleComplex
+
+    @classmethod
+    def at(cls, frequency: int, weight: SingleComplex) -> "Drive":
+        """All ERAs at one frequency."""
+        return cls(np.where(weight == 0, SILENT, frequency), weight)
+
+    def tones(self) -> list[tuple[int, SingleComplex]]:
+        """Index of each distinct frequency, and the weights (eras,) at it."""
+        frequencies = sorted({int(index) for index in self.index} - {SILENT})
+        return [
+            (index, np.where(self.index == index, self.weight, 0).astype(np.complex64))
+            for index in frequencies
+        ]
+
+
+@dataclass(frozen=True, eq=False)
+class Fields:
+    """Acceleration [m/s²] of each ERA alone at full stroke, and what is asked for.
+
+    targets: (f, eras, p) each; quiet: (f, eras, q). Where is_alone, the quiet points stand for the
+    rest of the plate and count by their root mean square, or else by their maximum. threshold (f,)
+    [m/s²]; wanted: how many times above it every target shall feel, mean over its points.
+    """
+
+    targets: tuple[SingleComplex, ...]
+    quiet: SingleComplex
+    is_alone: bool
+    threshold: Single
+    wanted: float
+
+    @property
+    def frequency_count(self) -> int:
+        """Number of frequencies."""
+        return len(self.quiet)
+
+    @property
+    def era_count(self) -> int:
+        """Number of ERAs."""
+        return int(self.quiet.shape[1])
+
+    def at(self, frequencies: NDArray[np.int64]) -> "Fields":
+        """The same at some of the frequencies, by index (n,)."""
+        return Fields(
+            targets=tuple(field[frequencies] for field in self.targets),
+            quiet=self.quiet[frequencies],
+            is_alone=self.is_alone,
+            threshold=self.threshold[frequencies],
+            wanted=self.wanted,
+        )
+
+    @cached_property
+    def quiet_power(self) -> Single:
+        """Squared magnitude at the quiet points, (f, eras, q)."""
+        return np.asarray(self.quiet.real**2 + self.quiet.imag**2)
+
+    @cached_property
+    def mean_targets(self) -> SingleComplex:
+        """Each ERA's field, mean over the points of each target, (targets, f, eras)."""
+        return np.stack([field.mean(axis=-1) for field in self.targets])
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a drive does at full level.
+
+    peak [m/s²], sensation (times above threshold): at the lesser target; quiet_peak,
+    quiet_sensation: at the loudest quiet point; score: see `robust_score`.
+    """
+
+    peak: float
+    sensation: float
+    quiet_peak: float
+    quiet_sensation: float
+    score: float
+
+
+def judge(fields: Fields, drive: Drive) -> Outcome:
+    """What a drive does; tones of different frequencies add as magnitudes (paper Eq. 28)."""
+    tones = drive.tones()
+    threshold = np.array([fields.threshold[index] for index, _ in tones])[:, None]
+    peaks, sensations = [], []
+    for target in fields.targets:
+        amplitudes = np.abs([weight @ target[index] for index, weight in tones])
+        peaks.append(amplitudes.sum(axis=0).mean())
+        sensations.append(np.sqrt(((amplitudes / threshold) ** 2).sum(axis=0)).mean())
+    quiet = np.abs([weight @ fields.quiet[index] for index, weight in tones])
+    wrong = np.array([(np.abs(weight) ** 2) @ fields.quiet_power[index] for index, weight in tones])
+    likely = np.sqrt(quiet**2 + ERROR_SHARE**2 * wrong).sum(axis=0)
+    return Outcome(
+        peak=float(min(peaks)),
+        sensation=float(min(sensations)),
+        quiet_peak=quietness(quiet.sum(axis=0), fields),
+        quiet_sensation=float(np.sqrt(((quiet / threshold) ** 2).sum(axis=0)).max()),
+        score=float(min(peaks)) / quietness(likely, fields),
+    )
+
+
+def quietness(magnitude: Single | FloatArray, fields: Fields) -> float:
+    """What the quiet points (q,) count as: their maximum, or around a lone finger their rms."""
+    if fields.is_alone:
+        return float(np.sqrt((magnitude.astype(float) ** 2).mean()))
+    return float(magnitude.max())

@@ -1,0 +1,18 @@
+"""The drive mode `phased`: any amplitude and phase, all ERAs at one frequency, robustly.
+
+The wanted weights are R^-1 conj(h_target), see `model.drive_modes.coherent`. What a spring or damper
+at an ERA adds is a force where one acts anyway, so without errors what can be had does not depend
+on it.
+"""
+
+import numpy as np
+
+from model.drive_modes.coherent import Coherent
+from model.drive_modes.fields import SingleComplex
+
+
+def _solve(R: SingleComplex, c: SingleComplex) -> SingleComplex:
+    return np.asarray(np.linalg.solve(R, c[..., None])[..., 0])
+
+
+PHASED = Coherent(_solve, phases=(1, 5), ascents=8)

@@ -1,0 +1,23 @@
+"""The drive mode `signed`: amplitudes in phase or in opposition, all ERAs at one frequency."""
+
+import numpy as np
+
+from model.drive_modes.coherent import Coherent
+from model.drive_modes.fields import SingleComplex
+
+
+def _solve(R: SingleComplex, c: SingleComplex) -> SingleComplex:
+    """Real weights for which |c^H w| is largest for its w^H R w, which then is w^T Re(R) w.
+
+    All targets may be turned by one phase; the best one is the top eigenvector of the form of real
+    and imaginary part of c, a half of the angle by hand.
+    """
+    parts = np.stack([c.real, c.imag], axis=-1)
+    solved = np.linalg.solve(R.real, parts)
+    form = parts.swapaxes(1, 2) @ solved
+    angle = np.arctan2(2 * form[:, 0, 1], form[:, 0, 0] - form[:, 1, 1]) / 2
+    w = solved[:, :, 0] * np.cos(angle)[:, None] + solved[:, :, 1] * np.sin(angle)[:, None]
+    return np.asarray(w, dtype=np.complex64)
+
+
+SIGNED = Coherent(_solve, phases=(1, 5), ascents=8)

@@ -1,0 +1,85 @@
+"""What is asked of a localization table: who shall feel it, who must not, how strongly, and how."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TypeAlias
+
+from model.drive_modes import MODES
+from model.errors import InputError
+from model.fingertip import FINGERTIP_RADIUS
+from model.perception import STRONG_DB_SL
+from model.plate import Plate
+
+Point: TypeAlias = tuple[float, float]
+"""x, y [m]."""
+
+MOST_CONTACTS = 10
+
+
+@dataclass(frozen=True)
+class Question:
+    """Contacts and a wanted level in; `LocalizationTable.ask` gives a pattern out.
+
+    targets: where fingers shall feel it, one or more; quiet: where fingers must not; level_db_sl:
+    wanted at every target; mode: a name in MODES, None for the table's own; playable: the modes
+    that the amplifiers can play; frequencies: the lowest and highest they can [Hz]; eras_at_most:
+    how many ERAs `switched` may drive, beyond two by exact search, which is not for live use.
+    """
+
+    targets: tuple[Point, ...]
+    quiet: tuple[Point, ...] = ()
+    level_db_sl: float = STRONG_DB_SL
+    mode: str | None = None
+    playable: tuple[str, ...] = tuple(MODES)
+    frequencies: tuple[float, float] = (0.0, math.inf)
+    eras_at_most: int = 2
+
+    def __post_init__(self) -> None:
+        """Refuse what has no answer on any plate."""
+        if not self.targets:
+            raise InputError("nobody is to feel anything: name at least one target")
+        if len(self.targets) + len(self.quiet) > MOST_CONTACTS:
+            raise InputError(
+                f"{len(self.targets) + len(self.quiet)} contacts are more than ten fingers; "
+                f"leave out all but {MOST_CONTACTS}"
+            )
+        if not math.isfinite(self.level_db_sl):
+            raise InputError(f"a level of {self.level_db_sl} dB SL is none; 20 is strong, 12 felt")
+        if self.eras_at_most < 1:
+            raise InputError(f"{self.eras_at_most} ERAs cannot move anything; allow at least one")
+        if self.mode is not None and self.mode not in MODES:
+            raise InputError(f"unknown drive mode {self.mode!r}; known: {', '.join(MODES)}")
+        for target in self.targets:
+            for position in self.quiet:
+                if math.dist(position, target) < FINGERTIP_RADIUS:
+                    raise InputError(
+                        f"target ({target[0]:g}, {target[1]:g}) m lies within the quiet fingertip "
+                        f"at ({position[0]:g}, {position[1]:g}) m; keep them "
+                        f"{1000 * FINGERTIP_RADIUS:g} mm apart at least"
+                    )
+
+    def check_on(self, plate: Plate) -> None:
+        """Raise InputError for a contact off the plate, or one that is no place."""
+        for what, contacts in (("target", self.targets), ("quiet", self.quiet)):
+            for x, y in contacts:
+                if not plate.contains(x, y):  # not true of NaN either
+                    raise InputError(
+                        f"{what} ({x:g}, {y:g}) m is not on the plate, which reaches from (0, 0) "
+                        f"to ({plate.length:g}, {plate.width:g}) m"
+                    )
+
+    def mode_on(self, own: str) -> str:
+        """The mode to answer in on a table whose own is given; InputError if it is not playable."""
+        mode = self.mode or own
+        if mode not in self.playable:
+            raise InputError(
+                f"these amplifiers cannot play mode {mode}, only {', '.join(self.playable)}; "
+                f"ask for one of these, or build a table for them: era table build --mode"
+            )
+        return mode
+
+
+def as_points(points: Sequence[Sequence[float]]) -> tuple[Point, ...]:
+    """Points [m] as numbers."""
+    return tuple((float(x), float(y)) for x, y in points)

@@ -37,7 +37,7 @@ from model.question import Point, Question
 from model.raster import Raster
 from model.reduction import reduce_plate
 from model.rig import Rig, physics_fingerprint
-from model.vibration import tone_amplitudes
+from model.vibration import base_amplitudes
 
 PAPER_FREQUENCIES = np.arange(60.0, 321.0, 10.0)
 """The 27 excitation frequencies [Hz]: 60 to 320 in steps of 10 holds every one the paper names."""
@@ -137,20 +137,19 @@ class LocalizationTable:
             wanted=10 ** (question.level_db_sl / 20),
         )
 
-    def amplitudes(self, excitation: Excitation) -> tuple[FloatArray, FloatArray]:
-        """Frequencies (f,) [Hz] and peak acceleration on the raster (f, points) [m/s²].
+    def amplitudes(
+        self, excitation: Excitation, points: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Frequencies (f,) [Hz] and peak acceleration at points (p, 2) [m] of the plate, (f, p).
 
         The excitation's frequencies must be the table's own.
         """
-        return tone_amplitudes(
-            excitation,
-            self.eras,
-            lambda f: (
-                self.acceleration[:, np.searchsorted(self.frequencies, f)]
-                .transpose(1, 2, 0)
-                .astype(complex)
-            ),
-        )
+        frequencies, bases = base_amplitudes(excitation, self.eras)
+        weights = (bases / [era.stroke for era in self.eras]).astype(np.complex64)
+        rows = np.searchsorted(self.frequencies, frequencies)
+        coherent = np.einsum("fe,pfe->pf", weights, self.acceleration[:, rows])
+        found = self.raster.at(np.ascontiguousarray(coherent).view(np.float32), points)
+        return frequencies, np.abs(found.view(np.complex64)).T.astype(float)
 
     def shapes_at(self, points: Sequence[Point]) -> FloatArray:
         """Shapes of the reduced plate at points [m] of it, (p, r)."""

@@ -21,9 +21,7 @@ NULL_SHARE = 0.1
 """A null lies below this share of the map's maximum."""
 
 
-def base_amplitudes(
-    excitation: Excitation, eras: Sequence[Era]
-) -> tuple[FloatArray, ComplexArray]:
+def base_amplitudes(excitation: Excitation, eras: Sequence[Era]) -> tuple[FloatArray, ComplexArray]:
     """Distinct frequencies (f,) [Hz], and how each ERA's base moves at them, (f, eras) [m].
 
     Raises InputError where nothing is driven, or an ERA that is not there.

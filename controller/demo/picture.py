@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
@@ -17,6 +18,7 @@ from model.perception import sensation_level
 from model.table import LocalizationTable
 
 PANELS = 6
+SIDE = 121  # points along a side; nulls are narrow
 COLORS = "magma"
 LOWEST_DB_SL, HIGHEST_DB_SL = -10.0, 30.0
 
@@ -67,12 +69,10 @@ def _draw_touch(
     axes: Axes, table: LocalizationTable, row: TouchRow, played: PlayedPattern, *, scale: Normalize
 ) -> None:
     excitation = played.pattern.excitation
-    frequencies, amplitudes = table.amplitudes(excitation)
-    raster = table.raster
-    level = sensation_level(frequencies, amplitudes).reshape(raster.ny, raster.nx)
-    axes.pcolormesh(
-        100 * raster.x, 100 * raster.y, level, cmap=COLORS, shading="gouraud", norm=scale
-    )
+    x, y = (np.linspace(0, side, SIDE) for side in (table.plate.length, table.plate.width))
+    points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    level = sensation_level(*table.amplitudes(excitation, points)).reshape(SIDE, SIDE)
+    axes.pcolormesh(100 * x, 100 * y, level, cmap=COLORS, shading="gouraud", norm=scale)
     axes.set_aspect("equal")
     draw_eras(axes, table.eras, active=excitation.keys())
     for era in table.eras:

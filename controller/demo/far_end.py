@@ -51,11 +51,12 @@ class BenchControl:
         self._turn = asyncio.Lock()
 
     async def close(self) -> None:
-        """Hang up."""
-        if self._streams is not None:
-            self._streams[1].close()
+        """Hang up; a further question connects again."""
+        streams, self._streams = self._streams, None
+        if streams is not None:
+            streams[1].close()
             with contextlib.suppress(OSError):
-                await self._streams[1].wait_closed()
+                await streams[1].wait_closed()
 
     async def place_fingers(self, positions: Mapping[str, tuple[float, float]]) -> None:
         """Let fingers rest at these positions [m], by id, and at no others."""
@@ -82,9 +83,13 @@ class BenchControl:
             if self._streams is None:
                 self._streams = await self._connect()
             reader, writer = self._streams
-            writer.write(json.dumps(question).encode() + b"\n")
-            await writer.drain()
-            line = await reader.readline()
+            try:
+                writer.write(json.dumps(question).encode() + b"\n")
+                await writer.drain()
+                line = await reader.readline()
+            except BaseException:
+                await self.close()  # the answer would be taken for that of the next question
+                raise
         if not line:
             raise LinkError("the simulated plate is gone: its process closed the control socket")
         answer: dict[str, Any] = json.loads(line)

@@ -3,6 +3,7 @@
 import asyncio
 from collections.abc import Awaitable, Callable
 from pathlib import Path
+from typing import TypeAlias
 
 from controller.contacts import LEASE
 from controller.demo.far_end import open_far_end
@@ -20,6 +21,8 @@ from drivers.registry import open_backend
 from model.figures import save_figure
 from model.rig_file import load_rig
 from model.table import LocalizationTable
+
+Play: TypeAlias = Callable[[], Awaitable[None]]
 
 WIRES = ("serial", "sim")
 
@@ -52,8 +55,9 @@ async def run_demo(
     recording that is none, LinkError if the far end is lost.
     """
     rig = load_rig(rig_file)
-    source, play = await _touch_stream(touches)
+    stream = _read_touches(touches)
     async with open_far_end(rig_file, rig.amplifiers, wire=wire) as far_end:
+        source, play = await stream()
         recorder = TouchRecorder(far_end.bench, on_row=on_row)
         controller = Controller(
             rig,
@@ -84,18 +88,26 @@ def write_picture(table: LocalizationTable, rows: list[TouchRow], folder: Path) 
     return [path]
 
 
-async def _touch_stream(path: Path) -> tuple[TouchSource, Callable[[], Awaitable[None]]]:
-    """A source for a recording, and what to await while it plays."""
+def _read_touches(path: Path) -> Callable[[], Awaitable[tuple[TouchSource, Play]]]:
+    """Read a recording now; what is returned opens its source, and what to await while it plays."""
     if path.suffix == ".events":
         recording = EvemuSource(f"evemu:{path}")
-        return recording, lambda: asyncio.sleep(recording.frames[-1].time)
+
+        async def open_recording() -> tuple[TouchSource, Play]:
+            return recording, lambda: asyncio.sleep(recording.frames[-1].time)
+
+        return open_recording
     datagrams = read_capture(path)
-    tuio = TuioSource("tuio:127.0.0.1:0")
-    await tuio.open()
-    return tuio, lambda: replay_capture(datagrams, tuio.host, tuio.port)
+
+    async def open_port() -> tuple[TouchSource, Play]:
+        tuio = TuioSource("tuio:127.0.0.1:0")
+        await tuio.open()
+        return tuio, lambda: replay_capture(datagrams, tuio.host, tuio.port)
+
+    return open_port
 
 
-async def _drive(controller: Controller, play: Callable[[], Awaitable[None]]) -> None:
+async def _drive(controller: Controller, play: Play) -> None:
     """Arm, let the touches come, and wait until the last one has been noticed as lifted."""
     await controller.arm()
     tasks = [asyncio.create_task(controller.run()), asyncio.create_task(_play_out(play))]
@@ -109,6 +121,6 @@ async def _drive(controller: Controller, play: Callable[[], Awaitable[None]]) ->
         await asyncio.gather(*tasks, return_exceptions=True)
 
 
-async def _play_out(play: Callable[[], Awaitable[None]]) -> None:
+async def _play_out(play: Play) -> None:
     await play()
     await asyncio.sleep(LEASE + AFTERGLOW)

@@ -7,7 +7,7 @@ PYTHON ?= $(shell for python in $(PYTHONS); do \
 BIN := .venv/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet --editable
 
-.PHONY: demo test lint format clean
+.PHONY: demo test lint format bench clean
 .NOTPARALLEL:
 
 demo: .venv/installed
@@ -26,6 +26,10 @@ format: .venv/installed-test
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
+# What the machine does beside it shows in the times: leave it alone meanwhile.
+bench: .venv/installed-peers
+	$(BIN)/python -m benchmarks.plate
+
 clean:
 	rm -rf .venv .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache out
 
@@ -43,4 +47,8 @@ $(BIN)/python:
 
 .venv/installed-test: $(BIN)/python pyproject.toml
 	$(PIP) '.[test]'
+	touch $@ .venv/installed
+
+.venv/installed-peers: $(BIN)/python pyproject.toml
+	$(PIP) '.[peers]'
 	touch $@ .venv/installed

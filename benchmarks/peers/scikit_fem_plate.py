@@ -1,0 +1,45 @@
+"""scikit-fem: the Kirchhoff plate with Bogner-Fox-Schmit elements, as in its example 02."""
+
+import numpy as np
+import skfem
+from skfem.helpers import dd, ddot, eye, trace
+
+from benchmarks.peers.scipy_sweep import sweep
+from benchmarks.problem import LENGTH, NU, RHO, THICKNESS, WIDTH, E
+
+NAME = "scikit-fem"
+METHOD = "Kirchhoff, Bogner-Fox-Schmit"
+
+
+class Plate:
+    """Matrices of the free plate on nx by ny elements."""
+
+    def __init__(self, nx, ny):
+        mesh = skfem.MeshQuad.init_tensor(
+            np.linspace(0, LENGTH, nx + 1), np.linspace(0, WIDTH, ny + 1)
+        )
+        basis = skfem.Basis(mesh, skfem.ElementQuadBFS(), intorder=6)
+        rigidity = E * THICKNESS**3 / (12 * (1 - NU**2))
+
+        @skfem.BilinearForm
+        def bending(u, v, _):
+            curvature = dd(u)
+            moment = rigidity * ((1 - NU) * curvature + NU * eye(trace(curvature), 2))
+            return ddot(moment, dd(v))
+
+        @skfem.BilinearForm
+        def inertia(u, v, _):
+            return RHO * THICKNESS * u * v
+
+        self.points = mesh.p.T
+        self.deflection = basis.nodal_dofs[0]
+        self.stiffness = bending.assemble(basis)
+        self.mass = inertia.assemble(basis)
+        self.dof = self.stiffness.shape[0]
+
+    def sweep(self, places, observed):
+        return sweep(self.stiffness, self.mass, self._dofs(places), self._dofs(observed))
+
+    def _dofs(self, places):
+        far = np.linalg.norm(self.points[None] - places[:, None], axis=2)
+        return self.deflection[far.argmin(axis=1)]

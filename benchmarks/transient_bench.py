@@ -99,30 +99,49 @@ class Bench:
             )
         return columns
 
-    def endings(self, cases: list[Case], *, full: bool) -> Columns:
-        columns: Columns = defaultdict(list)
+    def endings(self, cases: list[Case], *, full: bool) -> tuple[Columns, Columns]:
+        left: Columns = defaultdict(list)
+        contrast: Columns = defaultdict(list)
         eras = self.rig.eras
         for case in cases:
             level = 1.0 if full else case.felt_level
             excitation = case.excitation(self.rig, level)
+            errors = wrong(self._rng, len(eras), self._draws)
             for name, ramp in (("stopped", 0.0), ("20 ms ramp", 0.02), ("40 ms ramp", 0.04)):
                 bases = ramped_ending(excitation, eras, ramp=ramp)
-                columns[name].append(self.transients.left_db(excitation, bases))
-            envelopes = self.clock("ending", partial(self.shaper.ending, excitation))
-            bases = shaped(envelopes, eras)
-            columns["40 ms brake"].append(self._left(excitation, bases))
-            realised = [
-                self._left(
-                    case.excitation(self.rig, level, each),
-                    shaped(with_errors(envelopes, self.rig, each), eras),
-                )
-                for each in wrong(self._rng, len(eras), self._draws)
-            ]
-            columns["40 ms brake, realised"].append(float(np.median(realised)))
-            columns["largest level"].append(
-                max(each.largest / self.rig.era(name).stroke for name, each in envelopes.items())
+                left[name].append(self._left(excitation, bases))
+                contrast[name].append(self._end_contrast(case, excitation, bases))
+            brake = self.clock("ending", partial(self.shaper.ending, excitation))
+            quiet_brake = self.clock(
+                f"ending, {len(case.quiet)} quiet",
+                partial(self.shaper.ending, excitation, targets=case.targets, quiet=case.quiet),
             )
-        return columns
+            for name, envelopes in (("40 ms brake", brake), ("the same, quietly", quiet_brake)):
+                bases = shaped(envelopes, eras)
+                left[name].append(self._left(excitation, bases))
+                contrast[name].append(self._end_contrast(case, excitation, bases))
+                realised = [
+                    (
+                        case.excitation(self.rig, level, each),
+                        shaped(with_errors(envelopes, self.rig, each), eras),
+                    )
+                    for each in errors
+                ]
+                left[f"{name}, realised"].append(
+                    float(np.median([self._left(*each) for each in realised]))
+                )
+                contrast[f"{name}, realised"].append(
+                    float(np.median([self._end_contrast(case, *each) for each in realised]))
+                )
+                left[f"{name}, largest level"].append(
+                    max(each.largest / self.rig.era(era).stroke for era, each in envelopes.items())
+                )
+        return left, contrast
+
+    def _end_contrast(self, case: Case, excitation: Excitation, bases: Bases) -> float:
+        return self.transients.ending_contrast_db(
+            excitation, bases, targets=case.targets, quiet=case.quiet
+        )
 
     def _left(self, excitation: Excitation, bases: Bases) -> float:
         return self.clock("level left", lambda: self.transients.left_db(excitation, bases))
@@ -144,5 +163,5 @@ def in_time(rig: Rig) -> PlateInTime:
 def print_columns(title: str, columns: Columns, *, worse: float) -> None:
     print(f"\n{title}")
     for name, values in columns.items():
-        unit = "" if name == "largest level" else " dB"
+        unit = "" if name.endswith("largest level") else " dB"
         print(f"  {name:34s} {np.median(values):6.1f} ({np.percentile(values, worse):6.1f}){unit}")

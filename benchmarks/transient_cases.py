@@ -10,9 +10,9 @@ from model.envelope import Envelopes
 from model.excitation import Excitation, Tone
 from model.fingertip import FINGERTIP_RADIUS, fingertip_points
 from model.free_plate import solve_free_plate
+from model.knots import GAIN_ERROR, PHASE_ERROR
 from model.perception import STRONG_DB_SL, detection_threshold
 from model.rig import Rig
-from model.shaping import GAIN_ERROR, PHASE_ERROR
 
 FREQUENCIES = np.linspace(40, 500, 27)
 APART = 0.05

@@ -26,7 +26,7 @@ def draw(plate: PlateInTime, rig: Rig, cases: list[list[Case]], path: Path) -> N
     excitation = case.excitation(rig, case.felt_level)
     shaper, transients = Shaper(plate), Transients(plate)
     onset = shaper.onset(excitation, targets=case.targets, quiet=case.quiet)
-    ending = shaper.ending(excitation)
+    ending = shaper.ending(excitation, targets=case.targets, quiet=case.quiet)
     rows: list[tuple[str, Bases, str, Bases]] = [
         (
             "abrupt",
@@ -40,7 +40,7 @@ def draw(plate: PlateInTime, rig: Rig, cases: list[list[Case]], path: Path) -> N
             "20 ms ramp",
             ramped_ending(excitation, rig.eras, ramp=0.02),
         ),
-        ("shaped", shaped(onset, rig.eras), "40 ms brake", shaped(ending, rig.eras)),
+        ("shaped", shaped(onset, rig.eras), "brake, quietly", shaped(ending, rig.eras)),
     ]
     points = [fingertip_points(*each, rig.plate) for each in case.contacts]
     count = len(points[0])

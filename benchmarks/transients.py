@@ -51,9 +51,11 @@ def main() -> None:
             (f"below {LOW:g} Hz", [case for case in everything if case.frequency < LOW]),
             (f"{LOW:g} Hz and above", [case for case in everything if case.frequency >= LOW]),
         ):
-            columns = bench.endings(chosen, full=full)
-            name = f"left in the 100 ms after the end, {title}, {len(chosen)} patterns, {how}"
-            print_columns(name, columns, worse=90)
+            left, contrast = bench.endings(chosen, full=full)
+            name = f"{title}, {len(chosen)} patterns, {how}"
+            print_columns(f"left in the 100 ms after the end, {name}", left, worse=90)
+            if not full:
+                print_columns(f"contrast from the end on, {title}, {how}", contrast, worse=10)
     bench.clock.show()
 
 

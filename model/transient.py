@@ -58,6 +58,36 @@ class Transients:
         peak = np.abs(felt).max(axis=0)
         return float(contrast_db(peak[: len(at_targets)], peak[len(at_targets) :]))
 
+    def ending_contrast_db(
+        self,
+        excitation: Excitation,
+        ending: Bases,
+        *,
+        targets: Sequence[tuple[float, float]],
+        quiet: Sequence[tuple[float, float]],
+    ) -> float:
+        """Contrast [dB] of the targets while they still felt an excitation to the end of it.
+
+        Mean steady peak acceleration over the points of all targets to the loudest peak at a quiet
+        point until 100 ms after the ending, whose bases move as told from time 0 on; positions in
+        m.
+        """
+        plate = self._plate.reduced.plate
+        at_targets = np.concatenate([fingertip_points(*each, plate) for each in targets])
+        at_quiet = np.concatenate([fingertip_points(*each, plate) for each in quiet])
+        shapes = self._plate.reduced.at(at_targets) @ self._plate.displacement
+        by_frequency: dict[float, ComplexArray] = {}
+        for name, state in self._steady(excitation).items():
+            frequency = excitation[name].frequency
+            by_frequency[frequency] = by_frequency.get(frequency, 0) + shapes @ state
+        steady = sum(
+            (2 * math.pi * frequency) ** 2 * np.abs(field)
+            for frequency, field in by_frequency.items()
+        )
+        over = max((term.end for base in ending for term in base), default=0.0)
+        felt = self.acceleration(ending, at_quiet, duration=over + AFTER, after=excitation)
+        return float(contrast_db(np.asarray(steady), np.abs(felt).max(axis=0)))
+
     def acceleration(
         self,
         bases: Bases,

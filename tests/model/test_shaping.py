@@ -9,7 +9,8 @@ from model.envelope import Envelopes, ramped_ending, ramped_onset, shaped
 from model.excitation import Excitation, Tone
 from model.fingertip import fingertip_points
 from model.hats import steady_states
-from model.shaping import ENDING_KNOTS, ONSET_KNOTS, Shaper
+from model.knots import ONSET_KNOTS
+from model.shaping import Shaper
 from model.transient import Transients
 from plate_in_time import make_plate_in_time
 
@@ -158,6 +159,77 @@ def test_a_shaped_onset_keeps_most_of_the_steady_contrast(setup, target, quiet, 
     assert np.median(realised) > np.median(steady) - 6
 
 
+def test_what_is_found_trusts_no_era_more_than_it_may(setup, monkeypatch):
+    """With errors the robust onset and brake do better than those that know of no errors."""
+    rig, plate, shaper, transients = setup
+    target, quiet, frequency = PAIRS[2]
+    excitation = tones(rig, frequency, robust_weights(plate, frequency, target, quiet))
+    low = random_excitation(rig, 110.8, np.random.default_rng(1))
+    found = [(shaper.onset(excitation, targets=[target], quiet=[quiet]), shaper.ending(low))]
+    monkeypatch.setattr("model.knots._ERROR_VARIANCE", 0.0)
+    found.append((shaper.onset(excitation, targets=[target], quiet=[quiet]), shaper.ending(low)))
+    contrast, left = [], []
+    for onset, ending in found:
+        for seed in range(40):
+            rng = np.random.default_rng(seed)
+            gains = 1 + 0.05 * rng.standard_normal(4)
+            errors = gains * np.exp(1j * np.radians(5) * rng.standard_normal(4))
+            bases = shaped(wrong(onset, errors), rig.eras)
+            contrast.append(transients.contrast_db(bases, targets=[target], quiet=[quiet]))
+            off = {
+                name: Tone(tone.frequency, tone.amplitude * abs(e), tone.phase + np.angle(e))
+                for (name, tone), e in zip(sorted(low.items()), errors, strict=True)
+            }
+            left.append(transients.left_db(off, shaped(wrong(ending, errors), rig.eras)))
+    assert np.median(contrast[:40]) > np.median(contrast[40:]) + 0.2
+    assert np.median(left[:40]) < np.median(left[40:]) - 1
+
+
+def test_a_target_follows_its_ramp(setup):
+    """A target has nothing at first, half its amplitude within 35 ms, and most of it by 60 ms."""
+    rig, plate, shaper, transients = setup
+    for target, quiet, frequency in PAIRS[1:]:
+        weights = robust_weights(plate, frequency, target, quiet)
+        excitation = tones(rig, frequency, 0.1 * weights)
+        onset = shaper.onset(excitation, targets=[target], quiet=[quiet])
+        felt = transients.acceleration(shaped(onset, rig.eras), np.array([target]), duration=0.3)[
+            :, 0
+        ]
+        steady = np.abs(felt[-800:]).max()
+        assert np.abs(felt[:24]).max() < 0.1 * steady  # 3 ms
+        assert np.abs(felt[:280]).max() > 0.5 * steady
+        assert np.abs(felt[280:480]).max() > 0.65 * steady
+
+
+def test_an_ending_that_knows_the_quiet_finger_keeps_it_quiet(setup):
+    """Its peaks are lower than if the ending did not know it, above 150 Hz lower than in a ramp.
+
+    In a few periods of a low frequency a plate is not stopped that quietly, but it is stopped.
+    """
+    rig, plate, shaper, transients = setup
+    for target, quiet, frequency in PAIRS:
+        weights = robust_weights(plate, frequency, target, quiet)
+        excitation = tones(rig, frequency, 0.2 * weights)
+        knowing = shaped(shaper.ending(excitation, targets=[target], quiet=[quiet]), rig.eras)
+        peaks = [
+            np.abs(
+                transients.acceleration(
+                    bases, fingertip_points(*quiet, rig.plate), duration=0.1, after=excitation
+                )
+            ).max()
+            for bases in (
+                knowing,
+                shaped(shaper.ending(excitation), rig.eras),
+                ramped_ending(excitation, rig.eras, ramp=0.02),
+            )
+        ]
+        assert peaks[0] < 0.7 * peaks[1]
+        if frequency > 150:
+            assert peaks[0] < 0.7 * peaks[2]
+        limit = -30 if frequency < 150 else -40
+        assert transients.left_db(excitation, knowing) < limit
+
+
 def test_mirrored_contacts_get_mirrored_envelopes(setup):
     """On a symmetric plate, west and east swap with the contacts."""
     rig, _, shaper, _ = setup
@@ -271,4 +343,3 @@ def test_around_a_lone_finger_the_plate_takes_the_quiet_fingers_place(setup):
         share.append(np.sqrt((felt[:, 1:] ** 2).mean()) / np.abs(felt[:, 0]).max())
     assert share[0] < share[1]
     assert len(onset["SW"].knots) == 21
-    assert ENDING_KNOTS == 8

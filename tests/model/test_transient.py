@@ -166,3 +166,30 @@ def test_tones_of_two_frequencies_leave_the_sum_of_their_powers(plate):
     ]
     both = transients.left_db(low | high, ramped_ending(low | high, rig.eras, ramp=0.02))
     assert min(alone) < both < max(alone)
+
+
+def test_contrast_of_an_end_is_that_of_its_peaks(plate):
+    """What the target felt steadily, by sampling, to the loudest quiet peak from the end on."""
+    rig, in_time = plate
+    transients = Transients(in_time)
+    excitation = {"SW": Tone(110.0, 1e-4), "NE": Tone(300.0, 5e-5, 1.0)}
+    target, quiet = (0.05, 0.05), (0.2, 0.1)
+    ending = ramped_ending(excitation, rig.eras, ramp=0.02)
+    points = fingertip_points(*target, rig.plate)
+    steady = sum(
+        np.abs(
+            transients.acceleration(
+                ramped_onset({name: tone}, rig.eras, ramp=0.0),
+                points,
+                duration=0.2,
+                after={name: tone},
+            )
+        ).max(axis=0)
+        for name, tone in excitation.items()
+    )
+    felt = transients.acceleration(
+        ending, fingertip_points(*quiet, rig.plate), duration=0.12, after=excitation
+    )
+    expected = 20 * np.log10(steady.mean() / np.abs(felt).max())
+    found = transients.ending_contrast_db(excitation, ending, targets=[target], quiet=[quiet])
+    assert found == pytest.approx(expected, abs=0.1)

@@ -20,9 +20,15 @@ from model.actuator import Era
 from model.arrays import FloatArray
 from model.assembly import era_positions
 from model.drive_modes import MODES, best_drive, loudest
-from model.drive_modes.fields import Drive, Fields, Outcome, SingleComplex
-from model.drive_modes.switched import all_patterns, peak_of_patterns, sensation_of_patterns
+from model.drive_modes.fields import Drive, Fields, Outcome, SingleComplex, judge
+from model.drive_modes.sources import (
+    all_patterns,
+    magnitudes_of_sources,
+    per_source,
+    sums_of_sources,
+)
 from model.errors import InputError
+from model.exact_search import search_exactly
 from model.excitation import Excitation, Tone
 from model.fingertip import UNIT_DISC, fingertip_points
 from model.free_plate import solve_free_plate
@@ -54,8 +60,9 @@ class LocalizationTable:
     mode: what questions are answered in unless they say; frequencies (f,) [Hz]; acceleration
     (points, f, eras) complex [m/s²] on the raster, each ERA alone at full stroke; omega (r,)
     [rad/s], held (eras + masses, r) and shapes (points, r) [1/sqrt(kg)]: the reduced free plate, at
-    what holds it and on the raster (`model.reduction`); cell_response (n, cells) [m/s²]: mean peak
-    acceleration over each cell of every `switched` pattern, in the order of `patterns`.
+    what holds it and on the raster (`model.reduction`); cell_sources (sources, cells) [m/s²]: mean
+    peak acceleration over each cell of what `switched` patterns are made of
+    (`model.drive_modes.sources`).
     """
 
     plate: Plate
@@ -71,7 +78,7 @@ class LocalizationTable:
     omega: FloatArray
     held: FloatArray
     shapes: NDArray[np.float32]
-    cell_response: NDArray[np.float32]
+    cell_sources: NDArray[np.float32]
 
     @property
     def fingerprint(self) -> str:
@@ -82,6 +89,11 @@ class LocalizationTable:
     def patterns(self) -> NDArray[np.int16]:
         """Every `switched` pattern: index of each ERA's frequency, or SILENT, (n, eras)."""
         return all_patterns(len(self.eras), len(self.frequencies)).index
+
+    @property
+    def cell_response(self) -> NDArray[np.float32]:
+        """Mean peak acceleration over each cell of every `switched` pattern, (n, cells) [m/s²]."""
+        return sums_of_sources(self.cell_sources.T, len(self.eras)).T
 
     def answer(
         self,
@@ -105,7 +117,11 @@ class LocalizationTable:
         question.check_on(self.plate)
         mode = question.mode_on(self.mode)
         usable, fields = self._usable(question)
-        found = best_drive(fields, mode)
+        if mode == "switched" and question.eras_at_most != 2:
+            drive = search_exactly(fields, eras_at_most=question.eras_at_most).drive
+            found = None if drive is None else (drive, judge(fields, drive))
+        else:
+            found = best_drive(fields, mode)
         if found is None:
             raise InputError(self._too_loud(question, fields, mode))
         drive, outcome = found
@@ -175,8 +191,11 @@ class LocalizationTable:
     @cached_property
     def available_level_db_sl(self) -> FloatArray:
         """Highest level [dB SL] of any `switched` pattern at the centre of each cell, (cells,)."""
-        sensation = sensation_of_patterns(self._cell_fields, self._threshold)
-        return decibels(sensation.max(axis=0).astype(float))
+        sources = magnitudes_of_sources(self._cell_fields)
+        powers = (sources / per_source(self._threshold, len(self.eras))) ** 2
+        # One cell after the other: of fine frequency steps there are millions of patterns.
+        most = [sums_of_sources(cell[None], len(self.eras)).max() for cell in powers.T]
+        return decibels(np.sqrt(np.array(most, dtype=float)))
 
     @cached_property
     def cell_centres(self) -> FloatArray:
@@ -302,7 +321,7 @@ def build_table(
 
     attached = np.vstack([era_positions(rig.eras), load_positions(rig.loads)])
     reduced = reduce_plate(rig.plate, rig.mesh, attached, frequency_max=highest)
-    cells = peak_of_patterns(fields[:, :, raster.point_count :].astype(np.complex64))
+    cells = magnitudes_of_sources(fields[:, :, raster.point_count :].astype(np.complex64))
     return LocalizationTable(
         plate=rig.plate,
         eras=rig.eras,
@@ -319,7 +338,7 @@ def build_table(
         omega=reduced.omega,
         held=reduced.at(attached),
         shapes=reduced.at(raster.points).astype(np.float32),
-        cell_response=cells.reshape(len(cells), -1, CELL_SAMPLES**2).mean(axis=-1),
+        cell_sources=cells.reshape(len(cells), -1, CELL_SAMPLES**2).mean(axis=-1),
     )
 
 

@@ -5,8 +5,8 @@ header carries the format version, the plate's fingerprint, everything that made
 SHA-256 over the content, so that a damaged or foreign file is refused before any of it is used.
 
 Version 1 held the fields at the nodes of the mesh; 2 holds them on a raster, with the plate's modes
-and point masses, and leaves out the list of `switched` patterns, which follows from the counts of
-ERAs and frequencies.
+and point masses, and what `switched` patterns are made of at the cells in place of every one of
+them: of fine frequency steps there are millions.
 """
 
 import hashlib
@@ -35,7 +35,7 @@ from model.table import LocalizationTable
 FORMAT = "era-haptics localization table"
 FORMAT_VERSION = 2
 
-# A table of the paper's plate has 3 MB, one of eight ERAs and a fine grid some hundred; what is
+# A table of the paper's plate has 1.4 MB, one of eight ERAs and a fine grid some hundred; what is
 # larger than this is not a table.
 MAX_BYTES = 2 << 30
 
@@ -46,7 +46,7 @@ _DTYPES = {
     "omega": "<f8",
     "held": "<f8",
     "shapes": "<f4",
-    "cell_response": "<f4",
+    "cell_sources": "<f4",
 }
 
 
@@ -215,14 +215,14 @@ def _assemble(header: _Header, arrays: dict[str, NDArray[Any]], path: Path) -> L
     if table.mode not in MODES:
         raise InputError(f"{path}: unknown drive mode {table.mode!r}")
     count, era_count, coordinates = len(table.frequencies), len(table.eras), len(table.omega)
-    patterns = era_count * count + era_count * (era_count - 1) // 2 * count**2
+    sources = era_count * (era_count + 1) // 2 * count + 1
     expected = {
         "frequencies": (count,),
         "acceleration": (table.raster.point_count, count, era_count),
         "omega": (coordinates,),
         "held": (era_count + len(table.masses), coordinates),
         "shapes": (table.raster.point_count, coordinates),
-        "cell_response": (patterns, table.grid.cell_count),
+        "cell_sources": (sources, table.grid.cell_count),
     }
     for name, shape in expected.items():
         values = getattr(table, name)

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from model.assembly import assemble
+from model.drive_modes.sources import all_patterns, magnitudes_of_sources, sums_of_sources
 from model.errors import InputError
 from model.fingertip import fingertip_points
 from model.harmonic import direct_acceleration
-from model.drive_modes.switched import all_patterns, peak_of_patterns
 from model.localization import Grid
 from model.mesh import Mesh
 from model.perception import sensation_level
@@ -59,7 +59,7 @@ def test_every_pattern_is_what_adding_up_its_tones_gives():
     """Row by row, the vectorised sum equals Eq. 28 written out for that pattern."""
     rng = np.random.default_rng(0)
     response = rng.normal(size=(5, 3, 4)) + 1j * rng.normal(size=(5, 3, 4))
-    fast = peak_of_patterns(response)
+    fast = sums_of_sources(magnitudes_of_sources(response).T, 3).T
     for row, pattern in zip(fast, all_patterns(3, 5).index, strict=True):
         slow = np.zeros(4)
         for frequency in range(5):
@@ -174,7 +174,7 @@ def test_a_table_survives_its_file_to_the_bit(table, tmp_path):
     path = tmp_path / "t.npz"
     save_table(table, path)
     back = load_table(path, fingerprint=table.fingerprint)
-    for name in ("frequencies", "acceleration", "omega", "held", "shapes", "cell_response"):
+    for name in ("frequencies", "acceleration", "omega", "held", "shapes", "cell_sources"):
         np.testing.assert_array_equal(getattr(back, name), getattr(table, name))
     assert (back.plate, back.eras, back.masses, back.raster, back.grid) == (
         table.plate, table.eras, table.masses, table.raster, table.grid,
@@ -286,7 +286,7 @@ def repacked(source, target, **changed):
         (lambda t: {"frequencies": np.array([{"a": 1}], dtype=object)}, "not a readable"),
         (lambda t: {"acceleration": t.acceleration.astype(np.complex128)}, "not a readable"),
         (lambda t: {"acceleration": t.acceleration * np.complex64(np.nan)}, "damaged"),
-        (lambda t: {"cell_response": t.cell_response[:10]}, "damaged"),
+        (lambda t: {"cell_sources": t.cell_sources[:10]}, "damaged"),
         (lambda t: {"extra": np.zeros(3)}, "not a readable"),
         (lambda t: {"header": np.frombuffer(b"{}", dtype=np.uint8)}, "bad header"),
         (lambda t: {"header": np.frombuffer(b"\xff\x00", dtype=np.uint8)}, "bad header"),

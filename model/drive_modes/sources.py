@@ -1,0 +1,90 @@
+"""What patterns of one or two ERAs are made of: sources, and the patterns as sums of them.
+
+A source is an ERA at a frequency, or a pair of ERAs together at the same one. Two ERAs at one
+frequency add as complex numbers, at two frequencies their magnitudes add (paper Eq. 28): every
+pattern is one source or the sum of two, and what is known of the sources is known of all patterns.
+"""
+
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model.arrays import ComplexArray, FloatArray, IntArray
+from model.drive_modes.fields import SILENT, Single, SingleComplex
+
+
+@dataclass(frozen=True, eq=False)
+class Patterns:
+    """All patterns of one or two ERAs, as sums of two sources.
+
+    index (n, eras): of each ERA's frequency, or SILENT; first every ERA alone, then every pair,
+    frequencies of the pair's first ERA running slowest. first, second (n,): rows of the sources,
+    which are: each ERA at each frequency, each pair together at each frequency, and nothing.
+    """
+
+    index: NDArray[np.int16]
+    first: IntArray
+    second: IntArray
+
+
+@lru_cache(maxsize=8)
+def all_patterns(era_count: int, frequency_count: int) -> Patterns:
+    """Every pattern of so many ERAs and frequencies: 4482 of four ERAs and 27."""
+    f = np.arange(frequency_count)
+    pairs = list(combinations(range(era_count), 2))
+    together = era_count * frequency_count
+    nothing = together + len(pairs) * frequency_count
+    index, first, second = [], [], []
+    for era in range(era_count):
+        block = np.full((frequency_count, era_count), SILENT, dtype=np.int16)
+        block[:, era] = f
+        index.append(block)
+        first.append(era * frequency_count + f)
+        second.append(np.full(frequency_count, nothing))
+    for number, (one, other) in enumerate(pairs):
+        f_one, f_other = np.repeat(f, frequency_count), np.tile(f, frequency_count)
+        block = np.full((frequency_count**2, era_count), SILENT, dtype=np.int16)
+        block[:, one], block[:, other] = f_one, f_other
+        index.append(block)
+        same = f_one == f_other
+        coherent = together + number * frequency_count + f_one
+        first.append(np.where(same, coherent, one * frequency_count + f_one))
+        second.append(np.where(same, nothing, other * frequency_count + f_other))
+    return Patterns(np.concatenate(index), np.concatenate(first), np.concatenate(second))
+
+
+def magnitudes_of_sources(acceleration: SingleComplex | ComplexArray) -> Single:
+    """Peak acceleration (sources, p) of all sources from each ERA's field (f, eras, p)."""
+    _, eras, p = acceleration.shape
+    pairs = list(combinations(range(eras), 2))
+    one, other = np.array(pairs, dtype=int).reshape(-1, 2).T
+    by_era = acceleration.transpose(1, 0, 2)
+    fields = np.concatenate([by_era, by_era[one] + by_era[other]]).reshape(-1, p)
+    rows = np.zeros((len(fields) + 1, p), dtype=acceleration.real.dtype)
+    # Half the time of np.abs, which guards against overflow.
+    np.sqrt(fields.real**2 + fields.imag**2, out=rows[:-1])
+    return rows
+
+
+def per_source(threshold: Single | FloatArray, era_count: int) -> Single:
+    """Threshold (f,) of every source, (sources, 1); of nothing it is 1."""
+    blocks = era_count * (era_count + 1) // 2
+    return np.append(np.tile(threshold, blocks), np.ones(1, threshold.dtype))[:, None]
+
+
+def sums_of_sources(rows: Single, eras: int) -> Single:
+    """From values of all sources (c, sources) those of all patterns, (c, n)."""
+    c = len(rows)
+    f = (rows.shape[1] - 1) // (eras * (eras + 1) // 2)
+    alone = rows[:, : eras * f].reshape(c, eras, f)
+    one, other = np.array(list(combinations(range(eras), 2)), dtype=int).reshape(-1, 2).T
+    sums = np.empty((c, eras * f + len(one) * f * f), dtype=rows.dtype)
+    sums[:, : eras * f] = rows[:, : eras * f]
+    pairs = sums[:, eras * f :].reshape(c, len(one), f, f)
+    np.add(alone[:, one, :, None], alone[:, other, None, :], out=pairs)
+    same = np.arange(f)
+    pairs[:, :, same, same] = rows[:, eras * f : -1].reshape(c, len(one), f)
+    return sums

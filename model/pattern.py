@@ -21,7 +21,9 @@ class Pattern:
     surroundings_contrast_db: to the plate farther than 50 mm, root mean square. None: the first two
     about quiet fingers where there are none, the last where there are.
     robust_contrast_db: tenth percentile of the contrast over what may differ on the real plate
-    (`model.robust`); transient_contrast_db: over the first 100 ms; None unless asked for.
+    (`model.robust`); transient_contrast_db: over the first 100 ms; left_after_db: vibration of the
+    plate in the 100 ms after the end, relative to the steady one (`model.timing` for both); None
+    unless asked for.
     onset, ending: envelopes in place of the ramp, for amplifiers that play them.
     """
 
@@ -34,6 +36,7 @@ class Pattern:
     surroundings_contrast_db: float | None = None
     robust_contrast_db: float | None = None
     transient_contrast_db: float | None = None
+    left_after_db: float | None = None
     onset: Envelopes | None = None
     ending: Envelopes | None = None
 

@@ -107,6 +107,10 @@ def query(
     eras: Annotated[
         int, typer.Option(metavar="N", help="How many ERAs mode switched may drive.")
     ] = 2,
+    envelopes: Annotated[
+        bool,
+        typer.Option("--envelopes", help="The amplifiers play envelopes: shape onset and ending."),
+    ] = False,
     batch: Annotated[
         Path | None,
         typer.Option(metavar="FILE", help="Questions as JSON lines; answers one to a line."),
@@ -118,7 +122,7 @@ def query(
     from model.points import parse_point
     from model.question import Question
     from model.table_file import load_table
-    from model.table_query import answer_as_json
+    from model.table_query import answer_as_json, prepared_timing
 
     if batch is not None:
         if target or quiet:
@@ -131,10 +135,11 @@ def query(
         level_db_sl=level,
         mode=mode,
         eras_at_most=eras,
+        envelopes=envelopes,
     )
     table = load_table(table_file)
     table.prepare(mode)
-    answer = answer_as_json(table, question)
+    answer = answer_as_json(table, question, prepared_timing(table))
     if as_json:
         print(json.dumps(answer))
         return
@@ -148,10 +153,12 @@ def query(
         unaware = "unaware" if answer["quiet_is_unaware"] else "may feel it"
         print(f"contrast to the others   {answer['contrast_db']:6.1f} dB")
         print(f"  in nine of ten plates  {answer['robust_contrast_db']:6.1f} dB or more")
+        print(f"  in the first 100 ms    {answer['transient_contrast_db']:6.1f} dB")
         print(f"loudest quiet finger     {answer['quiet_level_db_sl']:6.1f} dB SL, {unaware}")
         print(f"leaves them unaware up to{answer['usable_level_db_sl']:6.1f} dB SL")
     else:
         print(f"to the plate around it   {answer['surroundings_contrast_db']:6.1f} dB")
+    print(f"left after its end       {answer['left_after_db']:6.1f} dB")
     print(f"found in {1000 * answer['solve_time_s']:.1f} ms")
 
 

@@ -1,16 +1,20 @@
 """Questions to a table as JSON, and its answers."""
 
+import cmath
+import math
 import time
 from collections.abc import Iterable, Iterator
 from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from model.envelope import Envelopes
 from model.errors import InputError
 from model.perception import STRONG_DB_SL
 from model.question import Question
 from model.robust import with_robust_contrast
 from model.table import LocalizationTable
+from model.timing import Timing
 
 _Place = Annotated[list[float], Field(min_length=2, max_length=2)]
 
@@ -26,13 +30,14 @@ class _Line(BaseModel):
     mode: str | None = None
     level_db_sl: float = STRONG_DB_SL
     eras_at_most: int = 2
+    envelopes: bool = False
 
 
 def question_from_json(line: str) -> Question:
     """The question of one line, `{"target": [x, y], "quiet": [[x, y], ...], "mode": ...}`.
 
-    Several targets: `"targets": [[x, y], ...]`; also `"level_db_sl"` and `"eras_at_most"`. Raises
-    InputError.
+    Several targets: `"targets": [[x, y], ...]`; also `"level_db_sl"`, `"eras_at_most"` and
+    `"envelopes"`. Raises InputError.
     """
     try:
         asked = _Line.model_validate_json(line)
@@ -47,17 +52,21 @@ def question_from_json(line: str) -> Question:
         level_db_sl=asked.level_db_sl,
         mode=asked.mode,
         eras_at_most=asked.eras_at_most,
+        envelopes=asked.envelopes,
     )
 
 
-def answer_as_json(table: LocalizationTable, question: Question) -> dict[str, Any]:
-    """The answer with all its measures; solve_time_s is that of the pattern, without robustness.
+def answer_as_json(table: LocalizationTable, question: Question, timing: Timing) -> dict[str, Any]:
+    """The answer with all its measures; solve_time_s is that of the pattern, without measures.
 
     A table that has been prepared answers as it does while fingers wait.
     """
     started = time.perf_counter()
     pattern = table.ask(question)
+    if question.envelopes:
+        pattern = timing.with_envelopes(question, pattern)
     elapsed = time.perf_counter() - started
+    pattern = timing.with_transient_measures(question, pattern)
     pattern = with_robust_contrast(table, question, pattern)
     return {
         "drive": table.drive_of(pattern.excitation),
@@ -67,22 +76,53 @@ def answer_as_json(table: LocalizationTable, question: Question) -> dict[str, An
         "contrast_db_sl": pattern.contrast_db_sl,
         "robust_contrast_db": pattern.robust_contrast_db,
         "transient_contrast_db": pattern.transient_contrast_db,
+        "left_after_db": pattern.left_after_db,
         "surroundings_contrast_db": pattern.surroundings_contrast_db,
         "quiet_level_db_sl": pattern.quiet_level_db_sl,
         "quiet_is_unaware": pattern.quiet_is_unaware,
         "usable_level_db_sl": pattern.usable_level_db_sl,
         "ramp_s": pattern.ramp,
+        "onset": envelopes_as_json(pattern.onset, table),
+        "ending": envelopes_as_json(pattern.ending, table),
         "solve_time_s": elapsed,
+    }
+
+
+def prepared_timing(table: LocalizationTable) -> Timing:
+    """What shapes the table's patterns, with all that does not depend on fingers worked out."""
+    timing = Timing(table)
+    timing.prepare(table.frequencies.tolist())
+    return timing
+
+
+def envelopes_as_json(
+    envelopes: Envelopes | None, table: LocalizationTable
+) -> dict[str, Any] | None:
+    """By ERA: level 0..1 of the stroke and phase at every knot, and the time between knots."""
+    if envelopes is None:
+        return None
+    strokes = {era.name: era.stroke for era in table.eras}
+    return {
+        name: {
+            "frequency_hz": envelope.frequency,
+            "step_s": envelope.step,
+            "knots": [
+                {"level": abs(knot) / strokes[name], "phase_deg": math.degrees(cmath.phase(knot))}
+                for knot in envelope.knots
+            ],
+        }
+        for name, envelope in envelopes.items()
     }
 
 
 def answer_lines(table: LocalizationTable, lines: Iterable[str]) -> Iterator[dict[str, Any]]:
     """An answer for every line that is not empty; `{"error": ..., "line": n}` where it has none."""
     table.prepare()
+    timing = prepared_timing(table)
     for number, line in enumerate(lines, start=1):
         if not line.strip():
             continue
         try:
-            yield answer_as_json(table, question_from_json(line))
+            yield answer_as_json(table, question_from_json(line), timing)
         except InputError as error:
             yield {"error": str(error), "line": number}

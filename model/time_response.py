@@ -25,6 +25,7 @@ base jumped (ramp 0): displacement and velocity of the plate are continuous thro
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,8 +36,26 @@ from model.arrays import ComplexArray, FloatArray
 from model.assembly import era_positions
 from model.base_motion import Term
 from model.errors import InputError
+from model.plate import Plate
 from model.point_load import PointLoad, load_positions
-from model.reduction import ReducedPlate
+
+
+class Reduced(Protocol):
+    """A free plate in few coordinates, its mass the identity and its stiffness diag(omega²).
+
+    As `model.reduction.ReducedPlate`: omega (r,) [rad/s]; at(points) gives its shapes (p, r).
+    """
+
+    @property
+    def plate(self) -> Plate:
+        """What it is made of."""
+
+    @property
+    def omega(self) -> FloatArray:
+        """Natural frequencies [rad/s], (r,)."""
+
+    def at(self, points: FloatArray) -> FloatArray:
+        """Shapes at points [m] (p, 2), (p, r)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -66,7 +85,7 @@ class PlateInTime:
     the reduced coordinates are vectors @ z; inverse: of the vectors; participation (2 r, eras).
     """
 
-    reduced: ReducedPlate
+    reduced: Reduced
     eras: tuple[Era, ...]
     eigenvalues: ComplexArray
     vectors: ComplexArray
@@ -141,14 +160,21 @@ class PlateInTime:
 
 
 def plate_in_time(
-    reduced: ReducedPlate, eras: Sequence[Era], *, loads: Sequence[PointLoad] = ()
+    reduced: Reduced,
+    eras: Sequence[Era],
+    *,
+    loads: Sequence[PointLoad] = (),
+    held: FloatArray | None = None,
 ) -> PlateInTime:
     """Diagonalise the equations of motion of a reduced plate on its ERAs, with what it carries.
 
-    Raises InputError for ERAs that do not hold the plate (fewer than three, or all in one line),
-    and for a mode that is damped critically.
+    held: shapes at the ERAs and loads (n, r) where they are known already. Raises InputError for
+    ERAs that do not hold the plate (fewer than three, or all in one line), and for a mode that is
+    damped critically.
     """
-    M, C, K = modal_matrices(reduced, eras, loads=loads)
+    if held is None:
+        held = reduced.at(np.vstack([era_positions(eras), load_positions(loads)]))
+    M, C, K = _matrices(reduced, held, [*_as_loads(eras), *loads])
     r = len(K)
     inverse = linalg.inv(M)
     A = np.block([[np.zeros((r, r)), np.eye(r)], [-inverse @ K, -inverse @ C]])
@@ -160,27 +186,35 @@ def plate_in_time(
             "the plate's equations of motion cannot be separated into modes: a mode is damped "
             "critically; change an ERA's damping by a per mille"
         )
-    push = np.vstack([np.zeros((r, len(eras))), inverse @ reduced.at(era_positions(eras)).T])
+    push = np.vstack([np.zeros((r, len(eras))), inverse @ held[: len(eras)].T])
     return PlateInTime(
         reduced, tuple(eras), eigenvalues, vectors, inverse_vectors, inverse_vectors @ push
     )
 
 
 def modal_matrices(
-    reduced: ReducedPlate, eras: Sequence[Era], *, loads: Sequence[PointLoad] = ()
+    reduced: Reduced, eras: Sequence[Era], *, loads: Sequence[PointLoad] = ()
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """M, C, K (r, r) of the plate on its ERAs, in the coordinates of the reduced free plate."""
-    attached = [PointLoad(e.x, e.y, e.stiffness, e.damping, e.bolt_mass) for e in eras]
-    attached += loads
-    phi = reduced.at(load_positions(attached))
+    attached = [*_as_loads(eras), *loads]
+    return _matrices(reduced, reduced.at(load_positions(attached)), attached)
+
+
+def _as_loads(eras: Sequence[Era]) -> list[PointLoad]:
+    return [PointLoad(e.x, e.y, e.stiffness, e.damping, e.bolt_mass) for e in eras]
+
+
+def _matrices(
+    reduced: Reduced, phi: FloatArray, attached: Sequence[PointLoad]
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     elastic = np.diag(reduced.omega**2)
     M = np.eye(len(reduced.omega)) + (phi.T * [load.mass for load in attached]) @ phi
     K = elastic + (phi.T * [load.stiffness for load in attached]) @ phi
     squares, psi = linalg.eigh(K, M)
     if squares[0] < 1.0:  # (rad/s)²: slower than one sway in six seconds is not held at all
         raise InputError(
-            f"the plate does not stand on its {len(eras)} ERAs and would tip over; put at least "
-            "three under it that do not lie in one line"
+            "the plate does not stand on its ERAs and would tip over; put at least three under it "
+            "that do not lie in one line"
         )
     omega = np.sqrt(squares)
     viscous = reduced.plate.loss_factor * (psi.T @ elastic @ psi) / np.sqrt(np.outer(omega, omega))

@@ -1,0 +1,87 @@
+"""Onset, ending and transient measures of the patterns that a table answers."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+from model.arrays import FloatArray
+from model.envelope import Bases, ramped_ending, ramped_onset, shaped
+from model.pattern import Pattern
+from model.plate import Plate
+from model.point_load import PointLoad
+from model.question import Question
+from model.shaping import Shaper
+from model.table import LocalizationTable
+from model.time_response import plate_in_time
+from model.transient import Transients
+
+
+@dataclass(frozen=True, eq=False)
+class _OnRaster:
+    """The reduced plate as a table holds it."""
+
+    table: LocalizationTable
+
+    @property
+    def plate(self) -> Plate:
+        return self.table.plate
+
+    @property
+    def omega(self) -> FloatArray:
+        return self.table.omega
+
+    def at(self, points: FloatArray) -> FloatArray:
+        return self.table.raster.at(self.table.shapes, points).astype(float)
+
+
+class Timing:
+    """Knows the plate of a table in time; made once, it serves any number of patterns.
+
+    Some ten milliseconds to make, one more for each frequency when it is first needed.
+    """
+
+    def __init__(self, table: LocalizationTable) -> None:
+        loads = [PointLoad(mass.x, mass.y, mass=mass.mass) for mass in table.masses]
+        plate = plate_in_time(_OnRaster(table), table.eras, loads=loads, held=table.held)
+        self._eras = table.eras
+        self._shaper, self._transients = Shaper(plate), Transients(plate)
+
+    def prepare(self, frequencies: Iterable[float]) -> None:
+        """Work out ahead what shaping needs to know about frequencies [Hz]."""
+        for frequency in frequencies:
+            self._shaper.prepare(frequency)
+
+    def with_envelopes(self, question: Question, pattern: Pattern) -> Pattern:
+        """The pattern with a shaped onset and ending, for amplifiers that play them.
+
+        A few milliseconds for both. Where nobody is to be kept quiet the plate around the targets
+        is, at the onset.
+        """
+        targets, quiet = question.targets, question.quiet
+        return replace(
+            pattern,
+            onset=self._shaper.onset(pattern.excitation, targets=targets, quiet=quiet),
+            ending=self._shaper.ending(pattern.excitation, targets=targets, quiet=quiet),
+        )
+
+    def with_transient_measures(self, question: Question, pattern: Pattern) -> Pattern:
+        """The pattern with its contrast over the first 100 ms and what it leaves when it ends.
+
+        With its own onset and ending: its envelopes, or its ramp where it has none.
+        """
+        contrast = None
+        if question.quiet:
+            contrast = self._transients.contrast_db(
+                self._onset(pattern), targets=question.targets, quiet=question.quiet
+            )
+        left = self._transients.left_db(pattern.excitation, self._ending(pattern))
+        return replace(pattern, transient_contrast_db=contrast, left_after_db=left)
+
+    def _onset(self, pattern: Pattern) -> Bases:
+        if pattern.onset is None:
+            return ramped_onset(pattern.excitation, self._eras, ramp=pattern.ramp)
+        return shaped(pattern.onset, self._eras)
+
+    def _ending(self, pattern: Pattern) -> Bases:
+        if pattern.ending is None:
+            return ramped_ending(pattern.excitation, self._eras, ramp=pattern.ramp)
+        return shaped(pattern.ending, self._eras)

@@ -19,7 +19,7 @@ from sim.base_motion import terms_of
 from sim.felt import Felt, feel
 from sim.finger import KEPT, Fingers, Position, Record
 from sim.plant import Plant
-from sim.waveform import FadingTone, Output
+from sim.waveform import Output, Tone
 
 SAMPLE_RATE = 10_000.0  # Hz; the peak of 500 Hz is then seen to 1.3 %
 
@@ -43,7 +43,7 @@ class Bench:
         }
         # By ERA: what its channel plays, as the plant has been told.
         self._told: list[Output] = [()] * len(rig.eras)
-        self._played: deque[tuple[FadingTone, float]] = deque()  # and when it was replaced [s]
+        self._played: deque[tuple[Tone, float]] = deque()  # and when it was replaced [s]
 
     @property
     def time(self) -> float:

@@ -25,6 +25,16 @@ def sim(
     serial: Annotated[
         bool, typer.Option("--serial", help="Put every amplifier on a pseudo-terminal.")
     ] = False,
+    shared: Annotated[
+        bool, typer.Option("--shared", help="All amplifiers on one line, at addresses 1, 2, ...")
+    ] = False,
+    speed: Annotated[
+        int | None,
+        typer.Option(metavar="BIT/S", help="Let bytes take their time on the wire.", min=300),
+    ] = None,
+    faults: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="What shall go wrong, and when.")
+    ] = None,
     finger: Annotated[
         list[str] | None,
         typer.Option(metavar="X,Y", help="A finger that rests here [m]; may be repeated."),
@@ -42,10 +52,15 @@ def sim(
 
     from model.points import parse_point
     from model.rig_file import load_rig
+    from sim.fault_file import FaultFile, load_faults
     from sim.process import run_far_end
+    from sim.wires import Wire
 
     if not serial:
         raise InputError("which wire? add --serial to put the amplifiers on pseudo-terminals")
+    loaded = load_rig(rig)
+    schedule = load_faults(faults, amplifiers=loaded.amplifiers) if faults else FaultFile(())
+    wire = Wire("serial", speed=speed, shared=shared, unpluggable=faults is not None)
     positions = {
         str(number): parse_point(text, what="--finger")
         for number, text in enumerate(finger or [], start=1)
@@ -54,7 +69,9 @@ def sim(
     try:
         asyncio.run(
             run_far_end(
-                load_rig(rig),
+                loaded,
+                wire=wire,
+                faults=schedule,
                 fingers=positions,
                 control=control,
                 ready=_announce,

@@ -13,9 +13,11 @@ from pathlib import Path
 from model.rig import Rig
 from sim.bench import Bench
 from sim.control import control_socket
+from sim.fault_file import FaultFile
 from sim.finger import Position
-from sim.real_time import exchange_with, keep_time
-from sim.serial_end import SerialEnd
+from sim.real_time import keep_time
+from sim.station import Station
+from sim.wires import Wire, open_wire
 
 _VIEW_EVERY = 0.2  # s; a person reads no faster
 
@@ -23,14 +25,17 @@ _VIEW_EVERY = 0.2  # s; a person reads no faster
 async def run_far_end(
     rig: Rig,
     *,
+    wire: Wire,
+    faults: FaultFile,
     fingers: Mapping[str, Position],
     control: Path | None,
     ready: Callable[[Mapping[str, str]], None],
     view: Callable[[Bench], None] | None,
     until_eof: bool = False,
 ) -> None:
-    """Simulate a rig on pseudo-terminals until SIGTERM or SIGINT, or the end of standard input.
+    """Simulate a rig on a wire until SIGTERM or SIGINT, or the end of standard input.
 
+    faults: what goes wrong, counted from when the URLs are there;
     fingers rest where they are told [m]; control: where the control socket is served, if anywhere;
     ready is called once with the URL of each amplifier by its name, view a few times a second.
     until_eof: whether standard input counts. Raises InputError, LinkError.
@@ -47,12 +52,14 @@ async def run_far_end(
     async with contextlib.AsyncExitStack() as stack:
         if control is not None:
             await stack.enter_async_context(control_socket(bench, control))
-        urls = {}
-        for name in bench.amplifiers:
-            end = SerialEnd(exchange_with(bench, name))
-            stack.callback(end.close)
-            end.start()
-            urls[name] = end.url
+        stations = [
+            Station(bench, name, number=number, faults=faults.of(name, begin=time.monotonic()))
+            for number, name in enumerate(bench.amplifiers, start=1)
+        ]
+        urls = await stack.enter_async_context(open_wire(wire, stations))
+        for station in stations:
+            stack.callback(station.close)
+            station.start()
         await stack.enter_async_context(_in_background(keep_time(bench), ended))
         if view is not None:
             await stack.enter_async_context(_in_background(_keep_viewing(bench, view), ended))

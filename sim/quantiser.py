@@ -1,8 +1,8 @@
-"""Whether a simulated amplifier can play a set, and what it makes of it with its finite steps."""
+"""Whether a simulated amplifier can play something, and what its finite steps make of it."""
 
 from dataclasses import replace
 
-from drivers.command import CommandSet, DriveCommand
+from drivers.command import CommandSet, DriveCommand, Envelope, Knot
 from drivers.errors import CommandError
 from drivers.protocol.definition import PROTOCOL, Quantity
 from drivers.protocol.messages import Capabilities, Nak, NakCode
@@ -11,14 +11,14 @@ _Q = PROTOCOL.quantities
 
 
 class RefusedSet(Exception):
-    """A set that cannot be played; nak says why."""
+    """A set or an envelope that cannot be played; nak says why."""
 
     def __init__(self, code: NakCode, channel: int | None = None) -> None:
         super().__init__(code.name)
         self.nak = Nak(code, channel)
 
 
-def check_and_quantise(wanted: CommandSet, capabilities: Capabilities) -> CommandSet:
+def quantise_set(wanted: CommandSet, capabilities: Capabilities) -> CommandSet:
     """The set as it will really be played; raises RefusedSet if any part of it cannot be.
 
     Every number is rounded to the step of the protocol, as any wire would. The frequency of a
@@ -36,6 +36,23 @@ def check_and_quantise(wanted: CommandSet, capabilities: Capabilities) -> Comman
         ramp=_in_steps(_Q.ramp, wanted.ramp),
         valid_for=_in_steps(_Q.valid_for, wanted.valid_for),
     )
+
+
+def quantise_envelope(wanted: Envelope, capabilities: Capabilities) -> Envelope:
+    """The envelope as it will be kept; raises RefusedSet if it cannot be."""
+    low, high = capabilities.envelope_step_min, capabilities.envelope_step_max
+    step = _in_steps(_Q.envelope_step, wanted.step)
+    if (
+        not 1 <= wanted.slot <= capabilities.envelope_slots
+        or not low <= step <= high
+        or len(wanted.knots) > capabilities.envelope_knots
+    ):
+        raise RefusedSet(NakCode.BAD_VALUE)
+    knots = tuple(
+        Knot(_in_steps(_Q.level, knot.level), _in_steps(_Q.phase, knot.phase))
+        for knot in wanted.knots
+    )
+    return Envelope(wanted.slot, step, knots)
 
 
 def _quantised(command: DriveCommand, capabilities: Capabilities) -> DriveCommand:

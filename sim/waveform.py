@@ -8,7 +8,10 @@ import cmath
 import math
 from collections import defaultdict
 from dataclasses import dataclass, replace
-from typing import TypeAlias
+from typing import TYPE_CHECKING, TypeAlias, Union
+
+if TYPE_CHECKING:
+    from sim.shaped_tone import ShapedTone
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,6 +38,16 @@ class FadingTone:
         return self.start + self.ramp
 
     @property
+    def lasts(self) -> bool:
+        """Whether it stays, once it has settled."""
+        return self.gain_to > 0
+
+    @property
+    def settled_amplitude(self) -> complex:
+        """Complex amplitude in full strokes once it has settled."""
+        return cmath.rect(self.level * self.gain_to, self.phase)
+
+    @property
     def silent_from(self) -> float:
         """When the tone has faded out [s]; infinity for one that stays."""
         return self.settled if self.gain_to == 0 else math.inf
@@ -46,6 +59,10 @@ class FadingTone:
         share = (1 - math.cos(math.pi * (time - self.start) / self.ramp)) / 2
         return self.gain_from + (self.gain_to - self.gain_from) * share
 
+    def amplitude(self, time: float) -> complex:
+        """Complex amplitude in full strokes at a time [s] not before start."""
+        return cmath.rect(self.level * self.gain(time), self.phase)
+
     def fade_out(self, time: float, *, ramp: float) -> "FadingTone":
         """This tone, silent within ramp [s]; a fade-out that ends sooner is left as it is.
 
@@ -56,7 +73,9 @@ class FadingTone:
         return replace(self, start=time, ramp=ramp, gain_from=self.gain(time), gain_to=0.0)
 
 
-Output: TypeAlias = tuple[FadingTone, ...]
+Tone: TypeAlias = Union[FadingTone, "ShapedTone"]
+
+Output: TypeAlias = tuple[Tone, ...]
 """What one channel plays: the sum of these tones."""
 
 
@@ -82,7 +101,7 @@ def fade_to(
         return fading
     origin = time
     if keep_phase:
-        same = [tone for tone in playing if tone.gain_to > 0 and tone.frequency == frequency]
+        same = [tone for tone in playing if tone.lasts and tone.frequency == frequency]
         origin = same[0].origin if same else time
     gain_from = 1.0 if ramp == 0 else 0.0
     return (*fading, FadingTone(frequency, level, phase, origin, time, ramp, gain_from, 1.0))
@@ -95,6 +114,6 @@ def level_of(playing: Output, time: float) -> float:
     """
     amplitudes: dict[float, complex] = defaultdict(complex)
     for tone in playing:
-        angle = tone.phase - 2 * math.pi * tone.frequency * tone.origin
-        amplitudes[tone.frequency] += tone.level * tone.gain(time) * cmath.exp(1j * angle)
+        turn = cmath.exp(-2j * math.pi * tone.frequency * tone.origin)
+        amplitudes[tone.frequency] += tone.amplitude(time) * turn
     return sum(abs(amplitude) for amplitude in amplitudes.values())

@@ -117,6 +117,7 @@ class SerialLine:
     baud: int
     address: int
     address_max: int
+    broadcast: int
     payload_max: int
 
 

@@ -2,6 +2,7 @@
 
 import asyncio
 import os
+import time
 import tty
 from collections.abc import AsyncIterator
 
@@ -22,8 +23,10 @@ from drivers.protocol.messages import (
 )
 from drivers.protocol.serial_codec import decode_reply, encode_request
 from drivers.protocol.serial_frame import Frame, FrameReader, encode_frame
-from sim.amplifier import SimulatedAmplifier
+from model.rig import Rig
+from sim.bench import Bench
 from sim.serial_end import SerialEnd
+from sim.station import Station
 
 ADDRESS = PROTOCOL.serial.address
 
@@ -60,10 +63,9 @@ class Host:
 
 
 @pytest.fixture
-async def end() -> AsyncIterator[SerialEnd]:
-    """An amplifier on a line whose clock stands still."""
-    amplifier = SimulatedAmplifier("main", channels=4)
-    end = SerialEnd(lambda request: amplifier.handle(request, 0.0))
+async def end(coarse_rig: Rig) -> AsyncIterator[SerialEnd]:
+    """An amplifier on a line."""
+    end = SerialEnd([Station(Bench(coarse_rig, now=time.monotonic()), "main")])
     end.start()
     yield end
     end.close()
@@ -72,7 +74,7 @@ async def end() -> AsyncIterator[SerialEnd]:
 @pytest.fixture
 async def host(end: SerialEnd) -> AsyncIterator[Host]:
     """A host on that line."""
-    host = Host(end.url)
+    host = Host(end.urls["main"])
     yield host
     host.close()
 
@@ -129,14 +131,16 @@ async def test_frames_for_others_and_echoes_are_not_answered(host: Host) -> None
 async def test_a_host_may_come_and_go(end: SerialEnd) -> None:
     """The amplifier stays on its line when a host leaves, and answers the next one."""
     for _ in range(3):
-        host = Host(end.url)
+        host = Host(end.urls["main"])
         assert isinstance(await host.ask(Hello()), Identity)
         host.close()
 
 
 async def test_a_host_that_never_reads_holds_nothing_up(end: SerialEnd) -> None:
     """Replies that nobody takes are dropped and counted; requests are still carried out."""
-    fd = os.open(end.url.removeprefix("serial://").partition("?")[0], os.O_RDWR | os.O_NOCTTY)
+    fd = os.open(
+        end.urls["main"].removeprefix("serial://").partition("?")[0], os.O_RDWR | os.O_NOCTTY
+    )
     hello = encode_frame(encode_request(Hello(), address=ADDRESS, sequence=1))
     for _ in range(4000):
         os.write(fd, hello)

@@ -1,0 +1,55 @@
+"""Which far end stands behind which wire.
+
+A far end is an asynchronous context in which stations answer on a real wire; it gives the URL of
+each amplifier by its name. A new one is a file of its own and one line in `_OPENERS`.
+"""
+
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
+from contextlib import AbstractAsyncContextManager, AsyncExitStack, asynccontextmanager
+from dataclasses import dataclass
+from typing import TypeAlias
+
+from sim.station import Station
+
+
+@dataclass(frozen=True)
+class Wire:
+    """How simulated amplifiers are reached.
+
+    kind: a key of this module's table; speed [bit/s]: telegrams take as long as at this speed, None
+    for no time; port: where to listen on the loopback interface, 0 for any that is free; shared:
+    all amplifiers on one wire, told apart by their numbers, where the kind leaves the choice;
+    unpluggable: the URLs hold when the wire is unplugged and comes back.
+    """
+
+    kind: str
+    speed: int | None = None
+    port: int = 0
+    shared: bool = False
+    unpluggable: bool = False
+
+
+FarEnd: TypeAlias = AbstractAsyncContextManager[Mapping[str, str]]
+
+
+def open_wire(wire: Wire, stations: Sequence[Station]) -> FarEnd:
+    """The far end of this wire with these stations on it; entering it may raise LinkError."""
+    return _OPENERS[wire.kind](wire, stations)
+
+
+@asynccontextmanager
+async def _serial(wire: Wire, stations: Sequence[Station]) -> AsyncIterator[Mapping[str, str]]:
+    from sim.serial_end import SerialEnd
+
+    lines = [list(stations)] if wire.shared else [[station] for station in stations]
+    urls = {}
+    async with AsyncExitStack() as stack:
+        for line in lines:
+            end = SerialEnd(line, baud=wire.speed, unpluggable=wire.unpluggable)
+            stack.callback(end.close)
+            end.start()
+            urls.update(end.urls)
+        yield urls
+
+
+_OPENERS: Mapping[str, Callable[[Wire, Sequence[Station]], FarEnd]] = {"serial": _serial}

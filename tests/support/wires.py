@@ -1,0 +1,72 @@
+"""Every wire with its far end, for tests that hold on all of them: one entry a wire.
+
+The far ends run in the test's own event loop, so that a test can look into the amplifier's clock.
+"""
+
+import time
+from collections.abc import AsyncIterator, Mapping, Sequence
+from contextlib import asynccontextmanager
+from dataclasses import dataclass
+
+from model.rig import Rig
+from sim.amplifier import SimulatedAmplifier
+from sim.bench import Bench
+from sim.faults import Faults
+from sim.station import Station
+from sim.wires import Wire, open_wire
+
+WIRES: Mapping[str, Wire] = {
+    "serial": Wire("serial", unpluggable=True),
+}
+"""Each is far end and backend by one scheme; see `sim.wires`."""
+
+SHARED_WIRES: Mapping[str, Wire] = {
+    "serial": Wire("serial", shared=True),
+}
+"""Those on which several amplifiers hear one broadcast."""
+
+
+@dataclass(frozen=True)
+class FarSide:
+    """The far side of a wire: URLs and stations by the amplifiers' names, and the bench behind."""
+
+    urls: Mapping[str, str]
+    stations: Mapping[str, Station]
+    bench: Bench
+
+    @property
+    def url(self) -> str:
+        """Of the only amplifier, or the first."""
+        return next(iter(self.urls.values()))
+
+    @property
+    def station(self) -> Station:
+        """The only one, or the first."""
+        return next(iter(self.stations.values()))
+
+    @property
+    def amplifier(self) -> SimulatedAmplifier:
+        """What stands behind it."""
+        return self.bench.amplifiers[self.station.name]
+
+    def silent_from(self) -> float:
+        """When the amplifier is silent for good [s], or infinity, by its own clock."""
+        self.bench.advance(time.monotonic())
+        ends = [tone.silent_from for output in self.amplifier.outputs for tone in output]
+        return max(ends, default=self.bench.time)
+
+
+@asynccontextmanager
+async def far_side(wire: Wire, rig: Rig, *, seed: int = 0) -> AsyncIterator[FarSide]:
+    """The amplifiers of a rig behind a wire, without faults until a test lets them befall."""
+    bench = Bench(rig, now=time.monotonic())
+    stations: Sequence[Station] = [
+        Station(bench, name, number=number, faults=Faults(begin=time.monotonic(), seed=seed))
+        for number, name in enumerate(bench.amplifiers, start=1)
+    ]
+    async with open_wire(wire, stations) as urls:
+        try:
+            yield FarSide(urls, {station.name: station for station in stations}, bench)
+        finally:
+            for station in stations:
+                station.close()

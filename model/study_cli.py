@@ -65,7 +65,7 @@ def study(
     from model.points import parse_frequencies, parse_pair
     from model.rig_file import load_rig
     from model.studies.cache import ResultCache
-    from model.studies.cases import STUDIES
+    from model.studies.kinds import STUDIES
     from model.studies.outcome import ranking_summary, write_outcome
     from model.studies.ranking import rank
     from model.studies.run import run_study

@@ -16,7 +16,7 @@ from model.point_load import PointLoad
 from model.point_mass import PointMass
 from model.studies import solve
 from model.studies.cache import ResultCache
-from model.studies.cases import count_cases, placement_cases, stiffness_cases
+from model.studies.kinds import count_cases, placement_cases, stiffness_cases
 from model.studies.ranking import era_counts, rank
 from model.studies.run import CHUNK, run_study
 from model.studies.solve import DRIVES, CaseResults, code_version, solve_cases, study_problem

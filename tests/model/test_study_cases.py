@@ -8,8 +8,8 @@ import pytest
 
 from model.actuator import damping_from_ratio
 from model.errors import InputError
-from model.studies.cases import (
-    OWN,
+from model.studies.cases import OWN
+from model.studies.kinds import (
     STIFFNESS_FACTORS,
     STUDIES,
     count_cases,

@@ -4,7 +4,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from model.studies.cases import Cases, placement_cases
+from model.studies.cases import Cases
+from model.studies.kinds import placement_cases
 from model.studies.solve import CaseResults, StudyProblem, study_problem
 from paper_plate import make_paper_rig
 

@@ -9,11 +9,8 @@ from scipy.sparse.linalg import LinearOperator, eigsh
 
 from model.arrays import FloatArray
 from model.assembly import ElementMatrices
-from model.factorisation import BandCholesky
+from model.factorisation import Factor, factorise_definite
 from model.symmetry import SymmetryClass
-
-# How many modes of a class are asked for at first; twice as many if they do not reach the cut-off.
-_FIRST_COUNT = 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,7 +22,7 @@ class ClassModes:
     """
 
     symmetry: SymmetryClass
-    factor: BandCholesky
+    factor: Factor
     mass: sparse.csr_array
     squared: FloatArray
     vectors: FloatArray
@@ -55,17 +52,19 @@ class ClassModes:
 
 
 def solve_class(
-    symmetry: SymmetryClass, elements: ElementMatrices, *, shift: float, cut: float
+    symmetry: SymmetryClass, elements: ElementMatrices, *, shift: float, cut: float, count: int
 ) -> ClassModes:
-    """All modes of a class below the cut [rad²/s²], which is met by asking for ever more."""
-    band, mass = symmetry.assemble(elements, shift)
-    factor = BandCholesky.of(band)
-    count = _FIRST_COUNT
+    """All modes of a class below the cut [rad²/s²].
+
+    count: how many to look for at first; more where they do not reach the cut.
+    """
+    shifted, unsummed = symmetry.assemble(elements, shift)
+    factor, mass = factorise_definite(shifted), sparse.csr_array(unsummed)
     while True:
         squared, vectors = _lowest(factor, mass, count, shift=shift)
         if squared[-1] >= cut or len(squared) == symmetry.size:
             break
-        count *= 2
+        count += count // 3 + 1
     kept = int(np.searchsorted(squared, cut))
     squared[np.abs(squared) < 1e-6 * shift] = 0.0
     return ClassModes(
@@ -79,7 +78,7 @@ def solve_class(
 
 
 def _lowest(
-    factor: BandCholesky, mass: sparse.csr_array, count: int, *, shift: float
+    factor: Factor, mass: sparse.csr_array, count: int, *, shift: float
 ) -> tuple[FloatArray, FloatArray]:
     """The lowest eigenpairs; all of them where that is no more work."""
     size = mass.shape[0]

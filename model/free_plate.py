@@ -305,11 +305,29 @@ def solve_free_plate(plate: Plate, mesh: Mesh, *, frequency_max: float = 500.0) 
     """Solve the free plate once on a mesh, for answers up to a frequency [Hz]."""
     if not (math.isfinite(frequency_max) and frequency_max > 0):
         raise InputError(f"frequency_max is {frequency_max} Hz, must be above zero")
-    shift = (2 * math.pi * plate.lowest_bending_frequency) ** 2
-    cut = (2 * math.pi * FREQUENCY_MARGIN * frequency_max) ** 2
+    # Above nothing, since rigid motion could not be factored, and well below the modes left out: it
+    # takes from how fast their sum converges.
+    shift = (2 * math.pi * min(plate.lowest_bending_frequency, frequency_max / 3)) ** 2
+    cut = FREQUENCY_MARGIN * frequency_max
     elements = element_matrices(plate, mesh)
     classes = tuple(
-        solve_class(symmetry_class(mesh, parity), elements, shift=shift, cut=cut)
+        solve_class(
+            symmetry_class(mesh, parity),
+            elements,
+            shift=shift,
+            cut=(2 * math.pi * cut) ** 2,
+            count=_class_count(plate, cut),
+        )
         for parity in CLASSES
     )
     return FreePlate(plate, mesh, frequency_max, shift, classes)
+
+
+def _class_count(plate: Plate, frequency: float) -> int:
+    """About how many modes a symmetry class has up to a frequency [Hz], and a few more.
+
+    Area term of the mode count of a thin plate, pi S / wavelength², and a quarter more for its
+    edges; a quarter of that for each class.
+    """
+    area_term = math.pi * plate.length * plate.width / plate.bending_wavelength(frequency) ** 2
+    return math.ceil(1.25 * area_term / 4) + 4

@@ -51,8 +51,8 @@ class SymmetryClass:
 
     def assemble(
         self, elements: ElementMatrices, shift: float
-    ) -> tuple[FloatArray, sparse.csr_array]:
-        """Lower band of stiffness + shift * mass, (bandwidth + 1, size), and the mass."""
+    ) -> tuple[sparse.coo_array, sparse.coo_array]:
+        """Stiffness + shift * mass and the mass, (size, size), entries not yet summed."""
         count_x, count_y = self.mesh.element_counts
         weight_x, weight_y = _quarter_weights(count_x), _quarter_weights(count_y)
         column, row = np.meshgrid(np.arange(len(weight_x)), np.arange(len(weight_y)))
@@ -62,26 +62,14 @@ class SymmetryClass:
         place, sign = self.place[dofs], self.sign[dofs]
         size = elements.size[chosen]
 
-        def entries(matrices: FloatArray) -> tuple[IntArray, IntArray, FloatArray]:
+        def whole(matrices: FloatArray) -> sparse.coo_array:
             a, b = np.nonzero(matrices.any(axis=0))
+            # What is zero by symmetry adds zeros somewhere near.
             values = matrices[:, a, b][size] * sign[:, a] * sign[:, b] * weight[:, None]
-            return place[:, a].ravel(), place[:, b].ravel(), values.ravel()
+            places = (place[:, a].ravel(), place[:, b].ravel())
+            return sparse.coo_array((values.ravel(), places), shape=(self.size, self.size))
 
-        i, j, values = entries(elements.stiffness + shift * elements.mass)
-        # What is zero by symmetry adds zeros somewhere within the band.
-        lower = i >= j
-        i, j, values = i[lower], j[lower], values[lower]
-        bandwidth = int((i - j).max())
-        # Column by column, as LAPACK wants it.
-        flat = np.bincount(
-            j * (bandwidth + 1) + (i - j),
-            weights=values,
-            minlength=self.size * (bandwidth + 1),
-        )
-        i, j, values = entries(elements.mass)
-        mass = sparse.coo_array((values, (i, j)), shape=(self.size, self.size))
-        band = np.asarray(flat, dtype=float).reshape(self.size, bandwidth + 1).T
-        return band, sparse.csr_array(mass)
+        return whole(elements.stiffness + shift * elements.mass), whole(elements.mass)
 
 
 def symmetry_class(mesh: Mesh, parity: tuple[int, int]) -> SymmetryClass:

@@ -38,7 +38,7 @@ def write_report(measured, agreement, *, peers, fastest, runs, folder: Path) -> 
     ]
     from_nothing = [
         row("era-haptics, 48x36", ours, times(peer_first, ours)),
-        row("era-haptics, automatic mesh (8x6 elements of order 5)", automatic,
+        row("era-haptics, automatic mesh (10x8 elements of order 5)", automatic,
             times(peer_first, automatic)),
         *(row(f"{measured[f'nothing {p}']['name']}, {measured[f'nothing {p}']['dof']} unknowns",
               measured[f"nothing {p}"]) for p in peers),
@@ -117,13 +117,13 @@ Factoring every layout again, {name} would take {hours:.1f} hours on both cores,
 
 
 def _picture(measured, peers) -> Figure:
-    bars = [
-        ("27 frequencies x 4 drives\nfrom nothing, 48x36", "nothing", "ours"),
-        ("a further layout", "layout", "ours 48"),
-    ]
+    titles = {
+        "nothing": "27 frequencies x 4 drives\nfrom nothing, 48x36",
+        "layout": "every further layout\non the same plate",
+    }
     figure = Figure(figsize=(9, 3.6), layout="constrained")
     panels = figure.subplots(1, 2)
-    for axes, (title, task, _) in zip(panels, bars, strict=True):
+    for axes, (task, title) in zip(panels, titles.items(), strict=True):
         entries = [(measured[f"{task} {peer}"], PEER_COLOR) for peer in peers]
         entries.sort(key=lambda entry: -entry[0]["seconds"])
         labels = [entry[0]["name"] for entry in entries]
@@ -137,11 +137,16 @@ def _picture(measured, peers) -> Figure:
             ]
             labels += ["era-haptics,\nnew places", "era-haptics,\nplaces solved before"]
         seconds = [entry[0]["seconds"] for entry in entries]
-        axes.barh(labels, seconds, color=[entry[1] for entry in entries])
+        colors = [entry[1] for entry in entries]
+        axes.hlines(labels, 1e-6, seconds, colors="#dddddd", zorder=0)
+        axes.scatter(seconds, labels, color=colors, s=70)
         for number, value in enumerate(seconds):
-            axes.text(value * 1.15, number, _time(value), va="center")
+            axes.annotate(
+                _time(value), (value, number), (9, 0), textcoords="offset points", va="center"
+            )
         axes.set_xscale("log")
         axes.set_xlim(min(seconds) / 3, max(seconds) * 8)
+        axes.set_ylim(-0.6, len(seconds) - 0.4)
         axes.set_xlabel("time / s")
         axes.set_title(title)
         for side in ("top", "right"):

@@ -29,7 +29,7 @@ def test_the_papers_own_mesh_is_among_those_compared(study):
         "24x18",
         "48x36",
         "96x72",
-        "8x6 Q5 with strips of 3 mm",
+        "10x8 Q5 with strips of 3 mm",
     ]
 
 
@@ -43,7 +43,7 @@ def test_the_automatic_mesh_keeps_its_promise(study):
     automatic = study.errors[-1]
     assert np.abs(automatic.frequency).max() < 1e-3
     assert automatic.response.max() < 1e-2
-    assert automatic.dof < study.errors[3].dof / 3
+    assert automatic.dof < study.errors[3].dof / 2
 
 
 def test_another_element_converges_to_the_same_field(study):

@@ -61,8 +61,8 @@ def test_the_automatic_mesh_follows_the_wave():
     """At twice the frequency the wave is 1.41 times shorter, at four times half as long."""
     plate = Plate(LENGTH, WIDTH, 0.0015, ALUMINIUM)
     low, high = (Mesh.auto(plate, frequency_max=f) for f in (500.0, 2000.0))
-    # 0.3048 m and 0.2286 m of waves 0.1704 m and 0.0852 m long, four elements each
-    assert [(mesh.nx, mesh.ny) for mesh in (low, high)] == [(8, 6), (15, 11)]
+    # 0.3048 m and 0.2286 m of waves 0.1704 m and 0.0852 m long, 5.5 elements each
+    assert [(mesh.nx, mesh.ny) for mesh in (low, high)] == [(10, 8), (20, 15)]
     assert low.strip == high.strip == 0.003
 
 

@@ -65,7 +65,7 @@ def test_a_finer_mesh_approaches_the_converged_frequencies(support):
 
 @pytest.mark.parametrize("support", CONVERGED)
 def test_the_automatic_mesh_is_converged(support):
-    """Twelve modes of its 8x6 elements of order 5 are within 0.02 %, whatever holds the plate."""
+    """Twelve modes of its 10x8 elements of order 5 are within 0.02 %, whatever holds the plate."""
     rig = make_paper_rig(12, 9)
     matrices = assemble(rig.plate, Mesh.auto(rig.plate, frequency_max=500.0))
     solved = modes(matrices, 12, support=support, eras=rig.eras).natural_frequencies

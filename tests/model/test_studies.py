@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from model.activation import MEDIAN, cumulative_peak, cumulative_statistics
+from model.actuator import Era
 from model.assembly import assemble
 from model.errors import InputError
 from model.harmonic import direct_acceleration
@@ -69,6 +70,23 @@ def test_statistics_are_those_of_the_direct_solve(study, results):
             assert median == pytest.approx(np.median(cumulative_peak(direct, active)), rel=1e-4)
         best = cumulative_statistics(direct)[:4, MEDIAN].max()
         assert results.statistics[case, 0, MEDIAN] == pytest.approx(best, rel=1e-4)
+
+
+def test_eras_that_differ_are_solved_as_they_are():
+    """Stiffness, damping, bolt mass and stroke of each ERA are its own, as in the direct solve."""
+    paper = make_paper_rig(12, 9)
+    parameters = [(8e3, 1.0, 0.0, 1e-4), (3e4, 5.0, 0.01, 5e-5), (17e3, 3.0, 0.02, 2e-4)]
+    eras = tuple(
+        Era(era.name, era.x, era.y, *numbers)
+        for era, numbers in zip(paper.eras[:3], parameters, strict=True)
+    )
+    rig = replace(paper, eras=eras)
+    cases = placement_cases(rig, layouts=12, seed=0, raster=(7, 5))
+    problem = study_problem(rig, cases, FREQUENCIES)
+    placed = cases.eras_of(9, eras)
+    direct = direct_acceleration(assemble(rig.plate, rig.mesh), placed, FREQUENCIES, problem.points)
+    fast = problem.solve().acceleration(cases.places_of(9), placed)
+    np.testing.assert_allclose(fast, direct, rtol=1e-4, atol=1e-4 * np.abs(direct).max())
 
 
 def test_what_the_plate_carries_is_in_the_answer(study):

@@ -1,4 +1,10 @@
-"""Serial amplifier URLs: serial:///dev/ttyUSB0?baud=921600&address=1, or serial://HOST:PORT."""
+"""Serial amplifier URLs.
+
+serial:///dev/ttyUSB0?baud=921600&address=1     a port of this machine
+socket://HOST:PORT (or serial://HOST:PORT)      a serial server that passes bytes on
+rfc2217://HOST:PORT?baud=115200                 one whose speed is set from here
+hwgrep://0403:6001                              the port whose description fits the pattern
+"""
 
 import re
 from dataclasses import dataclass
@@ -19,12 +25,17 @@ class SerialUrl:
     baud: int
     address: int
 
+    @property
+    def is_local(self) -> bool:
+        """Whether the speed is that of a line to the amplifier, and nothing else is in between."""
+        return not self.port.startswith(("socket://", "rfc2217://"))
+
     @classmethod
     def parse(cls, url: str) -> "SerialUrl":
         """Take a URL apart; CommandError says which part is wrong and what it should be."""
         try:
             parts = urlsplit(url)
-            number = parts.port
+            number = None if parts.scheme == "hwgrep" else parts.port
         except ValueError as problem:
             raise CommandError(f"{url!r} is no serial URL: {problem}; use {_FORM}") from None
         options = dict(parse_qsl(parts.query, keep_blank_values=True))
@@ -34,10 +45,16 @@ class SerialUrl:
                 f"{url!r}: unknown option {', '.join(unknown)}; a serial URL has baud and address"
             )
         path = unquote(parts.path)
-        if parts.netloc:
+        if parts.scheme == "hwgrep":
+            pattern = unquote(parts.netloc) + path
+            if not pattern:
+                raise CommandError(f"{url!r} names no pattern; use hwgrep://VENDOR:PRODUCT")
+            port = f"hwgrep://{pattern}"
+        elif parts.netloc:
             if parts.hostname is None or number is None or path.strip("/"):
                 raise CommandError(f"{url!r} names no host and port; use {_FORM}")
-            port = f"socket://{parts.netloc}"
+            kind = "rfc2217" if parts.scheme == "rfc2217" else "socket"
+            port = f"{kind}://{parts.netloc}"
         elif re.fullmatch(r"/COM\d+", path, re.IGNORECASE):
             port = path[1:]
         elif path.strip("/"):

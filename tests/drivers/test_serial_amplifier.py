@@ -3,6 +3,7 @@ import contextlib
 import errno
 import gc
 import socket
+import sys
 import threading
 from collections.abc import AsyncIterator, Callable
 from dataclasses import replace
@@ -12,7 +13,7 @@ import pytest
 import serial
 
 from drivers.amplifier import Amplifier
-from drivers.backends import serial_amplifier
+from drivers.backends import serial_line
 from drivers.backends.serial_amplifier import SerialBackend
 from drivers.backends.serial_url import SerialUrl
 from drivers.errors import CommandError, FrameError, LinkError, LinkTimeout
@@ -176,7 +177,7 @@ async def test_closing_ends_the_reader_and_what_waits(far_end: FarEnd) -> None:
     far_end.answer = lambda request, frame: None
     backend = SerialBackend(far_end.url)
     await backend.open()
-    assert len(reader_threads()) == 1
+    assert reader_threads() == []  # the event loop watches a port of this machine itself
     waiting = asyncio.create_task(backend.exchange(Ping(), timeout=PATIENCE))
     await far_end.count(1)
     await backend.close()
@@ -244,9 +245,18 @@ async def test_a_lost_reply_is_asked_for_again_over_the_wire(
 
 
 async def test_a_line_is_opened_by_one_only(far_end: FarEnd, backend: SerialBackend) -> None:
-    """A second program on the same port is told that it is in use."""
-    with pytest.raises(LinkError, match="another program has it open"):
+    """Whoever opens the port a second time is told that it is in use, within a program too."""
+    with pytest.raises(LinkError, match="this program has it open already"):
         await SerialBackend(far_end.url).open()
+    script = (
+        "import asyncio, sys; from drivers.backends.serial_amplifier import SerialBackend; "
+        "asyncio.run(SerialBackend(sys.argv[1]).open())"
+    )
+    process = await asyncio.create_subprocess_exec(
+        *(sys.executable, "-c", script, far_end.url), stderr=asyncio.subprocess.PIPE
+    )
+    _, errors = await process.communicate()
+    assert b"another program has it open" in errors
 
 
 async def test_a_missing_port_says_what_to_do() -> None:
@@ -263,7 +273,7 @@ async def test_a_forbidden_port_says_what_to_do(
     def forbidden(*args: object, **kwargs: object) -> None:
         raise serial.SerialException(errno.EACCES, "could not open port: Permission denied")
 
-    monkeypatch.setattr(serial_amplifier.serial, "serial_for_url", forbidden)
+    monkeypatch.setattr(serial_line.serial, "serial_for_url", forbidden)
     with pytest.raises(LinkError, match="dialout"):
         await SerialBackend(far_end.url).open()
 
@@ -310,6 +320,9 @@ async def test_a_server_that_is_not_there_says_what_to_do() -> None:
         ("serial:///dev/ttyUSB0", SerialUrl("/dev/ttyUSB0", 921_600, 1)),
         ("serial:///dev/ttyS1?baud=115200&address=7", SerialUrl("/dev/ttyS1", 115_200, 7)),
         ("serial:///COM3?baud=9600", SerialUrl("COM3", 9600, 1)),
+        ("socket://box.local:4001", SerialUrl("socket://box.local:4001", 921_600, 1)),
+        ("rfc2217://box:4001?baud=9600", SerialUrl("rfc2217://box:4001", 9600, 1)),
+        ("hwgrep://0403:6001?address=3", SerialUrl("hwgrep://0403:6001", 921_600, 3)),
         ("serial://box.local:4001", SerialUrl("socket://box.local:4001", 921_600, 1)),
     ],
 )
@@ -322,6 +335,7 @@ def test_urls_are_understood(url: str, expected: SerialUrl) -> None:
     ("url", "problem"),
     [
         ("serial://", "names no port"),
+        ("hwgrep://", "names no pattern"),
         ("serial://host", "no host and port"),
         ("serial://host:99999", "no serial URL"),
         ("serial:///dev/x?baud=fast", "baud is 'fast'"),

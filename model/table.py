@@ -10,7 +10,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from importlib import metadata
 from itertools import accumulate
 
 import numpy as np
@@ -18,8 +17,7 @@ from numpy.typing import NDArray
 
 from model.actuator import Era
 from model.arrays import FloatArray
-from model.assembly import era_positions
-from model.drive_modes import MODES, best_drive, loudest
+from model.drive_modes import best_drive, loudest
 from model.drive_modes.fields import Drive, Fields, Outcome, SingleComplex, judge
 from model.drive_modes.sources import (
     all_patterns,
@@ -31,18 +29,15 @@ from model.errors import InputError
 from model.exact_search import search_exactly
 from model.excitation import Excitation, Tone
 from model.fingertip import UNIT_DISC, fingertip_points
-from model.free_plate import solve_free_plate
-from model.localization import CELL_SAMPLES, SURROUNDINGS_RADIUS, Grid, decibels
+from model.localization import SURROUNDINGS_RADIUS, Grid, decibels
 from model.mesh import Mesh
 from model.pattern import ONSET_RAMP, Pattern
 from model.perception import STRONG_DB_SL, detection_threshold
 from model.plate import Plate
-from model.point_load import load_positions
 from model.point_mass import PointMass
 from model.question import Point, Question
 from model.raster import Raster
-from model.reduction import reduce_plate
-from model.rig import Rig, physics_fingerprint
+from model.rig import physics_fingerprint
 from model.vibration import base_amplitudes
 
 PAPER_FREQUENCIES = np.arange(60.0, 321.0, 10.0)
@@ -62,7 +57,8 @@ class LocalizationTable:
     [rad/s], held (eras + masses, r) and shapes (points, r) [1/sqrt(kg)]: the reduced free plate, at
     what holds it and on the raster (`model.reduction`); cell_sources (sources, cells) [m/s²]: mean
     peak acceleration over each cell of what `switched` patterns are made of
-    (`model.drive_modes.sources`).
+    (`model.drive_modes.sources`); discretisation_error (f,): of the fields of any ERA alone,
+    relative L2 over the raster, against the same plate on the reference mesh.
     """
 
     plate: Plate
@@ -79,6 +75,8 @@ class LocalizationTable:
     held: FloatArray
     shapes: NDArray[np.float32]
     cell_sources: NDArray[np.float32]
+    reference_mesh: Mesh
+    discretisation_error: FloatArray
 
     @property
     def fingerprint(self) -> str:
@@ -297,59 +295,3 @@ class LocalizationTable:
                         phase=0.0 if in_phase else float(np.angle(w)),
                     )
         return tones
-
-
-def build_table(
-    rig: Rig,
-    *,
-    frequencies: FloatArray = PAPER_FREQUENCIES,
-    grid: Grid = PAPER_GRID,
-    mode: str = "switched",
-) -> LocalizationTable:
-    """Solve the rig's plate on its mesh and keep what localization needs.
-
-    frequencies [Hz], ascending, within the rig's limits; mode: one of MODES. Raises InputError.
-    """
-    if mode not in MODES:
-        raise InputError(f"unknown drive mode {mode!r}; known: {', '.join(MODES)}")
-    _check_frequencies(frequencies, rig)
-    highest = float(frequencies[-1])
-    raster = Raster.for_plate(rig.plate, frequency_max=highest)
-    points = np.vstack([raster.points, grid.samples(rig.plate)])
-    free = solve_free_plate(rig.plate, rig.mesh, frequency_max=highest)
-    fields = free.acceleration(rig.eras, frequencies, points, loads=rig.loads)
-
-    attached = np.vstack([era_positions(rig.eras), load_positions(rig.loads)])
-    reduced = reduce_plate(rig.plate, rig.mesh, attached, frequency_max=highest)
-    cells = magnitudes_of_sources(fields[:, :, raster.point_count :].astype(np.complex64))
-    return LocalizationTable(
-        plate=rig.plate,
-        eras=rig.eras,
-        masses=rig.masses,
-        mesh=rig.mesh,
-        raster=raster,
-        grid=grid,
-        mode=mode,
-        code_version=metadata.version("era-haptics"),
-        frequencies=frequencies,
-        acceleration=np.ascontiguousarray(
-            fields[:, :, : raster.point_count].transpose(2, 0, 1), dtype=np.complex64
-        ),
-        omega=reduced.omega,
-        held=reduced.at(attached),
-        shapes=reduced.at(raster.points).astype(np.float32),
-        cell_sources=cells.reshape(len(cells), -1, CELL_SAMPLES**2).mean(axis=-1),
-    )
-
-
-def _check_frequencies(frequencies: FloatArray, rig: Rig) -> None:
-    if len(frequencies) == 0 or not (np.isfinite(frequencies).all()):
-        raise InputError("a table needs at least one frequency, all of them numbers")
-    if not (np.diff(frequencies) > 0).all():
-        raise InputError("the frequencies of a table must ascend, each given once")
-    low, high = rig.limits.frequency_min, rig.limits.frequency_max
-    if frequencies[0] < low or frequencies[-1] > high:
-        raise InputError(
-            f"frequencies from {frequencies[0]:g} to {frequencies[-1]:g} Hz leave the rig's limits "
-            f"of {low:g} to {high:g} Hz; choose others or change limits.frequency in the rig"
-        )

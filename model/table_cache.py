@@ -10,7 +10,8 @@ from model.arrays import FloatArray
 from model.errors import InputError
 from model.localization import Grid
 from model.rig import Rig
-from model.table import PAPER_FREQUENCIES, PAPER_GRID, LocalizationTable, build_table
+from model.table import PAPER_FREQUENCIES, PAPER_GRID, LocalizationTable
+from model.table_build import build_table
 from model.table_file import FORMAT_VERSION, load_table, save_table
 
 _logger = logging.getLogger(__name__)

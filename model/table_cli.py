@@ -34,7 +34,7 @@ def build(
     from model.localization import Grid
     from model.points import parse_frequencies, parse_pair
     from model.rig_file import load_rig
-    from model.table import build_table
+    from model.table_build import build_table
     from model.table_file import save_table
 
     rig = load_rig(rig_file, mesh=mesh)

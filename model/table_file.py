@@ -6,14 +6,10 @@ SHA-256 over the content, so that a damaged or foreign file is refused before an
 
 Version 1 held the fields at the nodes of the mesh; 2 holds them on a raster, with the plate's modes
 and point masses, and what `switched` patterns are made of at the cells in place of every one of
-them: of fine frequency steps there are millions.
+them: of fine frequency steps there are millions. 3 says how wrong the mesh is.
 """
 
-import hashlib
 import json
-import os
-import tempfile
-import zipfile
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -23,6 +19,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from model.actuator import Era
+from model.array_file import UNREADABLE, digest_of, read_arrays, write_arrays
 from model.drive_modes import MODES
 from model.errors import InputError
 from model.localization import Grid
@@ -33,7 +30,7 @@ from model.raster import Raster
 from model.table import LocalizationTable
 
 FORMAT = "era-haptics localization table"
-FORMAT_VERSION = 2
+FORMAT_VERSION = 3
 
 # A table of the paper's plate has 1.4 MB, one of eight ERAs and a fine grid some hundred; what is
 # larger than this is not a table.
@@ -65,6 +62,9 @@ class _Header(BaseModel):
     eras: list[dict[str, Any]]
     masses: list[dict[str, Any]]
     mesh: dict[str, Any]
+    reference_mesh: dict[str, Any]
+    discretisation_error: list[float]
+    frequencies_hz: list[float]
     raster: dict[str, Any]
     grid: dict[str, Any]
 
@@ -85,21 +85,15 @@ def save_table(table: LocalizationTable, path: Path) -> None:
         "eras": [asdict(era) for era in table.eras],
         "masses": [asdict(mass) for mass in table.masses],
         "mesh": asdict(table.mesh),
+        "reference_mesh": asdict(table.reference_mesh),
+        "discretisation_error": table.discretisation_error.tolist(),
+        "frequencies_hz": table.frequencies.tolist(),
         "raster": asdict(table.raster),
         "grid": asdict(table.grid),
     }
     header["sha256"] = _digest(header, arrays)
     encoded = np.frombuffer(json.dumps(header).encode(), dtype=np.uint8)
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    try:
-        with os.fdopen(handle, "wb") as stream:
-            np.savez(stream, allow_pickle=False, header=encoded, **arrays)
-            stream.flush()
-            os.fsync(stream.fileno())
-        Path(temporary).replace(path)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
+    write_arrays(path, {"header": encoded, **arrays})
 
 
 def load_table(path: Path, *, fingerprint: str | None = None) -> LocalizationTable:
@@ -110,12 +104,12 @@ def load_table(path: Path, *, fingerprint: str | None = None) -> LocalizationTab
     """
     rebuild = f"build it again: era table build RIG -o {path}"
     try:
-        content = _read_members(path)
+        content = read_arrays(path, _DTYPES, max_bytes=MAX_BYTES)
     except FileNotFoundError:
         raise InputError(
             f"there is no table {path}; build one: era table build RIG -o {path}"
         ) from None
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile, NotImplementedError) as error:
+    except UNREADABLE as error:
         raise InputError(f"{path} is not a readable localization table ({error}); {rebuild}") from (
             error
         )
@@ -153,46 +147,7 @@ def _arrays(table: LocalizationTable) -> dict[str, NDArray[Any]]:
 
 def _digest(header: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> str:
     """SHA-256 over the header without its checksum, and over every array with its shape."""
-    digest = hashlib.sha256(json.dumps(header, sort_keys=True).encode())
-    for name in sorted(arrays):
-        digest.update(f"{name}{arrays[name].dtype.str}{arrays[name].shape}".encode())
-        digest.update(arrays[name].tobytes())
-    return digest.hexdigest()
-
-
-def _read_members(path: Path) -> dict[str, NDArray[Any]]:
-    """The arrays of the file; ValueError where members, types or sizes are not a table's."""
-    with zipfile.ZipFile(path) as archive:
-        members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
-        if sorted(members) != sorted(_DTYPES) or len(archive.infolist()) != len(_DTYPES):
-            raise ValueError(f"it holds {', '.join(sorted(members)) or 'nothing'}")
-        if any(info.compress_type != zipfile.ZIP_STORED for info in members.values()):
-            raise ValueError("it is compressed")
-        declared = sum(info.file_size for info in members.values())
-        if declared > min(path.stat().st_size, MAX_BYTES):
-            raise ValueError(f"it declares {declared} bytes")
-        arrays = {}
-        for name, info in members.items():
-            with archive.open(info) as stream:
-                _check_npy_header(stream, name=name, member_bytes=info.file_size)
-            with archive.open(info) as stream:
-                arrays[name] = np.lib.format.read_array(stream, allow_pickle=False)
-        return arrays
-
-
-def _check_npy_header(stream: Any, *, name: str, member_bytes: int) -> None:
-    """Refuse an array whose declared type or size is not what the member can hold."""
-    version = np.lib.format.read_magic(stream)
-    if version != (1, 0):
-        raise ValueError(f"{name} has .npy version {version}")
-    shape, _, dtype = np.lib.format.read_array_header_1_0(stream)
-    if dtype.str != _DTYPES[name]:
-        raise ValueError(f"{name} holds {dtype.str}")
-    size = dtype.itemsize
-    for length in shape:
-        size *= length  # Python integers: no overflow
-    if size + stream.tell() != member_bytes:
-        raise ValueError(f"{name} declares {size} bytes")
+    return digest_of(json.dumps(header, sort_keys=True), arrays)
 
 
 def _assemble(header: _Header, arrays: dict[str, NDArray[Any]], path: Path) -> LocalizationTable:
@@ -204,6 +159,8 @@ def _assemble(header: _Header, arrays: dict[str, NDArray[Any]], path: Path) -> L
             eras=tuple(Era(**era) for era in header.eras),
             masses=tuple(PointMass(**mass) for mass in header.masses),
             mesh=Mesh(**header.mesh),
+            reference_mesh=Mesh(**header.reference_mesh),
+            discretisation_error=np.array(header.discretisation_error, dtype=float),
             raster=Raster(**header.raster),
             grid=Grid(**header.grid),
             mode=header.mode,
@@ -218,6 +175,7 @@ def _assemble(header: _Header, arrays: dict[str, NDArray[Any]], path: Path) -> L
     sources = era_count * (era_count + 1) // 2 * count + 1
     expected = {
         "frequencies": (count,),
+        "discretisation_error": (count,),
         "acceleration": (table.raster.point_count, count, era_count),
         "omega": (coordinates,),
         "held": (era_count + len(table.masses), coordinates),
@@ -230,6 +188,8 @@ def _assemble(header: _Header, arrays: dict[str, NDArray[Any]], path: Path) -> L
             raise InputError(f"{path}: {name} has shape {values.shape}, expected {shape}")
         if not np.isfinite(values).all():
             raise InputError(f"{path}: {name} holds values that are not numbers")
+    if table.frequencies.tolist() != header.frequencies_hz:
+        raise InputError(f"{path}: the header's frequencies are not those of the table")
     size = (table.raster.length, table.raster.width)
     if size != (table.plate.length, table.plate.width):
         raise InputError(f"{path}: the raster is not of the plate's size")

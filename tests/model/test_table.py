@@ -17,7 +17,7 @@ from model.mesh import Mesh
 from model.perception import sensation_level
 from model.point_load import PointLoad
 from model.point_mass import PointMass
-from model.table import build_table
+from model.table_build import build_table
 from model.table_file import load_table, save_table
 from model.table_summary import summarize
 from model.vibration import peak_acceleration, tone_amplitudes
@@ -188,7 +188,7 @@ def test_the_file_opens_with_plain_numpy(table, tmp_path):
     save_table(table, path)
     with np.load(path, allow_pickle=False) as content:
         assert content["acceleration"].shape == (table.raster.point_count, 27, 4)
-        assert json.loads(content["header"].tobytes())["format_version"] == 2
+        assert json.loads(content["header"].tobytes())["format_version"] == 3
 
 
 def test_a_failed_write_leaves_the_old_table(table, tmp_path, monkeypatch):

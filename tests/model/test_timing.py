@@ -9,7 +9,7 @@ from model.assembly import era_positions
 from model.envelope import ramped_ending, ramped_onset, shaped
 from model.question import Question
 from model.reduction import reduce_plate
-from model.table import build_table
+from model.table_build import build_table
 from model.table_query import answer_lines
 from model.time_response import plate_in_time
 from model.timing import Timing

@@ -63,7 +63,7 @@ def meshes_to_compare(rig: Rig) -> tuple[Mesh, ...]:
 
 
 def reference_mesh(plate: Plate, *, frequency_max: float) -> Mesh:
-    """Half as many elements again along both sides as the automatic mesh, in strips half as wide."""
+    """Half as many elements again along both sides as the automatic one, in strips half as wide."""
     auto = Mesh.auto(plate, frequency_max=frequency_max)
     nx, ny = (math.ceil(1.5 * count) for count in (auto.nx, auto.ny))
     return Mesh(nx, ny, auto.length, auto.width, auto.element, auto.strip / 2)

@@ -14,8 +14,8 @@ from model.plate import Plate
 
 # What the automatic mesh is made of. The lowest twelve natural frequencies of the paper's plate are
 # then within 0.01 % of converged, and its accelerations (relative L2) within 0.1 % on ERAs at the
-# corners, 0.2 % on ERAs elsewhere and 0.6 % there at a resonance: a force at a point bends the plate
-# more sharply than an element does.
+# corners, 0.2 % on ERAs elsewhere and 0.6 % there at a resonance: a force at a point bends the
+# plate more sharply than an element does.
 AUTO_ELEMENT = "Q5"
 AUTO_ELEMENTS_PER_WAVELENGTH = 5.5
 AUTO_LEAST_ELEMENTS = 3

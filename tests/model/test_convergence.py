@@ -1,6 +1,8 @@
 """How far meshes are from converged, against independent solvers and a different element."""
 
+import re
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -62,3 +64,15 @@ def test_eras_within_the_plate_converge_too():
     error = study_convergence(moved, [automatic]).errors[0]
     assert np.abs(error.frequency).max() < 1e-3
     assert error.response.max() < 1e-2
+
+
+def test_the_documentation_shows_these_figures(study):
+    """The page on the plate model prints each mesh with the errors that are found here."""
+    page = Path(__file__).parents[2] / "docs" / "plate-model.md"
+    rows = re.findall(r"^ +(\d+x\d+) +\S+ .*?((?: +[\d.]+ %){3})", page.read_text(), re.MULTILINE)
+    assert len(rows) == len(study.errors)
+    for (mesh, printed), error in zip(rows, study.errors, strict=True):
+        assert mesh == f"{error.mesh.nx}x{error.mesh.ny}"
+        figures = [np.abs(error.frequency).max(), *error.response]
+        shown = [float(value) for value in re.findall(r"[\d.]+", printed)]
+        np.testing.assert_allclose(shown, 100 * np.array(figures), rtol=1e-3, atol=2e-3)

@@ -180,7 +180,7 @@ def test_a_folder_that_is_not_there_is_bad_input(era, tmp_path):
         (("--target", "0.9,0.1"), "not on the plate"),
         (("--target", "0.1,0.1", "--quiet", "0.1,0.1"), "within the quiet fingertip"),
         (("--target", "0.1,0.1", "--level", "99"), "most that can be had"),
-        (("--target", "0.1,0.1", "--mode", "phased"), "built for mode switched"),
+        (("--target", "0.1,0.1", "--mode", "loud"), "unknown drive mode"),
     ],
 )
 def test_a_question_without_an_answer_is_bad_input(era, small_table, options, says):

@@ -1,33 +1,47 @@
 """The guard: the only maker of commands that an encoder will take.
 
-Its limits are the least of the configuration, what the amplifier reports and the ceilings below;
+Its limits are the least of the configuration, what the amplifier reports and built-in ceilings;
 nothing sets them at run time.
 """
 
-import math
+import time
 from collections.abc import Callable, Collection
-from dataclasses import dataclass
-from numbers import Integral, Real
 from typing import final
 
 from drivers.command import CommandSet, DriveCommand, Envelope, Knot, token_after
-from drivers.errors import CommandError, CommandRefused
+from drivers.guard_budget import Budget
+from drivers.guard_limits import (
+    FREQUENCY_CEILING,
+    FREQUENCY_FLOOR,
+    LEVEL_CEILING,
+    GuardLimits,
+    tightest,
+)
+from drivers.guard_rules import Known, check_envelope, check_set, is_number, is_token
 from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.messages import Capabilities
 
-# Below 10 Hz a plate on springs only rocks, nothing is felt, and the voltage stands nearly still.
-FREQUENCY_FLOOR = 10.0
-# What the wire can say; the skin's sensitivity to vibration has fallen off long before it.
-FREQUENCY_CEILING = PROTOCOL.quantities.frequency.high
-# Full stroke: beyond it the electrodes of an actuator touch.
-LEVEL_CEILING = 1.0
+__all__ = [
+    "FREQUENCY_CEILING",
+    "FREQUENCY_FLOOR",
+    "LEVEL_CEILING",
+    "Guard",
+    "GuardLimits",
+    "SafeCommand",
+    "SafeEnvelope",
+]
 
 _KEY = object()
 
 
 @final
 class SafeCommand(CommandSet):
-    """A command set that a guard has let through; only a `Guard` can make one."""
+    """A command set that a guard has let through; only a `Guard` can make one.
+
+    settled_after [s]: how long after its commit at the latest nothing fades any more.
+    """
+
+    settled_after: float
 
     def __init__(
         self,
@@ -36,11 +50,13 @@ class SafeCommand(CommandSet):
         *,
         ramp: float,
         valid_for: float,
+        settled_after: float = 0.0,
         key: object = None,
     ) -> None:
         if key is not _KEY:
             raise TypeError("a SafeCommand is made by Guard.check or Guard.silence, by nobody else")
         super().__init__(token=token, commands=commands, ramp=ramp, valid_for=valid_for)
+        object.__setattr__(self, "settled_after", settled_after)
 
     def __init_subclass__(cls) -> None:
         raise TypeError("SafeCommand cannot be subclassed")
@@ -61,187 +77,64 @@ class SafeEnvelope(Envelope):
         raise TypeError("SafeEnvelope cannot be subclassed")
 
 
-@dataclass(frozen=True)
-class GuardLimits:
-    """What the configuration allows: mechanical frequencies [Hz] and level (1 is full stroke)."""
-
-    frequency_min: float
-    frequency_max: float
-    level: float
-
-
-@dataclass(frozen=True)
-class _Bounds:
-    """The least of all limits."""
-
-    frequency_min: float
-    frequency_max: float
-    level: float
-    ramp: float
-    channels: int
-    envelope_slots: int
-    envelope_knots: int
-    envelope_step_min: float
-    envelope_step_max: float
-
-
-def _tightest(limits: GuardLimits, capabilities: Capabilities) -> _Bounds:
-    numbers = (
-        *(limits.frequency_min, limits.frequency_max, limits.level),
-        *(capabilities.frequency_min, capabilities.frequency_max),
-        *(capabilities.level_max, capabilities.ramp_max),
-    )
-    if not all(math.isfinite(number) for number in numbers):
-        raise CommandError(f"guard limits must be finite; got {limits} and {capabilities}")
-    bounds = _Bounds(
-        frequency_min=max(limits.frequency_min, capabilities.frequency_min, FREQUENCY_FLOOR),
-        frequency_max=min(limits.frequency_max, capabilities.frequency_max, FREQUENCY_CEILING),
-        level=min(limits.level, capabilities.level_max, LEVEL_CEILING),
-        ramp=max(0.0, min(capabilities.ramp_max, PROTOCOL.quantities.ramp.high)),
-        channels=min(capabilities.channels, PROTOCOL.quantities.channel_count.maximum),
-        envelope_slots=capabilities.envelope_slots,
-        envelope_knots=capabilities.envelope_knots,
-        envelope_step_min=capabilities.envelope_step_min,
-        envelope_step_max=capabilities.envelope_step_max,
-    )
-    if bounds.frequency_min > bounds.frequency_max:
-        raise CommandError(
-            "the configured limits and the amplifier's own leave no frequency: from "
-            f"{bounds.frequency_min:g} to {bounds.frequency_max:g} Hz; widen limits.frequency in "
-            "the rig file or use another amplifier"
-        )
-    if bounds.level < 0:
-        raise CommandError(f"the level limit is {bounds.level:g}; it must lie between 0 and 1")
-    return bounds
-
-
-def _is_number(value: object) -> bool:
-    return isinstance(value, Real) and math.isfinite(value)
-
-
-def _is_whole(value: object, *, low: int, high: int) -> bool:
-    return isinstance(value, Integral) and low <= int(value) <= high
-
-
-def _is_token(value: object) -> bool:
-    token = PROTOCOL.quantities.token
-    return _is_whole(value, low=token.minimum, high=token.maximum)
-
-
-def _check_token(command_set: CommandSet, bounds: _Bounds) -> None:
-    if not _is_token(command_set.token):
-        raise CommandRefused(
-            f"token is {command_set.token!r}; it must be a whole number from 1 to 65535"
-        )
-
-
-def _check_times(command_set: CommandSet, bounds: _Bounds) -> None:
-    longest = PROTOCOL.quantities.valid_for.high
-    for name, value, most in (
-        ("ramp", command_set.ramp, bounds.ramp),
-        ("valid_for", command_set.valid_for, longest),
-    ):
-        if not (_is_number(value) and 0 <= value <= most):
-            raise CommandRefused(f"{name} is {value!r} s; it must lie between 0 and {most:g} s")
-
-
-def _check_channels(command_set: CommandSet, bounds: _Bounds) -> None:
-    seen: set[int] = set()
-    for command in command_set.commands:
-        channel = command.channel
-        if not _is_whole(channel, low=0, high=bounds.channels - 1):
-            raise CommandRefused(
-                f"channel {channel!r} does not exist; the amplifier has channels 0 to "
-                f"{bounds.channels - 1}",
-                channel=channel,
-            )
-        if channel in seen:
-            raise CommandRefused(f"channel {channel} is named twice in one set", channel=channel)
-        seen.add(channel)
-
-
-def _check_finite(command_set: CommandSet, bounds: _Bounds) -> None:
-    for command in command_set.commands:
-        for name in ("frequency", "level", "phase"):
-            value = getattr(command, name)
-            if not _is_number(value):
-                raise CommandRefused(
-                    f"{name} of channel {command.channel} is {value!r}, not a finite number",
-                    channel=command.channel,
-                )
-
-
-def _check_levels(command_set: CommandSet, bounds: _Bounds) -> None:
-    for command in command_set.commands:
-        if not 0 <= command.level <= bounds.level:
-            raise CommandRefused(
-                f"level of channel {command.channel} is {command.level:g}; it must lie between 0 "
-                f"and {bounds.level:g}",
-                channel=command.channel,
-            )
-
-
-def _check_frequencies(command_set: CommandSet, bounds: _Bounds) -> None:
-    for command in command_set.commands:
-        within = bounds.frequency_min <= command.frequency <= bounds.frequency_max
-        if command.level > 0 and not within:
-            raise CommandRefused(
-                f"frequency of channel {command.channel} is {command.frequency:g} Hz; it must lie "
-                f"between {bounds.frequency_min:g} and {bounds.frequency_max:g} Hz",
-                channel=command.channel,
-            )
-
-
-def _check_slots(command_set: CommandSet, bounds: _Bounds) -> None:
-    for command in command_set.commands:
-        for name in ("onset", "ending"):
-            slot = getattr(command, name)
-            if not _is_whole(slot, low=0, high=bounds.envelope_slots):
-                raise CommandRefused(
-                    f"{name} of channel {command.channel} is slot {slot!r}; the amplifier keeps "
-                    f"envelopes in slots 1 to {bounds.envelope_slots} (0 is none)",
-                    channel=command.channel,
-                )
-
-
-# In this order; each raises CommandRefused or lets the set pass, and may rely on those before it.
-_RULES: tuple[Callable[[CommandSet, _Bounds], None], ...] = (
-    _check_token,
-    _check_times,
-    _check_channels,
-    _check_finite,
-    _check_levels,
-    _check_frequencies,
-    _check_slots,
-)
-
-
 @final
 class Guard:
     """Lets the command sets of one amplifier through or refuses them.
 
-    Raises CommandError for limits that leave nothing to play.
+    clock [s]: by which rate, on-time and duty are counted. Raises CommandError for limits that
+    leave nothing to play.
     """
 
-    def __init__(self, limits: GuardLimits, capabilities: Capabilities) -> None:
-        self._bounds = _tightest(limits, capabilities)
+    def __init__(
+        self,
+        limits: GuardLimits,
+        capabilities: Capabilities,
+        *,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._bounds = tightest(limits, capabilities)
+        self._clock = clock
+        self._budget = Budget(self._bounds)
         self._last_token = 0
+        self._playing: dict[int, DriveCommand] = {}
+        self._loaded: dict[int, SafeEnvelope] = {}
 
     @property
     def limits(self) -> GuardLimits:
         """The limits in force: the least of configuration, amplifier and ceilings."""
         bounds = self._bounds
-        return GuardLimits(bounds.frequency_min, bounds.frequency_max, bounds.level)
+        return GuardLimits(
+            frequency_min=bounds.frequency_min,
+            frequency_max=bounds.frequency_max,
+            level=bounds.level,
+            slew=bounds.slew,
+            power=bounds.power,
+            on_time=bounds.on_time,
+            duty=bounds.duty,
+            rate=bounds.rate,
+        )
 
     def check(self, command_set: CommandSet) -> SafeCommand:
-        """The set as a command that may be sent; CommandRefused says which channel and why."""
-        for rule in _RULES:
-            rule(command_set, self._bounds)
+        """The set as a command that may be sent; CommandRefused says which channel and why.
+
+        Where on-time or duty are limited, valid_for is made short enough for them.
+        """
+        check_set(command_set, self._bounds, Known(self._playing, self._loaded))
+        valid_for = float(command_set.valid_for)
+        shaped = any(command.onset for command in command_set.commands)
+        if shaped or not command_set.is_silent:
+            remaining = self._budget.remaining(self._clock())
+            if remaining is not None:
+                valid_for = min(valid_for or remaining, remaining, _LONGEST)
         # A silent channel keeps no frequency that an amplifier could stumble over.
         commands = tuple(
             DriveCommand(
                 channel=int(command.channel),
-                frequency=float(command.frequency if command.level > 0 else self._idle_frequency),
+                frequency=float(
+                    command.frequency
+                    if command.level > 0 or command.onset
+                    else self._idle_frequency
+                ),
                 level=float(command.level),
                 phase=float(command.phase),
                 keep_phase=bool(command.keep_phase),
@@ -252,40 +145,22 @@ class Guard:
             for command in command_set.commands
         )
         return self._let_through(
-            int(command_set.token),
-            commands,
-            ramp=float(command_set.ramp),
-            valid_for=float(command_set.valid_for),
+            int(command_set.token), commands, ramp=float(command_set.ramp), valid_for=valid_for
         )
 
     def check_envelope(self, envelope: Envelope) -> SafeEnvelope:
-        """The envelope as one that may be loaded; CommandRefused says which knot and why."""
-        bounds = self._bounds
-        if not _is_whole(envelope.slot, low=1, high=bounds.envelope_slots):
-            raise CommandRefused(
-                f"slot is {envelope.slot!r}; the amplifier keeps envelopes in slots 1 to "
-                f"{bounds.envelope_slots}"
-            )
-        low, high = bounds.envelope_step_min, bounds.envelope_step_max
-        if not (_is_number(envelope.step) and low <= envelope.step <= high):
-            raise CommandRefused(
-                f"the step of an envelope is {envelope.step!r} s; it must lie between {low:g} and "
-                f"{high:g} s"
-            )
-        if len(envelope.knots) > bounds.envelope_knots:
-            raise CommandRefused(
-                f"an envelope has {len(envelope.knots)} knots; the amplifier takes "
-                f"{bounds.envelope_knots}"
-            )
-        for number, knot in enumerate(envelope.knots):
-            is_finite = _is_number(knot.level) and _is_number(knot.phase)
-            if not (is_finite and 0 <= knot.level <= bounds.level):
-                raise CommandRefused(
-                    f"knot {number} has level {knot.level!r} and phase {knot.phase!r} degrees; "
-                    f"both must be finite, and the level between 0 and {bounds.level:g}"
-                )
+        """The envelope as one that may be loaded; CommandRefused says which knot and why.
+
+        Sets that refer to its slot are checked with it from now on: it must be loaded before.
+        """
+        check_envelope(envelope, self._bounds)
         knots = tuple(Knot(float(knot.level), float(knot.phase)) for knot in envelope.knots)
-        return SafeEnvelope(int(envelope.slot), float(envelope.step), knots, key=_KEY)
+        safe = SafeEnvelope(int(envelope.slot), float(envelope.step), knots, key=_KEY)
+        if knots:
+            self._loaded[safe.slot] = safe
+        else:
+            self._loaded.pop(safe.slot, None)
+        return safe
 
     def silence(self, token: int, channels: Collection[int], *, ramp: float) -> SafeCommand:
         """Level zero on these channels (and on all others, as ever); never fails.
@@ -294,7 +169,7 @@ class Guard:
         range, and a token that cannot be sent becomes the one after the last. Along the ramp, no
         endings.
         """
-        if not _is_token(token):
+        if not is_token(token):
             token = token_after(self._last_token)
         commands = tuple(
             DriveCommand(
@@ -303,7 +178,7 @@ class Guard:
             for channel in range(self._bounds.channels)
             if channel in channels
         )
-        ramp = min(max(float(ramp), 0.0), self._bounds.ramp) if _is_number(ramp) else 0.0
+        ramp = min(max(float(ramp), 0.0), self._bounds.ramp) if is_number(ramp) else 0.0
         return self._let_through(int(token), commands, ramp=ramp, valid_for=0.0)
 
     def check_or_silence(
@@ -329,4 +204,25 @@ class Guard:
         self, token: int, commands: tuple[DriveCommand, ...], *, ramp: float, valid_for: float
     ) -> SafeCommand:
         self._last_token = token
-        return SafeCommand(token, commands, ramp=ramp, valid_for=valid_for, key=_KEY)
+        fades = [ramp]
+        if not all(command.skip_ending for command in commands):  # an earlier ending may play
+            fades += [_duration(envelope) for envelope in self._loaded.values()]
+        vibrates = any(command.level > 0 or command.onset for command in commands)
+        self._budget.note(self._clock(), lasts=(valid_for or _FOREVER) if vibrates else 0.0)
+        self._playing = {command.channel: command for command in commands if command.level > 0}
+        return SafeCommand(
+            token,
+            commands,
+            ramp=ramp,
+            valid_for=valid_for,
+            settled_after=max(fades),
+            key=_KEY,
+        )
+
+
+_LONGEST = PROTOCOL.quantities.valid_for.high
+_FOREVER = float("inf")
+
+
+def _duration(envelope: Envelope) -> float:
+    return envelope.step * (len(envelope.knots) + 1)

@@ -89,6 +89,8 @@ ENVELOPES = st.builds(
     knots=st.lists(st.builds(Knot, values(Q.level), values(Q.phase)), max_size=32).map(tuple),
 )
 GUARD = Guard(GuardLimits(20.0, 600.0, 1.0), WIDE)
+for _slot in range(1, 64):
+    GUARD.check_envelope(Envelope(_slot, 0.005, (Knot(0.5, 0.0),)))
 TEXTS = st.text(st.characters(codec="ascii", categories=["L", "N", "P"]), max_size=32)
 
 REQUESTS = st.one_of(

@@ -52,6 +52,7 @@ COMMANDS = (
 GUARD = Guard(GuardLimits(20.0, 600.0, 1.0), CAPABILITIES)
 SET = GUARD.check(CommandSet(token=513, commands=COMMANDS, ramp=0.02, valid_for=0.5))
 SHAPE = GUARD.check_envelope(Envelope(slot=5, step=0.005, knots=(Knot(0.1, 90), Knot(1, -0.01))))
+GUARD.check_envelope(Envelope(slot=6, step=0.005, knots=(Knot(0.1, 0.0),)))
 SHAPED_COMMANDS = (DriveCommand(0, 110.0, 0.2, onset=5, ending=6),)
 SHAPED = GUARD.check(CommandSet(514, SHAPED_COMMANDS, ramp=0.0, valid_for=0.0))
 OFF = Status(State.SWITCH_ON_DISABLED, Fault.NONE, 0, False, 25.0, 0.0, (0.0,) * 4)

@@ -1,0 +1,187 @@
+"""The guard's limits beyond one command: slew, power, on-time, duty, rate, envelopes."""
+
+import math
+
+import pytest
+
+from drivers.command import CommandSet, DriveCommand, Envelope, Knot
+from drivers.errors import CommandError, CommandRefused
+from drivers.guard import Guard, GuardLimits, SafeCommand, SafeEnvelope
+from drivers.protocol.messages import Capabilities
+
+CAPABILITIES = Capabilities(
+    *(4, 20.0, 600.0, 0.01, 1.0, 0.0001, 0.01, 1.0, 0.1, 2.0, 32, 16, 0.001, 0.1, False)
+)
+
+
+class Clock:
+    """Time that a test sets."""
+
+    def __init__(self) -> None:
+        self.now = 100.0
+
+    def __call__(self) -> float:
+        """The time [s]."""
+        return self.now
+
+
+def guard(clock: Clock | None = None, **limits: float) -> Guard:
+    """A guard with these limits beside 40 to 500 Hz and level 0.8."""
+    return Guard(GuardLimits(40.0, 500.0, 0.8, **limits), CAPABILITIES, clock=clock or Clock())
+
+
+def playing(
+    token: int, *levels: float, ramp: float = 0.0, valid_for: float = 0.0, **more: int
+) -> CommandSet:
+    """A set at 110 Hz, a level a channel from 0 on."""
+    commands = tuple(
+        DriveCommand(channel, 110.0, level, **more) for channel, level in enumerate(levels)
+    )
+    return CommandSet(token, commands, ramp=ramp, valid_for=valid_for)
+
+
+def test_a_level_rises_no_faster_than_allowed() -> None:
+    """At 10 a second, 0.5 takes 50 ms; falling and staying cost nothing; a new tone starts anew."""
+    strict = guard(slew=10.0)
+    for ramp in (0.0, 0.049):
+        with pytest.raises(CommandRefused, match=r"rise by 0\.5 .* longer ramp"):
+            strict.check(playing(1, 0.5, ramp=ramp))
+    strict.check(playing(2, 0.5, ramp=0.05))
+    strict.check(playing(3, 0.6, ramp=0.01))
+    strict.check(playing(4, 0.1, ramp=0.0))
+    other = CommandSet(5, (DriveCommand(0, 200.0, 0.1),), ramp=0.005, valid_for=0.0)
+    with pytest.raises(CommandRefused, match="rise"):
+        strict.check(other)
+    assert strict.silence(6, [0], ramp=0.0).is_silent
+
+
+def test_knots_rise_no_faster_than_allowed() -> None:
+    """Within an envelope, from its begin, and from its last knot to the command's level."""
+    strict = guard(slew=10.0)
+    with pytest.raises(CommandRefused, match=r"slot 1 would rise by 0\.2"):
+        strict.check_envelope(Envelope(1, 0.01, (Knot(0.1, 0.0), Knot(0.3, 0.0))))
+    strict.check_envelope(Envelope(1, 0.01, (Knot(0.1, 0.0), Knot(0.2, 0.0))))
+    strict.check(playing(1, 0.3, onset=1))
+    with pytest.raises(CommandRefused, match="rise"):
+        strict.check(playing(2, 0.31, onset=1))
+    strict.check_envelope(Envelope(2, 0.01, (Knot(0.2, 0.0),)))
+    with pytest.raises(CommandRefused, match="rise"):
+        strict.check(playing(3, 0.2, onset=2))
+
+
+def test_the_power_of_all_channels_is_limited() -> None:
+    """Squares of the levels add up; those of envelopes count where they are higher."""
+    strict = guard(power=0.5)
+    strict.check(playing(1, 0.5, 0.5))
+    with pytest.raises(CommandRefused, match=r"add up to 0\.75; at most 0\.5"):
+        strict.check(playing(2, 0.5, 0.5, 0.5))
+    strict.check_envelope(Envelope(1, 0.01, (Knot(0.8, 0.0),)))
+    with pytest.raises(CommandRefused, match="add up"):
+        strict.check(playing(3, 0.1, onset=1))
+
+
+def test_vibration_ends_when_its_time_is_over() -> None:
+    """2 s without a pause: the set ends by itself by then, and the next one comes too late."""
+    clock = Clock()
+    strict = guard(clock, on_time=2.0)
+    assert strict.check(playing(1, 0.5)).valid_for == 2.0
+    clock.now += 1.5
+    assert strict.check(playing(2, 0.5)).valid_for == 0.5
+    assert strict.check(playing(3, 0.5, valid_for=0.25)).valid_for == 0.25
+    clock.now += 0.2
+    strict.silence(4, [0], ramp=0.0)
+    assert strict.check(playing(5, 0.5)).valid_for == 2.0
+    clock.now += 1.999
+    strict.check(playing(6, 0.5))
+    clock.now += 1.0  # it has ended by itself
+    assert strict.check(playing(7, 0.5)).valid_for == 2.0
+
+
+def test_a_share_of_the_time_is_silent() -> None:
+    """A tenth of ten seconds: 1 s, then a rest until the window has moved on."""
+    clock = Clock()
+    strict = guard(clock, duty=0.1)
+    assert strict.check(playing(1, 0.5)).valid_for == pytest.approx(1.0)
+    clock.now += 1.0
+    with pytest.raises(CommandRefused, match="let it rest"):
+        strict.check(playing(2, 0.5))
+    assert strict.check(playing(3, 0.0)).is_silent
+    clock.now += 9.5
+    assert strict.check(playing(4, 0.5)).valid_for == pytest.approx(0.5)
+
+
+def test_sets_come_no_faster_than_allowed() -> None:
+    """Ten a second: ten at once are let through, the eleventh not, one more after 0.1 s."""
+    clock = Clock()
+    strict = guard(clock, rate=10.0)
+    for token in range(1, 11):
+        strict.check(playing(token, 0.5))
+    with pytest.raises(CommandRefused, match="10 command sets a second"):
+        strict.check(playing(11, 0.5))
+    assert strict.check(playing(12, 0.0)).is_silent
+    clock.now += 0.1001
+    strict.check(playing(13, 0.5))
+    with pytest.raises(CommandRefused, match="a second"):
+        strict.check(playing(14, 0.5))
+
+
+def test_without_limits_nothing_is_shortened() -> None:
+    """A set that lasts until the next stays one."""
+    assert guard().check(playing(1, 0.5)).valid_for == 0.0
+
+
+@pytest.mark.parametrize("name", ["slew", "power", "on_time", "duty", "rate"])
+@pytest.mark.parametrize("value", [0.0, -1.0, math.nan])
+def test_limits_that_leave_nothing_are_refused(name: str, value: float) -> None:
+    """A limit of zero, below, or no number is a mistake of the configuration."""
+    with pytest.raises(CommandError, match=name):
+        guard(**{name: value})
+
+
+@pytest.mark.parametrize(
+    ("envelope", "problem"),
+    [
+        (Envelope(0, 0.005, (Knot(0.1, 0.0),)), "slots 1 to 16"),
+        (Envelope(17, 0.005, (Knot(0.1, 0.0),)), "slots 1 to 16"),
+        (Envelope(1, 0.0, (Knot(0.1, 0.0),)), "step"),
+        (Envelope(1, math.nan, (Knot(0.1, 0.0),)), "step"),
+        (Envelope(1, 0.005, (Knot(0.1, 0.0),) * 33), "33 knots"),
+        (Envelope(1, 0.005, (Knot(0.1, 0.0), Knot(0.81, 0.0))), "knot 1"),
+        (Envelope(1, 0.005, (Knot(math.nan, 0.0),)), "knot 0"),
+        (Envelope(1, 0.005, (Knot(0.1, math.inf),)), "knot 0"),
+    ],
+)
+def test_envelopes_out_of_range_are_refused(envelope: Envelope, problem: str) -> None:
+    """Slot, step, number of knots, and every knot's level and phase."""
+    with pytest.raises(CommandRefused, match=problem):
+        guard().check_envelope(envelope)
+
+
+def test_a_set_may_only_refer_to_what_the_guard_has_seen() -> None:
+    """What is in a slot decides about slew and power, so it must be known; until it is emptied."""
+    known = guard()
+    with pytest.raises(CommandRefused, match="no envelope"):
+        known.check(playing(1, 0.5, ending=3))
+    known.check_envelope(Envelope(3, 0.005, (Knot(0.1, 0.0),)))
+    known.check(playing(2, 0.5, ending=3))
+    known.check_envelope(Envelope(3, 0.005, ()))
+    with pytest.raises(CommandRefused, match="no envelope"):
+        known.check(playing(3, 0.5, ending=3))
+
+
+def test_it_says_when_everything_has_settled() -> None:
+    """The ramp, or the longest envelope that may play, each a step longer than its knots."""
+    known = guard()
+    assert known.check(playing(1, 0.5, ramp=0.02)).settled_after == 0.02
+    known.check_envelope(Envelope(3, 0.01, (Knot(0.1, 0.0),) * 4))
+    assert known.check(playing(2, 0.5, ramp=0.02)).settled_after == pytest.approx(0.05)
+    assert known.silence(3, [0], ramp=0.01).settled_after == 0.01
+
+
+def test_only_a_guard_makes_what_is_safe() -> None:
+    """Neither can be made by hand, nor be derived from."""
+    with pytest.raises(TypeError):
+        SafeEnvelope(1, 0.005, ())
+    for kind in (SafeCommand, SafeEnvelope):
+        with pytest.raises(TypeError):
+            type("Sly", (kind,), {})

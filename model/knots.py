@@ -129,16 +129,17 @@ def ending_knots(
     if felt is not None and still is not None:
         vibration = amplitudes @ carrier.steady
         target = np.linalg.norm(felt @ vibration) ** 2
-        meanwhile = _meanwhile(carrier.hats[:, active], carrier.steady[active], still)
+        meanwhile = while_ending(carrier.hats[:, active], carrier.steady[active], still)
         form = form + _QUIET_WEIGHT * np.linalg.norm(vibration) ** 2 / target * meanwhile
     form = _robust(form, eras)
     knots = _least(form[eras:, eras:], -form[eras:, :eras] @ start)
     return np.vstack([start, knots.reshape(-1, eras), np.zeros(eras)])
 
 
-def _meanwhile(hats: ComplexArray, steady: ComplexArray, still: FloatArray) -> ComplexArray:
+def while_ending(hats: ComplexArray, steady: ComplexArray, still: FloatArray) -> ComplexArray:
     """Form of the mean square at quiet fingers during an ending: the tone that ends, then knots.
 
+    hats (n, eras, r) and steady (eras, r) as in `Carrier`, still (d, r) as in `onset_knots`.
     An ending is the steady tone less hats: one of the tone's own height at every knot, and the
     knots in their place.
     """

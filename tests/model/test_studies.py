@@ -18,6 +18,7 @@ from model.point_mass import PointMass
 from model.studies import solve
 from model.studies.cache import ResultCache
 from model.studies.kinds import count_cases, placement_cases, stiffness_cases
+from model.studies.outcome import ranking_summary
 from model.studies.ranking import era_counts, rank
 from model.studies.run import CHUNK, run_study
 from model.studies.solve import DRIVES, CaseResults, code_version, solve_cases, study_problem
@@ -267,6 +268,18 @@ def test_the_ranking_is_by_the_median_of_the_drive(study, results):
     assert medians[ranking.middle] == pytest.approx(np.median(medians), rel=0.01)
     assert ranking.own == 0
     assert ranking.recommended == ranking.best
+
+
+def test_the_rig_as_it_is_is_told_even_from_the_end_of_the_ranking(study):
+    """Ten cases and, where it is not among them, the rig's own with its rank."""
+    problem, cases = study
+    part = cases.part(0, 30)
+    statistics = np.ones((30, 3, 6))
+    statistics[:, 1, MEDIAN] = np.arange(30)  # the first one, the rig's, comes last
+    results = CaseResults(statistics, np.ones((30, 3), dtype=np.uint64))
+    told = ranking_summary(problem.rig, rank(part, results, drive=1))["ranking"]
+    assert [case["rank"] for case in told] == [*range(1, 11), 30]
+    assert told[-1]["layout"] == "own"
 
 
 def test_softer_eras_are_recommended_where_they_do_as_well():

@@ -63,6 +63,16 @@ def test_a_worker_with_other_code_is_refused(address):
         dict(on_cluster(address)(problem, chunks_of(cases, 4)))
 
 
+def test_every_worker_looks_at_its_own_code():
+    """Not only the one that solves the plate: another may join later, with other code."""
+    problem, cases = small_study(layouts=4)
+    object.__setattr__(problem, "code_version", "0.0.1+123456789abc")
+    with pytest.raises(InputError, match="other code"):
+        cluster._solve_plate(problem)
+    with pytest.raises(InputError, match="other code"):
+        cluster._solve_chunk(problem.code_version, problem.solve(), problem.rig.eras, cases)
+
+
 def test_a_cluster_without_workers_is_refused():
     """Waiting for ever for a worker to come is no answer."""
     problem, cases = small_study(layouts=4)

@@ -32,9 +32,15 @@ def find_switched(fields: Fields, least: float) -> Drive | None:
     eras = fields.era_count
     patterns = all_patterns(eras, fields.frequency_count)
     first, second = patterns.first, patterns.second
+    peak = _least_of_means([magnitudes_of_sources(field) for field in fields.targets], eras)
+    if least > 0 and not fields.is_alone:
+        # Some of the points will mostly do to see that nothing here is better than what is there.
+        step = max(1, fields.quiet.shape[2] // BOUND_POINTS)
+        few = magnitudes_of_sources(np.ascontiguousarray(fields.quiet[:, :, ::step]))
+        if not (peak > least * sums_of_sources(few.T, eras).max(axis=0)).any():
+            return None
     powers = _powers(fields)
     quiet = magnitudes_of_sources(fields.quiet)
-    peak = _least_of_means([magnitudes_of_sources(field) for field in fields.targets], eras)
     if fields.is_alone:
         loud = _rms_of_sums(quiet, first, second, alone=eras * fields.frequency_count)
     else:

@@ -1,0 +1,91 @@
+"""Contact sets on the paper's plate, and what a drive does to them when amplifiers err."""
+
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+
+from model.drive_modes.fields import Fields
+from model.fingertip import fingertip_points
+from model.question import Question
+from model.rig_file import load_rig
+from model.table_build import build_table
+
+RIG = Path(__file__).parent.parent / "examples" / "paper_plate.yaml"
+FREQUENCIES = np.linspace(40.0, 500.0, 27)
+APART = 0.05  # m
+LEAST = 1.0  # m/s² at the target
+GAIN_ERROR, PHASE_ERROR = 0.05, np.radians(5.0)
+
+
+@cache
+def paper_table():
+    """The table of the paper's plate that all figures are from."""
+    return build_table(load_rig(RIG), frequencies=FREQUENCIES)
+
+
+def contact_sets(count, *, fingers, rng, apart=APART):
+    """Sets of fingers [m] anywhere on the plate, (count, fingers, 2)."""
+    plate = paper_table().plate
+    found = []
+    while len(found) < count:
+        places = rng.uniform(0, [plate.length, plate.width], (fingers, 2))
+        gaps = np.linalg.norm(places[:, None] - places, axis=-1)
+        if gaps[np.triu_indices(fingers, 1)].min(initial=np.inf) >= apart:
+            found.append(places)
+    return np.array(found)
+
+
+def question_of(places, *, targets=1, **how):
+    """The first ones are targets, the others quiet."""
+    points = [(float(x), float(y)) for x, y in places]
+    return Question(tuple(points[:targets]), tuple(points[targets:]), **how)
+
+
+def fields_of(places, *, targets=1):
+    """Fields at the fingertips; the level asked for is an acceleration of 1 m/s²."""
+    fields = paper_table().fields(question_of(places, targets=targets))
+    ones = np.ones_like(fields.threshold)
+    return Fields(fields.targets, fields.quiet, fields.is_alone, ones, LEAST)
+
+
+def quiet_centres(places, *, targets=1):
+    """Which of the quiet points are centres of fingertips: the first of each one's points."""
+    plate = paper_table().plate
+    counts = [len(fingertip_points(x, y, plate)) for x, y in places[targets:]]
+    return np.concatenate([[0], np.cumsum(counts)[:-1]]).astype(int)
+
+
+@dataclass(frozen=True)
+class Errors:
+    """What amplifiers do against what they were told: complex factors (draws, eras)."""
+
+    factors: np.ndarray
+
+    @classmethod
+    def draw(cls, draws, *, eras, rng):
+        gain = 1 + GAIN_ERROR * rng.standard_normal((draws, eras))
+        return cls(gain * np.exp(1j * PHASE_ERROR * rng.standard_normal((draws, eras))))
+
+    def contrast_db(self, fields, weights):
+        """Contrast of weights (f, eras) in every draw, (draws,); of several targets the least."""
+
+        def peak(field):
+            active = np.flatnonzero(np.abs(weights).any(axis=1))
+            tones = [np.abs((self.factors * weights[f]) @ field[f]) for f in active]
+            return np.sum(tones, axis=0)
+
+        targets = np.min([peak(target).mean(axis=-1) for target in fields.targets], axis=0)
+        return 20 * np.log10(targets / peak(fields.quiet).max(axis=-1))
+
+
+def weights_of(drive, fields):
+    """A drive as weights (f, eras)."""
+    weights = np.zeros((fields.frequency_count, fields.era_count), dtype=complex)
+    for frequency, weight in drive.tones():
+        weights[frequency] = weight
+    return weights
+
+
+NO_ERRORS = Errors(np.ones((1, 4), dtype=complex))

@@ -1,0 +1,160 @@
+"""How long answers take, on one thread, and how that grows."""
+
+import time
+from dataclasses import replace
+
+import numpy as np
+
+from benchmarks.localization_cases import (
+    FREQUENCIES,
+    RIG,
+    contact_sets,
+    paper_table,
+    question_of,
+)
+from benchmarks.localization_contrast import Section
+from model.drive_modes.fields import Fields
+from model.exact_search import search_exactly
+from model.localization import Grid
+from model.question import Question
+from model.rig_file import load_rig
+from model.table_build import build_table
+
+QUESTIONS = 400
+MODES = ("switched", "phased")
+MOST_ERAS = 8
+CLOSE = 0.03  # m; ten fingers 5 cm apart hardly fit
+
+
+def live_times(table, mode, *, quiet, rng, questions=QUESTIONS):
+    """Seconds of every answer."""
+    table.prepare(mode)
+    apart = 0.05 if quiet < 6 else CLOSE
+    times = []
+    for places in contact_sets(questions, fingers=quiet + 1, rng=rng, apart=apart):
+        question = question_of(places, mode=mode, level_db_sl=12.0)
+        started = time.perf_counter()
+        table.ask(question)
+        times.append(time.perf_counter() - started)
+    return np.array(times)
+
+
+def cell_times(table, *, loudest):
+    """Seconds and patterns of the exact search for every cell of the grid."""
+    eras = len(table.eras)
+    count = looked_at = 0
+    started = time.perf_counter()
+    for x, y in table.cell_centres:
+        fields = table.fields(Question(((float(x), float(y)),)))
+        if loudest:
+            fields = Fields(fields.targets, fields.quiet, False, fields.threshold, fields.wanted)
+        found = search_exactly(fields, eras_at_most=eras)
+        count, looked_at = found.pattern_count, looked_at + found.looked_at
+    return time.perf_counter() - started, count, looked_at
+
+
+def speed_section(seed):
+    """What the requirements name: live answers, the table from nothing, the exact search."""
+    table = paper_table()
+    rows = []
+    for mode in MODES:
+        for quiet in (1, 3, 9):
+            rng = np.random.default_rng([seed, 300 + quiet])
+            times = 1e3 * live_times(table, mode, quiet=quiet, rng=rng)
+            rows.append(
+                [
+                    f"live answer, {mode}, {quiet} quiet",
+                    f"{np.median(times):.2f} ms",
+                    f"{np.percentile(times, 99):.2f} ms",
+                ]
+            )
+    rng = np.random.default_rng([seed, 310])
+    for quiet in (1, 3):
+        times = []
+        for places in contact_sets(100, fingers=quiet + 1, rng=rng):
+            question = question_of(places, eras_at_most=4, level_db_sl=12.0)
+            started = time.perf_counter()
+            table.ask(question)
+            times.append(1e3 * (time.perf_counter() - started))
+        rows.append(
+            [
+                f"exact search, 614 655 patterns, {quiet} quiet",
+                f"{np.median(times):.1f} ms",
+                f"{np.percentile(times, 99):.1f} ms",
+            ]
+        )
+    for name, loudest in (("root mean square", False), ("loudest point", True)):
+        seconds, count, looked_at = cell_times(table, loudest=loudest)
+        rows.append(
+            [
+                f"the same for all {table.grid.cell_count} cells, {name} beyond 5 cm",
+                f"{seconds:.2f} s",
+                f"{looked_at} of {table.grid.cell_count} x {count} looked at",
+            ]
+        )
+    started = time.perf_counter()
+    build_table(load_rig(RIG), frequencies=FREQUENCIES)
+    rows.append(["the table from nothing", f"{time.perf_counter() - started:.2f} s", ""])
+    return Section("Time on one thread", ["", "median or total", "99th percentile"], rows)
+
+
+def growth_section(seed):
+    """Times against the number of ERAs, of frequencies and of cells, the others as they are."""
+    data = {}
+    for what, values in (
+        ("ERAs", range(2, MOST_ERAS + 1)),
+        ("frequencies", (9, 27, 54, 93, 185)),
+        ("cells", (27, 108, 432, 1728)),
+    ):
+        for value in values:
+            data[what, value] = _times_of(what, value, seed)
+    names = ["build", "switched", "phased", "exact"]
+    rows = [
+        [f"{value} {what}", *(_readable(times[name]) for name in names)]
+        for (what, value), times in data.items()
+    ]
+    return Section(
+        "Growth: one quiet finger, medians; the table from nothing",
+        ["", "the table", "live, switched", "live, phased", "exact search"],
+        rows,
+        data=data,
+    )
+
+
+def _times_of(what, value, seed):
+    eras = value if what == "ERAs" else 4
+    frequencies = np.linspace(40.0, 500.0, value if what == "frequencies" else 27)
+    side = int(np.sqrt((value if what == "cells" else 108) / 108 * 144) + 0.5)
+    grid = Grid(side, side * 3 // 4)
+    started = time.perf_counter()
+    table = build_table(_rig(eras), frequencies=frequencies, grid=grid)
+    times = {"build": time.perf_counter() - started}
+    for mode in MODES:
+        rng = np.random.default_rng([seed, 320])
+        times[mode] = np.median(live_times(table, mode, quiet=1, rng=rng, questions=60))
+    rng = np.random.default_rng([seed, 321])
+    exact = []
+    for places in contact_sets(7, fingers=2, rng=rng):
+        question = question_of(places, eras_at_most=eras, level_db_sl=12.0)
+        fields = table.fields(question)
+        started = time.perf_counter()
+        search_exactly(fields, eras_at_most=eras, time_limit=60.0)
+        exact.append(time.perf_counter() - started)
+    return times | {"exact": np.median(exact)}
+
+
+def _rig(eras):
+    """The paper's plate on so many ERAs: its corners first, then the middles of its sides."""
+    rig = load_rig(RIG)
+    length, width = rig.plate.length, rig.plate.width
+    places = [(0, 0), (length, width), (length, 0), (0, width)]
+    places += [(length / 2, 0), (length / 2, width), (0, width / 2), (length, width / 2)]
+    one = rig.eras[0]
+    several = tuple(
+        replace(one, name=f"E{number}", x=x, y=y) for number, (x, y) in enumerate(places[:eras])
+    )
+    return replace(rig, eras=several, wiring={}, amplifiers={})
+
+
+def _readable(seconds):
+    return f"{seconds:.2f} s" if seconds >= 1 else f"{1e3 * seconds:.2f} ms"

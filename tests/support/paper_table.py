@@ -1,0 +1,39 @@
+"""The paper's plate on a mesh that is quick to solve, as smooth as its fields, and its table."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+
+from model.mesh import Mesh
+from model.rig import Rig
+from model.table import LocalizationTable
+from model.table_build import build_table
+from paper_plate import make_paper_rig
+
+FREQUENCIES = np.linspace(40.0, 500.0, 27)
+
+
+def smooth_rig() -> Rig:
+    """The paper's rig on 6x5 elements of the fifth order."""
+    rig = make_paper_rig(6, 5)
+    return replace(rig, mesh=Mesh(6, 5, rig.plate.length, rig.plate.width, "Q5"))
+
+
+@cache
+def smooth_table() -> LocalizationTable:
+    """Its table at 27 frequencies from 40 to 500 Hz."""
+    return build_table(smooth_rig(), frequencies=FREQUENCIES)
+
+
+def contact_sets(count: int, *, fingers: int, seed: int) -> list[list[tuple[float, float]]]:
+    """Fingertips anywhere on the paper's plate, at least 5 cm apart."""
+    rng = np.random.default_rng(seed)
+    plate = smooth_rig().plate
+    found: list[list[tuple[float, float]]] = []
+    while len(found) < count:
+        places = rng.uniform(0, [plate.length, plate.width], (fingers, 2))
+        gaps = np.linalg.norm(places[:, None] - places, axis=-1)
+        if gaps[np.triu_indices(fingers, 1)].min() >= 0.05:
+            found.append([(float(x), float(y)) for x, y in places])
+    return found

@@ -6,6 +6,7 @@ from collections.abc import Coroutine, Iterable, Mapping
 from enum import Enum, auto
 from typing import Any, TypeVar
 
+from controller.read_backs import ReadBacks
 from drivers.amplifier import Amplifier
 from drivers.errors import CommandError, CommandRefused, DriverError, LinkError
 from drivers.guard import SafeCommand
@@ -42,6 +43,7 @@ class AmplifierGroup:
         self._amplifiers = dict(amplifiers)
         self._silencings = 0  # how often they were disarmed, stopped or closed
         self._may_be_armed = False  # since they were opened
+        self._read_backs = ReadBacks()
         self._limit: asyncio.Timeout | None = None  # of a play or heartbeat that is under way
 
     @property
@@ -83,6 +85,7 @@ class AmplifierGroup:
             self._leave_armed()
             await _to_the_end(self._each(amplifier.disarm() for amplifier in self._all))
             raise
+        self._read_backs.forget()
         self.phase = Phase.ARMED
 
     async def play(self, commands: Mapping[str, SafeCommand]) -> dict[str, Achieved] | None:
@@ -91,10 +94,18 @@ class AmplifierGroup:
         None if they were disarmed, stopped or closed meanwhile, or `hurry` ended it. Raises
         DriverError.
         """
-        return await self._or_stop(self._play(commands))
+        self._read_backs.forget()
+        achieved = await self._or_stop(self._play(commands))
+        if achieved is not None:
+            now = asyncio.get_running_loop().time()
+            self._read_backs.expect(commands, achieved, now=now)
+        return achieved
 
     async def heartbeat(self) -> bool:
-        """Feed the watchdogs and see that every amplifier still is enabled; raises DriverError.
+        """Feed the watchdogs; raises DriverError.
+
+        An amplifier that is not enabled any more is refused, as is one whose levels have differed
+        from the commanded ones for 100 ms.
 
         False where `play` would give None.
         """
@@ -153,18 +164,27 @@ class AmplifierGroup:
                 self._amplifiers[name].apply(safe) for name, safe in commands.items()
             )
             return dict(zip(commands, applied, strict=True))
-        await self._together(self._amplifiers[name].stage(safe) for name, safe in commands.items())
+        achieved = await self._together(
+            self._amplifiers[name].stage(safe) for name, safe in commands.items()
+        )
         if self.phase is not Phase.ARMED:
             return None  # a commit now would undo the silence that came in between
-        achieved = await self._together(
-            self._amplifiers[name].commit(safe.token) for name, safe in commands.items()
-        )
+        await self._together(self._commits(commands))
         for name, status in (await self._statuses()).items():
             if status.token != commands[name].token:
                 raise CommandRefused(
                     f"amplifier {name} plays set {status.token} instead of {commands[name].token}"
                 )
         return dict(zip(commands, achieved, strict=True))
+
+    def _commits(self, sets: Mapping[str, SafeCommand]) -> Iterable[Coroutine[Any, Any, object]]:
+        """Commit everything that is staged: at one moment where amplifiers share a bus."""
+        together: dict[tuple[str, int], list[Amplifier]] = {}
+        for name, safe in sets.items():
+            amplifier = self._amplifiers[name]
+            together.setdefault((amplifier.bus or name, safe.token), []).append(amplifier)
+        for (_, token), (first, *others) in together.items():
+            yield first.commit_on_bus(token) if others else first.commit(token)
 
     async def _wind_down(self, silence: Mapping[str, SafeCommand]) -> None:
         """Silence, proof of it, and high voltage off."""
@@ -188,6 +208,7 @@ class AmplifierGroup:
                     f"amplifier {name} is in {status.state.name}, fault {status.fault.name}; "
                     "all were stopped: clear and arm again"
                 )
+            self._read_backs.check(name, status, now=asyncio.get_running_loop().time())
         return True
 
     async def _or_stop(self, exchange: Coroutine[Any, Any, _T]) -> _T | None:

@@ -1,11 +1,13 @@
 """An amplifier as the controller sees it: arm, play, stop, whatever wire it hangs on."""
 
 import asyncio
+import time
+from collections.abc import Callable
 from typing import TypeVar, final
 
 from drivers.backend import Backend
 from drivers.command import token_after
-from drivers.errors import CommandError, CommandRefused, FrameError, LinkError, LinkTimeout
+from drivers.errors import CommandError, FrameError, LinkError, LinkTimeout
 from drivers.guard import SafeCommand, SafeEnvelope
 from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.messages import (
@@ -16,6 +18,7 @@ from drivers.protocol.messages import (
     Clear,
     Commit,
     Disarm,
+    Event,
     FaultList,
     FaultRecord,
     GetCaps,
@@ -26,7 +29,6 @@ from drivers.protocol.messages import (
     Loaded,
     LoadEnvelope,
     Nak,
-    NakCode,
     Ping,
     Reply,
     Request,
@@ -34,6 +36,8 @@ from drivers.protocol.messages import (
     Status,
     Stop,
 )
+from drivers.refusals import is_busy, refusal
+from drivers.statistics import LinkStatistics
 from drivers.turns import Kind, Turns
 
 WATCHDOG = 0.25  # s; five heartbeats of 50 ms
@@ -43,19 +47,6 @@ RETRIES = 2
 BUSY_PAUSE = 0.005  # s; before a busy amplifier is asked again: short enough for a touch to be felt
 DISARM_RAMP = 0.05  # s; long enough not to click
 STOP_RAMP = 0.005  # s; the shortest that is no step
-
-_REASONS = {
-    NakCode.UNKNOWN_TYPE: "it does not know this kind of request",
-    NakCode.BAD_LENGTH: "it read a request of another length; its firmware may be too old or new",
-    NakCode.BAD_VALUE: "a value is out of the range that it can play",
-    NakCode.BAD_CHANNEL: "it has no such channel, or the channel was named twice",
-    NakCode.WRONG_STATE: "it is not armed, or it is stopped or in a fault until that is cleared; "
-    "ask for its status",
-    NakCode.BAD_TOKEN: "no set is staged under this token",
-    NakCode.BUSY: "it was busy three times in a row; try again",
-    NakCode.NO_ENVELOPE: "no envelope is loaded in a slot that the set refers to",
-    NakCode.UNSUPPORTED_VERSION: "it speaks another version of the protocol",
-}
 
 _ReplyT = TypeVar("_ReplyT", Identity, Capabilities, Status, Achieved, FaultList, Loaded)
 
@@ -68,12 +59,26 @@ class Amplifier:
     safe. After a LinkError
     it is lost until it is closed and opened anew: every other call raises LinkError at once, and
     nothing re-arms.
-    reply_timeout [s]: how long it may take over one request.
+    reply_timeout [s]: how long it may take over one request; serial_number: of the amplifier that
+    is expected, any one the first time if None. Another one is refused when it is opened.
     """
 
-    def __init__(self, backend: Backend, *, reply_timeout: float = REPLY_TIMEOUT) -> None:
+    def __init__(
+        self,
+        backend: Backend,
+        *,
+        reply_timeout: float = REPLY_TIMEOUT,
+        serial_number: str | None = None,
+    ) -> None:
         self._backend = backend
         self._reply_timeout = reply_timeout
+        self._serial_number = serial_number
+        self._listeners: list[Callable[[Event], None]] = []
+        self._retries = self._timeouts = self._refusals = 0
+        self._is_stuck = False  # it was busy to the last: until it is not, nothing is repeated
+        self._last_round_trip: float | None = None
+        self._last_heartbeat: float | None = None
+        backend.listen(self._told, self._found_lost)
         self._turns = Turns()
         self._token = 0
         self._unanswered = 0
@@ -105,6 +110,32 @@ class Amplifier:
         """Whether every further call raises LinkError."""
         return self._loss is not None
 
+    @property
+    def bus(self) -> str | None:
+        """Names what it shares with others that one broadcast reaches; None without broadcasts."""
+        return self._backend.bus
+
+    @property
+    def statistics(self) -> LinkStatistics:
+        """How well the link does; counts since it was opened, retries since it was made."""
+        seen, now = self._backend.counters, time.monotonic()
+        return LinkStatistics(
+            frames_out=seen.frames_out,
+            frames_in=seen.frames_in,
+            bad=seen.bad,
+            foreign=seen.foreign,
+            events=seen.events,
+            retries=self._retries,
+            timeouts=self._timeouts,
+            refusals=self._refusals,
+            last_round_trip=self._last_round_trip,
+            heartbeat_age=None if self._last_heartbeat is None else now - self._last_heartbeat,
+        )
+
+    def listen(self, on_event: Callable[[Event], None]) -> None:
+        """Be told, in the event loop, what the amplifier says unasked; a hint that may be lost."""
+        self._listeners.append(on_event)
+
     def next_token(self) -> int:
         """A token for the next command set: 1..65535, then from 1 again."""
         self._token = token_after(self._token)
@@ -123,10 +154,16 @@ class Amplifier:
                     f"{identity.protocol_version} of the protocol, this program version "
                     f"{PROTOCOL.version}; update the older of the two"
                 )
+            if self._serial_number not in (None, identity.serial_number):
+                raise LinkError(
+                    f"amplifier {identity.serial_number} answers where {self._serial_number} is "
+                    "expected; undo the mix-up, or close everything and begin anew with this one"
+                )
             self._capabilities = await self._ask(
                 GetCaps(), expect=Capabilities, timeout=OPEN_TIMEOUT
             )
             self._identity = identity
+            self._serial_number = identity.serial_number
         except BaseException:
             await self.close()
             raise
@@ -213,7 +250,35 @@ class Amplifier:
 
     async def heartbeat(self) -> Status:
         """Feed the watchdog; to be called by the control loop itself, after it has run."""
-        return await self._ask(Ping(), expect=Status)
+        status = await self._ask(Ping(), expect=Status)
+        self._last_heartbeat = time.monotonic()
+        return status
+
+    async def commit_on_bus(self, token: int) -> None:
+        """Have every amplifier of the bus play what it has staged under this token, at one moment.
+
+        Nobody answers: `status` of each tells whether it followed. Raises CommandError where the
+        bus knows no broadcast.
+        """
+        await self._broadcast(Commit(token=token), Kind.APPLY)
+
+    async def stop_on_bus(self, ramp: float = STOP_RAMP) -> None:
+        """Quick stop of every amplifier of the bus; goes out at once, and nobody answers."""
+        await self._backend.broadcast(Stop(ramp=self._ramp(ramp)))
+
+    async def _broadcast(self, request: Commit, kind: Kind) -> None:
+        self._raise_if_lost()
+        async with self._turns.take(kind):
+            await self._backend.broadcast(request)
+
+    def _told(self, event: Event) -> None:
+        for listener in self._listeners:
+            listener(event)
+
+    def _found_lost(self, what: str) -> None:
+        """The wire is gone, and no request was on its way to notice."""
+        if self._loss is None:
+            self._lose(what)
 
     def _ramp(self, ramp: float) -> float:
         """A ramp that the amplifier can play: falling silent is never refused for its ramp."""
@@ -236,11 +301,8 @@ class Amplifier:
             reply = await self._exchange(request, kind, timeout or self._reply_timeout)
         name = type(request).__name__
         if isinstance(reply, Nak):
-            where = "" if reply.channel is None else f" (channel {reply.channel})"
-            raise CommandRefused(
-                f"the amplifier refused {name}{where}: {_REASONS[reply.code]}",
-                channel=reply.channel,
-            )
+            self._refusals += 1
+            raise refusal(name, reply)
         if not isinstance(reply, expect):
             raise FrameError(f"the amplifier answered {name} with {type(reply).__name__}")
         return reply
@@ -248,9 +310,11 @@ class Amplifier:
     async def _exchange(self, request: Request, kind: Kind, timeout: float) -> Reply:
         busy = 0
         while True:
+            begin = time.monotonic()
             try:
                 reply = await self._backend.exchange(request, timeout=timeout)
             except LinkTimeout as problem:
+                self._timeouts += 1
                 # Counted across requests: a stream of superseded ones must not hide a dead link.
                 self._unanswered += 1
                 if self._unanswered > RETRIES:
@@ -260,11 +324,17 @@ class Amplifier:
                 raise LinkError(self._lose(str(problem))) from problem
             else:
                 self._unanswered = 0
-                if busy == RETRIES or not _is_busy(reply):
+                self._last_round_trip = time.monotonic() - begin
+                if not is_busy(reply):
+                    self._is_stuck = False
+                    return reply
+                if self._is_stuck or busy == RETRIES:
+                    self._is_stuck = True
                     return reply
                 busy += 1
                 await asyncio.sleep(BUSY_PAUSE)
             self._turns.raise_if_overtaken(kind)
+            self._retries += 1
 
     def _lose(self, what: str) -> str:
         self._loss = (
@@ -276,10 +346,6 @@ class Amplifier:
     def _raise_if_lost(self) -> None:
         if self._loss is not None:
             raise LinkError(self._loss)
-
-
-def _is_busy(reply: Reply) -> bool:
-    return isinstance(reply, Nak) and reply.code is NakCode.BUSY
 
 
 def _safe(safe: SafeCommand) -> SafeCommand:

@@ -13,7 +13,7 @@ VERSIONS = ("numpy", "scipy", "scikit-fem", "pyfe3d", "ngsolve")
 
 
 def write_report(measured, agreement, *, peers, fastest, runs, folder: Path) -> None:
-    """Write benchmarks.md and benchmarks.png; measured holds medians by name."""
+    """Write benchmarks.md and pictures/benchmarks.png; measured holds medians by name."""
     ours = measured["nothing ours"]
     peer_first = measured[f"nothing {fastest}"]
     peer_again = measured[f"layout {fastest}"]
@@ -108,12 +108,12 @@ points for every set of active ERAs of every layout:
 
 Factoring every layout again, {name} would take {hours:.1f} hours on both cores, by its time above.
 
-![Times of era-haptics and its peers](benchmarks.png)
+![Times of era-haptics and its peers](pictures/benchmarks.png)
 """
     (folder / "benchmarks.md").write_text(page)
     figure = _picture(measured, peers)
     FigureCanvasAgg(figure)
-    figure.savefig(folder / "benchmarks.png", dpi=130)
+    figure.savefig(folder / "pictures" / "benchmarks.png", dpi=130)
 
 
 def _picture(measured, peers) -> Figure:

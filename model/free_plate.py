@@ -9,14 +9,15 @@ as small as their number for each frequency, whatever the mesh.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
-from scipy import sparse
 
 from model.actuator import Era
 from model.arrays import ComplexArray, FloatArray
 from model.assembly import element_matrices, era_positions
+from model.attachments import TERMS, Attachments, AttachmentSolver
 from model.class_modes import ClassModes, solve_class
 from model.errors import InputError
 from model.harmonic import check_frequencies, hold_and_drive
@@ -28,27 +29,6 @@ from model.truncation import truncation_error, truncation_weights
 
 # Modes are kept up to this multiple of the highest frequency asked for.
 FREQUENCY_MARGIN = 2.0
-
-# Solves for each point. A field then converges with their number, a receptance between attachments
-# with twice that, since it can be had from inner products of what was solved.
-TERMS = 4
-
-# Memory for solved points [bytes]; beyond it the oldest are forgotten.
-KEPT_BYTES = 512 << 20
-KEPT_RASTERS = 4  # and sets of points that answers were asked for
-
-
-@dataclass(frozen=True, eq=False)
-class Attachments:
-    """Points where forces act on a free plate, with what has been solved for them.
-
-    shapes: (n, r) of the modes; residuals: by symmetry class, (n, TERMS, size); moments: (2 TERMS,
-    n, n) receptances of all truncated modes together with their u / u_c to the power 1, 2, ...
-    """
-
-    shapes: FloatArray
-    residuals: tuple[FloatArray, ...]
-    moments: FloatArray
 
 
 @dataclass(frozen=True)
@@ -75,44 +55,21 @@ class FreePlate:
     frequency_max: float
     shift: float
     classes: tuple[ClassModes, ...]
-    _solved: dict[tuple[float, float], tuple[FloatArray, ...]] = field(default_factory=dict)
-    _observed: dict[bytes, tuple[FloatArray, tuple[sparse.csr_array, ...]]] = field(
-        default_factory=dict
-    )
 
     @property
     def squared(self) -> FloatArray:
         """omega² of the modes (r,) [rad²/s²], class by class; the first of a class may be 0."""
         return np.concatenate([part.squared for part in self.classes])
 
+    @cached_property
+    def attachments(self) -> AttachmentSolver:
+        """What has been solved for the points where forces act."""
+        return AttachmentSolver(self.mesh, self.classes, scale=self.largest_truncated)
+
     @property
     def largest_truncated(self) -> float:
         """1 / (lambda + shift) of the lowest mode left out [s²/rad²]."""
         return 1 / (min(part.next_squared for part in self.classes) + self.shift)
-
-    def attach(self, points: FloatArray) -> Attachments:
-        """Solve for forces at points [m] (n, 2), as far as they have not been solved for."""
-        points = np.asarray(points, dtype=float).reshape(-1, 2)
-        keys = [(float(x), float(y)) for x, y in points]
-        unknown = [key for key in dict.fromkeys(keys) if key not in self._solved]
-        if unknown:
-            self._solve_for(unknown)
-        known = [self._solved[key] for key in keys]
-        count = len(points)
-        shapes, residuals, moments = [], [], np.zeros((2 * TERMS, count, count))
-        for number, part in enumerate(self.classes):
-            size = part.symmetry.size
-            solved = np.array([each[number] for each in known]).reshape(count, TERMS + 1, size)
-            force, residual = solved[:, 0], solved[:, 1:]
-            flat = residual.reshape(-1, size)
-            inner = (flat @ (part.mass @ flat.T)).reshape(count, TERMS, count, TERMS)
-            moments[0] += force @ residual[:, 0].T
-            for power in range(2, 2 * TERMS + 1):
-                moments[power - 1] += inner[:, power // 2 - 1, :, (power + 1) // 2 - 1]
-            shapes.append(force @ part.vectors)
-            residuals.append(residual)
-        self._forget()
-        return Attachments(np.hstack(shapes), tuple(residuals), moments)
 
     def acceleration(
         self,
@@ -143,7 +100,7 @@ class FreePlate:
         """
         omega = self._omega(frequencies)
         hold, drive = hold_and_drive(eras, loads, omega)
-        attached = self.attach(np.vstack([era_positions(eras), load_positions(loads)]))
+        attached = self.attachments.solve(np.vstack([era_positions(eras), load_positions(loads)]))
         count = len(hold[0])
         answers, weights = self._answers(omega, TERMS)
 
@@ -154,7 +111,7 @@ class FreePlate:
         residual = np.asarray(weights[:, :, None, None] * unit[:, None], dtype=complex)
         coordinates = np.concatenate([modal, residual.reshape(len(omega), -1, count)], axis=1)
         driven = coordinates[:, :, : len(eras)] * drive[:, None, :]
-        displacement = _apply(self.basis(attached, points), driven)
+        displacement = _apply(self.attachments.basis(attached, points), driven)
         acceleration = -(omega**2)[:, None, None] * displacement
 
         size = _field_size(modal, residual, attached.moments)
@@ -181,10 +138,10 @@ class FreePlate:
         `respond` does.
         """
         omega = self._omega(frequencies)
-        attached = self.attach(np.vstack([places, load_positions(loads)]))
+        attached = self.attachments.solve(np.vstack([places, load_positions(loads)]))
         count = len(attached.shapes)
         answers, weights = self._answers(omega, TERMS)
-        basis = self.basis(attached, points)
+        basis = self.attachments.basis(attached, points)
         shapes, residual = np.split(basis, [len(self.squared)], axis=1)
         to_points = _apply(shapes, answers[:, :, None] * attached.shapes.T)
         to_points += np.tensordot(weights, residual.reshape(-1, TERMS, count).T, axes=(1, 1))
@@ -232,52 +189,6 @@ class FreePlate:
                 f"{frequencies.max():g} Hz; solve it with a higher frequency_max"
             )
         return 2 * np.pi * frequencies
-
-    def basis(self, attached: Attachments, points: FloatArray) -> FloatArray:
-        """Deflection at points by modes and by residual vectors, (p, r + TERMS n).
-
-        Residual vectors come term by term, each for all attachments.
-        """
-        shapes, maps = self._observe(np.asarray(points, dtype=float))
-        extra = np.zeros((len(shapes), TERMS * len(attached.shapes)))
-        for each, residual in zip(maps, attached.residuals, strict=True):
-            extra += each @ residual.transpose(2, 1, 0).reshape(residual.shape[2], -1)
-        return np.hstack([shapes, extra])
-
-    def _observe(self, points: FloatArray) -> tuple[FloatArray, tuple[sparse.csr_array, ...]]:
-        """Mode shapes at points (p, r), and by class the map to deflections there; kept a while."""
-        key = points.tobytes()
-        if key not in self._observed:
-            interpolation = self.mesh.interpolation(points)
-            maps = tuple(
-                sparse.csr_array(interpolation @ part.symmetry.spread) for part in self.classes
-            )
-            pairs = zip(maps, self.classes, strict=True)
-            shapes = np.hstack([each @ part.vectors for each, part in pairs])
-            if len(self._observed) >= KEPT_RASTERS:
-                self._observed.clear()
-            self._observed[key] = shapes, maps
-        return self._observed[key]
-
-    def _solve_for(self, points: list[tuple[float, float]]) -> None:
-        """For each point and class its force, then sums of phi (u / u_c)^j: (1 + TERMS, size)."""
-        interpolation = self.mesh.interpolation(np.array(points))
-        solved = [
-            part.residuals(
-                (interpolation @ part.symmetry.spread).toarray(),
-                terms=TERMS,
-                scale=self.largest_truncated,
-            )
-            for part in self.classes
-        ]
-        for number, point in enumerate(points):
-            self._solved[point] = tuple(each[number].copy() for each in solved)
-
-    def _forget(self) -> None:
-        """Drop the oldest solved points where they take too much memory."""
-        size = 8 * (TERMS + 1) * sum(part.symmetry.size for part in self.classes)
-        while len(self._solved) * size > KEPT_BYTES:
-            del self._solved[next(iter(self._solved))]
 
 
 def _apply(basis: FloatArray, coordinates: ComplexArray) -> ComplexArray:

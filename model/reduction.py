@@ -47,8 +47,8 @@ def reduce_plate(
     frequency_max [Hz]: up to where the response shall hold; modes well above it are kept.
     """
     free = solve_free_plate(plate, mesh, frequency_max=frequency_max)
-    attached = free.attach(attachments)
-    basis = free.basis(attached, mesh.nodes)
+    attached = free.attachments.solve(attachments)
+    basis = free.attachments.basis(attached, mesh.nodes)
     modes = len(free.squared)
     count = len(attached.shapes)
 

@@ -85,6 +85,7 @@ def test_any_layout_at_any_frequency_agrees_with_the_direct_solve(free):
 def test_the_estimate_covers_poor_answers_at_resonances_too(monkeypatch):
     """One solve a point: what couples stiff ERAs is then poor, and resonances amplify that."""
     monkeypatch.setattr("model.free_plate.TERMS", 1)
+    monkeypatch.setattr("model.attachments.TERMS", 1)
     plate = Plate(LENGTH, WIDTH, 0.0015, ALUMINIUM, loss_factor=1e-3)
     mesh = MESHES["24x18"]
     free = solve_free_plate(plate, mesh)
@@ -208,3 +209,17 @@ def test_receptances_are_what_a_direct_solve_gives(free):
             (to_points[row], (matrices.deflection_at(points) @ field).T),
         ):
             assert np.linalg.norm(quick - exact) < 2e-6 * np.linalg.norm(exact)
+
+
+def test_what_is_forgotten_is_solved_again(monkeypatch):
+    """A plate that may keep no solved point answers as one that keeps them all."""
+    plate = Plate(LENGTH, WIDTH, 0.0015, ALUMINIUM)
+    frequencies = np.array([60.0, 470.0])
+    layouts = [random_eras(np.random.default_rng(seed), 4) for seed in (0, 1, 0)]
+    plates = [solve_free_plate(plate, MESHES["19x15"]) for _ in range(2)]
+    keeping = [plates[0].acceleration(eras, frequencies, plates[0].mesh.nodes) for eras in layouts]
+    monkeypatch.setattr("model.attachments.KEPT_BYTES", 0)
+    monkeypatch.setattr("model.attachments.KEPT_RASTERS", 1)
+    for eras, kept in zip(layouts, keeping, strict=True):
+        again = plates[1].acceleration(eras, frequencies, plates[1].mesh.nodes)
+        np.testing.assert_allclose(again, kept, rtol=1e-9)

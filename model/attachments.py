@@ -1,0 +1,119 @@
+"""What the modes that were left out add where forces act on the free plate.
+
+Solved with each symmetry class's factors when a point is first asked for, and kept.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import sparse
+
+from model.arrays import FloatArray
+from model.class_modes import ClassModes
+from model.mesh import Mesh
+
+# Solves for each point. A field then converges with their number, a receptance between attachments
+# with twice that, since it can be had from inner products of what was solved.
+TERMS = 4
+
+# Memory for solved points [bytes]; beyond it the oldest are forgotten.
+KEPT_BYTES = 512 << 20
+KEPT_RASTERS = 4  # and sets of points that answers were asked for
+
+
+@dataclass(frozen=True, eq=False)
+class Attachments:
+    """Points where forces act on a free plate, with what has been solved for them.
+
+    shapes: (n, r) of the modes; residuals: by symmetry class, (n, TERMS, size); moments: (2 TERMS,
+    n, n) receptances of all truncated modes together with their u / u_c to the power 1, 2, ...
+    """
+
+    shapes: FloatArray
+    residuals: tuple[FloatArray, ...]
+    moments: FloatArray
+
+
+class AttachmentSolver:
+    """Solves for points of one plate, and remembers.
+
+    scale: u_c, 1 / (lambda + shift) of the lowest mode left out [s²/rad²].
+    """
+
+    def __init__(self, mesh: Mesh, classes: Sequence[ClassModes], *, scale: float) -> None:
+        self._mesh = mesh
+        self._classes = tuple(classes)
+        self._scale = scale
+        self._solved: dict[tuple[float, float], tuple[FloatArray, ...]] = {}
+        self._observed: dict[bytes, tuple[FloatArray, tuple[sparse.csr_array, ...]]] = {}
+
+    def solve(self, points: FloatArray) -> Attachments:
+        """Solve for forces at points [m] (n, 2), as far as they have not been solved for."""
+        points = np.asarray(points, dtype=float).reshape(-1, 2)
+        keys = [(float(x), float(y)) for x, y in points]
+        unknown = [key for key in dict.fromkeys(keys) if key not in self._solved]
+        if unknown:
+            self._solve_for(unknown)
+        known = [self._solved[key] for key in keys]
+        count = len(points)
+        shapes, residuals, moments = [], [], np.zeros((2 * TERMS, count, count))
+        for number, part in enumerate(self._classes):
+            size = part.symmetry.size
+            solved = np.array([each[number] for each in known]).reshape(count, TERMS + 1, size)
+            force, residual = solved[:, 0], solved[:, 1:]
+            flat = residual.reshape(-1, size)
+            inner = (flat @ (part.mass @ flat.T)).reshape(count, TERMS, count, TERMS)
+            moments[0] += force @ residual[:, 0].T
+            for power in range(2, 2 * TERMS + 1):
+                moments[power - 1] += inner[:, power // 2 - 1, :, (power + 1) // 2 - 1]
+            shapes.append(force @ part.vectors)
+            residuals.append(residual)
+        self._forget()
+        return Attachments(np.hstack(shapes), tuple(residuals), moments)
+
+    def basis(self, attached: Attachments, points: FloatArray) -> FloatArray:
+        """Deflection at points by modes and by residual vectors, (p, r + TERMS n).
+
+        Residual vectors come term by term, each for all attachments.
+        """
+        shapes, maps = self._observe(np.asarray(points, dtype=float))
+        extra = np.zeros((len(shapes), TERMS * len(attached.shapes)))
+        for each, residual in zip(maps, attached.residuals, strict=True):
+            extra += each @ residual.transpose(2, 1, 0).reshape(residual.shape[2], -1)
+        return np.hstack([shapes, extra])
+
+    def _observe(self, points: FloatArray) -> tuple[FloatArray, tuple[sparse.csr_array, ...]]:
+        """Mode shapes at points (p, r), and by class the map to deflections there; kept a while."""
+        key = points.tobytes()
+        if key not in self._observed:
+            interpolation = self._mesh.interpolation(points)
+            maps = tuple(
+                sparse.csr_array(interpolation @ part.symmetry.spread) for part in self._classes
+            )
+            pairs = zip(maps, self._classes, strict=True)
+            shapes = np.hstack([each @ part.vectors for each, part in pairs])
+            if len(self._observed) >= KEPT_RASTERS:
+                self._observed.clear()
+            self._observed[key] = shapes, maps
+        return self._observed[key]
+
+    def _solve_for(self, points: list[tuple[float, float]]) -> None:
+        """For each point and class its force, then sums of phi (u / u_c)^j: (1 + TERMS, size)."""
+        interpolation = self._mesh.interpolation(np.array(points))
+        solved = [
+            part.residuals(
+                (interpolation @ part.symmetry.spread).toarray(),
+                terms=TERMS,
+                scale=self._scale,
+            )
+            for part in self._classes
+        ]
+        for number, point in enumerate(points):
+            self._solved[point] = tuple(each[number].copy() for each in solved)
+
+    def _forget(self) -> None:
+        """Drop the oldest solved points where they take too much memory."""
+        size = 8 * (TERMS + 1) * sum(part.symmetry.size for part in self._classes)
+        while len(self._solved) * size > KEPT_BYTES:
+            del self._solved[next(iter(self._solved))]

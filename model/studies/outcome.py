@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 
 from model.activation import STATISTICS
-from model.csv_file import Columns, write_columns
+from model.csv_file import Column, Columns, write_columns
 from model.document import Value
 from model.figures import save_figure
 from model.rig import Rig
 from model.studies.cases import Cases
 from model.studies.pictures import PICTURES
-from model.studies.ranking import Ranking
+from model.studies.ranking import Ranking, era_counts
 from model.studies.solve import DRIVE_NAMES, DRIVES, CaseResults
 from model.studies.wording import in_words, rig_yaml
 
@@ -77,19 +77,23 @@ def case_summary(rig: Rig, ranking: Ranking, case: int) -> dict[str, object]:
 
 def all_columns(cases: Cases, results: CaseResults) -> Columns:
     """Every case and drive, one a row."""
-    columns: dict[str, list[object]] = {
-        name: [] for name in ("layout", "eras", "stiffness_factor", "at_m", "driven", "active")
-    }
+    at = [
+        " ".join(f"({x:.6g};{y:.6g})" for x, y in cases.positions_of(case).tolist())
+        for case in range(len(cases))
+    ]
     rows, drives = np.nonzero(~np.isnan(results.statistics[..., 0]))
-    for case, drive in zip(rows.tolist(), drives.tolist(), strict=True):
-        positions = cases.positions_of(case)
-        columns["layout"].append(cases.names[case])
-        columns["eras"].append(len(positions))
-        columns["stiffness_factor"].append(float(cases.stiffness_factors[case]))
-        columns["at_m"].append(" ".join(f"({x:.6g};{y:.6g})" for x, y in positions))
-        columns["driven"].append(DRIVES[drive])
-        active = results.active_eras(case, drive)
-        columns["active"].append("+".join(str(era + 1) for era in active))
+    pairs = list(zip(rows.tolist(), drives.tolist(), strict=True))
+    columns: dict[str, Column] = {
+        "layout": [cases.names[case] for case in rows],
+        "eras": era_counts(cases)[rows],
+        "stiffness_factor": cases.stiffness_factors[rows],
+        "at_m": [at[case] for case in rows],
+        "driven": [DRIVES[drive] for drive in drives],
+        "active": [
+            "+".join(str(era + 1) for era in results.active_eras(case, drive))
+            for case, drive in pairs
+        ],
+    }
     statistics = results.statistics[rows, drives]
     return columns | {
         f"{name.replace(' ', '_')}{'' if name == STATISTICS[-1] else '_m_s2'}": statistics[:, k]

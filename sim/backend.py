@@ -7,13 +7,15 @@ one plate needs the far end as a process (`era sim`). Not modelled: the time a w
 import asyncio
 import contextlib
 import time
+from collections.abc import Callable
 from pathlib import Path
 from urllib.parse import parse_qsl, unquote
 
 from drivers.backend import Backend
 from drivers.errors import CommandError, LinkError
-from drivers.guard import SafeCommand
-from drivers.protocol.messages import Apply, Reply, Request, Stage
+from drivers.guard import SafeCommand, SafeEnvelope
+from drivers.protocol.messages import Apply, Event, LoadEnvelope, Reply, Request, Stage
+from drivers.statistics import WireCounters
 from model.errors import InputError
 from model.rig_file import load_rig
 from sim.bench import Bench
@@ -43,6 +45,17 @@ class SimulatedBackend(Backend):
         self._open: contextlib.AsyncExitStack | None = None
         self._exchange: Exchange | None = None
         self._last_sent = 0.0
+        self._counters = WireCounters()
+        self._on_event: Callable[[Event], None] = lambda event: None
+
+    @property
+    def counters(self) -> WireCounters:
+        """Requests and replies; nothing is ever damaged here."""
+        return self._counters
+
+    def listen(self, on_event: Callable[[Event], None], on_loss: Callable[[str], None]) -> None:
+        """Whom to tell of events; nothing is ever lost here."""
+        self._on_event = on_event
 
     @property
     def last_sent(self) -> float:
@@ -65,6 +78,7 @@ class SimulatedBackend(Backend):
             task = asyncio.create_task(keep_time(bench), name=f"simulated plate of {self._url}")
             stack.push_async_callback(_cancel, task)
             self._exchange = exchange_with(bench, name)
+            bench.amplifiers[name].listeners.append(self._tell)
             self._open = stack.pop_all()
 
     async def close(self) -> None:
@@ -76,15 +90,17 @@ class SimulatedBackend(Backend):
 
     async def exchange(self, request: Request, *, timeout: float) -> Reply:
         """Hand a request over; the answer is there at once. LinkError if it is not open."""
-        if isinstance(request, Stage | Apply) and type(request.command_set) is not SafeCommand:
-            raise TypeError(
-                f"only a SafeCommand is played, not a {type(request.command_set).__name__}: "
-                "let Guard.check make one"
-            )
+        _require_safe(request)
         if self._exchange is None:
             raise LinkError(f"{self._url} is not open")
         self._last_sent = time.monotonic()
+        self._counters.frames_out += 1
+        self._counters.frames_in += 1
         return self._exchange(request)
+
+    def _tell(self, event: Event, moment: float) -> None:
+        self._counters.events += 1
+        self._on_event(event)
 
     def _name(self, names: tuple[str, ...]) -> str:
         if self._amplifier is None and len(names) == 1:
@@ -94,6 +110,21 @@ class SimulatedBackend(Backend):
         raise CommandError(
             f"{self._url}: the rig has the amplifiers {', '.join(names)}; name one of them with "
             "amplifier=NAME"
+        )
+
+
+def _require_safe(request: Request) -> None:
+    match request:
+        case Stage(command_set=asked) | Apply(command_set=asked):
+            is_safe = type(asked) is SafeCommand
+        case LoadEnvelope(envelope=asked):
+            is_safe = type(asked) is SafeEnvelope
+        case _:
+            return
+    if not is_safe:
+        raise TypeError(
+            f"only a SafeCommand or a SafeEnvelope is played, not a {type(asked).__name__}: "
+            "let a Guard make one"
         )
 
 

@@ -70,3 +70,9 @@ async def far_side(wire: Wire, rig: Rig, *, seed: int = 0) -> AsyncIterator[FarS
         finally:
             for station in stations:
                 station.close()
+
+
+PROCESS_WIRES: Mapping[str, Sequence[str]] = {
+    "serial": ["--serial"],
+}
+"""The same as options of `era sim`, for a far end that is a process of its own."""

@@ -13,7 +13,7 @@ LEVEL = 0.2
 """At which channels vibrate: felt by a finger, and far from any limit."""
 
 CALM = 2.0  # s; a watchdog that does not trip while a check goes on, where there is one so long
-_PATIENCE = 5.0  # s; for what comes by itself
+PATIENCE = 5.0  # s; for what comes by itself
 LEVEL_ERROR = 0.002  # of full stroke; of an amplifier that measures
 
 
@@ -77,14 +77,14 @@ class Bench:
         """Ask until the status is as wanted; feed: whether asking feeds the watchdog."""
         ask = self.amplifier.heartbeat if feed else self.amplifier.status
         try:
-            async with asyncio.timeout(_PATIENCE):
+            async with asyncio.timeout(PATIENCE):
                 while True:
                     status = await ask()
                     if reached(status):
                         return status
                     await asyncio.sleep(0.005)
         except TimeoutError:
-            raise ContractBroken(f"{what} did not happen within {_PATIENCE:g} s") from None
+            raise ContractBroken(f"{what} did not happen within {PATIENCE:g} s") from None
 
     async def refused(self, call: Awaitable[object], *, what: str) -> None:
         """The amplifier must say no."""

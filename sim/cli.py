@@ -25,6 +25,18 @@ def sim(
     serial: Annotated[
         bool, typer.Option("--serial", help="Put every amplifier on a pseudo-terminal.")
     ] = False,
+    modbus_tcp: Annotated[
+        int | None,
+        typer.Option(
+            metavar="PORT",
+            help="Modbus TCP on this port of the loopback interface; 0: any.",
+            min=0,
+            max=65535,
+        ),
+    ] = None,
+    modbus_rtu: Annotated[
+        bool, typer.Option("--modbus-rtu", help="Modbus RTU, all on one pseudo-terminal.")
+    ] = False,
     shared: Annotated[
         bool, typer.Option("--shared", help="All amplifiers on one line, at addresses 1, 2, ...")
     ] = False,
@@ -56,11 +68,26 @@ def sim(
     from sim.process import run_far_end
     from sim.wires import Wire
 
-    if not serial:
-        raise InputError("which wire? add --serial to put the amplifiers on pseudo-terminals")
+    chosen = {
+        "serial": serial,
+        "modbus-tcp": modbus_tcp is not None,
+        "modbus-rtu": modbus_rtu,
+    }
+    kinds = [kind for kind, is_chosen in chosen.items() if is_chosen]
+    if len(kinds) != 1:
+        raise InputError(
+            "which wire? add one of --serial (a pseudo-terminal each), --modbus-tcp PORT and "
+            "--modbus-rtu"
+        )
     loaded = load_rig(rig)
     schedule = load_faults(faults, amplifiers=loaded.amplifiers) if faults else FaultFile(())
-    wire = Wire("serial", speed=speed, shared=shared, unpluggable=faults is not None)
+    wire = Wire(
+        kinds[0],
+        speed=speed,
+        port=modbus_tcp or 0,
+        shared=shared,
+        unpluggable=faults is not None,
+    )
     positions = {
         str(number): parse_point(text, what="--finger")
         for number, text in enumerate(finger or [], start=1)

@@ -52,4 +52,32 @@ async def _serial(wire: Wire, stations: Sequence[Station]) -> AsyncIterator[Mapp
         yield urls
 
 
-_OPENERS: Mapping[str, Callable[[Wire, Sequence[Station]], FarEnd]] = {"serial": _serial}
+@asynccontextmanager
+async def _modbus_tcp(wire: Wire, stations: Sequence[Station]) -> AsyncIterator[Mapping[str, str]]:
+    from sim.modbus_end import ModbusTcpEnd
+
+    end = ModbusTcpEnd(stations, port=wire.port)
+    try:
+        await end.start()
+        yield end.urls
+    finally:
+        await end.close()
+
+
+@asynccontextmanager
+async def _modbus_rtu(wire: Wire, stations: Sequence[Station]) -> AsyncIterator[Mapping[str, str]]:
+    from sim.modbus_end import ModbusRtuEnd
+
+    end = ModbusRtuEnd(stations, speed=wire.speed, unpluggable=wire.unpluggable)
+    try:
+        end.start()
+        yield end.urls
+    finally:
+        end.close()
+
+
+_OPENERS: Mapping[str, Callable[[Wire, Sequence[Station]], FarEnd]] = {
+    "serial": _serial,
+    "modbus-tcp": _modbus_tcp,
+    "modbus-rtu": _modbus_rtu,
+}

@@ -1,0 +1,206 @@
+"""An amplifier that speaks Modbus, over TCP or RTU.
+
+A request is one transaction, FC23: a block is written and one read back. An amplifier that cannot
+do that is found out by the first one and gets FC16 and FC4 in turn from then on. Why a write was
+refused is read afterwards. Every write carries a tag that is read back, so that no late answer is
+taken for another; identity and capabilities do not change and are read without one.
+
+An amplifier cannot speak unasked here: events are what its answers show to have changed.
+"""
+
+import secrets
+from collections.abc import Callable
+
+from drivers.backend import Backend
+from drivers.backends.modbus_frames import Answer
+from drivers.backends.modbus_link import ModbusLink
+from drivers.backends.modbus_url import ModbusUrl
+from drivers.errors import LinkError, LinkTimeout
+from drivers.protocol import modbus_map
+from drivers.protocol.messages import (
+    Broadcast,
+    Capabilities,
+    Event,
+    Fault,
+    Nak,
+    NakCode,
+    Reply,
+    Request,
+    State,
+)
+from drivers.protocol.modbus_map import Exchange, Read, Write
+from drivers.protocol.modbus_timing import round_trip_time
+from drivers.statistics import WireCounters
+
+_ILLEGAL_FUNCTION = 1
+_GATEWAY = (10, 11)  # a gateway has no path to the amplifier, or heard nothing from it
+_TAGS = (1 << 16) - 1
+
+
+class ModbusBackend(Backend):
+    """Carries requests over a Modbus line given by its URL (see `ModbusUrl`)."""
+
+    def __init__(self, url: str) -> None:
+        self._url = ModbusUrl.parse(url)
+        self._link: ModbusLink | None = None
+        # Not from zero, so that an answer to an earlier run is no answer to this one.
+        self._tag = secrets.randbelow(_TAGS)
+        self._can_read_back = True
+        self._channels: int | None = None
+        self._condition: tuple[State, Fault] | None = None
+        self._on_event: Callable[[Event], None] = _ignore
+        self._on_loss: Callable[[str], None] = _ignore
+        self._last_sent = 0.0
+        self._counters = WireCounters()
+
+    @property
+    def counters(self) -> WireCounters:
+        """What was seen on the line, by all who share it."""
+        return self._counters
+
+    @property
+    def last_sent(self) -> float:
+        """When the operating system took the last request's bytes, on time.monotonic() [s]."""
+        return self._last_sent
+
+    @property
+    def bus(self) -> str:
+        """The line, whose units a broadcast reaches."""
+        return f"modbus {self._url.place}"
+
+    def round_trip(self, channels: int) -> float:
+        """Time [s] on a serial line of an apply of so many channels and its answer; else 0."""
+        if not self._url.device:
+            return 0.0
+        bits = self._url.bits_per_byte
+        return round_trip_time(channels, baud=self._url.baud, bits_per_byte=bits)
+
+    def listen(self, on_event: Callable[[Event], None], on_loss: Callable[[str], None]) -> None:
+        """Whom to tell of changes that an answer shows, and of the end of the line."""
+        self._on_event, self._on_loss = on_event, on_loss
+
+    async def open(self) -> None:
+        """Open the line, or join those who have it open in this process; raises LinkError."""
+        if self._link is not None:
+            return
+        self._condition = None
+        self._link = await ModbusLink.of(self._url.line, self, self._lost)
+        self._counters = self._link.counters
+
+    async def close(self) -> None:
+        """Leave the line; the last one closes it."""
+        link, self._link = self._link, None
+        if link is not None:
+            link.leave(self)
+
+    async def exchange(self, request: Request, *, timeout: float) -> Reply:
+        """Send a request and wait for its reply; LinkTimeout, LinkError or FrameError.
+
+        timeout [s]: what the amplifier may take; the time on a serial line comes on top of it.
+        """
+        records = 0
+        while True:
+            tag = self._next_tag()
+            exchange = self._exchange_of(request, tag, records)
+            answer = await self._carry_out(exchange, tag, timeout)
+            if answer.exception:
+                return await self._refusal(answer, tag, timeout)
+            self._look_at(request, answer)
+            beyond = modbus_map.faults_beyond(request, answer.registers)
+            if records or not beyond:
+                break
+            records = beyond
+        reply = modbus_map.to_reply(request, answer.registers)
+        if isinstance(reply, Capabilities):
+            self._channels = reply.channels
+        return reply
+
+    async def broadcast(self, request: Broadcast) -> None:
+        """Write a commit or a stop to all units of the line at once; nobody answers."""
+        link = self._opened()
+        await link.broadcast(modbus_map.to_broadcast(request))
+        self._last_sent = link.last_sent
+
+    def _next_tag(self) -> int:
+        self._tag = self._tag % _TAGS + 1
+        return self._tag
+
+    def _exchange_of(self, request: Request, tag: int, records: int) -> Exchange:
+        options = {}
+        if self._channels is not None:
+            options["channels"] = self._channels
+        if records:
+            options["records"] = records
+        return modbus_map.to_exchange(request, tag=tag, **options)
+
+    async def _carry_out(self, exchange: Exchange, tag: int, timeout: float) -> Answer:
+        read, write = exchange.read, exchange.write
+        if write is None:
+            return await self._transact(read, None, timeout, tag=None)
+        if self._can_read_back:
+            answer = await self._transact(read, write, timeout, tag=tag)
+            if answer.exception != _ILLEGAL_FUNCTION:
+                return answer
+            self._can_read_back = False
+        answer = await self._transact(None, write, timeout, tag=None)
+        return answer if answer.exception else await self._transact(read, None, timeout, tag=tag)
+
+    async def _transact(
+        self, read: Read | None, write: Write | None, timeout: float, *, tag: int | None
+    ) -> Answer:
+        def accept(answer: Answer) -> bool:
+            if answer.exception or read is None:
+                return True
+            return modbus_map.is_of(answer.registers, tag=tag)
+
+        link = self._opened()
+        try:
+            answer = await link.transact(
+                read, write, unit=self._url.unit, timeout=timeout, accept=accept
+            )
+        finally:
+            self._last_sent = link.last_sent
+        if answer.exception in _GATEWAY:
+            raise LinkTimeout(
+                f"the gateway at {self._url.place} gets no answer from unit {self._url.unit}; "
+                "check that the amplifier is switched on and has this unit"
+            )
+        return answer
+
+    async def _refusal(self, answer: Answer, tag: int, timeout: float) -> Nak:
+        """Why a write was refused; exceptions that only one refusal leads to need no asking."""
+        if answer.exception == _ILLEGAL_FUNCTION:
+            return Nak(NakCode.UNKNOWN_TYPE)
+        only = modbus_map.nak_of_exception(answer.exception)
+        if only is not None and only.code is NakCode.BUSY:
+            return only
+        told = await self._transact(modbus_map.refusal_read(), None, timeout, tag=None)
+        nak = None if told.exception else modbus_map.to_nak(told.registers, tag=tag)
+        if nak is not None:
+            return nak
+        # Not of this write: a late exception to an earlier one, so this one's answer was missed.
+        raise LinkTimeout(
+            f"unit {self._url.unit} on {self._url.place} answered with Modbus exception "
+            f"{answer.exception} and names no reason for it"
+        )
+
+    def _look_at(self, request: Request, answer: Answer) -> None:
+        """Tell who listens what an answer shows to have changed."""
+        condition = modbus_map.condition(request, answer.registers)
+        if condition is None or condition == self._condition:
+            return
+        before, self._condition = self._condition, condition
+        if before is not None:
+            self._on_event(Event(*condition))
+
+    def _opened(self) -> ModbusLink:
+        if self._link is None:
+            raise LinkError(f"{self._url.place} is not open")
+        return self._link
+
+    def _lost(self, what: str) -> None:
+        self._on_loss(what)
+
+
+def _ignore(_: object) -> None:
+    pass

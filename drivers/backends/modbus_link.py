@@ -1,0 +1,202 @@
+"""One Modbus line, for all amplifiers of this process that are on it: a telegram at a time.
+
+Over RTU the line is silent for 3.5 characters before a telegram. Where nobody waits any more for an
+answer it is given the time to come all the same, or it would run into the next telegram.
+"""
+
+import asyncio
+import contextlib
+import time
+from collections.abc import Callable
+from weakref import WeakKeyDictionary
+
+from drivers.backends.modbus_frames import Answer, AnswerReader, Telegram, make_telegram
+from drivers.backends.modbus_stream import Stream, open_stream
+from drivers.backends.modbus_url import ModbusUrl
+from drivers.errors import LinkError, LinkTimeout
+from drivers.protocol.definition import PROTOCOL
+from drivers.protocol.modbus_map import Read, Write
+from drivers.protocol.modbus_timing import silence
+from drivers.statistics import WireCounters
+
+_REACTION: float = PROTOCOL.modbus["reaction"]
+_BROADCAST: int = PROTOCOL.modbus["broadcast"]
+_TRANSACTIONS = 1 << 16
+_RTU_OVERHEAD = 3  # bytes of an answer around its PDU
+
+_links: "WeakKeyDictionary[asyncio.AbstractEventLoop, dict[ModbusUrl, ModbusLink]]" = (
+    WeakKeyDictionary()
+)
+
+
+class ModbusLink:
+    """An open line; made by `ModbusLink.of`, closed when the last who uses it has left."""
+
+    def __init__(self, line: ModbusUrl) -> None:
+        self.line = line
+        self.counters = WireCounters()
+        self.last_sent = 0.0
+        self._stream: Stream | None = None
+        self._opening = asyncio.Lock()
+        self._turn = asyncio.Lock()
+        self._reader = AnswerReader(is_rtu=line.is_rtu, counters=self.counters)
+        self._users: dict[object, Callable[[str], None]] = {}
+        self._loss: str | None = None
+        self._transaction = 0
+        self._telegram: Telegram | None = None
+        self._accept: Callable[[Answer], bool] = _any
+        self._answer: asyncio.Future[Answer] | None = None
+        # Of a serial line: when it is free again, at the latest where an answer is owed.
+        self._free_from = 0.0
+        self._is_owed = False
+        self._came = asyncio.Event()
+        self._gap = 0.0
+        if line.device:
+            self._gap = silence(baud=line.baud, bits_per_byte=line.bits_per_byte)
+
+    @classmethod
+    async def of(
+        cls, line: ModbusUrl, user: object, on_loss: Callable[[str], None]
+    ) -> "ModbusLink":
+        """The link of a line, opened if it is not; on_loss: see `Backend.listen`."""
+        links = _links.setdefault(asyncio.get_running_loop(), {})
+        link = links.get(line)
+        if link is None or link._loss is not None:
+            link = links[line] = cls(line)
+        link._users[user] = on_loss
+        try:
+            async with link._opening:
+                if link._stream is None:
+                    link._stream = await open_stream(line, link._received, link._lost)
+        except BaseException:
+            link.leave(user)
+            raise
+        return link
+
+    def leave(self, user: object) -> None:
+        """Use it no more; safe to call twice."""
+        self._users.pop(user, None)
+        if self._users:
+            return
+        self._lose(f"{self.line.place} was closed")
+        links = _links.get(asyncio.get_running_loop(), {})
+        if links.get(self.line) is self:
+            del links[self.line]
+        stream, self._stream = self._stream, None
+        if stream is not None:
+            stream.close()
+
+    async def transact(
+        self,
+        read: Read | None,
+        write: Write | None,
+        *,
+        unit: int,
+        timeout: float,
+        accept: Callable[[Answer], bool],
+    ) -> Answer:
+        """Write, read, or both in one transaction, and wait for the answer.
+
+        accept: whether an answer in the right form is the right one. timeout [s]: what the
+        amplifier may take; the time on a serial line comes on top of it. Raises LinkTimeout,
+        LinkError.
+        """
+        async with self._turn:
+            await self._await_silence()
+            self._transaction = (self._transaction + 1) % _TRANSACTIONS
+            telegram = make_telegram(
+                read,
+                write,
+                unit=unit,
+                transaction=0 if self.line.is_rtu else self._transaction,
+                is_rtu=self.line.is_rtu,
+            )
+            self._telegram, self._accept = telegram, accept
+            self._answer = asyncio.get_running_loop().create_future()
+            on_line = self._time_of(len(telegram.frame) + _RTU_OVERHEAD + telegram.answer_size)
+            on_line += 2 * self._gap  # before the answer, and for the far end to see its end
+            try:
+                self._send(telegram.frame)
+                self._is_owed = True
+                self._free_from = self.last_sent + on_line + _REACTION
+                async with asyncio.timeout(timeout + on_line):
+                    return await self._answer
+            except LinkError:
+                raise
+            except TimeoutError:
+                raise LinkTimeout(
+                    f"no answer from unit {unit} on {self.line.place} within {timeout * 1e3:g} ms; "
+                    "check that the amplifier is switched on and has this unit"
+                    + (f" and {self.line.baud} baud" if self.line.device else "")
+                ) from None
+            finally:
+                self._answer = None
+
+    async def broadcast(self, write: Write) -> None:
+        """Write to all units; nobody answers."""
+        async with self._turn:
+            await self._await_silence()
+            self._telegram = None
+            telegram = make_telegram(
+                None, write, unit=_BROADCAST, transaction=0, is_rtu=self.line.is_rtu
+            )
+            self._send(telegram.frame)
+            self._free_from = self.last_sent + self._time_of(len(telegram.frame)) + self._gap
+
+    def _send(self, frame: bytes) -> None:
+        if self._stream is None or self._loss is not None:
+            raise LinkError(self._loss or f"{self.line.place} is not open")
+        if self.line.is_rtu:
+            self._reader.clear()
+        self._is_owed = False
+        self._came.clear()
+        self._stream.write(frame)
+        self.last_sent = time.monotonic()
+        self.counters.frames_out += 1
+
+    async def _await_silence(self) -> None:
+        """Wait until a serial line is free."""
+        if not self.line.is_rtu:
+            return
+        if self._is_owed and (wait := self._free_from - time.monotonic()) > 0:
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(wait):
+                    await self._came.wait()
+        if (wait := self._free_from - time.monotonic()) > 0:
+            await asyncio.sleep(wait)
+
+    def _time_of(self, size: int) -> float:
+        """Time [s] that so many bytes take on a serial line."""
+        return size * self.line.bits_per_byte / self.line.baud if self.line.device else 0.0
+
+    def _received(self, data: bytes) -> None:
+        for answer in self._reader.feed(data, self._telegram):
+            if not self._accept(answer):
+                self.counters.foreign += 1
+                continue
+            self._is_owed = False
+            self._came.set()
+            if self._answer is None or self._answer.done():
+                self.counters.foreign += 1
+            else:
+                self._answer.set_result(answer)
+        if not self._is_owed:
+            self._free_from = time.monotonic() + self._gap
+
+    def _lost(self, what: str) -> None:
+        """The stream has found that it is gone."""
+        is_asked = self._answer is not None and not self._answer.done()
+        self._lose(what)
+        if not is_asked:
+            for on_loss in tuple(self._users.values()):
+                on_loss(what)
+
+    def _lose(self, what: str) -> None:
+        if self._loss is None:
+            self._loss = what
+        if self._answer is not None and not self._answer.done():
+            self._answer.set_exception(LinkError(self._loss))
+
+
+def _any(answer: Answer) -> bool:
+    return True

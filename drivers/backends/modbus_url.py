@@ -1,0 +1,113 @@
+"""Modbus amplifier URLs: modbus+tcp://HOST:PORT/UNIT and modbus+rtu:///dev/ttyS1?baud=115200#UNIT."""
+
+import re
+from dataclasses import dataclass, replace
+from urllib.parse import SplitResult, parse_qsl, unquote, urlsplit
+
+from drivers.errors import CommandError
+from drivers.protocol.definition import PROTOCOL
+
+_MAP = PROTOCOL.modbus
+_TCP_FORM = "modbus+tcp://HOST:PORT/UNIT"
+_RTU_FORM = "modbus+rtu:///dev/ttyS1?baud=115200#UNIT"
+_BAUD_MAX = 12_000_000  # the fastest USB adapters
+_PARITIES = {"even": "E", "odd": "O", "none": "N"}
+
+
+@dataclass(frozen=True)
+class ModbusUrl:
+    """Where a Modbus amplifier is: a host and port, or a serial device; and its unit there.
+
+    is_rtu: whether its frames are those of RTU, which a serial server passes on as well. baud,
+    parity (as pyserial names it) and stop bits are of a serial device.
+    """
+
+    is_rtu: bool
+    host: str = ""
+    port: int = 0
+    device: str = ""
+    baud: int = _MAP["baud"]
+    parity: str = "E"
+    stop: int = 1
+    unit: int = 0
+
+    @property
+    def line(self) -> "ModbusUrl":
+        """The same without the unit: what several amplifiers share."""
+        return replace(self, unit=0)
+
+    @property
+    def place(self) -> str:
+        """How to name the line to a person."""
+        return self.device or f"{self.host}:{self.port}"
+
+    @property
+    def bits_per_byte(self) -> int:
+        """On a serial line: start, eight data, parity, stop."""
+        return 9 + (self.parity != "N") + self.stop
+
+    @classmethod
+    def parse(cls, url: str) -> "ModbusUrl":
+        """Take a URL apart; CommandError says which part is wrong and what it should be."""
+        try:
+            parts = urlsplit(url)
+            _ = parts.port
+        except ValueError as problem:
+            raise CommandError(f"{url!r} is no Modbus URL: {problem}; use {_TCP_FORM}") from None
+        if parts.scheme == "modbus+tcp":
+            return _tcp(parts, url)
+        if parts.scheme == "modbus+rtu":
+            return _rtu(parts, url)
+        raise CommandError(f"{url!r} is no Modbus URL; use {_TCP_FORM} or {_RTU_FORM}")
+
+
+def _tcp(parts: SplitResult, url: str) -> ModbusUrl:
+    if not parts.hostname or parts.query or parts.fragment:
+        raise CommandError(f"{url!r}: a Modbus TCP URL has a host, a port and a unit: {_TCP_FORM}")
+    unit = _unit(unquote(parts.path).strip("/"), url)
+    return ModbusUrl(False, host=parts.hostname, port=parts.port or _MAP["tcp_port"], unit=unit)
+
+
+def _rtu(parts: SplitResult, url: str) -> ModbusUrl:
+    options = dict(parse_qsl(parts.query, keep_blank_values=True))
+    unknown = sorted(options.keys() - {"baud", "parity", "stop"})
+    if unknown:
+        raise CommandError(
+            f"{url!r}: unknown option {', '.join(unknown)}; a Modbus RTU URL has baud, parity and "
+            "stop"
+        )
+    device = unquote(parts.path)
+    if re.fullmatch(r"/COM\d+", device, re.IGNORECASE):
+        device = device[1:]
+    if parts.netloc:
+        if not parts.hostname or parts.port is None or device.strip("/"):
+            raise CommandError(f"{url!r} names no host and port; use modbus+rtu://HOST:PORT#UNIT")
+        device = ""
+    elif not device.strip("/"):
+        raise CommandError(f"{url!r} names no port; use {_RTU_FORM}")
+    parity = options.get("parity", "even")
+    if parity not in _PARITIES:
+        raise CommandError(f"{url!r}: parity is {parity!r}; it must be {', '.join(_PARITIES)}")
+    return ModbusUrl(
+        True,
+        host=parts.hostname or "",
+        port=parts.port or 0,
+        device=device,
+        baud=_whole(options.get("baud", str(_MAP["baud"])), "baud", high=_BAUD_MAX, url=url),
+        parity=_PARITIES[parity],
+        stop=_whole(options.get("stop", "1"), "stop", high=2, url=url),
+        unit=_unit(parts.fragment, url),
+    )
+
+
+def _unit(text: str, url: str) -> int:
+    unit: int = _MAP["unit"]
+    return _whole(text, "unit", high=_MAP["unit_max"], url=url) if text else unit
+
+
+def _whole(text: str, name: str, *, high: int, url: str) -> int:
+    if not (text.isascii() and text.isdigit() and len(text) < 10 and 1 <= int(text) <= high):
+        raise CommandError(
+            f"{url!r}: {name} is {text!r}; it must be a whole number from 1 to {high}"
+        )
+    return int(text)

@@ -1,0 +1,211 @@
+"""What stands in the register blocks of an amplifier, as a Modbus host reads them.
+
+Reading is total: registers become a message with every value in range, or FrameError.
+"""
+
+import struct
+from collections.abc import Iterable, Sequence
+from enum import IntEnum
+from typing import Any, TypeVar
+
+from drivers.command import DriveCommand
+from drivers.errors import FrameError
+from drivers.protocol.definition import PROTOCOL, Quantity
+from drivers.protocol.messages import (
+    Achieved,
+    Capabilities,
+    Fault,
+    FaultList,
+    FaultRecord,
+    Identity,
+    Loaded,
+    Nak,
+    NakCode,
+    State,
+    Status,
+)
+
+_MAP = PROTOCOL.modbus
+_Q = PROTOCOL.quantities
+_HEAD = len(_MAP["head"])
+_CHANNEL_SIZE: int = _MAP["channel_registers"]
+_FAULT_SIZE: int = _MAP["fault_registers"]
+_TEXT_SIZE: int = _MAP["text_registers"]
+_NO_CHANNEL = 255
+
+# Registers that are not named as their quantity is.
+_QUANTITIES: dict[str, Quantity] = {
+    **vars(_Q),
+    **dict.fromkeys(("frequency_min", "frequency_max", "frequency_step"), _Q.frequency),
+    **dict.fromkeys(("level_max", "level_step"), _Q.level),
+    **dict.fromkeys(("watchdog_min", "watchdog_max"), _Q.watchdog),
+    **dict.fromkeys(("envelope_step_min", "envelope_step_max"), _Q.envelope_step),
+    **{"ramp_max": _Q.ramp, "slot": _Q.envelope_slot, "step": _Q.envelope_step},
+}
+
+_EnumT = TypeVar("_EnumT", bound=IntEnum)
+
+
+def _fields(names: Sequence[str], registers: Sequence[int]) -> tuple[dict[str, int], Sequence[int]]:
+    """The named registers after the head, and what follows them."""
+    end = _HEAD + len(names)
+    if len(registers) < end:
+        raise FrameError(f"{len(registers)} registers were read where {end} are needed")
+    return dict(zip(names, registers[_HEAD:end], strict=True)), registers[end:]
+
+
+def _integer(name: str, register: int) -> int:
+    quantity = _QUANTITIES[name]
+    value = register - (1 << 16) if quantity.wire == "i16" and register >> 15 else register
+    if not quantity.holds(value):
+        raise FrameError(f"{name} {value} is not within {quantity.minimum}..{quantity.maximum}")
+    return value
+
+
+def _number(name: str, register: int) -> float:
+    return _QUANTITIES[name].from_wire(_integer(name, register))
+
+
+def _one_of(kind: type[_EnumT], register: int) -> _EnumT:
+    try:
+        return kind(register)
+    except ValueError:
+        raise FrameError(f"{register} is no {kind.__name__.lower()}") from None
+
+
+def _channel(register: int) -> int | None:
+    return None if register == _NO_CHANNEL else _integer("channel", register)
+
+
+def identity(registers: Sequence[int]) -> Identity:
+    """Who it is."""
+    block = _MAP["input"]["identity"]
+    found, rest = _fields(block["registers"], registers)
+    texts = {
+        name: _text(rest[number * _TEXT_SIZE : (number + 1) * _TEXT_SIZE])
+        for number, name in enumerate(block["texts"])
+    }
+    version = _integer("protocol_version", found["protocol_version"])
+    return Identity(protocol_version=version, **texts)
+
+
+def _text(registers: Sequence[int]) -> str:
+    raw = struct.pack(f">{len(registers)}H", *registers).rstrip(b"\0")
+    try:
+        text = raw.decode("utf-8")
+    except UnicodeDecodeError:
+        raise FrameError("a text that is not UTF-8") from None
+    if not text.isprintable():
+        raise FrameError("a text with control characters")
+    return text
+
+
+def capabilities(registers: Sequence[int]) -> Capabilities:
+    """What it can play."""
+    found, _ = _fields(_MAP["input"]["capabilities"]["registers"], registers)
+    _integer("protocol_version", found.pop("protocol_version"))
+    whole: dict[str, Any] = {
+        name: _integer(name, found.pop(name)) for name in ("envelope_knots", "envelope_slots")
+    }
+    channels = _integer("channel_count", found.pop("channel_count"))
+    numbers: dict[str, Any] = {name: _number(name, register) for name, register in found.items()}
+    return Capabilities(channels=channels, **numbers, **whole)
+
+
+def status(registers: Sequence[int]) -> Status:
+    """How it is."""
+    found, levels = _fields(_MAP["input"]["status"]["registers"], registers)
+    channels = _integer("channel_count", found["channel_count"])
+    if channels > len(levels):
+        raise FrameError(f"{channels} channels where {len(levels)} were read")
+    if found["high_voltage"] > 1:
+        raise FrameError(f"high_voltage is {found['high_voltage']}, neither 0 nor 1")
+    return Status(
+        state=_one_of(State, found["state"]),
+        fault=_one_of(Fault, found["fault"]),
+        token=_integer("active_token", found["active_token"]),
+        high_voltage=bool(found["high_voltage"]),
+        temperature=_number("temperature", found["temperature"]),
+        watchdog_left=_number("watchdog_left", found["watchdog_left"]),
+        levels=tuple(_number("level", register) for register in levels[:channels]),
+        voltage=_number("voltage", found["voltage"]),
+    )
+
+
+def _groups(registers: Sequence[int], size: int) -> Iterable[Sequence[int]]:
+    return (registers[at : at + size] for at in range(0, len(registers) - size + 1, size))
+
+
+def achieved(registers: Sequence[int]) -> Achieved:
+    """What it plays, or would; the channels that were named, in their order."""
+    found, rest = _fields(_MAP["input"]["achieved"]["registers"], registers)
+    if _integer("channel_count", found["channel_count"]) * _CHANNEL_SIZE > len(rest):
+        raise FrameError("the amplifier has more channels than were read")
+    commands = tuple(
+        _command(channel, group)
+        for channel, group in enumerate(_groups(rest, _CHANNEL_SIZE))
+        if any(group)
+    )
+    return Achieved(token=_integer("token", found["token"]), commands=commands)
+
+
+def _command(channel: int, group: Sequence[int]) -> DriveCommand:
+    frequency, level, phase, flags = group
+    shape = {
+        name: flags >> place["bit"] & (1 << place["bits"]) - 1
+        for name, place in _MAP["flags"].items()
+    }
+    return DriveCommand(
+        channel=channel,
+        frequency=_number("frequency", frequency),
+        level=_number("level", level),
+        phase=_number("phase", phase),
+        keep_phase=bool(shape["keep_phase"]),
+        onset=shape["onset"],
+        ending=shape["ending"],
+        skip_ending=bool(shape["skip_ending"]),
+    )
+
+
+def faults(registers: Sequence[int]) -> FaultList:
+    """What went wrong, as far as it was read; see `fault_count`."""
+    found, rest = _fields(_MAP["input"]["faults"]["registers"], registers)
+    count = _integer("fault_count", found["fault_count"])
+    records = list(_groups(rest, _FAULT_SIZE))[:count]
+    return FaultList(
+        tuple(
+            FaultRecord(
+                fault=_one_of(Fault, fault),
+                channel=_channel(channel),
+                age=_Q.age.from_wire(high << 16 | low),
+            )
+            for fault, channel, high, low in records
+        )
+    )
+
+
+def fault_count(registers: Sequence[int]) -> int:
+    """How many faults there are to be read."""
+    found, _ = _fields(_MAP["input"]["faults"]["registers"], registers)
+    return _integer("fault_count", found["fault_count"])
+
+
+def loaded(registers: Sequence[int]) -> Loaded:
+    """The envelope that was loaded last."""
+    found, _ = _fields(_MAP["holding"]["envelope"]["registers"], registers)
+    return Loaded(
+        slot=_integer("slot", found["slot"]),
+        knots=_integer("envelope_knots", found["envelope_knots"]),
+    )
+
+
+def refusal(registers: Sequence[int]) -> tuple[Nak, int]:
+    """Why a write was refused, and its tag."""
+    found, _ = _fields(_MAP["input"]["refusal"]["registers"], registers)
+    return Nak(_one_of(NakCode, found["nak"]), _channel(found["channel"])), found["refused_tag"]
+
+
+def condition(registers: Sequence[int]) -> tuple[State, Fault]:
+    """With which a status and what was achieved begin."""
+    found, _ = _fields(("state", "fault"), registers)
+    return _one_of(State, found["state"]), _one_of(Fault, found["fault"])

@@ -19,6 +19,11 @@ _CONNECT_TIMEOUT = 1.0  # s; an amplifier in the same building answers a hundred
 _WRITE_TIMEOUT = 0.02  # s; a frame fits into any driver's buffer unless the line is stuck
 _UNSENT_MAX = 4096  # bytes; sixteen frames that a peer does not take are no slow network any more
 _READ_MAX = 4096
+_FAILURES: tuple[type[Exception], ...] = (OSError, ValueError)  # of pyserial, at opening
+with contextlib.suppress(ImportError):  # Windows has no terminals
+    import termios
+
+    _FAILURES += (termios.error,)
 
 
 class Stream(Protocol):
@@ -171,7 +176,7 @@ async def _open_serial(
 ) -> Stream:
     try:
         port = await asyncio.to_thread(_open_port, line)
-    except (OSError, ValueError) as problem:
+    except _FAILURES as problem:
         raise LinkError(_why_not_open(line.device, problem)) from problem
     try:
         return _SerialPort(port, line.device, on_data, on_loss)
@@ -184,10 +189,12 @@ async def _open_serial(
 
 
 def _open_port(line: ModbusUrl) -> serial.Serial:
+    # A pseudo-terminal has no parity, and where it is asked for one it may refuse everything.
+    is_pseudo = os.path.realpath(line.device).startswith("/dev/pts/")
     port = serial.Serial(
         line.device,
         baudrate=line.baud,
-        parity=line.parity,
+        parity=serial.PARITY_NONE if is_pseudo else line.parity,
         stopbits=line.stop,
         timeout=0,
         write_timeout=_WRITE_TIMEOUT,

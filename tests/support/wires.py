@@ -17,11 +17,15 @@ from sim.wires import Wire, open_wire
 
 WIRES: Mapping[str, Wire] = {
     "serial": Wire("serial", unpluggable=True),
+    "modbus+tcp": Wire("modbus-tcp", unpluggable=True),
+    "modbus+rtu": Wire("modbus-rtu", unpluggable=True),
 }
 """Each is far end and backend by one scheme; see `sim.wires`."""
 
 SHARED_WIRES: Mapping[str, Wire] = {
     "serial": Wire("serial", shared=True),
+    "modbus+tcp": Wire("modbus-tcp", shared=True),
+    "modbus+rtu": Wire("modbus-rtu", shared=True),
 }
 """Those on which several amplifiers hear one broadcast."""
 
@@ -74,5 +78,7 @@ async def far_side(wire: Wire, rig: Rig, *, seed: int = 0) -> AsyncIterator[FarS
 
 PROCESS_WIRES: Mapping[str, Sequence[str]] = {
     "serial": ["--serial"],
+    "modbus+tcp": ["--modbus-tcp", "0"],
+    "modbus+rtu": ["--modbus-rtu"],
 }
 """The same as options of `era sim`, for a far end that is a process of its own."""

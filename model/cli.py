@@ -8,10 +8,21 @@ from model.figure_cli import figure_app
 from model.plate_cli import plate_app
 from model.plate_show_cli import materials, show
 from model.study_cli import study_app
-from model.table_cli import table_app
+from model.table_build_cli import build
+from model.table_cli import query, table_app
+from model.table_export_cli import export, plot
+from model.table_show_cli import show as show_table
+from model.table_show_cli import verify
 
 plate_app.command()(materials)
 plate_app.command()(show)
+
+table_app.command()(build)
+table_app.command("show")(show_table)
+table_app.command()(verify)
+table_app.command()(query)
+table_app.command()(plot)
+table_app.command()(export)
 
 app = typer.Typer()
 app.add_typer(config_app, name="config")

@@ -22,6 +22,7 @@ from model.raster import Raster
 from model.reduction import reduce_plate
 from model.rig import Rig
 from model.studies.solve import code_version
+from model.table_file import MAX_BYTES
 
 # Some ten milliseconds of work on the paper's plate, and some megabytes.
 FREQUENCIES_AT_ONCE = 16
@@ -49,8 +50,16 @@ class TableProblem:
     grid: Grid
 
     def __post_init__(self) -> None:
-        """Refuse frequencies that make no table."""
+        """Refuse frequencies that make no table, and a table that would be too large to be read."""
         _check_frequencies(self.frequencies, self.rig)
+        eras, f = len(self.rig.eras), len(self.frequencies)
+        sources = eras * (eras + 1) // 2 * f + 1
+        size = 8 * self.raster.point_count * eras * f + 4 * sources * self.grid.cell_count
+        if size > MAX_BYTES:
+            raise InputError(
+                f"this table would have {size / 1e9:.1f} GB, more than the {MAX_BYTES / 1e9:.1f} "
+                "GB that are read; take fewer frequencies or a coarser grid"
+            )
 
     @cached_property
     def raster(self) -> Raster:

@@ -1,93 +1,18 @@
-"""`era table`: build, show and query a localization table."""
+"""`era table query`: what to play so that one finger feels it and the others do not."""
 
 import json
-import time
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
-from model.plate_cli import JsonOption, MeshOption, RigArgument
+from model.plate_cli import JsonOption
 
 table_app = typer.Typer(help="The localization table: what makes one finger feel it, not others.")
 
 TableArgument = Annotated[Path, typer.Argument(metavar="TABLE", help="A table file, e.g. T.npz.")]
 
 
-@table_app.command()
-def build(
-    rig_file: RigArgument,
-    output: Annotated[Path, typer.Option("--output", "-o", metavar="TABLE", help="File to write.")],
-    frequencies: Annotated[
-        str, typer.Option(metavar="LO:HI:STEP", help="Frequencies in Hz, both ends included.")
-    ] = "60:320:10",
-    mode: Annotated[
-        str, typer.Option(help="Drive mode to answer in: switched, graded, signed or phased.")
-    ] = "switched",
-    grid: Annotated[
-        str, typer.Option(metavar="NXxNY", help="Target cells along x and y.")
-    ] = "12x9",
-    mesh: MeshOption = None,
-    as_json: JsonOption = False,
-) -> None:
-    """Solve the plate and write its localization table."""
-    from model.localization import Grid
-    from model.points import parse_frequencies, parse_pair
-    from model.rig_file import load_rig
-    from model.table_build import build_table
-    from model.table_file import save_table
-
-    rig = load_rig(rig_file, mesh=mesh)
-    started = time.perf_counter()
-    table = build_table(
-        rig,
-        frequencies=parse_frequencies(frequencies),
-        grid=Grid(*parse_pair(grid, what="--grid")),
-        mode=mode,
-    )
-    save_table(table, output)
-    elapsed = time.perf_counter() - started
-    if as_json:
-        print(
-            json.dumps(
-                {
-                    "patterns": len(table.patterns),
-                    "cells": table.grid.cell_count,
-                    "frequencies_hz": table.frequencies.tolist(),
-                    "mesh": [table.mesh.nx, table.mesh.ny],
-                    "mode": table.mode,
-                    "fingerprint": table.fingerprint,
-                    "build_time_s": elapsed,
-                    "files": [str(output)],
-                }
-            )
-        )
-        return
-    print(
-        f"{len(table.patterns)} patterns for {table.grid.cell_count} cells on a {table.mesh} mesh, "
-        f"built in {elapsed:.2f} s"
-    )
-    print(f"wrote {output} ({output.stat().st_size / 1e6:.1f} MB)")
-    print(f"Next: era table show {output}")
-
-
-@table_app.command()
-def show(table_file: TableArgument, as_json: JsonOption = False) -> None:
-    """What is in a table: provenance, levels that can be had, dead zones, contrast."""
-    from model.table_file import load_table
-    from model.table_summary import summarize
-
-    summary = summarize(load_table(table_file))
-    if as_json:
-        print(json.dumps(summary))
-        return
-    width = max(len(key) for key in summary)
-    for key, value in summary.items():
-        print(f"{key:{width}}  {_shown(value)}")
-    print(f"Next: era table query {table_file} --target X,Y --quiet X,Y")
-
-
-@table_app.command()
 def query(
     table_file: TableArgument,
     target: Annotated[
@@ -179,7 +104,3 @@ def _answer_batch(table_file: Path, batch: Path) -> None:
         raise InputError(f"--batch {batch} cannot be read: {error}") from error
     if failed:
         raise typer.Exit(1)
-
-
-def _shown(value: Any) -> str:
-    return f"{value:.3g}" if isinstance(value, float) else str(value)

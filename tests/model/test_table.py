@@ -20,6 +20,7 @@ from model.point_mass import PointMass
 from model.table_build import build_table
 from model.table_file import load_table, save_table
 from model.table_summary import summarize
+from model.table_weak_cells import find_weak_cells
 from model.vibration import peak_acceleration, tone_amplitudes
 from paper_plate import make_paper_rig
 
@@ -346,7 +347,7 @@ def test_impossible_frequencies_are_refused(rig, frequencies, says):
 
 def test_the_summary_counts_what_the_table_holds(table):
     """Every cell of the paper's plate can be made to feel it; contrast falls with more fingers."""
-    summary = summarize(table)
+    summary = summarize(table, find_weak_cells(table))
     assert summary["cells"] == 108
     assert summary["patterns"] == 4482
     assert summary["dead_zone_share"] == 0.0
@@ -363,5 +364,6 @@ def test_a_small_plate_has_no_contact_sets_to_show():
         mesh=replace(rig.mesh, length=0.03, width=0.03),
         eras=(replace(rig.eras[0], x=0.0, y=0.0),),
     )
-    summary = summarize(build_table(small, grid=Grid(2, 2)))
+    built = build_table(small, grid=Grid(2, 2))
+    summary = summarize(built, find_weak_cells(built))
     assert summary["contrast_1_quiet_median_db"] is None

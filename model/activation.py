@@ -49,18 +49,9 @@ def equal_area_points(plate: Plate, *, frequency_max: float) -> FloatArray:
     return grid.centres(plate)
 
 
-def driven_together(acceleration: ComplexArray, active: ActivationSet) -> FloatArray:
-    """Peak acceleration (f, p) of a set from each ERA's complex one (f, eras, p)."""
-    # Slicing one ERA after the other beats fancy indexing, which copies.
-    together = acceleration[:, active[0]]
-    for era in active[1:]:
-        together = together + acceleration[:, era]
-    return np.abs(together)
-
-
 def cumulative_peak(acceleration: ComplexArray, active: ActivationSet) -> FloatArray:
-    """Peak acceleration added up over the frequencies (p,), from (f, eras, p)."""
-    return np.asarray(driven_together(acceleration, active).sum(axis=0))
+    """Peak acceleration of a set added up over the frequencies (p,), from (f, eras, p)."""
+    return np.asarray(np.abs(acceleration[:, list(active)].sum(axis=1)).sum(axis=0))
 
 
 def cumulative_statistics(
@@ -72,11 +63,18 @@ def cumulative_statistics(
     acceleration; the unfelt share is that of the plate where a tone stays below, mean over the
     frequencies (0 without felt).
     """
-    sets = activation_sets(acceleration.shape[1])
-    peaks = np.empty((len(sets), acceleration.shape[2]))
+    frequency_count, era_count, point_count = acceleration.shape
+    sets = activation_sets(era_count)
+    peaks = np.empty((len(sets), point_count))
     result = np.zeros((len(sets), len(STATISTICS)))
+    # Two arrays for all sets: fresh ones, handed back to the system each time, cost as much again.
+    together = np.empty((frequency_count, point_count), dtype=complex)
+    amplitudes = np.empty((frequency_count, point_count))
     for row, active in enumerate(sets):
-        amplitudes = driven_together(acceleration, active)
+        np.copyto(together, acceleration[:, active[0]])
+        for era in active[1:]:
+            together += acceleration[:, era]
+        np.abs(together, out=amplitudes)
         peaks[row] = amplitudes.sum(axis=0)
         if felt is not None:
             result[row, -1] = np.count_nonzero(amplitudes < felt[:, None]) / amplitudes.size

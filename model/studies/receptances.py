@@ -31,11 +31,22 @@ class Receptances:
     between: ComplexArray
     to_points: ComplexArray
 
-    def acceleration(self, places: IntArray, eras: tuple[Era, ...]) -> ComplexArray:
+    def room(self, era_count: int) -> ComplexArray:
+        """Room for `acceleration` to work in, (2, f, eras, p)."""
+        shape = (2, len(self.frequencies), era_count, self.to_points.shape[2])
+        return np.empty(shape, dtype=complex)
+
+    def acceleration(
+        self, places: IntArray, eras: tuple[Era, ...], *, room: ComplexArray | None = None
+    ) -> ComplexArray:
         """Acceleration [m/s²] of each ERA alone at full stroke, the others holding: (f, eras, p).
 
-        places: at which of the c places each ERA stands; its own position is not looked at.
+        places: at which of the c places each ERA stands; its own position is not looked at. room:
+        used again from call to call, for memory fresh from the system costs more than the sums;
+        the answer lies in it.
         """
+        if room is None:
+            room = self.room(len(eras))
         omega = 2 * np.pi * self.frequencies
         hold, drive = hold_and_drive(eras, (), omega)
         at_eras = self.between[:, places[:, None], places]
@@ -43,7 +54,9 @@ class Receptances:
         # Force on the plate by ERA driven: what its base pushes less what all ERAs hold back.
         force = np.linalg.solve(one + hold[:, :, None] * at_eras, drive[:, :, None] * one)
         scaled = -(omega**2)[:, None, None] * force.transpose(0, 2, 1)
-        return np.asarray(scaled @ self.to_points[:, places])
+        np.take(self.to_points, places, axis=1, out=room[0], mode="clip")  # else it is buffered
+        acceleration: ComplexArray = np.matmul(scaled, room[0], out=room[1])
+        return acceleration
 
 
 def solve_receptances(

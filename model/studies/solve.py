@@ -18,7 +18,7 @@ from model.activation import (
     felt_acceleration,
 )
 from model.actuator import Era
-from model.arrays import FloatArray
+from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
 from model.harmonic import check_frequencies
 from model.rig import Rig
@@ -95,9 +95,14 @@ def solve_cases(receptances: Receptances, eras: tuple[Era, ...], cases: Cases) -
     felt = felt_acceleration(receptances.frequencies)
     statistics = np.full((len(cases), len(DRIVES), len(STATISTICS)), np.nan)
     active = np.zeros((len(cases), len(DRIVES)), dtype=np.uint64)
+    rooms: dict[int, ComplexArray] = {}
     for case in range(len(cases)):
         placed = cases.eras_of(case, eras)
-        acceleration = receptances.acceleration(cases.places_of(case), placed)
+        if len(placed) not in rooms:
+            rooms[len(placed)] = receptances.room(len(placed))
+        acceleration = receptances.acceleration(
+            cases.places_of(case), placed, room=rooms[len(placed)]
+        )
         every = cumulative_statistics(acceleration, felt=felt)
         sets = activation_sets(len(placed))
         for drive, size in enumerate((1, 2, len(placed))):

@@ -32,7 +32,8 @@ def _controller() -> None:
 @app.command()
 def demo(
     wire: Annotated[
-        str, typer.Option(help="serial (a pseudo-terminal) or sim (no wire).")
+        str,
+        typer.Option(help="serial (a pseudo-terminal), modbus (TCP) or sim (no wire)."),
     ] = "serial",
     touches: Annotated[
         Path | None,

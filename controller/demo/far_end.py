@@ -9,7 +9,7 @@ import contextlib
 import json
 import sys
 import tempfile
-from collections.abc import AsyncIterator, Collection, Mapping
+from collections.abc import AsyncIterator, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
@@ -23,6 +23,12 @@ from model.arrays import FloatArray
 LINE_MAX = 1 << 20  # bytes of one answer; what ten fingers felt takes a fiftieth of it
 STARTUP_TIMEOUT = 30.0  # seconds; a machine at work on something else solves the plate slowly
 EXIT_TIMEOUT = 3.0
+
+# Options of `era sim` by wire; there is none for a plate within this process.
+OPTIONS: Mapping[str, Sequence[str]] = {
+    "serial": ("--serial",),
+    "modbus": ("--modbus-tcp", "0"),
+}
 
 
 @dataclass(frozen=True)
@@ -120,8 +126,8 @@ async def open_far_end(
 ) -> AsyncIterator[FarEnd]:
     """The simulated amplifiers of a rig file on a wire; they end with the context.
 
-    amplifiers: their names; wire: "sim" for one within this process, otherwise an option of
-    `era sim` without its dashes, in a process of its own. Raises LinkError if that does not start.
+    amplifiers: their names; wire: "sim" for a plate within this process, otherwise a key of
+    `OPTIONS`, for one in a process of its own. Raises LinkError if that does not start.
     """
     with tempfile.TemporaryDirectory(prefix="era-") as folder:
         control = Path(folder) / "control"
@@ -145,7 +151,8 @@ async def _start(
     """The process, and what it says."""
     process = await asyncio.create_subprocess_exec(
         # -P: a folder named sim where the user stands must not be taken for ours
-        *(sys.executable, "-P", "-m", "sim", str(rig_file), f"--{wire}", "--control", str(control)),
+        *(sys.executable, "-P", "-m", "sim", str(rig_file), *OPTIONS[wire]),
+        *("--control", str(control)),
         # A pipe that nobody writes to: it closes when we die, however that is, and ends the process
         "--until-eof",
         stdin=asyncio.subprocess.PIPE,

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TypeAlias
 
 from controller.contacts import LEASE
-from controller.demo.far_end import open_far_end
+from controller.demo.far_end import OPTIONS, open_far_end
 from controller.demo.picture import choose_rows, touches_figure
 from controller.demo.recorder import TouchRecorder
 from controller.demo.rows import TouchRow
@@ -24,7 +24,7 @@ from model.table import LocalizationTable
 
 Play: TypeAlias = Callable[[], Awaitable[None]]
 
-WIRES = ("serial", "sim")
+WIRES = (*OPTIONS, "sim")
 
 # The plate rings on for a moment after the last touch.
 AFTERGLOW = 0.1

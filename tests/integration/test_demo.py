@@ -60,7 +60,7 @@ def run_era(arguments, environment, cwd):
     )
 
 
-@pytest.mark.parametrize("wire", ["serial", "sim"])
+@pytest.mark.parametrize("wire", ["serial", "modbus", "sim"])
 def test_every_touch_is_felt_as_predicted(wire, capture, environment, tmp_path):
     """Each touch has its row; measured contrast and level are the predicted ones within 3 dB."""
     done = run_era(
@@ -178,7 +178,7 @@ def far_end_of(pid):
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        (["--wire", "modem"], "choose serial or sim"),
+        (["--wire", "modem"], "choose serial or modbus or"),
         (["--touches", "none.tuio"], "none.tuio"),
         (["--touches", "none.events"], "none.events"),
     ],

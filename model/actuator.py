@@ -1,9 +1,18 @@
 """The electrostatic resonant actuator (ERA): spring, damper and bolt between plate and base."""
 
+import cmath
 import math
 from dataclasses import dataclass
+from itertools import pairwise
+from typing import TypeAlias
 
+import numpy as np
+
+from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
+
+Gain: TypeAlias = tuple[float, float, float]
+"""Frequency [Hz], magnitude, phase [rad]."""
 
 
 @dataclass(frozen=True)
@@ -12,6 +21,8 @@ class Era:
 
     x, y: where it holds the plate [m]; stiffness k_b [N/m]; damping c [N s/m]; bolt_mass m_b [kg];
     stroke: the largest base amplitude [m]. An ERA that is not driven still supports and damps.
+    gains: how its base really moves for what it is asked, as measured at frequencies that ascend;
+    none of them: exactly.
     """
 
     name: str
@@ -21,6 +32,7 @@ class Era:
     damping: float
     bolt_mass: float
     stroke: float
+    gains: tuple[Gain, ...] = ()
 
     def __post_init__(self) -> None:
         """Refuse values that no ERA can have."""
@@ -35,6 +47,31 @@ class Era:
         for key in ("damping", "bolt_mass"):
             if getattr(self, key) < 0:
                 raise InputError(f"ERA {self.name}: {key} is {getattr(self, key)}, below zero")
+        # A file gives lists; only tuples can be compared and hashed with the rest.
+        gains = tuple((float(f), float(size), float(phase)) for f, size, phase in self.gains)
+        object.__setattr__(self, "gains", gains)
+        for frequency, size, phase in gains:
+            if not (math.isfinite(frequency + size + phase) and frequency > 0 and size > 0):
+                raise InputError(
+                    f"ERA {self.name}: gain {size} with phase {phase} at {frequency} Hz is none"
+                )
+        for (low, *_), (high, *_) in pairwise(gains):
+            if low >= high:
+                raise InputError(
+                    f"ERA {self.name}: the gain at {high} Hz stands after that at {low} Hz; "
+                    "frequencies must ascend"
+                )
+
+    def gain(self, frequencies: FloatArray) -> ComplexArray:
+        """Complex gain at frequencies [Hz], of their shape; 1 where none was measured.
+
+        Straight lines between what was measured, constant outside of it.
+        """
+        if not self.gains:
+            return np.ones(np.shape(frequencies), dtype=complex)
+        measured = [frequency for frequency, _, _ in self.gains]
+        values = np.array([cmath.rect(size, phase) for _, size, phase in self.gains])
+        return np.asarray(np.interp(np.abs(frequencies), measured, values))
 
 
 def damping_from_ratio(

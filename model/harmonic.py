@@ -43,7 +43,7 @@ def hold_and_drive(
 ) -> tuple[ComplexArray, ComplexArray]:
     """Dynamic stiffness (f, eras + loads) [N/m], and each ERA's force at full stroke (f, eras) [N].
 
-    omega: (f,) [rad/s].
+    omega: (f,) [rad/s]. The force is that of the base as it moves with the ERA's own gain.
     """
     held = np.array(
         [(era.stiffness, era.damping, era.bolt_mass) for era in eras]
@@ -52,7 +52,10 @@ def hold_and_drive(
     ).reshape(-1, 3)
     spring = held[:, 0] + 1j * omega[:, None] * held[:, 1]
     stroke = np.array([era.stroke for era in eras])
-    return spring - (omega**2)[:, None] * held[:, 2], spring[:, : len(eras)] * stroke
+    drive = spring[:, : len(eras)] * stroke
+    for number, era in enumerate(eras):
+        drive[:, number] *= era.gain(omega / (2 * np.pi))
+    return spring - (omega**2)[:, None] * held[:, 2], drive
 
 
 def direct_acceleration(

@@ -101,9 +101,14 @@ def physics_fingerprint(
     """
     numbers = asdict(plate)
     del numbers["material"]["name"]
+    # What has no gains keeps the fingerprint that it had before there were any.
+    held = [
+        {key: value for key, value in asdict(era).items() if key != "gains" or value}
+        for era in eras
+    ]
     physics = {
         "plate": numbers,
-        "eras": [asdict(era) for era in eras],
+        "eras": held,
         "masses": sorted((mass.x, mass.y, mass.mass) for mass in masses),
     }
     text = json.dumps(physics, sort_keys=True, separators=(",", ":"))

@@ -1,5 +1,6 @@
 """From the sections of a rig file to the values that the model computes with."""
 
+import math
 import re
 
 from model.actuator import Era, damping_from_ratio
@@ -59,6 +60,7 @@ def era_of(name: str, section: EraSection, plate: Plate, *, era_count: int) -> E
         damping=damping,
         bolt_mass=section.bolt_mass,
         stroke=section.stroke,
+        gains=tuple((f, size, math.radians(phase)) for f, size, phase in section.gains or ()),
     )
 
 

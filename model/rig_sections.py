@@ -4,6 +4,7 @@ Bounds are wide: they are there to catch a value in the wrong unit, not to teach
 """
 
 import re
+from itertools import pairwise
 from typing import Annotated, Any
 
 from pydantic import (
@@ -64,6 +65,19 @@ def _ascending(bounds: tuple[float, float]) -> tuple[float, float]:
     return bounds
 
 
+def _gains(rows: list[tuple[float, float, float]]) -> list[tuple[float, float, float]]:
+    for frequency, size, phase in rows:
+        if not (0 < frequency < 1e5 and 1e-3 <= size <= 1e3 and -360 <= phase <= 360):
+            raise ValueError(
+                f"[{frequency:g}, {size:g}, {phase:g}] is no gain; write [frequency in Hz, "
+                "magnitude from 0.001 to 1000, phase from -360 to 360 degrees]"
+            )
+    if any(low[0] >= high[0] for low, high in pairwise(rows)):
+        raise ValueError("has frequencies that do not ascend; sort its rows by the first number")
+    return rows
+
+
+GainRow = Annotated[tuple[float, float, float], Strict(strict=False)]  # a list in the file
 Identifier = Annotated[str, AfterValidator(_identifier)]
 Side = Annotated[float, Quantity(LENGTH, above=0, most=100)]
 Coordinate = Annotated[float, Quantity(LENGTH, least=-100, most=100)]
@@ -122,6 +136,7 @@ class EraSection(Section):
     damping: Annotated[float, Quantity(DAMPING, least=0, most=1e6)] | None = None
     bolt_mass: Annotated[float, Quantity(MASS, least=0, most=10)] = 0.0
     stroke: Annotated[float, Quantity(LENGTH, above=0, most=0.01)] = 100e-6
+    gains: Annotated[list[GainRow], Field(max_length=2000), AfterValidator(_gains)] | None = None
     amplifier: Identifier
     channel: Annotated[int, Field(ge=0, le=255)]
 

@@ -112,12 +112,14 @@ class PlateInTime:
         """z(t) = (a0 + a1 t) exp(s t), (n, 2 r) each, for bases y(t) = (c0 + c1 t) exp(s t) [m].
 
         eras, s [1/s], c0, c1: (n,), one ERA alone in each row. s must not be an eigenvalue, as no
-        imaginary number is where anything damps.
+        imaginary number is where anything damps. An ERA's measured gain is taken at the frequency
+        of s; what it does between two frequencies while c1 lasts is not modelled.
         """
         k = np.array([self.eras[era].stiffness for era in eras])
         c = np.array([self.eras[era].damping for era in eras])
         c0, c1 = np.asarray(c0), np.asarray(c1)
-        push = self.participation.T[list(eras)]
+        gains = [self.eras[era].gain(s[row].imag / (2 * np.pi)) for row, era in enumerate(eras)]
+        push = self.participation.T[list(eras)] * np.array(gains).reshape(-1, 1)
         force0 = push * (k * c0 + c * (c1 + s * c0))[:, None]
         force1 = push * ((k + c * s) * c1)[:, None]
         gap = s[:, None] - self.eigenvalues

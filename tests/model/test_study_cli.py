@@ -16,6 +16,7 @@ from typer.testing import CliRunner
 
 from model.errors import InputError
 from model.rig_file import example_rig_path, load_rig
+from model.studies.run import CHUNK
 from model.study_cli import study_app
 
 RUNNER = CliRunner()
@@ -200,7 +201,7 @@ def test_ctrl_c_leaves_a_study_that_goes_on(tmp_path: Path) -> None:
     assert "goes on from there" in said
     assert "Traceback" not in said
     kept = len(list(tmp_path.glob("chunks/*.npz")))
-    assert 0 < kept < 30000 / 64
+    assert 0 < kept < 30000 / CHUNK
     assert not list(tmp_path.glob("chunks/.*"))
-    answer = study("placement", tmp_path, "--layouts", "128", "--workers", "1")
-    assert answer["from_cache"] >= 64
+    answer = study("placement", tmp_path, "--layouts", str(2 * CHUNK), "--workers", "1")
+    assert answer["from_cache"] >= CHUNK

@@ -93,6 +93,13 @@ class Station:
         """Carry out what was said to all; nobody hears the answer."""
         self.exchange(request)
 
+    def restart(self) -> None:
+        """Lose the supply for a moment, as when it is told to start anew."""
+        now = time.monotonic()
+        self._bench.advance(now)
+        self._amplifier.restart(now)
+        self._bench.advance(now)
+
     def start(self) -> None:
         """Let the faults that are due later come, in the running event loop."""
         for episode in self.faults.episodes:

@@ -1,0 +1,458 @@
+"""An amplifier as a node of a CAN bus, by the conventions of CANopen.
+
+Orders go out as PDOs, and an answer belongs to the order whose sequence number it carries; what
+can wait is read and written as objects. The node's heartbeat is watched, ours is a part of Ping
+and sent by nobody else. While a set is armed each amplifier hears a heartbeat of its own, so that
+one that was lost is not fed by those for others.
+"""
+
+import asyncio
+import contextlib
+import secrets
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+from canopen.emcy import EmcyConsumer, EmcyError
+from canopen.nmt import NmtMaster
+
+from drivers.backend import Backend
+from drivers.backends.can_sdo import ObjectClient
+from drivers.backends.can_url import CanUrl
+from drivers.backends.can_wire import CanWire, acquire, release
+from drivers.errors import FrameError, LinkError, LinkTimeout
+from drivers.guard import SafeEnvelope
+from drivers.protocol.can_frame import CANOPEN, CanFrame, cob_id
+from drivers.protocol.can_timing import frames_time, round_trip_time
+from drivers.protocol.canopen_map import (
+    SEQUENCE_MAX,
+    UNASKED,
+    Answer,
+    AnswerReader,
+    Order,
+    action_of,
+    decode_emergency,
+    encode_broadcast,
+    encode_order,
+    host_number,
+    is_about_set,
+    plain_reply,
+    wanted_commands,
+)
+from drivers.protocol.definition import PROTOCOL
+from drivers.protocol.messages import (
+    Achieved,
+    Apply,
+    Arm,
+    Broadcast,
+    Commit,
+    Event,
+    GetCaps,
+    GetFaults,
+    Hello,
+    LoadEnvelope,
+    Nak,
+    NakCode,
+    Reply,
+    Request,
+    Stage,
+)
+from drivers.statistics import WireCounters
+
+HEARTBEATS_BORNE = 3  # of the amplifier's that may be missing before it counts as lost
+_OBJECTS_WAIT = 40  # an object is read in so many answers at most
+_START, _OPERATIONAL = CANOPEN["nmt"]["start"], CANOPEN["nmt_states"]["OPERATIONAL"]
+_BOOT_UP = CANOPEN["nmt_states"]["BOOT_UP"]
+_T = TypeVar("_T")
+
+
+@dataclass
+class _Pending:
+    """An order on the wire, who waits for its answer, and the token that it must name."""
+
+    action: int
+    token: int | None
+    answer: asyncio.Future[Answer]
+
+
+class CanBackend(Backend):
+    """Carries requests to the node of a CAN bus given by its URL (see `CanUrl`)."""
+
+    def __init__(self, url: str) -> None:
+        self._url = CanUrl.parse(url)
+        self._wire: CanWire | None = None
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._objects: ObjectClient | None = None
+        self._thread: ThreadPoolExecutor | None = None
+        self._subscribed: list[tuple[int, Callable[..., None]]] = []
+        self._answers = AnswerReader(self._url.node)
+        self._pending: dict[int, _Pending] = {}
+        # Not from the first, so that an answer to an earlier run is no answer to this one.
+        self._sequence = secrets.randbelow(SEQUENCE_MAX)
+        self._staged: Achieved | None = None  # as it was asked for
+        self._channels = PROTOCOL.quantities.channel_count.maximum
+        self._on_event: Callable[[Event], None] = lambda event: None
+        self._on_loss: Callable[[str], None] = lambda what: None
+        self._loss: str | None = None
+        self._last_sent = 0.0
+        self._counters = WireCounters()
+        self._is_watched = False
+        self._was_operational = False
+        self._heard = 0.0  # the node's heartbeat
+        self._host_heard = -1.0  # a heartbeat of another host to this node
+        self._next_look: asyncio.TimerHandle | None = None
+
+    @property
+    def counters(self) -> WireCounters:
+        """What was seen of this amplifier."""
+        return self._counters
+
+    @property
+    def last_sent(self) -> float:
+        """When the adapter took the last frame of the last request, on time.monotonic() [s]."""
+        return self._last_sent
+
+    @property
+    def bus(self) -> str:
+        """The bus, on which every amplifier hears a broadcast."""
+        return str(self._url.bus)
+
+    def listen(self, on_event: Callable[[Event], None], on_loss: Callable[[str], None]) -> None:
+        """Whom to tell of events and of the loss of bus or amplifier."""
+        self._on_event, self._on_loss = on_event, on_loss
+
+    def round_trip(self, channels: int) -> float:
+        """Time [s] on the bus of an apply of so many channels and its answer."""
+        bus = self._url.bus
+        return round_trip_time(channels, bitrate=bus.bitrate, fd=bus.fd)
+
+    async def open(self) -> None:
+        """Join the bus, which is opened by the first of its amplifiers; raises LinkError."""
+        if self._wire is not None:
+            return
+        wire = await acquire(self._url.bus)
+        self._loop = asyncio.get_running_loop()
+        self._wire = wire
+        self._loss = None
+        self._counters = WireCounters()
+        self._answers = AnswerReader(self._url.node)
+        self._is_watched = self._was_operational = False
+        self._objects = ObjectClient(wire.network, self._url.node)
+        self._thread = ThreadPoolExecutor(1, thread_name_prefix=f"era-sdo {self._url.node}")
+        self._subscribe(wire, self._objects)
+        wire.on_loss.append(self._lose)
+
+    async def close(self) -> None:
+        """Leave the bus; what still waits for an answer gets LinkError."""
+        wire, self._wire = self._wire, None
+        thread, self._thread = self._thread, None
+        self._stop_watching()
+        self._fail(f"{self._url.bus} was closed")
+        if wire is None or thread is None or self._objects is None:
+            return
+        self._objects.abandon()
+        await asyncio.to_thread(thread.shutdown)
+        for can_id, callback in self._subscribed:
+            with contextlib.suppress(KeyError, ValueError):
+                wire.network.unsubscribe(can_id, callback)
+        self._subscribed.clear()
+        with contextlib.suppress(ValueError):
+            wire.on_loss.remove(self._lose)
+        await release(wire)
+
+    async def exchange(self, request: Request, *, timeout: float) -> Reply:
+        """Send a request and wait for its answer; LinkTimeout, LinkError or FrameError.
+
+        timeout [s]: what the amplifier may take, for objects over each of their frames.
+        """
+        self._raise_if_lost()
+        match request:
+            case Hello():
+                return await self._hello(timeout)
+            case GetCaps():
+                capabilities = await self._objects_job(
+                    lambda objects: objects.capabilities(timeout=timeout), timeout
+                )
+                self._channels = capabilities.channels
+                return capabilities
+            case GetFaults():
+                return await self._objects_job(
+                    lambda objects: objects.faults(timeout=timeout), timeout
+                )
+            case LoadEnvelope(envelope=envelope):
+                return await self._load(envelope, timeout)
+            case _:
+                return await self._order(request, timeout)
+
+    async def broadcast(self, request: Broadcast) -> None:
+        """Say a commit or a stop to every amplifier of the bus; raises LinkError."""
+        self._raise_if_lost()
+        self._send(encode_broadcast(request))
+
+    async def _hello(self, timeout: float) -> Reply:
+        heartbeat = round(self._url.heartbeat * 1000)
+
+        def ask(objects: ObjectClient) -> Reply:
+            identity = objects.identity(timeout=timeout)
+            objects.set_heartbeat(heartbeat, timeout=timeout)
+            return identity
+
+        identity = await self._objects_job(ask, timeout)
+        self._send([CanFrame(cob_id("nmt"), bytes([_START, self._url.node]))])
+        self._watch()
+        return identity
+
+    async def _load(self, envelope: Any, timeout: float) -> Reply:
+        if type(envelope) is not SafeEnvelope:
+            raise TypeError(
+                f"only a SafeEnvelope goes on the wire, not a {type(envelope).__name__}: "
+                "let Guard.check_envelope make one"
+            )
+        return await self._objects_job(
+            lambda objects: objects.load_envelope(envelope, timeout=timeout), timeout
+        )
+
+    async def _order(self, order: Order, timeout: float) -> Reply:
+        if isinstance(order, Arm):
+            self._refuse_second_host()
+        self._sequence = self._sequence % SEQUENCE_MAX + 1
+        frames = encode_order(
+            order, node=self._url.node, sequence=self._sequence, fd=bool(self._url.bus.fd)
+        )
+        if isinstance(order, Apply | Stage):
+            for command in order.command_set.commands:
+                if command.channel >= self._channels:  # its frame would be another node's
+                    return Nak(NakCode.BAD_CHANNEL, command.channel)
+        bus = self._url.bus
+        on_wire = 2 * frames_time(frames, bitrate=bus.bitrate, fd=bus.fd)
+        try:
+            async with asyncio.timeout(timeout + on_wire):
+                answer = await self._answer_to(order, frames)
+        except LinkError:
+            raise
+        except TimeoutError:
+            raise LinkTimeout(
+                f"no answer from node {self._url.node} on {bus} within {timeout * 1e3:g} ms; check "
+                "that the amplifier is switched on and that the bit rates agree"
+            ) from None
+        reply = plain_reply(answer)
+        if reply is not None:
+            return reply
+        if not is_about_set(order):
+            raise FrameError(f"an answer without a status to {type(order).__name__}")
+        return await self._achieved(order, answer, timeout)
+
+    async def _answer_to(self, order: Order, frames: tuple[CanFrame, ...]) -> Answer:
+        sequence = self._sequence
+        token = None
+        if isinstance(order, Apply):
+            token = order.command_set.token
+        elif isinstance(order, Commit):
+            token = order.token
+        answer: asyncio.Future[Answer] = asyncio.get_running_loop().create_future()
+        self._pending[sequence] = pending = _Pending(action_of(order), token, answer)
+        try:
+            self._send(frames)
+            return await answer
+        finally:
+            if self._pending.get(sequence) is pending:
+                del self._pending[sequence]
+
+    async def _achieved(self, order: Order, answer: Answer, timeout: float) -> Achieved:
+        """What a set plays: what was asked for if the answer says so, else it is read."""
+        wanted = None
+        if isinstance(order, Apply | Stage):
+            token = order.command_set.token
+            wanted = Achieved(token, wanted_commands(order.command_set))
+        elif self._staged is not None and self._staged.token == order.token:  # type: ignore[union-attr]
+            wanted = self._staged
+        if wanted is not None and answer.exact:
+            achieved = wanted
+        else:
+            achieved = await self._objects_job(
+                lambda objects: objects.achieved(timeout=timeout), timeout
+            )
+            if wanted is not None:
+                achieved = _in_order_of(wanted, achieved)
+        if isinstance(order, Apply | Stage):
+            self._staged = achieved
+        return achieved
+
+    async def _objects_job(self, job: Callable[[ObjectClient], _T], timeout: float) -> _T:
+        """Do something with the amplifier's objects, in their own thread."""
+        objects, thread = self._objects, self._thread
+        if objects is None or thread is None:
+            raise LinkError(f"{self._url.bus} is not open")
+        future = asyncio.get_running_loop().run_in_executor(thread, job, objects)
+        try:
+            async with asyncio.timeout(_OBJECTS_WAIT * timeout):
+                result = await asyncio.shield(future)
+        except TimeoutError as problem:
+            if isinstance(problem, LinkError):
+                raise
+            objects.abandon()
+            future.add_done_callback(_forget)
+            raise LinkTimeout(
+                f"node {self._url.node} on {self._url.bus} took too long over an object"
+            ) from None
+        except asyncio.CancelledError:
+            objects.abandon()
+            future.add_done_callback(_forget)
+            raise
+        self._counters.frames_out += 1
+        self._counters.frames_in += 1
+        return result
+
+    def _send(self, frames: Any) -> None:
+        if self._wire is None:
+            raise LinkError(f"{self._url.bus} is not open")
+        self._wire.send(frames)
+        self._last_sent = time.monotonic()
+        self._counters.frames_out += len(frames)
+
+    # what comes, in the reader's thread
+
+    def _subscribe(self, wire: CanWire, objects: ObjectClient) -> None:
+        node, nmt, emergencies = self._url.node, NmtMaster(self._url.node), EmcyConsumer()
+        nmt.add_heartbeat_callback(self._heartbeat)
+
+        def emergency(error: EmcyError) -> None:
+            emergencies.reset()  # it would keep them all
+            self._counters.events += 1
+            data = error.code.to_bytes(2, "little") + bytes([error.register]) + error.data
+            self._post(self._on_event, decode_emergency(data))
+
+        emergencies.add_callback(emergency)
+        self._subscribed = [
+            (cob_id("sdo_answer", node), objects.feed),
+            (cob_id("heartbeat", node), nmt.on_heartbeat),
+            (cob_id("heartbeat", host_number(node)), self._other_host),
+            (cob_id("emergency", node), emergencies.on_emcy),
+            *((can_id, self._answer_frame) for can_id in self._answers.ids),
+        ]
+        for can_id, callback in self._subscribed:
+            wire.network.subscribe(can_id, callback)
+
+    def _answer_frame(self, can_id: int, data: bytearray, timestamp: float) -> None:
+        self._counters.frames_in += 1
+        try:
+            answer = self._answers.feed(CanFrame(can_id, bytes(data)))
+        except FrameError:
+            self._counters.bad += 1
+            return
+        if answer is not None:
+            self._post(self._answered, answer)
+
+    def _heartbeat(self, state: int) -> None:
+        self._heard = time.monotonic()
+        if not self._is_watched:
+            return
+        if state == _BOOT_UP:
+            what = "has started anew, or another with its number has"
+        elif self._was_operational and state != _OPERATIONAL:
+            what = "was taken out of operation by somebody else"
+        else:
+            self._was_operational = self._was_operational or state == _OPERATIONAL
+            return
+        self._post(
+            self._lose,
+            f"node {self._url.node} on {self._url.bus} {what}: open it again and arm it anew",
+        )
+
+    def _other_host(self, can_id: int, data: bytearray, timestamp: float) -> None:
+        self._host_heard = time.monotonic()
+        if self._is_watched:
+            self._counters.foreign += 1
+
+    def _post(self, callback: Callable[[_T], None], argument: _T) -> None:
+        """Call back in the event loop."""
+        if self._loop is not None:
+            with contextlib.suppress(RuntimeError):  # it is closed: nobody waits any more
+                self._loop.call_soon_threadsafe(callback, argument)
+
+    # in the event loop
+
+    def _answered(self, answer: Answer) -> None:
+        if answer.sequence == UNASKED:
+            self._counters.events += 1
+            self._on_event(answer.event)
+            return
+        pending = self._pending.get(answer.sequence)
+        is_of_it = (
+            pending is not None
+            and not pending.answer.done()
+            and pending.action == answer.action
+            and (answer.refusal is not None or pending.token in (None, answer.token))
+        )
+        if pending is not None and is_of_it:
+            pending.answer.set_result(answer)
+        else:
+            self._counters.foreign += 1
+
+    def _refuse_second_host(self) -> None:
+        if time.monotonic() - self._host_heard < HEARTBEATS_BORNE * self._url.heartbeat:
+            raise LinkError(
+                f"another program drives node {self._url.node} on {self._url.bus}; end that one"
+            )
+
+    def _watch(self) -> None:
+        """From now on the node must be heard."""
+        self._heard = time.monotonic()
+        if not self._is_watched:
+            self._is_watched = True
+            self._look()
+
+    def _stop_watching(self) -> None:
+        self._is_watched = False
+        if self._next_look is not None:
+            self._next_look.cancel()
+            self._next_look = None
+
+    def _look(self) -> None:
+        """See whether the node was heard lately, by the reader's clock: our loop may be late."""
+        silent = time.monotonic() - self._heard
+        limit = HEARTBEATS_BORNE * self._url.heartbeat
+        if silent >= limit:
+            self._lose(
+                f"node {self._url.node} on {self._url.bus} was not heard for {silent * 1e3:.0f} ms:"
+                " check its supply and the cable, then open the amplifier again"
+            )
+            return
+        loop = asyncio.get_running_loop()
+        self._next_look = loop.call_later(limit - silent, self._look)
+
+    def _lose(self, what: str) -> None:
+        if self._loss is not None or self._wire is None:
+            return
+        self._stop_watching()
+        self._fail(what)
+        self._on_loss(what)
+
+    def _fail(self, what: str) -> None:
+        self._loss = self._loss or what
+        if self._objects is not None:
+            self._objects.abandon()
+        for pending in self._pending.values():
+            if not pending.answer.done():
+                pending.answer.set_exception(LinkError(self._loss))
+
+    def _raise_if_lost(self) -> None:
+        if self._wire is None or self._loss is not None:
+            raise LinkError(self._loss or f"{self._url.bus} is not open")
+
+
+def _in_order_of(wanted: Achieved, achieved: Achieved) -> Achieved:
+    """The commands in the order in which they were asked for; those of others as they come."""
+    places = {command.channel: place for place, command in enumerate(wanted.commands)}
+    commands = sorted(
+        achieved.commands, key=lambda command: places.get(command.channel, len(places))
+    )
+    return Achieved(achieved.token, tuple(commands))
+
+
+def _forget(future: "asyncio.Future[Any]") -> None:
+    """Nobody waits for it any more, also not for its error."""
+    if not future.cancelled():
+        future.exception()

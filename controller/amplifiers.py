@@ -7,11 +7,12 @@ from enum import Enum, auto
 from typing import Any, TypeVar
 
 from controller.read_backs import ReadBacks
-from drivers.amplifier import Amplifier
+from drivers.amplifier import WATCHDOG, Amplifier
 from drivers.errors import CommandError, CommandRefused, DriverError, LinkError
 from drivers.guard import SafeCommand
 from drivers.protocol.messages import Achieved, State, Status
 from drivers.turns import PATIENCE
+from drivers.watchdog import check_watchdog
 
 # How often, and how far apart [s], zero is looked for after the closing ramp has ended.
 _READ_BACKS = 5
@@ -56,9 +57,14 @@ class AmplifierGroup:
         return self._amplifiers.values()
 
     async def open(self) -> None:
-        """Open all; raises LinkError, and then none stays open."""
+        """Open all; raises LinkError, and then none stays open.
+
+        Also CommandError, for a wire that is too slow for the amplifiers' watchdog.
+        """
         try:
             await _gathered(amplifier.open() for amplifier in self._all)
+            for amplifier in self._all:
+                check_watchdog(WATCHDOG, amplifier.round_trip())
         except BaseException:
             await self._close_wires()
             raise

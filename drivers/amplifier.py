@@ -132,6 +132,10 @@ class Amplifier:
             heartbeat_age=None if self._last_heartbeat is None else now - self._last_heartbeat,
         )
 
+    def round_trip(self) -> float:
+        """Time [s] on the wire of an apply of all channels and its answer; 0 where not known."""
+        return self._backend.round_trip(self.capabilities.channels)
+
     def listen(self, on_event: Callable[[Event], None]) -> None:
         """Be told, in the event loop, what the amplifier says unasked; a hint that may be lost."""
         self._listeners.append(on_event)

@@ -1,19 +1,17 @@
 """The `era amp` commands: talk to one amplifier by hand."""
 
 import asyncio
-import contextlib
 import json
-from collections.abc import AsyncIterator, Coroutine
-from contextlib import asynccontextmanager
+import sys
+from collections.abc import Coroutine
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from drivers.errors import CommandError, CommandRefused, DriverError, FrameError, LinkError
+from drivers.errors import CommandError, CommandRefused, FrameError, LinkError
 
 if TYPE_CHECKING:
-    from drivers.amplifier import Amplifier
-    from drivers.protocol.messages import Achieved, Status
+    from drivers.conformance import Check, Outcome
 
 EXIT_STATUS: dict[type[BaseException], int] = {
     CommandError: 2,
@@ -21,8 +19,6 @@ EXIT_STATUS: dict[type[BaseException], int] = {
     LinkError: 3,
     FrameError: 3,
 }
-
-_RAMP = 0.05  # s; neither start nor end of a drive clicks
 
 app = typer.Typer(no_args_is_help=True)
 amp = typer.Typer(no_args_is_help=True, help="Talk to one amplifier by hand.")
@@ -41,15 +37,76 @@ Json = Annotated[bool, typer.Option("--json", help="One JSON object on standard 
 
 
 @amp.command()
+def discover(
+    url: Annotated[
+        list[str] | None, typer.Argument(help="Ask here as well.", show_default=False)
+    ] = None,
+    probe: Annotated[
+        bool,
+        typer.Option(help="Ask at every port who is there; nothing else is sent."),
+    ] = True,
+    json_: Json = False,
+) -> None:
+    """List serial ports and CAN interfaces, and the amplifiers that answer on them."""
+    from drivers.discovery import ask, candidates
+
+    places = candidates()
+    usable = [one for place in places if place.remedy is None for one in place.urls]
+    found = asyncio.run(ask([*(url or []), *(usable if probe else [])]))
+    who = {one.url: one.identity for one in found if one.identity is not None}
+    rows = [
+        {
+            "place": place.place,
+            "description": place.description,
+            "urls": list(place.urls),
+            "answers": [one for one in place.urls if one in who],
+            "remedy": place.remedy,
+        }
+        for place in places
+    ]
+    amplifiers = [
+        {
+            "url": at,
+            "vendor": one.vendor,
+            "product": one.product,
+            "serial_number": one.serial_number,
+        }
+        for at, one in who.items()
+    ]
+    if json_:
+        print(json.dumps({"places": rows, "amplifiers": amplifiers}))
+        return
+    for row in rows:
+        print(f"{row['place']}  {row['description']}")
+        if row["remedy"]:
+            print(f"  {row['remedy']}")
+    if not rows:
+        print("no serial port and no CAN interface: plug an adapter in, and look again")
+    for one in found:
+        if one.identity is None and one.url in (url or []):
+            print(f"{one.url}: {one.problem}")
+    for amplifier in amplifiers:
+        print("  ".join(str(value) for value in amplifier.values()))
+    if not amplifiers:
+        print("no amplifier answered")
+    else:
+        print(f"Next: era amp identify {amplifiers[0]['url']}")
+
+
+@amp.command()
 def identify(url: Url, json_: Json = False) -> None:
-    """Who the amplifier is and what it can play."""
-    _show(_run(_identify(url)), as_json=json_)
+    """Who the amplifier is, what it can play, and what its wire allows."""
+    from drivers import amp_actions
+
+    _show(_run(amp_actions.identify(url)), as_json=json_)
 
 
 @amp.command()
 def status(url: Url, json_: Json = False) -> None:
     """How the amplifier is, and what went wrong with it."""
-    _show(_run(_status(url)), as_json=json_)
+    from drivers import amp_actions
+
+    _show(_run(amp_actions.status(url)), as_json=json_)
 
 
 @amp.command()
@@ -62,22 +119,79 @@ def drive(
     json_: Json = False,
 ) -> None:
     """Let one channel vibrate for a while; ends silent and disarmed, whatever happens."""
-    _show(
-        _run(_drive(url, channel=channel, frequency=frequency, level=level, duration=duration)),
-        as_json=json_,
+    from drivers import amp_actions
+
+    driven = amp_actions.drive(
+        url, channel=channel, frequency=frequency, level=level, duration=duration
     )
+    _show(_run(driven), as_json=json_)
 
 
 @amp.command()
 def stop(url: Url, json_: Json = False) -> None:
     """Quick stop: silent at once, and refusing to play until it is cleared."""
-    _show(_run(_stop(url)), as_json=json_)
+    from drivers import amp_actions
+
+    _show(_run(amp_actions.stop(url)), as_json=json_)
 
 
 @amp.command()
 def clear(url: Url, json_: Json = False) -> None:
     """Acknowledge a stop, or a fault whose cause is gone; the amplifier stays disarmed."""
-    _show(_run(_clear(url)), as_json=json_)
+    from drivers import amp_actions
+
+    _show(_run(amp_actions.clear(url)), as_json=json_)
+
+
+@amp.command()
+def conformance(
+    url: Url,
+    write: Annotated[
+        bool, typer.Option("--write", help="Drive the outputs too, without asking first.")
+    ] = False,
+    json_: Json = False,
+) -> None:
+    """Check that an amplifier keeps the contract: looking only, then at its channels if told so."""
+    from drivers.conformance import CHECKS, LEVEL
+
+    looking = tuple(check for check in CHECKS if not check.drives)
+    driving = tuple(check for check in CHECKS if check.drives)
+    outcomes = asyncio.run(_conform(url, looking, quiet=json_))
+    if not write and not json_ and sys.stdin.isatty():
+        write = typer.confirm(
+            f"{len(driving)} more checks arm it and let its channels vibrate at {LEVEL:.0%} of "
+            "full stroke. Go on?"
+        )
+    if write and all(outcome.problem is None for outcome in outcomes):
+        outcomes += asyncio.run(_conform(url, driving, quiet=json_))
+    broken = [outcome for outcome in outcomes if outcome.problem is not None]
+    left_out = len(CHECKS) - len(outcomes)
+    if json_:
+        rows = [
+            {"check": one.check.name, "proves": one.check.proves, "problem": one.problem}
+            for one in outcomes
+        ]
+        print(json.dumps({"url": url, "kept": not broken, "left_out": left_out, "checks": rows}))
+    else:
+        print(f"{len(outcomes) - len(broken)} kept, {len(broken)} broken, {left_out} left out")
+        if left_out:
+            print(f"Next: era amp conformance {url} --write")
+    if broken:
+        raise typer.Exit(1)
+
+
+async def _conform(url: str, checks: "tuple[Check, ...]", *, quiet: bool) -> "list[Outcome]":
+    from drivers.amp_actions import conform
+
+    outcomes = []
+    async for outcome in conform(url, checks):
+        outcomes.append(outcome)
+        if not quiet:
+            mark = "kept  " if outcome.problem is None else "BROKEN"
+            print(f"{mark}  It {outcome.check.proves}.")
+            if outcome.problem is not None:
+                print(f"        {outcome.problem}")
+    return outcomes
 
 
 def _run(result: Coroutine[Any, Any, dict[str, Any]]) -> dict[str, Any]:
@@ -91,146 +205,3 @@ def _show(result: dict[str, Any], *, as_json: bool) -> None:
     width = max(len(key) for key in result)
     for key, value in result.items():
         print(f"{key:{width}}  {value if isinstance(value, str) else json.dumps(value)}")
-
-
-@asynccontextmanager
-async def _opened(url: str) -> AsyncIterator["Amplifier"]:
-    from drivers.amplifier import Amplifier
-    from drivers.registry import open_backend
-
-    amplifier = Amplifier(open_backend(url))
-    await amplifier.open()
-    try:
-        yield amplifier
-    finally:
-        await amplifier.close()
-
-
-async def _identify(url: str) -> dict[str, Any]:
-    async with _opened(url) as amplifier:
-        who, what = amplifier.identity, amplifier.capabilities
-        return {
-            "url": url,
-            "vendor": who.vendor,
-            "product": who.product,
-            "serial_number": who.serial_number,
-            "firmware": who.firmware,
-            "protocol_version": who.protocol_version,
-            "channels": what.channels,
-            "frequency_min_hz": what.frequency_min,
-            "frequency_max_hz": what.frequency_max,
-            "frequency_step_hz": what.frequency_step,
-            "level_max": what.level_max,
-            "level_step": what.level_step,
-            "phase_step_deg": what.phase_step,
-            "ramp_max_s": what.ramp_max,
-            "watchdog_min_s": what.watchdog_min,
-            "watchdog_max_s": what.watchdog_max,
-            "envelope_knots": what.envelope_knots,
-        }
-
-
-async def _status(url: str) -> dict[str, Any]:
-    async with _opened(url) as amplifier:
-        now = await amplifier.status()
-        faults = await amplifier.faults()
-        return {
-            "url": url,
-            **_status_row(now),
-            "faults": [
-                {"fault": record.fault.name, "channel": record.channel, "age_s": record.age}
-                for record in faults
-            ],
-        }
-
-
-async def _stop(url: str) -> dict[str, Any]:
-    async with _opened(url) as amplifier:
-        return {"url": url, **_status_row(await amplifier.stop())}
-
-
-async def _clear(url: str) -> dict[str, Any]:
-    async with _opened(url) as amplifier:
-        return {"url": url, **_status_row(await amplifier.clear())}
-
-
-async def _drive(
-    url: str, *, channel: int, frequency: float, level: float, duration: float
-) -> dict[str, Any]:
-    from drivers.amplifier import WATCHDOG
-    from drivers.command import CommandSet, DriveCommand
-    from drivers.guard import FREQUENCY_CEILING, FREQUENCY_FLOOR, LEVEL_CEILING, Guard, GuardLimits
-    from drivers.protocol.definition import PROTOCOL
-
-    longest = PROTOCOL.quantities.valid_for.high
-    if not 0 < duration <= longest:
-        raise CommandError(f"--for is {duration:g} s; it must lie between 0 and {longest:g} s")
-    ceiling = GuardLimits(FREQUENCY_FLOOR, FREQUENCY_CEILING, LEVEL_CEILING)
-    async with _opened(url) as amplifier:
-        guard = Guard(ceiling, amplifier.capabilities)
-        wanted = DriveCommand(channel=channel, frequency=frequency, level=level)
-        safe = guard.check(
-            CommandSet(
-                token=amplifier.next_token(),
-                commands=(wanted,),
-                ramp=min(_RAMP, amplifier.capabilities.ramp_max),
-                valid_for=duration,
-            )
-        )
-        watchdog = max(WATCHDOG, amplifier.capabilities.watchdog_min)
-        try:
-            await amplifier.arm(watchdog)
-            achieved = await amplifier.apply(safe)
-            await _keep_alive(amplifier, duration, beat=watchdog / 5)
-        finally:
-            # What cannot be told to the amplifier any more is left to its watchdog.
-            with contextlib.suppress(DriverError):
-                await amplifier.disarm(_RAMP)
-        await asyncio.sleep(_RAMP)
-        after = await amplifier.status()
-    return {"url": url, **_achieved_row(achieved), "duration_s": duration, **_status_row(after)}
-
-
-async def _keep_alive(amplifier: "Amplifier", duration: float, *, beat: float) -> None:
-    """Feed the watchdog for a while [s], a heartbeat every `beat` [s]; raises CommandRefused.
-
-    That is where the amplifier has stopped by itself meanwhile.
-    """
-    from drivers.protocol.messages import State
-
-    loop = asyncio.get_running_loop()
-    end = loop.time() + duration
-    while (left := end - loop.time()) > 0:
-        await asyncio.sleep(min(beat, left))
-        status = await amplifier.heartbeat()
-        if status.state is not State.OPERATION_ENABLED:
-            raise CommandRefused(
-                f"the amplifier ended the drive by itself: it is in {status.state.name}, fault "
-                f"{status.fault.name}; see era amp status, and era amp clear once the cause is gone"
-            )
-
-
-def _achieved_row(achieved: "Achieved") -> dict[str, Any]:
-    return {
-        "achieved": [
-            {
-                "channel": command.channel,
-                "frequency_hz": command.frequency,
-                "level": command.level,
-                "phase_deg": command.phase,
-            }
-            for command in achieved.commands
-        ]
-    }
-
-
-def _status_row(status: "Status") -> dict[str, Any]:
-    return {
-        "state": status.state.name,
-        "fault": status.fault.name,
-        "token": status.token,
-        "high_voltage": status.high_voltage,
-        "temperature_c": status.temperature,
-        "watchdog_left_s": status.watchdog_left,
-        "levels": list(status.levels),
-    }

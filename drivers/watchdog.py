@@ -1,10 +1,7 @@
 """How short a watchdog the wire allows, worked out when a configuration is read."""
 
-from urllib.parse import urlsplit
-
-from drivers.backends.serial_url import SerialUrl
 from drivers.errors import CommandError
-from drivers.protocol.serial_timing import round_trip_time
+from drivers.registry import open_backend
 
 HEARTBEAT = 0.05  # s; the control loop's own
 HEARTBEATS_BORNE = 3  # two may be lost or late before the amplifier falls silent
@@ -13,11 +10,15 @@ HEARTBEATS_BORNE = 3  # two may be lost or late before the amplifier falls silen
 def round_trip_of(url: str, *, channels: int) -> float:
     """Time [s] that an apply of so many channels and its answer take on the wire of a URL.
 
-    0 for wires whose speed is not in their URL: inside one process, or over a network.
+    0 for wires whose speed is not in their URL: inside one process, or over a network. Raises
+    CommandError for a URL that no backend understands.
     """
-    if urlsplit(url).scheme != "serial" or urlsplit(url).netloc:
-        return 0.0
-    return round_trip_time(channels, baud=SerialUrl.parse(url).baud)
+    return open_backend(url).round_trip(channels)
+
+
+def shortest_watchdog(round_trip: float, *, heartbeat: float = HEARTBEAT) -> float:
+    """The shortest watchdog [s] that a wire with this round trip [s] allows."""
+    return HEARTBEATS_BORNE * heartbeat + round_trip
 
 
 def check_watchdog(watchdog: float, round_trip: float, *, heartbeat: float = HEARTBEAT) -> None:
@@ -26,7 +27,7 @@ def check_watchdog(watchdog: float, round_trip: float, *, heartbeat: float = HEA
     round_trip: of the longest exchange on the link (see `round_trip_of`). Raises CommandError that
     says what the wire allows.
     """
-    shortest = HEARTBEATS_BORNE * heartbeat + round_trip
+    shortest = shortest_watchdog(round_trip, heartbeat=heartbeat)
     if not watchdog >= shortest - 1e-9:  # sums of floats
         raise CommandError(
             f"a watchdog of {watchdog * 1e3:g} ms is too short: {HEARTBEATS_BORNE} heartbeats of "

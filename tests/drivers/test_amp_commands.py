@@ -10,9 +10,11 @@ from dataclasses import replace
 from typing import Any, TypeVar
 
 import pytest
+from serial.tools.list_ports_common import ListPortInfo
 from typer.testing import CliRunner
 
 from drivers.cli import EXIT_STATUS, app
+from drivers.discovery import candidates
 from drivers.errors import CommandError, CommandRefused, FrameError, LinkError, LinkTimeout
 from drivers.protocol.messages import (
     Apply,
@@ -20,6 +22,8 @@ from drivers.protocol.messages import (
     Clear,
     Disarm,
     Fault,
+    GetCaps,
+    Hello,
     Nak,
     NakCode,
     Ping,
@@ -185,3 +189,54 @@ def test_every_error_has_its_exit_status(error: type[Exception], status: int) ->
     """1 the answer is no, 2 bad input, 3 hardware or link."""
     found = {code for kind, code in EXIT_STATUS.items() if issubclass(error, kind)}
     assert found == {status}
+
+
+def test_conformance_says_what_is_kept_and_what_is_not(background: BackgroundFarEnd) -> None:
+    """Over a far end that is armed from the first, looking shows it: exit 1, and nothing driven."""
+    result = CliRunner().invoke(
+        app, ["amp", "conformance", background.end.url, "--write", "--json"]
+    )
+    assert result.exit_code == 1, result.output
+    answer = json.loads(result.stdout)
+    problems = {row["check"]: row["problem"] for row in answer["checks"]}
+    assert not answer["kept"]
+    assert "OPERATION_ENABLED" in problems["starts_disarmed"]
+    assert problems["identity"] is None
+    assert answer["left_out"] > 10
+    assert not any(isinstance(request, Arm | Apply) for request in background.end.requests)
+
+
+def test_discover_asks_who_is_there_and_nothing_else(background: BackgroundFarEnd) -> None:
+    """A URL that answers is named, one that does not is no error; only Hello and GetCaps go out."""
+    urls = [background.end.url, "serial:///dev/no-such-port"]
+    result = CliRunner().invoke(app, ["amp", "discover", *urls, "--no-probe", "--json"])
+    assert result.exit_code == 0, result.output
+    (found,) = json.loads(result.stdout)["amplifiers"]
+    assert (found["url"], found["serial_number"]) == (background.end.url, "A-17")
+    assert background.end.requests == [Hello(), GetCaps()]
+
+
+def test_discover_tells_how_to_mend_permissions(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A port that this user may not use is listed with its group, and is not asked."""
+    monkeypatch.setattr("drivers.discovery.comports", lambda: [ListPortInfo("/dev/null")])
+    monkeypatch.setattr("drivers.discovery.os.access", lambda path, mode: False)
+    (place,) = [one for one in candidates() if one.place == "/dev/null"]
+    assert "usermod -aG" in (place.remedy or "")
+    assert "chmod a+rw /dev/null" in (place.remedy or "")
+
+
+def test_identify_says_what_the_wire_allows(background: BackgroundFarEnd) -> None:
+    """At 115 200 baud: 50 and 46 bytes are 8.33 ms, 120 sets a second, a watchdog of 158 ms."""
+    url = f"{background.end.url}?baud=115200"
+    answer = json.loads(CliRunner().invoke(app, ["amp", "identify", url, "--json"]).stdout)
+    assert answer["wire_round_trip_s"] == pytest.approx(96 * 10 / 115200, abs=1e-6)
+    assert answer["sets_per_second_max"] == 120
+    assert answer["watchdog_shortest_s"] == pytest.approx(0.15 + 96 * 10 / 115200, abs=1e-6)
+
+
+def test_a_drive_over_too_slow_a_line_never_arms(background: BackgroundFarEnd) -> None:
+    """At 4800 baud three heartbeats and a round trip do not fit into the watchdog."""
+    result = CliRunner().invoke(app, ["amp", "drive", f"{background.end.url}?baud=4800"])
+    assert isinstance(result.exception, CommandError)
+    assert "need at least 350 ms" in str(result.exception)
+    assert not any(isinstance(request, Arm) for request in background.end.requests)

@@ -1,0 +1,185 @@
+"""What `era amp` does with one amplifier; each gives the rows that are shown."""
+
+import asyncio
+import contextlib
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from typing import Any
+
+from drivers.amplifier import WATCHDOG, Amplifier
+from drivers.command import CommandSet, DriveCommand
+from drivers.conformance import Check, Outcome, run_check
+from drivers.errors import CommandError, CommandRefused, DriverError
+from drivers.guard import FREQUENCY_CEILING, FREQUENCY_FLOOR, LEVEL_CEILING, Guard, GuardLimits
+from drivers.protocol.definition import PROTOCOL
+from drivers.protocol.messages import Achieved, State, Status
+from drivers.registry import open_backend
+from drivers.watchdog import check_watchdog, shortest_watchdog
+
+_RAMP = 0.05  # s; neither start nor end of a drive clicks
+
+
+async def identify(url: str) -> dict[str, Any]:
+    """Who it is, what it can play, and what its wire allows."""
+    async with _opened(url) as amplifier:
+        who, what = amplifier.identity, amplifier.capabilities
+        return {
+            "url": url,
+            "vendor": who.vendor,
+            "product": who.product,
+            "serial_number": who.serial_number,
+            "firmware": who.firmware,
+            "protocol_version": who.protocol_version,
+            "channels": what.channels,
+            "frequency_min_hz": what.frequency_min,
+            "frequency_max_hz": what.frequency_max,
+            "frequency_step_hz": what.frequency_step,
+            "level_max": what.level_max,
+            "level_step": what.level_step,
+            "phase_step_deg": what.phase_step,
+            "ramp_max_s": what.ramp_max,
+            "watchdog_min_s": what.watchdog_min,
+            "watchdog_max_s": what.watchdog_max,
+            "envelope_knots": what.envelope_knots,
+            "envelope_slots": what.envelope_slots,
+            "envelope_step_min_s": what.envelope_step_min,
+            "envelope_step_max_s": what.envelope_step_max,
+            "events": what.events,
+            **_wire_rows(amplifier),
+        }
+
+
+async def status(url: str) -> dict[str, Any]:
+    """How it is, what went wrong with it, and how its link does."""
+    async with _opened(url) as amplifier:
+        now = await amplifier.status()
+        faults = await amplifier.faults()
+        return {
+            "url": url,
+            **_status_rows(now),
+            "faults": [
+                {"fault": record.fault.name, "channel": record.channel, "age_s": record.age}
+                for record in faults
+            ],
+            "last_round_trip_s": amplifier.statistics.last_round_trip,
+            **_wire_rows(amplifier),
+        }
+
+
+async def stop(url: str) -> dict[str, Any]:
+    """Quick stop."""
+    async with _opened(url) as amplifier:
+        return {"url": url, **_status_rows(await amplifier.stop())}
+
+
+async def clear(url: str) -> dict[str, Any]:
+    """Acknowledge a stop or a fault."""
+    async with _opened(url) as amplifier:
+        return {"url": url, **_status_rows(await amplifier.clear())}
+
+
+async def drive(
+    url: str, *, channel: int, frequency: float, level: float, duration: float
+) -> dict[str, Any]:
+    """Let one channel vibrate for a while [s]; ends silent and disarmed."""
+    longest = PROTOCOL.quantities.valid_for.high
+    if not 0 < duration <= longest:
+        raise CommandError(f"--for is {duration:g} s; it must lie between 0 and {longest:g} s")
+    ceiling = GuardLimits(FREQUENCY_FLOOR, FREQUENCY_CEILING, LEVEL_CEILING)
+    async with _opened(url) as amplifier:
+        guard = Guard(ceiling, amplifier.capabilities)
+        wanted = DriveCommand(channel=channel, frequency=frequency, level=level)
+        safe = guard.check(
+            CommandSet(
+                token=amplifier.next_token(),
+                commands=(wanted,),
+                ramp=min(_RAMP, amplifier.capabilities.ramp_max),
+                valid_for=duration,
+            )
+        )
+        watchdog = max(WATCHDOG, amplifier.capabilities.watchdog_min)
+        check_watchdog(watchdog, amplifier.round_trip())
+        try:
+            await amplifier.arm(watchdog)
+            achieved = await amplifier.apply(safe)
+            await _keep_alive(amplifier, duration, beat=watchdog / 5)
+        finally:
+            # What cannot be told to the amplifier any more is left to its watchdog.
+            with contextlib.suppress(DriverError):
+                await amplifier.disarm(_RAMP)
+        await asyncio.sleep(_RAMP)
+        after = await amplifier.status()
+    return {"url": url, **_achieved_rows(achieved), "duration_s": duration, **_status_rows(after)}
+
+
+async def conform(url: str, checks: tuple[Check, ...]) -> AsyncIterator[Outcome]:
+    """What comes of each check in turn."""
+    async with _opened(url) as amplifier:
+        for check in checks:
+            yield await run_check(check, amplifier)
+
+
+@asynccontextmanager
+async def _opened(url: str) -> AsyncIterator[Amplifier]:
+    amplifier = Amplifier(open_backend(url))
+    await amplifier.open()
+    try:
+        yield amplifier
+    finally:
+        await amplifier.close()
+
+
+async def _keep_alive(amplifier: Amplifier, duration: float, *, beat: float) -> None:
+    """Feed the watchdog for a while [s], a heartbeat every `beat` [s]; raises CommandRefused.
+
+    That is where the amplifier has stopped by itself meanwhile.
+    """
+    loop = asyncio.get_running_loop()
+    end = loop.time() + duration
+    while (left := end - loop.time()) > 0:
+        await asyncio.sleep(min(beat, left))
+        status = await amplifier.heartbeat()
+        if status.state is not State.OPERATION_ENABLED:
+            raise CommandRefused(
+                f"the amplifier ended the drive by itself: it is in {status.state.name}, fault "
+                f"{status.fault.name}; see era amp status, and era amp clear once the cause is gone"
+            )
+
+
+def _wire_rows(amplifier: Amplifier) -> dict[str, Any]:
+    """What the wire allows, by arithmetic; nothing where its speed is not known."""
+    round_trip = amplifier.round_trip()
+    if not round_trip:
+        return {}
+    return {
+        "wire_round_trip_s": round(round_trip, 6),
+        "sets_per_second_max": int(1 / round_trip),
+        "watchdog_shortest_s": round(shortest_watchdog(round_trip), 6),
+    }
+
+
+def _achieved_rows(achieved: Achieved) -> dict[str, Any]:
+    return {
+        "achieved": [
+            {
+                "channel": command.channel,
+                "frequency_hz": command.frequency,
+                "level": command.level,
+                "phase_deg": command.phase,
+            }
+            for command in achieved.commands
+        ]
+    }
+
+
+def _status_rows(status: Status) -> dict[str, Any]:
+    return {
+        "state": status.state.name,
+        "fault": status.fault.name,
+        "token": status.token,
+        "high_voltage": status.high_voltage,
+        "high_voltage_v": status.voltage,
+        "temperature_c": status.temperature,
+        "watchdog_left_s": status.watchdog_left,
+        "levels": list(status.levels),
+    }

@@ -1,0 +1,99 @@
+"""What amplifiers could be reached from this machine, and which of them answer.
+
+Whoever is asked is asked who it is, and nothing else: no output is written.
+"""
+
+import os
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from serial.tools.list_ports import comports
+
+from drivers.amplifier import Amplifier
+from drivers.errors import DriverError
+from drivers.protocol.definition import PROTOCOL
+from drivers.protocol.messages import Identity
+from drivers.registry import known_schemes, open_backend
+
+_NETWORK = Path("/sys/class/net")
+_CAN_TYPE = "280"  # ARPHRD_CAN of Linux
+_SPEEDS = (PROTOCOL.serial.baud, 115_200)
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A port or an interface: the URLs to try there, and what stands in the way, if anything."""
+
+    place: str
+    description: str
+    urls: tuple[str, ...]
+    remedy: str | None = None
+
+
+@dataclass(frozen=True)
+class Found:
+    """What came of asking at a URL: who answered, or why nobody did."""
+
+    url: str
+    identity: Identity | None
+    problem: str | None = None
+
+
+def candidates() -> list[Candidate]:
+    """Serial ports and CAN interfaces of this machine, whether or not they can be used."""
+    return [*_serial_ports(), *_can_interfaces()]
+
+
+async def ask(urls: Iterable[str]) -> list[Found]:
+    """Who answers at these URLs, one after the other."""
+    return [await _ask(url) for url in urls]
+
+
+async def _ask(url: str) -> Found:
+    try:
+        amplifier = Amplifier(open_backend(url))
+        await amplifier.open()
+    except DriverError as problem:
+        return Found(url, None, str(problem))
+    identity = amplifier.identity
+    await amplifier.close()
+    return Found(url, identity)
+
+
+def _serial_ports() -> Iterator[Candidate]:
+    for port in sorted(comports()):
+        path = port.device
+        urls = tuple(f"serial://{_absolute(path)}?baud={speed}" for speed in _SPEEDS)
+        yield Candidate(path, port.description, urls, remedy=_why_not_usable(path))
+
+
+def _absolute(path: str) -> str:
+    return path if path.startswith("/") else f"/{path}"
+
+
+def _why_not_usable(path: str) -> str | None:
+    if not path.startswith("/") or os.access(path, os.R_OK | os.W_OK):
+        return None
+    group = Path(path).group()
+    return (
+        f"this user may not use it: sudo usermod -aG {group} $USER, then log in again "
+        f"(for a moment only: sudo chmod a+rw {path})"
+    )
+
+
+def _can_interfaces() -> Iterator[Candidate]:
+    if not _NETWORK.is_dir():
+        return
+    for interface in sorted(_NETWORK.iterdir()):
+        kind = interface / "type"
+        if not kind.is_file() or kind.read_text(encoding="ascii").strip() != _CAN_TYPE:
+            continue
+        name = interface.name
+        is_up = (interface / "operstate").read_text(encoding="ascii").strip() != "down"
+        node = PROTOCOL.canopen["node"]
+        scheme = "can+socketcan"
+        urls = (f"{scheme}://{name}#{node}",) if scheme in known_schemes() else ()
+        bitrate = PROTOCOL.canopen["bitrate"]
+        remedy = f"it is down: sudo ip link set {name} up type can bitrate {bitrate}"
+        yield Candidate(name, "CAN interface", urls, remedy=None if is_up else remedy)

@@ -32,6 +32,11 @@ from model.errors import InputError
 # What is enumerated at once; larger fronts are cut in pieces, one after the other.
 FRONT = 100_000
 
+# Of the quiet points a few decide; how much louder others may be than these, relative.
+FIRST_POINTS = 30
+DECISIVE_POINTS = 12
+CLOSE_ENOUGH = 1e-3
+
 # Beyond this many ways to group ERAs the search would not end in a day.
 MOST_ERAS = 9
 
@@ -101,6 +106,34 @@ def groupings(era_count: int, eras_at_most: int) -> tuple[tuple[int, ...], ...]:
     return tuple(extend(0, (), 0))
 
 
+def _loudest_points_share(relative: FloatArray) -> FloatArray:
+    """Weights (q,) of the points under which even the best mixture of sources (n, q) is loud.
+
+    A linear program over the loudest points; others come in where a mixture is louder there.
+    """
+    n, points = relative.shape
+    some = np.argsort(-relative.mean(axis=0))[:FIRST_POINTS]
+    while True:
+        answer = linprog(
+            np.append(np.zeros(n), 1.0),
+            A_ub=np.column_stack([relative[:, some].T, -np.ones(len(some))]),
+            b_ub=np.zeros(len(some)),
+            A_eq=[np.append(np.ones(n), 0.0)],
+            b_eq=[1.0],
+            bounds=[(0, None)] * n + [(None, None)],
+            method="highs-ds",
+        )
+        solution = np.asarray(answer.x)
+        field = solution[:n] @ relative
+        level = solution[n]
+        louder = np.setdiff1d(np.flatnonzero(field > level * (1 + CLOSE_ENOUGH)), some)
+        if len(louder) == 0:
+            share = np.zeros(points)
+            share[some] = np.maximum(-answer.ineqlin.marginals, 0)
+            return np.asarray(share / share.sum())
+        some = np.append(some, louder[np.argsort(-field[louder])[:FIRST_POINTS]])
+
+
 class _Search:
     """One search; `contrast` and `drive` are the best so far."""
 
@@ -119,7 +152,7 @@ class _Search:
         self._power = np.mean([power.mean(axis=-1) for power in self._powers], axis=0)
         self._share, self.mixture = self._dual()
         self._loud = self._quiet @ self._share
-        self._strict = np.argsort(-self._share)[:12]
+        self._decisive = self._quiet[:, :, np.argsort(-self._share)[:DECISIVE_POINTS]]
         self.looked_at = 0
         self.contrast = 0.0
         self.drive: Drive | None = None
@@ -179,17 +212,7 @@ class _Search:
             field = relative.T @ mixture
             share = field / np.linalg.norm(field) / math.sqrt(points)
         else:
-            answer = linprog(
-                np.append(np.zeros(n), 1.0),
-                A_ub=np.column_stack([relative.T, -np.ones(points)]),
-                b_ub=np.zeros(points),
-                A_eq=[np.append(np.ones(n), 0.0)],
-                b_eq=[1.0],
-                bounds=[(0, None)] * n + [(None, None)],
-                method="highs-ds",
-            )
-            share = np.maximum(-answer.ineqlin.marginals, 0)
-            share /= share.sum()
+            share = _loudest_points_share(relative)
         # Whatever the solver's tolerance, this holds for these weights.
         return share, float(1 / (relative @ share).min())
 
@@ -246,8 +269,7 @@ class _Search:
         """Judge choices (n, groups) in full and keep the best."""
         if not self._fields.is_alone:
             some = sum(
-                self._quiet[group][chosen[:, column]][:, self._strict]
-                for column, group in enumerate(groups)
+                self._decisive[group][chosen[:, column]] for column, group in enumerate(groups)
             )
             bounded = sums[:, 0] > self.contrast * np.asarray(some).max(axis=1)
             chosen = chosen[bounded]

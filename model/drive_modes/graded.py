@@ -24,13 +24,13 @@ def _solve(R: SingleComplex, c: SingleComplex) -> SingleComplex:
     for _ in range(EXCHANGES):
         both = driven[:, :, None] & driven[:, None, :]
         system = np.where(both, form, identity)
-        w = np.linalg.solve(system, np.where(driven, pull, 0)[..., None])[..., 0]
+        w[:] = np.linalg.solve(system, np.where(driven, pull, 0)[..., None])[..., 0]
         gain = pull - (form @ w[..., None])[..., 0]
         wrong = np.where(driven, w < 0, gain > 0)
         if not wrong.any():
             break
         driven = driven ^ wrong
-    w = np.maximum(w, 0)
+    np.maximum(w, 0, out=w)
     for _ in range(SWEEPS):
         for era in range(pull.shape[1]):
             others = (form[:, era] * w).sum(axis=1) - form[:, era, era] * w[:, era]

@@ -103,14 +103,7 @@ class ModbusLink:
         """
         async with self._turn:
             await self._await_silence()
-            self._transaction = (self._transaction + 1) % _TRANSACTIONS
-            telegram = make_telegram(
-                read,
-                write,
-                unit=unit,
-                transaction=0 if self.line.is_rtu else self._transaction,
-                is_rtu=self.line.is_rtu,
-            )
+            telegram = self._make(read, write, unit=unit)
             self._telegram, self._accept = telegram, accept
             self._answer = asyncio.get_running_loop().create_future()
             on_line = self._time_of(len(telegram.frame) + _RTU_OVERHEAD + telegram.answer_size)
@@ -137,11 +130,14 @@ class ModbusLink:
         async with self._turn:
             await self._await_silence()
             self._telegram = None
-            telegram = make_telegram(
-                None, write, unit=_BROADCAST, transaction=0, is_rtu=self.line.is_rtu
-            )
+            telegram = self._make(None, write, unit=_BROADCAST)
             self._send(telegram.frame)
             self._free_from = self.last_sent + self._time_of(len(telegram.frame)) + self._gap
+
+    def _make(self, read: Read | None, write: Write | None, *, unit: int) -> Telegram:
+        self._transaction = (self._transaction + 1) % _TRANSACTIONS
+        number = 0 if self.line.is_rtu else self._transaction
+        return make_telegram(read, write, unit=unit, transaction=number, is_rtu=self.line.is_rtu)
 
     def _send(self, frame: bytes) -> None:
         if self._stream is None or self._loss is not None:

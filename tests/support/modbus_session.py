@@ -1,0 +1,158 @@
+"""The session of the Modbus vendor page: what is asked, what is answered, and by whom."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from drivers.command import CommandSet, DriveCommand, Envelope, Knot
+from drivers.guard import Guard, GuardLimits
+from drivers.protocol.messages import (
+    Achieved,
+    Apply,
+    Arm,
+    Broadcast,
+    Capabilities,
+    Clear,
+    Commit,
+    Disarm,
+    Event,
+    Fault,
+    FaultList,
+    FaultRecord,
+    GetCaps,
+    GetFaults,
+    GetStatus,
+    Hello,
+    Identity,
+    Loaded,
+    LoadEnvelope,
+    Nak,
+    NakCode,
+    Ping,
+    Reply,
+    Request,
+    Stage,
+    State,
+    Status,
+    Stop,
+)
+from sim.faults import Faults
+
+CAPABILITIES = Capabilities(
+    *(4, 20.0, 600.0, 0.01, 1.0, 0.0001, 0.01, 1.0, 0.1, 2.0, 32, 16, 0.001, 0.1, False)
+)
+IDENTITY = Identity("Acme", "Quad", "A-17", "1.2", 1)
+COMMANDS = (
+    DriveCommand(channel=0, frequency=110.0, level=0.2, phase=0.0),
+    DriveCommand(channel=3, frequency=250.5, level=1.0, phase=-90.0, keep_phase=True),
+)
+GUARD = Guard(GuardLimits(20.0, 600.0, 1.0), CAPABILITIES)
+SET = GUARD.check(CommandSet(token=513, commands=COMMANDS, ramp=0.02, valid_for=0.5))
+SHAPE = GUARD.check_envelope(Envelope(slot=5, step=0.005, knots=(Knot(0.1, 90), Knot(1, -0.01))))
+GUARD.check_envelope(Envelope(slot=6, step=0.005, knots=(Knot(0.1, 0),)))
+SHAPED_COMMANDS = (DriveCommand(0, 110.0, 0.2, onset=5, ending=6),)
+SHAPED = GUARD.check(CommandSet(514, SHAPED_COMMANDS, ramp=0.0, valid_for=0.0))
+S = State
+OFF = Status(S.SWITCH_ON_DISABLED, Fault.NONE, 0, False, 25.0, 0.0, (0.0,) * 4)
+ARMED = Status(S.OPERATION_ENABLED, Fault.NONE, 0, True, 25.0, 0.25, (0.0,) * 4, 1800.0)
+LEVELS = (0.2, 0.0, 0.0, 1.0)
+PLAYING = Status(S.OPERATION_ENABLED, Fault.NONE, 513, True, 25.0, 0.25, LEVELS, 1800.0)
+FADING = Status(S.SWITCHED_ON, Fault.NONE, 513, True, 25.0, 0.0, LEVELS, 1800.0)
+STOPPED = Status(S.QUICK_STOP_ACTIVE, Fault.NONE, 513, True, 25.0, 0.0, LEVELS, 1800.0)
+TRIPPED = Status(S.FAULT, Fault.WATCHDOG, 513, False, -5.3, 0.0, (0.0,) * 4)
+
+
+@dataclass(frozen=True)
+class Example:
+    """One exchange of the session. status: how the amplifier is then."""
+
+    request: Request
+    reply: Reply
+    status: Status = PLAYING
+
+
+# In the order of the page; their tags, and over TCP their transactions, count from 1.
+EXAMPLES: dict[str, Example] = {
+    "Hello": Example(Hello(), IDENTITY, OFF),
+    "GetCaps": Example(GetCaps(), CAPABILITIES, OFF),
+    "Arm": Example(Arm(watchdog=0.25), ARMED, ARMED),
+    "Apply": Example(Apply(SET), Achieved(513, COMMANDS)),
+    "Ping": Example(Ping(), PLAYING),
+    "Stage": Example(Stage(SET), Achieved(513, COMMANDS), ARMED),
+    "Commit": Example(Commit(token=513), Achieved(513, COMMANDS)),
+    "LoadEnvelope": Example(LoadEnvelope(SHAPE), Loaded(slot=5, knots=2)),
+    "Shaped Apply": Example(Apply(SHAPED), Achieved(514, SHAPED_COMMANDS)),
+    "Refused Apply": Example(Apply(SET), Nak(NakCode.BAD_CHANNEL, 3)),
+    "Disarm": Example(Disarm(ramp=0.05), FADING, FADING),
+    "Stop": Example(Stop(ramp=0.005), STOPPED, STOPPED),
+    "GetStatus": Example(GetStatus(), TRIPPED, TRIPPED),
+    "GetFaults": Example(
+        GetFaults(),
+        FaultList((FaultRecord(Fault.WATCHDOG, None, 1.5), FaultRecord(Fault.ARC, 2, 65.536))),
+        TRIPPED,
+    ),
+    "Clear": Example(Clear(), OFF, OFF),
+}
+
+
+class ScriptedStation:
+    """An amplifier that says what it is told to say, and remembers what it was asked."""
+
+    name = "main"
+
+    def __init__(self, *, number: int = 1) -> None:
+        self.number = number
+        self.faults = Faults()
+        self.is_answering = True
+        self.asked: list[Request] = []
+        self.heard: list[Broadcast] = []
+        self.answer: Callable[[Request], Reply | None] = self.usual_answer
+
+    def tell(self, example: Example) -> None:
+        """Say from now on what the page says."""
+
+        def answer(request: Request) -> Reply:
+            match request:
+                case GetStatus() if not isinstance(example.request, GetStatus):
+                    return example.status
+                case _:
+                    return example.reply
+
+        self.answer = answer
+
+    def usual_answer(self, request: Request) -> Reply | None:
+        """What a well-behaved amplifier says."""
+        match request:
+            case Hello():
+                return IDENTITY
+            case GetCaps():
+                return CAPABILITIES
+            case GetFaults():
+                return FaultList(())
+            case Stage(command_set=wanted) | Apply(command_set=wanted):
+                return Achieved(wanted.token, wanted.commands)
+            case Commit(token=token):
+                return Achieved(token, COMMANDS)
+            case LoadEnvelope(envelope=envelope):
+                return Loaded(envelope.slot, len(envelope.knots))
+            case _:
+                return ARMED
+
+    def exchange(self, request: Request) -> Reply | None:
+        """Its answer."""
+        self.asked.append(request)
+        return self.answer(request)
+
+    def broadcast(self, request: Broadcast) -> None:
+        """What was said to all."""
+        self.heard.append(request)
+
+    def on_plug(self, on_plug: Callable[[bool], None]) -> None:
+        """Its wire stays where it is."""
+
+    def listen(self, on_event: Callable[[Event], None]) -> None:
+        """It never speaks unasked."""
+
+
+def as_hex(frames: Sequence[bytes]) -> list[str]:
+    """Frames as the page writes them."""
+    return [frame.hex(" ").upper() for frame in frames]

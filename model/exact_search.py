@@ -16,26 +16,24 @@ patterns some hundred are left to be looked at.
 
 import math
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import linprog, nnls
 
 from model.arrays import FloatArray, IntArray
 from model.drive_modes.fields import SILENT, Drive, Fields, quietness
 from model.drive_modes.switched import find_switched
 from model.errors import InputError
+from model.mixture_bound import mixture_bound
 
 # What is enumerated at once; larger fronts are cut in pieces, one after the other.
 FRONT = 100_000
 
-# Of the quiet points a few decide; how much louder others may be than these, relative.
-FIRST_POINTS = 30
+# Of the quiet points a few decide; most patterns are seen by them not to be better.
 DECISIVE_POINTS = 12
-CLOSE_ENOUGH = 1e-3
 
 # Beyond this many ways to group ERAs the search would not end in a day.
 MOST_ERAS = 9
@@ -77,6 +75,15 @@ def search_exactly(
     return search.run()
 
 
+def loudest_group(fields: Fields, *, eras_at_most: int) -> float:
+    """How many times above threshold up to so many ERAs at one frequency make the targets feel."""
+    masks = _masks(fields.era_count, eras_at_most)
+    each = [
+        _magnitudes(target, masks).mean(axis=-1) / fields.threshold for target in fields.targets
+    ]
+    return float(np.min(each, axis=0).max())
+
+
 def pattern_count(era_count: int, frequency_count: int, *, eras_at_most: int) -> int:
     """How many patterns there are with 1 to `eras_at_most` ERAs."""
     return sum(
@@ -106,32 +113,17 @@ def groupings(era_count: int, eras_at_most: int) -> tuple[tuple[int, ...], ...]:
     return tuple(extend(0, (), 0))
 
 
-def _loudest_points_share(relative: FloatArray) -> FloatArray:
-    """Weights (q,) of the points under which even the best mixture of sources (n, q) is loud.
+def _masks(era_count: int, eras_at_most: int) -> list[int]:
+    """Every group of so many ERAs at the most, as bit masks."""
+    return [mask for mask in range(1, 1 << era_count) if mask.bit_count() <= eras_at_most]
 
-    A linear program over the loudest points; others come in where a mixture is louder there.
-    """
-    n, points = relative.shape
-    some = np.argsort(-relative.mean(axis=0))[:FIRST_POINTS]
-    while True:
-        answer = linprog(
-            np.append(np.zeros(n), 1.0),
-            A_ub=np.column_stack([relative[:, some].T, -np.ones(len(some))]),
-            b_ub=np.zeros(len(some)),
-            A_eq=[np.append(np.ones(n), 0.0)],
-            b_eq=[1.0],
-            bounds=[(0, None)] * n + [(None, None)],
-            method="highs-ds",
-        )
-        solution = np.asarray(answer.x)
-        field = solution[:n] @ relative
-        level = solution[n]
-        louder = np.setdiff1d(np.flatnonzero(field > level * (1 + CLOSE_ENOUGH)), some)
-        if len(louder) == 0:
-            share = np.zeros(points)
-            share[some] = np.maximum(-answer.ineqlin.marginals, 0)
-            return np.asarray(share / share.sum())
-        some = np.append(some, louder[np.argsort(-field[louder])[:FIRST_POINTS]])
+
+def _magnitudes(field: NDArray[np.complex64], masks: Sequence[int]) -> FloatArray:
+    """Magnitude of every group's sum, (groups, f, p), from each ERA's field (f, eras, p)."""
+    f, eras, p = field.shape
+    member = (np.array(masks)[:, None] >> np.arange(eras)) & 1
+    flat = field.transpose(1, 0, 2).reshape(eras, -1)
+    return np.asarray(np.abs(member.astype(complex) @ flat).reshape(-1, f, p))
 
 
 class _Search:
@@ -141,18 +133,16 @@ class _Search:
         self._fields = fields
         self._deadline = deadline
         self._eras_at_most = eras_at_most
-        self._masks = [
-            mask for mask in range(1, 1 << fields.era_count) if mask.bit_count() <= eras_at_most
-        ]
-        self._quiet = self._magnitudes(fields.quiet)
-        self._targets = [self._magnitudes(target) for target in fields.targets]
+        self._masks = _masks(fields.era_count, eras_at_most)
+        self._quiet = _magnitudes(fields.quiet, self._masks)
+        self._targets = [_magnitudes(target, self._masks) for target in fields.targets]
         self._powers = [(target / fields.threshold[:, None]) ** 2 for target in self._targets]
         # By group and frequency. Of several targets the least is at most the mean.
         self._peak = np.mean([target.mean(axis=-1) for target in self._targets], axis=0)
         self._power = np.mean([power.mean(axis=-1) for power in self._powers], axis=0)
-        self._share, self.mixture = self._dual()
-        self._loud = self._quiet @ self._share
-        self._decisive = self._quiet[:, :, np.argsort(-self._share)[:DECISIVE_POINTS]]
+        share, self.mixture = self._dual_weights()
+        self._loud = self._quiet @ share
+        self._decisive = self._quiet[:, :, np.argsort(-share)[:DECISIVE_POINTS]]
         self.looked_at = 0
         self.contrast = 0.0
         self.drive: Drive | None = None
@@ -191,30 +181,11 @@ class _Search:
             looked_at=self.looked_at,
         )
 
-    def _magnitudes(self, field: NDArray[np.complex64]) -> FloatArray:
-        """Magnitude of every group's sum, (groups, f, p), from each ERA's field (f, eras, p)."""
-        bits = 1 << np.arange(self._fields.era_count)
-        member = (np.array(self._masks)[:, None] & bits) > 0
-        f, eras, p = field.shape
-        flat = field.transpose(1, 0, 2).reshape(eras, -1)
-        return np.asarray(np.abs(member.astype(complex) @ flat).reshape(-1, f, p))
-
-    def _dual(self) -> tuple[FloatArray, float]:
-        """Weights v of the quiet points (q,), and the contrast that no mixture exceeds."""
+    def _dual_weights(self) -> tuple[FloatArray, float]:
         # Sources that no target feels cannot help.
         peak = np.maximum(self._peak.ravel(), 1e-12 * self._peak.max())
         relative = self._quiet.reshape(len(peak), -1) / peak[:, None]
-        n, points = relative.shape
-        if self._fields.is_alone:
-            scale = np.abs(relative).max() * n
-            system = np.vstack([relative.T, np.full((1, n), scale)])
-            mixture, _ = nnls(system, np.append(np.zeros(points), scale))
-            field = relative.T @ mixture
-            share = field / np.linalg.norm(field) / math.sqrt(points)
-        else:
-            share = _loudest_points_share(relative)
-        # Whatever the solver's tolerance, this holds for these weights.
-        return share, float(1 / (relative @ share).min())
+        return mixture_bound(relative, is_rms=self._fields.is_alone)
 
     def _promise(self, groups: IntArray) -> FloatArray:
         """What the sums of groups (n, eras) of sources can be at the most, (n,); above 0 or out."""

@@ -19,7 +19,8 @@ class Pattern:
     level_db_sl: at the target, at the lesser one of several; contrast_db: from the target to the
     loudest quiet point, by peak acceleration; quiet_level_db_sl: at the loudest quiet point;
     surroundings_contrast_db: to the plate farther than 50 mm, root mean square. None: the first two
-    about quiet fingers where there are none, the last where there are.
+    about quiet fingers where there are none, the last where there are. contrast_bound_db: what no
+    pattern of the kind exceeds, where it was searched for exactly (`model.exact_search`).
     robust_contrast_db: tenth percentile of the contrast over what may differ on the real plate
     (`model.robust`); transient_contrast_db: over the first 100 ms; left_after_db: vibration of the
     plate in the 100 ms after the end, relative to the steady one (`model.timing` for both); None
@@ -34,6 +35,7 @@ class Pattern:
     quiet_level_db_sl: float | None
     mode: str = "switched"
     surroundings_contrast_db: float | None = None
+    contrast_bound_db: float | None = None
     robust_contrast_db: float | None = None
     transient_contrast_db: float | None = None
     left_after_db: float | None = None

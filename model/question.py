@@ -24,8 +24,9 @@ class Question:
     targets: where fingers shall feel it, one or more; quiet: where fingers must not; level_db_sl:
     wanted at every target; mode: a name in MODES, None for the table's own; playable: the modes
     that the amplifiers can play; frequencies: the lowest and highest they can [Hz]; eras_at_most:
-    how many ERAs `switched` may drive, beyond two by exact search, which is not for live use;
-    envelopes: whether the amplifiers play any (`model.timing`).
+    how many ERAs `switched` may drive, beyond two by exact search, which is not for live use and
+    ends after search_time [s] at the latest, with a bound in place of a proof; envelopes: whether
+    the amplifiers play any (`model.timing`).
     """
 
     targets: tuple[Point, ...]
@@ -35,6 +36,7 @@ class Question:
     playable: tuple[str, ...] = tuple(MODES)
     frequencies: tuple[float, float] = (0.0, math.inf)
     eras_at_most: int = 2
+    search_time: float = 10.0
     envelopes: bool = False
 
     def __post_init__(self) -> None:

@@ -8,7 +8,7 @@ follows what another stiffness, thickness or finger would change; and the respon
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import accumulate
 
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from model.actuator import Era
 from model.arrays import FloatArray
+from model.drive_excitation import excitation_of
 from model.drive_modes import best_drive, loudest
 from model.drive_modes.fields import Drive, Fields, Outcome, SingleComplex, judge
 from model.drive_modes.sources import (
@@ -26,8 +27,8 @@ from model.drive_modes.sources import (
     sums_of_sources,
 )
 from model.errors import InputError
-from model.exact_search import search_exactly
-from model.excitation import Excitation, Tone
+from model.exact_search import loudest_group, search_exactly
+from model.excitation import Excitation
 from model.fingertip import UNIT_DISC, fingertip_points
 from model.localization import SURROUNDINGS_RADIUS, Grid, decibels
 from model.mesh import Mesh
@@ -44,8 +45,6 @@ PAPER_FREQUENCIES = np.arange(60.0, 321.0, 10.0)
 """The 27 excitation frequencies [Hz]: 60 to 320 in steps of 10 holds every one the paper names."""
 
 PAPER_GRID = Grid(12, 9)
-
-ROUNDING = 1e-6  # of single precision, in which patterns are found
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,15 +115,24 @@ class LocalizationTable:
         mode = question.mode_on(self.mode)
         usable, fields = self._usable(question)
         if mode == "switched" and question.eras_at_most != 2:
-            drive = search_exactly(fields, eras_at_most=question.eras_at_most).drive
-            found = None if drive is None else (drive, judge(fields, drive))
-        else:
-            found = best_drive(fields, mode)
+            return self._ask_exactly(question, usable, fields)
+        found = best_drive(fields, mode)
         if found is None:
-            raise InputError(self._too_loud(question, fields, mode))
-        drive, outcome = found
-        gain = min(1.0, fields.wanted / outcome.sensation)
-        return self._pattern(question, mode, usable, drive, outcome, gain=gain)
+            most = loudest(fields, mode)
+            raise InputError(self._too_loud(question, mode, most=most))
+        return self._pattern(question, mode, usable, fields, *found)
+
+    def _ask_exactly(
+        self, question: Question, usable: NDArray[np.int64], fields: Fields
+    ) -> Pattern:
+        count = question.eras_at_most
+        found = search_exactly(fields, eras_at_most=count, time_limit=question.search_time)
+        if found.drive is None:
+            most = loudest_group(fields, eras_at_most=count)
+            raise InputError(self._too_loud(question, "switched", most=most))
+        outcome = judge(fields, found.drive)
+        pattern = self._pattern(question, "switched", usable, fields, found.drive, outcome)
+        return replace(pattern, contrast_bound_db=20 * math.log10(found.bound))
 
     def prepare(self, mode: str | None = None) -> None:
         """Work out what the first question in a mode would have to wait for."""
@@ -249,9 +257,9 @@ class LocalizationTable:
             )
         return usable, fields if len(usable) == len(self.frequencies) else fields.at(usable)
 
-    def _too_loud(self, question: Question, fields: Fields, mode: str) -> str:
+    def _too_loud(self, question: Question, mode: str, *, most: float) -> str:
         where = " and ".join(f"({x:g}, {y:g})" for x, y in question.targets)
-        most = 20 * math.log10(loudest(fields, mode))
+        most = 20 * math.log10(most)
         # Rounded down, so that it can be asked for.
         return (
             f"no pattern reaches {question.level_db_sl:g} dB SL at {where} m in mode {mode}; "
@@ -263,15 +271,15 @@ class LocalizationTable:
         question: Question,
         mode: str,
         usable: NDArray[np.int64],
+        fields: Fields,
         drive: Drive,
         outcome: Outcome,
-        *,
-        gain: float,
     ) -> Pattern:
+        gain = min(1.0, fields.wanted / outcome.sensation)
         contrast = 20 * math.log10(max(outcome.peak, 1e-30) / max(outcome.quiet_peak, 1e-30))
         quiet_level = 20 * math.log10(max(gain * outcome.quiet_sensation, 1e-30))
         return Pattern(
-            excitation=self._excitation(usable, drive, gain=gain),
+            excitation=excitation_of(drive, self.eras, self.frequencies[usable], gain=gain),
             ramp=ONSET_RAMP,
             level_db_sl=question.level_db_sl,
             contrast_db=contrast if question.quiet else None,
@@ -279,19 +287,3 @@ class LocalizationTable:
             mode=mode,
             surroundings_contrast_db=None if question.quiet else contrast,
         )
-
-    def _excitation(self, usable: NDArray[np.int64], drive: Drive, *, gain: float) -> Excitation:
-        """Tones by ERA; at each frequency the strongest has phase zero, since none is absolute."""
-        tones = {}
-        for frequency, weight in drive.tones():
-            strongest = weight[np.argmax(np.abs(weight))]
-            turned = weight * (np.conj(strongest) / np.abs(strongest))
-            for era, w in zip(self.eras, turned, strict=True):
-                if w != 0:
-                    in_phase = w.real > 0 and abs(w.imag) < ROUNDING * w.real
-                    tones[era.name] = Tone(
-                        frequency=float(self.frequencies[usable[frequency]]),
-                        amplitude=float(gain * min(abs(w), 1.0) * era.stroke),
-                        phase=0.0 if in_phase else float(np.angle(w)),
-                    )
-        return tones

@@ -74,6 +74,7 @@ def answer_as_json(table: LocalizationTable, question: Question, timing: Timing)
         "level_db_sl": pattern.level_db_sl,
         "contrast_db": pattern.contrast_db,
         "contrast_db_sl": pattern.contrast_db_sl,
+        "contrast_bound_db": pattern.contrast_bound_db,
         "robust_contrast_db": pattern.robust_contrast_db,
         "transient_contrast_db": pattern.transient_contrast_db,
         "left_after_db": pattern.left_after_db,

@@ -54,6 +54,18 @@ def test_a_table_says_why_it_has_no_answer(question, says):
         smooth_table().ask(question)
 
 
+def test_four_eras_are_searched_exactly_and_what_is_loudest_is_had():
+    """The answer is its own bound; a hair below the loudest level named there is an answer."""
+    table = smooth_table()
+    pattern = table.ask(Question((TARGET,), QUIET, eras_at_most=4))
+    assert pattern.contrast_bound_db == pytest.approx(pattern.contrast_db, abs=1e-4)
+    assert table.ask(Question((TARGET,), QUIET)).contrast_bound_db is None
+    with pytest.raises(InputError) as refusal:
+        table.ask(Question((TARGET,), QUIET, eras_at_most=4, level_db_sl=120.0))
+    most = float(str(refusal.value).split(" there is ")[1].split()[0])
+    assert table.ask(Question((TARGET,), QUIET, eras_at_most=4, level_db_sl=most))
+
+
 def test_frequencies_are_those_that_the_amplifiers_play():
     """With amplifiers from 150 to 250 Hz no tone lies outside, in any mode."""
     for mode in ("switched", "graded", "signed", "phased"):

@@ -1,0 +1,342 @@
+"""Faults of links and amplifiers over every wire: what must happen then, with its number.
+
+Times are those of the amplifier's own clock, which is this process's: how late the machine is with
+its work does not enter into them, unless it is said.
+"""
+
+import asyncio
+import gc
+import math
+import threading
+import time
+from collections.abc import AsyncIterator, Callable
+from pathlib import Path
+
+import pytest
+
+from drivers.amplifier import Amplifier
+from drivers.command import CommandSet, DriveCommand
+from drivers.errors import CommandRefused, DriverError, LinkError
+from drivers.guard import Guard, GuardLimits, SafeCommand
+from drivers.protocol.messages import Event, Fault, State
+from drivers.registry import open_backend
+from drivers.supervision import reopen
+from drivers.watchdog import HEARTBEAT, HEARTBEATS_BORNE
+from model.rig import Rig
+from sim.faults import Episode, FaultKind
+from wires import WIRES, FarSide, far_side
+
+WATCHDOG = 0.15  # s
+REACTION = 0.005  # s; the ramp to silence after the watchdog
+LIMITS = GuardLimits(40.0, 500.0, 1.0)
+REPLY_TIMEOUT = 0.5  # s; where lost answers are not what a test is about
+
+
+@pytest.fixture(params=list(WIRES))
+async def far(request: pytest.FixtureRequest, coarse_rig: Rig) -> AsyncIterator[FarSide]:
+    """The paper's amplifier behind each wire."""
+    async with far_side(WIRES[request.param], coarse_rig, seed=7) as far:
+        yield far
+
+
+class Link:
+    """An open amplifier with its guard."""
+
+    def __init__(self, far: FarSide, *, reply_timeout: float = REPLY_TIMEOUT) -> None:
+        self.far = far
+        self.amplifier = Amplifier(open_backend(far.url), reply_timeout=reply_timeout)
+        self.events: list[Event] = []
+        self.amplifier.listen(self.events.append)
+
+    async def __aenter__(self) -> "Link":
+        await self.amplifier.open()
+        self.guard = Guard(LIMITS, self.amplifier.capabilities)
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        await self.amplifier.close()
+
+    async def again(self) -> None:
+        """After a loss, with all faults over: open, cleared, armed."""
+        self.far.station.recover()
+        await reopen(self.amplifier, waits=iter([0.0] * 20))
+        await self.amplifier.clear()
+        await self.amplifier.arm(2.0)
+
+    def tone(self, level: float = 0.5, *, ramp: float = 0.0) -> SafeCommand:
+        """A set on channel 0."""
+        token = self.amplifier.next_token()
+        command = DriveCommand(0, 110.0, level)
+        return self.guard.check(CommandSet(token, (command,), ramp=ramp, valid_for=0.0))
+
+
+async def eventually(condition: Callable[[], bool]) -> None:
+    """Wait for what comes by itself."""
+    async with asyncio.timeout(10):
+        while True:
+            if condition():
+                return
+            await asyncio.sleep(0.001)
+
+
+async def beat(amplifier: Amplifier, times: int) -> None:
+    """Heartbeats, one after the other."""
+    for _ in range(times):
+        await amplifier.heartbeat()
+
+
+def fed_at(far: FarSide) -> float:
+    """When the amplifier was last fed, by its own clock [s]."""
+    return far.amplifier._fed
+
+
+async def test_a_host_that_is_gone_leaves_silence(far: FarSide) -> None:
+    """Silent within the watchdog time + 5 ms of the last sign of life, then a latched fault."""
+    async with Link(far) as link:
+        await link.amplifier.arm(WATCHDOG)
+        await link.amplifier.apply(link.tone())
+        fed = fed_at(far)
+    await eventually(lambda: far.silent_from() < math.inf)
+    measured = far.silent_from() - fed
+    assert WATCHDOG <= measured <= WATCHDOG + REACTION + 1e-9
+    await eventually(lambda: far.station.status().state is State.FAULT)
+    assert far.amplifier.fault is Fault.WATCHDOG
+
+
+@pytest.mark.parametrize("kind", ["unplug", "hang", "drop"])
+async def test_a_link_that_is_cut_leaves_silence_and_is_told(far: FarSide, kind: FaultKind) -> None:
+    """Silent as above; the host knows after three heartbeats at most, and does nothing any more."""
+    async with Link(far, reply_timeout=HEARTBEAT) as link:
+        await link.amplifier.arm(WATCHDOG)
+        await link.amplifier.apply(link.tone())
+        cut = time.monotonic()
+        fed = fed_at(far)
+        far.station.befall(Episode(kind))
+        with pytest.raises(LinkError):
+            await beat(link.amplifier, HEARTBEATS_BORNE)
+        asked = link.amplifier.statistics
+        assert link.amplifier.lost
+        # Three unanswered requests of one heartbeat each, whatever the machine adds to that.
+        assert asked.timeouts <= HEARTBEATS_BORNE
+        assert time.monotonic() - cut < 10
+        with pytest.raises(LinkError, match="energised until its watchdog"):
+            await link.amplifier.apply(link.tone())
+        await eventually(lambda: far.silent_from() < math.inf)
+        assert far.silent_from() - max(fed, fed_at(far)) <= WATCHDOG + REACTION + 1e-9
+
+
+async def test_each_token_is_applied_once_under_loss(far: FarSide) -> None:
+    """With 20 % of all telegrams lost each way, what is confirmed was played, and once only."""
+    played: list[int] = []  # in the order of their commits, by the amplifier itself
+    commit = far.amplifier._commit
+
+    def noted(token: int, now: float) -> object:
+        active = far.amplifier._active
+        reply = commit(token, now)
+        if far.amplifier._active is not active:
+            played.append(token)
+        return reply
+
+    far.amplifier._commit = noted
+    confirmed = []
+    async with Link(far, reply_timeout=0.02) as link:
+        await link.amplifier.arm(2.0)
+        far.station.befall(Episode("drop", share=0.2))
+        for number in range(60):
+            safe = link.tone(0.1 + 0.01 * (number % 10))
+            try:
+                achieved = await link.amplifier.apply(safe)
+            except LinkError:
+                await link.again()
+                far.station.befall(Episode("drop", share=0.2))
+                continue
+            except CommandRefused:  # a wire on which a set takes several telegrams
+                continue
+            assert achieved.token == safe.token
+            assert achieved.commands[0].level == pytest.approx(safe.commands[0].level)
+            confirmed.append(achieved.token)
+        lost = link.amplifier.statistics.timeouts
+        far.station.recover()
+    assert lost >= 5
+    assert len(confirmed) >= 20
+    assert len(played) == len(set(played))
+    assert set(confirmed) <= set(played)
+    assert played == sorted(played)
+
+
+@pytest.mark.parametrize("kind", ["corrupt", "truncate", "duplicate", "delay"])
+async def test_nothing_is_credited_to_another_request(far: FarSide, kind: FaultKind) -> None:
+    """Every answer belongs to its request, whatever befalls a third of the telegrams."""
+    patience = 0.5 if kind == "duplicate" else 0.03
+    async with Link(far, reply_timeout=patience) as link:
+        await link.amplifier.arm(2.0)
+        far.station.befall(Episode(kind, share=0.3, delay=0.05))
+        right = 0
+        for _ in range(25):
+            safe = link.tone(0.3)
+            try:
+                achieved = await link.amplifier.apply(safe)
+            except LinkError:
+                await link.again()
+                far.station.befall(Episode(kind, share=0.3, delay=0.05))
+                continue
+            except CommandRefused:  # a copy that came late, or twice, or only half
+                continue
+            assert achieved.token == safe.token
+            right += 1
+        await link.again()
+        assert right >= 5
+        assert (await link.amplifier.stop()).state is State.QUICK_STOP_ACTIVE
+
+
+async def test_one_good_telegram_resynchronises(far: FarSide) -> None:
+    """After a damaged one the very next is understood."""
+    async with Link(far, reply_timeout=0.2) as link:
+        for _ in range(5):
+            far.station.befall(Episode("corrupt", toward="amplifier"))
+            with pytest.raises(TimeoutError):
+                async with asyncio.timeout(0.03):
+                    await link.amplifier.heartbeat()
+            far.station.recover()
+            before = link.amplifier.statistics.timeouts
+            await link.amplifier.heartbeat()
+            assert link.amplifier.statistics.timeouts == before
+
+
+async def test_a_torn_set_changes_nothing(far: FarSide) -> None:
+    """A set of which a part is lost is not played, and neither is half of it."""
+    async with Link(far, reply_timeout=0.03) as link:
+        await link.amplifier.arm(2.0)
+        first = link.tone(0.4)
+        await link.amplifier.apply(first)
+        far.station.befall(Episode("torn_commit"))
+        both = tuple(DriveCommand(channel, 150.0, 0.2) for channel in range(4))
+        token = link.amplifier.next_token()
+        safe = link.guard.check(CommandSet(token, both, ramp=0.0, valid_for=0.0))
+        with pytest.raises(DriverError):
+            await link.amplifier.apply(safe)
+        far.bench.advance(time.monotonic())
+        status = far.station.status()
+        assert status.token == first.token
+        assert status.levels == pytest.approx((0.4, 0.0, 0.0, 0.0), abs=1e-4)
+
+
+async def test_a_storm_of_refusals_is_not_answered_with_one(far: FarSide) -> None:
+    """A host that beats 20 times a second sends at most 50 requests in it."""
+    async with Link(far) as link:
+        await link.amplifier.arm(2.0)
+        far.station.befall(Episode("nak_storm"))
+        before = link.amplifier.statistics
+        for _ in range(20):  # as many heartbeats as there are in a second
+            with pytest.raises(CommandRefused, match="busy"):
+                await link.amplifier.heartbeat()
+        after = link.amplifier.statistics
+        requests = 20 + after.retries - before.retries
+        assert after.refusals - before.refusals == 20
+        assert requests <= 50
+        far.station.recover()
+        assert (await link.amplifier.heartbeat()).state is State.OPERATION_ENABLED
+
+
+async def test_a_reboot_is_noticed_and_nothing_is_armed(far: FarSide) -> None:
+    """Silent at once; afterwards the host finds it disarmed, and sets are refused."""
+    async with Link(far) as link:
+        await link.amplifier.arm(2.0)
+        await link.amplifier.apply(link.tone())
+        begin = time.monotonic()
+        far.station.befall(Episode("reboot", lasts=0.05))
+        assert far.silent_from() - begin <= 0.01
+        try:
+            status = await link.amplifier.heartbeat()
+        except LinkError:  # of a wire that tells by itself who has started anew
+            await reopen(link.amplifier, waits=iter([0.01] * 50))
+            status = await link.amplifier.status()
+        assert status.state is State.SWITCH_ON_DISABLED
+        with pytest.raises(CommandRefused):
+            await link.amplifier.apply(link.tone())
+
+
+async def test_another_amplifier_is_refused(far: FarSide) -> None:
+    """Whoever answers after a loss must have the serial number of before."""
+    async with Link(far) as link:
+        await link.amplifier.close()
+        own = far.amplifier.identity
+        far.amplifier.identity = type(own)(own.vendor, own.product, "OTHER", own.firmware, 1)
+        failures: list[LinkError] = []
+        with pytest.raises(LinkError, match="OTHER answers where SIM-main is expected"):
+            await reopen(link.amplifier, waits=iter([0.0, 0.0]), on_failure=failures.append)
+        assert len(failures) == 3
+        assert link.amplifier.lost
+
+
+@pytest.mark.parametrize("kind", ["arc", "over_voltage", "channel"])
+async def test_a_fault_of_the_amplifier_silences_and_latches(far: FarSide, kind: FaultKind) -> None:
+    """Within 5 ms, high voltage off, and nothing plays until it is cleared."""
+    async with Link(far) as link:
+        await link.amplifier.arm(2.0)
+        await link.amplifier.apply(link.tone())
+        begin = time.monotonic()
+        far.station.befall(Episode(kind))
+        assert far.silent_from() - begin <= REACTION + 0.01  # and what the test itself took
+        await eventually(lambda: far.station.status().state is State.FAULT)
+        status = await link.amplifier.status()
+        assert status.fault.name == kind.upper()
+        assert not status.high_voltage
+        with pytest.raises(CommandRefused):
+            await link.amplifier.apply(link.tone())
+        if link.amplifier.capabilities.events:
+            await eventually(lambda: State.FAULT in [event.state for event in link.events])
+        await link.amplifier.clear()
+        assert (await link.amplifier.arm(2.0)).state is State.OPERATION_ENABLED
+
+
+async def test_warmth_derates_and_then_trips(far: FarSide) -> None:
+    """Half of the level first, which reading back shows, then a latched fault until it is cool."""
+    async with Link(far) as link:
+        await link.amplifier.arm(2.0)
+        await link.amplifier.apply(link.tone(0.6))
+        far.station.befall(Episode("over_temperature", lasts=0.3))
+        async with asyncio.timeout(10):
+            while (status := await link.amplifier.heartbeat()).state is State.OPERATION_ENABLED:
+                assert status.temperature > 70
+                await asyncio.sleep(0.01)
+        assert status.fault is Fault.OVER_TEMPERATURE
+        await asyncio.sleep(0.2)
+        assert (await link.amplifier.clear()).state is State.SWITCH_ON_DISABLED
+
+
+async def test_a_hung_host_that_goes_on_replays_nothing(far: FarSide) -> None:
+    """A host that is stopped for longer than the watchdog finds a fault, and its set refused."""
+    async with Link(far) as link:
+        await link.amplifier.arm(WATCHDOG)
+        await link.amplifier.apply(link.tone())
+        pending = link.tone(0.9)
+        await eventually(lambda: far.station.status().state is State.FAULT)
+        with pytest.raises(CommandRefused):
+            await link.amplifier.apply(pending)
+        assert (await link.amplifier.status()).levels == (0.0,) * 4
+
+
+def in_use() -> tuple[int, int, int]:
+    """Descriptors, threads and tasks of this process; not the workers that wait for work."""
+    gc.collect()
+    threads = [one for one in threading.enumerate() if not one.name.startswith("asyncio_")]
+    return len(list(Path("/dev/fd").iterdir())), len(threads), len(asyncio.all_tasks())
+
+
+async def test_a_hundred_replugs_leak_nothing(far: FarSide) -> None:
+    """Unplug, notice, plug in, reopen: descriptors, threads and tasks are as many as before."""
+    async with Link(far) as link:
+        before: tuple[int, int, int] | None = None
+        for number in range(105):
+            far.station.befall(Episode("unplug"))
+            with pytest.raises(LinkError):
+                await beat(link.amplifier, HEARTBEATS_BORNE)
+            far.station.recover()
+            await reopen(link.amplifier, waits=iter([0.01] * 200))
+            if number == 4:
+                before = in_use()
+        after = in_use()
+        assert before is not None
+        assert all(now <= then for now, then in zip(after, before, strict=True)), (before, after)
+        assert (await link.amplifier.arm(2.0)).state is State.OPERATION_ENABLED

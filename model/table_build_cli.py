@@ -100,6 +100,6 @@ def build(
         f"{patterns} patterns of {len(table.frequencies)} frequencies for {table.grid.cell_count} "
         f"cells, built in {elapsed:.2f} s"
     )
-    print(f"mesh {table.mesh}: fields within {error:.2g} % of a finer one ({table.reference_mesh})")
+    print(f"mesh {table.mesh}: fields within {error:.3g} % of a finer one ({table.reference_mesh})")
     print(f"wrote {output} ({output.stat().st_size / 1e6:.1f} MB)")
     print(f"Next: era table show {output}")

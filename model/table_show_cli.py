@@ -101,7 +101,7 @@ def _show_summary(summary: dict[str, Any]) -> None:
         ("patterns alike", f"{percent('alike_pattern_pairs_share')} of pairs (correlation > 0.95)"),
         (
             "mesh",
-            f"{summary['mesh']}, fields within {summary['discretisation_error_percent']:.2g} % of "
+            f"{summary['mesh']}, fields within {summary['discretisation_error_percent']:.3g} % of "
             f"{summary['reference_mesh']}",
         ),
         ("raster", summary["raster"]),

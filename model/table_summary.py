@@ -71,16 +71,19 @@ def contrast_distribution(
     """
     size = np.array([table.plate.length, table.plate.width])
     contrasts: list[float] = []
+    asked = 0
     for _ in range(50 * CONTACT_SETS):
         contacts = rng.uniform(0, size, (others + 1, 2))
         gaps = np.linalg.norm(contacts[:, None] - contacts[None], axis=-1)
         if gaps[np.triu_indices(others + 1, 1)].min() < LEAST_DISTANCE:
             continue
+        asked += 1
         target, *quiet = [(float(x), float(y)) for x, y in contacts]
         with contextlib.suppress(InputError):
             contrast = table.answer(target, quiet=quiet).contrast_db
             contrasts.append(np.nan if contrast is None else contrast)
-        if len(contrasts) == CONTACT_SETS:
+        # Where hardly a target is reached, the few that are must do.
+        if len(contrasts) == CONTACT_SETS or asked == 2 * CONTACT_SETS:
             break
     return np.array(contrasts)
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from model.array_file import digest_of
 from model.assembly import assemble
 from model.drive_modes.sources import all_patterns, magnitudes_of_sources, sums_of_sources
 from model.errors import InputError
@@ -367,3 +368,34 @@ def test_a_small_plate_has_no_contact_sets_to_show():
     built = build_table(small, grid=Grid(2, 2))
     summary = summarize(built, find_weak_cells(built))
     assert summary["contrast_1_quiet_median_db"] is None
+
+
+def test_the_header_names_every_parameter(table, tmp_path):
+    """Plain JSON: version, plate, ERAs, frequencies, grid, meshes, raster, mode, how wrong it is."""
+    save_table(table, tmp_path / "t.npz")
+    with np.load(tmp_path / "t.npz") as content:
+        header = json.loads(content["header"].tobytes())
+    assert header["frequencies_hz"] == list(range(60, 321, 10))
+    assert header["plate"]["thickness"] == 0.0015
+    assert [era["stroke"] for era in header["eras"]] == [100e-6] * 4
+    assert (header["mesh"]["nx"], header["mesh"]["element"]) == (6, "Q5")
+    assert (header["grid"]["nx"], header["grid"]["ny"], header["mode"]) == (12, 9, "switched")
+    assert header["raster"]["nx"] * header["raster"]["ny"] == len(table.acceleration)
+    assert len(header["discretisation_error"]) == 27
+    assert 0 < max(header["discretisation_error"]) < 0.02
+    assert header["code_version"].startswith("0.")
+
+
+def test_a_header_that_contradicts_the_table_is_refused(table, tmp_path):
+    """Other frequencies in the header than in the array, the checksum made for both."""
+    save_table(table, tmp_path / "t.npz")
+    with np.load(tmp_path / "t.npz") as content:
+        arrays = dict(content)
+    header = json.loads(arrays.pop("header").tobytes())
+    header["frequencies_hz"][0] = 61.0
+    del header["sha256"]
+    header["sha256"] = digest_of(json.dumps(header, sort_keys=True), arrays)
+    encoded = np.frombuffer(json.dumps(header).encode(), dtype=np.uint8)
+    np.savez(tmp_path / "t.npz", header=encoded, **arrays)
+    with pytest.raises(InputError, match="header's frequencies"):
+        load_table(tmp_path / "t.npz")

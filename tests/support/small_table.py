@@ -1,0 +1,21 @@
+"""A table of the paper's plate that is built in a moment."""
+
+import numpy as np
+
+from model.localization import Grid
+from model.table import LocalizationTable
+from model.table_build import build_in_parts
+from model.table_build_parts import TableProblem
+from paper_plate import make_paper_rig
+
+FREQUENCIES = np.array([60.0, 110.0, 250.0])
+
+
+def small_problem(*, nx: int = 12, ny: int = 9) -> TableProblem:
+    """Three frequencies, twelve cells."""
+    return TableProblem(make_paper_rig(nx, ny), FREQUENCIES, Grid(4, 3))
+
+
+def small_table(*, mode: str = "switched") -> LocalizationTable:
+    """On the paper's own mesh."""
+    return build_in_parts(small_problem(), mode=mode).table

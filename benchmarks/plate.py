@@ -42,6 +42,7 @@ def main() -> None:
 
     agreement = check_answers()
     measured: dict[str, list[dict]] = {}
+    loads = []
     for run in range(options.runs):  # one after the other, so that a slow minute hits everybody
         for program in (OURS, *PEERS):
             for task in ("nothing", "layout"):
@@ -50,6 +51,7 @@ def main() -> None:
             name = f"{task} {OURS} {mesh[0]}"
             measured.setdefault(name, []).append(measure(OURS, task, mesh))
         measured.setdefault("study", []).append(study())
+        loads.append(os.getloadavg()[0])
         print(f"run {run + 1} of {options.runs} done", file=sys.stderr)
     measured["nothing peer finest"] = [measure(fastest(measured), "nothing", FINEST)]
     write_report(
@@ -57,7 +59,7 @@ def main() -> None:
         agreement,
         peers=PEERS,
         fastest=fastest(measured),
-        runs=options.runs,
+        loads=loads,
         folder=options.output,
     )
 

@@ -12,7 +12,7 @@ OURS_COLOR, PEER_COLOR = "#d62728", "#7f7f7f"
 VERSIONS = ("numpy", "scipy", "scikit-fem", "pyfe3d", "ngsolve")
 
 
-def write_report(measured, agreement, *, peers, fastest, runs, folder: Path) -> None:
+def write_report(measured, agreement, *, peers, fastest, loads, folder: Path) -> None:
     """Write benchmarks.md and pictures/benchmarks.png; measured holds medians by name."""
     ours = measured["nothing ours"]
     peer_first = measured[f"nothing {fastest}"]
@@ -63,9 +63,12 @@ def write_report(measured, agreement, *, peers, fastest, runs, folder: Path) -> 
     page = f"""# How fast the plate model is
 
 Printed by `make bench`, which installs the peers and runs `python -m benchmarks.plate`. Medians of
-{runs} runs in {runs} processes, BLAS on one thread, imports not counted.
+{len(loads)} runs in {len(loads)} processes, BLAS on one thread, imports not counted.
 
-Machine: {_machine()}. {_versions()}.
+Machine: {_machine()}.
+{_versions()}.
+Load while measuring, one to two of it our own: {min(loads):.1f} to {max(loads):.1f}. What runs
+beside it makes all times longer; the ratios suffer less.
 
 The task is the founding paper's plate on four actuators (ERAs): 27 frequencies from 60 to 320 Hz,
 each ERA driven alone. Peers factor the dynamic stiffness at every frequency, as a user of theirs

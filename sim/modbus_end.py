@@ -24,7 +24,7 @@ from sim.station import Station
 _MAP = PROTOCOL.modbus
 _ALONE = 255
 _CONNECTIONS_MAX = 16
-_UNSENT_MAX = 4096  # bytes; a master that does not read is hung up on
+_UNSENT_MAX = 16384  # bytes; a master that does not read is hung up on
 _BITS_PER_BYTE = 11  # start, eight data, parity, stop
 
 
@@ -166,6 +166,8 @@ class _Connection(_Wire, asyncio.Protocol):
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         self._transport = cast(asyncio.Transport, transport)
+        open_socket: socket.socket = transport.get_extra_info("socket")
+        open_socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _UNSENT_MAX)
         self._end.connected(self)
 
     def data_received(self, data: bytes) -> None:

@@ -8,6 +8,7 @@ import numpy as np
 
 from model.arrays import ComplexArray, FloatArray
 from model.assembly import assemble
+from model.errors import InputError
 from model.free_plate import solve_free_plate
 from model.mesh import Mesh
 from model.modal import modes
@@ -69,21 +70,31 @@ def reference_mesh(plate: Plate, *, frequency_max: float) -> Mesh:
     return Mesh(nx, ny, auto.length, auto.width, auto.element, auto.strip / 2)
 
 
-def study_convergence(
-    rig: Rig, meshes: Sequence[Mesh], *, frequencies: Sequence[float] = PAPER_FREQUENCIES
-) -> Convergence:
+def default_frequencies(rig: Rig) -> FloatArray:
+    """Those of the paper's maps [Hz] as far as they are within the rig's limit, else the limit."""
+    high = rig.limits.frequency_max
+    within = [frequency for frequency in PAPER_FREQUENCIES if frequency <= high]
+    return np.array(within or [high])
+
+
+def study_convergence(rig: Rig, meshes: Sequence[Mesh], *, frequencies: FloatArray) -> Convergence:
     """Solve a rig on each mesh and on the reference.
 
     frequencies [Hz] up to the rig's limit. Raises InputError for those that a mesh cannot carry.
     """
-    reference = reference_mesh(rig.plate, frequency_max=rig.limits.frequency_max)
-    asked = np.array(frequencies, dtype=float)
+    high = rig.limits.frequency_max
+    if (frequencies > high).any():
+        raise InputError(
+            f"{frequencies.max():g} Hz is above the rig's limits.frequency of {high:g} Hz, for which its "
+            "meshes are made; ask for lower frequencies or raise the limit"
+        )
+    reference = reference_mesh(rig.plate, frequency_max=high)
     exact = _natural_frequencies(rig, reference)
-    exact_response = _response(rig, reference, asked)
+    exact_response = _response(rig, reference, frequencies)
     size = np.linalg.norm(exact_response, axis=2)
     errors = []
     for mesh in meshes:
-        difference = np.linalg.norm(_response(rig, mesh, asked) - exact_response, axis=2)
+        difference = np.linalg.norm(_response(rig, mesh, frequencies) - exact_response, axis=2)
         errors.append(
             MeshError(
                 mesh,
@@ -92,7 +103,7 @@ def study_convergence(
                 response=(difference / size).max(axis=1),
             )
         )
-    return Convergence(reference, asked, exact, tuple(errors))
+    return Convergence(reference, frequencies, exact, tuple(errors))
 
 
 def _natural_frequencies(rig: Rig, mesh: Mesh) -> FloatArray:

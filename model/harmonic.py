@@ -27,15 +27,21 @@ def check_frequencies(plate: Plate, mesh: Mesh, frequencies: FloatArray) -> None
     for frequency in frequencies:
         if not (np.isfinite(frequency) and frequency > 0):
             raise InputError(f"frequency is {frequency} Hz, must be above zero")
-        wavelength = plate.bending_wavelength(frequency)
-        if wavelength < mesh.shortest_wavelength:
-            need = 1.001 * mesh.shortest_wavelength / wavelength
-            raise InputError(
-                f"the {mesh} mesh has {wavelength / max(mesh.element_size):.1f} elements in a "
-                f"bending wavelength at {frequency:g} Hz, too few to answer: "
-                f"{LEAST_NODES_PER_WAVELENGTH / mesh.kind.order:g} of {mesh.element} are the "
-                f"least; use {math.ceil(mesh.nx * need)}x{math.ceil(mesh.ny * need)} or finer"
+    highest = max(frequencies, default=0.0)
+    if highest and plate.bending_wavelength(highest) < mesh.shortest_wavelength:
+        wavelength = plate.bending_wavelength(highest)
+        need = 1.001 * mesh.shortest_wavelength / wavelength
+        finer = f"{math.ceil(mesh.nx * need)}x{math.ceil(mesh.ny * need)}"
+        raise InputError(
+            f"the {mesh} mesh has {wavelength / max(mesh.element_size):.1f} elements in a bending "
+            f"wavelength at {highest:g} Hz, too few to answer: "
+            f"{LEAST_NODES_PER_WAVELENGTH / mesh.kind.order:g} of {mesh.element} are the least; "
+            + (
+                f"use {finer} or finer"
+                if mesh.element == "MITC4"
+                else f"raise the upper limits.frequency to {highest:g} Hz, which mesh: auto follows"
             )
+        )
 
 
 def hold_and_drive(

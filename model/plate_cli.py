@@ -134,18 +134,19 @@ def convergence(
     rig_file: RigArgument,
     mesh: MeshOption = None,
     frequencies: Annotated[
-        str, typer.Option(metavar="LO:HI:STEP|LIST", help="Where to compare responses, in Hz.")
-    ] = "110,250",
+        str | None,
+        typer.Option(metavar="LO:HI:STEP|LIST", help="Where to compare, in Hz; default 110,250."),
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """How wrong meshes are: natural frequencies and response, against a finer mesh."""
-    from model.convergence import meshes_to_compare, study_convergence
+    from model.convergence import default_frequencies, meshes_to_compare, study_convergence
     from model.points import parse_frequencies
     from model.rig_file import load_rig
 
     rig = load_rig(rig_file, mesh=mesh)
-    asked = parse_frequencies(frequencies)
-    study = study_convergence(rig, meshes_to_compare(rig), frequencies=asked.tolist())
+    asked = parse_frequencies(frequencies) if frequencies else default_frequencies(rig)
+    study = study_convergence(rig, meshes_to_compare(rig), frequencies=asked)
     if as_json:
         rows = [
             {

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from model.convergence import meshes_to_compare, study_convergence
+from model.convergence import default_frequencies, meshes_to_compare, study_convergence
 from model.mesh import Mesh
 from paper_plate import make_paper_rig
 
@@ -21,7 +21,9 @@ def study():
     """The paper's rig with its automatic mesh."""
     rig = make_paper_rig(12, 9)
     automatic = replace(rig, mesh=Mesh.auto(rig.plate, frequency_max=500.0))
-    return study_convergence(automatic, meshes_to_compare(automatic))
+    return study_convergence(
+        automatic, meshes_to_compare(automatic), frequencies=default_frequencies(automatic)
+    )
 
 
 def test_the_papers_own_mesh_is_among_those_compared(study):
@@ -61,9 +63,17 @@ def test_eras_within_the_plate_converge_too():
     inside = zip(rig.eras, [(0.051, 0.017), (0.29, 0.08), (0.12, 0.1), (0.2, 0.15)], strict=True)
     moved = replace(rig, eras=tuple(replace(era, x=x, y=y) for era, (x, y) in inside))
     automatic = Mesh.auto(rig.plate, frequency_max=500.0)
-    error = study_convergence(moved, [automatic]).errors[0]
+    error = study_convergence(moved, [automatic], frequencies=np.array([110.0, 250.0])).errors[0]
     assert np.abs(error.frequency).max() < 1e-3
     assert error.response.max() < 1e-2
+
+
+@pytest.mark.parametrize(("limit", "asked"), [(500.0, [110, 250]), (200.0, [110]), (80.0, [80])])
+def test_without_being_told_it_looks_where_the_paper_does(limit, asked):
+    """At 110 Hz and 250 Hz, as far as the rig's limit allows."""
+    rig = make_paper_rig(12, 9)
+    limited = replace(rig, limits=replace(rig.limits, frequency_max=limit))
+    assert default_frequencies(limited).tolist() == asked
 
 
 def test_the_documentation_shows_these_figures(study):

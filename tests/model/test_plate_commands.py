@@ -197,3 +197,26 @@ def small_table(tmp_path_factory):
     arguments = ["table", "build", RIG, "-o", str(path), "--mesh", "12x9"]
     assert run(arguments, entry_points(group="era_haptics.commands")) == 0
     return path
+
+
+def test_convergence_compares_meshes_as_text_and_as_json(era):
+    """Errors fall from mesh to mesh, and the rig's own is marked; both forms say the same."""
+    arguments = ("plate", "convergence", RIG, "--mesh", "12x9", "--frequencies", "110")
+    status, text, _ = era(*arguments, "--json")
+    assert status == 0
+    answer = json.loads(text)
+    errors = [row["response_error_percent"][0] for row in answer["meshes"]]
+    assert errors == sorted(errors, reverse=True)
+    assert [row["is_the_rigs"] for row in answer["meshes"]] == [True] + 4 * [False]
+    assert answer["meshes"][0]["dof"] == 390
+    assert answer["meshes"][-1]["element"] == "Q5"
+    status, text, _ = era(*arguments)
+    assert status == 0
+    assert [f"{error:.3f} %" in text for error in errors] == 5 * [True]
+
+
+def test_convergence_above_the_rigs_limit_is_bad_input(era):
+    """The meshes are made for the rig's highest frequency, and say nothing above it."""
+    status, text, said = era("plate", "convergence", RIG, "--frequencies", "110,900")
+    assert (status, text) == (2, "")
+    assert "900 Hz is above the rig's limits.frequency of 500 Hz" in said

@@ -156,7 +156,8 @@ class SerialLine:
             do_not_open=True,
             baudrate=self._baud,
             timeout=_READ_TIMEOUT,
-            write_timeout=_WRITE_TIMEOUT,
+            # pyserial has none over RFC 2217
+            write_timeout=None if self.port.startswith("rfc2217://") else _WRITE_TIMEOUT,
             exclusive=True,
         )
         port.open()
@@ -253,7 +254,7 @@ def _descriptor(port: serial.Serial) -> int | None:
 def _close_port(port: serial.Serial) -> None:
     # pyserial does not close the socket of a server that hung up first, so that is done here.
     connection = getattr(port, "_socket", None)
-    if connection is not None:
+    if connection is not None and str(port.port).startswith("socket://"):
         connection.close()
     with contextlib.suppress(OSError):
         port.close()

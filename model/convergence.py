@@ -85,8 +85,8 @@ def study_convergence(rig: Rig, meshes: Sequence[Mesh], *, frequencies: FloatArr
     high = rig.limits.frequency_max
     if (frequencies > high).any():
         raise InputError(
-            f"{frequencies.max():g} Hz is above the rig's limits.frequency of {high:g} Hz, for which its "
-            "meshes are made; ask for lower frequencies or raise the limit"
+            f"{frequencies.max():g} Hz is above the rig's limits.frequency of {high:g} Hz, for "
+            "which its meshes are made; ask for lower frequencies or raise the limit"
         )
     reference = reference_mesh(rig.plate, frequency_max=high)
     exact = _natural_frequencies(rig, reference)

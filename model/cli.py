@@ -1,7 +1,8 @@
-"""The model's share of the `era` command: config, plate, figure, study, table."""
+"""The model's share of the `era` command: calibrate, config, plate, figure, study, table."""
 
 import typer
 
+from model.calibrate_cli import calibrate
 from model.config_cli import config_app
 from model.errors import InputError
 from model.figure_cli import figure_app
@@ -25,6 +26,7 @@ table_app.command()(plot)
 table_app.command()(export)
 
 app = typer.Typer()
+app.command()(calibrate)
 app.add_typer(config_app, name="config")
 app.add_typer(plate_app, name="plate")
 app.add_typer(figure_app)

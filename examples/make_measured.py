@@ -1,0 +1,76 @@
+"""Makes measured.uff and measured.csv: responses of a plate that is not quite the paper's.
+
+A modal test on the simulated plate: twelve accelerometers, each ERA driven alone at a tenth of its
+stroke, frequency after frequency. The truth that `era calibrate` has to find is below; so are the
+faults of the measurement: noise, one sensor whose scale is wrong, one that is dead.
+
+    python examples/make_measured.py
+    era calibrate examples/paper_plate.yaml examples/measured.uff -o calibrated.yaml
+"""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from model.calibration.responses_file import write_responses_csv, write_responses_uff
+from model.rig import Rig
+from model.rig_file import load_rig
+from sim.sensors import Accelerometer, scanning_grid
+from sim.stepped_sine import record_responses
+
+FREQUENCIES = np.arange(40.0, 501.0, 10.0)
+SEED = 1
+
+# By ERA: stiffness and damping relative to the rig's, bolt mass [kg].
+ERAS = {
+    "SW": (1.12, 1.40, 0.012),
+    "SE": (0.91, 0.80, 0.008),
+    "NE": (1.05, 1.15, 0.015),
+    "NW": (0.84, 1.30, 0.010),
+}
+MODULUS = 74e9
+LOSS_FACTOR = 0.013
+SENSOR = Accelerometer("", 0, 0, noise_density=5e-3, reach=200.0, resolution=1e-3)
+WRONG, DEAD = "P3", "P8"
+
+
+def true_rig(rig: Rig) -> Rig:
+    """The plate that was measured, with gains of its own at every frequency."""
+    rng = np.random.default_rng(SEED)
+    material = replace(rig.plate.material, E=MODULUS)
+    eras = []
+    for era in rig.eras:
+        stiffness, damping, bolt_mass = ERAS[era.name]
+        size = 1 + 0.08 * rng.standard_normal(len(FREQUENCIES))
+        phase = np.radians(-0.02 * FREQUENCIES + 5 * rng.standard_normal(len(FREQUENCIES)))
+        eras.append(
+            replace(
+                era,
+                stiffness=stiffness * era.stiffness,
+                damping=damping * era.damping,
+                bolt_mass=bolt_mass,
+                gains=tuple(zip(FREQUENCIES, size, phase, strict=True)),
+            )
+        )
+    plate = replace(rig.plate, material=material, loss_factor=LOSS_FACTOR)
+    return replace(rig, plate=plate, eras=tuple(eras))
+
+
+def main() -> None:
+    """Measure, and write both files beside this one."""
+    here = Path(__file__).parent
+    rig = load_rig(here / "paper_plate.yaml")
+    scales = {WRONG: 1.25, DEAD: 0.0}
+    sensors = [
+        replace(sensor, scale=scales.get(sensor.name, 1.0))
+        for sensor in scanning_grid(rig.plate, 4, 3, like=SENSOR)
+    ]
+    responses = record_responses(true_rig(rig), sensors, FREQUENCIES, seed=SEED)
+    write_responses_uff(here / "measured.uff", responses, rig)
+    write_responses_csv(here / "measured.csv", responses, rig)
+    print(f"wrote measured.uff and measured.csv in {here}: {responses.count} values")
+
+
+if __name__ == "__main__":
+    main()

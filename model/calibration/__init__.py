@@ -1,0 +1,1 @@
+"""Fitting a rig to what was measured on it."""

@@ -1,0 +1,207 @@
+"""From measured responses to a rig's numbers, with what is wrong in the measurement set aside."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model.actuator import Gain
+from model.arrays import ComplexArray, FloatArray
+from model.calibration.fast_plate import FastPlate, fast_plate
+from model.calibration.fit import Fit, Problem, misfit, row_size, solve, with_free
+from model.calibration.held_out import as_it_was, hold_out, relative_error
+from model.calibration.outcome import Calibration, FittedParameter, HeldOut, SensorScale
+from model.calibration.parameters import Parameter, parameters_of, rig_with, starts
+from model.calibration.responses import Responses
+from model.calibration.screening import silent_eras, silent_sensors, unlike_the_plate
+from model.errors import InputError
+from model.rig import Rig
+
+_STARTS = 2  # of many, those that explain the shapes best
+_WRONG_SCALE = 0.02  # what sensors are commonly calibrated to
+_SURE = 4.0  # standard errors
+_LEAST_SENSORS = 3
+
+# What the model's own idealisations do to any value, of itself, however good the data: structural
+# damping that is viscous and not hysteretic moves the loss factor by 0.15 %, the rest by less.
+_MODEL_ERROR = 2e-3
+
+
+def calibrate(rig: Rig, responses: Responses, *, all_scales: bool = False) -> Calibration:
+    """Fit a rig to responses measured on it.
+
+    all_scales: estimate every sensor's scale, not only of those that are found to be wrong. Raises
+    InputError where fewer than three sensors are alive or nothing was driven.
+    """
+    alive, dead_eras = ~silent_sensors(responses), silent_eras(responses)
+    values = responses.values.copy()
+    values[:, dead_eras] = np.nan
+    _check_enough(alive, responses)
+    plate = fast_plate(rig, responses.points, responses.frequencies)
+    parameters = parameters_of(rig)
+
+    # First with every scale free, so that no wrong one leads astray.
+    problem = _problem(rig, plate, parameters, values, alive)
+    fit = _best_fit(problem)
+    relative = fit.scales / np.median(fit.scales)
+    unlike = unlike_the_plate(problem, fit, relative)
+    if unlike.any():
+        alive[alive] = ~unlike
+        _check_enough(alive, responses)
+        relative = relative[~unlike] / np.median(relative[~unlike])
+        problem = _problem(rig, plate, parameters, values, alive)
+        fit = solve(problem, fit.x, relative)
+        relative = fit.scales / np.median(fit.scales)
+    error = fit.scales_error / np.abs(np.median(fit.scales))
+    wrong = np.abs(relative - 1) > np.maximum(_WRONG_SCALE, _SURE * error)
+
+    free_scales = np.ones(len(wrong), dtype=bool) if all_scales else wrong
+    if not all_scales:
+        relative = np.where(wrong, relative, 1.0)
+    problem = replace(problem, free_scales=free_scales)
+    problem, fit = _identified(problem, solve(problem, fit.x, relative))
+    if all_scales:
+        fit = _with_median_scale_one(fit)
+    names = tuple(name for name, live in zip(responses.sensors, alive, strict=True) if live)
+    return _report(
+        problem,
+        fit,
+        names=names,
+        frequencies=responses.frequencies,
+        dead_sensors=tuple(
+            name for name, live in zip(responses.sensors, alive, strict=True) if not live
+        ),
+        dead_eras=tuple(era.name for era, dead in zip(rig.eras, dead_eras, strict=True) if dead),
+        held_out=hold_out(problem, fit, names),
+    )
+
+
+def _check_enough(alive: NDArray[np.bool_], responses: Responses) -> None:
+    if alive.sum() < _LEAST_SENSORS:
+        dead = [n for n, live in zip(responses.sensors, alive, strict=True) if not live]
+        said = f" ({', '.join(dead)} without a usable signal)" if dead else ""
+        raise InputError(
+            f"{int(alive.sum())} sensors were measured{said}; at least {_LEAST_SENSORS} are "
+            "needed, better eight or more, since gains of the ERAs take up what one alone says"
+        )
+
+
+def _problem(
+    rig: Rig,
+    plate: FastPlate,
+    parameters: tuple[Parameter, ...],
+    values: ComplexArray,
+    alive: NDArray[np.bool_],
+) -> Problem:
+    """The problem of some of the sensors, everything free."""
+    count = int(alive.sum())
+    return Problem(
+        rig,
+        replace(plate, shapes=plate.shapes[alive]),
+        parameters,
+        values[:, :, alive],
+        np.ones(len(parameters), dtype=bool),
+        np.ones(count, dtype=bool),
+    )
+
+
+def _best_fit(problem: Problem) -> Fit:
+    """The best of fits from several starts, for a fit finds only the nearest minimum."""
+    begins = sorted(starts(problem.parameters), key=lambda x: misfit(problem, x))[:_STARTS]
+    ones = np.ones(problem.values.shape[2])
+    fits = [solve(problem, begin, ones) for begin in begins]
+    return min(fits, key=lambda fit: misfit(problem, fit.x))
+
+
+def _identified(problem: Problem, fit: Fit) -> tuple[Problem, Fit]:
+    """Hold what the data leave open at the rig's own value, the worst first, and fit the rest."""
+    known = np.array([parameter.known for parameter in problem.parameters])
+    own = np.array([parameter.start for parameter in problem.parameters])
+    while True:
+        excess = np.where(problem.free, fit.x_error / known, 0)
+        if not excess.max() > 1:
+            return problem, fit
+        free = problem.free.copy()
+        free[int(excess.argmax())] = False
+        problem = with_free(problem, free)
+        fit = solve(problem, np.where(free, fit.x, own), fit.scales)
+
+
+def _with_median_scale_one(fit: Fit) -> Fit:
+    middle = float(np.median(fit.scales))
+    return replace(
+        fit,
+        scales=fit.scales / middle,
+        scales_error=fit.scales_error / abs(middle),
+        gains=fit.gains * middle,
+        gains_error=fit.gains_error * abs(middle),
+    )
+
+
+def _report(
+    problem: Problem,
+    fit: Fit,
+    *,
+    names: tuple[str, ...],
+    frequencies: FloatArray,
+    dead_sensors: tuple[str, ...],
+    dead_eras: tuple[str, ...],
+    held_out: HeldOut | None,
+) -> Calibration:
+    rig = rig_with(problem.rig, problem.parameters, fit.x)
+    model = problem.plate.responses(rig)
+    after = fit.gains[:, :, None] * model
+    eras = tuple(
+        replace(era, gains=_gain_rows(fit.gains[:, number], frequencies) or era.gains)
+        for number, era in enumerate(rig.eras)
+    )
+    parameters = tuple(
+        FittedParameter(
+            parameter,
+            parameter.value(float(x)),
+            _with_model_error(parameter, float(x), float(error)) if free else None,
+            bool(free and min(x - parameter.lower, parameter.upper - x) < 1e-6),
+        )
+        for parameter, x, error, free in zip(
+            problem.parameters, fit.x, fit.x_error, problem.free, strict=True
+        )
+    )
+    measured_count = int(np.isfinite(problem.values).sum())
+    return Calibration(
+        rig=replace(rig, eras=eras),
+        parameters=parameters,
+        gains_error=fit.gains_error,
+        dead_sensors=dead_sensors,
+        dead_eras=dead_eras,
+        scales=tuple(
+            SensorScale(name, float(scale), float(error))
+            for name, scale, error, free in zip(
+                names, fit.scales, fit.scales_error, problem.free_scales, strict=True
+            )
+            if free
+        ),
+        outlier_count=measured_count - int(fit.used.sum()),
+        value_count=measured_count,
+        error=relative_error(
+            problem.values, after * fit.scales, row_size(problem.values, fit.used), fit.used
+        ),
+        held_out=held_out,
+        sensors=names,
+        frequencies=frequencies,
+        measured=problem.values / fit.scales,
+        before=as_it_was(problem),
+        after=after,
+    )
+
+
+def _with_model_error(parameter: Parameter, x: float, error: float) -> float:
+    return math.hypot(parameter.standard_error(x, error), _MODEL_ERROR * parameter.value(x))
+
+
+def _gain_rows(gains: ComplexArray, frequencies: FloatArray) -> tuple[Gain, ...]:
+    known = np.isfinite(gains) & (gains != 0)
+    return tuple(
+        (float(f), float(abs(gain)), float(np.angle(gain)))
+        for f, gain in zip(frequencies[known], gains[known], strict=True)
+    )

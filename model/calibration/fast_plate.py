@@ -1,0 +1,76 @@
+"""A rig's plate as a fit needs it: hundreds of times with other values, each in milliseconds.
+
+The free plate is reduced once. Another modulus scales its natural frequencies and nothing else;
+ERAs are a correction of low rank to its receptance (Woodbury identity).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from model.arrays import ComplexArray, FloatArray
+from model.assembly import era_positions
+from model.harmonic import check_frequencies, hold_and_drive
+from model.point_load import load_positions
+from model.reduction import reduce_plate
+from model.rig import Rig
+
+
+@dataclass(frozen=True, eq=False)
+class FastPlate:
+    """The reduced plate of a rig at its ERAs and loads (h, r) and at points (p, r).
+
+    squared: omega² of the modes (r,) [rad²/s²] at the rig's own modulus; omega (f,) [rad/s].
+    """
+
+    modulus: float
+    squared: FloatArray
+    held: FloatArray
+    shapes: FloatArray
+    omega: FloatArray
+
+    def responses(self, rig: Rig) -> ComplexArray:
+        """Acceleration per base displacement [1/s²] of each ERA, its gain not counted: (f, e, p).
+
+        rig: the same plate on the same places, with other values.
+        """
+        plate = rig.plate
+        elastic = (1 + 1j * plate.loss_factor) * (plate.material.E / self.modulus) * self.squared
+        answer = 1 / (elastic - (self.omega**2)[:, None])
+        hold, _ = hold_and_drive((), rig.loads, self.omega)
+        spring, bolts = _springs(rig, self.omega)
+        hold = np.hstack([spring - (self.omega**2)[:, None] * bolts, hold])
+        forward = answer[:, :, None] * self.held.T
+        between = self.held @ forward
+        count = hold.shape[1]
+        inverse = np.linalg.inv(np.eye(count) + hold[:, :, None] * between)
+        force = inverse[:, :, : len(rig.eras)] * spring[:, None, :]
+        moved = self.shapes @ forward @ force
+        return np.asarray(-(self.omega**2)[:, None, None] * moved.transpose(0, 2, 1))
+
+
+def fast_plate(rig: Rig, points: FloatArray, frequencies: FloatArray) -> FastPlate:
+    """Solve a rig's free plate once, for points (p, 2) [m] and frequencies (f,) [Hz].
+
+    Raises InputError for frequencies that its mesh cannot carry.
+    """
+    check_frequencies(rig.plate, rig.mesh, frequencies)
+    attached = np.vstack([era_positions(rig.eras), load_positions(rig.loads)])
+    reduced = reduce_plate(
+        rig.plate, rig.mesh, attached, frequency_max=float(max(frequencies.max(), 200.0))
+    )
+    return FastPlate(
+        rig.plate.material.E,
+        reduced.omega**2,
+        reduced.at(attached),
+        reduced.at(points),
+        2 * np.pi * frequencies,
+    )
+
+
+def _springs(rig: Rig, omega: FloatArray) -> tuple[ComplexArray, FloatArray]:
+    """k + i omega c of each ERA (f, eras) [N/m], and bolt masses (eras,) [kg]."""
+    stiffness = np.array([era.stiffness for era in rig.eras])
+    damping = np.array([era.damping for era in rig.eras])
+    bolts = np.array([era.bolt_mass for era in rig.eras])
+    return stiffness + 1j * omega[:, None] * damping, bolts

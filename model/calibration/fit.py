@@ -1,0 +1,254 @@
+"""Nonlinear least squares for a rig's numbers, gains and sensor scales.
+
+    d_fes = g_fe s_s a_fes(x) + noise
+
+d measured, a the model's, g a complex gain for every frequency and ERA, s a real scale for every
+sensor. Gains enter linearly and are taken out (variable projection): for any x and s the best ones
+are known at once, so only x and s are searched, and what is left of the data is how shapes over the
+sensors change with frequency. The standard errors then contain what the gains leave open.
+
+Noise has a part of its own size and a part in proportion to the response, both estimated from the
+residuals; values that do not fit either are left out, the worst of a row first, for one wrong value
+pulls the gain of its whole row.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares, nnls
+
+from model.arrays import ComplexArray, FloatArray, IntArray
+from model.calibration.fast_plate import FastPlate
+from model.calibration.parameters import Parameter, rig_with
+from model.rig import Rig
+
+_Loss: TypeAlias = Literal["linear", "soft_l1"]
+
+_OUTLIER = 5.0  # standard deviations; of 10 000 good complex values 0.04 lie beyond
+_ROUNDS = 6
+_SMALLEST_NOISE = 1e-4  # of the response: what meshes and reduction are wrong by
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """What is fitted to what: a rig, and values (f, e, s), NaN where there is none.
+
+    free: which of the parameters are fitted; free_scales (s,): which sensors' scales are.
+    """
+
+    rig: Rig
+    plate: FastPlate
+    parameters: tuple[Parameter, ...]
+    values: ComplexArray
+    free: NDArray[np.bool_]
+    free_scales: NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """What came out.
+
+    x, x_error (n,); scales, scales_error (s,); gains, gains_error (f, e), NaN where unmeasured;
+    noise (f, e): standard deviation of a value; used (f, e, s): what was not left out; residual
+    (f, e, s): what is left, in standard deviations.
+    """
+
+    x: FloatArray
+    x_error: FloatArray
+    scales: FloatArray
+    scales_error: FloatArray
+    gains: ComplexArray
+    gains_error: FloatArray
+    noise: FloatArray
+    used: NDArray[np.bool_]
+    residual: FloatArray
+
+
+def solve(problem: Problem, x: FloatArray, scales: FloatArray) -> Fit:
+    """Fit from x (n,) and scales (s,) on; what is not free keeps its value."""
+    used = np.isfinite(problem.values)
+    noise = 0.05 * row_size(problem.values, used)  # until residuals tell more
+    loss: _Loss = "soft_l1"
+    for number in range(_ROUNDS):
+        x, scales, errors = _search(problem, x, scales, used / noise[:, :, None], loss=loss)
+        left = _residual(problem, x, scales, used / noise[:, :, None])
+        raw = np.abs(left) * noise[:, :, None]
+        noise = _noise(problem.values, raw, used)
+        kept = _without_outliers(raw / noise[:, :, None], used)
+        loss = "linear"
+        # The last rounds only sharpen what noise is; a change there is none.
+        if number >= 2 and (kept == used).all():
+            break
+        used = kept
+    weight = used / noise[:, :, None]
+    x, scales, errors = _search(problem, x, scales, weight, loss="linear")
+    model = problem.plate.responses(rig_with(problem.rig, problem.parameters, x)) * scales
+    gains = _gains(model, problem.values, weight)
+    power = (np.abs(weight * model) ** 2).sum(axis=2)
+    with np.errstate(divide="ignore"):
+        gains_error = np.where(power > 0, 1 / np.sqrt(power), np.nan)
+    x_error = np.zeros(len(x))
+    x_error[problem.free] = errors[: problem.free.sum()]
+    scales_error = np.zeros(len(scales))
+    scales_error[problem.free_scales] = errors[problem.free.sum() :]
+    residual = np.abs(_residual(problem, x, scales, weight))
+    return Fit(x, x_error, scales, scales_error, gains, gains_error, noise, used, residual)
+
+
+def with_free(problem: Problem, free: NDArray[np.bool_]) -> Problem:
+    """The same with other parameters free."""
+    return replace(problem, free=free)
+
+
+def misfit(problem: Problem, x: FloatArray) -> float:
+    """How badly shapes over the sensors fit, 0 to 1, whatever gains: median of 1 - MAC.
+
+    MAC: modal assurance criterion of each row of values, for one frequency and ERA.
+    """
+    model = problem.plate.responses(rig_with(problem.rig, problem.parameters, x))
+    used = np.isfinite(problem.values)
+    values = np.where(used, problem.values, 0)
+    model = np.where(used, model, 0)
+    inner = np.abs((model.conj() * values).sum(axis=2)) ** 2
+    size = (np.abs(model) ** 2).sum(axis=2) * (np.abs(values) ** 2).sum(axis=2)
+    return float(np.median(1 - inner[size > 0] / size[size > 0]))
+
+
+def _search(
+    problem: Problem, x: FloatArray, scales: FloatArray, weight: FloatArray, *, loss: _Loss
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """x, scales and the standard errors of the free ones among both."""
+    free, free_scales = problem.free, problem.free_scales
+    count = int(free.sum())
+
+    def unpack(z: FloatArray) -> tuple[FloatArray, FloatArray]:
+        full, sensors = x.copy(), scales.copy()
+        full[free], sensors[free_scales] = z[:count], z[count:]
+        return full, sensors
+
+    def residual(z: FloatArray) -> FloatArray:
+        left = _residual(problem, *unpack(z), weight)[weight > 0]
+        parts = np.concatenate([left.real, left.imag])
+        if free_scales.all():
+            # A common scale cannot be told from the gains; their mean is held at one.
+            return np.append(parts, 1e3 * (unpack(z)[1].mean() - scales.mean()))
+        return parts
+
+    start = np.concatenate([x[free], scales[free_scales]])
+    if len(start) == 0:
+        return x, scales, start
+    lower, upper = _bounds(problem.parameters, free, len(start) - count)
+    found = least_squares(
+        residual,
+        np.clip(start, lower + 1e-9, upper - 1e-9),
+        bounds=(lower, upper),
+        loss=loss,
+        x_scale="jac",
+        xtol=1e-9,
+        ftol=1e-9,
+    )
+    full, sensors = unpack(found.x)
+    frequency = np.broadcast_to(np.arange(len(weight))[:, None, None], weight.shape)[weight > 0]
+    rows = int((weight > 0).any(axis=2).sum())
+    freedom = max(2 * int((weight > 0).sum()) - 2 * rows - len(start), 1)
+    errors = _standard_errors(
+        np.asarray(found.jac), found.fun, np.tile(frequency, 2), freedom=freedom
+    )
+    return full, sensors, errors
+
+
+def _standard_errors(
+    jacobian: FloatArray, residual: FloatArray, group: IntArray, *, freedom: int
+) -> FloatArray:
+    """Standard errors of the fitted (n,); infinite along what the data do not see.
+
+    The larger of two: with all residuals (m,) independent, and with those of a frequency correlated
+    however they like, as they are where the model itself is a little wrong (sandwich estimate).
+    group: the number of the frequency of each residual; what has none stands at the end.
+    """
+    size = np.linalg.norm(jacobian, axis=0)
+    size[size == 0] = 1e-300
+    _, strength, directions = np.linalg.svd(jacobian / size, full_matrices=False)
+    seen = strength > 1e-9 * strength[0]
+    blind = (np.abs(directions[~seen]) > 1e-6).any(axis=0)
+    inverse = (directions[seen].T / strength[seen] ** 2) @ directions[seen]
+    independent = np.diagonal(inverse) * (residual**2).sum() / freedom
+    pull = (jacobian / size * residual[:, None])[: len(group)]
+    pulls = np.zeros((int(group.max()) + 1, len(size)))
+    np.add.at(pulls, group, pull)
+    grouped = ((pulls @ inverse) ** 2).sum(axis=0)
+    return np.where(blind, np.inf, np.sqrt(np.maximum(independent, grouped)) / size)
+
+
+def _bounds(
+    parameters: Sequence[Parameter], free: NDArray[np.bool_], scales: int
+) -> tuple[FloatArray, FloatArray]:
+    fitted = [parameter for parameter, is_free in zip(parameters, free, strict=True) if is_free]
+    lower = [parameter.lower for parameter in fitted] + [-100.0] * scales
+    upper = [parameter.upper for parameter in fitted] + [100.0] * scales
+    return np.array(lower), np.array(upper)
+
+
+def _residual(
+    problem: Problem, x: FloatArray, scales: FloatArray, weight: FloatArray
+) -> ComplexArray:
+    """Weighted residual (f, e, s) with the best gains; zero where nothing was measured."""
+    model = problem.plate.responses(rig_with(problem.rig, problem.parameters, x)) * scales
+    gains = _gains(model, problem.values, weight)
+    left = np.where(weight > 0, problem.values - np.nan_to_num(gains)[:, :, None] * model, 0)
+    return np.asarray(weight * left)
+
+
+def _gains(model: ComplexArray, values: ComplexArray, weight: FloatArray) -> ComplexArray:
+    """The best complex gain of each row (f, e); NaN where nothing was measured."""
+    values = np.where(weight > 0, values, 0)
+    inner = (weight**2 * model.conj() * values).sum(axis=2)
+    power = (np.abs(weight * model) ** 2).sum(axis=2)
+    return np.where(power > 0, inner / np.where(power > 0, power, 1), np.nan)
+
+
+def row_size(values: ComplexArray, used: NDArray[np.bool_]) -> FloatArray:
+    """Root mean square of each row over its sensors (f, e); 1 for an empty row."""
+    power = np.where(used, np.abs(np.where(used, values, 0)) ** 2, 0).sum(axis=2)
+    size = np.sqrt(power / np.maximum(used.sum(axis=2), 1))
+    return np.where(size > 0, size, 1.0)
+
+
+def _noise(values: ComplexArray, raw: FloatArray, used: NDArray[np.bool_]) -> FloatArray:
+    """Standard deviation (f, e) of a value's real or imaginary part: sqrt(a² + b² size²).
+
+    From the medians of residuals raw (f, e, s), over rows from weak to strong.
+    """
+    size = row_size(values, used)
+    sensors = used.sum(axis=2)
+    rows = np.flatnonzero((sensors >= 2).ravel())
+    floor = _SMALLEST_NOISE * size
+    if len(rows) < 4:
+        return floor
+    # A gain takes one of the row's values with it.
+    share = (sensors / np.maximum(sensors - 1, 1))[:, :, None]
+    power = np.where(used, raw**2 * share / 2, np.nan).reshape(-1, used.shape[2])[rows]
+    order = np.argsort(size.ravel()[rows])
+    found, at = [], []
+    for group in np.array_split(order, min(12, len(rows) // 2)):
+        # The median of |z|² of complex noise with variance 2 is 2 log 2.
+        found.append(np.nanmedian(power[group]) / np.log(2))
+        at.append(np.mean(size.ravel()[rows][group] ** 2))
+    scale = np.maximum(found, 1e-12 * np.array(at))
+    matrix = np.column_stack([1 / scale, np.array(at) / scale])
+    weight = np.linalg.norm(matrix, axis=0)
+    a2, b2 = nnls(matrix / weight, np.ones(len(scale)))[0] / weight
+    return np.asarray(np.sqrt(a2 + b2 * size**2 + floor**2))
+
+
+def _without_outliers(deviation: FloatArray, used: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Take the worst value out of each row that has one beyond bounds and others to stay."""
+    deviation = np.where(used, deviation / np.sqrt(2), 0)
+    worst = deviation.argmax(axis=2)
+    f, e = np.nonzero((deviation.max(axis=2) > _OUTLIER) & (used.sum(axis=2) > 2))
+    kept = used.copy()
+    kept[f, e, worst[f, e]] = False
+    return kept

@@ -1,0 +1,62 @@
+"""A fit checked on sensors that it has not seen."""
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model.arrays import ComplexArray, FloatArray
+from model.calibration.fit import Fit, Problem, row_size, solve
+from model.calibration.outcome import HeldOut
+from model.calibration.parameters import rig_with
+
+_HELD_OUT_SHARE = 0.2  # of the sensors
+_LEAST_TO_HOLD_OUT = 5  # sensors
+
+
+def hold_out(problem: Problem, fit: Fit, names: tuple[str, ...]) -> HeldOut | None:
+    """Fit again without some of the sensors whose scale is known, and predict them."""
+    count = len(names)
+    candidates = np.flatnonzero(~problem.free_scales)
+    if len(candidates) == 0:
+        candidates = np.arange(count)
+    wanted = max(round(_HELD_OUT_SHARE * count), 1)
+    if count < _LEAST_TO_HOLD_OUT or len(candidates) <= wanted:
+        return None
+    spread = np.linspace(0, len(candidates) - 1, wanted + 2)[1:-1].round().astype(int)
+    unseen = np.zeros(count, dtype=bool)
+    unseen[candidates[spread]] = True
+    part = replace(
+        problem,
+        plate=replace(problem.plate, shapes=problem.plate.shapes[~unseen]),
+        values=problem.values[:, :, ~unseen],
+        free_scales=problem.free_scales[~unseen],
+    )
+    seen = solve(part, fit.x, fit.scales[~unseen])
+    size = row_size(problem.values, np.isfinite(problem.values))
+    rig = rig_with(problem.rig, problem.parameters, seen.x)
+    predicted = seen.gains[:, :, None] * problem.plate.responses(rig) * fit.scales
+    return HeldOut(
+        tuple(name for name, out in zip(names, unseen, strict=True) if out),
+        relative_error(problem.values, as_it_was(problem) * fit.scales, size, unseen[None, None]),
+        relative_error(problem.values, predicted, size, fit.used & unseen),
+    )
+
+
+def as_it_was(problem: Problem) -> ComplexArray:
+    """Responses of the rig before, with the gains that it had."""
+    frequencies = problem.plate.omega / (2 * np.pi)
+    gains = np.column_stack([era.gain(frequencies) for era in problem.rig.eras])
+    return np.asarray(gains[:, :, None] * problem.plate.responses(problem.rig))
+
+
+def relative_error(
+    values: ComplexArray, predicted: ComplexArray, size: FloatArray, which: NDArray[np.bool_]
+) -> float:
+    """Root mean square of errors of some of the values (f, e, s), each relative to its row's size.
+
+    Infinite where there is nothing to compare.
+    """
+    share = np.abs(predicted - values) / size[:, :, None]
+    inside = np.broadcast_to(which, values.shape) & np.isfinite(share)
+    return float(np.sqrt((share[inside] ** 2).mean())) if inside.any() else float("inf")

@@ -1,0 +1,141 @@
+"""What a calibration fits: the numbers of a rig, each with how well it must be known to count."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from model.actuator import Era, damping_from_ratio
+from model.arrays import FloatArray
+from model.rig import Rig
+
+# The order of what the rig's author cannot know: a fit that leaves more than this open has not
+# found the parameter, and its value stays what it was.
+_MODULUS_KNOWN = 0.1  # of itself
+_STIFFNESS_KNOWN = 0.25  # of itself
+_LOSS_KNOWN = 0.005
+_DAMPING_RATIO_KNOWN = 0.02
+_BOLT_KNOWN = 0.05  # of the plate's mass that an ERA carries
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One number: what it is, of which ERA ("" for the plate), its value in the rig, and its unit.
+
+    A fit moves x, value = prior * exp(x) where is_factor, else unit * x; known: the largest
+    standard error of x at which it counts as identified; lower, upper: of x.
+    """
+
+    kind: str
+    era: str
+    prior: float
+    unit: str
+    is_factor: bool
+    step: float
+    known: float
+    lower: float
+    upper: float
+
+    @property
+    def start(self) -> float:
+        """x of the rig's own value."""
+        return 0.0 if self.is_factor else self.prior / self.step
+
+    def value(self, x: float) -> float:
+        """The value in its unit."""
+        return self.prior * math.exp(x) if self.is_factor else self.step * x
+
+    def standard_error(self, x: float, error: float) -> float:
+        """Standard error of the value from that of x."""
+        return self.value(x) * error if self.is_factor else self.step * error
+
+    @property
+    def name(self) -> str:
+        """As people read it."""
+        return f"{self.era} {self.kind}" if self.era else f"plate {self.kind}"
+
+
+def parameters_of(rig: Rig) -> tuple[Parameter, ...]:
+    """Modulus and loss factor of the plate, then stiffness, damping and bolt mass of every ERA."""
+    plate = rig.plate
+    share = plate.mass / len(rig.eras)
+    found = [
+        _factor("modulus", "", plate.material.E, "Pa", known=_MODULUS_KNOWN, reach=3.0),
+        _offset("loss_factor", "", plate.loss_factor, "", step=0.01, known=_LOSS_KNOWN, most=0.5),
+    ]
+    for era in rig.eras:
+        # Damping is told by its ratio to what the ERA carries, so that one bound fits all.
+        unit_damping = damping_from_ratio(
+            1.0, stiffness=era.stiffness, plate_mass=plate.mass, era_count=len(rig.eras)
+        )
+        found += [
+            _factor(
+                "stiffness", era.name, era.stiffness, "N/m", known=_STIFFNESS_KNOWN, reach=10.0
+            ),
+            _offset(
+                "damping",
+                era.name,
+                era.damping,
+                "N s/m",
+                step=0.05 * unit_damping,
+                known=_DAMPING_RATIO_KNOWN * unit_damping,
+                most=2 * unit_damping,
+            ),
+            _offset(
+                "bolt_mass",
+                era.name,
+                era.bolt_mass,
+                "kg",
+                step=0.05 * share,
+                known=_BOLT_KNOWN * share,
+                most=5 * share,
+            ),
+        ]
+    return tuple(found)
+
+
+def rig_with(rig: Rig, parameters: Sequence[Parameter], x: FloatArray) -> Rig:
+    """The rig with the values of x (n,); its ERAs keep their gains."""
+    values = {
+        (parameter.era, parameter.kind): parameter.value(float(at))
+        for parameter, at in zip(parameters, x, strict=True)
+    }
+    material = replace(rig.plate.material, E=values["", "modulus"])
+    plate = replace(rig.plate, material=material, loss_factor=values["", "loss_factor"])
+    eras = tuple(_era_with(era, values) for era in rig.eras)
+    return replace(rig, plate=plate, eras=eras)
+
+
+def starts(parameters: Sequence[Parameter]) -> list[FloatArray]:
+    """Where to begin looking: the rig's own values, its modulus and stiffnesses scaled together."""
+    own = np.array([parameter.start for parameter in parameters])
+    found = []
+    for modulus in np.log(np.linspace(0.6, 1.6, 11)):
+        for stiffness in np.log([0.4, 0.6, 0.8, 1.0, 1.25, 1.6, 2.5]):
+            moves = {"modulus": modulus, "stiffness": stiffness}
+            found.append(own + [moves.get(parameter.kind, 0.0) for parameter in parameters])
+    return found
+
+
+def _era_with(era: Era, values: dict[tuple[str, str], float]) -> Era:
+    return replace(
+        era,
+        stiffness=values[era.name, "stiffness"],
+        damping=values[era.name, "damping"],
+        bolt_mass=values[era.name, "bolt_mass"],
+    )
+
+
+def _factor(
+    kind: str, era: str, prior: float, unit: str, *, known: float, reach: float
+) -> Parameter:
+    bound = math.log(reach)
+    return Parameter(kind, era, prior, unit, True, prior, known, -bound, bound)
+
+
+def _offset(
+    kind: str, era: str, prior: float, unit: str, *, step: float, known: float, most: float
+) -> Parameter:
+    upper = max(most, 2 * prior) / step
+    return Parameter(kind, era, prior, unit, False, step, known / step, 0.0, upper)

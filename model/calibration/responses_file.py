@@ -1,0 +1,237 @@
+"""Files of measured frequency responses: CSV with named columns, and UFF 58.
+
+A CSV has the columns below, one value a line, in any order of lines; further columns are refused.
+A UFF has a function of type 4 for every sensor and ERA, acceleration over displacement, with the
+nodes' places in dataset 15 or 2411; the reference node is the ERA, by its name or place.
+"""
+
+import csv
+import io
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from model.calibration.responses import MeasuredFunction, Responses
+from model.csv_file import write_columns
+from model.errors import InputError
+from model.rig import Rig
+from model.uff import (
+    ACCELERATION,
+    DISPLACEMENT,
+    FREQUENCY,
+    FREQUENCY_RESPONSE,
+    Function,
+    Universal,
+    read_bytes,
+    read_universal,
+    write_universal,
+)
+
+COLUMNS = ("era", "sensor", "x_m", "y_m", "frequency_hz", "real_1_s2", "imag_1_s2")
+ERA_COLUMNS = ("era_x_m", "era_y_m")  # may be left out
+_UP = 3  # +z
+# What people call m/s² and m once signs are taken off.
+_ACCELERATION_UNITS = ("", "m/s2", "m/sec2", "m/ss", "ms-2", "ms2")
+_DISPLACEMENT_UNITS = ("", "m", "meter", "metre")
+
+
+def read_functions(path: Path) -> list[MeasuredFunction]:
+    """Read measured responses; raises InputError, with file and line, for what are none."""
+    suffix = path.suffix.lower()
+    if suffix == ".csv":
+        return _read_csv(path)
+    if suffix in (".uff", ".unv"):
+        return _read_uff(path)
+    raise InputError(f"{path}: measured responses are read from .csv, .uff and .unv files only")
+
+
+def write_responses_csv(path: Path, responses: Responses, rig: Rig) -> None:
+    """Write responses as CSV, with every digit; raises OSError."""
+    f, e, s = np.nonzero(np.isfinite(responses.values))
+    values = responses.values[f, e, s]
+    write_columns(
+        path,
+        {
+            "era": [rig.eras[number].name for number in e],
+            "era_x_m": [rig.eras[number].x for number in e],
+            "era_y_m": [rig.eras[number].y for number in e],
+            "sensor": [responses.sensors[number] for number in s],
+            "x_m": responses.points[s, 0],
+            "y_m": responses.points[s, 1],
+            "frequency_hz": responses.frequencies[f],
+            "real_1_s2": values.real,
+            "imag_1_s2": values.imag,
+        },
+    )
+
+
+def write_responses_uff(path: Path, responses: Responses, rig: Rig) -> None:
+    """Write responses as UFF 58: nodes 1.. are the sensors, 1001.. the ERAs; raises OSError."""
+    places = [*responses.points.tolist(), *([era.x, era.y] for era in rig.eras)]
+    numbers = [*range(1, len(responses.sensors) + 1), *range(1001, 1001 + len(rig.eras))]
+    functions = []
+    for e, era in enumerate(rig.eras):
+        for s, sensor in enumerate(responses.sensors):
+            there = np.isfinite(responses.values[:, e, s])
+            if there.any():
+                functions.append(
+                    Function(
+                        str(path),
+                        FREQUENCY_RESPONSE,
+                        s + 1,
+                        1001 + e,
+                        (sensor, era.name),
+                        (_UP, _UP),
+                        responses.frequencies[there],
+                        responses.values[there, e, s],
+                        (FREQUENCY, ACCELERATION, DISPLACEMENT),
+                        ("m/s^2", "m"),
+                    )
+                )
+    nodes = {n: (x, y, 0.0) for n, (x, y) in zip(numbers, places, strict=True)}
+    write_universal(path, Universal(nodes, functions))
+
+
+def _read_csv(path: Path) -> list[MeasuredFunction]:
+    try:
+        text = read_bytes(path).decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: is no text in UTF-8; save it as CSV") from error
+    rows = csv.reader(io.StringIO(text), strict=True)
+    grouped: dict[tuple[str, str], list[tuple[tuple[float, ...], int]]] = {}
+    try:
+        header = [name.strip() for name in next(rows)]
+        _check_header(path, header)
+        numeric = [*COLUMNS[2:], *(name for name in ERA_COLUMNS if name in header)]
+        for row in rows:
+            if not row:
+                continue
+            line = rows.line_num
+            if len(row) != len(header):
+                raise InputError(
+                    f"{path}:{line}: {len(row)} values stand here, the first line names "
+                    f"{len(header)} columns; the file is damaged"
+                )
+            cell = dict(zip(header, row, strict=True))
+            numbers = tuple(_number(path, line, name, cell[name]) for name in numeric)
+            key = (cell["era"].strip(), cell["sensor"].strip())
+            if not all(key):
+                raise InputError(f"{path}:{line}: era or sensor has no name; name both")
+            if numbers[2] <= 0:
+                raise InputError(f"{path}:{line}: frequency_hz is {numbers[2]:g}, not above zero")
+            grouped.setdefault(key, []).append((numbers, line))
+    except csv.Error as error:
+        raise InputError(f"{path}:{rows.line_num}: is no CSV: {error}") from error
+    if not grouped:
+        raise InputError(f"{path}:1: no measured value stands below the columns' names")
+    return [_csv_function(path, *key, found) for key, found in grouped.items()]
+
+
+def _csv_function(
+    path: Path, era: str, sensor: str, rows: Sequence[tuple[tuple[float, ...], int]]
+) -> MeasuredFunction:
+    table = np.array([numbers for numbers, _ in rows])
+    first = rows[0]
+    for numbers, line in rows:
+        if numbers[:2] != first[0][:2] or numbers[5:] != first[0][5:]:
+            raise InputError(
+                f"{path}:{line}: sensor {sensor} or ERA {era} is at another place here than on "
+                f"line {first[1]}; give each place its own name"
+            )
+    era_point = (float(table[0, 5]), float(table[0, 6])) if table.shape[1] > 5 else None
+    return MeasuredFunction(
+        era,
+        sensor,
+        (float(table[0, 0]), float(table[0, 1])),
+        era_point,
+        table[:, 2],
+        table[:, 3] + 1j * table[:, 4],
+        [f"{path}:{line}" for _, line in rows],
+    )
+
+
+def _check_header(path: Path, header: Sequence[str]) -> None:
+    missing = [name for name in COLUMNS if name not in header]
+    foreign = [name for name in header if name not in (*COLUMNS, *ERA_COLUMNS)]
+    if missing or foreign or len(set(header)) < len(header):
+        said = [f"{', '.join(missing)} missing"] if missing else []
+        said += [f"{', '.join(repr(name[:30]) for name in foreign)} unknown"] if foreign else []
+        said += ["a column stands twice"] if not said else []
+        raise InputError(
+            f"{path}:1: the columns must be {', '.join(COLUMNS)}, and may be "
+            f"{', '.join(ERA_COLUMNS)}, in these units (metres, Hz, 1/s²): {'; '.join(said)}"
+        )
+    if sum(name in header for name in ERA_COLUMNS) == 1:
+        raise InputError(f"{path}:1: {' and '.join(ERA_COLUMNS)} go together; give both or none")
+
+
+def _number(path: Path, line: int, name: str, text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise InputError(f"{path}:{line}: {name} is {text[:30]!r}, not a finite number")
+    return value
+
+
+def _read_uff(path: Path) -> list[MeasuredFunction]:
+    content = read_universal(path)
+    functions = [f for f in content.functions if f.function_type == FREQUENCY_RESPONSE]
+    if not functions:
+        raise InputError(
+            f"{path}: holds no frequency response (dataset 58, function type 4); export these, "
+            "acceleration over the base displacement of an ERA"
+        )
+    named: dict[str, set[int]] = {}
+    for function in functions:
+        named.setdefault(function.names[0], set()).add(function.response)
+    return [_uff_function(function, content, named) for function in functions]
+
+
+def _uff_function(
+    function: Function, content: Universal, named: dict[str, set[int]]
+) -> MeasuredFunction:
+    place = function.place
+    if function.kinds[1] != ACCELERATION or function.kinds[2] != DISPLACEMENT:
+        raise InputError(
+            f"{place}: the record is of data type {function.kinds[1]} over {function.kinds[2]}, "
+            f"not acceleration ({ACCELERATION}) over displacement ({DISPLACEMENT}) of an ERA's base"
+        )
+    for label, known, wanted in (
+        (function.units[0], _ACCELERATION_UNITS, "m/s²"),
+        (function.units[1], _DISPLACEMENT_UNITS, "m"),
+    ):
+        plain = label.lower().translate({ord("²"): "2", ord("^"): None, ord("*"): None})
+        if plain.replace(" ", "") not in known:
+            raise InputError(f"{place}: the record is in {label!r}, not in {wanted}; export it so")
+    if not np.iscomplexobj(function.data):
+        raise InputError(f"{place}: the response is real; export it complex, phases are needed")
+    if any(abs(direction) not in (0, _UP) for direction in function.directions):
+        raise InputError(
+            f"{place}: the record's directions are {function.directions[0]} and "
+            f"{function.directions[1]}; only motion across the plate (3 or -3, z) can be fitted"
+        )
+    if function.x[0] <= 0:
+        raise InputError(f"{place}: the record begins at {function.x[0]:g} Hz; leave 0 Hz out")
+    if function.response not in content.nodes:
+        raise InputError(
+            f"{place}: node {function.response} has no place; export the nodes too (dataset 15 or "
+            "2411)"
+        )
+    name, reference = function.names[0], content.nodes.get(function.reference)
+    if not name or len(named[name]) > 1:
+        name = f"{name or 'node'}:{function.response}"
+    sign = math.prod(-1 if direction < 0 else 1 for direction in function.directions)
+    x, y, _ = content.nodes[function.response]
+    return MeasuredFunction(
+        function.names[1],
+        name,
+        (float(x), float(y)),
+        None if reference is None else (float(reference[0]), float(reference[1])),
+        function.x,
+        sign * function.data,
+        [place] * len(function.x),
+    )

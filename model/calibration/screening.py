@@ -1,0 +1,54 @@
+"""Channels that say nothing: sensors without a usable signal, ERAs that move nothing."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model.arrays import FloatArray
+from model.calibration.fit import Fit, Problem
+from model.calibration.parameters import rig_with
+from model.calibration.responses import Responses
+from model.errors import InputError
+
+_SILENT_ERA = 0.02  # of what the others do
+_SILENT_SENSOR = 0.005  # of the loudest sensor, in the median over frequencies and ERAs
+_DEAD_SCALE = 0.1  # of the others' scale
+_DEAD_COHERENCE = 0.5  # with what the fitted plate does at the sensor
+
+
+def silent_eras(responses: Responses) -> NDArray[np.bool_]:
+    """Which ERAs were driven and move nothing (eras,).
+
+    Raises InputError where no ERA moves anything.
+    """
+    usual = np.array([_median(responses.values[:, e]) for e in range(responses.values.shape[1])])
+    if not np.nanmax(usual) > 0:
+        raise InputError("every measured response is zero; check that the ERAs were driven")
+    return np.asarray(usual < _SILENT_ERA * np.nanmedian(usual))
+
+
+def silent_sensors(responses: Responses) -> NDArray[np.bool_]:
+    """Which sensors hear nothing of anything (s,)."""
+    size = np.abs(responses.values)
+    loudest = np.where(np.isfinite(size), size, 0).max(axis=2, keepdims=True)
+    share = size / np.where(loudest > 0, loudest, np.nan)
+    usual = [_median(share[:, :, s]) for s in range(size.shape[2])]
+    return ~(np.array(usual) >= _SILENT_SENSOR)
+
+
+def _median(values: NDArray[np.inexact]) -> float:
+    """Median magnitude of what is there; NaN for nothing."""
+    there = np.abs(values)[np.isfinite(values)]
+    return float(np.median(there)) if len(there) else float("nan")
+
+
+def unlike_the_plate(problem: Problem, fit: Fit, relative: FloatArray) -> NDArray[np.bool_]:
+    """Which sensors do not follow the plate, whatever it is (s,)."""
+    rig = rig_with(problem.rig, problem.parameters, fit.x)
+    model = np.nan_to_num(fit.gains)[:, :, None] * problem.plate.responses(rig)
+    measured = np.isfinite(problem.values)
+    weight = measured / fit.noise[:, :, None]
+    model, values = weight * model, weight * np.where(measured, problem.values, 0)
+    inner = np.abs((model.conj() * values).sum(axis=(0, 1)))
+    power = (np.abs(model) ** 2).sum(axis=(0, 1)) * (np.abs(values) ** 2).sum(axis=(0, 1))
+    coherence = inner / np.sqrt(np.maximum(power, 1e-300))
+    return np.asarray((np.abs(relative) < _DEAD_SCALE) | (coherence < _DEAD_COHERENCE))

@@ -1,0 +1,152 @@
+"""A calibration as people read it, and as programs do."""
+
+from typing import Any
+
+import numpy as np
+
+from model.calibration.outcome import Calibration, FittedParameter
+from model.rig import Rig
+
+
+def change_rows(calibration: Calibration) -> list[str]:
+    """A line for every value: before -> after with its standard error, or why it was left."""
+    width = max(len(fitted.parameter.name) for fitted in calibration.parameters)
+    return [
+        f"{fitted.parameter.name:{width}}  {_change(fitted)}" for fitted in calibration.parameters
+    ]
+
+
+def gain_rows(calibration: Calibration) -> list[str]:
+    """A line for every ERA: its gains' median and range, and their standard error."""
+    rows = []
+    for number, era in enumerate(calibration.rig.eras):
+        if era.name in calibration.dead_eras or not era.gains:
+            rows.append(f"{era.name} gain  not measured")
+            continue
+        size = np.array([row[1] for row in era.gains])
+        phase = np.degrees([row[2] for row in era.gains])
+        error = float(np.nanmedian(calibration.gains_error[:, number]))
+        rows.append(
+            f"{era.name} gain  {np.median(size):.3f} ({size.min():.3f} to {size.max():.3f}), "
+            f"phase {np.median(phase):+.1f} ({phase.min():+.1f} to {phase.max():+.1f}) degrees, "
+            f"± {100 * error:.2g} % at {len(size)} frequencies"
+        )
+    return rows
+
+
+def finding_rows(calibration: Calibration) -> list[str]:
+    """What was found wrong in the measurement, and what could not be found."""
+    rows = [f"sensor {name}: dead, left out" for name in calibration.dead_sensors]
+    rows += [
+        f"ERA {name}: dead, moves nothing; its gains are left as they were"
+        for name in calibration.dead_eras
+    ]
+    rows += [
+        f"sensor {scale.name}: scale {scale.scale:.4g} ± {scale.standard_error:.1g} of the others'"
+        for scale in calibration.scales
+    ]
+    if calibration.outlier_count:
+        rows.append(
+            f"{calibration.outlier_count} of {calibration.value_count} values left out as outliers"
+        )
+    held = [p.parameter.name for p in calibration.parameters if not p.is_identified]
+    if held:
+        rows.append(f"not identified, held at the rig's own value: {', '.join(held)}")
+    return rows
+
+
+def check_row(calibration: Calibration) -> str:
+    """The self-check in one line."""
+    held_out = calibration.held_out
+    if held_out is None:
+        return (
+            f"self-check: too few sensors to hold one out; error of the fit "
+            f"{_percent(calibration.error)}"
+        )
+    return (
+        f"self-check: sensors {', '.join(held_out.sensors)} held out, predicted with an error of "
+        f"{_percent(held_out.after)} (rms, relative to the response); by the old rig "
+        f"{_percent(held_out.before)}"
+    )
+
+
+def as_json(calibration: Calibration, before: Rig, files: list[str]) -> dict[str, Any]:
+    """All of it, units in the keys' names or beside the values."""
+    held_out = calibration.held_out
+    frequencies = calibration.frequencies
+    return {
+        "parameters": [
+            {
+                "name": fitted.parameter.name,
+                "era": fitted.parameter.era or None,
+                "kind": fitted.parameter.kind,
+                "unit": fitted.parameter.unit,
+                "before": fitted.parameter.prior,
+                "after": fitted.value,
+                "standard_error": fitted.standard_error,
+                "identified": fitted.is_identified,
+                "at_bound": fitted.at_bound,
+            }
+            for fitted in calibration.parameters
+        ],
+        "gains": {
+            era.name: {
+                "frequency_hz": [row[0] for row in era.gains],
+                "magnitude": [row[1] for row in era.gains],
+                "phase_deg": np.degrees([row[2] for row in era.gains]).tolist(),
+                "standard_error": _known(calibration.gains_error[:, number]),
+            }
+            for number, era in enumerate(calibration.rig.eras)
+        },
+        "not_identified": [p.parameter.name for p in calibration.parameters if not p.is_identified],
+        "dead_sensors": list(calibration.dead_sensors),
+        "dead_eras": list(calibration.dead_eras),
+        "sensor_scales": {
+            scale.name: {"scale": scale.scale, "standard_error": scale.standard_error}
+            for scale in calibration.scales
+        },
+        "sensors": list(calibration.sensors),
+        "frequencies_hz": frequencies.tolist(),
+        "values": calibration.value_count,
+        "outliers": calibration.outlier_count,
+        "fit_error": calibration.error,
+        "held_out": None
+        if held_out is None
+        else {
+            "sensors": list(held_out.sensors),
+            "error_before": held_out.before,
+            "error_after": held_out.after,
+        },
+        "good": calibration.is_good,
+        "fingerprint_before": before.fingerprint,
+        "fingerprint_after": calibration.rig.fingerprint,
+        "files": files,
+    }
+
+
+def _known(errors: np.ndarray[Any, np.dtype[np.float64]]) -> list[float]:
+    return [float(error) for error in errors if np.isfinite(error)]
+
+
+def _change(fitted: FittedParameter) -> str:
+    parameter = fitted.parameter
+    before = _shown(parameter.prior, parameter.unit)
+    if fitted.standard_error is None:
+        return f"{before}  (not identified, held)"
+    note = "  (at the bound of what can be)" if fitted.at_bound else ""
+    after = _shown(fitted.value, parameter.unit)
+    error = _shown(fitted.standard_error, parameter.unit, digits=2)
+    share = f" ({100 * (fitted.value / parameter.prior - 1):+.1f} %)" if parameter.prior else ""
+    return f"{before} -> {after} ± {error}{share}{note}"
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.0f} %" if share > 0.1 else f"{100 * share:.2g} %"
+
+
+def _shown(value: float, unit: str, *, digits: int = 5) -> str:
+    if unit == "Pa":
+        return f"{value / 1e9:.{digits}g} GPa"
+    if unit == "kg":
+        return f"{1000 * value:.{digits}g} g"
+    return f"{value:.{digits}g} {unit}".strip()

@@ -1,0 +1,44 @@
+"""Measured responses beside what the rig says, before and after a calibration."""
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from model.calibration.outcome import Calibration
+
+_ROWS = 2  # of sensors
+
+
+def calibration_figure(calibration: Calibration) -> Figure:
+    """One panel for an ERA and a sensor: magnitude over frequency, for up to eight pairs."""
+    eras = [
+        number
+        for number, era in enumerate(calibration.rig.eras)
+        if era.name not in calibration.dead_eras
+        and np.isfinite(calibration.measured[:, number]).any()
+    ][:4]
+    sensors = np.linspace(0, len(calibration.sensors) - 1, _ROWS).round().astype(int)
+    figure = Figure(figsize=(3.2 * len(eras), 2.6 * _ROWS + 0.6), layout="constrained")
+    axes = figure.subplots(_ROWS, len(eras), sharex=True, sharey=True, squeeze=False)
+    # Per ERA base displacement of 1 µm: numbers that one meets on a bench.
+    size = 1e-6
+    for row, sensor in enumerate(sensors):
+        for column, era in enumerate(eras):
+            axis = axes[row, column]
+            for label, values, style in (
+                ("rig as it was", calibration.before, {"color": "0.6", "linewidth": 1.2}),
+                ("calibrated", calibration.after, {"color": "C0", "linewidth": 1.4}),
+                ("measured", calibration.measured, {"color": "C3", "marker": ".", "ls": "none"}),
+            ):
+                magnitude = size * np.abs(values[:, era, sensor])
+                axis.semilogy(calibration.frequencies, magnitude, label=label, **style)
+            axis.set_title(
+                f"{calibration.rig.eras[era].name} to {calibration.sensors[sensor]}", fontsize=9
+            )
+            axis.grid(True, which="both", alpha=0.2)
+    for axis in axes[-1]:
+        axis.set_xlabel("frequency / Hz")
+    for axis in axes[:, 0]:
+        axis.set_ylabel("m/s² per µm of base")
+    handles, labels = axes[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper center", ncols=3, fontsize=9)
+    return figure

@@ -1,0 +1,231 @@
+"""Universal files (UFF): functions at nodes (dataset 58), nodes (15, 2411) and units (164).
+
+The format of modal analysis since the 1970s, ASCII or binary; pyuff knows its fields. It reads over
+much that is wrong, though, so a file is first taken apart here: every dataset must be whole, and
+every number there and finite. Files are in SI units or refused.
+"""
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model.arrays import FloatArray
+from model.errors import InputError
+
+TIME_RESPONSE, FREQUENCY_RESPONSE = 1, 4  # function types
+DISPLACEMENT, ACCELERATION, TIME, FREQUENCY = 8, 12, 17, 18  # kinds of data
+
+_LARGEST = 512 << 20
+_HEADER_LINES = 13  # of dataset 58, from its opening mark on
+_SI = 1  # units code of dataset 164
+_DELIMITER = re.compile(rb"^    -1[ \t]*\r?$", re.MULTILINE)
+
+
+@dataclass(frozen=True, eq=False)
+class Function:
+    """One dataset 58.
+
+    place: file and line of it, for errors; response, reference: nodes, with a name each ("" for
+    none) and a direction, +-3 for +-z; x: abscissa, data (n,) real or complex; kinds: of abscissa,
+    ordinate and denominator, by code; units: of ordinate and denominator as labelled.
+    """
+
+    place: str
+    function_type: int
+    response: int
+    reference: int
+    names: tuple[str, str]
+    directions: tuple[int, int]
+    x: FloatArray
+    data: NDArray[Any]
+    kinds: tuple[int, int, int]
+    units: tuple[str, str]
+
+
+@dataclass(frozen=True, eq=False)
+class Universal:
+    """What a file holds. nodes: x, y, z [m] by number."""
+
+    nodes: Mapping[int, tuple[float, float, float]]
+    functions: Sequence[Function]
+
+
+def write_universal(path: Path, content: Universal) -> None:
+    """Write nodes, units and functions in ASCII, double precision (12 digits).
+
+    An evenly spaced abscissa has six digits for its step. Raises OSError where it cannot be
+    written, ValueError for numbers that are not finite: pyuff would write zeros in their place.
+    """
+    import pyuff
+
+    if any(not np.isfinite(function.data).all() for function in content.functions):
+        raise ValueError(f"{path}: only finite numbers can be written")
+    count = len(content.nodes)
+    x, y, z = np.array(list(content.nodes.values()), dtype=float).reshape(-1, 3).T
+    zeros = np.zeros(count, dtype=int)
+    units = {"type": 164, "units_code": _SI, "units_description": "SI", "temp_mode": 1}
+    factors = {"length": 1.0, "force": 1.0, "temp": 1.0, "temp_offset": 0.0}
+    nodes = {
+        "type": 2411,
+        "node_nums": np.array(list(content.nodes)),
+        "def_cs": zeros,
+        "disp_cs": zeros,
+        "color": zeros,
+        "x": x,
+        "y": y,
+        "z": z,
+    }
+    path.write_bytes(b"")  # whatever is wrong with the place shows here, in the system's words
+    sets = [units | factors, nodes, *(_as_58(function) for function in content.functions)]
+    pyuff.UFF(str(path)).write_sets(sets, "overwrite")
+
+
+def read_universal(path: Path) -> Universal:
+    """Read a file; raises InputError, with file and line, for one that is none or is damaged."""
+    import pyuff
+
+    content = read_bytes(path)
+    marks = [match.start() for match in _DELIMITER.finditer(content)]
+    lines = [content.count(b"\n", 0, mark) + 1 for mark in marks]
+    if not marks:
+        raise InputError(
+            f"{path}: is no universal file, for no line of it holds `    -1` alone; export the "
+            "measurement as UFF, datasets 58 with 15 or 2411"
+        )
+    if len(marks) % 2:
+        raise InputError(
+            f"{path}:{lines[-1]}: the dataset that begins here has no end; the file was cut off, "
+            "export it again"
+        )
+    file = pyuff.UFF(str(path))
+    kinds = [int(kind) for kind in file.get_set_types()]
+    if len(kinds) != len(marks) // 2:
+        raise InputError(f"{path}: its datasets cannot be told apart; export it again as ASCII")
+    nodes: dict[int, tuple[float, float, float]] = {}
+    functions = []
+    for number, kind in enumerate(kinds):
+        line = lines[2 * number]
+        place = f"{path}:{line}"
+        if kind not in (15, 58, 164, 2411):
+            continue
+        block = content[marks[2 * number] : marks[2 * number + 1]]
+        if kind == 58:
+            _check_numbers(path, line, block)
+        try:
+            found = file.read_sets(number)
+            if kind == 58:
+                functions.append(_function(place, found))
+            elif kind == 164:
+                _check_si(place, found)
+            else:
+                xyz = zip(found["x"], found["y"], found["z"], strict=True)
+                nodes.update(zip(map(int, found["node_nums"]), xyz, strict=True))
+        except InputError:
+            raise
+        except Exception as error:  # pyuff raises nothing narrower
+            raise InputError(
+                f"{place}: dataset {kind} is damaged and cannot be read; export it again"
+            ) from error
+    return Universal(nodes, functions)
+
+
+def read_bytes(path: Path) -> bytes:
+    """The content of a measured file; raises InputError for none, an empty or a huge one."""
+    try:
+        with path.open("rb") as stream:
+            content = stream.read(_LARGEST + 1)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
+    if not content.strip():
+        raise InputError(f"{path}: is empty; export the measurement again")
+    if len(content) > _LARGEST:
+        raise InputError(f"{path}: is larger than {_LARGEST >> 20} MiB; export fewer records")
+    return content
+
+
+def _as_58(function: Function) -> dict[str, Any]:
+    steps = np.diff(function.x)
+    even = function.kinds[0] == TIME and len(steps) > 0 and np.ptp(steps) < 1e-6 * steps[0]
+    return {
+        "type": 58,
+        "func_type": function.function_type,
+        "rsp_node": function.response,
+        "rsp_dir": function.directions[0],
+        "ref_node": function.reference,
+        "ref_dir": function.directions[1],
+        "rsp_ent_name": function.names[0][:10] or "NONE",
+        "ref_ent_name": function.names[1][:10] or "NONE",
+        "id1": " / ".join(name for name in function.names if name) or "NONE",
+        "abscissa_spacing": int(even),
+        "abscissa_spec_data_type": function.kinds[0],
+        "ordinate_spec_data_type": function.kinds[1],
+        "orddenom_spec_data_type": function.kinds[2],
+        "abscissa_axis_units_lab": "s" if function.kinds[0] == TIME else "Hz",
+        "ordinate_axis_units_lab": function.units[0] or "NONE",
+        "orddenom_axis_units_lab": function.units[1] or "NONE",
+        "x": function.x,
+        "data": function.data,
+    }
+
+
+def _function(place: str, found: Mapping[str, Any]) -> Function:
+    x, data = np.asarray(found["x"], dtype=float), np.asarray(found["data"])
+    if not len(data) == len(x) == found["num_pts"]:
+        raise InputError(
+            f"{place}: the record announces {found['num_pts']} values and holds {len(data)}; the "
+            "file is damaged, export it again"
+        )
+    if not (np.isfinite(x).all() and np.isfinite(data).all()):
+        raise InputError(f"{place}: the record holds values that are not finite; measure it again")
+    if len(x) == 0 or (np.diff(x) <= 0).any():
+        raise InputError(f"{place}: the record's abscissa does not ascend; export it again")
+    names = (_name(found["rsp_ent_name"]), _name(found["ref_ent_name"]))
+    kinds = ("abscissa", "ordinate", "orddenom")
+    return Function(
+        place,
+        found["func_type"],
+        found["rsp_node"],
+        found["ref_node"],
+        names,
+        (found["rsp_dir"], found["ref_dir"]),
+        x,
+        data,
+        tuple(found[f"{kind}_spec_data_type"] for kind in kinds),
+        (_name(found["ordinate_axis_units_lab"]), _name(found["orddenom_axis_units_lab"])),
+    )
+
+
+def _name(text: str) -> str:
+    plain = text.strip()
+    return "" if plain.upper() == "NONE" else plain
+
+
+def _check_si(place: str, found: Mapping[str, Any]) -> None:
+    if found["units_code"] != _SI:
+        raise InputError(
+            f"{place}: the file's units (dataset 164) are of code {found['units_code']} "
+            f"{found['units_description']!r}, not 1 (SI: metre, newton); export it in SI"
+        )
+
+
+def _check_numbers(path: Path, line: int, block: bytes) -> None:
+    """Refuse ASCII data in which a number is none, with its line."""
+    rows = block.split(b"\n")
+    if len(rows) > 1 and rows[1][6:7].lower() == b"b":
+        return
+    for number, row in enumerate(rows[_HEADER_LINES:], start=line + _HEADER_LINES):
+        try:
+            # Numbers may touch: 1.00000e+00-1.00000e+00.
+            for word in re.sub(rb"([eEdD][+-]?\d+)(?=[-+\d.])", rb"\1 ", row).split():
+                float(word)
+        except ValueError:
+            shown = row.decode("ascii", "backslashreplace").strip()[:40]
+            raise InputError(
+                f"{path}:{number}: {shown!r} is not the numbers that should stand here; the file "
+                "is damaged, export it again"
+            ) from None

@@ -1,0 +1,139 @@
+"""Virtual accelerometers on the simulated plate, one by one or as a scanning grid.
+
+A sensor turns the acceleration across the plate at its point into readings: times its scale, plus
+white noise over the whole band up to half the sampling rate, cut off at its range, rounded to its
+resolution. Not modelled: its mass, its own resonance, an anti-alias filter, cross-axis motion.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from model.arrays import FloatArray
+from model.errors import InputError
+from model.plate import Plate
+
+
+@dataclass(frozen=True)
+class Accelerometer:
+    """A sensor at x, y [m].
+
+    noise_density [m/s²/sqrt(Hz)]; reach: the largest acceleration that it can tell [m/s²], either
+    way; resolution: its smallest step [m/s²], 0 for none; scale: reading per truth, 1 for a sensor
+    that is right, 0 for a dead one.
+    """
+
+    name: str
+    x: float
+    y: float
+    noise_density: float = 0.0
+    reach: float = math.inf
+    resolution: float = 0.0
+    scale: float = 1.0
+
+    def __post_init__(self) -> None:
+        """Refuse what no sensor can be."""
+        for key in ("x", "y", "noise_density", "resolution", "scale"):
+            if not math.isfinite(getattr(self, key)):
+                raise InputError(f"sensor {self.name}: {key} is not a finite number")
+        if self.noise_density < 0 or self.resolution < 0 or not self.reach > 0:
+            raise InputError(
+                f"sensor {self.name}: noise density {self.noise_density:g} and resolution "
+                f"{self.resolution:g} must not be below zero, its reach {self.reach:g} above"
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """Readings [m/s²] of some sensors, samples (n, s), the first at start [s].
+
+    names, points (s, 2) [m]: of the sensors; sample_rate [Hz].
+    """
+
+    names: tuple[str, ...]
+    points: FloatArray
+    sample_rate: float
+    start: float
+    samples: FloatArray
+
+    def __post_init__(self) -> None:
+        """Refuse what does not fit together."""
+        shape = (len(self.samples), len(self.names))
+        if np.shape(self.samples) != shape or np.shape(self.points) != (len(self.names), 2):
+            raise InputError(
+                f"a recording of {len(self.names)} sensors needs as many columns and points"
+            )
+        if not (math.isfinite(self.sample_rate) and self.sample_rate > 0):
+            raise InputError(f"sampling rate {self.sample_rate} Hz is none, must be above zero")
+
+    @property
+    def times(self) -> FloatArray:
+        """When each sample was taken [s], (n,)."""
+        return np.asarray(self.start + np.arange(len(self.samples)) / self.sample_rate)
+
+    def during(self, since: float, until: float) -> "Recording":
+        """The part with since <= t < until [s]."""
+        inside = np.flatnonzero((self.times >= since) & (self.times < until))
+        if len(inside) == 0:
+            raise InputError(f"nothing was recorded from {since:g} to {until:g} s")
+        return Recording(
+            self.names,
+            self.points,
+            self.sample_rate,
+            float(self.times[inside[0]]),
+            self.samples[inside],
+        )
+
+
+def positions(sensors: Sequence[Accelerometer]) -> FloatArray:
+    """Where sensors are [m], (s, 2)."""
+    return np.array([[sensor.x, sensor.y] for sensor in sensors], dtype=float).reshape(-1, 2)
+
+
+def scanning_grid(plate: Plate, nx: int, ny: int, *, like: Accelerometer) -> list[Accelerometer]:
+    """nx by ny sensors in the middle of as many equal cells, alike but for name and place.
+
+    P1 is nearest the origin; numbers run along x first.
+    """
+    if nx < 1 or ny < 1:
+        raise InputError(f"a scanning grid of {nx}x{ny} points is none; take 1x1 at least")
+    return [
+        Accelerometer(
+            f"P{row * nx + column + 1}",
+            (column + 0.5) / nx * plate.length,
+            (row + 0.5) / ny * plate.width,
+            like.noise_density,
+            like.reach,
+            like.resolution,
+            like.scale,
+        )
+        for row in range(ny)
+        for column in range(nx)
+    ]
+
+
+def read_sensors(
+    sensors: Sequence[Accelerometer],
+    accelerations: FloatArray,
+    *,
+    sample_rate: float,
+    start: float,
+    rng: np.random.Generator,
+) -> Recording:
+    """What sensors read while the plate at their points accelerates so, (n, s) [m/s²].
+
+    start: time of the first sample [s].
+    """
+    density = np.array([sensor.noise_density for sensor in sensors])
+    reach = np.array([sensor.reach for sensor in sensors])
+    resolution = np.array([sensor.resolution for sensor in sensors])
+    readings = accelerations * [sensor.scale for sensor in sensors]
+    # White noise of this density up to half the sampling rate has this standard deviation.
+    readings += density * math.sqrt(sample_rate / 2) * rng.standard_normal(readings.shape)
+    readings = np.clip(readings, -reach, reach)
+    step = np.where(resolution > 0, resolution, 1.0)
+    readings = np.where(resolution > 0, step * np.round(readings / step), readings)
+    names = tuple(sensor.name for sensor in sensors)
+    return Recording(names, positions(sensors), sample_rate, start, readings)

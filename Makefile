@@ -7,7 +7,7 @@ PYTHON ?= $(shell for python in $(PYTHONS); do \
 BIN := .venv/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet --editable
 
-.PHONY: demo test lint format bench clean
+.PHONY: demo test lint format fuzz bench bench-wires clean
 .NOTPARALLEL:
 
 demo: .venv/installed
@@ -22,6 +22,10 @@ lint: .venv/installed-test
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
+# A million damaged frames for every codec; `make test` takes a few thousand.
+fuzz: .venv/installed-test
+	$(BIN)/python tests/support/mutation.py
+
 format: .venv/installed-test
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
@@ -29,6 +33,9 @@ format: .venv/installed-test
 # What the machine does beside it shows in the times: leave it alone meanwhile.
 bench: .venv/installed-peers
 	$(BIN)/python -m benchmarks.plate
+
+bench-wires: .venv/installed-test
+	$(BIN)/python -m benchmarks.wires
 
 clean:
 	rm -rf .venv .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache out

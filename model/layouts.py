@@ -14,8 +14,6 @@ from model.actuator import Era
 from model.arrays import FloatArray
 from model.errors import InputError
 from model.plate import Plate
-from model.point_load import PointLoad
-from model.rig import Rig
 
 Place = tuple[float, float]
 """Where an ERA stands, as fractions (of the length, of the width), 0 to 1."""
@@ -73,11 +71,6 @@ def place_eras(eras: Sequence[Era], positions: FloatArray) -> tuple[Era, ...]:
     return tuple(
         replace(era, x=float(x), y=float(y)) for era, (x, y) in zip(eras, positions, strict=True)
     )
-
-
-def carried_loads(rig: Rig) -> tuple[PointLoad, ...]:
-    """What the plate of a rig carries besides its ERAs, wherever these stand."""
-    return tuple(PointLoad(mass.x, mass.y, mass=mass.mass) for mass in rig.masses)
 
 
 def candidate_places(nx: int, ny: int) -> FloatArray:

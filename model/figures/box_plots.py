@@ -19,7 +19,7 @@ from model.csv_file import Columns
 from model.figures.layout_boxes import LayoutBox, layout_boxes_figure
 from model.figures.paper_figure import PaperFigure
 from model.free_plate import FreePlate
-from model.layouts import FOUR_ERA_LAYOUTS, Layout, alike, carried_loads
+from model.layouts import FOUR_ERA_LAYOUTS, Layout, alike
 from model.plate import Plate
 from model.rig import Rig
 from model.table import PAPER_FREQUENCIES
@@ -68,11 +68,10 @@ def _drives(rig: Rig, free_plate: FreePlate, *, active_count: int) -> list[_Driv
     """Every set of so many ERAs of every named layout; ERAs like the rig's first."""
     points = equal_area_points(rig.plate, frequency_max=float(PAPER_FREQUENCIES[-1]))
     felt = felt_acceleration(PAPER_FREQUENCIES)
-    loads = carried_loads(rig)
     drives = []
     for layout in FOUR_ERA_LAYOUTS:
         eras = alike(rig.eras[0], layout.positions(rig.plate))
-        acceleration = free_plate.acceleration(eras, PAPER_FREQUENCIES, points, loads=loads)
+        acceleration = free_plate.acceleration(eras, PAPER_FREQUENCIES, points, loads=rig.loads)
         statistics = cumulative_statistics(acceleration, felt=felt)
         drives += [
             _Drive(layout, active, row)

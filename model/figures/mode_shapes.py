@@ -124,7 +124,9 @@ def _shapes_figure(
 
 
 def _modes(rig: Rig, mesh: Mesh, support: str) -> Modes:
-    return modes(assemble(rig.plate, mesh), MODE_COUNT, support=support, eras=rig.eras)
+    return modes(
+        assemble(rig.plate, mesh), MODE_COUNT, support=support, eras=rig.eras, loads=rig.loads
+    )
 
 
 def _scaled(shape: FloatArray) -> FloatArray:

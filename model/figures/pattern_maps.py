@@ -14,7 +14,7 @@ from model.excitation import Excitation, Tone
 from model.figures.drawing import MapPanel, maps_figure, raster
 from model.figures.paper_figure import PaperFigure
 from model.free_plate import FreePlate
-from model.layouts import carried_loads, diagonal_pair, edge_pair
+from model.layouts import diagonal_pair, edge_pair
 from model.maps import PlateMap
 from model.paper import (
     FIGURE_11_FREQUENCY,
@@ -44,7 +44,7 @@ class MapSolver:
         x = np.linspace(0, plate.length, columns)
         y = np.linspace(0, plate.width, rows)
         points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-        loads = carried_loads(self.rig)
+        loads = self.rig.loads
         _, amplitudes = tone_amplitudes(
             excitation, eras, lambda f: self.free_plate.acceleration(eras, f, points, loads=loads)
         )

@@ -75,4 +75,4 @@ class Cases:
 
 def all_alike(eras: Sequence[Era]) -> bool:
     """Whether ERAs differ in nothing but their names and places."""
-    return len({(e.stiffness, e.damping, e.bolt_mass, e.stroke) for e in eras}) == 1
+    return len({replace(era, name="", x=0.0, y=0.0) for era in eras}) == 1

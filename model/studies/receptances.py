@@ -13,7 +13,6 @@ from model.arrays import ComplexArray, FloatArray, IntArray
 from model.errors import InputError
 from model.free_plate import solve_free_plate
 from model.harmonic import hold_and_drive
-from model.layouts import carried_loads
 from model.rig import Rig
 
 # More than this [bytes] and the machine is likely to run out of memory.
@@ -75,7 +74,5 @@ def solve_receptances(
             f"{size / 1e9:.1f} GB; take fewer --candidates or fewer --frequencies"
         )
     free_plate = solve_free_plate(rig.plate, rig.mesh, frequency_max=float(frequencies.max()))
-    between, to_points = free_plate.receptances(
-        positions, points, frequencies, loads=carried_loads(rig)
-    )
+    between, to_points = free_plate.receptances(positions, points, frequencies, loads=rig.loads)
     return Receptances(frequencies, between, to_points)

@@ -1,6 +1,7 @@
 """A case of a study in words, and as a rig file to paste."""
 
 from collections.abc import Mapping
+from copy import deepcopy
 
 import yaml
 
@@ -43,15 +44,20 @@ def rig_yaml(data: Mapping[str, Value], rig: Rig, ranking: Ranking, case: int) -
     wiring = list(rig.wiring.values())
     first = wiring[0].amplifier
     free = 1 + max(channel.number for channel in wiring if channel.amplifier == first)
+    before = data["eras"]
+    assert isinstance(before, dict)  # noqa: S101 - the rig was read from this data
     eras: dict[str, Value] = {}
     for number, era in enumerate(ranking.cases.eras_of(case, rig.eras)):
+        # One that was given a new name is like the first, in what no study changes too.
+        # A copy, or the file would say `as above` by an alias, which rig files do not know.
+        section = deepcopy(before.get(era.name, next(iter(before.values()))))
+        assert isinstance(section, dict)  # noqa: S101
         channel = wiring[number] if number < len(wiring) else None
         eras[era.name] = {
+            **{key: value for key, value in section.items() if key != "damping_ratio"},
             "at": [era.x, era.y],
             "stiffness": era.stiffness,
             "damping": era.damping,
-            "bolt_mass": era.bolt_mass,
-            "stroke": era.stroke,
             "amplifier": channel.amplifier if channel else first,
             "channel": channel.number if channel else free + number - len(wiring),
         }

@@ -17,6 +17,7 @@ from typer.testing import CliRunner
 from model.errors import InputError
 from model.rig_file import example_rig_path, load_rig
 from model.studies.run import CHUNK
+from model.studies.solve import code_version
 from model.study_cli import study_app
 
 RUNNER = CliRunner()
@@ -48,6 +49,27 @@ def test_a_study_recommends_a_rig_that_loads(tmp_path: Path, what: str) -> None:
     for name in answer["files"]:
         assert Path(name).is_file()
         assert not name.endswith(".png") or Path(name).read_bytes().startswith(PNG)
+
+
+def test_what_no_study_changes_is_kept(tmp_path: Path) -> None:
+    """Bolt mass, measured gains and what else a rig says of its ERAs is in the recommended one."""
+    data = yaml.safe_load(Path(RIG).read_text(encoding="utf-8"))
+    for era in data["eras"].values():
+        era |= {
+            "bolt_mass": "4 g",
+            "stroke": "80 um",
+            "gains": [[60, 0.9, -2], [320, 1, 3]],
+        }
+    path = tmp_path / "rig.yaml"
+    path.write_text(yaml.safe_dump(data, sort_keys=False), encoding="utf-8")
+    study("placement", tmp_path / "out", "--layouts", "12", rig=str(path))
+    rig = load_rig(tmp_path / "out" / "recommended.yaml")
+    before = load_rig(path).eras[0]
+    assert len(before.gains) == 2
+    for era in rig.eras:
+        assert (era.bolt_mass, era.stroke, era.gains) == (0.004, 80e-6, before.gains)
+        assert era.stiffness == before.stiffness
+        assert era.damping == before.damping
 
 
 def test_the_recommended_rig_does_what_was_promised(tmp_path: Path) -> None:
@@ -203,5 +225,6 @@ def test_ctrl_c_leaves_a_study_that_goes_on(tmp_path: Path) -> None:
     kept = len(list(tmp_path.glob("chunks/*.npz")))
     assert 0 < kept < 30000 / CHUNK
     assert not list(tmp_path.glob("chunks/.*"))
+    code_version.cache_clear()  # as the other process has seen it
     answer = study("placement", tmp_path, "--layouts", str(2 * CHUNK), "--workers", "1")
     assert answer["from_cache"] >= CHUNK

@@ -15,6 +15,7 @@ from drivers.protocol.messages import NakCode
 _CHANNEL = PROTOCOL.quantities.channel
 _NO_CHANNEL = 255
 _TEXT_MAX = 32
+_LAYOUTS = {code: struct.Struct("<" + code) for code in "BHIh"}
 
 EnumT = TypeVar("EnumT", bound=IntEnum)
 
@@ -103,9 +104,13 @@ class Cursor:
             raise Malformed(f"{extra} bytes too many", code=NakCode.BAD_LENGTH)
 
     def _raw(self, struct_code: str) -> int:
-        layout = struct.Struct("<" + struct_code)
-        (value,) = layout.unpack(self._take(layout.size))
-        return int(value)
+        layout = _LAYOUTS[struct_code]
+        at = self._at
+        self._at += layout.size
+        if self._at > len(self._payload):
+            raise Malformed("the payload ends too early", code=NakCode.BAD_LENGTH)
+        value: int = layout.unpack_from(self._payload, at)[0]
+        return value
 
     def _take(self, length: int) -> bytes:
         piece = self._payload[self._at : self._at + length]
@@ -117,8 +122,9 @@ class Cursor:
 
 def pack(*pairs: tuple[Quantity, float]) -> bytes:
     """Values in their units, one after the other; CommandError for one out of range."""
-    layout = "<" + "".join(quantity.struct_code for quantity, _ in pairs)
-    return struct.pack(layout, *(quantity.to_wire(value) for quantity, value in pairs))
+    return b"".join(
+        [_LAYOUTS[quantity.struct_code].pack(quantity.to_wire(value)) for quantity, value in pairs]
+    )
 
 
 def pack_text(text: str) -> bytes:

@@ -1,0 +1,152 @@
+"""`make bench-wires`: what the drivers cost beside the bare library of each wire.
+
+Writes docs/wire-benchmarks.md. A wire is one entry in WIRES.
+"""
+
+import asyncio
+import platform
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from benchmarks.wire_bare import bare_serial
+from benchmarks.wire_bench import CHANNELS, Times, all_at_once, far_end, make_sets, ours
+from drivers.guard import SafeCommand
+from drivers.protocol.messages import Apply, Capabilities
+from drivers.protocol.serial_codec import decode_request, encode_request
+from drivers.protocol.serial_frame import FrameReader, encode_frame
+
+ROOT = Path(__file__).parent.parent
+PAGE = ROOT / "docs" / "wire-benchmarks.md"
+COUNT = 1500
+ROUNDS = 5  # ours and bare take turns, so that both see the same machine
+WIDE = Capabilities(
+    *(16, 20.0, 600.0, 0.01, 1.0, 0.0001, 0.01, 1.0, 0.1, 2.0, 32, 63, 0.001, 0.1, True)
+)
+
+
+@dataclass(frozen=True)
+class Measured:
+    """A wire: options of `era sim`, and the bare library doing the same exchange.
+
+    codec: encodes and decodes a set once; None where the library does that.
+    """
+
+    options: Sequence[str]
+    bare: Callable[[str, Sequence[SafeCommand]], list[float]]
+    library: str
+    codec: Callable[[SafeCommand], None] | None = None
+
+
+_READER = FrameReader()
+
+
+def _serial_codec(safe: SafeCommand) -> None:
+    data = encode_frame(encode_request(Apply(safe), address=1, sequence=1))
+    decode_request(_READER.feed(data)[0])
+
+
+WIRES: Mapping[str, Measured] = {
+    "serial": Measured(["--serial"], bare_serial, "pyserial", _serial_codec),
+    "serial, 921 600 baud": Measured(["--serial", "--speed", "921600"], bare_serial, "pyserial"),
+}
+
+
+def main() -> None:
+    """Measure every wire and write the page."""
+    names = sys.argv[1:] or list(WIRES)
+    with tempfile.TemporaryDirectory() as folder:
+        rig = _coarse_rig(Path(folder))
+        rows = [_row(name, WIRES[name], rig) for name in names]
+        eight = _eight(Path(folder))
+    page = _page(rows, eight)
+    PAGE.write_text(page, encoding="utf-8")
+    print(page)
+    print(f"wrote {PAGE.relative_to(ROOT)}")
+
+
+def _row(name: str, wire: Measured, rig: Path) -> str:
+    our_times: list[float] = []
+    bare_times: list[float] = []
+    for _ in range(ROUNDS):
+        with far_end(rig, wire.options) as (url,):
+            our_times += asyncio.run(ours(url, COUNT // ROUNDS))
+        with far_end(rig, wire.options) as (url,):
+            bare_times += wire.bare(url, make_sets(WIDE, COUNT // ROUNDS))
+    mine, bare = Times.of(our_times), Times.of(bare_times)
+    return (
+        f"| {name} | {mine.median * 1e3:.2f} | {mine.p99 * 1e3:.2f} | {mine.rate:.0f} | "
+        f"{wire.library} | {bare.median * 1e3:.2f} | {bare.p99 * 1e3:.2f} | "
+        f"{mine.median / bare.median:.2f} | {_codec_rate(wire)} |"
+    )
+
+
+def _codec_rate(wire: Measured) -> str:
+    if wire.codec is None:
+        return ""
+    (safe,) = make_sets(WIDE, 1)
+    count, begin = 5000, time.perf_counter()
+    for _ in range(count):
+        wire.codec(safe)
+    return f"{count / (time.perf_counter() - begin):.0f}"
+
+
+def _eight(folder: Path) -> str:
+    rig = folder / "eight.yaml"
+    text = (ROOT / "examples" / "paper_plate.yaml").read_text(encoding="utf-8")
+    eras = "\n".join(
+        f"  E{number}: {{at: [{number % 4 * 4} in, {number // 4 * 9} in], stiffness: 17000, "
+        f"damping_ratio: 0.05, bolt_mass: 0, stroke: 100 um, amplifier: a{number}, channel: 0}}"
+        for number in range(8)
+    )
+    amplifiers = "\n".join(f'  a{number}: {{url: "sim://"}}' for number in range(8))
+    head = text[: text.index("eras:")].replace("mesh: auto", "mesh: 12x9")
+    limits = text[text.index("# What no command may exceed") :]
+    rig.write_text(f"{head}eras:\n{eras}\namplifiers:\n{amplifiers}\n{limits}", encoding="utf-8")
+    with far_end(rig, ["--serial"], amplifiers=8) as urls:
+        cpu = time.process_time()
+        together = Times.of(asyncio.run(all_at_once(urls, 300)))
+        cpu = time.process_time() - cpu
+    return (
+        f"Eight amplifiers on eight serial lines, all told at once: {together.median * 1e3:.2f} ms "
+        f"a round (99th percentile {together.p99 * 1e3:.2f} ms), of which this process computes "
+        f"{cpu / 300 * 1e3:.2f} ms. One far end plays all eight."
+    )
+
+
+def _coarse_rig(folder: Path) -> Path:
+    """The plate takes no part in this."""
+    text = (ROOT / "examples" / "paper_plate.yaml").read_text(encoding="utf-8")
+    path = folder / "coarse.yaml"
+    path.write_text(text.replace("mesh: auto", "mesh: 12x9"), encoding="utf-8")
+    return path
+
+
+def _page(rows: Sequence[str], eight: str) -> str:
+    return "\n".join(
+        [
+            "# What the wires cost",
+            "",
+            "Written by `make bench-wires` "
+            f"(Python {platform.python_version()}, {platform.system()} {platform.machine()}).",
+            f"An apply of {CHANNELS} channels and its answer, over loopback, to a simulated "
+            "amplifier in a process of its own; beside it the bare library of the wire, which "
+            "sends the same bytes, encoded beforehand, to the same far end and looks at nothing. "
+            f"{COUNT} exchanges each, in {ROUNDS} turns.",
+            "",
+            "| wire | median [ms] | 99th [ms] | applies/s | bare library | median [ms] | 99th [ms] "
+            "| ours / bare | codec [sets/s, there and back] |",
+            "|---|---|---|---|---|---|---|---|---|",
+            *rows,
+            "",
+            eight,
+            "",
+        ]
+    )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,96 @@
+"""A Modbus server on a TCP port that answers as a test scripts it, in RTU or TCP frames."""
+
+import asyncio
+import time
+from collections.abc import AsyncIterator, Callable, Sequence
+from contextlib import asynccontextmanager
+from typing import TypeAlias, cast
+
+from modbus_session import ScriptedStation
+from sim.modbus_frames import Request, RtuReader, TcpReader, rtu_frame, tcp_frame
+from sim.modbus_unit import ModbusUnit
+
+Answer: TypeAlias = bytes | None
+"""A PDU, or nothing."""
+
+
+class Peer(asyncio.Protocol):
+    """The far side of a line; its connection is one at a time.
+
+    answer(request) gives the PDU that answers at once, None is silence; by default that of the
+    `station`'s registers, a unit for each number that is asked for.
+    """
+
+    def __init__(self, *, is_rtu: bool) -> None:
+        self.is_rtu = is_rtu
+        self.station = ScriptedStation()
+        self.unit = ModbusUnit(self.station)
+        self.requests: list[Request] = []
+        self.connections = 0
+        self.answer: Callable[[Request], Answer] = lambda request: self.unit.answer(request.pdu)
+        self.url = ""
+        self._reader: RtuReader | TcpReader = TcpReader()
+        self._transport: asyncio.Transport | None = None
+        self._arrived = asyncio.Event()
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        """Somebody has come."""
+        self._transport = cast(asyncio.Transport, transport)
+        self._reader = RtuReader() if self.is_rtu else TcpReader()
+        self.connections += 1
+
+    def data_received(self, data: bytes) -> None:
+        """Answer what is asked."""
+        for request in self._reader.feed(data, time.monotonic()):
+            self.requests.append(request)
+            self._arrived.set()
+            pdu = self.answer(request) if request.unit else None
+            if pdu is not None:
+                self.send(request, pdu)
+
+    def send(self, request: Request, pdu: bytes) -> None:
+        """Answer a request."""
+        self.send_raw(self.frame(request, pdu))
+
+    def frame(self, request: Request, pdu: bytes) -> bytes:
+        """The frame of an answer."""
+        return rtu_frame(request.unit, pdu) if self.is_rtu else tcp_frame(request, pdu)
+
+    def send_raw(self, data: bytes) -> None:
+        """Any bytes."""
+        assert self._transport is not None
+        self._transport.write(data)
+
+    def hang_up(self) -> None:
+        """End the connection."""
+        assert self._transport is not None
+        self._transport.abort()
+
+    async def count(self, number: int) -> None:
+        """Wait until so many requests have come."""
+        async with asyncio.timeout(5):
+            while len(self.requests) < number:
+                self._arrived.clear()
+                await self._arrived.wait()
+
+    @property
+    def functions(self) -> Sequence[int]:
+        """Of the requests so far."""
+        return [request.pdu[0] for request in self.requests]
+
+
+@asynccontextmanager
+async def peer(*, is_rtu: bool) -> AsyncIterator[Peer]:
+    """A peer that listens; over RTU as a serial server does."""
+    peer = Peer(is_rtu=is_rtu)
+    server = await asyncio.get_running_loop().create_server(lambda: peer, "127.0.0.1", 0)
+    host, port = server.sockets[0].getsockname()
+    scheme, unit = ("modbus+rtu", "#1") if is_rtu else ("modbus+tcp", "/1")
+    peer.url = f"{scheme}://{host}:{port}{unit}"
+    try:
+        yield peer
+    finally:
+        server.close()
+        if peer._transport is not None:
+            peer._transport.abort()
+        await server.wait_closed()

@@ -77,24 +77,27 @@ def default_frequencies(rig: Rig) -> FloatArray:
     return np.array(within or [high])
 
 
-def study_convergence(rig: Rig, meshes: Sequence[Mesh], *, frequencies: FloatArray) -> Convergence:
+def study_convergence(
+    rig: Rig, meshes: Sequence[Mesh], *, frequencies: Sequence[float] | FloatArray
+) -> Convergence:
     """Solve a rig on each mesh and on the reference.
 
     frequencies [Hz] up to the rig's limit. Raises InputError for those that a mesh cannot carry.
     """
     high = rig.limits.frequency_max
-    if (frequencies > high).any():
+    asked = np.asarray(frequencies, dtype=float)
+    if (asked > high).any():
         raise InputError(
-            f"{frequencies.max():g} Hz is above the rig's limits.frequency of {high:g} Hz, for "
+            f"{asked.max():g} Hz is above the rig's limits.frequency of {high:g} Hz, for "
             "which its meshes are made; ask for lower frequencies or raise the limit"
         )
     reference = reference_mesh(rig.plate, frequency_max=high)
     exact = _natural_frequencies(rig, reference)
-    exact_response = _response(rig, reference, frequencies)
+    exact_response = _response(rig, reference, asked)
     size = np.linalg.norm(exact_response, axis=2)
     errors = []
     for mesh in meshes:
-        difference = np.linalg.norm(_response(rig, mesh, frequencies) - exact_response, axis=2)
+        difference = np.linalg.norm(_response(rig, mesh, asked) - exact_response, axis=2)
         errors.append(
             MeshError(
                 mesh,
@@ -103,7 +106,7 @@ def study_convergence(rig: Rig, meshes: Sequence[Mesh], *, frequencies: FloatArr
                 response=(difference / size).max(axis=1),
             )
         )
-    return Convergence(reference, frequencies, exact, tuple(errors))
+    return Convergence(reference, asked, exact, tuple(errors))
 
 
 def _natural_frequencies(rig: Rig, mesh: Mesh) -> FloatArray:

@@ -7,7 +7,7 @@ PYTHON ?= $(shell for python in $(PYTHONS); do \
 BIN := .venv/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet --editable
 
-.PHONY: demo test lint format fuzz bench bench-wires clean
+.PHONY: demo test lint format fuzz bench bench-localization bench-wires clean
 .NOTPARALLEL:
 
 demo: .venv/installed
@@ -33,6 +33,9 @@ format: .venv/installed-test
 # What the machine does beside it shows in the times: leave it alone meanwhile.
 bench: .venv/installed-peers
 	$(BIN)/python -m benchmarks.plate
+
+bench-localization: .venv/installed
+	$(BIN)/python -m benchmarks.localization --report
 
 bench-wires: .venv/installed-test
 	$(BIN)/python -m benchmarks.wires

@@ -23,7 +23,12 @@ def main() -> None:
     for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ[variable] = "1"  # before numpy loads: what is timed is one thread
 
-    from benchmarks.localization_contrast import contrast_section, two_target_section
+    from benchmarks.localization_contrast import (
+        contrast_section,
+        ensemble_section,
+        freedom_section,
+        two_target_section,
+    )
     from benchmarks.localization_report import write_report
     from benchmarks.localization_speed import growth_section, speed_section
 
@@ -32,6 +37,8 @@ def main() -> None:
     for section in (
         lambda: contrast_section(options.sets, options.draws, options.seed),
         lambda: two_target_section(options.sets, options.draws, options.seed),
+        lambda: ensemble_section(options.sets, options.seed),
+        lambda: freedom_section(options.sets, options.seed),
         lambda: speed_section(options.seed),
         lambda: growth_section(options.seed),
     ):

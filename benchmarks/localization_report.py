@@ -5,6 +5,7 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from benchmarks.localization_contrast import GOALS, QUIET
+from benchmarks.localization_picture import modes_figure
 
 DOCS = Path(__file__).parent.parent / "docs"
 PAGE = "localization-benchmarks.md"
@@ -43,13 +44,14 @@ READING = """
 def write_report(sections, options):
     """Write the page and its pictures."""
     page = INTRODUCTION.format(sets=options.sets, draws=options.draws, seed=options.seed)
-    pictures = ["localization_contrast.png", "localization_growth.png"]
-    contrast, two, speed, growth = sections
+    pictures = ["localization_contrast.png", "localization_growth.png", "localization_modes.png"]
+    contrast, two, ensemble, freedom, speed, growth = sections
     (DOCS / "pictures").mkdir(exist_ok=True)
     _save(_contrast_figure(contrast), pictures[0])
     _save(_growth_figure(growth), pictures[1])
+    _save(modes_figure(), pictures[2])
     parts = [page, _markdown(contrast), f"![contrast](pictures/{pictures[0]})", READING]
-    parts += [_markdown(two), _markdown(speed), _markdown(growth)]
+    parts += [_markdown(each) for each in (two, ensemble, freedom, speed, growth)]
     parts += [f"![growth](pictures/{pictures[1]})"]
     (DOCS / PAGE).write_text("\n\n".join(part.strip() for part in parts) + "\n", encoding="utf-8")
     print(f"wrote {DOCS / PAGE}")
@@ -60,6 +62,9 @@ def _markdown(section):
     lines.append("| " + " | ".join(section.columns) + " |")
     lines.append("|" + "---|" * len(section.columns))
     lines += ["| " + " | ".join(row) + " |" for row in section.rows]
+    if section.notes:
+        notes = " ".join(section.notes)
+        lines += ["", notes[0].upper() + notes[1:]]
     return "\n".join(lines)
 
 

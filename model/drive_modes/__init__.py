@@ -13,7 +13,9 @@ from model.drive_modes.phased import PHASED
 from model.drive_modes.signed import SIGNED
 from model.drive_modes.switched import find_switched, loudest_switched
 
-__all__ = ["MODES", "Mode", "best_drive", "loudest"]
+FINE_PHASE = 10.0  # degrees
+
+__all__ = ["MODES", "Mode", "best_drive", "loudest", "playable_modes"]
 
 
 @dataclass(frozen=True)
@@ -57,3 +59,16 @@ def best_drive(fields: Fields, mode: str) -> tuple[Drive, Outcome] | None:
 def loudest(fields: Fields, mode: str) -> float:
     """How many times above threshold the targets can be made to feel it in a mode."""
     return max(MODES[name].loudest(fields) for name in (*MODES[mode].poorer, mode))
+
+
+def playable_modes(*, level_step: float, phase_step: float) -> tuple[str, ...]:
+    """The modes that an amplifier can play whose levels and phases [degrees] have such steps.
+
+    A level step of 1 is on or off; phase steps above 180 degrees are no phase, 180 a sign.
+    """
+    if level_step >= 1:
+        return ("switched",)
+    if phase_step > 180:
+        return ("switched", "graded")
+    # Ten degrees are wrong by three at random, within what `phased` allows for.
+    return ("switched", "graded", "signed", "phased")[: 4 if phase_step <= FINE_PHASE else 3]

@@ -25,8 +25,8 @@ from model.drive_modes.fields import ERROR_SHARE, Drive, Fields, Single, SingleC
 Solve = Callable[[SingleComplex, SingleComplex], SingleComplex]
 """Weights (n, eras) for R (n, eras, eras) and c (n, eras), within what a mode allows."""
 
-PROMISING = 8  # frequencies at which shares are moved, at the most
-STEPS = np.array([1.0] + [0.7] * 5, dtype=np.float32)  # how far, round by round, at the most
+PROMISING = 12  # frequencies at which shares are moved, at the most
+STEPS = np.array([1.0] + [0.7] * 6, dtype=np.float32)  # how far, round by round, at the most
 CLOSE = 1.03  # a frequency that cannot be better than this times the best is left
 
 # Where nothing reaches the level, quieter fingers are given up for a louder target, step by step:

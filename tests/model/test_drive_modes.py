@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from model.drive_modes import MODES, best_drive, coherent, fields, loudest
+from model.drive_modes import MODES, best_drive, coherent, fields, loudest, playable_modes
 from model.drive_modes import switched as switched_mode
 from model.drive_modes.fields import ERROR_SHARE, SILENT, Drive, Fields, judge
 from model.question import Question
@@ -271,3 +271,19 @@ def test_two_targets_and_a_quiet_point_are_all_served():
                 cost = np.sqrt((w.conj() @ R @ w).real)
                 best = max(best, np.abs(h @ w).min() / cost)
         assert outcome.score >= 0.98 * best
+
+
+@pytest.mark.parametrize(
+    ("level_step", "phase_step", "richest"),
+    [
+        (1.0, 1.0, "switched"),
+        (0.01, 360.0, "graded"),
+        (0.01, 180.0, "signed"),
+        (1 / 4096, 0.1, "phased"),
+        (0.01, 45.0, "signed"),
+    ],
+)
+def test_what_an_amplifier_can_play_follows_from_its_steps(level_step, phase_step, richest):
+    """On and off only; levels; signs; phases; phases too coarse to cancel with."""
+    modes = playable_modes(level_step=level_step, phase_step=phase_step)
+    assert modes == tuple(MODES)[: list(MODES).index(richest) + 1]

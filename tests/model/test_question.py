@@ -136,6 +136,15 @@ def test_mirrored_contacts_get_mirrored_phased_patterns():
         )
 
 
+def test_the_strongest_era_of_a_frequency_has_phase_zero():
+    """No phase is absolute; the others are told from the strongest."""
+    for place, *quiet in contact_sets(4, fingers=3, seed=12):
+        pattern = smooth_table().ask(Question((place,), tuple(quiet), mode="phased"))
+        strongest = max(pattern.excitation.values(), key=lambda tone: tone.amplitude)
+        assert strongest.phase == 0.0
+        assert sum(tone.phase == 0.0 for tone in pattern.excitation.values()) == 1
+
+
 def test_two_targets_both_feel_it():
     """Both at the wanted level or above, one of them right at it."""
     table = smooth_table()

@@ -33,7 +33,9 @@ def _controller() -> None:
 def demo(
     wire: Annotated[
         str,
-        typer.Option(help="serial (a pseudo-terminal), modbus (TCP) or sim (no wire)."),
+        typer.Option(
+            help="serial (a pseudo-terminal), modbus (TCP), can (socketcand) or sim (no wire)."
+        ),
     ] = "serial",
     touches: Annotated[
         Path | None,

@@ -67,11 +67,11 @@ async def socketcand(
 
 @asynccontextmanager
 async def slcan(
-    stations: Sequence[Station], *, bitrate: int | None = None, named: bool = False
+    stations: Sequence[Station], *, bitrate: int | None = None, unpluggable: bool = False
 ) -> AsyncIterator[Mapping[str, str]]:
     """All amplifiers on one bus behind a serial adapter; their URLs by their names."""
     bus = CanBus()
-    end = SlcanEnd(bus, named=named)
+    end = SlcanEnd(bus, unpluggable=unpluggable)
     async with AsyncExitStack() as stack:
         stack.callback(end.close)
         nodes = await stack.enter_async_context(nodes_on(bus, stations, bitrate=bitrate))

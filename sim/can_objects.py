@@ -113,14 +113,17 @@ class ObjectDictionary:
         self._writes[producer, 0] = self._set_producer
 
     def _who_it_is(self) -> None:
-        identity, able = self._station.identity, self._station.capabilities
-        number = zlib.crc32(identity.serial_number.encode())
-        numbers = (CANOPEN["vendor_id"], CANOPEN["product_code"], CANOPEN["revision"], number)
-        texts = (identity.vendor, identity.product, identity.serial_number, identity.firmware)
+        numbers = [CANOPEN["vendor_id"], CANOPEN["product_code"], CANOPEN["revision"]]
         self._record("identity", [_pack("u32", value) for value in numbers])
-        self._record("texts", [text.encode() for text in texts])
+        self._count(_INDEX["identity"], 4)
+        self._reads[_INDEX["identity"], 4] = self._serial_number
+        texts = ("vendor", "product", "serial_number", "firmware")
+        self._count(_INDEX["texts"], len(texts))
+        for subindex, text in enumerate(texts, start=1):
+            self._reads[_INDEX["texts"], subindex] = partial(self._text, text)
+        able = self._station.capabilities
         kinds = CANOPEN["objects"]["capabilities"]["types"]
-        values = {**_fields(able), "protocol_version": identity.protocol_version}
+        values = {**_fields(able), "protocol_version": self._station.identity.protocol_version}
         self._record(
             "capabilities",
             [_scaled(_quantity(kind), values[name]) for name, kind in kinds.items()],
@@ -190,6 +193,14 @@ class ObjectDictionary:
             raise SdoAbort(BAD_LENGTH)
         self.blocks[f"{cob_id}"] = data
         self._pdo_written(cob_id, data)
+
+    def _serial_number(self) -> bytes:
+        """A number that the text of it makes, and no other is likely to."""
+        return _pack("u32", zlib.crc32(self._station.identity.serial_number.encode()))
+
+    def _text(self, name: str) -> bytes:
+        text: str = getattr(self._station.identity, name)
+        return text.encode()
 
     def _block(self, key: str) -> bytes:
         return self.blocks.get(key, bytes(8))

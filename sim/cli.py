@@ -37,6 +37,18 @@ def sim(
     modbus_rtu: Annotated[
         bool, typer.Option("--modbus-rtu", help="Modbus RTU, all on one pseudo-terminal.")
     ] = False,
+    socketcand: Annotated[
+        int | None,
+        typer.Option(
+            metavar="PORT",
+            help="A CAN bus behind a socketcand server on this loopback port; 0: any.",
+            min=0,
+            max=65535,
+        ),
+    ] = None,
+    slcan: Annotated[
+        bool, typer.Option("--slcan", help="A CAN bus behind a serial adapter (slcan).")
+    ] = False,
     shared: Annotated[
         bool, typer.Option("--shared", help="All amplifiers on one line, at addresses 1, 2, ...")
     ] = False,
@@ -72,19 +84,21 @@ def sim(
         "serial": serial,
         "modbus-tcp": modbus_tcp is not None,
         "modbus-rtu": modbus_rtu,
+        "socketcand": socketcand is not None,
+        "slcan": slcan,
     }
     kinds = [kind for kind, is_chosen in chosen.items() if is_chosen]
     if len(kinds) != 1:
         raise InputError(
-            "which wire? add one of --serial (a pseudo-terminal each), --modbus-tcp PORT and "
-            "--modbus-rtu"
+            "which wire? add one of --serial (a pseudo-terminal each), --modbus-tcp PORT, "
+            "--modbus-rtu, --socketcand PORT and --slcan"
         )
     loaded = load_rig(rig)
     schedule = load_faults(faults, amplifiers=loaded.amplifiers) if faults else FaultFile(())
     wire = Wire(
         kinds[0],
         speed=speed,
-        port=modbus_tcp or 0,
+        port=modbus_tcp or socketcand or 0,
         shared=shared,
         unpluggable=faults is not None,
     )

@@ -9,7 +9,7 @@ import re
 
 from drivers.protocol.can_frame import CanFrame
 from sim.can_bus import CanBus
-from sim.pty_port import PtyPort
+from sim.pseudo_terminal import PseudoTerminal
 
 _CR, _BELL = b"\r", b"\x07"
 _LONGEST = 160  # characters; a CAN FD frame has 133
@@ -21,27 +21,29 @@ _SETTING = re.compile(rb"S[0-9]|s[0-9A-Fa-f]{4,6}|Y[0-9]|[Mm][0-9A-Fa-f]{8}|[ZX]
 
 
 class SlcanEnd:
-    """An adapter between a pseudo-terminal and a bus; named: see `PtyPort`."""
+    """An adapter between a pseudo-terminal and a bus; unpluggable: see `PseudoTerminal`."""
 
-    def __init__(self, bus: CanBus, *, named: bool = False) -> None:
+    def __init__(self, bus: CanBus, *, unpluggable: bool = False) -> None:
         self._bus = bus
         self._listener = self._hear  # one object, by which the bus knows it
         self._rest = b""
         self._is_open = self._may_send = False
         self.refused = 0
-        self._port = PtyPort(self._received, named=named)
+        self._port = PseudoTerminal(self._received, unpluggable=unpluggable)
+        self._port.listen()
         bus.join(self._listener)
 
     @property
     def path(self) -> str:
         """The serial port of the adapter."""
-        return self._port.path
+        return self._port.port
 
     def plug(self, is_plugged: bool) -> None:
         """Have the adapter plugged in, or pulled out."""
         self._rest, self._is_open = b"", False
         if is_plugged:
             self._port.plug_in()
+            self._port.listen()
         else:
             self._port.unplug()
 

@@ -76,8 +76,22 @@ async def _modbus_rtu(wire: Wire, stations: Sequence[Station]) -> AsyncIterator[
         end.close()
 
 
+def _socketcand(wire: Wire, stations: Sequence[Station]) -> FarEnd:
+    from sim.can_end import socketcand
+
+    return socketcand(stations, port=wire.port, bitrate=wire.speed)
+
+
+def _slcan(wire: Wire, stations: Sequence[Station]) -> FarEnd:
+    from sim.can_end import slcan
+
+    return slcan(stations, bitrate=wire.speed, unpluggable=wire.unpluggable)
+
+
 _OPENERS: Mapping[str, Callable[[Wire, Sequence[Station]], FarEnd]] = {
     "serial": _serial,
     "modbus-tcp": _modbus_tcp,
     "modbus-rtu": _modbus_rtu,
+    "socketcand": _socketcand,
+    "slcan": _slcan,
 }

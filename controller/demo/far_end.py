@@ -28,6 +28,7 @@ EXIT_TIMEOUT = 3.0
 OPTIONS: Mapping[str, Sequence[str]] = {
     "serial": ("--serial",),
     "modbus": ("--modbus-tcp", "0"),
+    "can": ("--socketcand", "0"),
 }
 
 

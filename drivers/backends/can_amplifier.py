@@ -8,6 +8,7 @@ one that was lost is not fed by those for others.
 
 import asyncio
 import contextlib
+import math
 import secrets
 import time
 from collections.abc import Callable
@@ -101,7 +102,8 @@ class CanBackend(Backend):
         self._is_watched = False
         self._was_operational = False
         self._heard = 0.0  # the node's heartbeat
-        self._host_heard = -1.0  # a heartbeat of another host to this node
+        self._joined = 0.0
+        self._host_heard = -math.inf  # a heartbeat of another host to this node
         self._next_look: asyncio.TimerHandle | None = None
 
     @property
@@ -143,6 +145,7 @@ class CanBackend(Backend):
         self._thread = ThreadPoolExecutor(1, thread_name_prefix=f"era-sdo {self._url.node}")
         self._subscribe(wire, self._objects)
         wire.on_loss.append(self._lose)
+        self._joined = time.monotonic()
 
     async def close(self) -> None:
         """Leave the bus; what still waits for an answer gets LinkError."""
@@ -216,7 +219,7 @@ class CanBackend(Backend):
 
     async def _order(self, order: Order, timeout: float) -> Reply:
         if isinstance(order, Arm):
-            self._refuse_second_host()
+            await self._refuse_second_host()
         self._sequence = self._sequence % SEQUENCE_MAX + 1
         frames = encode_order(
             order, node=self._url.node, sequence=self._sequence, fd=bool(self._url.bus.fd)
@@ -391,7 +394,10 @@ class CanBackend(Backend):
         else:
             self._counters.foreign += 1
 
-    def _refuse_second_host(self) -> None:
+    async def _refuse_second_host(self) -> None:
+        """Listen for the heartbeat of another host before arming."""
+        heartbeat = CANOPEN["heartbeat_ms"] / 1000  # as every host sends it while it is armed
+        await asyncio.sleep(max(0.0, self._joined + 1.2 * heartbeat - time.monotonic()))
         if time.monotonic() - self._host_heard < HEARTBEATS_BORNE * self._url.heartbeat:
             raise LinkError(
                 f"another program drives node {self._url.node} on {self._url.bus}; end that one"

@@ -41,7 +41,7 @@ from drivers.protocol.messages import (
 
 _LENGTH = 8
 _WAITING_MAX = 256  # answers; a bus that is flooded with them must not fill the memory
-_SETTLE = 0.06  # s; two heartbeats, and time for a second amplifier of the same number to answer
+_SETTLE = 0.02  # s; time for a second amplifier of the same number to answer
 _RESYNCHRONISE = 5  # tries
 _BLOCK_FROM = 15  # bytes; shorter ones are sooner sent in segments
 _ABORTED_COMMAND = 0x0504_0001  # the amplifier takes no block transfers

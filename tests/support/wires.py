@@ -19,6 +19,8 @@ WIRES: Mapping[str, Wire] = {
     "serial": Wire("serial", unpluggable=True),
     "modbus+tcp": Wire("modbus-tcp", unpluggable=True),
     "modbus+rtu": Wire("modbus-rtu", unpluggable=True),
+    "can+socketcand": Wire("socketcand", unpluggable=True),
+    "can+slcan": Wire("slcan", unpluggable=True),
 }
 """Each is far end and backend by one scheme; see `sim.wires`."""
 
@@ -26,6 +28,8 @@ SHARED_WIRES: Mapping[str, Wire] = {
     "serial": Wire("serial", shared=True),
     "modbus+tcp": Wire("modbus-tcp", shared=True),
     "modbus+rtu": Wire("modbus-rtu", shared=True),
+    "can+socketcand": Wire("socketcand", shared=True),
+    "can+slcan": Wire("slcan", shared=True),
 }
 """Those on which several amplifiers hear one broadcast."""
 
@@ -80,5 +84,7 @@ PROCESS_WIRES: Mapping[str, Sequence[str]] = {
     "serial": ["--serial"],
     "modbus+tcp": ["--modbus-tcp", "0"],
     "modbus+rtu": ["--modbus-rtu"],
+    "can+socketcand": ["--socketcand", "0"],
+    "can+slcan": ["--slcan"],
 }
 """The same as options of `era sim`, for a far end that is a process of its own."""

@@ -18,6 +18,7 @@ from model.drive_modes.sources import all_patterns
 from model.errors import InputError
 from model.table import LocalizationTable
 from model.table_file import FORMAT_VERSION
+from model.table_summary import pattern_count
 
 MOST_BYTES = (1 << 31) - 1
 """Of one variable in a .mat file of version 5, its header included."""
@@ -30,6 +31,13 @@ def export_mat(table: LocalizationTable, path: Path) -> None:
     """
     from scipy.io import savemat
 
+    patterns = pattern_count(len(table.eras), len(table.frequencies))
+    size = patterns * (4 * table.grid.cell_count + 8 * len(table.eras)) + table.acceleration.nbytes
+    if size > MOST_BYTES:
+        raise InputError(
+            f"the table has {size / 1e9:.1f} GB with all its patterns, more than a .mat file of "
+            "version 5 holds; the table itself is a .npz file, which numpy.load opens"
+        )
     pattern_hz = _pattern_frequencies(table)
     content = {
         "format_version": float(FORMAT_VERSION),
@@ -55,12 +63,6 @@ def export_mat(table: LocalizationTable, path: Path) -> None:
         "pattern_frequency_hz": pattern_hz,
         "pattern_response_m_s2": table.cell_response,
     }
-    size = sum(value.nbytes for value in content.values() if isinstance(value, np.ndarray))
-    if size > MOST_BYTES:
-        raise InputError(
-            f"the table has {size / 1e9:.1f} GB with all its patterns, more than a .mat file of "
-            "version 5 holds; the table itself is a .npz file, which numpy.load opens"
-        )
     with whole_or_nothing(path) as stream:
         savemat(
             stream,  # type: ignore[arg-type]  # it takes files too, its types do not say so
@@ -132,6 +134,7 @@ _UNITS = {
     "bolt_mass": "bolt_mass_kg",
     "mass": "mass_kg",
     "stroke": "stroke_m",
+    "gains": "gain_hz_ratio_rad",
 }
 
 
@@ -143,5 +146,6 @@ def _structs(rows: list[dict[str, Any]]) -> np.ndarray[Any, np.dtype[Any]]:
     structs = np.empty((len(rows), 1), dtype=[(name, object) for name in names.values()])
     for number, row in enumerate(rows):
         for key, name in names.items():
-            structs[name][number, 0] = row[key]
+            value = row[key]
+            structs[name][number, 0] = np.reshape(value, (-1, 3)) if key == "gains" else value
     return structs

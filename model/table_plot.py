@@ -1,6 +1,7 @@
 """A table in pictures: where on the plate it is weak, what level it has, how much contrast."""
 
 from collections.abc import Iterator, Sequence
+from itertools import zip_longest
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -40,7 +41,7 @@ def weak_cells_figure(table: LocalizationTable, weak: WeakCells) -> Figure:
     figure = Figure(figsize=(11, 4.6), layout="compressed")
     panels = (
         ("median other finger", weak.median_db, ~weak.feasible),
-        ("one other finger in ten is no better told from it", weak.tenth_db, weak.weak),
+        ("one other finger in ten (tenth percentile)", weak.tenth_db, weak.weak),
     )
     known = np.concatenate([values[np.isfinite(values)] for _, values, _ in panels])
     limits = (float(known.min()), float(known.max())) if len(known) else (0.0, 1.0)
@@ -82,7 +83,7 @@ def contrast_figure(table: LocalizationTable) -> Figure:
     for others in (1, 2, 3):
         contrasts = np.sort(contrast_distribution(table, others=others, rng=rng))
         share = 1 - np.arange(len(contrasts)) / max(1, len(contrasts))
-        label = f"{others} other finger{'s' if others > 1 else ''}"
+        label = f"{others} other{'s' if others > 1 else ''}"
         if len(contrasts):
             label += f": median {np.median(contrasts):.1f} dB"
         axes.step(contrasts, 100 * share, where="pre", label=label)
@@ -92,7 +93,7 @@ def contrast_figure(table: LocalizationTable) -> Figure:
     axes.set_xlabel("contrast / dB")
     axes.set_ylabel("contact sets with at least this contrast / %")
     axes.grid(color="0.9")
-    axes.legend()
+    figure.legend(loc="outside lower center", ncols=3, fontsize=9, frameon=False)
     axes.set_title(f"Mode {table.mode}: random contact sets at least 5 cm apart")
     return figure
 
@@ -138,11 +139,13 @@ def answer_figure(table: LocalizationTable) -> Figure:
 
 
 def _in_words(table: LocalizationTable, pattern: Pattern) -> str:
-    drive = table.drive_of(pattern.excitation)
-    return "; ".join(
-        f"{name} {tone['frequency_hz']:g} Hz level {tone['level']:.3f} at {tone['phase_deg']:.0f}°"
-        for name, tone in drive.items()
-    )
+    """Two tones to a line, at most twelve."""
+    tones = [
+        f"{name} {tone['frequency_hz']:g} Hz, level {tone['level']:.3f} at {tone['phase_deg']:.0f}°"
+        for name, tone in table.drive_of(pattern.excitation).items()
+    ]
+    lines = ["; ".join(pair) for pair in zip_longest(tones[0:12:2], tones[1:12:2], fillvalue="")]
+    return "\n".join(line.removesuffix("; ") for line in lines)
 
 
 def _draw_cells(

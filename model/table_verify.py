@@ -25,7 +25,7 @@ from model.envelope import ramped_onset
 from model.errors import InputError
 from model.excitation import Excitation
 from model.fingertip import fingertip_points
-from model.harmonic import direct_acceleration
+from model.harmonic import direct_acceleration, hold_and_drive
 from model.localization import CELL_SAMPLES, Grid, contrast_db, mean_level_db_sl
 from model.pattern import Pattern
 from model.point_load import load_positions
@@ -199,12 +199,9 @@ def _modal_response(table: LocalizationTable, rig: Rig, index: int) -> ComplexAr
     loss = 1 + 1j * rig.plate.loss_factor
     answer = 1 / (loss * table.omega**2 - omega**2)
     receptance = (table.held * answer) @ table.held.T
-    spring = np.array([era.stiffness + 1j * omega * era.damping for era in rig.eras])
-    bolts = np.array([era.bolt_mass for era in rig.eras])
-    masses = np.array([load.mass for load in rig.loads])
-    hold = np.concatenate([spring - omega**2 * bolts, -(omega**2) * masses])
-    push = np.zeros((len(hold), len(rig.eras)), dtype=complex)
-    np.fill_diagonal(push, spring * [era.stroke for era in rig.eras])
+    (hold,), (drive,) = hold_and_drive(rig.eras, rig.loads, np.array([omega]))
+    push = np.zeros((len(hold), len(drive)), dtype=complex)
+    np.fill_diagonal(push, drive)
     force = np.linalg.solve(np.eye(len(hold)) + hold[:, None] * receptance, push)
     return np.asarray(-(omega**2) * (table.shapes @ ((answer * table.held).T @ force)).T)
 

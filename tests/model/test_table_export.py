@@ -1,7 +1,9 @@
 """What other programs get of a table."""
 
 import csv
+import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,7 +13,10 @@ from model import table_export
 from model.errors import InputError
 from model.point_mass import PointMass
 from model.table_export import export_csv, export_mat
+from model.table_file import save_table
 from small_table import FREQUENCIES, small_table
+
+PAGE = Path(__file__).parents[2] / "docs" / "table-file.md"
 
 
 @pytest.fixture(scope="module")
@@ -115,6 +120,16 @@ def test_fields_as_csv(table, tmp_path):
     assert row["frequency_hz"] == "250.0"
     found = np.complex64(complex(float(row["NE_real_m_s2"]), float(row["NE_imag_m_s2"])))
     assert found == table.acceleration[7, 2, 2]
+
+
+def test_the_page_names_everything_that_is_exported(struct, tmp_path, table):
+    """Every field of the struct and of its structs, every array and every key of the header."""
+    page = PAGE.read_text(encoding="utf-8")
+    names = [*struct._fieldnames, *struct.plate._fieldnames, *struct.eras[0]._fieldnames]
+    save_table(table, tmp_path / "t.npz")
+    with np.load(tmp_path / "t.npz") as content:
+        names += [*content, *json.loads(content["header"].tobytes())]
+    assert [name for name in names if f"`{name}`" not in page] == []
 
 
 @pytest.mark.parametrize("write", [export_mat, lambda t, p: export_csv(t, p, content="patterns")])

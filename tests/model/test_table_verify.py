@@ -6,10 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from model.table_build import build_in_parts
 from model.table_file import load_table, save_table
 from model.table_verify import AnswerCheck, verify_table
 from paper_plate import make_paper_rig
-from small_table import small_table
+from small_table import small_problem, small_table
 
 
 @pytest.fixture(scope="module")
@@ -43,6 +44,18 @@ def test_a_true_table_holds(confirmed):
     assert len(confirmed.content) == 3
     assert max(check.error for check in confirmed.content) < 5e-5
     assert [len(check.question.quiet) for check in confirmed.answers] == [1, 2, 3, 1]
+
+
+def test_a_rig_whose_eras_were_measured_holds(rig, tmp_path):
+    """ERAs that move by other amounts and phases than asked are in the table, its file and time."""
+    gains = ((60.0, 0.8, 0.3), (250.0, 1.2, -0.5))
+    measured = replace(rig, eras=(replace(rig.eras[0], gains=gains), *rig.eras[1:]))
+    problem = replace(small_problem(), rig=measured)
+    save_table(build_in_parts(problem, mode="phased").table, tmp_path / "t.npz")
+    found = verify_table(
+        load_table(tmp_path / "t.npz", fingerprint=measured.fingerprint), measured, samples=3
+    )
+    assert found.misses == 0
 
 
 def test_in_time_the_contrast_is_that_of_the_direct_solve(confirmed):

@@ -167,24 +167,28 @@ class AnswerReader:
 
 def _answer(pdu: bytes, to: Telegram) -> Answer | None:
     """What a PDU answers to a telegram, if it does."""
-    if pdu[0] == to.function | _EXCEPTION:
-        if len(pdu) != 2:
-            return None
-    elif pdu[0] != to.function or len(pdu) != to.answer_size:
+    if not _has_form(pdu, to):
         return None
     try:
         message = _DECODER.decode(pdu)
     except ModbusException:
         return None
-    if isinstance(message, ExceptionResponse):
-        return Answer(exception=message.exception_code)
     if message is None:
         return None
+    if isinstance(message, ExceptionResponse):
+        return Answer(exception=message.exception_code)
     if to.read is not None:
-        registers = tuple(message.registers)
-        return Answer(registers) if len(registers) == to.read.count else None
+        return Answer(tuple(message.registers))
     assert to.write is not None  # noqa: S101  one of the two
-    single = len(to.write.registers) == 1
-    echo = tuple(message.registers) if single else message.count
-    wanted = to.write.registers if single else len(to.write.registers)
-    return Answer() if (message.address, echo) == (to.write.address, wanted) else None
+    wanted = to.write.registers
+    echo = tuple(message.registers) if len(wanted) == 1 else message.count
+    is_echo = echo == (wanted if len(wanted) == 1 else len(wanted))
+    return Answer() if is_echo and message.address == to.write.address else None
+
+
+def _has_form(pdu: bytes, to: Telegram) -> bool:
+    """Whether function and lengths are those of an answer, or of an exception."""
+    if pdu[0] == to.function | _EXCEPTION:
+        return len(pdu) == 2
+    is_long = to.read is None or pdu[1:2] == bytes([2 * to.read.count])
+    return pdu[0] == to.function and len(pdu) == to.answer_size and is_long

@@ -267,7 +267,7 @@ class ModbusUnit:
         if address > _CONTROL + _HEAD:
             return None
         name = _WORDS.get(words[0])
-        ramp = control[_CONTROL + 4] / _Q.ramp.per_unit
+        ramp = min(control[_CONTROL + 4], _Q.ramp.maximum) / _Q.ramp.per_unit
         match name:
             case "ARM":
                 return Arm(value_of(_Q.watchdog, control[_CONTROL + 3]))

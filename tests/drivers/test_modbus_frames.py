@@ -1,4 +1,4 @@
-"""Modbus frames at the host, and mutated ones at both ends."""
+"""Modbus frames as the host takes them: in any pieces, behind anything, with any bit flipped."""
 
 from itertools import pairwise
 
@@ -11,12 +11,9 @@ from drivers.errors import FrameError
 from drivers.protocol import modbus_map
 from drivers.protocol.messages import Apply, Ping, Status
 from drivers.statistics import WireCounters
-from modbus_fuzz import attack_far_end, attack_host
 from modbus_session import ARMED, SET, ScriptedStation
 from sim.modbus_frames import PAUSE, Request, RtuReader, TcpReader, rtu_frame, tcp_frame
 from sim.modbus_unit import ModbusUnit
-
-FRAMES_IN_A_TEST = 4000  # at each end of each wire; a million in `make fuzz`
 
 
 def asked_and_answered(is_rtu: bool) -> tuple[Telegram, bytes]:
@@ -90,16 +87,6 @@ def test_any_bytes_are_borne(is_rtu: bool, stream: list[bytes]) -> None:
     reader.clear()
     good = EXAMPLES[is_rtu][1]
     assert accepted(reader.feed(good, EXAMPLES[is_rtu][0])) == [ARMED]
-
-
-@pytest.mark.parametrize("is_rtu", [True, False], ids=["RTU", "TCP"])
-def test_mutated_frames_do_no_harm(is_rtu: bool) -> None:
-    """Thousands at each end: no exception, nothing beyond limits, nothing that is out of range."""
-    good, bad, played = attack_far_end(FRAMES_IN_A_TEST, is_rtu=is_rtu, seed=1)
-    assert min(good, bad) > FRAMES_IN_A_TEST / 20
-    assert played > 10
-    taken, none = attack_host(FRAMES_IN_A_TEST, is_rtu=is_rtu, seed=2)
-    assert min(taken, none) > FRAMES_IN_A_TEST / 20
 
 
 @pytest.mark.parametrize("reader_type", [RtuReader, TcpReader])

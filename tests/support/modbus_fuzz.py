@@ -1,271 +1,152 @@
-"""Mutated frames for both ends of Modbus: `python tests/support/modbus_fuzz.py 1000000`."""
+"""Both ends of Modbus as something that takes any bytes; see `mutation`."""
 
 import random
-import struct
-import sys
-import time
 from collections.abc import Iterator, Sequence
 
 from drivers.backends.modbus_frames import AnswerReader, make_telegram
-from drivers.command import CommandSet, DriveCommand, Envelope, Knot
 from drivers.errors import FrameError
-from drivers.guard import Guard, GuardLimits
 from drivers.protocol import modbus_map
-from drivers.protocol.messages import (
-    Apply,
-    Arm,
-    Clear,
-    Commit,
-    Disarm,
-    GetCaps,
-    GetFaults,
-    GetStatus,
-    Hello,
-    LoadEnvelope,
-    Ping,
-    Request,
-    Stage,
-    State,
-    Stop,
-)
+from drivers.protocol.messages import Arm, Clear, Reply, Request, State
 from drivers.statistics import WireCounters
 from sim.amplifier import SimulatedAmplifier
-from sim.modbus_frames import PAUSE, Reader, RtuReader, TcpReader, crc, rtu_frame, tcp_frame
+from sim.modbus_frames import PAUSE, RtuReader, TcpReader, rtu_frame, tcp_frame
 from sim.modbus_frames import Request as Asked
 from sim.modbus_unit import ModbusUnit
 from sim.shaped_tone import ShapedTone
 
-BATCH = 500  # frames, from one set of good ones
-REVIVAL = 10  # frames, after which it is armed again, for most of what comes stops or disarms it
-EPOCH = 100.0  # s; any
+_REVIVAL = (
+    10  # telegrams, after which it is armed again, for most of what comes stops or disarms it
+)
+_TAG = 7
+_READ_WRITE = 23
+_BLOCK = 10  # where the block begins that a request of function 23 writes; its check is second
 
 
 class Station:
-    """A simulated amplifier whose clock stands where it is put."""
+    """A simulated amplifier whose clock stands where it is put; `asked` is what came lately."""
 
     is_answering = True
 
     def __init__(self) -> None:
         self.amplifier = SimulatedAmplifier("main", channels=4)
-        self.now = EPOCH
+        self.now = 100.0  # s; any
+        self.asked: list[object] = []
 
-    def exchange(self, request: Request) -> object:
+    def exchange(self, request: Request) -> Reply:
         """Its answer."""
+        self.asked.append(request)
         return self.amplifier.handle(request, self.now)
 
     broadcast = exchange
 
-    def is_within_limits(self) -> bool:
-        """Whether nothing plays that it could not be asked for, and nothing unless it is armed."""
+    def pass_time(self, duration: float) -> None:
+        """Let time [s] pass; AssertionError where something plays that must not."""
+        self.now += duration
+        self.amplifier.tick(self.now)
         can = self.amplifier.capabilities
-        for output in self.amplifier.outputs:
-            for tone in output:
-                if not can.frequency_min <= tone.frequency <= can.frequency_max:
-                    return False
-                if not isinstance(tone, ShapedTone) and not 0 <= tone.level <= can.level_max:
-                    return False
         levels = self.amplifier.status(self.now).levels
-        if not all(0 <= level <= can.level_max + 1e-9 for level in levels):
-            return False
-        return self.amplifier.state is State.OPERATION_ENABLED or not any(
-            tone.silent_from > self.now + can.ramp_max
-            for output in self.amplifier.outputs
-            for tone in output
-        )
+        assert all(0 <= level <= can.level_max + 1e-9 for level in levels)
+        for tone in (tone for output in self.amplifier.outputs for tone in output):
+            assert can.frequency_min <= tone.frequency <= can.frequency_max
+            assert isinstance(tone, ShapedTone) or 0 <= tone.level <= can.level_max
+            is_armed = self.amplifier.state is State.OPERATION_ENABLED
+            assert is_armed or tone.silent_from <= self.now + can.ramp_max
 
 
-def requests(numbers: random.Random) -> list[Request]:
-    """One of every kind, with numbers of any size within the limits."""
-    amplifier = SimulatedAmplifier("main", channels=4)
-    guard = Guard(GuardLimits(10.0, 600.0, 1.0), amplifier.capabilities)
-    shape = guard.check_envelope(
-        Envelope(
-            1, 0.005, tuple(Knot(numbers.random(), 90.0) for _ in range(numbers.randrange(32)))
-        )
-    )
-    commands = tuple(
-        DriveCommand(channel, numbers.uniform(20, 600), numbers.random() / 4, 0.0)
-        for channel in range(4)
-    )
-    token = numbers.randrange(1, 65536)
-    safe = guard.check(CommandSet(token, commands, ramp=0.1, valid_for=1.0))
-    return [
-        *(Hello(), GetCaps(), GetStatus(), GetFaults(), Ping(), Clear(), Arm(0.5), Arm(2.0)),
-        *(Stage(safe), Apply(safe), Commit(token), LoadEnvelope(shape), Stop(0.1), Disarm(0.1)),
-    ]
+class ModbusEnds:
+    """Host and far end of Modbus, for which the same damaged bytes are request and answer.
 
-
-def frames(numbers: random.Random, *, is_rtu: bool) -> list[bytes]:
-    """A good frame of each request."""
-    made = []
-    for tag, request in enumerate(requests(numbers), start=1):
-        exchange = modbus_map.to_exchange(request, tag=tag, channels=4)
-        telegram = make_telegram(
-            exchange.read, exchange.write, unit=1, transaction=tag, is_rtu=is_rtu
-        )
-        made.append(telegram.frame)
-    return made
-
-
-def mutated(numbers: random.Random, frame: bytes, others: Sequence[bytes]) -> bytes:
-    """A frame with something done to it; sometimes nothing."""
-    data = bytearray(frame)
-    match numbers.randrange(9):
-        case 0:
-            for _ in range(numbers.randint(1, 4)):
-                data[numbers.randrange(len(data))] ^= 1 << numbers.randrange(8)
-        case 1:
-            del data[numbers.randrange(len(data)) :]
-        case 2:
-            at = numbers.randrange(len(data))
-            data[at:at] = numbers.randbytes(numbers.randint(1, 8))
-        case 3:
-            at = numbers.randrange(len(data))
-            del data[at : at + numbers.randint(1, 6)]
-        case 4:
-            data += numbers.choice(others)[numbers.randrange(4) :]
-        case 5:
-            data = bytearray(numbers.randbytes(numbers.randint(1, 300)))
-        case 6:
-            at = numbers.randrange(len(data))
-            data[at : at + 2] = numbers.choice((b"\xff\xff", b"\x00\x00", b"\x7f\xff", b"\x80\x00"))
-        case 7:
-            data = data * 2
-        case _:
-            pass
-    return bytes(data)
-
-
-def mended(numbers: random.Random, data: bytes, *, is_rtu: bool) -> bytes:
-    """Mostly with a CRC or a header that fits, so that what is mutated gets further."""
-    if len(data) < 9 or numbers.random() < 0.2:
-        return data
-    if is_rtu:
-        return data[:-2] + struct.pack("<H", crc(data[:-2]))
-    return data[:2] + struct.pack(">HHB", 0, min(len(data) - 6, 254), 1) + data[7:]
-
-
-def without_check(numbers: random.Random, data: bytes, *, is_rtu: bool) -> bytes:
-    """Often without the check of its block, where a block with one is written by function 23."""
-    begin = 1 if is_rtu else 7
-    if len(data) > begin + 15 and data[begin] == 23 and numbers.random() < 0.7:
-        changed = bytearray(data)
-        changed[begin + 12 : begin + 14] = b"\0\0"
-        return bytes(changed)
-    return data
-
-
-def pieces(numbers: random.Random, data: bytes) -> Iterator[bytes]:
-    """In one piece, or in some."""
-    while data:
-        size = numbers.choice((len(data), len(data), numbers.randint(1, len(data))))
-        yield data[:size]
-        data = data[size:]
-
-
-def attack_far_end(count: int, *, is_rtu: bool, seed: int) -> tuple[int, int, int]:
-    """So many mutated frames to the amplifier; how many were understood, dropped, and played.
-
-    AssertionError where something plays beyond its limits; any other exception is a mistake too.
+    telegrams: PDUs of good requests and of their answers.
     """
-    numbers = random.Random(seed)
-    station = Station()
-    unit = ModbusUnit(station)
-    reader: Reader = RtuReader() if is_rtu else TcpReader()
-    played = 0
-    token = 0
-    for number in range(count):
-        if number % BATCH == 0:
-            good = frames(numbers, is_rtu=is_rtu)
-        if number % REVIVAL == 0:
+
+    def __init__(self, requests: Sequence[Request], *, is_rtu: bool) -> None:
+        self._is_rtu = is_rtu
+        self._requests = requests
+        self._chance = random.Random(1)
+        self._station = Station()
+        self._unit = ModbusUnit(self._station)
+        self._far = RtuReader() if is_rtu else TcpReader()
+        self._host = AnswerReader(is_rtu=is_rtu, counters=WireCounters())
+        self._taken = 0
+        self._requests_by_size: dict[int, Request] = {}  # in bytes that are read
+        self.telegrams: list[bytes] = []
+        for request in requests:
+            exchange = modbus_map.to_exchange(request, tag=_TAG, channels=4)
+            telegram = make_telegram(
+                exchange.read, exchange.write, unit=1, transaction=0, is_rtu=True
+            )
+            pdu = telegram.frame[1:-2]
+            answer = self._unit.answer(pdu)
+            assert answer is not None
+            self.telegrams += [pdu, answer]
+            self._requests_by_size[answer[1]] = request
+
+    def mend(self, pdu: bytes) -> bytes:
+        """A frame with a right header or CRC, mostly with lengths that fit, and without a check."""
+        pdu = pdu[:200]
+        block = pdu[_BLOCK : _BLOCK + (len(pdu) - _BLOCK) // 2 * 2]
+        if self._chance.random() < 0.3:  # as an answer
+            pdu = pdu[:1] + bytes([len(pdu) - 2]) + pdu[2:4] + bytes(2) + pdu[6:]
+        elif pdu[0] == _READ_WRITE and len(block) >= 4 and self._chance.random() < 0.8:
+            size = bytes([0, len(block) // 2, len(block)])
+            pdu = pdu[:7] + size + block[:2] + bytes(2) + block[4:]
+        elif pdu[0] in (3, 4):
+            pdu = pdu[:5]
+        if self._is_rtu:
+            return rtu_frame(1, pdu)
+        return tcp_frame(Asked(1, b"", _TAG), pdu)
+
+    def take(self, data: bytes) -> list[object]:
+        """What the far end was asked for, and what the host understood."""
+        self._taken += 1
+        if self._taken % _REVIVAL == 0:
             for request in (Clear(), Arm(2.0)):
-                station.exchange(request)
-        data = mutated(numbers, numbers.choice(good), good)
-        data = without_check(numbers, data, is_rtu=is_rtu)
-        data = mended(numbers, data, is_rtu=is_rtu)
-        for piece in pieces(numbers, data):
-            for request in reader.feed(piece, station.now):
-                if request.unit == 0:
-                    unit.hear(request.pdu)
-                else:
-                    answer(unit, request, is_rtu=is_rtu)
-        station.now += numbers.choice((0.0, 0.0, 0.001, 0.02, 2 * PAUSE))
-        station.amplifier.tick(station.now)
-        assert station.is_within_limits(), data.hex(" ")
-        now = station.amplifier.status(station.now).token
-        played += now not in (0, token)
-        token = now
-    return reader.counters.good, reader.counters.bad, played
+                self._station.exchange(request)
+        self._station.asked.clear()
+        for piece in self._pieces(data):
+            for request in self._far.feed(piece, self._station.now):
+                self._serve(request)
+        understood = [*self._station.asked, *self._read(data)]
+        self._station.pass_time(self._chance.choice((0.0, 0.0, 0.001, 0.02, 2 * PAUSE)))
+        return understood
 
+    def _pieces(self, data: bytes) -> Iterator[bytes]:
+        """In one piece, or in some."""
+        while data:
+            size = self._chance.choice((len(data), len(data), self._chance.randint(1, len(data))))
+            yield data[:size]
+            data = data[size:]
 
-def answer(unit: ModbusUnit, request: Asked, *, is_rtu: bool) -> None:
-    """The far end's answer must be one that a frame can hold."""
-    pdu = unit.answer(request.pdu)
-    if pdu is not None:
-        assert 2 <= len(pdu) <= 253
-        assert pdu[0] & 0x7F == request.pdu[0] & 0x7F
-        frame = rtu_frame(request.unit, pdu) if is_rtu else tcp_frame(request, pdu)
-        assert len(frame) <= 260
+    def _serve(self, request: Asked) -> None:
+        """Let the unit answer; the answer must be one that a frame can hold."""
+        if request.unit == 0:
+            self._unit.hear(request.pdu)
+            return
+        pdu = self._unit.answer(request.pdu)
+        if pdu is not None:
+            assert 2 <= len(pdu) <= 253
+            assert pdu[0] & 0x7F == request.pdu[0] & 0x7F
 
-
-def attack_host(count: int, *, is_rtu: bool, seed: int) -> tuple[int, int]:
-    """So many mutated answers to the host; how many became a message, and how many none.
-
-    What it takes is a message with every value in range, or FrameError says why it is none.
-    """
-    numbers = random.Random(seed)
-    station = Station()
-    unit = ModbusUnit(station)
-    counters = WireCounters()
-    reader = AnswerReader(is_rtu=is_rtu, counters=counters)
-    taken = none = 0
-    for number in range(count):
-        if number % BATCH == 0:
-            asked = requests(numbers)
-        tag = numbers.randrange(1, 65536)
-        request = numbers.choice(asked)
-        exchange = modbus_map.to_exchange(request, tag=tag, channels=4)
-        transaction = 0 if is_rtu else tag
+    def _read(self, data: bytes) -> list[object]:
+        """What the host takes for the answer to a request, and can read."""
+        size = data[2] if self._is_rtu else data[8] if len(data) > 8 else 0
+        request = self._requests_by_size.get(size, self._requests[0])
+        exchange = modbus_map.to_exchange(request, tag=_TAG, channels=4)
         telegram = make_telegram(
-            exchange.read, exchange.write, unit=1, transaction=transaction, is_rtu=is_rtu
+            exchange.read,
+            exchange.write,
+            unit=1,
+            transaction=0 if self._is_rtu else _TAG,
+            is_rtu=self._is_rtu,
         )
-        pdu = unit.answer(telegram.frame[1:-2] if is_rtu else telegram.frame[7:])
-        assert pdu is not None
-        own = rtu_frame(1, pdu) if is_rtu else tcp_frame(Asked(1, b"", tag), pdu)
-        data = mended(numbers, mutated(numbers, own, [own]), is_rtu=is_rtu)
-        answers = [one for part in pieces(numbers, data) for one in reader.feed(part, telegram)]
-        reader.clear()
-        for one in answers:
-            if one.exception or not modbus_map.is_of(one.registers, tag=tag):
-                none += 1
-                continue
-            try:
-                modbus_map.to_reply(request, one.registers)
-                modbus_map.condition(request, one.registers)
-                modbus_map.faults_beyond(request, one.registers)
-                taken += 1
-            except FrameError:
-                none += 1
-    return taken, none
-
-
-def main() -> None:
-    """So many frames at each end of each wire."""
-    count = int(sys.argv[1])
-    for is_rtu in (True, False):
-        wire = "RTU" if is_rtu else "TCP"
-        begin = time.perf_counter()
-        good, bad, played = attack_far_end(count, is_rtu=is_rtu, seed=count)
-        middle = time.perf_counter()
-        taken, none = attack_host(count, is_rtu=is_rtu, seed=count)
-        end = time.perf_counter()
-        sys.stdout.write(
-            f"Modbus {wire} far end: {count} mutated frames in {middle - begin:.0f} s; "
-            f"{good} understood, {bad} dropped, {played} sets played, none beyond limits\n"
-            f"Modbus {wire} host: {count} mutated answers in {end - middle:.0f} s; "
-            f"{taken} taken, {none} none\n"
-        )
-
-
-if __name__ == "__main__":
-    main()
+        replies: list[object] = []
+        for answer in self._host.feed(data, telegram):
+            if not answer.exception and modbus_map.is_of(answer.registers, tag=_TAG):
+                try:
+                    modbus_map.condition(request, answer.registers)
+                    modbus_map.faults_beyond(request, answer.registers)
+                    replies.append(modbus_map.to_reply(request, answer.registers))
+                except FrameError:
+                    continue
+        self._host.clear()
+        return replies

@@ -93,7 +93,18 @@ def _serial() -> Codec:
     )
 
 
-CODECS: Mapping[str, Callable[[], Codec]] = {"serial": _serial}
+def _modbus(*, is_rtu: bool) -> Codec:
+    from modbus_fuzz import ModbusEnds
+
+    ends = ModbusEnds(sample_requests(), is_rtu=is_rtu)
+    return Codec(ends.telegrams, ends.take, ends.mend)
+
+
+CODECS: Mapping[str, Callable[[], Codec]] = {
+    "serial": _serial,
+    "modbus rtu": lambda: _modbus(is_rtu=True),
+    "modbus tcp": lambda: _modbus(is_rtu=False),
+}
 
 
 def damage(data: bytes, chance: random.Random) -> bytes:

@@ -9,10 +9,7 @@ import asyncio
 import struct
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import NamedTuple
 
-from drivers.command import CommandSet, DriveCommand
 from drivers.protocol.can_frame import CanFrame
 from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.messages import (
@@ -37,11 +34,22 @@ from drivers.protocol.messages import (
 )
 from sim.can_objects import CANOPEN, IDS, ObjectDictionary, achieved_domain, channel_ids
 from sim.can_sdo import SdoServer
+from sim.can_sets import (
+    APPLY,
+    ARM,
+    COMMIT,
+    DISARM,
+    SETS,
+    STATUS,
+    STOP,
+    TORN,
+    Order,
+    Refused,
+    SetBuffer,
+    integers_of,
+)
 from sim.station import Station
 
-STATUS, APPLY, STAGE, COMMIT, ARM, DISARM, STOP, CLEAR = range(8)
-_SETS = (APPLY, STAGE, COMMIT)
-_TORN = 15
 _NMT = CANOPEN["nmt"]
 _NMT_STATES = CANOPEN["nmt_states"]
 _OPERATIONAL, _STOPPED = _NMT_STATES["OPERATIONAL"], _NMT_STATES["STOPPED"]
@@ -50,39 +58,6 @@ _Q = PROTOCOL.quantities
 _QUICK = 0.005  # s; the shortest ramp that is no step
 _FD_LENGTHS = (8, 12, 16, 20, 24, 32, 48, 64)
 _LOOK = 0.02  # s; how often it is looked whether the supply is back
-
-
-@dataclass(frozen=True, slots=True)
-class _Order:
-    """An order frame as it came; own: not said to all."""
-
-    token: int
-    ramp: int
-    time: int
-    action: int
-    count: int
-    sequence: int
-    own: bool
-    fd: bool
-
-
-class _Command(NamedTuple):
-    """A channel's command as it came, integers as on the wire."""
-
-    frequency: int
-    level: int
-    phase: int
-    flags: int
-    sequence: int
-
-
-class _Refused(Exception):
-    """An order that says nonsense, or a set with a frame missing."""
-
-    def __init__(self, code: int, channel: int = 255) -> None:
-        super().__init__(code, channel)
-        self.code = code
-        self.channel = channel
 
 
 class CanNode:
@@ -100,9 +75,8 @@ class CanNode:
             write=self._objects.write,
             send=lambda data: send(CanFrame(IDS["sdo_answer"] + node, data)),
         )
-        self._commands: dict[int, _Command] = {}
-        self._slots: dict[int, tuple[int, int]] = {}  # by channel: word of both slots, sequence
-        self._waiting: _Order | None = None  # for its SYNC
+        self._buffer = SetBuffer(station.capabilities.channels)
+        self._waiting: Order | None = None  # for its SYNC
         self._asked: tuple[int, list[tuple[object, ...]]] = (0, [])  # token, what was asked
         self._fault = Fault.NONE
         self._was_off = False
@@ -207,22 +181,20 @@ class CanNode:
         elif cob_id == IDS["order"]:
             self._order(data, own=False, fd=False)
         elif cob_id == IDS["slots"] + self._node and len(data) == 8:
-            self._take_slots(data)
+            self._buffer.take_slots(data)
         elif fd and cob_id == IDS["command"] + self._node:
-            self._take_blocks(data)
+            self._buffer.take_blocks(data)
         elif cob_id in self._channel_of and len(data) == 8:
-            command = _Command(*struct.unpack("<HHhBB", data))
-            # Its channel is named twice, by the identifier and in the flags.
-            self._commands[self._channel_of[cob_id]] = command
+            self._buffer.take(self._channel_of[cob_id], data)
 
     def _order(self, data: bytes, *, own: bool, fd: bool) -> None:
         token, ramp, duration, what, sequence = struct.unpack_from("<HHHBB", data)
-        order = _Order(token, ramp, duration, what & 7, what >> 3, sequence, own, fd)
+        order = Order(token, ramp, duration, what & 7, what >> 3, sequence, own, fd)
         if own and sequence == 0:
             return
         if fd:
-            self._take_blocks(data[8:])
-        if order.action in _SETS:
+            self._buffer.take_blocks(data[8:])
+        if order.action in SETS:
             self._waiting = order
         elif own:
             self._carry_out(order, lambda: self._plain_request(order))
@@ -235,21 +207,20 @@ class CanNode:
             self._carry_out(order, lambda: self._set_request(order))
         elif order is not None and order.action == COMMIT and _Q.token.holds(order.token):
             self._station.broadcast(Commit(order.token))
-        elif order is None and self._commands:
+        elif order is None and self._buffer.sequence is not None:
             # Commands without their order: it was lost, and whoever sent it waits.
-            sequence = next(iter(self._commands.values())).sequence
-            self._answer(_Order(0, 0, 0, APPLY, 0, sequence, True, False), _TORN, 255, False, ())
+            lost = Order(0, 0, 0, APPLY, 0, self._buffer.sequence, own=True, fd=False)
+            self._answer(lost, TORN, 255, False, ())
         self._forget_set()
 
     def _forget_set(self) -> None:
-        self._commands.clear()
-        self._slots.clear()
+        self._buffer.clear()
         self._waiting = None
 
-    def _carry_out(self, order: _Order, make: Callable[[], Request]) -> None:
+    def _carry_out(self, order: Order, make: Callable[[], Request]) -> None:
         try:
             reply = self._station.exchange(make())
-        except _Refused as refused:
+        except Refused as refused:
             self._answer(order, refused.code, refused.channel, False, ())
             return
         if reply is None:
@@ -264,14 +235,14 @@ class CanNode:
                 self._objects.host, self._objects.watchdog = order.token, order.time
             self._answer(order, 0, 255, False, self._status_blocks(order, reply))
 
-    def _plain_request(self, order: _Order) -> Request:
+    def _plain_request(self, order: Order) -> Request:
         ramp = order.ramp / 1000
         if order.action in (DISARM, STOP) and not _Q.ramp.holds(order.ramp):
-            raise _Refused(NakCode.BAD_VALUE)
+            raise Refused(NakCode.BAD_VALUE)
         match order.action:
             case 4:  # arm; its token is the number of the host
                 if not _Q.watchdog.holds(order.time) or not 1 <= order.token <= 127:
-                    raise _Refused(NakCode.BAD_VALUE)
+                    raise Refused(NakCode.BAD_VALUE)
                 return Arm(order.time / 1000)
             case 5:
                 return Disarm(ramp)
@@ -282,74 +253,25 @@ class CanNode:
             case _:
                 return GetStatus()
 
-    def _set_request(self, order: _Order) -> Request:
+    def _set_request(self, order: Order) -> Request:
         if not _Q.token.holds(order.token):
-            raise _Refused(NakCode.BAD_TOKEN)
+            raise Refused(NakCode.BAD_TOKEN)
         if order.action == COMMIT:
             return Commit(order.token)
-        if not (_Q.ramp.holds(order.ramp) and _Q.valid_for.holds(order.time)):
-            raise _Refused(NakCode.BAD_VALUE)
-        own = {
-            channel: command
-            for channel, command in self._commands.items()
-            if command.sequence == order.sequence
-        }
-        if len(own) != order.count:
-            raise _Refused(_TORN)
-        commands = tuple(
-            self._drive_command(channel, command, order.sequence)
-            for channel, command in sorted(own.items())
-        )
-        self._asked = order.token, [_integers(command) for command in commands]
-        wanted = CommandSet(order.token, commands, order.ramp / 1000, order.time / 1000)
+        wanted = self._buffer.command_set(order)
+        self._asked = order.token, [integers_of(command) for command in wanted.commands]
         return Apply(wanted) if order.action == APPLY else Stage(wanted)
-
-    def _drive_command(self, channel: int, command: _Command, sequence: int) -> DriveCommand:
-        if command.flags >> 4 != channel or channel >= self._station.capabilities.channels:
-            raise _Refused(NakCode.BAD_CHANNEL, command.flags >> 4)
-        if command.flags & 0b1000 or not (
-            _Q.level.holds(command.level) and _Q.phase.holds(command.phase)
-        ):
-            raise _Refused(NakCode.BAD_VALUE, channel)
-        slots = 0
-        if command.flags & 4:
-            slots, of = self._slots.get(channel, (0, -1))
-            if of != sequence:
-                raise _Refused(_TORN)
-        return DriveCommand(
-            channel=channel,
-            frequency=command.frequency / 100,
-            level=command.level / 10_000,
-            phase=command.phase / 100,
-            keep_phase=bool(command.flags & 1),
-            onset=slots & 0x3F,
-            ending=slots >> 6,
-            skip_ending=bool(command.flags & 2),
-        )
-
-    def _take_blocks(self, data: bytes) -> None:
-        """Commands in a row, as CAN FD carries them; eight bytes FF fill up."""
-        for begin in range(0, len(data) - 7, 8):
-            block = data[begin : begin + 8]
-            if block != b"\xff" * 8:
-                command = _Command(*struct.unpack("<HHhBB", block))
-                self._commands[command.flags >> 4] = command
-
-    def _take_slots(self, data: bytes) -> None:
-        word = int.from_bytes(data[:6], "little")
-        for place in range(4):
-            self._slots[4 * (data[6] & 3) + place] = (word >> 12 * place & 0xFFF, data[7])
 
     def _is_exact(self, achieved: Achieved) -> bool:
         """Whether a set plays as it was asked for; if not, the host reads what it does."""
         self._objects.achieved = achieved_domain(achieved)
         token, asked = self._asked
-        played = sorted(_integers(command) for command in achieved.commands)
+        played = sorted(integers_of(command) for command in achieved.commands)
         return token == achieved.token and played == asked
 
     # what the amplifier says
 
-    def _status_blocks(self, order: _Order, reply: Reply) -> tuple[bytes, ...]:
+    def _status_blocks(self, order: Order, reply: Reply) -> tuple[bytes, ...]:
         status = reply if isinstance(reply, Status) else self._station.status()
         levels = [_Q.level.to_wire(min(level, 1.0)) for level in status.levels]
         blocks = [
@@ -368,7 +290,7 @@ class CanNode:
         return tuple(blocks)
 
     def _answer(
-        self, order: _Order, result: int, channel: int, exact: bool, blocks: tuple[bytes, ...]
+        self, order: Order, result: int, channel: int, exact: bool, blocks: tuple[bytes, ...]
     ) -> None:
         """Answer in the kind of frame in which it was asked; the answer itself comes last."""
         status = self._station.status()
@@ -413,17 +335,3 @@ class CanNode:
         elif self._state == _OPERATIONAL:
             data = struct.pack("<BBBBHH", 0, STATUS, event.state, channel, 0, 0)
             self._send(CanFrame(IDS["answer"] + self._node, data))
-
-
-def _integers(command: DriveCommand) -> tuple[object, ...]:
-    """A command as it reads on the wire."""
-    return (
-        command.channel,
-        _Q.frequency.to_wire(command.frequency),
-        _Q.level.to_wire(command.level),
-        _Q.phase.to_wire(command.phase),
-        command.keep_phase,
-        command.onset,
-        command.ending,
-        command.skip_ending,
-    )

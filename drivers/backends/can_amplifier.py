@@ -1,14 +1,12 @@
 """An amplifier as a node of a CAN bus, by the conventions of CANopen.
 
 Orders go out as PDOs, and an answer belongs to the order whose sequence number it carries; what
-can wait is read and written as objects. The node's heartbeat is watched, ours is a part of Ping
-and sent by nobody else. While a set is armed each amplifier hears a heartbeat of its own, so that
-one that was lost is not fed by those for others.
+can wait is read and written as objects. The host's heartbeat is a part of Ping and sent by nobody
+else; each amplifier hears one of its own, so that one that was lost is not fed by those for others.
 """
 
 import asyncio
 import contextlib
-import math
 import secrets
 import time
 from collections.abc import Callable
@@ -16,10 +14,8 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
-from canopen.emcy import EmcyConsumer, EmcyError
-from canopen.nmt import NmtMaster
-
 from drivers.backend import Backend
+from drivers.backends.can_node import NodeWatch
 from drivers.backends.can_sdo import ObjectClient
 from drivers.backends.can_url import CanUrl
 from drivers.backends.can_wire import CanWire, acquire, release
@@ -27,19 +23,14 @@ from drivers.errors import FrameError, LinkError, LinkTimeout
 from drivers.guard import SafeEnvelope
 from drivers.protocol.can_frame import CANOPEN, CanFrame, cob_id
 from drivers.protocol.can_timing import frames_time, round_trip_time
+from drivers.protocol.canopen_answers import UNASKED, Answer, plain_reply
 from drivers.protocol.canopen_map import (
     SEQUENCE_MAX,
-    UNASKED,
-    Answer,
-    AnswerReader,
     Order,
     action_of,
-    decode_emergency,
     encode_broadcast,
     encode_order,
-    host_number,
     is_about_set,
-    plain_reply,
     wanted_commands,
 )
 from drivers.protocol.definition import PROTOCOL
@@ -62,10 +53,8 @@ from drivers.protocol.messages import (
 )
 from drivers.statistics import WireCounters
 
-HEARTBEATS_BORNE = 3  # of the amplifier's that may be missing before it counts as lost
 _OBJECTS_WAIT = 40  # an object is read in so many answers at most
-_START, _OPERATIONAL = CANOPEN["nmt"]["start"], CANOPEN["nmt_states"]["OPERATIONAL"]
-_BOOT_UP = CANOPEN["nmt_states"]["BOOT_UP"]
+_START = CANOPEN["nmt"]["start"]
 _T = TypeVar("_T")
 
 
@@ -84,11 +73,9 @@ class CanBackend(Backend):
     def __init__(self, url: str) -> None:
         self._url = CanUrl.parse(url)
         self._wire: CanWire | None = None
-        self._loop: asyncio.AbstractEventLoop | None = None
         self._objects: ObjectClient | None = None
         self._thread: ThreadPoolExecutor | None = None
-        self._subscribed: list[tuple[int, Callable[..., None]]] = []
-        self._answers = AnswerReader(self._url.node)
+        self._node = NodeWatch(self._url, answered=self._answered, told=self._told, lost=self._lose)
         self._pending: dict[int, _Pending] = {}
         # Not from the first, so that an answer to an earlier run is no answer to this one.
         self._sequence = secrets.randbelow(SEQUENCE_MAX)
@@ -99,12 +86,6 @@ class CanBackend(Backend):
         self._loss: str | None = None
         self._last_sent = 0.0
         self._counters = WireCounters()
-        self._is_watched = False
-        self._was_operational = False
-        self._heard = 0.0  # the node's heartbeat
-        self._joined = 0.0
-        self._host_heard = -math.inf  # a heartbeat of another host to this node
-        self._next_look: asyncio.TimerHandle | None = None
 
     @property
     def counters(self) -> WireCounters:
@@ -135,32 +116,25 @@ class CanBackend(Backend):
         if self._wire is not None:
             return
         wire = await acquire(self._url.bus)
-        self._loop = asyncio.get_running_loop()
         self._wire = wire
         self._loss = None
         self._counters = WireCounters()
-        self._answers = AnswerReader(self._url.node)
-        self._is_watched = self._was_operational = False
         self._objects = ObjectClient(wire.network, self._url.node)
         self._thread = ThreadPoolExecutor(1, thread_name_prefix=f"era-sdo {self._url.node}")
-        self._subscribe(wire, self._objects)
+        self._node.join(wire, self._objects, self._counters)
         wire.on_loss.append(self._lose)
-        self._joined = time.monotonic()
 
     async def close(self) -> None:
         """Leave the bus; what still waits for an answer gets LinkError."""
         wire, self._wire = self._wire, None
         thread, self._thread = self._thread, None
-        self._stop_watching()
+        self._node.stop()
         self._fail(f"{self._url.bus} was closed")
         if wire is None or thread is None or self._objects is None:
             return
         self._objects.abandon()
         await asyncio.to_thread(thread.shutdown)
-        for can_id, callback in self._subscribed:
-            with contextlib.suppress(KeyError, ValueError):
-                wire.network.unsubscribe(can_id, callback)
-        self._subscribed.clear()
+        self._node.leave(wire)
         with contextlib.suppress(ValueError):
             wire.on_loss.remove(self._lose)
         await release(wire)
@@ -204,7 +178,7 @@ class CanBackend(Backend):
 
         identity = await self._objects_job(ask, timeout)
         self._send([CanFrame(cob_id("nmt"), bytes([_START, self._url.node]))])
-        self._watch()
+        self._node.start()
         return identity
 
     async def _load(self, envelope: Any, timeout: float) -> Reply:
@@ -219,7 +193,7 @@ class CanBackend(Backend):
 
     async def _order(self, order: Order, timeout: float) -> Reply:
         if isinstance(order, Arm):
-            await self._refuse_second_host()
+            await self._node.check_no_other_host()
         self._sequence = self._sequence % SEQUENCE_MAX + 1
         frames = encode_order(
             order, node=self._url.node, sequence=self._sequence, fd=bool(self._url.bus.fd)
@@ -315,72 +289,13 @@ class CanBackend(Backend):
         self._last_sent = time.monotonic()
         self._counters.frames_out += len(frames)
 
-    # what comes, in the reader's thread
-
-    def _subscribe(self, wire: CanWire, objects: ObjectClient) -> None:
-        node, nmt, emergencies = self._url.node, NmtMaster(self._url.node), EmcyConsumer()
-        nmt.add_heartbeat_callback(self._heartbeat)
-
-        def emergency(error: EmcyError) -> None:
-            emergencies.reset()  # it would keep them all
-            self._counters.events += 1
-            data = error.code.to_bytes(2, "little") + bytes([error.register]) + error.data
-            self._post(self._on_event, decode_emergency(data))
-
-        emergencies.add_callback(emergency)
-        self._subscribed = [
-            (cob_id("sdo_answer", node), objects.feed),
-            (cob_id("heartbeat", node), nmt.on_heartbeat),
-            (cob_id("heartbeat", host_number(node)), self._other_host),
-            (cob_id("emergency", node), emergencies.on_emcy),
-            *((can_id, self._answer_frame) for can_id in self._answers.ids),
-        ]
-        for can_id, callback in self._subscribed:
-            wire.network.subscribe(can_id, callback)
-
-    def _answer_frame(self, can_id: int, data: bytearray, timestamp: float) -> None:
-        self._counters.frames_in += 1
-        try:
-            answer = self._answers.feed(CanFrame(can_id, bytes(data)))
-        except FrameError:
-            self._counters.bad += 1
-            return
-        if answer is not None:
-            self._post(self._answered, answer)
-
-    def _heartbeat(self, state: int) -> None:
-        self._heard = time.monotonic()
-        if not self._is_watched:
-            return
-        if state == _BOOT_UP:
-            what = "has started anew, or another with its number has"
-        elif self._was_operational and state != _OPERATIONAL:
-            what = "was taken out of operation by somebody else"
-        else:
-            self._was_operational = self._was_operational or state == _OPERATIONAL
-            return
-        self._post(
-            self._lose,
-            f"node {self._url.node} on {self._url.bus} {what}: open it again and arm it anew",
-        )
-
-    def _other_host(self, can_id: int, data: bytearray, timestamp: float) -> None:
-        self._host_heard = time.monotonic()
-        if self._is_watched:
-            self._counters.foreign += 1
-
-    def _post(self, callback: Callable[[_T], None], argument: _T) -> None:
-        """Call back in the event loop."""
-        if self._loop is not None:
-            with contextlib.suppress(RuntimeError):  # it is closed: nobody waits any more
-                self._loop.call_soon_threadsafe(callback, argument)
-
-    # in the event loop
+    def _told(self, event: Event) -> None:
+        self._counters.events += 1
+        self._on_event(event)
 
     def _answered(self, answer: Answer) -> None:
         if answer.sequence == UNASKED:
-            self._counters.events += 1
-            self._on_event(answer.event)
+            self._told(answer.event)
             return
         pending = self._pending.get(answer.sequence)
         is_of_it = (
@@ -394,45 +309,10 @@ class CanBackend(Backend):
         else:
             self._counters.foreign += 1
 
-    async def _refuse_second_host(self) -> None:
-        """Listen for the heartbeat of another host before arming."""
-        heartbeat = CANOPEN["heartbeat_ms"] / 1000  # as every host sends it while it is armed
-        await asyncio.sleep(max(0.0, self._joined + 1.2 * heartbeat - time.monotonic()))
-        if time.monotonic() - self._host_heard < HEARTBEATS_BORNE * self._url.heartbeat:
-            raise LinkError(
-                f"another program drives node {self._url.node} on {self._url.bus}; end that one"
-            )
-
-    def _watch(self) -> None:
-        """From now on the node must be heard."""
-        self._heard = time.monotonic()
-        if not self._is_watched:
-            self._is_watched = True
-            self._look()
-
-    def _stop_watching(self) -> None:
-        self._is_watched = False
-        if self._next_look is not None:
-            self._next_look.cancel()
-            self._next_look = None
-
-    def _look(self) -> None:
-        """See whether the node was heard lately, by the reader's clock: our loop may be late."""
-        silent = time.monotonic() - self._heard
-        limit = HEARTBEATS_BORNE * self._url.heartbeat
-        if silent >= limit:
-            self._lose(
-                f"node {self._url.node} on {self._url.bus} was not heard for {silent * 1e3:.0f} ms:"
-                " check its supply and the cable, then open the amplifier again"
-            )
-            return
-        loop = asyncio.get_running_loop()
-        self._next_look = loop.call_later(limit - silent, self._look)
-
     def _lose(self, what: str) -> None:
         if self._loss is not None or self._wire is None:
             return
-        self._stop_watching()
+        self._node.stop()
         self._fail(what)
         self._on_loss(what)
 

@@ -1,0 +1,140 @@
+"""The sets that come over CAN: an order, and the commands under its sequence number.
+
+A set is whole when as many commands as its order says have come under its number, and the envelope
+slots with those that refer to some; anything less is torn.
+"""
+
+import struct
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from drivers.command import CommandSet, DriveCommand
+from drivers.protocol.definition import PROTOCOL
+from drivers.protocol.messages import NakCode
+
+STATUS, APPLY, STAGE, COMMIT, ARM, DISARM, STOP, CLEAR = range(8)
+SETS = (APPLY, STAGE, COMMIT)
+TORN = 15
+_Q = PROTOCOL.quantities
+
+
+@dataclass(frozen=True, slots=True)
+class Order:
+    """An order frame as it came; own: not said to all."""
+
+    token: int
+    ramp: int
+    time: int
+    action: int
+    count: int
+    sequence: int
+    own: bool
+    fd: bool
+
+
+class _Command(NamedTuple):
+    """A channel's command as it came, integers as on the wire."""
+
+    frequency: int
+    level: int
+    phase: int
+    flags: int
+    sequence: int
+
+
+class Refused(Exception):
+    """An order that says nonsense, or a set with a frame missing."""
+
+    def __init__(self, code: int, channel: int = 255) -> None:
+        super().__init__(code, channel)
+        self.code = code
+        self.channel = channel
+
+
+class SetBuffer:
+    """What has come since the last SYNC, for an amplifier with so many channels."""
+
+    def __init__(self, channels: int) -> None:
+        self._channels = channels
+        self._commands: dict[int, _Command] = {}
+        self._slots: dict[int, tuple[int, int]] = {}  # by channel: word of both slots, sequence
+
+    @property
+    def sequence(self) -> int | None:
+        """That of some command that has come; None where none has."""
+        return next((command.sequence for command in self._commands.values()), None)
+
+    def clear(self) -> None:
+        """A SYNC has come."""
+        self._commands.clear()
+        self._slots.clear()
+
+    def take(self, channel: int, block: bytes) -> None:
+        """A command; its channel is named twice, by the frame's identifier and in the flags."""
+        self._commands[channel] = _Command(*struct.unpack("<HHhBB", block))
+
+    def take_blocks(self, data: bytes) -> None:
+        """Commands in a row, as CAN FD carries them; eight bytes FF fill up."""
+        for begin in range(0, len(data) - 7, 8):
+            block = data[begin : begin + 8]
+            if block != b"\xff" * 8:
+                self.take(block[6] >> 4, block)
+
+    def take_slots(self, data: bytes) -> None:
+        """The envelope slots of four channels."""
+        word = int.from_bytes(data[:6], "little")
+        for place in range(4):
+            self._slots[4 * (data[6] & 3) + place] = (word >> 12 * place & 0xFFF, data[7])
+
+    def command_set(self, order: Order) -> CommandSet:
+        """The set of an order; raises Refused."""
+        if not (_Q.ramp.holds(order.ramp) and _Q.valid_for.holds(order.time)):
+            raise Refused(NakCode.BAD_VALUE)
+        own = {
+            channel: command
+            for channel, command in self._commands.items()
+            if command.sequence == order.sequence
+        }
+        if len(own) != order.count:
+            raise Refused(TORN)
+        commands = tuple(
+            self._drive_command(channel, command) for channel, command in sorted(own.items())
+        )
+        return CommandSet(order.token, commands, order.ramp / 1000, order.time / 1000)
+
+    def _drive_command(self, channel: int, command: _Command) -> DriveCommand:
+        if command.flags >> 4 != channel or channel >= self._channels:
+            raise Refused(NakCode.BAD_CHANNEL, command.flags >> 4)
+        if command.flags & 0b1000 or not (
+            _Q.level.holds(command.level) and _Q.phase.holds(command.phase)
+        ):
+            raise Refused(NakCode.BAD_VALUE, channel)
+        slots = 0
+        if command.flags & 4:
+            slots, of = self._slots.get(channel, (0, -1))
+            if of != command.sequence:
+                raise Refused(TORN)
+        return DriveCommand(
+            channel=channel,
+            frequency=command.frequency / 100,
+            level=command.level / 10_000,
+            phase=command.phase / 100,
+            keep_phase=bool(command.flags & 1),
+            onset=slots & 0x3F,
+            ending=slots >> 6,
+            skip_ending=bool(command.flags & 2),
+        )
+
+
+def integers_of(command: DriveCommand) -> tuple[object, ...]:
+    """A command as it reads on the wire."""
+    return (
+        command.channel,
+        _Q.frequency.to_wire(command.frequency),
+        _Q.level.to_wire(command.level),
+        _Q.phase.to_wire(command.phase),
+        command.keep_phase,
+        command.onset,
+        command.ending,
+        command.skip_ending,
+    )

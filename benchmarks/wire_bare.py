@@ -4,14 +4,18 @@ Each takes the URL of a simulated amplifier that is armed and requests that are 
 gives the time of each exchange [s].
 """
 
+import asyncio
 import time
 from collections.abc import Sequence
 
 import serial
+from pymodbus.client import AsyncModbusSerialClient, AsyncModbusTcpClient
 
+from drivers.backends.modbus_url import ModbusUrl
 from drivers.backends.serial_url import SerialUrl
 from drivers.guard import SafeCommand
-from drivers.protocol.messages import Apply, Arm
+from drivers.protocol.messages import Apply, Arm, Request
+from drivers.protocol.modbus_map import to_exchange
 from drivers.protocol.serial_codec import encode_request
 from drivers.protocol.serial_frame import encode_frame
 
@@ -41,3 +45,38 @@ def _exchange(port: serial.Serial, request: bytes) -> None:
     ends = 0
     while ends < 2:  # one zero in front, one behind
         ends += port.read(max(1, port.in_waiting)).count(0)
+
+
+def bare_modbus(url: str, sets: Sequence[SafeCommand]) -> list[float]:
+    """pymodbus's own client: write the block and read what was achieved, function 23."""
+    return asyncio.run(_with_pymodbus(ModbusUrl.parse(url), sets))
+
+
+async def _with_pymodbus(url: ModbusUrl, sets: Sequence[SafeCommand]) -> list[float]:
+    client = (
+        AsyncModbusSerialClient(url.device, baudrate=url.baud, timeout=1)
+        if url.device
+        else AsyncModbusTcpClient(url.host, port=url.port, timeout=1)
+    )
+    await client.connect()
+
+    async def ask(request: Request, tag: int) -> None:
+        exchange = to_exchange(request, tag=tag, channels=4)
+        assert exchange.write is not None
+        words = list(exchange.write.registers)
+        begin = time.perf_counter()
+        await client.readwrite_registers(
+            read_address=exchange.read.address,
+            read_count=exchange.read.count,
+            write_address=exchange.write.address,
+            values=words,
+            device_id=url.unit,
+        )
+        times.append(time.perf_counter() - begin)
+
+    times: list[float] = []
+    await ask(Arm(2.0), 1)
+    for number, safe in enumerate(sets):
+        await ask(Apply(safe), number % 65535 + 1)
+    client.close()
+    return times[1:]

@@ -12,12 +12,25 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from benchmarks.wire_bare import bare_serial
+from benchmarks.wire_bare import bare_modbus, bare_serial
 from benchmarks.wire_bench import CHANNELS, Times, all_at_once, far_end, make_sets, ours
+from drivers.backends.modbus_frames import make_telegram
 from drivers.guard import SafeCommand
-from drivers.protocol.messages import Apply, Capabilities
+from drivers.protocol.messages import (
+    Achieved,
+    Apply,
+    Broadcast,
+    Capabilities,
+    Fault,
+    Reply,
+    Request,
+    State,
+    Status,
+)
+from drivers.protocol.modbus_map import to_exchange
 from drivers.protocol.serial_codec import decode_request, encode_request
 from drivers.protocol.serial_frame import FrameReader, encode_frame
+from sim.modbus_unit import ModbusUnit
 
 ROOT = Path(__file__).parent.parent
 PAGE = ROOT / "docs" / "wire-benchmarks.md"
@@ -49,9 +62,37 @@ def _serial_codec(safe: SafeCommand) -> None:
     decode_request(_READER.feed(data)[0])
 
 
+class _Taker:
+    """An amplifier that takes every set."""
+
+    is_answering = True
+
+    def exchange(self, request: Request) -> Reply:
+        if isinstance(request, Apply):
+            return Achieved(request.command_set.token, request.command_set.commands)
+        return Status(State.OPERATION_ENABLED, Fault.NONE, 1, True, 25.0, 1.0, (0.0,) * CHANNELS)
+
+    def broadcast(self, request: Broadcast) -> None:
+        pass
+
+
+_UNIT = ModbusUnit(_Taker())
+
+
+def _modbus_codec(safe: SafeCommand) -> None:
+    exchange = to_exchange(Apply(safe), tag=1, channels=CHANNELS)
+    telegram = make_telegram(exchange.read, exchange.write, unit=1, transaction=1, is_rtu=False)
+    answer = _UNIT.answer(telegram.frame[7:])
+    assert answer is not None
+
+
 WIRES: Mapping[str, Measured] = {
     "serial": Measured(["--serial"], bare_serial, "pyserial", _serial_codec),
     "serial, 921 600 baud": Measured(["--serial", "--speed", "921600"], bare_serial, "pyserial"),
+    "Modbus TCP": Measured(["--modbus-tcp", "0"], bare_modbus, "pymodbus", _modbus_codec),
+    "Modbus RTU, 115 200 baud": Measured(
+        ["--modbus-rtu", "--speed", "115200"], bare_modbus, "pymodbus"
+    ),
 }
 
 

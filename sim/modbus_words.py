@@ -36,14 +36,21 @@ class Unfit(Exception):
 
 
 def checksum(words: Sequence[int]) -> int:
-    """CRC-16 with polynomial 1021 from FFFF, bit by bit; FFFF stands for 0, which says none."""
+    """CRC-16 with polynomial 1021 from FFFF; FFFF stands for 0, which says that there is none."""
     remainder = 0xFFFF
     for byte in struct.pack(f">{len(words)}H", *words):
-        remainder ^= byte << 8
-        for _ in range(8):
-            remainder = (remainder << 1) ^ (0x1021 if remainder & 0x8000 else 0)
-            remainder &= 0xFFFF
+        remainder = (remainder << 8) & 0xFF00 ^ _CHECK_OF_BYTE[remainder >> 8 ^ byte]
     return remainder or 0xFFFF
+
+
+def _check_of_byte(byte: int) -> int:
+    remainder = byte << 8
+    for _ in range(8):
+        remainder = (remainder << 1) ^ (0x1021 if remainder & 0x8000 else 0)
+    return remainder & 0xFFFF
+
+
+_CHECK_OF_BYTE = [_check_of_byte(byte) for byte in range(256)]
 
 
 def value_of(quantity: Quantity, word: int, *, channel: int | None = None) -> float:

@@ -12,8 +12,10 @@ from sim.sensors import Recording
 
 TRANSIENT = 0.1  # s from the onset; what decides what is felt of a short effect
 
-# The level [dB] of the decay between which T60 is read, as ISO 3382-1 does for T20.
-_DECAY_FROM, _DECAY_TO = -5.0, -25.0
+# T60 is read from -5 dB on, as in ISO 3382-1, and as deep as noise allows, for beats make steps: at
+# least to -25 dB, at most to -45 dB.
+_DECAY_FROM, _DECAY_TO, _DECAY_DEEPEST = -5.0, -25.0, -45.0
+_ABOVE_NOISE = 10.0  # dB
 _FLOOR_SHARE = 0.1  # of a decay's end, taken for the sensor's noise
 
 
@@ -82,23 +84,27 @@ def reverberation_time(recording: Recording, *, end: float) -> float:
     """T60 [s]: how long the vibration takes to fall by 60 dB once the drive is silent at end [s].
 
     Schroeder's backward integral of the squared signals, summed over the sensors, with the noise of
-    its last tenth taken off; a line through it from -5 to -25 dB, three times as long. (Beats of
-    neighbouring modes, which bend a logarithmic envelope, are smooth in the integral.) Raises
-    InputError where the recording ends, or noise begins, before the level has fallen by 25 dB.
+    its last tenth taken off; a line through its level from -5 dB down to 10 dB above the noise.
+    (Beats of neighbouring modes, which bend a logarithmic envelope, are steps in the integral.)
+    Raises InputError where the recording ends, or noise begins, before the level has fallen by
+    25 dB.
     """
     power = (recording.during(end, math.inf).samples ** 2).sum(axis=1)
     floor = power[-max(int(_FLOOR_SHARE * len(power)), 1) :].mean()
-    # Up to where the smoothed decay meets the noise: what comes after would only add its wander.
-    width = max(len(power) // 50, 1)
+    # Up to where the decay meets the noise: what comes after would only add its wander.
+    width = max(len(power) // 200, 1)
     smooth = np.convolve(power, np.ones(width) / width, mode="same")
     last = int(np.argmax(smooth <= 2 * floor)) or len(power)
     left = np.cumsum((power[:last] - floor)[::-1])[::-1]
     level = 10 * np.log10(np.maximum(left / left[0], 1e-30)) if left[0] > 0 else np.zeros(1)
-    inside = (level <= _DECAY_FROM) & (level >= _DECAY_TO)
-    if level.min() > _DECAY_TO - 3 or inside.sum() < 3:
+    range_db = 10 * math.log10(max(smooth.max() / max(floor, 1e-300), 1.0))
+    deepest = max(_DECAY_DEEPEST, _ABOVE_NOISE - range_db)
+    inside = (level <= _DECAY_FROM) & (level >= deepest)
+    if deepest > _DECAY_TO or inside.sum() < 3:
         raise InputError(
-            f"the vibration falls by {-level.min():.0f} dB from {end:g} s on before it is lost in "
-            "noise or the recording ends; record longer, or drive the plate harder"
+            f"the vibration falls by {range_db:.0f} dB from {end:g} s on before it is lost in "
+            f"noise or the recording ends; {_ABOVE_NOISE - _DECAY_TO:g} dB are needed: record "
+            "longer, or drive the plate harder"
         )
     times = np.arange(len(level))[inside] / recording.sample_rate
     slope = np.polyfit(times, level[inside], 1)[0]

@@ -28,7 +28,8 @@ from model.rig import Rig
 _Loss: TypeAlias = Literal["linear", "soft_l1"]
 
 _OUTLIER = 5.0  # standard deviations; of 10 000 good complex values 0.04 lie beyond
-_ROUNDS = 6
+_PEAK = 3.0  # times the median of a row; twice that is rare on a plate
+_ROUNDS = 8
 _SMALLEST_NOISE = 1e-4  # of the response: what meshes and reduction are wrong by
 
 
@@ -70,21 +71,22 @@ class Fit:
 def solve(problem: Problem, x: FloatArray, scales: FloatArray) -> Fit:
     """Fit from x (n,) and scales (s,) on; what is not free keeps its value."""
     used = np.isfinite(problem.values)
-    noise = 0.05 * row_size(problem.values, used)  # until residuals tell more
-    loss: _Loss = "soft_l1"
+    # Until residuals tell more: nothing is believed that stands out of its row.
+    first = replace(problem, values=_without_peaks(problem.values, used))
+    noise = 0.05 * row_size(first.values, used)
+    x, scales, _ = _search(first, x, scales, used / noise[:, :, None], loss="soft_l1")
     for number in range(_ROUNDS):
-        x, scales, errors = _search(problem, x, scales, used / noise[:, :, None], loss=loss)
         left = _residual(problem, x, scales, used / noise[:, :, None])
         raw = np.abs(left) * noise[:, :, None]
         noise = _noise(problem.values, raw, used)
         kept = _without_outliers(raw / noise[:, :, None], used)
-        loss = "linear"
-        # The last rounds only sharpen what noise is; a change there is none.
-        if number >= 2 and (kept == used).all():
-            break
+        is_settled = number > 0 and bool((kept == used).all())
         used = kept
-    weight = used / noise[:, :, None]
-    x, scales, errors = _search(problem, x, scales, weight, loss="linear")
+        weight = used / noise[:, :, None]
+        loss: _Loss = "linear" if is_settled else "soft_l1"
+        x, scales, errors = _search(problem, x, scales, weight, loss=loss)
+        if is_settled:
+            break
     model = problem.plate.responses(rig_with(problem.rig, problem.parameters, x)) * scales
     gains = _gains(model, problem.values, weight)
     power = (np.abs(weight * model) ** 2).sum(axis=2)
@@ -208,6 +210,15 @@ def _gains(model: ComplexArray, values: ComplexArray, weight: FloatArray) -> Com
     inner = (weight**2 * model.conj() * values).sum(axis=2)
     power = (np.abs(weight * model) ** 2).sum(axis=2)
     return np.where(power > 0, inner / np.where(power > 0, power, 1), np.nan)
+
+
+def _without_peaks(values: ComplexArray, used: NDArray[np.bool_]) -> ComplexArray:
+    """Values cut down to a few times the median magnitude of their row, their phases kept."""
+    size = np.where(used, np.abs(values), np.nan)
+    rows = used.any(axis=2)
+    limit = np.full(size.shape[:2], np.inf)
+    limit[rows] = _PEAK * np.nanmedian(size[rows], axis=1)
+    return np.asarray(values * np.minimum(1, limit[:, :, None] / np.maximum(size, 1e-300)))
 
 
 def row_size(values: ComplexArray, used: NDArray[np.bool_]) -> FloatArray:

@@ -45,9 +45,8 @@ def unlike_the_plate(problem: Problem, fit: Fit, relative: FloatArray) -> NDArra
     """Which sensors do not follow the plate, whatever it is (s,)."""
     rig = rig_with(problem.rig, problem.parameters, fit.x)
     model = np.nan_to_num(fit.gains)[:, :, None] * problem.plate.responses(rig)
-    measured = np.isfinite(problem.values)
-    weight = measured / fit.noise[:, :, None]
-    model, values = weight * model, weight * np.where(measured, problem.values, 0)
+    weight = fit.used / fit.noise[:, :, None]
+    model, values = weight * model, weight * np.where(fit.used, problem.values, 0)
     inner = np.abs((model.conj() * values).sum(axis=(0, 1)))
     power = (np.abs(model) ** 2).sum(axis=(0, 1)) * (np.abs(values) ** 2).sum(axis=(0, 1))
     coherence = inner / np.sqrt(np.maximum(power, 1e-300))

@@ -6,7 +6,6 @@ holds it with k_b + i omega c - omega² m_b (paper Eq. 21 and 25). The plate's o
 hysteretic: (1 + i eta) K.
 """
 
-import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -28,16 +27,14 @@ def check_frequencies(plate: Plate, mesh: Mesh, frequencies: FloatArray) -> None
         if not (np.isfinite(frequency) and frequency > 0):
             raise InputError(f"frequency is {frequency} Hz, must be above zero")
     highest = max(frequencies, default=0.0)
-    if highest and plate.bending_wavelength(highest) < mesh.shortest_wavelength:
+    if highest > mesh.highest_frequency(plate):
         wavelength = plate.bending_wavelength(highest)
-        need = 1.001 * mesh.shortest_wavelength / wavelength
-        finer = f"{math.ceil(mesh.nx * need)}x{math.ceil(mesh.ny * need)}"
         raise InputError(
             f"the {mesh} mesh has {wavelength / max(mesh.element_size):.1f} elements in a bending "
             f"wavelength at {highest:g} Hz, too few to answer: "
             f"{LEAST_NODES_PER_WAVELENGTH / mesh.kind.order:g} of {mesh.element} are the least; "
             + (
-                f"use {finer} or finer"
+                f"use {Mesh.coarsest(plate, frequency=highest)} or finer"
                 if mesh.element == "MITC4"
                 else f"raise the upper limits.frequency to {highest:g} Hz, which mesh: auto follows"
             )

@@ -68,12 +68,21 @@ class Mesh:
             strip = 0.0
         return cls(nx, ny, plate.length, plate.width, AUTO_ELEMENT, strip)
 
+    @classmethod
+    def coarsest(cls, plate: Plate, *, frequency: float) -> "Mesh":
+        """The coarsest mesh of the paper's element that carries a frequency [Hz]."""
+        size = plate.bending_wavelength(frequency) / LEAST_NODES_PER_WAVELENGTH
+        # Rounding shall not put a mesh that fits exactly just beyond what it carries.
+        size *= 1 - 1e-9
+        nx, ny = (math.ceil(side / size) for side in (plate.length, plate.width))
+        return cls(nx, ny, plate.length, plate.width)
+
     def __str__(self) -> str:
         text = f"{self.nx}x{self.ny}"
         if self.kind.order > 1:
             text += f" {self.element}"
         if self.strip:
-            text += f" with strips of {1000 * self.strip:g} mm"
+            text += f" with strips of {1000 * self.strip:.3g} mm"
         return text
 
     @property
@@ -171,6 +180,10 @@ class Mesh:
     def shortest_wavelength(self) -> float:
         """The shortest bending wave [m] that it can carry: six elements of the first order."""
         return LEAST_NODES_PER_WAVELENGTH * max(self.element_size) / self.kind.order
+
+    def highest_frequency(self, plate: Plate) -> float:
+        """The highest frequency [Hz] whose bending waves in a plate it can carry."""
+        return plate.bending_frequency(self.shortest_wavelength)
 
     def interpolation(self, points: FloatArray) -> sparse.csr_array:
         """Shape functions at points [m] (n, 2): sparse (n, node_count), rows sum to 1.

@@ -88,6 +88,11 @@ class Plate:
         wavenumber = (surface_density * omega**2 / self.flexural_rigidity) ** 0.25
         return float(2 * math.pi / wavenumber)
 
+    def bending_frequency(self, wavelength: float) -> float:
+        """Frequency [Hz] of a bending wave of a wavelength [m] in the thin-plate limit."""
+        surface_density = self.material.rho * self.thickness
+        return 2 * math.pi / wavelength**2 * math.sqrt(self.flexural_rigidity / surface_density)
+
     def contains(self, x: float, y: float) -> bool:
         """Whether a point [m] lies on the plate, its edges included."""
         return 0 <= x <= self.length and 0 <= y <= self.width

@@ -43,11 +43,13 @@ def modes(
     matrices = assemble(rig.plate, rig.mesh)
     solved = modal.modes(matrices, count, support=support.value, eras=rig.eras, loads=rig.loads)
     elapsed = time.perf_counter() - started
+    carried = rig.mesh.highest_frequency(rig.plate)
     if as_json:
         print(
             json.dumps(
                 {
                     "frequencies_hz": solved.natural_frequencies.tolist(),
+                    "mesh_carries_up_to_hz": carried,
                     "support": support.value,
                     "mesh": [rig.mesh.nx, rig.mesh.ny],
                     "dof": matrices.dof,
@@ -60,7 +62,13 @@ def modes(
     mesh_text = f"{rig.mesh} ({rig.mesh.element}), {matrices.dof} dof"
     print(f"{rig_file}: {mesh_text}, support: {support.value}")
     for number, frequency in enumerate(solved.natural_frequencies, start=1):
-        print(f"mode {number:3d}  {frequency:9.2f} Hz")
+        beyond = "  beyond what the mesh carries" if frequency > carried else ""
+        print(f"mode {number:3d}  {frequency:9.2f} Hz{beyond}")
+    if solved.natural_frequencies[-1] > carried:
+        print(
+            f"above {carried:.0f} Hz a bending wavelength has fewer than six nodes of this mesh: "
+            "those frequencies are far off; use a finer --mesh"
+        )
     print(f"solved in {elapsed:.2f} s")
 
 
@@ -178,7 +186,7 @@ def convergence(
     print(f"{'mesh':>9}{'element':>9}{'strips':>8}{'dof':>8}{'nat. freq.':>12}{heads}")
     for error in study.errors:
         mesh_text = f"{error.mesh.nx}x{error.mesh.ny}"
-        strip = f"{1000 * error.mesh.strip:g} mm" if error.mesh.strip else "-"
+        strip = f"{1000 * error.mesh.strip:.3g} mm" if error.mesh.strip else "-"
         errors = [100 * abs(error.frequency).max(), *(100 * error.response)]
         columns = "".join(f"{value:10.3f} %" for value in errors)
         mine = "  <- the rig's" if error.mesh == rig.mesh else ""

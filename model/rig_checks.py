@@ -5,7 +5,7 @@ import math
 from model.config import Validation
 from model.document import key_name
 from model.errors import InputError
-from model.mesh import LEAST_NODES_PER_WAVELENGTH
+from model.mesh import LEAST_NODES_PER_WAVELENGTH, Mesh
 from model.plate import Plate
 from model.rig import SAME_POINT
 from model.rig_parts import laminate_of, mesh_of, plate_of
@@ -72,13 +72,12 @@ def _check_mesh(validation: Validation, plate: Plate, *, frequency_max: float) -
     except InputError as error:
         validation.add(("mesh",), str(error))
         return
-    if plate.bending_wavelength(frequency_max) < mesh.shortest_wavelength:
-        size = plate.bending_wavelength(frequency_max) / LEAST_NODES_PER_WAVELENGTH
-        nx, ny = math.ceil(plate.length / size), math.ceil(plate.width / size)
+    if frequency_max > mesh.highest_frequency(plate):
+        coarsest = Mesh.coarsest(plate, frequency=frequency_max)
         validation.add(
             ("mesh",),
             f"{mesh} is too coarse for bending waves at {frequency_max:g} Hz (limits.frequency): "
-            f"at least {nx}x{ny} is needed, {LEAST_NODES_PER_WAVELENGTH} elements a "
+            f"at least {coarsest} is needed, {LEAST_NODES_PER_WAVELENGTH} elements a "
             "wavelength; auto takes a mesh that is accurate",
         )
 

@@ -71,6 +71,38 @@ def test_a_thick_plate_needs_no_strips():
     assert Mesh.auto(Plate(0.2, 0.1, 0.02, ALUMINIUM), frequency_max=500.0).strip == 0
 
 
+@pytest.mark.parametrize("kind", [("MITC4", 12, 9), ("Q3", 4, 3)])
+def test_a_mesh_carries_six_nodes_to_a_wavelength(kind):
+    """Nodes an inch apart carry waves of 152.4 mm, which are those of 631.85 Hz."""
+    element, nx, ny = kind
+    mesh = Mesh(nx, ny, LENGTH, WIDTH, element)
+    # 2 pi / wavelength² * sqrt(D / rho h), with D = 22.0935 N m and rho h = 4.05 kg/m²
+    highest = mesh.highest_frequency(Plate(LENGTH, WIDTH, 0.0015, ALUMINIUM))
+    assert highest == pytest.approx(631.85, abs=0.01)
+
+
+@pytest.mark.parametrize("sides", [(0.3048, 0.2286), (0.7, 0.1), (0.05, 0.06)])
+def test_the_coarsest_mesh_carries_its_frequency_and_no_coarser_one_does(sides):
+    """Its elements are short enough along both sides; one fewer along either is too long."""
+    plate = Plate(*sides, 0.0015, ALUMINIUM)
+    for frequency in (40.0, 500.0, 1637.0):
+        mesh = Mesh.coarsest(plate, frequency=frequency)
+        assert mesh.highest_frequency(plate) >= frequency
+        for fewer in ((mesh.nx - 1, mesh.ny), (mesh.nx, mesh.ny - 1)):
+            if min(fewer):
+                assert Mesh(*fewer, *sides).highest_frequency(plate) < frequency
+    exact = Mesh(12, 9, LENGTH, WIDTH)
+    paper = Plate(LENGTH, WIDTH, 0.0015, ALUMINIUM)
+    again = Mesh.coarsest(paper, frequency=exact.highest_frequency(paper) * (1 - 1e-8))
+    assert (again.nx, again.ny) == (12, 9)
+
+
+def test_a_mesh_says_its_strips_in_three_digits():
+    """Twice the thickness of a laminate's equivalent plate is a long number."""
+    mesh = Mesh(4, 3, LENGTH, WIDTH, "Q5", 0.003127438)
+    assert str(mesh) == "4x3 Q5 with strips of 3.13 mm"
+
+
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [

@@ -45,6 +45,19 @@ def test_modes_prints_the_papers_tables(era, support, expected):
     assert [round(f, 2) for f in result["frequencies_hz"]] == [float(f) for f in expected]
 
 
+def test_modes_beyond_what_the_mesh_carries_are_marked(era):
+    """Elements of 76.2 mm carry waves of 457.2 mm, 70.2 Hz: mode 1 but not 2; 12x9 carries all."""
+    status, text, _ = era("plate", "modes", RIG, "--mesh", "4x3", "-n", "3")
+    assert status == 0
+    marked = ["beyond" in line for line in text.splitlines() if line.startswith("mode")]
+    assert marked == [False, True, True]
+    assert "above 70 Hz a bending wavelength has fewer than six nodes" in text
+    _, text, _ = era("plate", "modes", RIG, "--mesh", "4x3", "-n", "3", "--json")
+    assert round(json.loads(text)["mesh_carries_up_to_hz"], 1) == 70.2
+    _, text, _ = era("plate", "modes", RIG, "--mesh", "12x9")
+    assert "beyond" not in text
+
+
 def test_map_answers_in_numbers_and_as_a_picture(era, tmp_path):
     """A raster row per y, its maximum named, and a picture on request."""
     picture = tmp_path / "map.png"

@@ -1,5 +1,6 @@
 """From one element to the whole plate: sparse stiffness and mass, and what holds them."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -9,6 +10,7 @@ from scipy import sparse
 from model.actuator import Era
 from model.arrays import FloatArray, IntArray
 from model.elements import DOF_PER_NODE
+from model.errors import InputError
 from model.mesh import Mesh
 from model.plate import Plate
 
@@ -49,7 +51,16 @@ class ElementMatrices:
 
 
 def element_matrices(plate: Plate, mesh: Mesh) -> ElementMatrices:
-    """One matrix for the elements of a plain mesh, four where it has strips along its edges."""
+    """One matrix for the elements of a plain mesh, four where it has strips along its edges.
+
+    Raises InputError for a mesh of another plate.
+    """
+    sides = ((plate.length, mesh.length), (plate.width, mesh.width))
+    if not all(math.isclose(*side) for side in sides):
+        raise InputError(
+            f"the mesh lies over {mesh.length:g} x {mesh.width:g} m, the plate is "
+            f"{plate.length:g} x {plate.width:g} m; make the mesh for this plate"
+        )
     widths = [(size, mesh.strip) if mesh.strip else (size,) for size in mesh.element_size]
     sizes = [(dx, dy) for dy in widths[1] for dx in widths[0]]
     side_x, side_y = mesh.element_sides

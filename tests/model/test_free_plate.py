@@ -179,6 +179,16 @@ def test_a_frequency_beyond_the_mesh_is_refused():
         free.acceleration(eras, np.array([450.0]), free.mesh.nodes)
 
 
+def test_the_mesh_of_another_plate_is_refused():
+    """A plate 1 cm longer than its mesh is an error, not the answer of the shorter one."""
+    mesh = Mesh(12, 9, LENGTH, WIDTH)
+    longer = Plate(LENGTH + 0.01, WIDTH, 0.0015, ALUMINIUM)
+    with pytest.raises(InputError, match=r"over 0\.3048 x 0\.2286 m, the plate is 0\.3148 x"):
+        solve_free_plate(longer, mesh)
+    with pytest.raises(InputError, match="make the mesh for this plate"):
+        assemble(longer, mesh)
+
+
 def test_points_off_the_plate_are_refused(free):
     """An ERA or an observed point beyond the edge is an error, not an extrapolation."""
     eras = random_eras(np.random.default_rng(0), 3)

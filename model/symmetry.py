@@ -94,9 +94,9 @@ def symmetry_class(mesh: Mesh, parity: tuple[int, int]) -> SymmetryClass:
 
 
 def _fold(count: int) -> tuple[IntArray, IntArray]:
-    """For a row of nodes: the one in the first half that mirrors it; -1 beyond the middle, 0 on it.
+    """Of each node of a row: its mirror image in the first half, and on which side it lies.
 
-    1 before it.
+    Both (count,); the side is 1 before the middle, 0 on it, -1 beyond.
     """
     index = np.arange(count)
     mirrored = count - 1 - index

@@ -53,6 +53,5 @@ def rigidities(plate: Plate) -> tuple[FloatArray, float, FloatArray]:
     """
     nu, rho, h = plate.material.nu, plate.material.rho, plate.thickness
     bending = plate.flexural_rigidity * np.array([[1, nu, 0], [nu, 1, 0], [0, 0, (1 - nu) / 2]])
-    shear_modulus = plate.material.E / (2 * (1 + nu))
     inertia = np.diag([rho * h, rho * h**3 / 12, rho * h**3 / 12])
-    return bending, SHEAR_CORRECTION * shear_modulus * h, inertia
+    return bending, SHEAR_CORRECTION * plate.material.shear_modulus * h, inertia

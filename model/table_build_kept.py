@@ -57,8 +57,8 @@ class KeptParts:
         write_arrays(self._path(part), {**arrays, "sha256": digest})
 
     def clear(self) -> None:
-        """Take away all parts, those of other problems too; the table is there now."""
-        for path in self.folder.glob(f"*{_SUFFIX}"):
+        """Take away all parts, those of other problems and half-written ones too."""
+        for path in self.folder.glob(f"*{_SUFFIX}*"):
             path.unlink(missing_ok=True)
         with suppress(OSError):  # not there, or something of someone else's is in it
             self.folder.rmdir()

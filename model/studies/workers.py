@@ -16,8 +16,6 @@ from model.studies.solve import CaseResults, StudyProblem, solve_cases
 Solved: TypeAlias = Iterator[tuple[int, CaseResults]]
 Workers: TypeAlias = Callable[[StudyProblem, Mapping[int, Cases]], Solved]
 
-_Shared: TypeAlias = tuple[Receptances, tuple[Era, ...]]
-
 
 def in_process(problem: StudyProblem, chunks: Mapping[int, Cases]) -> Solved:
     """One chunk after the other, here."""
@@ -33,12 +31,13 @@ def on_processes(count: int) -> Workers:
     """
 
     def solve(problem: StudyProblem, chunks: Mapping[int, Cases]) -> Solved:
-        shared = (problem.solve(), problem.rig.eras)
-        yield from processes.on_processes(count, _solve, shared, chunks)
+        yield from processes.on_processes(
+            count, _solve, (problem.solve(), problem.rig.eras), chunks
+        )
 
     return solve
 
 
-def _solve(shared: _Shared, cases: Cases) -> CaseResults:
+def _solve(shared: tuple[Receptances, tuple[Era, ...]], cases: Cases) -> CaseResults:
     receptances, eras = shared
     return solve_cases(receptances, eras, cases)

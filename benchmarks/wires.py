@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from benchmarks.wire_bare import bare_modbus, bare_serial
+from benchmarks.wire_bare_can import bare_can, can_codec
 from benchmarks.wire_bench import CHANNELS, Times, all_at_once, far_end, make_sets, ours
 from drivers.backends.modbus_frames import make_telegram
 from drivers.guard import SafeCommand
@@ -93,6 +94,9 @@ WIRES: Mapping[str, Measured] = {
     "Modbus RTU, 115 200 baud": Measured(
         ["--modbus-rtu", "--speed", "115200"], bare_modbus, "pymodbus"
     ),
+    "CAN, socketcand": Measured(["--socketcand", "0"], bare_can, "python-can", can_codec),
+    "CAN, slcan": Measured(["--slcan"], bare_can, "python-can"),
+    "CAN, slcan, 500 kbit/s": Measured(["--slcan", "--speed", "500000"], bare_can, "python-can"),
 }
 
 

@@ -10,6 +10,7 @@ import select
 import socket
 import time
 from collections import deque
+from collections.abc import Sequence
 from typing import Any, cast
 
 import can
@@ -47,6 +48,15 @@ def open_bus(url: CanBusUrl) -> can.BusABC:
             return can.Bus(interface=url.interface, channel=url.channel, ignore_config=True)
 
 
+def send_all(bus: can.BusABC, messages: Sequence[can.Message]) -> None:
+    """Send messages one after the other; raises can.CanError or OSError."""
+    if isinstance(bus, _Slcan | _Socketcand):
+        bus.send_text("".join(map(bus.text_of, messages)))
+        return
+    for message in messages:
+        bus.send(message, timeout=SEND_TIMEOUT)
+
+
 def wake(bus: can.BusABC) -> None:
     """Let a thread that waits in `recv` return soon, where the adapter can."""
     if isinstance(bus, _Slcan | _Socketcand):
@@ -74,13 +84,15 @@ class _Socketcand(SocketCanDaemonBus):
         with contextlib.suppress(OSError):
             self._connection.shutdown(socket.SHUT_RDWR)
 
-    def send(self, msg: can.Message, timeout: float | None = None) -> None:
-        """Send a frame; CAN FD needs a daemon that knows it."""
-        if not msg.is_fd:
-            super().send(msg, timeout)  # type: ignore[no-untyped-call]
-            return
-        data = " ".join(f"{byte:x}" for byte in msg.data)
-        text = f"< fdsend {msg.arbitration_id:03X} 00 {msg.dlc} {data} >"
+    def text_of(self, message: can.Message) -> str:
+        """The element that sends a message; CAN FD needs a daemon that knows it."""
+        data = message.data.hex(" ")
+        if message.is_fd:
+            return f"< fdsend {message.arbitration_id:03X} 00 {message.dlc} {data} >"
+        return f"< send {message.arbitration_id:03X} {message.dlc:X} {data} >"
+
+    def send_text(self, text: str) -> None:
+        """Send elements."""
         self._connection.sendall(text.encode("ascii"))
 
     def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
@@ -119,6 +131,7 @@ class _Slcan(slcanBus):
             sleep_after_open=0.0,
             timeout=_SERIAL_TIMEOUT,
         )
+        self.serialPortOrig.write_timeout = SEND_TIMEOUT
         try:
             self.serialPortOrig.exclusive = True
             if url.fd:
@@ -139,9 +152,15 @@ class _Slcan(slcanBus):
         with contextlib.suppress(OSError):
             self.serialPortOrig.close()
 
-    def _write(self, string: str) -> None:
-        # Without python-can's wait until the last byte is out, which only costs time.
-        self.serialPortOrig.write(string.encode() + self.LINE_TERMINATOR)
+    def text_of(self, message: can.Message) -> str:
+        """The command that sends a message."""
+        kind = "b" if message.is_fd else "t"
+        length = _FD_LENGTHS.index(message.dlc)
+        return f"{kind}{message.arbitration_id:03X}{length:X}{message.data.hex().upper()}\r"
+
+    def send_text(self, text: str) -> None:
+        """Send commands, without python-can's wait until the last byte is out."""
+        self.serialPortOrig.write(text.encode("ascii"))
 
     def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
         if not self._lines:

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterable
 import can
 import canopen
 
-from drivers.backends.can_interfaces import SEND_TIMEOUT, open_bus, wake
+from drivers.backends.can_interfaces import open_bus, send_all, wake
 from drivers.backends.can_url import CanBusUrl
 from drivers.errors import LinkError
 from drivers.protocol.can_frame import CanFrame
@@ -96,17 +96,7 @@ class CanWire:
             raise LinkError(self.loss or f"{self.url} is not open")
         try:
             with self._sending:
-                for frame in frames:
-                    bus.send(
-                        can.Message(
-                            arbitration_id=frame.id,
-                            is_extended_id=False,
-                            is_fd=frame.fd,
-                            bitrate_switch=frame.fd,
-                            data=frame.data,
-                        ),
-                        timeout=SEND_TIMEOUT,
-                    )
+                send_all(bus, [_message(frame) for frame in frames])
         except _TROUBLE as problem:
             what = self._what_was_lost(problem)
             self._loop.call_soon_threadsafe(self._lose, what)
@@ -156,6 +146,16 @@ class CanWire:
             f"the CAN bus {self.url} was lost ({problem}): check the adapter and the cable, then "
             "open the amplifier again"
         )
+
+
+def _message(frame: CanFrame) -> can.Message:
+    return can.Message(
+        arbitration_id=frame.id,
+        is_extended_id=False,
+        is_fd=frame.fd,
+        bitrate_switch=frame.fd,
+        data=frame.data,
+    )
 
 
 _WIRES: dict[tuple[int, CanBusUrl], CanWire] = {}

@@ -85,6 +85,7 @@ class CanNode:
 
     def start(self) -> None:
         """Boot, in the running event loop."""
+        self._loop = asyncio.get_running_loop()
         self._station.listen(self._tell)
         self._boot()
         self._look()
@@ -149,7 +150,7 @@ class CanNode:
     def _next_heartbeat(self) -> None:
         period = self._objects.heartbeat
         delay = period / 1000 if period else _LOOK  # 0: none, until another is written
-        self._beat = asyncio.get_running_loop().call_later(delay, self._heartbeat)
+        self._beat = self._loop.call_later(delay, self._heartbeat)
 
     def _heartbeat(self) -> None:
         if self._is_awake() and self._objects.heartbeat:
@@ -161,7 +162,7 @@ class CanNode:
         self._is_awake()
         for timer in self._timers:
             timer.cancel()
-        self._timers = [asyncio.get_running_loop().call_later(_LOOK, self._look)]
+        self._timers = [self._loop.call_later(_LOOK, self._look)]
 
     def _is_awake(self) -> bool:
         is_off = self._station.faults.now("reboot", time.monotonic())

@@ -9,7 +9,7 @@ import contextlib
 import errno
 import logging
 import threading
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Sequence
 
 import can
 import canopen
@@ -89,14 +89,14 @@ class CanWire:
         await asyncio.to_thread(thread.join)
         self._bus = self._thread = None
 
-    def send(self, frames: Iterable[CanFrame]) -> None:
+    def send(self, frames: Sequence[CanFrame]) -> None:
         """Put frames on the bus, without another's in between; raises LinkError."""
         bus = self._bus
         if bus is None or self.loss is not None:
             raise LinkError(self.loss or f"{self.url} is not open")
         try:
             with self._sending:
-                send_all(bus, [_message(frame) for frame in frames])
+                send_all(bus, frames)
         except _TROUBLE as problem:
             what = self._what_was_lost(problem)
             self._loop.call_soon_threadsafe(self._lose, what)
@@ -146,16 +146,6 @@ class CanWire:
             f"the CAN bus {self.url} was lost ({problem}): check the adapter and the cable, then "
             "open the amplifier again"
         )
-
-
-def _message(frame: CanFrame) -> can.Message:
-    return can.Message(
-        arbitration_id=frame.id,
-        is_extended_id=False,
-        is_fd=frame.fd,
-        bitrate_switch=frame.fd,
-        data=frame.data,
-    )
 
 
 _WIRES: dict[tuple[int, CanBusUrl], CanWire] = {}

@@ -9,6 +9,7 @@ import asyncio
 import struct
 import time
 from collections.abc import Callable
+from typing import TypeAlias
 
 from drivers.protocol.can_frame import CanFrame
 from drivers.protocol.definition import PROTOCOL
@@ -60,6 +61,9 @@ _FD_LENGTHS = (8, 12, 16, 20, 24, 32, 48, 64)
 _LOOK = 0.02  # s; how often it is looked whether the supply is back
 
 
+CallLater: TypeAlias = Callable[[float, Callable[[], None]], asyncio.TimerHandle]
+
+
 class CanNode:
     """An amplifier as node `node` of a bus; send puts a frame of its own on the bus."""
 
@@ -83,9 +87,9 @@ class CanNode:
         self._timers: list[asyncio.TimerHandle] = []
         self._beat: asyncio.TimerHandle | None = None
 
-    def start(self) -> None:
-        """Boot, in the running event loop."""
-        self._loop = asyncio.get_running_loop()
+    def start(self, call_later: CallLater | None = None) -> None:
+        """Boot; what comes later is left to the running event loop, unless to somebody else."""
+        self._call_later = call_later or asyncio.get_running_loop().call_later
         self._station.listen(self._tell)
         self._boot()
         self._look()
@@ -150,7 +154,7 @@ class CanNode:
     def _next_heartbeat(self) -> None:
         period = self._objects.heartbeat
         delay = period / 1000 if period else _LOOK  # 0: none, until another is written
-        self._beat = self._loop.call_later(delay, self._heartbeat)
+        self._beat = self._call_later(delay, self._heartbeat)
 
     def _heartbeat(self) -> None:
         if self._is_awake() and self._objects.heartbeat:
@@ -162,7 +166,7 @@ class CanNode:
         self._is_awake()
         for timer in self._timers:
             timer.cancel()
-        self._timers = [self._loop.call_later(_LOOK, self._look)]
+        self._timers = [self._call_later(_LOOK, self._look)]
 
     def _is_awake(self) -> bool:
         is_off = self._station.faults.now("reboot", time.monotonic())

@@ -6,6 +6,7 @@ accepted and do nothing.
 """
 
 import re
+from collections.abc import Callable
 
 from drivers.protocol.can_frame import CanFrame
 from sim.can_bus import CanBus
@@ -24,14 +25,9 @@ class SlcanEnd:
     """An adapter between a pseudo-terminal and a bus; unpluggable: see `PseudoTerminal`."""
 
     def __init__(self, bus: CanBus, *, unpluggable: bool = False) -> None:
-        self._bus = bus
-        self._listener = self._hear  # one object, by which the bus knows it
-        self._rest = b""
-        self._is_open = self._may_send = False
-        self.refused = 0
-        self._port = PseudoTerminal(self._received, unpluggable=unpluggable)
+        self._adapter = SlcanAdapter(bus, lambda data: self._port.write(data))
+        self._port = PseudoTerminal(self._adapter.receive, unpluggable=unpluggable)
         self._port.listen()
-        bus.join(self._listener)
 
     @property
     def path(self) -> str:
@@ -40,7 +36,7 @@ class SlcanEnd:
 
     def plug(self, is_plugged: bool) -> None:
         """Have the adapter plugged in, or pulled out."""
-        self._rest, self._is_open = b"", False
+        self._adapter.reset()
         if is_plugged:
             self._port.plug_in()
             self._port.listen()
@@ -49,16 +45,38 @@ class SlcanEnd:
 
     def close(self) -> None:
         """Leave bus and port."""
-        self._bus.leave(self._listener)
+        self._adapter.close()
         self._port.close()
 
-    def _received(self, data: bytes) -> None:
+
+class SlcanAdapter:
+    """The adapter itself: text in, `write` called with text, frames to and from a bus."""
+
+    def __init__(self, bus: CanBus, write: Callable[[bytes], None]) -> None:
+        self._bus = bus
+        self._write = write
+        self._listener = self._hear  # one object, by which the bus knows it
+        self.refused = 0
+        self.reset()
+        bus.join(self._listener)
+
+    def reset(self) -> None:
+        """As after it was plugged in."""
+        self._rest = b""
+        self._is_open = self._may_send = False
+
+    def close(self) -> None:
+        """Leave the bus."""
+        self._bus.leave(self._listener)
+
+    def receive(self, data: bytes) -> None:
+        """Do what the host asks."""
         *lines, self._rest = (self._rest + data).split(_CR)
         for line in lines:
-            self._port.write(self._answer(line.strip(b"\n")))
+            self._write(self._answer(line.strip(b"\n")))
         if len(self._rest) > _LONGEST:
             self._rest = b""
-            self._port.write(self._refuse())
+            self._write(self._refuse())
 
     def _answer(self, line: bytes) -> bytes:
         match line:
@@ -93,7 +111,7 @@ class SlcanEnd:
             return
         kind = "d" if frame.fd else "t"
         length = _FD_LENGTHS.index(len(frame.data))
-        self._port.write(f"{kind}{frame.id:03X}{length:X}{frame.data.hex().upper()}\r".encode())
+        self._write(f"{kind}{frame.id:03X}{length:X}{frame.data.hex().upper()}\r".encode())
 
 
 def _parse(line: bytes) -> CanFrame | None:

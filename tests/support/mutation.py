@@ -100,10 +100,26 @@ def _modbus(*, is_rtu: bool) -> Codec:
     return Codec(ends.telegrams, ends.take, ends.mend)
 
 
+def _can() -> Codec:
+    from can_fuzz import CanEnds
+
+    ends = CanEnds(sample_requests())
+    return Codec(ends.telegrams, ends.take, ends.mend)
+
+
+def _can_text() -> Codec:
+    from can_fuzz import CanTexts
+
+    texts = CanTexts()
+    return Codec(texts.telegrams, texts.take, texts.mend)
+
+
 CODECS: Mapping[str, Callable[[], Codec]] = {
     "serial": _serial,
     "modbus rtu": lambda: _modbus(is_rtu=True),
     "modbus tcp": lambda: _modbus(is_rtu=False),
+    "can": _can,
+    "can as text": _can_text,
 }
 
 

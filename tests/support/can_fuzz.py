@@ -1,0 +1,274 @@
+"""Both ends of CAN as something that takes any frames and any text; see `mutation`.
+
+A telegram is the frames of a request in a row: identifier (bit 15: CAN FD), length, data. Damage
+hits all three. What is left is given to the far end, to the host's readers, and as text to both
+kinds of adapters.
+"""
+
+import asyncio
+import struct
+from collections.abc import Sequence
+from typing import cast
+
+from drivers.errors import DriverError
+from drivers.protocol.can_frame import CanFrame
+from drivers.protocol.can_text import (
+    SlcanReader,
+    SocketcandReader,
+    slcan_line,
+    socketcand_element,
+)
+from drivers.protocol.canopen_answers import AnswerReader, decode_emergency
+from drivers.protocol.canopen_map import encode_order
+from drivers.protocol.canopen_objects import achieved_of, encode_envelope, faults_of
+from drivers.protocol.messages import (
+    Arm,
+    Clear,
+    Event,
+    GetCaps,
+    GetFaults,
+    Hello,
+    Identity,
+    LoadEnvelope,
+    Reply,
+    Request,
+    State,
+    Status,
+)
+from sim.amplifier import SimulatedAmplifier
+from sim.can_bus import CanBus
+from sim.can_node import CanNode
+from sim.faults import Faults
+from sim.slcan_end import SlcanAdapter
+from sim.socketcand_end import SocketcandEnd, _Client
+
+_FD = 0x8000
+_FD_LENGTHS = (8, 12, 16, 20, 24, 32, 48, 64)
+_REVIVAL = 10  # telegrams, after which it is operational and armed again
+_ENVELOPE_SLOT = 5
+
+
+class _Never:
+    """A timer that does not come."""
+
+    def cancel(self) -> None:
+        """Nothing."""
+
+
+_NEVER = cast(asyncio.TimerHandle, _Never())
+
+
+class Station:
+    """A simulated amplifier whose clock stands where it is put; `asked` is what came lately."""
+
+    is_answering = True
+
+    def __init__(self) -> None:
+        self.amplifier = SimulatedAmplifier("main", channels=4)
+        self.capabilities = self.amplifier.capabilities
+        self.faults = Faults()
+        self.now = 100.0  # s; any
+        self.asked: list[Request] = []
+
+    @property
+    def identity(self) -> Identity:
+        """Who it is."""
+        return self.amplifier.identity
+
+    def listen(self, on_event: object) -> None:
+        """Pass events on."""
+        assert callable(on_event)
+        self.amplifier.listeners.append(lambda event, _: on_event(event))
+
+    def exchange(self, request: Request) -> Reply:
+        """Its answer."""
+        self.asked.append(request)
+        return self.amplifier.handle(request, self.now)
+
+    broadcast = exchange
+
+    def status(self) -> Status:
+        """How it is."""
+        return self.amplifier.status(self.now)
+
+    def restart(self) -> None:
+        """Anew."""
+        self.amplifier.restart(self.now)
+
+    def pass_time(self, duration: float) -> None:
+        """Let time [s] pass; AssertionError where something plays that must not."""
+        self.now += duration
+        self.amplifier.tick(self.now)
+        assert all(0 <= level <= 1 + 1e-9 for level in self.status().levels)
+        playing = any(tone.lasts for output in self.amplifier.outputs for tone in output)
+        assert not playing or self.amplifier.state is State.OPERATION_ENABLED
+
+
+class CanEnds:
+    """A node and what the host reads with; telegrams: the frames of good requests and answers."""
+
+    def __init__(self, requests: Sequence[Request]) -> None:
+        self._station = Station()
+        self._said: list[CanFrame] = []
+        self._node = CanNode(self._station, 1, send=self._said.append)  # type: ignore[arg-type]
+        self._node.start(lambda delay, callback: _NEVER)
+        self._revive()
+        self._answers = AnswerReader(1)
+        self._taken = 0
+        self.events: list[Event] = []
+        self.telegrams = [self._telegram(request) for request in requests]
+        self.telegrams += [_pack(self._answer_to(telegram)) for telegram in self.telegrams]
+
+    def take(self, data: bytes) -> list[object]:
+        """Give the frames of a telegram to both ends; what the far end was asked."""
+        self._taken += 1
+        if self._taken % _REVIVAL == 0:
+            self._revive()
+        self._station.asked.clear()
+        self._said.clear()
+        for frame in _unpack(data):
+            self._node.receive(frame)
+            self._hear(frame)
+        for frame in self._said:
+            self._hear(frame)
+        self._station.pass_time(0.01)
+        return list(self._station.asked)
+
+    def mend(self, data: bytes) -> bytes:
+        """A SYNC behind it, so that what came of a set takes effect."""
+        return data + _pack([CanFrame(0x80, b"")])
+
+    def _hear(self, frame: CanFrame) -> None:
+        """The host's side: every reader takes the frame, whatever it is."""
+        try:
+            if frame.id in self._answers.ids:
+                self._answers.feed(frame)
+            self.events.append(decode_emergency(frame.data))
+        except DriverError:
+            pass
+        self.events.clear()
+        for read in (faults_of, achieved_of):
+            try:
+                read(frame.data)
+            except DriverError:
+                continue
+
+    def _revive(self) -> None:
+        """Have it in operation and armed."""
+        for data in (b"\x01\x01",):
+            self._node.receive(CanFrame(0x000, data))
+        for order in (Clear(), Arm(2.0)):
+            for frame in encode_order(order, node=1, sequence=9):
+                self._node.receive(frame)
+
+    def _telegram(self, request: Request) -> bytes:
+        match request:
+            case Hello():
+                return _pack([_read_object(0x2000, 1), _segment(0x60), _segment(0x70)])
+            case GetCaps() | GetFaults():
+                return _pack([_read_object(0x2008, 0), _segment(0x60)])
+            case LoadEnvelope(envelope=envelope):
+                return _pack(_write_object(0x2100, _ENVELOPE_SLOT, encode_envelope(envelope)))
+            case _:
+                return _pack(list(encode_order(request, node=1, sequence=7)))
+
+    def _answer_to(self, telegram: bytes) -> list[CanFrame]:
+        self._said.clear()
+        for frame in _unpack(telegram):
+            self._node.receive(frame)
+        return self._said or [CanFrame(0x701, b"\x05")]
+
+
+class CanTexts:
+    """What adapters read and write as text, in both directions; telegrams: good text."""
+
+    def __init__(self) -> None:
+        self._bus = CanBus()
+        self.asked: list[object] = []
+        self._slcan = SlcanAdapter(self._bus, lambda text: None)
+        self._slcan.receive(b"O\r")
+        self._client = _Client(self._bus, SocketcandEnd(self._bus), is_open=True, is_raw=True)
+        self._client.transport = _Deaf()  # type: ignore[assignment]
+        self._readers = (SlcanReader(), SocketcandReader())
+        self._bus.join(self.asked.append)
+        frames = [CanFrame(0x481, bytes(range(8))), CanFrame(0x80, b"")]
+        fd = CanFrame(0x481, bytes(48), fd=True)
+        self.telegrams = [
+            *(write(one) for one in (*frames, fd) for write in (slcan_line, socketcand_element)),
+            b"< frame 181 1700000000.123456 0102030405060708 >",
+            b"< fdframe 181 00 1.5 0102030405060708 >",
+            b"C\rS6\rO\rV\rN\rF\rZ0\r",
+            b"< open can0 >< rawmode >< echo >",
+        ]
+
+    def take(self, data: bytes) -> list[object]:
+        """Let every reader read a piece of text; the frames that were understood."""
+        self.asked.clear()
+        self._slcan.receive(data)
+        self._slcan.receive(b"\rO\r")
+        self._client.is_open = self._client.is_raw = True
+        self._client.data_received(data)
+        for reader in self._readers:
+            self.asked.extend(reader.feed(data))
+        for frame in self.asked:
+            assert isinstance(frame, CanFrame)
+            assert 0 <= frame.id <= 0x7FF
+            assert len(frame.data) <= (64 if frame.fd else 8)
+        return list(self.asked)
+
+    def mend(self, data: bytes) -> bytes:
+        """An end of both kinds before it, so that it is a new beginning."""
+        return b"\r>" + data
+
+
+class _Deaf:
+    """A connection that takes everything."""
+
+    def write(self, data: bytes) -> None:
+        """Nothing."""
+
+    def get_write_buffer_size(self) -> int:
+        """Nothing waits."""
+        return 0
+
+    def close(self) -> None:
+        """Nothing."""
+
+    def abort(self) -> None:
+        """Nothing."""
+
+
+def _pack(frames: Sequence[CanFrame]) -> bytes:
+    return b"".join(
+        struct.pack("<HB", frame.id | (_FD if frame.fd else 0), len(frame.data)) + frame.data
+        for frame in frames
+    )
+
+
+def _unpack(data: bytes) -> list[CanFrame]:
+    frames, at = [], 0
+    while at + 3 <= len(data):
+        head, length = struct.unpack_from("<HB", data, at)
+        is_fd = bool(head & _FD)
+        length = _FD_LENGTHS[length % 8] if is_fd else length % 9
+        frames.append(CanFrame(head & 0x7FF, data[at + 3 : at + 3 + length], fd=is_fd))
+        at += 3 + length
+    return frames
+
+
+def _read_object(index: int, subindex: int) -> CanFrame:
+    return CanFrame(0x601, struct.pack("<BHB4x", 0x40, index, subindex))
+
+
+def _segment(command: int) -> CanFrame:
+    return CanFrame(0x601, bytes([command]) + bytes(7))
+
+
+def _write_object(index: int, subindex: int, data: bytes) -> list[CanFrame]:
+    frames = [CanFrame(0x601, struct.pack("<BHBL", 0x21, index, subindex, len(data)))]
+    for number, begin in enumerate(range(0, len(data), 7)):
+        piece = data[begin : begin + 7]
+        is_last = begin + 7 >= len(data)
+        command = (number & 1) << 4 | (7 - len(piece)) << 1 | is_last
+        frames.append(CanFrame(0x601, bytes([command]) + piece.ljust(7, b"\0")))
+    return frames

@@ -11,7 +11,7 @@ from model.arrays import ComplexArray, FloatArray
 from model.calibration.fast_plate import FastPlate, fast_plate
 from model.calibration.fit import Fit, Problem, misfit, row_size, solve, with_free
 from model.calibration.held_out import as_it_was, hold_out, relative_error
-from model.calibration.outcome import Calibration, FittedParameter, HeldOut, SensorScale
+from model.calibration.outcome import FITS, Calibration, FittedParameter, HeldOut, SensorScale
 from model.calibration.parameters import Parameter, parameters_of, rig_with, starts
 from model.calibration.responses import Responses
 from model.calibration.screening import silent_eras, silent_sensors, unlike_the_plate
@@ -120,12 +120,19 @@ def _identified(problem: Problem, fit: Fit) -> tuple[Problem, Fit]:
     own = np.array([parameter.start for parameter in problem.parameters])
     while True:
         excess = np.where(problem.free, fit.x_error / known, 0)
-        if not excess.max() > 1:
+        # Of a plate that does not fit, no value means anything, known or not.
+        if not excess.max() > 1 or _fit_error(problem, fit) > FITS:
             return problem, fit
         free = problem.free.copy()
         free[int(excess.argmax())] = False
         problem = with_free(problem, free)
         fit = solve(problem, np.where(free, fit.x, own), fit.scales)
+
+
+def _fit_error(problem: Problem, fit: Fit) -> float:
+    rig = rig_with(problem.rig, problem.parameters, fit.x)
+    predicted = fit.gains[:, :, None] * problem.plate.responses(rig) * fit.scales
+    return relative_error(problem.values, predicted, row_size(problem.values, fit.used), fit.used)
 
 
 def _with_median_scale_one(fit: Fit) -> Fit:
@@ -183,9 +190,7 @@ def _report(
         ),
         outlier_count=measured_count - int(fit.used.sum()),
         value_count=measured_count,
-        error=relative_error(
-            problem.values, after * fit.scales, row_size(problem.values, fit.used), fit.used
-        ),
+        error=_fit_error(problem, fit),
         held_out=held_out,
         sensors=names,
         frequencies=frequencies,

@@ -30,6 +30,7 @@ _Loss: TypeAlias = Literal["linear", "soft_l1"]
 _OUTLIER = 5.0  # standard deviations; of 10 000 good complex values 0.04 lie beyond
 _PEAK = 3.0  # times the median of a row; twice that is rare on a plate
 _ROUNDS = 8
+_STEPS = 60  # of one search; a plate that fits takes ten
 _SMALLEST_NOISE = 1e-4  # of the response: what meshes and reduction are wrong by
 
 
@@ -149,6 +150,7 @@ def _search(
         bounds=(lower, upper),
         loss=loss,
         x_scale="jac",
+        max_nfev=_STEPS,
         xtol=1e-9,
         ftol=1e-9,
     )

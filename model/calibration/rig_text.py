@@ -59,7 +59,8 @@ def check_reads_back(rig: Rig, expected: Calibration, path: Path) -> None:
         return plate + [v for era in one.eras for v in _numbers_of(era)]
 
     # The absolute part is for numbers near zero: 1 mg, 1 µN s/m, a millionth of a gain.
-    if not np.allclose(numbers(rig), numbers(wanted), rtol=1e-4, atol=1e-6):
+    read, fitted = numbers(rig), numbers(wanted)
+    if len(read) != len(fitted) or not np.allclose(read, fitted, rtol=1e-4, atol=1e-6):
         raise InputError(
             f"{path}: the new values could not be put into the rig file as it is written; write "
             "its plate and ERAs in the way of `era config init` and calibrate again"

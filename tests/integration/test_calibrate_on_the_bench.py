@@ -1,0 +1,141 @@
+"""From a modal test in time on the simulated plate, through a file, to a new rig: the commands."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from model.calibration.fast_plate import fast_plate
+from model.calibration.responses_file import write_responses_csv, write_responses_uff
+from model.cli import app
+from model.errors import InputError
+from model.rig import Rig
+from model.rig_file import example_rig_path, load_rig
+from perturbed_plate import FREQUENCIES, perturbed
+from sim.sensors import Accelerometer, scanning_grid
+from sim.stepped_sine import record_responses
+
+MESH = "16x12"
+SENSOR = Accelerometer("", 0, 0, noise_density=5e-3, reach=200.0, resolution=1e-3)
+
+
+@pytest.fixture(scope="module")
+def rig() -> Rig:
+    """The paper's plate as its file has it."""
+    return load_rig(example_rig_path(), mesh=MESH)
+
+
+@pytest.fixture(scope="module")
+def measured(rig: Rig, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with what twelve sensors recorded of the true plate, P3 wrong and P8 dead."""
+    scales = {"P3": 0.8, "P8": 0.0}
+    sensors = [
+        replace(sensor, scale=scales.get(sensor.name, 1.0))
+        for sensor in scanning_grid(rig.plate, 4, 3, like=SENSOR)
+    ]
+    responses = record_responses(perturbed(rig), sensors, FREQUENCIES)
+    folder = tmp_path_factory.mktemp("measured")
+    write_responses_uff(folder / "measured.uff", responses, rig)
+    write_responses_csv(folder / "measured.csv", responses, rig)
+    return folder
+
+
+def run(*arguments: object) -> tuple[int, str]:
+    """`era calibrate`: exit status and what it says."""
+    result = CliRunner().invoke(app, ["calibrate", *map(str, arguments)])
+    if isinstance(result.exception, InputError):
+        return 2, str(result.exception)
+    return result.exit_code, result.output
+
+
+def test_the_bench_measures_what_the_model_says(rig: Rig) -> None:
+    """Stepped sine in time with silent sensors against the steady state in frequency.
+
+    What differs is the structural damping, viscous in time: half a percent in the median.
+    """
+    truth = perturbed(rig)
+    sensors = scanning_grid(rig.plate, 3, 2, like=Accelerometer("", 0, 0))
+    found = record_responses(truth, sensors, FREQUENCIES[::4])
+    gains = np.column_stack([era.gain(FREQUENCIES[::4]) for era in truth.eras])
+    exact = fast_plate(truth, found.points, FREQUENCIES[::4]).responses(truth)
+    exact *= gains[:, :, None]
+    wrong = np.linalg.norm(found.values - exact, axis=2) / np.linalg.norm(exact, axis=2)
+    assert np.median(wrong) < 0.005
+    assert wrong.max() < 0.03
+
+
+@pytest.mark.parametrize("ending", ["uff", "csv"])
+def test_the_truth_is_found(rig: Rig, measured: Path, tmp_path: Path, ending: str) -> None:
+    """Every parameter within 2 %, faults of the measurement named, and a rig that can be used."""
+    new = tmp_path / "new.yaml"
+    status, said = run(
+        example_rig_path(), measured / f"measured.{ending}", "-o", new, "--mesh", MESH, "--json"
+    )
+    assert status == 0
+    told = json.loads(said)
+    truth = perturbed(rig)
+    wanted = [truth.plate.material.E, truth.plate.loss_factor]
+    wanted += [v for era in truth.eras for v in (era.stiffness, era.damping, era.bolt_mass)]
+    np.testing.assert_allclose([row["after"] for row in told["parameters"]], wanted, rtol=0.02)
+    assert told["dead_sensors"] == ["P8"]
+    assert told["sensor_scales"]["P3"]["scale"] == pytest.approx(0.8, rel=0.01)
+    assert told["held_out"]["error_after"] < 0.03 < 0.3 < told["held_out"]["error_before"]
+    assert told["files"] == [str(new)]
+    back = load_rig(new, mesh=MESH)
+    gains = np.column_stack([era.gain(FREQUENCIES) for era in back.eras])
+    true_gains = np.column_stack([era.gain(FREQUENCIES) for era in truth.eras])
+    assert np.median(np.abs(gains / true_gains - 1)) < 0.01
+
+
+def test_what_a_person_reads(measured: Path, tmp_path: Path) -> None:
+    """Old and new values with uncertainty, findings, the self-check, files and a next step."""
+    new, picture = tmp_path / "new.yaml", tmp_path / "fit.png"
+    status, said = run(
+        example_rig_path(), measured / "measured.uff", "-o", new, "--mesh", MESH,
+        "--picture", picture,
+    )  # fmt: skip
+    assert status == 0
+    assert "SW stiffness       17000 N/m -> 195" in said
+    assert "sensor P8: dead, left out" in said
+    assert "sensor P3: scale 0.8" in said
+    assert "self-check: sensors P" in said
+    assert f"Next: era table build {new}" in said
+    assert "SW stiffness       17000 N/m -> 195" in new.read_text()
+    assert "# The plate of the founding paper" in new.read_text()
+    assert picture.read_bytes().startswith(b"\x89PNG")
+
+
+def test_another_rig_is_not_written(measured: Path, tmp_path: Path) -> None:
+    """Measured on the paper's plate, asked of a longer one: no, and no file is written."""
+    other, new = tmp_path / "other.yaml", tmp_path / "new.yaml"
+    other.write_text(example_rig_path().read_text().replace("12 in", "16 in"))
+    status, said = run(other, measured / "measured.uff", "-o", new, "--mesh", "24x18")
+    assert status == 2
+    assert "ERA SE was measured at (0.3048, 0) m, the rig has it at (0.4064, 0) m" in said
+    # Where the file does not tell the ERAs' places only the fit can.
+    rows = [line.split(",") for line in (measured / "measured.csv").read_text().splitlines()]
+    placeless = tmp_path / "placeless.csv"
+    placeless.write_text("\n".join(",".join([row[0], *row[3:]]) for row in rows))
+    status, said = run(other, placeless, "-o", new, "--mesh", "24x18")
+    assert status == 1
+    assert "does not fit what was measured" in said
+    assert not new.exists()
+
+
+def test_files_that_are_refused(measured: Path, tmp_path: Path) -> None:
+    """Damaged, in wrong units, or about to be overwritten: what and where; nothing is written."""
+    rig = example_rig_path()
+    new = tmp_path / "new.yaml"
+    cut = tmp_path / "cut.csv"
+    lines = (measured / "measured.csv").read_text().splitlines()
+    cut.write_text("\n".join([*lines[:41], lines[41][:30]]))
+    assert run(rig, cut, "-o", new)[0] == 2
+    assert "cut.csv:42: " in run(rig, cut, "-o", new)[1]
+    cut.write_text("\n".join([lines[0].replace("frequency_hz", "omega_rad_s"), *lines[1:]]))
+    assert "cut.csv:1: " in run(rig, cut, "-o", new)[1]
+    assert "would overwrite" in run(new, cut, "-o", new)[1]
+    assert "ends in .yaml" in run(rig, cut, "-o", tmp_path / "new.json")[1]
+    assert not new.exists()

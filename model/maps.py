@@ -12,6 +12,9 @@ from model.harmonic import direct_acceleration
 from model.rig import Rig
 from model.vibration import find_nulls, peak_acceleration, tone_amplitudes
 
+MOST_POINTS = 1_000_000
+"""Of a map: finer than any screen, and some hundred bytes of memory each."""
+
 
 @dataclass(frozen=True)
 class PlateMap:
@@ -31,12 +34,17 @@ def plate_map(
 ) -> PlateMap:
     """Solve the rig's plate for an excitation; the raster defaults to that of the mesh.
 
-    Raises InputError for a raster below 2x2 or a frequency that the mesh cannot carry.
+    Raises InputError for a raster below 2x2 or of millions of points, or a frequency that the mesh
+    cannot carry.
     """
     mesh = rig.mesh
     columns, rows = raster or mesh.raster
     if columns < 2 or rows < 2:
         raise InputError(f"a map of {columns}x{rows} points is none; 2x2 is the least")
+    if columns * rows > MOST_POINTS:
+        raise InputError(
+            f"a map of {columns}x{rows} points is too large; {MOST_POINTS} points are the most"
+        )
     x = np.linspace(0, rig.plate.length, columns)
     y = np.linspace(0, rig.plate.width, rows)
     points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)

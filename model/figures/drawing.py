@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 
 from model.actuator import Era
 from model.arrays import FloatArray
+from model.errors import InputError
 from model.maps import PlateMap
 from model.plate import Plate
 from model.rig import Rig
@@ -21,6 +22,9 @@ ACTIVE_COLOR = "#d62728"
 RESTING_COLOR = "#2ca02c"
 
 POINTS_ALONG = 97
+
+PICTURE_ENDINGS = (".png", ".svg", ".pdf")
+"""Which kinds of pictures can be written."""
 
 
 def raster(plate: Plate) -> tuple[int, int]:
@@ -108,7 +112,16 @@ def map_figure(rig: Rig, plate_map: PlateMap, *, active: Collection[str], title:
 
 
 def save_figure(figure: Figure, path: Path, *, dpi: int = 150) -> None:
-    """Write a figure as PNG; needs no display."""
+    """Write a figure as what its file's name ends in; needs no display.
+
+    Raises InputError for an ending that is not in PICTURE_ENDINGS, OSError where the file cannot be
+    written.
+    """
+    if path.suffix.lower() not in PICTURE_ENDINGS:
+        raise InputError(
+            f"{path}: a picture's name must end in {', '.join(PICTURE_ENDINGS[:-1])} or "
+            f"{PICTURE_ENDINGS[-1]}, for instance {path.stem}.png"
+        )
     FigureCanvasAgg(figure)
     figure.savefig(path, dpi=dpi)
 

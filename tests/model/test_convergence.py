@@ -9,7 +9,7 @@ import pytest
 
 from model.convergence import default_frequencies, meshes_to_compare, study_convergence
 from model.mesh import Mesh
-from paper_plate import make_paper_rig
+from paper_plate import LENGTH, WIDTH, make_paper_rig
 
 # On four corner springs: founding paper, in-house column of Table 2, and converged (NGSolve).
 PAPER = np.array([31.98, 68.50, 76.62, 107.84, 160.77])
@@ -66,6 +66,17 @@ def test_eras_within_the_plate_converge_too():
     error = study_convergence(moved, [automatic], frequencies=np.array([110.0, 250.0])).errors[0]
     assert np.abs(error.frequency).max() < 1e-3
     assert error.response.max() < 1e-2
+
+
+@pytest.mark.parametrize(("count", "free"), [(1, 2), (2, 1)])
+def test_motion_that_nothing_holds_is_not_compared(count, free):
+    """On one ERA the plate can tilt both ways, on two about their line: 0 Hz has no error."""
+    rig = make_paper_rig(12, 9)
+    few = replace(rig, eras=rig.eras[:count])
+    study = study_convergence(few, [Mesh(24, 18, LENGTH, WIDTH)], frequencies=[110.0])
+    assert len(study.natural_frequencies) == len(study.errors[0].frequency) == 12 - free
+    assert study.natural_frequencies[0] > 1
+    assert np.abs(study.errors[0].frequency).max() < 0.03
 
 
 @pytest.mark.parametrize(("limit", "asked"), [(500.0, [110, 250]), (200.0, [110]), (80.0, [80])])

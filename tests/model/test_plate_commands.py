@@ -118,9 +118,20 @@ def test_one_era_is_driven_once(era):
     assert "driven twice" in said
 
 
-@pytest.mark.parametrize("points", ["13", "0x5", "1x1", "axb"])
+@pytest.mark.parametrize("name", ["map.xyz", "map"])
+def test_a_picture_of_no_known_kind_is_bad_input(era, tmp_path, name):
+    """The kind follows from the name's end; one that is none is said so, and nothing is written."""
+    status, _, said = era(
+        *("plate", "map", RIG, "--mesh", "12x9", "--drive", "SW=110", "-o", tmp_path / name)
+    )
+    assert status == 2
+    assert "must end in .png, .svg or .pdf, for instance map.png" in said
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("points", ["13", "0x5", "1x1", "axb", "99999x99999"])
 def test_a_raster_that_is_none_is_bad_input(era, points):
-    """The raster needs two points each way."""
+    """The raster needs two points each way, and must fit into memory."""
     status, _, said = era(
         *("plate", "map", RIG, "--mesh", "12x9", "--drive", "SW=110", "--points", points)
     )

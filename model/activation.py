@@ -39,7 +39,7 @@ def equal_area_points(plate: Plate, *, frequency_max: float) -> FloatArray:
     """Points [m] (p, 2) that stand for equal areas of a plate: centres of nearly square cells.
 
     24 of them along the longer side, or as many as put twelve into a bending wave of the highest
-    frequency [Hz]. On the paper's plate, against cells a quarter as large: medians within 3 %,
+    frequency [Hz]. On the paper's plate, against cells a quarter as long: medians within 3 %,
     quartiles within 8 %; the maximum, which lies on the edge, is up to 12 % low, and the minimum,
     which lies at a null, is just that of these points.
     """

@@ -105,7 +105,7 @@ frequency. Studies choose among the places of a raster, so they pay for each pla
 
 `era study placement examples/paper_plate.yaml --layouts 10000 --workers 2`, from typing the command
 to the ranking and its pictures, with the quartiles and extremes of peak acceleration over 432
-points for every set of active ERAs of every layout:
+points for every set of active ERAs of every layout; the memory is that of the largest process:
 
 {chr(10).join([*head, row("era-haptics, two processes", study)])}
 

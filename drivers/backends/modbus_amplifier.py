@@ -96,7 +96,8 @@ class ModbusBackend(Backend):
     async def exchange(self, request: Request, *, timeout: float) -> Reply:
         """Send a request and wait for its reply; LinkTimeout, LinkError or FrameError.
 
-        timeout [s]: what the amplifier may take; the time on a serial line comes on top of it.
+        timeout [s]: for each transaction; longer where a slow line needs it (see `ModbusLink`), so
+        that a loss is told after three heartbeats on a line that is fast enough for them.
         """
         records = 0
         while True:

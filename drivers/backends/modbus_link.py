@@ -97,9 +97,9 @@ class ModbusLink:
     ) -> Answer:
         """Write, read, or both in one transaction, and wait for the answer.
 
-        accept: whether an answer in the right form is the right one. timeout [s]: what the
-        amplifier may take; the time on a serial line comes on top of it. Raises LinkTimeout,
-        LinkError.
+        accept: whether an answer in the right form is the right one. timeout [s]: for all of it;
+        longer where a slow line and an amplifier that reacts in time need longer. Raises
+        LinkTimeout, LinkError.
         """
         async with self._turn:
             await self._await_silence()
@@ -112,7 +112,7 @@ class ModbusLink:
                 self._send(telegram.frame)
                 self._is_owed = True
                 self._free_from = self.last_sent + on_line + _REACTION
-                async with asyncio.timeout(timeout + on_line):
+                async with asyncio.timeout(max(timeout, on_line + _REACTION)):
                     return await self._answer
             except LinkError:
                 raise

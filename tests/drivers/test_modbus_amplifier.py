@@ -424,7 +424,7 @@ async def test_what_is_cancelled_leaves_its_answer_the_time_to_come(
             pdu = far.unit.answer(far.requests[0].pdu)
             assert pdu is not None
             far.send(far.requests[0], pdu)
-            assert await stopping == ARMED
+            assert await asyncio.wait_for(stopping, PATIENCE) == ARMED
             await backend.close()
 
 

@@ -290,6 +290,18 @@ EXCEPTIONS = {
 }
 
 
+@pytest.mark.parametrize("read", ["03 E8 00 7E", "05 3F 00 01"], ids=["126", "not there"])
+async def test_what_cannot_be_read_back_is_not_written(tcp: FarSide, read: str) -> None:
+    """Function 23 is one transaction: with a range that cannot be read, nothing of it is done."""
+    master = Master(tcp.url)
+    await master.open()
+    pdu = bytes.fromhex(f"17 {read} 00 02 00 03 06 00 0F 00 FA 00 00")  # and ARM
+    master.send(struct.pack(">HHHB", 5, 0, len(pdu) + 1, 1) + pdu)
+    assert (await master.receive(9))[7] == 0x97
+    assert tcp.amplifier.state is State.SWITCH_ON_DISABLED
+    await master.close()
+
+
 @pytest.mark.parametrize(("request_", "answer"), EXCEPTIONS.values(), ids=EXCEPTIONS)
 async def test_what_cannot_be_is_an_exception(tcp: FarSide, request_: str, answer: str) -> None:
     """The PDU gets the exception of the standard, and nothing has changed."""

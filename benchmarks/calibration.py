@@ -1,0 +1,110 @@
+"""What calibration regains, and what it needs: `python -m benchmarks.calibration`.
+
+The plate of examples/make_measured.py, measured on the simulated bench with more or less noise and
+more or fewer sensors; the errors of the fitted values, and the contrast that the patterns of the
+calibrated rig's table reach on the true plate.
+"""
+
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from examples.make_measured import FREQUENCIES, SENSOR, true_rig
+from model.calibration.calibrate import calibrate
+from model.calibration.outcome import Calibration
+from model.fingertip import fingertip_points
+from model.rig import Rig
+from model.rig_file import load_rig
+from model.table import LocalizationTable
+from model.table_build import build_table
+from sim.sensors import scanning_grid
+from sim.stepped_sine import record_responses
+
+RIG = Path(__file__).parent.parent / "examples" / "paper_plate.yaml"
+GRIDS = ((2, 2), (3, 2), (4, 3), (6, 4))
+NOISE = (1.0, 10.0, 100.0)  # times that of the example's sensors
+CONTACTS = 30
+APART = 0.05  # m
+
+
+def measure(rig: Rig, truth: Rig, *, grid: tuple[int, int], noise: float) -> Calibration:
+    sensor = replace(SENSOR, noise_density=noise * SENSOR.noise_density)
+    sensors = scanning_grid(rig.plate, *grid, like=sensor)
+    return calibrate(rig, record_responses(truth, sensors, FREQUENCIES, seed=1))
+
+
+def errors(found: Calibration, truth: Rig) -> dict[str, float]:
+    """The largest relative error of each kind of value that was identified."""
+    true = {"modulus": truth.plate.material.E, "loss_factor": truth.plate.loss_factor}
+    worst: dict[str, float] = {}
+    for one in found.parameters:
+        kind, era = one.parameter.kind, one.parameter.era
+        exact = getattr(truth.era(era), kind) if era else true[kind]
+        if one.is_identified:
+            worst[kind] = max(worst.get(kind, 0.0), abs(one.value / exact - 1))
+    return worst
+
+
+def reached(
+    truth: LocalizationTable, asked: LocalizationTable, places: np.ndarray, *, mode: str
+) -> float:
+    """Contrast [dB] on the true plate of the pattern that a table gives."""
+    target, *quiet = [(float(x), float(y)) for x, y in places]
+    excitation = asked.answer(target, quiet=quiet, level_db_sl=12.0, mode=mode).excitation
+
+    def peak(place: tuple[float, float]) -> np.ndarray:
+        points = fingertip_points(*place, truth.plate)
+        return truth.amplitudes(excitation, points)[1].sum(axis=0)
+
+    return float(20 * np.log10(peak(target).mean() / max(peak(place).max() for place in quiet)))
+
+
+def contacts(rng: np.random.Generator, count: int, rig: Rig) -> np.ndarray:
+    """Places [m] at least 5 cm apart, (count, 2)."""
+    while True:
+        places = rng.uniform(0.02, [rig.plate.length - 0.02, rig.plate.width - 0.02], (count, 2))
+        gaps = np.linalg.norm(places[:, None] - places[None], axis=-1)
+        if gaps[np.triu_indices(count, 1)].min() > APART:
+            return places
+
+
+def show_contrast(rig: Rig, truth: Rig, found: Calibration) -> None:
+    tables = [build_table(each) for each in (truth, found.rig, rig)]
+    print(f"contrast on the true plate, dB, median of {CONTACTS} random contact sets")
+    print("     mode quiet  true rig  calibrated  before  most lost")
+    for mode in ("switched", "signed", "phased"):
+        for quiet in (1, 2):
+            rng = np.random.default_rng(1)
+            sets = [contacts(rng, 1 + quiet, rig) for _ in range(CONTACTS)]
+            rows = [[reached(tables[0], each, s, mode=mode) for each in tables] for s in sets]
+            best, regained, before = np.array(rows).T
+            print(
+                f"{mode:>9} {quiet:5d} {np.median(best):9.1f} {np.median(regained):11.1f} "
+                f"{np.median(before):7.1f} {(best - regained).max():10.2f}"
+            )
+
+
+def main() -> None:
+    rig = load_rig(RIG)
+    truth = true_rig(rig)
+    print("largest error of the fitted values, %, by sensors and noise; held: not identified")
+    kinds = ("modulus", "loss_factor", "stiffness", "damping", "bolt_mass")
+    print(f"{'sensors':>8} {'noise':>6} " + " ".join(f"{kind:>12}" for kind in kinds) + "  held  s")
+    for grid in GRIDS:
+        for noise in NOISE:
+            started = time.perf_counter()
+            found = measure(rig, truth, grid=grid, noise=noise)
+            worst = errors(found, truth)
+            held = sum(not one.is_identified for one in found.parameters)
+            cells = [f"{100 * worst[kind]:12.2f}" if kind in worst else 12 * " " for kind in kinds]
+            elapsed = time.perf_counter() - started
+            count = grid[0] * grid[1]
+            print(f"{count:8d} {noise:6g} {' '.join(cells)} {held:5d} {elapsed:4.1f}", flush=True)
+    print()
+    show_contrast(rig, truth, measure(rig, truth, grid=(4, 3), noise=1.0))
+
+
+if __name__ == "__main__":
+    main()

@@ -142,7 +142,7 @@ async def test_each_token_is_applied_once_under_loss(far: FarSide) -> None:
     async with Link(far, reply_timeout=0.02) as link:
         await link.amplifier.arm(2.0)
         far.station.befall(Episode("drop", share=0.2))
-        for number in range(60):
+        for number in range(40):
             safe = link.tone(0.1 + 0.01 * (number % 10))
             try:
                 achieved = await link.amplifier.apply(safe)
@@ -157,8 +157,8 @@ async def test_each_token_is_applied_once_under_loss(far: FarSide) -> None:
             confirmed.append(achieved.token)
         lost = link.amplifier.statistics.timeouts
         far.station.recover()
-    assert lost >= 5
-    assert len(confirmed) >= 20
+    assert lost >= 3
+    assert len(confirmed) >= 15
     assert len(played) == len(set(played))
     assert set(confirmed) <= set(played)
     assert played == sorted(played)
@@ -172,7 +172,7 @@ async def test_nothing_is_credited_to_another_request(far: FarSide, kind: FaultK
         await link.amplifier.arm(2.0)
         far.station.befall(Episode(kind, share=0.3, delay=0.05))
         right = 0
-        for _ in range(25):
+        for _ in range(15):
             safe = link.tone(0.3)
             try:
                 achieved = await link.amplifier.apply(safe)
@@ -185,7 +185,7 @@ async def test_nothing_is_credited_to_another_request(far: FarSide, kind: FaultK
             assert achieved.token == safe.token
             right += 1
         await link.again()
-        assert right >= 5
+        assert right >= 3
         assert (await link.amplifier.stop()).state is State.QUICK_STOP_ACTIVE
 
 

@@ -8,6 +8,7 @@ is there, what it can play, faults, envelopes) is read and written as objects: `
 """
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 from drivers.command import CommandSet, DriveCommand
 from drivers.guard import SafeCommand
@@ -55,8 +56,16 @@ def encode_order(
 ) -> tuple[CanFrame, ...]:
     """The frames of an order to a node; TypeError for a set that has not passed a guard.
 
-    sequence: 1..255.
+    sequence: 1..255. fd: as CAN FD, which is answered in one frame of the same kind.
     """
+    frames = _frames(order, node, sequence, fd=fd)
+    order_id = cob_id("order", node)
+    return tuple(
+        replace(frame, fd=True) if fd and frame.id == order_id else frame for frame in frames
+    )
+
+
+def _frames(order: Order, node: int, sequence: int, *, fd: bool) -> tuple[CanFrame, ...]:
     match order:
         case Ping():
             beat = CanFrame(cob_id("heartbeat", host_number(node)), bytes([_OPERATIONAL]))

@@ -1,0 +1,185 @@
+"""A session between a host and one amplifier, frame by frame, as docs/wire-can.md shows it.
+
+The host's frames are those of its encoder, or written here by hand where a library of others makes
+them; the amplifier's are those of the far end, which knows nothing of the encoder.
+"""
+
+import asyncio
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import cast
+
+from can_fuzz import Station
+from drivers.command import CommandSet, DriveCommand, Envelope, Knot
+from drivers.guard import Guard, GuardLimits, SafeCommand
+from drivers.protocol.can_frame import CanFrame
+from drivers.protocol.canopen_map import Order, encode_broadcast, encode_order
+from drivers.protocol.canopen_objects import encode_envelope
+from drivers.protocol.messages import (
+    Apply,
+    Arm,
+    Clear,
+    Commit,
+    Disarm,
+    GetStatus,
+    Ping,
+    Stage,
+    Stop,
+)
+from sim.can_node import CanNode
+
+NODE = 1
+
+
+@dataclass(frozen=True)
+class Step:
+    """What is done, and the frames that go over the bus, those of the host marked."""
+
+    title: str
+    frames: tuple[tuple[bool, CanFrame], ...]
+
+    def lines(self) -> Iterator[str]:
+        """As on the page: identifier and data in hexadecimal; `>` from the host, `<` to it."""
+        for is_host, frame in self.frames:
+            mark = ">" if is_host else "<"
+            fd = " FD" if frame.fd else ""
+            yield f"{mark} {frame.id:03X}{fd} {frame.data.hex(' ').upper()}".rstrip()
+
+
+class Timers:
+    """The heartbeat's timer, which goes off when it is told to."""
+
+    def __init__(self) -> None:
+        self._due: list[object] = []
+
+    def call_later(self, delay: float, callback: object) -> asyncio.TimerHandle:
+        """Note who wants to be called."""
+        if delay > 0.02:
+            self._due = [callback]
+        return cast(asyncio.TimerHandle, self)
+
+    def cancel(self) -> None:
+        """As a timer."""
+
+    def ring(self) -> None:
+        """Call them."""
+        (callback,) = self._due
+        assert callable(callback)
+        callback()
+
+
+class Session:
+    """Plays it; `station` and `node` are there for a test to look into."""
+
+    def __init__(self) -> None:
+        self.station = Station()
+        self.station.amplifier.identity = replace(
+            self.station.amplifier.identity,
+            vendor="Acme",
+            product="Quad 1800 V",
+            serial_number="A-17",
+            firmware="1.2",
+        )
+        self._said: list[CanFrame] = []
+        self.timers = Timers()
+        self.node = CanNode(self.station, NODE, send=self._said.append)  # type: ignore[arg-type]
+        self.guard = Guard(GuardLimits(20.0, 600.0, 1.0), self.station.capabilities)
+
+    def steps(self) -> Iterator[Step]:
+        """All of them, in order."""
+        self.node.start(self.timers.call_later)
+        yield self._heard("The supply comes: boot-up")
+        self.timers.ring()
+        yield self._heard("Heartbeat, pre-operational")
+        yield self._asked("Read the serial number, 1018sub4", _read(0x1018, 4))
+        yield self._asked(
+            "Read the product's name, 2000sub2",
+            *(_read(0x2000, 2), _next_segment(0), _next_segment(1)),
+        )
+        yield self._asked("Read the protocol version, 2001sub1", _read(0x2001, 1))
+        yield self._asked("Read the number of channels, 2001sub2", _read(0x2001, 2))
+        yield self._asked("Read the highest frequency, 2001sub4", _read(0x2001, 4))
+        yield self._asked("NMT: start", CanFrame(0x000, bytes([1, NODE])))
+        self.timers.ring()
+        yield self._heard("Heartbeat, operational")
+        yield self._ordered("Arm, watchdog 250 ms", Arm(0.25), 1)
+        safe = self.guard.check(CommandSet(513, _COMMANDS, ramp=0.02, valid_for=0.5))
+        yield self._ordered("Apply token 513", Apply(safe), 2)
+        yield self._ordered("The same again, for its answer was lost", Apply(safe), 3)
+        self.station.pass_time(0.05)
+        yield self._ordered("Ping: the host's heartbeat, and how are you?", Ping(), 4)
+        staged = self.guard.check(CommandSet(514, _COMMANDS[:1], ramp=0.0, valid_for=0.0))
+        yield self._ordered("Stage token 514", Stage(staged), 5)
+        yield self._ordered("Commit token 514", Commit(514), 6)
+        other = self.guard.check(CommandSet(515, _COMMANDS, ramp=0.0, valid_for=0.0))
+        yield self._ordered("Stage token 515", Stage(other), 7)
+        yield self._asked(
+            "Commit token 515, to every amplifier of the bus", *encode_broadcast(Commit(515))
+        )
+        torn = encode_order(
+            Apply(self.guard.check(CommandSet(516, _COMMANDS, ramp=0.0, valid_for=0.0))),
+            node=NODE,
+            sequence=8,
+        )
+        yield self._asked("Apply token 516, but the frame of channel 3 is lost", torn[0], *torn[2:])
+        shape = self.guard.check_envelope(Envelope(5, 0.005, (Knot(0.1, 90.0), Knot(1.0, -0.01))))
+        assert encode_envelope(shape) == b"".join(frame.data[1:] for frame in _ENVELOPE[1:])[:11]
+        yield self._asked("Load an envelope into slot 5, 2100sub5", *_ENVELOPE)
+        shaped = self.guard.check(CommandSet(517, _SHAPED, ramp=0.0, valid_for=0.0))
+        yield self._ordered("Apply token 517 with this onset", Apply(shaped), 9)
+        yield self._ordered("Apply token 518, as CAN FD", Apply(self._next(518)), 10, fd=True)
+        yield self._ordered("Status, as CAN FD", GetStatus(), 11, fd=True)
+        self.station.pass_time(0.3)
+        yield self._heard("Nobody is heard for 250 ms: an emergency, and one more once silent")
+        yield self._ordered("Arm, but it has to be cleared first", Arm(0.25), 12)
+        yield self._ordered("Clear", Clear(), 13)
+        yield self._ordered("Stop, ramp 5 ms", Stop(0.005), 14)
+        self.station.pass_time(0.01)
+        yield self._ordered("Clear", Clear(), 15)
+        yield self._ordered("Disarm, ramp 50 ms", Disarm(0.05), 16)
+        yield self._asked("NMT: reset node", CanFrame(0x000, bytes([129, NODE])))
+
+    def _next(self, token: int) -> SafeCommand:
+        return self.guard.check(CommandSet(token, _COMMANDS, ramp=0.0, valid_for=0.0))
+
+    def _ordered(self, title: str, order: Order, sequence: int, *, fd: bool = False) -> Step:
+        frames = encode_order(order, node=NODE, sequence=sequence, fd=fd)
+        return self._asked(title, *frames)
+
+    def _asked(self, title: str, *frames: CanFrame) -> Step:
+        exchanged: list[tuple[bool, CanFrame]] = []
+        for frame in frames:
+            self._said.clear()
+            self.node.receive(frame)
+            exchanged += [(True, frame), *((False, said) for said in self._said)]
+        self._said.clear()
+        return Step(title, tuple(exchanged))
+
+    def _heard(self, title: str) -> Step:
+        said = tuple((False, frame) for frame in self._said)
+        self._said.clear()
+        return Step(title, said)
+
+
+def session() -> Sequence[Step]:
+    """All steps."""
+    return tuple(Session().steps())
+
+
+def _read(index: int, subindex: int) -> CanFrame:
+    return CanFrame(0x600 + NODE, bytes([0x40, index & 0xFF, index >> 8, subindex, 0, 0, 0, 0]))
+
+
+def _next_segment(toggle: int) -> CanFrame:
+    return CanFrame(0x600 + NODE, bytes([0x60 | toggle << 4, *bytes(7)]))
+
+
+_COMMANDS = (
+    DriveCommand(channel=0, frequency=110.0, level=0.2, phase=0.0),
+    DriveCommand(channel=3, frequency=250.5, level=1.0, phase=-90.0, keep_phase=True),
+)
+_SHAPED = (DriveCommand(0, 110.0, 0.2, onset=5),)
+_ENVELOPE = [
+    CanFrame(0x600 + NODE, bytes.fromhex(text))
+    for text in ("21 00 21 05 0B 00 00 00", "00 32 00 02 E8 03 28 23", "17 10 27 FF FF 00 00 00")
+]

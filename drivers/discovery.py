@@ -19,6 +19,7 @@ from drivers.registry import known_schemes, open_backend
 _NETWORK = Path("/sys/class/net")
 _CAN_TYPE = "280"  # ARPHRD_CAN of Linux
 _SPEEDS = (PROTOCOL.serial.baud, 115_200)
+_MODBUS = PROTOCOL.modbus
 
 
 @dataclass(frozen=True)
@@ -65,6 +66,7 @@ def _serial_ports() -> Iterator[Candidate]:
     for port in sorted(comports()):
         path = port.device
         urls = tuple(f"serial://{_absolute(path)}?baud={speed}" for speed in _SPEEDS)
+        urls += (f"modbus+rtu://{_absolute(path)}?baud={_MODBUS['baud']}#{_MODBUS['unit']}",)
         yield Candidate(path, port.description, urls, remedy=_why_not_usable(path))
 
 

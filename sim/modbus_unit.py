@@ -4,15 +4,12 @@ Written apart from the host's side, from protocol.yaml alone, so that the two ch
 is refused is not applied and does not feed the watchdog; what is damaged is not answered.
 """
 
-import struct
 from collections.abc import Mapping, Sequence
 from typing import Protocol, TypeVar
 
-from drivers.command import CommandSet, Envelope, Knot
 from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.messages import (
     Achieved,
-    Apply,
     Arm,
     Broadcast,
     Capabilities,
@@ -26,15 +23,29 @@ from drivers.protocol.messages import (
     Hello,
     Identity,
     Loaded,
-    LoadEnvelope,
     Nak,
     NakCode,
     Ping,
     Reply,
     Request,
-    Stage,
     Status,
     Stop,
+)
+from sim.modbus_pdu import (
+    IDENTIFY,
+    ILLEGAL_ADDRESS,
+    ILLEGAL_FUNCTION,
+    ILLEGAL_VALUE,
+    READ_HOLDING,
+    READ_INPUT,
+    READ_WRITE,
+    WRITE,
+    WRITE_ONE,
+    ModbusException,
+    check_range,
+    pair,
+    registers_read,
+    to_write,
 )
 from sim.modbus_words import (
     MAP,
@@ -43,9 +54,10 @@ from sim.modbus_words import (
     achieved_words,
     capability_words,
     checksum,
-    commands_of,
+    envelope_load,
     fault_words,
     identity_words,
+    playing,
     status_words,
     text_bytes,
     value_of,
@@ -54,9 +66,6 @@ from sim.modbus_words import (
 _T = TypeVar("_T")
 
 _Q = PROTOCOL.quantities
-_READ_HOLDING, _READ_INPUT, _WRITE_ONE, _WRITE, _READ_WRITE, _IDENTIFY = 3, 4, 6, 16, 23, 43
-_ILLEGAL_FUNCTION, _ILLEGAL_ADDRESS, _ILLEGAL_VALUE = 1, 2, 3
-_READ_MAX, _WRITE_MAX, _WRITE_BESIDE_READ_MAX = 125, 123, 121
 _HEAD = 2
 _GROUP: int = MAP["channel_registers"]
 _CONTROL: int = MAP["holding"]["control"]["address"]
@@ -100,14 +109,6 @@ class Amplifier(Protocol):
         """Carry out what was said to all."""
 
 
-class _Exception(Exception):
-    """A Modbus exception."""
-
-    def __init__(self, code: int) -> None:
-        super().__init__(code)
-        self.code = code
-
-
 class _Still(Exception):
     """No answer at all."""
 
@@ -130,7 +131,7 @@ class ModbusUnit:
             return None
         try:
             return self._carry_out(pdu[0], pdu[1:])
-        except _Exception as exception:
+        except ModbusException as exception:
             return bytes([pdu[0] | 0x80, exception.code])
         except _Still:
             return None
@@ -138,31 +139,31 @@ class ModbusUnit:
     def hear(self, pdu: bytes) -> None:
         """Carry out a broadcast: a commit or a stop, and nothing else."""
         try:
-            if pdu[0] not in (_WRITE_ONE, _WRITE):
+            if pdu[0] not in (WRITE_ONE, WRITE):
                 return
-            address, words = _to_write(pdu[0], pdu[1:])
+            address, words = to_write(pdu[0], pdu[1:])
             request = self._request(address, self._without_head(address, words))
-        except (_Exception, _Still, Unfit):
+        except (ModbusException, _Still, Unfit):
             return
         if isinstance(request, Commit | Stop):
             self._amplifier.broadcast(request)
 
     def _carry_out(self, function: int, body: bytes) -> bytes:
-        if function in (_READ_HOLDING, _READ_INPUT):
-            return _registers(function, self._read(*_pair(body)))
-        if function in (_WRITE_ONE, _WRITE):
-            self._write(*_to_write(function, body))
+        if function in (READ_HOLDING, READ_INPUT):
+            return registers_read(function, self._read(*pair(body)))
+        if function in (WRITE_ONE, WRITE):
+            self._write(*to_write(function, body))
             return bytes([function]) + body[:4]
-        if function == _READ_WRITE:
+        if function == READ_WRITE:
             if len(body) < 4:
-                raise _Exception(_ILLEGAL_VALUE)
-            wanted = _pair(body[:4])
-            _check_range(*wanted)
-            self._write(*_to_write(_READ_WRITE, body[4:]))
-            return _registers(function, self._read(*wanted))
-        if function == _IDENTIFY and body[:1] == b"\x0e":
+                raise ModbusException(ILLEGAL_VALUE)
+            wanted = pair(body[:4])
+            check_range(*wanted, end=_END)
+            self._write(*to_write(READ_WRITE, body[4:]))
+            return registers_read(function, self._read(*wanted))
+        if function == IDENTIFY and body[:1] == b"\x0e":
             return self._identify(body)
-        raise _Exception(_ILLEGAL_FUNCTION)
+        raise ModbusException(ILLEGAL_FUNCTION)
 
     def _ask(self, request: Request) -> Reply:
         reply = self._amplifier.exchange(request)
@@ -177,12 +178,12 @@ class ModbusUnit:
         try:
             return self._ask(request)
         except Unfit as unfit:
-            raise _Exception(MAP["exceptions"][unfit.code.name]) from None
+            raise ModbusException(MAP["exceptions"][unfit.code.name]) from None
 
     # Reading
 
     def _read(self, address: int, count: int) -> list[int]:
-        _check_range(address, count)
+        check_range(address, count, end=_END)
         words = [self._written.get(at, 0) for at in range(address, address + count)]
         for name, block in MAP["input"].items():
             begin = block["address"]
@@ -225,7 +226,7 @@ class ModbusUnit:
         except Unfit as unfit:
             channel = NO_CHANNEL if unfit.channel is None else unfit.channel & 0xFFFF
             self._refusal = [int(unfit.code), channel, tag]
-            raise _Exception(MAP["exceptions"][unfit.code.name]) from None
+            raise ModbusException(MAP["exceptions"][unfit.code.name]) from None
         if isinstance(reply, Achieved):
             self._achieved = reply
         self._written.update(enumerate(words, start=address))
@@ -247,7 +248,7 @@ class ModbusUnit:
         """What these words ask for, a block's without its head; None for nothing."""
         if address in (MAP["heartbeat"], MAP["look"]):
             if len(words) > 1:
-                raise _Exception(_ILLEGAL_ADDRESS)
+                raise ModbusException(ILLEGAL_ADDRESS)
             return Ping() if address == MAP["heartbeat"] else None
         if address in _ENDS:
             address += _HEAD
@@ -255,12 +256,12 @@ class ModbusUnit:
             if begin + _HEAD <= address and address + len(words) <= end:
                 break
         else:
-            raise _Exception(_ILLEGAL_ADDRESS)
+            raise ModbusException(ILLEGAL_ADDRESS)
         if begin == _CONTROL:
             return self._order(address, words)
         if address != begin + _HEAD:  # a part of it would be a torn one
-            raise _Exception(_ILLEGAL_ADDRESS)
-        return _playing(words) if begin == _SET else _envelope(words)
+            raise ModbusException(ILLEGAL_ADDRESS)
+        return playing(words) if begin == _SET else envelope_load(words)
 
     def _order(self, address: int, words: Sequence[int]) -> Request | None:
         control = {**self._written, **dict(enumerate(words, start=address))}
@@ -284,7 +285,7 @@ class ModbusUnit:
 
     def _identify(self, body: bytes) -> bytes:
         if len(body) != 3 or not 1 <= body[1] <= 4:
-            raise _Exception(_ILLEGAL_VALUE)
+            raise ModbusException(ILLEGAL_VALUE)
         _, code, first = body
         who = _of(Identity, self._asked(Hello()))
         objects = {
@@ -293,72 +294,17 @@ class ModbusUnit:
             if code >= 3 or number < _EXTENDED
         }
         if code == 4 and first not in objects:
-            raise _Exception(_ILLEGAL_ADDRESS)
+            raise ModbusException(ILLEGAL_ADDRESS)
         if code == 4:
             told = {first: objects[first]}
         else:
             begin = first if first in objects else 0
             told = {number: text for number, text in objects.items() if number >= begin}
         listed = b"".join(bytes([number, len(text)]) + text for number, text in told.items())
-        return bytes([_IDENTIFY, 0x0E, code, _CONFORMITY, 0, 0, len(told)]) + listed
+        return bytes([IDENTIFY, 0x0E, code, _CONFORMITY, 0, 0, len(told)]) + listed
 
 
 def _of(kind: type[_T], reply: Reply) -> _T:
     if not isinstance(reply, kind):
         raise TypeError(f"a {kind.__name__} was asked for, not a {type(reply).__name__}")
     return reply
-
-
-def _pair(body: bytes) -> tuple[int, int]:
-    if len(body) != 4:
-        raise _Exception(_ILLEGAL_VALUE)
-    first, second = struct.unpack(">HH", body)
-    return first, second
-
-
-def _check_range(address: int, count: int) -> None:
-    if not 1 <= count <= _READ_MAX:
-        raise _Exception(_ILLEGAL_VALUE)
-    if address + count > _END:
-        raise _Exception(_ILLEGAL_ADDRESS)
-
-
-def _to_write(function: int, body: bytes) -> tuple[int, Sequence[int]]:
-    """From where on which words are written."""
-    if function == _WRITE_ONE:
-        address, word = _pair(body)
-        return address, [word]
-    most = _WRITE_MAX if function == _WRITE else _WRITE_BESIDE_READ_MAX
-    if len(body) < 5:
-        raise _Exception(_ILLEGAL_VALUE)
-    address, count, size = struct.unpack_from(">HHB", body)
-    if not (1 <= count <= most and size == 2 * count == len(body) - 5):
-        raise _Exception(_ILLEGAL_VALUE)
-    return address, struct.unpack(f">{count}H", body[5:])
-
-
-def _registers(function: int, words: Sequence[int]) -> bytes:
-    return struct.pack(f">BB{len(words)}H", function, 2 * len(words), *words)
-
-
-def _playing(words: Sequence[int]) -> Request:
-    commit, *rest = words
-    if not rest:
-        return Commit(token=int(value_of(_Q.token, commit)))
-    if len(rest) < 3 or (len(rest) - 3) % _GROUP:
-        raise Unfit(NakCode.BAD_LENGTH)
-    token = int(value_of(_Q.token, rest[0]))
-    ramp, valid_for = value_of(_Q.ramp, rest[1]), value_of(_Q.valid_for, rest[2])
-    wanted = CommandSet(token, commands_of(rest[3:]), ramp=ramp, valid_for=valid_for)
-    if commit not in (0, token):
-        raise Unfit(NakCode.BAD_TOKEN)
-    return Apply(wanted) if commit else Stage(wanted)
-
-
-def _envelope(words: Sequence[int]) -> Request:
-    if len(words) < 3 or len(words) != 3 + 2 * words[2]:
-        raise Unfit(NakCode.BAD_LENGTH)
-    pairs = zip(words[3::2], words[4::2], strict=True)
-    knots = tuple(Knot(value_of(_Q.level, a), value_of(_Q.phase, b)) for a, b in pairs)
-    slot = int(value_of(_Q.envelope_slot, words[0]))
-    return LoadEnvelope(Envelope(slot, value_of(_Q.envelope_step, words[1]), knots))

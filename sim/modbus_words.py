@@ -7,14 +7,18 @@ import struct
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from drivers.command import DriveCommand
+from drivers.command import CommandSet, DriveCommand, Envelope, Knot
 from drivers.protocol.definition import PROTOCOL, Quantity
 from drivers.protocol.messages import (
     Achieved,
+    Apply,
     Capabilities,
+    Commit,
     FaultList,
     Identity,
+    LoadEnvelope,
     NakCode,
+    Stage,
     Status,
 )
 
@@ -184,3 +188,28 @@ def fault_words(faults: FaultList) -> list[int]:
         age = min(round(record.age * _Q.age.per_unit), _Q.age.maximum)
         words += [int(record.fault), channel, age // 0x10000, age % 0x10000]
     return words
+
+
+def playing(words: Sequence[int]) -> Stage | Apply | Commit:
+    """What the words of the set block ask for; raises Unfit."""
+    commit, *rest = words
+    if not rest:
+        return Commit(token=int(value_of(_Q.token, commit)))
+    if len(rest) < 3 or (len(rest) - 3) % _GROUP:
+        raise Unfit(NakCode.BAD_LENGTH)
+    token = int(value_of(_Q.token, rest[0]))
+    ramp, valid_for = value_of(_Q.ramp, rest[1]), value_of(_Q.valid_for, rest[2])
+    wanted = CommandSet(token, commands_of(rest[3:]), ramp=ramp, valid_for=valid_for)
+    if commit not in (0, token):
+        raise Unfit(NakCode.BAD_TOKEN)
+    return Apply(wanted) if commit else Stage(wanted)
+
+
+def envelope_load(words: Sequence[int]) -> LoadEnvelope:
+    """What the words of the envelope block ask for; raises Unfit."""
+    if len(words) < 3 or len(words) != 3 + 2 * words[2]:
+        raise Unfit(NakCode.BAD_LENGTH)
+    pairs = zip(words[3::2], words[4::2], strict=True)
+    knots = tuple(Knot(value_of(_Q.level, a), value_of(_Q.phase, b)) for a, b in pairs)
+    slot = int(value_of(_Q.envelope_slot, words[0]))
+    return LoadEnvelope(Envelope(slot, value_of(_Q.envelope_step, words[1]), knots))

@@ -47,6 +47,7 @@ from drivers.protocol.modbus_timing import round_trip_time, silence
 from drivers.watchdog import check_watchdog
 from modbus_peer import Peer, peer
 from modbus_session import ARMED, CAPABILITIES, COMMANDS, IDENTITY, SET, SHAPE, TRIPPED
+from sim.pseudo_terminal import PseudoTerminal
 
 PATIENCE = 5.0  # s; for what is expected to come
 SHORT = 0.02  # s; for what is expected not to come
@@ -352,6 +353,23 @@ async def test_nobody_there_says_so(far: Peer) -> None:
         await ModbusBackend("modbus+rtu:///dev/null#1").open()
     with pytest.raises(LinkError, match="is not open"):
         await ModbusBackend(far.url).exchange(Ping(), timeout=SHORT)
+
+
+async def test_a_serial_port_is_for_one_program() -> None:
+    """Who finds it in use is told so, and the first goes on undisturbed."""
+    terminal = PseudoTerminal(lambda _: None)
+    first = ModbusBackend(f"modbus+rtu://{terminal.port}#1")
+    await first.open()
+    with pytest.raises(LinkError, match="another program has it open"):
+        await ModbusBackend(f"modbus+rtu://{terminal.port}?baud=9600#1").open()
+    with pytest.raises(LinkTimeout):
+        await first.exchange(Ping(), timeout=SHORT)
+    await first.close()
+    again = ModbusBackend(f"modbus+rtu://{terminal.port}?baud=9600#1")
+    await again.open()
+    await again.close()
+    terminal.listen()
+    terminal.close()
 
 
 async def test_units_of_one_line_share_it(far: Peer) -> None:

@@ -1,0 +1,51 @@
+"""Request PDUs of Modbus taken apart, and the exceptions of those that cannot be."""
+
+import struct
+from collections.abc import Sequence
+
+READ_HOLDING, READ_INPUT, WRITE_ONE, WRITE, READ_WRITE, IDENTIFY = 3, 4, 6, 16, 23, 43
+ILLEGAL_FUNCTION, ILLEGAL_ADDRESS, ILLEGAL_VALUE = 1, 2, 3
+_READ_MAX, _WRITE_MAX, _WRITE_BESIDE_READ_MAX = 125, 123, 121
+
+
+class ModbusException(Exception):
+    """A Modbus exception, by its code."""
+
+    def __init__(self, code: int) -> None:
+        super().__init__(code)
+        self.code = code
+
+
+def pair(body: bytes) -> tuple[int, int]:
+    """Two words: an address and a count, or a value."""
+    if len(body) != 4:
+        raise ModbusException(ILLEGAL_VALUE)
+    first, second = struct.unpack(">HH", body)
+    return first, second
+
+
+def check_range(address: int, count: int, *, end: int) -> None:
+    """Whether so many registers from here on can be read, up to an end; raises ModbusException."""
+    if not 1 <= count <= _READ_MAX:
+        raise ModbusException(ILLEGAL_VALUE)
+    if address + count > end:
+        raise ModbusException(ILLEGAL_ADDRESS)
+
+
+def to_write(function: int, body: bytes) -> tuple[int, Sequence[int]]:
+    """From where on which words are written."""
+    if function == WRITE_ONE:
+        address, word = pair(body)
+        return address, [word]
+    most = _WRITE_MAX if function == WRITE else _WRITE_BESIDE_READ_MAX
+    if len(body) < 5:
+        raise ModbusException(ILLEGAL_VALUE)
+    address, count, size = struct.unpack_from(">HHB", body)
+    if not (1 <= count <= most and size == 2 * count == len(body) - 5):
+        raise ModbusException(ILLEGAL_VALUE)
+    return address, struct.unpack(f">{count}H", body[5:])
+
+
+def registers_read(function: int, words: Sequence[int]) -> bytes:
+    """The answer of a function that reads."""
+    return struct.pack(f">BB{len(words)}H", function, 2 * len(words), *words)

@@ -35,7 +35,10 @@ def parse_pair(text: str, *, what: str) -> tuple[int, int]:
 
 
 def parse_frequencies(text: str) -> FloatArray:
-    """Frequencies [Hz] from `LO:HI:STEP`, both ends included, or from a list `60,110,250`."""
+    """Frequencies [Hz] from `LO:HI:STEP`, both ends included, or from a list `60,110,250`.
+
+    Raises InputError for what is neither, and for one that is given twice.
+    """
     try:
         if ":" in text:
             low, high, step = (float(part) for part in text.split(":"))
@@ -49,4 +52,10 @@ def parse_frequencies(text: str) -> FloatArray:
             f"--frequencies {text!r} is not LO:HI:STEP in Hz with LO above zero, for instance "
             f"60:320:10, at most {MOST_FREQUENCIES} of them"
         ) from None
+    distinct, counts = np.unique(values, return_counts=True)
+    if len(distinct) < len(values):
+        raise InputError(
+            f"--frequencies {text[:40]!r} has {distinct[counts.argmax()]:g} Hz more than once; "
+            "each would count anew, so give it once"
+        )
     return values

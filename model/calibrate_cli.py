@@ -86,7 +86,8 @@ def calibrate(
     if not calibration.is_good:
         typer.echo(
             "The rig does not fit what was measured, and no new rig is written. Is it another "
-            "plate, are places or ERAs swapped, is a phase not that of exp(+i omega t)?",
+            "plate, are places or ERAs swapped, are phases not those of exp(+i omega t), or is "
+            "noise more than a quarter of the response?",
             err=True,
         )
         raise typer.Exit(NOT_THIS_PLATE)

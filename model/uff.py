@@ -24,6 +24,7 @@ _LARGEST = 512 << 20
 _HEADER_LINES = 13  # of dataset 58, from its opening mark on
 _SI = 1  # units code of dataset 164
 _DELIMITER = re.compile(rb"^    -1[ \t]*\r?$", re.MULTILINE)
+_AFTER_BYTES = re.compile(rb"    -1[ \t]*\r?$", re.MULTILINE)  # binary data end without a line
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,31 +91,18 @@ def read_universal(path: Path) -> Universal:
     import pyuff
 
     content = read_bytes(path)
-    marks = [match.start() for match in _DELIMITER.finditer(content)]
-    lines = [content.count(b"\n", 0, mark) + 1 for mark in marks]
-    if not marks:
-        raise InputError(
-            f"{path}: is no universal file, for no line of it holds `    -1` alone; export the "
-            "measurement as UFF, datasets 58 with 15 or 2411"
-        )
-    if len(marks) % 2:
-        raise InputError(
-            f"{path}:{lines[-1]}: the dataset that begins here has no end; the file was cut off, "
-            "export it again"
-        )
+    blocks = _blocks(path, content)
     file = pyuff.UFF(str(path))
     kinds = [int(kind) for kind in file.get_set_types()]
-    if len(kinds) != len(marks) // 2:
+    if len(kinds) != len(blocks):
         raise InputError(f"{path}: its datasets cannot be told apart; export it again as ASCII")
     nodes: dict[int, tuple[float, float, float]] = {}
     functions = []
-    for number, kind in enumerate(kinds):
-        line = lines[2 * number]
+    for number, (kind, (line, block)) in enumerate(zip(kinds, blocks, strict=True)):
         place = f"{path}:{line}"
         if kind not in (15, 58, 164, 2411):
             continue
-        block = content[marks[2 * number] : marks[2 * number + 1]]
-        if kind == 58:
+        if kind == 58 and not _is_binary(block):
             _check_numbers(path, line, block)
         try:
             found = file.read_sets(number)
@@ -146,6 +134,33 @@ def read_bytes(path: Path) -> bytes:
     if len(content) > _LARGEST:
         raise InputError(f"{path}: is larger than {_LARGEST >> 20} MiB; export fewer records")
     return content
+
+
+def _blocks(path: Path, content: bytes) -> list[tuple[int, bytes]]:
+    """Every dataset's line and content, its opening mark included and its closing one not."""
+    blocks, end = [], 0
+    while start := _DELIMITER.search(content, end):
+        line = content.count(b"\n", 0, start.start()) + 1
+        mark = _AFTER_BYTES if _is_binary(content[start.start() : start.start() + 200]) else None
+        stop = (mark or _DELIMITER).search(content, start.end())
+        if stop is None:
+            raise InputError(
+                f"{path}:{line}: the dataset that begins here has no end; the file was cut off, "
+                "export it again"
+            )
+        blocks.append((line, content[start.start() : stop.start()]))
+        end = stop.end()
+    if not blocks:
+        raise InputError(
+            f"{path}: is no universal file, for no line of it holds `    -1` alone; export the "
+            "measurement as UFF, datasets 58 with 15 or 2411"
+        )
+    return blocks
+
+
+def _is_binary(block: bytes) -> bool:
+    rows = block.split(b"\n", 2)
+    return len(rows) > 1 and rows[1][6:7].lower() == b"b"
 
 
 def _as_58(function: Function) -> dict[str, Any]:
@@ -216,8 +231,6 @@ def _check_si(place: str, found: Mapping[str, Any]) -> None:
 def _check_numbers(path: Path, line: int, block: bytes) -> None:
     """Refuse ASCII data in which a number is none, with its line."""
     rows = block.split(b"\n")
-    if len(rows) > 1 and rows[1][6:7].lower() == b"b":
-        return
     for number, row in enumerate(rows[_HEADER_LINES:], start=line + _HEADER_LINES):
         try:
             # Numbers may touch: 1.00000e+00-1.00000e+00.

@@ -88,6 +88,31 @@ def test_a_uff_of_another_program(coarse_rig: Rig, tmp_path: Path) -> None:
     assert np.isnan(back.values[:, [0, 2, 3]]).all()
 
 
+# pyuff does not close a file that it has written bytes to.
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+@pytest.mark.filterwarnings("ignore::ResourceWarning")
+@pytest.mark.parametrize("is_whole", [True, False])
+def test_a_binary_uff(
+    responses: Responses, coarse_rig: Rig, tmp_path: Path, *, is_whole: bool
+) -> None:
+    """Records as bytes (58b) are read to the last bit; one that lost some of them is refused."""
+    write_responses_uff(tmp_path / "ascii.uff", responses, coarse_rig)
+    sets = pyuff.UFF(str(tmp_path / "ascii.uff")).read_sets()
+    for each in sets[2:]:
+        each.update(binary=1, n_bytes=0)
+    path = tmp_path / "binary.uff"
+    pyuff.UFF(str(path)).write_sets(sets, "overwrite")
+    if is_whole:
+        back = responses_of(read_functions(path), coarse_rig)
+        np.testing.assert_allclose(back.values, responses.values, rtol=1e-11)
+        return
+    content = path.read_bytes()
+    cut = content.rindex(b"    -1")
+    path.write_bytes(content[: cut - 24] + b"\n" + content[cut:])
+    with pytest.raises(InputError, match=r"binary\.uff:?\d*: "):
+        read_functions(path)
+
+
 def damage(path: Path, before: str, after: str) -> None:
     """Replace the first occurrence of a text in a file."""
     text = path.read_bytes().decode()

@@ -60,8 +60,8 @@ def demo(
     table, table_file = cached_table(rig)
     if not as_json:
         print(
-            f"{rig_file.name}: {len(table.patterns)} patterns of {len(rig.eras)} ERAs on a "
-            f"{table.mesh} mesh, ready in {time.perf_counter() - started:.1f} s"
+            f"{rig_file.name}: {len(table.patterns)} patterns of {len(rig.eras)} ERAs on a mesh "
+            f"of {table.mesh}, ready in {time.perf_counter() - started:.1f} s"
         )
         print(_HEADING)
     rows = asyncio.run(

@@ -145,13 +145,17 @@ def test_wild_values_are_left_out(rig: Rig, truth: Rig) -> None:
 
 
 def test_a_dead_era_and_gaps(rig: Rig, truth: Rig) -> None:
-    """An ERA that moves nothing is named; its spring is still found by the others' responses."""
-    clean = measured(truth)
+    """An ERA that moves nothing is named; its spring is still found by the others' responses.
+
+    So is a sensor that has come off and hears next to nothing.
+    """
+    clean = measured(truth, scales={"P4": 0.05})
     values = clean.values.copy()
     values[:, 2] *= 1e-4
     values[np.random.default_rng(7).random(values.shape) < 0.3] = np.nan
     found = calibrate(rig, replace(clean, values=values))
     assert found.dead_eras == ("NE",)
+    assert found.dead_sensors == ("P4",)
     assert found.rig.era("NE").gains == ()
     np.testing.assert_allclose(
         [one.value for one in found.parameters], true_values(truth), rtol=0.02

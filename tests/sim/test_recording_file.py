@@ -101,7 +101,7 @@ def test_damaged_wav(recorded: Recording, tmp_path: Path) -> None:
     path = tmp_path / "run.wav"
     write_recording(path, recorded)
     whole = path.read_bytes()
-    for content in (whole[:-7], b"RIFFxxxx", b"\x00" * 100):
+    for content in (whole[:-7], whole[:-80], b"RIFFxxxx", b"\x00" * 100):
         path.write_bytes(content)
         with pytest.raises(InputError, match=r"run.wav: is no WAV, or damaged"):
             read_recording(path)

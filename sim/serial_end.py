@@ -6,24 +6,17 @@ is unplugged is another pseudo-terminal once it is there again: its URL names a 
 Not modelled: noise, parity, two that speak at once.
 """
 
-import asyncio
 import contextlib
-import os
-import tempfile
-import tty
 from collections.abc import Sequence
-from pathlib import Path
 
-from drivers.errors import LinkError
 from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.messages import Commit, Event, Nak, Reply, Stop
 from drivers.protocol.payload import Malformed
 from drivers.protocol.serial_codec import decode_request, encode_event, encode_reply
 from drivers.protocol.serial_frame import Frame, FrameCounters, FrameReader, encode_frame
 from sim.line import Line
+from sim.pseudo_terminal import PseudoTerminal
 from sim.station import Station
-
-_READ_MAX = 4096
 
 
 class SerialEnd:
@@ -44,23 +37,21 @@ class SerialEnd:
         self._baud = baud or PROTOCOL.serial.baud
         faults = self._first.faults
         self._inward = Line(self._arrived, toward="amplifier", faults=faults, bits_per_second=baud)
-        self._outward = Line(self._write, toward="host", faults=faults, bits_per_second=baud)
+        self._outward = Line(self._to_host, toward="host", faults=faults, bits_per_second=baud)
         self._events = 0
-        self._master = self._slave = -1
         self._reader = FrameReader()
-        self.dropped_replies = 0
-        self._folder: tempfile.TemporaryDirectory[str] | None = None
-        self._plug_in()
-        if unpluggable:
-            self._folder = tempfile.TemporaryDirectory(prefix="era-serial-")
-            self._link()
+        self._terminal = PseudoTerminal(self._inward.send, unpluggable=unpluggable)
+        self._is_unpluggable = unpluggable
 
     @property
     def port(self) -> str:
         """The path of the host's side."""
-        if self._folder is not None:
-            return str(Path(self._folder.name) / "port")
-        return os.ttyname(self._slave)
+        return self._terminal.port
+
+    @property
+    def dropped_replies(self) -> int:
+        """Replies that nobody made room for."""
+        return self._terminal.dropped
 
     @property
     def urls(self) -> dict[str, str]:
@@ -79,64 +70,30 @@ class SerialEnd:
 
     def start(self) -> None:
         """Answer from now on, in the running event loop."""
-        self._listen()
-        if self._folder is not None:
+        self._terminal.listen()
+        if self._is_unpluggable:
             self._first.on_plug(self._plug)
         if len(self._stations) == 1:
             self._first.listen(self._tell)
 
     def close(self) -> None:
         """Hang up; to be called in the event loop that it was started in."""
-        self._unplug()
-        if self._folder is not None:
-            self._folder.cleanup()
+        self._still()
+        self._terminal.close()
 
-    def _plug_in(self) -> None:
-        try:
-            self._master, self._slave = os.openpty()
-        except OSError as error:
-            raise LinkError(
-                f"the system gives no pseudo-terminal ({error.strerror}); close programs that hold "
-                "some, or raise their number"
-            ) from error
-        # The slave stays open here, so that a host may come and go without a hang-up.
-        tty.setraw(self._slave)
-        os.set_blocking(self._master, False)
-
-    def _link(self) -> None:
-        link = Path(self.port)
-        link.unlink(missing_ok=True)
-        link.symlink_to(os.ttyname(self._slave))
-
-    def _listen(self) -> None:
-        asyncio.get_running_loop().add_reader(self._master, self._readable)
-
-    def _unplug(self) -> None:
+    def _still(self) -> None:
+        """Forget what is under way on the line."""
         self._inward.close()
         self._outward.close()
-        if self._master < 0:
-            return
-        asyncio.get_running_loop().remove_reader(self._master)
-        os.close(self._master)
-        os.close(self._slave)
-        self._master = self._slave = -1
 
     def _plug(self, is_plugged: bool) -> None:
         """The line has come, or gone."""
-        if not is_plugged:
-            self._unplug()
-            Path(self.port).unlink(missing_ok=True)
-        elif self._master < 0:
-            self._plug_in()
-            self._link()
-            self._listen()
-
-    def _readable(self) -> None:
-        try:
-            data = os.read(self._master, _READ_MAX)
-        except BlockingIOError:  # another wake-up took the bytes
-            return
-        self._inward.send(data)
+        if is_plugged:
+            self._terminal.plug_in()
+            self._terminal.listen()
+        else:
+            self._still()
+            self._terminal.unplug()
 
     def _arrived(self, data: bytes) -> None:
         for frame in self._reader.feed(data):
@@ -169,12 +126,5 @@ class SerialEnd:
             frame = encode_event(event, address=PROTOCOL.serial.address, sequence=self._events)
             self._outward.send(encode_frame(frame))
 
-    def _write(self, data: bytes) -> None:
-        if self._master < 0:
-            return
-        try:
-            complete = os.write(self._master, data) == len(data)
-        except BlockingIOError:
-            complete = False
-        if not complete:  # nobody reads; an amplifier does not wait for its host
-            self.dropped_replies += 1
+    def _to_host(self, data: bytes) -> None:
+        self._terminal.write(data)

@@ -5,8 +5,8 @@ import math
 from itertools import pairwise
 
 from model.base_motion import Term, fade
+from sim.fading_tone import FadingTone
 from sim.shaped_tone import ShapedTone
-from sim.waveform import FadingTone
 
 
 def terms_of(tone: FadingTone | ShapedTone, *, stroke: float) -> tuple[Term, ...]:

@@ -6,8 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from drivers.command import CommandSet, DriveCommand, Envelope
-from sim.shaped_tone import end_along, shape_to
-from sim.waveform import Output, fade_to, level_of
+from sim.waveform import Output, end_along, fade_to, level_of, shape_to
 
 _DERATING_RAMP = 0.02  # s; no click
 

@@ -4,7 +4,7 @@ import cmath
 import math
 from dataclasses import dataclass
 
-from sim.waveform import FadingTone, Output
+from sim.fading_tone import FadingTone
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,50 +59,3 @@ class ShapedTone:
             return self
         level, phase = cmath.polar(self.amplitude(time))
         return FadingTone(self.frequency, level, phase, self.origin, time, ramp, 1.0, 0.0)
-
-
-def shape_to(
-    playing: Output,
-    time: float,
-    *,
-    ramp: float,
-    step: float,
-    knots: tuple[complex, ...],
-    frequency: float,
-    amplitude: complex,
-    keep_phase: bool,
-) -> Output:
-    """What a channel plays once it was told at time [s] to go to this tone along an envelope.
-
-    amplitude and knots in full strokes, ramp and step in s. Where the channel is about to play this
-    frequency already and keep_phase is set, the tone that does goes on from the amplitude it has;
-    else the new one begins at zero. All others fade out within ramp.
-    """
-    going_on = next(
-        (tone for tone in playing if keep_phase and tone.lasts and tone.frequency == frequency),
-        None,
-    )
-    faded = (tone.fade_out(time, ramp=ramp) for tone in playing if tone is not going_on)
-    fading = tuple(tone for tone in faded if tone.silent_from > time)
-    begin = 0j if going_on is None else going_on.amplitude(time)
-    origin = time if going_on is None else going_on.origin
-    return (*fading, ShapedTone(frequency, origin, time, step, (begin, *knots, amplitude)))
-
-
-def end_along(
-    playing: Output, time: float, *, ramp: float, step: float, knots: tuple[complex, ...]
-) -> Output:
-    """What a channel plays once it was told at time [s] to end along an envelope; as `shape_to`."""
-    lasting = next((tone for tone in playing if tone.lasts), None)
-    if lasting is None:
-        return tuple(tone for tone in playing if tone.silent_from > time)
-    return shape_to(
-        playing,
-        time,
-        ramp=ramp,
-        step=step,
-        knots=knots,
-        frequency=lasting.frequency,
-        amplitude=0j,
-        keep_phase=True,
-    )

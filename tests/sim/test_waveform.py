@@ -6,7 +6,8 @@ import pytest
 
 from model.base_motion import Term
 from sim.base_motion import terms_of
-from sim.waveform import FadingTone, Output, fade_to, level_of
+from sim.fading_tone import FadingTone
+from sim.waveform import Output, fade_to, level_of
 
 
 def moved(terms: tuple[Term, ...], t: float) -> float:

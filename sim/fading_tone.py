@@ -1,0 +1,64 @@
+"""A sinusoid that fades in or out along a raised cosine."""
+
+import cmath
+import math
+from dataclasses import dataclass, replace
+
+
+@dataclass(frozen=True, slots=True)
+class FadingTone:
+    """gain(t) level sin(2 pi frequency (t - origin) + phase) from start on.
+
+    frequency [Hz]; level: 0..1 of full stroke; phase [rad]; origin: when the phase was set [s].
+    The gain goes from gain_from at start [s] to gain_to along a raised cosine of ramp [s] and stays
+    there; a ramp of 0 is a jump.
+    """
+
+    frequency: float
+    level: float
+    phase: float
+    origin: float
+    start: float
+    ramp: float
+    gain_from: float
+    gain_to: float
+
+    @property
+    def settled(self) -> float:
+        """When the fade is over [s]."""
+        return self.start + self.ramp
+
+    @property
+    def lasts(self) -> bool:
+        """Whether it stays, once it has settled."""
+        return self.gain_to > 0
+
+    @property
+    def settled_amplitude(self) -> complex:
+        """Complex amplitude in full strokes once it has settled."""
+        return cmath.rect(self.level * self.gain_to, self.phase)
+
+    @property
+    def silent_from(self) -> float:
+        """When the tone has faded out [s]; infinity for one that stays."""
+        return self.settled if self.gain_to == 0 else math.inf
+
+    def gain(self, time: float) -> float:
+        """Gain at a time [s] not before start."""
+        if time >= self.settled:
+            return self.gain_to
+        share = (1 - math.cos(math.pi * (time - self.start) / self.ramp)) / 2
+        return self.gain_from + (self.gain_to - self.gain_from) * share
+
+    def amplitude(self, time: float) -> complex:
+        """Complex amplitude in full strokes at a time [s] not before start."""
+        return cmath.rect(self.level * self.gain(time), self.phase)
+
+    def fade_out(self, time: float, *, ramp: float) -> "FadingTone":
+        """This tone, silent within ramp [s]; a fade-out that ends sooner is left as it is.
+
+        A fade that is cut short goes on from the gain it has reached: its value is continuous.
+        """
+        if self.silent_from <= time + ramp:
+            return self
+        return replace(self, start=time, ramp=ramp, gain_from=self.gain(time), gain_to=0.0)

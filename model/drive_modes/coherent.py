@@ -27,6 +27,7 @@ Solve = Callable[[SingleComplex, SingleComplex], SingleComplex]
 
 PROMISING = 12  # frequencies at which shares are moved, at the most
 STEPS = np.array([1.0] + [0.7] * 6, dtype=np.float32)  # how far, round by round, at the most
+FEWER_STEPS, MANY_POINTS = 5, 100  # of six fingers and more, where a round takes longer
 CLOSE = 1.03  # a frequency that cannot be better than this times the best is left
 
 # Where nothing reaches the level, quieter fingers are given up for a louder target, step by step:
@@ -53,7 +54,7 @@ class Coherent:
         """The best of one frequency for all ERAs; None if it does not have this score at least."""
         found = _Best(fields, least)
         chosen, some, shares = np.arange(fields.frequency_count), fields, _even_shares(fields)
-        for step in STEPS[:1] if fields.is_alone else STEPS:
+        for step in STEPS[: _rounds(fields)]:
             weights, bound = self._weights(some, shares, sigma=ERROR_SHARE)
             likely = found.offer(chosen, weights, some)
             kept = np.flatnonzero(bound > CLOSE * found.score)
@@ -125,6 +126,13 @@ class _Best:
             self.score = float(score[best])
             self._frequency, self._weights = int(frequencies[best]), weights[best]
         return np.asarray(likely, dtype=np.float32)
+
+
+def _rounds(fields: Fields) -> int:
+    """How often the quiet points' shares are worth moving; a mean needs no moving."""
+    if fields.is_alone:
+        return 1
+    return FEWER_STEPS if fields.quiet.shape[-1] > MANY_POINTS else len(STEPS)
 
 
 def _even_shares(fields: Fields) -> Single:

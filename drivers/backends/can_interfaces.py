@@ -17,6 +17,7 @@ from typing import cast
 import can
 from can.interfaces.slcan import slcanBus
 from can.interfaces.socketcand.socketcand import SocketCanDaemonBus
+from can.interfaces.virtual import VirtualBus
 
 from drivers.backends.can_url import CanBusUrl
 from drivers.protocol.can_frame import CanFrame
@@ -60,9 +61,11 @@ def send_all(bus: can.BusABC, frames: Sequence[CanFrame]) -> None:
 
 
 def wake(bus: can.BusABC) -> None:
-    """Let a thread that waits in `recv` return soon, where the adapter can."""
+    """Let a thread that waits in `recv` return or fail soon, where the adapter can."""
     if isinstance(bus, _Socketcand | _Slcan):
         bus.wake()
+    elif isinstance(bus, VirtualBus):
+        bus.queue.put(can.Message(is_error_frame=True))  # which says nothing
 
 
 class _TextBus(can.BusABC):
@@ -123,6 +126,7 @@ class _Slcan(_TextBus, slcanBus):
     def __init__(self, url: CanBusUrl) -> None:
         self._begin()
         self._reader = SlcanReader()
+        self._is_ended = False
         slcanBus.__init__(
             self,
             url.channel,
@@ -141,7 +145,8 @@ class _Slcan(_TextBus, slcanBus):
             raise
 
     def wake(self) -> None:
-        """End a read that waits."""
+        """End a read that waits, for good."""
+        self._is_ended = True
         with contextlib.suppress(OSError, AttributeError):
             self.serialPortOrig.cancel_read()
 
@@ -159,6 +164,8 @@ class _Slcan(_TextBus, slcanBus):
     def _read_text(self, timeout: float | None) -> None:
         port = self.serialPortOrig
         self._take(self._reader.feed(port.read(max(1, port.in_waiting))))
+        if self._is_ended:
+            raise can.CanOperationError("the adapter is being closed")
 
 
 def _message(frame: CanFrame) -> can.Message:

@@ -20,7 +20,7 @@ from drivers.command import CommandSet, DriveCommand, Envelope, Knot
 from drivers.errors import CommandError, LinkError
 from drivers.guard import Guard, GuardLimits, SafeCommand
 from drivers.protocol.can_frame import CanFrame
-from drivers.protocol.messages import Event, Fault, Ping, State
+from drivers.protocol.messages import Apply, Event, Fault, Ping, State
 from model.rig import Rig
 from sim.bench import Bench
 from sim.can_bus import CanBus
@@ -44,7 +44,8 @@ class Gateway:
         self.bus = bus
         self.channel = f"test-{next(_NUMBERS)}"
         self.virtual = can.Bus(interface="virtual", channel=self.channel, ignore_config=True)
-        self.passing = True
+        self.passing = True  # to hosts
+        self.listening = True  # to them
         self._loop = asyncio.get_running_loop()
         self._listener = self.say
         bus.join(self._listener)
@@ -73,7 +74,7 @@ class Gateway:
 
     def _pass(self, frame: CanFrame) -> None:
         self.sent.append(frame)
-        if self.passing:
+        if self.listening:
             self.bus.send(frame, sender=self._listener)
 
     async def close(self) -> None:
@@ -330,6 +331,30 @@ async def test_an_amplifier_that_is_gone_is_told_unasked(virtual: Virtual, how: 
         await amplifier.close()
 
 
+async def test_a_boot_up_is_noticed_before_the_first_heartbeat(virtual: Virtual) -> None:
+    """An amplifier that starts anew right after it was identified is not the one that was."""
+    amplifier = Amplifier(CanBackend(virtual.url(options="?heartbeat=10000")), reply_timeout=0.5)
+    await amplifier.open()
+    try:
+        virtual.gateway.say(CanFrame(0x701, b"\x00"))
+        await eventually(lambda: amplifier.lost)
+    finally:
+        await amplifier.close()
+
+
+async def test_a_server_that_hangs_up_is_noticed_at_once(coarse_rig: Rig) -> None:
+    """Without a request, and long before three heartbeats of ten seconds."""
+    async with far_side(Wire(kind="socketcand"), coarse_rig) as far:
+        url = far.url.replace("#", "?heartbeat=10000#")
+        amplifier = Amplifier(CanBackend(url), reply_timeout=0.5)
+        await amplifier.open()
+        try:
+            far.station.befall(Episode("unplug"))
+            await eventually(lambda: amplifier.lost)
+        finally:
+            await amplifier.close()
+
+
 async def test_two_amplifiers_of_one_number_are_refused(virtual: Virtual) -> None:
     """A second, different answer to who is there: neither is talked to."""
     other = replace(virtual.far.amplifier.identity, serial_number="TWIN")
@@ -393,18 +418,22 @@ async def test_a_late_answer_is_nobody_s(virtual: Virtual) -> None:
     try:
         await amplifier.arm(2.0)
         before = backend.counters.foreign
-        asking = asyncio.create_task(amplifier.apply(tones(amplifier, 0.3)))
+        virtual.gateway.listening = False  # the amplifier hears nothing, so no answer is its own
+        safe = tones(amplifier, 0.3)
+        asking = asyncio.create_task(backend.exchange(Apply(safe), timeout=PATIENCE))
         await asyncio.sleep(0)
-        sequence = backend._sequence
-        for data in (
-            bytes([sequence % 255 + 1, 1 | 8, 4, 255, 99, 0, 0, 0]),
-            bytes([sequence, 2 | 8, 4, 255, 99, 0, 0, 0]),
-            bytes([sequence, 1 | 8, 4, 255, 99, 0, 0, 0]),
+        sequence, token = backend._sequence, safe.token
+        for number, action, named in (
+            (sequence % 255 + 1, 1, token),
+            (sequence, 2, token),
+            (sequence, 1, token + 1),
         ):
-            virtual.gateway.say(CanFrame(0x181, data))
-        achieved = await asking
-        assert achieved.commands[0].level == pytest.approx(0.3)
+            answer = bytes([number, action | 8, 4, 255, named, 0, 0, 0])
+            virtual.gateway.say(CanFrame(0x181, answer))
         await eventually(lambda: backend.counters.foreign == before + 3)
+        assert not asking.done()
+        virtual.gateway.say(CanFrame(0x181, bytes([sequence, 1 | 8, 4, 255, token, 0, 0, 0])))
+        assert (await asking).token == token
     finally:
         await amplifier.close()
 

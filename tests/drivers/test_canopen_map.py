@@ -172,6 +172,7 @@ def test_a_status_is_whole_when_its_answer_comes() -> None:
     assert feed(whole[0], whole[2]) == []
     stale = (0x281, bytes([3]) + CONDITION[1:])
     assert feed(whole[0], stale, whole[2]) == []
+    assert feed((0x381, LEVELS[:7] + b"\x03"), *whole[1:]) == []
 
 
 def test_over_can_fd_a_status_is_one_frame() -> None:

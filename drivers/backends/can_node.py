@@ -54,6 +54,7 @@ class NodeWatch:
         self._heard = 0.0  # the node
         self._host_heard = -math.inf  # another host of this node
         self._next_look: asyncio.TimerHandle | None = None
+        self._look_due = 0.0
 
     def join(self, wire: CanWire, objects: ObjectClient, counters: WireCounters) -> None:
         """Listen on a bus from now on, in the running event loop."""
@@ -86,7 +87,7 @@ class NodeWatch:
 
     def start(self) -> None:
         """From now on the node must be heard, and stay in operation."""
-        self._heard = time.monotonic()
+        self._heard = self._look_due = time.monotonic()
         self._was_operational = False
         if not self._is_watched:
             self._is_watched = True
@@ -152,12 +153,18 @@ class NodeWatch:
                 self._loop.call_soon_threadsafe(callback, argument)
 
     def _look(self) -> None:
-        """See whether the node was heard lately, by the reader's clock: our loop may be late."""
-        silent = time.monotonic() - self._heard
+        """See whether the node was heard lately, by the reader's clock.
+
+        Where this process itself was held up, what the node said meanwhile may not be read yet.
+        """
+        now = time.monotonic()
+        silent = now - self._heard
         limit = HEARTBEATS_BORNE * self._url.heartbeat
-        if silent < limit:
-            loop = asyncio.get_running_loop()
-            self._next_look = loop.call_later(limit - silent, self._look)
+        was_held_up = now - self._look_due > self._url.heartbeat / 2
+        if silent < limit or was_held_up:
+            pause = limit - silent if silent < limit else self._url.heartbeat
+            self._look_due = now + pause
+            self._next_look = asyncio.get_running_loop().call_later(pause, self._look)
             return
         self._on_loss(
             f"node {self._url.node} on {self._url.bus} was not heard for {silent * 1e3:.0f} ms: "

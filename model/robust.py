@@ -132,7 +132,8 @@ def _acceleration(
     answer = 1 / ((loss * (table.omega * scale) ** 2 - omega**2) * scale)
     receptance = (answer[:, None, :] * touch) @ touch.T
     pushed = np.zeros(hold.shape, dtype=complex)
-    pushed[:, : len(table.eras)] = push * ensemble.drive * base
+    gains = [complex(era.gain(np.array(frequency))) for era in table.eras]
+    pushed[:, : len(table.eras)] = push * ensemble.drive * gains * base
     system = np.eye(hold.shape[1]) + hold[:, :, None] * receptance
     force = np.linalg.solve(system, pushed[:, :, None])[:, :, 0]
     return np.asarray(-(omega**2) * ((answer * (force @ touch)) @ shapes.T))

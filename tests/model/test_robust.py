@@ -16,6 +16,7 @@ from model.robust import (
     ensemble_contrast_db,
     with_robust_contrast,
 )
+from model.table_build import build_table
 from model.vibration import base_amplitudes
 from paper_table import smooth_rig, smooth_table
 
@@ -67,6 +68,22 @@ def test_each_plate_is_what_the_direct_solver_says(mode):
     solved = [directly(smooth_rig(), pattern, member) for member in range(3)]
     np.testing.assert_allclose(found, solved, atol=0.1)
     assert np.ptp(solved) > 0.3  # the plates do differ
+
+
+def test_measured_gains_of_the_eras_count_on_each_plate():
+    """ERAs that were measured to do less, more and later: each plate is what is solved directly."""
+    rig = smooth_rig()
+    measured = ((1.0, 0.0), (0.6, 0.8), (1.3, -0.5), (0.8, 0.2))
+    eras = tuple(
+        replace(era, gains=((100.0, *gain),)) for era, gain in zip(rig.eras, measured, strict=True)
+    )
+    rig = replace(rig, eras=eras)
+    table = build_table(rig, frequencies=np.array([110.0, 250.0]))
+    question = Question((TARGET,), QUIET, mode="phased")
+    pattern = table.ask(question)
+    found = ensemble_contrast_db(table, question, pattern.excitation, MEMBERS)
+    solved = [directly(rig, pattern, member) for member in range(3)]
+    np.testing.assert_allclose(found, solved, atol=0.1)
 
 
 def test_it_is_the_tenth_percentile_of_the_same_plates_every_time():

@@ -6,6 +6,7 @@ pickled, and no array may declare more than the file holds.
 
 import hashlib
 import os
+import tokenize
 import uuid
 import zipfile
 from collections.abc import Iterator, Mapping
@@ -20,6 +21,12 @@ Arrays: TypeAlias = Mapping[str, NDArray[Any]]
 
 UNREADABLE = (OSError, ValueError, EOFError, zipfile.BadZipFile, NotImplementedError)
 """What `read_arrays` raises for a file that is not there, damaged, or not what was expected."""
+
+
+_ENCRYPTED = 0x1  # a flag of a zip member
+
+# numpy parses a header as Python text, and not all that parsing raises is turned to ValueError.
+_NO_HEADER = (SyntaxError, tokenize.TokenError, TypeError, RecursionError, MemoryError)
 
 
 @contextmanager
@@ -54,6 +61,8 @@ def read_arrays(path: Path, types: Mapping[str, str], *, max_bytes: int) -> dict
             raise ValueError(f"it holds {', '.join(sorted(members)) or 'nothing'}")
         if any(info.compress_type != zipfile.ZIP_STORED for info in members.values()):
             raise ValueError("it is compressed")
+        if any(info.flag_bits & _ENCRYPTED for info in members.values()):
+            raise ValueError("it is encrypted")
         declared = sum(info.file_size for info in members.values())
         if declared > min(path.stat().st_size, max_bytes):
             raise ValueError(f"it declares {declared} bytes")
@@ -80,7 +89,10 @@ def _check_npy_header(stream: IO[bytes], name: str, kind: str, *, member_bytes: 
     version = np.lib.format.read_magic(stream)
     if version != (1, 0):
         raise ValueError(f"{name} has .npy version {version}")
-    shape, _, dtype = np.lib.format.read_array_header_1_0(stream)
+    try:
+        shape, _, dtype = np.lib.format.read_array_header_1_0(stream)
+    except _NO_HEADER as error:
+        raise ValueError(f"{name} has a header that cannot be read") from error
     if dtype.str != kind:
         raise ValueError(f"{name} holds {dtype.str}")
     size = dtype.itemsize

@@ -260,6 +260,22 @@ def test_a_flipped_byte_is_refused(table, tmp_path, share):
         load_table(path)
 
 
+@pytest.mark.parametrize(
+    ("mark", "offset", "byte"),
+    [(b"PK\x01\x02", 8, 0x01), (b"), }", 3, ord(" "))],
+    ids=["encrypted member", "header that does not parse"],
+)
+def test_a_wrong_byte_in_the_framing_is_refused(table, tmp_path, mark, offset, byte):
+    """A flag that says encrypted, a bracket left open in an array's header."""
+    path = tmp_path / "t.npz"
+    save_table(table, path)
+    data = bytearray(path.read_bytes())
+    data[data.index(mark) + offset] = byte
+    path.write_bytes(data)
+    with pytest.raises(InputError, match="not a readable"):
+        load_table(path)
+
+
 def test_a_truncated_file_is_refused(table, tmp_path):
     """Half a table is none."""
     path = tmp_path / "t.npz"

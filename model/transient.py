@@ -49,14 +49,16 @@ class Transients:
     ) -> float:
         """Contrast [dB] of the peaks over the first 100 ms of bases that start from rest.
 
-        Mean over the points of all targets to the loudest quiet point; positions in m.
+        Mean over a target's points, at the target where it is least, to the loudest quiet point;
+        positions in m.
         """
         plate = self._plate.reduced.plate
-        at_targets = np.concatenate([fingertip_points(*each, plate) for each in targets])
-        at_quiet = np.concatenate([fingertip_points(*each, plate) for each in quiet])
-        felt = self.acceleration(bases, np.concatenate([at_targets, at_quiet]))
-        peak = np.abs(felt).max(axis=0)
-        return float(contrast_db(peak[: len(at_targets)], peak[len(at_targets) :]))
+        discs = [fingertip_points(*each, plate) for each in (*targets, *quiet)]
+        felt = self.acceleration(bases, np.concatenate(discs))
+        ends = np.cumsum([len(disc) for disc in discs])[:-1]
+        peaks = np.split(np.abs(felt).max(axis=0), ends)
+        loudest = np.concatenate(peaks[len(targets) :])
+        return min(float(contrast_db(peak, loudest)) for peak in peaks[: len(targets)])
 
     def ending_contrast_db(
         self,
@@ -68,12 +70,13 @@ class Transients:
     ) -> float:
         """Contrast [dB] of the targets while they still felt an excitation to the end of it.
 
-        Mean steady peak acceleration over the points of all targets to the loudest peak at a quiet
-        point until 100 ms after the ending, whose bases move as told from time 0 on; positions in
-        m.
+        Mean steady peak acceleration over a target's points, at the target where it is least, to
+        the loudest peak at a quiet point until 100 ms after the ending, whose bases move as told
+        from time 0 on; positions in m.
         """
         plate = self._plate.reduced.plate
-        at_targets = np.concatenate([fingertip_points(*each, plate) for each in targets])
+        discs = [fingertip_points(*each, plate) for each in targets]
+        at_targets = np.concatenate(discs)
         at_quiet = np.concatenate([fingertip_points(*each, plate) for each in quiet])
         shapes = self._plate.reduced.at(at_targets) @ self._plate.displacement
         by_frequency: dict[float, ComplexArray] = {}
@@ -86,7 +89,10 @@ class Transients:
         )
         over = max((term.end for base in ending for term in base), default=0.0)
         felt = self.acceleration(ending, at_quiet, duration=over + AFTER, after=excitation)
-        return float(contrast_db(np.asarray(steady), np.abs(felt).max(axis=0)))
+        loudest = np.abs(felt).max(axis=0)
+        ends = np.cumsum([len(disc) for disc in discs])[:-1]
+        each = np.split(np.asarray(steady), ends)
+        return min(float(contrast_db(peak, loudest)) for peak in each)
 
     def acceleration(
         self,

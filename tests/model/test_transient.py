@@ -131,6 +131,28 @@ def test_contrast_is_that_of_the_peaks(plate):
     assert len(at_target) == 0.1 * SAMPLE_RATE
 
 
+def test_of_two_targets_the_lesser_counts(plate):
+    """Contrast of an onset and of an end is that of the target which has less, as in the steady."""
+    rig, in_time = plate
+    transients = Transients(in_time)
+    excitation = {"SW": Tone(180.0, 1e-4)}
+    onset, ending = (
+        motion(excitation, rig.eras, ramp=0.02) for motion in (ramped_onset, ramped_ending)
+    )
+    targets, quiet = [(0.02, 0.02), (0.15, 0.11)], [(0.25, 0.2)]
+
+    def start(*felt):
+        return transients.contrast_db(onset, targets=felt, quiet=quiet)
+
+    def end(*felt):
+        return transients.ending_contrast_db(excitation, ending, targets=felt, quiet=quiet)
+
+    for measure in (start, end):
+        alone = [measure(target) for target in targets]
+        assert abs(alone[0] - alone[1]) > 0.3
+        assert measure(*targets) == pytest.approx(min(alone), abs=1e-9)
+
+
 def test_what_is_left_is_what_sampling_the_plate_gives(plate):
     """Root mean square over plate, 100 ms and four phases agrees with the closed form."""
     rig, in_time = plate

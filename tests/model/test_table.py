@@ -270,7 +270,7 @@ def test_a_wrong_byte_in_the_framing_is_refused(table, tmp_path, mark, offset, b
     path = tmp_path / "t.npz"
     save_table(table, path)
     data = bytearray(path.read_bytes())
-    data[data.index(mark) + offset] = byte
+    data[data.rindex(mark) + offset] = byte
     path.write_bytes(data)
     with pytest.raises(InputError, match="not a readable"):
         load_table(path)

@@ -16,6 +16,9 @@ Point: TypeAlias = tuple[float, float]
 
 MOST_CONTACTS = 10
 
+MOST_LEVEL_DB_SL = 300.0
+"""Up or down; beyond it lies nothing that vibrates, nor what single precision can square."""
+
 
 @dataclass(frozen=True)
 class Question:
@@ -48,8 +51,10 @@ class Question:
                 f"{len(self.targets) + len(self.quiet)} contacts are more than ten fingers; "
                 f"leave out all but {MOST_CONTACTS}"
             )
-        if not math.isfinite(self.level_db_sl):
+        if not abs(self.level_db_sl) <= MOST_LEVEL_DB_SL:  # not true of NaN either
             raise InputError(f"a level of {self.level_db_sl} dB SL is none; 20 is strong, 12 felt")
+        if not self.search_time >= 0:
+            raise InputError(f"a search cannot end after {self.search_time} s; give it 0 or more")
         if self.eras_at_most < 1:
             raise InputError(f"{self.eras_at_most} ERAs cannot move anything; allow at least one")
         if self.mode is not None and self.mode not in MODES:

@@ -127,6 +127,12 @@ class LocalizationTable:
     ) -> Pattern:
         count = question.eras_at_most
         found = search_exactly(fields, eras_at_most=count, time_limit=question.search_time)
+        if found.drive is None and not found.is_complete:
+            raise InputError(
+                f"no pattern of up to {count} ERAs that reaches {question.level_db_sl:g} dB SL was "
+                f"found within {question.search_time:g} s, and not all were looked at; search "
+                "longer, or ask for less"
+            )
         if found.drive is None:
             most = loudest_group(fields, eras_at_most=count)
             raise InputError(self._too_loud(question, "switched", most=most))

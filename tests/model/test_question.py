@@ -25,13 +25,16 @@ TARGET, QUIET = (0.09, 0.07), ((0.25, 0.18),)
         (lambda: Question(()), "at least one target"),
         (lambda: Question((TARGET,), ((0.2, 0.1),) * 10), "more than ten"),
         (lambda: Question((TARGET,), level_db_sl=math.nan), "dB SL is none"),
+        (lambda: Question((TARGET,), level_db_sl=4000.0), "dB SL is none"),
+        (lambda: Question((TARGET,), level_db_sl=-1e4), "dB SL is none"),
+        (lambda: Question((TARGET,), search_time=math.nan), "cannot end after nan s"),
         (lambda: Question((TARGET,), mode="loud"), "unknown drive mode 'loud'; known: switched"),
         (lambda: Question((TARGET,), eras_at_most=0), "at least one"),
         (lambda: Question(((0.2, 0.1), TARGET), ((0.095, 0.07),)), "within the quiet fingertip"),
     ],
 )
 def test_questions_that_nobody_can_answer_are_refused(question, says):
-    """No target, eleven fingers, no level, no mode, no ERA, fingers on top of each other."""
+    """No target, eleven fingers, no level, time, mode or ERA, fingers on top of each other."""
     with pytest.raises(InputError, match=says):
         question()
 
@@ -64,6 +67,18 @@ def test_four_eras_are_searched_exactly_and_what_is_loudest_is_had():
         table.ask(Question((TARGET,), QUIET, eras_at_most=4, level_db_sl=120.0))
     most = float(str(refusal.value).split(" there is ")[1].split()[0])
     assert table.ask(Question((TARGET,), QUIET, eras_at_most=4, level_db_sl=most))
+
+
+def test_a_search_that_ran_out_of_time_does_not_say_that_there_is_nothing():
+    """What only more than two ERAs reach is not called out of reach where nobody looked for it."""
+    question = Question((TARGET,), QUIET, eras_at_most=4)
+    with pytest.raises(InputError) as refusal:
+        smooth_table().ask(replace(question, level_db_sl=120.0, eras_at_most=2))
+    most = float(str(refusal.value).split(" there is ")[1].split()[0])
+    louder = replace(question, level_db_sl=most + 0.5)
+    assert smooth_table().ask(louder).level_db_sl == most + 0.5
+    with pytest.raises(InputError, match="not all were looked at"):
+        smooth_table().ask(replace(louder, search_time=0.0))
 
 
 def test_frequencies_are_those_that_the_amplifiers_play():

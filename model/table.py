@@ -27,7 +27,7 @@ from model.drive_modes.sources import (
     sums_of_sources,
 )
 from model.errors import InputError
-from model.exact_search import loudest_group, search_exactly
+from model.exact_search import loudest_found, search_exactly
 from model.excitation import Excitation
 from model.fingertip import UNIT_DISC, fingertip_points
 from model.localization import SURROUNDINGS_RADIUS, Grid, decibels
@@ -134,7 +134,7 @@ class LocalizationTable:
                 "longer, or ask for less"
             )
         if found.drive is None:
-            most = loudest_group(fields, eras_at_most=count)
+            most = loudest_found(fields, eras_at_most=count)
             raise InputError(self._too_loud(question, "switched", most=most))
         outcome = judge(fields, found.drive)
         pattern = self._pattern(question, "switched", usable, fields, found.drive, outcome)

@@ -8,7 +8,7 @@ import pytest
 from model.drive_modes.fields import SILENT, Drive, Fields, judge
 from model.drive_modes.switched import find_switched
 from model.errors import InputError
-from model.exact_search import groupings, pattern_count, search_exactly
+from model.exact_search import groupings, loudest_found, pattern_count, search_exactly
 from model.question import Question
 from paper_table import contact_sets, smooth_table
 
@@ -79,6 +79,20 @@ def test_where_nothing_is_loud_enough_there_is_no_drive():
     found = search_exactly(random_fields(0, is_alone=False, wanted=100.0), eras_at_most=E)
     assert found.drive is None
     assert found.is_complete
+
+
+def test_the_loudest_is_reached_and_nothing_is_much_louder():
+    """Of 1295 patterns of four ERAs on the plate, at one or two targets: within 1.5 dB below."""
+    some = np.arange(0, 27, 6)
+    patterns = [i for i in product([SILENT, *range(len(some))], repeat=4) if max(i) != SILENT]
+    drives = [Drive(np.array(i), (np.array(i) != SILENT).astype(np.complex64)) for i in patterns]
+    for places in contact_sets(4, fingers=3, seed=8):
+        for count in (1, 2):
+            question = Question(tuple(places[:count]), tuple(places[count:]))
+            given = smooth_table().fields(question).at(some)
+            most = max(judge(given, drive).sensation for drive in drives)
+            found = loudest_found(given, eras_at_most=4)
+            assert 10 ** (-1.5 / 20) * most <= found <= most * (1 + 1e-5)
 
 
 @pytest.mark.parametrize("is_alone", [False, True])

@@ -60,7 +60,7 @@ def run_era(arguments, environment, cwd):
     )
 
 
-@pytest.mark.parametrize("wire", ["serial", "modbus", "sim"])
+@pytest.mark.parametrize("wire", ["serial", "modbus", "can", "sim"])
 def test_every_touch_is_felt_as_predicted(wire, capture, environment, tmp_path):
     """Each touch has its row; measured contrast and level are the predicted ones within 3 dB."""
     done = run_era(

@@ -66,7 +66,7 @@ class _Header(BaseModel):
     discretisation_error: list[float]
     frequencies_hz: list[float]
     raster: dict[str, Any]
-    grid: dict[str, Any]
+    grid: dict[str, int]
 
 
 def save_table(table: LocalizationTable, path: Path) -> None:
@@ -188,6 +188,9 @@ def _assemble(header: _Header, arrays: dict[str, NDArray[Any]], path: Path) -> L
             raise InputError(f"{path}: {name} has shape {values.shape}, expected {shape}")
         if not np.isfinite(values).all():
             raise InputError(f"{path}: {name} holds values that are not numbers")
+    # Rows are found by frequency: in another order it would be the wrong ones.
+    if not (count > 0 and table.frequencies[0] > 0 and (np.diff(table.frequencies) > 0).all()):
+        raise InputError(f"{path}: the frequencies are none, not above zero, or do not ascend")
     if table.frequencies.tolist() != header.frequencies_hz:
         raise InputError(f"{path}: the header's frequencies are not those of the table")
     size = (table.raster.length, table.raster.width)

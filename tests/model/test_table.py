@@ -402,16 +402,49 @@ def test_the_header_names_every_parameter(table, tmp_path):
     assert header["code_version"].startswith("0.")
 
 
-def test_a_header_that_contradicts_the_table_is_refused(table, tmp_path):
-    """Other frequencies in the header than in the array, the checksum made for both."""
+def other_frequencies(header, arrays):
+    """In the header alone."""
+    header["frequencies_hz"][0] = 61.0
+
+
+def descending_frequencies(header, arrays):
+    """In the header and in the array."""
+    header["frequencies_hz"].reverse()
+    arrays["frequencies"] = arrays["frequencies"][::-1].copy()
+
+
+def no_frequencies(header, arrays):
+    """And nothing at them."""
+    header["frequencies_hz"], header["discretisation_error"] = [], []
+    arrays["frequencies"] = arrays["frequencies"][:0]
+    arrays["acceleration"] = arrays["acceleration"][:, :0].copy()
+    arrays["cell_sources"] = arrays["cell_sources"][:1]
+
+
+def cells_that_are_no_count(header, arrays):
+    """A count with a decimal point."""
+    header["grid"]["nx"] = 12.5
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (other_frequencies, "header's frequencies"),
+        (descending_frequencies, "do not ascend"),
+        (no_frequencies, "frequencies are none"),
+        (cells_that_are_no_count, "bad header .grid.nx"),
+    ],
+)
+def test_a_header_that_contradicts_the_table_is_refused(table, tmp_path, change, says):
+    """Frequencies that are others, out of order or none, the checksum made for all of it."""
     save_table(table, tmp_path / "t.npz")
     with np.load(tmp_path / "t.npz") as content:
         arrays = dict(content)
     header = json.loads(arrays.pop("header").tobytes())
-    header["frequencies_hz"][0] = 61.0
+    change(header, arrays)
     del header["sha256"]
     header["sha256"] = digest_of(json.dumps(header, sort_keys=True), arrays)
     encoded = np.frombuffer(json.dumps(header).encode(), dtype=np.uint8)
     np.savez(tmp_path / "t.npz", header=encoded, **arrays)
-    with pytest.raises(InputError, match="header's frequencies"):
+    with pytest.raises(InputError, match=says):
         load_table(tmp_path / "t.npz")

@@ -53,7 +53,10 @@ def all_patterns(era_count: int, frequency_count: int) -> Patterns:
         coherent = together + number * frequency_count + f_one
         first.append(np.where(same, coherent, one * frequency_count + f_one))
         second.append(np.where(same, nothing, other * frequency_count + f_other))
-    return Patterns(np.concatenate(index), np.concatenate(first), np.concatenate(second))
+    found = Patterns(np.concatenate(index), np.concatenate(first), np.concatenate(second))
+    for shared in (found.index, found.first, found.second):
+        shared.setflags(write=False)  # every table of this size has the same ones
+    return found
 
 
 def magnitudes_of_sources(acceleration: SingleComplex | ComplexArray) -> Single:

@@ -57,6 +57,12 @@ def test_the_paper_has_4482_patterns():
     assert set((patterns >= 0).sum(axis=1)) == {1, 2}
 
 
+def test_patterns_that_tables_share_cannot_be_overwritten(table):
+    """One table's user cannot change what another one answers."""
+    with pytest.raises(ValueError, match="read-only"):
+        table.patterns[0, 0] = 5
+
+
 def test_every_pattern_is_what_adding_up_its_tones_gives():
     """Row by row, the vectorised sum equals Eq. 28 written out for that pattern."""
     rng = np.random.default_rng(0)

@@ -9,6 +9,7 @@ from model.assembly import assemble
 from model.fingertip import fingertip_points
 from model.harmonic import direct_acceleration
 from model.point_load import PointLoad
+from model.point_mass import PointMass
 from model.question import Question
 from model.robust import (
     Ensemble,
@@ -51,7 +52,11 @@ def directly(rig, pattern, member):
     discs = [fingertip_points(*place, rig.plate) for place in (TARGET, *QUIET)]
     frequencies, bases = base_amplitudes(pattern.excitation, rig.eras)
     unit = direct_acceleration(
-        assemble(plate, rig.mesh), eras, frequencies, np.concatenate(discs), loads=fingers
+        assemble(plate, rig.mesh),
+        eras,
+        frequencies,
+        np.concatenate(discs),
+        loads=[*rig.loads, *fingers],
     )
     weights = bases / [era.stroke for era in rig.eras] * MEMBERS.drive[member]
     peak = np.abs(np.einsum("fe,fep->fp", weights, unit)).sum(axis=0)
@@ -70,14 +75,15 @@ def test_each_plate_is_what_the_direct_solver_says(mode):
     assert np.ptp(solved) > 0.3  # the plates do differ
 
 
-def test_measured_gains_of_the_eras_count_on_each_plate():
-    """ERAs that were measured to do less, more and later: each plate is what is solved directly."""
+def test_what_was_measured_of_a_rig_counts_on_each_plate():
+    """ERAs that do less, more and later, their bolts, a mass on the plate: as solved directly."""
     rig = smooth_rig()
     measured = ((1.0, 0.0), (0.6, 0.8), (1.3, -0.5), (0.8, 0.2))
     eras = tuple(
-        replace(era, gains=((100.0, *gain),)) for era, gain in zip(rig.eras, measured, strict=True)
+        replace(era, gains=((100.0, *gain),), bolt_mass=0.012)
+        for era, gain in zip(rig.eras, measured, strict=True)
     )
-    rig = replace(rig, eras=eras)
+    rig = replace(rig, eras=eras, masses=(PointMass(0.2, 0.05, 0.03),))
     table = build_table(rig, frequencies=np.array([110.0, 250.0]))
     question = Question((TARGET,), QUIET, mode="phased")
     pattern = table.ask(question)

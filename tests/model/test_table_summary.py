@@ -30,6 +30,25 @@ def test_the_map_of_a_symmetric_plate_is_symmetric(table):
     assert np.ptp(weak.median_db) > 0.5
 
 
+def test_of_a_cells_contrasts_the_median_and_the_tenth_percentile_are_kept(table, monkeypatch):
+    """Of random contrasts half are below the one, a tenth below the other, for every cell."""
+    rng = np.random.default_rng(0)
+    drawn: dict[tuple[float, float], list[float]] = {}
+
+    def at_random(table, target, other):
+        assert np.linalg.norm(target - other) >= 0.05
+        drawn.setdefault(tuple(target), []).append(float(rng.uniform(0, 30)))
+        return drawn[tuple(target)][-1]
+
+    monkeypatch.setattr("model.table_weak_cells._contrast", at_random)
+    weak = find_weak_cells(table)
+    assert len(drawn) == len(weak.centres) == 12
+    for values, share in ((weak.median_db, 0.5), (weak.tenth_db, 0.1)):
+        for value, contrasts in zip(values, drawn.values(), strict=True):
+            below = (np.array(contrasts) < value).mean()
+            assert below == pytest.approx(share, abs=1 / len(contrasts))
+
+
 def test_weak_and_feasible_follow_from_twelve_decibels():
     """Feasible by the median other finger, weak by one in ten; unreachable levels are neither."""
     weak = WeakCells(

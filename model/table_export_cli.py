@@ -70,6 +70,11 @@ def export(
 
     if content is not None and to is Format.MAT:
         raise InputError("--content is for CSV files; a .mat file holds everything")
+    if output.is_file() and output.suffix != f".{to.value}":
+        raise InputError(
+            f"--output {output}: a file is there that is no .{to.value} file; it is left alone. "
+            "Give another name, or remove it first"
+        )
     table = load_table(table_file)
     if to is Format.MAT:
         export_mat(table, output)

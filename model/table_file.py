@@ -30,6 +30,9 @@ from model.raster import Raster
 from model.table import LocalizationTable
 
 FORMAT = "era-haptics localization table"
+ZIP = b"PK\x03\x04"
+"""How every table, as every .npz file, begins."""
+
 FORMAT_VERSION = 3
 
 # A table of the paper's plate has 1.4 MB, one of eight ERAs and a fine grid some hundred; what is
@@ -110,9 +113,10 @@ def load_table(path: Path, *, fingerprint: str | None = None) -> LocalizationTab
             f"there is no table {path}; build one: era table build RIG -o {path}"
         ) from None
     except UNREADABLE as error:
-        raise InputError(f"{path} is not a readable localization table ({error}); {rebuild}") from (
-            error
-        )
+        raise InputError(
+            f"{path} is not a readable localization table ({error}); give a file that era table "
+            "build has written, or, if this was one, build it again"
+        ) from error
     try:
         header = _Header.model_validate_json(content.pop("header").tobytes())
     except ValidationError as error:

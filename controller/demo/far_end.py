@@ -158,6 +158,7 @@ async def _start(
         "--until-eof",
         stdin=asyncio.subprocess.PIPE,
         stdout=asyncio.subprocess.PIPE,
+        start_new_session=True,  # or Ctrl-C would end the amplifiers before they were silenced
     )
     return process, cast(asyncio.StreamReader, process.stdout)  # there is one: it was asked for
 

@@ -211,3 +211,22 @@ def test_export_writes_both_formats(built: Path, tmp_path: Path) -> None:
     assert heads == ["SW_hz", "x_m"]
     with pytest.raises(InputError, match="--content"):
         table("export", built, "--format", "mat", "--content", "fields", "-o", tmp_path / "t.mat")
+
+
+def test_a_rig_is_not_taken_for_a_table_nor_replaced_by_one(tmp_path: Path) -> None:
+    """Neither build nor export writes over a file of another kind; asking says what it is not."""
+    rig = tmp_path / "rig.yaml"
+    rig.write_bytes(Path(RIG).read_bytes())
+    made = tmp_path / "t.npz"
+    table("build", RIG, "-o", made, *QUICK)
+    for arguments in (
+        ("build", RIG, "-o", rig, *QUICK),
+        ("export", made, "--format", "csv", "-o", rig),
+        ("export", made, "--format", "mat", "-o", rig),
+    ):
+        with pytest.raises(InputError, match="left alone"):
+            table(*arguments)
+    with pytest.raises(InputError, match="give a file that era table build has written"):
+        table("query", rig, "--target", "0.1,0.1")
+    assert rig.read_bytes() == Path(RIG).read_bytes()
+    table("build", RIG, "-o", made, *QUICK)  # a table gives way to a newer one

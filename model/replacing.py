@@ -5,17 +5,22 @@ from pathlib import Path
 from model.errors import InputError
 
 
-def check_replaceable(path: Path, *, begins: bytes, what: str) -> None:
+def check_replaceable(path: Path, *, is_own: bool, what: str) -> None:
     """Raise InputError where a file of another kind stands; it is somebody's work, a rig's say.
 
-    begins: the first bytes of every file of this kind; what: its name.
+    is_own: whether the file there, if there is one, is of the kind that will be written; what: the
+    name of that kind.
     """
-    if not path.is_file():
-        return
-    with path.open("rb") as stream:
-        start = stream.read(len(begins))
-    if start and start != begins:
+    if path.is_file() and not is_own:
         raise InputError(
             f"--output {path}: a file is there that is no {what}; it is left alone. Give another "
             "name, or remove it first"
         )
+
+
+def begins_with(path: Path, start: bytes) -> bool:
+    """Whether a file is there that begins so, or an empty one."""
+    if not path.is_file():
+        return False
+    with path.open("rb") as stream:
+        return stream.read(len(start)) in (start, b"")

@@ -34,7 +34,7 @@ def build(
     from model.localization import Grid
     from model.points import parse_frequencies, parse_pair
     from model.progress import progress_bar
-    from model.replacing import check_replaceable
+    from model.replacing import begins_with, check_replaceable
     from model.rig_file import load_rig
     from model.table_build import build_in_parts
     from model.table_build_kept import KeptParts
@@ -48,7 +48,7 @@ def build(
         raise InputError(
             f"--output {output}: give the name of a file in a folder that exists, e.g. table.npz"
         )
-    check_replaceable(output, begins=ZIP, what="localization table")
+    check_replaceable(output, is_own=begins_with(output, ZIP), what="localization table")
     rig = load_rig(rig_file, mesh=mesh)
     started = time.perf_counter()
     cells = Grid(*parse_pair(grid, what="--grid"))

@@ -65,16 +65,14 @@ def export(
 ) -> None:
     """Write a table for other programs; docs/table-file.md says what is in it."""
     from model.errors import InputError
+    from model.replacing import check_replaceable
     from model.table_export import export_csv, export_mat
     from model.table_file import load_table
 
     if content is not None and to is Format.MAT:
         raise InputError("--content is for CSV files; a .mat file holds everything")
-    if output.is_file() and output.suffix != f".{to.value}":
-        raise InputError(
-            f"--output {output}: a file is there that is no .{to.value} file; it is left alone. "
-            "Give another name, or remove it first"
-        )
+    suffix = f".{to.value}"
+    check_replaceable(output, is_own=output.suffix == suffix, what=f"{suffix} file")
     table = load_table(table_file)
     if to is Format.MAT:
         export_mat(table, output)

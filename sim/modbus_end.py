@@ -10,6 +10,7 @@ a real cable says nothing.
 import asyncio
 import socket
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import cast
 
@@ -48,7 +49,7 @@ class _Units:
         return None if addressed is None else addressed.answer(request.pdu)
 
 
-class _Wire:
+class _Wire(ABC):
     """One stream of requests, with what befalls it on the way; `send` takes the answers."""
 
     def __init__(self, units: _Units, reader: Reader, *, speed: int | None) -> None:
@@ -78,13 +79,13 @@ class _Wire:
         if self._timer is not None:
             self._timer.cancel()
 
+    @abstractmethod
     def send(self, data: bytes) -> None:
         """Bytes for the host have arrived there."""
-        raise NotImplementedError
 
+    @abstractmethod
     def reply_to(self, request: Request) -> bytes | None:
         """The frame that answers a request."""
-        raise NotImplementedError
 
     def _arrived(self, data: bytes) -> None:
         self._take(self.reader.feed(data, time.monotonic()))

@@ -5,6 +5,7 @@ that pause inside a frame for longer than `PAUSE` are none of it any more.
 """
 
 import struct
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
 # s; a host asks again after 50 ms at the earliest, so what was cut off before is gone by then, and
@@ -64,7 +65,7 @@ def tcp_frame(request: Request, pdu: bytes) -> bytes:
     return _MBAP.pack(request.transaction, 0, len(pdu) + 1, request.unit) + pdu
 
 
-class Reader:
+class Reader(ABC):
     """Takes requests out of a stream of bytes."""
 
     def __init__(self) -> None:
@@ -91,8 +92,9 @@ class Reader:
             found = self._give_up()
         return found
 
+    @abstractmethod
     def _take(self) -> list[Request]:
-        raise NotImplementedError
+        """The requests that are whole by now, in order."""
 
     def _give_up(self) -> list[Request]:
         self.counters.bad += 1

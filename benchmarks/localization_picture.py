@@ -8,6 +8,7 @@ from matplotlib.patches import Circle
 from matplotlib.patheffects import withStroke
 
 from benchmarks.localization_cases import paper_table, question_of
+from model.arrays import lattice
 from model.drive_modes import MODES
 from model.figures.drawing import draw_eras
 from model.fingertip import FINGERTIP_RADIUS
@@ -24,7 +25,7 @@ def modes_figure():
     """A map of level above threshold for each mode, fingers drawn in."""
     table = paper_table()
     x, y = (np.linspace(0, side, SIDE) for side in (table.plate.length, table.plate.width))
-    points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    points = lattice(x, y)
     figure = Figure(figsize=(13, 3.4), layout="constrained")
     panels = figure.subplots(1, len(MODES))
     for axes, mode in zip(panels, MODES, strict=True):

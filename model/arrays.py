@@ -1,4 +1,4 @@
-"""Names for the array types that signatures use."""
+"""Names for the array types that signatures use, and the points of a lattice."""
 
 from typing import TypeAlias
 
@@ -8,3 +8,8 @@ from numpy.typing import NDArray
 FloatArray: TypeAlias = NDArray[np.float64]
 ComplexArray: TypeAlias = NDArray[np.complex128]
 IntArray: TypeAlias = NDArray[np.int64]
+
+
+def lattice(x: FloatArray, y: FloatArray) -> FloatArray:
+    """All points of a lattice, (len(x) * len(y), 2): row after row, x running first."""
+    return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)

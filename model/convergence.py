@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from model.arrays import ComplexArray, FloatArray
+from model.arrays import ComplexArray, FloatArray, lattice
 from model.assembly import assemble
 from model.errors import InputError
 from model.free_plate import solve_free_plate
@@ -126,6 +126,6 @@ def _natural_frequencies(rig: Rig, mesh: Mesh) -> FloatArray:
 def _response(rig: Rig, mesh: Mesh, frequencies: FloatArray) -> ComplexArray:
     x = np.linspace(0, rig.plate.length, _RASTER[0])
     y = np.linspace(0, rig.plate.width, _RASTER[1])
-    points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    points = lattice(x, y)
     free = solve_free_plate(rig.plate, mesh, frequency_max=rig.limits.frequency_max)
     return free.acceleration(rig.eras, frequencies, points, loads=rig.loads)

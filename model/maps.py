@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from model.arrays import FloatArray
+from model.arrays import FloatArray, lattice
 from model.assembly import assemble
 from model.errors import InputError
 from model.excitation import Excitation
@@ -47,7 +47,7 @@ def plate_map(
         )
     x = np.linspace(0, rig.plate.length, columns)
     y = np.linspace(0, rig.plate.width, rows)
-    points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    points = lattice(x, y)
     matrices = assemble(rig.plate, mesh)
     _, amplitudes = tone_amplitudes(
         excitation,

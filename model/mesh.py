@@ -7,7 +7,7 @@ from functools import cached_property
 import numpy as np
 from scipy import sparse
 
-from model.arrays import FloatArray, IntArray
+from model.arrays import FloatArray, IntArray, lattice
 from model.elements import ELEMENTS, Element
 from model.errors import InputError
 from model.plate import Plate
@@ -152,8 +152,7 @@ class Mesh:
     @cached_property
     def nodes(self) -> FloatArray:
         """Positions of the nodes [m], (node_count, 2)."""
-        xx, yy = np.meshgrid(self.node_x, self.node_y)
-        return np.column_stack([xx.ravel(), yy.ravel()])
+        return lattice(self.node_x, self.node_y)
 
     @cached_property
     def connectivity(self) -> IntArray:

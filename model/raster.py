@@ -12,7 +12,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from model.arrays import FloatArray, IntArray
+from model.arrays import FloatArray, IntArray, lattice
 from model.errors import InputError
 from model.fingertip import FINGERTIP_RADIUS, UNIT_DISC
 from model.plate import Plate
@@ -62,8 +62,7 @@ class Raster:
     @cached_property
     def points(self) -> FloatArray:
         """Positions [m], (point_count, 2)."""
-        xx, yy = np.meshgrid(self.x, self.y)
-        return np.column_stack([xx.ravel(), yy.ravel()])
+        return lattice(self.x, self.y)
 
     def under_fingertips(
         self, values: NDArray[np.float32], centres: FloatArray

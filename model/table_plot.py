@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle
 from numpy.typing import NDArray
 
-from model.arrays import FloatArray
+from model.arrays import FloatArray, lattice
 from model.errors import InputError
 from model.figures.drawing import COLORS, draw_eras, raster
 from model.fingertip import FINGERTIP_RADIUS
@@ -113,7 +113,7 @@ def answer_figure(table: LocalizationTable) -> Figure:
         return figure
     columns, rows = raster(plate)
     x, y = np.linspace(0, plate.length, columns), np.linspace(0, plate.width, rows)
-    points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    points = lattice(x, y)
     levels = sensation_level(*table.amplitudes(pattern.excitation, points))
     image = axes.pcolormesh(
         100 * x,

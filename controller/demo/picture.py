@@ -12,6 +12,7 @@ from matplotlib.patches import Circle
 from matplotlib.patheffects import withStroke
 
 from controller.demo.rows import Place, PlayedPattern, TouchRow
+from model.arrays import lattice
 from model.figures import draw_eras
 from model.fingertip import FINGERTIP_RADIUS
 from model.perception import sensation_level
@@ -70,7 +71,7 @@ def _draw_touch(
 ) -> None:
     excitation = played.pattern.excitation
     x, y = (np.linspace(0, side, SIDE) for side in (table.plate.length, table.plate.width))
-    points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    points = lattice(x, y)
     level = sensation_level(*table.amplitudes(excitation, points)).reshape(SIDE, SIDE)
     axes.pcolormesh(100 * x, 100 * y, level, cmap=COLORS, shading="gouraud", norm=scale)
     axes.set_aspect("equal")

@@ -5,7 +5,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.transforms import Bbox
 
-from model.arrays import FloatArray
+from model.arrays import FloatArray, lattice
 from model.assembly import assemble
 from model.csv_file import Column, Columns
 from model.figures.drawing import draw_eras, draw_shape, raster
@@ -90,7 +90,7 @@ def _shapes_figure(
     columns, rows = raster(rig.plate)
     x = np.linspace(0, rig.plate.length, columns)
     y = np.linspace(0, rig.plate.width, rows)
-    points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    points = lattice(x, y)
     shown = fine.mode_shapes[:, [mode - 1 for mode in SHOWN_MODES]]
     shapes = [_scaled(shape) for shape in (rig.mesh.interpolation(points) @ shown).T]
     figure = Figure(figsize=(9, 6.2), layout="constrained")

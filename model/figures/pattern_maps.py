@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 
 from model.actuator import Era
-from model.arrays import FloatArray
+from model.arrays import FloatArray, lattice
 from model.csv_file import Columns
 from model.excitation import Excitation, Tone
 from model.figures.drawing import MapPanel, maps_figure, raster
@@ -43,7 +43,7 @@ class MapSolver:
         columns, rows = raster(plate)
         x = np.linspace(0, plate.length, columns)
         y = np.linspace(0, plate.width, rows)
-        points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+        points = lattice(x, y)
         loads = self.rig.loads
         _, amplitudes = tone_amplitudes(
             excitation, eras, lambda f: self.free_plate.acceleration(eras, f, points, loads=loads)

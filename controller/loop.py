@@ -9,6 +9,7 @@ from typing import ParamSpec
 
 from controller.amplifiers import AmplifierGroup, Phase
 from controller.decision import Decider, Decision
+from controller.guards import make_guards
 from controller.observer import Applied, Observer, Silenced
 from controller.routing import drive_of_eras
 from controller.selection import PatternTable
@@ -16,7 +17,6 @@ from controller.tally import Tally
 from controller.touch import TouchFrame, TouchSource
 from drivers.amplifier import Amplifier
 from drivers.errors import CommandError, DriverError, LinkError
-from drivers.guard import Guard, GuardLimits
 from drivers.watchdog import HEARTBEAT
 from model.errors import InputError
 from model.perception import STRONG_DB_SL
@@ -84,7 +84,7 @@ class Controller:
         """
         await self._group.open()
         try:
-            guards = self._guards()
+            guards = make_guards(self._rig, self._amplifiers, clock=self._clock)
         except BaseException:
             await self._group.close({})
             raise
@@ -232,22 +232,6 @@ class Controller:
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(pause):
                 await self._wake.wait()
-
-    def _guards(self) -> dict[str, Guard]:
-        """A guard per amplifier; raises InputError for a channel that an amplifier has not."""
-        for era, wired in self._rig.wiring.items():
-            channels = self._amplifiers[wired.amplifier].capabilities.channels
-            if wired.number >= channels:
-                raise InputError(
-                    f"ERA {era} is wired to channel {wired.number} of amplifier "
-                    f"{wired.amplifier}, which has channels 0 to {channels - 1}; change the rig"
-                )
-        limits = self._rig.limits
-        configured = GuardLimits(limits.frequency_min, limits.frequency_max, limits.level)
-        return {
-            name: Guard(configured, amplifier.capabilities)
-            for name, amplifier in self._amplifiers.items()
-        }
 
     def _tell(self, callback: Callable[_P, None], *args: _P.args, **kwargs: _P.kwargs) -> None:
         """Call an observer; whatever it raises stays here."""

@@ -24,10 +24,11 @@ def route(
     """One command set per amplifier of the rig, by its name, all under the same token.
 
     Every wired channel is named: level = amplitude / stroke, phase in degrees within (-180, 180];
-    level 0 where the ERA is not driven. ramp, valid_for [s] as in `CommandSet`. playing: what ERAs
+    level 0 where the ERA is not driven. ramp, valid_for [s] as in `CommandSet`; the ramp becomes as
+    long as the rig's limit of slew asks for, on all amplifiers alike. playing: what ERAs
     play now, as `drive_of_eras` tells it; a frequency that only ERAs play which play it already
-    runs on undisturbed in time. Nothing is limited here, that is the guard's; raises InputError if
-    the excitation names an ERA the rig has not.
+    runs on undisturbed in time. Nothing else is limited here, that is the guard's; raises
+    InputError if the excitation names an ERA the rig has not.
     """
     unknown = sorted(excitation.keys() - rig.wiring.keys())
     if unknown:
@@ -39,6 +40,9 @@ def route(
     restarted = _restarted(excitation, playing or {})
     for name, channel in rig.wiring.items():
         commands[channel.amplifier].append(_drive(excitation, rig, name, restarted=restarted))
+    highest = max((command.level for wired in commands.values() for command in wired), default=0.0)
+    slowest = highest / rig.limits.slew  # from rest: what plays now only makes it shorter
+    ramp = slowest if slowest > ramp else ramp  # not finite stays so, for the guard to refuse
     return {
         name: CommandSet(
             token=token,

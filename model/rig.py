@@ -28,11 +28,21 @@ class Channel:
 
 @dataclass(frozen=True)
 class Limits:
-    """What no command may exceed: mechanical frequencies [Hz] and level (1 is full stroke)."""
+    """What no command may exceed: mechanical frequencies [Hz] and level (1 is full stroke).
+
+    slew [1/s]: how fast a level may rise. For each amplifier by itself: power, the sum of the
+    squared levels of its channels; on_time [s], how long it may vibrate without a pause; duty,
+    which share of any ten seconds; rate [1/s], how many command sets that are not silent.
+    """
 
     frequency_min: float
     frequency_max: float
     level: float
+    slew: float = math.inf
+    power: float = math.inf
+    on_time: float = math.inf
+    duty: float = 1.0
+    rate: float = math.inf
 
 
 @dataclass(frozen=True)

@@ -5,9 +5,9 @@ from typing import Any
 
 from model.config import Validation
 from model.document import read_document
-from model.rig import Channel, Limits, Rig
+from model.rig import Channel, Rig
 from model.rig_checks import check_across
-from model.rig_parts import era_of, laminate_of, mass_of, mesh_of, plate_of
+from model.rig_parts import era_of, laminate_of, limits_of, mass_of, mesh_of, plate_of
 from model.rig_sections import RigSection
 
 
@@ -23,18 +23,17 @@ def load_rig(path: Path | str, *, mesh: str | None = None) -> Rig:
     validation.finish()
     section = RigSection.model_validate(document.data)
     plate = plate_of(section.plate)
-    low, high = section.limits.frequency
     wanted = section.mesh if mesh is None else mesh
     return Rig(
         plate=plate,
-        mesh=mesh_of(wanted, plate, frequency_max=high),
+        mesh=mesh_of(wanted, plate, frequency_max=section.limits.frequency[1]),
         eras=tuple(
             era_of(name, era, plate, era_count=len(section.eras))
             for name, era in section.eras.items()
         ),
         wiring={name: Channel(era.amplifier, era.channel) for name, era in section.eras.items()},
         amplifiers={name: amplifier.url for name, amplifier in section.amplifiers.items()},
-        limits=Limits(frequency_min=low, frequency_max=high, level=section.limits.level),
+        limits=limits_of(section.limits),
         masses=tuple(mass_of(mass, plate) for mass in section.masses.values()),
         laminate=laminate_of(section.plate),
     )

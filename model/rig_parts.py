@@ -9,7 +9,14 @@ from model.laminate import Laminate, Layer, equivalent_plate
 from model.mesh import Mesh
 from model.plate import Material, Plate
 from model.point_mass import PointMass
-from model.rig_sections import EraSection, MassSection, MaterialSection, PlateSection
+from model.rig import Limits
+from model.rig_sections import (
+    EraSection,
+    LimitsSection,
+    MassSection,
+    MaterialSection,
+    PlateSection,
+)
 
 _MOST_ELEMENTS_PER_SIDE = 1000
 _MOST_AUTO_NODES = 300_000  # a million degrees of freedom: minutes, and most of a machine's memory
@@ -68,6 +75,13 @@ def mass_of(section: MassSection, plate: Plate) -> PointMass:
     """A mass on the plate."""
     x, y = _onto(plate, section.at)
     return PointMass(x, y, section.mass)
+
+
+def limits_of(section: LimitsSection) -> Limits:
+    """What no command may exceed; no limit where none is given."""
+    low, high = section.frequency
+    given = section.model_dump(exclude={"frequency"}, exclude_none=True)
+    return Limits(frequency_min=low, frequency_max=high, **given)
 
 
 def mesh_of(text: str, plate: Plate, *, frequency_max: float) -> Mesh:

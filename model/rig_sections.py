@@ -20,7 +20,19 @@ from pydantic_core import CoreSchema, core_schema
 from model.config import Quantity, Section
 from model.laminate import Bond
 from model.materials import KNOWN_MATERIALS, material
-from model.units import DAMPING, DENSITY, FREQUENCY, LENGTH, MASS, MODULUS, RATIO, STIFFNESS
+from model.units import (
+    DAMPING,
+    DENSITY,
+    FREQUENCY,
+    LENGTH,
+    MASS,
+    MODULUS,
+    RATE,
+    RATIO,
+    SLEW,
+    STIFFNESS,
+    TIME,
+)
 
 
 class _MaterialByName:
@@ -155,12 +167,20 @@ class AmplifierSection(Section):
 
 
 class LimitsSection(Section):
-    """What no command may exceed: frequencies between which skin feels vibration well, level."""
+    """What no command may exceed: frequencies between which skin feels vibration well, level.
+
+    The others are without limit unless given; see `Limits` for what they count.
+    """
 
     frequency: Annotated[
         tuple[Frequency, Frequency], Strict(strict=False), AfterValidator(_ascending)
     ] = (40.0, 500.0)
     level: Annotated[float, Quantity(RATIO, least=0, most=1)] = 1.0
+    slew: Annotated[float, Quantity(SLEW, above=0, most=1e6)] | None = None
+    power: Annotated[float, Quantity(RATIO, above=0, most=256)] | None = None
+    on_time: Annotated[float, Quantity(TIME, above=0, most=86_400)] | None = None
+    duty: Annotated[float, Quantity(RATIO, above=0, most=1)] | None = None
+    rate: Annotated[float, Quantity(RATE, least=1, most=2000)] | None = None
 
 
 class RigSection(Section):

@@ -29,6 +29,9 @@ STIFFNESS = Dimension("a stiffness", "N/m", "17 kN/m")
 DAMPING = Dimension("a damping", "N s/m", "2 N s/m")
 MASS = Dimension("a mass", "kg", "5 g")
 FREQUENCY = Dimension("a frequency", "Hz", "250 Hz")
+TIME = Dimension("a time", "s", "50 ms")
+RATE = Dimension("a rate", "1/s", "50 Hz")
+SLEW = Dimension("a rise of the level", "1/s", "2 %/ms")
 RATIO = Dimension("a plain number", "", "0.05 or 5 %")
 
 # A number is split from its unit here, so that nothing is ever evaluated and every text is short:

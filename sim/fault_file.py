@@ -14,20 +14,18 @@ from typing import Annotated
 
 from model.config import Quantity, Section, Validation
 from model.document import read_document
-from model.units import RATIO, Dimension
+from model.units import RATIO, TIME
 from sim.faults import Episode, FaultKind, Faults, Toward
-
-_TIME = Dimension("a time", "s", "50 ms")
 
 
 class _EpisodeSection(Section):
     fault: FaultKind
-    at: Annotated[float, Quantity(_TIME, least=0)] = 0.0
-    lasts: Annotated[float, Quantity(_TIME, above=0)] = math.inf
+    at: Annotated[float, Quantity(TIME, least=0)] = 0.0
+    lasts: Annotated[float, Quantity(TIME, above=0)] = math.inf
     amplifier: str | None = None
     share: Annotated[float, Quantity(RATIO, above=0, most=1)] = 1.0
     toward: Toward | None = None
-    delay: Annotated[float, Quantity(_TIME, above=0, most=10)] = 0.1
+    delay: Annotated[float, Quantity(TIME, above=0, most=10)] = 0.1
 
 
 class _FaultSection(Section):

@@ -111,6 +111,16 @@ def test_the_example_is_the_papers_plate() -> None:
     assert (rig.limits.frequency_min, rig.limits.frequency_max, rig.limits.level) == (40, 500, 1)
 
 
+def test_limits_over_time_are_read_with_their_units(tmp_path: Path) -> None:
+    """2 % a millisecond is 20 a second, half a minute 30 s; what is not given is no limit."""
+    text = GOOD + "  slew: 2 %/ms\n  power: 150 %\n  on_time: 0.5 min\n  duty: 25 %\n"
+    limits = load_rig(write(tmp_path, text)).limits
+    assert (limits.slew, limits.power, limits.on_time, limits.duty) == (20.0, 1.5, 30.0, 0.25)
+    assert limits.rate == math.inf
+    rate = load_rig(write(tmp_path, GOOD + "  rate: 0.1 kHz\n")).limits
+    assert (rate.rate, rate.slew, rate.power, rate.on_time, rate.duty) == (100, *[math.inf] * 3, 1)
+
+
 def test_mesh_and_limits_may_be_left_out(tmp_path: Path) -> None:
     """Without them the mesh is chosen for 500 Hz, which is the default limit."""
     without = "\n".join(line for line in GOOD.splitlines()[:20] if not line.startswith("mesh"))
@@ -213,6 +223,13 @@ def test_a_mesh_asked_for_stands_in_place_of_the_files(tmp_path: Path) -> None:
         (22, "  frequency: [40, 500 rpm]", (22, "limits.frequency[1]"), "is not a frequency"),
         (23, "  level: 1.1", (23, "limits.level"), "at most 1"),
         (23, "  level: -0.1", (23, "limits.level"), "at least 0"),
+        (23, "  slew: 0", (23, "limits.slew"), "above 0 1/s"),
+        (23, "  slew: 5 s", (23, "limits.slew"), "is not a rise of the level"),
+        (23, "  power: 0", (23, "limits.power"), "above 0"),
+        (23, "  on_time: 5 Hz", (23, "limits.on_time"), "is not a time"),
+        (23, "  duty: 101 %", (23, "limits.duty"), "at most 1"),
+        (23, "  rate: 3 kHz", (23, "limits.rate"), "at most 2000 1/s"),
+        (23, "  rate: .inf", (23, "limits.rate"), "is not a finite number"),
         (23, "  level: .nan", (23, "limits.level"), "is not a finite number"),
         (23, "  level: 0.5\nmasses: 2", (24, "masses"), "must be a mapping"),
         (

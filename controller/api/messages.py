@@ -1,0 +1,162 @@
+"""The methods of the API: what is asked, and what is answered.
+
+One table, `METHODS`, says which parameters and which result belong to a method; the server, the
+clients, the reference in docs/api.md and the gateway's description all go by it.
+"""
+
+from typing import Annotated, Any, NamedTuple
+
+from pydantic import Field
+
+from controller.api.parts import (
+    FASTEST_RATE,
+    LONGEST_LEASE,
+    SHORTEST_LEASE,
+    AmplifierStatus,
+    ContactStatus,
+    Count,
+    EffectDescription,
+    LatencySummary,
+    Message,
+    Name,
+    Nothing,
+    PhaseName,
+    RigSummary,
+    StateName,
+    TableSummary,
+    Tone,
+    Topic,
+    TouchPoint,
+)
+
+MOST_TOUCHES = 64  # of a frame; a panel reports ten, a forearm some more
+
+
+class HelloParams(Message):
+    """Who asks; for the log."""
+
+    client: Name
+
+
+class HelloResult(Message):
+    """What the daemon drives; none of it changes while it runs, but for the layout."""
+
+    api_version: str = Field(description="major.minor; another major cannot be talked to")
+    software_version: str
+    rig: RigSummary
+    table: TableSummary
+    rig_text: str = Field(description="the rig's file, from which fields can be computed")
+    layout: dict[str, Any] | None = Field(description="the surface layout, null without one")
+
+
+class StatusResult(Message):
+    """How everything is at this moment."""
+
+    time_s: float = Field(description="of this answer, on the daemon's CLOCK_MONOTONIC")
+    unix_time_s: float = Field(description="the same moment on the wall clock")
+    state: StateName
+    cause: str = Field(description="why it is in this state")
+    remedy: str | None = Field(description="what to do about it, where anything is to be done")
+    phase: PhaseName
+    assume_energised: bool = Field(
+        description="whether amplifiers that were lost may still be playing"
+    )
+    armed_by: str | None
+    lease_left_s: float | None
+    contacts: list[ContactStatus] = Field(description="in order of arrival, the newest last")
+    drive: dict[str, Tone] = Field(description="by ERA, silent ones left out")
+    predicted_contrast_db: float | None
+    robust_contrast_db: float | None
+    predicted_level_db_sl: float | None
+    amplifiers: list[AmplifierStatus]
+    latency_ms: LatencySummary
+    rejected_touches: dict[str, Count] = Field(description="how many, by the reason")
+    uptime_s: float
+
+
+class ArmParams(Message):
+    """High voltage on, for as long as the lease is renewed."""
+
+    owner: Name
+    lease_s: Annotated[float, Field(ge=SHORTEST_LEASE, le=LONGEST_LEASE)]
+
+
+class ArmResult(Message):
+    """The lease: keep it, renew it within lease_s."""
+
+    lease: str
+    lease_s: float
+
+
+class RenewParams(Message):
+    """The lease that arm gave."""
+
+    lease: Annotated[str, Field(min_length=1, max_length=80)]
+
+
+class RenewResult(Message):
+    """How long the lease lasts from now."""
+
+    lease_s: float
+
+
+class TouchParams(Message):
+    """All fingers of this client under a source name; valid for 150 ms, so repeat it."""
+
+    source: Name
+    touches: Annotated[list[TouchPoint], Field(max_length=MOST_TOUCHES)]
+
+
+class EffectsResult(Message):
+    """The effects that play can be asked for."""
+
+    effects: list[EffectDescription]
+
+
+class PlayParams(Message):
+    """Play an effect once, as if a finger were there."""
+
+    effect: Name
+    x_m: float
+    y_m: float
+    level_db_sl: float | None = Field(None, description="as the effect has it if left out")
+
+
+class SubscribeParams(Message):
+    """Topics to be told of; rate_hz is how often of what is measured all the time."""
+
+    topics: Annotated[list[Topic], Field(min_length=1, max_length=16)]
+    rate_hz: Annotated[float, Field(ge=1, le=FASTEST_RATE)] | None = Field(
+        None, description="of amplifiers and latency; 10 if left out"
+    )
+
+
+class UnsubscribeParams(Message):
+    """Topics not to be told of any more."""
+
+    topics: Annotated[list[Topic], Field(min_length=1, max_length=16)]
+
+
+class Method(NamedTuple):
+    """Parameters, result and meaning of a method."""
+
+    params: type[Message]
+    result: type[Message]
+    meaning: str
+
+
+METHODS: dict[str, Method] = {
+    "hello": Method(HelloParams, HelloResult, "who is there and what it drives"),
+    "status": Method(Nothing, StatusResult, "how everything is"),
+    "arm": Method(ArmParams, ArmResult, "high voltage on; touches are felt while the lease lasts"),
+    "renew": Method(RenewParams, RenewResult, "the owner of the lease is still there"),
+    "disarm": Method(Nothing, Nothing, "silent along a short ramp, high voltage off; by anyone"),
+    "stop": Method(Nothing, Nothing, "quick stop, latched until clear; by anyone, at any time"),
+    "clear": Method(Nothing, Nothing, "acknowledge a stop, or a fault whose cause is gone"),
+    "touch": Method(TouchParams, Nothing, "all fingers of this client, as a touch source"),
+    "effects": Method(Nothing, EffectsResult, "which effects there are"),
+    "play": Method(PlayParams, Nothing, "play an effect at a place"),
+    "subscribe": Method(SubscribeParams, Nothing, "be told of topics from now on"),
+    "unsubscribe": Method(UnsubscribeParams, Nothing, "be told of them no more"),
+}
+"""Every method of the API, by name."""

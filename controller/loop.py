@@ -3,7 +3,6 @@
 import asyncio
 import contextlib
 import logging
-import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import ParamSpec
 
@@ -15,6 +14,7 @@ from controller.routing import drive_of_eras
 from controller.selection import PatternTable
 from controller.tally import Tally
 from controller.touch import TouchFrame, TouchSource
+from drivers import clock
 from drivers.amplifier import Amplifier
 from drivers.errors import CommandError, DriverError, LinkError
 from drivers.watchdog import HEARTBEAT
@@ -46,7 +46,7 @@ class Controller:
         sources: Sequence[TouchSource] = (),
         observer: Observer | None = None,
         level_db_sl: float = STRONG_DB_SL,
-        clock: Callable[[], float] = time.monotonic,
+        clock: Callable[[], float] = clock.now,
     ) -> None:
         if amplifiers.keys() != rig.amplifiers.keys():
             raise InputError(

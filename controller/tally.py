@@ -1,9 +1,10 @@
 """Counting what was wrong with a stream of input without letting it flood the log."""
 
 import logging
-import time
 from collections import Counter
 from collections.abc import Callable
+
+from drivers import clock
 
 
 class Tally:
@@ -17,7 +18,7 @@ class Tally:
         logger: logging.Logger,
         *,
         pause: float = 1.0,
-        clock: Callable[[], float] = time.monotonic,
+        clock: Callable[[], float] = clock.now,
     ) -> None:
         self.counts: Counter[str] = Counter()
         self._logger = logger

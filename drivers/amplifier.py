@@ -1,10 +1,10 @@
 """An amplifier as the controller sees it: arm, play, stop, whatever wire it hangs on."""
 
 import asyncio
-import time
 from collections.abc import Callable
 from typing import TypeVar, final
 
+from drivers import clock
 from drivers.backend import Backend
 from drivers.command import token_after
 from drivers.errors import CommandError, FrameError, LinkError, LinkTimeout
@@ -118,7 +118,7 @@ class Amplifier:
     @property
     def statistics(self) -> LinkStatistics:
         """How well the link does; counts since it was opened, retries since it was made."""
-        seen, now = self._backend.counters, time.monotonic()
+        seen, now = self._backend.counters, clock.now()
         return LinkStatistics(
             frames_out=seen.frames_out,
             frames_in=seen.frames_in,
@@ -255,7 +255,7 @@ class Amplifier:
     async def heartbeat(self) -> Status:
         """Feed the watchdog; to be called by the control loop itself, after it has run."""
         status = await self._ask(Ping(), expect=Status)
-        self._last_heartbeat = time.monotonic()
+        self._last_heartbeat = clock.now()
         return status
 
     async def commit_on_bus(self, token: int) -> None:
@@ -314,7 +314,7 @@ class Amplifier:
     async def _exchange(self, request: Request, kind: Kind, timeout: float) -> Reply:
         busy = 0
         while True:
-            begin = time.monotonic()
+            begin = clock.now()
             try:
                 reply = await self._backend.exchange(request, timeout=timeout)
             except LinkTimeout as problem:
@@ -328,7 +328,7 @@ class Amplifier:
                 raise LinkError(self._lose(str(problem))) from problem
             else:
                 self._unanswered = 0
-                self._last_round_trip = time.monotonic() - begin
+                self._last_round_trip = clock.now() - begin
                 if not is_busy(reply):
                     self._is_stuck = False
                     return reply

@@ -6,11 +6,11 @@ one plate needs the far end as a process (`era sim`). Not modelled: the time a w
 
 import asyncio
 import contextlib
-import time
 from collections.abc import Callable
 from pathlib import Path
 from urllib.parse import parse_qsl, unquote
 
+from drivers import clock
 from drivers.backend import Backend
 from drivers.errors import CommandError, LinkError
 from drivers.guard import SafeCommand, SafeEnvelope
@@ -69,7 +69,7 @@ class SimulatedBackend(Backend):
         try:
             rig = load_rig(self._rig)
             name = self._name(tuple(rig.amplifiers))
-            bench = await asyncio.to_thread(Bench, rig, now=time.monotonic())
+            bench = await asyncio.to_thread(Bench, rig, now=clock.now())
         except (InputError, OSError) as error:
             raise CommandError(f"{self._url}: {error}") from error
         async with contextlib.AsyncExitStack() as stack:
@@ -93,7 +93,7 @@ class SimulatedBackend(Backend):
         _require_safe(request)
         if self._exchange is None:
             raise LinkError(f"{self._url} is not open")
-        self._last_sent = time.monotonic()
+        self._last_sent = clock.now()
         self._counters.frames_out += 1
         self._counters.frames_in += 1
         return self._exchange(request)

@@ -7,10 +7,10 @@ is busy.
 
 import asyncio
 import struct
-import time
 from collections.abc import Callable
 from typing import TypeAlias
 
+from drivers import clock
 from drivers.protocol.can_frame import CanFrame
 from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.messages import (
@@ -169,7 +169,7 @@ class CanNode:
         self._timers = [self._call_later(_LOOK, self._look)]
 
     def _is_awake(self) -> bool:
-        is_off = self._station.faults.now("reboot", time.monotonic())
+        is_off = self._station.faults.now("reboot", clock.now())
         if self._was_off and not is_off:
             self._was_off = False
             self._boot()

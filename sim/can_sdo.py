@@ -6,8 +6,9 @@ uploads, which are refused as the standard allows.
 
 import binascii
 import struct
-import time
 from collections.abc import Callable
+
+from drivers import clock
 
 LENGTH = 8
 BLOCK_SIZE = 127  # segments before an acknowledgement
@@ -64,7 +65,7 @@ class SdoServer:
         """Take a request and answer it; what has not eight bytes is no request."""
         if len(data) != LENGTH:
             return
-        now = time.monotonic()
+        now = clock.now()
         if now - self._heard > _PATIENCE:
             self.reset()
         self._heard = now

@@ -19,12 +19,12 @@ import json
 import math
 import os
 import socket
-import time
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any, TypeGuard
 
+from drivers import clock
 from drivers.errors import LinkError
 from model.errors import InputError
 from sim.bench import Bench
@@ -106,7 +106,7 @@ async def _converse(bench: Bench, connection: socket.socket) -> None:
         while data := await loop.sock_recv(connection, LINE_MAX):
             *lines, rest = (rest + data).split(b"\n")
             for line in lines:
-                make_answer = carry_out(bench, line, now=time.monotonic())
+                make_answer = carry_out(bench, line, now=clock.now())
                 # A long fit must not hold up the amplifiers, whose hosts wait for 50 ms at most.
                 reply = await asyncio.to_thread(_encode_made, make_answer)
                 await loop.sock_sendall(connection, reply)

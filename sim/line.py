@@ -4,9 +4,9 @@ Not modelled: the gaps between the bytes of one telegram; it arrives whole, when
 """
 
 import asyncio
-import time
 from collections.abc import Callable
 
+from drivers import clock
 from sim.faults import Faults, Toward
 
 
@@ -35,7 +35,7 @@ class Line:
 
     def send(self, telegram: bytes) -> None:
         """Put a telegram on the wire; it waits for those before it."""
-        now = time.monotonic()
+        now = clock.now()
         arriving = self._faults.pass_on(telegram, toward=self._toward, time=now)
         for delay, data in arriving:
             self._free_from = max(now, self._free_from) + len(data) * self._byte_time

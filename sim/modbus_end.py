@@ -9,11 +9,11 @@ a real cable says nothing.
 
 import asyncio
 import socket
-import time
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import cast
 
+from drivers import clock
 from drivers.errors import LinkError
 from drivers.protocol.definition import PROTOCOL
 from sim.line import Line
@@ -88,11 +88,11 @@ class _Wire(ABC):
         """The frame that answers a request."""
 
     def _arrived(self, data: bytes) -> None:
-        self._take(self.reader.feed(data, time.monotonic()))
+        self._take(self.reader.feed(data, clock.now()))
 
     def _paused(self) -> None:
         self._timer = None
-        self._take(self.reader.pause(time.monotonic()))
+        self._take(self.reader.pause(clock.now()))
 
     def _take(self, requests: Sequence[Request]) -> None:
         for request in requests:

@@ -5,11 +5,11 @@ import contextlib
 import os
 import signal
 import threading
-import time
 from collections.abc import AsyncIterator, Callable, Coroutine, Mapping
 from contextlib import asynccontextmanager
 from pathlib import Path
 
+from drivers import clock
 from model.rig import Rig
 from sim.bench import Bench
 from sim.control import control_socket
@@ -47,13 +47,13 @@ async def run_far_end(
     if until_eof:
         # A thread, for a loop cannot wait for every kind of standard input.
         threading.Thread(target=_await_eof, args=(loop, ended), daemon=True).start()
-    bench = await asyncio.to_thread(Bench, rig, now=time.monotonic())
-    bench.place_fingers(fingers, now=time.monotonic())
+    bench = await asyncio.to_thread(Bench, rig, now=clock.now())
+    bench.place_fingers(fingers, now=clock.now())
     async with contextlib.AsyncExitStack() as stack:
         if control is not None:
             await stack.enter_async_context(control_socket(bench, control))
         stations = [
-            Station(bench, name, number=number, faults=faults.of(name, begin=time.monotonic()))
+            Station(bench, name, number=number, faults=faults.of(name, begin=clock.now()))
             for number, name in enumerate(bench.amplifiers, start=1)
         ]
         urls = await stack.enter_async_context(open_wire(wire, stations))

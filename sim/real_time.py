@@ -4,10 +4,10 @@ That clock is the same in all processes of a machine, so a host can name moments
 """
 
 import asyncio
-import time
 from collections.abc import Callable
 from typing import TypeAlias
 
+from drivers import clock
 from drivers.protocol.messages import Reply, Request
 from sim.bench import Bench
 
@@ -19,7 +19,7 @@ Exchange: TypeAlias = Callable[[Request], Reply]
 async def keep_time(bench: Bench) -> None:
     """Advance the bench with the clock until cancelled."""
     while True:
-        bench.advance(time.monotonic())
+        bench.advance(clock.now())
         await asyncio.sleep(TICK)
 
 
@@ -27,6 +27,6 @@ def exchange_with(bench: Bench, amplifier: str) -> Exchange:
     """How one amplifier of the bench answers a request at the moment at which it arrives."""
 
     def exchange(request: Request) -> Reply:
-        return bench.exchange(amplifier, request, now=time.monotonic())
+        return bench.exchange(amplifier, request, now=clock.now())
 
     return exchange

@@ -7,9 +7,9 @@ discovery by broadcast.
 
 import asyncio
 import re
-import time
 from dataclasses import dataclass
 
+from drivers import clock
 from drivers.errors import LinkError
 from drivers.protocol.can_frame import CanFrame
 from sim.can_bus import CanBus
@@ -149,7 +149,7 @@ class _Client(asyncio.Protocol):
 
     def hear(self, frame: CanFrame) -> None:
         """Pass a frame of the bus on."""
-        stamp = f"{time.time():.6f}"
+        stamp = f"{clock.now():.6f}"  # only differences of it mean anything
         data = frame.data.hex().upper()
         if frame.fd:
             self.say(f"< fdframe {frame.id:03X} 00 {stamp} {data} >")

@@ -6,11 +6,11 @@ whether the amplifier answers at all.
 
 import asyncio
 import math
-import time
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Literal, TypeAlias
 
+from drivers import clock
 from drivers.protocol.messages import (
     Broadcast,
     Capabilities,
@@ -37,7 +37,8 @@ _FAILS = {
 class Station:
     """An amplifier of a bench by its name; number: its address on a wire, 1 or more.
 
-    Simulated time is tied to time.monotonic(), which is the same in all processes of a machine.
+    Simulated time is the event loop's, by default time.monotonic(), the same in all processes of a
+    machine.
     """
 
     def __init__(
@@ -64,7 +65,7 @@ class Station:
     @property
     def is_answering(self) -> bool:
         """Whether it does anything at all now: a far end keeps still as long as it does not."""
-        now = time.monotonic()
+        now = clock.now()
         return not (self.faults.now("hang", now) or self.faults.now("reboot", now))
 
     def on_plug(self, on_plug: Callable[[bool], None]) -> None:
@@ -77,12 +78,12 @@ class Station:
 
     def status(self) -> Status:
         """How it is now; for what a wire sends by itself."""
-        self._bench.advance(time.monotonic())
+        self._bench.advance(clock.now())
         return self._amplifier.status(self._bench.time)
 
     def exchange(self, request: Request) -> Reply | None:
         """Its answer to a request that arrives now; None if it keeps still."""
-        now = time.monotonic()
+        now = clock.now()
         if not self.is_answering:
             return None
         if self.faults.now("nak_storm", now):
@@ -95,7 +96,7 @@ class Station:
 
     def restart(self) -> None:
         """Lose the supply for a moment, as when it is told to start anew."""
-        now = time.monotonic()
+        now = clock.now()
         self._bench.advance(now)
         self._amplifier.restart(now)
         self._bench.advance(now)
@@ -107,7 +108,7 @@ class Station:
 
     def befall(self, episode: Episode) -> None:
         """One more fault, from now on: its `at` is not looked at."""
-        now = time.monotonic()
+        now = clock.now()
         episode = replace(episode, at=now - self.faults.begin)
         self.faults.episodes = (*self.faults.episodes, episode)
         self._expect(episode)
@@ -115,7 +116,7 @@ class Station:
     def recover(self) -> None:
         """Every fault that is on ends now, and none comes any more."""
         self.close()
-        over = time.monotonic() - self.faults.begin
+        over = clock.now() - self.faults.begin
         for episode in self.faults.episodes:
             if episode.at <= over < episode.end:
                 self._pass(replace(episode, lasts=over - episode.at), "end")
@@ -129,7 +130,7 @@ class Station:
 
     def _expect(self, episode: Episode) -> None:
         """Bring about, when they are due, those faults that nobody needs to ask for."""
-        begin = self.faults.begin + episode.at - time.monotonic()
+        begin = self.faults.begin + episode.at - clock.now()
         edges: dict[_Edge, float] = {
             "begin": begin,
             "half": begin + episode.lasts / 2,
@@ -144,7 +145,7 @@ class Station:
 
     def _pass(self, episode: Episode, edge: "_Edge") -> None:
         """An episode begins, is half over or ends."""
-        now = time.monotonic()
+        now = clock.now()
         self._bench.advance(now)
         match episode.fault, edge:
             case "unplug", "begin" | "end":

@@ -8,12 +8,12 @@ else; each amplifier hears one of its own, so that one that was lost is not fed 
 import asyncio
 import contextlib
 import secrets
-import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
+from drivers import clock
 from drivers.backend import Backend
 from drivers.backends.can_node import NodeWatch
 from drivers.backends.can_sdo import ObjectClient
@@ -286,7 +286,7 @@ class CanBackend(Backend):
         if self._wire is None:
             raise LinkError(f"{self._url.bus} is not open")
         self._wire.send(frames)
-        self._last_sent = time.monotonic()
+        self._last_sent = clock.now()
         self._counters.frames_out += len(frames)
 
     def _told(self, event: Event) -> None:

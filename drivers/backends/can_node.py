@@ -3,13 +3,13 @@
 import asyncio
 import contextlib
 import math
-import time
 from collections.abc import Callable
 from typing import TypeVar
 
 from canopen.emcy import EmcyConsumer, EmcyError
 from canopen.nmt import NmtMaster
 
+from drivers import clock
 from drivers.backends.can_sdo import ObjectClient
 from drivers.backends.can_url import CanUrl
 from drivers.backends.can_wire import CanWire
@@ -61,7 +61,7 @@ class NodeWatch:
         self._loop = asyncio.get_running_loop()
         self._counters = counters
         self._answers = AnswerReader(self._url.node)
-        self._joined = time.monotonic()
+        self._joined = clock.now()
         self._host_heard = -math.inf
         node, nmt = self._url.node, NmtMaster(self._url.node)
         self._emergencies = EmcyConsumer()
@@ -87,7 +87,7 @@ class NodeWatch:
 
     def start(self) -> None:
         """From now on the node must be heard, and stay in operation."""
-        self._heard = self._look_due = time.monotonic()
+        self._heard = self._look_due = clock.now()
         self._was_operational = False
         if not self._is_watched:
             self._is_watched = True
@@ -102,8 +102,8 @@ class NodeWatch:
 
     async def check_no_other_host(self) -> None:
         """Listen for the heartbeat of another host before arming; LinkError where there is one."""
-        await asyncio.sleep(max(0.0, self._joined + 1.2 * _HOST_HEARTBEAT - time.monotonic()))
-        if time.monotonic() - self._host_heard < HEARTBEATS_BORNE * _HOST_HEARTBEAT:
+        await asyncio.sleep(max(0.0, self._joined + 1.2 * _HOST_HEARTBEAT - clock.now()))
+        if clock.now() - self._host_heard < HEARTBEATS_BORNE * _HOST_HEARTBEAT:
             raise LinkError(
                 f"another program drives node {self._url.node} on {self._url.bus}; end that one"
             )
@@ -127,7 +127,7 @@ class NodeWatch:
             self._counters.bad += 1
 
     def _heartbeat(self, state: int) -> None:
-        self._heard = time.monotonic()
+        self._heard = clock.now()
         if not self._is_watched:
             return
         if state == _BOOT_UP:
@@ -143,7 +143,7 @@ class NodeWatch:
         )
 
     def _other_host(self, can_id: int, data: bytearray, timestamp: float) -> None:
-        self._host_heard = time.monotonic()
+        self._host_heard = clock.now()
         self._counters.foreign += 1
 
     def _post(self, callback: Callable[[_T], None], argument: _T) -> None:
@@ -157,7 +157,7 @@ class NodeWatch:
 
         Where this process itself was held up, what the node said meanwhile may not be read yet.
         """
-        now = time.monotonic()
+        now = clock.now()
         silent = now - self._heard
         limit = HEARTBEATS_BORNE * self._url.heartbeat
         was_held_up = now - self._look_due > self._url.heartbeat / 2

@@ -6,10 +6,10 @@ answer it is given the time to come all the same, or it would run into the next 
 
 import asyncio
 import contextlib
-import time
 from collections.abc import Callable
 from weakref import WeakKeyDictionary
 
+from drivers import clock
 from drivers.backends.modbus_frames import Answer, AnswerReader, Telegram, make_telegram
 from drivers.backends.modbus_stream import Stream, open_stream
 from drivers.backends.modbus_url import ModbusUrl
@@ -147,18 +147,18 @@ class ModbusLink:
         self._is_owed = False
         self._came.clear()
         self._stream.write(frame)
-        self.last_sent = time.monotonic()
+        self.last_sent = clock.now()
         self.counters.frames_out += 1
 
     async def _await_silence(self) -> None:
         """Wait until a serial line is free."""
         if not self.line.is_rtu:
             return
-        if self._is_owed and (wait := self._free_from - time.monotonic()) > 0:
+        if self._is_owed and (wait := self._free_from - clock.now()) > 0:
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(wait):
                     await self._came.wait()
-        if (wait := self._free_from - time.monotonic()) > 0:
+        if (wait := self._free_from - clock.now()) > 0:
             await asyncio.sleep(wait)
 
     def _time_of(self, size: int) -> float:
@@ -177,7 +177,7 @@ class ModbusLink:
             else:
                 self._answer.set_result(answer)
         if not self._is_owed:
-            self._free_from = time.monotonic() + self._gap
+            self._free_from = clock.now() + self._gap
 
     def _lost(self, what: str) -> None:
         """The stream has found that it is gone."""

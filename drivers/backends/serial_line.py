@@ -9,11 +9,11 @@ import contextlib
 import errno
 import os
 import threading
-import time
 from collections.abc import Callable
 
 import serial
 
+from drivers import clock
 from drivers.errors import LinkError, LinkTimeout
 from drivers.protocol.serial_frame import Frame, FrameReader
 
@@ -104,7 +104,7 @@ class SerialLine:
         except OSError as problem:
             self._lose(self._what_was_lost(problem))
             raise LinkError(self._loss) from problem
-        self.last_sent = time.monotonic()
+        self.last_sent = clock.now()
         self.frames_out += 1
 
     def _write(self, port: serial.Serial, data: bytes) -> None:

@@ -6,10 +6,12 @@ through the rig's wiring, level 1 being the ERA's full stroke.
 
 from collections import deque
 from collections.abc import Mapping
+from typing import Protocol
 
 import numpy as np
 
 from drivers.protocol.messages import Reply, Request
+from model.arrays import FloatArray
 from model.assembly import era_positions
 from model.point_load import load_positions
 from model.reduction import reduce_plate
@@ -22,14 +24,33 @@ from sim.plant import Plant
 from sim.waveform import Output, Tone
 
 SAMPLE_RATE = 10_000.0  # Hz; the peak of 500 Hz is then seen to 1.3 %
+_PORTION = 1.0  # s; what is sampled at once, however long nobody asked
+
+
+class Tap(Protocol):
+    """Something that hears the plate all the time, by its reduced shapes at points (p, r)."""
+
+    @property
+    def shapes(self) -> FloatArray:
+        """Where it listens."""
+        ...
+
+    def record(self, times: FloatArray, accelerations: FloatArray) -> None:
+        """Take what was there: (n,) [s], (n, p) [m/s²]; without a gap to what came before."""
+        ...
 
 
 class Bench:
-    """A simulated rig that is at rest at time now [s]."""
+    """A simulated rig that is at rest at time now [s]; sample_rate [Hz]: of all that is measured.
 
-    def __init__(self, rig: Rig, *, now: float) -> None:
+    taps: what listens beside the fingers.
+    """
+
+    def __init__(self, rig: Rig, *, now: float, sample_rate: float = SAMPLE_RATE) -> None:
         self.rig = rig
-        reduced = reduce_plate(
+        self.sample_rate = sample_rate
+        self.taps: list[Tap] = []
+        self._reduced = reduced = reduce_plate(
             rig.plate,
             rig.mesh,
             np.vstack([era_positions(rig.eras), load_positions(rig.loads)]),
@@ -52,9 +73,15 @@ class Bench:
 
     def advance(self, now: float) -> None:
         """Let everything happen that happens until now [s], each thing at its own moment."""
-        if now - self.time > KEPT:  # what nobody could ask for need not be sampled
+        if now - self.time > KEPT and not self.taps:  # what nobody could ask for is not sampled
             self._advance_amplifiers(now - KEPT, watched=False)
+        while now - self.time > _PORTION:
+            self._advance_amplifiers(self.time + _PORTION, watched=True)
         self._advance_amplifiers(now, watched=True)
+
+    def shapes_at(self, points: FloatArray) -> FloatArray:
+        """The reduced shapes (p, r) at points (p, 2) [m]: what a tap there listens by."""
+        return self._reduced.at(points)
 
     def exchange(self, amplifier: str, request: Request, *, now: float) -> Reply:
         """What an amplifier answers to a request that arrives now [s]."""
@@ -95,13 +122,17 @@ class Bench:
     def _move_plant(self, to_time: float, *, watched: bool) -> None:
         if to_time <= self.time:
             return
-        if not (watched and self.fingers.layout.positions):
+        if not (watched and (self.fingers.layout.positions or self.taps)):
             self._plant.skip(to_time)
             return
-        layout = self.fingers.layout
-        self.fingers.record(
-            *self._plant.advance(to_time, sample_rate=SAMPLE_RATE, shapes=layout.shapes)
+        heard = [self.fingers.layout.shapes, *(tap.shapes for tap in self.taps)]
+        times, accelerations = self._plant.advance(
+            to_time, sample_rate=self.sample_rate, shapes=np.concatenate(heard)
         )
+        parts = np.split(accelerations, np.cumsum([len(shapes) for shapes in heard])[:-1], axis=1)
+        self.fingers.record(times, parts[0])
+        for tap, part in zip(self.taps, parts[1:], strict=True):
+            tap.record(times, part)
 
     def _tell_plant(self) -> None:
         """Pass on what the channels play, where it is not what the plant knows already."""

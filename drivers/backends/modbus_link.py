@@ -19,7 +19,6 @@ from drivers.protocol.modbus_map import Read, Write
 from drivers.protocol.modbus_timing import silence
 from drivers.statistics import WireCounters
 
-_REACTION: float = PROTOCOL.modbus["reaction"]
 _BROADCAST: int = PROTOCOL.modbus["broadcast"]
 _TRANSACTIONS = 1 << 16
 _RTU_OVERHEAD = 3  # bytes of an answer around its PDU
@@ -111,8 +110,8 @@ class ModbusLink:
             try:
                 self._send(telegram.frame)
                 self._is_owed = True
-                self._free_from = self.last_sent + on_line + _REACTION
-                async with asyncio.timeout(max(timeout, on_line + _REACTION)):
+                self._free_from = self.last_sent + on_line + PROTOCOL.reaction
+                async with asyncio.timeout(max(timeout, on_line + PROTOCOL.reaction)):
                     return await self._answer
             except LinkError:
                 raise

@@ -125,10 +125,12 @@ class SerialLine:
 class Protocol:
     """Everything that host and amplifier must agree on, in numbers.
 
-    modbus, canopen: the sections of these names as they stand in the file.
+    reaction [s]: a reply has begun by then; modbus, canopen: the sections of these names as they
+    stand in the file.
     """
 
     version: int
+    reaction: float
     serial: SerialLine
     types: Mapping[str, int]
     states: Mapping[str, int]
@@ -145,6 +147,7 @@ def _load() -> Protocol:
     listed = raw["quantities"]
     return Protocol(
         version=raw["version"],
+        reaction=raw["reaction"],
         serial=SerialLine(**raw["serial"]),
         types=raw["types"],
         states=raw["states"],

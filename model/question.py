@@ -25,16 +25,21 @@ class Question:
     """Contacts and a wanted level in; `LocalizationTable.ask` gives a pattern out.
 
     targets: where fingers shall feel it, one or more; quiet: where fingers must not; level_db_sl:
-    wanted at every target; mode: a name in MODES, None for the table's own; playable: the modes
-    that the amplifiers can play; frequencies: the lowest and highest they can [Hz]; eras_at_most:
-    how many ERAs `switched` may drive, beyond two by exact search, which is not for live use and
-    ends after search_time [s] at the latest, with a bound in place of a proof; envelopes: whether
-    the amplifiers play any (`model.timing`).
+    wanted at every target; softer_db: by how much less each of them wants than that, empty for
+    nothing; mode: a name in MODES, None for the table's own; playable: the modes that the
+    amplifiers can play; frequencies: the lowest and highest they can [Hz]; eras_at_most: how many
+    ERAs `switched` may drive, beyond two by exact search, which is not for live use and ends after
+    search_time [s] at the latest, with a bound in place of a proof; envelopes: whether the
+    amplifiers play any (`model.timing`).
+
+    Where targets are not wanted alike, contrast and level of the answer are those of the target
+    that has least of what it wants, as if it wanted the full level.
     """
 
     targets: tuple[Point, ...]
     quiet: tuple[Point, ...] = ()
     level_db_sl: float = STRONG_DB_SL
+    softer_db: tuple[float, ...] = ()
     mode: str | None = None
     playable: tuple[str, ...] = tuple(MODES)
     frequencies: tuple[float, float] = (0.0, math.inf)
@@ -53,6 +58,17 @@ class Question:
             )
         if not abs(self.level_db_sl) <= MOST_LEVEL_DB_SL:  # not true of NaN either
             raise InputError(f"a level of {self.level_db_sl} dB SL is none; 20 is strong, 12 felt")
+        if self.softer_db and len(self.softer_db) != len(self.targets):
+            raise InputError(
+                f"{len(self.softer_db)} levels were given for {len(self.targets)} targets; give "
+                "each its own, or none"
+            )
+        for softer in self.softer_db:
+            if not 0 <= softer <= MOST_LEVEL_DB_SL:  # not true of NaN either
+                raise InputError(
+                    f"a target cannot be softer than the level asked for by {softer} dB; take the "
+                    "highest for the level, and say by how much the others are below it"
+                )
         if not self.search_time >= 0:
             raise InputError(f"a search cannot end after {self.search_time} s; give it 0 or more")
         if self.eras_at_most < 1:

@@ -81,16 +81,18 @@ class Shaper:
         *,
         targets: Sequence[Position] = (),
         quiet: Sequence[Position] = (),
+        helped: bool = True,
     ) -> Envelopes:
         """Envelopes that lead from an excitation to silence and bring the whole plate to rest.
 
-        With targets and quiet fingers [m] the quiet ones are kept quiet meanwhile.
+        With targets and quiet fingers [m] the quiet ones are kept quiet meanwhile. helped: whether
+        an ERA that the excitation leaves silent helps where there is one frequency only.
         """
         both = bool(targets and quiet)
         felt = self._fingertips(targets) if both else None
         still = self._fingertips(quiet) if both else None
         envelopes: dict[str, Envelope] = {}
-        for frequency, amplitudes, active in self._groups(excitation):
+        for frequency, amplitudes, active in self._groups(excitation, helped=helped):
             knots = ending_knots(
                 self._carrier(frequency), amplitudes, active, felt=felt, still=still
             )
@@ -110,14 +112,16 @@ class Shaper:
             envelopes[self._plate.eras[era].name] = Envelope(frequency, start, tuple(rest))
         return envelopes
 
-    def _groups(self, excitation: Excitation) -> list[tuple[float, ComplexArray, IntArray]]:
+    def _groups(
+        self, excitation: Excitation, *, helped: bool = True
+    ) -> list[tuple[float, ComplexArray, IntArray]]:
         """Per frequency [Hz]: amplitudes (eras,) in strokes, and which ERAs play it."""
         eras = self._plate.eras
         frequencies = sorted({tone.frequency for tone in excitation.values()})
         groups = []
         for frequency in frequencies:
             amplitudes = np.zeros(len(eras), dtype=complex)
-            plays = np.full(len(eras), len(frequencies) == 1)
+            plays = np.full(len(eras), helped and len(frequencies) == 1)
             for number, era in enumerate(eras):
                 tone = excitation.get(era.name)
                 if tone is not None and tone.frequency == frequency:

@@ -150,14 +150,16 @@ class LocalizationTable:
         """What a drive mode needs to know about a question, at all frequencies of the table."""
         found, ends = self._at_fingertips((*question.targets, *question.quiet))
         count = len(question.targets)
+        # A softer target counts as much louder as it is softer: then all want the same.
+        gains = [10 ** (softer / 20) for softer in question.softer_db] or [1.0] * count
         if question.quiet:
             quiet = found[:, :, ends[count - 1] :]
         else:
             quiet = self._cell_fields[:, :, self._far_from(question.targets)]
         return Fields(
             targets=tuple(
-                np.ascontiguousarray(found[:, :, start:end])
-                for start, end in zip((0, *ends), ends[:count], strict=False)
+                np.ascontiguousarray(found[:, :, start:end] * np.float32(gain))
+                for start, end, gain in zip((0, *ends), ends[:count], gains, strict=False)
             ),
             quiet=np.ascontiguousarray(quiet),
             is_alone=not question.quiet,

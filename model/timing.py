@@ -50,18 +50,22 @@ class Timing:
         for frequency in frequencies:
             self._shaper.prepare(frequency)
 
-    def with_envelopes(self, question: Question, pattern: Pattern) -> Pattern:
-        """The pattern with a shaped onset and ending, for amplifiers that play them.
+    def with_envelopes(
+        self, question: Question, pattern: Pattern, *, onset: bool = True, ending: bool = True
+    ) -> Pattern:
+        """The pattern with a shaped onset and ending, or one, for amplifiers with envelopes.
 
         A few milliseconds for both. Where nobody is to be kept quiet the plate around the targets
-        is, at the onset.
+        is, at the onset. An ending belongs to what plays: silent ERAs help at the onset only.
         """
-        targets, quiet = question.targets, question.quiet
-        return replace(
-            pattern,
-            onset=self._shaper.onset(pattern.excitation, targets=targets, quiet=quiet),
-            ending=self._shaper.ending(pattern.excitation, targets=targets, quiet=quiet),
-        )
+        targets, quiet, tones = question.targets, question.quiet, pattern.excitation
+        if onset:
+            envelopes = self._shaper.onset(tones, targets=targets, quiet=quiet)
+            pattern = replace(pattern, onset=envelopes)
+        if ending:
+            envelopes = self._shaper.ending(tones, targets=targets, quiet=quiet, helped=False)
+            pattern = replace(pattern, ending=envelopes)
+        return pattern
 
     def with_transient_measures(self, question: Question, pattern: Pattern) -> Pattern:
         """The pattern with its contrast over the first 100 ms and what it leaves when it ends.

@@ -326,6 +326,9 @@ def test_a_silent_era_helps_where_there_is_one_frequency(setup):
         transients.left_db(excitation, shaped(each, rig.eras)) for each in (ending, alone)
     )
     assert with_help < without
+    unhelped = shaper.ending(excitation, helped=False)
+    assert set(unhelped) == set(excitation)
+    assert transients.left_db(excitation, shaped(unhelped, rig.eras)) < without
 
 
 def test_around_a_lone_finger_the_plate_takes_the_quiet_fingers_place(setup):

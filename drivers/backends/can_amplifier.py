@@ -7,9 +7,7 @@ else; each amplifier hears one of its own, so that one that was lost is not fed 
 
 import asyncio
 import contextlib
-import secrets
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -19,6 +17,7 @@ from drivers.backends.can_node import NodeWatch
 from drivers.backends.can_sdo import ObjectClient
 from drivers.backends.can_url import CanUrl
 from drivers.backends.can_wire import CanWire, acquire, release
+from drivers.backends.stand_in import Worker, make_worker, number_below
 from drivers.errors import FrameError, LinkError, LinkTimeout
 from drivers.guard import SafeEnvelope
 from drivers.protocol.can_frame import CANOPEN, CanFrame, cob_id
@@ -74,11 +73,11 @@ class CanBackend(Backend):
         self._url = CanUrl.parse(url)
         self._wire: CanWire | None = None
         self._objects: ObjectClient | None = None
-        self._thread: ThreadPoolExecutor | None = None
+        self._worker: Worker | None = None
         self._node = NodeWatch(self._url, answered=self._answered, told=self._told, lost=self._lose)
         self._pending: dict[int, _Pending] = {}
         # Not from the first, so that an answer to an earlier run is no answer to this one.
-        self._sequence = secrets.randbelow(SEQUENCE_MAX)
+        self._sequence = number_below(SEQUENCE_MAX)
         self._staged: Achieved | None = None  # as it was asked for
         self._channels = PROTOCOL.quantities.channel_count.maximum
         self._on_event: Callable[[Event], None] = lambda event: None
@@ -119,21 +118,21 @@ class CanBackend(Backend):
         self._wire = wire
         self._loss = None
         self._counters = WireCounters()
-        self._objects = ObjectClient(wire.network, self._url.node)
-        self._thread = ThreadPoolExecutor(1, thread_name_prefix=f"era-sdo {self._url.node}")
+        self._worker = make_worker(f"era-sdo {self._url.node}")
+        self._objects = ObjectClient(wire.network, self._url.node, self._worker)
         self._node.join(wire, self._objects, self._counters)
         wire.on_loss.append(self._lose)
 
     async def close(self) -> None:
         """Leave the bus; what still waits for an answer gets LinkError."""
         wire, self._wire = self._wire, None
-        thread, self._thread = self._thread, None
+        worker, self._worker = self._worker, None
         self._node.stop()
         self._fail(f"{self._url.bus} was closed")
-        if wire is None or thread is None or self._objects is None:
+        if wire is None or worker is None or self._objects is None:
             return
         self._objects.abandon()
-        await asyncio.to_thread(thread.shutdown)
+        await worker.close()
         self._node.leave(wire)
         with contextlib.suppress(ValueError):
             wire.on_loss.remove(self._lose)
@@ -258,11 +257,11 @@ class CanBackend(Backend):
         return achieved
 
     async def _objects_job(self, job: Callable[[ObjectClient], _T], timeout: float) -> _T:
-        """Do something with the amplifier's objects, in their own thread."""
-        objects, thread = self._objects, self._thread
-        if objects is None or thread is None:
+        """Do something with the amplifier's objects, beside the event loop."""
+        objects, worker = self._objects, self._worker
+        if objects is None or worker is None:
             raise LinkError(f"{self._url.bus} is not open")
-        future = asyncio.get_running_loop().run_in_executor(thread, job, objects)
+        future = worker.submit(lambda: job(objects))
         try:
             async with asyncio.timeout(_OBJECTS_WAIT * timeout):
                 result = await asyncio.shield(future)

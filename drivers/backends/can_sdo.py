@@ -6,7 +6,6 @@ way, so before the next an object that is never asked for otherwise is read unti
 
 import queue
 import struct
-import time
 from collections.abc import Callable
 from typing import TypeVar
 
@@ -15,6 +14,7 @@ from canopen.objectdictionary import ObjectDictionary
 from canopen.sdo.client import SdoClient
 from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
+from drivers.backends.stand_in import Worker
 from drivers.errors import FrameError, LinkError, LinkTimeout
 from drivers.guard import SafeEnvelope
 from drivers.protocol.can_frame import cob_id
@@ -50,16 +50,35 @@ _ABANDON = struct.pack("<BHBL", 0x80, 0, 0, 0x0504_0000)
 _T = TypeVar("_T")
 
 
-class ObjectClient:
-    """The SDO client of one node; `feed` takes its answers from the reader's thread."""
+class _Client(SdoClient):
+    """`canopen`'s client, which waits as its worker does."""
 
-    def __init__(self, network: canopen.Network, node: int) -> None:
+    def __init__(self, node: int, worker: Worker) -> None:
+        self._make_queue = worker.make_queue
+        super().__init__(
+            cob_id("sdo_request", node), cob_id("sdo_answer", node), ObjectDictionary()
+        )
+
+    @property
+    def responses(self) -> "queue.Queue[bytes]":
+        """What has come."""
+        return self._responses
+
+    @responses.setter
+    def responses(self, empty: "queue.Queue[bytes]") -> None:
+        """The client forgets what has come by taking another queue."""
+        self._responses = self._make_queue()
+
+
+class ObjectClient:
+    """The SDO client of one node, for jobs of a worker; `feed` takes its answers as they come."""
+
+    def __init__(self, network: canopen.Network, node: int, worker: Worker) -> None:
         self.foreign = 0
         self._network = network
         self._node = node
-        self._client = SdoClient(
-            cob_id("sdo_request", node), cob_id("sdo_answer", node), ObjectDictionary()
-        )
+        self._worker = worker
+        self._client = _Client(node, worker)
         self._client.network = network
         self._busy = False
         self._broken = False
@@ -166,7 +185,7 @@ class ObjectClient:
         request = struct.pack("<BHB4x", 0x40, index, subindex)
         self._client.send_request(request)
         answers = {bytes(self._client.read_response())}
-        time.sleep(_SETTLE)
+        self._worker.sleep(_SETTLE)
         while True:
             try:
                 answers.add(self._client.responses.get_nowait())

@@ -8,13 +8,13 @@ taken for another; identity and capabilities do not change and are read without 
 An amplifier cannot speak unasked here: events are what its answers show to have changed.
 """
 
-import secrets
 from collections.abc import Callable
 
 from drivers.backend import Backend
 from drivers.backends.modbus_frames import Answer
 from drivers.backends.modbus_link import ModbusLink
 from drivers.backends.modbus_url import ModbusUrl
+from drivers.backends.stand_in import number_below
 from drivers.errors import LinkError, LinkTimeout
 from drivers.protocol import modbus_map
 from drivers.protocol.messages import (
@@ -44,7 +44,7 @@ class ModbusBackend(Backend):
         self._url = ModbusUrl.parse(url)
         self._link: ModbusLink | None = None
         # Not from zero, so that an answer to an earlier run is no answer to this one.
-        self._tag = secrets.randbelow(_TAGS)
+        self._tag = number_below(_TAGS)
         self._can_read_back = True
         self._channels: int | None = None
         self._condition: tuple[State, Fault] | None = None

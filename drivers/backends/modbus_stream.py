@@ -13,6 +13,7 @@ from typing import Protocol, cast
 import serial
 
 from drivers.backends.modbus_url import ModbusUrl
+from drivers.backends.stand_in import STAND_IN
 from drivers.errors import LinkError, LinkTimeout
 
 _CONNECT_TIMEOUT = 1.0  # s; an amplifier in the same building answers a hundred times faster
@@ -174,6 +175,9 @@ class _SerialPort:
 async def _open_serial(
     line: ModbusUrl, on_data: Callable[[bytes], None], on_loss: Callable[[str], None]
 ) -> Stream:
+    stand_in = STAND_IN.get()
+    if stand_in is not None:
+        return await stand_in.open_port(line.device, on_data=on_data, on_loss=on_loss)
     try:
         port = await asyncio.to_thread(_open_port, line)
     except _FAILURES as problem:

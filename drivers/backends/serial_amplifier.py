@@ -5,13 +5,13 @@ line, each at its own address.
 """
 
 import asyncio
-import secrets
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 from drivers.backend import Backend
 from drivers.backends.serial_line import SerialLine, shared_line
 from drivers.backends.serial_url import SerialUrl
+from drivers.backends.stand_in import number_below
 from drivers.errors import DriverError, LinkError, LinkTimeout
 from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.messages import Broadcast, Event, Reply, Request
@@ -37,7 +37,7 @@ class SerialBackend(Backend):
         self._line: SerialLine | None = None
         self._pending: dict[int, _Pending] = {}
         # Not from zero, so that an answer to an earlier run is no answer to this one.
-        self._sequence = secrets.randbelow(1 << 16)
+        self._sequence = number_below(1 << 16)
         self._counters = WireCounters()
         self._why_closed = f"{self._url.port} is not open"
         self._last_sent = 0.0

@@ -13,7 +13,7 @@ import pytest
 import serial
 
 from drivers.amplifier import Amplifier
-from drivers.backends import serial_line
+from drivers.backends import serial_port
 from drivers.backends.serial_amplifier import SerialBackend
 from drivers.backends.serial_url import SerialUrl
 from drivers.errors import CommandError, FrameError, LinkError, LinkTimeout
@@ -273,7 +273,7 @@ async def test_a_forbidden_port_says_what_to_do(
     def forbidden(*args: object, **kwargs: object) -> None:
         raise serial.SerialException(errno.EACCES, "could not open port: Permission denied")
 
-    monkeypatch.setattr(serial_line.serial, "serial_for_url", forbidden)
+    monkeypatch.setattr(serial_port.serial, "serial_for_url", forbidden)
     with pytest.raises(LinkError, match="dialout"):
         await SerialBackend(far_end.url).open()
 

@@ -104,6 +104,10 @@ class Amplifier:
         """Time [s] on the wire of an apply of all channels and its answer; 0 where not known."""
         return self._link.backend.round_trip(self.capabilities.channels)
 
+    def loading_time(self, knots: int) -> float:
+        """Time [s] on the wire of loading an envelope of so many knots; 0 where not known."""
+        return self._link.backend.loading_time(knots)
+
     def listen(self, on_event: Callable[[Event], None]) -> None:
         """Be told, in the event loop, what the amplifier says unasked; a hint that may be lost."""
         self._listeners.append(on_event)

@@ -35,15 +35,15 @@ class Backend(ABC):
     async def exchange(self, request: Request, *, timeout: float) -> Reply:
         """Send one request and wait for its own reply; a late reply to another is dropped.
 
-        timeout [s]: what the amplifier may take; what a slow wire needs comes on top of it. Raises
-        LinkTimeout, LinkError. A Nak is returned, not raised. Cancelling leaves the wire usable.
+        timeout [s]: for all of it; longer where the wire itself needs longer. Raises LinkTimeout,
+        LinkError. A Nak is returned, not raised. Cancelling leaves the wire usable.
         Sets and envelopes must be a SafeCommand and a SafeEnvelope: TypeError for others.
         """
 
     @property
     @abstractmethod
     def last_sent(self) -> float:
-        """When the last byte of the last request went out, on time.monotonic() [s]."""
+        """When the last byte of the last request went out, by the event loop's clock [s]."""
 
     @property
     def counters(self) -> WireCounters:
@@ -73,4 +73,8 @@ class Backend(ABC):
 
     def round_trip(self, channels: int) -> float:
         """Time [s] on the wire of an apply of so many channels and its answer; 0 if unknown."""
+        return 0.0
+
+    def loading_time(self, knots: int) -> float:
+        """Time [s] on the wire of loading an envelope of so many knots; 0 if unknown."""
         return 0.0

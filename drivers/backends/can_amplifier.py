@@ -18,10 +18,11 @@ from drivers.backends.can_sdo import ObjectClient
 from drivers.backends.can_url import CanUrl
 from drivers.backends.can_wire import CanWire, acquire, release
 from drivers.backends.stand_in import Worker, make_worker, number_below
+from drivers.backends.waiting import reply_within
 from drivers.errors import FrameError, LinkError, LinkTimeout
 from drivers.guard import SafeEnvelope
 from drivers.protocol.can_frame import CANOPEN, CanFrame, cob_id
-from drivers.protocol.can_timing import frames_time, round_trip_time
+from drivers.protocol.can_timing import frames_time, loading_time, round_trip_time
 from drivers.protocol.canopen_answers import UNASKED, Answer, plain_reply
 from drivers.protocol.canopen_map import (
     SEQUENCE_MAX,
@@ -110,6 +111,10 @@ class CanBackend(Backend):
         bus = self._url.bus
         return round_trip_time(channels, bitrate=bus.bitrate, fd=bus.fd)
 
+    def loading_time(self, knots: int) -> float:
+        """Time [s] on the bus of loading an envelope."""
+        return loading_time(knots, bitrate=self._url.bus.bitrate)
+
     async def open(self) -> None:
         """Join the bus, which is opened by the first of its amplifiers; raises LinkError."""
         if self._wire is not None:
@@ -141,7 +146,8 @@ class CanBackend(Backend):
     async def exchange(self, request: Request, *, timeout: float) -> Reply:
         """Send a request and wait for its answer; LinkTimeout, LinkError or FrameError.
 
-        timeout [s]: what the amplifier may take, for objects over each of their frames.
+        timeout [s]: for all of it, of objects for each of their frames; longer where the bus and an
+        amplifier that reacts in time need longer.
         """
         self._raise_if_lost()
         match request:
@@ -204,8 +210,7 @@ class CanBackend(Backend):
         bus = self._url.bus
         on_wire = 2 * frames_time(frames, bitrate=bus.bitrate, fd=bus.fd)
         try:
-            async with asyncio.timeout(timeout + on_wire):
-                answer = await self._answer_to(order, frames)
+            answer = await self._answer_to(order, frames, max(timeout, on_wire + PROTOCOL.reaction))
         except LinkError:
             raise
         except TimeoutError:
@@ -220,7 +225,9 @@ class CanBackend(Backend):
             raise FrameError(f"an answer without a status to {type(order).__name__}")
         return await self._achieved(order, answer, timeout)
 
-    async def _answer_to(self, order: Order, frames: tuple[CanFrame, ...]) -> Answer:
+    async def _answer_to(
+        self, order: Order, frames: tuple[CanFrame, ...], timeout: float
+    ) -> Answer:
         sequence = self._sequence
         token = None
         if isinstance(order, Apply):
@@ -231,7 +238,7 @@ class CanBackend(Backend):
         self._pending[sequence] = pending = _Pending(action_of(order), token, answer)
         try:
             self._send(frames)
-            return await answer
+            return await reply_within(answer, timeout)
         finally:
             if self._pending.get(sequence) is pending:
                 del self._pending[sequence]

@@ -29,7 +29,7 @@ from drivers.protocol.messages import (
     State,
 )
 from drivers.protocol.modbus_map import Exchange, Read, Write
-from drivers.protocol.modbus_timing import round_trip_time
+from drivers.protocol.modbus_timing import loading_time, round_trip_time
 from drivers.statistics import WireCounters
 
 _ILLEGAL_FUNCTION = 1
@@ -74,6 +74,13 @@ class ModbusBackend(Backend):
             return 0.0
         bits = self._url.bits_per_byte
         return round_trip_time(channels, baud=self._url.baud, bits_per_byte=bits)
+
+    def loading_time(self, knots: int) -> float:
+        """Time [s] on a serial line of loading an envelope; else 0."""
+        if not self._url.device:
+            return 0.0
+        bits = self._url.bits_per_byte
+        return loading_time(knots, baud=self._url.baud, bits_per_byte=bits)
 
     def listen(self, on_event: Callable[[Event], None], on_loss: Callable[[str], None]) -> None:
         """Whom to tell of changes that an answer shows, and of the end of the line."""

@@ -13,12 +13,14 @@ from drivers import clock
 from drivers.backends.modbus_frames import Answer, AnswerReader, Telegram, make_telegram
 from drivers.backends.modbus_stream import Stream, open_stream
 from drivers.backends.modbus_url import ModbusUrl
+from drivers.backends.waiting import reply_within
 from drivers.errors import LinkError, LinkTimeout
 from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.modbus_map import Read, Write
 from drivers.protocol.modbus_timing import silence
 from drivers.statistics import WireCounters
 
+_REACTION = PROTOCOL.reaction
 _BROADCAST: int = PROTOCOL.modbus["broadcast"]
 _TRANSACTIONS = 1 << 16
 _RTU_OVERHEAD = 3  # bytes of an answer around its PDU
@@ -110,9 +112,8 @@ class ModbusLink:
             try:
                 self._send(telegram.frame)
                 self._is_owed = True
-                self._free_from = self.last_sent + on_line + PROTOCOL.reaction
-                async with asyncio.timeout(max(timeout, on_line + PROTOCOL.reaction)):
-                    return await self._answer
+                self._free_from = self.last_sent + on_line + _REACTION
+                return await reply_within(self._answer, max(timeout, on_line + _REACTION))
             except LinkError:
                 raise
             except TimeoutError:

@@ -12,12 +12,13 @@ from drivers.backend import Backend
 from drivers.backends.serial_line import SerialLine, shared_line
 from drivers.backends.serial_url import SerialUrl
 from drivers.backends.stand_in import number_below
+from drivers.backends.waiting import reply_within
 from drivers.errors import DriverError, LinkError, LinkTimeout
 from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.messages import Broadcast, Event, Reply, Request
 from drivers.protocol.serial_codec import decode_event, decode_reply, encode_request, is_event
 from drivers.protocol.serial_frame import Frame, encode_frame
-from drivers.protocol.serial_timing import exchange_time, round_trip_time
+from drivers.protocol.serial_timing import exchange_time, loading_time, round_trip_time
 from drivers.statistics import WireCounters
 
 
@@ -66,6 +67,10 @@ class SerialBackend(Backend):
             return 0.0
         return round_trip_time(channels, baud=self._url.baud)
 
+    def loading_time(self, knots: int) -> float:
+        """Time [s] on the line of loading an envelope; 0 where the line's end is a server."""
+        return loading_time(knots, baud=self._url.baud) if self._url.is_local else 0.0
+
     def listen(self, on_event: Callable[[Event], None], on_loss: Callable[[str], None]) -> None:
         """Whom to tell of events, and of a line that hangs up."""
         self._on_event, self._on_loss = on_event, on_loss
@@ -92,7 +97,8 @@ class SerialBackend(Backend):
     async def exchange(self, request: Request, *, timeout: float) -> Reply:
         """Send a request and wait for its reply; LinkTimeout, LinkError or FrameError.
 
-        timeout [s]: what the amplifier may take; the time on the line comes on top of it.
+        timeout [s]: for all of it; longer where a slow line and an amplifier that reacts in time
+        need longer.
         """
         line = self._open_line()
         line.raise_if_lost()
@@ -111,11 +117,11 @@ class SerialBackend(Backend):
         pending = _Pending(frame, asyncio.get_running_loop().create_future())
         self._pending[frame.sequence] = pending
         try:
-            async with asyncio.timeout(timeout + exchange_time(len(data), baud=self._url.baud)):
-                line.send(data)
-                self._last_sent = line.last_sent
-                self._counters.frames_out += 1
-                return await pending.reply
+            line.send(data)
+            self._last_sent = line.last_sent
+            self._counters.frames_out += 1
+            on_line = exchange_time(len(data), baud=self._url.baud)
+            return await reply_within(pending.reply, max(timeout, on_line + PROTOCOL.reaction))
         except LinkError:
             raise
         except TimeoutError:

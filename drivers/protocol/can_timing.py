@@ -8,6 +8,9 @@ _FRAME_BITS = 47  # beside the data, with the pause after it
 _STUFFED_BITS = 34  # of these and the data, every fifth may be followed by one that is stuffed in
 _FD_SLOW_BITS = 30  # arbitration, acknowledgement and pause of a CAN FD frame
 _FD_FAST_BITS = 37  # control and CRC
+_ENVELOPE_HEAD = 3  # bytes: step, count
+_KNOT = 4  # bytes: level, phase
+_SEGMENT = 7  # bytes
 
 
 def frame_time(length: int, *, bitrate: int, fd: int = 0) -> float:
@@ -32,3 +35,12 @@ def round_trip_time(channels: int, *, bitrate: int, fd: int = 0) -> float:
         together = frame_time(BLOCK * (1 + channels), bitrate=bitrate, fd=fd)
         return together + sync + frame_time(BLOCK, bitrate=bitrate, fd=fd)
     return (channels + 2) * frame_time(BLOCK, bitrate=bitrate) + sync
+
+
+def loading_time(knots: int, *, bitrate: int) -> float:
+    """Time [s] of loading an envelope of so many knots, as an SDO block transfer with its answers.
+
+    Two frames begin it, two end it, one tells that the segments have come.
+    """
+    segments = -(-(_ENVELOPE_HEAD + _KNOT * knots) // _SEGMENT)
+    return (segments + 5) * frame_time(8, bitrate=bitrate)

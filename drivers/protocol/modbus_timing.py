@@ -5,6 +5,8 @@ from drivers.protocol.definition import PROTOCOL
 _MAP = PROTOCOL.modbus
 _SET_HEAD = len(_MAP["head"]) + len(_MAP["holding"]["set"]["registers"])
 _ACHIEVED_HEAD = len(_MAP["head"]) + len(_MAP["input"]["achieved"]["registers"])
+_ENVELOPE_HEAD = len(_MAP["head"]) + len(_MAP["holding"]["envelope"]["registers"])
+_KNOT = 2  # registers: level, phase
 _CHANNEL: int = _MAP["channel_registers"]
 _READ_WRITE = 13  # bytes of an FC23 request without its registers
 _READ = 5  # bytes of its answer without its registers
@@ -32,3 +34,11 @@ def round_trip_time(channels: int, *, baud: int, bits_per_byte: int = 11) -> flo
     answer = (_READ + 2 * registers) * bits_per_byte / baud
     gaps = 2 * silence(baud=baud, bits_per_byte=bits_per_byte)
     return apply_time(channels, baud=baud, bits_per_byte=bits_per_byte) + answer + gaps
+
+
+def loading_time(knots: int, *, baud: int, bits_per_byte: int = 11) -> float:
+    """Time [s] of loading an envelope of so many knots and of its answer, with the silences."""
+    request = _READ_WRITE + 2 * (_ENVELOPE_HEAD + _KNOT * knots)
+    answer = _READ + 2 * _ENVELOPE_HEAD
+    gaps = 2 * silence(baud=baud, bits_per_byte=bits_per_byte)
+    return (request + answer) * bits_per_byte / baud + gaps

@@ -186,6 +186,8 @@ def test_the_time_on_the_bus_is_known_beforehand() -> None:
     """Four channels at 500 kbit/s, worst stuffing: six frames of 135 bits, a SYNC of 55."""
     backend = CanBackend("can+socketcan://can0#1")
     assert backend.round_trip(4) == pytest.approx((6 * 135 + 55) / 500_000)
+    # 3 + 4 * 20 bytes are twelve segments of seven, and five frames frame them.
+    assert backend.loading_time(20) == pytest.approx(17 * 135 / 500_000)
     assert CanBackend("can+socketcan://can0?fd=2000000#1").round_trip(4) < 0.6e-3
 
 
@@ -469,7 +471,7 @@ async def test_whoever_asks_only_looks(virtual: Virtual) -> None:
 async def test_a_ping_is_two_frames_and_an_unarmed_one_is_answered(virtual: Virtual) -> None:
     """The backend alone: heartbeat and order, answered with the status."""
     async with opened(virtual.url()) as amplifier:
-        backend = amplifier._backend
+        backend = amplifier._link.backend
         sent = backend.counters.frames_out
         reply = await backend.exchange(Ping(), timeout=1.0)
         assert backend.counters.frames_out == sent + 2

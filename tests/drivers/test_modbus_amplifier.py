@@ -43,7 +43,7 @@ from drivers.protocol.messages import (
     Stop,
 )
 from drivers.protocol.modbus_map import Read, Write
-from drivers.protocol.modbus_timing import round_trip_time, silence
+from drivers.protocol.modbus_timing import loading_time, round_trip_time, silence
 from drivers.watchdog import check_watchdog
 from modbus_peer import Peer, peer
 from modbus_session import ARMED, CAPABILITIES, COMMANDS, IDENTITY, SET, SHAPE, TRIPPED
@@ -489,9 +489,12 @@ def test_wire_time_is_arithmetic() -> None:
     """
     assert round_trip_time(4, baud=115200) == pytest.approx(0.01362, abs=1e-5)
     assert round_trip_time(4, baud=9600) == pytest.approx(0.12948, abs=1e-5)
+    # The frames of the vendor's page, of two knots.
+    assert loading_time(2, baud=9600) == pytest.approx((31 + 15 + 7) * 11 / 9600)
     assert silence(baud=9600) == pytest.approx(3.5 * 11 / 9600)
     assert silence(baud=115200) == 0.00175
     assert ModbusBackend("modbus+tcp://h/1").round_trip(4) == 0
+    assert ModbusBackend("modbus+tcp://h/1").loading_time(20) == 0
     slow = ModbusBackend("modbus+rtu:///dev/ttyS1?baud=9600#1").round_trip(4)
     with pytest.raises(CommandError, match=r"round trip of 129\.5 ms need at least 279 ms"):
         check_watchdog(0.25, slow)

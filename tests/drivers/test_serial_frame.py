@@ -13,7 +13,7 @@ from drivers.protocol.serial_frame import (
     encode_frame,
     frame_length,
 )
-from drivers.protocol.serial_timing import round_trip_time, wire_time
+from drivers.protocol.serial_timing import loading_time, round_trip_time, wire_time
 
 FRAMES = st.builds(
     Frame,
@@ -133,3 +133,5 @@ def test_wire_times_are_those_of_the_arithmetic() -> None:
     assert wire_time(4, baud=115_200) == pytest.approx(50 * 10 / 115_200)
     assert wire_time(4, baud=921_600) == pytest.approx(0.5e-3, rel=0.1)
     assert round_trip_time(4, baud=115_200) == pytest.approx((50 + 46) * 10 / 115_200)
+    # The frames of the vendor's page, of two knots.
+    assert loading_time(2, baud=115_200) == pytest.approx((23 + 13) * 10 / 115_200)

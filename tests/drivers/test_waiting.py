@@ -1,0 +1,62 @@
+"""Waiting for a reply: in time, too late, and in a process that was held up itself."""
+
+import asyncio
+import os
+import time
+
+import pytest
+
+from drivers.backends.waiting import reply_within
+
+
+async def test_a_reply_in_time_is_returned_and_a_missing_one_is_not_waited_for() -> None:
+    """What is there is given at once; what does not come is a TimeoutError, and the future over."""
+    loop = asyncio.get_running_loop()
+    there: asyncio.Future[str] = loop.create_future()
+    there.set_result("here")
+    assert await reply_within(there, 60.0) == "here"
+    missing: asyncio.Future[str] = loop.create_future()
+    with pytest.raises(TimeoutError):
+        await reply_within(missing, 0.001)
+    assert missing.done()
+
+
+async def test_what_came_while_this_process_was_held_up_counts() -> None:
+    """A reply that lay in the pipe when the time was over is no missing one."""
+    loop = asyncio.get_running_loop()
+    reply: asyncio.Future[bytes] = loop.create_future()
+    reading, writing = os.pipe()
+    loop.add_reader(reading, lambda: reply.set_result(os.read(reading, 16)))
+    try:
+        waiting = asyncio.create_task(reply_within(reply, 0.002))
+        await asyncio.sleep(0)
+        os.write(writing, b"here")
+        time.sleep(0.004)  # noqa: ASYNC251  the process is held up, past the time
+        assert await waiting == b"here"
+    finally:
+        loop.remove_reader(reading)
+        os.close(reading)
+        os.close(writing)
+
+
+async def test_a_reader_thread_that_was_held_up_too_gets_a_moment() -> None:
+    """After a hold-up a reply that is posted a little later still counts."""
+    loop = asyncio.get_running_loop()
+    reply: asyncio.Future[str] = loop.create_future()
+    waiting = asyncio.create_task(reply_within(reply, 0.002))
+    await asyncio.sleep(0)
+    time.sleep(0.02)  # noqa: ASYNC251  held up
+    # As a thread posts that runs once the process runs again: after the timer has been seen.
+    loop.call_soon(lambda: loop.call_soon(lambda: reply.done() or reply.set_result("late")))
+    assert await waiting == "late"
+
+
+async def test_who_is_cancelled_does_not_wait_on() -> None:
+    """Cancelling ends the wait and the future."""
+    reply: asyncio.Future[str] = asyncio.get_running_loop().create_future()
+    waiting = asyncio.create_task(reply_within(reply, 60.0))
+    await asyncio.sleep(0)
+    waiting.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await waiting
+    assert reply.cancelled()

@@ -19,10 +19,11 @@ from drivers.protocol.definition import PROTOCOL
 from sim.line import Line
 from sim.modbus_frames import PAUSE, Reader, Request, RtuReader, TcpReader, rtu_frame, tcp_frame
 from sim.modbus_unit import ModbusUnit
-from sim.pseudo_terminal import PseudoTerminal
+from sim.pseudo_terminal import make_terminal
 from sim.station import Station
 
 _MAP = PROTOCOL.modbus
+_HOST = "127.0.0.1"
 _ALONE = 255
 _CONNECTIONS_MAX = 16
 _UNSENT_MAX = 16384  # bytes; a master that does not read is hung up on
@@ -120,7 +121,7 @@ class ModbusRtuEnd(_Wire):
         super().__init__(_Units(stations), RtuReader(), speed=speed)
         self._baud = speed or _MAP["baud"]
         self._is_unpluggable = unpluggable
-        self._terminal = PseudoTerminal(self.inward.send, unpluggable=unpluggable)
+        self._terminal = make_terminal(self.inward.send, unpluggable=unpluggable)
 
     @property
     def urls(self) -> dict[str, str]:
@@ -198,37 +199,35 @@ class _Connection(_Wire, asyncio.Protocol):
 
 
 class ModbusTcpEnd:
-    """A TCP port on the loopback interface; port 0 is any that is free. Raises LinkError."""
+    """A TCP port on the loopback interface; port 0 is any that is free."""
 
     def __init__(self, stations: Sequence[Station], *, port: int = 0) -> None:
         self._units = _Units(stations)
         self._is_plugged = True
         self.connections: set[_Connection] = set()
         self._server: asyncio.Server | None = None
-        self._socket = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
-        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            self._socket.bind(("127.0.0.1", port))
-        except OSError as error:
-            self._socket.close()
-            raise LinkError(
-                f"port {port} cannot be listened on ({error.strerror}); take another, or 0 for any"
-            ) from error
+        self._port = port
 
     @property
     def urls(self) -> dict[str, str]:
-        """The URL of each amplifier, by its name."""
-        host, port = self._socket.getsockname()
+        """The URL of each amplifier, by its name; once it has started."""
         return {
-            station.name: f"modbus+tcp://{host}:{port}/{station.number}"
+            station.name: f"modbus+tcp://{_HOST}:{self._port}/{station.number}"
             for station in self._units.stations
         }
 
     async def start(self) -> None:
-        """Answer from now on, in the running event loop."""
-        self._server = await asyncio.get_running_loop().create_server(
-            lambda: _Connection(self, self._units), sock=self._socket
-        )
+        """Answer from now on; raises LinkError where the port is taken."""
+        try:
+            self._server = await asyncio.get_running_loop().create_server(
+                lambda: _Connection(self, self._units), _HOST, self._port
+            )
+        except OSError as error:
+            raise LinkError(
+                f"port {self._port} cannot be listened on ({error.strerror or error}); take "
+                "another, or 0 for any"
+            ) from error
+        self._port = self._server.sockets[0].getsockname()[1]
         self._units.stations[0].on_plug(self._plug)
 
     async def close(self) -> None:
@@ -237,7 +236,6 @@ class ModbusTcpEnd:
         if self._server is not None:
             self._server.close()
             await self._server.wait_closed()
-        self._socket.close()
 
     def connected(self, connection: _Connection) -> None:
         """A master has come."""

@@ -4,20 +4,75 @@ import asyncio
 import os
 import tempfile
 import tty
+from abc import ABC, abstractmethod
 from collections.abc import Callable
+from contextvars import ContextVar
 from pathlib import Path
+from typing import Protocol
 
 from drivers.errors import LinkError
 
 _READ_MAX = 4096
 
 
-class PseudoTerminal:
-    """A serial line that can be pulled out and put in again.
+class Terminal(ABC):
+    """A serial line that can be pulled out and put in again, as far ends see it.
 
-    on_data is called with what the host has written. unpluggable: the port is named by a link that
-    outlives the pseudo-terminal, for each time it is plugged in it is another one. dropped: writes
-    that nobody made room for; an amplifier does not wait for its host.
+    dropped: writes that nobody made room for; an amplifier does not wait for its host.
+    """
+
+    dropped: int
+
+    @property
+    @abstractmethod
+    def port(self) -> str:
+        """The path of the host's side."""
+
+    @abstractmethod
+    def plug_in(self) -> None:
+        """Make the line, where there is none; raises LinkError."""
+
+    @abstractmethod
+    def listen(self) -> None:
+        """Read from now on, in the running event loop."""
+
+    @abstractmethod
+    def unplug(self) -> None:
+        """Take the line away: for the host it is gone."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Give everything back."""
+
+    @abstractmethod
+    def write(self, data: bytes) -> None:
+        """To the host; nothing where the line is unplugged."""
+
+
+class TerminalMaker(Protocol):
+    """Makes terminals; see `make_terminal`."""
+
+    def __call__(self, on_data: Callable[[bytes], None], *, unpluggable: bool) -> Terminal:
+        """A terminal."""
+
+
+TERMINAL_MAKER: ContextVar[TerminalMaker | None] = ContextVar("TERMINAL_MAKER", default=None)
+"""Who makes the terminals in this context; the system as a rule, a bench in virtual time itself."""
+
+
+def make_terminal(on_data: Callable[[bytes], None], *, unpluggable: bool = False) -> Terminal:
+    """A serial line; on_data is called with what the host has written. Raises LinkError.
+
+    unpluggable: its port has the same path when it is plugged in again.
+    """
+    return (TERMINAL_MAKER.get() or PseudoTerminal)(on_data, unpluggable=unpluggable)
+
+
+class PseudoTerminal(Terminal):
+    """A terminal of the system's.
+
+    unpluggable: the port is named by a link that outlives the pseudo-terminal, for each time it is
+    plugged in it is another one.
     """
 
     def __init__(self, on_data: Callable[[bytes], None], *, unpluggable: bool = False) -> None:

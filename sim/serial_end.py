@@ -15,7 +15,7 @@ from drivers.protocol.payload import Malformed
 from drivers.protocol.serial_codec import decode_request, encode_event, encode_reply
 from drivers.protocol.serial_frame import Frame, FrameCounters, FrameReader, encode_frame
 from sim.line import Line
-from sim.pseudo_terminal import PseudoTerminal
+from sim.pseudo_terminal import make_terminal
 from sim.station import Station
 
 
@@ -40,7 +40,7 @@ class SerialEnd:
         self._outward = Line(self._to_host, toward="host", faults=faults, bits_per_second=baud)
         self._events = 0
         self._reader = FrameReader()
-        self._terminal = PseudoTerminal(self._inward.send, unpluggable=unpluggable)
+        self._terminal = make_terminal(self._inward.send, unpluggable=unpluggable)
         self._is_unpluggable = unpluggable
 
     @property

@@ -10,7 +10,7 @@ from collections.abc import Callable
 
 from drivers.protocol.can_frame import CanFrame
 from sim.can_bus import CanBus
-from sim.pseudo_terminal import PseudoTerminal
+from sim.pseudo_terminal import make_terminal
 
 _CR, _BELL = b"\r", b"\x07"
 _LONGEST = 160  # characters; a CAN FD frame has 133
@@ -22,11 +22,11 @@ _SETTING = re.compile(rb"S[0-9]|s[0-9A-Fa-f]{4,6}|Y[0-9]|[Mm][0-9A-Fa-f]{8}|[ZX]
 
 
 class SlcanEnd:
-    """An adapter between a pseudo-terminal and a bus; unpluggable: see `PseudoTerminal`."""
+    """An adapter between a pseudo-terminal and a bus; unpluggable: see `make_terminal`."""
 
     def __init__(self, bus: CanBus, *, unpluggable: bool = False) -> None:
         self._adapter = SlcanAdapter(bus, lambda data: self._port.write(data))
-        self._port = PseudoTerminal(self._adapter.receive, unpluggable=unpluggable)
+        self._port = make_terminal(self._adapter.receive, unpluggable=unpluggable)
         self._port.listen()
 
     @property

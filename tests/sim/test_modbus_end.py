@@ -501,5 +501,5 @@ async def test_a_port_that_is_taken_is_named() -> None:
     await end.start()
     port = int(re.findall(r":(\d+)/", end.urls["main"])[0])
     with pytest.raises(LinkError, match=f"port {port} cannot be listened on.*0 for any"):
-        ModbusTcpEnd([ScriptedStation()], port=port)
+        await ModbusTcpEnd([ScriptedStation()], port=port).start()
     await end.close()

@@ -6,7 +6,7 @@ coordinates that the table holds, at the pattern's own frequencies only:
 - gains of the ERAs differ by 5 %, phases by 5 degrees (normal, standard deviation);
 - stiffness k_b of each ERA by up to 10 %, thickness by up to 2 % (uniform);
 - all damping, the plate's and the ERAs', is up to twice or half as much (uniform in its logarithm);
-- every finger presses on the plate: 1 kN/m, 2 N s/m and 0.2 g at each contact.
+- every finger presses on the plate (`model.finger_load`).
 
 A plate that is thicker by a factor s has the same mode shapes: natural frequencies go with s, modal
 masses too. That is exact for thin plates; the shear and rotary inertia of the paper's plate change
@@ -21,6 +21,7 @@ import numpy as np
 from model.actuator import Era
 from model.arrays import ComplexArray, FloatArray
 from model.excitation import Excitation
+from model.finger_load import finger_loads
 from model.pattern import Pattern
 from model.point_load import PointLoad
 from model.question import Point, Question
@@ -32,7 +33,6 @@ PHASE_DEVIATION = np.radians(5.0)
 STIFFNESS_RANGE = 0.10
 THICKNESS_RANGE = 0.02
 DAMPING_FACTOR = 2.0
-FINGER_STIFFNESS, FINGER_DAMPING, FINGER_MASS = 1000.0, 2.0, 0.0002  # N/m, N s/m, kg
 
 MEMBERS = 200
 PERCENTILE = 10
@@ -62,13 +62,6 @@ def draw_ensemble(era_count: int, *, members: int = MEMBERS, seed: int = 0) -> E
         damping=DAMPING_FACTOR ** rng.uniform(-1, 1, members),
         stiffness=rng.uniform(1 - STIFFNESS_RANGE, 1 + STIFFNESS_RANGE, each),
         drive=gain * np.exp(1j * phase),
-    )
-
-
-def finger_loads(contacts: Sequence[Point]) -> tuple[PointLoad, ...]:
-    """What fingers at contacts [m] do to the plate."""
-    return tuple(
-        PointLoad(x, y, FINGER_STIFFNESS, FINGER_DAMPING, FINGER_MASS) for x, y in contacts
     )
 
 

@@ -4,18 +4,20 @@
 
 q are the coordinates of the reduced free plate, phi its shapes at an ERA, y the motion of the
 ERA's base. M = I + sum m_b phi phi^T, K = diag(omega²) + sum k_b phi phi^T, C = C_s + sum c phi
-phi^T; what else the plate carries adds to M in the same way. The first-order system is diagonalised
-once; the base moves in terms with closed-form particular solutions (`model.base_motion`), so no
-step size enters and no error grows with time.
+phi^T; what else the plate carries adds to M in the same way, and a finger in contact adds its mass,
+stiffness and damping where it rests. The first-order system is diagonalised once for as long as
+nothing comes or goes; the base moves in terms with closed-form particular solutions
+(`model.base_motion`), so no step size enters and no error grows with time.
 
 Structural damping. The frequency domain uses a hysteretic stiffness (1 + i eta) diag(omega²),
 which no causal equation in time has. C_s is its viscous equivalent: in the modes psi_j, omega_j of
 the plate *on its ERAs*, C_s,jk = eta psi_j^T diag(omega²) psi_k / sqrt(omega_j omega_k). That is
 positive semidefinite, and at every resonance of the supported plate it takes exactly the power that
 the hysteretic one takes; a ratio eta/2 on the modes of the *free* plate would not, because the
-springs' share of a mode's energy has no loss. What is left differs off resonance: with eta = 1 %
-the steady accelerations of the paper's plate differ by at most 0.5 % (relative L2 over the plate,
-40 to 500 Hz), in proportion to eta; deep nulls are moved a little, not filled.
+springs' share of a mode's energy has no loss. It is the plate's own: contacts do not change it.
+What is left differs off resonance: with eta = 1 % the steady accelerations of the paper's plate
+differ by at most 0.5 % (relative L2 over the plate, 40 to 500 Hz), in proportion to eta; deep nulls
+are moved a little, not filled.
 
 Not modelled: large deflections, air, the ERAs' own dynamics beyond spring, damper and bolt mass,
 rocking and drag at the bolts, and the impulse c times the jump that the damper would pass on if a
@@ -166,17 +168,20 @@ def plate_in_time(
     eras: Sequence[Era],
     *,
     loads: Sequence[PointLoad] = (),
+    contacts: Sequence[PointLoad] = (),
     held: FloatArray | None = None,
 ) -> PlateInTime:
     """Diagonalise the equations of motion of a reduced plate on its ERAs, with what it carries.
 
-    held: shapes at the ERAs and loads (n, r) where they are known already. Raises InputError for
-    ERAs that do not hold the plate (fewer than three, or all in one line), and for a mode that is
-    damped critically.
+    contacts: fingers that rest on it now; held: shapes at the ERAs, loads and contacts (n, r) where
+    they are known already. Raises InputError for ERAs that do not hold the plate (fewer than three,
+    or all in one line), and for a mode that is damped critically.
     """
     if held is None:
-        held = reduced.at(np.vstack([era_positions(eras), load_positions(loads)]))
-    M, C, K = _matrices(reduced, held, [*_as_loads(eras), *loads])
+        held = reduced.at(
+            np.vstack([era_positions(eras), load_positions(loads), load_positions(contacts)])
+        )
+    M, C, K = _matrices(reduced, held, [*_as_loads(eras), *loads], contacts)
     r = len(K)
     inverse = linalg.inv(M)
     A = np.block([[np.zeros((r, r)), np.eye(r)], [-inverse @ K, -inverse @ C]])
@@ -195,11 +200,15 @@ def plate_in_time(
 
 
 def modal_matrices(
-    reduced: Reduced, eras: Sequence[Era], *, loads: Sequence[PointLoad] = ()
+    reduced: Reduced,
+    eras: Sequence[Era],
+    *,
+    loads: Sequence[PointLoad] = (),
+    contacts: Sequence[PointLoad] = (),
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """M, C, K (r, r) of the plate on its ERAs, in the coordinates of the reduced free plate."""
-    attached = [*_as_loads(eras), *loads]
-    return _matrices(reduced, reduced.at(load_positions(attached)), attached)
+    fixed = [*_as_loads(eras), *loads]
+    return _matrices(reduced, reduced.at(load_positions([*fixed, *contacts])), fixed, contacts)
 
 
 def _as_loads(eras: Sequence[Era]) -> list[PointLoad]:
@@ -207,11 +216,16 @@ def _as_loads(eras: Sequence[Era]) -> list[PointLoad]:
 
 
 def _matrices(
-    reduced: Reduced, phi: FloatArray, attached: Sequence[PointLoad]
+    reduced: Reduced,
+    phi: FloatArray,
+    fixed: Sequence[PointLoad],
+    contacts: Sequence[PointLoad],
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """phi: shapes at what is fixed to the plate and at the contacts, one after the other."""
     elastic = np.diag(reduced.omega**2)
-    M = np.eye(len(reduced.omega)) + (phi.T * [load.mass for load in attached]) @ phi
-    K = elastic + (phi.T * [load.stiffness for load in attached]) @ phi
+    M, C, K = _attached(phi[: len(fixed)], fixed)
+    M += np.eye(len(elastic))
+    K += elastic
     squares, psi = linalg.eigh(K, M)
     if squares[0] < 1.0:  # (rad/s)²: slower than one sway in six seconds is not held at all
         raise InputError(
@@ -221,5 +235,15 @@ def _matrices(
     omega = np.sqrt(squares)
     viscous = reduced.plate.loss_factor * (psi.T @ elastic @ psi) / np.sqrt(np.outer(omega, omega))
     back = M @ psi
-    C = back @ viscous @ back.T + (phi.T * [load.damping for load in attached]) @ phi
-    return M, C, K
+    C += back @ viscous @ back.T
+    added = _attached(phi[len(fixed) :], contacts)
+    return M + added[0], C + added[1], K + added[2]
+
+
+def _attached(
+    phi: FloatArray, loads: Sequence[PointLoad]
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """What loads with these shapes (n, r) add to M, C and K."""
+    mass = (phi.T * [load.mass for load in loads]) @ phi
+    damping = (phi.T * [load.damping for load in loads]) @ phi
+    return mass, damping, (phi.T * [load.stiffness for load in loads]) @ phi

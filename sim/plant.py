@@ -1,4 +1,4 @@
-"""The plate in time, from one change of the drive to the next.
+"""The plate in time, from one change of the drive or of the contacts to the next.
 
 The equations of motion and their exact solutions are the model's (`model.time_response`, which says
 what is not modelled); here is what a running plant adds: its clock, what the bases do now, and the
@@ -14,7 +14,8 @@ from model.arrays import FloatArray
 from model.base_motion import Term
 from model.point_load import PointLoad
 from model.reduction import ReducedPlate
-from model.time_response import Answer, plate_in_time
+from model.time_response import Answer
+from sim.contacts import Carried, ContactPlates
 
 _BLOCK = 256  # samples; the table of exponentials for one block is computed once
 _NEGLIGIBLE = 1e-60  # modal amplitude far below anything measurable, above slow subnormal numbers
@@ -36,16 +37,27 @@ class Plant:
         time: float = 0.0,
     ) -> None:
         self.time = time
-        self._plate = plate_in_time(reduced, eras, loads=loads)
-        self._free = np.zeros(len(self._plate.decay), dtype=complex)
+        self._plates = ContactPlates(reduced, eras, loads)
+        self._now: Carried = self._plates.carrying((), time=time)
+        self._free = np.zeros(len(self._now.plate.decay), dtype=complex)
         self._answers: list[list[Answer]] = [[] for _ in eras]
         self._table_rate = 0.0
         self._table = np.zeros((0, 0))
 
     @property
+    def reduced(self) -> ReducedPlate:
+        """The plate in the coordinates that it vibrates in now; other contacts, other ones."""
+        return self._now.reduced
+
+    @property
+    def contacts(self) -> tuple[PointLoad, ...]:
+        """The fingers that load it now."""
+        return self._now.contacts
+
+    @property
     def state(self) -> tuple[FloatArray, FloatArray]:
-        """Modal displacement and velocity (r,) each, now."""
-        x = (self._plate.free_state @ self._free).real
+        """Displacement and velocity (r,) each, now, in the coordinates of `reduced`."""
+        x = (self._now.plate.free_state @ self._free).real
         for answer in self._active():
             x = x + answer.state(self.time)
         r = len(x) // 2
@@ -55,32 +67,58 @@ class Plant:
         """From now on the base of this ERA moves as these terms say; terms may start later."""
         before = [answer for answer in self._active() if answer in self._answers[era]]
         self._answers[era] = [
-            self._plate.answer(era, term) for term in terms if term.end > self.time
+            self._now.plate.answer(era, term) for term in terms if term.end > self.time
         ]
         after = [answer for answer in self._active() if answer in self._answers[era]]
         self._exchange(before, after)
+
+    def set_contacts(self, contacts: Sequence[PointLoad]) -> None:
+        """From now on these fingers load the plate and no others, each from its rest plane.
+
+        Displacement and velocity of the plate stay what they are at this moment, and with them its
+        energy: what a finger's own spring and mass hold comes and goes with the finger.
+        """
+        if tuple(contacts) == self.contacts:
+            return
+        q, v = self.state
+        before = self._now.reduced
+        self._now = self._plates.carrying(contacts, time=self.time)
+        if self._now.reduced is not before:
+            carried = self._now.reduced.carried_over_from(before)
+            q, v = carried @ q, carried @ v
+        self._table_rate = 0.0
+        self._answers = [
+            [self._now.plate.answer(era, answer.term) for answer in answers]
+            for era, answers in enumerate(self._answers)
+        ]
+        left = np.concatenate([q, v])
+        for answer in self._active():
+            left = left - answer.state(self.time)
+        self._free = self._now.plate.to_free @ left
 
     def advance(
         self, to_time: float, *, sample_rate: float, shapes: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
         """Let the plate vibrate until to_time [s]; times (n,) [s], accelerations (n, p) [m/s²].
 
-        shapes (p, r): the reduced shapes at the points to measure at. Samples lie on the fixed grid
+        shapes (p, r): those of `reduced` at the points to measure at. Samples lie on the fixed grid
         k / sample_rate [Hz], those after the present time up to and including to_time.
         """
         first = np.floor(self.time * sample_rate) + 1
         last = np.floor(to_time * sample_rate)
         times = np.arange(first, last + 1) / sample_rate
-        modal = np.empty((len(times), shapes.shape[1]))
+        # Few points are sampled as they are, many by way of the coordinates.
+        seen = shapes if len(shapes) < shapes.shape[1] else np.eye(shapes.shape[1])
+        samples = np.empty((len(times), len(seen)))
         done = 0
         for boundary in self._boundaries(to_time):
             upto = int(np.searchsorted(times, boundary))
-            self._sample(times[done:upto], modal[done:upto], sample_rate)
+            self._sample(times[done:upto], samples[done:upto], sample_rate, seen)
             done = upto
             self._pass(boundary)
-        self._sample(times[done:], modal[done:], sample_rate)
+        self._sample(times[done:], samples[done:], sample_rate, seen)
         self._coast(to_time)
-        return times, modal @ shapes.T
+        return times, samples if seen is shapes else samples @ shapes.T
 
     def skip(self, to_time: float) -> None:
         """Let the plate vibrate until to_time [s] without looking at it."""
@@ -108,15 +146,15 @@ class Plant:
     def _exchange(self, before: Sequence[Answer], after: Sequence[Answer]) -> None:
         """Replace particular solutions, and keep displacement and velocity as they are."""
         if before or after:
-            jump = np.zeros(self._plate.free_state.shape[0])
+            jump = np.zeros(self._now.plate.free_state.shape[0])
             for answer in before:
                 jump += answer.state(self.time)
             for answer in after:
                 jump -= answer.state(self.time)
-            self._free = self._free + self._plate.to_free @ jump
+            self._free = self._free + self._now.plate.to_free @ jump
 
     def _coast(self, to_time: float) -> None:
-        self._free = self._free * np.exp(self._plate.decay * (to_time - self.time))
+        self._free = self._free * np.exp(self._now.plate.decay * (to_time - self.time))
         self._free[np.abs(self._free) < _NEGLIGIBLE] = 0
         self.time = to_time
 
@@ -134,19 +172,25 @@ class Plant:
             for answers in self._answers
         ]
 
-    def _sample(self, times: FloatArray, out: FloatArray, sample_rate: float) -> None:
-        """Write modal accelerations (n, r) at times on the grid, the drive being what it is now."""
+    def _sample(
+        self, times: FloatArray, out: FloatArray, sample_rate: float, seen: FloatArray
+    ) -> None:
+        """Write what is seen of the accelerations at times on the grid, the drive being as now.
+
+        seen: (q, r); out: (n, q).
+        """
         if not len(times):
             return
         out[:] = 0
         if self._free.any():
             table = self._exponentials(sample_rate)
+            shown = seen @ self._now.plate.free_acceleration
             for start in range(0, len(times), _BLOCK):
                 block = times[start : start + _BLOCK]
-                free = self._free * np.exp(self._plate.decay * (block[0] - self.time))
-                shapes = (self._plate.free_acceleration * free).T
+                free = self._free * np.exp(self._now.plate.decay * (block[0] - self.time))
+                part = (shown * free).T
                 out[start : start + _BLOCK] += table[: len(block)] @ np.vstack(
-                    [shapes.real, shapes.imag]
+                    [part.real, part.imag]
                 )
         active = self._active()
         if active:
@@ -156,17 +200,17 @@ class Plant:
             b0 = np.array([answer.b0 for answer in active])
             b1 = np.array([answer.b1 for answer in active])
             s = 1j * omega[:, None]
-            constant = s**2 * b0 + 2 * s * b1
+            constant = (s**2 * b0 + 2 * s * b1) @ seen.T
             out += turn.real @ constant.imag + turn.imag @ constant.real
             if b1.any():
                 rising = turn * tau
-                growth = s**2 * b1
+                growth = (s**2 * b1) @ seen.T
                 out += rising.real @ growth.imag + rising.imag @ growth.real
 
     def _exponentials(self, sample_rate: float) -> FloatArray:
         """Re and -Im of exp(eigenvalue k / sample_rate) for k up to a block, (block, 2 m)."""
         if sample_rate != self._table_rate:
-            grid = np.exp(np.outer(np.arange(_BLOCK) / sample_rate, self._plate.decay))
+            grid = np.exp(np.outer(np.arange(_BLOCK) / sample_rate, self._now.plate.decay))
             self._table = np.hstack([grid.real, -grid.imag])
             self._table_rate = sample_rate
         return self._table

@@ -25,6 +25,9 @@ from model.rig import Rig
 # On an orderly end nobody waits, so the end is soft.
 CLOSING_RAMP = 0.050
 
+# With nothing to do the loop runs all the same, for whoever watches whether it still does.
+IDLE_TURN = 0.5
+
 _logger = logging.getLogger(__name__)
 _P = ParamSpec("_P")
 
@@ -127,6 +130,7 @@ class Controller:
         try:
             while self.phase is not Phase.CLOSED:
                 await self.step()
+                self._tell(self._observer.turned)
                 await self._next_cause()
         finally:
             for task in listening:
@@ -224,13 +228,14 @@ class Controller:
 
     async def _next_cause(self) -> None:
         """Wait until there is a reason to run: news, a heartbeat, or a source that is overdue."""
-        moments = [self._decider.next_expiry]
+        now = self._clock()
+        moments = [now + IDLE_TURN]
+        if self._decider.next_expiry is not None:
+            moments.append(self._decider.next_expiry)
         if self.phase is Phase.ARMED:
             moments.append(self._heartbeat_due)
-        due = min((moment for moment in moments if moment is not None), default=None)
-        pause = None if due is None else max(0.0, due - self._clock())
         with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(pause):
+            async with asyncio.timeout(max(0.0, min(moments) - now)):
                 await self._wake.wait()
 
     def _tell(self, callback: Callable[_P, None], *args: _P.args, **kwargs: _P.kwargs) -> None:

@@ -58,3 +58,5 @@ class Observer:
     refused: Callable[[str], None] = _ignore
     link_lost: Callable[[str], None] = _ignore
     source_failed: Callable[[str], None] = _ignore
+    turned: Callable[[], None] = _ignore
+    """The loop has run once more: at least every second, whatever happens or does not."""

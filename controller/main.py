@@ -9,7 +9,7 @@ import os
 import signal
 import sys
 import traceback
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from importlib.metadata import EntryPoint, entry_points, version
 from typing import Annotated, TypeAlias
 
@@ -32,16 +32,33 @@ def main() -> int:
     """Run the command line that the process was started with; returns the exit status."""
     for variable in _THREAD_COUNTS:
         os.environ.setdefault(variable, "1")
-    # Being told to end is Ctrl-C from somebody else: amplifiers are silenced before the end.
+    # While modules load there is nothing to silence, and a KeyboardInterrupt could be swallowed.
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: os._exit(INTERRUPTED))
+    modules = entry_points(group="era_haptics.commands")
+    return run(sys.argv[1:], modules, on_loaded=_end_in_order)
+
+
+def _end_in_order() -> None:
+    """Being told to end is Ctrl-C from somebody else: amplifiers are silenced before the end."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     signal.signal(signal.SIGTERM, lambda *_: signal.raise_signal(signal.SIGINT))
-    return run(sys.argv[1:], entry_points(group="era_haptics.commands"))
 
 
-def run(arguments: Sequence[str], modules: Iterable[EntryPoint]) -> int:
-    """Run one command line with the commands of these modules; returns the exit status."""
+def run(
+    arguments: Sequence[str],
+    modules: Iterable[EntryPoint],
+    *,
+    on_loaded: Callable[[], None] = lambda: None,
+) -> int:
+    """Run one command line with the commands of these modules; returns the exit status.
+
+    on_loaded is called once these are there.
+    """
     debug, arguments = _take_debug(arguments)
     group, statuses = _put_together(modules, debug=debug)
     try:
+        on_loaded()
         status = _invoke(group, arguments)
         sys.stdout.flush()
     except BrokenPipeError:

@@ -8,10 +8,13 @@ def main() -> int:
     """Run the command line; returns the exit status."""
     for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(variable, "1")  # before numpy loads: two are slower here, and erratic
-    from sim.cli import EXIT_STATUS, app
+    from sim.endings import gone_when_told
 
     try:
-        app(prog_name="python -m sim")
+        with gone_when_told():  # while all the rest loads
+            from sim.cli import EXIT_STATUS, app
+
+            app(prog_name="python -m sim")
     except tuple(EXIT_STATUS) as error:
         sys.stderr.write(f"sim: error: {error}\n")
         return next(status for kind, status in EXIT_STATUS.items() if isinstance(error, kind))

@@ -21,6 +21,7 @@ from model.rig_file import load_rig
 from sim.bench import Bench
 from sim.control import control_socket
 from sim.real_time import Exchange, exchange_with, keep_time
+from sim.site import Site
 
 _FORM = "sim://RIG.yaml, with ?control=PATH and &amplifier=NAME where they are wanted"
 
@@ -74,7 +75,7 @@ class SimulatedBackend(Backend):
             raise CommandError(f"{self._url}: {error}") from error
         async with contextlib.AsyncExitStack() as stack:
             if self._control is not None:
-                await stack.enter_async_context(control_socket(bench, self._control))
+                await stack.enter_async_context(control_socket(Site(bench), self._control))
             task = asyncio.create_task(keep_time(bench), name=f"simulated plate of {self._url}")
             stack.push_async_callback(_cancel, task)
             self._exchange = exchange_with(bench, name)

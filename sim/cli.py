@@ -11,7 +11,11 @@ from drivers.errors import LinkError
 from model.errors import InputError
 
 if TYPE_CHECKING:
-    from sim.bench import Bench
+    from sim.process import FarEnd
+    from sim.sensors import Accelerometer
+    from sim.site import Site
+    from sim.view import PlateMap
+    from sim.wires import Wire
 
 app = typer.Typer(pretty_exceptions_enable=False)
 
@@ -49,6 +53,14 @@ def sim(
     slcan: Annotated[
         bool, typer.Option("--slcan", help="A CAN bus behind a serial adapter (slcan).")
     ] = False,
+    wire: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME=WIRE",
+            help="Put one amplifier elsewhere: main=serial, side=modbus-tcp:5020; repeatable. "
+            "What no option names is on the wire that its url in the rig asks for.",
+        ),
+    ] = None,
     shared: Annotated[
         bool, typer.Option("--shared", help="All amplifiers on one line, at addresses 1, 2, ...")
     ] = False,
@@ -63,66 +75,152 @@ def sim(
         list[str] | None,
         typer.Option(metavar="X,Y", help="A finger that rests here [m]; may be repeated."),
     ] = None,
+    sensor: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME=X,Y", help="An accelerometer here [m]; may be repeated."),
+    ] = None,
+    record: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Record sensors and fingers: .csv, .wav or .uff."),
+    ] = None,
+    rate: Annotated[
+        float, typer.Option(metavar="HZ", help="Sampling rate of sensors and fingers.")
+    ] = 10_000.0,
     control: Annotated[
         Path | None, typer.Option(metavar="PATH", help="Serve a control socket at this path.")
     ] = None,
+    virtual_time: Annotated[
+        bool,
+        typer.Option("--virtual-time", help="Time passes only as the control socket says."),
+    ] = False,
     until_eof: Annotated[
         bool,
         typer.Option("--until-eof", help="End with standard input, as when its writer dies."),
     ] = False,
 ) -> None:
     """Simulate a rig behind real wires until SIGTERM or Ctrl-C; prints a URL per amplifier."""
-    import asyncio
+    from sim.endings import gone_when_told
 
+    with gone_when_told():  # until there is something to end in order
+        _simulate(
+            rig,
+            common={
+                "serial": ("--serial", 0) if serial else None,
+                "modbus-tcp": ("--modbus-tcp", modbus_tcp) if modbus_tcp is not None else None,
+                "modbus-rtu": ("--modbus-rtu", 0) if modbus_rtu else None,
+                "socketcand": ("--socketcand", socketcand) if socketcand is not None else None,
+                "slcan": ("--slcan", 0) if slcan else None,
+            },
+            own=wire or [],
+            shared=shared,
+            speed=speed,
+            faults=faults,
+            fingers=finger or [],
+            sensors=sensor or [],
+            record=record,
+            rate=rate,
+            control=control,
+            virtual_time=virtual_time,
+            until_eof=until_eof,
+        )
+
+
+def _simulate(
+    rig: Path,
+    *,
+    common: Mapping[str, tuple[str, int] | None],
+    own: list[str],
+    shared: bool,
+    speed: int | None,
+    faults: Path | None,
+    fingers: list[str],
+    sensors: list[str],
+    record: Path | None,
+    rate: float,
+    control: Path | None,
+    virtual_time: bool,
+    until_eof: bool,
+) -> None:
+    """As told on the command line; common: by kind of wire, its option and port, if it stands."""
     from model.points import parse_point
     from model.rig_file import load_rig
     from sim.fault_file import FaultFile, load_faults
-    from sim.process import run_far_end
+    from sim.process import FarEnd
+    from sim.wire_choice import choose_wires
     from sim.wires import Wire
 
-    chosen = {
-        "serial": serial,
-        "modbus-tcp": modbus_tcp is not None,
-        "modbus-rtu": modbus_rtu,
-        "socketcand": socketcand is not None,
-        "slcan": slcan,
-    }
-    kinds = [kind for kind, is_chosen in chosen.items() if is_chosen]
-    if len(kinds) != 1:
+    given = {kind: option for kind, option in common.items() if option is not None}
+    if len(given) > 1:
+        named = " and ".join(option for option, _ in given.values())
         raise InputError(
-            "which wire? add one of --serial (a pseudo-terminal each), --modbus-tcp PORT, "
-            "--modbus-rtu, --socketcand PORT and --slcan"
+            f"{named}: all amplifiers can be on one of them only; leave one, or say which "
+            "amplifier is where, as in --wire main=serial --wire side=slcan"
         )
+    if virtual_time and control is None:
+        raise InputError("--virtual-time: who lets time pass? Add --control PATH")
     loaded = load_rig(rig)
-    schedule = load_faults(faults, amplifiers=loaded.amplifiers) if faults else FaultFile(())
-    wire = Wire(
-        kinds[0],
-        speed=speed,
-        port=modbus_tcp or socketcand or 0,
-        shared=shared,
-        unpluggable=faults is not None,
-    )
-    positions = {
-        str(number): parse_point(text, what="--finger")
-        for number, text in enumerate(finger or [], start=1)
-    }
-    view = _LiveView() if sys.stdout.isatty() else None
-    try:
-        asyncio.run(
-            run_far_end(
-                loaded,
-                wire=wire,
-                faults=schedule,
-                fingers=positions,
-                control=control,
-                ready=_announce,
-                view=view,
-                until_eof=until_eof,
-            )
+    least = 2.5 * loaded.limits.frequency_max
+    if not least <= rate <= 1e6:
+        raise InputError(
+            f"--rate {rate:g}: the plate is driven at up to {loaded.limits.frequency_max:g} Hz, "
+            f"which {least:g} to 1e+06 Hz can follow"
         )
+    plain = Wire("serial", speed=speed, shared=shared, unpluggable=faults is not None)
+    wires = choose_wires(
+        loaded.amplifiers,
+        common=next((_of_kind(plain, kind, port) for kind, (_, port) in given.items()), None),
+        own=own,
+        plain=plain,
+    )
+    far_end = FarEnd(
+        loaded,
+        wires,
+        faults=load_faults(faults, amplifiers=loaded.amplifiers) if faults else FaultFile(()),
+        fingers={
+            str(number): parse_point(text, what="--finger")
+            for number, text in enumerate(fingers, start=1)
+        },
+        sensors=[_sensor(text) for text in sensors],
+        sample_rate=rate,
+        control=control,
+        record=record,
+        until_eof=until_eof,
+    )
+    _run(far_end, virtual_time=virtual_time)
+
+
+def _of_kind(plain: "Wire", kind: str, port: int) -> "Wire":
+    from dataclasses import replace
+
+    return replace(plain, kind=kind, port=port)
+
+
+def _sensor(text: str) -> "Accelerometer":
+    from model.points import parse_point
+    from sim.sensors import Accelerometer
+
+    name, equals, place = text.partition("=")
+    if not (name and equals):
+        raise InputError(f"--sensor {text}: write its name and place, as in --sensor P1=0.10,0.08")
+    return Accelerometer(name, *parse_point(place, what="--sensor"))
+
+
+def _run(far_end: "FarEnd", *, virtual_time: bool) -> None:
+    import asyncio
+
+    from sim.process import run_far_end
+    from sim.virtual_time import SteppedLoop
+
+    view = _LiveView() if sys.stdout.isatty() else None
+    factory = SteppedLoop if virtual_time else None
+    try:
+        with asyncio.Runner(loop_factory=factory) as runner:
+            said = runner.run(run_far_end(far_end, ready=_announce, view=view))
     finally:
         if view is not None:
             view.close()
+    if said is not None:
+        print(said)
 
 
 def _announce(urls: Mapping[str, str]) -> None:
@@ -138,12 +236,16 @@ class _LiveView:
         from rich.live import Live
 
         self._live = Live(auto_refresh=False)
+        self._plate: PlateMap | None = None
 
-    def __call__(self, bench: "Bench") -> None:
-        from sim.view import draw
+    def __call__(self, site: "Site") -> None:
+        from sim.view import PlateMap, draw
 
-        self._live.start()
-        self._live.update(draw(bench), refresh=True)
+        if self._plate is None:
+            self._plate = PlateMap(site.bench)
+            site.bench.taps.append(self._plate)
+            self._live.start()
+        self._live.update(draw(site, self._plate), refresh=True)
 
     def close(self) -> None:
         self._live.stop()

@@ -7,13 +7,16 @@ faults:
 """
 
 import math
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
+
+from pydantic import ValidationError
 
 from model.config import Quantity, Section, Validation
 from model.document import read_document
+from model.errors import InputError
 from model.units import RATIO, TIME
 from sim.faults import Episode, FaultKind, Faults, Toward
 
@@ -62,3 +65,15 @@ def load_faults(path: Path, *, amplifiers: Collection[str]) -> FaultFile:
     section = _FaultSection.model_validate(document.data)
     episodes = tuple(Episode(**episode.model_dump()) for episode in section.faults)
     return FaultFile(episodes, seed=section.seed)
+
+
+def episode_of(told: Mapping[str, Any]) -> Episode:
+    """One fault from its keys, which are those of a file; InputError says what is wrong."""
+    try:
+        return Episode(**_EpisodeSection.model_validate(dict(told)).model_dump())
+    except ValidationError as error:
+        problems = (
+            f"{'.'.join(map(str, details['loc']))}: {details['msg']}"
+            for details in error.errors(include_url=False)
+        )
+        raise InputError("; ".join(problems)) from None

@@ -1,69 +1,121 @@
-"""The far end as a process: a bench in real time behind its wires, until it is told to end."""
+"""The far end as a process: a bench behind its wires, until it is told to end."""
 
 import asyncio
 import contextlib
 import os
 import signal
 import threading
-from collections.abc import AsyncIterator, Callable, Coroutine, Mapping
+from collections.abc import AsyncIterator, Callable, Coroutine, Mapping, Sequence
 from contextlib import asynccontextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from drivers import clock
 from model.rig import Rig
-from sim.bench import Bench
+from sim.bench import SAMPLE_RATE, Bench
 from sim.control import control_socket
 from sim.fault_file import FaultFile
 from sim.finger import Position
 from sim.real_time import keep_time
+from sim.sensors import Accelerometer
+from sim.site import Site, finish_recording
 from sim.station import Station
-from sim.wires import Wire, open_wire
+from sim.virtual_time import SteppedLoop
+from sim.wire_choice import Choice
+from sim.wires import open_wires
 
 _VIEW_EVERY = 0.2  # s; a person reads no faster
 
 
-async def run_far_end(
-    rig: Rig,
-    *,
-    wire: Wire,
-    faults: FaultFile,
-    fingers: Mapping[str, Position],
-    control: Path | None,
-    ready: Callable[[Mapping[str, str]], None],
-    view: Callable[[Bench], None] | None,
-    until_eof: bool = False,
-) -> None:
-    """Simulate a rig on a wire until SIGTERM or SIGINT, or the end of standard input.
+@dataclass(frozen=True)
+class FarEnd:
+    """What is simulated: a rig, and which wire each of its amplifiers is on, by its name.
 
-    faults: what goes wrong, counted from when the URLs are there;
-    fingers rest where they are told [m]; control: where the control socket is served, if anywhere;
+    faults: what goes wrong, counted from when the URLs are there; fingers rest where they are told
+    [m]; sensors are there from the first; sample_rate [Hz]: of all that is measured; control: where
+    the control socket is served, record: where sensors and fingers are recorded to, from the first
+    to the end; until_eof: whether it ends with standard input.
+    """
+
+    rig: Rig
+    wires: Mapping[str, Choice]
+    faults: FaultFile = field(default_factory=lambda: FaultFile(()))
+    fingers: Mapping[str, Position] = field(default_factory=dict)
+    sensors: Sequence[Accelerometer] = ()
+    sample_rate: float = SAMPLE_RATE
+    control: Path | None = None
+    record: Path | None = None
+    until_eof: bool = False
+
+
+async def run_far_end(
+    far_end: FarEnd,
+    *,
+    ready: Callable[[Mapping[str, str]], None],
+    view: Callable[[Site], None] | None,
+) -> str | None:
+    """Simulate until SIGTERM or SIGINT, or the end of standard input where that counts.
+
     ready is called once with the URL of each amplifier by its name, view a few times a second.
-    until_eof: whether standard input counts. Raises InputError, LinkError.
+    Virtual where the running loop is a `SteppedLoop`. Returns what is to be said of what was
+    written. Raises InputError, LinkError.
     """
     ended = asyncio.Event()
     loop = asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT):
         loop.add_signal_handler(number, ended.set)
-    if until_eof:
+    if far_end.until_eof:
         # A thread, for a loop cannot wait for every kind of standard input.
         threading.Thread(target=_await_eof, args=(loop, ended), daemon=True).start()
-    bench = await asyncio.to_thread(Bench, rig, now=clock.now())
-    bench.place_fingers(fingers, now=clock.now())
+    bench = await asyncio.to_thread(
+        Bench, far_end.rig, now=clock.now(), sample_rate=far_end.sample_rate
+    )
+    if ended.is_set():
+        return None
+    bench.place_fingers(far_end.fingers, now=clock.now())
+    site = Site(bench, step=loop.step if isinstance(loop, SteppedLoop) else None)
+    site.accelerometers.place(far_end.sensors)
+    if far_end.record is not None:
+        site.record(far_end.record)
+    try:
+        await _serve(far_end, site, ended=ended, ready=ready, view=view)
+    finally:
+        said = await finish_recording(site)
+    return said
+
+
+async def _serve(
+    far_end: FarEnd,
+    site: Site,
+    *,
+    ended: asyncio.Event,
+    ready: Callable[[Mapping[str, str]], None],
+    view: Callable[[Site], None] | None,
+) -> None:
+    """Put the amplifiers on their wires, and let time pass until the end."""
+    bench = site.bench
     async with contextlib.AsyncExitStack() as stack:
-        if control is not None:
-            await stack.enter_async_context(control_socket(bench, control))
         stations = [
-            Station(bench, name, number=number, faults=faults.of(name, begin=clock.now()))
+            Station(
+                bench,
+                name,
+                number=far_end.wires[name].number or number,
+                faults=far_end.faults.of(name, begin=clock.now()),
+            )
             for number, name in enumerate(bench.amplifiers, start=1)
         ]
-        urls = await stack.enter_async_context(open_wire(wire, stations))
+        wires = {name: choice.wire for name, choice in far_end.wires.items()}
+        site.urls = await stack.enter_async_context(open_wires(wires, stations))
+        site.stations = {station.name: station for station in stations}
+        if far_end.control is not None:
+            await stack.enter_async_context(control_socket(site, far_end.control))
         for station in stations:
             stack.callback(station.close)
             station.start()
         await stack.enter_async_context(_in_background(keep_time(bench), ended))
         if view is not None:
-            await stack.enter_async_context(_in_background(_keep_viewing(bench, view), ended))
-        ready(urls)
+            await stack.enter_async_context(_in_background(_keep_viewing(site, view), ended))
+        ready(site.urls)
         await ended.wait()
 
 
@@ -76,9 +128,9 @@ def _await_eof(loop: asyncio.AbstractEventLoop, ended: asyncio.Event) -> None:
         loop.call_soon_threadsafe(ended.set)
 
 
-async def _keep_viewing(bench: Bench, view: Callable[[Bench], None]) -> None:
+async def _keep_viewing(site: Site, view: Callable[[Site], None]) -> None:
     while True:
-        view(bench)
+        view(site)
         await asyncio.sleep(_VIEW_EVERY)
 
 

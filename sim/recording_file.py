@@ -6,6 +6,8 @@
   cannot say stand in a file beside it, `NAME.wav.json`. Audio tools drop metadata inside a WAV that
   they do not know; a sidecar survives them. Equal to 6e-8 of the largest value.
 - UFF: one record a sensor, 12 digits; start and sampling interval have six.
+
+A file appears when it is whole, or not at all.
 """
 
 import csv
@@ -13,14 +15,15 @@ import io
 import json
 import math
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from model.csv_file import write_columns
 from model.errors import InputError
+from model.replacing import begins_with
 from model.uff import (
     ACCELERATION,
     TIME,
@@ -39,6 +42,7 @@ _LONGEST_NAME = 10
 _EVEN = 1e-3  # of a sampling interval; by how much times may wander
 _SIDECAR_KEYS = {"format", "sensors", "x_m", "y_m", "start_s", "sample_rate_hz", "full_scale_m_s2"}
 _FORMAT = "era-haptics recording 1"
+_ROWS = 10_000  # of a CSV that are made at once
 
 
 def write_recording(path: Path, recording: Recording) -> None:
@@ -50,12 +54,47 @@ def write_recording(path: Path, recording: Recording) -> None:
         raise InputError(f"{path}: a recording of fewer than two samples cannot be written")
     if not np.isfinite(recording.samples).all():
         raise InputError(f"{path}: the recording has values that are not finite")
-    _of_ending(path)[0](path, recording)
+    check_recordable(path, recording.names, sample_rate=recording.sample_rate)
+    part = path.with_name(f".{path.stem}.part{path.suffix}")
+    try:
+        _of_ending(path).write(part, recording)
+        if sidecar(part).exists():
+            sidecar(part).replace(sidecar(path))
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)
+        sidecar(part).unlink(missing_ok=True)
+
+
+def check_recordable(path: Path, names: Sequence[str], *, sample_rate: float) -> None:
+    """Raise InputError for what a file of this name cannot hold, or where another one stands.
+
+    sample_rate [Hz]; names: of what is recorded.
+    """
+    form = _of_ending(path)
+    if path.is_file() and not begins_with(path, form.start):
+        raise InputError(
+            f"{path}: a file is there that is no recording; it is left alone. Give another name, "
+            "or remove it first"
+        )
+    if form.start == _WAV and sample_rate != round(sample_rate):
+        raise InputError(
+            f"{path}: a WAV takes whole sampling rates only, not {sample_rate:g} Hz; "
+            "write .csv or .uff"
+        )
+    long = [name for name in names if len(name) > _LONGEST_NAME]
+    if form.start == _UFF and long:
+        raise InputError(f"{path}: a UFF keeps {_LONGEST_NAME} characters of a name; {long[0]!r}")
+
+
+def values_max(path: Path) -> int:
+    """How many values a recording of this name may have, so that memory stays bounded."""
+    return _of_ending(path).values_max
 
 
 def read_recording(path: Path) -> Recording:
     """Read what `write_recording` writes; InputError, with file and line, for anything else."""
-    return _of_ending(path)[1](path)
+    return _of_ending(path).read(path)
 
 
 def sidecar(path: Path) -> Path:
@@ -64,12 +103,15 @@ def sidecar(path: Path) -> Path:
 
 
 def _write_csv(path: Path, recording: Recording) -> None:
-    columns: dict[str, list[object]] = {"time_s": ["x_m", "y_m", *recording.times.tolist()]}
-    for name, point, samples in zip(
-        recording.names, recording.points.tolist(), recording.samples.T.tolist(), strict=True
-    ):
-        columns[name + _UNIT] = [*point, *samples]
-    write_columns(path, columns)
+    with path.open("w", newline="", encoding="utf-8") as stream:
+        writer = csv.writer(stream, lineterminator="\n")
+        writer.writerow(["time_s", *(name + _UNIT for name in recording.names)])
+        for label, places in zip(_PLACES, recording.points.T.tolist(), strict=True):
+            writer.writerow([label, *places])
+        times = recording.times
+        for first in range(0, len(times), _ROWS):
+            part = slice(first, first + _ROWS)
+            writer.writerows(np.column_stack([times[part], recording.samples[part]]).tolist())
 
 
 def _read_csv(path: Path) -> Recording:
@@ -145,13 +187,8 @@ def _csv_numbers(
 def _write_wav(path: Path, recording: Recording) -> None:
     from scipy.io import wavfile
 
-    if recording.sample_rate != round(recording.sample_rate):
-        raise InputError(
-            f"{path}: a WAV takes whole sampling rates only, not {recording.sample_rate:g} Hz; "
-            "write .csv or .uff"
-        )
     # A power of two takes nothing from the digits.
-    largest = float(np.abs(recording.samples).max())
+    largest = float(max(recording.samples.max(), -recording.samples.min()))
     full_scale = 2.0 ** math.ceil(math.log2(largest)) if largest > 0 else 1.0
     samples = (recording.samples / full_scale).astype(np.float32)
     wavfile.write(path, int(recording.sample_rate), samples)
@@ -228,9 +265,6 @@ def _read_sidecar(path: Path) -> dict[str, Any]:
 
 
 def _write_uff(path: Path, recording: Recording) -> None:
-    long = [name for name in recording.names if len(name) > _LONGEST_NAME]
-    if long:
-        raise InputError(f"{path}: a UFF keeps {_LONGEST_NAME} characters of a name; {long[0]!r}")
     nodes = {n: (x, y, 0.0) for n, (x, y) in enumerate(recording.points.tolist(), start=1)}
     functions = [
         Function(
@@ -288,17 +322,27 @@ def _digits(value: float, count: int) -> float:
     return float(f"{value:.{count}g}")
 
 
-_Writer = Callable[[Path, Recording], None]
-_Reader = Callable[[Path], Recording]
-_FORMATS: dict[str, tuple[_Writer, _Reader]] = {
-    ".csv": (_write_csv, _read_csv),
-    ".wav": (_write_wav, _read_wav),
-    ".uff": (_write_uff, _read_uff),
-    ".unv": (_write_uff, _read_uff),
+@dataclass(frozen=True)
+class _Format:
+    """How a kind of file is written and read, what it begins with, and how many values it takes."""
+
+    write: Callable[[Path, Recording], None]
+    read: Callable[[Path], Recording]
+    start: bytes
+    values_max: int
+
+
+_CSV, _WAV, _UFF = b"time_s", b"RIFF", b"    -1"
+_UNIVERSAL = _Format(_write_uff, _read_uff, _UFF, 1 << 22)  # as text in memory, 20 bytes a value
+_FORMATS = {
+    ".csv": _Format(_write_csv, _read_csv, _CSV, 1 << 24),
+    ".wav": _Format(_write_wav, _read_wav, _WAV, 1 << 24),
+    ".uff": _UNIVERSAL,
+    ".unv": _UNIVERSAL,
 }
 
 
-def _of_ending(path: Path) -> tuple[_Writer, _Reader]:
+def _of_ending(path: Path) -> _Format:
     if path.suffix.lower() not in _FORMATS:
         raise InputError(f"{path}: a recording ends in {', '.join(_FORMATS)}")
     return _FORMATS[path.suffix.lower()]

@@ -19,7 +19,8 @@ class Wire:
     kind: a key of this module's table; speed [bit/s]: telegrams take as long as at this speed, None
     for no time; port: where to listen on the loopback interface, 0 for any that is free; shared:
     all amplifiers on one wire, told apart by their numbers, where the kind leaves the choice;
-    unpluggable: the URLs hold when the wire is unplugged and comes back.
+    unpluggable: the URLs hold when the wire is unplugged and comes back; line: tells wires apart
+    that are alike otherwise.
     """
 
     kind: str
@@ -27,6 +28,7 @@ class Wire:
     port: int = 0
     shared: bool = False
     unpluggable: bool = False
+    line: str = ""
 
 
 FarEnd: TypeAlias = AbstractAsyncContextManager[Mapping[str, str]]
@@ -35,6 +37,24 @@ FarEnd: TypeAlias = AbstractAsyncContextManager[Mapping[str, str]]
 def open_wire(wire: Wire, stations: Sequence[Station]) -> FarEnd:
     """The far end of this wire with these stations on it; entering it may raise LinkError."""
     return _OPENERS[wire.kind](wire, stations)
+
+
+@asynccontextmanager
+async def open_wires(
+    wires: Mapping[str, Wire], stations: Sequence[Station]
+) -> AsyncIterator[Mapping[str, str]]:
+    """The far ends of stations on several wires, by their names: those with equal ones on one.
+
+    Gives the URL of each by its name, in the stations' order. Raises LinkError.
+    """
+    lines: dict[Wire, list[Station]] = {}
+    for station in stations:
+        lines.setdefault(wires[station.name], []).append(station)
+    urls: dict[str, str] = {}
+    async with AsyncExitStack() as stack:
+        for wire, together in lines.items():
+            urls.update(await stack.enter_async_context(open_wire(wire, together)))
+        yield {station.name: urls[station.name] for station in stations}
 
 
 @asynccontextmanager

@@ -1,0 +1,68 @@
+"""The far end as users start it, a process of its own, with its control socket at hand."""
+
+import asyncio
+import json
+import sys
+import tempfile
+from collections.abc import AsyncIterator, Mapping
+from contextlib import asynccontextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from model.rig_file import example_rig_path
+
+PATIENCE = 30  # s; for a loaded machine, not an expectation
+
+
+@dataclass
+class FarEndProcess:
+    """What was started: URLs by the amplifiers' names, and its streams."""
+
+    urls: Mapping[str, str]
+    control: Path
+    process: asyncio.subprocess.Process
+    reader: asyncio.StreamReader
+    writer: asyncio.StreamWriter
+
+    async def ask(self, op: str, **request: Any) -> dict[str, Any]:
+        """One line of control and the answer to it, errors among them."""
+        self.writer.write(json.dumps({"op": op, **request}).encode() + b"\n")
+        line = await asyncio.wait_for(self.reader.readline(), PATIENCE)
+        answer: dict[str, Any] = json.loads(line)
+        return answer
+
+    async def end(self) -> tuple[int | None, str]:
+        """Tell it to end; its exit status and what it still said on standard output."""
+        self.process.terminate()
+        out, _ = await asyncio.wait_for(self.process.communicate(), PATIENCE)
+        return self.process.returncode, out.decode()
+
+
+@asynccontextmanager
+async def far_end_process(
+    rig: Path, *options: str, amplifiers: int = 1
+) -> AsyncIterator[FarEndProcess]:
+    """`era sim` of a rig file with these options; it ends with the context at the latest."""
+    with tempfile.TemporaryDirectory() as folder:  # a short path, as sockets need
+        control = Path(folder) / "control"
+        process = await asyncio.create_subprocess_exec(
+            *(sys.executable, "-P", "-m", "sim", str(rig), "--control", str(control), *options),
+            stdin=asyncio.subprocess.DEVNULL,
+            stdout=asyncio.subprocess.PIPE,
+            cwd=example_rig_path().parent.parent,
+        )
+        try:
+            assert process.stdout is not None
+            urls = {}
+            for _ in range(amplifiers):
+                line = (await asyncio.wait_for(process.stdout.readline(), PATIENCE)).decode()
+                name, _, url = line.strip().partition(": ")
+                urls[name] = url
+            reader, writer = await asyncio.open_unix_connection(control, limit=1 << 24)
+            yield FarEndProcess(urls, control, process, reader, writer)
+            writer.close()
+        finally:
+            if process.returncode is None:
+                process.kill()
+                await process.wait()

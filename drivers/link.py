@@ -28,7 +28,7 @@ from drivers.refusals import is_busy, refusal
 from drivers.statistics import LinkStatistics
 from drivers.turns import Kind, Turns
 
-REPLY_TIMEOUT = 0.031  # s; a heartbeat and three of these are less than three heartbeats of 50 ms
+REPLY_TIMEOUT = 0.030  # s; a heartbeat and three of these are less than three heartbeats of 50 ms
 RETRIES = 2
 BUSY_PAUSE = 0.005  # s; before a busy amplifier is asked again: short enough for a touch to be felt
 

@@ -18,12 +18,14 @@ from drivers.amplifier import Amplifier
 from drivers.command import CommandSet, DriveCommand
 from drivers.errors import CommandRefused, DriverError, LinkError
 from drivers.guard import Guard, GuardLimits, SafeCommand
+from drivers.link import REPLY_TIMEOUT as USUAL_TIMEOUT
 from drivers.protocol.messages import Event, Fault, State
 from drivers.registry import open_backend
 from drivers.supervision import reopen
 from drivers.watchdog import HEARTBEAT, HEARTBEATS_BORNE
 from model.rig import Rig
 from sim.faults import Episode, FaultKind
+from sim.wires import Wire
 from wires import WIRES, FarSide, far_side
 
 WATCHDOG = 0.15  # s
@@ -85,6 +87,13 @@ async def beat(amplifier: Amplifier, times: int) -> None:
         await amplifier.heartbeat()
 
 
+async def beat_on(amplifier: Amplifier) -> None:
+    """As the control loop does, until the amplifier is lost."""
+    while True:
+        await asyncio.sleep(HEARTBEAT)
+        await amplifier.heartbeat()
+
+
 def fed_at(far: FarSide) -> float:
     """When the amplifier was last fed, by its own clock [s]."""
     return far.amplifier._fed
@@ -123,6 +132,58 @@ async def test_a_link_that_is_cut_leaves_silence_and_is_told(far: FarSide, kind:
             await link.amplifier.apply(link.tone())
         await eventually(lambda: far.silent_from() < math.inf)
         assert far.silent_from() - max(fed, fed_at(far)) <= WATCHDOG + REACTION + 1e-9
+
+
+SLOW_WIRES = {
+    "serial, 115 200 baud": Wire("serial", speed=115_200),
+    "modbus+rtu, 115 200 baud": Wire("modbus-rtu", speed=115_200),
+    "modbus+rtu, 19 200 baud": Wire("modbus-rtu", speed=19_200),
+    "can+slcan, 125 kbit/s": Wire("slcan", speed=125_000),
+}
+
+
+@pytest.fixture(params=[*WIRES, *SLOW_WIRES])
+async def any_speed(request: pytest.FixtureRequest, coarse_rig: Rig) -> AsyncIterator[FarSide]:
+    """The same, also behind wires as slow as they may be."""
+    wire = {**WIRES, **SLOW_WIRES}[request.param]
+    async with far_side(wire, coarse_rig, seed=7) as far:
+        yield far
+
+
+async def test_a_hung_amplifier_is_told_within_three_heartbeats(any_speed: FarSide) -> None:
+    """150 ms from the moment that is worst: it hangs right after it has answered.
+
+    The host beats as the control loop does, with the time-outs that hold by default. A busy machine
+    can only add to the time, so the best of some tries counts.
+    """
+    clock = asyncio.get_running_loop().time
+    took = []
+    async with Link(any_speed, reply_timeout=USUAL_TIMEOUT) as host:
+        for _ in range(10):
+            await host.amplifier.arm(2.0)
+            await host.amplifier.heartbeat()
+            any_speed.station.befall(Episode("hang"))
+            hung = clock()
+            with pytest.raises(LinkError):
+                await beat_on(host.amplifier)
+            took.append(clock() - hung)
+            if took[-1] <= HEARTBEATS_BORNE * HEARTBEAT:
+                return
+            any_speed.station.recover()
+            await reopen(host.amplifier, waits=iter([0.01] * 50))
+    raise AssertionError(f"told after {', '.join(f'{1e3 * one:.0f} ms' for one in took)}")
+
+
+async def test_a_slow_wire_is_no_lost_one(any_speed: FarSide) -> None:
+    """Sets and heartbeats that take all the time of the wire are waited for."""
+    async with Link(any_speed, reply_timeout=USUAL_TIMEOUT) as host:
+        await host.amplifier.arm(2.0)
+        for _ in range(5):
+            commands = tuple(DriveCommand(channel, 110.0, 0.2) for channel in range(4))
+            wanted = CommandSet(host.amplifier.next_token(), commands, ramp=0.0, valid_for=0.0)
+            assert (await host.amplifier.apply(host.guard.check(wanted))).token == wanted.token
+            await beat(host.amplifier, 3)
+        assert not host.amplifier.lost
 
 
 async def test_each_token_is_applied_once_under_loss(far: FarSide) -> None:

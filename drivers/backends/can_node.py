@@ -21,6 +21,7 @@ from drivers.protocol.messages import Event
 from drivers.statistics import WireCounters
 
 HEARTBEATS_BORNE = 3  # of the amplifier's that may be missing before it counts as lost
+_LATE = 0.005  # s; by so much a timer is late, and a loss is to be told by the third heartbeat
 _HOST_HEARTBEAT = CANOPEN["heartbeat_ms"] / 1000  # s; as every host sends it while it is armed
 _OPERATIONAL = CANOPEN["nmt_states"]["OPERATIONAL"]
 _BOOT_UP = CANOPEN["nmt_states"]["BOOT_UP"]
@@ -159,7 +160,7 @@ class NodeWatch:
         """
         now = clock.now()
         silent = now - self._heard
-        limit = HEARTBEATS_BORNE * self._url.heartbeat
+        limit = HEARTBEATS_BORNE * self._url.heartbeat - _LATE
         was_held_up = now - self._look_due > self._url.heartbeat / 2
         if silent < limit or was_held_up:
             pause = limit - silent if silent < limit else self._url.heartbeat

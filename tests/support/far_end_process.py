@@ -1,6 +1,7 @@
 """The far end as users start it, a process of its own, with its control socket at hand."""
 
 import asyncio
+import contextlib
 import json
 import sys
 import tempfile
@@ -60,8 +61,12 @@ async def far_end_process(
                 name, _, url = line.strip().partition(": ")
                 urls[name] = url
             reader, writer = await asyncio.open_unix_connection(control, limit=1 << 24)
-            yield FarEndProcess(urls, control, process, reader, writer)
-            writer.close()
+            try:
+                yield FarEndProcess(urls, control, process, reader, writer)
+            finally:
+                writer.close()
+                with contextlib.suppress(ConnectionError):
+                    await writer.wait_closed()
         finally:
             if process.returncode is None:
                 process.kill()

@@ -7,16 +7,24 @@ picture of a finger that presses with less than half a newton (World Haptics 200
 """
 
 from collections.abc import Iterable
+from dataclasses import dataclass
 
 from model.point_load import PointLoad
 
-FINGER_STIFFNESS = 1000.0  # N/m
-FINGER_DAMPING = 2.0  # N s/m
-FINGER_MASS = 0.0002  # kg
+
+@dataclass(frozen=True)
+class FingerLoad:
+    """A finger's stiffness [N/m], damping [N s/m] and mass [kg]."""
+
+    stiffness: float = 1000.0
+    damping: float = 2.0
+    mass: float = 0.0002
+
+    def at(self, x: float, y: float) -> PointLoad:
+        """The finger at x, y [m]; InputError for values that no finger can have."""
+        return PointLoad(x, y, self.stiffness, self.damping, self.mass)
 
 
 def finger_loads(contacts: Iterable[tuple[float, float]]) -> tuple[PointLoad, ...]:
     """What fingers at contacts [m] do to the plate."""
-    return tuple(
-        PointLoad(x, y, FINGER_STIFFNESS, FINGER_DAMPING, FINGER_MASS) for x, y in contacts
-    )
+    return tuple(FingerLoad().at(x, y) for x, y in contacts)

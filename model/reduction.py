@@ -26,12 +26,23 @@ _SAME = 1e-9
 class Origin:
     """What a plate was reduced from: the solved free plate, for forces at points (n, 2) [m].
 
-    mixture (STATIC_VECTORS n, s): its static coordinates by the residual vectors of those points.
+    moments: what the truncated modes add between those points (`model.attachments`); mixture
+    (STATIC_VECTORS n, s): its static coordinates by the residual vectors of the points.
     """
 
     free: FreePlate
     points: FloatArray
+    moments: FloatArray
     mixture: FloatArray
+
+    def moments_with(self, other: "Origin") -> FloatArray:
+        """The same between its points and another's, (m, n, k)."""
+        places = [(self.points == point).all(axis=1) for point in other.points]
+        if all(place.any() for place in places):  # as when a finger comes: no need to solve again
+            return self.moments[:, :, [int(place.argmax()) for place in places]]
+        both = np.vstack([self.points, other.points])
+        here = len(self.points)
+        return self.free.attachments.solve(both).moments[:, :here, here:]
 
 
 @dataclass(frozen=True)
@@ -70,13 +81,10 @@ class ReducedPlate:
         """
         if self.origin is None or other.origin is None:
             return np.eye(len(self.omega))
-        points = np.vstack([self.origin.points, other.origin.points])
-        moments = self.origin.free.attachments.solve(points).moments
-        here = len(self.origin.points)
         modes = len(self.origin.free.squared)
         carried = np.zeros((len(self.omega), len(other.omega)))
         carried[:modes, :modes] = np.eye(modes)
-        mass = _products(moments[:, :here, here:], power=1)
+        mass = _products(self.origin.moments_with(other.origin), power=1)
         carried[modes:, modes:] = self.origin.mixture.T @ mass @ other.origin.mixture
         return carried
 
@@ -113,7 +121,7 @@ def reduce_free_plate(free: FreePlate, attachments: FloatArray) -> ReducedPlate:
         free.mesh,
         np.concatenate([np.sqrt(free.squared), omega]),
         np.hstack([basis[:, :modes], basis[:, modes : modes + len(mass)] @ mixture]),
-        Origin(free, np.asarray(attachments, dtype=float), mixture),
+        Origin(free, np.asarray(attachments, dtype=float), attached.moments, mixture),
     )
 
 

@@ -22,7 +22,11 @@ class Accelerometers:
         self._rng = np.random.default_rng(seed)
         self._pieces: deque[Recording] = deque()
         self.sensors: tuple[Accelerometer, ...] = ()
-        self.shapes = bench.shapes_at(np.zeros((0, 2)))
+
+    @property
+    def shapes(self) -> FloatArray:
+        """Where they listen, in the coordinates that the plate has now."""
+        return self._bench.shapes_at(positions(self.sensors))
 
     def place(self, sensors: Sequence[Accelerometer]) -> None:
         """From now on these sensors are there and no others; InputError changes nothing."""
@@ -38,7 +42,6 @@ class Accelerometers:
                     f"sensor {sensor.name} is at ({sensor.x:g}, {sensor.y:g}) m, which is not on "
                     f"the plate: it reaches from (0, 0) to ({plate.length:g}, {plate.width:g}) m"
                 )
-        self.shapes = self._bench.shapes_at(positions(sensors))
         self.sensors = tuple(sensors)
         self._pieces.clear()
         if self in self._bench.taps:

@@ -1,6 +1,6 @@
 """Fingers that rest on the plate and feel it: what each of their points went through, kept a while.
 
-A finger is a sensor only: its own mass, stiffness and damping do not load the plate.
+Here a finger is a sensor only; what it does to the plate is the plant's (`sim.contacts`).
 """
 
 import math
@@ -66,14 +66,25 @@ class Fingers:
         self._pieces: deque[tuple[Layout, FloatArray, FloatArray]] = deque()
         self.layout = self._lay_out({})
 
-    def place(self, positions: Mapping[str, Position]) -> None:
-        """From now on these fingers rest here [m] and no others; InputError changes nothing."""
+    def place(
+        self, positions: Mapping[str, Position], *, reduced: ReducedPlate | None = None
+    ) -> None:
+        """From now on these fingers rest here [m] and no others; InputError changes nothing.
+
+        reduced: the plate in the coordinates that it vibrates in from now on, where others.
+        """
+        self.check(positions)
+        reduced = reduced or self._reduced
+        if dict(positions) != dict(self.layout.positions) or reduced is not self._reduced:
+            self._reduced = reduced
+            self.layout = self._lay_out(positions)
+
+    def check(self, positions: Mapping[str, Position]) -> None:
+        """Raise InputError for fingers that cannot rest here [m], one of them or together."""
         if len(positions) > FINGERS_MAX:
             raise InputError(f"{len(positions)} fingers are too many; at most {FINGERS_MAX}")
         for name, position in positions.items():
             check_position(name, position, plate=self._reduced.plate)
-        if dict(positions) != dict(self.layout.positions):
-            self.layout = self._lay_out(positions)
 
     def record(self, times: FloatArray, accelerations: FloatArray) -> None:
         """Keep what the points of the present layout went through: (n,) [s], (n, p) [m/s²]."""

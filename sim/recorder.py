@@ -50,7 +50,6 @@ class Recorder:
         self._room = values_max(path) // len(names)
         at = [bench.fingers.layout.positions[id] for id in fingers]
         self._points = np.concatenate([positions(sensors), np.array(at).reshape(-1, 2)])
-        self._sensor_shapes = bench.shapes_at(positions(sensors))
         self._rng = np.random.default_rng(seed)
         try:
             self._spool = tempfile.TemporaryFile(dir=path.parent)  # noqa: SIM115  lives on
@@ -77,13 +76,14 @@ class Recorder:
     def shapes(self) -> FloatArray:
         """Where it listens now: fingers move."""
         layout = self._bench.fingers.layout
+        at_sensors = self._bench.shapes_at(positions(self._sensors))
         rows = [
             layout.shapes[layout.columns[id].start]
             if id in layout.columns
-            else np.zeros(self._sensor_shapes.shape[1])
+            else np.zeros(at_sensors.shape[1])
             for id in self._fingers
         ]
-        return np.vstack([self._sensor_shapes, *rows])
+        return np.vstack([at_sensors, *rows])
 
     def record(self, times: FloatArray, accelerations: FloatArray) -> None:
         """Keep what is read: (n,) [s], (n, p) [m/s²]."""

@@ -27,9 +27,14 @@ class PlateMap:
         plate = bench.rig.plate
         x = (np.arange(_COLUMNS) + 0.5) / _COLUMNS * plate.length
         y = (np.arange(_ROWS) + 0.5) / _ROWS * plate.width
-        points = np.array([[a, b] for b in y for a in x])
-        self.shapes = bench.shapes_at(points)
-        self._peaks = np.zeros(len(points))
+        self._bench = bench
+        self._points = np.array([[a, b] for b in y for a in x])
+        self._peaks = np.zeros(len(self._points))
+
+    @property
+    def shapes(self) -> FloatArray:
+        """Where it listens, in the coordinates that the plate has now."""
+        return self._bench.shapes_at(self._points)
 
     def record(self, times: FloatArray, accelerations: FloatArray) -> None:
         """Keep the largest of what is there, (n, p) [m/s²]."""

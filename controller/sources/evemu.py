@@ -1,22 +1,24 @@
-"""Recordings of Linux touch panels in evemu's text format: multi-touch protocol type B (slots).
+"""Recordings of Linux touch panels in evemu's text format.
 
 The format is evemu's (freedesktop.org, evemu-record(1)): a description of the device, then events
-`E: seconds.micros type code value`, type and code in hexadecimal, value in decimal. What the events
-mean is in the Linux kernel's Documentation/input/multi-touch-protocol.rst.
+`E: seconds.micros type code value`, type and code in hexadecimal, value in decimal.
 """
 
-import asyncio
 import re
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
-from controller.touch import Touch, TouchFrame, TouchSource
+from controller.sources.playing import play
+from controller.sources.slots import (
+    ABS_MT_POSITION_X,
+    ABS_MT_POSITION_Y,
+    ABS_MT_SLOT,
+    EventError,
+    SlotReader,
+)
+from controller.touch import TouchFrame, TouchSource
 from model.errors import InputError
-
-_EV_SYN, _EV_ABS = 0x00, 0x03
-_SYN_REPORT, _SYN_MT_REPORT, _SYN_DROPPED = 0, 2, 3
-_SLOT, _POSITION_X, _POSITION_Y, _TRACKING_ID = 0x2F, 0x35, 0x36, 0x39
 
 _EVENT = re.compile(
     r"E: (\d{1,10}\.\d{1,6}) ([0-9a-fA-F]{1,4}) ([0-9a-fA-F]{1,4}) (-?\d{1,10})\s*(#.*)?"
@@ -25,9 +27,6 @@ _AXIS = re.compile(r"A: ([0-9a-fA-F]{1,2}) (-?\d{1,10}) (-?\d{1,10})( -?\d+)*\s*
 _COMMENT_CODE = re.compile(r"#\s+Event (?:code|type) (\d+) \((\w+)\)")
 _COMMENT_VALUE = re.compile(r"#\s+(Value|Min|Max)\s+(-?\d{1,10})\s*")
 _OTHER = re.compile(r"[A-Z]: .*|#.*|\s*")
-
-# A panel at rest says nothing, but a contact without news counts as lifted.
-_REPEAT = 0.05
 
 
 @dataclass(frozen=True)
@@ -39,78 +38,6 @@ class _Event:
     type: int
     code: int
     value: int
-
-
-@dataclass
-class _Slot:
-    """What the recording has said of one slot; None where it has not.
-
-    contact: the touch's id, None without a contact. certain: whether a tracking id said so; a
-    slot that moves without one has had its contact since before the recording.
-    """
-
-    contact: int | None = None
-    certain: bool = False
-    x: float | None = None
-    y: float | None = None
-
-
-class _Panel:
-    """The slots of a panel, from events to touches.
-
-    A contact appears when both its coordinates are known. What a slot still knows of its last
-    contact holds for the next one, since the kernel leaves out values that did not change.
-    """
-
-    def __init__(
-        self, x_range: tuple[int, int], y_range: tuple[int, int], *, first_slot: int
-    ) -> None:
-        self._x_range = x_range
-        self._y_range = y_range
-        self._slots: dict[int, _Slot] = {}
-        self._current = first_slot
-        self._nameless = 0
-
-    @property
-    def touches(self) -> tuple[Touch, ...]:
-        """All contacts whose place is known, by slot."""
-        return tuple(
-            Touch(slot.contact, slot.x, slot.y)
-            for _, slot in sorted(self._slots.items())
-            if slot.contact is not None and slot.x is not None and slot.y is not None
-        )
-
-    @property
-    def slot(self) -> int:
-        """The slot that the next event is about."""
-        return self._current
-
-    def forget(self) -> None:
-        """Events were lost: no contact and no coordinate is sure any more."""
-        self._slots.clear()
-
-    def take(self, code: int, value: int) -> None:
-        """Follow one EV_ABS event."""
-        slot = self._slots.setdefault(self._current, _Slot())
-        if code == _SLOT:
-            self._current = value
-        elif code == _TRACKING_ID:
-            slot.contact = value if value >= 0 else None
-            slot.certain = True
-        elif code in (_POSITION_X, _POSITION_Y):
-            if slot.contact is None and not slot.certain:
-                self._nameless += 1
-                slot.contact = -self._nameless  # tracking ids are never negative
-            if code == _POSITION_X:
-                slot.x = _share(value, self._x_range)
-            else:
-                slot.y = _share(value, self._y_range)
-
-
-def _share(value: int, limits: tuple[int, int]) -> float:
-    """Where a value lies in its axis' range, 0..1 within it."""
-    low, high = limits
-    return (value - low) / (high - low)
 
 
 def read_evemu(path: Path | str) -> list[TouchFrame]:
@@ -130,49 +57,28 @@ def read_evemu(path: Path | str) -> list[TouchFrame]:
                 key: limit for key, limit in _parse(description)[0].items() if key[1] != "Value"
             }
             header = ranges | header
-    panel = _Panel(
-        _axis(path, header, _POSITION_X, "ABS_MT_POSITION_X"),
-        _axis(path, header, _POSITION_Y, "ABS_MT_POSITION_Y"),
-        first_slot=header.get((_SLOT, "Value"), 0),
+    reader = SlotReader(
+        _axis(path, header, ABS_MT_POSITION_X, "ABS_MT_POSITION_X"),
+        _axis(path, header, ABS_MT_POSITION_Y, "ABS_MT_POSITION_Y"),
+        first_slot=header.get((ABS_MT_SLOT, "Value"), 0),
     )
-    frames = _frames(path, events, panel)
+    frames = _frames(path, events, reader)
     if not frames:
         raise InputError(f"{path}: no touch report in it; expected an evemu recording of a panel")
     return frames
 
 
-def _frames(path: Path, events: list[_Event], panel: _Panel) -> list[TouchFrame]:
+def _frames(path: Path, events: list[_Event], reader: SlotReader) -> list[TouchFrame]:
     """Frames of a recording's events."""
     frames: list[TouchFrame] = []
-    pending: list[tuple[Touch, ...]] = []  # states within this report that would go unseen
-    retold: set[int] = set()  # slots whose contact has changed within this report
-    dropped = False
     for event in events:
-        if (event.type, event.code) == (_EV_SYN, _SYN_MT_REPORT):
-            raise InputError(
-                f"{path}, line {event.line}: multi-touch protocol type A (SYN_MT_REPORT); "
-                "only panels that report slots (type B) can be read"
-            )
-        if (event.type, event.code) == (_EV_SYN, _SYN_DROPPED):
-            dropped = True
-        elif (event.type, event.code) == (_EV_SYN, _SYN_REPORT):
-            if dropped:  # what came since is a part of a report
-                panel.forget()
-                dropped = False
+        try:
+            report = reader.take(event.type, event.code, event.value)
+        except EventError as error:
+            raise InputError(f"{path}, line {event.line}: {error}") from error
+        if report is not None:
             time = event.time - events[0].time
-            frames += [
-                TouchFrame(f"evemu:{path.name}", time, touches)
-                for touches in (*pending, panel.touches)
-            ]
-            pending, retold = [], set()
-        elif event.type == _EV_ABS:
-            if event.code == _SLOT and event.value < 0:
-                raise InputError(f"{path}, line {event.line}: slot {event.value} is below zero")
-            if event.code == _TRACKING_ID:
-                if panel.slot in retold and not dropped:
-                    pending.append(panel.touches)
-                retold.add(panel.slot)
-            panel.take(event.code, event.value)
+            frames += [TouchFrame(f"evemu:{path.name}", time, touches) for touches in report.states]
     return frames
 
 
@@ -248,16 +154,4 @@ class EvemuSource(TouchSource):
 
     async def run(self, deliver: Callable[[TouchFrame], None]) -> None:
         """Deliver the recording's frames, each again every 50 ms while it has touches."""
-        loop = asyncio.get_running_loop()
-        start = loop.time()
-        last = self.frames[-1]
-        end = TouchFrame(last.source, last.time + (_REPEAT if last.touches else 0.0), ())
-        current = TouchFrame(last.source, 0.0, ())
-        for frame in (*self.frames, end):
-            due = start + frame.time
-            while current.touches and loop.time() + _REPEAT < due:
-                await asyncio.sleep(_REPEAT)
-                deliver(replace(current, time=loop.time()))
-            await asyncio.sleep(max(0.0, due - loop.time()))
-            current = frame
-            deliver(replace(frame, time=loop.time()))
+        await play(self.frames, deliver)

@@ -1,0 +1,243 @@
+"""Touch panels read from the kernel's input devices; the device itself is a pipe here."""
+
+import asyncio
+import contextlib
+import errno
+import os
+import struct
+from collections.abc import Callable, Coroutine
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from controller.sources.evdev import EvdevSource
+from controller.sources.input_device import (
+    GRAB,
+    InputDevice,
+    InputEvent,
+    get_axis,
+    get_slots,
+    parse_events,
+)
+from controller.sources.slots import SlotState
+from controller.touch import TouchFrame
+from controller.touch_registry import open_source
+from model.errors import InputError
+
+RunVirtual = Callable[[Coroutine[Any, Any, Any]], Any]
+
+EMPTY = SlotState(-1, 0, 0)
+KINDS = {"slot": (3, 0x2F), "id": (3, 0x39), "x": (3, 0x35), "y": (3, 0x36)}
+
+
+def raw(words: str, *, dropped: bool = False) -> bytes:
+    """A report such as "slot 0 id 7 x 100 y 50" as struct input_event puts it on x86-64 and Arm."""
+    pairs = words.split()
+    events = [(*KINDS[key], int(value)) for key, value in zip(pairs[::2], pairs[1::2], strict=True)]
+    events += [(0, 3, 0)] * dropped + [(0, 0, 0)]
+    return b"".join(struct.pack("@qqHHi", 0, 0, *event) for event in events)
+
+
+class PipePanel:
+    """A panel of 1000 by 500 with two slots, whose events come through a pipe."""
+
+    def __init__(self) -> None:
+        self.x_range, self.y_range = (0, 1000), (0, 500)
+        self.current_slot = 0
+        self.state = {0: EMPTY, 1: EMPTY}
+        self.is_gone = False
+        self._out, self.into = os.pipe()
+        os.set_blocking(self._out, False)
+
+    def fileno(self) -> int:
+        """The pipe's end to read from."""
+        return self._out
+
+    def slots(self) -> dict[int, SlotState]:
+        """What a test has put there."""
+        if self.is_gone:
+            raise OSError(errno.ENODEV, "No such device")
+        return self.state
+
+    def read(self) -> list[InputEvent]:
+        """What came through the pipe."""
+        if self.is_gone:
+            raise OSError(errno.ENODEV, "No such device")
+        try:
+            return list(parse_events(os.read(self._out, 4096)))
+        except BlockingIOError:
+            return []
+
+    def close(self) -> None:
+        """Both ends."""
+        os.close(self._out)
+        os.close(self.into)
+
+
+Seen = list[tuple[float, dict[int, tuple[float, float]]]]
+
+
+async def follow(
+    panels: list[PipePanel], play: Callable[[], Coroutine[Any, Any, None]], *, url: str = "evdev:p"
+) -> Seen:
+    """What a source delivers [s from the start] while something plays; panels are opened in turn.
+
+    An exception that the source raises is raised here.
+    """
+    seen: Seen = []
+    start = asyncio.get_running_loop().time()
+
+    def deliver(frame: TouchFrame) -> None:
+        assert frame.source == "evdev:p"
+        seen.append(
+            (
+                round(frame.time - start, 6),
+                {touch.id: (touch.x, touch.y) for touch in frame.touches},
+            )
+        )
+
+    def open_panel(path: str, *, grab: bool) -> PipePanel:
+        if not panels:
+            raise InputError("not there")
+        return panels.pop(0)
+
+    source = EvdevSource(url, open_panel=open_panel)
+    running = asyncio.create_task(source.run(deliver))
+    await asyncio.sleep(0)
+    await play()
+    running.cancel()
+    with contextlib.suppress(asyncio.CancelledError):
+        await running
+    return seen
+
+
+def test_fingers_come_move_and_go(run_virtual: RunVirtual) -> None:
+    """Each report is a frame, in shares of the panel's axes, y downwards as the kernel counts."""
+    panel = PipePanel()
+
+    async def play() -> None:
+        for words in ("id 7 x 250 y 100", "slot 1 id 8 x 1000 y 500", "slot 0 x 300", "id -1"):
+            os.write(panel.into, raw(words))
+            await asyncio.sleep(0.01)
+
+    seen = run_virtual(follow([panel], play))
+    assert [touches for _, touches in seen] == [
+        {},
+        {7: (0.25, 0.2)},
+        {7: (0.25, 0.2), 8: (1.0, 1.0)},
+        {7: (0.3, 0.2), 8: (1.0, 1.0)},
+        {8: (1.0, 1.0)},
+    ]
+
+
+def test_fingers_that_were_there_before(run_virtual: RunVirtual) -> None:
+    """What rests on the panel when it is opened is there at once, by the kernel's own state."""
+    panel = PipePanel()
+    panel.state = {0: EMPTY, 1: SlotState(5, 500, 250)}
+    panel.current_slot = 1
+
+    async def play() -> None:
+        os.write(panel.into, raw("x 600"))
+        await asyncio.sleep(0.01)
+
+    seen = run_virtual(follow([panel], play))
+    assert [touches for _, touches in seen] == [{5: (0.5, 0.5)}, {5: (0.6, 0.5)}]
+
+
+def test_a_resting_finger_is_told_again(run_virtual: RunVirtual) -> None:
+    """Every 50 ms the kernel is asked, well within the 150 ms after which a contact counts as gone.
+
+    If it knows of a lift that no event told, the finger is lifted then.
+    """
+    panel = PipePanel()
+
+    async def play() -> None:
+        os.write(panel.into, raw("id 7 x 0 y 0"))
+        panel.state = {0: SlotState(7, 0, 0), 1: EMPTY}
+        await asyncio.sleep(0.12)
+        panel.state = {0: EMPTY, 1: EMPTY}
+        await asyncio.sleep(0.2)
+
+    seen = run_virtual(follow([panel], play))
+    assert seen == [
+        (0.0, {}),
+        (0.0, {7: (0.0, 0.0)}),
+        (0.05, {7: (0.0, 0.0)}),
+        (0.1, {7: (0.0, 0.0)}),
+        (0.15, {}),
+    ]
+
+
+def test_lost_events(run_virtual: RunVirtual) -> None:
+    """After SYN_DROPPED the kernel's state counts, as its documentation asks for."""
+    panel = PipePanel()
+
+    async def play() -> None:
+        os.write(panel.into, raw("id 7 x 100 y 100"))
+        await asyncio.sleep(0.01)
+        panel.state = {0: EMPTY, 1: SlotState(9, 1000, 0)}
+        os.write(panel.into, raw("x 900", dropped=True))
+        await asyncio.sleep(0.01)
+
+    seen = run_virtual(follow([panel], play))
+    assert [touches for _, touches in seen][-1] == {9: (1.0, 0.0)}
+
+
+@pytest.mark.parametrize("notices", ["by reading", "by asking"])
+def test_a_panel_that_is_pulled_out(run_virtual: RunVirtual, notices: str) -> None:
+    """Its fingers are lifted when it goes; it is waited for, and followed when it is back."""
+    first, second = PipePanel(), PipePanel()
+    first.state = {0: SlotState(7, 0, 0), 1: EMPTY}
+    panels = [first]
+
+    async def play() -> None:
+        await asyncio.sleep(0.01)
+        first.is_gone = True
+        if notices == "by reading":
+            os.write(first.into, b"x")  # a device that goes becomes readable
+        await asyncio.sleep(3)
+        panels.append(second)
+        await asyncio.sleep(6)
+        os.write(second.into, raw("id 8 x 1000 y 0"))
+        await asyncio.sleep(0.01)
+
+    seen = run_virtual(follow(panels, play))
+    assert [touches for _, touches in seen] == [{7: (0.0, 0.0)}, {}, {}, {8: (1.0, 0.0)}]
+    assert seen[1][0] <= 0.06
+
+
+def test_request_numbers() -> None:
+    """The numbers that the kernel's header gives on x86-64 and Arm, as strace shows them."""
+    assert get_axis(0x35) == 0x80184575  # EVIOCGABS(ABS_MT_POSITION_X)
+    assert get_slots(44) == 0x802C450A  # EVIOCGMTSLOTS(44)
+    assert GRAB == 0x40044590  # EVIOCGRAB
+
+
+def test_events_are_whole() -> None:
+    """Type, code and value of each event; what is no whole event at the end is left out."""
+    assert list(parse_events(raw("x -5") + b"\0" * 10)) == [
+        InputEvent(3, 0x35, -5),
+        InputEvent(0, 0, 0),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("path", "words"),
+    [("/dev/null", "no touch panel"), ("/dev/input/event987", "no such device")],
+)
+def test_what_is_no_panel(path: str, words: str) -> None:
+    """A file that is no panel, and none at all: an error that says so, and no open descriptor."""
+    before = sorted(Path("/proc/self/fd").iterdir())
+    with pytest.raises(InputError, match=words):
+        InputDevice(path)
+    assert sorted(Path("/proc/self/fd").iterdir()) == before
+
+
+@pytest.mark.parametrize(
+    "url", ["evdev:", "evdev:?grab=yes", "evdev:/dev/x?grab=no", "evdev:/dev/x?grab=yes&a=b"]
+)
+def test_urls_that_say_something_else(url: str) -> None:
+    """They are refused with what is expected."""
+    with pytest.raises(InputError, match="expected evdev:PATH"):
+        open_source(url)

@@ -9,22 +9,51 @@ picture of a finger that presses with less than half a newton (World Haptics 200
 from collections.abc import Iterable
 from dataclasses import dataclass
 
+from model.errors import InputError
 from model.point_load import PointLoad
+from model.units import DAMPING, MASS, STIFFNESS, quantity
 
 
 @dataclass(frozen=True)
 class FingerLoad:
-    """A finger's stiffness [N/m], damping [N s/m] and mass [kg]."""
+    """A finger's stiffness [N/m], damping [N s/m] and mass [kg]; by default it presses lightly."""
 
     stiffness: float = 1000.0
     damping: float = 2.0
     mass: float = 0.0002
 
+    def __post_init__(self) -> None:
+        """Refuse what no finger has."""
+        self.at(0.0, 0.0)
+
     def at(self, x: float, y: float) -> PointLoad:
-        """The finger at x, y [m]; InputError for values that no finger can have."""
+        """The finger at x, y [m]."""
         return PointLoad(x, y, self.stiffness, self.damping, self.mass)
 
 
 def finger_loads(contacts: Iterable[tuple[float, float]]) -> tuple[PointLoad, ...]:
     """What fingers at contacts [m] do to the plate."""
     return tuple(FingerLoad().at(x, y) for x, y in contacts)
+
+
+def parse_finger_load(text: str, *, what: str) -> FingerLoad:
+    """What a finger does from `light` or its stiffness, damping and mass, `1 kN/m,2 N s/m,0.2 g`.
+
+    Bare numbers are N/m, N s/m and kg; what names the option in the error.
+    """
+    if text.strip() == "light":
+        return FingerLoad()
+    parts = text.split(",")
+    if len(parts) != 3:
+        raise InputError(
+            f"{what} {text!r}: write light, or stiffness, damping and mass of a finger, as in "
+            f"{what} '1 kN/m,2 N s/m,0.2 g'"
+        )
+    try:
+        numbers = [
+            quantity(part, dimension)
+            for part, dimension in zip(parts, (STIFFNESS, DAMPING, MASS), strict=True)
+        ]
+        return FingerLoad(*numbers)
+    except InputError as error:
+        raise InputError(f"{what} {text!r}: {error}") from None

@@ -75,6 +75,13 @@ def sim(
         list[str] | None,
         typer.Option(metavar="X,Y", help="A finger that rests here [m]; may be repeated."),
     ] = None,
+    finger_load: Annotated[
+        str | None,
+        typer.Option(
+            metavar="LOAD",
+            help="Fingers load the plate: light, or N/m,N s/m,kg. Else they only feel.",
+        ),
+    ] = None,
     sensor: Annotated[
         list[str] | None,
         typer.Option(metavar="NAME=X,Y", help="An accelerometer here [m]; may be repeated."),
@@ -116,6 +123,7 @@ def sim(
             speed=speed,
             faults=faults,
             fingers=finger or [],
+            finger_load=finger_load,
             sensors=sensor or [],
             record=record,
             rate=rate,
@@ -134,6 +142,7 @@ def _simulate(
     speed: int | None,
     faults: Path | None,
     fingers: list[str],
+    finger_load: str | None,
     sensors: list[str],
     record: Path | None,
     rate: float,
@@ -142,6 +151,7 @@ def _simulate(
     until_eof: bool,
 ) -> None:
     """As told on the command line; common: by kind of wire, its option and port, if it stands."""
+    from model.finger_load import parse_finger_load
     from model.points import parse_point
     from model.rig_file import load_rig
     from sim.fault_file import FaultFile, load_faults
@@ -180,6 +190,7 @@ def _simulate(
             str(number): parse_point(text, what="--finger")
             for number, text in enumerate(fingers, start=1)
         },
+        finger_load=parse_finger_load(finger_load, what="--finger-load") if finger_load else None,
         sensors=[_sensor(text) for text in sensors],
         sample_rate=rate,
         control=control,

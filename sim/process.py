@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from drivers import clock
+from model.finger_load import FingerLoad
 from model.rig import Rig
 from sim.bench import SAMPLE_RATE, Bench
 from sim.control import control_socket
@@ -32,15 +33,17 @@ class FarEnd:
     """What is simulated: a rig, and which wire each of its amplifiers is on, by its name.
 
     faults: what goes wrong, counted from when the URLs are there; fingers rest where they are told
-    [m]; sensors are there from the first; sample_rate [Hz]: of all that is measured; control: where
-    the control socket is served, record: where sensors and fingers are recorded to, from the first
-    to the end; until_eof: whether it ends with standard input.
+    [m], and load the plate by finger_load, or not at all; sensors are there from the first;
+    sample_rate [Hz]: of all that is measured; control: where the control socket is served, record:
+    where sensors and fingers are recorded to, from the first to the end; until_eof: whether it ends
+    with standard input.
     """
 
     rig: Rig
     wires: Mapping[str, Choice]
     faults: FaultFile = field(default_factory=lambda: FaultFile(()))
     fingers: Mapping[str, Position] = field(default_factory=dict)
+    finger_load: FingerLoad | None = None
     sensors: Sequence[Accelerometer] = ()
     sample_rate: float = SAMPLE_RATE
     control: Path | None = None
@@ -68,7 +71,11 @@ async def run_far_end(
         # A thread, for a loop cannot wait for every kind of standard input.
         threading.Thread(target=_await_eof, args=(loop, ended), daemon=True).start()
     bench = await asyncio.to_thread(
-        Bench, far_end.rig, now=clock.now(), sample_rate=far_end.sample_rate
+        Bench,
+        far_end.rig,
+        now=clock.now(),
+        sample_rate=far_end.sample_rate,
+        finger_load=far_end.finger_load,
     )
     if ended.is_set():
         return None

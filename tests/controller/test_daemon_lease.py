@@ -21,7 +21,7 @@ def test_one_lease_at_a_time() -> None:
     """While one runs nobody else gets one; its owner is named, its token is not."""
     book = LeaseBook()
     lease = book.grant("me", lasts=5, now=0)
-    with pytest.raises(RpcError, match="armed by 'me' for 2.0 s more") as caught:
+    with pytest.raises(RpcError, match=r"armed by 'me' for 2\.0 s more") as caught:
         book.grant("you", lasts=5, now=3)
     assert lease.token not in str(caught.value)
     assert book.grant("you", lasts=5, now=5).owner == "you"

@@ -1,0 +1,192 @@
+"""Reading a daemon's configuration, and everything that it names, before anything is touched."""
+
+import os
+import tempfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from urllib.parse import quote
+
+from controller.daemon.sections import CalibrationSection, DaemonSection, TouchSection
+from controller.touch import TouchSource
+from controller.touch_calibration import CalibratedSource, TouchCalibration, turned
+from controller.touch_registry import open_source
+from drivers.errors import CommandError
+from drivers.registry import open_backend
+from model.config import Validation
+from model.document import ConfigError, Document, read_document
+from model.errors import InputError
+from model.rig import Rig
+from model.rig_file import load_rig
+
+
+@dataclass(frozen=True)
+class TouchInput:
+    """A touch source by its name in the configuration, not yet made."""
+
+    name: str
+    url: str
+    calibration: TouchCalibration
+
+    def make(self) -> TouchSource:
+        """The source in the plate's coordinates; raises InputError."""
+        return CalibratedSource(open_source(self.url), self.calibration)
+
+
+@dataclass(frozen=True)
+class DaemonConfig:
+    """All that a daemon runs by; rig_text: the rig's file as it stands there.
+
+    urls: by amplifier; table: its file, or None to build it or take it from the cache.
+    """
+
+    source: Path
+    section: DaemonSection
+    rig: Rig
+    rig_file: Path
+    rig_text: str
+    urls: Mapping[str, str]
+    table: Path | None
+    layout: Path | None
+    touch: tuple[TouchInput, ...]
+    socket: Path
+    log_file: Path | None
+    dump_folder: Path | None
+
+
+def load_daemon_config(path: Path) -> DaemonConfig:
+    """Read a daemon's file and the rig that it names; raises ConfigError with every problem."""
+    document = read_document(path)
+    validation = Validation(document, DaemonSection)
+    rig_file = _file(document, "rig")
+    rig, rig_text = _rig(validation, rig_file)
+    urls = _urls(validation, rig, rig_file)
+    touch = _touch(validation, document)
+    for key in ("table", "layout"):
+        file = _file(document, key)
+        if file is not None and not file.is_file():
+            validation.add((key,), f"there is no file {file}; check its name and folder")
+    _check_serial_numbers(validation, rig)
+    validation.finish()
+    if rig is None or rig_file is None:  # finish has raised by then
+        raise InputError(f"{path}: rig: is missing; add it")
+    section = DaemonSection.model_validate(document.data)
+    return DaemonConfig(
+        source=path,
+        section=section,
+        rig=rig,
+        rig_file=rig_file,
+        rig_text=rig_text,
+        urls=urls,
+        table=_file(document, "table"),
+        layout=_file(document, "layout"),
+        touch=touch,
+        socket=_file(document, "socket") or default_socket(),
+        log_file=_beside(document, section.log.file),
+        dump_folder=_beside(document, section.dumps.folder if section.dumps else None),
+    )
+
+
+def is_daemon_document(document: Document) -> bool:
+    """Whether a configuration file is a daemon's: it names a rig and is none."""
+    return "rig" in document.data and "plate" not in document.data
+
+
+def default_socket(environment: Mapping[str, str] = os.environ) -> Path:
+    """Where daemon and clients meet unless they are told otherwise."""
+    runtime = environment.get("XDG_RUNTIME_DIR")
+    if runtime:
+        return Path(runtime) / "era-haptics" / "daemon.sock"
+    folder = Path(f"/run/user/{os.getuid()}")
+    if folder.is_dir():
+        return folder / "era-haptics" / "daemon.sock"
+    return Path(tempfile.gettempdir()) / f"era-haptics-{os.getuid()}" / "daemon.sock"
+
+
+def _file(document: Document, key: str) -> Path | None:
+    """A file that a key names, from the folder of the configuration; None for none."""
+    value = document.data.get(key)
+    return _beside(document, value) if isinstance(value, str) and "\0" not in value else None
+
+
+def _beside(document: Document, name: str | None) -> Path | None:
+    return None if name is None else Path(document.source).parent / Path(name).expanduser()
+
+
+def _rig(validation: Validation, file: Path | None) -> tuple[Rig | None, str]:
+    """The rig and its text; what is wrong with it stands at the key that names it."""
+    if file is None:
+        return None, ""
+    try:
+        return load_rig(file), file.read_text("utf-8")
+    except ConfigError as error:
+        validation.add(("rig",), "the rig cannot be used:\n    " + str(error).replace("\n", "\n  "))
+    except (InputError, OSError) as error:
+        validation.add(("rig",), f"the rig cannot be used: {error}")
+    return None, ""
+
+
+def _urls(validation: Validation, rig: Rig | None, rig_file: Path | None) -> dict[str, str]:
+    """How to reach each amplifier; `sim://` is one over the rig itself."""
+    if rig is None or rig_file is None:
+        return {}
+    here = quote(str(rig_file.resolve()))
+    urls = {
+        name: f"sim://{here}?amplifier={quote(name)}" if url == "sim://" else url
+        for name, url in rig.amplifiers.items()
+    }
+    for name, url in urls.items():
+        try:
+            open_backend(url)
+        except CommandError as error:
+            validation.add(("rig",), f"amplifiers.{name}.url of the rig cannot be used: {error}")
+    if len(urls) > 1 and any(url.startswith("sim://") for url in urls.values()):
+        validation.add(
+            ("rig",),
+            "the rig has several amplifiers, which are simulated over one plate by a process of "
+            "their own only: run era sim RIG --serial and put the URLs that it prints into the rig",
+        )
+    return urls
+
+
+def _touch(validation: Validation, document: Document) -> tuple[TouchInput, ...]:
+    """The touch sources that are in order; a source is made once, to know that it can be."""
+    listed = document.data.get("touch")
+    inputs: list[TouchInput] = []
+    for number, entry in enumerate(listed if isinstance(listed, list) else []):
+        try:
+            section = TouchSection.model_validate(entry)
+        except ValueError:
+            continue  # the validation has said so
+        here = ("touch", number)
+        if any(section.name == other.name for other in inputs):
+            validation.add((*here, "name"), f"two sources are called {section.name}; rename one")
+            continue
+        try:
+            made = TouchInput(section.name, section.url, _calibration(section.calibration))
+        except InputError as error:
+            validation.add((*here, "calibration"), str(error))
+            continue
+        try:
+            made.make()
+        except InputError as error:
+            validation.add((*here, "url"), str(error))
+        inputs.append(made)
+    return tuple(inputs)
+
+
+def _calibration(section: CalibrationSection) -> TouchCalibration:
+    if section.matrix is None:
+        return turned(section.turned, mirror=section.mirror)
+    if section.turned or section.mirror:
+        raise InputError("give turned and mirror, or a matrix in their place, not both")
+    return TouchCalibration(section.matrix)
+
+
+def _check_serial_numbers(validation: Validation, rig: Rig | None) -> None:
+    for name in validation.mapping(("serial_numbers",)):
+        if rig is not None and name not in rig.amplifiers:
+            validation.add(
+                ("serial_numbers", name),
+                f"the rig has no such amplifier; it has {', '.join(rig.amplifiers)}",
+            )

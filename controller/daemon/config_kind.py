@@ -1,0 +1,38 @@
+"""Daemon files, as `era config` deals with them."""
+
+from pathlib import Path
+from typing import Any
+
+from controller.daemon.config import is_daemon_document, load_daemon_config
+from controller.daemon.sections import DaemonSection
+from model.document import Document
+
+
+class DaemonKind:
+    """A daemon's configuration file."""
+
+    def recognises(self, document: Document) -> bool:
+        """It names a rig, and is none."""
+        return is_daemon_document(document)
+
+    def check(self, path: Path) -> str:
+        """Read it with the rig that it names; a good one in a line."""
+        config = load_daemon_config(path)
+        return (
+            f"good: ERAs {', '.join(era.name for era in config.rig.eras)} on "
+            f"{', '.join(f'{name} ({url})' for name, url in config.urls.items())}; touches from "
+            f"{', '.join(source.name for source in config.touch) or 'the API only'}; "
+            f"socket {config.socket}"
+        )
+
+    def example(self) -> str:
+        """Every key, with what it is for."""
+        return Path(__file__).with_name("example.yaml").read_text(encoding="utf-8")
+
+    def schema(self) -> dict[str, Any]:
+        """For editors."""
+        schema = {"$schema": "https://json-schema.org/draft/2020-12/schema"}
+        return schema | DaemonSection.model_json_schema() | {"title": "A daemon of era-haptics"}
+
+
+DAEMON = DaemonKind()

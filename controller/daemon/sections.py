@@ -1,0 +1,87 @@
+"""What may stand in a daemon's configuration: its sections, keys, defaults and bounds."""
+
+import re
+from typing import Annotated, Literal
+
+from pydantic import AfterValidator, Field, Strict
+
+from controller.api.parts import LONGEST_LEASE, SHORTEST_LEASE
+from model.config import Quantity, Section
+from model.drive_modes import MODES
+from model.perception import STRONG_DB_SL
+from model.rig_sections import Identifier
+from model.units import RATIO, TIME
+
+_NUMBER = Annotated[float, Quantity(RATIO, least=-10, most=10)]
+_ROW = Annotated[tuple[_NUMBER, _NUMBER, _NUMBER], Strict(strict=False)]  # a list in the file
+
+
+def _mode(text: str) -> str:
+    if text not in MODES:
+        raise ValueError(f"{text[:40]!r} is no drive mode; choose {', '.join(MODES)}")
+    return text
+
+
+def _loopback(text: str) -> str:
+    match = re.fullmatch(r"(127\.0\.0\.1|localhost|\[::1\]):(\d{1,5})", text)
+    if match is None or int(match[2]) > 65535:
+        raise ValueError(
+            f"{text[:40]!r} is no loopback address with a port, such as 127.0.0.1:8000; for others "
+            "run the gateway by itself: python -m controller.gateway --help"
+        )
+    return text
+
+
+Port = Annotated[int, Field(ge=0, le=65535)]
+File = Annotated[str, Field(min_length=1, max_length=4096, pattern=r"^[^\x00]*$")]
+LevelDbSl = Annotated[float, Quantity(RATIO, least=-20, most=60)]
+
+
+class CalibrationSection(Section):
+    """How a sensor lies on the plate: turned clockwise, mirrored after that, or by a matrix."""
+
+    turned: Literal[0, 90, 180, 270] = 0
+    mirror: Literal["x", "y"] | None = None
+    matrix: Annotated[tuple[_ROW, _ROW], Strict(strict=False)] | None = None
+
+
+class TouchSection(Section):
+    """One touch source."""
+
+    name: Identifier
+    url: Annotated[str, Field(min_length=1, max_length=4096)]
+    calibration: CalibrationSection = CalibrationSection()
+
+
+class LogSection(Section):
+    """The log: JSON, one object a line, to standard error or a file."""
+
+    level: Literal["debug", "info", "warning", "error"] = "info"
+    file: File | None = None
+
+
+class DumpSection(Section):
+    """Where the last messages are written on a fault, and how many such files are kept."""
+
+    folder: File
+    keep: Annotated[int, Field(ge=1, le=1000)] = 20
+
+
+class DaemonSection(Section):
+    """A daemon's configuration; files count from the folder that it lies in."""
+
+    rig: File
+    table: File | None = None
+    mode: Annotated[str, AfterValidator(_mode)] | None = None
+    level_db_sl: LevelDbSl = STRONG_DB_SL
+    layout: File | None = None
+    touch: Annotated[list[TouchSection], Field(max_length=16, default_factory=list)]
+    serial_numbers: Annotated[dict[Identifier, str], Field(max_length=64, default_factory=dict)]
+    longest_lease: Annotated[float, Quantity(TIME, least=SHORTEST_LEASE, most=LONGEST_LEASE)] = (
+        LONGEST_LEASE
+    )
+    socket: File | None = None
+    log: LogSection = LogSection()
+    dumps: DumpSection | None = None
+    metrics: Port | None = None
+    dashboard: Annotated[str, AfterValidator(_loopback)] | None = None

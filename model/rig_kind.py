@@ -1,0 +1,48 @@
+"""Rigs, as `era config` deals with them."""
+
+from pathlib import Path
+from typing import Any
+
+from model.document import Document
+from model.rig import Rig
+from model.rig_file import example_rig_path, load_rig, rig_schema
+
+
+class RigKind:
+    """A rig file."""
+
+    def recognises(self, document: Document) -> bool:
+        """A rig has a plate."""
+        return "plate" in document.data
+
+    def check(self, path: Path) -> str:
+        """A good rig in one line, so that a value that is only unlikely catches the eye."""
+        return _summary(load_rig(path))
+
+    def example(self) -> str:
+        """The paper's plate."""
+        return example_rig_path().read_text(encoding="utf-8")
+
+    def schema(self) -> dict[str, Any]:
+        """For editors."""
+        return rig_schema()
+
+
+RIG = RigKind()
+
+
+def _summary(rig: Rig) -> str:
+    plate, laminate = rig.plate, rig.laminate
+    thickness = plate.thickness if laminate is None else laminate.thickness
+    sizes = " x ".join(f"{1e3 * size:g}" for size in (plate.length, plate.width, thickness))
+    made_of = plate.material.name
+    if laminate is not None:
+        made_of = f"laminate ({', '.join(layer.material.name for layer in laminate.layers)})"
+    parts = [
+        f"{sizes} mm of {made_of}",
+        f"mesh {rig.mesh}",
+        f"ERAs {', '.join(era.name for era in rig.eras)}",
+    ]
+    if rig.masses:
+        parts.append(f"carries {1e3 * sum(mass.mass for mass in rig.masses):g} g")
+    return f"good: {', '.join(parts)}"

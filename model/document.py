@@ -124,6 +124,11 @@ def read_document(path: Path) -> Document:
         line = content.count(b"\n", 0, error.start) + 1
         message = f"byte 0x{content[error.start]:02x} is no UTF-8; save the file as UTF-8"
         raise ConfigError(source, [Problem(line, "", message)]) from error
+    return parse_document(source, text)
+
+
+def parse_document(source: str, text: str) -> Document:
+    """Read the text of a YAML file that came from a source; raises ConfigError."""
     return _Builder(source, text).document()
 
 

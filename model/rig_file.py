@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Any
 
 from model.config import Validation
-from model.document import read_document
+from model.document import Document, parse_document, read_document
 from model.rig import Channel, Rig
 from model.rig_checks import check_across
 from model.rig_parts import era_of, laminate_of, limits_of, mass_of, mesh_of, plate_of
@@ -17,7 +17,16 @@ def load_rig(path: Path | str, *, mesh: str | None = None) -> Rig:
     Raises ConfigError with every problem of the file; InputError for a mesh that is none. A mesh
     asked for here may be as coarse as is wanted: how wrong it then is may be the question.
     """
-    document = read_document(Path(path))
+    return _rig_of(read_document(Path(path)), mesh=mesh)
+
+
+def parse_rig(source: str, text: str) -> Rig:
+    """Read the text of a rig file that came from a source; raises ConfigError."""
+    return _rig_of(parse_document(source, text), mesh=None)
+
+
+def _rig_of(document: Document, *, mesh: str | None) -> Rig:
+    """The rig that a document says, with another mesh where one is given."""
     validation = Validation(document, RigSection)
     check_across(validation, mesh_given=mesh is not None)
     validation.finish()

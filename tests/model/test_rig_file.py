@@ -12,7 +12,7 @@ from model.materials import material
 from model.plate import Plate
 from model.point_mass import PointMass
 from model.rig import Channel
-from model.rig_file import example_rig_path, load_rig, rig_schema
+from model.rig_file import example_rig_path, load_rig, parse_rig, rig_schema
 from model.rig_parts import parse_mesh
 
 # A line per value, so that every problem has a line of its own.
@@ -468,3 +468,11 @@ def test_the_schema_for_editors_knows_what_the_example_says() -> None:
         assert set(sections[section].get("required", [])) <= content.keys()
         assert sections[section]["additionalProperties"] is False
     assert json.loads(json.dumps(schema)) == schema
+
+
+def test_text_of_a_rig() -> None:
+    """The text of a file gives the rig of the file, and its problems name where it came from."""
+    text = example_rig_path().read_text(encoding="utf-8")
+    assert parse_rig("the daemon", text) == load_rig(example_rig_path())
+    with pytest.raises(ConfigError, match="the daemon"):
+        parse_rig("the daemon", text.replace("thickness", "thikness"))

@@ -1,0 +1,270 @@
+"""CAN, from docs/wire-can.md: orders and answers, sets, heartbeats and emergencies.
+
+A set is the commands that came under its order's sequence number. SDO and NMT mean nothing here but
+that somebody was identified, that an envelope was loaded, or that an amplifier starts anew.
+"""
+
+import struct
+from collections.abc import Mapping
+
+from sim.witness import quantities as q
+from sim.witness.can_text import CanFrame, SlcanText, SocketcandText
+from sim.witness.quantities import OutOfRange, value, whole
+from sim.witness.seen import (
+    Answered,
+    Asked,
+    Condition,
+    Damaged,
+    Decoded,
+    Drive,
+    Kind,
+    Meaning,
+    Restarted,
+    Told,
+    Toward,
+)
+
+_ACTIONS = (
+    *(Kind.STATUS, Kind.APPLY, Kind.STAGE, Kind.COMMIT),
+    *(Kind.ARM, Kind.DISARM, Kind.STOP, Kind.CLEAR),
+)
+_TORN = 15
+_FILLING = b"\xff" * 8
+_PER_NODE = 4
+
+
+class CanDecoder:
+    """Text of an adapter both ways to meanings; nodes: of the amplifiers, with their channels."""
+
+    def __init__(self, kind: str, nodes: Mapping[int, int]) -> None:
+        reader = SlcanText if kind == "slcan" else SocketcandText
+        self._text = {
+            "amplifier": reader("amplifier"),
+            "host": reader("host"),
+        }
+        self._nodes = {node: _Node(node, channels) for node, channels in nodes.items()}
+
+    def feed(self, toward: Toward, time: float, data: bytes) -> list[Decoded]:
+        """What these bytes complete."""
+        seen: list[Decoded] = []
+        for text in self._text[toward].feed(data):
+            if text.is_damaged:
+                seen.append((text.raw, Damaged("a line that makes no frame")))
+            elif text.frame is not None:
+                seen += [(text.raw, meaning) for meaning in self.take(toward, text.frame)]
+        return seen
+
+    def take(self, toward: Toward, frame: CanFrame) -> list[Meaning | None]:
+        """What one frame means, to each amplifier that it concerns."""
+        try:
+            if toward == "amplifier":
+                return self._asked(frame)
+            return self._said(frame)
+        except (OutOfRange, struct.error, IndexError) as problem:
+            node = frame.identifier & 0x7F
+            if toward == "amplifier":
+                return [Asked(Kind.LOOK, node, problem=str(problem))]
+            return [Damaged(f"a frame that makes no message: {problem}")]
+
+    def _asked(self, frame: CanFrame) -> list[Meaning | None]:
+        function, number = frame.identifier & 0x780, frame.identifier & 0x7F
+        if frame.identifier == 0:
+            return [None]
+        if frame.identifier == 0x080:
+            for node in self._nodes.values():
+                node.commands.clear()
+                node.shaped.clear()
+            return [None]
+        if function == 0x700:
+            return [Asked(Kind.PING, 128 - number)]
+        if frame.identifier == 0x480:
+            return [_broadcast(frame)]
+        if function == 0x480 and number in self._nodes:
+            return [self._nodes[number].order(frame)]
+        for node in self._nodes.values():
+            if node.owns(frame):
+                node.take(frame)
+                return [None]
+        if function == 0x600 and number in self._nodes:
+            index = int.from_bytes(frame.data[1:3], "little")
+            identifies = frame.data[0] == 0x40 and index in (0x1018, 0x2000)
+            return [Asked(Kind.HELLO if identifies else Kind.LOOK, number)]
+        return [None]
+
+    def _said(self, frame: CanFrame) -> list[Meaning | None]:
+        function, number = frame.identifier & 0x780, frame.identifier & 0x7F
+        if function == 0x700 and frame.data == b"\0" and number in self._nodes:
+            return [Restarted(number)]
+        if function == 0x080 and number in self._nodes:
+            state = frame.data[3] & 0xF
+            return [Told(number, state, frame.data[3] >> 4)]
+        if function == 0x580 and number in self._nodes:
+            # Of a transfer nobody knows here when it was carried out: it may have fed the watchdog.
+            return [Answered(number, "objects")]
+        for node in self._nodes.values():
+            if frame.identifier == 0x180 + node.number:
+                return [node.answer(frame)]
+            if frame.identifier == 0x280 + node.number:
+                node.condition = frame.data
+                return [None]
+            if function == 0x380 and number in node.numbers:
+                node.levels[number - node.number] = frame.data
+                return [None]
+        return [None]
+
+
+class _Node:
+    """What has come for and from one amplifier and is not whole yet."""
+
+    def __init__(self, number: int, channels: int) -> None:
+        self.number = number
+        self.numbers = range(number, number + max(1, -(-channels // _PER_NODE)))
+        self.commands: dict[int, bytes] = {}
+        self.shaped: dict[int, tuple[int, int, int]] = {}
+        self.condition: bytes | None = None
+        self.levels: dict[int, bytes] = {}
+
+    def owns(self, frame: CanFrame) -> bool:
+        """Whether it is a command, or slots, for this amplifier."""
+        function, number = frame.identifier & 0x780, frame.identifier & 0x7F
+        if frame.identifier == 0x680 + self.number:
+            return True
+        return function in (0x200, 0x300, 0x400, 0x500) and number in self.numbers
+
+    def take(self, frame: CanFrame) -> None:
+        """A command, commands in a CAN FD frame, or slots."""
+        if frame.identifier == 0x680 + self.number:
+            word, group = int.from_bytes(frame.data[:6], "little"), frame.data[6] & 3
+            for place in range(_PER_NODE):
+                pair = word >> 12 * place & 0xFFF
+                self.shaped[_PER_NODE * group + place] = pair & 0x3F, pair >> 6, frame.data[7]
+        elif frame.is_fd:
+            self.take_blocks(frame.data)
+        else:
+            group = (frame.identifier & 0x7F) - self.number
+            self.commands[_PER_NODE * group + (frame.identifier >> 8) - 2] = frame.data
+
+    def take_blocks(self, data: bytes) -> None:
+        """Commands one after the other, filled up."""
+        for at in range(0, len(data) - 7, 8):
+            block = data[at : at + 8]
+            if block != _FILLING:
+                self.commands[block[6] >> 4] = block
+
+    def order(self, frame: CanFrame) -> Asked:
+        """An order, with what has come under its number."""
+        token, ramp, time, what, sequence = struct.unpack_from("<HHHBB", frame.data)
+        kind, count = _ACTIONS[what & 7], what >> 3
+        if frame.is_fd:
+            self.take_blocks(frame.data[8:])
+        key = (self.number, sequence, kind)
+        problem = "" if sequence else "an order with the sequence number 0"
+        drives: dict[int, Drive] = {}
+        try:
+            if kind in (Kind.APPLY, Kind.STAGE):
+                drives = self._drives(sequence)
+                if len(drives) != count:
+                    problem = f"torn: {len(drives)} of {count} commands have come"
+            return Asked(
+                kind,
+                self.number,
+                key,
+                token=whole(q.TOKEN, token, "token") if _has_token(kind) else 0,
+                ramp=value(q.RAMP, ramp, "ramp"),
+                valid_for=value(q.VALID_FOR, time, "valid_for") if drives else 0.0,
+                watchdog=value(q.WATCHDOG, time, "watchdog") if kind is Kind.ARM else 0.0,
+                drives=drives,
+                problem=problem,
+            )
+        except OutOfRange as wrong:
+            return Asked(kind, self.number, key, problem=str(wrong))
+
+    def _drives(self, sequence: int) -> dict[int, Drive]:
+        drives = {}
+        for channel, block in self.commands.items():
+            frequency, level, phase, flags, own = struct.unpack("<HHhBB", block)
+            if own != sequence:
+                continue
+            if flags >> 4 != channel or flags & 8:
+                raise OutOfRange(f"a command of channel {flags >> 4} in the frame of {channel}")
+            onset, ending, of = self.shaped.get(channel, (0, 0, -1)) if flags & 4 else (0, 0, own)
+            if of != own:
+                raise OutOfRange(f"torn: the slots of channel {channel} are missing")
+            drives[channel] = Drive(
+                value(q.FREQUENCY, frequency, "frequency"),
+                value(q.LEVEL, level, "level"),
+                value(q.PHASE, phase, "phase"),
+                keep_phase=bool(flags & 1),
+                skip_ending=bool(flags & 2),
+                onset=onset,
+                ending=ending,
+            )
+        return drives
+
+    def answer(self, frame: CanFrame) -> Meaning:
+        """An answer with the condition and levels that came before it, or an event."""
+        sequence, what, both, _, token, left = struct.unpack_from("<BBBBHH", frame.data)
+        state, fault = whole(q.STATE, both & 0xF, "state"), whole(q.FAULT, both >> 4, "fault")
+        if sequence == 0:
+            return Told(self.number, state, fault)
+        if frame.is_fd:
+            self._take_answer(frame.data[8:])
+        condition, levels = self.condition, self.levels
+        self.condition, self.levels = None, {}
+        result = what >> 4
+        high_voltage = temperature = said = None
+        if condition is not None and condition[0] == sequence:
+            _, flag, degrees, _, count = struct.unpack_from("<BBhHB", condition)
+            high_voltage, temperature = bool(flag & 1), degrees * 0.1
+            said = _levels(levels, count & 0x1F, sequence)
+        kind = _ACTIONS[what & 7]
+        return Answered(
+            self.number,
+            (self.number, sequence, kind),
+            refusal=result,
+            is_as_asked=bool(what & 8) if kind in (Kind.APPLY, Kind.STAGE) else None,
+            condition=Condition(
+                state=state,
+                fault=fault,
+                token=token,
+                watchdog_left=value(q.WATCHDOG_LEFT, left, "watchdog_left"),
+                high_voltage=high_voltage,
+                temperature=temperature,
+                levels=said,
+            ),
+        )
+
+    def _take_answer(self, data: bytes) -> None:
+        blocks = [data[at : at + 8] for at in range(0, len(data) - 7, 8)]
+        blocks = [block for block in blocks if block != _FILLING]
+        if blocks:
+            self.condition = blocks[0]
+            self.levels = dict(enumerate(blocks[1:]))
+
+
+def _has_token(kind: Kind) -> bool:
+    return kind in (Kind.APPLY, Kind.STAGE, Kind.COMMIT)
+
+
+def _broadcast(frame: CanFrame) -> Asked:
+    token, ramp, _, what, _ = struct.unpack_from("<HHHBB", frame.data)
+    kind = _ACTIONS[what & 7]
+    if kind is Kind.COMMIT:
+        return Asked(kind, 0, token=whole(q.TOKEN, token, "token"))
+    if kind is Kind.STOP:
+        return Asked(kind, 0, ramp=value(q.RAMP, ramp, "ramp"))
+    raise OutOfRange(f"{kind.value} to all")
+
+
+def _levels(blocks: dict[int, bytes], count: int, sequence: int) -> tuple[float, ...] | None:
+    """The levels of so many channels; None where a block is missing."""
+    levels: list[float] = []
+    for group in range(-(-count // _PER_NODE)):
+        block = blocks.get(group)
+        if block is None or block[7] != sequence:
+            return None
+        word = int.from_bytes(block[:7], "little")
+        levels += [
+            value(q.LEVEL, word >> 14 * place & 0x3FFF, "level") for place in range(_PER_NODE)
+        ]
+    return tuple(levels[:count])

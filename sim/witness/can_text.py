@@ -1,0 +1,93 @@
+"""CAN frames out of the text that adapters speak: socketcand over TCP, slcan over a serial port.
+
+Written from the formats themselves: `< send ID LEN BYTES >` and `< frame ID TIME DATA >` with their
+`fd` siblings, and LAWICEL's `tIIILDD..` with `d` and `b` for CAN FD. What adapters and hosts say to
+each other beside frames means nothing here.
+"""
+
+import re
+from typing import NamedTuple
+
+from sim.witness.seen import Toward
+
+LENGTHS = (0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64)
+"""That a CAN FD frame can have."""
+
+_LONGEST = 512
+_SEND = re.compile(rb"< send ([0-9A-Fa-f]+) (\d+)((?: [0-9A-Fa-f]+)*) +>")
+_FD_SEND = re.compile(rb"< fdsend ([0-9A-Fa-f]+) [0-9A-Fa-f]+ (\d+)((?: [0-9A-Fa-f]+)*) +>")
+_FRAME = re.compile(rb"< frame ([0-9A-Fa-f]+) [0-9.]+ ([0-9A-Fa-f ]*?) ?>")
+_FD_FRAME = re.compile(rb"< fdframe ([0-9A-Fa-f]+) [0-9A-Fa-f]+ [0-9.]+ ([0-9A-Fa-f ]*?) ?>")
+_SLCAN = re.compile(rb"([tdb])([0-7][0-9A-Fa-f]{2})([0-9A-Fa-f])((?:[0-9A-Fa-f]{2})*)")
+
+
+class CanFrame(NamedTuple):
+    """A frame with an identifier of 11 bits."""
+
+    identifier: int
+    data: bytes
+    is_fd: bool
+
+
+class Text(NamedTuple):
+    """A piece of text: the frame in it; is_damaged: it ought to be one and is none."""
+
+    raw: bytes
+    frame: CanFrame | None
+    is_damaged: bool
+
+
+class SocketcandText:
+    """Elements `< ... >` that go one way."""
+
+    def __init__(self, toward: Toward) -> None:
+        self._toward: Toward = toward
+        self._rest = b""
+
+    def feed(self, data: bytes) -> list[Text]:
+        """What these bytes complete."""
+        *elements, self._rest = re.split(rb"(?<=>)", self._rest + data)
+        self._rest = self._rest[-_LONGEST:]
+        return [self._text(element.strip()) for element in elements]
+
+    def _text(self, element: bytes) -> Text:
+        sent, fd_sent = (_SEND, _FD_SEND) if self._toward == "amplifier" else (_FRAME, _FD_FRAME)
+        found = sent.fullmatch(element) or fd_sent.fullmatch(element)
+        if found is None:
+            words = (b"send", b"fdsend", b"frame", b"fdframe")
+            return Text(element, None, element[2:].split(b" ")[0] in words)
+        is_fd = found.re is fd_sent
+        if self._toward == "amplifier":
+            data = bytes(int(byte, 16) for byte in found[3].split())
+            good = len(data) == int(found[2])
+        else:
+            digits = found[2].replace(b" ", b"")
+            good = len(digits) % 2 == 0
+            data = bytes.fromhex(digits.decode()) if good else b""
+        good = good and len(data) in (LENGTHS if is_fd else LENGTHS[:9])
+        return Text(element, CanFrame(int(found[1], 16), data, is_fd) if good else None, not good)
+
+
+class SlcanText:
+    """Lines that go one way; each direction ends them with CR, refusals with BELL."""
+
+    def __init__(self, toward: Toward) -> None:
+        self._rest = b""
+
+    def feed(self, data: bytes) -> list[Text]:
+        """What these bytes complete."""
+        *lines, self._rest = re.split(rb"[\r\a]", self._rest + data)
+        self._rest = self._rest[-_LONGEST:]
+        return [_slcan(line) for line in lines if line]
+
+
+def _slcan(line: bytes) -> Text:
+    found = _SLCAN.fullmatch(line)
+    if found is None:
+        return Text(line, None, line[:1] in b"tdb")
+    data = bytes.fromhex(found[4].decode())
+    is_fd = found[1] != b"t"
+    length = LENGTHS[int(found[3], 16)]
+    if len(data) != length or (length > 8 and not is_fd):
+        return Text(line, None, True)
+    return Text(line, CanFrame(int(found[2], 16), data, is_fd), False)

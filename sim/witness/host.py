@@ -1,0 +1,441 @@
+"""What a host owes: to the fingers, to the amplifiers, and to whoever arms and stops it.
+
+Rules about single frames are checked as a frame passes; what must happen within a time is noted as
+a duty and looked at when the time is over.
+"""
+
+import math
+from collections import deque
+from collections.abc import Callable, Collection, Hashable, Mapping
+from dataclasses import dataclass, field
+
+from sim.witness.follower import Complain, Follower
+from sim.witness.plan import AmplifierPlan, Times
+from sim.witness.seen import FEEDING, Asked, Drive, Kind
+
+_REMEMBERED = 16  # tokens since Arm
+_STEP = 0.6  # of a step of the wire: what rounding may make
+_SETS = (Kind.APPLY, Kind.STAGE)
+_UNCOUNTED = (Kind.LOOK, Kind.HELLO, Kind.CAPABILITIES)
+
+Expected = Mapping[str, Mapping[int, tuple[float, float, float]]]
+"""What a touch should give, by amplifier and channel: Hz, level, degrees."""
+
+
+@dataclass
+class Duty:
+    """What must have happened when a time [s] is over; is_done is asked then."""
+
+    due: float
+    is_done: Callable[[], bool]
+    invariant: str
+    wire: str
+    sentence: str
+
+
+@dataclass
+class Side:
+    """A host's side of one amplifier; complain: see `Complain`."""
+
+    name: str
+    plan: AmplifierPlan
+    follower: Follower
+    complain: Complain
+    is_troubled: Callable[[], bool]
+    pending: dict[Hashable, tuple[float, Asked]] = field(default_factory=dict)
+    overdue: set[Hashable] = field(default_factory=set)
+    vibrates: bool = False  # the last that it was told
+    vibrated_at: float = -math.inf  # when a set that vibrates was granted last
+    staged: dict[int, Asked] = field(default_factory=dict)
+    tokens: deque[tuple[int, Asked]] = field(default_factory=lambda: deque(maxlen=_REMEMBERED))
+    levels: dict[int, Drive] = field(default_factory=dict)
+    is_identified: bool | None = None
+    is_open: bool = True
+    is_stopped: bool = False
+    stop_wished: float | None = None
+    last_life: float | None = None
+    last_token: int = 0
+
+
+class Host:
+    """The rules about hosts, over all amplifiers of a plan."""
+
+    def __init__(self, sides: Mapping[str, Side], *, times: Times) -> None:
+        self._sides = sides
+        self._times = times
+        self._duties: list[Duty] = []
+        self._contacts: frozenset[Hashable] | None = None
+        self._lifted = -math.inf
+        self._touched = -math.inf  # by whoever came last
+        self._hung: float | None = None
+        self._arm_wished: bool | None = None  # None: wishes are not told
+        self._silence_wished = -math.inf
+        self._expected: Expected | None = None
+
+    # what the witness is told beside the wires
+
+    def contacts(self, time: float, contacts: Collection[Hashable], *, is_answerable: bool) -> None:
+        """These fingers are on the plate from now on."""
+        before = self._contacts or frozenset()
+        self._contacts = now = frozenset(contacts)
+        if before and not now:
+            self._lifted = time
+            for side in self._sides.values():
+                self._owe(
+                    Duty(
+                        time + self._times.lift,
+                        lambda side=side: self._is_released(side, time),  # type: ignore[misc]
+                        "lift",
+                        side.plan.wire,
+                        f"the last finger was lifted at {time:.4f} s, and "
+                        f"{self._times.lift * 1e3:g} ms later {side.name} was not told to be "
+                        "silent",
+                    )
+                )
+        if now - before:
+            self._touched = time
+        for new in now - before:
+            if is_answerable and self._can_play():
+                self._owe(
+                    Duty(
+                        time + self._times.touch,
+                        lambda new=new: self._is_answered(new, time),  # type: ignore[misc]
+                        "touch",
+                        next(iter(self._sides.values())).plan.wire,
+                        f"a finger came at {time:.4f} s, and {self._times.touch * 1e3:g} ms later "
+                        "no amplifier plays a pattern for it",
+                    )
+                )
+
+    def expect(self, expected: Expected | None) -> None:
+        """What every pattern must be from now on; None: any."""
+        self._expected = expected
+
+    def wish(self, time: float, what: str) -> None:
+        """Somebody wants it to arm, disarm, stop or clear."""
+        self._arm_wished = what == "arm" or (self._arm_wished is True and what == "clear")
+        if what in ("stop", "disarm"):
+            self._silence_wished = time
+        if what == "stop":
+            for side in self._sides.values():
+                if side.is_open and not side.is_troubled():
+                    self._owe_stop(side, time)
+
+    def hang(self, time: float | None) -> None:
+        """The control loop hangs from a time [s] on; None: it runs again."""
+        self._hung = time
+
+    # what it sends
+
+    def asked(self, side: Side, time: float, asked: Asked) -> None:
+        """A request to one amplifier; a broadcast is one to each."""
+        if asked.problem:
+            rule = "commit" if asked.problem.startswith("torn") else "garbage"
+            side.complain(rule, time, f"the host sent {asked.kind.value}: {asked.problem}")
+        if asked.key is not None:
+            self._check_credit(side, time, asked)
+        self._check_stop(side, time, asked)
+        if asked.kind in FEEDING:
+            self._check_life(side, time, asked)
+        if asked.kind is Kind.ARM:
+            self._check_arm(side, time)
+        if asked.kind in _SETS:
+            self._check_set(side, time, asked)
+        if asked.kind is Kind.ENVELOPE and asked.shape is not None:
+            self._check_shape(side, time, max(asked.shape.levels, default=0.0))
+        self._note(side, time, asked)
+
+    def granted(self, side: Side, time: float, asked: Asked) -> None:
+        """A request of it was not refused."""
+        match asked.kind:
+            case Kind.HELLO:
+                side.is_identified = True
+            case Kind.ARM:
+                side.tokens.clear()
+                side.last_life = time
+            case Kind.CLEAR:
+                side.is_stopped = False
+            case Kind.APPLY | Kind.COMMIT:
+                if self._vibrates(side, asked):
+                    side.vibrated_at = time
+
+    def pass_to(self, time: float) -> None:
+        """Look at the duties whose time is over."""
+        if any(duty.due < time for duty in self._duties):
+            over = [duty for duty in self._duties if duty.due < time]
+            self._duties = [duty for duty in self._duties if duty.due >= time]
+            for duty in over:
+                side = next(s for s in self._sides.values() if s.plan.wire == duty.wire)
+                if not (side.is_troubled() or duty.is_done()):
+                    side.complain(duty.invariant, duty.due, duty.sentence)
+        for side in self._sides.values():
+            self._check_pulse(side, time)
+
+    # rules
+
+    def _check_credit(self, side: Side, time: float, asked: Asked) -> None:
+        """Nothing is asked while something else may still be answered, but for silence."""
+        if self._silences(asked):
+            return
+        for at, other in side.pending.values():
+            if time - at < self._times.reply - self._times.slack:
+                side.complain(
+                    "credit",
+                    time,
+                    f"the host asked {side.name} {asked.kind.value} {(time - at) * 1e3:.1f} ms "
+                    f"after {other.kind.value}, which nobody has answered: it took something else "
+                    "for the answer",
+                )
+
+    def _check_stop(self, side: Side, time: float, asked: Asked) -> None:
+        is_other = asked.kind is not Kind.STOP and asked.kind not in _UNCOUNTED
+        if side.stop_wished is not None and is_other:
+            side.complain(
+                "stop",
+                time,
+                f"a stop was wished at {side.stop_wished:.4f} s, but the next that {side.name} was "
+                f"told is {asked.kind.value}",
+            )
+            side.stop_wished = None
+        if side.is_stopped and asked.kind is Kind.ARM:
+            side.complain("stop", time, f"{side.name} is armed although its stop is not cleared")
+
+    def _check_life(self, side: Side, time: float, asked: Asked) -> None:
+        hung = self._hung
+        if hung is not None and time > hung + self._times.slack and not self._silences(asked):
+            side.complain(
+                "heartbeat",
+                time,
+                f"the control loop hangs since {hung:.4f} s, but {side.name} is sent "
+                f"{asked.kind.value}, which feeds its watchdog",
+            )
+        side.last_life = time
+
+    def _check_pulse(self, side: Side, time: float) -> None:
+        last = side.last_life
+        is_owed = side.is_open and side.follower.is_enabled and self._hung is None
+        if last is None or not is_owed or side.is_troubled():
+            return
+        if time > last + self._times.heartbeat + self._times.slack:
+            side.last_life = time
+            side.complain(
+                "heartbeat", time, f"{side.name} has had no sign of life since {last:.4f} s"
+            )
+
+    def _check_arm(self, side: Side, time: float) -> None:
+        if self._arm_wished is False:
+            side.complain("armed", time, f"{side.name} is armed although nobody wished it")
+        if side.is_identified is False:
+            side.complain("identified", time, f"{side.name} is armed without being asked who it is")
+
+    def _check_set(self, side: Side, time: float, asked: Asked) -> None:
+        self._check_token(side, time, asked)
+        for channel, drive in asked.drives.items():
+            if drive.vibrates:
+                self._check_limits(side, time, channel, drive, asked.ramp)
+        if asked.vibrates:
+            self._check_justified(side, time)
+            if self._expected is not None:
+                self._check_expected(side, time, asked)
+
+    def _check_limits(
+        self, side: Side, time: float, channel: int, drive: Drive, ramp: float
+    ) -> None:
+        limits = side.plan.channels.get(channel)
+        what = f"channel {channel} of {side.name} is told {drive.frequency:g} Hz at {drive.level:g}"
+        if limits is None:
+            side.complain("limits", time, f"{what}, but there is no such channel")
+            return
+        fine = 0.01 * _STEP
+        if not limits.frequency_min - fine <= drive.frequency <= limits.frequency_max + fine:
+            side.complain(
+                "limits",
+                time,
+                f"{what}; allowed are {limits.frequency_min:g} to {limits.frequency_max:g} Hz",
+            )
+        if drive.level > limits.level + 1e-4 * _STEP:
+            side.complain("limits", time, f"{what}; allowed is a level of {limits.level:g}")
+        before = side.levels.get(channel)
+        goes_on = before is not None and before.frequency == drive.frequency
+        rise = drive.level - (before.level if before is not None and goes_on else 0.0)
+        if not drive.onset and rise > limits.slew * ramp + 1e-4 * _STEP:
+            side.complain(
+                "limits", time, f"{what} within {ramp:g} s; allowed is {limits.slew:g} a second"
+            )
+
+    def _check_shape(self, side: Side, time: float, level: float) -> None:
+        highest = max((limits.level for limits in side.plan.channels.values()), default=0.0)
+        if level > highest + 1e-4 * _STEP:
+            side.complain(
+                "limits",
+                time,
+                f"an envelope of {side.name} goes to level {level:g}; allowed is {highest:g}",
+            )
+
+    def _check_justified(self, side: Side, time: float) -> None:
+        if side.is_stopped:
+            side.complain("stop", time, f"{side.name} is told to vibrate after its stop")
+        elif side.follower.state is not None and not side.follower.is_enabled:
+            side.complain(
+                "enabled", time, f"{side.name} is told to vibrate although it is not enabled"
+            )
+        is_touched = self._contacts is None or self._contacts
+        if not is_touched and time > self._lifted + self._times.lift + self._times.slack:
+            side.complain(
+                "justified",
+                time,
+                f"{side.name} is told to vibrate although nobody touches the plate since "
+                f"{self._lifted:.4f} s",
+            )
+
+    def _check_expected(self, side: Side, time: float, asked: Asked) -> None:
+        wanted = (self._expected or {}).get(side.name, {})
+        told = {
+            channel: (drive.frequency, drive.level, drive.phase)
+            for channel, drive in asked.drives.items()
+            if drive.vibrates
+        }
+        same = told.keys() == wanted.keys() and all(
+            abs(told[channel][0] - frequency) < 0.01 * _STEP
+            and abs(told[channel][1] - level) < 1e-4 * _STEP
+            and abs(math.remainder(told[channel][2] - phase, 360.0)) < 0.01 * _STEP
+            for channel, (frequency, level, phase) in wanted.items()
+        )
+        if not same:
+            side.complain(
+                "pattern",
+                time,
+                f"{side.name} is told {_listed(told)}; the touch asks for {_listed(wanted)}",
+            )
+
+    def _check_token(self, side: Side, time: float, asked: Asked) -> None:
+        for place, (token, other) in enumerate(side.tokens):
+            is_last = place == len(side.tokens) - 1
+            if token == asked.token and not (is_last and other.drives == asked.drives):
+                side.complain(
+                    "token",
+                    time,
+                    f"set {token} is sent to {side.name} again "
+                    + ("with other contents" if is_last else "after others"),
+                )
+                return
+        if not any(token == asked.token for token, _ in side.tokens):
+            side.tokens.append((asked.token, asked))
+
+    # what is remembered
+
+    def _note(self, side: Side, time: float, asked: Asked) -> None:
+        match asked.kind:
+            case Kind.STAGE:
+                side.staged = {asked.token: asked}
+            case Kind.APPLY | Kind.COMMIT:
+                is_new = asked.token != side.last_token
+                drives = self._drives(side, asked)
+                side.vibrates = self._vibrates(side, asked)
+                side.last_token = asked.token
+                side.levels = {channel: drive for channel, drive in drives.items() if drive.level}
+                if is_new and side.vibrates:
+                    self._owe_company(side, time, asked.token)
+                if not side.vibrates:
+                    self._check_release(side, time, asked.ramp, drives)
+            case Kind.STOP | Kind.DISARM | Kind.ARM:
+                side.vibrates = False
+                side.levels = {}
+                side.staged = {}
+                if asked.kind is Kind.STOP:
+                    side.is_stopped, side.stop_wished = True, None
+                    self._arm_wished = self._arm_wished and False
+            case _:
+                pass
+
+    def _check_release(
+        self, side: Side, time: float, ramp: float, drives: Mapping[int, Drive]
+    ) -> None:
+        """Zero itself, not only its command, is there soon after the last lift."""
+        if self._contacts or not 0 <= time - self._lifted <= self._times.lift:
+            return
+        has_endings = any(not drive.skip_ending for drive in drives.values()) and side.staged
+        if time + ramp > self._lifted + self._times.release + self._times.slack and not has_endings:
+            side.complain(
+                "lift",
+                time,
+                f"the last finger was lifted at {self._lifted:.4f} s, but {side.name} is silent "
+                f"only after a ramp of {ramp:g} s",
+            )
+
+    def _owe(self, duty: Duty) -> None:
+        self._duties.append(duty)
+
+    def _owe_stop(self, side: Side, time: float) -> None:
+        side.stop_wished = time
+        self._owe(
+            Duty(
+                time + self._times.stop,
+                lambda: side.stop_wished is None or not side.is_open,
+                "stop",
+                side.plan.wire,
+                f"a stop was wished at {time:.4f} s, and {self._times.stop * 1e3:g} ms later "
+                f"{side.name} has not been told",
+            )
+        )
+
+    def _owe_company(self, first: Side, time: float, token: int) -> None:
+        """Where one amplifier plays a set, all do, or it is silenced."""
+        for side in self._sides.values():
+            if side is first or not side.follower.is_enabled:
+                continue
+            self._owe(
+                Duty(
+                    time + self._times.together,
+                    lambda side=side: side.last_token == token or not first.vibrates,  # type: ignore[misc]
+                    "commit",
+                    side.plan.wire,
+                    f"{first.name} was told at {time:.4f} s to play set {token}, and "
+                    f"{self._times.together * 1e3:g} ms later {side.name} was not",
+                )
+            )
+
+    def _drives(self, side: Side, asked: Asked) -> Mapping[int, Drive]:
+        if asked.kind is Kind.COMMIT:
+            staged = side.staged.get(asked.token)
+            return staged.drives if staged is not None else side.levels
+        return asked.drives
+
+    def _vibrates(self, side: Side, asked: Asked) -> bool:
+        return any(drive.vibrates for drive in self._drives(side, asked).values())
+
+    def _silences(self, asked: Asked) -> bool:
+        is_silent_set = asked.kind is Kind.APPLY and not asked.vibrates
+        return is_silent_set or asked.kind in (Kind.STOP, Kind.DISARM)
+
+    def _is_released(self, side: Side, lifted: float) -> bool:
+        """Whether it was told to be silent after a lift, or has a good reason not to be."""
+        is_touched_again = self._touched >= lifted
+        told = not side.vibrates or side.follower.is_in_fault or not side.is_open
+        return told or is_touched_again
+
+    def _can_play(self) -> bool:
+        sides = self._sides.values()
+        return self._hung is None and all(
+            side.is_open and side.follower.is_enabled and not side.is_stopped for side in sides
+        )
+
+    def _is_answered(self, contact: Hashable, since: float) -> bool:
+        """Whether a pattern plays since then, or there is a good reason why none does."""
+        return (
+            any(side.vibrated_at >= since for side in self._sides.values())
+            or contact not in (self._contacts or ())
+            or self._silence_wished >= since
+            or self._hung is not None
+            or any(side.follower.is_in_fault or not side.is_open for side in self._sides.values())
+        )
+
+
+def _listed(channels: Mapping[int, tuple[float, float, float]]) -> str:
+    return (
+        ", ".join(
+            f"{channel}: {frequency:g} Hz {level:g} {phase:g} degrees"
+            for channel, (frequency, level, phase) in sorted(channels.items())
+        )
+        or "nothing"
+    )

@@ -2,14 +2,14 @@
 
 import asyncio
 import logging
-from collections.abc import Coroutine, Iterable, Mapping
+from collections.abc import Coroutine, Iterable, Mapping, Sequence
 from enum import Enum, auto
 from typing import Any, TypeVar
 
 from controller.read_backs import ReadBacks
 from drivers.amplifier import WATCHDOG, Amplifier
 from drivers.errors import CommandError, CommandRefused, DriverError, LinkError
-from drivers.guard import SafeCommand
+from drivers.guard import SafeCommand, SafeEnvelope
 from drivers.protocol.messages import Achieved, State, Status
 from drivers.turns import PATIENCE
 from drivers.watchdog import check_watchdog
@@ -41,6 +41,7 @@ class AmplifierGroup:
 
     def __init__(self, amplifiers: Mapping[str, Amplifier]) -> None:
         self.phase = Phase.CLOSED
+        self.loading_time = 0.0  # s; that of the last envelopes
         self._amplifiers = dict(amplifiers)
         self._silencings = 0  # how often they were disarmed, stopped or closed
         self._may_be_armed = False  # since they were opened
@@ -94,14 +95,19 @@ class AmplifierGroup:
         self._read_backs.forget()
         self.phase = Phase.ARMED
 
-    async def play(self, commands: Mapping[str, SafeCommand]) -> dict[str, Achieved] | None:
+    async def play(
+        self,
+        commands: Mapping[str, SafeCommand],
+        *,
+        envelopes: Mapping[str, Sequence[SafeEnvelope]] | None = None,
+    ) -> dict[str, Achieved] | None:
         """Have every amplifier play its set; what they make of it, by name.
 
-        None if they were disarmed, stopped or closed meanwhile, or `hurry` ended it. Raises
-        DriverError.
+        envelopes: to be loaded before. None if they were disarmed, stopped or closed meanwhile, or
+        `hurry` ended it. Raises DriverError.
         """
         self._read_backs.forget()
-        achieved = await self._or_stop(self._play(commands))
+        achieved = await self._or_stop(self._play(commands, envelopes or {}))
         if achieved is not None:
             now = asyncio.get_running_loop().time()
             self._read_backs.expect(commands, achieved, now=now)
@@ -163,7 +169,17 @@ class AmplifierGroup:
         finally:
             await self._close_wires()
 
-    async def _play(self, commands: Mapping[str, SafeCommand]) -> dict[str, Achieved] | None:
+    async def _play(
+        self,
+        commands: Mapping[str, SafeCommand],
+        envelopes: Mapping[str, Sequence[SafeEnvelope]],
+    ) -> dict[str, Achieved] | None:
+        if any(envelopes.values()):
+            begin = asyncio.get_running_loop().time()
+            await self._together(self._load(name, each) for name, each in envelopes.items())
+            self.loading_time = asyncio.get_running_loop().time() - begin
+            if self.phase is not Phase.ARMED:
+                return None  # whatever is played now would undo the silence that came in between
         if len(commands) == 1 or all(safe.is_silent for safe in commands.values()):
             # One has nobody to wait for, and silence waits for nobody.
             applied = await self._together(
@@ -182,6 +198,10 @@ class AmplifierGroup:
                     f"amplifier {name} plays set {status.token} instead of {commands[name].token}"
                 )
         return dict(zip(commands, achieved, strict=True))
+
+    async def _load(self, name: str, envelopes: Sequence[SafeEnvelope]) -> None:
+        for envelope in envelopes:
+            await self._amplifiers[name].load_envelope(envelope)
 
     def _commits(self, sets: Mapping[str, SafeCommand]) -> Iterable[Coroutine[Any, Any, object]]:
         """Commit everything that is staged: at one moment where amplifiers share a bus."""

@@ -48,12 +48,19 @@ def demo(
     import asyncio
     import time
 
-    from controller.demo.run import WIRES, example_touches_path, run_demo, write_picture
+    from controller.demo.run import (
+        WIRES,
+        example_touches_path,
+        read_touches,
+        run_demo,
+        write_picture,
+    )
     from model.rig_file import example_rig_path, load_rig
     from model.table_cache import cached_table
 
     if wire not in WIRES:
         raise InputError(f"--wire {wire}: there is no such wire yet; choose {' or '.join(WIRES)}")
+    recorded = read_touches(touches or example_touches_path())
     rig_file = example_rig_path()
     rig = load_rig(rig_file)
     started = time.perf_counter()
@@ -63,13 +70,13 @@ def demo(
             f"{rig_file.name}: {len(table.patterns)} patterns of {len(rig.eras)} ERAs on a mesh "
             f"of {table.mesh}, ready in {time.perf_counter() - started:.1f} s"
         )
-        print(_HEADING)
+        print(_HEADING, end="")
     rows = asyncio.run(
         run_demo(
             rig_file,
             table,
             wire=wire,
-            touches=touches or example_touches_path(),
+            touches=recorded,
             on_row=lambda row: None if as_json else print(_line(row), flush=True),
         )
     )
@@ -93,8 +100,10 @@ def demo(
 
 
 _HEADING = """\
-                                                     contrast / dB       level / dB SL   latency
- time  target / cm  others  ERAs                    predicted measured   pred.  meas.      / ms"""
+                                                          contrast / dB
+                                                       steady  first 100 ms level / dB SL latency
+ time  target / cm  others  ERAs                    pred.  meas.  pred.  meas.  pred.  meas.  / ms
+"""
 
 
 def _line(row: "TouchRow") -> str:
@@ -103,13 +112,19 @@ def _line(row: "TouchRow") -> str:
     played = row.played
     if played is None:
         return f"{start}silent: {row.reason}"
-    eras = ", ".join(f"{era} {tone['frequency_hz']:g} Hz" for era, tone in played.drive.items())
-    level = played.measured.level_db_sl if played.measured else None
+    by_frequency: dict[float, list[str]] = {}
+    for era, tone in played.drive.items():
+        by_frequency.setdefault(tone["frequency_hz"], []).append(era)
+    eras = ", ".join(f"{' '.join(some)} {hertz:g} Hz" for hertz, some in by_frequency.items())
+    numbers = (
+        *(played.predicted_contrast_db, played.measured_contrast_db),
+        *(played.onset.predicted_contrast_db, played.onset.measured_contrast_db),
+        played.predicted_level_db_sl,
+        played.measured.level_db_sl if played.measured else None,
+    )
     return (
-        f"{start}{eras:24s}"
-        f"{_number(played.pattern.contrast_db):>8s} {_number(played.measured_contrast_db):>8s} "
-        f"{_number(played.pattern.level_db_sl):>8s} {_number(level):>6s} "
-        f"{_number(1000 * played.latency):>9s}{'' if played.is_steady else '  still ringing'}"
+        f"{start}{eras:22s} {' '.join(f'{_number(number):>6s}' for number in numbers)} "
+        f"{_number(1000 * played.latency):>6s}{'' if played.is_steady else '  still ringing'}"
     )
 
 
@@ -120,11 +135,11 @@ def _number(value: float | None) -> str:
 def _summary(rows: "list[TouchRow]") -> str:
     """How well prediction and measurement agree over the touches that reached the steady state."""
     differences = [
-        abs(row.played.pattern.contrast_db - row.played.measured_contrast_db)
+        abs(row.played.predicted_contrast_db - row.played.measured_contrast_db)
         for row in rows
         if row.played is not None
         and row.played.is_steady
-        and row.played.pattern.contrast_db is not None
+        and row.played.predicted_contrast_db is not None
         and row.played.measured_contrast_db is not None
     ]
     counted = f"{len(rows)} touches"

@@ -1,27 +1,30 @@
 """What the control loop decides, without waiting for anything: touch frames in, safe commands out.
 
 take(frame)  ->  contacts
-decide(now)  ->  contacts -> selection -> routing -> guard -> commands, if others are due
+decide(now)  ->  contacts -> wishes -> selection -> routing -> guard -> order, if another is due
 """
 
 import logging
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from controller.contacts import Change, Contact, ContactTracker
-from controller.routing import route
+from controller.envelopes import ENVELOPE_TIME, PLAIN
+from controller.means import Means
+from controller.orders import FADE_RAMP, Order, OrderMaker, PatternTiming
 from controller.selection import PatternTable, Selection, Selector
 from controller.touch import TouchFrame
-from drivers.command import DriveCommand, token_after
-from drivers.guard import Guard, SafeCommand
-from model.pattern import Pattern
-from model.perception import STRONG_DB_SL
+from controller.wishes import Wishes
+from drivers.command import DriveCommand
+from drivers.guard import Guard
+from model.question import Question
 from model.rig import Rig
 
-# With nobody on the plate the end may be short, so that zero is reached within 20 ms of the lift;
-# fingers that stay would feel so short an end as a tap.
+# With nobody on the plate the end may be short, so that zero is reached within 20 ms of the lift.
 RELEASE_RAMP = 0.010
-FADE_RAMP = 0.020
+
+# One slow answer is a hiccup; three in a row are how this wire is.
+_SLOW_LOADINGS = 3
 
 _logger = logging.getLogger(__name__)
 
@@ -30,25 +33,28 @@ _logger = logging.getLogger(__name__)
 class Decision:
     """What is to be done now.
 
-    changes: of the contacts, since the last decision; commands: by amplifier, None if what plays
-    stays; problem: why the selected pattern was not let through; since: when [s] the news came that
-    led to this.
+    changes: of the contacts, since the last decision; is_new: whether the selection is another;
+    order: what the amplifiers shall do, None if what plays stays; problem: why the selected pattern
+    was not let through; from_rest: whether nothing played before; since: when [s] the news came
+    that led to this.
     """
 
     contacts: tuple[Contact, ...]
     changes: tuple[Change, ...]
     selection: Selection
     is_new: bool
-    commands: Mapping[str, SafeCommand] | None
+    order: Order | None
     problem: str | None
+    from_rest: bool
     since: float
 
 
 class Decider:
-    """Contacts, selection, routing and guard of one plate; reads no clock and waits for nothing.
+    """Contacts, wishes, selection and orders of one plate; reads no clock and waits for nothing.
 
-    guards: by the name of the amplifier, one for each in the rig. Never raises: whatever goes wrong
-    in a decision, the decision is silence.
+    guards: by the name of the amplifier, one for each in the rig; envelope_time: longest [s] that
+    loading envelopes may take. Never raises while it decides: whatever goes wrong, the decision is
+    silence.
     """
 
     def __init__(
@@ -57,23 +63,63 @@ class Decider:
         table: PatternTable,
         *,
         guards: Mapping[str, Guard],
-        level_db_sl: float = STRONG_DB_SL,
+        means: Means,
+        wishes: Wishes,
+        timing: PatternTiming | None = None,
+        envelope_time: float = ENVELOPE_TIME,
     ) -> None:
         self._rig = rig
-        self._guards = guards
+        self._table = table
+        self._timing = timing
+        self._means = means
+        self._envelope_time = envelope_time
+        self._slow_loadings = 0
         self._tracker = ContactTracker(rig.plate)
-        self._selector = Selector(table, level_db_sl=level_db_sl)
+        self._selector = Selector(table, wishes, means)
+        self._orders = OrderMaker(rig, guards, timing=timing)
         self._decided: Selection | None = None
         self._is_silent = False
         self._playing: Mapping[str, DriveCommand] = {}
-        self._token = 0
+        self._ordered: Order | None = None
+        self._brake_due: float | None = None  # when endings fit what plays
+        self._has_brakes = False
         self._changes: list[Change] = []
         self._since: float | None = None
 
     @property
-    def next_expiry(self) -> float | None:
-        """When [s] the next source is overdue unless it is heard; a decision is due then."""
-        return self._tracker.next_expiry
+    def means(self) -> Means:
+        """What the amplifiers can play."""
+        return self._means
+
+    def prepare(self) -> None:
+        """Work out what the first touch would have to wait for; tens of milliseconds.
+
+        Raises InputError for a table that has no answer to anything.
+        """
+        self._table.prepare(self._means.mode)
+        if self._timing is None:
+            return
+        self._timing.prepare(self._table.frequencies.tolist())
+        plate, shaping = self._table.plate, self._means.shaping
+        anybody = Question(
+            ((plate.length / 2, plate.width / 2),),
+            ((0.0, 0.0),),
+            level_db_sl=-100.0,
+            mode=self._means.mode,
+        )
+        pattern = self._timing.with_envelopes(
+            anybody, self._table.ask(anybody), onset=shaping.onsets, ending=shaping.endings
+        )
+        self._timing.with_transient_measures(anybody, pattern)
+
+    @property
+    def due(self) -> float | None:
+        """When [s] a decision is due, news or not.
+
+        A source is overdue then, a wish runs out, or what plays has settled and gets its brakes.
+        """
+        moments = (self._tracker.next_expiry, self._selector.until, self._brake_due)
+        return min((moment for moment in moments if moment is not None), default=None)
 
     @property
     def owes_silence(self) -> bool:
@@ -91,79 +137,99 @@ class Decider:
         self._decided = None
         self._is_silent = False
         self._playing = {}
+        self._brake_due = None
+        self._has_brakes = False
 
-    def confirm(self, drive: Mapping[str, DriveCommand]) -> None:
-        """This is what the amplifiers made of the last commands, by ERA without the silent ones."""
+    def confirm(self, drive: Mapping[str, DriveCommand], *, now: float) -> None:
+        """This is what the amplifiers made of the last order, by ERA, silent ones left out."""
         self._playing = drive
+        ordered = self._ordered
+        if ordered is None or ordered.pattern is None:
+            return
+        if ordered.is_brake:
+            self._has_brakes = True
+        elif self._means.shaping.endings and self._timing is not None:
+            self._brake_due = now + ordered.settled_after
+
+    def loaded_in(self, duration: float) -> None:
+        """Loading the envelopes took so long [s]; where that is too long, there are no more."""
+        self._slow_loadings = self._slow_loadings + 1 if duration > self._envelope_time else 0
+        if self._slow_loadings == _SLOW_LOADINGS and self._means.shaping:
+            _logger.warning(
+                "loading envelopes takes %.0f ms, and touches may wait for %.0f ms: from now on "
+                "there are plain ramps; use a faster wire",
+                1000 * duration,
+                1000 * self._envelope_time,
+            )
+            self._means = replace(self._means, shaping=PLAIN)
+            self._selector.means = self._means
 
     def decide(self, now: float) -> Decision:
         """Decide at a time [s]."""
         self._note(self._tracker.expire(now), now)
         contacts = self._tracker.contacts
-        commands: Mapping[str, SafeCommand] | None = None
+        order: Order | None = None
         problem = None
+        is_calm = True
         try:
-            selection = self._selector.select(contacts)
+            selection = self._selector.select(contacts, now)
             is_new = selection != self._decided
-            if is_new and selection.pattern is not None:
-                commands, problem = self._guarded(selection.pattern)
+            if is_new and selection.pattern is not None and selection.question is not None:
+                order, problem = self._orders.play(
+                    selection.pattern,
+                    selection.question,
+                    is_shaped=self._means.shaping.onsets,
+                    playing=self._playing,
+                )
+            elif not is_new and self._brake_due is not None and now >= self._brake_due:
+                order = self._brake(selection)
         except Exception as error:
-            selection = Selection(None, contacts, None, f"{type(error).__name__}: {error}")
+            is_calm = False
+            selection = Selection((), contacts, None, f"{type(error).__name__}: {error}")
             is_new = selection != self._decided
             if is_new:
                 _logger.exception("the decision failed, all channels fall silent")
-        if is_new and commands is None and not self._is_silent:
-            commands = self.silence(ramp=FADE_RAMP if contacts else RELEASE_RAMP)
-        if commands is not None:
-            self._is_silent = all(command.is_silent for command in commands.values())
+        if is_new and order is None and not self._is_silent:
+            order = self._ending(contacts, is_calm=is_calm)
+        from_rest = not self._playing
+        if order is not None:
+            self._is_silent = order.is_silence
+            self._ordered = order
             self._playing = {}  # until the amplifiers have confirmed
+            self._brake_due = None
+            self._has_brakes = False
         self._decided = selection
         decision = Decision(
             contacts=contacts,
             changes=tuple(self._changes),
             selection=selection,
             is_new=is_new,
-            commands=commands,
+            order=order,
             problem=problem,
+            from_rest=from_rest,
             since=now if self._since is None else min(self._since, now),
         )
         self._changes, self._since = [], None
         return decision
 
-    def silence(self, *, ramp: float) -> dict[str, SafeCommand]:
-        """Commands that bring every wired channel to zero along a ramp [s]; never fails."""
-        token = self._next_token()
-        return {
-            name: guard.silence(
-                token,
-                [wired.number for wired in self._rig.wiring.values() if wired.amplifier == name],
-                ramp=ramp,
-            )
-            for name, guard in self._guards.items()
-        }
+    def silence(self, *, ramp: float) -> Order:
+        """The order that brings every wired channel to zero along a ramp [s]; never fails."""
+        return self._orders.silence(ramp=ramp)
 
-    def _guarded(self, pattern: Pattern) -> tuple[dict[str, SafeCommand], str | None]:
-        """Commands of a pattern, or silence everywhere and why, if a guard refuses any of it."""
-        sets = route(
-            pattern.excitation,
-            self._rig,
-            token=self._next_token(),
-            ramp=pattern.ramp,
-            playing=self._playing,
-        )
-        checked = {
-            name: guard.check_or_silence(sets[name], ramp=FADE_RAMP)
-            for name, guard in self._guards.items()
-        }
-        reasons = [f"{name}: {reason}" for name, (_, reason) in checked.items() if reason]
-        if reasons:
-            return self.silence(ramp=FADE_RAMP), "; ".join(reasons)
-        return {name: safe for name, (safe, _) in checked.items()}, None
+    def _brake(self, selection: Selection) -> Order | None:
+        """The order that gives what plays its brakes, now that it has settled."""
+        self._brake_due = None
+        if selection.pattern is None or selection.question is None or not self._playing:
+            return None
+        return self._orders.brake(selection.pattern, selection.question, playing=self._playing)
 
-    def _next_token(self) -> int:
-        """A token that all amplifiers share: 1..65535, then from 1 again."""
-        self._token = token_after(self._token)
-        return self._token
+    def _ending(self, contacts: tuple[Contact, ...], *, is_calm: bool) -> Order:
+        """How what plays ends: by its brakes only for fingers that stay, and without any fault."""
+        if not contacts:
+            return self.silence(ramp=RELEASE_RAMP)
+        if self._has_brakes and is_calm:
+            return self._orders.end()
+        return self.silence(ramp=FADE_RAMP)
 
     def _note(self, change: Change, time: float) -> None:
         """Keep a change for the next decision, with the time of the first."""

@@ -8,12 +8,16 @@ from typing import ParamSpec
 
 from controller.amplifiers import AmplifierGroup, Phase
 from controller.decision import Decider, Decision
+from controller.envelopes import ENVELOPE_TIME
 from controller.guards import make_guards
+from controller.means import Means, means_of
 from controller.observer import Applied, Observer, Silenced
+from controller.orders import PatternTiming
 from controller.routing import drive_of_eras
 from controller.selection import PatternTable
 from controller.tally import Tally
 from controller.touch import TouchFrame, TouchSource
+from controller.wishes import NewestBuzzes, Wishes
 from drivers import clock
 from drivers.amplifier import Amplifier
 from drivers.errors import CommandError, DriverError, LinkError
@@ -38,6 +42,11 @@ class Controller:
     table must be for this rig; amplifiers by their names in it, not yet open. Starts disarmed: then
     contacts are followed but nothing is sent. The heartbeat is sent by the loop itself after it has
     run, so that a loop that hangs lets the amplifiers' watchdogs trip. clock [s] is the sources'.
+
+    wishes: who feels what; unless given, the newest contact buzzes where it is, at level_db_sl.
+    timing: what shapes the table's patterns; ramps only without it. mode: in which the table is
+    asked, None for the best that the amplifiers can play. envelope_time [s]: how long loading
+    envelopes may hold up a touch, 0 for ramps only.
     """
 
     def __init__(
@@ -48,7 +57,11 @@ class Controller:
         amplifiers: Mapping[str, Amplifier],
         sources: Sequence[TouchSource] = (),
         observer: Observer | None = None,
+        wishes: Wishes | None = None,
         level_db_sl: float = STRONG_DB_SL,
+        timing: PatternTiming | None = None,
+        mode: str | None = None,
+        envelope_time: float = ENVELOPE_TIME,
         clock: Callable[[], float] = clock.now,
     ) -> None:
         if amplifiers.keys() != rig.amplifiers.keys():
@@ -62,7 +75,10 @@ class Controller:
         self._group = AmplifierGroup(amplifiers)
         self._sources = sources
         self._observer = observer or Observer()
-        self._level = level_db_sl
+        self._wishes = wishes or NewestBuzzes(level_db_sl)
+        self._timing = timing
+        self._mode = mode
+        self._envelope_time = envelope_time if timing is not None else 0.0
         self._clock = clock
         self._tally = Tally(_logger, clock=clock)
         self._opened_decider: Decider | None = None
@@ -75,25 +91,42 @@ class Controller:
         return self._group.phase
 
     @property
+    def means(self) -> Means:
+        """What the opened amplifiers can play together; raises CommandError before `open`."""
+        return self._decider.means
+
+    @property
     def rejected_touches(self) -> Mapping[str, int]:
         """How many touches could not be contacts, by the reason."""
         return self._tally.counts
 
     async def open(self) -> None:
-        """Open every amplifier; all stay disarmed.
+        """Open every amplifier and prepare what they can play; all stay disarmed.
 
         Raises LinkError, CommandError, and InputError if the rig wires a channel that an amplifier
-        has not; then none stays open.
+        has not or one cannot play the mode; then none stays open.
         """
         await self._group.open()
         try:
-            guards = make_guards(self._rig, self._amplifiers, clock=self._clock)
+            decider = Decider(
+                self._rig,
+                self._table,
+                guards=make_guards(self._rig, self._amplifiers, clock=self._clock),
+                means=means_of(
+                    self._rig,
+                    self._amplifiers,
+                    mode=self._mode,
+                    envelope_time=self._envelope_time,
+                ),
+                wishes=self._wishes,
+                timing=self._timing,
+                envelope_time=self._envelope_time,
+            )
+            decider.prepare()
         except BaseException:
             await self._group.close({})
             raise
-        self._opened_decider = Decider(
-            self._rig, self._table, guards=guards, level_db_sl=self._level
-        )
+        self._opened_decider = decider
 
     async def arm(self) -> None:
         """High voltage on; from now on touches are felt. `run` must be running or start at once."""
@@ -117,7 +150,8 @@ class Controller:
 
     async def close(self) -> None:
         """Ramp to zero in 50 ms, confirm it by reading back, disarm and close; ends `run`."""
-        silence = self._opened_decider.silence(ramp=CLOSING_RAMP) if self._opened_decider else {}
+        decider = self._opened_decider
+        silence = decider.silence(ramp=CLOSING_RAMP).commands if decider else {}
         self._wake.set()
         await self._group.close(silence)
 
@@ -144,7 +178,7 @@ class Controller:
         for change in decision.changes:
             self._tell(self._observer.contacts_changed, decision.contacts, change)
         try:
-            if self.phase is Phase.ARMED and decision.is_new:
+            if self.phase is Phase.ARMED and (decision.is_new or decision.order is not None):
                 await self._carry_out(decision)
             if self._is_heartbeat_due and await self._group.heartbeat():
                 self._heartbeat_due = self._clock() + HEARTBEAT
@@ -181,10 +215,11 @@ class Controller:
         """Send the commands of a decision and tell what came of them; raises DriverError."""
         latency = None
         drive = {}
-        if decision.commands is not None:
+        order = decision.order
+        if order is not None:
             achieved = None
             try:
-                achieved = await self._group.play(decision.commands)
+                achieved = await self._group.play(order.commands, envelopes=order.envelopes)
             finally:
                 if achieved is None:  # whoever goes on from here must not count on it
                     self._decider.forget()
@@ -192,12 +227,16 @@ class Controller:
                 return
             commands = {name: several.commands for name, several in achieved.items()}
             drive = drive_of_eras(commands, self._rig)
-            self._decider.confirm(drive)
+            self._decider.confirm(drive, now=self._clock())
+            if any(order.envelopes.values()):
+                self._decider.loaded_in(self._group.loading_time)
             latency = self._group.last_sent - decision.since
         if decision.problem is not None:
             self._tell(self._observer.refused, decision.problem)
+        if order is not None and order.is_brake:
+            return
         selection = decision.selection
-        if decision.problem or selection.target is None or selection.pattern is None:
+        if order is None or order.pattern is None:
             silenced = Silenced(
                 contacts=decision.contacts,
                 selection=selection,
@@ -209,12 +248,15 @@ class Controller:
         elif latency is not None:
             applied = Applied(
                 contacts=decision.contacts,
-                target=selection.target,
+                targets=selection.felt,
                 quiet=selection.quiet,
-                pattern=selection.pattern,
+                pattern=order.pattern,
                 drive=drive,
                 latency=latency,
                 time=decision.since + latency,
+                from_rest=decision.from_rest,
+                question=selection.question,
+                timing=self._timing,
             )
             self._tell(self._observer.pattern_applied, applied)
 
@@ -227,11 +269,11 @@ class Controller:
             self._tell(self._observer.source_failed, f"{type(error).__name__}: {error}")
 
     async def _next_cause(self) -> None:
-        """Wait until there is a reason to run: news, a heartbeat, or a source that is overdue."""
+        """Wait until there is a reason to run: news, a heartbeat, an overdue source or wish."""
         now = self._clock()
         moments = [now + IDLE_TURN]
-        if self._decider.next_expiry is not None:
-            moments.append(self._decider.next_expiry)
+        if self._decider.due is not None:
+            moments.append(self._decider.due)
         if self.phase is Phase.ARMED:
             moments.append(self._heartbeat_due)
         with contextlib.suppress(TimeoutError):

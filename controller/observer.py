@@ -1,30 +1,51 @@
 """What the control loop tells whoever watches it: a demo, a log, a dashboard."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import cached_property
 
 from controller.contacts import Change, Contact
-from controller.selection import Selection
+from controller.orders import PatternTiming
+from controller.selection import Felt, Selection
 from drivers.command import DriveCommand
 from model.pattern import Pattern
+from model.question import Question
 
 
 @dataclass(frozen=True)
 class Applied:
     """A pattern that the amplifiers have confirmed.
 
-    contacts: all of them, in order of arrival; target, quiet: as it was chosen; drive: what the
-    amplifiers really play, by ERA, silent ones left out; latency [s]: from the touch frame that
-    asked for it to the last byte of the command on the wire; time [s] of that byte.
+    contacts: all of them, in order of arrival; targets: who feels it, with the level and the
+    contrast of each, and quiet: who must not, as it was chosen; pattern: as it is played, with its
+    mode, its ramp, and envelopes where there are any; drive: what the amplifiers really play, by
+    ERA, silent ones left out; latency [s]: from the touch frame that asked for it to the last byte
+    of the command on the wire; time [s] of that byte; from_rest: whether nothing played before.
     """
 
     contacts: tuple[Contact, ...]
-    target: Contact
+    targets: tuple[Felt, ...]
     quiet: tuple[Contact, ...]
     pattern: Pattern
     drive: Mapping[str, DriveCommand]
     latency: float
     time: float
+    from_rest: bool = True
+    question: Question | None = field(default=None, repr=False)
+    timing: PatternTiming | None = field(default=None, repr=False, compare=False)
+
+    @cached_property
+    def transient_contrast_db(self) -> float | None:
+        """Predicted contrast over the first 100 ms [dB], with the onset as it is played.
+
+        Worked out when it is first asked for, some two milliseconds: not before the touch is on its
+        way. None where nobody is to be quiet, where another pattern played before, or where the
+        controller knows no `timing`.
+        """
+        if self.timing is None or self.question is None or not (self.from_rest and self.quiet):
+            return None
+        measured = self.timing.with_transient_measures(self.question, self.pattern)
+        return measured.transient_contrast_db
 
 
 @dataclass(frozen=True)

@@ -5,8 +5,11 @@
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
+from controller.envelopes import ending_slots, onset_slots
 from drivers.command import CommandSet, DriveCommand
+from model.envelope import Envelopes
 from model.errors import InputError
 from model.excitation import Excitation
 from model.rig import Rig
@@ -20,6 +23,7 @@ def route(
     ramp: float,
     valid_for: float = 0.0,
     playing: Mapping[str, DriveCommand] | None = None,
+    onset: Envelopes | None = None,
 ) -> dict[str, CommandSet]:
     """One command set per amplifier of the rig, by its name, all under the same token.
 
@@ -27,8 +31,9 @@ def route(
     level 0 where the ERA is not driven. ramp, valid_for [s] as in `CommandSet`; the ramp becomes as
     long as the rig's limit of slew asks for, on all amplifiers alike. playing: what ERAs
     play now, as `drive_of_eras` tells it; a frequency that only ERAs play which play it already
-    runs on undisturbed in time. Nothing else is limited here, that is the guard's; raises
-    InputError if the excitation names an ERA the rig has not.
+    runs on undisturbed in time. onset: envelopes that stand in the slots of `controller.envelopes`;
+    one may lead an ERA to silence that is not driven. Nothing else is limited here, that is the
+    guard's; raises InputError if the excitation names an ERA the rig has not.
     """
     unknown = sorted(excitation.keys() - rig.wiring.keys())
     if unknown:
@@ -38,8 +43,12 @@ def route(
         )
     commands: dict[str, list[DriveCommand]] = {name: [] for name in rig.amplifiers}
     restarted = _restarted(excitation, playing or {})
+    slots = onset_slots(rig)
     for name, channel in rig.wiring.items():
-        commands[channel.amplifier].append(_drive(excitation, rig, name, restarted=restarted))
+        command = _drive(excitation, rig, name, restarted=restarted)
+        if onset and name in onset:
+            command = replace(command, frequency=onset[name].frequency, onset=slots[name])
+        commands[channel.amplifier].append(command)
     highest = max((command.level for wired in commands.values() for command in wired), default=0.0)
     slowest = highest / rig.limits.slew  # from rest: what plays now only makes it shorter
     ramp = slowest if slowest > ramp else ramp  # not finite stays so, for the guard to refuse
@@ -71,6 +80,50 @@ def drive_of_eras(
     }
 
 
+def goes_on(excitation: Excitation, playing: Mapping[str, DriveCommand]) -> bool:
+    """Whether any tone of an excitation runs on from what ERAs play now."""
+    restarted = _restarted(excitation, playing)
+    return any(tone.frequency not in restarted for tone in excitation.values())
+
+
+def route_again(
+    playing: Mapping[str, DriveCommand],
+    rig: Rig,
+    *,
+    token: int,
+    ramp: float,
+    ending: Envelopes,
+) -> dict[str, CommandSet]:
+    """The sets, by amplifier, that go on with what ERAs play and give it endings."""
+    commands: dict[str, list[DriveCommand]] = {name: [] for name in rig.amplifiers}
+    slots = ending_slots(rig)
+    for name, channel in rig.wiring.items():
+        command = playing.get(name) or _silent(channel.number, rig)
+        if name in playing:
+            slot = slots[name] if name in ending else 0
+            command = replace(command, keep_phase=True, onset=0, ending=slot)
+        commands[channel.amplifier].append(command)
+    return {
+        name: CommandSet(token=token, commands=tuple(wired), ramp=ramp, valid_for=0.0)
+        for name, wired in commands.items()
+    }
+
+
+def route_end(rig: Rig, *, token: int, ramp: float) -> dict[str, CommandSet]:
+    """The sets, by amplifier, by which all ERAs fall silent, each along its ending if it has one.
+
+    ramp [s]: for those without.
+    """
+    commands: dict[str, list[DriveCommand]] = {name: [] for name in rig.amplifiers}
+    for channel in rig.wiring.values():
+        silent = _silent(channel.number, rig)
+        commands[channel.amplifier].append(replace(silent, skip_ending=False))
+    return {
+        name: CommandSet(token=token, commands=tuple(wired), ramp=ramp, valid_for=0.0)
+        for name, wired in commands.items()
+    }
+
+
 def _restarted(excitation: Excitation, playing: Mapping[str, DriveCommand]) -> set[float]:
     """Frequencies [Hz] whose phases must count from the commit, for an ERA joins in with them.
 
@@ -88,14 +141,24 @@ def _drive(excitation: Excitation, rig: Rig, name: str, *, restarted: set[float]
     number = rig.wiring[name].number
     tone = excitation.get(name)
     if tone is None:
-        # A silent channel has a frequency too, on every wire; this one is always allowed.
-        return DriveCommand(channel=number, frequency=rig.limits.frequency_min, level=0.0)
+        return _silent(number, rig)
     return DriveCommand(
         channel=number,
         frequency=tone.frequency,
         level=tone.amplitude / rig.era(name).stroke,
         phase=_wrapped_degrees(tone.phase),
         keep_phase=tone.frequency not in restarted,
+    )
+
+
+def _silent(number: int, rig: Rig) -> DriveCommand:
+    """Nothing for a channel, from whatever it plays along the ramp.
+
+    A silent channel has a frequency too, on every wire; this one is always allowed. A brake is one
+    of all ERAs: what falls silent while others play fades.
+    """
+    return DriveCommand(
+        channel=number, frequency=rig.limits.frequency_min, level=0.0, skip_ending=True
     )
 
 

@@ -1,108 +1,241 @@
-"""From contacts to what is felt: who is the target, who must feel nothing, and by which pattern."""
+"""From wishes to a pattern: who feels it and how strongly, who must feel nothing, by what."""
 
+import logging
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Protocol
 
+import numpy as np
+
 from controller.contacts import Contact
+from controller.means import Means
+from controller.wishes import Target, Wish, Wishes
+from model.arrays import FloatArray
 from model.errors import InputError
-from model.pattern import Pattern
-from model.perception import STRONG_DB_SL
+from model.excitation import Excitation
+from model.fingertip import fingertip_points
+from model.localization import contrast_db, mean_level_db_sl
+from model.pattern import UNAWARE_DB_SL, Pattern
+from model.perception import FELT_DB_SL
+from model.plate import Plate
+from model.question import Question
+from model.vibration import peak_acceleration
 
 # Fields vary over a good part of a bending wavelength, 17 cm and more below 500 Hz; a fingertip
 # that moved by less than its own radius is still within the disc it was chosen for.
 MOVE_TOLERANCE = 0.008
 
+MOST_DB_SL = 26.0
+"""Where `as strongly as the neighbours allow` ends: at twice what is strong, lest a finger without
+neighbours be numbed."""
+
+_SHORTEST_WAIT = 0.001  # s
+
+_logger = logging.getLogger(__name__)
+
 
 class PatternTable(Protocol):
     """What selection needs of a localization table."""
 
-    def answer(
-        self,
-        target: tuple[float, float],
-        *,
-        quiet: Sequence[tuple[float, float]] = (),
-        level_db_sl: float = STRONG_DB_SL,
-    ) -> Pattern:
-        """The best pattern for a target and quiet contacts [m]; raises InputError."""
+    @property
+    def plate(self) -> Plate:
+        """The plate that it is for."""
+
+    @property
+    def frequencies(self) -> FloatArray:
+        """What its patterns may use [Hz]."""
+
+    def prepare(self, mode: str) -> None:
+        """Work out what the first question in a mode would have to wait for."""
+
+    def ask(self, question: Question) -> Pattern:
+        """The best pattern; raises InputError where there is none."""
+
+    def amplitudes(
+        self, excitation: Excitation, points: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Frequencies (f,) [Hz] and peak acceleration [m/s²] at points (p, 2) [m], (f, p)."""
+
+
+@dataclass(frozen=True)
+class Felt:
+    """What a target is predicted to feel once the vibration is steady.
+
+    contact: where it was when the pattern was chosen; wanted_db_sl: None for as strongly as the
+    neighbours allow; contrast_db: to the loudest quiet point, None where nobody is to be quiet.
+    """
+
+    contact: Contact
+    wanted_db_sl: float | None
+    level_db_sl: float
+    contrast_db: float | None
 
 
 @dataclass(frozen=True)
 class Selection:
     """What was chosen: for whom, who must feel nothing, and the pattern.
 
-    Contacts stand where they were when it was chosen. Without a pattern all is silent, and reason
-    says why.
+    Contacts stand where they were when it was chosen; targets: whom it was chosen for with what
+    they want; felt: what each of them will feel. Without a pattern all is silent, and reason says
+    why. question: what the table was asked.
     """
 
-    target: Contact | None
+    targets: tuple[tuple[Contact, Target], ...]
     quiet: tuple[Contact, ...]
     pattern: Pattern | None
     reason: str | None
-
-
-NOBODY = Selection(None, (), None, "nobody touches the plate")
+    question: Question | None = None
+    felt: tuple[Felt, ...] = ()
 
 
 class Selector:
-    """Chooses a pattern for the contacts on a plate that has no surface layout.
+    """Chooses the pattern that does what is wished for the contacts on a plate.
 
-    The newest contact is the target, all others are quiet. When the target lifts, all is silent
-    until the next contact comes. A pattern stays while no contact has moved more than 8 mm from
-    where it was chosen for; a quiet contact that lifts leaves it as it is, since less is asked of
-    it then and a change would be felt.
+    A pattern stays while its targets and their levels do and no contact has moved more than 8 mm
+    from where it was chosen for; a quiet contact that lifts leaves it as it is, since less is asked
+    of it then and a change would be felt.
     """
 
-    def __init__(self, table: PatternTable, *, level_db_sl: float = STRONG_DB_SL) -> None:
+    def __init__(self, table: PatternTable, wishes: Wishes, means: Means) -> None:
         self._table = table
-        self._level = level_db_sl
-        self._current = NOBODY
-        self._seen: frozenset[tuple[str, int]] = frozenset()
+        self._wishes = wishes
+        self.means = means
+        self._current = Selection((), (), None, None)
+        self._until: float | None = None
 
-    def select(self, contacts: tuple[Contact, ...]) -> Selection:
+    @property
+    def until(self) -> float | None:
+        """When [s] the wish may be another though no contact has changed."""
+        return self._until
+
+    def select(self, contacts: Sequence[Contact], now: float) -> Selection:
         """The selection for contacts in their order of arrival; the same object if it stays."""
-        target = self._target(contacts)
-        quiet = tuple(contact for contact in contacts if contact is not target)
-        self._seen = frozenset(contact.key for contact in contacts)
-        if not self._holds(target, quiet):
-            self._current = self._choose(target, quiet)
+        self._until = None
+        wish = self._wishes.wish(contacts, now)
+        if wish.until is not None:
+            # One that has run out already must not keep the loop from everything else.
+            self._until = wish.until if wish.until > now else now + _SHORTEST_WAIT
+        wanted = {target.key: target for target in wish.targets}
+        targets = tuple((each, wanted[each.key]) for each in contacts if each.key in wanted)
+        quiet = tuple(each for each in contacts if each.key not in wanted)
+        if not self._holds(wish, targets, quiet):
+            self._current = self._choose(wish, targets, quiet)
         return self._current
 
-    def _target(self, contacts: tuple[Contact, ...]) -> Contact | None:
-        """Whom to drive: the newest contact if it is new, or else the target that was."""
-        if contacts and contacts[-1].key not in self._seen:
-            return contacts[-1]
-        old = self._current.target
-        return next((contact for contact in contacts if old and contact.key == old.key), None)
-
-    def _holds(self, target: Contact | None, quiet: tuple[Contact, ...]) -> bool:
+    def _holds(
+        self,
+        wish: Wish,
+        targets: tuple[tuple[Contact, Target], ...],
+        quiet: tuple[Contact, ...],
+    ) -> bool:
         """Whether what was chosen for contacts elsewhere still serves."""
         current = self._current
-        if target is None or current.target is None:
-            return target is current.target and bool(quiet) == bool(current.quiet)
-        then = {contact.key: contact for contact in (current.target, *current.quiet)}
-        now = {contact.key: contact for contact in (target, *quiet)}
+        if not targets or not current.targets:
+            return not targets and not current.targets and current.reason == wish.reason
+        if {target for _, target in targets} != {target for _, target in current.targets}:
+            return False
+        then = {each.key: each for each in (*(c for c, _ in current.targets), *current.quiet)}
+        now = {each.key: each for each in (*(c for c, _ in targets), *quiet)}
         same = now.keys() <= then.keys() if current.pattern else now.keys() == then.keys()
-        return (
-            target.key == current.target.key
-            and same
-            and all(
-                math.dist((contact.x, contact.y), (then[key].x, then[key].y)) <= MOVE_TOLERANCE
-                for key, contact in now.items()
-            )
+        return same and all(
+            math.dist((contact.x, contact.y), (then[key].x, then[key].y)) <= MOVE_TOLERANCE
+            for key, contact in now.items()
         )
 
-    def _choose(self, target: Contact | None, quiet: tuple[Contact, ...]) -> Selection:
-        """Ask the table."""
-        if target is None:
-            return Selection(None, quiet, None, "the target was lifted") if quiet else NOBODY
+    def _choose(
+        self,
+        wish: Wish,
+        targets: tuple[tuple[Contact, Target], ...],
+        quiet: tuple[Contact, ...],
+    ) -> Selection:
+        """Ask the table; whatever goes wrong there is silence until something else is wanted."""
+        if not targets:
+            return Selection((), quiet, None, wish.reason)
         try:
-            pattern = self._table.answer(
-                (target.x, target.y),
-                quiet=[(contact.x, contact.y) for contact in quiet],
-                level_db_sl=self._level,
-            )
+            question = self._question(targets, quiet)
+            pattern = self._table.ask(question)
+            if all(target.level_db_sl is None for _, target in targets):
+                pattern = strongest(pattern, self.means.largest)
+            felt = self._felt(targets, quiet, pattern)
         except InputError as error:
-            return Selection(target, quiet, None, str(error))
-        return Selection(target, quiet, pattern, None)
+            return Selection(targets, quiet, None, str(error))
+        except Exception as error:
+            _logger.exception("the table failed, all channels fall silent")
+            return Selection(targets, quiet, None, f"{type(error).__name__}: {error}")
+        return Selection(targets, quiet, pattern, None, question, felt)
+
+    def _question(
+        self, targets: tuple[tuple[Contact, Target], ...], quiet: tuple[Contact, ...]
+    ) -> Question:
+        given = [target.level_db_sl for _, target in targets if target.level_db_sl is not None]
+        level = max(given, default=FELT_DB_SL)
+        levels = [level if t.level_db_sl is None else t.level_db_sl for _, t in targets]
+        return Question(
+            targets=tuple((contact.x, contact.y) for contact, _ in targets),
+            quiet=tuple((contact.x, contact.y) for contact in quiet),
+            level_db_sl=level,
+            softer_db=tuple(level - each for each in levels),
+            mode=self.means.mode,
+            playable=self.means.playable,
+            frequencies=self.means.frequencies,
+            envelopes=self.means.shaping.onsets,
+        )
+
+    def _felt(
+        self,
+        targets: tuple[tuple[Contact, Target], ...],
+        quiet: tuple[Contact, ...],
+        pattern: Pattern,
+    ) -> tuple[Felt, ...]:
+        """What each target will feel; of a lone one the pattern says it."""
+        if len(targets) == 1:
+            ((contact, target),) = targets
+            return (Felt(contact, target.level_db_sl, pattern.level_db_sl, pattern.contrast_db),)
+        fingers = [*(contact for contact, _ in targets), *quiet]
+        discs = [fingertip_points(each.x, each.y, self._table.plate) for each in fingers]
+        frequencies, all_fields = self._table.amplitudes(pattern.excitation, np.concatenate(discs))
+        ends = np.cumsum([len(disc) for disc in discs])[: len(targets)]
+        *fields, at_quiet = np.split(all_fields, ends, axis=1)
+        loudest = peak_acceleration(at_quiet)
+        return tuple(
+            Felt(
+                contact,
+                target.level_db_sl,
+                mean_level_db_sl(frequencies, field),
+                float(contrast_db(peak_acceleration(field), loudest)) if quiet else None,
+            )
+            for (contact, target), field in zip(targets, fields, strict=True)
+        )
+
+
+def strongest(pattern: Pattern, largest: Mapping[str, float]) -> Pattern:
+    """The pattern turned up or down to as strong as the neighbours allow.
+
+    No quiet finger is aware of it then, no ERA exceeds its largest amplitude [m], by its name, and
+    no target is beyond MOST_DB_SL. Raises InputError where that leaves nothing to be felt.
+    """
+    room = [
+        20 * math.log10(largest[name] / tone.amplitude)
+        for name, tone in pattern.excitation.items()
+        if tone.amplitude > 0
+    ]
+    gain = min([MOST_DB_SL - pattern.level_db_sl, *room])
+    if pattern.quiet_level_db_sl is not None:
+        gain = min(gain, UNAWARE_DB_SL - pattern.quiet_level_db_sl)
+    level = pattern.level_db_sl + gain
+    if level <= 0:
+        raise InputError(
+            "whatever can be felt there is felt by another finger too; lift it, or move it away"
+        )
+    factor = 10 ** (gain / 20)
+    quiet = pattern.quiet_level_db_sl
+    return replace(
+        pattern,
+        excitation={
+            name: replace(tone, amplitude=tone.amplitude * factor)
+            for name, tone in pattern.excitation.items()
+        },
+        level_db_sl=level,
+        quiet_level_db_sl=None if quiet is None else quiet + gain,
+    )

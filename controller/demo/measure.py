@@ -35,3 +35,8 @@ def measure(target: FingerFelt, quiet: Sequence[FingerFelt]) -> Measured | None:
         others = np.concatenate([peak_acceleration(finger.amplitudes) for finger in quiet])
         contrast = float(contrast_db(peak_acceleration(target.amplitudes), others))
     return Measured(finger_level(target), contrast)
+
+
+def peak_contrast_db(target: FingerFelt, quiet: Sequence[FingerFelt]) -> float:
+    """Contrast [dB] of the peaks of a window, as `model.transient` predicts that of an onset."""
+    return float(contrast_db(target.peaks, np.concatenate([finger.peaks for finger in quiet])))

@@ -2,16 +2,18 @@
 
 import asyncio
 import math
-import time
 from collections.abc import Callable, Coroutine, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 from controller.contacts import Change, Contact, ContactKey
 from controller.demo.far_end import BenchControl, FingerFelt
-from controller.demo.measure import finger_level, measure
-from controller.demo.rows import Place, PlayedPattern, TouchRow
+from controller.demo.measure import finger_level, measure, peak_contrast_db
+from controller.demo.rows import Onset, Place, PlayedPattern, TouchRow
 from controller.observer import Applied, Observer, Silenced
+from controller.selection import Felt
+from drivers import clock
+from model.transient import FIRST
 
 # The last part of a pattern is judged: by then the plate has settled, if the pattern was held long
 # enough, and a quarter of a second tells frequencies 10 Hz apart from each other.
@@ -40,12 +42,16 @@ class _Touch:
 
 @dataclass
 class _Playing:
-    """A pattern from its commit to the next command [s], and what was felt meanwhile."""
+    """A pattern from its commit to the next command [s], and what was felt meanwhile.
+
+    touches: the targets that are still known; onset: what was felt in its first 100 ms.
+    """
 
     applied: Applied
-    touch: _Touch | None
+    touches: list[_Touch]
     until: float = math.inf
     felt: asyncio.Task[dict[str, FingerFelt]] | None = None
+    onset: asyncio.Task[dict[str, FingerFelt]] | None = None
 
     @property
     def duration(self) -> float:
@@ -64,7 +70,7 @@ class TouchRecorder:
         self.problems: list[str] = []
         self._bench = bench
         self._on_row = on_row
-        self._start = time.monotonic()
+        self._start = clock.now()
         self._touches: dict[ContactKey, _Touch] = {}
         self._playing: _Playing | None = None
         self._resting: dict[str, Place] = {}
@@ -95,25 +101,27 @@ class TouchRecorder:
             self._touches[contact.key] = _Touch(contact, {_id(o): (o.x, o.y) for o in others})
         for contact in change.up:
             touch = self._touches.pop(contact.key)
-            touch.until = time.monotonic()
-            if self._playing is None or self._playing.touch is not touch:
+            touch.until = clock.now()
+            if self._playing is None or touch not in self._playing.touches:
                 self._run(self._complete(touch))
 
     def _pattern_applied(self, applied: Applied) -> None:
         self._end_pattern(applied.time)
-        touch = self._touches.get(applied.target.key)
-        self._playing = _Playing(applied, touch)
-        if touch is not None:
+        found = (self._touches.get(felt.contact.key) for felt in applied.targets)
+        self._playing = _Playing(applied, [touch for touch in found if touch is not None])
+        for touch in self._playing.touches:
             touch.patterns.append(self._playing)
+        if applied.from_rest and applied.quiet:
+            self._playing.onset = self._run(self._feel_onset(self._playing))
 
     def _silenced(self, silenced: Silenced) -> None:
         self._end_pattern(silenced.time)
-        target = silenced.selection.target
-        if target is not None and (touch := self._touches.get(target.key)):
-            touch.reason = silenced.reason
+        for contact, _ in silenced.selection.targets:
+            if touch := self._touches.get(contact.key):
+                touch.reason = silenced.reason
 
     def _failed(self, problem: str) -> None:
-        self._end_pattern(time.monotonic())
+        self._end_pattern(clock.now())
         self.problems.append(problem)
 
     def _end_pattern(self, now: float) -> None:
@@ -126,8 +134,17 @@ class TouchRecorder:
         since, until = max(settled, now - WINDOW) + MARGIN, now - MARGIN
         if since < until:
             ended.felt = self._run(self._bench.felt(since, until))
-        if ended.touch is not None and ended.touch.is_lifted:
-            self._run(self._complete(ended.touch))
+        for touch in ended.touches:
+            if touch.is_lifted:
+                self._run(self._complete(touch))
+
+    async def _feel_onset(self, playing: _Playing) -> dict[str, FingerFelt]:
+        """What fingers felt in the first 100 ms of a pattern; nothing if it was over before."""
+        since = playing.applied.time
+        await asyncio.sleep(max(0.0, since + FIRST + MARGIN - clock.now()))
+        if playing.until < since + FIRST:
+            return {}
+        return await self._bench.felt(since, since + FIRST)
 
     def _rest(self, contacts: tuple[Contact, ...]) -> None:
         """Let the plate's sensors follow the fingers."""
@@ -145,17 +162,19 @@ class TouchRecorder:
     async def _complete(self, touch: _Touch) -> None:
         """Make the row of a lifted touch from the pattern that was played longest for it."""
         longest = max(touch.patterns, key=lambda playing: playing.duration, default=None)
-        contact, quiet = touch.contact, touch.quiet
+        contact, quiet, together = touch.contact, touch.quiet, []
         if longest is not None:
-            contact = longest.applied.target
+            contact = _felt_of(touch, longest).contact
+            together = [each.contact for each in longest.applied.targets]
             quiet = {_id(other): (other.x, other.y) for other in longest.applied.quiet}
         row = TouchRow(
             target_id=_id(contact),
             time=contact.since - self._start,
             until=touch.until - self._start,
             target=(contact.x, contact.y),
+            together=tuple((each.x, each.y) for each in together if each.key != contact.key),
             quiet=quiet,
-            played=await _played(longest, first=touch.patterns[0]) if longest else None,
+            played=await _played(touch, longest) if longest else None,
             reason=None if longest else touch.reason,
         )
         self.rows.append(row)
@@ -173,14 +192,18 @@ class TouchRecorder:
             self.problems.append(str(error))
 
 
-async def _played(longest: _Playing, *, first: _Playing) -> PlayedPattern:
-    """The longest pattern of a touch as it was felt; latency is that of the touch's first."""
-    applied = longest.applied
+async def _played(touch: _Touch, longest: _Playing) -> PlayedPattern:
+    """The longest pattern of a touch as it was felt; latency and onset are those of its first."""
+    applied, first = longest.applied, touch.patterns[0]
+    predicted = _felt_of(touch, longest)
     felt = await longest.felt if longest.felt else {}
-    target = felt.get(_id(applied.target))
+    target = felt.get(_id(predicted.contact))
     others = [felt[_id(contact)] for contact in applied.quiet if _id(contact) in felt]
     return PlayedPattern(
         pattern=applied.pattern,
+        predicted_level_db_sl=predicted.level_db_sl,
+        predicted_contrast_db=predicted.contrast_db,
+        onset=await _onset(touch, first),
         drive={
             era: {
                 "frequency_hz": command.frequency,
@@ -194,6 +217,25 @@ async def _played(longest: _Playing, *, first: _Playing) -> PlayedPattern:
         measured=measure(target, others) if target and len(others) == len(applied.quiet) else None,
         levels={id: finger_level(finger) for id, finger in felt.items()},
     )
+
+
+async def _onset(touch: _Touch, first: _Playing) -> Onset:
+    """The first 100 ms of the first pattern of a touch."""
+    applied = first.applied
+    felt = await first.onset if first.onset else {}
+    target = felt.get(_id(touch.contact))
+    others = [felt[_id(contact)] for contact in applied.quiet if _id(contact) in felt]
+    is_felt = target is not None and others and len(others) == len(applied.quiet)
+    return Onset(
+        is_shaped=bool(applied.pattern.onset),
+        predicted_contrast_db=applied.transient_contrast_db,
+        measured_contrast_db=peak_contrast_db(target, others) if target and is_felt else None,
+    )
+
+
+def _felt_of(touch: _Touch, playing: _Playing) -> Felt:
+    """What a touch was predicted to feel of a pattern that was played for it."""
+    return next(felt for felt in playing.applied.targets if felt.contact.key == touch.contact.key)
 
 
 def _id(contact: Contact) -> str:

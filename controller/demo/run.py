@@ -21,8 +21,10 @@ from drivers.registry import open_backend
 from model.figures import save_figure
 from model.rig_file import load_rig
 from model.table import LocalizationTable
+from model.timing import Timing
 
 Play: TypeAlias = Callable[[], Awaitable[None]]
+RecordedTouches: TypeAlias = Callable[[], Awaitable[tuple[TouchSource, Play]]]
 
 WIRES = (*OPTIONS, "sim")
 
@@ -45,19 +47,17 @@ async def run_demo(
     table: LocalizationTable,
     *,
     wire: str,
-    touches: Path,
+    touches: RecordedTouches,
     on_row: Callable[[TouchRow], None],
 ) -> list[TouchRow]:
     """Play recorded touches into a controller, over a wire, onto a simulated plate.
 
-    wire: one of WIRES; touches: a TUIO capture, or an evemu recording (.events). on_row is called
-    with every row as it is complete; all are returned in order of time. Raises InputError for a
-    recording that is none, LinkError if the far end is lost.
+    wire: one of WIRES; touches: from `read_touches`. on_row is called with every row as it is
+    complete; all are returned in order of time. Raises LinkError if the far end is lost.
     """
     rig = load_rig(rig_file)
-    stream = _read_touches(touches)
     async with open_far_end(rig_file, rig.amplifiers, wire=wire) as far_end:
-        source, play = await stream()
+        source, play = await touches()
         recorder = TouchRecorder(far_end.bench, on_row=on_row)
         controller = Controller(
             rig,
@@ -65,6 +65,7 @@ async def run_demo(
             amplifiers={name: Amplifier(open_backend(url)) for name, url in far_end.urls.items()},
             sources=[source],
             observer=recorder.observer,
+            timing=Timing(table),
         )
         await controller.open()
         try:
@@ -88,8 +89,12 @@ def write_picture(table: LocalizationTable, rows: list[TouchRow], folder: Path) 
     return [path]
 
 
-def _read_touches(path: Path) -> Callable[[], Awaitable[tuple[TouchSource, Play]]]:
-    """Read a recording now; what is returned opens its source, and what to await while it plays."""
+def read_touches(path: Path) -> RecordedTouches:
+    """Read a TUIO capture, or an evemu recording (.events).
+
+    What is returned opens its source, and says what to await while it plays. Raises InputError for
+    a recording that is none.
+    """
     if path.suffix == ".events":
         recording = EvemuSource(f"evemu:{path}")
 

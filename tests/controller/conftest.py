@@ -8,6 +8,7 @@ from contextlib import AbstractAsyncContextManager, asynccontextmanager
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
+import numpy as np
 import pytest
 
 from controller.loop import Controller
@@ -39,10 +40,12 @@ from drivers.protocol.messages import (
     Stop,
 )
 from model.actuator import Era
+from model.arrays import FloatArray
 from model.excitation import Excitation, Tone
 from model.mesh import Mesh
 from model.pattern import Pattern
 from model.plate import Material, Plate
+from model.question import Question
 from model.rig import Channel, Limits, Rig
 
 T = TypeVar("T")
@@ -185,20 +188,40 @@ class FarEnd(Backend):
 class Table:
     """A table whose answer is set by the test, or an exception to raise."""
 
-    def __init__(self, excitation: Excitation | Exception) -> None:
+    def __init__(self, excitation: Excitation | Exception, plate: Plate) -> None:
         self.excitation = excitation
+        self.plate = plate
+        self.prepared: list[str] = []
+        self.asked: list[Question] = []
 
-    def answer(
-        self,
-        target: tuple[float, float],
-        *,
-        quiet: Sequence[tuple[float, float]] = (),
-        level_db_sl: float = 0.0,
-    ) -> Pattern:
+    @property
+    def frequencies(self) -> FloatArray:
+        """Those of the tests' tones [Hz]."""
+        return np.array([110.0, 250.0])
+
+    def prepare(self, mode: str) -> None:
+        """Remember it."""
+        self.prepared.append(mode)
+
+    def ask(self, question: Question) -> Pattern:
         """The same for every target."""
+        self.asked.append(question)
         if isinstance(self.excitation, Exception):
             raise self.excitation
-        return Pattern(self.excitation, 0.015, 20.0, 12.0 if quiet else None, None)
+        return Pattern(
+            self.excitation,
+            0.015,
+            20.0,
+            12.0 if question.quiet else None,
+            None,
+            question.mode or "",
+        )
+
+    def amplitudes(
+        self, excitation: Excitation, points: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """1 m/s² everywhere."""
+        return np.array([110.0]), np.ones((1, len(points)))
 
 
 @dataclass
@@ -273,13 +296,14 @@ def _make_bench(
     sources: Sequence[TouchSource] = (),
     observer: Observer | None = None,
     channels: int = 2,
+    **options: Any,
 ) -> Bench:
     """A bench within a running loop; one amplifier unless more are named."""
     names = amplifiers or ("main",)
     far_ends = [FarEnd(channels) for _ in names]
-    table = Table({"SW": Tone(110.0, 20e-6, math.pi / 2)})
     told = Told()
     rig = _rig(*names)
+    table = Table({"SW": Tone(110.0, 20e-6, math.pi / 2)}, rig.plate)
     controller = Controller(
         rig,
         table,
@@ -287,6 +311,7 @@ def _make_bench(
         sources=sources,
         observer=observer or told.observer(),
         clock=asyncio.get_running_loop().time,
+        **options,
     )
     return Bench(controller, rig, far_ends, table, told)
 
@@ -308,7 +333,7 @@ async def _running(*amplifiers: str, **options: Any) -> AsyncIterator[Bench]:
 
 @pytest.fixture
 def make_bench() -> Callable[..., Bench]:
-    """Make a bench: names of amplifiers, and sources, observer, channels."""
+    """Make a bench: names of amplifiers, and sources, observer, channels, and a Controller's."""
     return _make_bench
 
 

@@ -53,7 +53,9 @@ def test_touch_to_wire(run_virtual: Run, running: Running) -> None:
             assert played.ramp == 0.015
             (applied,) = bench.told.applied
             assert applied.latency == pytest.approx(0.003)
-            assert (applied.target.x, applied.target.y) == pytest.approx((0.15, 0.1))
+            (felt,) = applied.targets
+            assert (felt.contact.x, felt.contact.y) == pytest.approx((0.15, 0.1))
+            assert (felt.wanted_db_sl, felt.level_db_sl, felt.contrast_db) == (20.0, 20.0, None)
             assert applied.quiet == ()
             assert applied.pattern.level_db_sl == 20.0
             assert applied.drive == {"SW": played.commands[0]}
@@ -292,7 +294,8 @@ def test_the_latest_frame_wins(run_virtual: Run, running: Running) -> None:
                 await asyncio.sleep(0.001)
                 bench.touch((1, 0.5 + 0.04 * step, 0.5))
             await asyncio.sleep(0.1)
-            assert [round(applied.target.x, 3) for applied in bench.told.applied] == [0.15, 0.258]
+            touched = [applied.targets[0].contact.x for applied in bench.told.applied]
+            assert touched == pytest.approx([0.15, 0.258])
 
     run_virtual(scenario())
 

@@ -6,7 +6,7 @@ import pytest
 from controller.demo.far_end import FingerFelt
 from controller.demo.measure import finger_level, measure
 from controller.demo.picture import choose_rows
-from controller.demo.rows import PlayedPattern, TouchRow
+from controller.demo.rows import Onset, PlayedPattern, TouchRow
 from model.pattern import Pattern
 from model.perception import detection_threshold
 
@@ -22,8 +22,9 @@ def row(time, *, contrast, others):
     quiet = {f"q{n}": (0.1, 0.01 * n) for n in range(others)}
     measured = measure(felt([[10 ** (contrast / 20)], [0.0]]), [felt([[1.0], [0.0]])])
     pattern = Pattern({}, 0.02, 20.0, contrast, 0.0)
-    played = PlayedPattern(pattern, {}, 0.004, 0.5, measured, {})
-    return TouchRow("t", time, time + 1, (0.05, 0.05), quiet, played, None)
+    onset = Onset(True, 10.0, 11.0)
+    played = PlayedPattern(pattern, 20.0, contrast, onset, {}, 0.004, 0.5, measured, {})
+    return TouchRow("t", time, time + 1, (0.05, 0.05), (), quiet, played, None)
 
 
 def test_contrast_is_the_targets_mean_to_the_loudest_quiet_point():
@@ -51,7 +52,7 @@ def test_nothing_played_is_nothing_measured():
 def test_the_picture_takes_the_clearest_touches_of_each_number_of_fingers():
     """Six panels, fewest fingers first; a touch that was not measured is left out."""
     rows = [row(n, contrast=float(n), others=1 + n % 2) for n in range(10)]
-    silent = TouchRow("t", 99.0, 99.5, (0.1, 0.1), {}, None, "too close")
+    silent = TouchRow("t", 99.0, 99.5, (0.1, 0.1), (), {}, None, "too close")
     chosen = choose_rows([*rows, silent])
     assert [len(r.quiet) for r in chosen] == [1, 1, 1, 2, 2, 2]
     assert {r.time for r in chosen} == {8, 6, 4, 9, 7, 5}
@@ -59,7 +60,7 @@ def test_the_picture_takes_the_clearest_touches_of_each_number_of_fingers():
 
 def test_a_silent_touch_says_why_in_json():
     """No drive, no figures, a reason."""
-    silent = TouchRow("t", 1.0, 1.5, (0.1, 0.2), {"q": (0.2, 0.2)}, None, "too close")
+    silent = TouchRow("t", 1.0, 1.5, (0.1, 0.2), (), {"q": (0.2, 0.2)}, None, "too close")
     printed = silent.as_json()
     assert printed["drive"] == {}
     assert printed["reason"] == "too close"

@@ -40,7 +40,7 @@ def test_by_hand() -> None:
         "left": CommandSet(
             token=7,
             commands=(
-                DriveCommand(channel=0, frequency=40.0, level=0.0),
+                DriveCommand(channel=0, frequency=40.0, level=0.0, skip_ending=True),
                 DriveCommand(
                     channel=1,
                     frequency=110.0,

@@ -1,45 +1,77 @@
-"""Who is the target, and when a pattern is chosen anew."""
+"""What the table is asked for wishes, and when a pattern is chosen anew."""
 
+import math
 from collections.abc import Sequence
+from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from controller.contacts import Contact, ContactKey
-from controller.selection import Selection, Selector
+from controller.envelopes import PLAIN
+from controller.means import Means
+from controller.selection import Selector, strongest
+from controller.wishes import Target, Wish
+from model.arrays import FloatArray
 from model.errors import InputError
-from model.excitation import Tone
+from model.excitation import Excitation, Tone
 from model.pattern import Pattern
+from model.perception import detection_threshold
+from model.plate import Material, Plate
+from model.question import Question
+
+MEANS = Means("phased", ("switched", "phased"), (45.0, 300.0), {"SW": 1e-4}, PLAIN)
 
 
 class Table:
     """A table that remembers what it was asked, and refuses targets left of `refuse_below`."""
 
-    def __init__(self, refuse_below: float = 0.0) -> None:
-        self.asked: list[tuple[tuple[float, float], list[tuple[float, float]], float]] = []
-        self.refuse_below = refuse_below
+    plate = Plate(0.3, 0.2, 0.0015, Material("aluminium", 70e9, 2700.0, 0.33))
+    frequencies = np.array([100.0])
 
-    def answer(
-        self,
-        target: tuple[float, float],
-        *,
-        quiet: Sequence[tuple[float, float]] = (),
-        level_db_sl: float = 0.0,
-    ) -> Pattern:
+    def __init__(self) -> None:
+        self.asked: list[Question] = []
+        self.refuse_below = 0.0
+        self.error: Exception | None = None
+        self.quiet_level: float | None = None
+
+    def prepare(self, mode: str) -> None:
+        """Not asked for here."""
+
+    def ask(self, question: Question) -> Pattern:
         """A pattern that names its question."""
-        self.asked.append((target, list(quiet), level_db_sl))
-        if target[0] < self.refuse_below:
+        self.asked.append(question)
+        if self.error is not None:
+            raise self.error
+        if question.targets[0][0] < self.refuse_below:
             raise InputError("nothing is felt there")
-        return Pattern({"SW": Tone(100.0 + len(self.asked), 1e-6)}, 0.02, level_db_sl, None, None)
+        tone = Tone(100.0 + len(self.asked), 1e-6)
+        return Pattern({"SW": tone}, 0.02, question.level_db_sl, None, self.quiet_level)
+
+    def amplitudes(
+        self, excitation: Excitation, points: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Ten times above threshold at x = 0.1 m, and in proportion to x."""
+        frequencies = np.array([100.0])
+        return frequencies, detection_threshold(frequencies)[:, None] * 100 * points[None, :, 0]
+
+
+class Wanted:
+    """Wishes as a test sets them: level by id."""
+
+    def __init__(self, **levels: float | None) -> None:
+        self.levels = {int(name[1:]): level for name, level in levels.items()}
+        self.until: float | None = None
+
+    def wish(self, contacts: Sequence[Contact], now: float) -> Wish:
+        """What is set, for contacts on the plate or not."""
+        targets = tuple(Target(ContactKey("a", id), each) for id, each in self.levels.items())
+        return Wish(targets, "nothing is wanted", self.until)
 
 
 def at(id: int, x: float, y: float = 0.1) -> Contact:
     """A contact."""
     return Contact(ContactKey("a", id), x, y, since=0.0)
-
-
-def target_id(selection: Selection) -> int | None:
-    """Whose pattern it is."""
-    return selection.target.key.id if selection.target else None
 
 
 @pytest.fixture
@@ -48,52 +80,92 @@ def table() -> Table:
     return Table()
 
 
-def test_the_newest_is_the_target(table: Table) -> None:
-    """The newest contact is asked for at the wanted level with all others as quiet zone."""
-    selector = Selector(table, level_db_sl=17.0)
-    assert target_id(selector.select((at(1, 0.1),))) == 1
-    selection = selector.select((at(1, 0.1), at(2, 0.2), at(3, 0.3)))
-    assert target_id(selection) == 3
-    assert table.asked == [
-        ((0.1, 0.1), [], 17.0),
-        ((0.3, 0.1), [(0.1, 0.1), (0.2, 0.1)], 17.0),
-    ]
+def test_all_others_are_quiet(table: Table) -> None:
+    """The table is asked for the target at its level, in the mode and band of the amplifiers."""
+    selection = Selector(table, Wanted(c3=17.0), MEANS).select(
+        (at(1, 0.1), at(2, 0.2), at(3, 0.25)), 0.0
+    )
+    (question,) = table.asked
+    assert (question.targets, question.quiet) == (((0.25, 0.1),), ((0.1, 0.1), (0.2, 0.1)))
+    assert (question.level_db_sl, question.mode) == (17.0, "phased")
+    assert (question.playable, question.frequencies) == (("switched", "phased"), (45.0, 300.0))
+    assert not question.envelopes
+    (felt,) = selection.felt
+    assert (felt.contact.key.id, felt.wanted_db_sl, felt.level_db_sl) == (3, 17.0, 17.0)
 
 
-def test_nobody(table: Table) -> None:
-    """Without contacts nothing is asked and nothing felt."""
-    selection = Selector(table).select(())
-    assert (selection.target, selection.pattern) == (None, None)
-    assert selection.reason == "nobody touches the plate"
+def test_several_targets_are_told_one_by_one(table: Table) -> None:
+    """The strongest gives the level, the others are softer; each is told what it will feel.
+
+    By hand: amplitudes go with x, so the mean over a fingertip is that at its centre, 20 dB SL at
+    0.1 m and 26 at 0.2; the loudest point of the quiet one, on a rim of 13 mm, lies at 0.063 m.
+    """
+    selection = Selector(table, Wanted(c1=12.0, c2=20.0), MEANS).select(
+        (at(1, 0.1), at(2, 0.2), at(3, 0.05)), 0.0
+    )
+    (question,) = table.asked
+    assert question.targets == ((0.1, 0.1), (0.2, 0.1))
+    assert (question.level_db_sl, question.softer_db) == (20.0, (8.0, 0.0))
+    assert [felt.wanted_db_sl for felt in selection.felt] == [12.0, 20.0]
+    levels = [felt.level_db_sl for felt in selection.felt]
+    assert levels == pytest.approx([20.0, 20 + 20 * math.log10(2)], abs=0.01)
+    rim = 0.05 + 0.013 * math.cos(math.pi / 12)
+    contrasts = [felt.contrast_db for felt in selection.felt]
+    assert contrasts == pytest.approx([20 * math.log10(x / rim) for x in (0.1, 0.2)], abs=0.01)
+
+
+def test_beside_a_level_no_level_means_the_strongest_of_them(table: Table) -> None:
+    """One that takes what the neighbours allow does not turn the others up or down."""
+    selector = Selector(table, Wanted(c1=None, c2=15.0, c3=9.0), MEANS)
+    selector.select((at(1, 0.1), at(2, 0.2), at(3, 0.25)), 0.0)
+    assert table.asked[0].level_db_sl == 15.0
+    assert table.asked[0].softer_db == (0.0, 0.0, 6.0)
+
+
+def test_as_strong_as_the_neighbours_allow(table: Table) -> None:
+    """Asked for at 12 dB SL; with 14 dB less at the quiet finger, -10 dB there leave 4 here."""
+    table.quiet_level = -2.0
+    selection = Selector(table, Wanted(c1=None), MEANS).select((at(1, 0.1), at(2, 0.2)), 0.0)
+    assert table.asked[0].level_db_sl == 12.0
+    assert selection.pattern is not None
+    assert selection.felt[0].level_db_sl == pytest.approx(4.0)
+    assert selection.pattern.quiet_level_db_sl == pytest.approx(-10.0)
+    assert selection.pattern.excitation["SW"].amplitude == pytest.approx(1e-6 * 10 ** (-8 / 20))
+
+
+@pytest.mark.parametrize(
+    ("quiet", "largest", "level"),
+    [
+        (-40.0, 1.0, 26.0),  # nobody is to be numbed
+        (None, 1.0, 26.0),
+        (-40.0, 2e-6, 12 + 20 * math.log10(2)),  # the ERA's stroke ends it
+    ],
+)
+def test_where_strength_ends(quiet: float | None, largest: float, level: float) -> None:
+    """At twice what is strong, or at the stroke; without neighbours too."""
+    pattern = Pattern({"SW": Tone(100.0, 1e-6)}, 0.02, 12.0, None, quiet)
+    found = strongest(pattern, {"SW": largest})
+    assert found.level_db_sl == pytest.approx(level)
+    gain = 10 ** ((level - 12.0) / 20)
+    assert found.excitation["SW"].amplitude == pytest.approx(1e-6 * gain)
+
+
+def test_what_cannot_be_felt_alone_is_not_played() -> None:
+    """Less than 10 dB between target and neighbour leave nothing to be felt."""
+    pattern = Pattern({"SW": Tone(100.0, 1e-6)}, 0.02, 12.0, None, 3.0)
+    with pytest.raises(InputError, match="felt by another finger too"):
+        strongest(pattern, {"SW": 1.0})
+
+
+def test_nothing_wanted(table: Table) -> None:
+    """No target, or none that is on the plate: nothing is asked, and the reason is the wish's."""
+    for wishes in (Wanted(), Wanted(c9=20.0)):
+        selector = Selector(table, wishes, MEANS)
+        for contacts in [(), (at(1, 0.1),), (at(1, 0.29),)]:
+            selection = selector.select(contacts, 0.0)
+            assert (selection.targets, selection.pattern) == ((), None)
+            assert selection.reason == "nothing is wanted"
     assert table.asked == []
-
-
-def test_target_lifts_while_others_stay(table: Table) -> None:
-    """All is silent until the next contact comes, whatever the ones that stay do."""
-    selector = Selector(table)
-    selector.select((at(1, 0.1), at(2, 0.2)))
-    for contacts in [(at(1, 0.1),), (at(1, 0.29),)]:
-        selection = selector.select(contacts)
-        assert selection.pattern is None
-        assert selection.reason == "the target was lifted"
-    assert target_id(selector.select((at(1, 0.29), at(3, 0.2)))) == 3
-    assert len(table.asked) == 2
-
-
-def test_lift_of_all_is_told_as_such(table: Table) -> None:
-    """After the last finger the reason is that nobody is there."""
-    selector = Selector(table)
-    selector.select((at(1, 0.1), at(2, 0.2)))
-    selector.select((at(1, 0.1),))
-    assert selector.select(()).reason == "nobody touches the plate"
-
-
-def test_the_same_finger_again(table: Table) -> None:
-    """A finger that comes back under its old id after a lift is a new contact."""
-    selector = Selector(table)
-    selector.select((at(1, 0.1), at(2, 0.2)))
-    selector.select((at(1, 0.1),))
-    assert target_id(selector.select((at(1, 0.1), at(2, 0.2)))) == 2
 
 
 @pytest.mark.parametrize("mover", [0, 1])
@@ -102,40 +174,80 @@ def test_moves(table: Table, mover: int) -> None:
 
     It is the way from there that counts, not from the frame before, and of any contact.
     """
-    selector = Selector(table)
+    selector = Selector(table, Wanted(c2=20.0), MEANS)
 
     def contacts(distance: float) -> tuple[Contact, ...]:
         moved = [0.0, 0.0]
         moved[mover] = distance
         return (at(1, 0.1, 0.1 + moved[0]), at(2, 0.2, 0.1 - moved[1]))
 
-    first = selector.select(contacts(0.0))
-    assert selector.select(contacts(0.004)) is first
-    assert selector.select(contacts(0.0079)) is first
-    second = selector.select(contacts(0.0081))
+    first = selector.select(contacts(0.0), 0.0)
+    assert selector.select(contacts(0.004), 0.1) is first
+    assert selector.select(contacts(0.0079), 0.2) is first
+    second = selector.select(contacts(0.0081), 0.3)
     assert second.pattern != first.pattern
-    assert selector.select(contacts(0.0)) is not second
+    assert selector.select(contacts(0.0), 0.4) is not second
+
+
+def test_other_wishes_are_another_pattern(table: Table) -> None:
+    """Another level, one more target, one fewer."""
+    wishes = Wanted(c1=20.0)
+    selector = Selector(table, wishes, MEANS)
+    contacts = (at(1, 0.1), at(2, 0.2))
+    for levels in ({1: 20.0}, {1: 14.0}, {1: 14.0, 2: 14.0}, {2: 14.0}):
+        wishes.levels = dict(levels)
+        chosen = selector.select(contacts, 0.0)
+        assert selector.select(contacts, 0.0) is chosen
+    assert len(table.asked) == 4
 
 
 def test_a_quiet_contact_that_lifts_changes_nothing(table: Table) -> None:
     """The target goes on feeling the same."""
-    selector = Selector(table)
-    first = selector.select((at(1, 0.1), at(2, 0.2)))
-    assert selector.select((at(2, 0.2),)) is first
+    selector = Selector(table, Wanted(c2=20.0), MEANS)
+    first = selector.select((at(1, 0.1), at(2, 0.2)), 0.0)
+    assert selector.select((at(2, 0.2),), 0.0) is first
 
 
-def test_refused_by_the_table() -> None:
+def test_refused_by_the_table(table: Table) -> None:
     """A table's refusal is silence with its words, asked again when it may have changed."""
-    table = Table(refuse_below=0.2)
-    selector = Selector(table)
-    refused = selector.select((at(1, 0.25), at(2, 0.1)))
-    assert (target_id(refused), refused.pattern, refused.reason) == (
-        2,
-        None,
-        "nothing is felt there",
-    )
-    assert selector.select((at(1, 0.25), at(2, 0.1))) is refused
+    table.refuse_below = 0.2
+    selector = Selector(table, Wanted(c2=20.0), MEANS)
+    refused = selector.select((at(1, 0.25), at(2, 0.1)), 0.0)
+    assert [contact.key.id for contact, _ in refused.targets] == [2]
+    assert (refused.pattern, refused.reason) == (None, "nothing is felt there")
+    assert selector.select((at(1, 0.25), at(2, 0.1)), 0.0) is refused
     assert len(table.asked) == 1
-    assert selector.select((at(2, 0.1),)).reason == "nothing is felt there"
+    assert selector.select((at(2, 0.1),), 0.0).reason == "nothing is felt there"
     assert len(table.asked) == 2  # without the quiet contact it might have been possible
-    assert selector.select((at(2, 0.21),)).pattern is not None
+    assert selector.select((at(2, 0.21),), 0.0).pattern is not None
+
+
+def test_a_table_that_fails_is_not_asked_again_for_the_same(table: Table) -> None:
+    """Whatever it raises is silence with its words until something else is wanted."""
+    table.error = ZeroDivisionError("by no ERA")
+    selector = Selector(table, Wanted(c1=20.0), MEANS)
+    failed = selector.select((at(1, 0.1),), 0.0)
+    assert (failed.pattern, failed.reason) == (None, "ZeroDivisionError: by no ERA")
+    assert selector.select((at(1, 0.1),), 0.0) is failed
+    assert len(table.asked) == 1
+    table.error = None
+    assert selector.select((at(1, 0.2),), 0.0).pattern is not None
+
+
+@pytest.mark.parametrize(
+    ("until", "looked_at"), [(None, None), (7.0, 7.0), (3.0, 5.001), (math.nan, 5.001)]
+)
+def test_a_wish_runs_out(table: Table, until: float | None, looked_at: float | None) -> None:
+    """The loop comes back when it does; one that has run out does not keep it busy."""
+    wishes = Wanted(c1=20.0)
+    wishes.until = until
+    selector = Selector(table, wishes, MEANS)
+    selector.select((at(1, 0.1),), 5.0)
+    assert selector.until == looked_at
+
+
+def test_with_envelopes_the_table_is_told_so(table: Table) -> None:
+    """It may choose by steady contrast then."""
+    means = replace(MEANS, shaping=replace(PLAIN, onsets=True))
+    Selector(table, Wanted(c1=20.0), means).select((at(1, 0.1),), 0.0)
+    assert table.asked[0].envelopes

@@ -75,7 +75,7 @@ def test_every_touch_is_felt_as_predicted(wire, capture, environment, tmp_path):
     assert len(rows) == len(SCHEDULE)
     for row, (_, _, _, x, y) in zip(rows, SCHEDULE, strict=True):
         assert row["targets_m"] == [[pytest.approx(x * 0.3048), pytest.approx((1 - y) * 0.2286)]]
-        assert 1 <= len(row["drive"]) <= 2
+        assert row["mode"] == "phased"
         assert row["drive"].keys() <= ERA_NAMES
         for tone in row["drive"].values():
             assert tone["frequency_hz"] in range(60, 321, 10)

@@ -1,0 +1,73 @@
+"""Who wants to feel what: the seam between what touches mean and how that is played.
+
+Whoever gives touches a meaning says which contacts shall feel it and how strongly; all others on
+the plate are kept quiet. The rest, from the table to the wire, does not know why.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+from controller.contacts import Contact, ContactKey
+from model.perception import STRONG_DB_SL
+
+NOBODY_TOUCHES = "nobody touches the plate"
+
+
+@dataclass(frozen=True, slots=True)
+class Target:
+    """A contact that shall feel something.
+
+    level_db_sl: how strongly; None for as strongly as the neighbours allow. Among targets with a
+    level one without feels it as the strongest of them does.
+    """
+
+    key: ContactKey
+    level_db_sl: float | None = STRONG_DB_SL
+
+
+@dataclass(frozen=True)
+class Wish:
+    """What is wanted now.
+
+    targets: each contact once; those that are not on the plate are left out. reason: why there are
+    none. until: when [s] the wish may be another though no contact has changed; None for never.
+    """
+
+    targets: tuple[Target, ...]
+    reason: str = "nobody is to feel anything"
+    until: float | None = None
+
+
+class Wishes(Protocol):
+    """Where wishes come from; asked whenever contacts have changed, and when a wish runs out."""
+
+    def wish(self, contacts: Sequence[Contact], now: float) -> Wish:
+        """The wish for contacts in their order of arrival, at a time [s]; must return at once.
+
+        What it raises silences all channels for as long as it does.
+        """
+
+
+class NewestBuzzes:
+    """The newest contact buzzes where it is, and nobody else feels it.
+
+    When it lifts, all is silent until the next contact comes.
+    """
+
+    def __init__(self, level_db_sl: float | None = STRONG_DB_SL) -> None:
+        self._level = level_db_sl
+        self._seen: frozenset[ContactKey] = frozenset()
+        self._target: ContactKey | None = None
+
+    def wish(self, contacts: Sequence[Contact], now: float) -> Wish:
+        """The newest contact if it is new, or else the target that was, while it is down."""
+        keys = [contact.key for contact in contacts]
+        if keys and keys[-1] not in self._seen:
+            self._target = keys[-1]
+        elif self._target not in keys:
+            self._target = None
+        self._seen = frozenset(keys)
+        if self._target is not None:
+            return Wish((Target(self._target, self._level),))
+        return Wish((), "the target was lifted" if keys else NOBODY_TOUCHES)

@@ -1,0 +1,51 @@
+"""Who is the target where nobody gave touches another meaning."""
+
+import pytest
+
+from controller.contacts import Contact, ContactKey
+from controller.wishes import NewestBuzzes, Target
+
+
+def at(id: int) -> Contact:
+    """A contact; where it is does not matter here."""
+    return Contact(ContactKey("a", id), 0.1, 0.1, since=0.0)
+
+
+def wanted(wishes: NewestBuzzes, *ids: int) -> list[int]:
+    """Which of these contacts shall feel something."""
+    wish = wishes.wish(tuple(at(id) for id in ids), 0.0)
+    return [target.key.id for target in wish.targets]
+
+
+@pytest.mark.parametrize(
+    ("steps", "targets"),
+    [
+        ([(1,), (1, 2, 3)], [[1], [3]]),  # the newest
+        ([(1, 2), (1,), (1,), (1, 3)], [[2], [], [], [3]]),  # silent until the next contact comes
+        ([(1, 2), (1,), (1, 2)], [[2], [], [2]]),  # one that comes back under its id is new
+        ([(1, 2), (2,), ()], [[2], [2], []]),  # another one's lift changes nothing
+    ],
+)
+def test_the_newest_contact_is_the_target(
+    steps: list[tuple[int, ...]], targets: list[list[int]]
+) -> None:
+    """From contacts to target, step by step."""
+    wishes = NewestBuzzes()
+    assert [wanted(wishes, *ids) for ids in steps] == targets
+
+
+def test_it_is_wanted_at_the_given_level_for_as_long_as_it_is_down() -> None:
+    """None is for as strongly as the neighbours allow; nothing is to be asked again for."""
+    for level in (17.0, None):
+        wish = NewestBuzzes(level).wish((at(1),), 0.0)
+        assert wish.targets == (Target(ContactKey("a", 1), level),)
+        assert wish.until is None
+
+
+def test_it_says_why_nobody_is_to_feel_anything() -> None:
+    """After a lift another reason than on an empty plate."""
+    wishes = NewestBuzzes()
+    assert wishes.wish((), 0.0).reason == "nobody touches the plate"
+    wishes.wish((at(1), at(2)), 0.0)
+    assert wishes.wish((at(1),), 0.0).reason == "the target was lifted"
+    assert wishes.wish((), 0.0).reason == "nobody touches the plate"

@@ -1,0 +1,87 @@
+"""Bases that move in a way known twice: as a function of time, and as terms for the plant."""
+
+import cmath
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+from model.base_motion import Term, fade
+from sim.base_motion import terms_of
+from sim.shaped_tone import ShapedTone
+
+
+@dataclass(frozen=True)
+class Base:
+    """motion: displacement [m] and velocity [m/s] at a time [s]; terms: the same motion."""
+
+    motion: Callable[[float], tuple[float, float]]
+    terms: tuple[Term, ...]
+
+
+STILL = Base(lambda time: (0.0, 0.0), ())
+
+
+def faded_base(
+    amplitude: float,
+    frequency: float,
+    phase: float,
+    *,
+    rise: tuple[float, float],
+    fall: tuple[float, float],
+) -> Base:
+    """amplitude g(t) sin(2 pi frequency t + phase); g rises and falls along raised cosines.
+
+    amplitude [m], frequency [Hz], phase [rad]; rise and fall: when each begins and ends [s].
+    """
+    omega = 2 * math.pi * frequency
+
+    def motion(time: float) -> tuple[float, float]:
+        (on, full), (off, silent) = rise, fall
+        if not on <= time < silent:
+            return 0.0, 0.0
+        if time < full:
+            turn = math.pi / (full - on)
+            gain = (1 - math.cos(turn * (time - on))) / 2
+            growth = turn * math.sin(turn * (time - on)) / 2
+        elif time < off:
+            gain, growth = 1.0, 0.0
+        else:
+            turn = math.pi / (silent - off)
+            gain = (1 + math.cos(turn * (time - off))) / 2
+            growth = -turn * math.sin(turn * (time - off)) / 2
+        angle = omega * time + phase
+        return (
+            amplitude * gain * math.sin(angle),
+            amplitude * (growth * math.sin(angle) + gain * omega * math.cos(angle)),
+        )
+
+    def at(time: float) -> complex:
+        return cmath.rect(amplitude, omega * time + phase)
+
+    up = fade(at(rise[0]), omega=omega, start=rise[0], ramp=rise[1] - rise[0], gains=(0, 1))
+    up = (*up[:-1], replace(up[-1], end=fall[0]))
+    down = fade(at(fall[0]), omega=omega, start=fall[0], ramp=fall[1] - fall[0], gains=(1, 0))
+    return Base(motion, (*up, *down))
+
+
+def shaped_base(
+    amplitude: float, frequency: float, *, start: float, step: float, knots: tuple[complex, ...]
+) -> Base:
+    """amplitude Im[a(t) exp(2 pi i frequency t)], a along straight lines through the knots.
+
+    The first knot is at start [s], then one every step [s], then rest; amplitude [m].
+    """
+    omega = 2 * math.pi * frequency
+
+    def motion(time: float) -> tuple[float, float]:
+        steps = (time - start) / step
+        before = math.floor(steps)
+        if not 0 <= before < len(knots) - 1:
+            return 0.0, 0.0
+        slope = (knots[before + 1] - knots[before]) / step
+        value = knots[before] + slope * (steps - before) * step
+        turn = amplitude * cmath.exp(1j * omega * time)
+        return (value * turn).imag, ((slope + 1j * omega * value) * turn).imag
+
+    tone = ShapedTone(frequency, 0.0, start, step, knots)
+    return Base(motion, terms_of(tone, stroke=amplitude))

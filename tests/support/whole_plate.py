@@ -1,0 +1,122 @@
+"""The unreduced finite-element plate on its ERAs, stepped through time by Newmark's method.
+
+Matrices come from the mesh and its assembly, what holds and loads the plate is put on them here,
+and structural damping is made of all modes of the supported plate by the formula of the
+documentation; none of it is the code of the plate in time.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import linalg, sparse
+
+from model.actuator import Era
+from model.arrays import ComplexArray, FloatArray
+from model.assembly import PlateMatrices, assemble
+from model.mesh import Mesh
+from model.plate import Plate
+from model.point_load import PointLoad
+
+Motion = Callable[[float], tuple[float, float]]
+"""Displacement [m] and velocity [m/s] of a base at a time [s]."""
+
+
+@dataclass(frozen=True, eq=False)
+class WholePlate:
+    """M, C, K (dof, dof) of the plate on its ERAs; hold: takes the deflections at them (n, dof)."""
+
+    matrices: PlateMatrices
+    eras: Sequence[Era]
+    M: FloatArray
+    C: FloatArray
+    K: FloatArray
+    hold: FloatArray
+
+    def with_contacts(
+        self, contacts: Sequence[PointLoad]
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """M, C, K with fingers on it."""
+        M, C, K = self.M.copy(), self.C.copy(), self.K.copy()
+        for each in contacts:
+            touch = self.matrices.deflection_at(np.array([[each.x, each.y]])).toarray()
+            M += each.mass * touch.T @ touch
+            C += each.damping * touch.T @ touch
+            K += each.stiffness * touch.T @ touch
+        return M, C, K
+
+    def steady(
+        self, driven: int, frequency: float, points: FloatArray, contacts: Sequence[PointLoad]
+    ) -> ComplexArray:
+        """Acceleration per base amplitude [1/s²] at points, one ERA driven as sin, solved whole."""
+        M, C, K = self.with_contacts(contacts)
+        w = 2 * np.pi * frequency
+        push = (self.eras[driven].stiffness + 1j * w * self.eras[driven].damping) * self.hold[
+            driven
+        ]
+        answer = linalg.solve(K + 1j * w * C - w**2 * M, push)
+        return np.asarray(-(w**2) * self.matrices.deflection_at(points) @ answer)
+
+    def stepped(
+        self,
+        bases: Sequence[Motion],
+        contacts: Sequence[tuple[float, Sequence[PointLoad]]],
+        *,
+        until: float,
+        step: float,
+        every: int,
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Displacement, velocity and acceleration (n, dof) from rest, every so many steps.
+
+        By Newmark's method of the mean acceleration. step [s]; contacts: from when on which fingers
+        rest on the plate, at multiples of the step. A sample at such a moment is still of the plate
+        as it was before.
+        """
+        count = round(until / step)
+        begins = {round(begin / step): fingers for begin, fingers in contacts}
+        M, C, K = self.with_contacts(begins.pop(0, ()))
+        u, v = np.zeros(len(M)), np.zeros(len(M))
+
+        def force(number: int) -> FloatArray:
+            motion = [base(number * step) for base in bases]
+            size = [
+                era.stiffness * y + era.damping * dy
+                for era, (y, dy) in zip(self.eras, motion, strict=True)
+            ]
+            return np.asarray(np.array(size) @ self.hold)
+
+        inverse = linalg.inv(M + step / 2 * C + step**2 / 4 * K)
+        a = linalg.solve(M, force(0))
+        samples = np.empty((3, count // every, len(M)))
+        for number in range(1, count + 1):
+            u_guess = u + step * v + step**2 / 4 * a
+            v_guess = v + step / 2 * a
+            a = inverse @ (force(number) - C @ v_guess - K @ u_guess)
+            u, v = u_guess + step**2 / 4 * a, v_guess + step / 2 * a
+            if number % every == 0:
+                samples[:, number // every - 1] = u, v, a
+            if number in begins:
+                M, C, K = self.with_contacts(begins[number])
+                inverse = linalg.inv(M + step / 2 * C + step**2 / 4 * K)
+                a = linalg.solve(M, force(number) - C @ v - K @ u)
+        return samples[0], samples[1], samples[2]
+
+
+def whole_plate(plate: Plate, mesh: Mesh, eras: Sequence[Era]) -> WholePlate:
+    """Put a plate on its ERAs; C_jk = eta psi_j' K psi_k / sqrt(omega_j omega_k) in its modes."""
+    matrices = assemble(plate, mesh)
+    hold = matrices.deflection_at(np.array([[era.x, era.y] for era in eras])).toarray()
+    dense = [sparse.csc_array(each).toarray() for each in (matrices.mass, matrices.stiffness)]
+    M = dense[0] + sum(
+        era.bolt_mass * np.outer(row, row) for era, row in zip(eras, hold, strict=True)
+    )
+    K = dense[1] + sum(
+        era.stiffness * np.outer(row, row) for era, row in zip(eras, hold, strict=True)
+    )
+    squares, psi = linalg.eigh(K, M)
+    omega = np.sqrt(squares)
+    back = M @ psi
+    lossy = psi.T @ dense[1] @ psi / np.sqrt(np.outer(omega, omega))
+    C = plate.loss_factor * back @ lossy @ back.T
+    C += sum(era.damping * np.outer(row, row) for era, row in zip(eras, hold, strict=True))
+    return WholePlate(matrices, tuple(eras), M, C, K, hold)

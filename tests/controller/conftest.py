@@ -268,12 +268,12 @@ class Bench:
 
     controller: Controller
     rig: Rig
-    far_ends: list[FarEnd]
+    far_ends: list[Any]
     table: Table
     told: Told
 
     @property
-    def far_end(self) -> FarEnd:
+    def far_end(self) -> Any:
         """The first amplifier."""
         return self.far_ends[0]
 
@@ -296,11 +296,12 @@ def _make_bench(
     sources: Sequence[TouchSource] = (),
     observer: Observer | None = None,
     channels: int = 2,
+    far_ends: list[Any] | None = None,
     **options: Any,
 ) -> Bench:
     """A bench within a running loop; one amplifier unless more are named."""
     names = amplifiers or ("main",)
-    far_ends = [FarEnd(channels) for _ in names]
+    far_ends = far_ends or [FarEnd(channels) for _ in names]
     told = Told()
     rig = _rig(*names)
     table = Table({"SW": Tone(110.0, 20e-6, math.pi / 2)}, rig.plate)
@@ -333,7 +334,7 @@ async def _running(*amplifiers: str, **options: Any) -> AsyncIterator[Bench]:
 
 @pytest.fixture
 def make_bench() -> Callable[..., Bench]:
-    """Make a bench: names of amplifiers, and sources, observer, channels, and a Controller's."""
+    """Make a bench: names of amplifiers; observer, channels, far_ends, what a Controller takes."""
     return _make_bench
 
 

@@ -15,6 +15,7 @@ from drivers.backend import Backend
 from drivers.errors import DriverError, LinkTimeout
 from drivers.protocol.messages import Reply, Request, State
 from model.excitation import Tone
+from shaped_link import Shapes
 from sim.amplifier import SimulatedAmplifier
 
 PAUSES = (0.0, 0.001, 0.004, 0.02, 0.06)
@@ -106,6 +107,7 @@ def test_nothing_stays_vibrating(
             bench.rig,
             bench.table,
             amplifiers={name: Amplifier(link) for name, link in links.items()},
+            timing=dice.choice((None, Shapes())),
             clock=loop.time,
         )
         await controller.open()

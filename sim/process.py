@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from drivers import clock
+from drivers.steady import no_long_collections
 from model.finger_load import FingerLoad
 from model.rig import Rig
 from sim.bench import SAMPLE_RATE, Bench
@@ -122,6 +123,7 @@ async def _serve(
         await stack.enter_async_context(_in_background(keep_time(bench), ended))
         if view is not None:
             await stack.enter_async_context(_in_background(_keep_viewing(site, view), ended))
+        stack.enter_context(no_long_collections())
         ready(site.urls)
         await ended.wait()
 

@@ -18,6 +18,7 @@ from controller.touch import TouchSource
 from drivers.amplifier import Amplifier
 from drivers.errors import LinkError
 from drivers.registry import open_backend
+from drivers.steady import no_long_collections
 from model.figures import save_figure
 from model.rig_file import load_rig
 from model.table import LocalizationTable
@@ -69,7 +70,8 @@ async def run_demo(
         )
         await controller.open()
         try:
-            await _drive(controller, play)
+            with no_long_collections():
+                await _drive(controller, play)
             await recorder.finish()
         finally:
             await controller.close()

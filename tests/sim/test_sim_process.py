@@ -90,6 +90,7 @@ async def test_ends_with_its_standard_input_where_that_was_asked_for() -> None:
         (["no_such_rig.yaml", "--serial"], 2, "no_such_rig.yaml"),
         ([str(example_rig_path()), "--serial", "--finger", "0.1"], 2, "--finger"),
         ([str(example_rig_path()), "--serial", "--finger", "9,9"], 2, "not on the plate"),
+        ([str(example_rig_path()), "--serial", "--finger-load", "1,2"], 2, "--finger-load"),
         ([str(example_rig_path()), "--serial", "--control", "/no/where"], 3, "/no/where"),
     ],
 )

@@ -201,6 +201,8 @@ class AmplifierGroup:
 
     async def _load(self, name: str, envelopes: Sequence[SafeEnvelope]) -> None:
         for envelope in envelopes:
+            if self.phase is not Phase.ARMED:
+                return  # nothing will be played
             await self._amplifiers[name].load_envelope(envelope)
 
     def _commits(self, sets: Mapping[str, SafeCommand]) -> Iterable[Coroutine[Any, Any, object]]:

@@ -95,6 +95,8 @@ def test_brakes_follow_once_it_has_settled(
                 seen.append(link.levels()[0])
             onset, ending = loaded(link)
             assert ending.slot != onset.slot
+            loadings = [t for t, each in link.asked if isinstance(each, LoadEnvelope)]
+            assert loadings[1] - loadings[0] == pytest.approx(ONSET)
             assert [knot.level for knot in ending.knots] == pytest.approx(
                 [FULL * (1 - number / 8) for number in range(1, 8)]
             )
@@ -224,6 +226,73 @@ def test_what_runs_on_has_no_new_onset(
             _, moved = bench.told.applied
             assert moved.pattern.onset is None
             assert moved.transient_contrast_db is None
+
+    run_virtual(scenario())
+
+
+def test_a_brake_is_not_another_patterns(
+    run_virtual: Run, running: Running, link: Link, shapes: Shapes
+) -> None:
+    """Lifted right after it slid on: what plays now has no brake yet, and fades."""
+
+    async def scenario() -> None:
+        async with running(far_ends=[link], timing=shapes) as bench:
+            await bench.hold(OTHER, FINGER, seconds=0.2)
+            bench.touch(OTHER, (1, 0.6, 0.5))
+            await asyncio.sleep(0.005)
+            bench.touch(OTHER)
+            await asyncio.sleep(0.005)
+            assert sets(link)[-1].is_silent
+            assert [each.skip_ending for each in sets(link)[-1].commands] == [True, True]
+
+    run_virtual(scenario())
+
+
+def test_a_fault_knows_no_brake(
+    run_virtual: Run,
+    running: Running,
+    link: Link,
+    shapes: Shapes,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Whatever goes wrong in a decision, all fall silent along the ramp."""
+
+    async def scenario() -> None:
+        async with running(far_ends=[link], timing=shapes, wishes=Always()) as bench:
+            await bench.hold(FINGER, seconds=0.2)
+            monkeypatch.setattr(Always, "wish", lambda self, contacts, now: 1 / 0)
+            bench.touch((1, 0.51, 0.5))
+            await asyncio.sleep(0.005)
+            assert sets(link)[-1].is_silent
+            assert [each.skip_ending for each in sets(link)[-1].commands] == [True, True]
+            monkeypatch.undo()
+
+    run_virtual(scenario())
+
+
+class Always:
+    """Every finger feels it for as long as it is there."""
+
+    def wish(self, contacts: Sequence[Contact], now: float) -> Wish:
+        """All of them."""
+        return Wish(tuple(Target(each.key, 20.0) for each in contacts))
+
+
+def test_nothing_is_loaded_or_played_after_a_disarm(
+    run_virtual: Run, running: Running, link: Link, shapes: Shapes
+) -> None:
+    """Disarmed while the first of two onsets is loaded: it is the last that the amplifier hears."""
+    link.delay = lambda request: 0.005 if isinstance(request, LoadEnvelope) else 0.0
+
+    async def scenario() -> None:
+        async with running(far_ends=[link], timing=shapes) as bench:
+            bench.table.excitation = {"SW": Tone(110.0, 2e-5), "NE": Tone(110.0, 4e-5)}
+            bench.touch(FINGER)
+            await asyncio.sleep(0.002)
+            await bench.controller.disarm()
+            await asyncio.sleep(0.05)
+            assert len(loaded(link)) == 1
+            assert sets(link) == []
 
     run_virtual(scenario())
 

@@ -104,6 +104,10 @@ class Amplifier:
         """Time [s] on the wire of an apply of all channels and its answer; 0 where not known."""
         return self._link.backend.round_trip(self.capabilities.channels)
 
+    def commit_time(self) -> float:
+        """Time [s] on the wire until a commit has arrived whole; 0 where not known."""
+        return self._link.backend.commit_time()
+
     def loading_time(self, knots: int) -> float:
         """Time [s] on the wire of loading an envelope of so many knots; 0 where not known."""
         return self._link.backend.loading_time(knots)

@@ -75,6 +75,10 @@ class Backend(ABC):
         """Time [s] on the wire of an apply of so many channels and its answer; 0 if unknown."""
         return 0.0
 
+    def commit_time(self) -> float:
+        """Time [s] on the wire until a commit has arrived whole; 0 if unknown."""
+        return 0.0
+
     def loading_time(self, knots: int) -> float:
         """Time [s] on the wire of loading an envelope of so many knots; 0 if unknown."""
         return 0.0

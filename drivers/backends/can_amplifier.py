@@ -22,7 +22,12 @@ from drivers.backends.waiting import reply_within
 from drivers.errors import FrameError, LinkError, LinkTimeout
 from drivers.guard import SafeEnvelope
 from drivers.protocol.can_frame import CANOPEN, CanFrame, cob_id
-from drivers.protocol.can_timing import frames_time, loading_time, round_trip_time
+from drivers.protocol.can_timing import (
+    commit_time,
+    frames_time,
+    loading_time,
+    round_trip_time,
+)
 from drivers.protocol.canopen_answers import UNASKED, Answer, plain_reply
 from drivers.protocol.canopen_map import (
     SEQUENCE_MAX,
@@ -110,6 +115,10 @@ class CanBackend(Backend):
         """Time [s] on the bus of an apply of so many channels and its answer."""
         bus = self._url.bus
         return round_trip_time(channels, bitrate=bus.bitrate, fd=bus.fd)
+
+    def commit_time(self) -> float:
+        """Time [s] on the bus until a commit has arrived."""
+        return commit_time(bitrate=self._url.bus.bitrate)
 
     def loading_time(self, knots: int) -> float:
         """Time [s] on the bus of loading an envelope."""

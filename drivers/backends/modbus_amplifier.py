@@ -29,7 +29,7 @@ from drivers.protocol.messages import (
     State,
 )
 from drivers.protocol.modbus_map import Exchange, Read, Write
-from drivers.protocol.modbus_timing import loading_time, round_trip_time
+from drivers.protocol.modbus_timing import commit_time, loading_time, round_trip_time
 from drivers.statistics import WireCounters
 
 _ILLEGAL_FUNCTION = 1
@@ -74,6 +74,12 @@ class ModbusBackend(Backend):
             return 0.0
         bits = self._url.bits_per_byte
         return round_trip_time(channels, baud=self._url.baud, bits_per_byte=bits)
+
+    def commit_time(self) -> float:
+        """Time [s] on a serial line until a commit has arrived; else 0."""
+        if not self._url.device:
+            return 0.0
+        return commit_time(baud=self._url.baud, bits_per_byte=self._url.bits_per_byte)
 
     def loading_time(self, knots: int) -> float:
         """Time [s] on a serial line of loading an envelope; else 0."""

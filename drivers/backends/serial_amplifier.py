@@ -18,7 +18,12 @@ from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.messages import Broadcast, Event, Reply, Request
 from drivers.protocol.serial_codec import decode_event, decode_reply, encode_request, is_event
 from drivers.protocol.serial_frame import Frame, encode_frame
-from drivers.protocol.serial_timing import exchange_time, loading_time, round_trip_time
+from drivers.protocol.serial_timing import (
+    commit_time,
+    exchange_time,
+    loading_time,
+    round_trip_time,
+)
 from drivers.statistics import WireCounters
 
 
@@ -66,6 +71,10 @@ class SerialBackend(Backend):
         if not self._url.is_local:
             return 0.0
         return round_trip_time(channels, baud=self._url.baud)
+
+    def commit_time(self) -> float:
+        """Time [s] on the line until a commit has arrived; 0 where the line's end is a server."""
+        return commit_time(baud=self._url.baud) if self._url.is_local else 0.0
 
     def loading_time(self, knots: int) -> float:
         """Time [s] on the line of loading an envelope; 0 where the line's end is a server."""

@@ -37,6 +37,11 @@ def round_trip_time(channels: int, *, bitrate: int, fd: int = 0) -> float:
     return (channels + 2) * frame_time(BLOCK, bitrate=bitrate) + sync
 
 
+def commit_time(*, bitrate: int) -> float:
+    """Time [s] on the bus until a commit and its SYNC have arrived."""
+    return frame_time(BLOCK, bitrate=bitrate) + frame_time(0, bitrate=bitrate)
+
+
 def loading_time(knots: int, *, bitrate: int) -> float:
     """Time [s] of loading an envelope of so many knots, as an SDO block transfer with its answers.
 

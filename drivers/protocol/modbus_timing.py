@@ -7,6 +7,7 @@ _SET_HEAD = len(_MAP["head"]) + len(_MAP["holding"]["set"]["registers"])
 _ACHIEVED_HEAD = len(_MAP["head"]) + len(_MAP["input"]["achieved"]["registers"])
 _ENVELOPE_HEAD = len(_MAP["head"]) + len(_MAP["holding"]["envelope"]["registers"])
 _KNOT = 2  # registers: level, phase
+_COMMIT = len(_MAP["head"]) + 1  # registers, the last for the token
 _CHANNEL: int = _MAP["channel_registers"]
 _READ_WRITE = 13  # bytes of an FC23 request without its registers
 _READ = 5  # bytes of its answer without its registers
@@ -34,6 +35,12 @@ def round_trip_time(channels: int, *, baud: int, bits_per_byte: int = 11) -> flo
     answer = (_READ + 2 * registers) * bits_per_byte / baud
     gaps = 2 * silence(baud=baud, bits_per_byte=bits_per_byte)
     return apply_time(channels, baud=baud, bits_per_byte=bits_per_byte) + answer + gaps
+
+
+def commit_time(*, baud: int, bits_per_byte: int = 11) -> float:
+    """Time [s] on the line until a commit has arrived, its end known by the silence after it."""
+    size = _READ_WRITE + 2 * _COMMIT
+    return size * bits_per_byte / baud + silence(baud=baud, bits_per_byte=bits_per_byte)
 
 
 def loading_time(knots: int, *, baud: int, bits_per_byte: int = 11) -> float:

@@ -7,6 +7,7 @@ _BITS_PER_BYTE = 10  # start, eight data, stop
 _SET_HEAD = 7  # token, ramp, valid_for, count
 _ACHIEVED_HEAD = 3  # token, count
 _COMMAND = 8  # channel, flags, frequency, level, phase; two more with envelopes
+_COMMIT = 2  # token
 _ENVELOPE_HEAD = 4  # slot, step, count
 _KNOT = 4  # level, phase
 _LOADED = 2  # slot, count
@@ -22,6 +23,11 @@ def round_trip_time(channels: int, *, baud: int = PROTOCOL.serial.baud) -> float
     """Time [s] on the line of an apply and its answer, the amplifier's own delay not counted."""
     answer = frame_length(_ACHIEVED_HEAD + _COMMAND * channels)
     return wire_time(channels, baud=baud) + answer * _BITS_PER_BYTE / baud
+
+
+def commit_time(*, baud: int = PROTOCOL.serial.baud) -> float:
+    """Time [s] on the line until a commit has arrived."""
+    return frame_length(_COMMIT) * _BITS_PER_BYTE / baud
 
 
 def loading_time(knots: int, *, baud: int = PROTOCOL.serial.baud) -> float:

@@ -1,0 +1,41 @@
+"""Letting amplifiers on different links begin at one moment, as far as their wires allow.
+
+Nobody but the wire knows when a commit arrives, and a slow one takes longer. What is known by
+arithmetic is made up for; what remains is how far apart the operating system lets bytes go out.
+"""
+
+from asyncio import sleep
+from collections.abc import Awaitable, Callable, Coroutine, Sequence
+from typing import Any, Protocol
+
+from drivers import clock
+
+_SLACK = 0.002  # s; timers wake up to so much late, so the rest of a wait is spent awake
+
+
+class Starter(Protocol):
+    """What is known of an amplifier that begins with others: see `Amplifier`."""
+
+    def commit_time(self) -> float:
+        """Time [s] on the wire until a commit has arrived whole."""
+
+
+def at_one_moment(
+    commits: Sequence[tuple[Starter, Callable[[], Awaitable[object]]]],
+) -> list[Coroutine[Any, Any, object]]:
+    """Commits, each with its amplifier, as what to run together so that all arrive together.
+
+    The one whose wire takes longest goes first, the others later by what theirs take less.
+    """
+    by_time = sorted(commits, key=lambda commit: -commit[0].commit_time())
+    arrival = clock.now() + max((one.commit_time() for one, _ in by_time), default=0.0)
+    return [_commit_at(arrival - one.commit_time(), commit) for one, commit in by_time]
+
+
+async def _commit_at(moment: float, commit: Callable[[], Awaitable[object]]) -> object:
+    before = None
+    while (left := moment - clock.now()) > 0:
+        # A clock that stands still while others run is virtual, and its timers are exact.
+        await sleep(left - _SLACK if left > _SLACK else left if left == before else 0)
+        before = left
+    return await commit()

@@ -4,6 +4,7 @@ import asyncio
 import logging
 from collections.abc import Coroutine, Iterable, Mapping, Sequence
 from enum import Enum, auto
+from functools import partial
 from typing import Any, TypeVar
 
 from controller.read_backs import ReadBacks
@@ -11,6 +12,7 @@ from drivers.amplifier import WATCHDOG, Amplifier
 from drivers.errors import CommandError, CommandRefused, DriverError, LinkError
 from drivers.guard import SafeCommand, SafeEnvelope
 from drivers.protocol.messages import Achieved, State, Status
+from drivers.simultaneous import at_one_moment
 from drivers.turns import PATIENCE
 from drivers.watchdog import check_watchdog
 
@@ -206,13 +208,17 @@ class AmplifierGroup:
             await self._amplifiers[name].load_envelope(envelope)
 
     def _commits(self, sets: Mapping[str, SafeCommand]) -> Iterable[Coroutine[Any, Any, object]]:
-        """Commit everything that is staged: at one moment where amplifiers share a bus."""
+        """Commit everything that is staged, to arrive at one moment; once where a bus is shared."""
         together: dict[tuple[str, int], list[Amplifier]] = {}
         for name, safe in sets.items():
             amplifier = self._amplifiers[name]
             together.setdefault((amplifier.bus or name, safe.token), []).append(amplifier)
-        for (_, token), (first, *others) in together.items():
-            yield first.commit_on_bus(token) if others else first.commit(token)
+        return at_one_moment(
+            [
+                (first, partial(first.commit_on_bus if others else first.commit, token))
+                for (_, token), (first, *others) in together.items()
+            ]
+        )
 
     async def _wind_down(self, silence: Mapping[str, SafeCommand]) -> None:
         """Silence, proof of it, and high voltage off."""

@@ -1,0 +1,106 @@
+"""Which ERA a channel really drives: shapes over the sensors, compared with those of every ERA.
+
+The measure is the modal assurance criterion (MAC) of a row of values with what the model says of an
+ERA: 1 for the same shape, whatever gain and phase, about one over the number of sensors for noise.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import ttest_1samp
+
+from model.arrays import ComplexArray, FloatArray
+from model.calibration.fast_plate import FastPlate
+from model.calibration.parameters import parameters_of, rig_with, starts
+from model.rig import Rig
+
+_LEAST_MISFIT = 0.02  # below it sensors' errors decide and not shapes
+
+
+@dataclass(frozen=True, eq=False)
+class Likeness:
+    """How alike channels and ERAs are, with the model that is alike on the whole.
+
+    mac (f, e, e): of the channel that the rig wires to the first with the second, NaN where it was
+    not driven; start: logarithms of factors on modulus and stiffnesses that this takes.
+    """
+
+    mac: FloatArray
+    start: tuple[float, float]
+
+    @property
+    def nearest(self) -> tuple[int, ...]:
+        """The ERA that each channel is most like; its own where it was not driven."""
+        typical = np.array(
+            [
+                [_typical(self.mac[:, i, j]) for j in range(self.mac.shape[2])]
+                for i in range(self.mac.shape[1])
+            ]
+        )
+        return tuple(
+            int(np.nanargmax(row)) if np.isfinite(row).any() else i for i, row in enumerate(typical)
+        )
+
+    def confidence(self, channel: int, era: int, other: int) -> float:
+        """How sure it is, 0..1, that the channel drives one ERA and not the other.
+
+        From a t-test over frequencies of how much less the shapes of the one differ.
+        """
+        misfit = np.log(np.maximum(1 - self.mac[:, channel], _LEAST_MISFIT))
+        gain = misfit[:, other] - misfit[:, era]
+        gain = gain[np.isfinite(gain)]
+        if len(gain) < 3 or np.ptp(gain) == 0:
+            return 0.5
+        return float(1 - ttest_1samp(gain, 0.0, alternative="greater").pvalue)
+
+
+def likeness(rig: Rig, plate: FastPlate, values: ComplexArray) -> Likeness:
+    """The likeness of values (f, e, s) to a rig's ERAs, over plates somewhat like the rig's."""
+    parameters = parameters_of(rig)
+    own = np.array([parameter.start for parameter in parameters])
+    best: tuple[float, Likeness] | None = None
+    for x in [own, *starts(parameters)]:
+        shift = {p.kind: float(a - b) for p, a, b in zip(parameters, x, own, strict=True)}
+        mac = _mac(values, plate.responses(rig_with(rig, parameters, x)))
+        found = Likeness(mac, (shift["modulus"], shift["stiffness"]))
+        score = float(
+            sum(_typical(mac[:, i, j]) for i, j in enumerate(found.nearest) if _driven(mac, i))
+        )
+        # Far from the rig's own values it must be clearly better.
+        score -= 0.05 * (abs(shift["modulus"]) + abs(shift["stiffness"])) * len(rig.eras)
+        if best is None or score > best[0]:
+            best = (score, found)
+    assert best is not None  # noqa: S101  the rig's own values are tried at least
+    return best[1]
+
+
+def likeness_to(model: ComplexArray, values: ComplexArray) -> Likeness:
+    """The likeness of values (f, e, s) to responses of one plate (f, e, s)."""
+    return Likeness(_mac(values, model), (0.0, 0.0))
+
+
+def mac_of(values: ComplexArray, model: ComplexArray) -> float:
+    """MAC of two shapes (s,), 0..1."""
+    there = np.isfinite(values)
+    power = (np.abs(values[there]) ** 2).sum() * (np.abs(model[there]) ** 2).sum()
+    return float(abs(np.vdot(model[there], values[there])) ** 2 / power) if power > 0 else 0.0
+
+
+def _mac(values: ComplexArray, model: ComplexArray) -> FloatArray:
+    there = np.isfinite(values)
+    filled = np.where(there, values, 0)
+    inner = np.abs(np.einsum("fis,fjs->fij", filled, model.conj())) ** 2
+    power = (np.abs(filled) ** 2).sum(axis=2)[:, :, None]
+    model_power = np.einsum("fis,fjs->fij", there.astype(float), np.abs(model) ** 2)
+    size = power * model_power
+    return np.where(size > 0, inner / np.where(size > 0, size, 1), np.nan)
+
+
+def _driven(mac: FloatArray, channel: int) -> bool:
+    return bool(np.isfinite(mac[:, channel]).any())
+
+
+def _typical(mac: FloatArray) -> float:
+    """The median over frequencies, NaN for none."""
+    there = mac[np.isfinite(mac)]
+    return float(np.median(there)) if len(there) else float("nan")

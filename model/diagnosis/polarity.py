@@ -1,0 +1,111 @@
+"""Which channels push where the others pull.
+
+With phases of the drive the sign of a channel shows at once. Without them channels are driven in
+pairs: the shape over the sensors is that of the sum or that of the difference. Then only the signs
+of channels among each other are known, and the fewer are taken to be the wrong ones.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from model.arrays import ComplexArray, FloatArray
+from model.diagnosis.assignment import mac_of
+from model.diagnosis.observation import Observation
+
+_LEAST_MISFIT = 0.02
+_STEADY = 0.6  # length of the mean of unit phasors, of a phase that can be believed
+_SURE = 2.0  # logarithm of misfits, summed over a pair's frequencies
+
+
+@dataclass(frozen=True)
+class Phase:
+    """How a channel's phase differs from what was asked [degrees]; None where it is not known.
+
+    sign: 1 or -1 among the channels of its amplifier, 0 where it is not known; confidence 0..1.
+    """
+
+    degrees: float | None
+    sign: int
+    confidence: float
+
+
+def phases_of_drive(observation: Observation, predicted: ComplexArray) -> list[Phase]:
+    """From phases of the drive; predicted (f, e, s), NaN where a channel is not to be judged."""
+    found = []
+    for channel in range(predicted.shape[1]):
+        measured, model = observation.values[:, channel], predicted[:, channel]
+        there = np.isfinite(measured) & np.isfinite(model)
+        inner = (np.where(there, np.conj(model), 0) * np.where(there, measured, 0)).sum(axis=1)
+        inner = inner[np.abs(inner) > 0]
+        if len(inner) == 0:
+            found.append(Phase(None, 0, 0.0))
+            continue
+        mean = complex(np.mean(inner / np.abs(inner)))
+        angle = math.degrees(np.angle(mean))
+        if abs(mean) < _STEADY:
+            found.append(Phase(None, 0, abs(mean)))
+        else:
+            found.append(Phase(angle, 1 if abs(angle) < 90 else -1, abs(mean)))
+    return found
+
+
+def signs_of_pairs(
+    observation: Observation, predicted: ComplexArray, groups: Sequence[Sequence[int]]
+) -> list[Phase]:
+    """From pairs; groups: the channels of one amplifier each, whose phases begin together."""
+    evidence = np.zeros((predicted.shape[1], predicted.shape[1]))
+    for pair in observation.pairs:
+        first, second = (_row(observation, predicted, pair.frequency, era) for era in pair.eras)
+        if first is None or second is None:
+            continue
+        plus, minus = (
+            math.log(max(1 - mac_of(pair.values, first + sign * second), _LEAST_MISFIT))
+            for sign in (1, -1)
+        )
+        evidence[pair.eras] += minus - plus
+        evidence[pair.eras[::-1]] += minus - plus
+    signs: dict[int, tuple[int, float]] = {}
+    for group in groups:
+        signs.update(_signs(group, evidence))
+    return [
+        Phase(None, *signs[channel]) if channel in signs else Phase(None, 0, 0.0)
+        for channel in range(predicted.shape[1])
+    ]
+
+
+def _row(
+    observation: Observation, predicted: ComplexArray, frequency: float, era: int
+) -> ComplexArray | None:
+    at = np.flatnonzero(np.isclose(observation.frequencies, frequency))
+    if not len(at) or not np.isfinite(predicted[at[0], era]).any():
+        return None
+    return np.asarray(predicted[at[0], era])
+
+
+def _signs(group: Sequence[int], evidence: FloatArray) -> dict[int, tuple[int, float]]:
+    """Signs of the channels that pairs connect, by the surest of them first."""
+    best: dict[int, tuple[int, float]] = {}
+    for start in group:
+        reached = {start: (1, 1.0)}
+        while True:
+            edges = [
+                (abs(evidence[a, b]), a, b)
+                for a in reached
+                for b in group
+                if b not in reached and abs(evidence[a, b]) >= _SURE
+            ]
+            if not edges:
+                break
+            sure, a, b = max(edges)
+            sign = int(math.copysign(reached[a][0], reached[a][0] * evidence[a, b]))
+            reached[b] = (sign, min(reached[a][1], 1 / (1 + math.exp(-sure))))
+        if len(reached) > len(best):
+            best = reached
+    if len(best) < 2:
+        return {}
+    if sum(sign for sign, _ in best.values()) < 0:
+        best = {channel: (-sign, sure) for channel, (sign, sure) in best.items()}
+    return best

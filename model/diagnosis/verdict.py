@@ -1,0 +1,358 @@
+"""What a rig is, by what was measured on it: the plate, and each channel."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model.arrays import ComplexArray, FloatArray
+from model.calibration.fast_plate import FastPlate, fast_plate
+from model.calibration.responses import Responses
+from model.calibration.screening import silent_sensors
+from model.diagnosis.assignment import Likeness, likeness, likeness_to
+from model.diagnosis.causes import Explanation, explain
+from model.diagnosis.observation import Observation
+from model.diagnosis.plate_match import MODEL_ERROR, Match, match_plate
+from model.diagnosis.polarity import Phase, phases_of_drive, signs_of_pairs
+from model.errors import InputError
+from model.rig import Channel, Rig
+
+_DEAD = 0.03  # of the response that the rig predicts
+_FAINT = 0.3  # of it: dead if its shape is that of no ERA either
+_NOISY = 3.0  # times the floor
+_NO_SHAPE = 0.6  # MAC
+WEAK, STRONG = 0.7, 1.4  # gain of a channel: 3 dB either way
+FITS = 0.2  # rms error, relative to the response, of a plate to believe
+UNLIKELY = 3.0  # standard deviations from what a rig's author can know
+_CLEARLY = 0.99  # confidence in another ERA than the rig's
+_BETTER = 20.0  # of cost; what another wiring must explain beyond the rig's own
+_OFF_PHASE = 45.0  # degrees
+_SENSOR_SCALE = (0.7, 1.4)
+_LEAST_SENSORS, _LEAST_FREQUENCIES = 3, 4
+
+State: TypeAlias = Literal[
+    "well", "dead", "weak", "strong", "other ERA", "inverted", "out of phase", "not driven"
+]
+
+
+@dataclass(frozen=True)
+class ChannelVerdict:
+    """One channel: the ERA that the rig says it drives, the one that it drives, and how.
+
+    states: all that holds, "well" alone if nothing is wrong; drives: None for a dead one or one
+    that was not driven; gain: of what was asked for; phase [degrees], None where it is not known;
+    likeness_own, likeness_found: median MAC with the rig's ERA and with the one found; confidence:
+    0..1, in drives and states.
+    """
+
+    era: str
+    channel: Channel
+    states: tuple[State, ...]
+    drives: str | None
+    gain: float | None
+    phase: float | None
+    likeness_own: float | None
+    likeness_found: float | None
+    confidence: float
+
+
+@dataclass(frozen=True, eq=False)
+class Verdict:
+    """All of it.
+
+    plate_matches: whether a plate as the rig describes it, within what its author can know,
+    explains what was measured; match: that plate; explanations: what else would, likeliest first,
+    where it does not; bad_sensors: left out, and why; swapped: cycles of channels by their ERAs.
+    """
+
+    channels: tuple[ChannelVerdict, ...]
+    plate_matches: bool
+    match: Match | None
+    explanations: tuple[Explanation, ...]
+    bad_sensors: tuple[tuple[str, str], ...]
+    swapped: tuple[tuple[str, ...], ...]
+    sensor_count: int
+    frequencies: FloatArray
+
+    @property
+    def is_well(self) -> bool:
+        """Whether nothing is wrong with the rig."""
+        return self.plate_matches and all(
+            set(channel.states) <= {"well", "not driven"} for channel in self.channels
+        )
+
+
+def diagnose(rig: Rig, observation: Observation) -> Verdict:
+    """Compare what was measured with what the rig predicts.
+
+    Raises InputError for fewer than three usable sensors or four frequencies: less cannot tell.
+    """
+    if not observation.measured.any():
+        raise InputError("no channel was driven; drive each in turn and measure again")
+    dead = _dead(rig, observation)
+    observation, bad = _usable_sensors(observation, dead)
+    _check_enough(observation, bad)
+    plate = fast_plate(rig, observation.points, observation.frequencies)
+    values = observation.values.copy()
+    dead = dead | _shapeless(rig, plate, observation)
+    values[:, dead] = np.nan
+    if not np.isfinite(values).any():
+        return _nothing_moves(rig, observation, dead, bad)
+    alike = likeness(rig, plate, values)
+    match, drives, error = _best_match(rig, plate, values, alike, observation)
+    off = _off_scale(observation, values, match)
+    if off and len(observation.sensors) - len(off) >= _LEAST_SENSORS:
+        wrong = np.isin(observation.sensors, [name for name, _ in off])
+        again = diagnose(rig, observation.without(wrong))
+        return replace(again, bad_sensors=(*bad, *off, *again.bad_sensors))
+    matches = match.error <= FITS and match.worst <= UNLIKELY
+    explanations: Sequence[Explanation] = ()
+    fitted = match
+    if not matches:
+        explanations = explain(
+            rig,
+            plate,
+            observation.points,
+            observation.frequencies,
+            values,
+            drives=drives,
+            floor=observation.floor,
+            model_error=error,
+        )
+        fitted = min([match, *(each.match for each in explanations)], key=lambda each: each.cost)
+    shapes = likeness_to(fitted.responses, values)
+    phases = _phases(rig, observation, fitted, dead)
+    channels = tuple(
+        _channel(
+            rig, number, observation, shapes, drives, fitted, phases[number], bool(dead[number])
+        )
+        for number in range(len(rig.eras))
+    )
+    return Verdict(
+        channels,
+        matches,
+        match,
+        tuple(explanations),
+        bad,
+        _cycles(rig, drives, dead),
+        len(observation.sensors),
+        observation.frequencies,
+    )
+
+
+def _dead(rig: Rig, observation: Observation) -> NDArray[np.bool_]:
+    """Which channels move nothing that a sensor could tell from silence (e,)."""
+    plate = fast_plate(rig, observation.points, observation.frequencies)
+    size = np.abs(observation.values)
+    share = size / np.abs(plate.responses(rig))
+    dead = np.zeros(len(rig.eras), dtype=bool)
+    for channel in np.flatnonzero(observation.measured):
+        there = np.isfinite(size[:, channel])
+        dead[channel] = np.median(share[:, channel][there]) < _DEAD
+        if observation.floor is not None:
+            over = (size[:, channel] / np.maximum(observation.floor, 1e-300))[there]
+            dead[channel] |= bool(np.median(over) < _NOISY)
+    return dead
+
+
+def _shapeless(rig: Rig, plate: FastPlate, observation: Observation) -> NDArray[np.bool_]:
+    """Which channels are faint and like no ERA: what sensors read is noise (e,)."""
+    model = plate.responses(rig)
+    share = np.abs(observation.values) / np.abs(model)
+    mac = likeness(rig, plate, observation.values).mac
+    found = np.zeros(len(rig.eras), dtype=bool)
+    for channel in np.flatnonzero(observation.measured):
+        faint = np.nanmedian(share[:, channel]) < _FAINT
+        found[channel] = faint and np.nanmax(np.nanmedian(mac[:, channel], axis=0)) < _NO_SHAPE
+    return found
+
+
+def _usable_sensors(
+    observation: Observation, dead: NDArray[np.bool_]
+) -> tuple[Observation, tuple[tuple[str, str], ...]]:
+    """Without the sensors that read nothing, whichever live channel is driven."""
+    values = observation.values[:, ~dead]
+    if not np.isfinite(values).any():
+        return observation, ()
+    silent = silent_sensors(
+        Responses(observation.sensors, observation.points, observation.frequencies, values)
+    )
+    names = [name for name, out in zip(observation.sensors, silent, strict=True) if out]
+    return observation.without(silent), tuple((name, "reads nothing") for name in names)
+
+
+def _check_enough(observation: Observation, bad: Sequence[tuple[str, str]]) -> None:
+    count, frequencies = len(observation.sensors), len(observation.frequencies)
+    if count < _LEAST_SENSORS or frequencies < _LEAST_FREQUENCIES:
+        said = f" ({', '.join(name for name, _ in bad)} read nothing)" if bad else ""
+        raise InputError(
+            f"{count} usable sensors{said} at {frequencies} frequencies cannot tell ERAs apart; "
+            f"measure with {_LEAST_SENSORS} at least, better eight, at {_LEAST_FREQUENCIES} "
+            "frequencies at least"
+        )
+
+
+def _best_match(
+    rig: Rig,
+    plate: FastPlate,
+    values: ComplexArray,
+    alike: Likeness,
+    observation: Observation,
+) -> tuple[Match, tuple[int, ...], float]:
+    """The plate and the wiring that explain most; the rig's own wiring unless clearly not."""
+    own = tuple(range(len(rig.eras)))
+    starts = tuple(dict.fromkeys([(0.0, 0.0), alike.start]))
+
+    def matched(drives: Sequence[int], error: float) -> Match:
+        return match_plate(
+            rig,
+            plate,
+            values,
+            drives=drives,
+            floor=observation.floor,
+            model_error=error,
+            starts=starts,
+        )
+
+    nearest = tuple(
+        era if era == i or alike.confidence(i, era, i) >= _CLEARLY else i
+        for i, era in enumerate(alike.nearest)
+    )
+    drives, match = own, matched(own, MODEL_ERROR)
+    if nearest != own:
+        other = matched(nearest, MODEL_ERROR)
+        if other.cost < match.cost - _BETTER:
+            drives, match = nearest, other
+    # Noise that is larger than the usual makes numbers of the rig less sure.
+    error = float(np.clip(1.2 * match.usual_error, MODEL_ERROR, 0.3))
+    if error > MODEL_ERROR:
+        match = matched(drives, error)
+    return match, drives, error
+
+
+def _off_scale(
+    observation: Observation, values: ComplexArray, match: Match
+) -> list[tuple[str, str]]:
+    """Sensors that do not read what the rest of them say, and how much of it; if the rest agree."""
+    if match.usual_error > FITS:
+        return []
+    there = np.isfinite(values) & np.isfinite(match.predicted)
+    model = np.where(there, match.predicted, 0)
+    measured = np.where(there, values, 0)
+    turn = np.exp(-1j * np.angle((model.conj() * measured).sum(axis=2, keepdims=True)))
+    inner = (model.conj() * measured * turn).real.sum(axis=(0, 1))
+    scale = inner / np.maximum((np.abs(model) ** 2).sum(axis=(0, 1)), 1e-300)
+    scale = scale / np.median(scale)
+    low, high = _SENSOR_SCALE
+    return [
+        (name, f"reads {value:.2f} of what the others say")
+        for name, value in zip(observation.sensors, scale, strict=True)
+        if not low <= value <= high
+    ]
+
+
+def _phases(
+    rig: Rig, observation: Observation, match: Match, dead: NDArray[np.bool_]
+) -> list[Phase]:
+    predicted = np.where(dead[None, :, None], np.nan, match.predicted)
+    if observation.has_phases:
+        return phases_of_drive(observation, predicted)
+    groups: dict[str, list[int]] = {}
+    for number, era in enumerate(rig.eras):
+        groups.setdefault(rig.wiring[era.name].amplifier, []).append(number)
+    return signs_of_pairs(observation, predicted, list(groups.values()))
+
+
+def _channel(
+    rig: Rig,
+    number: int,
+    observation: Observation,
+    shapes: Likeness,
+    drives: Sequence[int],
+    match: Match,
+    phase: Phase,
+    is_dead: bool,
+) -> ChannelVerdict:
+    era = rig.eras[number]
+    channel = rig.wiring[era.name]
+    if not observation.measured[number]:
+        return ChannelVerdict(era.name, channel, ("not driven",), None, None, None, None, None, 0.0)
+    if is_dead:
+        return ChannelVerdict(era.name, channel, ("dead",), None, 0.0, None, None, None, 0.99)
+    driven = drives[number]
+    # What was asked for was a share of the own ERA's stroke.
+    gain = float(match.gains[number]) * era.stroke / rig.eras[driven].stroke
+    states: list[State] = []
+    confidence = min(
+        shapes.confidence(number, driven, other)
+        for other in range(len(rig.eras))
+        if other != driven
+    )
+    if driven != number:
+        states.append("other ERA")
+    if gain < WEAK:
+        states.append("weak")
+    elif gain > STRONG:
+        states.append("strong")
+    if phase.sign < 0:
+        states.append("inverted")
+    elif phase.degrees is not None and abs(phase.degrees) > _OFF_PHASE:
+        states.append("out of phase")
+    if phase.sign < 0:
+        confidence = min(confidence, phase.confidence)
+    mac = np.nanmedian(shapes.mac[:, number], axis=0)
+    return ChannelVerdict(
+        era.name,
+        channel,
+        tuple(states) or ("well",),
+        rig.eras[driven].name,
+        gain,
+        phase.degrees,
+        float(mac[number]),
+        float(mac[driven]),
+        confidence,
+    )
+
+
+def _cycles(
+    rig: Rig, drives: Sequence[int], dead: NDArray[np.bool_]
+) -> tuple[tuple[str, ...], ...]:
+    """Channels that drive each other's ERAs, in turn."""
+    found: list[tuple[str, ...]] = []
+    seen: set[int] = set()
+    for start in range(len(drives)):
+        cycle = [start]
+        while drives[cycle[-1]] != start and drives[cycle[-1]] not in cycle:
+            cycle.append(drives[cycle[-1]])
+        closed = drives[cycle[-1]] == start and len(cycle) > 1
+        if closed and not seen & set(cycle) and not dead[cycle].any():
+            seen |= set(cycle)
+            found.append(tuple(rig.eras[number].name for number in cycle))
+    return tuple(found)
+
+
+def _nothing_moves(
+    rig: Rig,
+    observation: Observation,
+    dead: NDArray[np.bool_],
+    bad: tuple[tuple[str, str], ...],
+) -> Verdict:
+    channels = tuple(
+        ChannelVerdict(
+            era.name,
+            rig.wiring[era.name],
+            ("dead",) if dead[number] else ("not driven",),
+            None,
+            0.0 if dead[number] else None,
+            None,
+            None,
+            None,
+            0.99 if dead[number] else 0.0,
+        )
+        for number, era in enumerate(rig.eras)
+    )
+    return Verdict(
+        channels, True, None, (), bad, (), len(observation.sensors), observation.frequencies
+    )

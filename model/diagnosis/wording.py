@@ -1,0 +1,204 @@
+"""A verdict as people read it, and as programs do."""
+
+from collections.abc import Sequence
+from typing import Any
+
+from model.diagnosis.causes import Explanation
+from model.diagnosis.verdict import FITS, UNLIKELY, ChannelVerdict, State, Verdict
+
+_TO_DO: dict[State, str] = {
+    "dead": "check its supply, its cable and the amplifier's channel",
+    "weak": "check its voltage and its fastening; `era calibrate` writes what it really does",
+    "strong": "lower its voltage, or give its true stroke in the rig",
+    "inverted": "turn its two wires round",
+    "out of phase": "measure it with `era calibrate`, which writes its gains into the rig",
+}
+_UNITS = {"m": (1e3, "mm"), "Pa": (1e-9, "GPa"), "N/m": (1e-3, "kN/m"), "kg": (1e3, "g")}
+_LIKELY = 0.05  # what is less likely is not worth a line
+
+
+def verdict_rows(verdict: Verdict) -> list[str]:
+    """What was found and what to do about it, a line each; one line where nothing is wrong."""
+    rows = []
+    for cycle in verdict.swapped:
+        if len(cycle) == 2:
+            one, other = (_at(_of(verdict, era)) for era in cycle)
+            rows.append(
+                f"SWAPPED: {one} drives ERA {cycle[1]}, and {other} drives ERA {cycle[0]} "
+                f"({_sure(verdict, cycle)}): exchange the two plugs, or the channels in the rig"
+            )
+        else:
+            rows.append(
+                f"SWAPPED in a circle: the channels of {', '.join(cycle)} each drive the next "
+                f"one's ERA ({_sure(verdict, cycle)}): put the plugs right"
+            )
+    told = {era for cycle in verdict.swapped for era in cycle}
+    for channel in verdict.channels:
+        rows += [_row(channel, state) for state in channel.states if _is_news(state, channel, told)]
+    inverted = [c for c in verdict.channels if "inverted" in c.states]
+    if len(inverted) > 1 and len(inverted) == sum(c.drives is not None for c in verdict.channels):
+        rows.append(
+            "all of them: are the sensors upside down, or are phases of another convention?"
+        )
+    rows += [f"SENSOR {name} {why}: it was left out" for name, why in verdict.bad_sensors]
+    if not verdict.plate_matches:
+        rows += plate_rows(verdict)
+    return rows or ["ALL WELL: plate and channels are what the rig says"]
+
+
+def plate_rows(verdict: Verdict) -> list[str]:
+    """Why the plate is not the rig's, and what would explain it."""
+    match = verdict.match
+    if match is None:
+        return []
+    if match.error > FITS:
+        why = f"no plate like it leaves less than {_percent(match.error)} unexplained"
+    else:
+        at = int(abs(match.z).argmax())
+        why = (
+            f"it would take {match.parameters[at].name} {abs(match.z[at]):.1f} standard "
+            "deviations off"
+        )
+    rows = [f"PLATE: the rig does not match the plate: {why}"]
+    good = [each for each in verdict.explanations if explains(each) and each.share >= _LIKELY]
+    for number, each in enumerate(good):
+        rows.append(
+            f"  {'or ' if number else ''}{each.cause.key} {_shown(each.value, each.cause.unit)} "
+            f"and not {_shown(each.expected, each.cause.unit)} would explain it: "
+            f"{_percent(each.match.error)} unexplained, likelihood {_percent(each.share)}"
+        )
+    if good:
+        rows.append(f"  correct {good[0].cause.key} in the rig, or the plate; then check again")
+    else:
+        rows.append(
+            "  no single number of the rig would explain it: check that this is the rig's plate, "
+            "that sensors and ERAs are where the files say, and measure for `era calibrate`"
+        )
+    return rows
+
+
+def explains(explanation: Explanation) -> bool:
+    """Whether with it the rest of the rig is what its author can have meant."""
+    return explanation.match.error <= FITS and explanation.match.worst <= UNLIKELY
+
+
+def channel_table(verdict: Verdict) -> list[str]:
+    """A line a channel, below a line of names."""
+    rows = [f"{'ERA':8} {'channel':12} {'drives':8} {'gain':>6} {'phase':>7} {'alike':>6}  verdict"]
+    for channel in verdict.channels:
+        gain = "-" if channel.gain is None else f"{channel.gain:.2f}"
+        phase = "-" if channel.phase is None else f"{channel.phase:+.0f}°"
+        alike = "-" if channel.likeness_found is None else f"{channel.likeness_found:.3f}"
+        rows.append(
+            f"{channel.era:8} {channel.channel.amplifier + ':' + str(channel.channel.number):12} "
+            f"{channel.drives or '-':8} {gain:>6} {phase:>7} {alike:>6}  "
+            f"{', '.join(channel.states)}"
+        )
+    return rows
+
+
+def as_json(verdict: Verdict) -> dict[str, Any]:
+    """The same for programs; every number's unit is in its key."""
+    match = verdict.match
+    return {
+        "all_well": verdict.is_well,
+        "channels": [
+            {
+                "era": channel.era,
+                "amplifier": channel.channel.amplifier,
+                "channel": channel.channel.number,
+                "states": list(channel.states),
+                "drives": channel.drives,
+                "gain": channel.gain,
+                "phase_deg": channel.phase,
+                "mac_of_the_rigs_era": channel.likeness_own,
+                "mac_of_the_era_found": channel.likeness_found,
+                "confidence": channel.confidence,
+            }
+            for channel in verdict.channels
+        ],
+        "swapped": [list(cycle) for cycle in verdict.swapped],
+        "plate": {
+            "matches": verdict.plate_matches,
+            "unexplained": None if match is None else match.error,
+            "farthest_standard_deviations": None if match is None else match.worst,
+            "parameters": []
+            if match is None
+            else [
+                {
+                    "parameter": parameter.name,
+                    "unit": parameter.unit,
+                    "expected": parameter.prior,
+                    "found": parameter.value(parameter.start + z * known),
+                    "standard_deviations": float(z),
+                }
+                for parameter, z, known in zip(match.parameters, match.z, match.known, strict=True)
+            ],
+            "explanations": [
+                {
+                    "key": each.cause.key,
+                    "unit": each.cause.unit,
+                    "expected": each.expected,
+                    "found": each.value,
+                    "explains": explains(each),
+                    "likelihood": each.share,
+                    "unexplained": each.match.error,
+                }
+                for each in verdict.explanations
+            ],
+        },
+        "bad_sensors": [{"sensor": name, "problem": why} for name, why in verdict.bad_sensors],
+        "sensor_count": verdict.sensor_count,
+        "frequencies_hz": verdict.frequencies.tolist(),
+        "findings": verdict_rows(verdict),
+    }
+
+
+def _is_news(state: State, channel: ChannelVerdict, told: set[str]) -> bool:
+    return state not in ("well", "not driven") and not (
+        state == "other ERA" and channel.era in told
+    )
+
+
+def _row(channel: ChannelVerdict, state: State) -> str:
+    at = _at(channel)
+    match state:
+        case "dead":
+            return f"DEAD: {at} moves nothing: {_TO_DO[state]}"
+        case "other ERA":
+            return (
+                f"WRONG ERA: {at} drives ERA {channel.drives} and not {channel.era} (shapes alike "
+                f"to {channel.likeness_found:.3f}, with its own ERA's {channel.likeness_own:.3f}; "
+                f"confidence {channel.confidence:.3f}): put the plug right, or the rig's channels"
+            )
+        case "weak" | "strong":
+            return (
+                f"{state.upper()}: {at} does {channel.gain:.2f} of what it is told: "
+                + (_TO_DO[state])
+            )
+        case "inverted":
+            return f"INVERTED: {at} pulls where the others push: {_TO_DO[state]}"
+        case _:
+            return f"OUT OF PHASE: {at} is off by {channel.phase:+.0f}°: {_TO_DO['out of phase']}"
+
+
+def _at(channel: ChannelVerdict) -> str:
+    wired = channel.channel
+    return f"channel {wired.number} of amplifier {wired.amplifier} (ERA {channel.era} in the rig)"
+
+
+def _of(verdict: Verdict, era: str) -> ChannelVerdict:
+    return next(channel for channel in verdict.channels if channel.era == era)
+
+
+def _sure(verdict: Verdict, eras: Sequence[str]) -> str:
+    return f"confidence {min(_of(verdict, era).confidence for era in eras):.3f}"
+
+
+def _shown(value: float, unit: str) -> str:
+    factor, shown = _UNITS.get(unit, (1.0, unit))
+    return f"{value * factor:.3g} {shown}".strip()
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.0f} %" if share > 0.0995 else f"{100 * share:.2g} %"

@@ -120,7 +120,8 @@ class Connection(asyncio.Protocol):
         """Send an answer; a client that has not read for long is left instead."""
         if self._transport is None or self._transport.is_closing():
             return
-        if self._waiting(self._transport) + len(line) > OUTGOING_LIMIT:
+        waiting = self._waiting(self._transport)
+        if waiting and waiting + len(line) > OUTGOING_LIMIT:
             self._transport.abort()
             return
         self._transport.write(line)

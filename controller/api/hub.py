@@ -6,7 +6,7 @@ and `latency` are asked for at the rate each client wishes.
 """
 
 import asyncio
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 from controller.api.connection import Connection
 from controller.api.jsonrpc import event_line
@@ -30,7 +30,7 @@ class Hub:
         self._clock = clock
         self._topics: dict[Connection, set[Topic]] = {}
         self._timers: dict[Connection, asyncio.TimerHandle] = {}
-        self._newest: dict[Topic, Callable[[], Message]] = {}
+        self._newest: dict[Topic, Callable[[], Message | None]] = {}
         self._flush: asyncio.TimerHandle | None = None
         self._flushed_at = -1.0
 
@@ -40,10 +40,8 @@ class Hub:
         """Tell a client of more topics, from what is so now on; rate [Hz] of what is periodic."""
         topics = set(topics)
         self._topics.setdefault(connection, set()).update(topics)
-        for topic in sorted(topics):
-            said = self._current[topic]() if topic in self._current else None
-            if said is not None:
-                self._send([connection], topic, said)
+        for topic in sorted(topics & self._current.keys()):
+            self._send([connection], topic, self._current[topic])
         if topics & _PERIODIC:
             self._cancel(connection)
             self._repeat(connection, 1 / (rate or USUAL_RATE))
@@ -66,12 +64,13 @@ class Hub:
         """Whether a client has subscribed to anything."""
         return connection in self._topics
 
-    def publish(self, topic: Topic, make: Callable[[], Message]) -> None:
-        """Tell all who have subscribed; make is only called where there is somebody."""
+    def publish(self, topic: Topic, make: Callable[[], Message | None]) -> None:
+        """Tell all who have subscribed; make is only called where there is somebody.
+
+        What it makes None of is not told: it is over by then.
+        """
         if topic not in _COALESCED:
-            listeners = self._listeners(topic)
-            if listeners:
-                self._send(listeners, topic, make())
+            self._send(self._listeners(topic), topic, make)
             return
         if not self._topics:
             return
@@ -93,14 +92,20 @@ class Hub:
         self._flushed_at = self._clock()
         newest, self._newest = self._newest, {}
         for topic, make in newest.items():
-            listeners = self._listeners(topic)
-            if listeners:
-                self._send(listeners, topic, make())
+            self._send(self._listeners(topic), topic, make)
 
     def _listeners(self, topic: Topic) -> list[Connection]:
         return [one for one, topics in self._topics.items() if topic in topics]
 
-    def _send(self, listeners: Iterable[Connection], topic: Topic, said: Message) -> None:
+    def _send(
+        self,
+        listeners: Sequence[Connection],
+        topic: Topic,
+        make: Callable[[], Message | None],
+    ) -> None:
+        said = make() if listeners else None
+        if said is None:
+            return
         now, data = self._clock(), said.model_dump_json().encode()
         for connection in listeners:
             connection.notify(lambda lost: event_line(topic, time=now, lost=lost, data=data))
@@ -110,9 +115,7 @@ class Hub:
 
         def tell() -> None:
             for topic in sorted(self._topics.get(connection, set()) & _PERIODIC):
-                said = self._current[topic]()
-                if said is not None:
-                    self._send([connection], topic, said)
+                self._send([connection], topic, self._current[topic])
             self._timers[connection] = loop.call_later(period, tell)
 
         loop = asyncio.get_running_loop()

@@ -6,10 +6,10 @@ the control loop first of all. What takes longer than a turn, such as arming, go
 
 import asyncio
 import logging
+import socket
 import time
 from collections import deque
 from collections.abc import Awaitable, Callable, Mapping
-from pathlib import Path
 from typing import Any, TypeAlias
 
 from controller.api.connection import Connection
@@ -66,10 +66,10 @@ class ApiServer:
         self._turn_is_due = False
         self._server: asyncio.Server | None = None
 
-    async def open(self, path: Path) -> None:
-        """Listen at a path where nothing is; who may open it is up to its folder and the umask."""
+    async def open(self, bound: socket.socket) -> None:
+        """Listen on a Unix socket that is bound; who may open it is up to whoever bound it."""
         loop = asyncio.get_running_loop()
-        self._server = await loop.create_unix_server(self._connection, str(path), backlog=64)
+        self._server = await loop.create_unix_server(self._connection, sock=bound, backlog=64)
 
     async def close(self) -> None:
         """Listen no more, and leave all clients after what was said to them."""

@@ -1,12 +1,11 @@
 """Reading a daemon's configuration, and everything that it names, before anything is touched."""
 
-import os
-import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import quote
 
+from controller.api.socket_path import default_socket
 from controller.daemon.sections import CalibrationSection, DaemonSection, TouchSection
 from controller.touch import TouchSource
 from controller.touch_calibration import CalibratedSource, TouchCalibration, turned
@@ -90,17 +89,6 @@ def load_daemon_config(path: Path) -> DaemonConfig:
 def is_daemon_document(document: Document) -> bool:
     """Whether a configuration file is a daemon's: it names a rig and is none."""
     return "rig" in document.data and "plate" not in document.data
-
-
-def default_socket(environment: Mapping[str, str] = os.environ) -> Path:
-    """Where daemon and clients meet unless they are told otherwise."""
-    runtime = environment.get("XDG_RUNTIME_DIR")
-    if runtime:
-        return Path(runtime) / "era-haptics" / "daemon.sock"
-    folder = Path(f"/run/user/{os.getuid()}")
-    if folder.is_dir():
-        return folder / "era-haptics" / "daemon.sock"
-    return Path(tempfile.gettempdir()) / f"era-haptics-{os.getuid()}" / "daemon.sock"
 
 
 def _file(document: Document, key: str) -> Path | None:

@@ -4,7 +4,8 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from controller.daemon.config import default_socket, load_daemon_config
+from controller.api.socket_path import default_socket
+from controller.daemon.config import load_daemon_config
 from controller.touch import Touch
 from model.config_cli import config_app
 from model.document import ConfigError

@@ -1,0 +1,301 @@
+"""The daemon put together: control loop, drivers, API; from its configuration to its end."""
+
+import asyncio
+import contextlib
+import logging
+import signal
+import threading
+from collections.abc import Mapping
+from pathlib import Path
+
+from controller.api.events import LinkEvent, LogEvent
+from controller.api.server import ApiServer
+from controller.contacts import Change, Contact
+from controller.daemon.companions import Companion, Companions
+from controller.daemon.config import DaemonConfig, load_daemon_config
+from controller.daemon.inputs import ApiTouches, TouchInputs
+from controller.daemon.latency import Latencies
+from controller.daemon.log import LogThread
+from controller.daemon.meaning import Meaning
+from controller.daemon.notify import ServiceManager
+from controller.daemon.place import Place
+from controller.daemon.records import RecordedBackend, Recorder, write_dump
+from controller.daemon.reload import plan_reload
+from controller.daemon.service import Service
+from controller.daemon.states import Machine, State
+from controller.daemon.supervisor import Supervisor
+from controller.daemon.view import Scene
+from controller.loop import Controller
+from controller.observer import Applied, Observer, Silenced
+from controller.touch import TouchFrame
+from controller.wishes import NewestBuzzes
+from drivers import clock
+from drivers.amplifier import Amplifier
+from drivers.errors import DriverError
+from drivers.registry import open_backend
+from drivers.steady import no_long_collections
+from model.errors import InputError
+from model.table import LocalizationTable
+from model.timing import Timing
+
+_DUMP_PAUSE = 1.0  # s; between two dumps, for faults come in company
+
+_logger = logging.getLogger(__name__)
+
+
+class Daemon:
+    """One daemon; `run` is its whole life. Must be made within the event loop that runs it.
+
+    dashboard: HOST:PORT where the gateway shall serve the page, None for nowhere.
+    """
+
+    def __init__(
+        self,
+        config: DaemonConfig,
+        table: LocalizationTable,
+        *,
+        log: LogThread,
+        manager: ServiceManager,
+        dashboard: str | None,
+    ) -> None:
+        self._config = config
+        self._log = log
+        self._manager = manager
+        self._dashboard = dashboard
+        self._loop = asyncio.get_running_loop()
+        self._reloads: set[asyncio.Task[None]] = set()
+        self._ended = asyncio.Event()
+        self._end_cause = "the daemon ends"
+        self._scene = Scene()
+        self._latencies = Latencies()
+        self._recorder = Recorder()
+        self._dumped_at = float("-inf")
+        backends = self._make_backends(config)
+        amplifiers = {
+            name: Amplifier(backend, serial_number=config.section.serial_numbers.get(name))
+            for name, backend in backends.items()
+        }
+        self._supervisor = Supervisor(
+            amplifiers,
+            state_changed=self._state_changed,
+            link_told=self._link_told,
+            alive=lambda: manager.alive(clock.now()),
+        )
+        self._meaning = Meaning(config.section.level_db_sl)
+        self._controller = Controller(
+            config.rig,
+            table,
+            amplifiers=amplifiers,
+            observer=self._supervisor.observe(self._observer()),
+            wishes=self._meaning,
+            timing=Timing(table),
+            mode=config.section.mode,
+        )
+        self._touches = ApiTouches(config.rig.plate, self._deliver)
+        self._inputs = TouchInputs(self._deliver, failed=self._input_failed)
+        self._service = Service(
+            config,
+            table,
+            self._controller,
+            self._supervisor,
+            amplifiers=amplifiers,
+            backends=backends,
+            scene=self._scene,
+            latencies=self._latencies,
+            touches=self._touches,
+        )
+        self._server = ApiServer(
+            self._service.handlers(),
+            left=self._service.left,
+            keeps=self._service.keeps,
+            clock=clock.now,
+        )
+        self._companions = Companions()
+
+    async def run(self, place: Place) -> None:
+        """Open, serve until told to end, fall silent and close.
+
+        Raises LinkError, CommandError and InputError where it cannot begin.
+        """
+        loop = asyncio.get_running_loop()
+        for number in (signal.SIGTERM, signal.SIGINT):
+            loop.add_signal_handler(number, self.end, f"told to end by {signal.strsignal(number)}")
+        loop.add_signal_handler(signal.SIGHUP, self._reload_soon)
+        running: asyncio.Task[None] | None = None
+        try:
+            await self._supervisor.open(self._controller)
+            await self._server.open(place.bound())
+            await self._inputs.exchange(self._config.touch)
+            self._log.listener = self._tell_log
+            running = asyncio.create_task(self._supervisor.run(), name="control loop")
+            self._start_companions()
+            ended = asyncio.create_task(self._ended.wait())
+            with no_long_collections():
+                self._manager.ready(self._status_line())
+                _logger.info("serving at %s", place.path)
+                await asyncio.wait({running, ended}, return_when=asyncio.FIRST_COMPLETED)
+            ended.cancel()
+        finally:
+            await self._close(running)
+        await running
+
+    def end(self, cause: str) -> None:
+        """End in order; from a signal, or from whoever runs the daemon."""
+        self._end_cause = cause
+        self._ended.set()
+
+    async def reload(self) -> None:
+        """Read the configuration again, and take over what can be taken over."""
+        self._manager.reloading()
+        try:
+            new = await asyncio.to_thread(load_daemon_config, self._config.source)
+        except InputError as error:
+            _logger.error("the configuration is left as it was: %s", error)
+        else:
+            await self._take_over(new)
+        self._manager.ready(self._status_line())
+
+    async def _take_over(self, new: DaemonConfig) -> None:
+        is_armed = self._supervisor.machine.state in (State.SWITCHED_ON, State.OPERATION_ENABLED)
+        plan = plan_reload(self._config, new, is_armed=is_armed)
+        if plan.refused is not None:
+            _logger.error("the configuration is left as it was: %s", plan.refused)
+            return
+        for key in plan.restart:
+            _logger.warning("%s has changed: restart the daemon to take it over", key)
+        for key in plan.apply:
+            match key:
+                case "touch":
+                    await self._inputs.exchange(new.touch)
+                case "level_db_sl":
+                    self._meaning.exchange(NewestBuzzes(new.section.level_db_sl))
+                case "longest_lease":
+                    self._service.longest_lease = new.section.longest_lease
+                case "log.level":
+                    logging.getLogger().setLevel(new.section.log.level.upper())
+                case _:
+                    pass  # is read when it is needed
+        self._config = new
+        _logger.info("took over %s", ", ".join(plan.apply) or "nothing: all is as it was")
+
+    async def _close(self, running: "asyncio.Task[None] | None") -> None:
+        """Silence first; then everything else, as far as it comes."""
+        self._manager.stopping()
+        try:
+            await self._supervisor.close(self._end_cause)
+        finally:
+            if running is not None:
+                await asyncio.wait({running})
+            self._log.listener = None
+            for step in (self._inputs.close(), self._companions.close(), self._server.close()):
+                with contextlib.suppress(OSError):
+                    await step
+            self._service.hub.close()
+
+    def _make_backends(self, config: DaemonConfig) -> dict[str, RecordedBackend]:
+        return {
+            name: RecordedBackend(open_backend(url), name, self._recorder)
+            for name, url in config.urls.items()
+        }
+
+    def _start_companions(self) -> None:
+        socket = str(self._config.socket)
+        if self._dashboard is not None:
+            self._companions.start(
+                Companion("controller.gateway", ("--socket", socket, "--listen", self._dashboard))
+            )
+        if self._config.section.metrics is not None:
+            port = str(self._config.section.metrics)
+            self._companions.start(
+                Companion("controller.metrics", ("--socket", socket, "--port", port))
+            )
+
+    def _observer(self) -> Observer:
+        return Observer(
+            contacts_changed=self._contacts_changed,
+            pattern_applied=self._pattern_applied,
+            silenced=self._silenced,
+            refused=lambda reason: _logger.warning("refused: %s", reason),
+            link_lost=lambda what: self._link_told("lost", what),
+        )
+
+    def _contacts_changed(self, contacts: tuple[Contact, ...], change: Change) -> None:
+        self._scene.changed(contacts)
+        self._service.hub.publish("contacts", self._scene.contacts_event)
+
+    def _pattern_applied(self, applied: Applied) -> None:
+        self._scene.played(applied)
+        self._latencies.note(applied.latency)
+        self._service.hub.publish("pattern", self._scene.pattern_event)
+
+    def _silenced(self, silenced: Silenced) -> None:
+        self._scene.fell_silent(silenced)
+        if silenced.latency is not None:
+            self._latencies.note(silenced.latency)
+        self._service.hub.publish("silence", self._scene.silence_event)
+
+    def _deliver(self, frame: TouchFrame) -> None:
+        """Hand touches to the control loop; where there is none just now, they are not felt."""
+        with contextlib.suppress(DriverError):
+            self._controller.deliver(frame)
+
+    def _input_failed(self, name: str, error: Exception) -> None:
+        _logger.error("touch source %s has failed: %s", name, error)
+
+    def _state_changed(self, old: Machine, new: Machine) -> None:
+        self._service.state_changed(old, new)
+        self._manager.status(f"{new.state.value}: {new.cause}")
+        if new.state in (State.FAULT_REACTION_ACTIVE, State.COMM_LOST):
+            self._dump(new.cause)
+
+    def _link_told(self, event: str, message: str) -> None:
+        kinds: Mapping[str, str] = {"lost": "error", "retry": "warning", "reopened": "info"}
+        _logger.log(getattr(logging, kinds[event].upper()), "link %s: %s", event, message)
+        remedy = None if event == "reopened" else "look at cables and supply"
+        self._service.hub.publish(
+            "link",
+            lambda: LinkEvent.model_validate(
+                {"event": event, "amplifier": None, "message": message, "remedy": remedy}
+            ),
+        )
+
+    def _dump(self, cause: str) -> None:
+        """Write the last messages to a file, in a thread: a disk may be slow, full or gone."""
+        folder, dumps = self._config.dump_folder, self._config.section.dumps
+        if folder is None or dumps is None or clock.now() - self._dumped_at < _DUMP_PAUSE:
+            return
+        self._dumped_at = clock.now()
+        records, keep = self._recorder.last(), dumps.keep
+
+        def write() -> None:
+            try:
+                path: Path = write_dump(folder, records, cause=cause, keep=keep)
+                _logger.info("the last messages are in %s", path)
+            except OSError as error:
+                _logger.warning("the last messages could not be written to %s: %s", folder, error)
+
+        threading.Thread(target=write, name="dump", daemon=True).start()
+
+    def _tell_log(self, record: logging.LogRecord) -> None:
+        """Tell subscribers of a line of the log; called in any thread."""
+        told = {
+            "level": "error" if record.levelno >= logging.ERROR else record.levelname.lower(),
+            "message": record.getMessage()[:1000],
+            "cause": getattr(record, "cause", None),
+            "remedy": getattr(record, "remedy", None),
+        }
+
+        def publish() -> None:
+            self._service.hub.publish("log", lambda: LogEvent.model_validate(told))
+
+        with contextlib.suppress(RuntimeError):  # the loop may be over
+            self._loop.call_soon_threadsafe(publish)
+
+    def _reload_soon(self) -> None:
+        task = asyncio.ensure_future(self.reload())
+        self._reloads.add(task)
+        task.add_done_callback(self._reloads.discard)
+
+    def _status_line(self) -> str:
+        machine = self._supervisor.machine
+        return f"{machine.state.value}: {machine.cause}"

@@ -1,0 +1,71 @@
+"""`era daemon`: from a file to a running daemon, and back out of it."""
+
+import asyncio
+import logging
+import sys
+from pathlib import Path
+
+from controller.daemon.config import DaemonConfig, load_daemon_config
+from controller.daemon.daemon import Daemon
+from controller.daemon.log import LogThread, start_log
+from controller.daemon.notify import ServiceManager
+from controller.daemon.place import Place
+from model.table import LocalizationTable
+from model.table_cache import cached_table
+from model.table_file import load_table
+
+_SWITCH_INTERVAL = 0.001  # s; another thread keeps the control loop waiting no longer
+
+_logger = logging.getLogger(__name__)
+
+
+def check_daemon(path: Path) -> str:
+    """Read a daemon's file and all that it names; what was found, or ConfigError, InputError."""
+    config = load_daemon_config(path)
+    if config.table is None:
+        table = "its table is built, or taken from the cache, when it starts"
+    else:
+        loaded = load_table(config.table, fingerprint=config.rig.fingerprint)
+        table = f"its table has {len(loaded.frequencies)} frequencies"
+    return f"{path}: good: {len(config.rig.eras)} ERAs, {len(config.urls)} amplifiers; {table}"
+
+
+def run_daemon(path: Path, *, dashboard: str | None) -> None:
+    """Run a daemon until it is told to end; raises what keeps it from beginning."""
+    config = load_daemon_config(path)
+    place = Place(config.socket)
+    try:
+        log = start_log(config.log_file, level=config.section.log.level)
+        try:
+            _run(config, place, log=log, dashboard=dashboard or config.section.dashboard)
+        finally:
+            log.close()
+    finally:
+        place.leave()
+
+
+def _run(config: DaemonConfig, place: Place, *, log: LogThread, dashboard: str | None) -> None:
+    manager = ServiceManager()
+    manager.status("the localization table is made ready")
+    table = _table(config)
+    sys.setswitchinterval(_SWITCH_INTERVAL)
+
+    async def run() -> None:
+        daemon = Daemon(config, table, log=log, manager=manager, dashboard=dashboard)
+        await daemon.run(place)
+
+    try:
+        asyncio.run(run())
+    except Exception:
+        _logger.exception("the daemon ends")
+        raise
+    finally:
+        manager.close()
+
+
+def _table(config: DaemonConfig) -> LocalizationTable:
+    if config.table is not None:
+        return load_table(config.table, fingerprint=config.rig.fingerprint)
+    table, file = cached_table(config.rig)
+    _logger.info("the localization table is %s", file or "not kept for the next start")
+    return table

@@ -1,0 +1,332 @@
+"""The methods of the API, as the daemon carries them out."""
+
+import asyncio
+import time
+from collections.abc import Mapping
+from importlib.metadata import version
+
+from controller.api.connection import Connection
+from controller.api.events import AmplifiersEvent, LatencyEvent, StateEvent
+from controller.api.hub import Hub
+from controller.api.jsonrpc import ErrorCode, RpcError
+from controller.api.messages import (
+    ArmParams,
+    ArmResult,
+    EffectsResult,
+    HelloParams,
+    HelloResult,
+    PlayParams,
+    RenewParams,
+    RenewResult,
+    StatusResult,
+    SubscribeParams,
+    TouchParams,
+    UnsubscribeParams,
+)
+from controller.api.parts import (
+    API_VERSION,
+    AmplifierStatus,
+    EraPlace,
+    Nothing,
+    PhaseName,
+    RigSummary,
+    TableSummary,
+)
+from controller.api.server import Handler
+from controller.daemon.config import DaemonConfig
+from controller.daemon.inputs import ApiTouches
+from controller.daemon.latency import Latencies
+from controller.daemon.lease import LeaseBook
+from controller.daemon.records import RecordedBackend
+from controller.daemon.states import Event, Kind, Machine, State
+from controller.daemon.supervisor import Supervisor
+from controller.daemon.view import Scene, amplifier_statuses
+from controller.loop import Controller
+from drivers import clock
+from drivers.amplifier import Amplifier
+from drivers.errors import CommandError
+from model.table import LocalizationTable
+
+_ARMABLE = (State.SWITCHED_ON, State.OPERATION_ENABLED)
+_LOST = RpcError(
+    ErrorCode.LINK,
+    "the link to an amplifier is lost",
+    remedy="see era status; the daemon tries again by itself",
+)
+
+
+class Service:
+    """Answers clients. Whoever arms has a lease; disarm and stop are anybody's.
+
+    Everything that it is made of is run by others; it starts only the timer of the lease.
+    """
+
+    def __init__(
+        self,
+        config: DaemonConfig,
+        table: LocalizationTable,
+        controller: Controller,
+        supervisor: Supervisor,
+        *,
+        amplifiers: Mapping[str, Amplifier],
+        backends: Mapping[str, RecordedBackend],
+        scene: Scene,
+        latencies: Latencies,
+        touches: ApiTouches,
+    ) -> None:
+        self.longest_lease = config.section.longest_lease
+        self._config = config
+        self._table = table
+        self._controller = controller
+        self._supervisor = supervisor
+        self._amplifiers = amplifiers
+        self._backends = backends
+        self._scene = scene
+        self._latencies = latencies
+        self._touches = touches
+        self._lease = LeaseBook()
+        self._expiry: asyncio.TimerHandle | None = None
+        self._numbers: dict[Connection, int] = {}
+        self._clients = 0
+        self._begun = clock.now()
+        self.hub = Hub(
+            {
+                "state": self._state_event,
+                "contacts": scene.contacts_event,
+                "pattern": scene.pattern_event,
+                "silence": scene.silence_event,
+                "amplifiers": lambda: AmplifiersEvent(amplifiers=self._amplifier_statuses()),
+                "latency": lambda: LatencyEvent(latency_ms=latencies.summary()),
+            },
+            clock=clock.now,
+        )
+
+    def handlers(self) -> Mapping[str, Handler]:
+        """By method."""
+        return {
+            "hello": self._hello,
+            "status": lambda client, params: self.status(),
+            "arm": self._arm,
+            "renew": self._renew,
+            "disarm": lambda client, params: self._disarm(client),
+            "stop": lambda client, params: self._stop(client),
+            "clear": lambda client, params: self._clear(client),
+            "touch": self._touch,
+            "effects": lambda client, params: EffectsResult(effects=[]),
+            "play": self._play,
+            "subscribe": self._subscribe,
+            "unsubscribe": self._unsubscribe,
+        }
+
+    def state_changed(self, old: Machine, new: Machine) -> None:
+        """Tell clients; whatever ends the armed state ends the lease with it."""
+        if new.state not in _ARMABLE:
+            self._lease.end()
+            self._scene.ended()
+        self.hub.publish(
+            "state",
+            lambda: StateEvent(
+                old=old.state.value, new=new.state.value, cause=new.cause, remedy=new.remedy
+            ),
+        )
+
+    def left(self, client: Connection) -> None:
+        """A client is gone: its fingers are lifted."""
+        self.hub.forget(client)
+        self._numbers.pop(client, None)
+        self._touches.leave(client, now=clock.now())
+
+    def keeps(self, client: Connection) -> bool:
+        """Whether a client must not give way to another: it listens to something."""
+        return self.hub.is_told(client)
+
+    def status(self) -> StatusResult:
+        """How everything is."""
+        machine, scene, now = self._supervisor.machine, self._scene, clock.now()
+        held = self._lease.held(now)
+        pattern = scene.pattern_event()
+        return StatusResult(
+            time_s=now,
+            unix_time_s=time.time(),
+            state=machine.state.value,
+            cause=machine.cause,
+            remedy=machine.remedy,
+            phase=_phase(self._controller),
+            assume_energised=machine.assume_energised(now),
+            armed_by=held.owner if held else None,
+            lease_left_s=held.ends - now if held else None,
+            contacts=scene.contact_statuses(),
+            drive=scene.drive(),
+            predicted_contrast_db=pattern.predicted_contrast_db if pattern else None,
+            robust_contrast_db=pattern.robust_contrast_db if pattern else None,
+            predicted_level_db_sl=pattern.predicted_level_db_sl if pattern else None,
+            amplifiers=self._amplifier_statuses(),
+            latency_ms=self._latencies.summary(),
+            rejected_touches=dict(self._controller.rejected_touches),
+            uptime_s=now - self._begun,
+        )
+
+    def _hello(self, client: Connection, params: HelloParams) -> HelloResult:
+        client.name = params.client
+        rig, table = self._config.rig, self._table
+        products = [_product(amplifier) for amplifier in self._amplifiers.values()]
+        return HelloResult(
+            api_version=API_VERSION,
+            software_version=version("era-haptics"),
+            rig=RigSummary(
+                length_m=rig.plate.length,
+                width_m=rig.plate.width,
+                eras=[
+                    EraPlace(
+                        name=era.name,
+                        x_m=era.x,
+                        y_m=era.y,
+                        amplifier=rig.wiring[era.name].amplifier,
+                        channel=rig.wiring[era.name].number,
+                    )
+                    for era in rig.eras
+                ],
+                simulated=any("simulated" in product for product in products),
+                frequency_hz=[rig.limits.frequency_min, rig.limits.frequency_max],
+            ),
+            table=TableSummary(
+                fingerprint=table.fingerprint,
+                mode=self._controller.means.mode,
+                frequencies_hz=[float(each) for each in table.frequencies],
+                cells_x=table.grid.nx,
+                cells_y=table.grid.ny,
+            ),
+            rig_text=self._config.rig_text,
+            layout=None,
+        )
+
+    async def _arm(self, client: Connection, params: ArmParams) -> ArmResult:
+        machine, now = self._supervisor.machine, clock.now()
+        if machine.state not in (State.READY_TO_SWITCH_ON, *_ARMABLE):
+            raise _wrong_state(machine)
+        lasts = min(params.lease_s, self.longest_lease)
+        lease = self._lease.grant(params.owner, lasts=lasts, now=now)
+        try:
+            await self._supervisor.handle(
+                Event(Kind.ARM, f"armed by {params.owner!a}", "era disarm, or era stop")
+            )
+        except BaseException:
+            self._end_lease(lease.token)
+            raise
+        if self._supervisor.machine.state is not State.OPERATION_ENABLED:
+            self._end_lease(lease.token)
+            raise _wrong_state(self._supervisor.machine)
+        # Arming took a moment: the lease counts from when it was done.
+        lease = self._lease.renew(lease.token, now=clock.now())
+        self._watch_lease()
+        return ArmResult(lease=lease.token, lease_s=lease.lasts)
+
+    def _renew(self, client: Connection, params: RenewParams) -> RenewResult:
+        lease = self._lease.renew(params.lease, now=clock.now())
+        self._watch_lease()
+        return RenewResult(lease_s=lease.lasts)
+
+    async def _disarm(self, client: Connection) -> Nothing:
+        await self._supervisor.handle(Event(Kind.DISARM, f"disarmed by {client.name!a}"))
+        return Nothing()
+
+    async def _stop(self, client: Connection) -> Nothing:
+        await self._supervisor.handle(
+            Event(Kind.STOP, f"stopped by {client.name!a}", "clear (era clear), then arm again")
+        )
+        return Nothing()
+
+    async def _clear(self, client: Connection) -> Nothing:
+        if self._supervisor.machine.state is State.COMM_LOST:
+            raise _LOST
+        await self._supervisor.handle(Event(Kind.CLEAR, f"acknowledged by {client.name!a}"))
+        return Nothing()
+
+    def _touch(self, client: Connection, params: TouchParams) -> Nothing:
+        if client not in self._numbers:
+            self._clients += 1
+            self._numbers[client] = self._clients
+        self._touches.take(
+            client, params, client_name=str(self._numbers[client]), now=client.heard_at
+        )
+        return Nothing()
+
+    def _play(self, client: Connection, params: PlayParams) -> Nothing:
+        raise RpcError(
+            ErrorCode.REFUSED, f"there is no effect {params.effect!a}", remedy="see effects"
+        )
+
+    def _subscribe(self, client: Connection, params: SubscribeParams) -> Nothing:
+        # After the answer, so that nothing comes before it is known to have worked.
+        asyncio.get_running_loop().call_soon(self._subscribe_now, client, params)
+        return Nothing()
+
+    def _subscribe_now(self, client: Connection, params: SubscribeParams) -> None:
+        if client.is_open:
+            self.hub.subscribe(client, params.topics, rate=params.rate_hz)
+
+    def _unsubscribe(self, client: Connection, params: UnsubscribeParams) -> Nothing:
+        self.hub.unsubscribe(client, params.topics)
+        return Nothing()
+
+    def _end_lease(self, token: str) -> None:
+        """End a lease, unless another has taken its place."""
+        held = self._lease.held(clock.now())
+        if held is not None and held.token == token:
+            self._lease.end()
+
+    def _watch_lease(self) -> None:
+        """Look again when the lease is over."""
+        if self._expiry is not None:
+            self._expiry.cancel()
+        ends = self._lease.ends
+        if ends is not None:
+            self._expiry = asyncio.get_running_loop().call_later(
+                max(0.0, ends - clock.now()), self._look_at_lease
+            )
+
+    def _look_at_lease(self) -> None:
+        self._expiry = None
+        if self._lease.ends is None:
+            return
+        if self._lease.held(clock.now()) is not None:
+            self._watch_lease()
+            return
+        self._supervisor.tell(
+            Event(Kind.LEASE_LOST, "whoever armed has not renewed the lease", "arm again")
+        )
+
+    def _state_event(self) -> StateEvent:
+        now = self._supervisor.machine
+        return StateEvent(
+            old=now.state.value, new=now.state.value, cause=now.cause, remedy=now.remedy
+        )
+
+    def _amplifier_statuses(self) -> list[AmplifierStatus]:
+        return amplifier_statuses(self._amplifiers, self._backends, self._config.urls)
+
+
+def _wrong_state(machine: Machine) -> RpcError:
+    return RpcError(
+        ErrorCode.WRONG_STATE,
+        f"the daemon is in {machine.state.value}: {machine.cause}",
+        where="state",
+        remedy=machine.remedy,
+    )
+
+
+def _phase(controller: Controller) -> PhaseName:
+    names: dict[str, PhaseName] = {
+        "CLOSED": "closed",
+        "DISARMED": "disarmed",
+        "ARMED": "armed",
+        "LOST": "lost",
+    }
+    return names[controller.phase.name]
+
+
+def _product(amplifier: Amplifier) -> str:
+    try:
+        return amplifier.identity.product
+    except CommandError:
+        return ""

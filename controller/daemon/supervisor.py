@@ -1,0 +1,309 @@
+"""Runs the daemon's state table on a controller: events in, actions done, the link kept up."""
+
+import asyncio
+import logging
+from collections.abc import Awaitable, Callable, Mapping
+from dataclasses import replace
+from functools import partial
+
+from controller.amplifiers import Phase
+from controller.daemon.states import Action, Event, Kind, Machine, State, step
+from controller.loop import Controller
+from controller.observer import Observer
+from drivers import clock
+from drivers.amplifier import Amplifier
+from drivers.errors import CommandRefused, DriverError, LinkError
+from drivers.protocol.messages import Event as AmplifierEvent
+from drivers.protocol.messages import Fault, Status
+from drivers.protocol.messages import State as AmplifierState
+from drivers.supervision import pauses
+from model.errors import InputError
+
+LOOK_EVERY = 0.5  # s; how often a disarmed amplifier is asked how it is
+_TICK = 0.05  # s; how often it is looked whether a lost amplifier may be taken for silent
+_READ_BACKS = 15
+_READ_BACK_PAUSE = 0.02  # s
+
+_SETTLED = (AmplifierState.SWITCH_ON_DISABLED, AmplifierState.READY_TO_SWITCH_ON)
+
+_CLEAR = "find the cause, then clear (era clear) and arm again"
+
+_logger = logging.getLogger(__name__)
+
+
+class Supervisor:
+    """Keeps a controller's amplifiers open, armed only as the state table allows, and silent else.
+
+    controller: made with `observe(observer)` of this; amplifiers: the same as the controller's.
+    state_changed is told of every change, old and new; link_told of each attempt to come back, with
+    what came of it; alive is called whenever the control loop, or what stands in for it while there
+    is no link, has run.
+    """
+
+    def __init__(
+        self,
+        amplifiers: Mapping[str, Amplifier],
+        *,
+        state_changed: Callable[[Machine, Machine], None],
+        link_told: Callable[[str, str], None],
+        alive: Callable[[], None],
+    ) -> None:
+        self.machine = Machine()
+        self._amplifiers = amplifiers
+        self._state_changed = state_changed
+        self._link_told = link_told
+        self._alive = alive
+        self._controller: Controller | None = None
+        self._refusal = ""
+        self._tasks: set[asyncio.Task[None]] = set()
+
+    def observe(self, observer: Observer) -> Observer:
+        """The observer that the controller is to be made with: this one, and ours before it."""
+
+        def refused(reason: str) -> None:
+            self._refusal = reason
+            observer.refused(reason)
+
+        def turned() -> None:
+            self._look_at_phase()
+            self._alive()
+            observer.turned()
+
+        return replace(observer, refused=refused, turned=turned)
+
+    async def open(self, controller: Controller) -> None:
+        """Open the amplifiers and find out how they are; raises what `Controller.open` raises.
+
+        One that is in a fault, or refuses, is no reason not to begin: the state tells.
+        """
+        self._controller = controller
+        for name, amplifier in self._amplifiers.items():
+            amplifier.listen(partial(self._heard, name))
+        await controller.open()
+        try:
+            await self.handle(Event(Kind.OPENED, "every amplifier has answered"))
+        except LinkError:
+            raise
+        except DriverError as error:
+            _quiet_logger.warning("%s", error)
+
+    async def run(self) -> None:
+        """Run the control loop, and come back after every loss, until `close`."""
+        watching = asyncio.create_task(self._watch())
+        try:
+            while self.machine.state is not State.NOT_READY:
+                try:
+                    await self._the_controller.run()
+                except LinkError as error:
+                    await self._quietly(self._lost(error))
+                while self.machine.state is State.COMM_LOST:
+                    await self._come_back()
+        finally:
+            watching.cancel()
+            await asyncio.gather(watching, *self._tasks, return_exceptions=True)
+
+    async def close(self, cause: str) -> None:
+        """Silent, read back, disarmed, closed; ends `run`."""
+        await self.handle(Event(Kind.CLOSE, cause))
+
+    async def handle(self, event: Event) -> None:
+        """See an event through, with all that follows; raises what went wrong in doing so."""
+        for action in self._step(event):
+            await self._do(action)
+
+    def tell(self, event: Event) -> None:
+        """Take an event in at once, and do what follows beside; for those who cannot wait."""
+        actions = self._step(event)
+
+        async def do_all() -> None:
+            for action in actions:
+                await self._do(action)
+
+        task = asyncio.ensure_future(self._quietly(do_all()))
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+
+    @property
+    def _the_controller(self) -> Controller:
+        if self._controller is None:
+            raise RuntimeError("the supervisor was not opened")
+        return self._controller
+
+    def _step(self, event: Event) -> tuple[Action, ...]:
+        """One step of the table; a change is told before anything is done."""
+        before = self.machine
+        self.machine, actions = step(before, event, clock.now())
+        after = self.machine
+        if after.state is not before.state:
+            _logger.info(
+                "%s -> %s",
+                before.state,
+                after.state,
+                extra={"cause": after.cause, "remedy": after.remedy},
+            )
+            self._state_changed(before, after)
+        return actions
+
+    async def _do(self, action: Action) -> None:
+        controller = self._the_controller
+        match action:
+            case Action.VERIFY:
+                await self._on_the_link(self._verify())
+            case Action.ARM:
+                await self._arm()
+            case Action.DISARM:
+                await self._on_the_link(controller.disarm())
+            case Action.STOP:
+                await controller.stop()
+            case Action.REACT:
+                await controller.stop()
+                await self.handle(Event(Kind.REACTED, self.machine.cause, self.machine.remedy))
+            case Action.CLEAR:
+                await self._on_the_link(self._clear())
+            case Action.RECONNECT | Action.CLOSE:
+                await controller.close()
+
+    async def _on_the_link(self, work: Awaitable[None]) -> None:
+        """Do something that needs the link; its loss, or a refusal, is an event of its own."""
+        try:
+            await work
+        except LinkError as error:
+            await self._lost(error)
+            raise
+        except DriverError as error:
+            await self.handle(Event(Kind.FAULT, str(error), _CLEAR))
+            raise
+
+    async def _arm(self) -> None:
+        try:
+            await self._the_controller.arm()
+        except LinkError as error:
+            await self._lost(error)
+            raise
+        except DriverError as error:
+            # Where somebody stopped or disarmed meanwhile, that is why, and it is no fault.
+            if self.machine.state is State.SWITCHED_ON:
+                await self.handle(Event(Kind.FAULT, str(error), _CLEAR))
+            raise
+        await self.handle(Event(Kind.ARMED, self.machine.cause))
+
+    async def _verify(self) -> None:
+        """Disarm whatever still plays, then look whether all are as they should be."""
+        statuses = await self._statuses()
+        if any(each.state is AmplifierState.OPERATION_ENABLED for each in statuses.values()):
+            await self._the_controller.disarm()
+        problem = await self._unsound()
+        if problem is None:
+            await self.handle(Event(Kind.SOUND, "all amplifiers are sound, disarmed and at zero"))
+        else:
+            await self.handle(Event(Kind.FAULT, problem, _CLEAR))
+
+    async def _clear(self) -> None:
+        await self._the_controller.clear()
+        problem = await self._unsound()
+        if problem is None:
+            await self.handle(Event(Kind.SOUND, "acknowledged, and the cause is gone"))
+            return
+        await self.handle(Event(Kind.FAULT, problem, _CLEAR))
+        raise CommandRefused(f"{problem}; the cause is not gone, so nothing was cleared")
+
+    async def _unsound(self) -> str | None:
+        """What is wrong with an amplifier that should be disarmed, once ramps had their time."""
+        problem = None
+        for _ in range(_READ_BACKS):
+            problem = _problem(await self._statuses())
+            if problem is None:
+                break
+            await asyncio.sleep(_READ_BACK_PAUSE)
+        return problem
+
+    async def _statuses(self) -> dict[str, Status]:
+        return {name: await each.status() for name, each in self._amplifiers.items()}
+
+    async def _lost(self, error: LinkError) -> None:
+        remedy = "look at cables and supply; the daemon tries again by itself, and stays disarmed"
+        await self.handle(Event(Kind.LINK_LOST, str(error), remedy))
+
+    async def _come_back(self) -> None:
+        """One attempt to leave COMM_LOST, with the pause after it."""
+        controller = self._the_controller
+        if self.machine.reopened:
+            await asyncio.sleep(_TICK)
+            self._alive()
+            await self._quietly(self.handle(Event(Kind.TICK)))
+            return
+        for pause in pauses():
+            if self.machine.state is not State.COMM_LOST:
+                return
+            try:
+                await controller.open()
+                await controller.disarm()  # one was lost for less than its watchdog, perhaps
+            except (DriverError, InputError) as error:
+                self._link_told("retry", str(error))
+                await controller.close()
+            else:
+                self._link_told("reopened", "every amplifier answers again, and is disarmed")
+                await self._quietly(self.handle(Event(Kind.REOPENED)))
+                return
+            await self._pause(pause)
+
+    async def _pause(self, seconds: float) -> None:
+        end = clock.now() + seconds
+        while (left := end - clock.now()) > 0 and self.machine.state is State.COMM_LOST:
+            self._alive()
+            await asyncio.sleep(min(left, _TICK))
+
+    async def _watch(self) -> None:
+        """Ask disarmed amplifiers how they are; armed ones are asked by the control loop."""
+        while True:
+            await asyncio.sleep(LOOK_EVERY)
+            if self._the_controller.phase is not Phase.DISARMED:
+                continue
+            try:
+                problem = _problem(await self._statuses())
+            except LinkError as error:
+                if self._the_controller.phase is Phase.DISARMED:
+                    await self._quietly(self._lost(error))
+            except DriverError:
+                continue  # somebody else took the turn: that will tell
+            except Exception:
+                _quiet_logger.exception("the amplifiers could not be asked how they are")
+            else:
+                if problem is not None and self.machine.state is State.READY_TO_SWITCH_ON:
+                    await self._quietly(self.handle(Event(Kind.FAULT, problem, _CLEAR)))
+
+    def _look_at_phase(self) -> None:
+        """After a turn of the control loop: whether it has stopped the amplifiers by itself."""
+        if self.machine.state is not State.OPERATION_ENABLED:
+            return
+        if self._the_controller.phase is Phase.DISARMED:
+            self.tell(Event(Kind.FAULT, self._refusal or "an amplifier refused", _CLEAR))
+
+    def _heard(self, name: str, event: AmplifierEvent) -> None:
+        """What an amplifier says unasked; a heartbeat would tell later."""
+        if event.fault is Fault.NONE or self.machine.state is not State.OPERATION_ENABLED:
+            return
+        channel = "" if event.channel is None else f", channel {event.channel}"
+        cause = f"amplifier {name} reports {event.fault.name}{channel}"
+        self.tell(Event(Kind.FAULT, cause, _CLEAR))
+
+    async def _quietly(self, work: Awaitable[None]) -> None:
+        """Do something for nobody who could be told what goes wrong: the state tells it."""
+        try:
+            await work
+        except DriverError as error:
+            _quiet_logger.info("not done: %s", error)
+
+
+_quiet_logger = logging.getLogger(f"{__name__}.beside")
+
+
+def _problem(statuses: Mapping[str, Status]) -> str | None:
+    """What is wrong with amplifiers that should be disarmed, at zero and without a fault."""
+    for name, status in statuses.items():
+        if status.state not in _SETTLED or status.fault is not Fault.NONE:
+            fault = "" if status.fault is Fault.NONE else f", fault {status.fault.name}"
+            return f"amplifier {name} is in {status.state.name}{fault}"
+        if any(status.levels):
+            return f"amplifier {name} reports a level though it is disarmed"
+    return None

@@ -1,0 +1,161 @@
+"""What clients are told of the control loop: its news, in the words of the API."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from controller.api.events import ContactsEvent, PatternEvent, SilenceEvent
+from controller.api.parts import AmplifierStatus, ContactStatus, LinkCounts, Tone
+from controller.contacts import Contact
+from controller.daemon.records import RecordedBackend
+from controller.observer import Applied, Silenced
+from drivers import clock
+from drivers.amplifier import Amplifier
+from drivers.errors import CommandError
+
+
+@dataclass
+class Scene:
+    """What is on the plate and what is played: the last that the control loop has told."""
+
+    contacts: tuple[Contact, ...] = ()
+    applied: Applied | None = None
+    silenced: Silenced | None = None
+
+    def changed(self, contacts: tuple[Contact, ...]) -> None:
+        """The contacts are these."""
+        self.contacts = contacts
+
+    def played(self, applied: Applied) -> None:
+        """A pattern is played."""
+        self.applied, self.silenced = applied, None
+
+    def fell_silent(self, silenced: Silenced) -> None:
+        """Nothing is played."""
+        self.applied, self.silenced = None, silenced
+
+    def ended(self) -> None:
+        """The amplifiers were silenced by something else than the control loop."""
+        self.applied = None
+
+    def contact_statuses(self) -> list[ContactStatus]:
+        """All contacts, with what was decided about each."""
+        return [contact_status(contact, self.applied) for contact in self.contacts]
+
+    def contacts_event(self) -> ContactsEvent:
+        """For the topic `contacts`."""
+        return ContactsEvent(contacts=self.contact_statuses())
+
+    def pattern_event(self) -> PatternEvent | None:
+        """For the topic `pattern`; None where none is played."""
+        return None if self.applied is None else pattern_event(self.applied)
+
+    def silence_event(self) -> SilenceEvent | None:
+        """For the topic `silence`; None where something is played, or nothing was decided yet."""
+        return None if self.silenced is None else silence_event(self.silenced)
+
+    def drive(self) -> dict[str, Tone]:
+        """What is played, by ERA."""
+        return {} if self.applied is None else _drive(self.applied)
+
+
+def contact_status(contact: Contact, applied: Applied | None) -> ContactStatus:
+    """A contact with what it is predicted to feel of a pattern."""
+    told = {"source": contact.key.source, "id": contact.key.id, "x_m": contact.x, "y_m": contact.y}
+    if applied is not None:
+        for felt in applied.targets:
+            if felt.contact.key == contact.key:
+                told |= {
+                    "role": "target",
+                    "level_db_sl": _finite(felt.level_db_sl),
+                    "contrast_db": _finite(felt.contrast_db),
+                }
+        if any(quiet.key == contact.key for quiet in applied.quiet):
+            # Of several quiet contacts only the loudest one's level is known.
+            level = applied.pattern.quiet_level_db_sl if len(applied.quiet) == 1 else None
+            told |= {"role": "quiet", "level_db_sl": _finite(level)}
+    return ContactStatus.model_validate(told)
+
+
+def pattern_event(applied: Applied) -> PatternEvent:
+    """A confirmed pattern."""
+    return PatternEvent(
+        contacts=[contact_status(contact, applied) for contact in applied.contacts],
+        drive=_drive(applied),
+        predicted_contrast_db=_finite(applied.pattern.contrast_db),
+        robust_contrast_db=_finite(applied.pattern.robust_contrast_db),
+        predicted_level_db_sl=_finite(applied.pattern.level_db_sl),
+        latency_ms=1e3 * applied.latency,
+    )
+
+
+def silence_event(silenced: Silenced) -> SilenceEvent:
+    """Silence, and why."""
+    return SilenceEvent(
+        contacts=[contact_status(contact, None) for contact in silenced.contacts],
+        reason=silenced.reason,
+        latency_ms=None if silenced.latency is None else 1e3 * silenced.latency,
+    )
+
+
+def amplifier_statuses(
+    amplifiers: Mapping[str, Amplifier],
+    backends: Mapping[str, RecordedBackend],
+    urls: Mapping[str, str],
+) -> list[AmplifierStatus]:
+    """Every amplifier, as its last answer tells; nothing is asked for it."""
+    return [
+        _amplifier_status(name, amplifier, backends[name], urls[name])
+        for name, amplifier in amplifiers.items()
+    ]
+
+
+def _amplifier_status(
+    name: str, amplifier: Amplifier, backend: RecordedBackend, url: str
+) -> AmplifierStatus:
+    status, heard = backend.status or (None, None)
+    seen = amplifier.statistics
+    round_trip = seen.last_round_trip
+    return AmplifierStatus(
+        name=name,
+        url=url,
+        serial_number=serial_number(amplifier),
+        state=status.state.name if status else None,
+        fault=status.fault.name if status else None,
+        levels=list(status.levels) if status else [],
+        temperature_c=_finite(status.temperature) if status else None,
+        high_voltage=status.high_voltage if status else None,
+        high_voltage_v=_finite(status.voltage) if status else None,
+        reply_age_s=None if heard is None else max(0.0, clock.now() - heard),
+        lost=amplifier.lost,
+        statistics=LinkCounts(
+            frames_out=seen.frames_out,
+            frames_in=seen.frames_in,
+            bad=seen.bad,
+            foreign=seen.foreign,
+            events=seen.events,
+            retries=seen.retries,
+            timeouts=seen.timeouts,
+            refusals=seen.refusals,
+            round_trip_ms=None if round_trip is None else 1e3 * round_trip,
+        ),
+    )
+
+
+def serial_number(amplifier: Amplifier) -> str | None:
+    """Of the amplifier that answered; None before any has."""
+    try:
+        return amplifier.identity.serial_number
+    except CommandError:
+        return None
+
+
+def _drive(applied: Applied) -> dict[str, Tone]:
+    return {
+        era: Tone(frequency_hz=tone.frequency, level=tone.level, phase_deg=tone.phase)
+        for era, tone in applied.drive.items()
+    }
+
+
+def _finite(value: float | None) -> float | None:
+    """A number that JSON has; None for infinity and what is no number."""
+    return value if value is not None and abs(value) < float("inf") else None

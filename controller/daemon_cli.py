@@ -1,0 +1,239 @@
+"""`era daemon`, and its clients: `era status`, `arm`, `disarm`, `stop`, `touch`, `watch`."""
+
+import json
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from drivers.errors import CommandError, CommandRefused, FrameError, LinkError
+from model.errors import InputError
+
+if TYPE_CHECKING:
+    from controller.api.client import Client
+    from controller.api.messages import StatusResult
+
+app = typer.Typer()
+
+EXIT_STATUS: dict[type[BaseException], int] = {
+    InputError: 2,
+    CommandError: 2,
+    CommandRefused: 1,
+    LinkError: 3,
+    FrameError: 3,
+}
+"""Exit status of the errors that these commands raise on purpose."""
+
+Socket = Annotated[
+    Path | None,
+    typer.Option("--socket", metavar="PATH", help="Where the daemon listens, if not as usual."),
+]
+Json = Annotated[bool, typer.Option("--json", help="One JSON object, nothing else.")]
+
+_REPEAT = 0.05  # s; a touch that is not repeated for 150 ms is lifted
+
+
+@app.command()
+def daemon(
+    config: Annotated[
+        Path, typer.Argument(metavar="CONFIG", help="era config init FILE --kind daemon makes one.")
+    ],
+    check: Annotated[
+        bool, typer.Option("--check", help="Check the file and all it names; touch no amplifier.")
+    ] = False,
+    dashboard: Annotated[
+        str | None,
+        typer.Option(metavar="HOST:PORT", help="Serve the page there, by a process of its own."),
+    ] = None,
+) -> None:
+    """Drive a plate by touches, all day; starts disarmed."""
+    from controller.daemon.run import check_daemon, run_daemon
+
+    if check:
+        typer.echo(check_daemon(config))
+        return
+    run_daemon(config, dashboard=dashboard)
+
+
+@app.command()
+def status(socket: Socket = None, as_json: Json = False) -> None:
+    """How the daemon, its amplifiers and the plate are."""
+    with _client(socket) as era:
+        told = era.status()
+    typer.echo(told.model_dump_json() if as_json else _shown(told))
+
+
+@app.command()
+def arm(
+    lease: Annotated[
+        float, typer.Option(metavar="S", min=1, max=60, help="How long without being renewed.")
+    ] = 10.0,
+    owner: Annotated[str, typer.Option(help="Who arms; others are told.")] = "era arm",
+    once: Annotated[
+        bool, typer.Option("--once", help="Do not stay and renew: disarmed when the lease is over.")
+    ] = False,
+    socket: Socket = None,
+    as_json: Json = False,
+) -> None:
+    """High voltage on: touches are felt. Stays and renews the lease; Ctrl-C disarms."""
+    with _client(socket) as era:
+        granted = era.arm(owner, lease_s=lease)
+        try:
+            if as_json:
+                typer.echo(granted.model_dump_json())
+            else:
+                how = f"for {granted.lease_s:g} s" if once else "until Ctrl-C"
+                typer.echo(f"armed {how}; era stop stops everything at once")
+            while not once:
+                time.sleep(granted.lease_s / 3)
+                era.renew(granted.lease)
+        except KeyboardInterrupt:
+            era.disarm()
+            if not as_json:
+                typer.echo("disarmed")
+
+
+@app.command()
+def disarm(socket: Socket = None, as_json: Json = False) -> None:
+    """Silent along a short ramp, then high voltage off."""
+    with _client(socket) as era:
+        era.disarm()
+        _tell_state(era, as_json=as_json)
+
+
+@app.command()
+def stop(socket: Socket = None, as_json: Json = False) -> None:
+    """Quick stop of everything; stays until era clear. No emergency stop: see the manual."""
+    with _client(socket) as era:
+        era.stop()
+        _tell_state(era, as_json=as_json)
+
+
+@app.command()
+def clear(socket: Socket = None, as_json: Json = False) -> None:
+    """Acknowledge a stop, or a fault whose cause is gone; stays disarmed."""
+    with _client(socket) as era:
+        era.clear()
+        _tell_state(era, as_json=as_json)
+
+
+@app.command()
+def touch(
+    at: Annotated[list[str], typer.Argument(metavar="X,Y ...", help="Fingers on the plate [m].")],
+    duration: Annotated[float, typer.Option("--for", metavar="S", min=0, max=3600)] = 1.0,
+    socket: Socket = None,
+    as_json: Json = False,
+) -> None:
+    """Put fingers on the plate for a while; the last one is felt, the others are kept quiet."""
+    from model.points import parse_point
+
+    places = [parse_point(text, what="X,Y") for text in at]
+    with _client(socket) as era:
+        era.touch(places, source="era touch")
+        end = time.monotonic() + duration
+        time.sleep(min(duration, 2 * _REPEAT))
+        told = era.status()
+        while (left := end - time.monotonic()) > 0:
+            era.touch(places, source="era touch")
+            time.sleep(min(left, _REPEAT))
+        era.touch([], source="era touch")
+    typer.echo(told.model_dump_json() if as_json else _shown(told))
+
+
+@app.command()
+def watch(
+    topics: Annotated[list[str] | None, typer.Argument(metavar="[TOPIC ...]")] = None,
+    rate: Annotated[float, typer.Option(min=1, max=60, help="Of amplifiers and latency, Hz.")] = 1,
+    socket: Socket = None,
+    as_json: Annotated[bool, typer.Option("--json", help="A JSON object a line.")] = False,
+) -> None:
+    """Tell what happens as it happens, until Ctrl-C."""
+    from typing import cast
+
+    from controller.api.events import TOPICS
+    from controller.api.parts import Topic
+
+    wanted = topics or ["state", "contacts", "pattern", "silence", "link", "log"]
+    unknown = [topic for topic in wanted if topic not in TOPICS]
+    if unknown:
+        raise InputError(f"there is no topic {unknown[0]!r}; known are {', '.join(TOPICS)}")
+    with _client(socket) as era:
+        era.subscribe(*cast("list[Topic]", wanted), rate_hz=rate)
+        for told in era.events():
+            if as_json:
+                said = {"topic": told.topic, "time_s": told.time, "lost": told.lost}
+                typer.echo(json.dumps({**said, "data": told.data}))
+            else:
+                lost = f"  ({told.lost} lost)" if told.lost else ""
+                typer.echo(f"{told.time:12.3f}  {told.topic:10s} {json.dumps(told.data)}{lost}")
+
+
+@contextmanager
+def _client(socket: Path | None) -> "Iterator[Client]":
+    """A connection; what the daemon refuses becomes an error with the exit status it deserves."""
+    from controller.api.client import Client
+    from controller.api.jsonrpc import ErrorCode, RpcError
+
+    with Client.connect(socket, name="era") as era:
+        try:
+            yield era
+        except RpcError as error:
+            if error.code is ErrorCode.LINK:
+                raise LinkError(str(error)) from error
+            if error.code is ErrorCode.INVALID_PARAMS:
+                raise InputError(str(error)) from error
+            raise CommandRefused(str(error)) from error
+
+
+def _tell_state(era: "Client", *, as_json: bool) -> None:
+    told = era.status()
+    if as_json:
+        typer.echo(json.dumps({"state": told.state, "cause": told.cause, "remedy": told.remedy}))
+    else:
+        typer.echo(f"{told.state}: {told.cause}")
+
+
+def _shown(told: "StatusResult") -> str:
+    """A status for people to read."""
+    lines = [f"{told.state}: {told.cause}"]
+    if told.remedy:
+        lines.append(f"  what to do: {told.remedy}")
+    if told.assume_energised:
+        lines.append("  ASSUME ENERGISED: an amplifier that was lost may still be playing")
+    if told.armed_by is not None and told.lease_left_s is not None:
+        lines.append(f"  armed by {told.armed_by}, {told.lease_left_s:.1f} s left")
+    for contact in told.contacts:
+        level = "" if contact.level_db_sl is None else f" {contact.level_db_sl:.1f} dB SL"
+        contrast = "" if contact.contrast_db is None else f", contrast {contact.contrast_db:.1f} dB"
+        lines.append(
+            f"  finger {contact.source} {contact.id} at {contact.x_m:.3f}, {contact.y_m:.3f} m: "
+            f"{contact.role or 'nothing is played'}{level}{contrast}"
+        )
+    for era, tone in told.drive.items():
+        lines.append(
+            f"  ERA {era}: {tone.frequency_hz:g} Hz, level {tone.level:.3f}, {tone.phase_deg:g} deg"
+        )
+    for amplifier in told.amplifiers:
+        parts = [amplifier.state or "never heard"]
+        if amplifier.fault not in (None, "NONE"):
+            parts.append(f"fault {amplifier.fault}")
+        if amplifier.temperature_c is not None:
+            parts.append(f"{amplifier.temperature_c:.1f} degC")
+        if amplifier.reply_age_s is not None:
+            parts.append(f"heard {amplifier.reply_age_s:.2f} s ago")
+        if amplifier.lost:
+            parts.append("LOST")
+        lines.append(f"  amplifier {amplifier.name} ({amplifier.url}): {', '.join(parts)}")
+    latency = told.latency_ms
+    if latency.median is not None:
+        lines.append(
+            f"  latency of {latency.count} commands: median {latency.median:.2f} ms, "
+            f"99 % {latency.p99:.2f} ms, 99.9 % {latency.p999:.2f} ms"
+        )
+    for reason, count in told.rejected_touches.items():
+        lines.append(f"  rejected touches, {reason.replace('_', ' ')}: {count}")
+    lines.append(f"  up for {told.uptime_s:.0f} s")
+    return "\n".join(lines)

@@ -55,7 +55,7 @@ class _Client(SdoClient):
 
     def __init__(self, node: int, worker: Worker) -> None:
         self._make_queue = worker.make_queue
-        super().__init__(
+        super().__init__(  # type: ignore[no-untyped-call]
             cob_id("sdo_request", node), cob_id("sdo_answer", node), ObjectDictionary()
         )
 

@@ -5,8 +5,13 @@ from dataclasses import dataclass
 from model.envelope import Envelopes
 from model.excitation import Excitation
 
-# Long enough not to click, short enough to be felt as one with the touch.
-ONSET_RAMP = 0.020
+ONSET_RAMP = 0.040
+"""How long [s] a plain ramp lasts.
+
+At 20 dB SL the target feels it after a fifth of that, and half of it after half; twice as long as
+what just does not click, since a plate that is stirred less rings less at the quiet fingers: 4 dB
+of contrast over the first 100 ms (docs/transients.md).
+"""
 
 UNAWARE_DB_SL = -10.0
 """At this level and below even the most sensitive quiet finger feels nothing."""

@@ -64,21 +64,13 @@ class Raster:
         """Positions [m], (point_count, 2)."""
         return lattice(self.x, self.y)
 
-    def under_fingertips(
-        self, values: NDArray[np.float32], centres: FloatArray
-    ) -> NDArray[np.float32]:
-        """Values (point_count, c) at the discs of fingertips centred at (k, 2) [m]: (n, c).
-
-        The points are those of `fingertip_points`, finger after finger. Centres must be on the
-        plate.
-        """
+    def fingertips(self, centres: FloatArray) -> "Fingertips":
+        """Where the discs of fingertips centred at (k, 2) [m] lie; centres must be on the plate."""
         size = np.array([self.length, self.width])
         discs = centres[:, None, :] + FINGERTIP_RADIUS * UNIT_DISC
         within = np.clip(discs, 0.0, size)
-        on_plate = (within == discs).all(axis=2)
         index, weights = self._patches(centres, within)
-        found = weights @ values[index]
-        return found.reshape(-1, values.shape[1]) if on_plate.all() else found[on_plate]
+        return Fingertips(index, weights, (within == discs).all(axis=2))
 
     def at(self, values: NDArray[np.float32], points: FloatArray) -> NDArray[np.float32]:
         """Values (point_count, c) at points [m] (n, 2) of the plate: (n, c)."""
@@ -125,6 +117,30 @@ class Raster:
         weights = weight_y[:, :, :, None] * weight_x[:, :, None, :]
         index = (start[:, 1] * self.nx + start[:, 0])[:, None] + self._patch_index
         return index, weights.reshape(*points.shape[:2], -1).astype(np.float32)
+
+
+@dataclass(frozen=True, eq=False)
+class Fingertips:
+    """Points under fingertips, finger after finger, and how values there follow from a raster's.
+
+    The points are those of `fingertip_points`: all of the disc (k, p) that is on_plate. index
+    (k, patch): raster points around each finger; weights (k, p, patch).
+    """
+
+    index: IntArray
+    weights: NDArray[np.float32]
+    on_plate: NDArray[np.bool_]
+
+    @cached_property
+    def ends(self) -> list[int]:
+        """Where the points of each finger end among those of all."""
+        return [int(end) for end in self.on_plate.sum(axis=1).cumsum()]
+
+    def read(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Values (point_count, c) of the raster at all points: (n, c)."""
+        found = self.weights @ values[self.index]
+        whole = self.ends[-1] == self.on_plate.size
+        return found.reshape(-1, values.shape[1]) if whole else found[self.on_plate]
 
 
 def _powers(x: FloatArray, count: int) -> FloatArray:

@@ -1,36 +1,14 @@
 """Onset, ending and transient measures of the patterns that a table answers."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
-from model.arrays import FloatArray
 from model.envelope import Bases, ramped_ending, ramped_onset, shaped
 from model.pattern import Pattern
-from model.plate import Plate
-from model.point_load import PointLoad
 from model.question import Question
 from model.shaping import Shaper
 from model.table import LocalizationTable
-from model.time_response import plate_in_time
 from model.transient import Transients
-
-
-@dataclass(frozen=True, eq=False)
-class _OnRaster:
-    """The reduced plate as a table holds it."""
-
-    table: LocalizationTable
-
-    @property
-    def plate(self) -> Plate:
-        return self.table.plate
-
-    @property
-    def omega(self) -> FloatArray:
-        return self.table.omega
-
-    def at(self, points: FloatArray) -> FloatArray:
-        return self.table.raster.at(self.table.shapes, points).astype(float)
 
 
 class Timing:
@@ -40,10 +18,8 @@ class Timing:
     """
 
     def __init__(self, table: LocalizationTable) -> None:
-        loads = [PointLoad(mass.x, mass.y, mass=mass.mass) for mass in table.masses]
-        plate = plate_in_time(_OnRaster(table), table.eras, loads=loads, held=table.held)
         self._eras = table.eras
-        self._shaper, self._transients = Shaper(plate), Transients(plate)
+        self._shaper, self._transients = Shaper(table.in_time), Transients(table.in_time)
 
     def prepare(self, frequencies: Iterable[float]) -> None:
         """Work out ahead what shaping needs to know about frequencies [Hz]."""

@@ -1,13 +1,23 @@
 """Drive modes, from what every amplifier can do to what takes amplitude and phase; a file each.
 
 Every mode but the first finds one frequency for all ERAs. More freedom must not be worse: what a
-mode allows, the modes after it allow too, so each answer is the best of all up to its own.
+mode allows, the modes after it allow too, so each answer is the best of all up to its own. What a
+richer mode could have at most at a frequency bounds the poorer ones too, so that few frequencies
+are left to them.
+
+`phased` has a millisecond for one target. It considers `signed` and `graded` where there are more,
+or where the level wanted keeps its own best weights from being used: what is given up for the
+level is then found by trial, and the poorer modes may have found better. Elsewhere its own search
+contains theirs but for unfinished rounds: 0.1 dB on average, 0.5 dB at the most.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
-from model.drive_modes.fields import Drive, Fields, Outcome, judge
+import numpy as np
+
+from model.arrays import IntArray
+from model.drive_modes.coherent import Coherent
+from model.drive_modes.fields import Drive, Fields, Outcome, Single, SingleComplex, judge
 from model.drive_modes.graded import GRADED
 from model.drive_modes.phased import PHASED
 from model.drive_modes.signed import SIGNED
@@ -15,29 +25,97 @@ from model.drive_modes.switched import find_switched, loudest_switched
 
 FINE_PHASE = 10.0  # degrees
 
-__all__ = ["MODES", "Mode", "best_drive", "loudest", "playable_modes"]
+__all__ = ["MODES", "Choice", "Mode", "best_drive", "find_drives", "loudest", "playable_modes"]
 
 
 @dataclass(frozen=True)
 class Mode:
     """A drive mode.
 
-    find: the best drive with at least a score, or None; loudest: how many times above threshold the
-    targets can be made to feel it; poorer: the modes whose drives are considered too.
+    coherent: how it finds weights of all ERAs at one frequency, None for `switched`; poorer: the
+    modes whose drives are considered too, from the richest on.
     """
 
-    find: Callable[[Fields, float], Drive | None]
-    loudest: Callable[[Fields], float]
+    coherent: Coherent | None
     poorer: tuple[str, ...]
+
+    def find(self, fields: Fields, least: float) -> Drive | None:
+        """The best drive of this mode alone with more than a score; None where there is none."""
+        if self.coherent is None:
+            return find_switched(fields, least)
+        search = self.coherent.search(fields, least)
+        return search.drive() if search.score.max() > least else None
+
+    def loudest(self, fields: Fields) -> float:
+        """How many times above threshold the targets can be made to feel it in this mode alone.
+
+        The most that was found: of several targets a coherent mode may reach a decibel more.
+        """
+        return (self.coherent.loudest if self.coherent else loudest_switched)(fields)
 
 
 MODES: dict[str, Mode] = {
-    "switched": Mode(find_switched, loudest_switched, ()),
-    "graded": Mode(GRADED.find, GRADED.loudest, ("switched",)),
-    "signed": Mode(SIGNED.find, SIGNED.loudest, ("graded", "switched")),
-    "phased": Mode(PHASED.find, PHASED.loudest, ("switched",)),
+    "switched": Mode(None, ()),
+    "graded": Mode(GRADED, ("switched",)),
+    "signed": Mode(SIGNED, ("graded", "switched")),
+    "phased": Mode(PHASED, ("signed", "graded", "switched")),
 }
 """By name, from the least freedom to the most."""
+
+
+@dataclass(frozen=True, eq=False)
+class Choice:
+    """The drive of the best robust score, what it does, and what is nearly as good.
+
+    frequencies (n,) by index, weights (n, eras), score (n,): the best that was found of all ERAs at
+    each frequency, where it reaches the level; none in mode `switched`.
+    """
+
+    drive: Drive
+    outcome: Outcome
+    frequencies: IntArray
+    weights: SingleComplex
+    score: Single
+
+
+def find_drives(fields: Fields, mode: str) -> Choice | None:
+    """The drive of the best robust score in a mode and the poorer ones, with those near it.
+
+    None where none reaches the wanted level.
+    """
+    best: tuple[Drive, Outcome] | None = None
+    open_ = np.arange(fields.frequency_count)
+    score = np.zeros(len(open_), dtype=np.float32)
+    weights = np.zeros((len(open_), fields.era_count), dtype=np.complex64)
+    for name in (mode, *MODES[mode].poorer):
+        least = best[1].score if best else 0.0
+        coherent = MODES[name].coherent
+        if coherent is None:
+            # What is there already lets most of the search for something better be left out.
+            drive = find_switched(fields, least)
+        elif len(open_) > 0:
+            some = fields if len(open_) == fields.frequency_count else fields.at(open_)
+            found = coherent.search(some, least)
+            better = found.score > score[open_]
+            score[open_[better]] = found.score[better]
+            weights[open_[better]] = found.weights[better]
+            top = int(score.argmax())
+            drive = Drive.at(top, weights[top]) if score[top] > least else None
+        else:
+            continue
+        if drive is not None:
+            outcome = judge(fields, drive)
+            if best is None or outcome.score > best[1].score:
+                best = drive, outcome
+        if coherent is not None and best is not None:
+            left = found.bound > best[1].score
+            if name == "phased" and not found.is_held_back and len(fields.targets) == 1:
+                left[:] = False
+            open_ = open_[left]
+    if best is None:
+        return None
+    reached = np.flatnonzero(score)
+    return Choice(*best, reached, weights[reached], score[reached])
 
 
 def best_drive(fields: Fields, mode: str) -> tuple[Drive, Outcome] | None:
@@ -45,15 +123,8 @@ def best_drive(fields: Fields, mode: str) -> tuple[Drive, Outcome] | None:
 
     None where none reaches the wanted level.
     """
-    best: tuple[Drive, Outcome] | None = None
-    for name in (mode, *MODES[mode].poorer):
-        # What is there already lets most of the search for something better be left out.
-        drive = MODES[name].find(fields, best[1].score if best else 0.0)
-        if drive is not None:
-            outcome = judge(fields, drive)
-            if best is None or outcome.score > best[1].score:
-                best = drive, outcome
-    return best
+    choice = find_drives(fields, mode)
+    return (choice.drive, choice.outcome) if choice else None
 
 
 def loudest(fields: Fields, mode: str) -> float:

@@ -50,15 +50,22 @@ class Coherent:
     phases: tuple[int, int]
     ascents: int
 
-    def find(self, fields: Fields, least: float) -> Drive | None:
-        """The best of one frequency for all ERAs; None if it does not have this score at least."""
+    def search(self, fields: Fields, least: float) -> "Search":
+        """The best weights at each frequency, as far as the best of all may be among them.
+
+        least: a score that is there already. Frequencies that can be hardly better than the best
+        are left as they are, or those that cannot be better at all where there is one already: a
+        richer mode then has what a poorer one would have found.
+        """
         found = _Best(fields, least)
+        near = CLOSE if least == 0 else 1.0
         chosen, some, shares = np.arange(fields.frequency_count), fields, _even_shares(fields)
         for step in STEPS[: _rounds(fields)]:
             weights, bound = self._weights(some, shares, sigma=ERROR_SHARE)
+            found.bound[chosen] = np.minimum(found.bound[chosen], bound)
             likely = found.offer(chosen, weights, some)
-            kept = np.flatnonzero(bound > CLOSE * found.score)
-            if found.score == 0 or len(kept) == 0:
+            kept = np.flatnonzero(bound > near * found.score)
+            if not found.reaches or len(kept) == 0:
                 break
             if len(kept) > PROMISING:
                 kept = kept[np.argsort(-bound[kept])[:PROMISING]]
@@ -67,7 +74,9 @@ class Coherent:
                 some = fields.at(chosen)
             shares = shares[kept] * likely[kept] ** step
             shares /= shares.sum(axis=-1, keepdims=True)
-        return found.drive if found.score > 0 else self._louder(fields, found)
+        if not found.reaches:
+            self._offer_louder(fields, found)
+        return Search(found.scores, found.weights, found.bound, found.refused > found.score)
 
     def loudest(self, fields: Fields) -> float:
         """How many times above threshold the targets can be made to feel it."""
@@ -76,13 +85,12 @@ class Coherent:
         peak = _peak(fields, _raised(weights, gain))
         return float((peak / fields.threshold).max())
 
-    def _louder(self, fields: Fields, found: "_Best") -> Drive | None:
+    def _offer_louder(self, fields: Fields, found: "_Best") -> None:
         for sigma, gain in GIVEN_UP:
             weights, _ = self._weights(fields, _even_shares(fields), sigma=sigma)
             found.offer(np.arange(fields.frequency_count), _raised(weights, gain), fields)
-            if found.score > 0:
-                return found.drive
-        return None
+            if found.reaches:
+                break
 
     def _weights(
         self, fields: Fields, shares: Single, *, sigma: float
@@ -95,18 +103,38 @@ class Coherent:
         return _ascend(R, targets, self.solve, starts=starts, ascents=ascents)
 
 
+@dataclass(frozen=True, eq=False)
+class Search:
+    """The best weights (f, eras) at each frequency, and their robust score (f,).
+
+    The score is 0 where none were found that reach the level. bound (f,): what no weights that the
+    mode allows can have there, but for the target's field not being quite even over its fingertip.
+    is_held_back: better weights than the best were found that do not reach the level.
+    """
+
+    score: Single
+    weights: SingleComplex
+    bound: Single
+    is_held_back: bool
+
+    def drive(self) -> Drive | None:
+        """The best of all frequencies; None where nothing reaches the level."""
+        best = int(self.score.argmax())
+        return Drive.at(best, self.weights[best]) if self.score[best] > 0 else None
+
+
 class _Best:
-    """The best of the weights that were offered."""
+    """The best of the weights that were offered, at each frequency; score: of all, or the least.
+
+    reaches: whether any of them reached the level; refused: the best score of those that did not.
+    """
 
     def __init__(self, fields: Fields, least: float) -> None:
-        self._frequency = 0
-        self._weights: SingleComplex | None = None
-        self.score = least
-
-    @property
-    def drive(self) -> Drive | None:
-        """What was best so far."""
-        return None if self._weights is None else Drive.at(self._frequency, self._weights)
+        count = fields.frequency_count
+        self.scores: Single = np.zeros(count, dtype=np.float32)
+        self.weights: SingleComplex = np.zeros((count, fields.era_count), dtype=np.complex64)
+        self.bound: Single = np.full(count, np.inf, dtype=np.float32)
+        self.score, self.refused, self.reaches = least, 0.0, False
 
     def offer(self, frequencies: IntArray, weights: SingleComplex, fields: Fields) -> Single:
         """Power at the quiet points, errors included (n, q), of weights (n, eras).
@@ -120,11 +148,15 @@ class _Best:
         power = likely.mean(axis=-1) if fields.is_alone else likely.max(axis=-1)
         peak = _peak(fields, weights)
         reaches = peak >= fields.wanted * fields.threshold
-        score = np.where(reaches, peak / np.sqrt(power + _TINY * peak**2), 0)
-        best = int(score.argmax())
-        if score[best] > self.score:
-            self.score = float(score[best])
-            self._frequency, self._weights = int(frequencies[best]), weights[best]
+        score = peak / np.sqrt(power + _TINY * peak**2)
+        if not reaches.all():
+            self.refused = max(self.refused, float(score[~reaches].max()))
+            score = np.where(reaches, score, 0)
+        better = score > self.scores[frequencies]
+        self.scores[frequencies[better]] = score[better]
+        self.weights[frequencies[better]] = weights[better]
+        self.score = max(self.score, float(score.max()))
+        self.reaches = self.reaches or bool(reaches.any())
         return np.asarray(likely, dtype=np.float32)
 
 

@@ -33,12 +33,8 @@ def find_switched(fields: Fields, least: float) -> Drive | None:
     patterns = all_patterns(eras, fields.frequency_count)
     first, second = patterns.first, patterns.second
     peak = _least_of_means([magnitudes_of_sources(field) for field in fields.targets], eras)
-    if least > 0 and not fields.is_alone:
-        # Some of the points will mostly do to see that nothing here is better than what is there.
-        step = max(1, fields.quiet.shape[2] // BOUND_POINTS)
-        few = magnitudes_of_sources(np.ascontiguousarray(fields.quiet[:, :, ::step]))
-        if not (peak > least * sums_of_sources(few.T, eras).max(axis=0)).any():
-            return None
+    if least > 0 and not fields.is_alone and not _may_be_better(fields, patterns, peak, least):
+        return None
     powers = _powers(fields)
     quiet = magnitudes_of_sources(fields.quiet)
     if fields.is_alone:
@@ -68,6 +64,20 @@ def find_switched(fields: Fields, least: float) -> Drive | None:
         return None
     index = patterns.index[best].astype(int)
     return Drive(index, (index != SILENT).astype(np.complex64))
+
+
+def _may_be_better(fields: Fields, patterns: Patterns, peak: Single, least: float) -> bool:
+    """Whether any pattern of some peaks (n,) at the targets can have more contrast than `least`.
+
+    Some of the quiet points will mostly do to see that nothing can. Their mean, which a sum of two
+    sources has from the means of both, leaves few patterns of which to find the loudest point.
+    """
+    step = max(1, fields.quiet.shape[2] // BOUND_POINTS)
+    few = magnitudes_of_sources(np.ascontiguousarray(fields.quiet[:, :, ::step]))
+    mean = sums_of_sources(few.mean(axis=1)[None], fields.era_count)[0]
+    left = np.flatnonzero(peak > least * mean)
+    loud = (few[patterns.first[left]] + few[patterns.second[left]]).max(axis=1, initial=0.0)
+    return bool((peak[left] > least * loud).any())
 
 
 def loudest_switched(fields: Fields) -> float:

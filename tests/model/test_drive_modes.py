@@ -10,6 +10,7 @@ from scipy.optimize import minimize
 from model.drive_modes import MODES, best_drive, coherent, fields, loudest, playable_modes
 from model.drive_modes import switched as switched_mode
 from model.drive_modes.fields import ERROR_SHARE, SILENT, Drive, Fields, judge
+from model.drive_modes.phased import PHASED
 from model.question import Question
 from model.table_build import build_table
 from paper_table import FREQUENCIES, contact_sets, smooth_rig, smooth_table
@@ -170,21 +171,28 @@ def test_modes_keep_to_what_they_may(seed):
         assert np.abs(drive.weight).max() == pytest.approx(1.0, rel=1e-5)
 
 
-def test_more_freedom_is_never_worse():
+@pytest.mark.parametrize("level", [12.0, 60.0])
+def test_more_freedom_is_never_worse(level):
     """On the paper's plate each mode's robust score is at least that of the mode before it.
 
-    Exact where the poorer mode is considered; `phased` leaves out `signed`, which its own search
-    contains, and may miss it by the 0.35 dB that unfinished rounds cost.
+    At 60 dB SL the level holds the best weights back, and poorer modes find better ones by chance;
+    of one target `phased` leaves them out elsewhere and may miss half a decibel.
     """
-    for quiet in (1, 3, 7):
-        for places in contact_sets(15, fingers=quiet + 1, seed=quiet):
-            given = fields_on_plate(places)
-            scores = [best_drive(given, mode)[1].score for mode in MODES]
+    held_back = 0
+    for quiet, targets in ((1, 1), (3, 1), (7, 1), (2, 2)):
+        for places in contact_sets(10, fingers=quiet + targets, seed=quiet):
+            given = fields_on_plate(places, targets=targets, level=level)
+            found = [best_drive(given, mode) for mode in MODES]
+            scores = [one[1].score if one else 1e-3 for one in found]
             switched, graded, signed, phased = 20 * np.log10(scores)
             assert graded >= switched
-            assert signed >= graded
+            assert signed >= graded - 1e-4
             assert phased >= switched
-            assert phased >= signed - 0.35
+            is_held_back = PHASED.search(given, 0.0).is_held_back
+            held_back += is_held_back
+            strict = is_held_back or targets > 1
+            assert phased >= signed - (1e-4 if strict else 0.5)
+    assert (held_back > 10) == (level > 50.0)
 
 
 def test_more_frequencies_and_eras_are_never_worse():

@@ -18,7 +18,7 @@ def test_points_under_a_fingertip_are_those_of_the_disc():
     plate = smooth_rig().plate
     raster = Raster.for_plate(plate, frequency_max=500.0)
     places = raster.points.astype(np.float32)
-    found = raster.under_fingertips(places, np.array(CONTACTS))
+    found = raster.fingertips(np.array(CONTACTS)).read(places)
     expected = np.concatenate([fingertip_points(x, y, plate) for x, y in CONTACTS])
     np.testing.assert_allclose(found, expected, atol=1e-7)
 
@@ -30,7 +30,7 @@ def test_fields_between_its_points_are_those_of_the_plate():
     free = solve_free_plate(rig.plate, rig.mesh, frequency_max=500.0)
     kept = free.acceleration(rig.eras, FREQUENCIES, raster.points).transpose(2, 0, 1)
     values = np.ascontiguousarray(kept.astype(np.complex64)).reshape(len(kept), -1)
-    found = raster.under_fingertips(values.view(np.float32), np.array(CONTACTS))
+    found = raster.fingertips(np.array(CONTACTS)).read(values.view(np.float32))
     points = np.concatenate([fingertip_points(x, y, rig.plate) for x, y in CONTACTS])
     solved = free.acceleration(rig.eras, FREQUENCIES, points).transpose(2, 0, 1)
     size = np.sqrt((np.abs(kept) ** 2).mean(axis=0))

@@ -43,8 +43,8 @@ def test_without_envelopes_the_measures_are_those_of_the_ramp(rig, table, solved
     pattern = Timing(table).with_transient_measures(QUESTION, table.ask(QUESTION))
     assert pattern.onset is None
     assert pattern.ending is None
-    onset = ramped_onset(pattern.excitation, rig.eras, ramp=0.020)
-    ending = ramped_ending(pattern.excitation, rig.eras, ramp=0.020)
+    onset = ramped_onset(pattern.excitation, rig.eras, ramp=0.040)
+    ending = ramped_ending(pattern.excitation, rig.eras, ramp=0.040)
     contrast = solved.contrast_db(onset, targets=QUESTION.targets, quiet=QUESTION.quiet)
     assert pattern.transient_contrast_db == pytest.approx(contrast, abs=0.1)
     left = solved.left_db(pattern.excitation, ending)

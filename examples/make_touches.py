@@ -18,8 +18,10 @@ LENGTH, WIDTH = 0.3048, 0.2286
 MARGIN = 0.015
 APART = 0.06
 FINGERS_PER_GROUP = (1, 2, 3, 2, 3, 1, 3, 2, 3, 2)
+AT_ONCE = (3, 7, 9)  # groups whose fingers all come down at one moment
 HOLD = 0.55  # seconds from one finger to the next, and after the last one
 PAUSE = 0.15  # seconds with no finger down
+REST = 0.75  # the same before those that come at one moment: the plate has stopped ringing
 FRAME = 1 / 60  # seconds between the frames of a tracker
 SETTLING = 0.08  # seconds over which a fingertip rolls into its place
 ROLL = 0.0015  # metres that it rolls
@@ -38,10 +40,12 @@ def schedule(rng: np.random.Generator) -> tuple[list[tuple[float, float, np.ndar
     """Every touch as (down [s], up [s], place [m]) and when the last one is up."""
     touches = []
     start = 0.3
-    for count in FINGERS_PER_GROUP:
-        up = start + count * HOLD
+    for group, count in enumerate(FINGERS_PER_GROUP):
+        apart = 0.0 if group in AT_ONCE else HOLD
+        start += REST - PAUSE if group in AT_ONCE else 0.0
+        up = start + (count - 1) * apart + HOLD
         places = draw_places(count, rng)
-        touches += [(start + n * HOLD, up, place) for n, place in enumerate(places)]
+        touches += [(start + n * apart, up, place) for n, place in enumerate(places)]
         start = up + PAUSE
     return touches, start
 

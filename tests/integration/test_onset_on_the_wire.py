@@ -1,0 +1,49 @@
+"""From a touch over its envelopes on a serial line to what fingertips feel while it starts."""
+
+import asyncio
+
+import numpy as np
+import pytest
+
+from controller.demo.run import read_touches, run_demo
+from controller.sources.capture import Datagram, write_capture
+from controller.sources.tuio import tuio_datagram
+from controller.touch import Touch, TouchFrame
+from model.question import Question
+from model.rig_file import example_rig_path, load_rig
+from model.table_build import build_table
+from model.timing import Timing
+
+FRAME = 1 / 50
+FINGERS = ((1, 0.30, 0.35), (2, 0.80, 0.70))  # id, x, y in TUIO's coordinates
+DOWN, UP, END = 0.1, 0.4, 0.5  # s
+
+
+@pytest.fixture
+def touches(tmp_path):
+    """Two fingers that come down at one moment on a plate at rest."""
+    datagrams = []
+    for number in range(int(END / FRAME)):
+        now = number * FRAME
+        down = tuple(Touch(*finger) for finger in FINGERS) if DOWN <= now < UP else ()
+        datagrams.append(Datagram(now, tuio_datagram(TouchFrame("test", now, down), number + 1)))
+    path = tmp_path / "touches.tuio"
+    write_capture(path, datagrams)
+    return read_touches(path)
+
+
+def test_contrast_of_the_onset_is_the_predicted_one(touches):
+    """Within 2 dB over the first 100 ms, and far above what the amplifier's own ramp would give."""
+    rig_file = example_rig_path()
+    rig = load_rig(rig_file)
+    table = build_table(rig, frequencies=np.arange(80.0, 241.0, 20.0))
+    rows = asyncio.run(
+        run_demo(rig_file, table, wire="serial", touches=touches, on_row=lambda row: None)
+    )
+    (row,) = [row for row in rows if row.played is not None]
+    onset = row.played.onset
+    assert onset.is_shaped
+    assert onset.measured_contrast_db == pytest.approx(onset.predicted_contrast_db, abs=2)
+    question = Question((row.target,), tuple(row.quiet.values()), mode="phased")
+    ramped = Timing(table).with_transient_measures(question, table.ask(question))
+    assert onset.measured_contrast_db > ramped.transient_contrast_db + 6

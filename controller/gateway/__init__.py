@@ -1,0 +1,1 @@
+"""The web gateway: a process of its own that puts the API of the daemon before browsers."""

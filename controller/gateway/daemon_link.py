@@ -1,0 +1,89 @@
+"""The gateway's one connection to the daemon, for the requests of everybody."""
+
+import asyncio
+import logging
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from controller.api.async_client import AsyncClient
+from controller.api.events import TOPICS
+from controller.api.jsonrpc import ErrorCode, Request, RpcError, read_params
+from controller.api.messages import METHODS, HelloResult
+from controller.api.replies import Notification, Unreachable
+from drivers.supervision import pauses
+
+_FIRST_PAUSE, _LONGEST_PAUSE = 0.1, 2.0  # s; between attempts to reach the daemon
+_RATE = 10.0  # Hz; of amplifiers and latency
+_NAME = "gateway"
+
+_logger = logging.getLogger(__name__)
+
+
+class DaemonLink:
+    """Reaches the daemon at a socket, again and again; see `run`.
+
+    on_hello: told of the daemon at each new connection, and None when it is lost; on_event: told of
+    each notification.
+    """
+
+    def __init__(
+        self,
+        socket: Path,
+        *,
+        on_hello: Callable[[HelloResult | None], None],
+        on_event: Callable[[Notification], None],
+    ) -> None:
+        self._socket = socket
+        self._on_hello = on_hello
+        self._on_event = on_event
+        self._client: AsyncClient | None = None
+
+    async def run(self) -> None:
+        """Connect, listen, and connect again after a loss, until cancelled."""
+        while True:
+            client = await self._connect()
+            try:
+                self._on_hello(await client.hello(_NAME))
+                self._client = client
+                await client.subscribe(*TOPICS, rate_hz=_RATE)
+                async for told in client.events():
+                    self._on_event(told)
+                _logger.warning("the daemon has hung up")
+            except (RpcError, Unreachable) as error:
+                _logger.warning("the daemon was lost: %s", error)
+            finally:
+                self._client = None
+                self._on_hello(None)
+                await client.close()
+
+    async def call(self, method: str, params: Mapping[str, Any]) -> dict[str, Any]:
+        """Ask the daemon; its result as JSON. Raises RpcError, its own or that it is not there."""
+        known = METHODS.get(method)
+        if known is None:
+            raise RpcError(
+                ErrorCode.UNKNOWN_METHOD,
+                f"there is no method {method[:40]!a}",
+                remedy=f"known are {', '.join(METHODS)}",
+            )
+        asked = read_params(known.params, Request(method, dict(params), None, wants_answer=True))
+        if self._client is None:
+            raise RpcError(
+                ErrorCode.LINK,
+                "the daemon does not answer",
+                remedy="see whether `era daemon` runs; the gateway connects by itself then",
+            )
+        try:
+            result = await self._client.call(method, asked, known.result)
+        except Unreachable as error:
+            raise RpcError(ErrorCode.LINK, str(error)) from error
+        return result.model_dump(mode="json")
+
+    async def _connect(self) -> AsyncClient:
+        """A connection, as soon as there is a daemon."""
+        for pause in pauses(first=_FIRST_PAUSE, longest=_LONGEST_PAUSE):
+            try:
+                return await AsyncClient.connect(self._socket, name=_NAME)
+            except (RpcError, Unreachable):
+                await asyncio.sleep(pause)
+        raise AssertionError("pauses have no end")

@@ -1,0 +1,110 @@
+// The WebSocket to the gateway: JSON-RPC 2.0 both ways, connected again by itself.
+
+const PAUSES_MS = [200, 500, 1000, 2000];
+const PATIENCE_MS = 6000;
+
+export class RpcError extends Error {
+  constructor({ code, message, data }) {
+    super(message);
+    this.code = code;
+    this.remedy = data?.remedy ?? null;
+  }
+}
+
+export class Link {
+  // token: the gateway's; topics: what to be told of; handlers: connected(isConnected, wasRefused),
+  // event(params), field(ArrayBuffer).
+  constructor(token, topics, handlers) {
+    this.token = token;
+    this.topics = topics;
+    this.handlers = handlers;
+    this.waiting = new Map();
+    this.lastId = 0;
+    this.attempt = 0;
+    this.wasOpen = false;
+    this.connect();
+  }
+
+  get isOpen() {
+    return this.socket.readyState === WebSocket.OPEN;
+  }
+
+  connect() {
+    const url = new URL("api/v1/ws", location.href);
+    url.protocol = location.protocol === "https:" ? "wss:" : "ws:";
+    url.hash = "";
+    this.socket = new WebSocket(url, ["era-haptics.v1", `era-haptics.token.${this.token}`]);
+    this.socket.binaryType = "arraybuffer";
+    this.socket.onopen = () => this.opened();
+    this.socket.onmessage = ({ data }) => this.take(data);
+    this.socket.onclose = () => this.closed();
+  }
+
+  opened() {
+    this.attempt = 0;
+    this.wasOpen = true;
+    this.call("subscribe", { topics: this.topics, rate_hz: 10 }).catch(() => {});
+    this.handlers.connected(true);
+  }
+
+  closed() {
+    for (const { reject } of this.waiting.values()) {
+      reject(new RpcError({ code: 0, message: "the gateway does not answer" }));
+    }
+    this.waiting.clear();
+    this.handlers.connected(false);
+    const pause = PAUSES_MS[Math.min(this.attempt++, PAUSES_MS.length - 1)];
+    setTimeout(() => this.connect(), pause);
+  }
+
+  take(data) {
+    if (data instanceof ArrayBuffer) {
+      this.handlers.field(data);
+      return;
+    }
+    const said = JSON.parse(data);
+    if (said.method === "event") {
+      this.handlers.event(said.params);
+      return;
+    }
+    const asked = this.waiting.get(said.id);
+    if (!asked) return;
+    this.waiting.delete(said.id);
+    if (said.error) asked.reject(new RpcError(said.error));
+    else asked.resolve(said.result);
+  }
+
+  // Ask for a method; a promise of its result.
+  call(method, params = {}) {
+    if (!this.isOpen) {
+      return Promise.reject(new RpcError({ code: 0, message: "not connected to the gateway" }));
+    }
+    const id = ++this.lastId;
+    this.socket.send(JSON.stringify({ jsonrpc: "2.0", id, method, params }));
+    return new Promise((resolve, reject) => {
+      this.waiting.set(id, { resolve, reject });
+      setTimeout(() => {
+        if (this.waiting.delete(id)) {
+          reject(new RpcError({ code: 0, message: `no answer to ${method}` }));
+        }
+      }, PATIENCE_MS);
+    });
+  }
+
+  // Say something that needs no answer, such as where fingers are now.
+  say(method, params) {
+    if (this.isOpen) this.socket.send(JSON.stringify({ jsonrpc: "2.0", method, params }));
+  }
+
+  // Stop by every way there is; a promise that one of them was answered.
+  stop() {
+    const headers = { Authorization: `Bearer ${this.token}`, "Content-Type": "application/json" };
+    const url = new URL("api/v1/stop", location.href);
+    url.hash = "";
+    const overHttp = fetch(url, { method: "POST", headers, body: "{}", keepalive: true })
+      .then((answer) => {
+        if (!answer.ok) throw new Error("the stop was not carried out");
+      });
+    return Promise.any([this.call("stop"), overHttp]);
+  }
+}

@@ -1,0 +1,198 @@
+"""A real headless Chromium, driven over its own DevTools protocol."""
+
+import asyncio
+import base64
+import contextlib
+import itertools
+import json
+import os
+import shutil
+from collections.abc import AsyncIterator, Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+import websockets
+
+BINARIES = ("chromium", "chromium-browser", "google-chrome")
+FLAGS = (
+    "--headless=new",
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-quic",
+    "--disable-dev-shm-usage",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+    "--no-first-run",
+    "--remote-debugging-port=0",
+    "about:blank",
+)
+STARTING = 60.0  # s; a loaded machine takes its time
+WAITING = 30.0  # s; for anything that should be seen
+
+
+def chromium() -> str:
+    """The browser's path; without one the test is skipped, but fails where CI=true."""
+    for name in BINARIES:
+        if found := shutil.which(name):
+            return found
+    reason = "no Chromium is installed; on Debian: apt install chromium"
+    if os.environ.get("CI") == "true":
+        pytest.fail(reason)
+    pytest.skip(reason)
+
+
+class Page:
+    """One tab; everything that it writes to its console as a warning or error is kept."""
+
+    def __init__(self, socket: websockets.ClientConnection) -> None:
+        self.complaints: list[str] = []
+        self._socket = socket
+        self._numbers = itertools.count(1)
+        self._waiting: dict[int, asyncio.Future[dict[str, Any]]] = {}
+        self._listening = asyncio.create_task(self._listen())
+
+    async def close(self) -> None:
+        """Leave it."""
+        await self._socket.close()
+        await asyncio.gather(self._listening, return_exceptions=True)
+
+    async def call(self, method: str, **params: Any) -> dict[str, Any]:
+        """One command of the DevTools protocol."""
+        number = next(self._numbers)
+        answer = self._waiting[number] = asyncio.get_running_loop().create_future()
+        await self._socket.send(json.dumps({"id": number, "method": method, "params": params}))
+        async with asyncio.timeout(WAITING):
+            said = await answer
+        assert "error" not in said, f"{method}: {said['error']}"
+        return dict(said["result"])
+
+    async def evaluate(self, expression: str) -> Any:
+        """The value of a JavaScript expression; promises are waited for."""
+        said = await self.call(
+            "Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True
+        )
+        assert "exceptionDetails" not in said, said["exceptionDetails"]
+        return said["result"].get("value")
+
+    async def until(self, expression: str, accepts: Callable[[Any], bool] = bool) -> Any:
+        """The value of an expression as soon as it is accepted."""
+        value = None
+        try:
+            async with asyncio.timeout(WAITING):
+                while not accepts(value := await self.evaluate(expression)):  # noqa: ASYNC110
+                    await asyncio.sleep(0.05)
+        except TimeoutError:
+            pytest.fail(f"{expression} stayed {value!r}; the page complains of {self.complaints}")
+        return value
+
+    async def show(
+        self, url: str, *, width: int = 1280, height: int = 800, is_phone: bool = False
+    ) -> None:
+        """Go to a URL with a screen of a size, that of a phone or a desktop."""
+        for domain in ("Page", "Runtime", "Log"):
+            await self.call(f"{domain}.enable")
+        await self.call(
+            "Emulation.setDeviceMetricsOverride",
+            width=width,
+            height=height,
+            deviceScaleFactor=2 if is_phone else 1,
+            mobile=is_phone,
+        )
+        await self.call("Emulation.setTouchEmulationEnabled", enabled=True, maxTouchPoints=10)
+        await self.call("Page.navigate", url=url)
+
+    async def dark(self, is_dark: bool) -> None:
+        """Prefer dark or light colours."""
+        scheme = {"name": "prefers-color-scheme", "value": "dark" if is_dark else "light"}
+        await self.call("Emulation.setEmulatedMedia", features=[scheme])
+
+    async def touch(self, kind: str, points: Sequence[tuple[float, float]]) -> None:
+        """Real touches: touchStart, touchMove, touchEnd (no points) at x, y in CSS pixels."""
+        fingers = [{"x": x, "y": y, "id": id} for id, (x, y) in enumerate(points)]
+        await self.call("Input.dispatchTouchEvent", type=kind, touchPoints=fingers)
+
+    async def mouse(self, kind: str, x: float, y: float) -> None:
+        """Real mouse events: mousePressed, mouseMoved, mouseReleased."""
+        await self.call(
+            "Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1
+        )
+
+    async def press(self, key: str, code: str | None = None) -> None:
+        """A key, down and up."""
+        for kind in ("keyDown", "keyUp"):
+            await self.call("Input.dispatchKeyEvent", type=kind, key=key, code=code or key)
+
+    async def click(self, selector: str) -> None:
+        """Click an element where it is, as a mouse would; it must be visible and uncovered."""
+        place = await self.evaluate(
+            f"(() => {{ const e = document.querySelector({json.dumps(selector)});"
+            "e.scrollIntoView({block: 'nearest'}); const b = e.getBoundingClientRect();"
+            "const [x, y] = [b.x + b.width / 2, b.y + b.height / 2];"
+            "return e.contains(document.elementFromPoint(x, y)) ? [x, y] : null; })()"
+        )
+        assert place is not None, f"{selector} is covered by something else"
+        await self.mouse("mousePressed", *place)
+        await self.mouse("mouseReleased", *place)
+
+    async def screenshot(self, path: Path) -> None:
+        """What is to be seen, as a PNG file."""
+        said = await self.call("Page.captureScreenshot", format="png")
+        path.write_bytes(base64.b64decode(said["data"]))  # noqa: ASYNC240 (nothing else waits)
+
+    async def _listen(self) -> None:
+        with contextlib.suppress(websockets.ConnectionClosed):
+            async for line in self._socket:
+                said = json.loads(line)
+                if "id" in said:
+                    answer = self._waiting.pop(said["id"])
+                    if not answer.done():
+                        answer.set_result(said)
+                elif said["method"] == "Log.entryAdded":
+                    entry = said["params"]["entry"]
+                    if entry["level"] in ("warning", "error"):
+                        self.complaints.append(f"{entry['text']} {entry.get('url', '')}")
+                elif said["method"] == "Runtime.exceptionThrown":
+                    self.complaints.append(str(said["params"]["exceptionDetails"]))
+
+
+@contextlib.asynccontextmanager
+async def open_page(profile: Path) -> AsyncIterator[Page]:
+    """A browser of its own with one tab; profile: an empty folder."""
+    process = await asyncio.create_subprocess_exec(
+        *(chromium(), f"--user-data-dir={profile}", *FLAGS),
+        stdout=asyncio.subprocess.DEVNULL,
+        stderr=asyncio.subprocess.DEVNULL,
+    )
+    try:
+        async with asyncio.timeout(STARTING):
+            told = profile / "DevToolsActivePort"
+            # A file that another process writes sets no event.
+            while not (told.exists() and len(told.read_text().splitlines()) == 2):  # noqa: ASYNC110
+                await asyncio.sleep(0.05)
+            port = told.read_text().splitlines()[0]
+            url = await _tab(int(port))
+        async with websockets.connect(url, max_size=None, compression=None) as socket:
+            page = Page(socket)
+            try:
+                yield page
+            finally:
+                await page.close()
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            process.kill()
+        await process.wait()
+
+
+async def _tab(port: int) -> str:
+    """Where the browser's first tab listens."""
+    import httpx
+
+    async with httpx.AsyncClient() as client:
+        while True:
+            tabs = (await client.get(f"http://127.0.0.1:{port}/json/list")).json()
+            for tab in tabs:
+                if tab["type"] == "page":
+                    return str(tab["webSocketDebuggerUrl"])
+            await asyncio.sleep(0.05)

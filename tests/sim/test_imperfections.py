@@ -164,6 +164,16 @@ def test_noise_is_as_loud_as_it_says_and_only_while_a_channel_plays(two_amplifie
     assert_allclose(other, quiet, rtol=0, atol=0)
 
 
+def test_noise_runs_on_when_a_channel_is_told_something_else() -> None:
+    """Taken up at another moment it is the same noise, so that a new command does not repeat it."""
+    noise = draw_noise(seed=3, number=0)
+    at = [
+        [(term.c0 * np.exp(1j * term.omega * (1.0 - term.start))).imag for term in terms]
+        for terms in (noise.terms(1.0, start=0.5, end=2.0), noise.terms(1.0, start=0.83, end=2.0))
+    ]
+    assert_allclose(at[1], at[0], rtol=0, atol=1e-9)
+
+
 def test_another_seed_is_another_noise(two_amplifiers: Rig) -> None:
     """The same seed is the same noise, whatever else is set; channels differ from each other."""
     assert draw_noise(seed=3, number=0) == draw_noise(seed=3, number=0)

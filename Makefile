@@ -7,7 +7,7 @@ PYTHON ?= $(shell for python in $(PYTHONS); do \
 BIN := .venv/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet --editable
 
-.PHONY: demo test lint format fuzz bench bench-localization bench-wires clean
+.PHONY: demo test lint format fuzz soak bench bench-localization bench-wires clean
 .NOTPARALLEL:
 
 demo: .venv/installed
@@ -25,6 +25,11 @@ lint: .venv/installed-test
 # A million damaged frames for every codec; `make test` takes a few thousand.
 fuzz: .venv/installed-test
 	$(BIN)/python tests/support/mutation.py
+
+# The whole chain in virtual time, thousands of seeds; `make test` takes a few hundred short ones.
+# Others: make soak SOAK='--hours 10 --wire serial', or one again: make soak SOAK='--seed 17'
+soak: .venv/installed-test
+	$(BIN)/python tests/support/soak.py $(SOAK)
 
 format: .venv/installed-test
 	$(BIN)/ruff check --fix .

@@ -1,0 +1,431 @@
+"""One soak run: the whole chain in virtual time, from touch frames to the plate, as its plan says.
+
+Everything between the table and the plate is the project's own: controller, guard, drivers,
+backends, codecs, far ends and amplifiers. Only the lines are memory, and the clock is virtual.
+"""
+
+import asyncio
+import hashlib
+import logging
+import random
+from collections import Counter
+from collections.abc import Callable, Coroutine, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from functools import cache
+from typing import Any, TextIO
+
+from controller.amplifiers import Phase
+from controller.loop import Controller
+from controller.observer import Applied, Observer
+from controller.touch import Touch, TouchFrame
+from drivers.amplifier import Amplifier
+from drivers.backends.stand_in import STAND_IN
+from drivers.errors import DriverError
+from drivers.protocol.messages import Reply, Request
+from drivers.registry import open_backend
+from memory_machine import MemoryMachine
+from model.rig import Channel, Rig
+from model.table import LocalizationTable
+from paper_plate import make_paper_rig
+from sim.bench import Bench
+from sim.faults import Faults
+from sim.pseudo_terminal import TERMINAL_MAKER
+from sim.station import Station
+from sim.wires import Wire, open_wires
+from small_table import small_table
+from soak_checks import RELEASE, Checks, Touched
+from soak_plan import Ask, Hand, Plan, Trouble
+from virtual_loop import START, Stuck, VirtualLoop, run_virtual
+
+_ON_THE_WIRE = 0.002  # s; through driver, adapter and back
+# Bytes of a silent set for four channels and what may be on the line before it, there and back.
+_BYTES = {"serial": 200, "modbus-rtu": 200, "slcan": 200, "socketcand": 200, "modbus-tcp": 0}
+_PATTERN = 0.25  # s; from a touch to its pattern
+_NOTICED = 0.3  # s; from a wire that is pulled out to a controller that knows
+_TIMERS_MAX = 2_000
+_PAUSES = (0.1, 0.2, 0.4, 0.8, 1.6)  # s; between attempts to open
+_QUIET_END = 1.0  # s; after everything was closed nothing may play
+
+
+@dataclass
+class Outcome:
+    """What came of a run; counts: of touches, faults, patterns, frames and so on, by name."""
+
+    seed: int
+    digest: str
+    violations: list[str]
+    counts: Counter[str]
+    virtual: float
+    busy: float
+
+
+class Trace:
+    """Everything that happened, a line each: hashed, and written where there is a file."""
+
+    def __init__(self, file: TextIO | None) -> None:
+        self._hash = hashlib.sha256()
+        self._file = file
+
+    @property
+    def digest(self) -> str:
+        """Of all lines so far."""
+        return self._hash.hexdigest()
+
+    def note(self, time: float, *words: object) -> None:
+        """One line; time [s] since the begin."""
+        line = f"{time:.9f} {' '.join(map(str, words))}\n"
+        self._hash.update(line.encode())
+        if self._file is not None:
+            self._file.write(line)
+
+
+@cache
+def _table() -> LocalizationTable:
+    return small_table()
+
+
+def make_soak_rig(amplifiers: int) -> Rig:
+    """The paper's plate with its ERAs on one amplifier, or two on each of two."""
+    rig = make_paper_rig(12, 9)
+    if amplifiers == 1:
+        return rig
+    wiring = {
+        era.name: Channel(("west", "east")[number % 2], number // 2)
+        for number, era in enumerate(rig.eras)
+    }
+    return replace(rig, wiring=wiring, amplifiers={"west": "sim://", "east": "sim://"})
+
+
+def run_plan(plan: Plan, *, trace: TextIO | None = None) -> Outcome:
+    """Run a plan to its end."""
+    written = Trace(trace)
+    counts: Counter[str] = Counter()
+    run = _Run(plan, written, counts)
+
+    def seen(link: str, toward: str, data: bytes) -> None:
+        counts["pieces on the wires"] += 1
+        counts["bytes on the wires"] += len(data)
+        run.note("bytes", link, toward, data.hex())
+
+    with _errors_of(run):
+        try:
+            run_virtual(run.main(), dice=random.Random(plan.seed + 1), seen=seen)
+        except Stuck as problem:
+            run.violations.append(str(problem))
+    return Outcome(plan.seed, written.digest, run.violations, counts, plan.lasts, plan.busy)
+
+
+@dataclass
+class _Run:
+    """The chain of one plan."""
+
+    plan: Plan
+    trace: Trace
+    counts: Counter[str]
+    violations: list[str] = field(default_factory=list)
+
+    def note(self, *words: object) -> None:
+        """Write a line of the trace."""
+        self.trace.note(self.loop.time() - START, *words)
+
+    async def main(self) -> None:
+        """Everything, from the far ends' first moment to their last."""
+        loop = asyncio.get_running_loop()
+        assert isinstance(loop, VirtualLoop)
+        self.loop = loop
+        loop.set_exception_handler(self._unhandled)
+        self.machine = MemoryMachine(loop)
+        STAND_IN.set(self.machine)
+        TERMINAL_MAKER.set(self.machine.make_terminal)
+        self.rig = make_soak_rig(self.plan.amplifiers)
+        self.bench = Bench(self.rig, now=loop.time())
+        self.touched = Touched()
+        self.asking = 0
+        self.is_ending = False
+        self.stalled_for = 0.0
+        self.running: asyncio.Task[None] | None = None
+        self.controller: Controller | None = None
+        self.tasks: list[asyncio.Task[Any]] = []
+        self.checks = Checks(
+            self.bench,
+            self.plan,
+            begin=loop.time(),
+            release=self._release(),
+            touched=self.touched,
+            arming=lambda: self.asking > 0,
+        )
+        self.checks.violations = self.violations
+        stations = self._stations()
+        lines = self.plan.lines
+        wires = {
+            name: Wire(
+                lines[number % len(lines)].kind,
+                speed=lines[number % len(lines)].speed,
+                shared=len(lines) < len(stations),
+                unpluggable=True,
+                line=str(number % len(lines)),
+            )
+            for number, name in enumerate(stations)
+        }
+        async with open_wires(wires, [*stations.values()]) as urls:
+            self.urls = urls
+            watching = asyncio.create_task(self.checks.watch())
+            self.serving = asyncio.create_task(self._serve())
+            await self._play(stations)
+            await self._end()
+            self.checks.look()
+            watching.cancel()
+            await asyncio.gather(watching, return_exceptions=True)
+            if watching.done() and not watching.cancelled():
+                self.violations.append(f"the watch ended: {watching.exception()!r}")
+            for station in stations.values():
+                station.close()
+        self.checks.close()
+        await asyncio.sleep(2.0)  # what was still on its way has come
+        left = [task for task in asyncio.all_tasks() if task is not asyncio.current_task()]
+        if left:
+            names = sorted(str(task.get_coro()) for task in left)
+            self.checks.violate(f"{len(left)} tasks are left: {names}")
+
+    def _release(self) -> float:
+        """How long after the last finger the plate may play, without faults [s]."""
+        on_wire = [
+            _BYTES[line.kind] * 10 / line.speed if line.speed else 0.0 for line in self.plan.lines
+        ]
+        return RELEASE + max(on_wire) + _ON_THE_WIRE
+
+    def _stations(self) -> dict[str, Station]:
+        stations = {}
+        for number, name in enumerate(self.bench.amplifiers, start=1):
+            faults = Faults(begin=self.loop.time(), seed=self.plan.seed)
+            station = Station(self.bench, name, number=number, faults=faults)
+            station.exchange = self._exchanging(name, station.exchange)  # type: ignore[method-assign]
+            station.listen(
+                lambda event, name=name: self.note("amplifier", name, event.state, event.fault)  # type: ignore[misc]
+            )
+            stations[name] = station
+        return stations
+
+    def _exchanging(
+        self, name: str, exchange: Callable[[Request], Reply | None]
+    ) -> Callable[[Request], Reply | None]:
+        def exchanging(request: Request) -> Reply | None:
+            reply = exchange(request)
+            self.counts["requests"] += 1
+            self.checks.exchanged(name, request, reply)
+            return reply
+
+        return exchanging
+
+    async def _play(self, stations: dict[str, Station]) -> None:
+        """Let the plan happen."""
+        by_number = [*stations.values()]
+        for action in self.plan.actions:
+            await self._until(action.at)
+            match action:
+                case Hand():
+                    self.counts["gestures"] += 1
+                    self._spawn(self._touch(action))
+                case Trouble(number=number, episode=episode):
+                    self.counts[f"fault {episode.fault}"] += 1
+                    self.note("fault", by_number[number].name, episode)
+                    by_number[number].befall(episode)
+                    if episode.fault == "unplug":
+                        self._expect_loss(number)
+                case Ask():
+                    self.counts[f"operator {action.what}"] += 1
+                    self.note("operator", action.what)
+                    self._spawn(self._ask(action))
+        await self._until(self.plan.lasts)
+
+    async def _until(self, at: float) -> None:
+        await asyncio.sleep(max(0.0, START + at - self.loop.time()))
+
+    def _spawn(self, work: Coroutine[Any, Any, None]) -> None:
+        self.tasks = [task for task in self.tasks if not task.done()]
+        self.tasks.append(asyncio.create_task(work))
+
+    async def _touch(self, hand: Hand) -> None:
+        begin = self.loop.time()
+        for time, stamp, touches in hand.frames:
+            await asyncio.sleep(max(0.0, begin + time - self.loop.time()))
+            now = self.loop.time()
+            self.note("touch", hand.source, stamp, touches)
+            self.counts["touch frames"] += 1
+            was_touched = self.touched.is_touched(now)
+            self.touched.frame(hand.source, now + stamp, touches, now)
+            if self.controller is not None:
+                frame = TouchFrame(
+                    hand.source, now + stamp, tuple(Touch(*touch) for touch in touches)
+                )
+                self.controller.deliver(frame)
+            self.checks.lifted()
+            if not was_touched and self.touched.is_touched(now) and hand.gesture == "hold":
+                self._expect_pattern()
+
+    def _expect_pattern(self) -> None:
+        """A finger has come to an untouched plate: it must be felt soon."""
+        at = self.loop.time() - START
+        is_armed = self.controller is not None and self.controller.phase is Phase.ARMED
+        if not (is_armed and self.plan.is_calm(at - 0.1, at + _PATTERN)):
+            return
+        before = self.counts["patterns"]
+        self.counts["touches that must be felt"] += 1
+
+        def look() -> None:
+            if self.counts["patterns"] == before:
+                self.checks.violate(f"the touch at {at:.6f} has led to no pattern")
+
+        self.loop.call_later(min(_PATTERN, 0.19), look)
+
+    def _expect_loss(self, number: int) -> None:
+        """A wire was pulled out under an armed controller: it must know soon."""
+        controller = self.controller
+        if controller is None or controller.phase is not Phase.ARMED:
+            return
+        if number and len(self.plan.lines) == 1:
+            return  # a shared line is unplugged at its first amplifier
+
+        def look() -> None:
+            if self.controller is controller and controller.phase is Phase.ARMED:
+                self.checks.violate("a wire is out and the controller still armed")
+
+        self.loop.call_later(_NOTICED, look)
+
+    async def _ask(self, ask: Ask) -> None:
+        controller = self.controller
+        if ask.what == "kill":
+            await self._kill()
+        elif ask.what == "stall":
+            self._stall(ask.lasts)
+        elif controller is None:
+            return
+        elif ask.what == "ready":
+            if controller.phase is not Phase.ARMED:
+                await self._call("clear", controller.clear)
+                await self._call("arm", controller.arm)
+        else:
+            await self._call(ask.what, getattr(controller, ask.what))
+
+    async def _call(self, name: str, call: Callable[[], Coroutine[Any, Any, None]]) -> None:
+        """What an operator asks; a refusal is an answer, too."""
+        self.asking += name == "arm"
+        try:
+            await call()
+            self.note("done", name)
+        except DriverError as problem:
+            self.note("refused", name, type(problem).__name__, problem)
+        finally:
+            self.asking -= name == "arm"
+
+    async def _kill(self) -> None:
+        """The host's process dies; another comes up."""
+        self.machine.kill_host()
+        self.loop.kill_hosts()
+        self.serving.cancel()
+        await asyncio.gather(self.serving, return_exceptions=True)
+        self.serving = asyncio.create_task(self._serve())
+
+    def _stall(self, lasts: float) -> None:
+        """The control loop stands still for so long [s], and goes on."""
+        if self.running is not None:
+            self.stalled_for = lasts
+            self.running.cancel()
+
+    async def _serve(self) -> None:
+        """Open, run, and open again after a loss, as a daemon does."""
+        pauses: Iterator[float] = iter(_PAUSES)
+        while not self.is_ending:
+            controller = self._make_controller()
+            try:
+                await controller.open()
+                pauses = iter(_PAUSES)
+                self.note("open")
+                self.controller = controller
+                await self._run_on(controller)
+            except DriverError as problem:
+                self.note("lost", type(problem).__name__, problem)
+                self.counts["links lost"] += 1
+            finally:
+                self.controller = None
+                await controller.close()
+            await asyncio.sleep(next(pauses, _PAUSES[-1]))
+
+    async def _run_on(self, controller: Controller) -> None:
+        """Run the control loop to its end, across stalls."""
+        while True:
+            self.running = asyncio.create_task(controller.run())
+            try:
+                await self.running
+                return
+            except asyncio.CancelledError:
+                if not self.stalled_for:
+                    self.running.cancel()
+                    raise
+                lasts, self.stalled_for = self.stalled_for, 0.0
+            finally:
+                self.running = None
+            await asyncio.sleep(lasts)
+
+    def _make_controller(self) -> Controller:
+        return Controller(
+            self.rig,
+            _table(),
+            amplifiers={name: Amplifier(open_backend(url)) for name, url in self.urls.items()},
+            observer=Observer(
+                pattern_applied=self._applied,
+                refused=lambda why: self.note("told refused", why),
+                link_lost=lambda what: self.note("told lost", what),
+            ),
+        )
+
+    def _applied(self, applied: Applied) -> None:
+        self.counts["patterns"] += 1
+        drive = dict(sorted(applied.drive.items()))
+        self.note("pattern", f"{applied.latency:.9f}", drive)
+
+    async def _end(self) -> None:
+        """Close everything; then nothing plays, and nobody is left."""
+        self.is_ending = True
+        if self.controller is not None:
+            await self.controller.close()
+        else:
+            self.serving.cancel()
+        await asyncio.gather(self.serving, return_exceptions=True)
+        await asyncio.gather(*self.tasks, return_exceptions=True)
+        for task in self.tasks:
+            error = None if task.cancelled() else task.exception()
+            if error is not None:
+                self.checks.violate(f"{task.get_coro()} ended with {error!r}")
+        await asyncio.sleep(_QUIET_END)
+        for name, amplifier in self.bench.amplifiers.items():
+            self.bench.advance(self.loop.time())
+            if any(amplifier.status(self.loop.time()).levels):
+                self.checks.violate(f"{name} plays after everything was closed")
+        if len(self.loop._scheduled) > _TIMERS_MAX:
+            self.checks.violate(f"{len(self.loop._scheduled)} timers wait")
+
+    def _unhandled(self, loop: Any, context: dict[str, Any]) -> None:
+        error = context.get("exception")
+        self.checks.violate(f"unhandled: {context['message']} {error!r}")
+
+
+@contextmanager
+def _errors_of(run: _Run) -> Iterator[None]:
+    """What the project logs with a traceback is a violation, too."""
+
+    class Handler(logging.Handler):
+        def emit(self, record: logging.LogRecord) -> None:
+            if record.exc_info:
+                run.violations.append(f"logged: {record.getMessage()} {record.exc_info[1]!r}")
+
+    handler = Handler(logging.ERROR)
+    names = ("controller", "drivers", "sim")
+    for name in names:
+        logging.getLogger(name).addHandler(handler)
+    try:
+        yield
+    finally:
+        for name in names:
+            logging.getLogger(name).removeHandler(handler)

@@ -1,0 +1,198 @@
+"""What must hold in every soak run, watched at the simulated amplifiers and at the touches alone.
+
+Bounds with faults are what the fault table and the timeouts of a link add up to; without faults
+they are the table's own.
+"""
+
+import asyncio
+import math
+from collections.abc import Callable, Mapping, Sequence
+
+from drivers.protocol.messages import (
+    Arm,
+    Event,
+    GetCaps,
+    GetFaults,
+    GetStatus,
+    Hello,
+    Nak,
+    Reply,
+    Request,
+    State,
+)
+from sim.bench import Bench
+from soak_plan import Plan
+
+AUDIBLE = 1e-3  # of full stroke; below it a ramp counts as ended
+LEASE = 0.150  # s; a contact without news for so long counts as lifted
+WATCHDOG = 0.25 + 0.005  # s; then every channel is silent
+RELEASE = 0.020  # s; from the last finger up to zero
+# s; three unanswered requests, then the watchdog, and a heartbeat that was on its way.
+RELEASE_WITH_FAULTS = 3 * 0.15 + WATCHDOG + 0.1
+TOGETHER = 0.6  # s; until all are silent after one of them has a fault
+STEP = 0.010  # s; how often is looked while something vibrates
+IDLE_STEP = 0.100
+_NOT_FEEDING = (Hello, GetCaps, GetStatus, GetFaults)
+_FAULTED = (State.FAULT, State.FAULT_REACTION_ACTIVE)
+_PLAYING = (
+    State.OPERATION_ENABLED,
+    State.FAULT_REACTION_ACTIVE,
+    State.QUICK_STOP_ACTIVE,
+    State.SWITCHED_ON,
+)
+
+
+class Touched:
+    """Whether somebody touches, by the frames alone; times [s]."""
+
+    def __init__(self) -> None:
+        self._until: dict[str, float] = {}
+        self.last = -math.inf
+        """Until when the plate was touched last, as far as it is known by now."""
+
+    def frame(
+        self, source: str, stamp: float, touches: Sequence[tuple[int, float, float]], now: float
+    ) -> None:
+        """A frame has been delivered."""
+        was_until = min(self._until.get(source, -math.inf), now)
+        valid = math.isfinite(stamp) and any(
+            0 <= x <= 1 and 0 <= y <= 1
+            for _, x, y in touches  # NaN is not
+        )
+        heard_until = min(stamp, now) + LEASE if valid else -math.inf
+        self._until[source] = max(heard_until, was_until)
+        self.last = max(self._until.values(), default=-math.inf)
+
+    def is_touched(self, now: float) -> bool:
+        """Whether somebody does."""
+        return now < self.last
+
+
+class Checks:
+    """Watches a bench; `violations` is what was found, each once with its time.
+
+    release [s]: from the last finger up to silence on the plate, without faults; begin [s]: when
+    the plan's time began; arming: whether the operator wants to arm just now.
+    """
+
+    def __init__(
+        self,
+        bench: Bench,
+        plan: Plan,
+        *,
+        begin: float,
+        release: float,
+        touched: Touched,
+        arming: Callable[[], bool],
+    ) -> None:
+        self.violations: list[str] = []
+        self._bench = bench
+        self._plan = plan
+        self._begin = begin
+        self._release = release
+        self._touched = touched
+        self._arming = arming
+        self._fed = dict.fromkeys(bench.amplifiers, -math.inf)
+        self._due: dict[str, asyncio.TimerHandle] = {}
+        self._tokens: dict[str, set[int]] = {name: set() for name in bench.amplifiers}
+        self._token = dict.fromkeys(bench.amplifiers, 0)
+        self._faulted: dict[str, float] = {}
+        self._loop = asyncio.get_running_loop()
+        for name, amplifier in bench.amplifiers.items():
+            amplifier.listeners.append(lambda event, at, name=name: self._told(name, event, at))
+
+    def violate(self, what: str) -> None:
+        """Something that must hold does not."""
+        if len(self.violations) < 20:
+            self.violations.append(f"{self._loop.time() - self._begin:.6f} {what}")
+
+    async def watch(self) -> None:
+        """Move the bench and look, until cancelled."""
+        while True:
+            is_quiet = self.look()
+            await asyncio.sleep(IDLE_STEP if is_quiet else STEP)
+
+    def look(self) -> bool:
+        """Look now; whether all is quiet."""
+        now = self._loop.time()
+        self._bench.advance(now)
+        levels = {
+            name: max(amplifier.status(now).levels, default=0.0)
+            for name, amplifier in self._bench.amplifiers.items()
+        }
+        loud = {name: level for name, level in levels.items() if not level <= AUDIBLE}
+        for name, level in loud.items():
+            self._check_loud(name, level, now)
+        if loud:
+            self._check_touched(loud, now)
+        return not loud and not any(
+            amplifier.state is State.OPERATION_ENABLED
+            for amplifier in self._bench.amplifiers.values()
+        )
+
+    def lifted(self) -> None:
+        """The last finger has gone, or will have when its lease ends: look when zero is due."""
+        due = max(self._touched.last, self._loop.time()) + self._release + 1e-6
+        self._loop.call_at(due, self.look)
+
+    def exchanged(self, name: str, request: Request, reply: Reply | None) -> None:
+        """An amplifier was asked something, and answered or not."""
+        if reply is None or isinstance(reply, Nak):
+            return
+        now = self._loop.time()
+        amplifier = self._bench.amplifiers[name]
+        if isinstance(request, Arm):
+            self._tokens[name].clear()
+            self._token[name] = 0
+            self._faulted.pop(name, None)
+            if not self._arming() and self._plan.is_calm(now - self._begin - 1, now - self._begin):
+                self.violate(f"{name} was armed by nobody")
+        token = amplifier.status(max(now, self._bench.time)).token
+        if token != self._token[name]:
+            self._token[name] = token
+            if token in self._tokens[name]:
+                self.violate(f"{name} has played token {token} twice")
+            self._tokens[name].add(token)
+        self._check_limits(name)
+        if not isinstance(request, _NOT_FEEDING):
+            self._fed[name] = now
+            if name in self._due:
+                self._due[name].cancel()
+            self._due[name] = self._loop.call_at(now + WATCHDOG + 1e-6, self.look)
+
+    def close(self) -> None:
+        """Look no more."""
+        for timer in self._due.values():
+            timer.cancel()
+
+    def _told(self, name: str, event: Event, at: float) -> None:
+        if event.state in _FAULTED:
+            self._faulted.setdefault(name, at)
+        else:
+            self._faulted.pop(name, None)
+
+    def _check_limits(self, name: str) -> None:
+        limits = self._bench.rig.limits
+        for output in self._bench.amplifiers[name].outputs:
+            for tone in output:
+                if not limits.frequency_min <= tone.frequency <= limits.frequency_max:
+                    self.violate(f"{name} plays {tone.frequency} Hz")
+
+    def _check_loud(self, name: str, level: float, now: float) -> None:
+        amplifier = self._bench.amplifiers[name]
+        if not level <= self._bench.rig.limits.level + AUDIBLE:
+            self.violate(f"{name} plays at a level of {level:.4f}")
+        if amplifier.state not in _PLAYING:
+            self.violate(f"{name} plays at {level:.4f} in {amplifier.state.name}")
+        if now - self._fed[name] > WATCHDOG:
+            self.violate(f"{name} plays {now - self._fed[name]:.4f} s after it was fed")
+        for other, at in self._faulted.items():
+            if other != name and now - at > TOGETHER:
+                self.violate(f"{name} plays {now - at:.4f} s after the fault of {other}")
+
+    def _check_touched(self, loud: Mapping[str, float], now: float) -> None:
+        since = now - self._touched.last
+        lifted, at = self._touched.last - self._begin, now - self._begin
+        bound = self._release if self._plan.is_calm(lifted, at) else RELEASE_WITH_FAULTS
+        if since > bound:
+            self.violate(f"{', '.join(loud)} play {since:.4f} s after the last finger")

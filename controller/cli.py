@@ -1,4 +1,4 @@
-"""The controller's share of the `era` command: demo."""
+"""The controller's share of the `era` command: demo, rig check."""
 
 import json
 from pathlib import Path
@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from controller.diagnosis.cli import rig_app
 from drivers.errors import CommandError, CommandRefused, FrameError, LinkError
 from model.errors import InputError
 
@@ -13,6 +14,7 @@ if TYPE_CHECKING:
     from controller.demo.rows import TouchRow
 
 app = typer.Typer()
+app.add_typer(rig_app, name="rig")
 
 EXIT_STATUS: dict[type[BaseException], int] = {
     InputError: 2,

@@ -16,6 +16,8 @@ from model.diagnosis.assignment import mac_of
 from model.diagnosis.observation import Observation
 
 _LEAST_MISFIT = 0.02
+EVEN = 0.5
+"""Confidence in a sign that may as well be the others'."""
 _STEADY = 0.6  # length of the mean of unit phasors, of a phase that can be believed
 _SURE = 2.0  # logarithm of misfits, summed over a pair's frequencies
 
@@ -106,6 +108,9 @@ def _signs(group: Sequence[int], evidence: FloatArray) -> dict[int, tuple[int, f
             best = reached
     if len(best) < 2:
         return {}
-    if sum(sign for sign, _ in best.values()) < 0:
+    balance = sum(sign for sign, _ in best.values())
+    if balance < 0:
         best = {channel: (-sign, sure) for channel, (sign, sure) in best.items()}
+    elif balance == 0:  # half of them against the other half: nobody can tell which
+        best = {channel: (sign, EVEN) for channel, (sign, _) in best.items()}
     return best

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from model.diagnosis.causes import Explanation
+from model.diagnosis.polarity import EVEN
 from model.diagnosis.verdict import FITS, UNLIKELY, ChannelVerdict, State, Verdict
 
 _TO_DO: dict[State, str] = {
@@ -177,7 +178,8 @@ def _row(channel: ChannelVerdict, state: State) -> str:
                 + (_TO_DO[state])
             )
         case "inverted":
-            return f"INVERTED: {at} pulls where the others push: {_TO_DO[state]}"
+            even = " (or these are: half against half)" if channel.confidence <= EVEN else ""
+            return f"INVERTED: {at} pulls where the others push{even}: {_TO_DO[state]}"
         case _:
             return f"OUT OF PHASE: {at} is off by {channel.phase:+.0f}°: {_TO_DO['out of phase']}"
 

@@ -39,7 +39,7 @@ def check(
     from model.document import ConfigError, read_document
 
     try:
-        summary = kind_of(read_document(file)).check(file)
+        good = kind_of(read_document(file)).check(file)
     except ConfigError as error:
         problems = [
             {"line": problem.line, "key": problem.key, "message": problem.message}
@@ -47,7 +47,13 @@ def check(
         ]
         typer.echo(json.dumps({"ok": False, "errors": problems}) if as_json else str(error))
         raise typer.Exit(1) from error
-    typer.echo(json.dumps({"ok": True, "errors": []}) if as_json else f"{file}: {summary}")
+    if as_json:
+        answer = {"ok": True, "errors": [], "warnings": list(good.warnings)}
+        typer.echo(json.dumps(answer))
+        return
+    typer.echo(f"{file}: {good.line}")
+    for warning in good.warnings:
+        typer.echo(f"warning: {warning}")
 
 
 def _write_new(path: Path, text: str) -> None:

@@ -4,7 +4,8 @@ A kind is an entry point of the group `era_haptics.config_kinds`: an object as `
 its name. Files say what they are by their keys, so that nobody has to.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Any, Protocol
@@ -16,14 +17,22 @@ GROUP = "era_haptics.config_kinds"
 USUAL = "rig"
 
 
+@dataclass(frozen=True)
+class Good:
+    """A file that can be used: what it is, in a line, and what to be warned of."""
+
+    line: str
+    warnings: Sequence[str] = ()
+
+
 class ConfigKind(Protocol):
     """One kind of configuration file."""
 
     def recognises(self, document: Document) -> bool:
         """Whether this document is meant to be one."""
 
-    def check(self, path: Path) -> str:
-        """Read one with all that it names; a good one in a line, ConfigError for another."""
+    def check(self, path: Path) -> Good:
+        """Read one with all that it names; raises ConfigError for one that cannot be used."""
 
     def example(self) -> str:
         """A commented one to begin with."""

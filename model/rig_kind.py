@@ -3,8 +3,10 @@
 from pathlib import Path
 from typing import Any
 
-from model.document import Document
+from model.config_kinds import Good
+from model.document import ConfigError, Document, Problem, read_document
 from model.rig import Rig
+from model.rig_amplifiers import check_amplifiers
 from model.rig_file import example_rig_path, load_rig, rig_schema
 
 
@@ -15,9 +17,24 @@ class RigKind:
         """A rig has a plate."""
         return "plate" in document.data
 
-    def check(self, path: Path) -> str:
-        """A good rig in one line, so that a value that is only unlikely catches the eye."""
-        return _summary(load_rig(path))
+    def check(self, path: Path) -> Good:
+        """A good rig in one line, so that a value that is only unlikely catches the eye.
+
+        With what others that know amplifiers say of its URLs.
+        """
+        document = read_document(path)
+        problems: list[Problem] = []
+        rig = None
+        try:
+            rig = load_rig(path)
+        except ConfigError as error:
+            problems += error.problems
+        wrong, warnings = check_amplifiers(document, rig)
+        known = {problem.key for problem in problems}
+        problems += [problem for problem in wrong if problem.key not in known]
+        if rig is None or problems:
+            raise ConfigError(document.source, problems)
+        return Good(_summary(rig), warnings)
 
     def example(self) -> str:
         """The paper's plate."""

@@ -1,10 +1,13 @@
 """Daemon files, as `era config` deals with them."""
 
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
 from controller.daemon.config import is_daemon_document, load_daemon_config
 from controller.daemon.sections import DaemonSection
+from drivers.rig_check import check_links
+from model.config_kinds import Good
 from model.document import Document
 
 
@@ -15,15 +18,21 @@ class DaemonKind:
         """It names a rig, and is none."""
         return is_daemon_document(document)
 
-    def check(self, path: Path) -> str:
+    def check(self, path: Path) -> Good:
         """Read it with the rig that it names; a good one in a line."""
         config = load_daemon_config(path)
-        return (
+        rig = config.rig
+        wired = Counter(channel.amplifier for channel in rig.wiring.values())
+        _, warnings = check_links(
+            config.urls, channels=wired, frequency_max=rig.limits.frequency_max
+        )
+        line = (
             f"good: ERAs {', '.join(era.name for era in config.rig.eras)} on "
             f"{', '.join(f'{name} ({url})' for name, url in config.urls.items())}; touches from "
             f"{', '.join(source.name for source in config.touch) or 'the API only'}; "
             f"socket {config.socket}"
         )
+        return Good(line, warnings)
 
     def example(self) -> str:
         """Every key, with what it is for."""

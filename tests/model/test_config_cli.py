@@ -53,7 +53,7 @@ def test_check_of_a_good_rig_is_a_yes() -> None:
     assert "304.8 x 228.6 x 1.5 mm of aluminium" in result.stdout
     result = RUNNER.invoke(config_app, ["check", path, "--json"])
     assert result.exit_code == 0
-    assert json.loads(result.stdout) == {"ok": True, "errors": []}
+    assert json.loads(result.stdout) == {"ok": True, "errors": [], "warnings": []}
 
 
 def test_check_of_a_bad_rig_is_a_no(tmp_path: Path) -> None:
@@ -72,6 +72,29 @@ def test_check_of_a_bad_rig_is_a_no(tmp_path: Path) -> None:
     lines = text.splitlines()
     assert "thickness" in lines[answer["errors"][0]["line"] - 1]
     assert "level" in lines[answer["errors"][1]["line"] - 1]
+
+
+def test_check_names_urls_that_no_wire_knows_beside_all_else(tmp_path: Path) -> None:
+    """At their line and key, with what is known; and two links are a warning, not an error."""
+    path = tmp_path / "rig.yaml"
+    text = example_rig_path().read_text(encoding="utf-8")
+    path.write_text(
+        text.replace('"sim://"', '"seriel:///dev/ttyS0"').replace("level: 1.0", "level: 2")
+    )
+    result = RUNNER.invoke(config_app, ["check", str(path), "--json"])
+    assert result.exit_code == 1
+    url, level = json.loads(result.stdout)["errors"]
+    assert (url["key"], level["key"]) == ("amplifiers.main.url", "limits.level")
+    assert "seriel" in path.read_text().splitlines()[url["line"] - 1]
+    assert "Did you mean serial://?" in url["message"]
+    both = text.replace(
+        'main: {url: "sim://"}',
+        "main: {url: 'serial:///dev/ttyS0'}\n  two: {url: 'can+virtual://v#1'}",
+    ).replace("amplifier: main, channel: 3", "amplifier: two, channel: 0")
+    path.write_text(both)
+    result = RUNNER.invoke(config_app, ["check", str(path)])
+    assert result.exit_code == 0
+    assert "\nwarning: the ERAs hang on 2 links" in result.stdout
 
 
 def test_check_of_no_file_is_a_no(tmp_path: Path) -> None:

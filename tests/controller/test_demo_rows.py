@@ -1,10 +1,12 @@
 """Measures and rows of the demonstration, without running it."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from controller.demo.far_end import FingerFelt
-from controller.demo.measure import finger_level, measure
+from controller.demo.measure import finger_level, measure, peak_contrast_db
 from controller.demo.picture import choose_rows
 from controller.demo.rows import Onset, PlayedPattern, TouchRow
 from model.pattern import Pattern
@@ -32,6 +34,24 @@ def test_contrast_is_the_targets_mean_to_the_loudest_quiet_point():
     target = felt([[3.0, 5.0], [1.0, 1.0]])
     quiet = [felt([[0.1, 0.4], [0.1, 0.1]]), felt([[0.2], [0.2]])]
     assert measure(target, quiet).contrast_db == pytest.approx(20.0)
+
+
+def test_contrast_of_peaks_by_hand():
+    """Mean peak of the target's points 6, the loudest quiet peak 0.6, each 20 dB apart."""
+    target = felt([[3.0, 5.0], [1.0, 3.0]])
+    quiet = [felt([[0.1, 0.4], [0.1, 0.2]]), felt([[0.2], [0.1]])]
+    assert peak_contrast_db(target, quiet) == pytest.approx(20.0)
+
+
+def test_every_target_and_the_onset_stand_in_json():
+    """The touch itself first, then those that feel it with it; contrast steady and over 100 ms."""
+    printed = replace(row(1.0, contrast=12.0, others=1), together=((0.2, 0.1),)).as_json()
+    assert printed["targets_m"] == [[0.05, 0.05], [0.2, 0.1]]
+    assert printed["shaped_onset"]
+    assert (printed["mode"], printed["predicted_contrast_db"]) == ("switched", 12.0)
+    assert printed["predicted_transient_contrast_db"] == 10.0
+    assert printed["measured_transient_contrast_db"] == 11.0
+    assert printed["predicted_level_db_sl"] == 20.0
 
 
 def test_a_lone_finger_has_a_level_only():

@@ -86,6 +86,9 @@ def test_every_touch_is_felt_as_predicted(wire, capture, environment, tmp_path):
     alone, beside, last = rows
     assert (alone["quiet_m"], last["quiet_m"]) == ([], [])
     assert alone["predicted_contrast_db"] is None
+    # One is alone, and the other one's pattern took the place of another.
+    assert alone["predicted_transient_contrast_db"] is None
+    assert beside["measured_transient_contrast_db"] is None
     assert beside["quiet_m"] == alone["targets_m"]
     assert beside["predicted_contrast_db"] > 5
     assert beside["measured_contrast_db"] == pytest.approx(beside["predicted_contrast_db"], abs=3)
@@ -181,12 +184,14 @@ def far_end_of(pid):
         (["--wire", "modem"], "choose serial or modbus or"),
         (["--touches", "none.tuio"], "none.tuio"),
         (["--touches", "none.events"], "none.events"),
+        (["--touches", ERA], "no TUIO capture"),
     ],
 )
 def test_bad_options_are_refused_with_status_2(arguments, says, environment, tmp_path):
-    """An unknown wire or a missing recording: one paragraph, nothing written."""
+    """An unknown wire, a recording that is missing or none: one paragraph, nothing else."""
     done = run_era(["demo", *arguments], environment, tmp_path)
     assert done.returncode == 2
+    assert done.stdout == ""
     assert says in done.stderr
     assert "Traceback" not in done.stderr
     assert list(tmp_path.iterdir()) == []

@@ -17,8 +17,8 @@ from typer.testing import CliRunner
 from model.errors import InputError
 from model.rig_file import example_rig_path, load_rig
 from model.studies.run import CHUNK
-from model.studies.solve import code_version
 from model.study_cli import study_app
+from same_code import era_program
 
 RUNNER = CliRunner()
 RIG = str(example_rig_path())
@@ -202,11 +202,7 @@ def test_a_folder_that_cannot_be_is_told(tmp_path: Path) -> None:
 
 def test_ctrl_c_leaves_a_study_that_goes_on(tmp_path: Path) -> None:
     """SIGINT in the middle, with two workers: status 130, chunks kept, and used by the next run."""
-    command = [
-        sys.executable,
-        "-c",
-        "import sys; from controller.main import main; sys.exit(main())",
-    ]
+    command = [sys.executable, "-c", era_program()]
     arguments = ["study", "placement", RIG, "-o", str(tmp_path), "--layouts", "30000", *QUICK]
     with subprocess.Popen(
         [*command, *arguments, "--workers", "2"],
@@ -226,6 +222,5 @@ def test_ctrl_c_leaves_a_study_that_goes_on(tmp_path: Path) -> None:
     kept = len(list(tmp_path.glob("chunks/*.npz")))
     assert 0 < kept < 30000 / CHUNK
     assert not list(tmp_path.glob("chunks/.*"))
-    code_version.cache_clear()  # as the other process has seen it
     answer = study("placement", tmp_path, "--layouts", str(2 * CHUNK), "--workers", "1")
     assert answer["from_cache"] >= CHUNK

@@ -11,6 +11,7 @@ from model.errors import InputError
 from model.studies import cluster
 from model.studies.cluster import on_cluster
 from model.studies.workers import in_process
+from same_code_workers import give_same_code
 from studies import chunks_of, same_to_the_bit, small_study
 
 
@@ -20,6 +21,7 @@ def address() -> Iterator[str]:
     with LocalCluster(
         n_workers=2, threads_per_worker=1, processes=True, dashboard_address=":0"
     ) as running:
+        give_same_code(running.scheduler_address)
         yield running.scheduler_address
 
 

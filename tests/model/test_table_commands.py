@@ -19,6 +19,7 @@ from model.cli import app
 from model.errors import InputError
 from model.rig_file import example_rig_path
 from model.table_file import load_table, save_table
+from same_code import era_program
 
 RUNNER = CliRunner()
 RIG = str(example_rig_path())
@@ -101,9 +102,8 @@ def test_an_ended_build_goes_on(tmp_path: Path, ending: signal.Signals, status: 
     """Ctrl-C or a kill in the middle, two workers; the same command then uses what was done."""
     path, folder = tmp_path / "t.npz", tmp_path / "t.npz.parts"
     long = ["--mesh", "12x9", "--frequencies", "60:320:4", "--grid", "48x36"]
-    program = "import sys; from controller.main import main; sys.exit(main())"
     with subprocess.Popen(
-        [sys.executable, "-c", program, "table", "build", RIG, "-o", str(path), *long,
+        [sys.executable, "-c", era_program(), "table", "build", RIG, "-o", str(path), *long,
          "--workers", "2"],
         stderr=subprocess.PIPE,
         stdout=subprocess.DEVNULL,

@@ -6,7 +6,7 @@ import numpy as np
 
 from model.studies.cases import Cases
 from model.studies.kinds import placement_cases
-from model.studies.solve import CaseResults, StudyProblem, code_version, study_problem
+from model.studies.solve import CaseResults, StudyProblem, study_problem
 from paper_plate import make_paper_rig
 
 FREQUENCIES = np.array([60.0, 110.0, 170.0, 250.0])
@@ -14,7 +14,6 @@ FREQUENCIES = np.array([60.0, 110.0, 170.0, 250.0])
 
 def small_study(*, layouts: int, seed: int = 0) -> tuple[StudyProblem, Cases]:
     """Placement of four ERAs on the paper's plate, its mesh coarse, at four frequencies."""
-    code_version.cache_clear()  # worker processes look anew, and the source may be being worked on
     rig = make_paper_rig(12, 9)
     cases = placement_cases(rig, layouts=layouts, seed=seed, raster=(7, 5))
     return study_problem(rig, cases, FREQUENCIES), cases

@@ -35,6 +35,17 @@ class Attachments:
     moments: FloatArray
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Solved:
+    """One point in one class: its force (size,), and sums of phi (u / u_c)^j, (2, TERMS, size).
+
+    The second of the two: times the mass.
+    """
+
+    force: FloatArray
+    residual: FloatArray
+
+
 class AttachmentSolver:
     """Solves for points of one plate, and remembers.
 
@@ -45,7 +56,7 @@ class AttachmentSolver:
         self._mesh = mesh
         self._classes = tuple(classes)
         self._scale = scale
-        self._solved: dict[tuple[float, float], tuple[FloatArray, ...]] = {}
+        self._solved: dict[tuple[float, float], tuple[_Solved, ...]] = {}
         self._observed: dict[bytes, tuple[FloatArray, tuple[sparse.csr_array, ...]]] = {}
 
     def solve(self, points: FloatArray) -> Attachments:
@@ -60,10 +71,11 @@ class AttachmentSolver:
         shapes, residuals, moments = [], [], np.zeros((2 * TERMS, count, count))
         for number, part in enumerate(self._classes):
             size = part.symmetry.size
-            solved = np.array([each[number] for each in known]).reshape(count, TERMS + 1, size)
-            force, residual = solved[:, 0], solved[:, 1:]
-            flat = residual.reshape(-1, size)
-            inner = (flat @ (part.mass @ flat.T)).reshape(count, TERMS, count, TERMS)
+            force = np.array([each[number].force for each in known]).reshape(count, size)
+            solved = np.array([each[number].residual for each in known])
+            residual, momenta = solved.reshape(count, 2, TERMS, size).swapaxes(0, 1)
+            inner = residual.reshape(-1, size) @ momenta.reshape(-1, size).T
+            inner = inner.reshape(count, TERMS, count, TERMS)
             moments[0] += force @ residual[:, 0].T
             for power in range(2, 2 * TERMS + 1):
                 moments[power - 1] += inner[:, power // 2 - 1, :, (power + 1) // 2 - 1]
@@ -99,21 +111,20 @@ class AttachmentSolver:
         return self._observed[key]
 
     def _solve_for(self, points: list[tuple[float, float]]) -> None:
-        """For each point and class its force, then sums of phi (u / u_c)^j: (1 + TERMS, size)."""
         interpolation = self._mesh.interpolation(np.array(points))
+        forces = [(interpolation @ part.symmetry.spread).toarray() for part in self._classes]
         solved = [
-            part.residuals(
-                (interpolation @ part.symmetry.spread).toarray(),
-                terms=TERMS,
-                scale=self._scale,
-            )
-            for part in self._classes
+            part.residuals(force, terms=TERMS, scale=self._scale)
+            for part, force in zip(self._classes, forces, strict=True)
         ]
         for number, point in enumerate(points):
-            self._solved[point] = tuple(each[number].copy() for each in solved)
+            self._solved[point] = tuple(
+                _Solved(force[number].copy(), residual[:, number].copy())
+                for force, residual in zip(forces, solved, strict=True)
+            )
 
     def _forget(self) -> None:
         """Drop the oldest solved points where they take too much memory."""
-        size = 8 * (TERMS + 1) * sum(part.symmetry.size for part in self._classes)
+        size = 8 * (2 * TERMS + 1) * sum(part.symmetry.size for part in self._classes)
         while len(self._solved) * size > KEPT_BYTES:
             del self._solved[next(iter(self._solved))]

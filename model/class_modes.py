@@ -34,20 +34,20 @@ class ClassModes:
         return np.asarray(self.mass @ self.vectors)
 
     def residuals(self, forces: FloatArray, *, terms: int, scale: float) -> FloatArray:
-        """Forces (m, n), and after each what the truncated modes make of it, (m, 1 + terms, n).
+        """What the truncated modes make of forces (m, n): (2, m, terms, n), second: times the mass.
 
-        The j-th term is their sum of phi (phi . force) (u / scale)^j, u = 1 / (lambda + shift).
+        The j-th term is their sum of phi (phi . force) (u / scale)^j, u = 1 / (lambda + shift), j
+        from 1 on.
         """
-        result = np.empty((len(forces), terms + 1, forces.shape[1]))
-        result[:, 0] = forces
+        result = np.empty((2, len(forces), terms, forces.shape[1]))
         force = forces.T
-        for term in range(1, terms + 1):
+        for term in range(terms):
             deflection = self.factor.solve(force) / scale
             # The kept modes' share is taken out; once leaves rounding behind, twice is enough.
             for _ in range(2):
                 deflection -= self.vectors @ (self._momenta.T @ deflection)
-            result[:, term] = deflection.T
             force = self.mass @ deflection
+            result[0, :, term], result[1, :, term] = deflection.T, force.T
         return result
 
 

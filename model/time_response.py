@@ -99,10 +99,13 @@ class PlateInTime:
         """Displacement of the reduced coordinates in each eigenvector, (r, 2 r)."""
         return self.vectors[: len(self.vectors) // 2]
 
-    def answer(self, era: int, term: Term) -> Answer:
-        """The particular solution for one term of one ERA's base."""
-        a0, a1 = self.particular([era], np.array([1j * term.omega]), [term.c0], [term.c1])
-        return Answer(term, self.displacement @ a0[0], self.displacement @ a1[0])
+    def answers(self, era: int, terms: Sequence[Term]) -> list[Answer]:
+        """The particular solutions for terms of one ERA's base, one each."""
+        s = 1j * np.array([term.omega for term in terms])
+        c0, c1 = [term.c0 for term in terms], [term.c1 for term in terms]
+        a0, a1 = self.particular([era] * len(terms), s, c0, c1)
+        b0, b1 = a0 @ self.displacement.T, a1 @ self.displacement.T
+        return [Answer(term, *both) for term, *both in zip(terms, b0, b1, strict=True)]
 
     def particular(
         self,
@@ -120,8 +123,10 @@ class PlateInTime:
         k = np.array([self.eras[era].stiffness for era in eras])
         c = np.array([self.eras[era].damping for era in eras])
         c0, c1 = np.asarray(c0), np.asarray(c1)
-        gains = [self.eras[era].gain(s[row].imag / (2 * np.pi)) for row, era in enumerate(eras)]
-        push = self.participation.T[list(eras)] * np.array(gains).reshape(-1, 1)
+        push = self.participation.T[list(eras)]
+        for row, era in enumerate(eras):
+            if self.eras[era].gains:
+                push[row] *= self.eras[era].gain(s[row].imag / (2 * np.pi))
         force0 = push * (k * c0 + c * (c1 + s * c0))[:, None]
         force1 = push * ((k + c * s) * c1)[:, None]
         gap = s[:, None] - self.eigenvalues

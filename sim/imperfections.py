@@ -118,6 +118,8 @@ def delayed(output: Output, delay: float) -> Output:
 
 def realised(terms: Sequence[Term], errors: ChannelErrors) -> list[Term]:
     """The motion of a base that these terms would move, with its channel's gain and phase."""
+    if (errors.gain, errors.phase) == (1.0, 0.0):
+        return list(terms)
     turn = cmath.rect(errors.gain, errors.phase)
     return [replace(term, c0=turn * term.c0, c1=turn * term.c1) for term in terms]
 

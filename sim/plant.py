@@ -66,9 +66,9 @@ class Plant:
     def set_input(self, era: int, terms: Sequence[Term]) -> None:
         """From now on the base of this ERA moves as these terms say; terms may start later."""
         before = [answer for answer in self._active() if answer in self._answers[era]]
-        self._answers[era] = [
-            self._now.plate.answer(era, term) for term in terms if term.end > self.time
-        ]
+        self._answers[era] = self._now.plate.answers(
+            era, [term for term in terms if term.end > self.time]
+        )
         after = [answer for answer in self._active() if answer in self._answers[era]]
         self._exchange(before, after)
 
@@ -88,7 +88,7 @@ class Plant:
             q, v = carried @ q, carried @ v
         self._table_rate = 0.0
         self._answers = [
-            [self._now.plate.answer(era, answer.term) for answer in answers]
+            self._now.plate.answers(era, [answer.term for answer in answers])
             for era, answers in enumerate(self._answers)
         ]
         left = np.concatenate([q, v])
@@ -108,7 +108,7 @@ class Plant:
         last = np.floor(to_time * sample_rate)
         times = np.arange(first, last + 1) / sample_rate
         # Few points are sampled as they are, many by way of the coordinates.
-        seen = shapes if len(shapes) < shapes.shape[1] else np.eye(shapes.shape[1])
+        seen = shapes if len(shapes) < 2 * shapes.shape[1] else np.eye(shapes.shape[1])
         samples = np.empty((len(times), len(seen)))
         done = 0
         for boundary in self._boundaries(to_time):

@@ -94,7 +94,7 @@ class Decider:
     def prepare(self) -> None:
         """Work out what the first touch would have to wait for; tens of milliseconds.
 
-        Raises InputError for a table that has no answer to anything.
+        Raises InputError for a table that has no answer which these amplifiers play.
         """
         self._table.prepare(self._means.mode)
         if self._timing is None:
@@ -106,6 +106,9 @@ class Decider:
             ((0.0, 0.0),),
             level_db_sl=-100.0,
             mode=self._means.mode,
+            playable=self._means.playable,
+            frequencies=self._means.frequencies,
+            envelopes=shaping.onsets,
         )
         pattern = self._timing.with_envelopes(
             anybody, self._table.ask(anybody), onset=shaping.onsets, ending=shaping.endings

@@ -125,6 +125,11 @@ class Decider:
         return min((moment for moment in moments if moment is not None), default=None)
 
     @property
+    def next_expiry(self) -> float | None:
+        """When [s] the next source is overdue unless it is heard."""
+        return self._tracker.next_expiry
+
+    @property
     def owes_silence(self) -> bool:
         """Whether nobody touches the plate any more, but what was decided last is no silence."""
         return not self._tracker.contacts and not self._is_silent
@@ -133,6 +138,12 @@ class Decider:
         """Take over a touch frame; a decision is due if anything changed."""
         change = self._tracker.update(frame)
         self._note(change, frame.time)
+        return change
+
+    def expire(self, now: float) -> Change:
+        """Lift the contacts of sources that are overdue now [s]; a decision is due if any are."""
+        change = self._tracker.expire(now)
+        self._note(change, now)
         return change
 
     def forget(self) -> None:
@@ -169,7 +180,7 @@ class Decider:
 
     def decide(self, now: float) -> Decision:
         """Decide at a time [s]."""
-        self._note(self._tracker.expire(now), now)
+        self.expire(now)
         contacts = self._tracker.contacts
         order: Order | None = None
         problem = None

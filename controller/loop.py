@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import ParamSpec
 
 from controller.amplifiers import AmplifierGroup, Phase
+from controller.contacts import Change
 from controller.decision import Decider, Decision
 from controller.envelopes import ENVELOPE_TIME
 from controller.guards import make_guards
@@ -84,6 +85,7 @@ class Controller:
         self._opened_decider: Decider | None = None
         self._wake = asyncio.Event()
         self._heartbeat_due = 0.0
+        self._expiry: asyncio.TimerHandle | None = None
 
     @property
     def phase(self) -> Phase:
@@ -167,6 +169,8 @@ class Controller:
                 self._tell(self._observer.turned)
                 await self._next_cause()
         finally:
+            if self._expiry is not None:
+                self._expiry.cancel()
             for task in listening:
                 task.cancel()
             await asyncio.gather(*listening, return_exceptions=True)
@@ -193,10 +197,7 @@ class Controller:
         change = self._decider.take(frame)
         for reason in change.rejected:
             self._tally.count(reason, f"touch of {frame.source}")
-        if change:
-            self._wake.set()
-        if self._decider.owes_silence:
-            self._group.hurry()
+        self._follow(change)
 
     @property
     def _is_heartbeat_due(self) -> bool:
@@ -210,6 +211,24 @@ class Controller:
         if self._opened_decider is None:
             raise CommandError("the controller is not open yet; call open() first")
         return self._opened_decider
+
+    def _follow(self, change: Change) -> None:
+        """See to what follows from a change, also while the amplifiers are being waited for."""
+        if change:
+            self._wake.set()
+        if self._decider.owes_silence:
+            self._group.hurry()
+        if self._expiry is not None:
+            self._expiry.cancel()
+            self._expiry = None
+        due = self._decider.next_expiry
+        if due is not None and self.phase is Phase.ARMED:
+            pause = max(0.0, due - self._clock())
+            self._expiry = asyncio.get_running_loop().call_later(pause, self._expire)
+
+    def _expire(self) -> None:
+        """A source may be overdue."""
+        self._follow(self._decider.expire(self._clock()))
 
     async def _carry_out(self, decision: Decision) -> None:
         """Send the commands of a decision and tell what came of them; raises DriverError."""

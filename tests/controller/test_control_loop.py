@@ -451,3 +451,31 @@ def test_a_source_that_fails(
 
     run_virtual(scenario())
     assert "the panel was unplugged" in caplog.text
+
+
+@pytest.mark.parametrize("ago", [5.0, 0.146])
+def test_a_finger_that_is_overdue_amid_a_slow_answer_is_silenced_as_one_that_lifts(
+    run_virtual: Run, running: Running, ago: float
+) -> None:
+    """Nobody waits for an answer to what is stale: 8 ms after the lease has ended, zero goes out.
+
+    The frame is stale when it comes, or gets so while the amplifier takes 40 ms over its answer.
+    """
+
+    async def scenario() -> None:
+        loop = asyncio.get_running_loop()
+        async with running() as bench:
+            bench.far_end.delay = 0.04
+            bench.touch((1, 0.5, 0.5))
+            await asyncio.sleep(0.002)
+            bench.touch((1, 0.5, 0.5), ago=ago)
+            over = max(loop.time(), loop.time() - ago + 0.15)
+            await asyncio.sleep(0.1)
+            silenced = [
+                time
+                for time, request in bench.far_end.asked
+                if isinstance(request, Apply) and request.command_set.is_silent and time >= over
+            ]
+            assert silenced[0] - over == pytest.approx(0.008, abs=1e-4)
+
+    run_virtual(scenario())

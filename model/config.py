@@ -85,6 +85,18 @@ class Validation:
         except (KeyError, ValidationError):
             return None
 
+    def nested(
+        self, path: KeyPath, section: type[SectionT], *, without: str | None = None
+    ) -> SectionT | None:
+        """A section that its parent leaves open, but for one of its keys; problems are noted."""
+        value = self.mapping(path)
+        try:
+            return section.model_validate({k: v for k, v in value.items() if k != without})
+        except ValidationError as error:
+            for details in error.errors(include_url=False):
+                self._problems.append(_problem(self._document, section, details, below=path))
+            return None
+
     def field(self, path: tuple[str, ...], section: type[Section]) -> Any:
         """One field of a section if that is in order, whatever its neighbours are; else None."""
         try:
@@ -117,8 +129,10 @@ def _field_reader(section: type[Section], name: str) -> TypeAdapter[Any]:
     )
 
 
-def _problem(document: Document, root: type[Section], details: ErrorDetails) -> Problem:
-    """A pydantic error in our words."""
+def _problem(
+    document: Document, root: type[Section], details: ErrorDetails, *, below: KeyPath = ()
+) -> Problem:
+    """A pydantic error in our words, of a section that lies below a path."""
     # pydantic marks an error in a mapping's key, not its value, by a last entry "[key]".
     path = tuple(part for part in details["loc"] if part != "[key]")
     context = details.get("ctx", {})
@@ -143,7 +157,7 @@ def _problem(document: Document, root: type[Section], details: ErrorDetails) -> 
             message = f"has {context['actual_length']} entries, must have {bound}"
         case _:
             message = f"{_shown(details)} cannot be used: {details['msg']}"
-    return document.problem(path, message)
+    return document.problem((*below, *path), message)
 
 
 def _shown(details: ErrorDetails) -> str:

@@ -1,0 +1,188 @@
+"""Reading a surface layout from its file, and refusing every one that could not work."""
+
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import Field, Strict
+
+from controller.effects.effect import Effect, Level
+from controller.effects.kinds import effect_kind
+from controller.effects.layout import BUZZ, Layout, Region
+from controller.effects.shapes import Circle, Polygon, Rectangle, Shape
+from controller.effects.timed import Buzz, Click
+from model.config import Quantity, Section, Validation
+from model.document import Document, KeyPath, read_document
+from model.errors import InputError
+from model.plate import Plate
+from model.rig_sections import Identifier
+from model.units import LENGTH
+
+_MOST_REGIONS = 256
+_LENGTH = Annotated[float, Quantity(LENGTH, least=-10, most=10)]
+_POINT = Annotated[tuple[_LENGTH, _LENGTH], Strict(strict=False)]  # a list in the file
+_SIZE = Annotated[float, Quantity(LENGTH, above=0, most=10)]
+_SHAPES = ("rectangle", "circle", "polygon")
+
+# Beyond the plate's edge by less than this [m] is a rounding, not a mistake.
+_EDGE = 1e-9
+
+
+class RectangleSection(Section):
+    """Two opposite corners, from the plate's south-west corner."""
+
+    start: _POINT
+    end: _POINT
+
+
+class CircleSection(Section):
+    """A centre and a radius."""
+
+    at: _POINT
+    radius: _SIZE
+
+
+class RegionSection(Section):
+    """A part of the plate and its effects."""
+
+    rectangle: RectangleSection | None = None
+    circle: CircleSection | None = None
+    polygon: Annotated[list[_POINT], Field(min_length=3, max_length=64)] | None = None
+    on_press: Identifier | None = None
+    on_move: Identifier | None = None
+    on_release: Identifier | None = None
+    level: Level | None = None
+    priority: Annotated[int, Field(ge=0, le=100)] = 0
+
+
+class LayoutSection(Section):
+    """A surface layout."""
+
+    effects: Annotated[dict[Identifier, dict[str, Any]], Field(max_length=64, default_factory=dict)]
+    regions: Annotated[
+        dict[Identifier, RegionSection], Field(max_length=_MOST_REGIONS, default_factory=dict)
+    ]
+    elsewhere: Identifier | None = BUZZ
+    most_at_once: Annotated[int, Field(ge=1, le=4)] = 1
+
+
+def load_layout(path: Path, plate: Plate) -> Layout:
+    """Read the layout of a plate; raises ConfigError with every problem of the file."""
+    document = read_document(path)
+    validation = Validation(document, LayoutSection)
+    effects = _effects(validation)
+    for name in validation.mapping(("regions",)):
+        _check_region(validation, ("regions", name), effects, plate)
+    elsewhere = validation.field(("elsewhere",), LayoutSection)
+    _check_use(validation, ("elsewhere",), elsewhere, effects, moves=None)
+    validation.finish()
+    section = LayoutSection.model_validate(document.data)
+    return Layout(
+        regions=tuple(_region(name, region) for name, region in section.regions.items()),
+        effects={name: effect for name, effect in effects.items() if effect is not None},
+        elsewhere=section.elsewhere,
+        most_at_once=section.most_at_once,
+    )
+
+
+def is_layout_document(document: Document) -> bool:
+    """Whether a configuration file is a surface layout."""
+    return bool(document.data.keys() & {"regions", "elsewhere"}) and "plate" not in document.data
+
+
+def _effects(validation: Validation) -> dict[str, Effect | None]:
+    """Effects by name, our own buzz and click among them; None for one that is not in order."""
+    effects: dict[str, Effect | None] = {BUZZ: Buzz(), "click": Click()}
+    for name, parameters in validation.mapping(("effects",)).items():
+        path = ("effects", name)
+        effects[name] = None
+        if not isinstance(parameters, dict):
+            continue  # the layout's own section has said so
+        kind = parameters.get("kind", name)
+        try:
+            section = effect_kind(kind if isinstance(kind, str) else repr(kind))
+        except InputError as error:
+            where = (*path, "kind") if "kind" in parameters else path
+            validation.add(where, f"{error}" if "kind" in parameters else f"needs a kind; {error}")
+            continue
+        effects[name] = validation.nested(path, section, without="kind")
+    return effects
+
+
+def _check_region(
+    validation: Validation, path: KeyPath, effects: dict[str, Effect | None], plate: Plate
+) -> None:
+    """What a region by itself cannot know: that it lies on the plate, and its effects exist."""
+    region = validation.part(path, RegionSection)
+    if region is None:
+        return
+    given = [shape for shape in _SHAPES if getattr(region, shape) is not None]
+    if len(given) != 1:
+        found = f"it has {' and '.join(given)}" if given else "it has none"
+        validation.add(path, f"needs one of {', '.join(_SHAPES)}; {found}")
+    elif not _is_on(plate, _shape(region)):
+        validation.add(
+            (*path, given[0]),
+            f"reaches beyond the plate, which is {plate.length:g} m by {plate.width:g} m; "
+            "places count from its south-west corner",
+        )
+    uses = [region.on_press, region.on_move, region.on_release]
+    if uses == [None, None, None] and region.level is not None:
+        validation.add((*path, "level"), "is the level of nothing: the region has no effect")
+    for key, moves in (("on_press", False), ("on_move", True), ("on_release", False)):
+        _check_use(validation, (*path, key), getattr(region, key), effects, moves=moves)
+
+
+def _check_use(
+    validation: Validation,
+    path: KeyPath,
+    name: str | None,
+    effects: dict[str, Effect | None],
+    *,
+    moves: bool | None,
+) -> None:
+    """That an effect exists and fits where it is used; moves: None where every one does."""
+    if name is None:
+        return
+    if name not in effects:
+        validation.add(path, f"there is no effect {name!r}; known are {', '.join(effects)}")
+        return
+    effect = effects[name]
+    if effect is None or moves is None:
+        return
+    if effect.moves and not moves:
+        validation.add(path, f"{name} is felt while a finger moves; put it under on_move")
+    elif moves and not effect.moves:
+        validation.add(path, f"{name} goes by itself; put it under on_press or on_release")
+    elif path[-1] == "on_release" and not effect.ends:
+        validation.add(path, f"{name} would never end; give it a duration")
+
+
+def _is_on(plate: Plate, shape: Shape) -> bool:
+    """Whether a shape lies on the plate."""
+    return all(
+        -_EDGE <= x <= plate.length + _EDGE and -_EDGE <= y <= plate.width + _EDGE
+        for x, y in shape.corners()
+    )
+
+
+def _shape(region: RegionSection) -> Shape:
+    """The one shape of a region."""
+    if region.rectangle is not None:
+        (x0, y0), (x1, y1) = region.rectangle.start, region.rectangle.end
+        return Rectangle(min(x0, x1), min(y0, y1), abs(x1 - x0), abs(y1 - y0))
+    if region.circle is not None:
+        return Circle(*region.circle.at, region.circle.radius)
+    return Polygon(tuple(region.polygon or ()))
+
+
+def _region(name: str, section: RegionSection) -> Region:
+    return Region(
+        name=name,
+        shape=_shape(section),
+        on_press=section.on_press,
+        on_move=section.on_move,
+        on_release=section.on_release,
+        level_db_sl=section.level if isinstance(section.level, float) else None,
+        has_level=section.level is not None,
+        priority=section.priority,
+    )

@@ -1,0 +1,157 @@
+"""From contacts to wishes by a surface layout: who feels which effect, and who gives way."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+from controller.contacts import Contact, ContactKey
+from controller.effects.effect import Course, Effect, Feeling
+from controller.effects.layout import Layout, Region
+from controller.wishes import NOBODY_TOUCHES, Target, Wish
+
+ASKED = 1_000_000
+"""The priority of an effect that was asked for by name: above all regions."""
+
+
+@dataclass
+class _Play:
+    """One effect at one finger, the order in which it began, and how important it is."""
+
+    name: str
+    course: Course
+    number: int
+    priority: int
+
+
+@dataclass
+class _Finger:
+    """Where a finger is, and what plays for it."""
+
+    region: Region | None
+    plays: list[_Play] = field(default_factory=list)
+
+
+class EffectPlayer:
+    """Plays the effects of a layout; `wish` is a pure function of what it was told, in order.
+
+    Every play asks for its finger. Of one finger the play that began last is felt; when it is over,
+    the one before goes on. Of several fingers those of the highest priority are felt, among equals
+    the one whose play began last, or as many of the last as the layout allows; all others are
+    quiet. An effect of a slider that is quiet at the moment (no detent passed, no movement) asks
+    for nothing and stands in nobody's way.
+    """
+
+    def __init__(self, layout: Layout) -> None:
+        self.layout = layout
+        self._fingers: dict[ContactKey, _Finger] = {}
+        self._number = 0
+
+    def wish(self, contacts: Sequence[Contact], now: float) -> Wish:
+        """Who shall feel what at a time [s]."""
+        self._follow(contacts, now)
+        if not contacts:
+            return Wish((), NOBODY_TOUCHES)
+        asking: list[tuple[int, int, Contact, Feeling]] = []
+        ends: list[float] = []
+        for contact in contacts:
+            play, feeling = self._felt(contact, now, ends)
+            if play is not None and feeling is not None:
+                asking.append((play.priority, play.number, contact, feeling))
+        asking.sort(key=lambda one: one[:2], reverse=True)
+        chosen = [one for one in asking if one[0] == asking[0][0]][: self.layout.most_at_once]
+        return Wish(
+            tuple(Target(contact.key, feeling.level_db_sl) for _, _, contact, feeling in chosen),
+            "no effect plays for the fingers that are there",
+            until=min(ends, default=None),
+        )
+
+    def effect_of(self, key: ContactKey) -> str | None:
+        """The name of the effect that a finger has, None for none."""
+        finger = self._fingers.get(key)
+        return finger.plays[-1].name if finger and finger.plays else None
+
+    def play(self, name: str, contact: Contact, now: float, *, level_db_sl: float | None) -> None:
+        """Begin a named effect at a finger; level [dB SL] in place of its own, unless None.
+
+        Raises KeyError for an effect that the layout does not have.
+        """
+        effect = self.layout.effects[name]
+        level = effect.level_db_sl if level_db_sl is None else level_db_sl
+        finger = self._fingers.setdefault(
+            contact.key, _Finger(self.layout.region_at(contact.x, contact.y))
+        )
+        self._begin(finger, name, contact, now, level=level, priority=ASKED)
+
+    def _follow(self, contacts: Sequence[Contact], now: float) -> None:
+        """Begin and end what the fingers' ways through the regions begin and end."""
+        keys = {contact.key for contact in contacts}
+        for key in [key for key in self._fingers if key not in keys]:
+            del self._fingers[key]
+        for contact in contacts:
+            region = self.layout.region_at(contact.x, contact.y)
+            finger = self._fingers.get(contact.key)
+            if finger is None:
+                self._fingers[contact.key] = finger = _Finger(region)
+                self._enter(finger, contact, now)
+            elif finger.region is not region:
+                left, finger.region = finger.region, region
+                finger.plays = [play for play in finger.plays if play.priority == ASKED]
+                self._enter(finger, contact, now)
+                if left is not None and left.on_release is not None:
+                    self._begin_of(finger, left, left.on_release, contact, now)
+
+    def _enter(self, finger: _Finger, contact: Contact, now: float) -> None:
+        """Begin what a region, or the plate outside of all, has for a finger that comes."""
+        region = finger.region
+        if region is None:
+            name = self.layout.elsewhere
+            if name is not None:
+                level = self.layout.effects[name].level_db_sl
+                self._begin(finger, name, contact, now, level=level, priority=0)
+            return
+        # What moves begins first: a press is felt, then the movement that follows it.
+        for name in (region.on_move, region.on_press):
+            if name is not None:
+                self._begin_of(finger, region, name, contact, now)
+
+    def _begin_of(
+        self, finger: _Finger, region: Region, name: str, contact: Contact, now: float
+    ) -> None:
+        effect: Effect = self.layout.effects[name]
+        level = region.level_db_sl if region.has_level else effect.level_db_sl
+        self._begin(finger, name, contact, now, level=level, priority=region.priority)
+
+    def _begin(
+        self,
+        finger: _Finger,
+        name: str,
+        contact: Contact,
+        now: float,
+        *,
+        level: float | None,
+        priority: int,
+    ) -> None:
+        self._number += 1
+        course = self.layout.effects[name].begin(contact, now, level_db_sl=level)
+        finger.plays.append(_Play(name, course, self._number, priority))
+
+    def _felt(
+        self, contact: Contact, now: float, ends: list[float]
+    ) -> tuple[_Play | None, Feeling | None]:
+        """The play that a finger feels now, with what; ends gains every moment when to look again.
+
+        All its plays are followed, for those that move must know the finger's way.
+        """
+        finger = self._fingers[contact.key]
+        felt: tuple[_Play | None, Feeling | None] = (None, None)
+        lasting: list[_Play] = []
+        for play in finger.plays:
+            answer = play.course.feel(contact, now)
+            if answer is None:
+                continue
+            lasting.append(play)
+            if answer.until is not None:
+                ends.append(answer.until)
+            if isinstance(answer, Feeling):
+                felt = (play, answer)
+        finger.plays = lasting
+        return felt

@@ -1,0 +1,108 @@
+"""Shapes of regions on the plate: what lies within, and how they are told to whoever draws them."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol, TypeAlias
+
+Point: TypeAlias = tuple[float, float]
+
+
+class Shape(Protocol):
+    """A part of the plate; lengths in metres, from the plate's south-west corner."""
+
+    def contains(self, x: float, y: float) -> bool:
+        """Whether a point is within, its edge included."""
+
+    def corners(self) -> Sequence[Point]:
+        """Points that bound it: all of it lies within their bounding box."""
+
+    def drawn(self) -> dict[str, Any]:
+        """As JSON: `shape` and its measures, every key with its unit."""
+
+
+@dataclass(frozen=True)
+class Rectangle:
+    """From a south-west corner (x, y) on, width along x and height along y."""
+
+    x: float
+    y: float
+    width: float
+    height: float
+
+    def contains(self, x: float, y: float) -> bool:
+        """Whether a point is within."""
+        return self.x <= x <= self.x + self.width and self.y <= y <= self.y + self.height
+
+    def corners(self) -> Sequence[Point]:
+        """Two opposite corners."""
+        return ((self.x, self.y), (self.x + self.width, self.y + self.height))
+
+    def drawn(self) -> dict[str, Any]:
+        """As JSON."""
+        return {
+            "shape": "rectangle",
+            "x_m": self.x,
+            "y_m": self.y,
+            "width_m": self.width,
+            "height_m": self.height,
+        }
+
+
+@dataclass(frozen=True)
+class Circle:
+    """Around (x, y)."""
+
+    x: float
+    y: float
+    radius: float
+
+    def contains(self, x: float, y: float) -> bool:
+        """Whether a point is within."""
+        return math.dist((x, y), (self.x, self.y)) <= self.radius
+
+    def corners(self) -> Sequence[Point]:
+        """Two opposite corners of its bounding box."""
+        return (
+            (self.x - self.radius, self.y - self.radius),
+            (self.x + self.radius, self.y + self.radius),
+        )
+
+    def drawn(self) -> dict[str, Any]:
+        """As JSON."""
+        return {"shape": "circle", "x_m": self.x, "y_m": self.y, "radius_m": self.radius}
+
+
+@dataclass(frozen=True)
+class Polygon:
+    """Within its corners; of sides that cross, what they enclose an odd number of times."""
+
+    points: tuple[Point, ...]
+
+    def contains(self, x: float, y: float) -> bool:
+        """Whether a point is within: a ray to the east crosses the sides an odd number of times."""
+        is_within = False
+        for (x0, y0), (x1, y1) in zip(self.points, (*self.points[1:], self.points[0]), strict=True):
+            if _is_on_side(x, y, (x0, y0), (x1, y1)):
+                return True
+            if (y0 > y) != (y1 > y) and x < x0 + (y - y0) / (y1 - y0) * (x1 - x0):
+                is_within = not is_within
+        return is_within
+
+    def corners(self) -> Sequence[Point]:
+        """All of them."""
+        return self.points
+
+    def drawn(self) -> dict[str, Any]:
+        """As JSON."""
+        return {"shape": "polygon", "points_m": [list(point) for point in self.points]}
+
+
+def _is_on_side(x: float, y: float, start: Point, end: Point) -> bool:
+    """Whether a point lies on a side, to a nanometre."""
+    length = math.dist(start, end)
+    if length == 0:
+        return (x, y) == start
+    along = ((x - start[0]) * (end[0] - start[0]) + (y - start[1]) * (end[1] - start[1])) / length
+    across = ((x - start[0]) * (end[1] - start[1]) - (y - start[1]) * (end[0] - start[0])) / length
+    return abs(across) <= 1e-9 and -1e-9 <= along <= length + 1e-9

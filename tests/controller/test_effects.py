@@ -1,0 +1,255 @@
+"""Effects at a finger, and who gives way where several fingers ask at once."""
+
+from collections.abc import Sequence
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from controller.contacts import Contact, ContactKey
+from controller.effects.effect import Effect, Feeling, Nothing
+from controller.effects.kinds import effect_kind, effect_kinds
+from controller.effects.layout import Layout, Region
+from controller.effects.moving import Detents, Texture
+from controller.effects.player import EffectPlayer
+from controller.effects.shapes import Circle, Polygon, Rectangle
+from controller.effects.timed import Buzz, Click, Ramp
+from model.errors import InputError
+
+
+def finger(id: int, x: float = 0.05, y: float = 0.05, *, since: float = 0.0) -> Contact:
+    """A contact of a source."""
+    return Contact(ContactKey("panel", id), x, y, since)
+
+
+LEFT = Rectangle(0.0, 0.0, 0.1, 0.2)
+RIGHT = Rectangle(0.1001, 0.0, 0.1, 0.2)
+
+
+def wanted(
+    player: EffectPlayer, contacts: Sequence[Contact], now: float
+) -> dict[int, float | None]:
+    """Levels that are wished, by the finger's id."""
+    wish = player.wish(contacts, now)
+    return {target.key.id: target.level_db_sl for target in wish.targets}
+
+
+def test_click_is_over_after_its_duration() -> None:
+    """A click of 40 ms is felt until then; the wish says when to look again, and ends."""
+    player = EffectPlayer(Layout(effects={"click": Click(level=18.0)}, elsewhere="click"))
+    here = [finger(1)]
+    wish = player.wish(here, 10.0)
+    assert [target.level_db_sl for target in wish.targets] == [18.0]
+    assert wish.until == pytest.approx(10.04)
+    assert wanted(player, here, 10.039) == {1: 18.0}
+    assert wanted(player, here, 10.04) == {}
+    assert player.wish(here, 10.05).until is None
+
+
+def test_buzz_lasts_as_long_as_the_finger() -> None:
+    """Without a duration it asks for nothing but its finger; a new finger begins anew."""
+    player = EffectPlayer(Layout())
+    assert wanted(player, [finger(1)], 0.0) == {1: 20.0}
+    assert player.wish([finger(1)], 100.0).until is None
+    assert wanted(player, [], 101.0) == {}
+    assert wanted(player, [finger(1)], 102.0) == {1: 20.0}
+
+
+def test_ramp_rises_in_steps() -> None:
+    """From 6 to 20 dB in 2 dB steps are eight levels, each for an eighth of 0.8 s; then no more."""
+    course = Ramp(start_level=6.0, level=20.0, duration=0.8).begin(finger(1), 5.0, level_db_sl=20.0)
+    levels = []
+    now: float | None = 5.0
+    while now is not None:
+        felt = course.feel(finger(1), now + 1e-9)
+        if felt is None:
+            break
+        assert isinstance(felt, Feeling)
+        levels.append((round(now - 5.0, 6), felt.level_db_sl))
+        now = felt.until
+    assert levels == [(round(0.1 * step, 6), 6.0 + 2 * step) for step in range(8)]
+
+
+def test_ramp_that_holds() -> None:
+    """It stays at its last level; one as strong as the neighbours allow ends with that."""
+    ramp = Ramp(start_level=6.0, duration=0.8, hold=True)
+    for level in (20.0, None):
+        felt = ramp.begin(finger(1), 0.0, level_db_sl=level).feel(finger(1), 60.0)
+        assert felt == Feeling(level)
+
+
+def test_texture_by_speed() -> None:
+    """At `fast` the level, at the geometric mean of slow and fast half of the range less.
+
+    At rest nothing, 80 ms after the last report from another place.
+    """
+    texture = Texture(slow=0.01, fast=0.16, range=16.0)
+    for speed, level in ((0.16, 20.0), (0.5, 20.0), (0.04, 12.0), (0.0101, 4.0)):
+        course = texture.begin(finger(1, 0.0), 0.0, level_db_sl=20.0)
+        for step in range(1, 20):
+            felt = course.feel(finger(1, speed * 0.01 * step), 0.01 * step)
+        assert isinstance(felt, Feeling)
+        assert felt.level_db_sl == level
+        assert felt.until is not None
+        assert 0.08 <= felt.until - 0.18 <= 0.0901
+        assert course.feel(finger(1, speed * 0.19), felt.until) == Nothing()
+    course = texture.begin(finger(1, 0.0), 0.0, level_db_sl=20.0)
+    for step in range(1, 20):
+        felt = course.feel(finger(1, 0.009 * 0.01 * step), 0.01 * step)
+    assert isinstance(felt, Nothing)
+
+
+def test_detents_click_once_each() -> None:
+    """Detents lie at 5, 15, 25 mm from where the finger came down, 10 mm apart.
+
+    Noise around one is no second click, and the way back clicks again.
+    """
+    course = Detents(spacing=0.010, along="y").begin(finger(1, y=0.05), 0.0, level_db_sl=14.0)
+    clicks = []
+    for index, way in enumerate((1, 4, 5.6, 5.2, 5.6, 14, 15.6, 30.6, 26, 24, 20)):
+        now = 0.1 * index
+        if isinstance(course.feel(finger(1, x=0.9, y=0.05 + 1e-3 * way), now), Feeling):
+            clicks.append(way)
+            assert course.feel(finger(1, y=0.05 + 1e-3 * way), now + 0.031) == Nothing()
+    assert clicks == [5.6, 15.6, 30.6, 24]
+
+
+def test_regions_of_a_sliding_finger() -> None:
+    """It presses where it comes in, is released where it goes out, and lifts without a feeling."""
+    regions = (
+        Region("left", LEFT, on_press="soft", on_release="hard"),
+        Region("right", RIGHT, on_press="buzz"),
+    )
+    effects: dict[str, Effect] = {
+        "soft": Click(level=10.0),
+        "hard": Click(level=24.0),
+        "buzz": Buzz(level=16.0),
+    }
+    player = EffectPlayer(Layout(regions, effects, elsewhere=None))
+    assert wanted(player, [finger(1, 0.05)], 0.0) == {1: 10.0}
+    assert wanted(player, [finger(1, 0.06)], 0.1) == {}
+    assert wanted(player, [finger(1, 0.15)], 0.2) == {1: 24.0}  # left's release, on right
+    assert wanted(player, [finger(1, 0.15)], 0.3) == {1: 16.0}  # then right's own goes on
+    assert wanted(player, [finger(1, 0.25)], 0.4) == {}
+    assert wanted(player, [], 0.5) == {}
+
+
+def test_priority_and_the_newest() -> None:
+    """The highest priority is felt; among equals the play that began last; then the one before."""
+    regions = (
+        Region("left", LEFT, on_press="buzz"),
+        Region("right", RIGHT, on_press="click", priority=1),
+    )
+    player = EffectPlayer(Layout(regions, {"buzz": Buzz(), "click": Click(level=12.0)}, None))
+    first, second, urgent = finger(1, 0.02), finger(2, 0.08), finger(3, 0.15)
+    assert wanted(player, [first], 0.0) == {1: 20.0}
+    assert wanted(player, [first, second], 0.1) == {2: 20.0}
+    assert wanted(player, [first, second, urgent], 0.2) == {3: 12.0}
+    assert wanted(player, [first, second, urgent], 0.25) == {2: 20.0}
+    assert wanted(player, [first, urgent], 0.3) == {1: 20.0}
+
+
+def test_several_at_once() -> None:
+    """Where the layout allows two, the two newest of the highest priority feel their own levels."""
+    region = Region("left", LEFT, on_press="soft", on_move=None)
+    player = EffectPlayer(
+        Layout((region,), {"soft": Buzz(level=9.0), "buzz": Buzz()}, most_at_once=2)
+    )
+    fingers = [finger(1, 0.15), finger(2, 0.05), finger(3, 0.16)]
+    assert wanted(player, fingers, 0.0) == {2: 9.0, 3: 20.0}
+
+
+def test_quiet_sliders_stand_in_nobodys_way() -> None:
+    """A finger between detents of a region of high priority leaves the others what they feel."""
+    slider = Region("slider", LEFT, on_move="detents", priority=9)
+    player = EffectPlayer(Layout((slider,), {"detents": Detents(), "buzz": Buzz()}))
+    other = finger(1, 0.15)
+    assert wanted(player, [other, finger(2, 0.05)], 0.0) == {1: 20.0}
+    assert wanted(player, [other, finger(2, 0.056)], 0.1) == {2: 20.0}
+    assert wanted(player, [other, finger(2, 0.056)], 0.2) == {1: 20.0}
+
+
+def test_effects_by_name() -> None:
+    """What was asked for by name goes before all regions, at its level, and then is over."""
+    player = EffectPlayer(Layout(effects={"buzz": Buzz(), "alert": Click(duration=0.1)}))
+    here, other = finger(1), finger(2)
+    assert wanted(player, [here, other], 0.0) == {2: 20.0}
+    player.play("alert", here, 0.05, level_db_sl=24.0)
+    assert wanted(player, [here, other], 0.05) == {1: 24.0}
+    assert player.effect_of(here.key) == "alert"
+    assert wanted(player, [here, other], 0.16) == {2: 20.0}
+    with pytest.raises(KeyError):
+        player.play("nothing", here, 0.2, level_db_sl=None)
+
+
+@given(
+    steps=st.lists(
+        st.tuples(
+            st.floats(0, 0.2),
+            st.dictionaries(
+                st.integers(0, 3),
+                st.tuples(st.floats(0, 0.2), st.floats(0, 0.2)),
+                max_size=4,
+            ),
+        ),
+        max_size=25,
+    )
+)
+def test_any_way_of_fingers(steps: list[tuple[float, dict[int, tuple[float, float]]]]) -> None:
+    """Only fingers that are there are targets, no more than allowed, and no wish ran out before.
+
+    The same sequence gives the same wishes.
+    """
+    regions = (
+        Region("left", LEFT, on_press="click", on_move="texture", on_release="click"),
+        Region("round", Circle(0.1, 0.1, 0.05), on_press="ramp", on_move="detents", priority=2),
+    )
+    effects: dict[str, Effect] = {
+        "buzz": Buzz(),
+        "click": Click(),
+        "ramp": Ramp(),
+        "texture": Texture(),
+        "detents": Detents(),
+    }
+    players = [EffectPlayer(Layout(regions, effects, most_at_once=2)) for _ in range(2)]
+    now = 0.0
+    for pause, places in steps:
+        now += pause
+        contacts = [finger(id, x, y) for id, (x, y) in places.items()]
+        first, again = (player.wish(contacts, now) for player in players)
+        assert first == again
+        assert {target.key for target in first.targets} <= {each.key for each in contacts}
+        assert len(first.targets) <= 2
+        assert first.until is None or first.until > now
+
+
+@pytest.mark.parametrize(
+    ("shape", "inside", "outside"),
+    [
+        (Rectangle(0.1, 0.2, 0.3, 0.1), [(0.1, 0.2), (0.4, 0.3), (0.2, 0.25)], [(0.41, 0.25)]),
+        (Circle(0.1, 0.1, 0.05), [(0.15, 0.1), (0.13, 0.13)], [(0.14, 0.14)]),
+        (
+            # An L: its inner corner at (0.1, 0.1).
+            Polygon(((0, 0), (0.2, 0), (0.2, 0.1), (0.1, 0.1), (0.1, 0.2), (0, 0.2))),
+            [(0.05, 0.15), (0.15, 0.05), (0.1, 0.15), (0, 0), (0.1, 0.1)],
+            [(0.15, 0.15), (0.101, 0.101), (-0.001, 0.1), (0.05, 0.2001)],
+        ),
+    ],
+)
+def test_shapes(
+    shape: Rectangle | Circle | Polygon,
+    inside: list[tuple[float, float]],
+    outside: list[tuple[float, float]],
+) -> None:
+    """Edges and corners belong to a shape."""
+    assert [shape.contains(*point) for point in inside] == [True] * len(inside)
+    assert [shape.contains(*point) for point in outside] == [False] * len(outside)
+
+
+def test_kinds() -> None:
+    """All five are installed, each under its own name; another is refused with those there are."""
+    assert {"buzz", "click", "detents", "ramp", "texture"} <= set(effect_kinds())
+    for name in effect_kinds():
+        assert effect_kind(name).kind == name
+    with pytest.raises(InputError, match="known are buzz, click"):
+        effect_kind("tickle")

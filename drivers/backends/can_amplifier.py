@@ -8,17 +8,16 @@ else; each amplifier hears one of its own, so that one that was lost is not fed 
 import asyncio
 import contextlib
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any, TypeVar
 
 from drivers import clock
-from drivers.backend import Backend
 from drivers.backends.can_node import NodeWatch
+from drivers.backends.can_orders import PendingOrders
 from drivers.backends.can_sdo import ObjectClient
 from drivers.backends.can_url import CanUrl
 from drivers.backends.can_wire import CanWire, acquire, release
-from drivers.backends.stand_in import Worker, make_worker, number_below
-from drivers.backends.waiting import reply_within
+from drivers.backends.stand_in import Worker, make_worker
+from drivers.backends.wire_backend import WireBackend
 from drivers.errors import FrameError, LinkError, LinkTimeout
 from drivers.guard import SafeEnvelope
 from drivers.protocol.can_frame import CANOPEN, CanFrame, cob_id
@@ -30,9 +29,7 @@ from drivers.protocol.can_timing import (
 )
 from drivers.protocol.canopen_answers import UNASKED, Answer, plain_reply
 from drivers.protocol.canopen_map import (
-    SEQUENCE_MAX,
     Order,
-    action_of,
     encode_broadcast,
     encode_order,
     is_about_set,
@@ -44,7 +41,6 @@ from drivers.protocol.messages import (
     Apply,
     Arm,
     Broadcast,
-    Commit,
     Event,
     GetCaps,
     GetFaults,
@@ -63,53 +59,25 @@ _START = CANOPEN["nmt"]["start"]
 _T = TypeVar("_T")
 
 
-@dataclass
-class _Pending:
-    """An order on the wire, who waits for its answer, and the token that it must name."""
-
-    action: int
-    token: int | None
-    answer: asyncio.Future[Answer]
-
-
-class CanBackend(Backend):
+class CanBackend(WireBackend):
     """Carries requests to the node of a CAN bus given by its URL (see `CanUrl`)."""
 
     def __init__(self, url: str) -> None:
+        super().__init__()
         self._url = CanUrl.parse(url)
         self._wire: CanWire | None = None
         self._objects: ObjectClient | None = None
         self._worker: Worker | None = None
         self._node = NodeWatch(self._url, answered=self._answered, told=self._told, lost=self._lose)
-        self._pending: dict[int, _Pending] = {}
-        # Not from the first, so that an answer to an earlier run is no answer to this one.
-        self._sequence = number_below(SEQUENCE_MAX)
+        self._orders = PendingOrders()
         self._staged: Achieved | None = None  # as it was asked for
         self._channels = PROTOCOL.quantities.channel_count.maximum
-        self._on_event: Callable[[Event], None] = lambda event: None
-        self._on_loss: Callable[[str], None] = lambda what: None
         self._loss: str | None = None
-        self._last_sent = 0.0
-        self._counters = WireCounters()
-
-    @property
-    def counters(self) -> WireCounters:
-        """What was seen of this amplifier."""
-        return self._counters
-
-    @property
-    def last_sent(self) -> float:
-        """When the adapter took the last frame of the last request, on time.monotonic() [s]."""
-        return self._last_sent
 
     @property
     def bus(self) -> str:
         """The bus, on which every amplifier hears a broadcast."""
         return str(self._url.bus)
-
-    def listen(self, on_event: Callable[[Event], None], on_loss: Callable[[str], None]) -> None:
-        """Whom to tell of events and of the loss of bus or amplifier."""
-        self._on_event, self._on_loss = on_event, on_loss
 
     def round_trip(self, channels: int) -> float:
         """Time [s] on the bus of an apply of so many channels and its answer."""
@@ -129,6 +97,11 @@ class CanBackend(Backend):
         if self._wire is not None:
             return
         wire = await acquire(self._url.bus)
+        try:
+            wire.claim(self._url.node)
+        except LinkError:
+            await release(wire)
+            raise
         self._wire = wire
         self._loss = None
         self._counters = WireCounters()
@@ -148,6 +121,7 @@ class CanBackend(Backend):
         self._objects.abandon()
         await worker.close()
         self._node.leave(wire)
+        wire.give_back(self._url.node)
         with contextlib.suppress(ValueError):
             wire.on_loss.remove(self._lose)
         await release(wire)
@@ -208,9 +182,9 @@ class CanBackend(Backend):
     async def _order(self, order: Order, timeout: float) -> Reply:
         if isinstance(order, Arm):
             await self._node.check_no_other_host()
-        self._sequence = self._sequence % SEQUENCE_MAX + 1
+        sequence = self._orders.next_sequence()
         frames = encode_order(
-            order, node=self._url.node, sequence=self._sequence, fd=bool(self._url.bus.fd)
+            order, node=self._url.node, sequence=sequence, fd=bool(self._url.bus.fd)
         )
         if isinstance(order, Apply | Stage):
             for command in order.command_set.commands:
@@ -219,7 +193,12 @@ class CanBackend(Backend):
         bus = self._url.bus
         on_wire = 2 * frames_time(frames, bitrate=bus.bitrate, fd=bus.fd)
         try:
-            answer = await self._answer_to(order, frames, max(timeout, on_wire + PROTOCOL.reaction))
+            answer = await self._orders.answer_to(
+                order,
+                sequence=sequence,
+                send=lambda: self._send(frames),
+                timeout=max(timeout, on_wire + PROTOCOL.reaction),
+            )
         except LinkError:
             raise
         except TimeoutError:
@@ -233,24 +212,6 @@ class CanBackend(Backend):
         if not is_about_set(order):
             raise FrameError(f"an answer without a status to {type(order).__name__}")
         return await self._achieved(order, answer, timeout)
-
-    async def _answer_to(
-        self, order: Order, frames: tuple[CanFrame, ...], timeout: float
-    ) -> Answer:
-        sequence = self._sequence
-        token = None
-        if isinstance(order, Apply):
-            token = order.command_set.token
-        elif isinstance(order, Commit):
-            token = order.token
-        answer: asyncio.Future[Answer] = asyncio.get_running_loop().create_future()
-        self._pending[sequence] = pending = _Pending(action_of(order), token, answer)
-        try:
-            self._send(frames)
-            return await reply_within(answer, timeout)
-        finally:
-            if self._pending.get(sequence) is pending:
-                del self._pending[sequence]
 
     async def _achieved(self, order: Order, answer: Answer, timeout: float) -> Achieved:
         """What a set plays: what was asked for if the answer says so, else it is read."""
@@ -312,16 +273,7 @@ class CanBackend(Backend):
         if answer.sequence == UNASKED:
             self._told(answer.event)
             return
-        pending = self._pending.get(answer.sequence)
-        is_of_it = (
-            pending is not None
-            and not pending.answer.done()
-            and pending.action == answer.action
-            and (answer.refusal is not None or pending.token in (None, answer.token))
-        )
-        if pending is not None and is_of_it:
-            pending.answer.set_result(answer)
-        else:
+        if not self._orders.take(answer):
             self._counters.foreign += 1
 
     def _lose(self, what: str) -> None:
@@ -335,9 +287,7 @@ class CanBackend(Backend):
         self._loss = self._loss or what
         if self._objects is not None:
             self._objects.abandon()
-        for pending in self._pending.values():
-            if not pending.answer.done():
-                pending.answer.set_exception(LinkError(self._loss))
+        self._orders.fail(self._loss)
 
     def _raise_if_lost(self) -> None:
         if self._wire is None or self._loss is not None:

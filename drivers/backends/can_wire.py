@@ -40,6 +40,7 @@ class CanWire:
         self.network = _Network(self)
         self.on_loss: list[Callable[[str], None]] = []
         self.users = 0
+        self._nodes: set[int] = set()
         self.bad = 0
         self.loss: str | None = None
         self.opening = asyncio.Lock()
@@ -50,6 +51,19 @@ class CanWire:
     def is_open(self) -> bool:
         """Whether it is there."""
         return self._adapter is not None and self.loss is None
+
+    def claim(self, node: int) -> None:
+        """Use the bus for a node; LinkError where this program does so already."""
+        if node in self._nodes:
+            raise LinkError(
+                f"node {node} on {self.url}: this program has it open already; give every "
+                "amplifier a node number of its own"
+            )
+        self._nodes.add(node)
+
+    def give_back(self, node: int) -> None:
+        """No longer use it for this node."""
+        self._nodes.discard(node)
 
     async def open(self) -> None:
         """Open the adapter and start reading; raises LinkError."""

@@ -8,16 +8,16 @@ taken for another; identity and capabilities do not change and are read without 
 An amplifier cannot speak unasked here: events are what its answers show to have changed.
 """
 
-from collections.abc import Callable
-
-from drivers.backend import Backend
 from drivers.backends.modbus_frames import Answer
 from drivers.backends.modbus_link import ModbusLink
 from drivers.backends.modbus_url import ModbusUrl
+from drivers.backends.sole_host import SoleHost
 from drivers.backends.stand_in import number_below
+from drivers.backends.wire_backend import WireBackend
 from drivers.errors import LinkError, LinkTimeout
 from drivers.protocol import modbus_map
 from drivers.protocol.messages import (
+    Arm,
     Broadcast,
     Capabilities,
     Event,
@@ -30,38 +30,25 @@ from drivers.protocol.messages import (
 )
 from drivers.protocol.modbus_map import Exchange, Read, Write
 from drivers.protocol.modbus_timing import commit_time, loading_time, round_trip_time
-from drivers.statistics import WireCounters
 
 _ILLEGAL_FUNCTION = 1
 _GATEWAY = (10, 11)  # a gateway has no path to the amplifier, or heard nothing from it
 _TAGS = (1 << 16) - 1
 
 
-class ModbusBackend(Backend):
+class ModbusBackend(WireBackend):
     """Carries requests over a Modbus line given by its URL (see `ModbusUrl`)."""
 
     def __init__(self, url: str) -> None:
+        super().__init__()
         self._url = ModbusUrl.parse(url)
         self._link: ModbusLink | None = None
+        self._sole_host = SoleHost(f"{self._url.place}/{self._url.unit}")
         # Not from zero, so that an answer to an earlier run is no answer to this one.
         self._tag = number_below(_TAGS)
         self._can_read_back = True
         self._channels: int | None = None
         self._condition: tuple[State, Fault] | None = None
-        self._on_event: Callable[[Event], None] = _ignore
-        self._on_loss: Callable[[str], None] = _ignore
-        self._last_sent = 0.0
-        self._counters = WireCounters()
-
-    @property
-    def counters(self) -> WireCounters:
-        """What was seen on the line, by all who share it."""
-        return self._counters
-
-    @property
-    def last_sent(self) -> float:
-        """When the operating system took the last request's bytes, on time.monotonic() [s]."""
-        return self._last_sent
 
     @property
     def bus(self) -> str:
@@ -88,23 +75,20 @@ class ModbusBackend(Backend):
         bits = self._url.bits_per_byte
         return loading_time(knots, baud=self._url.baud, bits_per_byte=bits)
 
-    def listen(self, on_event: Callable[[Event], None], on_loss: Callable[[str], None]) -> None:
-        """Whom to tell of changes that an answer shows, and of the end of the line."""
-        self._on_event, self._on_loss = on_event, on_loss
-
     async def open(self) -> None:
         """Open the line, or join those who have it open in this process; raises LinkError."""
         if self._link is not None:
             return
         self._condition = None
-        self._link = await ModbusLink.of(self._url.line, self, self._lost)
+        self._link = await ModbusLink.of(self._url.line, self._url.unit, self._lost)
         self._counters = self._link.counters
 
     async def close(self) -> None:
         """Leave the line; the last one closes it."""
         link, self._link = self._link, None
         if link is not None:
-            link.leave(self)
+            link.leave(self._url.unit)
+        self._sole_host.release()
 
     async def exchange(self, request: Request, *, timeout: float) -> Reply:
         """Send a request and wait for its reply; LinkTimeout, LinkError or FrameError.
@@ -112,6 +96,8 @@ class ModbusBackend(Backend):
         timeout [s]: for each transaction; longer where a slow line needs it (see `ModbusLink`), so
         that a loss is told after three heartbeats on a line that is fast enough for them.
         """
+        if isinstance(request, Arm) and not self._url.device:
+            self._sole_host.claim()
         records = 0
         while True:
             tag = self._next_tag()
@@ -214,7 +200,3 @@ class ModbusBackend(Backend):
 
     def _lost(self, what: str) -> None:
         self._on_loss(what)
-
-
-def _ignore(_: object) -> None:
-    pass

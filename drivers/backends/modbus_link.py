@@ -41,7 +41,7 @@ class ModbusLink:
         self._opening = asyncio.Lock()
         self._turn = asyncio.Lock()
         self._reader = AnswerReader(is_rtu=line.is_rtu, counters=self.counters)
-        self._users: dict[object, Callable[[str], None]] = {}
+        self._users: dict[int, Callable[[str], None]] = {}  # by their units
         self._loss: str | None = None
         self._transaction = 0
         self._telegram: Telegram | None = None
@@ -56,27 +56,33 @@ class ModbusLink:
             self._gap = silence(baud=line.baud, bits_per_byte=line.bits_per_byte)
 
     @classmethod
-    async def of(
-        cls, line: ModbusUrl, user: object, on_loss: Callable[[str], None]
-    ) -> "ModbusLink":
-        """The link of a line, opened if it is not; on_loss: see `Backend.listen`."""
+    async def of(cls, line: ModbusUrl, unit: int, on_loss: Callable[[str], None]) -> "ModbusLink":
+        """The link of a line for a unit, opened if it is not; on_loss: see `Backend.listen`.
+
+        Raises LinkError, also for a unit that this program has open already.
+        """
         links = _links.setdefault(asyncio.get_running_loop(), {})
         link = links.get(line)
         if link is None or link._loss is not None:
             link = links[line] = cls(line)
-        link._users[user] = on_loss
+        if unit in link._users:
+            raise LinkError(
+                f"unit {unit} on {line.place}: this program has it open already; give every "
+                "amplifier a unit of its own"
+            )
+        link._users[unit] = on_loss
         try:
             async with link._opening:
                 if link._stream is None:
                     link._stream = await open_stream(line, link._received, link._lost)
         except BaseException:
-            link.leave(user)
+            link.leave(unit)
             raise
         return link
 
-    def leave(self, user: object) -> None:
+    def leave(self, unit: int) -> None:
         """Use it no more; safe to call twice."""
-        self._users.pop(user, None)
+        self._users.pop(unit, None)
         if self._users:
             return
         self._lose(f"{self.line.place} was closed")

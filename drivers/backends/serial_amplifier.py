@@ -5,17 +5,16 @@ line, each at its own address.
 """
 
 import asyncio
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-from drivers.backend import Backend
 from drivers.backends.serial_line import SerialLine, shared_line
 from drivers.backends.serial_url import SerialUrl
 from drivers.backends.stand_in import number_below
 from drivers.backends.waiting import reply_within
+from drivers.backends.wire_backend import WireBackend
 from drivers.errors import DriverError, LinkError, LinkTimeout
 from drivers.protocol.definition import PROTOCOL
-from drivers.protocol.messages import Broadcast, Event, Reply, Request
+from drivers.protocol.messages import Broadcast, Reply, Request
 from drivers.protocol.serial_codec import decode_event, decode_reply, encode_request, is_event
 from drivers.protocol.serial_frame import Frame, encode_frame
 from drivers.protocol.serial_timing import (
@@ -35,31 +34,23 @@ class _Pending:
     reply: asyncio.Future[Reply]
 
 
-class SerialBackend(Backend):
+class SerialBackend(WireBackend):
     """Carries requests over a serial line given by its URL (see `SerialUrl`)."""
 
     def __init__(self, url: str) -> None:
+        super().__init__()
         self._url = SerialUrl.parse(url)
         self._line: SerialLine | None = None
         self._pending: dict[int, _Pending] = {}
         # Not from zero, so that an answer to an earlier run is no answer to this one.
         self._sequence = number_below(1 << 16)
-        self._counters = WireCounters()
         self._why_closed = f"{self._url.port} is not open"
-        self._last_sent = 0.0
-        self._on_event: Callable[[Event], None] = lambda event: None
-        self._on_loss: Callable[[str], None] = lambda what: None
 
     @property
     def counters(self) -> WireCounters:
         """What was seen for this amplifier; damaged frames are those of the whole line."""
         bad = self._counters.bad if self._line is None else self._line.bad
         return replace(self._counters, bad=bad)
-
-    @property
-    def last_sent(self) -> float:
-        """When the operating system took the last request's bytes, on time.monotonic() [s]."""
-        return self._last_sent
 
     @property
     def bus(self) -> str:
@@ -79,10 +70,6 @@ class SerialBackend(Backend):
     def loading_time(self, knots: int) -> float:
         """Time [s] on the line of loading an envelope; 0 where the line's end is a server."""
         return loading_time(knots, baud=self._url.baud) if self._url.is_local else 0.0
-
-    def listen(self, on_event: Callable[[Event], None], on_loss: Callable[[str], None]) -> None:
-        """Whom to tell of events, and of a line that hangs up."""
-        self._on_event, self._on_loss = on_event, on_loss
 
     async def open(self) -> None:
         """Open the port, for this process alone where the system can; raises LinkError."""

@@ -424,7 +424,7 @@ async def test_a_late_answer_is_nobody_s(virtual: Virtual) -> None:
         safe = tones(amplifier, 0.3)
         asking = asyncio.create_task(backend.exchange(Apply(safe), timeout=PATIENCE))
         await asyncio.sleep(0)
-        sequence, token = backend._sequence, safe.token
+        sequence, token = backend._orders._sequence, safe.token
         for number, action, named in (
             (sequence % 255 + 1, 1, token),
             (sequence, 2, token),

@@ -1,0 +1,92 @@
+"""A second user of an amplifier, over every wire: in this program, and in another one."""
+
+import subprocess
+import sys
+from collections.abc import AsyncIterator, Iterator
+from contextlib import contextmanager
+
+import pytest
+
+from drivers.amplifier import Amplifier
+from drivers.backends.sole_host import SoleHost
+from drivers.errors import LinkError
+from drivers.protocol.messages import State
+from drivers.registry import open_backend
+from model.rig import Rig
+from wires import WIRES, FarSide, far_side
+
+PATIENT = 2.0  # s
+
+
+@pytest.fixture(params=list(WIRES))
+async def far(request: pytest.FixtureRequest, coarse_rig: Rig) -> AsyncIterator[FarSide]:
+    """The paper's amplifier behind each wire."""
+    async with far_side(WIRES[request.param], coarse_rig) as far:
+        yield far
+
+
+async def test_the_second_user_of_an_address_is_refused_and_the_first_undisturbed(
+    far: FarSide,
+) -> None:
+    """Within one program: told what to do, and the first goes on; once it has left, it is free."""
+    first = Amplifier(open_backend(far.url), reply_timeout=PATIENT)
+    second = Amplifier(open_backend(far.url), reply_timeout=PATIENT)
+    await first.open()
+    await first.arm(2.0)
+    with pytest.raises(LinkError, match="this program has it open already; give every amplifier"):
+        await second.open()
+    assert (await first.heartbeat()).state is State.OPERATION_ENABLED
+    await first.close()
+    await second.open()
+    assert (await second.disarm()).state is State.SWITCH_ON_DISABLED
+    await second.close()
+
+
+@contextmanager
+def held_by_another_program(name: str) -> Iterator[None]:
+    """Another program has the right to arm, until it is killed at the end."""
+    hold = (
+        "import sys; from drivers.backends.sole_host import SoleHost; "
+        f"host = SoleHost({name!r}); host.claim(); print('held', flush=True); sys.stdin.read()"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", hold], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    ) as other:
+        assert other.stdout is not None
+        assert other.stdout.readline() == b"held\n"
+        try:
+            yield
+        finally:
+            other.kill()
+
+
+async def test_over_tcp_only_one_program_arms_and_any_may_stop(coarse_rig: Rig) -> None:
+    """Whoever has the right to arm keeps it while it lives; asking and stopping need none."""
+    async with far_side(WIRES["modbus+tcp"], coarse_rig) as far:
+        amplifier = Amplifier(open_backend(far.url), reply_timeout=PATIENT)
+        with held_by_another_program(far.url.removeprefix("modbus+tcp://")):
+            await amplifier.open()
+            assert (await amplifier.status()).state is State.SWITCH_ON_DISABLED
+            assert (await amplifier.stop()).state is not State.OPERATION_ENABLED
+            await amplifier.clear()
+            with pytest.raises(LinkError, match="another program on this machine drives"):
+                await amplifier.arm(2.0)
+        await amplifier.close()
+        await amplifier.open()
+        assert (await amplifier.arm(2.0)).state is State.OPERATION_ENABLED
+        await amplifier.close()
+
+
+def test_the_right_to_arm_is_for_one_and_can_be_given_back() -> None:
+    """By name; giving it back twice is once."""
+    one, same, other = SoleHost("here:1/1"), SoleHost("here:1/1"), SoleHost("here:1/2")
+    one.claim()
+    one.claim()
+    other.claim()
+    with pytest.raises(LinkError, match="here:1/1"):
+        same.claim()
+    one.release()
+    one.release()
+    same.claim()
+    same.release()
+    other.release()

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 rig_app = typer.Typer(no_args_is_help=True, help="A rig and what it really is.")
 
 NOT_WELL = 1
+_REPLY_TIMEOUT = 0.5  # s; nobody feels a check that is late, and silence is the watchdog's task
 _LEVEL_MAX = 0.2  # a check is no demonstration
 
 
@@ -173,7 +174,10 @@ def _live(
 
     async def measure() -> "Observation":
         async with simulated_sensors(control, points, noise=noise) as sensors:
-            amplifiers = {name: Amplifier(open_backend(at[name])) for name in rig.amplifiers}
+            amplifiers = {
+                name: Amplifier(open_backend(at[name]), reply_timeout=_REPLY_TIMEOUT)
+                for name in rig.amplifiers
+            }
             drive = Drive(
                 rig,
                 amplifiers,

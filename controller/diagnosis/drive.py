@@ -24,7 +24,6 @@ from model.excitation import Excitation, Tone
 from model.rig import Rig
 
 RAMP = 0.05  # s; neither begin nor end of a tone strikes the plate
-_BEAT = 0.05  # s
 _PAIRED = 3  # frequencies at which channels are driven in pairs
 _CHANGED = 0.02  # of a level: more than any amplifier rounds
 
@@ -170,7 +169,7 @@ class Drive:
     async def _pass(self, seconds: float) -> None:
         """Let time pass, and keep the amplifiers' watchdogs fed."""
         while seconds > 0:
-            step = min(_BEAT, seconds)
+            step = min(self._sensors.beat, seconds)
             await self._sensors.wait(step)
             await self._group.heartbeat()
             seconds -= step

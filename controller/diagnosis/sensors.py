@@ -16,17 +16,20 @@ from model.arrays import ComplexArray, FloatArray
 
 _VERSION = 2
 _LINE_MAX = 1 << 20  # bytes of an answer
+_VIRTUAL_BEAT = 0.2  # s; of the 0.25 s that amplifiers wait; virtual time is never late
 _PATIENCE = 30.0  # s; a far end on a busy machine
 
 
 class Sensors(ABC):
     """What listens to the plate.
 
-    names (s,); points (s, 2) [m].
+    names (s,); points (s, 2) [m]; beat [s]: how long may be waited at once, for amplifiers want to
+    be fed meanwhile.
     """
 
     names: tuple[str, ...]
     points: FloatArray
+    beat: float = 0.05
 
     @abstractmethod
     async def wait(self, seconds: float) -> None:
@@ -58,6 +61,8 @@ class SimulatedSensors(Sensors):
         if hello.get("version", 0) < _VERSION:
             raise LinkError("the simulated plate is of an older version, without sensors")
         self._is_virtual = hello["clock"] == "virtual"
+        if self._is_virtual:
+            self.beat = _VIRTUAL_BEAT
         sensors = {
             name: {"at_m": point, "noise_m_s2_rthz": noise}
             for name, point in zip(self.names, self.points.tolist(), strict=True)

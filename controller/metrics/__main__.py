@@ -1,0 +1,35 @@
+"""`python -m controller.metrics --socket PATH --port N`: metrics of a daemon on the loopback."""
+
+import signal
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from prometheus_client import CollectorRegistry, start_http_server
+
+from controller.api.client import Client
+from controller.api.messages import StatusResult
+from controller.api.socket_path import find_socket
+from controller.metrics.collector import DaemonCollector
+
+
+def serve(
+    port: Annotated[int, typer.Option(help="On 127.0.0.1.", min=0, max=65535)],
+    socket: Annotated[Path | None, typer.Option(help="The daemon's socket.")] = None,
+) -> None:
+    """Serve the metrics of a daemon to Prometheus, on 127.0.0.1, until told to end."""
+
+    def ask() -> StatusResult:
+        with Client.connect(find_socket(socket), name="metrics") as era:
+            return era.status()
+
+    registry = CollectorRegistry(auto_describe=False)
+    registry.register(DaemonCollector(ask))
+    server, _ = start_http_server(port, addr="127.0.0.1", registry=registry)
+    typer.echo(f"metrics: http://127.0.0.1:{server.server_port}/metrics")
+    signal.sigwait({signal.SIGTERM, signal.SIGINT})
+
+
+if __name__ == "__main__":
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM, signal.SIGINT})
+    typer.run(serve)

@@ -1,17 +1,15 @@
 """Messages to frames and back, for both ends of a serial line.
 
-Each message has its layout written down once as a pair of functions, pack and unpack. Decoding is
-total: any payload becomes a message with every value in range, or `Malformed`. Encoding a set or
-an envelope asks for what a guard made of it; decoding gives the plain one, which must pass a guard
-before it can be sent on.
+Each message has its layout as a pair of functions, pack and unpack (`serial_sets` and
+`serial_reports` have the longer ones). Decoding is total: any payload becomes a message with every
+value in range, or `Malformed`. Encoding a set or an envelope asks for what a guard made of it;
+decoding gives the plain one, which must pass a guard before it can be sent on.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from drivers.command import CommandSet, DriveCommand, Envelope, Knot
-from drivers.guard import SafeCommand, SafeEnvelope
 from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.messages import (
     Achieved,
@@ -24,7 +22,6 @@ from drivers.protocol.messages import (
     Event,
     Fault,
     FaultList,
-    FaultRecord,
     GetCaps,
     GetFaults,
     GetStatus,
@@ -42,227 +39,30 @@ from drivers.protocol.messages import (
     Status,
     Stop,
 )
-from drivers.protocol.payload import Cursor, Malformed, pack, pack_optional_channel, pack_text
+from drivers.protocol.payload import Cursor, Malformed, pack, pack_optional_channel
 from drivers.protocol.serial_frame import REPLY, Frame
+from drivers.protocol.serial_reports import (
+    pack_capabilities,
+    pack_faults,
+    pack_identity,
+    pack_status,
+    unpack_capabilities,
+    unpack_faults,
+    unpack_identity,
+    unpack_status,
+)
+from drivers.protocol.serial_sets import (
+    pack_achieved,
+    pack_envelope,
+    pack_set,
+    unpack_achieved,
+    unpack_envelope,
+    unpack_set,
+)
 
 _NAK = PROTOCOL.types["nak"]
 _EVENT = PROTOCOL.types["event"]
 _Q = PROTOCOL.quantities
-_KEEP_PHASE = 0x01
-_SKIP_ENDING = 0x02
-_ENVELOPES = 0x04  # onset and ending follow the command
-_HIGH_VOLTAGE = 0x01
-_EVENTS = 0x01
-
-
-def _pack_commands(commands: tuple[DriveCommand, ...]) -> bytes:
-    packed = pack((_Q.channel_count, len(commands)))
-    for command in commands:
-        packed += pack((_Q.channel, command.channel))
-        is_shaped = command.onset or command.ending
-        flags = _KEEP_PHASE if command.keep_phase else 0
-        flags |= _SKIP_ENDING if command.skip_ending else 0
-        packed += bytes([flags | (_ENVELOPES if is_shaped else 0)])
-        packed += pack(
-            (_Q.frequency, command.frequency),
-            (_Q.level, command.level),
-            (_Q.phase, command.phase),
-        )
-        if is_shaped:
-            packed += pack((_Q.envelope_slot, command.onset), (_Q.envelope_slot, command.ending))
-    return packed
-
-
-def _unpack_commands(cursor: Cursor) -> tuple[DriveCommand, ...]:
-    commands: list[DriveCommand] = []
-    seen: set[int] = set()
-    for _ in range(cursor.integer(_Q.channel_count)):
-        channel = cursor.integer(_Q.channel)
-        if channel in seen:
-            raise Malformed(
-                f"channel {channel} is named twice", code=NakCode.BAD_CHANNEL, channel=channel
-            )
-        seen.add(channel)
-        flags = cursor.flags(_KEEP_PHASE | _SKIP_ENDING | _ENVELOPES)
-        is_shaped = bool(flags & _ENVELOPES)
-        commands.append(
-            DriveCommand(
-                channel=channel,
-                frequency=cursor.number(_Q.frequency),
-                level=cursor.number(_Q.level),
-                phase=cursor.number(_Q.phase),
-                keep_phase=bool(flags & _KEEP_PHASE),
-                onset=cursor.integer(_Q.envelope_slot) if is_shaped else 0,
-                ending=cursor.integer(_Q.envelope_slot) if is_shaped else 0,
-                skip_ending=bool(flags & _SKIP_ENDING),
-            )
-        )
-    return tuple(commands)
-
-
-def _pack_set(command_set: CommandSet) -> bytes:
-    if type(command_set) is not SafeCommand:
-        raise TypeError(
-            f"only a SafeCommand goes on the wire, not a {type(command_set).__name__}: "
-            "let Guard.check make one"
-        )
-    times = pack(
-        (_Q.token, command_set.token),
-        (_Q.ramp, command_set.ramp),
-        (_Q.valid_for, command_set.valid_for),
-    )
-    return times + _pack_commands(command_set.commands)
-
-
-def _unpack_set(cursor: Cursor) -> CommandSet:
-    token = cursor.integer(_Q.token)
-    ramp = cursor.number(_Q.ramp)
-    valid_for = cursor.number(_Q.valid_for)
-    return CommandSet(
-        token=token, commands=_unpack_commands(cursor), ramp=ramp, valid_for=valid_for
-    )
-
-
-def _pack_envelope(envelope: Envelope) -> bytes:
-    if type(envelope) is not SafeEnvelope:
-        raise TypeError(
-            f"only a SafeEnvelope goes on the wire, not a {type(envelope).__name__}: "
-            "let Guard.check_envelope make one"
-        )
-    head = pack((_Q.envelope_slot, envelope.slot), (_Q.envelope_step, envelope.step))
-    head += pack((_Q.envelope_knots, len(envelope.knots)))
-    return head + b"".join(
-        pack((_Q.level, knot.level), (_Q.phase, knot.phase)) for knot in envelope.knots
-    )
-
-
-def _unpack_envelope(cursor: Cursor) -> Envelope:
-    slot = cursor.integer(_Q.envelope_slot)
-    step = cursor.number(_Q.envelope_step)
-    count = cursor.integer(_Q.envelope_knots)
-    knots = tuple(
-        Knot(level=cursor.number(_Q.level), phase=cursor.number(_Q.phase)) for _ in range(count)
-    )
-    return Envelope(slot=slot, step=step, knots=knots)
-
-
-def _pack_identity(identity: Identity) -> bytes:
-    version = pack((_Q.protocol_version, identity.protocol_version))
-    texts = (identity.vendor, identity.product, identity.serial_number, identity.firmware)
-    return version + b"".join(pack_text(text) for text in texts)
-
-
-def _unpack_identity(cursor: Cursor) -> Identity:
-    version = cursor.integer(_Q.protocol_version)
-    return Identity(
-        vendor=cursor.text(),
-        product=cursor.text(),
-        serial_number=cursor.text(),
-        firmware=cursor.text(),
-        protocol_version=version,
-    )
-
-
-def _pack_capabilities(capabilities: Capabilities) -> bytes:
-    return pack(
-        (_Q.channel_count, capabilities.channels),
-        (_Q.frequency, capabilities.frequency_min),
-        (_Q.frequency, capabilities.frequency_max),
-        (_Q.frequency, capabilities.frequency_step),
-        (_Q.level, capabilities.level_max),
-        (_Q.level, capabilities.level_step),
-        (_Q.phase_step, capabilities.phase_step),
-        (_Q.ramp, capabilities.ramp_max),
-        (_Q.watchdog, capabilities.watchdog_min),
-        (_Q.watchdog, capabilities.watchdog_max),
-        (_Q.envelope_knots, capabilities.envelope_knots),
-        (_Q.envelope_slots, capabilities.envelope_slots),
-        (_Q.envelope_step, capabilities.envelope_step_min),
-        (_Q.envelope_step, capabilities.envelope_step_max),
-    ) + bytes([_EVENTS if capabilities.events else 0])
-
-
-def _unpack_capabilities(cursor: Cursor) -> Capabilities:
-    return Capabilities(
-        channels=cursor.integer(_Q.channel_count),
-        frequency_min=cursor.number(_Q.frequency),
-        frequency_max=cursor.number(_Q.frequency),
-        frequency_step=cursor.number(_Q.frequency),
-        level_max=cursor.number(_Q.level),
-        level_step=cursor.number(_Q.level),
-        phase_step=cursor.number(_Q.phase_step),
-        ramp_max=cursor.number(_Q.ramp),
-        watchdog_min=cursor.number(_Q.watchdog),
-        watchdog_max=cursor.number(_Q.watchdog),
-        envelope_knots=cursor.integer(_Q.envelope_knots),
-        envelope_slots=cursor.integer(_Q.envelope_slots),
-        envelope_step_min=cursor.number(_Q.envelope_step),
-        envelope_step_max=cursor.number(_Q.envelope_step),
-        events=bool(cursor.flags(_EVENTS)),
-    )
-
-
-def _pack_status(status: Status) -> bytes:
-    head = bytes([status.state, status.fault]) + pack((_Q.active_token, status.token))
-    head += bytes([_HIGH_VOLTAGE if status.high_voltage else 0])
-    head += pack(
-        (_Q.temperature, status.temperature),
-        (_Q.watchdog_left, status.watchdog_left),
-        (_Q.voltage, status.voltage),
-        (_Q.channel_count, len(status.levels)),
-    )
-    return head + b"".join(pack((_Q.level, level)) for level in status.levels)
-
-
-def _unpack_status(cursor: Cursor) -> Status:
-    state = cursor.one_of(State)
-    fault = cursor.one_of(Fault)
-    token = cursor.integer(_Q.active_token)
-    flags = cursor.flags(_HIGH_VOLTAGE)
-    temperature = cursor.number(_Q.temperature)
-    watchdog_left = cursor.number(_Q.watchdog_left)
-    voltage = cursor.number(_Q.voltage)
-    channels = cursor.integer(_Q.channel_count)
-    return Status(
-        state=state,
-        fault=fault,
-        token=token,
-        high_voltage=bool(flags & _HIGH_VOLTAGE),
-        temperature=temperature,
-        watchdog_left=watchdog_left,
-        voltage=voltage,
-        levels=tuple(cursor.number(_Q.level) for _ in range(channels)),
-    )
-
-
-def _pack_achieved(achieved: Achieved) -> bytes:
-    return pack((_Q.token, achieved.token)) + _pack_commands(achieved.commands)
-
-
-def _unpack_achieved(cursor: Cursor) -> Achieved:
-    return Achieved(token=cursor.integer(_Q.token), commands=_unpack_commands(cursor))
-
-
-def _pack_faults(faults: FaultList) -> bytes:
-    newest = faults.faults[: _Q.fault_count.maximum]
-    packed = pack((_Q.fault_count, len(newest)))
-    for record in newest:
-        packed += bytes([record.fault]) + pack_optional_channel(record.channel)
-        packed += pack((_Q.age, min(record.age, _Q.age.high)))
-    return packed
-
-
-def _unpack_faults(cursor: Cursor) -> FaultList:
-    return FaultList(
-        faults=tuple(
-            FaultRecord(
-                fault=cursor.one_of(Fault),
-                channel=cursor.optional_channel(),
-                age=cursor.number(_Q.age),
-            )
-            for _ in range(cursor.integer(_Q.fault_count))
-        )
-    )
 
 
 @dataclass(frozen=True)
@@ -278,11 +78,11 @@ def _empty(message: type[Any]) -> _Layout:
     return _Layout(message, lambda _: b"", lambda _: message())
 
 
-_IDENTITY = _Layout(Identity, _pack_identity, _unpack_identity)
-_CAPABILITIES = _Layout(Capabilities, _pack_capabilities, _unpack_capabilities)
-_STATUS = _Layout(Status, _pack_status, _unpack_status)
-_ACHIEVED = _Layout(Achieved, _pack_achieved, _unpack_achieved)
-_FAULTS = _Layout(FaultList, _pack_faults, _unpack_faults)
+_IDENTITY = _Layout(Identity, pack_identity, unpack_identity)
+_CAPABILITIES = _Layout(Capabilities, pack_capabilities, unpack_capabilities)
+_STATUS = _Layout(Status, pack_status, unpack_status)
+_ACHIEVED = _Layout(Achieved, pack_achieved, unpack_achieved)
+_FAULTS = _Layout(FaultList, pack_faults, unpack_faults)
 
 _ARM = _Layout(
     Arm,
@@ -296,8 +96,8 @@ _DISARM = _Layout(
 )
 _STAGE = _Layout(
     Stage,
-    lambda stage: _pack_set(stage.command_set),
-    lambda cursor: Stage(_unpack_set(cursor)),
+    lambda stage: pack_set(stage.command_set),
+    lambda cursor: Stage(unpack_set(cursor)),
 )
 _COMMIT = _Layout(
     Commit,
@@ -306,8 +106,8 @@ _COMMIT = _Layout(
 )
 _APPLY = _Layout(
     Apply,
-    lambda apply: _pack_set(apply.command_set),
-    lambda cursor: Apply(_unpack_set(cursor)),
+    lambda apply: pack_set(apply.command_set),
+    lambda cursor: Apply(unpack_set(cursor)),
 )
 _STOP = _Layout(
     Stop,
@@ -316,8 +116,8 @@ _STOP = _Layout(
 )
 _LOAD_ENVELOPE = _Layout(
     LoadEnvelope,
-    lambda load: _pack_envelope(load.envelope),
-    lambda cursor: LoadEnvelope(_unpack_envelope(cursor)),
+    lambda load: pack_envelope(load.envelope),
+    lambda cursor: LoadEnvelope(unpack_envelope(cursor)),
 )
 _LOADED = _Layout(
     Loaded,

@@ -100,9 +100,9 @@ async def drive(
         watchdog = max(WATCHDOG, amplifier.capabilities.watchdog_min)
         check_watchdog(watchdog, amplifier.round_trip())
         try:
-            await amplifier.arm(watchdog)
+            await _arm(amplifier, watchdog, url)
             achieved = await amplifier.apply(safe)
-            await _keep_alive(amplifier, duration, beat=watchdog / 5)
+            await _keep_alive(amplifier, duration, beat=watchdog / 5, url=url)
         finally:
             # What cannot be told to the amplifier any more is left to its watchdog.
             with contextlib.suppress(DriverError):
@@ -129,7 +129,21 @@ async def _opened(url: str) -> AsyncIterator[Amplifier]:
         await amplifier.close()
 
 
-async def _keep_alive(amplifier: Amplifier, duration: float, *, beat: float) -> None:
+async def _arm(amplifier: Amplifier, watchdog: float, url: str) -> None:
+    """Arm, or say how to get out of a stop or fault; watchdog [s]."""
+    try:
+        await amplifier.arm(watchdog)
+    except CommandRefused as refused:
+        now = await amplifier.status()
+        if now.state not in (State.QUICK_STOP_ACTIVE, State.FAULT_REACTION_ACTIVE, State.FAULT):
+            raise
+        raise CommandRefused(
+            f"the amplifier does not arm: it is in {now.state.name}, fault {now.fault.name}, until "
+            f"that is acknowledged; once its cause is gone: era amp clear {url}"
+        ) from refused
+
+
+async def _keep_alive(amplifier: Amplifier, duration: float, *, beat: float, url: str) -> None:
     """Feed the watchdog for a while [s], a heartbeat every `beat` [s]; raises CommandRefused.
 
     That is where the amplifier has stopped by itself meanwhile.
@@ -142,7 +156,8 @@ async def _keep_alive(amplifier: Amplifier, duration: float, *, beat: float) -> 
         if status.state is not State.OPERATION_ENABLED:
             raise CommandRefused(
                 f"the amplifier ended the drive by itself: it is in {status.state.name}, fault "
-                f"{status.fault.name}; see era amp status, and era amp clear once the cause is gone"
+                f"{status.fault.name}; see era amp status {url}, and era amp clear {url} once the "
+                "cause is gone"
             )
 
 

@@ -20,8 +20,24 @@ EXIT_STATUS: dict[type[BaseException], int] = {
     FrameError: 3,
 }
 
+# \b: these lines stay as they are.
+_URLS = """\b
+URLs:
+  serial:///dev/ttyUSB0?baud=921600&address=1   a serial port, on Windows serial:///COM3
+  serial://HOST:PORT  rfc2217://HOST:PORT       a serial server
+  hwgrep://VENDOR:PRODUCT                       the serial port of a USB adapter
+  modbus+tcp://HOST:PORT/UNIT                   Modbus over TCP
+  modbus+rtu:///dev/ttyS1?baud=115200#UNIT      Modbus on a serial port
+  can+socketcan://can0#NODE                     CAN on an interface of the system
+  can+slcan:///dev/ttyACM0?bitrate=500000#NODE  CAN on a serial adapter
+  can+socketcand://HOST:PORT/can0#NODE          CAN by a server
+  sim://RIG.yaml                                a simulated amplifier of a rig
+"""
+
 app = typer.Typer(no_args_is_help=True)
-amp = typer.Typer(no_args_is_help=True, help="Talk to one amplifier by hand.")
+amp = typer.Typer(
+    no_args_is_help=True, help="Talk to one amplifier by hand.", epilog=_URLS, rich_markup_mode=None
+)
 app.add_typer(amp, name="amp")
 
 
@@ -31,7 +47,12 @@ def _group() -> None:
 
 
 Url = Annotated[
-    str, typer.Argument(help="serial:///dev/ttyUSB0?baud=921600 or sim://RIG", show_default=False)
+    str,
+    typer.Argument(
+        metavar="URL",
+        help="serial:///dev/ttyUSB0?baud=921600, or another as era amp --help lists them.",
+        show_default=False,
+    ),
 ]
 Json = Annotated[bool, typer.Option("--json", help="One JSON object on standard output.")]
 
@@ -133,6 +154,8 @@ def stop(url: Url, json_: Json = False) -> None:
     from drivers import amp_actions
 
     _show(_run(amp_actions.stop(url)), as_json=json_)
+    if not json_:
+        print(f"Next: era amp clear {url}")
 
 
 @amp.command()

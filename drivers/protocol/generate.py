@@ -1,5 +1,6 @@
 """`python -m drivers.protocol.generate FOLDER`: the EDS and the DBC file, from protocol.yaml."""
 
+import argparse
 import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -15,11 +16,18 @@ FILES: Mapping[str, Callable[[], str]] = {
 
 def main() -> int:
     """Write the files; returns the exit status."""
-    if len(sys.argv) != 2:
-        sys.stderr.write(f"{__doc__}\n")
-        return 2
+    parser = argparse.ArgumentParser(
+        prog="python -m drivers.protocol.generate",
+        description="Write the EDS and the DBC file of an amplifier, from protocol.yaml.",
+    )
+    parser.add_argument("folder", metavar="FOLDER", type=Path, help="where they are written")
+    folder: Path = parser.parse_args().folder
+    if not folder.is_dir():
+        parser.error(f"there is no folder {folder}; make it first")
     for name, make in FILES.items():
-        Path(sys.argv[1], name).write_text(make(), encoding="utf-8")
+        path = folder / name
+        path.write_text(make(), encoding="utf-8")
+        sys.stdout.write(f"wrote {path}\n")
     return 0
 
 

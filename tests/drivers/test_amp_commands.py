@@ -23,6 +23,7 @@ from drivers.protocol.messages import (
     Disarm,
     Fault,
     GetCaps,
+    GetStatus,
     Hello,
     Nak,
     NakCode,
@@ -30,6 +31,7 @@ from drivers.protocol.messages import (
     State,
     Stop,
 )
+from drivers.registry import known_schemes
 from scripted_amplifier import STATUS, FarEnd
 
 T = TypeVar("T")
@@ -240,3 +242,30 @@ def test_a_drive_over_too_slow_a_line_never_arms(background: BackgroundFarEnd) -
     assert isinstance(result.exception, CommandError)
     assert "need at least 350 ms" in str(result.exception)
     assert not any(isinstance(request, Arm) for request in background.end.requests)
+
+
+def test_a_drive_after_a_stop_says_how_to_clear(background: BackgroundFarEnd) -> None:
+    """The state, the fault and the command that acknowledges it, with the URL."""
+    usual = background.end.answer
+    stopped = replace(STATUS, state=State.QUICK_STOP_ACTIVE)
+    background.end.answer = lambda request, frame: (
+        Nak(NakCode.WRONG_STATE)
+        if isinstance(request, Arm)
+        else stopped
+        if isinstance(request, GetStatus)
+        else usual(request, frame)
+    )
+    url = background.end.url
+    result = CliRunner().invoke(app, ["amp", "drive", url])
+    assert isinstance(result.exception, CommandRefused)
+    assert "QUICK_STOP_ACTIVE" in str(result.exception)
+    assert str(result.exception).endswith(f"era amp clear {url}")
+    result = CliRunner().invoke(app, ["amp", "stop", url])
+    assert result.stdout.splitlines()[-1] == f"Next: era amp clear {url}"
+
+
+def test_the_help_shows_urls_of_all_wires() -> None:
+    """Every scheme, but for another spelling of a serial server and the bus inside a program."""
+    shown = CliRunner().invoke(app, ["amp", "--help"]).stdout
+    for scheme in set(known_schemes()) - {"socket", "can+virtual"}:
+        assert f"  {scheme}://" in shown

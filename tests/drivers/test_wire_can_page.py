@@ -8,7 +8,7 @@ from can_session import session
 from drivers.protocol.can_frame import CANOPEN, LAYOUTS
 from drivers.protocol.canopen_objects import entries
 from drivers.protocol.definition import PROTOCOL
-from drivers.protocol.generate import FILES
+from drivers.protocol.generate import FILES, main
 
 DOCS = Path(drivers.__file__).parent.parent / "docs"
 PAGE = (DOCS / "wire-can.md").read_text("utf-8")
@@ -97,3 +97,18 @@ def test_every_fault_and_nak_has_a_code() -> None:
 def test_the_files_are_up_to_date(name: str) -> None:
     """EDS and DBC in docs/ are what `python -m drivers.protocol.generate docs` writes."""
     assert (DOCS / name).read_text("utf-8") == FILES[name]()
+
+
+def test_the_files_are_written_where_they_are_wanted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Into the folder; help ends well, and a folder that is none is bad usage without a trace."""
+    monkeypatch.setattr("sys.argv", ["generate", str(tmp_path)])
+    assert main() == 0
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(FILES)
+    for argument, status in (("--help", 0), (str(tmp_path / "none"), 2)):
+        monkeypatch.setattr("sys.argv", ["generate", argument])
+        with pytest.raises(SystemExit) as ended:
+            main()
+        assert ended.value.code == status
+    assert "there is no folder" in capsys.readouterr().err

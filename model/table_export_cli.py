@@ -34,16 +34,18 @@ def plot(
 ) -> None:
     """Draw weak cells, levels, distributions of contrast and an example answer."""
     from model.figures import save_figure
+    from model.progress import progress_bar
     from model.table_file import load_table
     from model.table_plot import table_figures
 
     table = load_table(table_file)
     output.mkdir(parents=True, exist_ok=True)
     files = []
-    for name, figure in table_figures(table):
-        path = output / f"{name}.png"
-        save_figure(figure, path)
-        files.append(str(path))
+    with progress_bar("cells and contact sets") as progress:
+        for name, figure in table_figures(table, progress=progress):
+            path = output / f"{name}.png"
+            save_figure(figure, path)
+            files.append(str(path))
     if as_json:
         print(json.dumps({"files": files}))
         return

@@ -1,6 +1,6 @@
 """A table in pictures: where on the plate it is weak, what level it has, how much contrast."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from itertools import zip_longest
 
 import numpy as np
@@ -19,8 +19,8 @@ from model.pattern import Pattern
 from model.perception import FELT_DB_SL, sensation_level
 from model.question import Point, Question
 from model.table import LocalizationTable
-from model.table_summary import contrast_distribution
-from model.table_weak_cells import WANTED_CONTRAST_DB, WeakCells, find_weak_cells
+from model.table_summary import CONTACT_SETS, contrast_distribution
+from model.table_weak_cells import WANTED_CONTRAST_DB, WeakCells, find_weak_cells, map_grid
 
 TARGET_COLOR, QUIET_COLOR = "#2ca02c", "#1f77b4"
 
@@ -28,11 +28,22 @@ TARGET_COLOR, QUIET_COLOR = "#2ca02c", "#1f77b4"
 _EXAMPLE = ((0.3, 0.35), (0.8, 0.6), (0.45, 0.85))
 
 
-def table_figures(table: LocalizationTable) -> Iterator[tuple[str, Figure]]:
-    """Every picture with its name."""
-    yield "weak_cells", weak_cells_figure(table, find_weak_cells(table))
+def table_figures(
+    table: LocalizationTable, *, progress: Callable[[int, int], None] = lambda done, of: None
+) -> Iterator[tuple[str, Figure]]:
+    """Every picture with its name; progress: called with how many questions are done, of how many.
+
+    Cells count as one each, though each takes up to 48 questions.
+    """
+    cells = map_grid(table).cell_count
+    total = cells + 3 * CONTACT_SETS
+    weak = find_weak_cells(table, progress=lambda done, _: progress(done, total))
+    yield "weak_cells", weak_cells_figure(table, weak)
     yield "levels", levels_figure(table)
-    yield "contrast", contrast_figure(table)
+    yield (
+        "contrast",
+        contrast_figure(table, progress=lambda done, _: progress(cells + done, total)),
+    )
     yield "answer", answer_figure(table)
 
 
@@ -75,13 +86,16 @@ def levels_figure(table: LocalizationTable) -> Figure:
     return figure
 
 
-def contrast_figure(table: LocalizationTable) -> Figure:
+def contrast_figure(
+    table: LocalizationTable, *, progress: Callable[[int, int], None] = lambda done, of: None
+) -> Figure:
     """Which share of random contact sets has at least a contrast, for 1, 2 and 3 other fingers."""
     figure = Figure(figsize=(7, 4.5), layout="constrained")
     axes = figure.subplots()
     rng = np.random.default_rng(0)
     for others in (1, 2, 3):
-        contrasts = np.sort(contrast_distribution(table, others=others, rng=rng))
+        found = contrast_distribution(table, others=others, rng=rng, progress=progress)
+        contrasts = np.sort(found)
         share = 1 - np.arange(len(contrasts)) / max(1, len(contrasts))
         label = f"{others} other{'s' if others > 1 else ''}"
         if len(contrasts):

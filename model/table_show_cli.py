@@ -28,7 +28,8 @@ def show(
     table = load_table(table_file)
     with progress_bar("cells") as progress:
         cells = find_weak_cells(table, progress=progress)
-    summary = summarize(table, cells)
+    with progress_bar("contact sets") as progress:
+        summary = summarize(table, cells, progress=progress)
     if as_json:
         print(json.dumps(summary | {"map": _map_as_json(cells)}))
         return

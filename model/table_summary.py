@@ -1,6 +1,7 @@
 """What a table can do, in a handful of numbers."""
 
 import contextlib
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -19,10 +20,16 @@ ALIKE = 0.95
 """Two patterns are alike where their responses at the cells are correlated more than this."""
 
 
-def summarize(table: LocalizationTable, weak: WeakCells) -> dict[str, Any]:
+def summarize(
+    table: LocalizationTable,
+    weak: WeakCells,
+    *,
+    progress: Callable[[int, int], None] = lambda done, of: None,
+) -> dict[str, Any]:
     """Provenance, levels that can be had, dead zones, weak cells, contrast, likeness of patterns.
 
-    Contrast: median and tenth percentile [dB] over random contact sets (seed 0).
+    Contrast: median and tenth percentile [dB] over random contact sets (seed 0). progress: called
+    with how many of these are done, of how many.
     """
     available = table.available_level_db_sl
     known = np.isfinite(weak.tenth_db) | np.isneginf(weak.tenth_db)
@@ -42,7 +49,7 @@ def summarize(table: LocalizationTable, weak: WeakCells) -> dict[str, Any]:
     }
     rng = np.random.default_rng(0)
     for others in (1, 2, 3):
-        contrasts = contrast_distribution(table, others=others, rng=rng)
+        contrasts = contrast_distribution(table, others=others, rng=rng, progress=progress)
         for name, percentile in (("median", 50), ("tenth_percentile", 10)):
             value = float(np.percentile(contrasts, percentile)) if len(contrasts) else None
             summary[f"contrast_{others}_quiet_{name}_db"] = value
@@ -63,11 +70,16 @@ def pattern_count(era_count: int, frequency_count: int) -> int:
 
 
 def contrast_distribution(
-    table: LocalizationTable, *, others: int, rng: np.random.Generator
+    table: LocalizationTable,
+    *,
+    others: int,
+    rng: np.random.Generator,
+    progress: Callable[[int, int], None] = lambda done, of: None,
 ) -> FloatArray:
     """Predicted contrast [dB] of random contact sets, up to (CONTACT_SETS,).
 
     Sets whose target no pattern reaches are left out, and so are all on a plate too small for them.
+    progress: as for `summarize`, which asks for one, two and three others in turn.
     """
     size = np.array([table.plate.length, table.plate.width])
     contrasts: list[float] = []
@@ -82,6 +94,7 @@ def contrast_distribution(
         with contextlib.suppress(InputError):
             contrast = table.answer(target, quiet=quiet).contrast_db
             contrasts.append(np.nan if contrast is None else contrast)
+        progress((others - 1) * CONTACT_SETS + len(contrasts), 3 * CONTACT_SETS)
         # Where hardly a target is reached, the few that are must do.
         if len(contrasts) == CONTACT_SETS or asked == 2 * CONTACT_SETS:
             break

@@ -57,6 +57,11 @@ class WeakCells:
         return np.asarray(self.tenth_db < WANTED_CONTRAST_DB)
 
 
+def map_grid(table: LocalizationTable) -> Grid:
+    """The cells that are asked about: the table's own, or fewer of a fine grid."""
+    return Grid(min(table.grid.nx, _FINEST.nx), min(table.grid.ny, _FINEST.ny))
+
+
 def find_weak_cells(
     table: LocalizationTable,
     *,
@@ -67,7 +72,7 @@ def find_weak_cells(
 
     progress: called with how many cells are done, of how many.
     """
-    grid = Grid(min(table.grid.nx, _FINEST.nx), min(table.grid.ny, _FINEST.ny))
+    grid = map_grid(table)
     centres = grid.centres(table.plate)
     size = np.array([table.plate.length, table.plate.width])
     corner = np.stack(np.meshgrid(*(np.arange(n) for n in STRATA)), axis=-1).reshape(-1, 1, 2)

@@ -1,16 +1,25 @@
 """The drive mode `switched`: one or two ERAs at full stroke, each at a frequency of its own.
 
 The paper's idea: switching frequencies and activation sets moves the nulls about. Four ERAs and 27
-frequencies make 4 * 27 + 6 * 27² = 4482 patterns. Every pattern is one source or the sum of two: an
-ERA at a frequency, or a pair of ERAs at the same one (`model.exact_search` drives more of them).
+frequencies make 4 * 27 + 6 * 27² = 4482 patterns, six and 361 two millions. Every pattern is one
+source or the sum of two: an ERA at a frequency, or a pair of ERAs at the same one
+(`model.exact_search` drives more of them).
+
+Patterns are not gone through: the loudest quiet point is at least any mean of them, and of a sum of
+two sources a mean is the sum of theirs. So a pattern of contrast above c needs
+
+    sum over its sources of (target - c mean of quiet) > 0,
+
+one number for each source, which leaves few sources and fewer pairs.
 """
+
+from itertools import combinations
 
 import numpy as np
 
 from model.arrays import IntArray
 from model.drive_modes.fields import SILENT, Drive, Fields, Single
 from model.drive_modes.sources import (
-    Patterns,
     all_patterns,
     magnitudes_of_sources,
     per_source,
@@ -20,6 +29,7 @@ from model.drive_modes.sources import (
 # A bound on the quiet maximum comes from this many of the quiet points.
 BOUND_POINTS = 12
 AT_ONCE = 48  # patterns that are looked at in full together
+FEW_SOURCES = 500  # of these all sums are made faster than some of them are picked
 
 
 def find_switched(fields: Fields, least: float) -> Drive | None:
@@ -29,55 +39,104 @@ def find_switched(fields: Fields, least: float) -> Drive | None:
     trade against them. Exact: patterns are left out only where a bound says that they cannot be
     better.
     """
-    eras = fields.era_count
-    patterns = all_patterns(eras, fields.frequency_count)
-    first, second = patterns.first, patterns.second
-    peak = _least_of_means([magnitudes_of_sources(field) for field in fields.targets], eras)
-    if least > 0 and not fields.is_alone and not _may_be_better(fields, patterns, peak, least):
+    felt = [magnitudes_of_sources(field) for field in fields.targets]
+    means = np.array([rows.mean(axis=1) for rows in felt])
+    peak = means.mean(axis=0)
+    if least > 0 and not fields.is_alone and not _may_be_better(fields, means, least):
         return None
-    powers = _powers(fields)
     quiet = magnitudes_of_sources(fields.quiet)
-    if fields.is_alone:
-        loud = _rms_of_sums(quiet, first, second, alone=eras * fields.frequency_count)
-    else:
-        loud = sums_of_sources(quiet[:, _loud_points(quiet)].T, eras).max(axis=0)
+    powers = _powers(felt, fields)
+    power = np.min([rows.mean(axis=1) for rows in powers], axis=0)
+    loud = quiet.mean(axis=1) if fields.is_alone else quiet @ _shares(quiet)
+
+    def value(one: IntArray, other: IntArray) -> Single:
+        """Contrast of patterns (n,); 0 where they do not reach the level."""
+        at_quiet = quiet[one] + quiet[other]
+        sensed = np.min([np.sqrt(rows[one] + rows[other]).mean(axis=1) for rows in powers], axis=0)
+        peaks = (means[:, one] + means[:, other]).min(axis=0)
+        if fields.is_alone:
+            contrast = peaks / np.sqrt((at_quiet**2).mean(axis=1))
+        else:
+            contrast = peaks / at_quiet.max(axis=1)
+        return np.asarray(np.where(sensed >= fields.wanted, contrast, 0))
+
+    nothing = len(quiet) - 1
+    contrast, best = least, (nothing, nothing)
+    # What one source can do is had at once, and leaves fewer pairs of them.
+    alone = value(np.arange(nothing), np.full(nothing, nothing))
+    if alone.max() > contrast:
+        contrast, best = float(alone.max()), (int(alone.argmax()), nothing)
+    one, other = _pairs(peak - contrast * loud, fields)
     # The mean of a root is at most the root of the mean.
-    reaches = _least_of_means(powers, eras) >= fields.wanted**2
-    bound = np.where(reaches, peak / loud, 0)
+    reaches = power[one] + power[other] >= fields.wanted**2
+    one, other = one[reaches], other[reaches]
+    bound = (peak[one] + peak[other]) / (loud[one] + loud[other])
+    closer = fields.is_alone
+    while len(one) > 0:
+        if len(one) > AT_ONCE:
+            order = np.argpartition(-bound, AT_ONCE)
+            one, other, bound = one[order], other[order], bound[order]
+        found = value(one[:AT_ONCE], other[:AT_ONCE])
+        if found.max() > contrast:
+            at = int(found.argmax())
+            contrast, best = float(found[at]), (int(one[at]), int(other[at]))
+        left = AT_ONCE + np.flatnonzero(bound[AT_ONCE:] > contrast)
+        one, other, bound = one[left], other[left], bound[left]
+        if not closer and len(one) > 0:
+            closer = True
+            some = quiet[:, np.argsort(-_shares(quiet))[:BOUND_POINTS]]
+            bound = (peak[one] + peak[other]) / (some[one] + some[other]).max(axis=1)
+            left = np.flatnonzero(bound > contrast)
+            one, other, bound = one[left], other[left], bound[left]
+    return None if best[0] == nothing else _drive(best, fields)
 
-    best, contrast = -1, least
-    open_ = np.flatnonzero(bound > least)
-    while len(open_) > 0:
-        if len(open_) > AT_ONCE:
-            open_ = open_[np.argpartition(-bound[open_], AT_ONCE)]
-        candidates, open_ = open_[:AT_ONCE], open_[AT_ONCE:]
-        one, other = first[candidates], second[candidates]
-        value = bound[candidates]
-        if not fields.is_alone:
-            value = peak[candidates] / (quiet[one] + quiet[other]).max(axis=1)
-        felt = _sensation(powers, patterns, candidates)
-        value = np.where(felt >= fields.wanted, value, 0)
-        if value.max() > contrast:
-            best, contrast = int(candidates[value.argmax()]), float(value.max())
-        open_ = open_[bound[open_] > contrast]
-    if best < 0:
-        return None
-    index = patterns.index[best].astype(int)
-    return Drive(index, (index != SILENT).astype(np.complex64))
 
+def _may_be_better(fields: Fields, means: Single, least: float) -> bool:
+    """Whether any pattern can have more contrast than `least`; means (targets, sources).
 
-def _may_be_better(fields: Fields, patterns: Patterns, peak: Single, least: float) -> bool:
-    """Whether any pattern of some peaks (n,) at the targets can have more contrast than `least`.
-
-    Some of the quiet points will mostly do to see that nothing can. Their mean, which a sum of two
-    sources has from the means of both, leaves few patterns of which to find the loudest point.
+    Some of the quiet points will mostly do to see that nothing can.
     """
     step = max(1, fields.quiet.shape[2] // BOUND_POINTS)
     few = magnitudes_of_sources(np.ascontiguousarray(fields.quiet[:, :, ::step]))
-    mean = sums_of_sources(few.mean(axis=1)[None], fields.era_count)[0]
-    left = np.flatnonzero(peak > least * mean)
-    loud = (few[patterns.first[left]] + few[patterns.second[left]]).max(axis=1, initial=0.0)
-    return bool((peak[left] > least * loud).any())
+    if means.shape[1] < FEW_SOURCES:
+        peak = sums_of_sources(means, fields.era_count).min(axis=0)
+        return bool((peak > least * sums_of_sources(few.T, fields.era_count).max(axis=0)).any())
+    if (means.min(axis=0) > least * few.max(axis=1))[:-1].any():
+        return True
+    one, other = _pairs(means.mean(axis=0) - least * few @ _shares(few), fields)
+    loud = (few[one] + few[other]).max(axis=1, initial=0.0)
+    return bool(((means[:, one] + means[:, other]).min(axis=0) > least * loud).any())
+
+
+def _pairs(gain: Single, fields: Fields) -> tuple[IntArray, IntArray]:
+    """Patterns of two ERAs at two frequencies whose gains (sources,) have a sum above zero."""
+    count = fields.frequency_count
+    of_era = gain[: fields.era_count * count].reshape(-1, count)
+    most = of_era.max(axis=1)
+    ones, others = [], []
+    for one, other in combinations(range(fields.era_count), 2):
+        if most[one] + most[other] <= 0:
+            continue
+        first = np.flatnonzero(of_era[one] > -most[other])
+        second = np.flatnonzero(of_era[other] > -most[one])
+        sums = of_era[one][first, None] + of_era[other][second]
+        row, column = np.nonzero((sums > 0) & (first[:, None] != second))
+        ones.append(one * count + first[row])
+        others.append(other * count + second[column])
+    if not ones:
+        return np.empty(0, dtype=int), np.empty(0, dtype=int)
+    return np.concatenate(ones), np.concatenate(others)
+
+
+def _drive(sources: tuple[int, int], fields: Fields) -> Drive:
+    """All ERAs of two sources at full stroke; see `magnitudes_of_sources` for their order."""
+    count, eras = fields.frequency_count, fields.era_count
+    members = [(era,) for era in range(eras)] + list(combinations(range(eras), 2)) + [()]
+    index = np.full(eras, SILENT)
+    for source in sources:
+        block, frequency = divmod(source, count)
+        index[list(members[block])] = frequency
+    return Drive(index, (index != SILENT).astype(np.complex64))
 
 
 def loudest_switched(fields: Fields) -> float:
@@ -86,45 +145,22 @@ def loudest_switched(fields: Fields) -> float:
     Of the loudest patterns by a bound, and of one and the same for all targets.
     """
     patterns = all_patterns(fields.era_count, fields.frequency_count)
-    powers = _powers(fields)
-    most = _least_of_means(powers, fields.era_count)
+    powers = _powers([magnitudes_of_sources(field) for field in fields.targets], fields)
+    means = np.array([rows.mean(axis=1) for rows in powers])
+    most = sums_of_sources(means, fields.era_count).min(axis=0)
     loudest = np.argsort(-most)[:AT_ONCE]
-    return float(_sensation(powers, patterns, loudest).max())
+    one, other = patterns.first[loudest], patterns.second[loudest]
+    felt = np.min([np.sqrt(rows[one] + rows[other]).mean(axis=1) for rows in powers], axis=0)
+    return float(felt.max())
 
 
-def _powers(fields: Fields) -> list[Single]:
-    """Squared sensation of every source at the points of each target, (sources, p)."""
+def _powers(felt: list[Single], fields: Fields) -> list[Single]:
+    """Squared sensation of every source from its magnitudes at each target, (sources, p)."""
     threshold = per_source(fields.threshold, fields.era_count)
-    return [(magnitudes_of_sources(field) / threshold) ** 2 for field in fields.targets]
+    return [(rows / threshold) ** 2 for rows in felt]
 
 
-def _least_of_means(rows: list[Single], eras: int) -> Single:
-    """Of every pattern (n,) the mean over a target's points, at the target where it is least."""
-    means = np.array([each.mean(axis=1) for each in rows])
-    return np.asarray(sums_of_sources(means, eras).min(axis=0))
-
-
-def _sensation(powers: list[Single], patterns: Patterns, chosen: IntArray) -> Single:
-    """How many times above threshold some patterns (n,) are felt at the lesser target."""
-    one, other = patterns.first[chosen], patterns.second[chosen]
-    each = [np.sqrt(rows[one] + rows[other]).mean(axis=1) for rows in powers]
-    return np.asarray(np.min(each, axis=0))
-
-
-def _loud_points(quiet: Single) -> IntArray:
-    """The quiet points that are the loudest of most sources, up to BOUND_POINTS of them."""
+def _shares(quiet: Single) -> Single:
+    """For a mean over the quiet points: each counts as often as it is the loudest of a source."""
     often = np.bincount(quiet.argmax(axis=1), minlength=quiet.shape[1])
-    return np.argsort(-often)[:BOUND_POINTS]
-
-
-def _rms_of_sums(quiet: Single, first: IntArray, second: IntArray, *, alone: int) -> Single:
-    """Root mean square over the points of every sum of two sources, of which the second is alone.
-
-    The mean square of a + b is that of a, that of b, and twice the mean of a b.
-    """
-    mean_square = (quiet**2).mean(axis=1)
-    cross = np.zeros((alone + 1, alone + 1), dtype=quiet.dtype)
-    cross[:alone, :alone] = quiet[:alone] @ quiet[:alone].T / quiet.shape[1]
-    # What is not alone has nothing beside it.
-    product = cross[np.minimum(first, alone), np.minimum(second, alone)]
-    return np.asarray(np.sqrt(mean_square[first] + mean_square[second] + 2 * product))
+    return np.asarray(often / len(quiet), dtype=quiet.dtype)

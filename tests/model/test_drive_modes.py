@@ -85,6 +85,21 @@ def test_switched_finds_the_best_of_all_patterns(is_alone, targets, wanted, monk
         assert found == pytest.approx(best, rel=1e-5)
 
 
+@pytest.mark.parametrize("few", [0, 10_000])
+@pytest.mark.parametrize("targets", [1, 2])
+def test_switched_says_whether_something_is_better(few, targets, monkeypatch):
+    """Just below its best contrast it finds that, just above nothing, of few sources and many."""
+    monkeypatch.setattr(switched_mode, "FEW_SOURCES", few)
+    for seed in range(8):
+        given = random_fields(seed, targets=targets)
+        best = judge(given, MODES["switched"].find(given, 0.0))
+        contrast = best.peak / best.quiet_peak
+        again = MODES["switched"].find(given, 0.999 * contrast)
+        assert again is not None
+        assert judge(given, again).peak == best.peak
+        assert MODES["switched"].find(given, 1.001 * contrast) is None
+
+
 def test_what_a_drive_does_is_equation_28():
     """Peak, level and contrast of a drive at two frequencies, by hand."""
     given = random_fields(1)

@@ -45,6 +45,7 @@ class AmplifierGroup:
         self.phase = Phase.CLOSED
         self.loading_time = 0.0  # s; that of the last envelopes
         self._amplifiers = dict(amplifiers)
+        self._closing = asyncio.Lock()  # who closes again must not hang up on who still silences
         self._silencings = 0  # how often they were disarmed, stopped or closed
         self._may_be_armed = False  # since they were opened
         self._read_backs = ReadBacks()
@@ -157,6 +158,11 @@ class AmplifierGroup:
         armed = self.phase is Phase.ARMED
         self._leave_armed()
         self.phase = Phase.CLOSED
+        async with self._closing:
+            await self._close(silence, armed=armed)
+
+    async def _close(self, silence: Mapping[str, SafeCommand], *, armed: bool) -> None:
+        """Silence what was armed, and close; one after the other."""
         try:
             if armed:
                 await self._wind_down(silence)

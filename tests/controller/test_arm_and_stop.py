@@ -368,6 +368,25 @@ def test_close(run_virtual: Run, make_bench: MakeBench) -> None:
     run_virtual(scenario())
 
 
+def test_closing_again_hangs_up_on_nobody(
+    run_virtual: Run, running: Running, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Who closes while another still reads zero back waits for that, and all ends in order."""
+
+    async def scenario() -> None:
+        async with running() as bench:
+            bench.touch(FINGER)
+            await asyncio.sleep(0.01)
+            asked = len(bench.far_end.asked)
+            await asyncio.gather(bench.controller.close(), bench.controller.close())
+            kinds = [type(request) for _, request in bench.far_end.asked[asked:]]
+            assert kinds == [Apply, GetStatus, Disarm]
+            assert not bench.far_end.is_open
+
+    run_virtual(scenario())
+    assert caplog.text == ""
+
+
 def test_close_without_proof_of_silence(
     run_virtual: Run, caplog: pytest.LogCaptureFixture, running: Running
 ) -> None:

@@ -4,10 +4,10 @@ Its limits are the least of the configuration, what the amplifier reports and bu
 nothing sets them at run time.
 """
 
-import time
 from collections.abc import Callable, Collection
 from typing import final
 
+from drivers.clock import now
 from drivers.command import CommandSet, DriveCommand, Envelope, Knot, token_after
 from drivers.guard_budget import Budget
 from drivers.guard_limits import (
@@ -81,8 +81,8 @@ class SafeEnvelope(Envelope):
 class Guard:
     """Lets the command sets of one amplifier through or refuses them.
 
-    clock [s]: by which rate, on-time and duty are counted. Raises CommandError for limits that
-    leave nothing to play.
+    clock [s]: by which rate, on-time and duty are counted, the event loop's unless given. Raises
+    CommandError for limits that leave nothing to play.
     """
 
     def __init__(
@@ -90,7 +90,7 @@ class Guard:
         limits: GuardLimits,
         capabilities: Capabilities,
         *,
-        clock: Callable[[], float] = time.monotonic,
+        clock: Callable[[], float] = now,
     ) -> None:
         self._bounds = tightest(limits, capabilities)
         self._clock = clock

@@ -27,6 +27,8 @@
         by least squares over the signals; Im[a exp(i omega t)], t the far end's time
 
     {"op": "befall", "fault": ..., "lasts": ..., ...}  a fault as in a fault file, from now on
+    {"op": "faults"}                                   {"faults": {NAME: [{"fault", "begin_s",
+                                                           "end_s" or null, "is_on"}]}}
     {"op": "recover", "amplifier": NAME}               every fault ends; without a name, of all
     {"op": "step", "seconds": s}                       lets virtual time pass: {"time_s": t}
     {"op": "record", "file": PATH}                     sensors and fingers that are there now
@@ -271,6 +273,22 @@ def _befall(site: Site, request: dict[str, Any], now: float) -> _Answer:
     return _already({"ok": True, "time_s": now})
 
 
+def _faults(site: Site, request: dict[str, Any], now: float) -> _Answer:
+    listed = {}
+    for name, station in site.stations.items():
+        begin = station.faults.begin
+        listed[name] = [
+            {
+                "fault": episode.fault,
+                "begin_s": begin + episode.at,
+                "end_s": begin + episode.end if math.isfinite(episode.end) else None,
+                "is_on": episode.at <= now - begin < episode.end,
+            }
+            for episode in station.faults.episodes
+        ]
+    return _already({"faults": listed})
+
+
 def _recover(site: Site, request: dict[str, Any], now: float) -> _Answer:
     for station in site.stations_of(request.get("amplifier")):
         station.recover()
@@ -327,6 +345,7 @@ _OPS: Mapping[str, Callable[[Site, dict[str, Any], float], _Answer | Wait]] = {
     "signals": _signals,
     "tones": _tones,
     "befall": _befall,
+    "faults": _faults,
     "recover": _recover,
     "step": _step,
     "record": _record,

@@ -64,7 +64,12 @@ async def test_stepped_recorded_touched_and_broken(tmp_path: Path) -> None:
             await amplifier.arm(0.5)
             assert (await far_end.ask("befall", fault="arc", amplifier="main"))["ok"]
             assert (await far_end.ask("state"))["amplifiers"]["main"]["fault"] == "ARC"
+            befallen = (await far_end.ask("state"))["time_s"]
+            assert (await far_end.ask("faults"))["faults"]["main"] == [
+                {"fault": "arc", "begin_s": befallen, "end_s": None, "is_on": True}
+            ]
             assert (await far_end.ask("recover"))["ok"]
+            assert (await far_end.ask("faults")) == {"faults": {"main": []}}
             assert (
                 "none of the far end's"
                 in (await far_end.ask("befall", fault="arc", amplifier="x"))["error"]

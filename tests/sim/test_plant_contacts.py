@@ -7,6 +7,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from driven_bases import Base, faded_base, shaped_base
+from finger_energy import held_by_fingers
 from model.arrays import FloatArray
 from model.assembly import era_positions
 from model.base_motion import Term
@@ -94,15 +95,6 @@ def test_the_coordinates_of_a_finger_that_left_are_dropped_once_they_are_still(
     assert len(plant.reduced.omega) == len(reduced.omega) + 3
     for old, new in zip(before, on_the_mesh(plant), strict=True):
         assert_allclose(new, old, rtol=0, atol=1e-4 * np.abs(old).max())
-
-
-def held_by_fingers(plant: Plant) -> float:
-    """What the springs and masses of the fingers on the plate hold now [J]."""
-    q, v = plant.state
-    at = plant.reduced.at(load_positions(plant.contacts))
-    springs = np.array([each.stiffness for each in plant.contacts])
-    masses = np.array([each.mass for each in plant.contacts])
-    return float((springs @ (at @ q) ** 2 + masses @ (at @ v) ** 2) / 2)
 
 
 def test_a_finger_that_taps_gives_no_more_than_it_brought(

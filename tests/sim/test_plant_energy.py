@@ -8,6 +8,7 @@ import pytest
 from scipy.integrate import simpson
 
 from driven_bases import STILL, faded_base, shaped_base
+from finger_energy import held_by_fingers
 from model.assembly import era_positions
 from model.finger_load import finger_loads
 from model.point_load import PointLoad, load_positions
@@ -90,15 +91,6 @@ def kept_for(plant: Plant, rig: Rig, until: float) -> Books:
         ) / 2
     put_in, lost = simpson([power, loss], times)
     return Books(float(put_in), float(lost), float(stored[0]), float(stored[-1]))
-
-
-def held_by_fingers(plant: Plant) -> float:
-    """What the springs and masses of the fingers on the plate hold now [J]."""
-    q, v = plant.state
-    at = plant.reduced.at(load_positions(plant.contacts))
-    springs = np.array([each.stiffness for each in plant.contacts])
-    masses = np.array([each.mass for each in plant.contacts])
-    return float((springs @ (at @ q) ** 2 + masses @ (at @ v) ** 2) / 2)
 
 
 def test_work_is_stored_or_lost(rig: Rig) -> None:

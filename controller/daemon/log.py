@@ -5,6 +5,7 @@ written, is counted. Of lines from one place in the code a few a second are writ
 says how many were left out. Texts from outside are escaped by JSON, so that no line can be forged.
 """
 
+import contextlib
 import json
 import logging
 import queue
@@ -112,12 +113,19 @@ class LogThread:
                 stream.flush()
             except (OSError, ValueError):
                 self.lost += 1
-                stream = None  # a full disk may have room again, a rotated file is made anew
+                self._leave(stream)
+                stream = None  # a full disk may have room again
+        self._leave(stream)
 
     def _open(self) -> TextIO:
         if self._file is None:
             return sys.stderr
         return self._file.open("a", encoding="utf-8")
+
+    def _leave(self, stream: TextIO | None) -> None:
+        if stream is not None and self._file is not None:
+            with contextlib.suppress(OSError, ValueError):
+                stream.close()
 
 
 class LogHandler(logging.Handler):

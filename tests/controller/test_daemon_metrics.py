@@ -1,0 +1,60 @@
+"""The metrics, as another program's parser reads them."""
+
+from pathlib import Path
+
+import pytest
+from prometheus_client import CollectorRegistry, generate_latest
+from prometheus_client.parser import text_string_to_metric_families
+
+from controller.api.client import Client
+from controller.api.messages import StatusResult
+from controller.api.replies import Unreachable
+from controller.metrics.collector import DaemonCollector
+from daemon_bench import running_daemon, until_state
+
+
+def scraped(ask: object) -> dict[tuple[str, str], float]:
+    """What Prometheus would read, by the metric's name and its first label."""
+    registry = CollectorRegistry(auto_describe=False)
+    registry.register(DaemonCollector(ask))  # type: ignore[arg-type]
+    text = generate_latest(registry).decode()
+    return {
+        (sample.name, next(iter(sample.labels.values()), "")): sample.value
+        for family in text_string_to_metric_families(text)
+        for sample in family.samples
+    }
+
+
+async def test_a_running_daemon_is_measured(tmp_path: Path) -> None:
+    """State, link counts and latency of a daemon over a wire, in base units."""
+    async with running_daemon(tmp_path) as bench, await bench.client() as era:
+        await until_state(era, "READY_TO_SWITCH_ON")
+        status = await era.status()
+        read = scraped(lambda: status)
+    assert read["era_up", ""] == 1
+    assert read["era_state", "READY_TO_SWITCH_ON"] == 1
+    assert read["era_state", "FAULT"] == 0
+    assert read["era_link_frames_out_total", "main"] == status.amplifiers[0].statistics.frames_out
+    assert read["era_amplifier_temperature_celsius", "main"] == pytest.approx(25)
+    assert read["era_amplifier_high_voltage", "main"] == 0
+    assert read["era_touch_to_wire_seconds_bucket", "+Inf"] == 0
+    histogram = [(1.0, 2), (5.0, 3), (100.0, 4)]
+    latency = status.latency_ms.model_copy(update={"count": 9, "histogram": histogram})
+    later = status.model_copy(update={"latency_ms": latency, "rejected_touches": {"off_plate": 3}})
+    read = scraped(lambda: later)
+    assert read["era_touch_to_wire_seconds_bucket", "0.001"] == 2
+    assert read["era_touch_to_wire_seconds_bucket", "0.005"] == 5
+    assert read["era_touch_to_wire_seconds_bucket", "+Inf"] == 9
+    assert read["era_rejected_touches_total", "off_plate"] == 3
+
+
+def test_without_a_daemon_it_is_down(tmp_path: Path) -> None:
+    """Nothing but `era_up 0`, so that the alarm is that one."""
+
+    def ask() -> StatusResult:
+        with Client.connect(tmp_path / "none") as era:
+            return era.status()
+
+    with pytest.raises(Unreachable, match="no daemon runs at"):
+        ask()
+    assert scraped(ask) == {("era_up", ""): 0}

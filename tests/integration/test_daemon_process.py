@@ -1,0 +1,304 @@
+"""`era daemon` as users run it: a process over a pseudo-terminal, with signals, locks and its end.
+
+The far end is in the test's own process, so that its amplifier's clock can be read: it is
+time.monotonic(), the same for all processes.
+"""
+
+import asyncio
+import contextlib
+import json
+import os
+import signal
+import socket
+import sys
+import time
+from collections.abc import AsyncIterator, Sequence
+from contextlib import asynccontextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from controller.api.async_client import AsyncClient
+from daemon_bench import PATIENCE, PLACE, daemon_table, far_end, until, until_state, write_daemon
+from drivers.protocol.messages import Fault, State
+from model.table_file import save_table
+from wires import FarSide
+
+ERA = Path(sys.executable).with_name("era")
+WATCHDOG, REACTION = 0.25, 0.005  # s; what an amplifier may take to be silent
+
+
+@dataclass
+class DaemonProcess:
+    """A daemon that serves."""
+
+    process: asyncio.subprocess.Process
+    socket: Path
+    far: FarSide
+    log: list[dict[str, object]]
+
+    async def client(self) -> AsyncClient:
+        """A client of it."""
+        return await AsyncClient.connect(self.socket, name="test", timeout=PATIENCE)
+
+    async def status(self) -> int:
+        """Its exit status, once it has one."""
+        return await asyncio.wait_for(self.process.wait(), PATIENCE)
+
+    def said(self, text: str) -> bool:
+        """Whether a text stands in its log."""
+        return any(text in json.dumps(line) for line in self.log)
+
+
+@asynccontextmanager
+async def daemon_process(
+    folder: Path, far: FarSide, more: str = "", *, environment: dict[str, str] | None = None
+) -> AsyncIterator[DaemonProcess]:
+    """`era daemon` of a file with these further lines; killed with the context at the latest."""
+    save_table(daemon_table(), folder / "table.npz")
+    config = write_daemon(folder, {"main": far.url}, f"table: table.npz\n{more}")
+    process = await asyncio.create_subprocess_exec(
+        *(ERA, "daemon", str(config)),
+        stdin=asyncio.subprocess.DEVNULL,
+        stderr=asyncio.subprocess.PIPE,
+        env={**os.environ, **(environment or {})},
+    )
+    assert process.stderr is not None
+    made = DaemonProcess(process, folder / "era.sock", far, [])
+    reading = asyncio.create_task(_read_log(process.stderr, made.log))
+    try:
+        await until(lambda: made.said("serving at") or process.returncode is not None)
+        assert process.returncode is None, made.log
+        yield made
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            process.kill()
+        await process.wait()
+        await reading
+
+
+async def _read_log(stream: asyncio.StreamReader, log: list[dict[str, object]]) -> None:
+    while line := await stream.readline():
+        try:
+            log.append(json.loads(line))
+        except ValueError:
+            log.append({"no json": line.decode()})
+
+
+async def run_era(*arguments: object) -> tuple[int, str, str]:
+    """Another `era` command: its exit status, and both outputs."""
+    process = await asyncio.create_subprocess_exec(
+        *(ERA, *map(str, arguments)),
+        stdin=asyncio.subprocess.DEVNULL,
+        stdout=asyncio.subprocess.PIPE,
+        stderr=asyncio.subprocess.PIPE,
+    )
+    out, err = await asyncio.wait_for(process.communicate(), 3 * PATIENCE)
+    assert process.returncode is not None
+    return process.returncode, out.decode(), err.decode()
+
+
+@asynccontextmanager
+async def playing(daemon: DaemonProcess) -> AsyncIterator[AsyncClient]:
+    """A client whose finger is felt, for as long as the daemon lives."""
+    async with await daemon.client() as era:
+        await until_state(era, "READY_TO_SWITCH_ON")
+        await era.arm("test", lease_s=60)
+
+        async def hold() -> None:
+            with contextlib.suppress(ConnectionError):
+                while True:
+                    await era.touch([PLACE])
+                    await asyncio.sleep(0.03)
+
+        holding = asyncio.create_task(hold())
+        try:
+            await until(lambda: any(daemon.far.station.status().levels))
+            yield era
+        finally:
+            holding.cancel()
+            await asyncio.gather(holding, return_exceptions=True)
+
+
+def no_lines_beside_json(daemon: DaemonProcess) -> Sequence[object]:
+    """Lines of the log that are not JSON."""
+    return [line for line in daemon.log if "no json" in line]
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+async def test_told_to_end_it_is_silent_disarmed_and_gone_within_a_second(
+    tmp_path: Path, number: signal.Signals
+) -> None:
+    """Ramp to zero in 50 ms, read back, exit status 0, within 1 s of the signal; nothing left."""
+    async with far_end(tmp_path) as far, daemon_process(tmp_path, far) as daemon:
+        async with playing(daemon):
+            begin = time.monotonic()
+            daemon.process.send_signal(number)
+            assert await daemon.status() == 0
+            took = time.monotonic() - begin
+        assert took < 1.0
+        assert far.station.status().state is State.SWITCH_ON_DISABLED
+        assert far.silent_from() - begin < 0.5
+        assert not daemon.socket.exists()
+        assert daemon.said("OPERATION_ENABLED -> NOT_READY")
+        assert not no_lines_beside_json(daemon)
+
+
+async def test_killed_while_playing_the_amplifier_falls_silent_in_time(tmp_path: Path) -> None:
+    """SIGKILL: silent within the watchdog time + 5 ms of the last sign of life, then a fault.
+
+    Another daemon at the same place starts, disarmed, and needs the fault acknowledged.
+    """
+    async with far_end(tmp_path) as far:
+        async with daemon_process(tmp_path, far) as daemon, playing(daemon):
+            daemon.process.kill()
+            await daemon.process.wait()
+            dead = time.monotonic()
+            await until(lambda: far.station.status().state is State.FAULT)
+            fed = far.amplifier._fed
+            # What it had sent may have lain in the pseudo-terminal for a moment.
+            assert fed <= dead + 0.05
+            assert far.silent_from() - fed <= WATCHDOG + REACTION + 1e-9
+            assert far.amplifier.fault is Fault.WATCHDOG
+        assert daemon.socket.exists()  # nobody could take it away
+        async with daemon_process(tmp_path, far) as daemon, await daemon.client() as era:
+            await until_state(era, "FAULT")
+            assert far.station.status().state is State.FAULT
+            await era.clear()
+            await until_state(era, "READY_TO_SWITCH_ON")
+
+
+async def test_stopped_and_resumed_it_replays_nothing(tmp_path: Path) -> None:
+    """SIGSTOP for longer than the watchdog: silent in time; resumed, a fault and no level."""
+    async with (
+        far_end(tmp_path) as far,
+        daemon_process(tmp_path, far) as daemon,
+        playing(daemon) as era,
+    ):
+        daemon.process.send_signal(signal.SIGSTOP)
+        await until(lambda: far.station.status().state is State.FAULT)
+        assert far.silent_from() - far.amplifier._fed <= WATCHDOG + REACTION + 1e-9
+        daemon.process.send_signal(signal.SIGCONT)
+        assert await until_state(era, "FAULT", "COMM_LOST")
+        await asyncio.sleep(0.1)
+        assert not any(far.station.status().levels)
+        assert far.amplifier.fault is Fault.WATCHDOG
+
+
+async def test_a_second_daemon_is_refused_and_disturbs_nothing(tmp_path: Path) -> None:
+    """Exit status 2 and the first one's number; the first plays on all the while."""
+    async with (
+        far_end(tmp_path) as far,
+        daemon_process(tmp_path, far) as daemon,
+        playing(daemon) as era,
+    ):
+        status, _, err = await run_era("daemon", tmp_path / "daemon.yaml")
+        assert status == 2
+        assert f"process {daemon.process.pid}" in err
+        # At another socket the link is what they cannot share.
+        text = (tmp_path / "daemon.yaml").read_text("utf-8")
+        (tmp_path / "other.yaml").write_text(text.replace("era.sock", "b.sock"), "utf-8")
+        status, _, err = await run_era("daemon", tmp_path / "other.yaml")
+        assert status == 3
+        assert (await era.status()).state == "OPERATION_ENABLED"
+        await until(lambda: any(far.station.status().levels))
+
+
+async def test_the_commands_do_what_they_say(tmp_path: Path) -> None:
+    """status, arm, touch, stop, clear, disarm from a shell, with exit statuses and JSON."""
+    async with far_end(tmp_path) as far, daemon_process(tmp_path, far) as daemon:
+        where = ("--socket", daemon.socket)
+        status, out, _ = await run_era("status", *where, "--json")
+        told = json.loads(out)
+        assert (status, told["state"]) == (0, "READY_TO_SWITCH_ON")
+        status, _, err = await run_era("clear", *where)
+        assert (status, err) == (0, "")
+        arming = await asyncio.create_subprocess_exec(
+            *(ERA, "arm", "--lease", "2", *map(str, where)), stdout=asyncio.subprocess.PIPE
+        )
+        assert arming.stdout is not None
+        assert b"armed until Ctrl-C" in await asyncio.wait_for(arming.stdout.readline(), PATIENCE)
+        status, out, _ = await run_era("touch", "0.1,0.1", "0.25,0.2", "--for", 0.5, *where)
+        assert status == 0
+        assert "target 20.0 dB SL" in out
+        status, _, err = await run_era("arm", "--once", *where)
+        assert status == 1
+        assert "armed by 'era arm'" in err
+        arming.send_signal(signal.SIGINT)
+        assert await asyncio.wait_for(arming.wait(), PATIENCE) == 0
+        async with await daemon.client() as era:
+            await until_state(era, "READY_TO_SWITCH_ON")
+        status, out, _ = await run_era("stop", *where, "--json")
+        assert (status, json.loads(out)["state"]) == (0, "QUICK_STOP_ACTIVE")
+        status, out, _ = await run_era("clear", *where)
+        assert (status, out.partition(":")[0]) == (0, "READY_TO_SWITCH_ON")
+        assert far.station.status().state is State.SWITCH_ON_DISABLED
+    status, _, err = await run_era("status", *where)
+    assert status == 3
+    assert "no daemon runs at" in err
+
+
+async def test_systemd_hears_of_it_and_metrics_are_served(tmp_path: Path) -> None:
+    """READY=1 once it serves, WATCHDOG=1 while the loop runs, STOPPING=1; companions end too."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
+        manager.bind(str(tmp_path / "notify"))
+        manager.setblocking(False)
+        environment = {"NOTIFY_SOCKET": str(tmp_path / "notify"), "WATCHDOG_USEC": "1000000"}
+        async with (
+            far_end(tmp_path) as far,
+            daemon_process(tmp_path, far, f"metrics: {port}\n", environment=environment) as daemon,
+        ):
+            heard: list[str] = []
+
+            def has_heard(text: str) -> bool:
+                with contextlib.suppress(BlockingIOError):
+                    while True:
+                        heard.append(manager.recv(4096).decode())
+                return any(text in message for message in heard)
+
+            await until(lambda: has_heard("READY=1"))
+            await until(lambda: has_heard("WATCHDOG=1"))
+            text = await _get(port, "/metrics")
+            assert 'era_state{state="READY_TO_SWITCH_ON"} 1.0' in text
+            daemon.process.send_signal(signal.SIGHUP)
+            await until(lambda: has_heard("RELOADING=1"))
+            daemon.process.send_signal(signal.SIGTERM)
+            assert await daemon.status() == 0
+            assert has_heard("STOPPING=1")
+            with pytest.raises(OSError):  # noqa: PT011  refused or reset, as the machine likes
+                await asyncio.open_connection("127.0.0.1", port)
+
+
+async def _get(port: int, path: str) -> str:
+    """A page, as soon as somebody serves it."""
+    end = time.monotonic() + PATIENCE
+    while True:
+        try:
+            reader, writer = await asyncio.open_connection("127.0.0.1", port)
+            break
+        except OSError:
+            assert time.monotonic() < end, "nobody serves the page"
+            await asyncio.sleep(0.05)
+    writer.write(f"GET {path} HTTP/1.0\r\n\r\n".encode())
+    text = (await asyncio.wait_for(reader.read(), PATIENCE)).decode()
+    writer.close()
+    await writer.wait_closed()
+    return text
+
+
+async def test_check_touches_no_amplifier(tmp_path: Path) -> None:
+    """`--check` reads everything that is named: exit status 0, or 2 with what is wrong."""
+    async with far_end(tmp_path) as far:
+        save_table(daemon_table(), tmp_path / "table.npz")
+        path = write_daemon(tmp_path, {"main": far.url}, "table: table.npz\n")
+        status, out, _ = await run_era("daemon", path, "--check")
+        assert (status, far.station.status().token) == (0, 0)
+        assert "good" in out
+        (tmp_path / "table.npz").write_bytes(b"no table")
+        status, _, err = await run_era("daemon", path, "--check")
+        assert status == 2
+        assert "table.npz" in err

@@ -88,6 +88,29 @@ async def test_stepped_recorded_touched_and_broken(tmp_path: Path) -> None:
     assert (recording.start, recording.samples.shape) == (0.0005, (2000, 2))
 
 
+async def test_what_is_due_within_a_step_happens_at_its_time(tmp_path: Path) -> None:
+    """A fault half a second on, in one step of 0.8 s: silent 15 ms after it, and not before."""
+    async with far_end_process(
+        write_rig(tmp_path / "rig.yaml"), "--serial", "--virtual-time", "--sensor", "P1=0.0,0.0"
+    ) as far_end:
+        amplifier = Amplifier(open_backend(far_end.urls["main"]), reply_timeout=5.0)
+        await amplifier.open()
+        try:
+            await amplifier.arm(2.0)
+            guard = Guard(GuardLimits(40, 500, 1), amplifier.capabilities)
+            wanted = CommandSet(1, (DriveCommand(0, 110.0, 0.5),), ramp=0.0, valid_for=0.0)
+            await amplifier.apply(guard.check(wanted))
+            await far_end.ask("befall", fault="over_temperature", lasts=1.0)
+            await far_end.ask("step", seconds=0.8)
+            assert (await far_end.ask("state"))["amplifiers"]["main"]["fault"] == "OVER_TEMPERATURE"
+            signals = await far_end.ask("signals", since_s=0.3, until_s=0.8)
+        finally:
+            await amplifier.close()
+    strength = np.abs(np.reshape(signals["sensors"]["P1"]["m_s2"], (5, 1000))).max(axis=1)
+    assert strength[1] == pytest.approx(strength[0], rel=0.1)  # 0.3 to 0.5 s
+    assert strength[3] < 0.5 * strength[1]  # from 0.6 s on it only rings down
+
+
 async def test_a_recording_of_the_whole_run_is_written_at_its_end(tmp_path: Path) -> None:
     """Told to end, it writes the file and says so; sensors come from the command line."""
     file = tmp_path / "run.wav"

@@ -7,7 +7,7 @@ PYTHON ?= $(shell for python in $(PYTHONS); do \
 BIN := .venv/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet --editable
 
-.PHONY: demo test lint format fuzz soak bench bench-localization bench-wires clean
+.PHONY: demo test lint format fuzz soak bench bench-localization bench-plant bench-wires clean
 .NOTPARALLEL:
 
 demo: .venv/installed
@@ -41,6 +41,9 @@ bench: .venv/installed-peers
 
 bench-localization: .venv/installed
 	$(BIN)/python -m benchmarks.localization --report
+
+bench-plant: .venv/installed
+	$(BIN)/python -m benchmarks.plant_time
 
 bench-wires: .venv/installed-test
 	$(BIN)/python -m benchmarks.wires

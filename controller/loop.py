@@ -199,6 +199,10 @@ class Controller:
             self._tally.count(reason, f"touch of {frame.source}")
         self._follow(change)
 
+    def reconsider(self) -> None:
+        """Ask for wishes again, for they are others though no contact has changed."""
+        self._wake.set()
+
     @property
     def _is_heartbeat_due(self) -> bool:
         """Whether the amplifiers are to be told that the loop has run; silence goes before that."""

@@ -14,9 +14,9 @@ config_app = typer.Typer(help="Begin a configuration file, and check one.", no_a
 @config_app.command()
 def init(
     file: Annotated[Path, typer.Argument(metavar="FILE.yaml", help="The file to make.")],
-    kind: Annotated[str, typer.Option(help="What it shall be: rig or daemon.")] = "rig",
+    kind: Annotated[str, typer.Option(help="What it shall be: rig, daemon, layout.")] = "rig",
 ) -> None:
-    """Write a commented rig or daemon to edit, and its JSON schema for editors beside it."""
+    """Write a commented rig, daemon or layout to edit, and its JSON schema for editors beside it."""
     from model.config_kinds import kind_called
 
     made = kind_called(kind)
@@ -34,7 +34,7 @@ def check(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="The file to check.")],
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object on stdout.")] = False,
 ) -> None:
-    """Say everything that is wrong with a rig or daemon file; exit status 1 if anything is."""
+    """Say everything that is wrong with a rig, daemon or layout file; exit status 1 if anything is."""
     from model.config_kinds import kind_of
     from model.document import ConfigError, read_document
 

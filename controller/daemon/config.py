@@ -7,6 +7,8 @@ from urllib.parse import quote
 
 from controller.api.socket_path import default_socket
 from controller.daemon.sections import CalibrationSection, DaemonSection, TouchSection
+from controller.effects.layout import Layout, usual_effects
+from controller.effects.layout_file import load_layout
 from controller.touch import TouchSource
 from controller.touch_calibration import CalibratedSource, TouchCalibration, turned
 from controller.touch_registry import open_source
@@ -15,6 +17,7 @@ from drivers.registry import open_backend
 from model.config import Validation
 from model.document import ConfigError, Document, read_document
 from model.errors import InputError
+from model.perception import STRONG_DB_SL
 from model.rig import Rig
 from model.rig_file import load_rig
 
@@ -36,7 +39,8 @@ class TouchInput:
 class DaemonConfig:
     """All that a daemon runs by; rig_text: the rig's file as it stands there.
 
-    urls: by amplifier; table: its file, or None to build it or take it from the cache.
+    urls: by amplifier; table: its file, or None to build it or take it from the cache; layout: None
+    for one effect everywhere.
     """
 
     source: Path
@@ -46,11 +50,16 @@ class DaemonConfig:
     rig_text: str
     urls: Mapping[str, str]
     table: Path | None
-    layout: Path | None
+    layout: Layout | None
     touch: tuple[TouchInput, ...]
     socket: Path
     log_file: Path | None
     dump_folder: Path | None
+
+    @property
+    def meaning(self) -> Layout:
+        """What touches mean: the layout, or without one that every touch buzzes where it is."""
+        return self.layout or Layout(effects=usual_effects(self.section.level_db_sl))
 
 
 def load_daemon_config(path: Path) -> DaemonConfig:
@@ -61,10 +70,10 @@ def load_daemon_config(path: Path) -> DaemonConfig:
     rig, rig_text = _rig(validation, rig_file)
     urls = _urls(validation, rig, rig_file)
     touch = _touch(validation, document)
-    for key in ("table", "layout"):
-        file = _file(document, key)
-        if file is not None and not file.is_file():
-            validation.add((key,), f"there is no file {file}; check its name and folder")
+    table = _file(document, "table")
+    if table is not None and not table.is_file():
+        validation.add(("table",), f"there is no file {table}; check its name and folder")
+    layout = _layout(validation, document, rig)
     _check_serial_numbers(validation, rig)
     validation.finish()
     if rig is None or rig_file is None:  # finish has raised by then
@@ -77,8 +86,8 @@ def load_daemon_config(path: Path) -> DaemonConfig:
         rig_file=rig_file,
         rig_text=rig_text,
         urls=urls,
-        table=_file(document, "table"),
-        layout=_file(document, "layout"),
+        table=table,
+        layout=layout,
         touch=touch,
         socket=_file(document, "socket") or default_socket(),
         log_file=_beside(document, section.log.file),
@@ -112,6 +121,24 @@ def _rig(validation: Validation, file: Path | None) -> tuple[Rig | None, str]:
     except (InputError, OSError) as error:
         validation.add(("rig",), f"the rig cannot be used: {error}")
     return None, ""
+
+
+def _layout(validation: Validation, document: Document, rig: Rig | None) -> Layout | None:
+    """The surface layout; what is wrong with it stands at the key that names it."""
+    file = _file(document, "layout")
+    if file is None:
+        return None
+    level = validation.field(("level_db_sl",), DaemonSection)
+    try:
+        return load_layout(
+            file,
+            None if rig is None else rig.plate,
+            level_db_sl=STRONG_DB_SL if level is None else level,
+        )
+    except InputError as error:
+        told = str(error).replace("\n", "\n  ")
+        validation.add(("layout",), f"the layout cannot be used:\n    {told}")
+    return None
 
 
 def _urls(validation: Validation, rig: Rig | None, rig_file: Path | None) -> dict[str, str]:

@@ -28,7 +28,6 @@ from controller.daemon.view import Scene
 from controller.loop import Controller
 from controller.observer import Applied, Observer, Silenced
 from controller.touch import TouchFrame
-from controller.wishes import NewestBuzzes
 from drivers import clock
 from drivers.amplifier import Amplifier
 from drivers.errors import DriverError
@@ -66,7 +65,6 @@ class Daemon:
         self._reloads: set[asyncio.Task[None]] = set()
         self._ended = asyncio.Event()
         self._end_cause = "the daemon ends"
-        self._scene = Scene()
         self._latencies = Latencies()
         self._recorder = Recorder()
         self._dumped_at = float("-inf")
@@ -81,7 +79,8 @@ class Daemon:
             link_told=self._link_told,
             alive=lambda: manager.alive(clock.now()),
         )
-        self._meaning = Meaning(config.section.level_db_sl)
+        self._meaning = Meaning(config.meaning)
+        self._scene = Scene(self._meaning.effect_of)
         self._controller = Controller(
             config.rig,
             table,
@@ -103,6 +102,7 @@ class Daemon:
             scene=self._scene,
             latencies=self._latencies,
             touches=self._touches,
+            meaning=self._meaning,
         )
         self._server = ApiServer(
             self._service.handlers(),
@@ -167,8 +167,10 @@ class Daemon:
             match key:
                 case "touch":
                     await self._inputs.exchange(new.touch)
-                case "level_db_sl":
-                    self._meaning.exchange(NewestBuzzes(new.section.level_db_sl))
+                case "layout":
+                    self._meaning.exchange(new.meaning)
+                    self._service.layout = new.layout
+                    self._controller.reconsider()
                 case "longest_lease":
                     self._service.longest_lease = new.section.longest_lease
                 case "log.level":

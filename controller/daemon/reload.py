@@ -33,12 +33,13 @@ def plan_reload(old: DaemonConfig, new: DaemonConfig, *, is_armed: bool) -> Relo
             basis,
             f"{', '.join(basis)} changed, which only a restart can take over; nothing was changed",
         )
-    if is_armed and new.section.level_db_sl > old.section.level_db_sl:
+    before, after = old.meaning.strongest_db_sl, new.meaning.strongest_db_sl
+    if is_armed and after > before:
         return ReloadPlan(
             (),
             (),
-            f"level_db_sl would rise from {old.section.level_db_sl:g} to "
-            f"{new.section.level_db_sl:g} while armed; nothing was changed: disarm, then reload",
+            f"the strongest effect would rise from {before:g} to {after:g} dB SL while armed; "
+            "nothing was changed: disarm, then reload",
         )
     restart = tuple(key for key in RESTART if key in changed)
     return ReloadPlan(tuple(key for key in changed if key not in restart), restart)
@@ -51,7 +52,7 @@ def _changed(old: DaemonConfig, new: DaemonConfig) -> list[str]:
         "table": old.table != new.table,
         "mode": old.section.mode != new.section.mode,
         "serial_numbers": old.section.serial_numbers != new.section.serial_numbers,
-        "level_db_sl": old.section.level_db_sl != new.section.level_db_sl,
+        "layout": old.meaning != new.meaning,
         "touch": old.touch != new.touch,
         "longest_lease": old.section.longest_lease != new.section.longest_lease,
         "log.level": old.section.log.level != new.section.log.level,

@@ -12,7 +12,6 @@ from controller.api.jsonrpc import ErrorCode, RpcError
 from controller.api.messages import (
     ArmParams,
     ArmResult,
-    EffectsResult,
     HelloParams,
     HelloResult,
     PlayParams,
@@ -37,6 +36,7 @@ from controller.daemon.config import DaemonConfig
 from controller.daemon.inputs import ApiTouches
 from controller.daemon.latency import Latencies
 from controller.daemon.lease import LeaseBook
+from controller.daemon.meaning import Meaning
 from controller.daemon.records import RecordedBackend
 from controller.daemon.states import Event, Kind, Machine, State
 from controller.daemon.supervisor import Supervisor
@@ -73,8 +73,10 @@ class Service:
         scene: Scene,
         latencies: Latencies,
         touches: ApiTouches,
+        meaning: Meaning,
     ) -> None:
         self.longest_lease = config.section.longest_lease
+        self.layout = config.layout
         self._config = config
         self._table = table
         self._controller = controller
@@ -84,6 +86,7 @@ class Service:
         self._scene = scene
         self._latencies = latencies
         self._touches = touches
+        self._meaning = meaning
         self._lease = LeaseBook()
         self._expiry: asyncio.TimerHandle | None = None
         self._numbers: dict[Connection, int] = {}
@@ -112,7 +115,7 @@ class Service:
             "stop": lambda client, params: self._stop(client),
             "clear": lambda client, params: self._clear(client),
             "touch": self._touch,
-            "effects": lambda client, params: EffectsResult(effects=[]),
+            "effects": lambda client, params: self._meaning.effects(),
             "play": self._play,
             "subscribe": self._subscribe,
             "unsubscribe": self._unsubscribe,
@@ -197,7 +200,7 @@ class Service:
                 cells_y=table.grid.ny,
             ),
             rig_text=self._config.rig_text,
-            layout=None,
+            layout=None if self.layout is None else self.layout.drawn(),
         )
 
     async def _arm(self, client: Connection, params: ArmParams) -> ArmResult:
@@ -252,9 +255,12 @@ class Service:
         return Nothing()
 
     def _play(self, client: Connection, params: PlayParams) -> Nothing:
-        raise RpcError(
-            ErrorCode.REFUSED, f"there is no effect {params.effect!a}", remedy="see effects"
-        )
+        machine = self._supervisor.machine
+        if machine.state is not State.OPERATION_ENABLED:
+            raise _wrong_state(machine)
+        self._meaning.play(params, self._scene.contacts, now=clock.now())
+        self._controller.reconsider()
+        return Nothing()
 
     def _subscribe(self, client: Connection, params: SubscribeParams) -> Nothing:
         # After the answer, so that nothing comes before it is known to have worked.

@@ -1,11 +1,11 @@
 """What clients are told of the control loop: its news, in the words of the API."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from controller.api.events import ContactsEvent, PatternEvent, SilenceEvent
 from controller.api.parts import AmplifierStatus, ContactStatus, LinkCounts, Tone
-from controller.contacts import Contact
+from controller.contacts import Contact, ContactKey
 from controller.daemon.records import RecordedBackend
 from controller.observer import Applied, Silenced
 from drivers import clock
@@ -15,8 +15,12 @@ from drivers.errors import CommandError
 
 @dataclass
 class Scene:
-    """What is on the plate and what is played: the last that the control loop has told."""
+    """What is on the plate and what is played: the last that the control loop has told.
 
+    effect_of: the effect that plays for a finger.
+    """
+
+    effect_of: Callable[[ContactKey], str | None]
     contacts: tuple[Contact, ...] = ()
     applied: Applied | None = None
     silenced: Silenced | None = None
@@ -39,7 +43,10 @@ class Scene:
 
     def contact_statuses(self) -> list[ContactStatus]:
         """All contacts, with what was decided about each."""
-        return [contact_status(contact, self.applied) for contact in self.contacts]
+        return [
+            contact_status(contact, self.applied, effect=self.effect_of(contact.key))
+            for contact in self.contacts
+        ]
 
     def contacts_event(self) -> ContactsEvent:
         """For the topic `contacts`."""
@@ -47,7 +54,7 @@ class Scene:
 
     def pattern_event(self) -> PatternEvent | None:
         """For the topic `pattern`; None where none is played."""
-        return None if self.applied is None else pattern_event(self.applied)
+        return None if self.applied is None else pattern_event(self.applied, self.effect_of)
 
     def silence_event(self) -> SilenceEvent | None:
         """For the topic `silence`; None where something is played, or nothing was decided yet."""
@@ -58,9 +65,17 @@ class Scene:
         return {} if self.applied is None else _drive(self.applied)
 
 
-def contact_status(contact: Contact, applied: Applied | None) -> ContactStatus:
-    """A contact with what it is predicted to feel of a pattern."""
-    told = {"source": contact.key.source, "id": contact.key.id, "x_m": contact.x, "y_m": contact.y}
+def contact_status(
+    contact: Contact, applied: Applied | None, *, effect: str | None = None
+) -> ContactStatus:
+    """A contact with what it is predicted to feel of a pattern, and the effect that it has."""
+    told: dict[str, object] = {
+        "source": contact.key.source,
+        "id": contact.key.id,
+        "x_m": contact.x,
+        "y_m": contact.y,
+        "effect": effect,
+    }
     if applied is not None:
         for felt in applied.targets:
             if felt.contact.key == contact.key:
@@ -76,10 +91,13 @@ def contact_status(contact: Contact, applied: Applied | None) -> ContactStatus:
     return ContactStatus.model_validate(told)
 
 
-def pattern_event(applied: Applied) -> PatternEvent:
+def pattern_event(applied: Applied, effect_of: Callable[[ContactKey], str | None]) -> PatternEvent:
     """A confirmed pattern."""
     return PatternEvent(
-        contacts=[contact_status(contact, applied) for contact in applied.contacts],
+        contacts=[
+            contact_status(contact, applied, effect=effect_of(contact.key))
+            for contact in applied.contacts
+        ],
         drive=_drive(applied),
         predicted_contrast_db=_finite(applied.pattern.contrast_db),
         robust_contrast_db=_finite(applied.pattern.robust_contrast_db),

@@ -1,12 +1,14 @@
 """A surface layout: which parts of the plate have which effects."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 from controller.effects.effect import Effect
 from controller.effects.shapes import Shape
-from controller.effects.timed import Buzz
+from controller.effects.timed import Buzz, Click
+from model.perception import STRONG_DB_SL
 
 
 @dataclass(frozen=True)
@@ -44,6 +46,11 @@ BUZZ = "buzz"
 """The effect that plays where there is no layout."""
 
 
+def usual_effects(level_db_sl: float = STRONG_DB_SL) -> dict[str, Effect]:
+    """Effects that need not be written down, at a level."""
+    return {BUZZ: Buzz(level=level_db_sl), "click": Click(level=level_db_sl)}
+
+
 @dataclass(frozen=True)
 class Layout:
     """Regions, of which a later one lies on top of an earlier one, and effects by their names.
@@ -53,7 +60,7 @@ class Layout:
     """
 
     regions: tuple[Region, ...] = ()
-    effects: Mapping[str, Effect] = field(default_factory=lambda: {BUZZ: Buzz()})
+    effects: Mapping[str, Effect] = field(default_factory=lambda: usual_effects())
     elsewhere: str | None = BUZZ
     most_at_once: int = 1
 
@@ -62,6 +69,13 @@ class Layout:
         return next(
             (region for region in reversed(self.regions) if region.shape.contains(x, y)), None
         )
+
+    @property
+    def strongest_db_sl(self) -> float:
+        """The highest level that anything in it can have; infinite for what neighbours allow."""
+        levels = [effect.level_db_sl for effect in self.effects.values()]
+        levels += [region.level_db_sl for region in self.regions if region.has_level]
+        return max((math.inf if level is None else level for level in levels), default=-math.inf)
 
     def drawn(self) -> dict[str, Any]:
         """As JSON, for whoever draws it."""

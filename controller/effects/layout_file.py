@@ -7,12 +7,12 @@ from pydantic import Field, Strict
 
 from controller.effects.effect import Effect, Level
 from controller.effects.kinds import effect_kind
-from controller.effects.layout import BUZZ, Layout, Region
+from controller.effects.layout import BUZZ, Layout, Region, usual_effects
 from controller.effects.shapes import Circle, Polygon, Rectangle, Shape
-from controller.effects.timed import Buzz, Click
 from model.config import Quantity, Section, Validation
 from model.document import Document, KeyPath, read_document
 from model.errors import InputError
+from model.perception import STRONG_DB_SL
 from model.plate import Plate
 from model.rig_sections import Identifier
 from model.units import LENGTH
@@ -65,11 +65,15 @@ class LayoutSection(Section):
     most_at_once: Annotated[int, Field(ge=1, le=4)] = 1
 
 
-def load_layout(path: Path, plate: Plate) -> Layout:
-    """Read the layout of a plate; raises ConfigError with every problem of the file."""
+def load_layout(path: Path, plate: Plate | None, *, level_db_sl: float = STRONG_DB_SL) -> Layout:
+    """Read a layout; raises ConfigError with every problem of the file.
+
+    plate: which its regions must lie on, None for any. level_db_sl: of the effects that are there
+    without being written down.
+    """
     document = read_document(path)
     validation = Validation(document, LayoutSection)
-    effects = _effects(validation)
+    effects = _effects(validation, level_db_sl)
     for name in validation.mapping(("regions",)):
         _check_region(validation, ("regions", name), effects, plate)
     elsewhere = validation.field(("elsewhere",), LayoutSection)
@@ -89,9 +93,9 @@ def is_layout_document(document: Document) -> bool:
     return bool(document.data.keys() & {"regions", "elsewhere"}) and "plate" not in document.data
 
 
-def _effects(validation: Validation) -> dict[str, Effect | None]:
-    """Effects by name, our own buzz and click among them; None for one that is not in order."""
-    effects: dict[str, Effect | None] = {BUZZ: Buzz(), "click": Click()}
+def _effects(validation: Validation, level_db_sl: float) -> dict[str, Effect | None]:
+    """Effects by name, the usual ones among them; None for one that is not in order."""
+    effects: dict[str, Effect | None] = {**usual_effects(level_db_sl)}
     for name, parameters in validation.mapping(("effects",)).items():
         path = ("effects", name)
         effects[name] = None
@@ -109,7 +113,7 @@ def _effects(validation: Validation) -> dict[str, Effect | None]:
 
 
 def _check_region(
-    validation: Validation, path: KeyPath, effects: dict[str, Effect | None], plate: Plate
+    validation: Validation, path: KeyPath, effects: dict[str, Effect | None], plate: Plate | None
 ) -> None:
     """What a region by itself cannot know: that it lies on the plate, and its effects exist."""
     region = validation.part(path, RegionSection)
@@ -119,7 +123,7 @@ def _check_region(
     if len(given) != 1:
         found = f"it has {' and '.join(given)}" if given else "it has none"
         validation.add(path, f"needs one of {', '.join(_SHAPES)}; {found}")
-    elif not _is_on(plate, _shape(region)):
+    elif plate is not None and not _is_on(plate, _shape(region)):
         validation.add(
             (*path, given[0]),
             f"reaches beyond the plate, which is {plate.length:g} m by {plate.width:g} m; "

@@ -11,7 +11,7 @@ from controller.effects.timed import Click
 from model.document import ConfigError
 from model.rig_file import example_rig_path, load_rig
 
-EXAMPLE = Path(__file__).parents[2] / "examples" / "layout.yaml"
+EXAMPLE = Path(__file__).parents[2] / "controller" / "effects" / "example.yaml"
 
 
 def refused(path: Path, text: str) -> str:

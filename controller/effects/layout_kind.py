@@ -1,0 +1,44 @@
+"""Surface layouts, as `era config` deals with them."""
+
+from pathlib import Path
+from typing import Any
+
+from controller.effects.kinds import effect_kind, effect_kinds
+from controller.effects.layout_file import LayoutSection, is_layout_document, load_layout
+from model.config_kinds import Good
+from model.document import Document
+
+
+class LayoutKind:
+    """A surface layout."""
+
+    def recognises(self, document: Document) -> bool:
+        """It has regions."""
+        return is_layout_document(document)
+
+    def check(self, path: Path) -> Good:
+        """Read it; whether it fits a plate is seen with the daemon's file that names it."""
+        layout = load_layout(path, None)
+        return Good(
+            f"good: regions {', '.join(region.name for region in layout.regions) or 'none'}; "
+            f"effects {', '.join(layout.effects)}; elsewhere {layout.elsewhere or 'nothing'}. "
+            "Check the daemon's file that names it to see whether it fits the plate"
+        )
+
+    def example(self) -> str:
+        """Every key, with what it is for."""
+        return Path(__file__).with_name("example.yaml").read_text(encoding="utf-8")
+
+    def schema(self) -> dict[str, Any]:
+        """For editors; what each kind of effect takes is under `$defs`."""
+        schema = LayoutSection.model_json_schema()
+        kinds = {f"effect {name}": effect_kind(name).model_json_schema() for name in effect_kinds()}
+        return {
+            "$schema": "https://json-schema.org/draft/2020-12/schema",
+            **schema,
+            "$defs": {**schema.get("$defs", {}), **kinds},
+            "title": "A surface layout of era-haptics",
+        }
+
+
+LAYOUT = LayoutKind()

@@ -218,10 +218,12 @@ class _Node:
             high_voltage, temperature = bool(flag & 1), degrees * 0.1
             said = _levels(levels, count & 0x1F, sequence)
         kind = _ACTIONS[what & 7]
+        is_whole = said is not None or result or kind in (Kind.APPLY, Kind.STAGE, Kind.COMMIT)
         return Answered(
             self.number,
             (self.number, sequence, kind),
             refusal=result,
+            problem="" if is_whole else "its condition or its levels are missing",
             is_as_asked=bool(what & 8) if kind in (Kind.APPLY, Kind.STAGE) else None,
             condition=Condition(
                 state=state,

@@ -65,6 +65,8 @@ class Follower:
         self._ends: tuple[float, float] | None = None
         self._ramp = 0.0
         self._is_warm = False
+        # Of sensors that find too little, while it may be in a fault of its own that nobody knows.
+        self._suspicions: list[tuple[str, float, str]] = []
 
     @property
     def is_enabled(self) -> bool:
@@ -335,7 +337,7 @@ class Follower:
         if said.watchdog_left is not None:
             self._check_left(said, begin, end)
         if said.levels is not None:
-            self._check_levels(said.levels, begin, end, may_have_tripped=self._may_trip(end))
+            self._check_levels(said.levels, begin, end)
         if said.high_voltage is not None:
             must = {_ENABLED: True, _FAULT: False, **dict.fromkeys(_OFF, False)}.get(said.state)
             if must is not None and must != said.high_voltage:
@@ -374,6 +376,10 @@ class Follower:
             )
         if now in (_REACTING, _FAULT):
             self._fault = said.fault
+        else:
+            for suspicion in self._suspicions:
+                self._complain(*suspicion)
+        self._suspicions.clear()
         self.state, self._is_reported = now, True
 
     def _check_trip(self, said: Condition, end: float) -> None:
@@ -429,7 +435,7 @@ class Follower:
     def plays(self, levels: Sequence[float], frequencies: Mapping[int, float], time: float) -> None:
         """What a sensor finds on its channels: levels, and where it is known the frequency [Hz]."""
         self.pass_to(time)
-        self._check_levels(levels, time, time, may_have_tripped=self._may_trip(time))
+        self._check_levels(levels, time, time, of_sensor=True)
         for channel, frequency in frequencies.items():
             drive = self._drives.get(channel)
             is_settled = time > self._fades.get(channel, Fade()).settled_from
@@ -446,24 +452,30 @@ class Follower:
         return self.state == _ENABLED and time > self._fed[0] + self._watchdog - self._slack
 
     def _check_levels(
-        self, levels: Sequence[float], begin: float, end: float, *, may_have_tripped: bool
+        self, levels: Sequence[float], begin: float, end: float, *, of_sensor: bool = False
     ) -> None:
         for channel, level in enumerate(levels):
             fade = self._fades.get(channel, Fade())
             low, high = fade.within(begin - self._slack, end + self._slack)
+            is_low = False
             if level > high + _LEVEL:
                 wrong = f"at most {high:.4f}"
-            elif level < low - _LEVEL and not (self._is_warm or may_have_tripped):
+            elif level < low - _LEVEL and not (self._is_warm or self._may_trip(end)):
+                is_low = True
                 wrong = f"at least {low:.4f}"
             else:
                 continue
             is_settled = begin > fade.settled_from
-            self._complain(
+            found = (
                 self._rule_of_level(channel, level, is_settled=is_settled),
                 end,
                 f"channel {channel} of {self._name} has level {level:.4f}; it must be {wrong}, "
                 f"{'' if is_settled else 'fading '}after {self._cause}",
             )
+            if is_low and of_sensor and self.is_enabled:
+                self._suspicions.append(found)
+            else:
+                self._complain(*found)
 
     def _rule_of_level(self, channel: int, level: float, *, is_settled: bool) -> str:
         if self._cause == "the watchdog":

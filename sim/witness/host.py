@@ -170,6 +170,8 @@ class Host:
                     side.complain(duty.invariant, duty.due, duty.sentence)
         for side in self._sides.values():
             self._check_pulse(side, time)
+            if side.follower.is_in_fault and self._arm_wished:
+                self._arm_wished = False  # a fault ends what was wished before it
 
     # rules
 
@@ -202,7 +204,8 @@ class Host:
 
     def _check_life(self, side: Side, time: float, asked: Asked) -> None:
         hung = self._hung
-        if hung is not None and time > hung + self._times.slack and not self._silences(asked):
+        is_by_loop = asked.kind in (Kind.PING, Kind.COMMIT, Kind.STAGE) or asked.vibrates
+        if hung is not None and time > hung + self._times.slack and is_by_loop:
             side.complain(
                 "heartbeat",
                 time,
@@ -412,7 +415,7 @@ class Host:
         """Whether it was told to be silent after a lift, or has a good reason not to be."""
         is_touched_again = self._touched >= lifted
         told = not side.vibrates or side.follower.is_in_fault or not side.is_open
-        return told or is_touched_again
+        return told or is_touched_again or self._hung is not None
 
     def _can_play(self) -> bool:
         sides = self._sides.values()

@@ -222,7 +222,8 @@ class Witness:
 
     def _sent(self, link: str, wire: _Wire, time: float, raw: Data, meaning: Meaning) -> None:
         """A frame toward the amplifiers."""
-        is_copy = self._is_troubled(link) and raw in wire.recent
+        is_torn = isinstance(meaning, Asked) and meaning.problem.startswith("torn")
+        is_copy = self._is_troubled(link) and (raw in wire.recent or is_torn)
         wire.recent.append(raw)
         if isinstance(meaning, Damaged):
             if not self._is_troubled(link):
@@ -302,6 +303,10 @@ class Witness:
                 what = f"{side.name} answers what nobody has asked it, or asks no more{why}"
                 side.complain("credit", time, what)
             return
+        if answer.problem and not self._is_troubled(link):
+            side.complain(
+                "answer", time, f"an answer of {side.name} is not whole: {answer.problem}"
+            )
         was_lost = answer.key in side.overdue
         side.overdue.discard(answer.key)
         if answer.refusal:

@@ -1,0 +1,306 @@
+"""What is played before the witness: an ordinary day, and days on which something is wrong."""
+
+import asyncio
+import contextlib
+
+from drivers.errors import CommandRefused
+from drivers.guard import Guard, GuardLimits
+from witnessed_chain import Chain, with_level
+
+_STOP = bytes.fromhex("00042801070205 05B4C3FD8600")  # one bit of its CRC is wrong
+
+
+async def day(chain: Chain) -> None:
+    """Touches, a neighbour, a lift, a stop amid a touch, clearing, arming, disarming."""
+    await chain.arm()
+    await chain.rest(0.12)
+    chain.touch(1)
+    await chain.rest(0.1)
+    chain.touch(1, 2)
+    await chain.rest(0.12)
+    chain.touch(1)
+    await chain.rest(0.05)
+    chain.touch()
+    await chain.rest(0.1)
+    chain.touch(3)
+    await chain.rest(0.1)
+    await chain.stop()
+    await chain.rest(0.1)
+    chain.touch()
+    await chain.clear()
+    await chain.arm()
+    chain.touch(4)
+    await chain.rest(0.06)
+    chain.touch()
+    await chain.rest(0.06)
+    await chain.disarm()
+    await chain.rest(0.1)
+
+
+async def hung(chain: Chain) -> None:
+    """The control loop hangs while a finger is felt; somebody looks on, clears and arms again."""
+    await chain.arm()
+    chain.touch(1)
+    await chain.rest(0.1)
+    await chain.hang()
+    for _ in range(20):
+        await chain.rest(0.02)
+        await chain.amplifier.status()
+    chain.touch()
+    await chain.clear()
+    await chain.rest(0.05)
+    await chain.arm()
+    chain.run()
+    chain.touch(2)
+    await chain.rest(0.06)
+    chain.touch()
+    await chain.rest(0.06)
+
+
+async def source_dies(chain: Chain) -> None:
+    """The source of touches dies with a finger down."""
+    await chain.arm()
+    chain.touch(1)
+    await chain.rest(0.1)
+    await chain.fall_silent()
+    await chain.rest(0.1)
+
+
+async def slow_stop(chain: Chain) -> None:
+    """An amplifier that takes its time over answers is stopped while it does."""
+    await chain.arm()
+    await chain.rest(0.02)
+    chain.between.delay = 0.025
+    chain.touch(1)
+    await chain.rest(0.001)
+    await chain.stop()
+    chain.touch()
+    await chain.rest(0.05)
+    chain.between.delay = 0.0
+    await chain.rest(0.05)
+
+
+async def slow_lift(chain: Chain) -> None:
+    """The last finger goes while an amplifier takes its time over the answer to its touch."""
+    await chain.arm()
+    await chain.rest(0.02)
+    chain.between.delay = 0.025
+    chain.touch(1)
+    await chain.rest(0.001)
+    chain.touch()
+    await chain.rest(0.05)
+    chain.between.delay = 0.0
+    await chain.rest(0.05)
+
+
+async def too_loud(chain: Chain) -> None:
+    """The table asks for more than full level on one ERA: nothing must play."""
+    chain.table.alone = with_level(chain.table.alone, "NE", 0.7)
+    await _unanswerable(chain)
+
+
+async def too_high(chain: Chain) -> None:
+    """The table asks for a frequency that is not allowed."""
+    chain.table.alone = with_level(chain.table.alone, "NE", 0.4, frequency=620.0)
+    await _unanswerable(chain)
+
+
+async def not_a_number(chain: Chain) -> None:
+    """The table is damaged: a phase is NaN."""
+    chain.table.alone = with_level(chain.table.alone, "NE", 0.4, phase=float("nan"))
+    await _unanswerable(chain)
+
+
+async def _unanswerable(chain: Chain) -> None:
+    await chain.arm()
+    chain.touch(1, answerable=False)
+    chain.witness.expect(None)
+    await chain.rest(0.1)
+    chain.touch()
+    await chain.rest(0.05)
+
+
+async def reopened(chain: Chain) -> None:
+    """Everything is closed, opened again, and somebody arms it."""
+    await chain.arm()
+    await chain.rest(0.05)
+    await chain.reopen()
+    await chain.arm()
+    chain.touch(1)
+    await chain.rest(0.06)
+    chain.touch()
+    await chain.rest(0.05)
+
+
+async def arc(chain: Chain) -> None:
+    """An amplifier has a fault of its own while a finger is felt; later it is cleared."""
+    await chain.arm()
+    chain.touch(1)
+    await chain.rest(0.06)
+    chain.trip()
+    for _ in range(10):
+        await chain.rest(0.02)
+        await chain.amplifier.status()
+    chain.touch()
+    await chain.clear()
+    await chain.rest(0.05)
+
+
+async def noise(chain: Chain) -> None:
+    """Damaged frames come to the amplifier (a stop and a ping), which must not mind them."""
+    await chain.arm()
+    chain.touch(1)
+    await chain.rest(0.06)
+    chain.witness.faults(chain.loop.time(), chain.link, are_on=True)
+    chain.inject("amplifier", _STOP)
+    await chain.rest(0.1)
+    chain.witness.faults(chain.loop.time(), chain.link, are_on=False)
+    chain.touch()
+    await chain.rest(0.05)
+
+
+async def late_copy(chain: Chain) -> None:
+    """The first set that vibrated comes once more, after others: a stale frame."""
+    kept: list[bytes] = []
+
+    def keep(toward: str, data: bytes) -> bytes:
+        if toward == "amplifier":
+            kept.append(data)
+        return data
+
+    await chain.arm()
+    chain.touch(1)
+    await asyncio.sleep(0)
+    chain.between.mangle = keep
+    await chain.rest(0.03)
+    chain.touch(1, 2)
+    await chain.rest(0.1)
+    chain.witness.faults(chain.loop.time(), chain.link, are_on=True)
+    stale = next(data for data in kept if len(data) > 30)
+    chain.inject("amplifier", stale)
+    await chain.rest(0.1)
+    chain.witness.faults(chain.loop.time(), chain.link, are_on=False)
+    chain.touch()
+    await chain.rest(0.05)
+
+
+async def damaged_answer(chain: Chain) -> None:
+    """The answer to a heartbeat is damaged, and a finger comes meanwhile."""
+    damaged = asyncio.Event()
+
+    def damage(toward: str, data: bytes) -> bytes:
+        if toward == "host" and not damaged.is_set():
+            damaged.set()
+            at = len(data) - 4  # in the checksum, and never a zero byte
+            return data[:at] + bytes([data[at] ^ 0x55 or 1]) + data[at + 1 :]
+        return data
+
+    await chain.arm()
+    await chain.rest(0.02)
+    chain.witness.faults(chain.loop.time(), chain.link, are_on=True)
+    chain.between.mangle = damage
+    await damaged.wait()
+    await chain.rest(0.005)
+    chain.touch(1)
+    await chain.rest(0.15)
+    chain.touch()
+    await chain.rest(0.05)
+
+
+async def foreign_answer(chain: Chain) -> None:
+    """Instead of the answer to a heartbeat comes that to another request, and a finger."""
+    kept: list[bytes] = []
+    replaced = asyncio.Event()
+
+    def replace(toward: str, data: bytes) -> bytes:
+        if toward != "host" or replaced.is_set():
+            return data
+        kept.append(data)
+        if len(kept) > 1 and len(data) == len(kept[-2]):
+            replaced.set()
+            return kept[-2]
+        return data
+
+    await chain.arm()
+    await chain.rest(0.02)
+    chain.witness.faults(chain.loop.time(), chain.link, are_on=True)
+    chain.between.mangle = replace
+    await replaced.wait()
+    await chain.rest(0.005)
+    chain.touch(1)
+    await chain.rest(0.15)
+    chain.touch()
+    await chain.rest(0.05)
+
+
+async def torn(chain: Chain) -> None:
+    """On CAN the frame of one channel is lost."""
+    lost = asyncio.Event()
+
+    def lose(toward: str, data: bytes) -> bytes:
+        at = data.find(b"t301")
+        if toward == "amplifier" and at >= 0 and not lost.is_set():
+            lost.set()
+            return data[:at] + data[data.index(b"\r", at) + 1 :]
+        return data
+
+    await chain.arm()
+    await chain.rest(0.02)
+    chain.witness.faults(chain.loop.time(), chain.link, are_on=True)
+    chain.between.mangle = lose
+    chain.touch(1)
+    await chain.rest(0.1)
+    chain.touch()
+    await chain.rest(0.05)
+
+
+async def slow_touch(chain: Chain) -> None:
+    """A finger comes, and somebody looks on, while the answer to a heartbeat is on its way."""
+    asked = asyncio.Event()
+
+    def look(toward: str, data: bytes) -> bytes:
+        if toward == "amplifier":
+            asked.set()
+        return data
+
+    await chain.arm()
+    await chain.rest(0.02)
+    chain.between.delay = 0.020
+    chain.between.mangle = look
+    await asked.wait()
+    await chain.rest(0.005)
+    chain.touch(1)
+    await chain.amplifier.status()
+    await chain.rest(0.1)
+    chain.between.delay = 0.0
+    chain.touch()
+    await chain.rest(0.05)
+
+
+async def disarmed_amid(chain: Chain) -> None:
+    """Somebody disarms it while a finger is felt."""
+    await chain.arm()
+    chain.touch(1)
+    await chain.rest(0.06)
+    await chain.disarm()
+    await chain.rest(0.1)
+    await chain.amplifier.status()
+    chain.touch()
+
+
+async def strangers_set(chain: Chain) -> None:
+    """A program that goes round the controller sends a silent set to a disarmed amplifier."""
+    guard = Guard(GuardLimits(40.0, 500.0, 0.5), chain.amplifier.capabilities)
+    await chain.rest(0.02)
+    await chain.amplifier.status()
+    with contextlib.suppress(CommandRefused):
+        await chain.amplifier.apply(guard.silence(7, (0, 1), ramp=0.0))
+    await chain.rest(0.02)
+
+
+async def touched_beside(chain: Chain) -> None:
+    """A sensor tells of a finger beside the plate."""
+    await chain.arm()
+    await chain.rest(0.05)
+    chain.touch_beside()
+    await chain.rest(0.1)

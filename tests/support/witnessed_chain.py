@@ -1,0 +1,441 @@
+"""The whole chain in virtual time, with a witness on its wires: controller, drivers, far ends.
+
+A scenario is played as a person would: fingers come and go, somebody arms, stops and clears, the
+control loop hangs. What each touch must give is known by hand from the rig below.
+"""
+
+import asyncio
+import contextlib
+import math
+import random
+from collections.abc import AsyncIterator, Awaitable, Callable, Collection, Mapping, Sequence
+from contextlib import asynccontextmanager
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from controller.loop import Controller
+from controller.touch import Touch, TouchFrame
+from drivers import clock
+from drivers.amplifier import Amplifier
+from drivers.backends.stand_in import STAND_IN
+from drivers.protocol.messages import Fault
+from drivers.registry import open_backend
+from memory_machine import MemoryMachine
+from model.actuator import Era
+from model.arrays import FloatArray
+from model.excitation import Excitation, Tone
+from model.mesh import Mesh
+from model.pattern import Pattern
+from model.plate import Material, Plate
+from model.question import Question
+from model.rig import Channel, Limits, Rig
+from sim.bench import Bench
+from sim.pseudo_terminal import TERMINAL_MAKER
+from sim.station import Station
+from sim.waveform import level_of
+from sim.wires import Wire, open_wire
+from sim.witness.violation import Violation
+from sim.witness.witness import Witness
+from virtual_loop import VirtualLoop, run_virtual
+
+STROKE = 100e-6  # m
+SENSED_EVERY = 0.001  # s
+_LONGEST = 5.0  # s; a chain with a bug in it may wait for ever
+ALONE: Excitation = {"SW": Tone(110.0, 20e-6, math.pi / 2), "NE": Tone(150.0, 40e-6, -math.pi)}
+SHARED: Excitation = {"SW": Tone(90.0, 30e-6, 0.0)}
+WITNESSED = {
+    "serial": Wire("serial"),
+    "modbus-tcp": Wire("modbus-tcp"),
+    "modbus-rtu": Wire("modbus-rtu"),
+    "socketcand": Wire("socketcand"),
+    "slcan": Wire("slcan"),
+}
+"""Every kind of wire, by the name that the witness has for it."""
+
+Mangle = Callable[[str, bytes], bytes | None]
+
+
+class OneTable:
+    """Gives one pattern for a finger that is alone and another for more; both may be replaced."""
+
+    def __init__(self, plate: Plate) -> None:
+        self.plate = plate
+        self.alone = ALONE
+        self.shared = SHARED
+
+    @property
+    def frequencies(self) -> FloatArray:
+        """Those of its tones [Hz]."""
+        return np.array([90.0, 110.0, 150.0])
+
+    def prepare(self, mode: str) -> None:
+        """There is nothing to work out."""
+
+    def ask(self, question: Question) -> Pattern:
+        """By the number of fingers alone."""
+        excitation = self.shared if question.quiet else self.alone
+        contrast = 12.0 if question.quiet else None
+        return Pattern(excitation, 0.015, 20.0, contrast, None, question.mode)
+
+    def amplitudes(
+        self, excitation: Excitation, points: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """1 m/s² everywhere."""
+        return np.array([110.0]), np.ones((1, len(points)))
+
+
+def make_rig(amplifiers: Sequence[str], limits: Limits) -> Rig:
+    """Three ERAs on one amplifier, or NE on another; SE is never driven."""
+    return Rig(
+        plate=Plate(0.3, 0.2, 0.0015, Material("aluminium", 70e9, 2700.0, 0.33)),
+        mesh=Mesh(4, 4, 0.3, 0.2),
+        eras=(
+            Era("SW", 0.0, 0.0, 17_000.0, 1.0, 0.0, STROKE),
+            Era("NE", 0.3, 0.2, 17_000.0, 1.0, 0.0, STROKE),
+            Era("SE", 0.3, 0.0, 17_000.0, 1.0, 0.0, STROKE),
+        ),
+        wiring={
+            "SW": Channel(amplifiers[0], 0),
+            "NE": Channel(amplifiers[-1], 1),
+            "SE": Channel(amplifiers[0], 2),
+        },
+        amplifiers=dict.fromkeys(amplifiers, "memory://"),
+        limits=limits,
+    )
+
+
+def plan_for(wire: str, urls: Mapping[str, str], links: Mapping[str, str]) -> dict[str, Any]:
+    """What the witness is told: written by hand, not taken from the rig."""
+    channel = {"frequency_hz": [40, 500], "level": 0.5, "slew_per_s": 100}
+    return {
+        "wires": dict.fromkeys(links.values(), wire),
+        "amplifiers": {
+            name: {
+                "wire": links[name],
+                "address": _address(wire, url),
+                "channels": dict.fromkeys(range(3), channel),
+            }
+            for name, url in urls.items()
+        },
+    }
+
+
+def _address(wire: str, url: str) -> int:
+    if wire == "serial":
+        return int(url.partition("address=")[2] or 1)
+    return int(url.rpartition("/" if wire == "modbus-tcp" else "#")[2])
+
+
+def _link(wire: str, url: str) -> str:
+    """The name that the memory network has for what a URL leads to."""
+    place = url.partition("://")[2]
+    return place.partition("/" if wire in ("modbus-tcp", "socketcand") else "?")[0]
+
+
+@dataclass
+class Chain:
+    """A running chain and its witness; names of amplifiers as in the rig."""
+
+    loop: VirtualLoop
+    machine: MemoryMachine
+    between: "Between"
+    bench: Bench
+    witness: Witness
+    table: OneTable
+    controller: Controller
+    amplifiers: Mapping[str, Amplifier]
+    links: Mapping[str, str]
+    errors: list[BaseException] = field(default_factory=list)
+    running: "asyncio.Task[None] | None" = None
+    fingers: tuple[int, ...] = ()
+    holding: "asyncio.Task[None] | None" = None
+
+    @property
+    def amplifier(self) -> Amplifier:
+        """The first."""
+        return next(iter(self.amplifiers.values()))
+
+    @property
+    def link(self) -> str:
+        """The wire of the first."""
+        return next(iter(self.links.values()))
+
+    async def rest(self, seconds: float) -> None:
+        """Let time pass."""
+        await asyncio.sleep(seconds)
+
+    async def arm(self) -> None:
+        """Somebody arms it."""
+        self.witness.wish(self.loop.time(), "arm")
+        await self._try(self.controller.arm())
+
+    async def stop(self) -> None:
+        """Somebody stops it."""
+        self.witness.wish(self.loop.time(), "stop")
+        await self._try(self.controller.stop())
+
+    async def disarm(self) -> None:
+        """Somebody disarms it."""
+        self.witness.wish(self.loop.time(), "disarm")
+        await self._try(self.controller.disarm())
+
+    async def clear(self) -> None:
+        """Somebody clears what is latched."""
+        self.witness.wish(self.loop.time(), "clear")
+        await self._try(self.controller.clear())
+
+    def run(self) -> None:
+        """The control loop runs from now on."""
+        self.witness.hang(self.loop.time(), False)
+        self.running = asyncio.get_running_loop().create_task(self._try(self.controller.run()))
+
+    async def hang(self) -> None:
+        """The control loop gets no further."""
+        if self.running is not None:
+            self.running.cancel()
+            await asyncio.gather(self.running, return_exceptions=True)
+        await self.rest(0.002)  # what was on its way is on the wire by then
+        self.witness.hang(self.loop.time())
+
+    def touch_beside(self) -> None:
+        """The source tells of a touch beside the plate, which nobody feels."""
+        touches = (Touch(9, 1.3, 0.5),)
+        self.controller.deliver(TouchFrame("test", self.loop.time(), touches))
+
+    def touch(self, *fingers: int, answerable: bool = True) -> None:
+        """These fingers are on the plate from now on; the source repeats them, as it must."""
+        self.fingers = fingers
+        self.witness.expect(self.expected())
+        self.witness.contacts(self.loop.time(), fingers, is_answerable=answerable)
+        self._deliver()
+
+    def expected(self) -> dict[str, dict[int, tuple[float, float, float]]]:
+        """What the patterns are on the wire, by hand: metres over 100 um, radians in degrees."""
+        alone = {0: (110.0, 0.2, 90.0)}, {1: (150.0, 0.4, 180.0)}
+        parts = alone if len(self.fingers) < 2 else ({0: (90.0, 0.3, 0.0)}, {})
+        names = tuple(self.amplifiers)
+        if len(names) == 1:
+            return {names[0]: {**parts[0], **parts[1]}}
+        return {names[0]: parts[0], names[1]: parts[1]}
+
+    async def reopen(self) -> None:
+        """Close everything and open it again, the control loop too."""
+        self.witness.wish(self.loop.time(), "disarm")
+        await self._try(self.controller.close())
+        for link in {*self.links.values()}:
+            self.witness.closed(link, self.loop.time())
+        await self.rest(0.01)
+        for link in {*self.links.values()}:
+            self.witness.opened(link, self.loop.time())
+        await self.controller.open()
+        self.run()
+
+    def trip(self) -> None:
+        """The first amplifier finds an arc in itself."""
+        amplifier = next(iter(self.bench.amplifiers.values()))
+        self.bench.advance(self.loop.time())
+        amplifier.trip(Fault.ARC, self.loop.time())
+
+    async def fall_silent(self) -> None:
+        """The source dies with its fingers down: after its lease of 150 ms they count as lifted."""
+        heard = self.loop.time()
+        self._deliver()
+        if self.holding is not None:
+            self.holding.cancel()
+        await self.rest(0.150)
+        self.witness.contacts(heard + 0.150, ())
+
+    def inject(self, toward: str, data: bytes) -> None:
+        """Noise, or a late copy of something, on the first wire."""
+        terminal = self.machine._terminals[self.link]
+        port = self.machine._open[self.link]
+        direction = terminal.inward if toward == "amplifier" else port.outward
+        self.machine.deliver(self.link, toward, data, direction)
+
+    async def _try(self, work: Awaitable[Any]) -> None:
+        try:
+            await work
+        except Exception as error:
+            self.errors.append(error)
+
+    def _deliver(self) -> None:
+        touches = tuple(Touch(number, 0.1 + 0.2 * number, 0.5) for number in self.fingers)
+        self.controller.deliver(TouchFrame("test", self.loop.time(), touches))
+        if self.holding is None:
+            self.holding = asyncio.get_running_loop().create_task(self._hold())
+
+    async def _hold(self) -> None:
+        while True:
+            await asyncio.sleep(0.05)
+            self._deliver()
+
+
+Scenario = Callable[[Chain], Awaitable[None]]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What the witness found among so many frames, and what was raised to whoever asked."""
+
+    found: list[Violation]
+    frames: int
+    errors: list[BaseException]
+
+
+def play(
+    wire: str,
+    scenario: Scenario,
+    *,
+    amplifiers: Collection[str] = ("main",),
+    limits: Limits | None = None,
+    seed: int = 1,
+) -> Outcome:
+    """Play a scenario to its end on a wire of this kind; what came of it."""
+    tap = _Tap()
+    dice = random.Random(seed)
+    main = _play(wire, scenario, tuple(amplifiers), limits or _LIMITS, tap)
+    return run_virtual(main, dice=dice, seen=tap.seen)
+
+
+_LIMITS = Limits(40.0, 500.0, 0.5)
+
+
+class _Tap:
+    """What the loop's network shows to the witness, once there is one."""
+
+    def __init__(self) -> None:
+        self.witness: Witness | None = None
+        self.early: list[tuple[float, str, str, bytes]] = []
+
+    def seen(self, link: str, toward: str, data: bytes) -> None:
+        """Bytes go out."""
+        if self.witness is None:
+            self.early.append((clock.now(), link, toward, data))
+        else:
+            self.witness.bytes(link, toward, clock.now(), data)  # type: ignore[arg-type]
+
+
+async def _play(
+    wire: str,
+    scenario: Scenario,
+    names: tuple[str, ...],
+    limits: Limits,
+    tap: _Tap,
+) -> Outcome:
+    loop = asyncio.get_running_loop()
+    assert isinstance(loop, VirtualLoop)
+    machine = MemoryMachine(loop)
+    between = Between(machine)
+    STAND_IN.set(machine)
+    TERMINAL_MAKER.set(machine.make_terminal)
+    rig = make_rig(names, limits)
+    bench = Bench(rig, now=loop.time())
+    stations = [
+        Station(bench, name, number=number) for number, name in enumerate(bench.amplifiers, 1)
+    ]
+    async with open_wire(WITNESSED[wire], stations) as urls:
+        links = {name: _link(wire, url) for name, url in urls.items()}
+        tap.witness = witness = Witness(plan_for(wire, urls, links))
+        for link in {*links.values()}:
+            witness.opened(link, loop.time())
+        witness.contacts(loop.time(), ())
+        backends = {name: Amplifier(open_backend(url)) for name, url in urls.items()}
+        table = OneTable(rig.plate)
+        controller = Controller(rig, table, amplifiers=backends, clock=loop.time)
+        chain = Chain(loop, machine, between, bench, witness, table, controller, backends, links)
+        async with _sensed(chain):
+            await controller.open()
+            chain.run()
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(_LONGEST):
+                    await chain._try(scenario(chain))
+            await _end(chain)
+        for station in stations:
+            station.close()
+    return Outcome(witness.finish(loop.time()), witness.frames, chain.errors)
+
+
+async def _end(chain: Chain) -> None:
+    if chain.holding is not None:
+        chain.holding.cancel()
+    if chain.fingers:
+        chain.witness.contacts(chain.loop.time(), ())
+    chain.witness.wish(chain.loop.time(), "disarm")
+    await chain._try(chain.controller.close())
+    for link in {*chain.links.values()}:
+        chain.witness.closed(link, chain.loop.time())
+    if chain.running is not None:
+        chain.running.cancel()
+        await asyncio.gather(chain.running, return_exceptions=True)
+
+
+class Between:
+    """What happens to the bytes of lines before they are on the wire, where the witness is.
+
+    mangle: gives other bytes, or None where they are lost; delay [s]: of what goes to the host.
+    """
+
+    def __init__(self, machine: MemoryMachine) -> None:
+        self.mangle: Mangle = lambda toward, data: data
+        self.delay = 0.0
+        self._due = 0.0
+        self._deliver = machine.deliver
+        machine.deliver = self._changed  # type: ignore[method-assign]
+
+    def _changed(self, link: str, toward: str, data: bytes, to: Any) -> None:
+        passed = self.mangle(toward, data)
+        if passed is None:
+            return
+        if toward == "host" and self.delay:
+            # Timers of one moment come in any order, bytes of one line do not.
+            self._due = max(self._due + 1e-9, clock.now() + self.delay)
+            asyncio.get_running_loop().call_at(self._due, self._deliver, link, toward, passed, to)
+        else:
+            self._deliver(link, toward, passed, to)
+
+
+@asynccontextmanager
+async def _sensed(chain: Chain) -> AsyncIterator[None]:
+    """Sensors on every channel, a thousand times a second."""
+
+    async def sense() -> None:
+        while True:
+            now = chain.loop.time()
+            chain.bench.advance(now)
+            for name, amplifier in chain.bench.amplifiers.items():
+                levels = [min(level_of(output, now), 1.0) for output in amplifier.outputs]
+                frequencies = {
+                    channel: tone.frequency
+                    for channel, output in enumerate(amplifier.outputs)
+                    for tone in output
+                    if tone.lasts
+                }
+                chain.witness.levels(now, name, levels, frequencies=frequencies)
+            await asyncio.sleep(SENSED_EVERY)
+
+    task = asyncio.get_running_loop().create_task(sense())
+    try:
+        yield
+    finally:
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)
+
+
+def with_level(
+    excitation: Excitation,
+    era: str,
+    level: float,
+    *,
+    frequency: float | None = None,
+    phase: float | None = None,
+) -> Excitation:
+    """The same with another tone of one ERA."""
+    tone = excitation[era]
+    other = Tone(
+        tone.frequency if frequency is None else frequency,
+        level * STROKE,
+        tone.phase if phase is None else phase,
+    )
+    return {**excitation, era: other}

@@ -19,7 +19,8 @@ def parse_point(text: str, *, what: str) -> tuple[float, float]:
         x, y = (float(part) for part in parts)
     except ValueError:
         raise InputError(
-            f"{what} {text!r} is not X,Y in metres, for instance {what} 0.10,0.08"
+            f"{what} {text!r} is not X,Y, two plain numbers in metres without a unit, for instance "
+            f"{what} 0.10,0.08"
         ) from None
     if not (math.isfinite(x) and math.isfinite(y)):
         raise InputError(f"{what} {text!r}: both coordinates must be finite numbers")

@@ -5,6 +5,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TypeAlias
 
+import numpy as np
+
 from model.drive_modes import MODES
 from model.errors import InputError
 from model.fingertip import FINGERTIP_RADIUS
@@ -16,8 +18,8 @@ Point: TypeAlias = tuple[float, float]
 
 MOST_CONTACTS = 10
 
-MOST_LEVEL_DB_SL = 300.0
-"""Up or down; beyond it lies nothing that vibrates, nor what single precision can square."""
+LEAST_LEVEL_DB_SL, MOST_LEVEL_DB_SL = -100.0, 200.0
+"""Below lies nothing that a channel can play, above nothing that a plate survives."""
 
 
 @dataclass(frozen=True)
@@ -56,8 +58,12 @@ class Question:
                 f"{len(self.targets) + len(self.quiet)} contacts are more than ten fingers; "
                 f"leave out all but {MOST_CONTACTS}"
             )
-        if not abs(self.level_db_sl) <= MOST_LEVEL_DB_SL:  # not true of NaN either
-            raise InputError(f"a level of {self.level_db_sl} dB SL is none; 20 is strong, 12 felt")
+        low, high = LEAST_LEVEL_DB_SL, MOST_LEVEL_DB_SL
+        if not low <= self.level_db_sl <= high:  # not true of NaN either
+            raise InputError(
+                f"a level of {self.level_db_sl:g} dB SL is none that can be asked for; 20 is "
+                f"strong, 12 is felt, 0 is just detected: give one from {low:g} to {high:g}"
+            )
         if self.softer_db and len(self.softer_db) != len(self.targets):
             raise InputError(
                 f"{len(self.softer_db)} levels were given for {len(self.targets)} targets; give "
@@ -73,6 +79,13 @@ class Question:
             raise InputError(f"a search cannot end after {self.search_time} s; give it 0 or more")
         if self.eras_at_most < 1:
             raise InputError(f"{self.eras_at_most} ERAs cannot move anything; allow at least one")
+        for what, contacts in (("target", self.targets), ("quiet finger", self.quiet)):
+            for number, contact in enumerate(contacts):
+                if contact in contacts[:number]:
+                    raise InputError(
+                        f"the {what} ({contact[0]:g}, {contact[1]:g}) m is given twice; two "
+                        "fingers are at two places, so give each once"
+                    )
         if self.mode is not None and self.mode not in MODES:
             raise InputError(f"unknown drive mode {self.mode!r}; known: {', '.join(MODES)}")
         for target in self.targets:
@@ -84,6 +97,15 @@ class Question:
                         f"{1000 * FINGERTIP_RADIUS:g} mm apart at least"
                     )
 
+    @property
+    def gains(self) -> tuple[np.float32, ...]:
+        """What each target's field is multiplied with: a softer one counts as that much louder.
+
+        Then all want the same.
+        """
+        softer = self.softer_db or (0.0,) * len(self.targets)
+        return tuple(np.float32(10 ** (each / 20)) for each in softer)
+
     def check_on(self, plate: Plate) -> None:
         """Raise InputError for a contact off the plate, or one that is no place."""
         for what, contacts in (("target", self.targets), ("quiet", self.quiet)):
@@ -94,9 +116,22 @@ class Question:
                         f"to ({plate.length:g}, {plate.width:g}) m"
                     )
 
-    def mode_on(self, own: str) -> str:
-        """The mode to answer in on a table whose own is given; InputError if it is not playable."""
+    def mode_on(self, own: str, *, era_count: int) -> str:
+        """The mode to answer in on a table of so many ERAs, whose own mode is given.
+
+        Raises InputError if it is not playable, and for a number of ERAs that it cannot keep to.
+        """
         mode = self.mode or own
+        if self.eras_at_most > max(2, era_count):
+            raise InputError(
+                f"the table has {era_count} ERAs, of which up to {self.eras_at_most} cannot be "
+                f"driven; allow {era_count} at the most"
+            )
+        if self.eras_at_most != 2 and mode != "switched":
+            raise InputError(
+                f"how many ERAs are driven is a matter of mode switched; mode {mode} drives all of "
+                "them: ask for mode switched, or leave the number of ERAs out"
+            )
         if mode not in self.playable:
             raise InputError(
                 f"these amplifiers cannot play mode {mode}, only {', '.join(self.playable)}; "

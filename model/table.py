@@ -10,7 +10,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,7 +36,7 @@ from model.perception import STRONG_DB_SL, detection_threshold
 from model.plate import Plate
 from model.point_load import PointLoad
 from model.point_mass import PointMass
-from model.question import Point, Question
+from model.question import LEAST_LEVEL_DB_SL, Point, Question
 from model.raster import Fingertips, Raster
 from model.reduced_on_raster import ReducedOnRaster
 from model.rig import physics_fingerprint
@@ -49,9 +48,9 @@ PAPER_FREQUENCIES = np.arange(60.0, 321.0, 10.0)
 
 PAPER_GRID = Grid(12, 9)
 
-# Among drives near the best one the onset decides, too: three decibels of contrast in the first
-# 100 ms for one of the score. Four are looked at, within 3 dB.
-ONSETS, NEARLY_AS_GOOD, ONSET_WEIGHT = 4, 10 ** (-3 / 20), 1 / 3
+# Among drives near the best one the onset decides, too: a decibel of the score counts as much as
+# three of contrast in the first 100 ms (docs/decisions, on ramps).
+ONSET_WEIGHT = 1 / 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,7 +118,7 @@ class LocalizationTable:
         contacts off the plate or on top of each other and a level that cannot be reached.
         """
         question.check_on(self.plate)
-        mode = question.mode_on(self.mode)
+        mode = question.mode_on(self.mode, era_count=len(self.eras))
         fingertips = self._fingertips(question)
         usable, fields = self._usable(question, fingertips)
         if mode == "switched" and question.eras_at_most != 2:
@@ -130,38 +129,34 @@ class LocalizationTable:
             raise InputError(self._too_loud(question, mode, most=most))
         drive, outcome = choice.drive, choice.outcome
         if question.quiet and not question.envelopes:
-            better = self._quietest_onset(choice, usable, fingertips, len(question.targets))
+            better = self._quietest_onset(question, choice, usable, fingertips)
             if better is not None:
                 drive, outcome = better, judge(fields, better)
         return self._pattern(question, mode, usable, fields, drive, outcome)
 
     def _quietest_onset(
         self,
+        question: Question,
         choice: Choice,
         usable: NDArray[np.int64],
         fingertips: Fingertips,
-        targets: int,
     ) -> Drive | None:
-        """Of the best drive and those near it the one for its score and its onset; None: the best.
-
-        A plain ramp; a decibel of the score counts as much as three of contrast while it starts.
-        """
-        near = np.flatnonzero(choice.score > NEARLY_AS_GOOD * choice.outcome.score)
-        # Where a pattern of several frequencies is the best, its onset is not known.
-        if len(near) < 2 or choice.score.max() < 0.999 * choice.outcome.score:
+        """What a plain ramp should rather start than the drive of the best score, if anything."""
+        near = choice.near()
+        if len(near.frequencies) < 2 or self._onsets is None:
             return None
-        near = near[np.argsort(-choice.score[near])[:ONSETS]]
         shapes, ends = fingertips.read(self.shapes), fingertips.ends
         contrast = self._onsets.contrast(
-            usable[choice.frequencies[near]],
-            choice.weights[near],
-            targets=[shapes[start:end] for start, end in pairwise((0, *ends[:targets]))],
-            quiet=shapes[ends[targets - 1] :],
+            usable[near.frequencies],
+            near.weights,
+            targets=[
+                shapes[start:end] * gain
+                for start, end, gain in zip((0, *ends), ends, question.gains, strict=False)
+            ],
+            quiet=shapes[ends[len(question.targets) - 1] :],
         )
-        best = near[int((choice.score[near] * contrast**ONSET_WEIGHT).argmax())]
-        if best == near[0]:
-            return None
-        return Drive.at(int(choice.frequencies[best]), choice.weights[best])
+        best = int((near.score * contrast**ONSET_WEIGHT).argmax())
+        return Drive.at(int(near.frequencies[best]), near.weights[best]) if best > 0 else None
 
     def _ask_exactly(
         self, question: Question, usable: NDArray[np.int64], fields: Fields
@@ -184,8 +179,10 @@ class LocalizationTable:
     def prepare(self, mode: str | None = None) -> None:
         """Work out what the first question in a mode would have to wait for."""
         centre = (self.plate.length / 2, self.plate.width / 2)
-        self.ask(Question((centre,), (), level_db_sl=-100.0, mode=mode))
-        self.ask(Question((centre,), ((0.0, 0.0),), level_db_sl=-100.0, mode=mode))
+        for quiet in ((), ((0.0, 0.0),)):
+            self.ask(Question((centre,), quiet, level_db_sl=LEAST_LEVEL_DB_SL, mode=mode))
+        if (mode or self.mode) != "switched":
+            _ = self._onsets  # not every question has patterns to choose among
 
     def fields(self, question: Question) -> Fields:
         """What a drive mode needs to know about a question, at all frequencies of the table."""
@@ -194,16 +191,14 @@ class LocalizationTable:
     def _fields(self, question: Question, fingertips: Fingertips) -> Fields:
         found, ends = self._by_frequency(fingertips.read(self._values)), fingertips.ends
         count = len(question.targets)
-        # A softer target counts as much louder as it is softer: then all want the same.
-        gains = [10 ** (softer / 20) for softer in question.softer_db] or [1.0] * count
         if question.quiet:
             quiet = found[:, :, ends[count - 1] :]
         else:
             quiet = self._cell_fields[:, :, self._far_from(question.targets)]
         return Fields(
             targets=tuple(
-                np.ascontiguousarray(found[:, :, start:end] * np.float32(gain))
-                for start, end, gain in zip((0, *ends), ends[:count], gains, strict=False)
+                np.ascontiguousarray(found[:, :, start:end] * gain)
+                for start, end, gain in zip((0, *ends), ends[:count], question.gains, strict=False)
             ),
             quiet=np.ascontiguousarray(quiet),
             is_alone=not question.quiet,
@@ -268,8 +263,11 @@ class LocalizationTable:
         return plate_in_time(reduced, self.eras, loads=loads, held=self.held)
 
     @cached_property
-    def _onsets(self) -> RampedOnsets:
-        return RampedOnsets(self.in_time, self.frequencies, ramp=ONSET_RAMP)
+    def _onsets(self) -> RampedOnsets | None:
+        try:
+            return RampedOnsets(self.in_time, self.frequencies, ramp=ONSET_RAMP)
+        except InputError:  # too few ERAs to rest on: it has answers, but no motion in time
+            return None
 
     @cached_property
     def _threshold(self) -> NDArray[np.float32]:
@@ -318,9 +316,12 @@ class LocalizationTable:
         where = " and ".join(f"({x:g}, {y:g})" for x, y in question.targets)
         most = 20 * math.log10(most)
         # Rounded down, so that it can be asked for.
+        # Of several targets the phases of all are tried for, not gone through.
+        sure = mode == "switched" or len(question.targets) == 1
+        what = "the most that can be had there is" if sure else "the most that was found there is"
         return (
             f"no pattern reaches {question.level_db_sl:g} dB SL at {where} m in mode {mode}; "
-            f"the most that can be had there is {math.floor(10 * most) / 10:.1f} dB SL"
+            f"{what} {math.floor(10 * most) / 10:.1f} dB SL"
         )
 
     def _pattern(

@@ -60,11 +60,12 @@ def build(
                 problem, mode=mode, workers=workers, kept=kept, progress=progress
             )
         except KeyboardInterrupt:
-            typer.echo(
-                f"era: interrupted; what is done is kept in {kept.folder}, and the same command "
-                "goes on from there",
-                err=True,
+            done = (
+                f"what is done is kept in {kept.folder}, and the same command goes on from there"
+                if kept.folder.is_dir()
+                else "nothing was done yet"
             )
+            typer.echo(f"era: interrupted; {done}", err=True)
             raise
     table = built.table
     save_table(table, output)

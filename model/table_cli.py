@@ -54,8 +54,13 @@ def query(
             raise InputError("--batch holds the contacts already; leave --target and --quiet out")
         _answer_batch(table_file, batch)
         return
+    if not target:
+        raise InputError(
+            "nobody is to feel anything: say who with --target X,Y, metres, or give many questions "
+            "with --batch FILE"
+        )
     question = Question(
-        targets=tuple(parse_point(text, what="--target") for text in target or []),
+        targets=tuple(parse_point(text, what="--target") for text in target),
         quiet=tuple(parse_point(text, what="--quiet") for text in quiet or []),
         level_db_sl=level,
         mode=mode,

@@ -50,6 +50,29 @@ _DTYPES = {
 }
 
 
+# Of accelerations [m/s²], frequencies [rad/s] and shapes [1/sqrt(kg)]; what is larger is of no
+# plate, and cannot be squared in single precision.
+MOST = 1e9
+
+
+class _Raster(BaseModel):
+    """What it must hold about the raster."""
+
+    model_config = ConfigDict(extra="forbid", strict=True)
+
+    nx: int
+    ny: int
+    length: float
+    width: float
+
+
+class _Mesh(_Raster):
+    """And about a mesh."""
+
+    element: str
+    strip: float
+
+
 class _Header(BaseModel):
     """What the JSON header must hold."""
 
@@ -64,11 +87,11 @@ class _Header(BaseModel):
     plate: dict[str, Any]
     eras: list[dict[str, Any]]
     masses: list[dict[str, Any]]
-    mesh: dict[str, Any]
-    reference_mesh: dict[str, Any]
+    mesh: _Mesh
+    reference_mesh: _Mesh
     discretisation_error: list[float]
     frequencies_hz: list[float]
-    raster: dict[str, Any]
+    raster: _Raster
     grid: dict[str, int]
 
 
@@ -162,10 +185,10 @@ def _assemble(header: _Header, arrays: dict[str, NDArray[Any]], path: Path) -> L
             plate=Plate(**header.plate, material=Material(**material)),
             eras=tuple(Era(**era) for era in header.eras),
             masses=tuple(PointMass(**mass) for mass in header.masses),
-            mesh=Mesh(**header.mesh),
-            reference_mesh=Mesh(**header.reference_mesh),
+            mesh=Mesh(**header.mesh.model_dump()),
+            reference_mesh=Mesh(**header.reference_mesh.model_dump()),
             discretisation_error=np.array(header.discretisation_error, dtype=float),
-            raster=Raster(**header.raster),
+            raster=Raster(**header.raster.model_dump()),
             grid=Grid(**header.grid),
             mode=header.mode,
             code_version=header.code_version,
@@ -192,6 +215,13 @@ def _assemble(header: _Header, arrays: dict[str, NDArray[Any]], path: Path) -> L
             raise InputError(f"{path}: {name} has shape {values.shape}, expected {shape}")
         if not np.isfinite(values).all():
             raise InputError(f"{path}: {name} holds values that are not numbers")
+        if values.size and np.abs(values).max() > MOST:
+            raise InputError(
+                f"{path}: {name} holds values up to {np.abs(values).max():.3g}, which no plate has"
+            )
+    for name in ("acceleration", "shapes", "cell_sources"):
+        if count > 0 and not getattr(table, name).any():
+            raise InputError(f"{path}: {name} is zero everywhere, and no plate rests so")
     # Rows are found by frequency: in another order it would be the wrong ones.
     if not (count > 0 and table.frequencies[0] > 0 and (np.diff(table.frequencies) > 0).all()):
         raise InputError(f"{path}: the frequencies are none, not above zero, or do not ascend")

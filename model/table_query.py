@@ -99,7 +99,7 @@ def prepared_timing(table: LocalizationTable) -> Timing:
 def envelopes_as_json(
     envelopes: Envelopes | None, table: LocalizationTable
 ) -> dict[str, Any] | None:
-    """By ERA: level 0..1 of the stroke and phase at every knot, and the time between knots."""
+    """By ERA: level 0..1 of the stroke and phase at the start and at every knot, and their step."""
     if envelopes is None:
         return None
     strokes = {era.name: era.stroke for era in table.eras}
@@ -107,13 +107,15 @@ def envelopes_as_json(
         name: {
             "frequency_hz": envelope.frequency,
             "step_s": envelope.step,
-            "knots": [
-                {"level": abs(knot) / strokes[name], "phase_deg": math.degrees(cmath.phase(knot))}
-                for knot in envelope.knots
-            ],
+            "start": _as_level_and_phase(envelope.start, stroke=strokes[name]),
+            "knots": [_as_level_and_phase(knot, stroke=strokes[name]) for knot in envelope.knots],
         }
         for name, envelope in envelopes.items()
     }
+
+
+def _as_level_and_phase(amplitude: complex, *, stroke: float) -> dict[str, float]:
+    return {"level": abs(amplitude) / stroke, "phase_deg": math.degrees(cmath.phase(amplitude))}
 
 
 def answer_lines(table: LocalizationTable, lines: Iterable[str]) -> Iterator[dict[str, Any]]:

@@ -47,11 +47,18 @@ def verify(
     as_json: JsonOption = False,
 ) -> None:
     """Recompute a sample by the reference solver and in the time domain; status 1 on a miss."""
+    from model.errors import InputError
     from model.progress import progress_bar
+    from model.replacing import begins_with
     from model.rig_file import load_rig
-    from model.table_file import load_table
+    from model.table_file import ZIP, load_table
     from model.table_verify import verify_table
 
+    if begins_with(rig_file, ZIP) and not begins_with(table_file, ZIP):
+        raise InputError(
+            f"{rig_file} is a table and {table_file} is none: the table comes first, then the rig: "
+            f"era table verify {rig_file} {table_file}"
+        )
     rig = load_rig(rig_file)
     table = load_table(table_file, fingerprint=rig.fingerprint)
     started = time.perf_counter()

@@ -11,7 +11,7 @@ level is then found by trial, and the poorer modes may have found better. Elsewh
 contains theirs but for unfinished rounds: 0.1 dB on average, 0.5 dB at the most.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -24,6 +24,8 @@ from model.drive_modes.signed import SIGNED
 from model.drive_modes.switched import find_switched, loudest_switched
 
 FINE_PHASE = 10.0  # degrees
+
+NEAR, NEARLY_AS_GOOD = 4, 10 ** (-3 / 20)
 
 __all__ = ["MODES", "Choice", "Mode", "best_drive", "find_drives", "loudest", "playable_modes"]
 
@@ -76,6 +78,22 @@ class Choice:
     frequencies: IntArray
     weights: SingleComplex
     score: Single
+
+    def near(self) -> "Choice":
+        """The same with up to NEAR of them that are less than 3 dB behind, the best first.
+
+        None where the best drive is of several frequencies, and so not among them.
+        """
+        left = np.flatnonzero(self.score > NEARLY_AS_GOOD * self.outcome.score)
+        if self.score.max(initial=0.0) < 0.999 * self.outcome.score:
+            left = left[:0]
+        left = left[np.argsort(-self.score[left])[:NEAR]]
+        return replace(
+            self,
+            frequencies=self.frequencies[left],
+            weights=self.weights[left],
+            score=self.score[left],
+        )
 
 
 def find_drives(fields: Fields, mode: str) -> Choice | None:

@@ -11,9 +11,10 @@ from model.drive_modes.fields import Drive, judge
 from model.envelope import ramped_onset
 from model.onset import RampedOnsets
 from model.question import Question
+from model.table_build import build_table
 from model.timing import Timing
 from model.transient import Transients
-from paper_table import FREQUENCIES, contact_sets, smooth_table
+from paper_table import FREQUENCIES, contact_sets, smooth_rig, smooth_table
 
 
 @pytest.mark.parametrize(("ramp", "within"), [(0.020, 0.5), (0.040, 0.25)])
@@ -97,3 +98,11 @@ def test_amplifiers_with_envelopes_get_the_best_steady_pattern(mode):
         }
         for name, tone in answered.items():
             assert tone.phase == pytest.approx(tones[name].phase)
+
+
+def test_a_plate_on_two_eras_has_answers_all_the_same():
+    """It would tip over, so it has no motion in time to choose by; contrast it has."""
+    rig = smooth_rig()
+    table = build_table(replace(rig, eras=rig.eras[:2]), frequencies=FREQUENCIES[::3])
+    question = Question(((0.09, 0.07),), ((0.25, 0.18),), mode="phased")
+    assert table.ask(question).contrast_db > 0

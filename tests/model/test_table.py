@@ -432,9 +432,33 @@ def cells_that_are_no_count(header, arrays):
     header["grid"]["nx"] = 12.5
 
 
+def raster_that_is_no_count(header, arrays):
+    """A side of so many and a half points."""
+    header["raster"]["nx"] += 0.5
+
+
+def nothing_moves(header, arrays):
+    """At any frequency."""
+    arrays["acceleration"] *= 0
+
+
+def more_than_any_plate(header, arrays):
+    """What overflows when it is squared."""
+    arrays["acceleration"][3, 2, 1] = 1e30
+
+
+def not_a_number(header, arrays):
+    """One of all fields."""
+    arrays["acceleration"][0, 0, 0] = np.nan
+
+
 @pytest.mark.parametrize(
     ("change", "says"),
     [
+        (raster_that_is_no_count, "bad header .raster.nx"),
+        (nothing_moves, "acceleration is zero everywhere"),
+        (more_than_any_plate, r"values up to 1e\+30"),
+        (not_a_number, "not numbers"),
         (other_frequencies, "header's frequencies"),
         (descending_frequencies, "do not ascend"),
         (no_frequencies, "frequencies are none"),
@@ -442,7 +466,7 @@ def cells_that_are_no_count(header, arrays):
     ],
 )
 def test_a_header_that_contradicts_the_table_is_refused(table, tmp_path, change, says):
-    """Frequencies that are others, out of order or none, the checksum made for all of it."""
+    """Frequencies and counts that cannot be, fields of no plate; the checksum is that of all."""
     save_table(table, tmp_path / "t.npz")
     with np.load(tmp_path / "t.npz") as content:
         arrays = dict(content)

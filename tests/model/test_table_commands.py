@@ -189,6 +189,30 @@ def test_verify_refuses_another_plate_first(built: Path, tmp_path: Path) -> None
     other.write_text(Path(RIG).read_text().replace("1.5 mm", "1.6 mm"))
     with pytest.raises(InputError, match="another plate"):
         table("verify", built, other)
+    with pytest.raises(InputError, match="the table comes first, then the rig"):
+        table("verify", RIG, built)
+
+
+def test_contacts_that_cannot_be_read_are_told_by_their_option(built: Path) -> None:
+    """No target at all, and one with a unit."""
+    with pytest.raises(InputError, match=r"with --target X,Y, metres, or .* --batch FILE"):
+        table("query", built, "--quiet", "0.1,0.1")
+    with pytest.raises(InputError, match=r"--target '9cm,8cm' .* metres without a unit"):
+        table("query", built, "--target", "9cm,8cm")
+
+
+def test_a_build_that_is_interrupted_at_once_names_no_folder(tmp_path: Path, monkeypatch) -> None:
+    """Nothing is kept yet, so nothing goes on."""
+
+    def interrupted(*arguments: object, **options: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("model.table_build.build_in_parts", interrupted)
+    outcome = CliRunner().invoke(
+        app, ["table", "build", RIG, "-o", str(tmp_path / "t.npz"), *QUICK]
+    )
+    assert "interrupted; nothing was done yet" in outcome.stderr
+    assert ".parts" not in outcome.stderr
 
 
 def test_plot_writes_its_pictures(built: Path, tmp_path: Path) -> None:

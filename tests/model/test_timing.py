@@ -87,7 +87,11 @@ def test_answers_in_json_carry_knots_only_where_asked_for(table):
     assert plain["onset"] is plain["ending"] is None
     assert {len(each["knots"]) for each in with_knots["onset"].values()} == {21}
     assert {len(each["knots"]) for each in with_knots["ending"].values()} == {8}
+    assert {each["start"]["level"] for each in with_knots["onset"].values()} == {0.0}
     for era, tone in with_knots["drive"].items():
+        start = with_knots["ending"][era]["start"]
+        assert start["level"] == pytest.approx(tone["level"])
+        assert start["phase_deg"] == pytest.approx(tone["phase_deg"], abs=1e-6)
         last = with_knots["onset"][era]["knots"][-1]
         assert last["level"] == pytest.approx(tone["level"])
         assert last["phase_deg"] == pytest.approx(tone["phase_deg"], abs=1e-6)

@@ -37,13 +37,14 @@ class Attachments:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Solved:
-    """One point in one class: its force (size,), and sums of phi (u / u_c)^j, (2, TERMS, size).
+    """One point in one class: its force (size,), and sums of phi (u / u_c)^j, (TERMS, size).
 
-    The second of the two: times the mass.
+    momenta: the same sums times the mass.
     """
 
     force: FloatArray
     residual: FloatArray
+    momenta: FloatArray
 
 
 class AttachmentSolver:
@@ -61,28 +62,49 @@ class AttachmentSolver:
 
     def solve(self, points: FloatArray) -> Attachments:
         """Solve for forces at points [m] (n, 2), as far as they have not been solved for."""
-        points = np.asarray(points, dtype=float).reshape(-1, 2)
-        keys = [(float(x), float(y)) for x, y in points]
+        known = self._known(points)
+        shapes = [
+            np.array([each[number].force for each in known]).reshape(len(known), -1) @ part.vectors
+            for number, part in enumerate(self._classes)
+        ]
+        residuals = tuple(
+            np.array([each[number].residual for each in known]).reshape(
+                len(known), TERMS, part.symmetry.size
+            )
+            for number, part in enumerate(self._classes)
+        )
+        moments = self._between(known, known)
+        self._forget()
+        return Attachments(np.hstack(shapes), residuals, moments)
+
+    def moments(self, points: FloatArray, others: FloatArray) -> FloatArray:
+        """As the moments of attachments at points (n, 2), with others (m, 2): (2 TERMS, n, m)."""
+        return self._between(self._known(points), self._known(others))
+
+    def _known(self, points: FloatArray) -> "list[tuple[_Solved, ...]]":
+        """What is solved for points [m] (n, 2), by point and class."""
+        keys = [(float(x), float(y)) for x, y in np.asarray(points, dtype=float).reshape(-1, 2)]
         unknown = [key for key in dict.fromkeys(keys) if key not in self._solved]
         if unknown:
             self._solve_for(unknown)
-        known = [self._solved[key] for key in keys]
-        count = len(points)
-        shapes, residuals, moments = [], [], np.zeros((2 * TERMS, count, count))
+        return [self._solved[key] for key in keys]
+
+    def _between(
+        self, points: "list[tuple[_Solved, ...]]", others: "list[tuple[_Solved, ...]]"
+    ) -> FloatArray:
+        rows, columns = len(points), len(others)
+        moments = np.zeros((2 * TERMS, rows, columns))
         for number, part in enumerate(self._classes):
             size = part.symmetry.size
-            force = np.array([each[number].force for each in known]).reshape(count, size)
-            solved = np.array([each[number].residual for each in known])
-            residual, momenta = solved.reshape(count, 2, TERMS, size).swapaxes(0, 1)
-            inner = residual.reshape(-1, size) @ momenta.reshape(-1, size).T
-            inner = inner.reshape(count, TERMS, count, TERMS)
-            moments[0] += force @ residual[:, 0].T
+            force = np.array([each[number].force for each in points]).reshape(rows, size)
+            residual = np.array([each[number].residual for each in points]).reshape(-1, size)
+            momenta = np.array([each[number].momenta for each in others]).reshape(-1, size)
+            first = np.array([each[number].residual[0] for each in others]).reshape(columns, size)
+            moments[0] += force @ first.T
+            inner = (residual @ momenta.T).reshape(rows, TERMS, columns, TERMS)
             for power in range(2, 2 * TERMS + 1):
                 moments[power - 1] += inner[:, power // 2 - 1, :, (power + 1) // 2 - 1]
-            shapes.append(force @ part.vectors)
-            residuals.append(residual)
-        self._forget()
-        return Attachments(np.hstack(shapes), tuple(residuals), moments)
+        return moments
 
     def basis(self, attached: Attachments, points: FloatArray) -> FloatArray:
         """Deflection at points by modes and by residual vectors, (p, r + TERMS n).
@@ -119,7 +141,9 @@ class AttachmentSolver:
         ]
         for number, point in enumerate(points):
             self._solved[point] = tuple(
-                _Solved(force[number].copy(), residual[:, number].copy())
+                _Solved(
+                    force[number].copy(), residual[0, number].copy(), residual[1, number].copy()
+                )
                 for force, residual in zip(forces, solved, strict=True)
             )
 

@@ -37,12 +37,14 @@ class Origin:
 
     def moments_with(self, other: "Origin") -> FloatArray:
         """The same between its points and another's, (m, n, k)."""
-        places = [(self.points == point).all(axis=1) for point in other.points]
-        if all(place.any() for place in places):  # as when a finger comes: no need to solve again
-            return self.moments[:, :, [int(place.argmax()) for place in places]]
-        both = np.vstack([self.points, other.points])
-        here = len(self.points)
-        return self.free.attachments.solve(both).moments[:, :here, here:]
+        # Most are among its own, as when a finger comes or goes: no need to solve for them again.
+        same = (self.points[:, None] == other.points).all(axis=2)
+        moments = self.moments[:, :, same.argmax(axis=0)]
+        missing = ~same.any(axis=0)
+        if missing.any():
+            solver = self.free.attachments
+            moments[:, :, missing] = solver.moments(self.points, other.points[missing])
+        return moments
 
 
 @dataclass(frozen=True)

@@ -8,15 +8,18 @@ before. Structural damping stays that of the plate on its ERAs.
 
 from collections import OrderedDict
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TypeAlias, TypeVar
 
 import numpy as np
 
 from model.actuator import Era
+from model.arrays import FloatArray
 from model.point_load import PointLoad
 from model.reduction import ReducedPlate
 from model.time_response import PlateInTime, plate_in_time
+
+BLOCK = 256  # samples that one table of exponentials serves
 
 # A point that a finger has left keeps its coordinates this long [s], so that nothing is lost of the
 # motion under it: they are the quickest of all and die away within a tenth of that.
@@ -36,6 +39,15 @@ class Carried:
     contacts: tuple[PointLoad, ...]
     reduced: ReducedPlate
     plate: PlateInTime
+    _tables: dict[float, FloatArray] = field(default_factory=dict)
+
+    def exponentials(self, sample_rate: float) -> FloatArray:
+        """Re and -Im of exp(eigenvalue k / sample_rate) for k up to a block, (BLOCK, 2 m)."""
+        if sample_rate not in self._tables:
+            grid = np.exp(np.outer(np.arange(BLOCK) / sample_rate, self.plate.decay))
+            self._tables.clear()
+            self._tables[sample_rate] = np.hstack([grid.real, -grid.imag])
+        return self._tables[sample_rate]
 
 
 class ContactPlates:

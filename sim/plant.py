@@ -15,9 +15,8 @@ from model.base_motion import Term
 from model.point_load import PointLoad
 from model.reduction import ReducedPlate
 from model.time_response import Answer
-from sim.contacts import Carried, ContactPlates
+from sim.contacts import BLOCK, Carried, ContactPlates
 
-_BLOCK = 256  # samples; the table of exponentials for one block is computed once
 _NEGLIGIBLE = 1e-60  # modal amplitude far below anything measurable, above slow subnormal numbers
 
 
@@ -41,8 +40,6 @@ class Plant:
         self._now: Carried = self._plates.carrying((), time=time)
         self._free = np.zeros(len(self._now.plate.decay), dtype=complex)
         self._answers: list[list[Answer]] = [[] for _ in eras]
-        self._table_rate = 0.0
-        self._table = np.zeros((0, 0))
 
     @property
     def reduced(self) -> ReducedPlate:
@@ -86,7 +83,6 @@ class Plant:
         if self._now.reduced is not before:
             carried = self._now.reduced.carried_over_from(before)
             q, v = carried @ q, carried @ v
-        self._table_rate = 0.0
         self._answers = [
             self._now.plate.answers(era, [answer.term for answer in answers])
             for era, answers in enumerate(self._answers)
@@ -183,13 +179,13 @@ class Plant:
             return
         out[:] = 0
         if self._free.any():
-            table = self._exponentials(sample_rate)
+            table = self._now.exponentials(sample_rate)
             shown = seen @ self._now.plate.free_acceleration
-            for start in range(0, len(times), _BLOCK):
-                block = times[start : start + _BLOCK]
+            for start in range(0, len(times), BLOCK):
+                block = times[start : start + BLOCK]
                 free = self._free * np.exp(self._now.plate.decay * (block[0] - self.time))
                 part = (shown * free).T
-                out[start : start + _BLOCK] += table[: len(block)] @ np.vstack(
+                out[start : start + BLOCK] += table[: len(block)] @ np.vstack(
                     [part.real, part.imag]
                 )
         active = self._active()
@@ -206,11 +202,3 @@ class Plant:
                 rising = turn * tau
                 growth = (s**2 * b1) @ seen.T
                 out += rising.real @ growth.imag + rising.imag @ growth.real
-
-    def _exponentials(self, sample_rate: float) -> FloatArray:
-        """Re and -Im of exp(eigenvalue k / sample_rate) for k up to a block, (block, 2 m)."""
-        if sample_rate != self._table_rate:
-            grid = np.exp(np.outer(np.arange(_BLOCK) / sample_rate, self._now.plate.decay))
-            self._table = np.hstack([grid.real, -grid.imag])
-            self._table_rate = sample_rate
-        return self._table

@@ -58,7 +58,7 @@ async def run_far_end(
     ready: Callable[[Mapping[str, str]], None],
     view: Callable[[Site], None] | None,
 ) -> str | None:
-    """Simulate until SIGTERM or SIGINT, or the end of standard input where that counts.
+    """Simulate until SIGTERM, SIGINT or SIGHUP, or the end of standard input where that counts.
 
     ready is called once with the URL of each amplifier by its name, view a few times a second.
     Virtual where the running loop is a `SteppedLoop`. Returns what is to be said of what was
@@ -66,7 +66,7 @@ async def run_far_end(
     """
     ended = asyncio.Event()
     loop = asyncio.get_running_loop()
-    for number in (signal.SIGTERM, signal.SIGINT):
+    for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):  # the last: a terminal closes
         loop.add_signal_handler(number, ended.set)
     if far_end.until_eof:
         # A thread, for a loop cannot wait for every kind of standard input.

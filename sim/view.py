@@ -16,6 +16,7 @@ WINDOW = 0.2  # s; as long as a picture stays
 _GRAVITY = 9.8  # m/s²
 _SHADES = " ·-+*#@"
 _FULL = 5.0  # g; shown as the last shade, and what lies above
+_NOTHING = 0.002  # of it; what is less is not drawn
 _COLUMNS, _ROWS = 28, 10
 _FADING = 0.5  # of the peaks from one picture to the next
 
@@ -51,7 +52,8 @@ class PlateMap:
 def draw(site: Site, plate: PlateMap) -> RenderableType:
     """The present state of a far end."""
     bench = site.bench
-    amplifiers = Table("amplifier", "state", "fault", "set", "level of each channel", "wire")
+    amplifiers = Table("amplifier", "state", "fault", "set", "level of each channel")
+    amplifiers.add_column("wire", overflow="fold")  # to be copied whole
     for name, amplifier in bench.amplifiers.items():
         status = amplifier.status(bench.time)
         levels = "  ".join(f"{level:4.0%}" for level in status.levels)
@@ -73,7 +75,8 @@ def draw(site: Site, plate: PlateMap) -> RenderableType:
 
 def _picture(bench: Bench, peaks: FloatArray) -> Text:
     """The plate with y upwards; fingers are O, ERAs are E."""
-    shade = np.ceil(peaks / (_FULL * _GRAVITY) * (len(_SHADES) - 1)).astype(int)
+    share = np.maximum(peaks / (_FULL * _GRAVITY) - _NOTHING, 0)
+    shade = np.ceil(share * (len(_SHADES) - 1)).astype(int)
     rows = [[_SHADES[min(cell, len(_SHADES) - 1)] for cell in row] for row in shade]
     size = bench.rig.plate.length, bench.rig.plate.width
     places = [((era.x, era.y), "E") for era in bench.rig.eras]

@@ -6,17 +6,23 @@ virtual there, for what is told does not depend on it.
 
 import asyncio
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 from controller.cli import app
 from drivers.errors import LinkError
 from far_end_process import far_end_process
+from model.calibration.responses_file import write_responses_csv, write_responses_uff
 from model.errors import InputError
+from model.rig_file import load_rig
 from rig_files import TWO_AMPLIFIERS, write_rig
+from sim.sensors import Accelerometer, scanning_grid
+from sim.stepped_sine import record_responses
 
 QUICK = ("--frequencies", "61:461:80", "--settle", "0.5", "--listen", "0.1", "--grid", "3x3")
 MESH = "12x9"
@@ -107,6 +113,25 @@ async def test_plugs_exchanged_between_two_amplifiers_on_two_wires(tmp_path: Pat
     assert told["plate"]["matches"]
     by_era = {row["era"]: (row["amplifier"], row["channel"]) for row in told["channels"]}
     assert (by_era["SE"], by_era["NE"]) == (("main", 1), ("side", 0))
+
+
+@pytest.mark.parametrize("ending", ["csv", "uff"])
+def test_responses_of_a_real_plate_are_read_from_a_file(tmp_path: Path, ending: str) -> None:
+    """Measured by a modal test in time, two plugs exchanged: the file's names are the rig's own."""
+    rig = load_rig(write_rig(tmp_path / "rig.yaml", mesh=MESH))
+    sensors = scanning_grid(rig.plate, 3, 2, like=Accelerometer("", 0, 0, noise_density=5e-3))
+    responses = record_responses(rig, sensors, np.linspace(61, 461, 6))
+    swapped = replace(responses, values=responses.values[:, [0, 3, 2, 1]])
+    file = tmp_path / f"measured.{ending}"
+    write = write_responses_csv if ending == "csv" else write_responses_uff
+    write(file, swapped, rig)
+    result = CliRunner().invoke(
+        app, ["rig", "check", str(tmp_path / "rig.yaml"), "--measured", str(file)]
+    )
+    assert result.exit_code == 1
+    assert "SWAPPED: channel 1 of amplifier main (ERA SE in the rig) drives ERA NW" in result.stdout
+    assert "PLATE" not in result.stdout
+    assert "INVERTED" not in result.stdout
 
 
 async def test_what_cannot_be_checked_is_said(tmp_path: Path) -> None:

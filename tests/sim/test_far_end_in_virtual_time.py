@@ -1,5 +1,6 @@
 """A far end as a process whose time passes only as its control socket says."""
 
+import signal
 from pathlib import Path
 
 import numpy as np
@@ -111,8 +112,11 @@ async def test_what_is_due_within_a_step_happens_at_its_time(tmp_path: Path) -> 
     assert strength[3] < 0.5 * strength[1]  # from 0.6 s on it only rings down
 
 
-async def test_a_recording_of_the_whole_run_is_written_at_its_end(tmp_path: Path) -> None:
-    """Told to end, it writes the file and says so; sensors come from the command line."""
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+async def test_a_recording_of_the_whole_run_is_written_at_its_end(
+    tmp_path: Path, number: signal.Signals
+) -> None:
+    """Told to end, or its terminal closed, it writes the file and says so."""
     file = tmp_path / "run.wav"
     async with far_end_process(
         write_rig(tmp_path / "rig.yaml"),
@@ -122,10 +126,11 @@ async def test_a_recording_of_the_whole_run_is_written_at_its_end(tmp_path: Path
         assert await far_end.ask("tones", since_s=0, until_s=1) == {
             "error": "frequencies_hz must be 1 to 64 different frequencies below 5000 Hz"
         }
-        status, said = await far_end.end()
+        status, said = await far_end.end(number)
     assert status == 0
     assert said.startswith(f"wrote {file}: ")
     assert read_recording(file).names == ("P1",)
+    assert not far_end.control.exists()
 
 
 @pytest.mark.parametrize("after", [0.06, 0.15, 0.3, 0.45])

@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 import json
+import signal
 import sys
 import tempfile
 from collections.abc import AsyncIterator, Mapping
@@ -33,9 +34,9 @@ class FarEndProcess:
         answer: dict[str, Any] = json.loads(line)
         return answer
 
-    async def end(self) -> tuple[int | None, str]:
+    async def end(self, number: signal.Signals = signal.SIGTERM) -> tuple[int | None, str]:
         """Tell it to end; its exit status and what it still said on standard output."""
-        self.process.terminate()
+        self.process.send_signal(number)
         out, _ = await asyncio.wait_for(self.process.communicate(), PATIENCE)
         return self.process.returncode, out.decode()
 

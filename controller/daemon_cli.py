@@ -1,13 +1,16 @@
 """`era daemon`, and its clients: `era status`, `arm`, `disarm`, `stop`, `touch`, `watch`."""
 
 import json
+import re
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from itertools import zip_longest
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from typer.core import TyperCommand
 
 from drivers.errors import CommandError, CommandRefused, FrameError, LinkError
 from model.errors import InputError
@@ -33,10 +36,26 @@ Socket = Annotated[
 ]
 Json = Annotated[bool, typer.Option("--json", help="One JSON object, nothing else.")]
 
+DASHBOARD = "127.0.0.1:8137"
+"""Where the page is served unless another place is named; the gateway's own default, too."""
+
 _REPEAT = 0.05  # s; a touch that is not repeated for 150 ms is lifted
 
 
-@app.command()
+class _DashboardCommand(TyperCommand):
+    """Lets `--dashboard` stand without a place."""
+
+    def parse_args(self, context: Any, arguments: list[str]) -> list[str]:
+        """Put the usual place behind a `--dashboard` that is not followed by one."""
+        filled = []
+        for argument, following in zip_longest(arguments, arguments[1:], fillvalue=""):
+            filled.append(argument)
+            if argument == "--dashboard" and not re.search(r":\d+$", following):
+                filled.append(DASHBOARD)
+        return super().parse_args(context, filled)
+
+
+@app.command(cls=_DashboardCommand)
 def daemon(
     config: Annotated[
         Path, typer.Argument(metavar="CONFIG", help="era config init FILE --kind daemon makes one.")
@@ -46,7 +65,10 @@ def daemon(
     ] = False,
     dashboard: Annotated[
         str | None,
-        typer.Option(metavar="HOST:PORT", help="Serve the page there, by a process of its own."),
+        typer.Option(
+            metavar="[HOST:PORT]",
+            help=f"Serve the page there, or at {DASHBOARD}, by a process of its own.",
+        ),
     ] = None,
 ) -> None:
     """Drive a plate by touches, all day; starts disarmed."""

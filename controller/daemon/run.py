@@ -10,6 +10,8 @@ from controller.daemon.daemon import Daemon
 from controller.daemon.log import LogThread, start_log
 from controller.daemon.notify import ServiceManager
 from controller.daemon.place import Place
+from controller.daemon.sections import loopback_address
+from model.errors import InputError
 from model.table import LocalizationTable
 from model.table_cache import cached_table
 from model.table_file import load_table
@@ -31,13 +33,20 @@ def check_daemon(path: Path) -> str:
 
 
 def run_daemon(path: Path, *, dashboard: str | None) -> None:
-    """Run a daemon until it is told to end; raises what keeps it from beginning."""
+    """Run a daemon until it is told to end; raises what keeps it from beginning.
+
+    dashboard: HOST:PORT on the loopback, in place of what the file says.
+    """
+    try:
+        at = None if dashboard is None else loopback_address(dashboard)
+    except ValueError as error:
+        raise InputError(f"--dashboard {error}") from error
     config = load_daemon_config(path)
     place = Place(config.socket)
     try:
         log = start_log(config.log_file, level=config.section.log.level)
         try:
-            _run(config, place, log=log, dashboard=dashboard or config.section.dashboard)
+            _run(config, place, log=log, dashboard=at or config.section.dashboard)
         finally:
             log.close()
     finally:

@@ -22,7 +22,8 @@ def _mode(text: str) -> str:
     return text
 
 
-def _loopback(text: str) -> str:
+def loopback_address(text: str) -> str:
+    """The text if it is HOST:PORT on the loopback interface; ValueError for anything else."""
     match = re.fullmatch(r"(127\.0\.0\.1|localhost|\[::1\]):(\d{1,5})", text)
     if match is None or int(match[2]) > 65535:
         raise ValueError(
@@ -84,4 +85,4 @@ class DaemonSection(Section):
     log: LogSection = LogSection()
     dumps: DumpSection | None = None
     metrics: Port | None = None
-    dashboard: Annotated[str, AfterValidator(_loopback)] | None = None
+    dashboard: Annotated[str, AfterValidator(loopback_address)] | None = None

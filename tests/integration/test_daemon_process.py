@@ -53,14 +53,20 @@ class DaemonProcess:
 
 @asynccontextmanager
 async def daemon_process(
-    folder: Path, far: FarSide, more: str = "", *, environment: dict[str, str] | None = None
+    folder: Path,
+    far: FarSide,
+    more: str = "",
+    *,
+    options: Sequence[str] = (),
+    environment: dict[str, str] | None = None,
 ) -> AsyncIterator[DaemonProcess]:
     """`era daemon` of a file with these further lines; killed with the context at the latest."""
     save_table(daemon_table(), folder / "table.npz")
     config = write_daemon(folder, {"main": far.url}, f"table: table.npz\n{more}")
     process = await asyncio.create_subprocess_exec(
-        *(ERA, "daemon", str(config)),
+        *(ERA, "daemon", str(config), *options),
         stdin=asyncio.subprocess.DEVNULL,
+        stdout=asyncio.subprocess.PIPE,
         stderr=asyncio.subprocess.PIPE,
         env={**os.environ, **(environment or {})},
     )
@@ -273,7 +279,7 @@ async def test_systemd_hears_of_it_and_metrics_are_served(tmp_path: Path) -> Non
                 await asyncio.open_connection("127.0.0.1", port)
 
 
-async def _get(port: int, path: str) -> str:
+async def _get(port: int, path: str, *, host: str = "localhost") -> str:
     """A page, as soon as somebody serves it."""
     end = time.monotonic() + PATIENCE
     while True:
@@ -283,11 +289,41 @@ async def _get(port: int, path: str) -> str:
         except OSError:
             assert time.monotonic() < end, "nobody serves the page"
             await asyncio.sleep(0.05)
-    writer.write(f"GET {path} HTTP/1.0\r\n\r\n".encode())
+    writer.write(f"GET {path} HTTP/1.0\r\nHost: {host}\r\n\r\n".encode())
     text = (await asyncio.wait_for(reader.read(), PATIENCE)).decode()
     writer.close()
     await writer.wait_closed()
     return text
+
+
+async def test_the_dashboard_is_a_process_that_ends_with_the_daemon(tmp_path: Path) -> None:
+    """`--dashboard` prints where the page is; killed, the daemon leaves nobody behind."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    async with far_end(tmp_path) as far:
+        options = ("--dashboard", f"127.0.0.1:{port}")
+        async with daemon_process(tmp_path, far, options=options) as daemon:
+            assert daemon.process.stdout is not None
+            line = await asyncio.wait_for(daemon.process.stdout.readline(), PATIENCE)
+            assert line.decode().startswith(f"dashboard: http://127.0.0.1:{port}/")
+            assert "<html" in await _get(port, "/", host=f"127.0.0.1:{port}")
+            daemon.process.kill()
+            await daemon.process.wait()
+            end = time.monotonic() + PATIENCE
+            while await _serves(port):
+                assert time.monotonic() < end, "the gateway has outlived its daemon"
+
+
+async def _serves(port: int) -> bool:
+    """Whether anybody takes connections, some time later."""
+    await asyncio.sleep(0.05)
+    try:
+        _, writer = await asyncio.open_connection("127.0.0.1", port)
+    except OSError:
+        return False
+    writer.close()
+    return True
 
 
 async def test_check_touches_no_amplifier(tmp_path: Path) -> None:

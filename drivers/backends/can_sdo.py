@@ -15,6 +15,7 @@ from canopen.sdo.client import SdoClient
 from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
 from drivers.backends.stand_in import Worker
+from drivers.backends.waiting import SETTLE
 from drivers.errors import FrameError, LinkError, LinkTimeout
 from drivers.guard import SafeEnvelope
 from drivers.protocol.can_frame import cob_id
@@ -41,7 +42,6 @@ from drivers.protocol.messages import (
 
 _LENGTH = 8
 _WAITING_MAX = 256  # answers; a bus that is flooded with them must not fill the memory
-_SETTLE = 0.02  # s; time for a second amplifier of the same number to answer
 _RESYNCHRONISE = 5  # tries
 _BLOCK_FROM = 15  # bytes; shorter ones are sooner sent in segments
 _ABORTED_COMMAND = 0x0504_0001  # the amplifier takes no block transfers
@@ -185,7 +185,7 @@ class ObjectClient:
         request = struct.pack("<BHB4x", 0x40, index, subindex)
         self._client.send_request(request)
         answers = {bytes(self._client.read_response())}
-        self._worker.sleep(_SETTLE)
+        self._worker.sleep(SETTLE)
         while True:
             try:
                 answers.add(self._client.responses.get_nowait())

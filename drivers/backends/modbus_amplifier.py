@@ -8,11 +8,14 @@ taken for another; identity and capabilities do not change and are read without 
 An amplifier cannot speak unasked here: events are what its answers show to have changed.
 """
 
+import asyncio
+
 from drivers.backends.modbus_frames import Answer
 from drivers.backends.modbus_link import ModbusLink
 from drivers.backends.modbus_url import ModbusUrl
 from drivers.backends.sole_host import SoleHost
 from drivers.backends.stand_in import number_below
+from drivers.backends.waiting import SETTLE
 from drivers.backends.wire_backend import WireBackend
 from drivers.errors import LinkError, LinkTimeout
 from drivers.protocol import modbus_map
@@ -22,6 +25,7 @@ from drivers.protocol.messages import (
     Capabilities,
     Event,
     Fault,
+    Hello,
     Nak,
     NakCode,
     Reply,
@@ -110,6 +114,8 @@ class ModbusBackend(WireBackend):
             if records or not beyond:
                 break
             records = beyond
+        if isinstance(request, Hello) and self._url.is_rtu:
+            await self._check_alone()
         reply = modbus_map.to_reply(request, answer.registers)
         if isinstance(reply, Capabilities):
             self._channels = reply.channels
@@ -120,6 +126,16 @@ class ModbusBackend(WireBackend):
         link = self._opened()
         await link.broadcast(modbus_map.to_broadcast(request))
         self._last_sent = link.last_sent
+
+    async def _check_alone(self) -> None:
+        """Leave a second amplifier of this unit the time to answer; LinkError where one does."""
+        link = self._opened()
+        await asyncio.sleep(SETTLE)
+        if link.is_contradicted:
+            raise LinkError(
+                f"more than one amplifier answers as unit {self._url.unit} on {self._url.place}; "
+                "give each on the line a unit of its own"
+            )
 
     def _next_tag(self) -> int:
         self._tag = self._tag % _TAGS + 1

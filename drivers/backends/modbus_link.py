@@ -42,6 +42,8 @@ class ModbusLink:
         self._turn = asyncio.Lock()
         self._reader = AnswerReader(is_rtu=line.is_rtu, counters=self.counters)
         self._users: dict[int, Callable[[str], None]] = {}  # by their units
+        self.is_contradicted = False  # whether the last answer was followed by another
+        self._given: Answer | None = None
         self._loss: str | None = None
         self._transaction = 0
         self._telegram: Telegram | None = None
@@ -151,6 +153,7 @@ class ModbusLink:
         if self.line.is_rtu:
             self._reader.clear()
         self._is_owed = False
+        self._given, self.is_contradicted = None, False
         self._came.clear()
         self._stream.write(frame)
         self.last_sent = clock.now()
@@ -180,7 +183,9 @@ class ModbusLink:
             self._came.set()
             if self._answer is None or self._answer.done():
                 self.counters.foreign += 1
+                self.is_contradicted = self.is_contradicted or answer != self._given
             else:
+                self._given = answer
                 self._answer.set_result(answer)
         if not self._is_owed:
             self._free_from = clock.now() + self._gap

@@ -5,16 +5,17 @@ line, each at its own address.
 """
 
 import asyncio
+import contextlib
 from dataclasses import dataclass, replace
 
 from drivers.backends.serial_line import SerialLine, shared_line
 from drivers.backends.serial_url import SerialUrl
 from drivers.backends.stand_in import number_below
-from drivers.backends.waiting import reply_within
+from drivers.backends.waiting import SETTLE, reply_within
 from drivers.backends.wire_backend import WireBackend
 from drivers.errors import DriverError, LinkError, LinkTimeout
 from drivers.protocol.definition import PROTOCOL
-from drivers.protocol.messages import Broadcast, Reply, Request
+from drivers.protocol.messages import Broadcast, Hello, Reply, Request
 from drivers.protocol.serial_codec import decode_event, decode_reply, encode_request, is_event
 from drivers.protocol.serial_frame import Frame, encode_frame
 from drivers.protocol.serial_timing import (
@@ -44,6 +45,8 @@ class SerialBackend(WireBackend):
         self._pending: dict[int, _Pending] = {}
         # Not from zero, so that an answer to an earlier run is no answer to this one.
         self._sequence = number_below(1 << 16)
+        self._answered: Frame | None = None  # the reply to the last request, once it is there
+        self._is_contradicted = False  # by another reply to that
         self._why_closed = f"{self._url.port} is not open"
 
     @property
@@ -98,20 +101,31 @@ class SerialBackend(WireBackend):
         """
         line = self._open_line()
         line.raise_if_lost()
-        if len(line.addresses) == 1:
-            return await self._exchange(line, request, timeout)
-        async with line.turn:
-            return await self._exchange(line, request, timeout)
+        async with contextlib.nullcontext() if len(line.addresses) == 1 else line.turn:
+            reply = await self._exchange(line, request, timeout)
+            if isinstance(request, Hello):
+                await self._check_alone()
+            return reply
 
     async def broadcast(self, request: Broadcast) -> None:
         """Send a commit or a stop to every amplifier of the line, whoever is waited for there."""
         self._open_line().send(encode_frame(self._frame(request, PROTOCOL.serial.broadcast)))
+
+    async def _check_alone(self) -> None:
+        """Leave a second amplifier of this address the time to answer; LinkError where one does."""
+        await asyncio.sleep(SETTLE)
+        if self._is_contradicted:
+            raise LinkError(
+                f"more than one amplifier answers at address {self._url.address} on "
+                f"{self._url.port}; give each on the line an address of its own"
+            )
 
     async def _exchange(self, line: SerialLine, request: Request, timeout: float) -> Reply:
         frame = self._frame(request, self._url.address)
         data = encode_frame(frame)
         pending = _Pending(frame, asyncio.get_running_loop().create_future())
         self._pending[frame.sequence] = pending
+        self._answered, self._is_contradicted = None, False
         try:
             line.send(data)
             self._last_sent = line.last_sent
@@ -144,6 +158,9 @@ class SerialBackend(WireBackend):
         if frame.address == self._url.address and is_event(frame):
             self._told(frame)
             return
+        first = self._answered
+        if first is not None and (frame.sequence, frame.address) == (first.sequence, first.address):
+            self._is_contradicted = self._is_contradicted or frame != first
         pending = self._pending.get(frame.sequence)
         if (
             pending is None
@@ -153,6 +170,7 @@ class SerialBackend(WireBackend):
         ):
             self._counters.foreign += 1
             return
+        self._answered = frame
         try:
             pending.reply.set_result(decode_reply(frame, pending.request))
         except DriverError as problem:

@@ -3,6 +3,7 @@
 import asyncio
 from typing import TypeVar
 
+SETTLE = 0.02  # s; time for a second amplifier of the same address to answer
 _LATE = 0.005  # s; by so much a timer is late only where this process was held up
 _GRACE = 0.010  # s; then what came meanwhile may lie unread, here or in a reader's thread
 

@@ -46,7 +46,18 @@ from drivers.protocol.modbus_map import Read, Write
 from drivers.protocol.modbus_timing import loading_time, round_trip_time, silence
 from drivers.watchdog import check_watchdog
 from modbus_peer import Peer, peer
-from modbus_session import ARMED, CAPABILITIES, COMMANDS, IDENTITY, SET, SHAPE, TRIPPED
+from modbus_session import (
+    ARMED,
+    CAPABILITIES,
+    COMMANDS,
+    IDENTITY,
+    SET,
+    SHAPE,
+    TRIPPED,
+    ScriptedStation,
+)
+from sim.modbus_frames import Request as Telegram
+from sim.modbus_unit import ModbusUnit
 from sim.pseudo_terminal import PseudoTerminal
 
 PATIENCE = 5.0  # s; for what is expected to come
@@ -528,3 +539,32 @@ async def test_a_server_that_is_not_ours_understands_the_frames(framer: FramerTy
     assert link.counters.bad == link.counters.foreign == 0
     link.leave("test")
     await server.shutdown()
+
+
+async def test_two_amplifiers_of_one_unit_are_refused() -> None:
+    """Over RTU two different answers to one Hello; one that came twice is no second amplifier."""
+    async with peer(is_rtu=True) as far:
+        second = ScriptedStation()
+        second.answer = lambda request: (
+            replace(IDENTITY, serial_number="B-18")
+            if isinstance(request, Hello)
+            else second.usual_answer(request)
+        )
+        other = ModbusUnit(second)
+
+        def answered_by(*units: ModbusUnit) -> Callable[[Telegram], None]:
+            def answer(request: Telegram) -> None:
+                for unit in units:
+                    pdu = unit.answer(request.pdu)
+                    assert pdu is not None
+                    far.send(request, pdu)
+
+            return answer
+
+        far.answer = answered_by(far.unit, other)
+        amplifier = Amplifier(ModbusBackend(far.url), reply_timeout=PATIENCE)
+        with pytest.raises(LinkError, match="more than one amplifier answers as unit 1 on"):
+            await amplifier.open()
+        far.answer = answered_by(far.unit, far.unit)
+        await amplifier.open()
+        await amplifier.close()

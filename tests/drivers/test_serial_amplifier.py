@@ -349,3 +349,23 @@ def test_bad_urls_are_refused(url: str, problem: str) -> None:
     """Each bad part of a URL is named."""
     with pytest.raises(CommandError, match=problem):
         SerialBackend(url)
+
+
+async def test_two_amplifiers_of_one_address_are_refused(far_end: FarEnd) -> None:
+    """Two different replies to one Hello; one that came twice is no second amplifier."""
+    other = replace(IDENTITY, serial_number="B-18")
+
+    def both(request: object, frame: Frame) -> bytes:
+        replies = [IDENTITY, other if isinstance(request, Hello) else usual_answer(request)]
+        return b"".join(encode_frame(encode_reply(reply, frame)) for reply in replies)
+
+    def twice(request: object, frame: Frame) -> bytes:
+        return 2 * encode_frame(encode_reply(usual_answer(request), frame))
+
+    far_end.answer = both
+    amplifier = Amplifier(SerialBackend(far_end.url), reply_timeout=PATIENCE)
+    with pytest.raises(LinkError, match="more than one amplifier answers at address 1 on"):
+        await amplifier.open()
+    far_end.answer = twice
+    await amplifier.open()
+    await amplifier.close()

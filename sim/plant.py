@@ -177,28 +177,45 @@ class Plant:
         """
         if not len(times):
             return
-        out[:] = 0
-        if self._free.any():
-            table = self._now.exponentials(sample_rate)
-            shown = seen @ self._now.plate.free_acceleration
-            for start in range(0, len(times), BLOCK):
-                block = times[start : start + BLOCK]
-                free = self._free * np.exp(self._now.plate.decay * (block[0] - self.time))
-                part = (shown * free).T
-                out[start : start + BLOCK] += table[: len(block)] @ np.vstack(
-                    [part.real, part.imag]
-                )
-        active = self._active()
-        if active:
-            tau = times[:, None] - np.array([answer.term.start for answer in active])
-            omega = np.array([answer.term.omega for answer in active])
-            turn = np.exp(1j * omega * tau)
-            b0 = np.array([answer.b0 for answer in active])
-            b1 = np.array([answer.b1 for answer in active])
-            s = 1j * omega[:, None]
-            constant = (s**2 * b0 + 2 * s * b1) @ seen.T
-            out += turn.real @ constant.imag + turn.imag @ constant.real
-            if b1.any():
-                rising = turn * tau
-                growth = (s**2 * b1) @ seen.T
-                out += rising.real @ growth.imag + rising.imag @ growth.real
+        decay = self._now.plate.decay
+        free = self._free * np.exp(decay * (times[0] - self.time))
+        shown = ((seen @ self._now.plate.free_acceleration) * free).T
+        table = self._now.exponentials(sample_rate)
+        forced = _Forced(self._active(), seen)
+        for start in range(0, len(times), BLOCK):
+            block = times[start : start + BLOCK]
+            into = out[start : start + BLOCK]
+            if start:
+                shown = shown * np.exp(decay * (BLOCK / sample_rate))[:, None]
+            if shown.any():
+                np.matmul(table[: len(block)], np.vstack([shown.real, shown.imag]), out=into)
+            else:
+                into[:] = 0
+            forced.add(block, into)
+
+
+class _Forced:
+    """What is seen of the accelerations that the bases' terms force, (q, r) telling what is."""
+
+    def __init__(self, active: Sequence[Answer], seen: FloatArray) -> None:
+        self._starts = np.array([answer.term.start for answer in active])
+        self._omegas = np.array([answer.term.omega for answer in active])
+        r = seen.shape[1]
+        b0 = np.array([answer.b0 for answer in active]).reshape(-1, r)
+        b1 = np.array([answer.b1 for answer in active]).reshape(-1, r)
+        s = 1j * self._omegas[:, None]
+        constant = (s**2 * b0 + 2 * s * b1) @ seen.T
+        self._constant = np.vstack([constant.imag, constant.real])
+        growth = (s**2 * b1) @ seen.T
+        self._growth = np.vstack([growth.imag, growth.real]) if b1.any() else None
+
+    def add(self, times: FloatArray, out: FloatArray) -> None:
+        """Add it at times (n,) [s] to out (n, q)."""
+        if not len(self._omegas):
+            return
+        tau = times[:, None] - self._starts
+        angle = self._omegas * tau
+        turn = np.hstack([np.cos(angle), np.sin(angle)])
+        out += turn @ self._constant
+        if self._growth is not None:
+            out += (turn * np.hstack([tau, tau])) @ self._growth

@@ -115,6 +115,18 @@ def find_cases(rig: Rig, *, others: int, count: int, rng: np.random.Generator) -
     return cases
 
 
+def case_of(excitation: Excitation, patterns: list[Case], rig: Rig) -> Case:
+    """The case of another excitation of one frequency, for the same contacts."""
+    weights = np.zeros(len(rig.eras), dtype=complex)
+    for number, era in enumerate(rig.eras):
+        tone = excitation.get(era.name)
+        if tone is not None:
+            weights[number] = tone.amplitude / era.stroke * np.exp(1j * tone.phase)
+    (frequency,) = {tone.frequency for tone in excitation.values()}
+    same = min(patterns, key=lambda each: abs(each.frequency - frequency))
+    return replace(same, weights=weights)
+
+
 def wrong(rng: np.random.Generator, eras: int, draws: int) -> ComplexArray:
     gains = 1 + GAIN_ERROR * rng.standard_normal((draws, eras))
     return gains * np.exp(1j * PHASE_ERROR * rng.standard_normal((draws, eras)))

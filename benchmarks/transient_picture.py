@@ -9,12 +9,14 @@ from benchmarks.transient_cases import Case
 from model.arrays import FloatArray
 from model.envelope import Bases, ramped_ending, ramped_onset, shaped
 from model.fingertip import fingertip_points
+from model.pattern import ONSET_RAMP
 from model.rig import Rig
 from model.shaping import Shaper
 from model.time_response import PlateInTime
 from model.transient import SAMPLE_RATE, Transients
 
 LASTS = 0.160  # s
+RAMPED = f"{1e3 * ONSET_RAMP:.0f} ms ramp"
 
 
 def draw(plate: PlateInTime, rig: Rig, cases: list[list[Case]], path: Path) -> None:
@@ -35,10 +37,10 @@ def draw(plate: PlateInTime, rig: Rig, cases: list[list[Case]], path: Path) -> N
             ramped_ending(excitation, rig.eras, ramp=0.0),
         ),
         (
-            "20 ms ramp",
-            ramped_onset(excitation, rig.eras, ramp=0.02),
-            "20 ms ramp",
-            ramped_ending(excitation, rig.eras, ramp=0.02),
+            RAMPED,
+            ramped_onset(excitation, rig.eras, ramp=ONSET_RAMP),
+            RAMPED,
+            ramped_ending(excitation, rig.eras, ramp=ONSET_RAMP),
         ),
         ("shaped", shaped(onset, rig.eras), "brake, quietly", shaped(ending, rig.eras)),
     ]

@@ -9,6 +9,7 @@ import typer
 
 from drivers.errors import LinkError
 from model.errors import InputError
+from sim.witness_cli import witness
 
 if TYPE_CHECKING:
     from sim.process import FarEnd
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
     from sim.wires import Wire
 
 app = typer.Typer(pretty_exceptions_enable=False)
+app.command()(witness)
 
 EXIT_STATUS: dict[type[BaseException], int] = {InputError: 2, LinkError: 3}
 """Exit status of the errors that this command raises on purpose."""

@@ -102,6 +102,11 @@ class Witness:
         follower = Follower(name, plan, times=self._plan.times, complain=complain)
         return Side(name, plan, follower, complain, lambda: self._is_troubled(plan.wire))
 
+    @property
+    def wires(self) -> tuple[str, ...]:
+        """The names of the wires."""
+        return tuple(self._wires)
+
     # what it is told
 
     def bytes(self, link: str, direction: Toward, time: float, data: Data) -> None:

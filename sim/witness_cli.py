@@ -1,0 +1,157 @@
+"""`era witness`: stand in the wires of amplifiers, or read a capture, and say what is wrong."""
+
+import json
+import sys
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, TextIO
+
+import typer
+
+from model.errors import InputError
+
+if TYPE_CHECKING:
+    from sim.witness.place import Place
+    from sim.witness.violation import Violation
+    from sim.witness.witness import Witness
+
+
+def witness(
+    urls: Annotated[
+        list[str], typer.Argument(metavar="URL...", help="Amplifiers, as era sim prints them.")
+    ],
+    replay: Annotated[
+        Path | None,
+        typer.Option(metavar="CAPTURE", help="Read this capture instead of standing in wires."),
+    ] = None,
+    record: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Write a capture of all that passes.")
+    ] = None,
+    frequency: Annotated[
+        str, typer.Option(metavar="LOW,HIGH", help="Frequencies that are allowed [Hz].")
+    ] = "10,655.35",
+    level: Annotated[
+        float, typer.Option(metavar="LEVEL", help="The highest level that is allowed.")
+    ] = 1.0,
+    slew: Annotated[
+        float | None, typer.Option(metavar="PER_S", help="How fast a level may rise.")
+    ] = None,
+    channels: Annotated[
+        int, typer.Option(metavar="N", help="Channels that each amplifier has.", min=1, max=16)
+    ] = 4,
+    slack: Annotated[
+        float, typer.Option(metavar="MS", help="What times may be wrong by on this machine.")
+    ] = 20.0,
+    as_json: Annotated[bool, typer.Option("--json", help="One JSON object and no text.")] = False,
+) -> None:
+    """Watch the wires of amplifiers by decoders of its own; exit status 1 if a rule was broken.
+
+    Prints a URL for each: use it in place of the amplifier's. Ends with Ctrl-C.
+    """
+    from sim.witness.place import place_of
+    from sim.witness.witness import Witness
+
+    limits: dict[str, Any] = {"frequency_hz": _band(frequency), "level": level}
+    if slew is not None:
+        limits["slew_per_s"] = slew
+    places = [place_of(url) for url in urls]
+    wires = {place: f"wire{n}" for n, place in enumerate(dict.fromkeys(p.place for p in places), 1)}
+    plan = {
+        "wires": {wires[place.place]: place.kind for place in places},
+        "amplifiers": {
+            place.url: {
+                "wire": wires[place.place],
+                "address": place.address,
+                "channels": dict.fromkeys(range(channels), limits),
+            }
+            for place in places
+        },
+        "times_s": {"slack": slack * 1e-3},
+    }
+    with ExitStack() as stack:
+        write = None
+        if record is not None:
+            file = stack.enter_context(_opened(record))
+            write = lambda line: print(line, file=file)  # noqa: E731  as short as what it does
+        seen = Witness(plan, record=write)
+        if replay is not None:
+            found = _replay(replay, seen)
+        else:
+            names = [wires[place.place] for place in places]
+            found = _stand_in(places, names, seen, to=sys.stderr if as_json else sys.stdout)
+    _tell(found, seen, as_json=as_json)
+    if found:
+        raise typer.Exit(1)
+
+
+def _band(text: str) -> list[float]:
+    try:
+        low, high = (float(part) for part in text.split(","))
+    except ValueError:
+        raise InputError(f"--frequency {text!r} is not LOW,HIGH in Hz, as in 40,500") from None
+    return [low, high]
+
+
+def _opened(path: Path) -> Any:
+    try:
+        return path.open("w", encoding="utf-8")
+    except OSError as problem:
+        raise InputError(f"--record {path} cannot be written: {problem.strerror}") from problem
+
+
+def _replay(path: Path, seen: "Witness") -> list["Violation"]:
+    from sim.witness.capture import read_capture
+
+    end = None
+    for piece in read_capture(path):
+        if piece.wire not in seen.wires:
+            raise InputError(
+                f"{path} has bytes of {piece.wire}; the URLs given are {', '.join(seen.wires)}"
+            )
+        seen.bytes(piece.wire, piece.toward, piece.time, piece.data)
+        end = piece.time
+    if end is None:
+        raise InputError(f"{path} holds no bytes at all")
+    return seen.finish(end)
+
+
+def _stand_in(
+    places: list["Place"], names: list[str], seen: "Witness", *, to: TextIO
+) -> list["Violation"]:
+    import asyncio
+    import signal
+    import time
+
+    from sim.witness_relay import relays
+
+    async def run() -> None:
+        ended = asyncio.Event()
+        for number in (signal.SIGTERM, signal.SIGINT):
+            asyncio.get_running_loop().add_signal_handler(number, ended.set)
+        async with relays(places, names, seen) as ends:
+            for place, end in zip(places, ends, strict=True):
+                print(f"{place.url}: {end}", file=to, flush=True)
+            await ended.wait()
+
+    asyncio.run(run())
+    return seen.finish(time.monotonic())
+
+
+def _tell(found: list["Violation"], seen: "Witness", *, as_json: bool) -> None:
+    if as_json:
+        listed = [
+            {
+                "invariant": one.invariant,
+                "wire": one.wire,
+                "time_s": one.time,
+                "sentence": one.sentence,
+                "frames": list(one.frames),
+            }
+            for one in found
+        ]
+        print(json.dumps({"frames": seen.frames, "violations": listed}))
+        return
+    for one in found:
+        print(one)
+    said = f"{len(found)} broken" if found else "no rule was broken"
+    print(f"{seen.frames} frames: {said}")

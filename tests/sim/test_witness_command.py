@@ -1,0 +1,133 @@
+"""`era witness`: captures read, relays stood in, and what it says about input that is none."""
+
+import asyncio
+import json
+import signal
+import sys
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from drivers.amplifier import Amplifier
+from drivers.registry import open_backend
+from model.errors import InputError
+from model.rig import Rig
+from model.rig_file import example_rig_path
+from sim.cli import app
+from sim.witness.capture import read_capture
+from sim.witness.plan import plan_of
+from wires import WIRES, far_side
+
+URL = "serial:///dev/ttyUSB0"
+# docs/wire-protocol.md: Hello, Arm and Stop with their answers; then an Apply although stopped.
+SESSION = """
+0.000 wire1 > 00 04 21 01 07 05 B7 EB 49 77 00   # Hello
+0.002 wire1 < 0004A1010719010441636D65045175616404412D313703312E323BC169D100
+0.010 wire1 > 00 04 23 01 07 02 FA 05 05 CE 1E 7E 00
+0.012 wire1 < 0004A30107020401010301FA02FA040807040101010101010105C005795C00
+"""
+DAMAGED = "0.020 wire1 > 00 04 28 01 07 02 05 05 B4 C3 FD 86 00\n"
+PATIENCE = 30  # s; for a loaded machine, not an expectation
+
+
+def _replay(tmp_path: Path, text: str, *options: str) -> tuple[int, str]:
+    capture = tmp_path / "capture.txt"
+    capture.write_text(text, encoding="utf-8")
+    arguments = ["witness", URL, "--replay", str(capture), "--json", *options]
+    result = CliRunner().invoke(app, arguments)
+    if isinstance(result.exception, InputError):
+        return 2, str(result.exception)
+    return result.exit_code, result.stdout
+
+
+def test_a_capture_without_fault_passes(tmp_path: Path) -> None:
+    """Four good frames break no rule: exit status 0."""
+    status, out = _replay(tmp_path, SESSION)
+    assert (status, json.loads(out)) == (0, {"frames": 4, "violations": []})
+
+
+def test_a_capture_with_a_fault_does_not(tmp_path: Path) -> None:
+    """A damaged frame of the host is named, with its time and the frames before it."""
+    status, out = _replay(tmp_path, SESSION + DAMAGED)
+    (found,) = json.loads(out)["violations"]
+    assert status == 1
+    assert (found["invariant"], found["wire"], found["time_s"]) == ("garbage", "wire1", 0.02)
+    assert len(found["frames"]) == 5
+
+
+@pytest.mark.parametrize(
+    ("text", "named"),
+    [
+        ("", "no bytes"),
+        ("0.1 wire1 > 0Z\n", "line 1"),
+        ("0.1 wire1 = 00\n", "line 1"),
+        ("0.2 wire1 > 00\n0.1 wire1 > 00\n", "line 2"),
+        ("nan wire1 > 00\n", "line 1"),
+        ("0.1 other > 00\n", "other"),
+        ("\udcff", "cannot be read"),
+    ],
+)
+def test_what_is_no_capture_is_refused(tmp_path: Path, text: str, named: str) -> None:
+    """The line, or the wire, is named."""
+    capture = tmp_path / "capture.txt"
+    capture.write_bytes(text.encode("utf-8", errors="surrogateescape"))
+    result = CliRunner().invoke(app, ["witness", URL, "--replay", str(capture)])
+    assert isinstance(result.exception, InputError)
+    assert named in str(result.exception)
+
+
+def test_a_capture_is_read_as_it_was_written(tmp_path: Path) -> None:
+    """Time, wire, direction and bytes of each line; comments and empty lines are nothing."""
+    capture = tmp_path / "capture.txt"
+    capture.write_text("# a session\n\n0.5 a > 00 04\n0.75 b < ff # back\n", encoding="utf-8")
+    assert list(read_capture(capture)) == [
+        (0.5, "a", "amplifier", b"\x00\x04"),
+        (0.75, "b", "host", b"\xff"),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("plan", "named"),
+    [
+        ({}, "wires"),
+        ({"wires": {"a": "smoke"}, "amplifiers": {}}, "wires.a"),
+        ({"wires": {"a": "serial"}, "amplifiers": {"m": {"wire": "b"}}}, "amplifiers.m.wire"),
+        ({"wires": {"a": "serial"}, "amplifiers": {"m": 1}}, "amplifiers.m"),
+        (
+            {"wires": {"a": "serial"}, "amplifiers": {"m": {"wire": "a", "channels": {0: {}}}}},
+            "channels.0.frequency_hz",
+        ),
+        ({"wires": {"a": "serial"}, "amplifiers": {"m": {"wire": "a"}}, "x": 1}, "'x'"),
+    ],
+)
+def test_plans_that_are_none_are_refused(plan: dict[str, object], named: str) -> None:
+    """The key that is wrong is named."""
+    with pytest.raises(InputError) as refused:
+        plan_of(plan)
+    assert named in str(refused.value)
+
+
+async def test_the_command_stands_in_a_wire(coarse_rig: Rig, tmp_path: Path) -> None:
+    """A host that uses the URL it prints works as ever; told to end, it says that all was right."""
+    capture = tmp_path / "capture.txt"
+    async with far_side(WIRES["serial"], coarse_rig) as far:
+        options = ("--slack", "5000", "--record", str(capture))
+        code = "import sys; from controller.main import main; sys.exit(main())"
+        process = await asyncio.create_subprocess_exec(
+            *(sys.executable, "-P", "-c", code, "witness", far.url, *options),
+            stdout=asyncio.subprocess.PIPE,
+            cwd=example_rig_path().parent.parent,
+        )
+        assert process.stdout is not None
+        line = await asyncio.wait_for(process.stdout.readline(), PATIENCE)
+        url = line.decode().split(": ")[1].strip()
+        amplifier = Amplifier(open_backend(url), reply_timeout=2.0)
+        await amplifier.open()
+        await amplifier.status()
+        await amplifier.close()
+        process.send_signal(signal.SIGINT)
+        out, _ = await asyncio.wait_for(process.communicate(), PATIENCE)
+    assert process.returncode == 0
+    assert out.decode().strip() == "6 frames: no rule was broken"
+    assert sum(len(piece.data) > 0 for piece in read_capture(capture)) >= 6

@@ -1,0 +1,91 @@
+"""A relay in every real wire: the host notices nothing, and the witness sees it all."""
+
+import asyncio
+from typing import Any
+
+import pytest
+
+from drivers.amplifier import Amplifier
+from drivers.command import CommandSet, DriveCommand
+from drivers.guard import Guard, GuardLimits
+from drivers.protocol.messages import State
+from drivers.registry import open_backend
+from model.errors import InputError
+from model.rig import Rig
+from sim.witness.place import place_of
+from sim.witness.witness import Witness
+from sim.witness_relay import relays
+from wires import WIRES, far_side
+
+
+def _witness(url: str, *, level: float) -> Witness:
+    place = place_of(url)
+    limits = {"frequency_hz": [40, 500], "level": level}
+    plan: dict[str, Any] = {
+        "wires": {"line": place.kind},
+        "amplifiers": {
+            "main": {
+                "wire": "line",
+                "address": place.address,
+                "channels": dict.fromkeys(range(4), limits),
+            }
+        },
+        # How late this machine is with its work is not what is tried here.
+        "times_s": dict.fromkeys(("slack", "reply", "heartbeat"), 5.0),
+    }
+    return Witness(plan)
+
+
+async def _drive(url: str) -> None:
+    amplifier = Amplifier(open_backend(url), reply_timeout=2.0)
+    await amplifier.open()
+    try:
+        guard = Guard(GuardLimits(40.0, 500.0, 1.0), amplifier.capabilities)
+        wanted = CommandSet(1, (DriveCommand(0, 110.0, 0.4, 90.0),), ramp=0.01, valid_for=0.0)
+        assert (await amplifier.arm()).state is State.OPERATION_ENABLED
+        assert (await amplifier.apply(guard.check(wanted))).commands[0].level == 0.4
+        await asyncio.sleep(0.02)
+        await amplifier.heartbeat()
+        assert (await amplifier.stop()).state is State.QUICK_STOP_ACTIVE
+        await asyncio.sleep(0.02)  # its ramp, after which it can be cleared
+        assert (await amplifier.clear()).state is State.SWITCH_ON_DISABLED
+    finally:
+        await amplifier.close()
+
+
+@pytest.mark.parametrize("wire", WIRES)
+async def test_what_passes_a_relay_is_seen(wire: str, coarse_rig: Rig) -> None:
+    """A session passes clean; the same session is found to be too loud where 0.3 is the limit."""
+    async with far_side(WIRES[wire], coarse_rig) as far:
+        for level, broken in ((0.5, set()), (0.3, {"limits"})):
+            witness = _witness(far.url, level=level)
+            async with relays([place_of(far.url)], ["line"], witness) as (url,):
+                assert url != far.url
+                await _drive(url)
+            found = witness.finish()
+            assert {one.invariant for one in found} == broken, [str(one) for one in found]
+            assert witness.frames > 10
+
+
+@pytest.mark.parametrize(
+    ("url", "place", "address"),
+    [
+        ("serial:///dev/ttyUSB0?baud=921600&address=3", "/dev/ttyUSB0", 3),
+        ("modbus+tcp://127.0.0.1:5020/2", "127.0.0.1:5020", 2),
+        ("modbus+rtu:///dev/ttyS1?baud=19200#7", "/dev/ttyS1", 7),
+        ("can+slcan:///dev/ttyACM0?bitrate=500000#5", "/dev/ttyACM0", 5),
+        ("can+socketcand://localhost:29536/can0#1", "localhost:29536", 1),
+    ],
+)
+def test_urls_are_taken_apart(url: str, place: str, address: int) -> None:
+    """Device or server and number are those of the URL, and all else stays in the new one."""
+    taken = place_of(url)
+    assert (taken.place, taken.address) == (place, address)
+    assert taken.through("X").replace("X", place) == url
+
+
+@pytest.mark.parametrize("url", ["sim://rig.yaml", "serial://", "modbus+tcp://host/1", "nonsense"])
+def test_urls_that_lead_to_no_wire_are_refused(url: str) -> None:
+    """What a relay cannot stand in is said in one sentence."""
+    with pytest.raises(InputError, match=r"URL|HOST:PORT"):
+        place_of(url)

@@ -31,8 +31,10 @@ Topic: TypeAlias = Literal[
     "state", "contacts", "pattern", "silence", "amplifiers", "latency", "log", "link"
 ]
 
-Name: TypeAlias = Annotated[str, Field(min_length=1, max_length=80, pattern=r"^[^\x00-\x1f\x7f]+$")]
-"""A short text on one line."""
+_ONE_LINE = r"^[^\x00-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069]+$"
+
+Name: TypeAlias = Annotated[str, Field(min_length=1, max_length=80, pattern=_ONE_LINE)]
+"""A short text on one line, without what could garble a terminal."""
 
 Count: TypeAlias = Annotated[int, Field(ge=0)]
 

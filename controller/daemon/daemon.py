@@ -63,6 +63,7 @@ class Daemon:
         self._dashboard = dashboard
         self._loop = asyncio.get_running_loop()
         self._reloads: set[asyncio.Task[None]] = set()
+        self._reloading = asyncio.Lock()
         self._ended = asyncio.Event()
         self._end_cause = "the daemon ends"
         self._latencies = Latencies()
@@ -146,14 +147,15 @@ class Daemon:
 
     async def reload(self) -> None:
         """Read the configuration again, and take over what can be taken over."""
-        self._manager.reloading()
-        try:
-            new = await asyncio.to_thread(load_daemon_config, self._config.source)
-        except InputError as error:
-            _logger.error("the configuration is left as it was: %s", error)
-        else:
-            await self._take_over(new)
-        self._manager.ready(self._status_line())
+        async with self._reloading:
+            self._manager.reloading()
+            try:
+                new = await asyncio.to_thread(load_daemon_config, self._config.source)
+            except InputError as error:
+                _logger.error("the configuration is left as it was: %s", error)
+            else:
+                await self._take_over(new)
+            self._manager.ready(self._status_line())
 
     async def _take_over(self, new: DaemonConfig) -> None:
         is_armed = self._supervisor.machine.state in (State.SWITCHED_ON, State.OPERATION_ENABLED)

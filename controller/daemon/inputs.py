@@ -50,7 +50,9 @@ class TouchInputs:
 
     async def _run(self, given: TouchInput) -> None:
         def named(frame: TouchFrame) -> None:
-            self._deliver(replace(frame, source=f"{given.name}:{frame.source}"))
+            # Whoever sends datagrams names itself; the name is shown on terminals.
+            source = frame.source if frame.source.isprintable() else ascii(frame.source)
+            self._deliver(replace(frame, source=f"{given.name}:{source}"))
 
         try:
             await given.make().run(named)

@@ -3,6 +3,7 @@
 import fcntl
 import os
 import socket
+import stat
 from pathlib import Path
 from typing import IO
 
@@ -27,6 +28,7 @@ class Place:
             )
         try:
             path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+            _check_folder(path.parent)
             self._lock: IO[str] = path.with_name(f"{path.name}.lock").open("a+", encoding="utf-8")
         except OSError as error:
             raise InputError(
@@ -64,5 +66,16 @@ class Place:
 
     def leave(self) -> None:
         """Give the place back."""
-        self.path.unlink(missing_ok=True)
+        if self.path.is_socket():
+            self.path.unlink()
         self._lock.close()
+
+
+def _check_folder(folder: Path) -> None:
+    """Refuse a folder in which somebody else could put a socket of theirs for ours."""
+    status = folder.stat()
+    if status.st_uid not in (0, os.getuid()) or status.st_mode & stat.S_IWOTH:
+        raise InputError(
+            f"{folder}: others may write here, or it is theirs; name another path with socket: in "
+            "the daemon's file, in a folder of your own"
+        )

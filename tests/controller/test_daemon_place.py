@@ -1,0 +1,76 @@
+import os
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from controller.daemon.place import Place
+from model.errors import InputError
+
+
+def test_the_socket_is_its_users_alone(tmp_path: Path) -> None:
+    """Mode 0600 in a folder of mode 0700, whatever the umask; gone in the end."""
+    before = os.umask(0)
+    try:
+        place = Place(tmp_path / "new" / "era.sock")
+        with place.bound():
+            assert place.path.stat().st_mode & 0o777 == 0o600
+            assert place.path.parent.stat().st_mode & 0o777 == 0o700
+        assert os.umask(0) == 0
+        place.leave()
+        assert not place.path.exists()
+    finally:
+        os.umask(before)
+
+
+def test_a_socket_that_a_killed_daemon_left_is_no_obstacle(tmp_path: Path) -> None:
+    """The lock goes with its process; the file that stays says nothing."""
+    path = tmp_path / "era.sock"
+    script = (
+        "import os, sys; from pathlib import Path; from controller.daemon.place import Place; "
+        "place = Place(Path(sys.argv[1])); place.bound(); os.kill(os.getpid(), 9)"
+    )
+    done = subprocess.run([sys.executable, "-c", script, str(path)], check=False)
+    assert done.returncode == -9
+    assert path.is_socket()
+    place = Place(path)
+    place.bound().close()
+    place.leave()
+
+
+def test_what_is_no_socket_is_not_removed(tmp_path: Path) -> None:
+    """A file of somebody's at the path stays as it is."""
+    path = tmp_path / "era.sock"
+    path.write_text("mine", "utf-8")
+    place = Place(path)
+    with pytest.raises(InputError, match="no socket can be here"):
+        place.bound()
+    assert path.read_text("utf-8") == "mine"
+    place.leave()
+
+
+def test_a_folder_where_others_may_write_is_refused(tmp_path: Path) -> None:
+    """Or somebody could listen in our place."""
+    folder = tmp_path / "open"
+    folder.mkdir()
+    folder.chmod(0o777)
+    with pytest.raises(InputError, match="others may write here"):
+        Place(folder / "era.sock")
+
+
+def test_a_path_that_is_too_long_is_said_to_be(tmp_path: Path) -> None:
+    """The system's own error would name no length."""
+    with pytest.raises(InputError, match="at most 107 bytes"):
+        Place(tmp_path / ("x" * 120))
+
+
+def test_two_places_in_one_folder_are_two(tmp_path: Path) -> None:
+    """Each socket has its own lock."""
+    places = [Place(tmp_path / name) for name in ("a.sock", "b.sock")]
+    for place in places:
+        bound = place.bound()
+        assert isinstance(bound, socket.socket)
+        bound.close()
+        place.leave()

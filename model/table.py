@@ -8,17 +8,16 @@ follows what another stiffness, thickness or finger would change; and the respon
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from model.actuator import Era
+from model.answer import answer_to
 from model.arrays import FloatArray
-from model.drive_excitation import excitation_of
-from model.drive_modes import Choice, find_drives, loudest
-from model.drive_modes.fields import Drive, Fields, Outcome, SingleComplex, judge
+from model.drive_modes.fields import Fields, SingleComplex
 from model.drive_modes.sources import (
     all_patterns,
     magnitudes_of_sources,
@@ -26,7 +25,6 @@ from model.drive_modes.sources import (
     sums_of_sources,
 )
 from model.errors import InputError
-from model.exact_search import loudest_found, search_exactly
 from model.excitation import Excitation
 from model.localization import SURROUNDINGS_RADIUS, Grid, decibels
 from model.mesh import Mesh
@@ -47,10 +45,6 @@ PAPER_FREQUENCIES = np.arange(60.0, 321.0, 10.0)
 """The 27 excitation frequencies [Hz]: 60 to 320 in steps of 10 holds every one the paper names."""
 
 PAPER_GRID = Grid(12, 9)
-
-# Among drives near the best one the onset decides, too: a decibel of the score counts as much as
-# three of contrast in the first 100 ms (docs/decisions, on ramps).
-ONSET_WEIGHT = 1 / 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,64 +111,7 @@ class LocalizationTable:
         turned down to the level asked for; contrast does not depend on that. Raises InputError for
         contacts off the plate or on top of each other and a level that cannot be reached.
         """
-        question.check_on(self.plate)
-        mode = question.mode_on(self.mode, era_count=len(self.eras))
-        fingertips = self._fingertips(question)
-        usable, fields = self._usable(question, fingertips)
-        if mode == "switched" and question.eras_at_most != 2:
-            return self._ask_exactly(question, usable, fields)
-        choice = find_drives(fields, mode)
-        if choice is None:
-            most = loudest(fields, mode)
-            raise InputError(self._too_loud(question, mode, most=most))
-        drive, outcome = choice.drive, choice.outcome
-        if question.quiet and not question.envelopes:
-            better = self._quietest_onset(question, choice, usable, fingertips)
-            if better is not None:
-                drive, outcome = better, judge(fields, better)
-        return self._pattern(question, mode, usable, fields, drive, outcome)
-
-    def _quietest_onset(
-        self,
-        question: Question,
-        choice: Choice,
-        usable: NDArray[np.int64],
-        fingertips: Fingertips,
-    ) -> Drive | None:
-        """What a plain ramp should rather start than the drive of the best score, if anything."""
-        near = choice.near()
-        if len(near.frequencies) < 2 or self._onsets is None:
-            return None
-        shapes, ends = fingertips.read(self.shapes), fingertips.ends
-        contrast = self._onsets.contrast(
-            usable[near.frequencies],
-            near.weights,
-            targets=[
-                shapes[start:end] * gain
-                for start, end, gain in zip((0, *ends), ends, question.gains, strict=False)
-            ],
-            quiet=shapes[ends[len(question.targets) - 1] :],
-        )
-        best = int((near.score * contrast**ONSET_WEIGHT).argmax())
-        return Drive.at(int(near.frequencies[best]), near.weights[best]) if best > 0 else None
-
-    def _ask_exactly(
-        self, question: Question, usable: NDArray[np.int64], fields: Fields
-    ) -> Pattern:
-        count = question.eras_at_most
-        found = search_exactly(fields, eras_at_most=count, time_limit=question.search_time)
-        if found.drive is None and not found.is_complete:
-            raise InputError(
-                f"no pattern of up to {count} ERAs that reaches {question.level_db_sl:g} dB SL was "
-                f"found within {question.search_time:g} s, and not all were looked at; search "
-                "longer, or ask for less"
-            )
-        if found.drive is None:
-            most = loudest_found(fields, eras_at_most=count)
-            raise InputError(self._too_loud(question, "switched", most=most))
-        outcome = judge(fields, found.drive)
-        pattern = self._pattern(question, "switched", usable, fields, found.drive, outcome)
-        return replace(pattern, contrast_bound_db=20 * math.log10(found.bound))
+        return answer_to(self, question)
 
     def prepare(self, mode: str | None = None) -> None:
         """Work out what the first question in a mode would have to wait for."""
@@ -182,13 +119,14 @@ class LocalizationTable:
         for quiet in ((), ((0.0, 0.0),)):
             self.ask(Question((centre,), quiet, level_db_sl=LEAST_LEVEL_DB_SL, mode=mode))
         if (mode or self.mode) != "switched":
-            _ = self._onsets  # not every question has patterns to choose among
+            _ = self.onsets  # not every question has patterns to choose among
 
     def fields(self, question: Question) -> Fields:
         """What a drive mode needs to know about a question, at all frequencies of the table."""
-        return self._fields(question, self._fingertips(question))
+        return self.fields_at(question, self.fingertips(question))
 
-    def _fields(self, question: Question, fingertips: Fingertips) -> Fields:
+    def fields_at(self, question: Question, fingertips: Fingertips) -> Fields:
+        """The same, with the question's fingertips as `fingertips` has them."""
         found, ends = self._by_frequency(fingertips.read(self._values)), fingertips.ends
         count = len(question.targets)
         if question.quiet:
@@ -263,7 +201,8 @@ class LocalizationTable:
         return plate_in_time(reduced, self.eras, loads=loads, held=self.held)
 
     @cached_property
-    def _onsets(self) -> RampedOnsets | None:
+    def onsets(self) -> RampedOnsets | None:
+        """What plain ramps do at the table's frequencies."""
         try:
             return RampedOnsets(self.in_time, self.frequencies, ramp=ONSET_RAMP)
         except InputError:  # too few ERAs to rest on: it has answers, but no motion in time
@@ -283,8 +222,8 @@ class LocalizationTable:
         """Fields at the centres of the cells, (f, eras, cells)."""
         return self._by_frequency(self.raster.at(self._values, self.cell_centres))
 
-    def _fingertips(self, question: Question) -> Fingertips:
-        """Targets first."""
+    def fingertips(self, question: Question) -> Fingertips:
+        """Where the question's fingers are on the raster, targets first."""
         return self.raster.fingertips(np.array([*question.targets, *question.quiet]))
 
     def _by_frequency(self, values: NDArray[np.float32]) -> SingleComplex:
@@ -296,52 +235,3 @@ class LocalizationTable:
         apart = np.linalg.norm(self.cell_centres[:, None] - np.array(targets), axis=-1)
         far: NDArray[np.bool_] = (apart > SURROUNDINGS_RADIUS).all(axis=1)
         return far if far.any() else np.ones_like(far)
-
-    def _usable(
-        self, question: Question, fingertips: Fingertips
-    ) -> tuple[NDArray[np.int64], Fields]:
-        """Indices of the frequencies that the amplifiers can play, and the fields at them."""
-        low, high = question.frequencies
-        fields = self._fields(question, fingertips)
-        usable = np.flatnonzero((self.frequencies >= low) & (self.frequencies <= high))
-        if len(usable) == 0:
-            raise InputError(
-                f"the table's frequencies, {self.frequencies[0]:g} to {self.frequencies[-1]:g} Hz, "
-                f"are none that these amplifiers play ({low:g} to {high:g} Hz); build a table with "
-                "others: era table build --frequencies"
-            )
-        return usable, fields if len(usable) == len(self.frequencies) else fields.at(usable)
-
-    def _too_loud(self, question: Question, mode: str, *, most: float) -> str:
-        where = " and ".join(f"({x:g}, {y:g})" for x, y in question.targets)
-        most = 20 * math.log10(most)
-        # Rounded down, so that it can be asked for.
-        # Of several targets the phases of all are tried for, not gone through.
-        sure = mode == "switched" or len(question.targets) == 1
-        what = "the most that can be had there is" if sure else "the most that was found there is"
-        return (
-            f"no pattern reaches {question.level_db_sl:g} dB SL at {where} m in mode {mode}; "
-            f"{what} {math.floor(10 * most) / 10:.1f} dB SL"
-        )
-
-    def _pattern(
-        self,
-        question: Question,
-        mode: str,
-        usable: NDArray[np.int64],
-        fields: Fields,
-        drive: Drive,
-        outcome: Outcome,
-    ) -> Pattern:
-        gain = min(1.0, fields.wanted / outcome.sensation)
-        contrast = 20 * math.log10(max(outcome.peak, 1e-30) / max(outcome.quiet_peak, 1e-30))
-        quiet_level = 20 * math.log10(max(gain * outcome.quiet_sensation, 1e-30))
-        return Pattern(
-            excitation=excitation_of(drive, self.eras, self.frequencies[usable], gain=gain),
-            ramp=ONSET_RAMP,
-            level_db_sl=question.level_db_sl,
-            contrast_db=contrast if question.quiet else None,
-            quiet_level_db_sl=quiet_level if question.quiet else None,
-            mode=mode,
-            surroundings_contrast_db=None if question.quiet else contrast,
-        )

@@ -245,3 +245,15 @@ def test_fingers_lie_where_they_are_told(coarse_rig: Rig, reduced: ReducedPlate)
         moved.append(np.abs(at @ plant.state[0]))
     held, free = np.max(moved, axis=0)
     assert held < 0.01 * free
+
+
+def test_the_sampling_rate_may_change_in_between(coarse_rig: Rig, reduced: ReducedPlate) -> None:
+    """Every tenth sample at 10 kHz is the sample at 1 kHz, also right after the other rate."""
+    quick, mixed = (vibrating(reduced, coarse_rig) for _ in range(2))
+    shapes = reduced.at(POINTS)
+    _, expected = quick.advance(0.12, sample_rate=10_000.0, shapes=shapes)
+    mixed.advance(0.07, sample_rate=10_000.0, shapes=shapes)
+    times, found = mixed.advance(0.12, sample_rate=1000.0, shapes=shapes)
+    assert len(times) == 50
+    rows = np.round((times - 0.05) * 10_000).astype(int) - 1
+    assert_allclose(found, expected[rows], rtol=0, atol=1e-9 * np.abs(expected).max())

@@ -12,8 +12,12 @@ def main() -> int:
 
     try:
         with gone_when_told():  # while all the rest loads
-            from sim.cli import EXIT_STATUS, app
+            import typer
 
+            from sim.cli import EXIT_STATUS, sim
+
+            app = typer.Typer(pretty_exceptions_enable=False)
+            app.command()(sim)  # alone, whatever else the package offers
             app(prog_name="python -m sim")
     except tuple(EXIT_STATUS) as error:
         sys.stderr.write(f"sim: error: {error}\n")

@@ -44,9 +44,10 @@ import math
 from collections.abc import Callable, Coroutine, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeAlias, TypeGuard
+from typing import Any, TypeAlias
 
 from model.errors import InputError
+from sim.control_values import finger_of, is_number, number_of, place_of, window_of
 from sim.fault_file import episode_of
 from sim.felt import feel
 from sim.finger import Position, Record
@@ -131,21 +132,23 @@ def _fingers(site: Site, request: dict[str, Any], now: float) -> _Answer:
     fingers = request.get("fingers")
     if not isinstance(fingers, dict):
         raise InputError('fingers must be an object of positions, as in {"1": [0.10, 0.08]}')
-    places = {name: _place(place, what=f"finger {name[:40]!r}") for name, place in fingers.items()}
+    places = {
+        name: place_of(place, what=f"finger {name[:40]!r}") for name, place in fingers.items()
+    }
     return _placed(site, places, now)
 
 
 def _come(site: Site, request: dict[str, Any], now: float) -> _Answer:
-    name, present = _finger(request), site.bench.fingers.layout.positions
+    name, present = finger_of(request), site.bench.fingers.layout.positions
     if (name in present) != (request["op"] == "move"):
         there = "is on the plate already" if name in present else "is not on the plate"
         raise InputError(f"finger {name!r} {there}")
-    at = _place(request.get("at_m"), what=f"finger {name!r}")
+    at = place_of(request.get("at_m"), what=f"finger {name!r}")
     return _placed(site, {**present, name: at}, now)
 
 
 def _go(site: Site, request: dict[str, Any], now: float) -> _Answer:
-    name, present = _finger(request), site.bench.fingers.layout.positions
+    name, present = finger_of(request), site.bench.fingers.layout.positions
     if name not in present:
         raise InputError(f"finger {name!r} is not on the plate")
     return _placed(site, {id: at for id, at in present.items() if id != name}, now)
@@ -157,7 +160,7 @@ def _placed(site: Site, places: Mapping[str, Position], now: float) -> _Answer:
 
 
 def _felt(site: Site, request: dict[str, Any], now: float) -> _Answer:
-    since, until = _window(request)
+    since, until = window_of(request)
     site.bench.advance(now)
     records, frequencies = site.bench.records(since, until)
     return lambda: {"fingers": {id: _as_felt(rec, frequencies) for id, rec in records.items()}}
@@ -189,8 +192,8 @@ def _sensor(name: str, told: object) -> Accelerometer:
     unknown = sorted(told.keys() - {"at_m", *_SENSOR_KEYS})
     if unknown:
         raise InputError(f"sensor {name[:40]!r}: {unknown[0][:40]!r} is unknown")
-    x, y = _place(told.get("at_m"), what=f"sensor {name[:40]!r}")
-    values = {key: _number(told, key, unit) for key, unit in _SENSOR_KEYS.items() if key in told}
+    x, y = place_of(told.get("at_m"), what=f"sensor {name[:40]!r}")
+    values = {key: number_of(told, key, unit) for key, unit in _SENSOR_KEYS.items() if key in told}
     return Accelerometer(
         name,
         x,
@@ -232,7 +235,7 @@ def _tones(site: Site, request: dict[str, Any], now: float) -> _Answer:
     if not (
         isinstance(frequencies, list)
         and 0 < len(frequencies) <= _TONES_MAX
-        and all(_is_number(f) and 0 < f < site.bench.sample_rate / 2 for f in frequencies)
+        and all(is_number(f) and 0 < f < site.bench.sample_rate / 2 for f in frequencies)
         and len(set(frequencies)) == len(frequencies)
     ):
         raise InputError(
@@ -260,7 +263,7 @@ def _tones(site: Site, request: dict[str, Any], now: float) -> _Answer:
 
 
 def _recorded(site: Site, request: dict[str, Any], now: float) -> Recording:
-    since, until = _window(request)
+    since, until = window_of(request)
     site.bench.advance(now)
     return site.accelerometers.read(since, until)
 
@@ -296,7 +299,7 @@ def _recover(site: Site, request: dict[str, Any], now: float) -> _Answer:
 
 
 def _step(site: Site, request: dict[str, Any], now: float) -> Wait:
-    seconds, step = _number(request, "seconds", "seconds"), site.step
+    seconds, step = number_of(request, "seconds", "seconds"), site.step
     if step is None:
         raise InputError("time is the clock's here; start the far end with --virtual-time")
     if not 0 < seconds <= _STEP_MAX:
@@ -351,43 +354,6 @@ _OPS: Mapping[str, Callable[[Site, dict[str, Any], float], _Answer | Wait]] = {
     "record": _record,
     "finish": _finish,
 }
-
-
-def _window(request: dict[str, Any]) -> tuple[float, float]:
-    since = _number(request, "since_s", "seconds")
-    until = _number(request, "until_s", "seconds")
-    if since >= until:
-        raise InputError(f"since_s {since} must come before until_s {until}")
-    return since, until
-
-
-def _number(told: dict[str, Any], key: str, unit: str) -> float:
-    value = told.get(key)
-    if not _is_number(value):
-        raise InputError(f"{key} is {str(value)[:40]!r}; it must be a number of {unit}")
-    return float(value)
-
-
-def _is_number(value: object) -> TypeGuard[int | float]:
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        return False
-    try:
-        return math.isfinite(value)
-    except OverflowError:  # JSON allows integers of any length
-        return False
-
-
-def _finger(request: dict[str, Any]) -> str:
-    name = request.get("finger")
-    if not isinstance(name, str) or not 0 < len(name) <= 40:
-        raise InputError("finger must be the finger's id, a short text")
-    return name
-
-
-def _place(place: object, *, what: str) -> Position:
-    if not (isinstance(place, list) and len(place) == 2 and all(_is_number(p) for p in place)):
-        raise InputError(f"{what} needs a position [x, y] in metres")
-    return float(place[0]), float(place[1])
 
 
 def _already(reply: dict[str, Any]) -> Callable[[], dict[str, Any]]:

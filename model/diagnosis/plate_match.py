@@ -32,6 +32,7 @@ _DAMPING_KNOWN = 0.7  # of itself
 _BOLT_KNOWN = 1.0  # twentieths of what an ERA carries
 _GAIN_KNOWN = 1.0  # of a logarithm: a factor of 2.7
 _GAIN_WANDERS = 0.08  # over frequency, of itself
+FITS = 0.2  # rms error, relative to the response, of a plate to believe
 MODEL_ERROR = 0.05  # of a row's rms: sensors' scales and places, what is not modelled
 _ROBUST = 2.0  # standard deviations
 _STEPS = 40

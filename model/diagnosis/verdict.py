@@ -9,28 +9,27 @@ from numpy.typing import NDArray
 
 from model.arrays import ComplexArray, FloatArray
 from model.calibration.fast_plate import FastPlate, fast_plate
-from model.calibration.responses import Responses
-from model.calibration.screening import silent_sensors
 from model.diagnosis.assignment import Likeness, likeness, likeness_to
 from model.diagnosis.causes import Explanation, explain
 from model.diagnosis.observation import Observation
-from model.diagnosis.plate_match import MODEL_ERROR, Match, match_plate
+from model.diagnosis.plate_match import FITS, MODEL_ERROR, Match, match_plate
 from model.diagnosis.polarity import Phase, phases_of_drive, signs_of_pairs
+from model.diagnosis.screening import (
+    LEAST_SENSORS,
+    check_enough,
+    dead_channels,
+    off_scale,
+    shapeless_channels,
+    usable_sensors,
+)
 from model.errors import InputError
 from model.rig import Channel, Rig
 
-_DEAD = 0.03  # of the response that the rig predicts
-_FAINT = 0.3  # of it: dead if its shape is that of no ERA either
-_NOISY = 3.0  # times the floor
-_NO_SHAPE = 0.6  # MAC
 WEAK, STRONG = 0.7, 1.4  # gain of a channel: 3 dB either way
-FITS = 0.2  # rms error, relative to the response, of a plate to believe
 UNLIKELY = 3.0  # standard deviations from what a rig's author can know
 _CLEARLY = 0.99  # confidence in another ERA than the rig's
 _BETTER = 20.0  # of cost; what another wiring must explain beyond the rig's own
 _OFF_PHASE = 45.0  # degrees
-_SENSOR_SCALE = (0.7, 1.4)
-_LEAST_SENSORS, _LEAST_FREQUENCIES = 3, 4
 
 State: TypeAlias = Literal[
     "well", "dead", "weak", "strong", "other ERA", "inverted", "out of phase", "not driven"
@@ -91,19 +90,19 @@ def diagnose(rig: Rig, observation: Observation) -> Verdict:
     """
     if not observation.measured.any():
         raise InputError("no channel was driven; drive each in turn and measure again")
-    dead = _dead(rig, observation)
-    observation, bad = _usable_sensors(observation, dead)
-    _check_enough(observation, bad)
+    dead = dead_channels(rig, observation)
+    observation, bad = usable_sensors(observation, dead)
+    check_enough(observation, bad)
     plate = fast_plate(rig, observation.points, observation.frequencies)
     values = observation.values.copy()
-    dead = dead | _shapeless(rig, plate, observation)
+    dead = dead | shapeless_channels(rig, plate, observation)
     values[:, dead] = np.nan
     if not np.isfinite(values).any():
         return _nothing_moves(rig, observation, dead, bad)
     alike = likeness(rig, plate, values)
     match, drives, error = _best_match(rig, plate, values, alike, observation)
-    off = _off_scale(observation, values, match)
-    if off and len(observation.sensors) - len(off) >= _LEAST_SENSORS:
+    off = off_scale(observation, values, match)
+    if off and len(observation.sensors) - len(off) >= LEAST_SENSORS:
         wrong = np.isin(observation.sensors, [name for name, _ in off])
         again = diagnose(rig, observation.without(wrong))
         return replace(again, bad_sensors=(*bad, *off, *again.bad_sensors))
@@ -142,58 +141,6 @@ def diagnose(rig: Rig, observation: Observation) -> Verdict:
     )
 
 
-def _dead(rig: Rig, observation: Observation) -> NDArray[np.bool_]:
-    """Which channels move nothing that a sensor could tell from silence (e,)."""
-    plate = fast_plate(rig, observation.points, observation.frequencies)
-    size = np.abs(observation.values)
-    share = size / np.abs(plate.responses(rig))
-    dead = np.zeros(len(rig.eras), dtype=bool)
-    for channel in np.flatnonzero(observation.measured):
-        there = np.isfinite(size[:, channel])
-        dead[channel] = np.median(share[:, channel][there]) < _DEAD
-        if observation.floor is not None:
-            over = (size[:, channel] / np.maximum(observation.floor, 1e-300))[there]
-            dead[channel] |= bool(np.median(over) < _NOISY)
-    return dead
-
-
-def _shapeless(rig: Rig, plate: FastPlate, observation: Observation) -> NDArray[np.bool_]:
-    """Which channels are faint and like no ERA: what sensors read is noise (e,)."""
-    model = plate.responses(rig)
-    share = np.abs(observation.values) / np.abs(model)
-    mac = likeness(rig, plate, observation.values).mac
-    found = np.zeros(len(rig.eras), dtype=bool)
-    for channel in np.flatnonzero(observation.measured):
-        faint = np.nanmedian(share[:, channel]) < _FAINT
-        found[channel] = faint and np.nanmax(np.nanmedian(mac[:, channel], axis=0)) < _NO_SHAPE
-    return found
-
-
-def _usable_sensors(
-    observation: Observation, dead: NDArray[np.bool_]
-) -> tuple[Observation, tuple[tuple[str, str], ...]]:
-    """Without the sensors that read nothing, whichever live channel is driven."""
-    values = observation.values[:, ~dead]
-    if not np.isfinite(values).any():
-        return observation, ()
-    silent = silent_sensors(
-        Responses(observation.sensors, observation.points, observation.frequencies, values)
-    )
-    names = [name for name, out in zip(observation.sensors, silent, strict=True) if out]
-    return observation.without(silent), tuple((name, "reads nothing") for name in names)
-
-
-def _check_enough(observation: Observation, bad: Sequence[tuple[str, str]]) -> None:
-    count, frequencies = len(observation.sensors), len(observation.frequencies)
-    if count < _LEAST_SENSORS or frequencies < _LEAST_FREQUENCIES:
-        said = f" ({', '.join(name for name, _ in bad)} read nothing)" if bad else ""
-        raise InputError(
-            f"{count} usable sensors{said} at {frequencies} frequencies cannot tell ERAs apart; "
-            f"measure with {_LEAST_SENSORS} at least, better eight, at {_LEAST_FREQUENCIES} "
-            "frequencies at least"
-        )
-
-
 def _best_match(
     rig: Rig,
     plate: FastPlate,
@@ -230,27 +177,6 @@ def _best_match(
     if error > MODEL_ERROR:
         match = matched(drives, error)
     return match, drives, error
-
-
-def _off_scale(
-    observation: Observation, values: ComplexArray, match: Match
-) -> list[tuple[str, str]]:
-    """Sensors that do not read what the rest of them say, and how much of it; if the rest agree."""
-    if match.usual_error > FITS:
-        return []
-    there = np.isfinite(values) & np.isfinite(match.predicted)
-    model = np.where(there, match.predicted, 0)
-    measured = np.where(there, values, 0)
-    turn = np.exp(-1j * np.angle((model.conj() * measured).sum(axis=2, keepdims=True)))
-    inner = (model.conj() * measured * turn).real.sum(axis=(0, 1))
-    scale = inner / np.maximum((np.abs(model) ** 2).sum(axis=(0, 1)), 1e-300)
-    scale = scale / np.median(scale)
-    low, high = _SENSOR_SCALE
-    return [
-        (name, f"reads {value:.2f} of what the others say")
-        for name, value in zip(observation.sensors, scale, strict=True)
-        if not low <= value <= high
-    ]
 
 
 def _phases(

@@ -4,8 +4,9 @@ from collections.abc import Sequence
 from typing import Any
 
 from model.diagnosis.causes import Explanation
+from model.diagnosis.plate_match import FITS
 from model.diagnosis.polarity import EVEN
-from model.diagnosis.verdict import FITS, UNLIKELY, ChannelVerdict, State, Verdict
+from model.diagnosis.verdict import UNLIKELY, ChannelVerdict, State, Verdict
 
 _TO_DO: dict[State, str] = {
     "dead": "check its supply, its cable and the amplifier's channel",

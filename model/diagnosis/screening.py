@@ -1,0 +1,97 @@
+"""What in a measurement says nothing of the rig's wiring: the dead and the unusable."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model.arrays import ComplexArray
+from model.calibration.fast_plate import FastPlate, fast_plate
+from model.calibration.responses import Responses
+from model.calibration.screening import silent_sensors
+from model.diagnosis.assignment import likeness
+from model.diagnosis.observation import Observation
+from model.diagnosis.plate_match import FITS, Match
+from model.errors import InputError
+from model.rig import Rig
+
+_DEAD = 0.03  # of the response that the rig predicts
+_FAINT = 0.3  # of it: dead if its shape is that of no ERA either
+_NOISY = 3.0  # times the floor
+_NO_SHAPE = 0.6  # MAC
+_SENSOR_SCALE = (0.7, 1.4)
+LEAST_SENSORS, _LEAST_FREQUENCIES = 3, 4
+
+
+def dead_channels(rig: Rig, observation: Observation) -> NDArray[np.bool_]:
+    """Which channels move nothing that a sensor could tell from silence (e,)."""
+    plate = fast_plate(rig, observation.points, observation.frequencies)
+    size = np.abs(observation.values)
+    share = size / np.abs(plate.responses(rig))
+    dead = np.zeros(len(rig.eras), dtype=bool)
+    for channel in np.flatnonzero(observation.measured):
+        there = np.isfinite(size[:, channel])
+        dead[channel] = np.median(share[:, channel][there]) < _DEAD
+        if observation.floor is not None:
+            over = (size[:, channel] / np.maximum(observation.floor, 1e-300))[there]
+            dead[channel] |= bool(np.median(over) < _NOISY)
+    return dead
+
+
+def shapeless_channels(rig: Rig, plate: FastPlate, observation: Observation) -> NDArray[np.bool_]:
+    """Which channels are faint and like no ERA: what sensors read is noise (e,)."""
+    model = plate.responses(rig)
+    share = np.abs(observation.values) / np.abs(model)
+    mac = likeness(rig, plate, observation.values).mac
+    found = np.zeros(len(rig.eras), dtype=bool)
+    for channel in np.flatnonzero(observation.measured):
+        faint = np.nanmedian(share[:, channel]) < _FAINT
+        found[channel] = faint and np.nanmax(np.nanmedian(mac[:, channel], axis=0)) < _NO_SHAPE
+    return found
+
+
+def usable_sensors(
+    observation: Observation, dead: NDArray[np.bool_]
+) -> tuple[Observation, tuple[tuple[str, str], ...]]:
+    """Without the sensors that read nothing, whichever live channel is driven."""
+    values = observation.values[:, ~dead]
+    if not np.isfinite(values).any():
+        return observation, ()
+    silent = silent_sensors(
+        Responses(observation.sensors, observation.points, observation.frequencies, values)
+    )
+    names = [name for name, out in zip(observation.sensors, silent, strict=True) if out]
+    return observation.without(silent), tuple((name, "reads nothing") for name in names)
+
+
+def check_enough(observation: Observation, bad: Sequence[tuple[str, str]]) -> None:
+    """Raise InputError where too little is left to tell ERAs apart; bad: what was left out."""
+    count, frequencies = len(observation.sensors), len(observation.frequencies)
+    if count < LEAST_SENSORS or frequencies < _LEAST_FREQUENCIES:
+        said = f" ({', '.join(name for name, _ in bad)} read nothing)" if bad else ""
+        raise InputError(
+            f"{count} usable sensors{said} at {frequencies} frequencies cannot tell ERAs apart; "
+            f"measure with {LEAST_SENSORS} at least, better eight, at {_LEAST_FREQUENCIES} "
+            "frequencies at least"
+        )
+
+
+def off_scale(
+    observation: Observation, values: ComplexArray, match: Match
+) -> list[tuple[str, str]]:
+    """Sensors that do not read what the rest of them say, and how much of it; if the rest agree."""
+    if match.usual_error > FITS:
+        return []
+    there = np.isfinite(values) & np.isfinite(match.predicted)
+    model = np.where(there, match.predicted, 0)
+    measured = np.where(there, values, 0)
+    turn = np.exp(-1j * np.angle((model.conj() * measured).sum(axis=2, keepdims=True)))
+    inner = (model.conj() * measured * turn).real.sum(axis=(0, 1))
+    scale = inner / np.maximum((np.abs(model) ** 2).sum(axis=(0, 1)), 1e-300)
+    scale = scale / np.median(scale)
+    low, high = _SENSOR_SCALE
+    return [
+        (name, f"reads {value:.2f} of what the others say")
+        for name, value in zip(observation.sensors, scale, strict=True)
+        if not low <= value <= high
+    ]

@@ -196,8 +196,8 @@ def ensemble_section(sets, seed):
         rows,
         notes=[
             "nine of ten plates have more: gains, phases, stiffness of each ERA within 10 %,",
-            "thickness within 2 %, damping half to twice, fingers that press on the plate. Patterns",
-            "as they are chosen for a plain ramp.",
+            "thickness within 2 %, damping half to twice, fingers that press on the plate.",
+            "Patterns as they are chosen for a plain ramp.",
         ],
     )
 

@@ -52,9 +52,15 @@ class Place:
             path.unlink()  # of a daemon that was killed
 
     def bound(self) -> socket.socket:
-        """A socket at the path that only this user may open; raises InputError."""
+        """A socket at the path that only this user may open, and a group whom its folder is for.
+
+        Raises InputError.
+        """
         bound = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_CLOEXEC)
-        before = os.umask(0o177)
+        # A folder for a group and nobody else, such as systemd makes with mode 0750, is meant so.
+        folder = self.path.parent.stat().st_mode
+        is_shared = folder & stat.S_IXGRP and not folder & stat.S_IRWXO
+        before = os.umask(0o117 if is_shared else 0o177)
         try:
             bound.bind(str(self.path))
         except OSError as error:

@@ -25,6 +25,16 @@ def test_the_socket_is_its_users_alone(tmp_path: Path) -> None:
         os.umask(before)
 
 
+@pytest.mark.parametrize(("folder", "socket"), [(0o750, 0o660), (0o755, 0o600), (0o710, 0o660)])
+def test_a_folder_that_is_a_groups(tmp_path: Path, folder: int, socket: int) -> None:
+    """Where the folder is for a group and nobody else, so is the socket; never for everybody."""
+    tmp_path.chmod(folder)
+    place = Place(tmp_path / "era.sock")
+    with place.bound():
+        assert place.path.stat().st_mode & 0o777 == socket
+    place.leave()
+
+
 def test_a_socket_that_a_killed_daemon_left_is_no_obstacle(tmp_path: Path) -> None:
     """The lock goes with its process; the file that stays says nothing."""
     path = tmp_path / "era.sock"

@@ -1,0 +1,1 @@
+"""What a machine needs to run the daemon as a service of the system."""

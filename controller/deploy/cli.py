@@ -1,0 +1,99 @@
+"""`era systemd`: the daemon as a service of the system."""
+
+import os
+import shutil
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from model.errors import InputError
+
+if TYPE_CHECKING:
+    from controller.deploy.needs import Needs
+
+app = typer.Typer()
+systemd_app = typer.Typer(no_args_is_help=True, help="Run the daemon as a service of the system.")
+app.add_typer(systemd_app, name="systemd")
+
+EXIT_STATUS: dict[type[BaseException], int] = {InputError: 2}
+
+
+@systemd_app.callback()
+def _only_commands() -> None:
+    """Run the daemon as a service of the system."""
+
+
+@systemd_app.command()
+def install(
+    config: Annotated[Path, typer.Argument(metavar="[CONFIG]", help="The daemon's file.")] = Path(
+        "/etc/era-haptics/daemon.yaml"
+    ),
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Print the files and write none.")
+    ] = False,
+    root: Annotated[
+        Path, typer.Option(help="Write below this folder, as for an image of a system.")
+    ] = Path("/"),
+) -> None:
+    """Write a hardened unit, its user and the rights to its devices, then say what to run.
+
+    What the unit allows follows from the daemon's file, where that is there.
+    """
+    from controller.deploy.files import NAME, service_files
+
+    config = config.absolute()
+    files = service_files(config, _era(), _needs(config))
+    if dry_run:
+        for file in files:
+            print(f"# ---- {file.path}\n{file.text}")
+        _print_next(NAME, config)
+        return
+    for file in files:
+        path = root / file.path.relative_to("/")
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(file.text, encoding="utf-8")
+        except OSError as error:
+            raise InputError(
+                f"{path}: cannot be written: {error.strerror}; run it with sudo, or with --dry-run "
+                "to see what it would write"
+            ) from error
+        print(f"Wrote {path}")
+    _print_next(NAME, config)
+
+
+def _needs(config: Path) -> "Needs":
+    """What a configuration needs; everything where there is none yet."""
+    from controller.deploy.needs import Needs, needs_of
+
+    if not config.exists():
+        print(
+            f"{config} is not there yet, so the unit allows every kind of device", file=sys.stderr
+        )
+        return Needs()
+    from controller.daemon.config import load_daemon_config
+
+    loaded = load_daemon_config(config)
+    return needs_of(loaded.urls.values(), [touch.url for touch in loaded.touch])
+
+
+def _era() -> Path:
+    """The installed command; one that lies in a home folder cannot be seen by the service."""
+    beside = Path(sys.executable).with_name("era")
+    found = beside if os.access(beside, os.X_OK) else Path(shutil.which("era") or "")
+    if not found.is_absolute():
+        raise InputError("the era command is not installed; pip install era-haptics")
+    return found
+
+
+def _print_next(name: str, config: Path) -> None:
+    print(
+        "Next, as root:\n"
+        f"  systemd-sysusers && usermod -aG {name} YOU   # who shall arm; log in again then\n"
+        "  udevadm control --reload && udevadm trigger\n"
+        f"  era daemon {config} --check\n"
+        f"  systemctl daemon-reload && systemctl enable --now {name}\n"
+        f"  systemctl status {name}"
+    )

@@ -226,7 +226,7 @@ async def test_each_token_is_applied_once_under_loss(far: FarSide) -> None:
 
     far.amplifier._commit = noted
     confirmed = []
-    async with Link(far, reply_timeout=0.02) as link:
+    async with Link(far, reply_timeout=0.03) as link:
         await link.amplifier.arm(2.0)
         far.station.befall(Episode("drop", share=0.2))
         for number in range(40):

@@ -9,11 +9,12 @@ from collections.abc import Callable, Sequence
 from typing import final
 
 import can
+import serial
 
 from drivers.backends.can_interfaces import open_bus, send_all, wake
 from drivers.backends.can_url import CanBusUrl
 from drivers.backends.stand_in import STAND_IN, Adapter
-from drivers.errors import LinkError
+from drivers.errors import LinkError, LinkTimeout
 from drivers.protocol.can_frame import CanFrame
 
 _READ_TIMEOUT = 0.05  # s; how long the reader of a bus that cannot be woken notices its end
@@ -70,10 +71,14 @@ class _ThreadedAdapter:
         self._thread.start()
 
     def send(self, frames: Sequence[CanFrame]) -> None:
-        """Send frames without another's in between; raises LinkError."""
+        """Send frames without another's in between; LinkTimeout where it is stuck, LinkError."""
         try:
             with self._sending:
                 send_all(self._bus, frames)
+        except serial.SerialTimeoutException as stuck:
+            raise LinkTimeout(
+                f"{self._url} takes no more frames; check the adapter and flow control"
+            ) from stuck
         except _TROUBLE as problem:
             what = self._what_was_lost(problem)
             self._loop.call_soon_threadsafe(self._lose, what)

@@ -127,6 +127,7 @@ class _Slcan(_TextBus, slcanBus):
         self._begin()
         self._reader = SlcanReader()
         self._is_ended = False
+        self._is_cut = False
         slcanBus.__init__(
             self,
             url.channel,
@@ -159,7 +160,10 @@ class _Slcan(_TextBus, slcanBus):
 
     def send_frames(self, frames: Sequence[CanFrame]) -> None:
         """Send all at once, without python-can's wait until the last byte is out."""
-        self.serialPortOrig.write(b"".join(map(slcan_line, frames)))
+        begin = b"\r" if self._is_cut else b""  # so that what was left half sent ends here
+        self._is_cut = True
+        self.serialPortOrig.write(begin + b"".join(map(slcan_line, frames)))
+        self._is_cut = False
 
     def _read_text(self, timeout: float | None) -> None:
         port = self.serialPortOrig

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import can
 import pytest
+import serial
 
 from drivers.amplifier import Amplifier
 from drivers.backends.can_amplifier import CanBackend
@@ -508,3 +509,24 @@ async def test_a_hundred_openings_leak_nothing(kind: str, coarse_rig: Rig) -> No
             lambda: all(now <= then for now, then in zip(counts(), before, strict=True))
         )
         assert counts()[1] == 0
+
+
+async def test_an_adapter_that_takes_no_more_for_a_moment_is_not_lost(
+    coarse_rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A write that times out half-way is a missing answer: it is asked again, and understood."""
+    async with far_side(Wire(kind="slcan"), coarse_rig) as far, opened(far.url) as amplifier:
+        await amplifier.arm(2.0)
+        port = amplifier._link.backend._wire._adapter._bus.serialPortOrig
+        write = port.write
+
+        def half(data: bytes) -> None:
+            write(data[: len(data) // 2])
+            monkeypatch.setattr(port, "write", write)
+            raise serial.SerialTimeoutException("Write timeout")
+
+        monkeypatch.setattr(port, "write", half)
+        safe = tones(amplifier, 0.3)
+        assert (await amplifier.apply(safe)).token == safe.token
+        assert amplifier.statistics.retries >= 1
+        assert not amplifier.lost

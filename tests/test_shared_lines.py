@@ -1,5 +1,6 @@
 """Several amplifiers on one wire: their own replies, and one commit for all."""
 
+import asyncio
 from collections.abc import AsyncIterator
 from dataclasses import replace
 
@@ -57,6 +58,15 @@ async def test_each_answers_for_itself(amplifiers: dict[str, Amplifier]) -> None
     await west.apply(tone(west, 0.4, 1))
     assert (await east.status()).levels[0] == pytest.approx(0.2)
     assert (await west.status()).levels[0] == pytest.approx(0.4)
+
+
+async def test_they_may_be_opened_at_once(far: FarSide) -> None:
+    """Who comes while another opens their wire waits for it, and each answers for itself."""
+    both = {name: Amplifier(open_backend(url), reply_timeout=1.0) for name, url in far.urls.items()}
+    await asyncio.gather(*(amplifier.open() for amplifier in both.values()))
+    for name, amplifier in both.items():
+        assert amplifier.identity.serial_number == f"SIM-{name}"
+        await amplifier.close()
 
 
 async def test_one_commit_is_played_by_all_at_one_moment(

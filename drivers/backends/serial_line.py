@@ -26,6 +26,7 @@ class SerialLine:
         self._users: dict[int, tuple[Callable[[Frame], None], Callable[[str], None]]] = {}
         self._loss: str | None = None
         self._port: Port | None = None
+        self._opening = asyncio.Lock()
 
     @property
     def baud(self) -> int:
@@ -60,12 +61,12 @@ class SerialLine:
                 "give every amplifier an address of its own"
             )
         self._users[address] = (on_frame, on_loss)
-        if len(self._users) > 1:
-            return
         try:
-            await self._open()
+            async with self._opening:  # who comes meanwhile waits for the port, too
+                if self._port is None:
+                    await self._open()
         except BaseException:
-            self._users.clear()
+            del self._users[address]
             raise
 
     async def leave(self, address: int) -> None:

@@ -26,6 +26,7 @@ HEADERS = {
         "connect-src 'self'; manifest-src 'self'; base-uri 'none'; form-action 'none'; "
         "frame-ancestors 'none'"
     ),
+    "Cache-Control": "no-cache",
     "Cross-Origin-Opener-Policy": "same-origin",
     "Cross-Origin-Resource-Policy": "same-origin",
     "Permissions-Policy": "camera=(), geolocation=(), microphone=()",
@@ -51,9 +52,6 @@ class Access:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Check a request or WebSocket, then hand it on."""
-        if scope["type"] == "lifespan":
-            await self._app(scope, receive, send)
-            return
         refusal = self._refusal(scope)
         if refusal is None:
             await self._app(scope, receive, _with_headers(send))
@@ -72,9 +70,9 @@ class Access:
         origins = headers.getlist("origin")
         if origins and not self._is_allowed_origin(origins, hosts[0]):
             return 403, "pages of this origin may not use the gateway; see --allow-origin"
-        if headers.get("sec-fetch-site") == "cross-site" and not origins:
+        if headers.get("sec-fetch-site") == "cross-site" and not (origins or _is_visit(headers)):
             return 403, "pages of others may not use the gateway"
-        if not _needs_token(scope["path"]):
+        if not _needs_token(scope["path"]) or scope.get("method") == "OPTIONS":  # does nothing
             return None
         if not self._has_token(headers):
             return 401, "the token is missing or another; open the URL that the gateway printed"
@@ -111,6 +109,11 @@ class Access:
         return len(said) == 1 and hmac.compare_digest(
             said[0].encode(), self._settings.token.encode()
         )
+
+
+def _is_visit(headers: Headers) -> bool:
+    """Whether somebody has followed a link to the page."""
+    return headers.get("sec-fetch-mode") == "navigate"
 
 
 def _needs_token(path: str) -> bool:

@@ -1,29 +1,28 @@
 """The gateway's routes: the page, the API over HTTP, and the WebSocket."""
 
-import asyncio
-import contextlib
 import json
 import time
-from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
 
 from starlette.applications import Starlette
 from starlette.exceptions import HTTPException
 from starlette.middleware import Middleware
-from starlette.requests import Request
+from starlette.middleware.cors import CORSMiddleware
+from starlette.requests import ClientDisconnect, Request
 from starlette.responses import JSONResponse, Response
 from starlette.routing import Mount, Route, WebSocketRoute
 from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocket
 
-from controller.api.jsonrpc import ErrorCode, RpcError
-from controller.api.messages import METHODS
+from controller.api.jsonrpc import ErrorCode, RpcError, read_params
+from controller.api.jsonrpc import Request as RpcRequest
+from controller.api.messages import METHODS, TouchParams
 from controller.gateway.access import LARGEST_BODY, SUBPROTOCOL, Access
 from controller.gateway.openapi import NOT_OVER_HTTP, STATUS_OF, openapi
 from controller.gateway.picture import Picture
 from controller.gateway.rate import Rate
-from controller.gateway.session import GOING_AWAY, TRY_AGAIN_LATER, Session
+from controller.gateway.session import TRY_AGAIN_LATER, Session, told_apart
 from controller.gateway.settings import Settings
 
 MOST_SESSIONS = 32
@@ -42,27 +41,31 @@ class Gateway:
         self._description = json.dumps(openapi()).encode()
         self.app = Starlette(
             routes=[
-                Route("/api/v1/openapi.json", self._describe),
-                Route("/api/v1/{method}", self._call, methods=["POST"]),
-                WebSocketRoute("/api/v1/ws", self._serve),
+                Mount(
+                    "/api/v1",
+                    routes=[
+                        Route("/openapi.json", self._describe),
+                        Route("/{method}", self._call, methods=["POST"]),
+                        WebSocketRoute("/ws", self._serve),
+                    ],
+                ),
                 Mount("/", StaticFiles(directory=_PAGE, html=True)),
             ],
-            middleware=[Middleware(Access, settings=settings)],
+            middleware=[
+                Middleware(Access, settings=settings),
+                Middleware(
+                    CORSMiddleware,
+                    allow_origins=settings.origins,
+                    allow_methods=["POST"],
+                    allow_headers=["Authorization", "Content-Type"],
+                ),
+            ],
             exception_handlers={HTTPException: _refused},
-            lifespan=self._live,
         )
 
-    @contextlib.asynccontextmanager
-    async def _live(self, _: Starlette) -> AsyncIterator[None]:
-        """Reach for the daemon while the gateway runs."""
-        running = asyncio.create_task(self._picture.run())
-        try:
-            yield
-        finally:
-            for session in list(self._sessions):
-                await session.close(GOING_AWAY, "the gateway ends")
-            running.cancel()
-            await asyncio.gather(running, return_exceptions=True)
+    async def follow(self) -> None:
+        """Reach for the daemon, and follow what it tells, until cancelled."""
+        await self._picture.run()
 
     def _tell(self, topic: str, frame: str | bytes) -> None:
         for session in self._sessions:
@@ -85,11 +88,16 @@ class Gateway:
             params = await _body(request)
             if method != "stop" and not self._rate.take():
                 raise RpcError(ErrorCode.BUSY, "too many requests", remedy="ask less often")
-            if method == "touch" and isinstance(params.get("source"), str):
-                params["source"] = f"http:{params['source']}"[:80]
-            return JSONResponse(await self._picture.daemon.call(method, params))
+            asked = read_params(
+                METHODS[method].params, RpcRequest(method, params, None, wants_answer=True)
+            )
+            if isinstance(asked, TouchParams):
+                asked = told_apart(asked, "http")
+            return JSONResponse(await self._picture.daemon.call(method, asked))
         except RpcError as error:
             return _failed(STATUS_OF[error.code], error)
+        except ClientDisconnect:
+            return Response(status_code=400)  # which nobody will read
 
     async def _serve(self, socket: WebSocket) -> None:
         """One browser."""

@@ -72,9 +72,8 @@ def gateway(
 
     def announce(port: int) -> None:
         scheme = "https" if settings.is_encrypted else "http"
-        shown = f"[{host}]" if ":" in host else host
         token = "" if settings.chose_token else f"#token={settings.token}"
-        print(f"dashboard: {scheme}://{shown}:{port}/{token}", flush=True)
+        print(f"dashboard: {scheme}://{settings.shown_host}:{port}/{token}", flush=True)
 
     asyncio.run(serve(settings, announce=announce))
 

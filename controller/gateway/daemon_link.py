@@ -2,20 +2,25 @@
 
 import asyncio
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from pydantic import ValidationError
+
 from controller.api.async_client import AsyncClient
 from controller.api.events import TOPICS
-from controller.api.jsonrpc import ErrorCode, Request, RpcError, read_params
+from controller.api.jsonrpc import ErrorCode, RpcError
 from controller.api.messages import METHODS, HelloResult
+from controller.api.parts import Message
 from controller.api.replies import Notification, Unreachable
 from drivers.supervision import pauses
 
 _FIRST_PAUSE, _LONGEST_PAUSE = 0.1, 2.0  # s; between attempts to reach the daemon
 _RATE = 10.0  # Hz; of amplifiers and latency
 _NAME = "gateway"
+_FOREIGN = "the daemon's answer cannot be understood"
+_UPDATE = "update the older of daemon and gateway, then start both anew"
 
 _logger = logging.getLogger(__name__)
 
@@ -38,13 +43,15 @@ class DaemonLink:
         self._on_hello = on_hello
         self._on_event = on_event
         self._client: AsyncClient | None = None
+        self._hello: HelloResult | None = None
 
     async def run(self) -> None:
         """Connect, listen, and connect again after a loss, until cancelled."""
         while True:
             client = await self._connect()
             try:
-                self._on_hello(await client.hello(_NAME))
+                self._hello = await client.hello(_NAME)
+                self._on_hello(self._hello)
                 self._client = client
                 await client.subscribe(*TOPICS, rate_hz=_RATE)
                 async for told in client.events():
@@ -52,31 +59,30 @@ class DaemonLink:
                 _logger.warning("the daemon has hung up")
             except (RpcError, Unreachable) as error:
                 _logger.warning("the daemon was lost: %s", error)
+            except ValidationError:
+                _logger.warning("%s; %s", _FOREIGN, _UPDATE)
+                await asyncio.sleep(_LONGEST_PAUSE)
             finally:
-                self._client = None
+                self._client = self._hello = None
                 self._on_hello(None)
                 await client.close()
 
-    async def call(self, method: str, params: Mapping[str, Any]) -> dict[str, Any]:
+    async def call(self, method: str, params: Message) -> dict[str, Any]:
         """Ask the daemon; its result as JSON. Raises RpcError, its own or that it is not there."""
-        known = METHODS.get(method)
-        if known is None:
-            raise RpcError(
-                ErrorCode.UNKNOWN_METHOD,
-                f"there is no method {method[:40]!a}",
-                remedy=f"known are {', '.join(METHODS)}",
-            )
-        asked = read_params(known.params, Request(method, dict(params), None, wants_answer=True))
-        if self._client is None:
+        if self._client is None or self._hello is None:
             raise RpcError(
                 ErrorCode.LINK,
                 "the daemon does not answer",
                 remedy="see whether `era daemon` runs; the gateway connects by itself then",
             )
+        if method == "hello":  # or anybody could give the gateway another name in the daemon's log
+            return self._hello.model_dump(mode="json")
         try:
-            result = await self._client.call(method, asked, known.result)
+            result = await self._client.call(method, params, METHODS[method].result)
         except Unreachable as error:
             raise RpcError(ErrorCode.LINK, str(error)) from error
+        except ValidationError as error:
+            raise RpcError(ErrorCode.INTERNAL, _FOREIGN, remedy=_UPDATE) from error
         return result.model_dump(mode="json")
 
     async def _connect(self) -> AsyncClient:
@@ -84,6 +90,6 @@ class DaemonLink:
         for pause in pauses(first=_FIRST_PAUSE, longest=_LONGEST_PAUSE):
             try:
                 return await AsyncClient.connect(self._socket, name=_NAME)
-            except (RpcError, Unreachable):
+            except (RpcError, Unreachable, ValidationError):
                 await asyncio.sleep(pause)
         raise AssertionError("pauses have no end")

@@ -1,9 +1,12 @@
 """What all browsers are shown: the daemon's state as it was last told, and the plate's field."""
 
 import asyncio
+import contextlib
 import json
 import logging
+import threading
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -80,7 +83,7 @@ class Picture:
             await self._wanted.wait()
             self._wanted.clear()
             try:
-                frame = await asyncio.to_thread(self._field, self._rig_text, dict(self._drive))
+                frame = await _beside(partial(self._field, self._rig_text, dict(self._drive)))
             except InputError as error:
                 _logger.warning("the plate cannot be drawn: %s", error)
                 frame = _NO_FIELD
@@ -94,6 +97,32 @@ class Picture:
         if self._drawn is None or self._drawn[0] != rig_text:
             self._drawn = rig_text, FieldMaker(parse_rig("the daemon's rig", rig_text))
         return self._drawn[1].field(drive).encoded()
+
+
+async def _beside(work: Callable[[], bytes]) -> bytes:
+    """Do work in a thread that the process does not wait for at its end, unlike a pool's."""
+    loop = asyncio.get_running_loop()
+    done: asyncio.Future[bytes] = loop.create_future()
+
+    def settle(result: bytes, error: Exception | None) -> None:
+        if done.cancelled():
+            return
+        if error is None:
+            done.set_result(result)
+        else:
+            done.set_exception(error)
+
+    def run() -> None:
+        result, failure = b"", None
+        try:
+            result = work()
+        except Exception as error:
+            failure = error
+        with contextlib.suppress(RuntimeError):  # the loop may be over
+            loop.call_soon_threadsafe(settle, result, failure)
+
+    threading.Thread(target=run, name="the plate's field", daemon=True).start()
+    return await done
 
 
 def _event_frame(topic: str, data: Mapping[str, Any] | None, **when: float) -> str:

@@ -1,67 +1,24 @@
-"""The gateway as a process: uvicorn, with bounds on what has not asked for anything yet."""
+"""The gateway as a process: uvicorn, from a socket to its end within a second."""
 
 import asyncio
 import contextlib
 import resource
 import signal
 import socket
+import ssl
 from collections.abc import AsyncIterator, Callable
 from typing import Any
 
-import h11
 import uvicorn
-from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from controller.gateway.app import Gateway
+from controller.gateway.connections import HttpConnection, WebSocketConnection
 from controller.gateway.settings import Settings
 from model.errors import InputError
 
-MOST_WAITING = 128  # connections that have not sent a whole request yet
-FIRST_REQUEST = 5.0  # s; a connection without a request by then is closed
 _MOST_CONCURRENT = 256  # requests and connections; beyond it 503
 _LARGEST_MESSAGE = 1 << 16
-_ENDING = 1.0  # s; for connections to end by themselves
-
-
-class _Patient(H11Protocol):
-    """HTTP, as uvicorn speaks it, for connections that come to ask something.
-
-    Whoever connects and says nothing holds a place for five seconds at most, or until 128 others
-    have come after; so two thousand silent connections do not keep a browser out.
-    """
-
-    _waiting: dict["_Patient", asyncio.TimerHandle] = {}  # noqa: RUF012 (of all connections)
-
-    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """Let it in, if need be in place of the one that has waited longest."""
-        super().connection_made(transport)
-        while len(self._waiting) >= MOST_WAITING:
-            oldest = next(iter(self._waiting))
-            oldest.heard()
-            oldest.transport.abort()
-        self._waiting[self] = self.loop.call_later(FIRST_REQUEST, transport.abort)
-
-    def handle_events(self) -> None:
-        """Note that it has asked, once its first request is whole."""
-        super().handle_events()
-        if self.cycle is not None:
-            self.heard()
-
-    def handle_websocket_upgrade(self, event: h11.Request) -> None:
-        """A WebSocket takes the connection over."""
-        self.heard()
-        super().handle_websocket_upgrade(event)
-
-    def connection_lost(self, exc: Exception | None) -> None:
-        """Free its place."""
-        self.heard()
-        super().connection_lost(exc)
-
-    def heard(self) -> None:
-        """It does not wait any longer."""
-        timer = self._waiting.pop(self, None)
-        if timer is not None:
-            timer.cancel()
+_ENDING = 0.3  # s; for connections to end by themselves
 
 
 class _Server(uvicorn.Server):
@@ -77,27 +34,39 @@ class _Server(uvicorn.Server):
         if sockets and self.started:
             self._announce(sockets[0].getsockname()[1])
 
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        """End; who does not read or never ends what it says is not waited for."""
+        asyncio.get_running_loop().call_later(_ENDING, self._abort)
+        await super().shutdown(sockets)
+
     @contextlib.contextmanager
     def capture_signals(self) -> Any:
         """Not here."""
         yield
 
+    def _abort(self) -> None:
+        for connection in list(self.server_state.connections):
+            connection.transport.abort()
+
 
 async def serve(settings: Settings, *, announce: Callable[[int], None]) -> None:
     """Serve until SIGINT or SIGTERM; announce is told the port. Raises InputError."""
     _allow_many_descriptors()
+    _check_certificate(settings)
+    gateway = Gateway(settings)
     listening = _listen(settings)
     config = uvicorn.Config(
-        Gateway(settings).app,
-        http=_Patient,
-        ws="websockets-sansio",
+        gateway.app,
+        http=HttpConnection,
+        ws=WebSocketConnection,
         ws_max_size=_LARGEST_MESSAGE,
         ws_ping_interval=10.0,
         ws_ping_timeout=10.0,
         ws_per_message_deflate=False,  # no bombs, and nothing to win over loopback
         limit_concurrency=_MOST_CONCURRENT,
-        timeout_graceful_shutdown=int(_ENDING),
-        log_level="warning",
+        timeout_graceful_shutdown=1,
+        lifespan="off",
+        log_level="error",  # its warnings are of what others send, as often as they like
         access_log=False,
         server_header=False,
         proxy_headers=False,  # whoever calls could write into them what it likes
@@ -105,8 +74,34 @@ async def serve(settings: Settings, *, announce: Callable[[int], None]) -> None:
         ssl_keyfile=settings.key,
     )
     server = _Server(config, announce=announce)
-    async with _ending(server):
-        await server.serve(sockets=[listening])
+    following = asyncio.create_task(gateway.follow())
+    # Without it the page would show for ever what was so last.
+    following.add_done_callback(lambda _: setattr(server, "should_exit", True))
+    try:
+        async with _ending(server):
+            await server.serve(sockets=[listening])
+    finally:
+        following.cancel()
+        await asyncio.wait({following})
+    if not following.cancelled():
+        following.result()
+
+
+def _check_certificate(settings: Settings) -> None:
+    """Whether certificate and key are some, and belong together; raises InputError."""
+    if settings.certificate is None:
+        return
+    try:
+        ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER).load_cert_chain(
+            *(settings.certificate, settings.key),
+            password="",  # of a key that has one; nobody shall be asked for it at a start
+        )
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "reason", None) or getattr(error, "strerror", None) or error
+        raise InputError(
+            f"{settings.certificate} and {settings.key} cannot be used for TLS ({reason}): give a "
+            "certificate chain and the key that belongs to it, PEM both, the key without password"
+        ) from error
 
 
 def _listen(settings: Settings) -> socket.socket:

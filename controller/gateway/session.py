@@ -3,14 +3,14 @@
 import asyncio
 import itertools
 import json
+import logging
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any, Protocol
 
-from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
+from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from controller.api.jsonrpc import (
-    LONGEST_LINE,
     ErrorCode,
     Request,
     RpcError,
@@ -19,6 +19,7 @@ from controller.api.jsonrpc import (
     read_request,
 )
 from controller.api.messages import METHODS, SubscribeParams, TouchParams, UnsubscribeParams
+from controller.api.parts import Message
 from controller.gateway.outbox import Outbox
 from controller.gateway.rate import Rate
 from controller.gateway.topics import OWN
@@ -27,19 +28,20 @@ REQUESTS_PER_SECOND = 200.0  # touches and stop are not counted
 MOST_PENDING = 16
 MOST_STOPPING = 4
 MOST_TOUCH_SOURCES = 4  # of one session: a page has one
+_LONGEST_NAME = 80  # characters; as the API has it
 SEND_PATIENCE = 5.0  # s; for one frame to a reader that does not read
 
-TRY_AGAIN_LATER = 1013  # close codes of RFC 6455 and its registry
-TOO_BIG, GOING_AWAY, POLICY_VIOLATION = 1009, 1001, 1008
+TRY_AGAIN_LATER, UNSUPPORTED_DATA = 1013, 1003  # close codes of RFC 6455 and its registry
 
 _EVERY_ONE: frozenset[str] = frozenset({"state", "log", "link"})  # of the others only the newest
 _numbers = itertools.count(1)
+_logger = logging.getLogger(__name__)
 
 
 class Daemon(Protocol):
     """What a session needs of the way to the daemon."""
 
-    async def call(self, method: str, params: Mapping[str, Any]) -> dict[str, Any]:
+    async def call(self, method: str, params: Message) -> dict[str, Any]:
         """Ask the daemon; raises RpcError."""
 
 
@@ -77,15 +79,13 @@ class Session:
         try:
             await asyncio.wait({sending, receiving}, return_when=asyncio.FIRST_COMPLETED)
         finally:
-            for task in (sending, receiving, *self._pending):
+            tasks = (sending, receiving, *self._pending)
+            for task in tasks:
                 task.cancel()
-            await asyncio.gather(sending, receiving, *self._pending, return_exceptions=True)
+            for ended in await asyncio.gather(*tasks, return_exceptions=True):
+                if isinstance(ended, Exception):
+                    _logger.error("a session has failed", exc_info=ended)
             await self._lift()
-
-    async def close(self, code: int, reason: str) -> None:
-        """Leave it."""
-        if self._socket.application_state is WebSocketState.CONNECTED:
-            await self._socket.close(code, reason)
 
     def tell(self, topic: str, frame: str | bytes) -> None:
         """What happened, if it wants to know."""
@@ -99,14 +99,13 @@ class Session:
     async def _receive(self) -> None:
         """Take what it sends, until it leaves."""
         while True:
-            try:
-                text = await self._socket.receive_text()
-            except (WebSocketDisconnect, KeyError):  # a binary frame has no text
+            said = await self._socket.receive()
+            if said["type"] == "websocket.disconnect":
                 return
-            if len(text) > LONGEST_LINE:
-                await self.close(TOO_BIG, f"a message has at most {LONGEST_LINE} characters")
+            if said.get("text") is None:
+                await self._socket.close(UNSUPPORTED_DATA, "send text frames")
                 return
-            self._take(text)
+            self._take(said["text"])
 
     def _take(self, text: str) -> None:
         """Begin what was asked for, or say why not."""
@@ -141,11 +140,12 @@ class Session:
         """Keep the newest frame of a source; one at a time is told to the daemon."""
         params = read_params(TouchParams, request)
         assert isinstance(params, TouchParams)  # noqa: S101 (read_params gives what it is given)
-        source = f"{self.name}:{params.source}"[:80]
+        params = told_apart(params, self.name)
+        source = params.source
         known = self._touches.keys() | self._touching
         if source not in known and len(known) >= MOST_TOUCH_SOURCES:
             raise RpcError(ErrorCode.BUSY, "too many touch sources", remedy="use one or two")
-        self._touches[source] = params.model_copy(update={"source": source})
+        self._touches[source] = params
         self._answer(request, {})
         if self._told is None or self._told.done():
             self._told = asyncio.create_task(self._tell_touches())
@@ -162,7 +162,7 @@ class Session:
             else:
                 self._touching.discard(source)
             try:
-                await self._daemon.call("touch", params.model_dump())
+                await self._daemon.call("touch", params)
             except RpcError as error:
                 self.outbox.state("touch-error", error_line(None, error).decode())
 
@@ -170,21 +170,25 @@ class Session:
         """Lift its fingers; where the daemon does not hear it they are lifted after 150 ms."""
         for source in self._touching:
             try:
-                await self._daemon.call("touch", {"source": source, "touches": []})
+                await self._daemon.call("touch", TouchParams(source=source, touches=[]))
             except RpcError:
                 return
 
     def _ask(self, request: Request) -> None:
         """Pass a request on; a stop always."""
-        if request.method not in METHODS:
+        method = METHODS.get(request.method)
+        if method is None:
             raise RpcError(
                 ErrorCode.UNKNOWN_METHOD,
                 f"there is no method {request.method!a}",
                 remedy=f"known are {', '.join(METHODS)}",
             )
+        params = read_params(method.params, request)
         if request.method == "stop":
             if self._stopping >= MOST_STOPPING:
-                return  # several are on their way already; none of them waits for anything
+                raise RpcError(
+                    ErrorCode.BUSY, "stops are under way already", remedy="wait for their answers"
+                )
             self._stopping += 1
         else:
             if not self._rate.take():
@@ -193,13 +197,13 @@ class Session:
                 raise RpcError(
                     ErrorCode.BUSY, "too many requests under way", remedy="wait for answers"
                 )
-        task = asyncio.create_task(self._pass_on(request))
+        task = asyncio.create_task(self._pass_on(request, params))
         self._pending.add(task)
         task.add_done_callback(self._pending.discard)
 
-    async def _pass_on(self, request: Request) -> None:
+    async def _pass_on(self, request: Request, params: Message) -> None:
         try:
-            result = await self._daemon.call(request.method, request.params)
+            result = await self._daemon.call(request.method, params)
         except RpcError as error:
             if request.wants_answer:
                 self.outbox.answer(error_line(request.id, error).decode())
@@ -225,6 +229,11 @@ class Session:
                         await self._socket.send_bytes(frame)
         except (TimeoutError, OverflowError, WebSocketDisconnect, RuntimeError):
             return
+
+
+def told_apart(params: TouchParams, who: str) -> TouchParams:
+    """Touches with whose they are in the name of their source: all go over one connection."""
+    return params.model_copy(update={"source": f"{who}:{params.source}"[:_LONGEST_NAME]})
 
 
 def _topics(request: Request, model: type[SubscribeParams | UnsubscribeParams]) -> set[str]:

@@ -1,8 +1,10 @@
 """Where the gateway listens and whom it lets in; what would be unsafe is refused here."""
 
 import ipaddress
+import os
 import re
 import secrets
+import stat
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -12,7 +14,9 @@ DEFAULT_HOST = "127.0.0.1"
 DEFAULT_PORT = 8137
 
 _TOKEN = re.compile(r"[A-Za-z0-9_-]{22,128}")  # also fits a URL and a WebSocket subprotocol
+_HOST_NAME = re.compile(r"[A-Za-z0-9._-]{1,253}|\[[0-9A-Fa-f:.]{2,45}\]")
 _LOOPBACK_NAMES = ("localhost", "127.0.0.1", "[::1]")
+_LARGEST_TOKEN_FILE = 4096  # bytes
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,6 +70,12 @@ class Settings:
                 f"the gateway listens on {self.host}, beyond this machine: say with --allow-host "
                 "by which name or address browsers call it, for all others are refused"
             )
+        for name in self.names:
+            if not _HOST_NAME.fullmatch(name):
+                raise InputError(
+                    f"{name!r} is no host name: give one without port and without *, such as "
+                    "panel.local, 192.0.2.7 or [2001:db8::7]"
+                )
         for origin in self.origins:
             if not re.fullmatch(r"https?://[^/\s]+", origin):
                 raise InputError(
@@ -80,18 +90,30 @@ class Settings:
     @property
     def allowed_names(self) -> frozenset[str]:
         """Host names, without port and in lower case, by which it may be called."""
-        return frozenset(name.lower() for name in (*_LOOPBACK_NAMES, *self.names))
+        own = () if ipaddress.ip_address(self.host).is_unspecified else (self.shown_host,)
+        return frozenset(name.lower() for name in (*_LOOPBACK_NAMES, *own, *self.names))
+
+    @property
+    def shown_host(self) -> str:
+        """The host as it stands in a URL that can be opened."""
+        if ipaddress.ip_address(self.host).is_unspecified:
+            return self.names[0]
+        return f"[{self.host}]" if ":" in self.host else self.host
 
 
 def read_token(path: Path) -> str:
     """The token in a file that nobody else may read; raises InputError."""
     try:
-        mode = path.stat().st_mode
-        text = path.read_text(encoding="ascii").strip()
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}: not a text file, so no token") from error
+        # Not to hang where it is a pipe.
+        with open(path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK)) as f:
+            about = os.fstat(f.fileno())
+            said = f.read(_LARGEST_TOKEN_FILE) if stat.S_ISREG(about.st_mode) else b""
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror}") from error
-    if mode & 0o077:
+    if not stat.S_ISREG(about.st_mode) or not said.isascii():
+        raise InputError(f"{path}: not a text file, so no token")
+    if about.st_mode & 0o077:
         raise InputError(f"{path}: others may read this token; forbid it with chmod 600 {path}")
-    return text
+    if about.st_uid not in (0, os.geteuid()):
+        raise InputError(f"{path}: belongs to somebody else, who can read this token; use your own")
+    return said.decode().strip()

@@ -1,0 +1,429 @@
+"""The gateway as a process before a scripted or a real daemon, and clients that say what they like.
+
+Everything here blocks: a test is one thread, the scripted daemon another, the gateway a process.
+"""
+
+import asyncio
+import contextlib
+import json
+import os
+import socket
+import ssl
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from controller.api.client import Client
+from controller.api.connection import Connection
+from controller.api.events import StateEvent
+from controller.api.hub import Hub
+from controller.api.jsonrpc import ErrorCode, RpcError
+from controller.api.messages import (
+    METHODS,
+    ArmResult,
+    EffectsResult,
+    HelloResult,
+    RenewResult,
+    SubscribeParams,
+)
+from controller.api.parts import (
+    API_VERSION,
+    EffectDescription,
+    EraPlace,
+    Message,
+    Nothing,
+    RigSummary,
+    TableSummary,
+    Topic,
+)
+from controller.api.server import ApiServer
+from daemon_bench import PATIENCE, daemon_table, write_daemon
+from model.rig_file import parse_rig
+from model.table_file import save_table
+from rig_files import write_rig
+
+ERA = Path(sys.executable).with_name("era")
+TOKEN = "a-token-of-these-tests-only"
+
+
+class ScriptedDaemon:
+    """The daemon's API over a thread of its own, whose methods only note that they were asked."""
+
+    def __init__(self, folder: Path) -> None:
+        self.socket = folder / "era.sock"
+        self.asked: list[tuple[str, Message]] = []
+        self._rig_text = write_rig(folder / "rig.yaml").read_text(encoding="utf-8")
+        self._loop = asyncio.new_event_loop()
+        self._serving = threading.Event()
+        self._over = asyncio.Event()
+        self._answers = asyncio.Event()
+        self._answers.set()
+        self._thread = threading.Thread(target=self._loop.run_until_complete, args=(self._serve(),))
+
+    def __enter__(self) -> "ScriptedDaemon":
+        self._thread.start()
+        assert self._serving.wait(PATIENCE)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._loop.call_soon_threadsafe(self._over.set)
+        self._thread.join()
+        self._loop.close()
+        self.socket.unlink()
+
+    def publish(self, topic: Topic, event: Message) -> None:
+        """Tell whoever has subscribed."""
+        self._loop.call_soon_threadsafe(self._hub.publish, topic, lambda: event)
+
+    def hold(self, *, is_held: bool) -> None:
+        """Whether `arm` gets no answer for now."""
+        change = self._answers.clear if is_held else self._answers.set
+        self._loop.call_soon_threadsafe(change)
+
+    @property
+    def methods(self) -> list[str]:
+        """What was asked, without parameters."""
+        return [method for method, _ in self.asked]
+
+    async def _serve(self) -> None:
+        self._hub = Hub({"state": _ready}, clock=time.monotonic)
+        server = ApiServer(
+            {name: self._handler(name) for name in METHODS},
+            left=self._hub.forget,
+            keeps=self._hub.is_told,
+        )
+        bound = socket.socket(socket.AF_UNIX)
+        bound.bind(str(self.socket))
+        await server.open(bound)
+        self._serving.set()
+        await self._over.wait()
+        self._answers.set()
+        self._hub.close()
+        await server.close()
+
+    def _handler(self, name: str) -> Callable[[Connection, Message], object]:
+        def handle(client: Connection, params: Message) -> object:
+            if name == "subscribe" and isinstance(params, SubscribeParams):
+                self._hub.subscribe(client, params.topics)
+            if name not in ("hello", "subscribe"):  # those are the gateway's own
+                self.asked.append((name, params))
+            return self._arm() if name == "arm" else self._answer(name)
+
+        return handle
+
+    async def _arm(self) -> Message:
+        await self._answers.wait()
+        return ArmResult(lease="a-lease", lease_s=5.0)
+
+    def _answer(self, name: str) -> Message:
+        match name:
+            case "hello":
+                return self._hello()
+            case "renew":
+                return RenewResult(lease_s=5.0)
+            case "effects":
+                tap = EffectDescription(name="tap", kind="click", description="", parameters={})
+                return EffectsResult(effects=[tap])
+            case "play":
+                raise RpcError(ErrorCode.REFUSED, "there is no such effect", remedy="see effects")
+            case "status":
+                raise RpcError(ErrorCode.WRONG_STATE, "it is only a script")
+            case _:
+                return Nothing()
+
+    def _hello(self) -> HelloResult:
+        rig = parse_rig("rig.yaml", self._rig_text)
+        return HelloResult(
+            api_version=API_VERSION,
+            software_version="1",
+            rig=RigSummary(
+                length_m=rig.plate.length,
+                width_m=rig.plate.width,
+                eras=[
+                    EraPlace(name=era.name, x_m=era.x, y_m=era.y, amplifier="main", channel=number)
+                    for number, era in enumerate(rig.eras)
+                ],
+                simulated=True,
+                frequency_hz=[rig.limits.frequency_min, rig.limits.frequency_max],
+            ),
+            table=TableSummary(
+                fingerprint="0", mode="switched", frequencies_hz=[110.0], cells_x=4, cells_y=3
+            ),
+            rig_text=self._rig_text,
+            layout=None,
+        )
+
+
+def _ready() -> StateEvent:
+    return StateEvent(
+        old="READY_TO_SWITCH_ON", new="READY_TO_SWITCH_ON", cause="it is a script", remedy=None
+    )
+
+
+@dataclass
+class GatewayProcess:
+    """A gateway that serves."""
+
+    process: "subprocess.Popen[str]"
+    url: str
+    errors: Path
+    token: str
+    context: ssl.SSLContext | None = field(default=None, repr=False)
+
+    @property
+    def host(self) -> str:
+        """Host and port, as in a Host header."""
+        return self.url.partition("://")[2].partition("/")[0]
+
+    @property
+    def port(self) -> int:
+        """Where it listens."""
+        return int(self.host.rpartition(":")[2])
+
+    def connect(self) -> socket.socket:
+        """A TCP connection, or a TLS one."""
+        name = self.host.rpartition(":")[0].strip("[]")
+        plain = socket.create_connection((name, self.port), timeout=PATIENCE)
+        return plain if self.context is None else self.context.wrap_socket(plain)
+
+    def said(self) -> str:
+        """What it has written to standard error."""
+        return self.errors.read_text(encoding="utf-8")
+
+    def end(self) -> int:
+        """Tell it to end; its exit status."""
+        self.process.terminate()
+        return self.process.wait(PATIENCE)
+
+
+@contextmanager
+def gateway_process(
+    folder: Path, daemon: Path, *options: str, token: str | None = TOKEN
+) -> Iterator[GatewayProcess]:
+    """`era gateway` on a free port of the loopback; token: None for one of its own."""
+    if token is not None:
+        file = folder / "token"
+        file.write_text(token, encoding="ascii")
+        file.chmod(0o600)
+        options = (*options, "--token-file", str(file))
+    if "--listen" not in options:
+        options = (*options, "--listen", "127.0.0.1:0")
+    errors = folder / "gateway.log"
+    with (
+        errors.open("w", encoding="utf-8") as stderr,
+        subprocess.Popen(
+            [ERA, "gateway", "--socket", str(daemon), *options],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=stderr,
+            text=True,
+        ) as process,
+    ):
+        try:
+            assert process.stdout is not None
+            line = process.stdout.readline()
+            assert line.startswith("dashboard: "), errors.read_text()
+            url, _, own = line.removeprefix("dashboard: ").strip().partition("#token=")
+            yield GatewayProcess(process, url, errors, token or own)
+        finally:
+            process.kill()
+
+
+def wait_for_daemon(gateway: GatewayProcess) -> None:
+    """Wait until the gateway has found its daemon."""
+    wait_for(lambda: http(gateway, "/api/v1/hello", body=b'{"client": "test"}').status == 200)
+
+
+@contextmanager
+def real_daemon(folder: Path, more: str = "") -> Iterator[Path]:
+    """`era daemon` over a simulated amplifier, its socket; more: further lines of its file."""
+    save_table(daemon_table(), folder / "table.npz")
+    config = write_daemon(folder, {}, f"table: table.npz\n{more}")
+    made = folder / "era.sock"
+    with (
+        (folder / "daemon.log").open("a", encoding="utf-8") as log,
+        subprocess.Popen(
+            [ERA, "daemon", str(config)],
+            stdin=subprocess.DEVNULL,
+            stdout=log,
+            stderr=log,
+            env={**os.environ},
+        ) as process,
+    ):
+        try:
+            wait_for(lambda: made.is_socket() or process.poll() is not None)
+            assert process.poll() is None, (folder / "daemon.log").read_text()
+            yield made
+        finally:
+            process.terminate()
+            try:
+                process.wait(PATIENCE)
+            except subprocess.TimeoutExpired:
+                process.kill()
+
+
+def wait_for(holds: Callable[[], object], *, patience: float = PATIENCE) -> None:
+    """Wait until something holds; fails when the patience [s] is over."""
+    end = time.monotonic() + patience
+    while not holds():
+        assert time.monotonic() < end, "it never came to hold"
+        time.sleep(0.01)
+
+
+def wait_for_state(era: Client, *states: str) -> str:
+    """Wait until the daemon is in one of these states; which one."""
+    end = time.monotonic() + PATIENCE
+    while (state := era.status().state) not in states:
+        assert time.monotonic() < end, f"the daemon stays in {state}"
+        time.sleep(0.01)
+    return state
+
+
+ARM = b'{"owner": "me", "lease_s": 5}'
+
+
+@dataclass(frozen=True)
+class Answer:
+    """An answer over HTTP; status 0 where the connection was closed without one."""
+
+    status: int
+    headers: str
+    body: bytes
+
+
+def http(
+    gateway: GatewayProcess,
+    target: str = "/api/v1/arm",
+    *,
+    method: str = "POST",
+    body: bytes = ARM,
+    host: Sequence[str] | None = None,
+    token: Sequence[str] | None = None,
+    media: str | None = "application/json",
+    more: Sequence[str] = (),
+    length: int | None = None,
+) -> Answer:
+    """Ask for something that would be granted but for what the caller makes different."""
+    lines = [f"{method} {target} HTTP/1.1", "Connection: close"]
+    lines += [f"Host: {each}" for each in ([gateway.host] if host is None else host)]
+    lines += [f"Authorization: Bearer {each}" for each in ([TOKEN] if token is None else token)]
+    lines += [] if media is None else [f"Content-Type: {media}"]
+    lines += [*more, f"Content-Length: {len(body) if length is None else length}"]
+    return raw(gateway, "\r\n".join(lines).encode("latin-1") + b"\r\n\r\n" + body)
+
+
+def raw(gateway: GatewayProcess, said: bytes) -> Answer:
+    """Send bytes as they are; what comes back until the gateway closes."""
+    with gateway.connect() as connection:
+        heard = b""
+        # It may close while we still talk; what it said before counts.
+        with contextlib.suppress(ConnectionError):
+            connection.sendall(said)
+        with contextlib.suppress(ConnectionError):
+            while part := connection.recv(1 << 16):
+                heard += part
+    head, _, rest = heard.partition(b"\r\n\r\n")
+    status = head[9:12]
+    return Answer(int(status) if status.isdigit() else 0, head.decode("latin-1"), rest)
+
+
+def upgrade(
+    gateway: GatewayProcess,
+    *,
+    target: str = "/api/v1/ws",
+    host: str | None = None,
+    origin: str | None = None,
+    protocols: Sequence[str] = ("era-haptics.v1", f"era-haptics.token.{TOKEN}"),
+    more: Sequence[str] = (),
+) -> bytes:
+    """The handshake of a WebSocket."""
+    lines = [f"GET {target} HTTP/1.1", f"Host: {host or gateway.host}", "Upgrade: websocket"]
+    lines += ["Connection: Upgrade", "Sec-WebSocket-Version: 13"]
+    lines += ["Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ=="]  # of RFC 6455
+    lines += [f"Sec-WebSocket-Protocol: {', '.join(protocols)}"] if protocols else []
+    lines += [] if origin is None else [f"Origin: {origin}"]
+    return "\r\n".join([*lines, *more, "", ""]).encode()
+
+
+class RawWebSocket:
+    """A WebSocket whose frames are made by hand, by RFC 6455, section 5."""
+
+    def __init__(self, gateway: GatewayProcess) -> None:
+        self.connection = gateway.connect()
+        self.connection.sendall(upgrade(gateway, origin=f"http://{gateway.host}"))
+        self._rest = b""
+        while b"\r\n\r\n" not in self._rest:
+            part = self.connection.recv(1 << 16)
+            assert part, f"no handshake: {self._rest!r}"
+            self._rest += part
+        self.head, _, self._rest = self._rest.partition(b"\r\n\r\n")
+        assert b" 101 " in self.head, self.head
+
+    def __enter__(self) -> "RawWebSocket":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.connection.close()
+
+    def send(self, payload: bytes, *, first: int = 0x81, is_masked: bool = True) -> None:
+        """One frame; first: its first byte, FIN and text unless said otherwise."""
+        self.connection.sendall(frame(payload, first=first, is_masked=is_masked))
+
+    def ask(self, method: str, params: object, *, id: int = 1) -> None:
+        """A request."""
+        said = {"jsonrpc": "2.0", "id": id, "method": method, "params": params}
+        self.send(json.dumps(said).encode())
+
+    def next(self) -> tuple[int, bytes]:
+        """Opcode and payload of the next frame; (8, b"") where the connection just ends."""
+        try:
+            head = self._take(2)
+            size = head[1] & 0x7F
+            if size == 126:
+                size = int.from_bytes(self._take(2), "big")
+            elif size == 127:
+                size = int.from_bytes(self._take(8), "big")
+            return head[0] & 0x0F, self._take(size)
+        except ConnectionError:
+            return 8, b""
+
+    def answer(self, id: int | None = 1) -> dict[str, object]:
+        """The answer with an id; what else comes before it is passed over."""
+        while True:
+            opcode, payload = self.next()
+            assert opcode != 8, payload
+            if opcode == 1 and "id" in (said := json.loads(payload)) and said["id"] == id:
+                return dict(said)
+
+    def close_code(self) -> int:
+        """With which code the gateway ends it; 0 where it gives none."""
+        while True:
+            opcode, payload = self.next()
+            if opcode == 8:
+                return int.from_bytes(payload[:2], "big")
+
+    def _take(self, count: int) -> bytes:
+        while len(self._rest) < count:
+            part = self.connection.recv(1 << 16)
+            if not part:
+                raise ConnectionResetError
+            self._rest += part
+        taken, self._rest = self._rest[:count], self._rest[count:]
+        return taken
+
+
+def frame(payload: bytes, *, first: int = 0x81, is_masked: bool = True) -> bytes:
+    """A frame of a WebSocket as a client sends it, masked with zeros."""
+    mask, key = (0x80, bytes(4)) if is_masked else (0, b"")
+    if len(payload) < 126:
+        size = bytes([mask | len(payload)])
+    elif len(payload) < 1 << 16:
+        size = bytes([mask | 126]) + len(payload).to_bytes(2, "big")
+    else:
+        size = bytes([mask | 127]) + len(payload).to_bytes(8, "big")
+    return bytes([first]) + size + key + payload

@@ -322,7 +322,7 @@ class Follower:
 
     def _check_condition(self, said: Condition, begin: float, end: float) -> None:
         if self.state is None:
-            self._adopt(said)
+            self._adopt(said, end)
         else:
             self._check_state(said, begin, end)
         if said.token is not None:
@@ -348,15 +348,14 @@ class Follower:
                     f"{self._name} has its high voltage {what} in {NAMES[said.state]}",
                 )
 
-    def _adopt(self, said: Condition) -> None:
+    def _adopt(self, said: Condition, time: float) -> None:
         """The first that is known of it."""
         self.state, self._fault, self._is_reported = said.state, said.fault, True
         if said.state in _SILENT:
             self._fades, self._cause = {}, f"{NAMES[said.state]}"
         else:
             self._free(math.inf)
-            if said.watchdog_left is not None:
-                self._watchdog = math.inf  # until it is armed by somebody who is seen
+            self._fed = (-math.inf, time)
 
     def _check_state(self, said: Condition, begin: float, end: float) -> None:
         here, now = self.state, said.state

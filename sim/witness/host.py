@@ -55,6 +55,7 @@ class Side:
     stop_wished: float | None = None
     last_life: float | None = None
     last_token: int = 0
+    overtaken: float = -math.inf  # when silence went before whatever was waited for
 
 
 class Host:
@@ -178,9 +179,10 @@ class Host:
     def _check_credit(self, side: Side, time: float, asked: Asked) -> None:
         """Nothing is asked while something else may still be answered, but for silence."""
         if self._silences(asked):
+            side.overtaken = time  # what it overtakes is waited for no more
             return
         for at, other in side.pending.values():
-            if time - at < self._times.reply - self._times.slack:
+            if at > side.overtaken and time - at < self._times.reply - self._times.slack:
                 side.complain(
                     "credit",
                     time,
@@ -215,9 +217,11 @@ class Host:
         side.last_life = time
 
     def _check_pulse(self, side: Side, time: float) -> None:
+        if side.is_troubled():
+            side.last_life = None  # who has given an amplifier up owes it nothing
         last = side.last_life
         is_owed = side.is_open and side.follower.is_enabled and self._hung is None
-        if last is None or not is_owed or side.is_troubled():
+        if last is None or not is_owed:
             return
         if time > last + self._times.heartbeat + self._times.slack:
             side.last_life = time

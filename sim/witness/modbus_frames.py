@@ -5,7 +5,7 @@ from typing import NamedTuple, Protocol
 
 from sim.witness.seen import Toward
 
-_LONGEST = 256
+_SHORTEST, _LONGEST = 4, 256
 _PAUSE = 0.04  # s; what pauses longer inside a frame is none any more
 _SIZES: dict[Toward, dict[int, int]] = {
     "amplifier": {3: 8, 4: 8, 6: 8, 43: 7},
@@ -73,40 +73,59 @@ class RtuSplitter:
             self._buffer = b""
         self._last = time
         self._buffer += data
-        while len(self._buffer) >= 4:
-            size = self._size()
-            if size is not None and len(self._buffer) < size:
+        while len(self._buffer) >= _SHORTEST:
+            begin, size = self._good()
+            if not size:
                 break
-            raw = self._buffer[:size]
-            if size is None or size > _LONGEST or crc16(raw[:-2]) != raw[-2:]:
-                # Nothing says where the next one begins.
-                found.append(Telegram(self._buffer, raw[0], 0, None))
-                self._buffer = b""
-                break
-            self._buffer = self._buffer[size:]
+            if begin:
+                found.append(self._damaged(begin))
+            raw, self._buffer = self._buffer[:size], self._buffer[size:]
             found.append(Telegram(raw, raw[0], 0, raw[1:-2]))
+        if len(self._buffer) >= _SHORTEST and not self._may_become_whole():
+            found.append(self._damaged(len(self._buffer)))
         return found
 
-    def _size(self) -> int | None:
-        """How long the frame is that begins here; None where none can."""
-        function = self._buffer[1]
+    def _good(self) -> tuple[int, int]:
+        """Where the first good telegram begins, maybe behind a damaged one, and its size or 0."""
+        for begin in range(len(self._buffer) - _SHORTEST + 1):
+            size = self._size(self._buffer[begin:])
+            end = begin + size
+            if size and end <= len(self._buffer):
+                raw = self._buffer[begin:end]
+                if crc16(raw[:-2]) == raw[-2:]:
+                    return begin, size
+        return 0, 0
+
+    def _may_become_whole(self) -> bool:
+        """Whether what has come may be the beginning of a telegram."""
+        return len(self._buffer) < self._size(self._buffer)
+
+    def _damaged(self, size: int) -> Telegram:
+        raw, self._buffer = self._buffer[:size], self._buffer[size:]
+        return Telegram(raw, raw[0], 0, None)
+
+    def _size(self, data: bytes) -> int:
+        """How long the telegram is that begins so; 0 where none can."""
+        function = data[1]
         if self._toward == "host" and function & 0x80:
             return 5
         if function in _SIZES[self._toward]:
             return _SIZES[self._toward][function]
         if self._toward == "host" and function == 43:
-            return self._identification_size()
+            return _identification_size(data)
         if function not in _COUNTS[self._toward]:
-            return None
+            return 0
         at, around = _COUNTS[self._toward][function]
-        return around + self._buffer[at] if len(self._buffer) > at else around
+        size = around + data[at] if len(data) > at else around
+        return size if size <= _LONGEST else 0
 
-    def _identification_size(self) -> int:
-        """Of an answer to function 43: eight bytes, then each object with its length."""
-        at = 8
-        for _ in range(self._buffer[7] if len(self._buffer) > 7 else 0):
-            at += 2 + (self._buffer[at + 1] if len(self._buffer) > at + 1 else 0)
-        return at + 2
+
+def _identification_size(data: bytes) -> int:
+    """Of an answer to function 43: eight bytes, then each object with its length."""
+    at = 8
+    for _ in range(data[7] if len(data) > 7 else 0):
+        at += 2 + (data[at + 1] if len(data) > at + 1 else 0)
+    return at + 2
 
 
 def crc16(data: bytes) -> bytes:

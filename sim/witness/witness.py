@@ -325,7 +325,16 @@ class Witness:
             if answer.condition is not None:
                 side.follower.said(answer.condition, at, time)
             return
+        if asked.kind in MOVING:
+            # It may have been carried out when it was asked first, and that answer was lost.
+            same = [before for before, one in side.pending.values() if _is_repeated(one, asked)]
+            at = min([at, *same])
         self._host.granted(side, time, asked)
         if self._is_troubled(link) and asked.kind is Kind.ARM:
             side.follower.lose_track()
         side.follower.granted(asked, answer, at, time)
+
+
+def _is_repeated(asked: Asked, again: Asked) -> bool:
+    """Whether a request is another one once more, as a host repeats it."""
+    return asked.kind is again.kind and asked.token == again.token

@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import random
 
 from drivers.errors import CommandRefused
 from drivers.guard import Guard, GuardLimits
@@ -304,3 +305,35 @@ async def touched_beside(chain: Chain) -> None:
     await chain.rest(0.05)
     chain.touch_beside()
     await chain.rest(0.1)
+
+
+async def rough(chain: Chain) -> None:
+    """Every twelfth frame is lost and as many have a bit flipped, while fingers come and go."""
+    dice = random.Random(chain.loop.dice.random())
+
+    def spoil(toward: str, data: bytes) -> bytes | None:
+        fate = dice.random()
+        if fate < 1 / 12:
+            return None
+        if fate < 1 / 6:
+            at, bit = dice.randrange(len(data)), dice.randrange(8)
+            return data[:at] + bytes([data[at] ^ 1 << bit]) + data[at + 1 :]
+        return data
+
+    await chain.arm()
+    chain.touch(1)
+    await chain.rest(0.1)
+    chain.witness.faults(chain.loop.time(), chain.link, are_on=True)
+    chain.between.mangle = spoil
+    for _ in range(6):
+        chain.touch(1)
+        await chain.rest(0.08)
+        chain.touch()
+        await chain.rest(0.05)
+    chain.between.mangle = lambda toward, data: data
+    chain.witness.faults(chain.loop.time(), chain.link, are_on=False)
+    await chain.rest(0.6)
+    chain.touch(2)
+    await chain.rest(0.12)
+    chain.touch()
+    await chain.rest(0.05)

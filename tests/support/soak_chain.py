@@ -100,7 +100,7 @@ def make_soak_rig(amplifiers: int) -> Rig:
 def run_plan(plan: Plan, *, trace: TextIO | None = None) -> Outcome:
     """Run a plan to its end."""
     written = Trace(trace)
-    counts: Counter[str] = Counter()
+    counts: Counter[str] = Counter(f"on {line.kind}" for line in plan.lines)
     run = _Run(plan, written, counts)
 
     def seen(link: str, toward: str, data: bytes) -> None:
@@ -300,11 +300,16 @@ class _Run:
         elif ask.what == "stall":
             self._stall(ask.lasts)
         elif controller is None:
-            return
+            if self.plan.is_calm(ask.at - 0.4, ask.at):
+                self.checks.violate("could not be opened, and nothing was wrong")
         elif ask.what == "ready":
             if controller.phase is not Phase.ARMED:
                 await self._call("clear", controller.clear)
                 await self._call("arm", controller.arm)
+            at = self.loop.time() - START
+            is_calm = self.plan.is_calm(ask.at - 0.1, at)
+            if is_calm and controller.phase is not Phase.ARMED:
+                self.checks.violate("could not be armed, and nothing was wrong")
         else:
             await self._call(ask.what, getattr(controller, ask.what))
 

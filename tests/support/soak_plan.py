@@ -122,8 +122,6 @@ class Plan:
                 spans.append((action.at, action.at + action.episode.lasts + SETTLED))
             elif isinstance(action, Ask) and action.what != "ready":
                 spans.append((action.at, action.at + action.lasts + SETTLED))
-            elif isinstance(action, Ask):
-                spans.append((action.at, action.at + 0.5))
         return spans
 
 
@@ -218,7 +216,7 @@ def _hand(dice: random.Random, at: float, source: str) -> Hand:
     gesture = dice.choice(GESTURES)
     lasts = dice.uniform(0.03, 0.3) if gesture == "tap" else dice.uniform(0.2, 1.5)
     every = 0.002 if gesture == "flood" else dice.choice((0.01, 0.033, 0.08))
-    lasts = min(lasts, 0.3) if gesture == "flood" else lasts
+    lasts = min(lasts, 0.1) if gesture == "flood" else lasts
     fingers = dice.randint(2, 4) if gesture in ("chord", "flood") else 1
     places = [[dice.random(), dice.random()] for _ in range(fingers)]
     comes = [0.0, *(dice.uniform(0, lasts) for _ in range(fingers - 1))]

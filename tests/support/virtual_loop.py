@@ -14,6 +14,7 @@ T = TypeVar("T")
 
 START = 1000.0  # s; a clock that begins at zero hides who takes zero for "never"
 _FIRST_PORT = 20_000
+_TURNS_MAX = 20_000  # at one moment; nothing needs as many
 _LATENCY = (50e-6, 400e-6)  # s; of a loopback connection with something else to do
 
 Seen = Callable[[str, str, bytes], None]
@@ -30,7 +31,7 @@ class VirtualLoop(BaseEventLoop):
     def __init__(self, dice: random.Random | None = None, seen: Seen | None = None) -> None:
         super().__init__()
         self.now = START
-        self.turns = 0
+        self._turns = 0
         self.dice = dice or random.Random(0)
         self.seen: Seen = seen or (lambda link, toward, data: None)
         self._selector = self
@@ -43,10 +44,14 @@ class VirtualLoop(BaseEventLoop):
 
     def select(self, timeout: float | None) -> list[Any]:
         """Nobody from outside has anything to say: go to the next moment."""
-        self.turns += 1
+        self._turns += 1
+        if self._turns > _TURNS_MAX:
+            self._turns = 0
+            raise Stuck(f"{_TURNS_MAX} turns at one moment: something asks itself again for ever")
         if timeout is None:
             raise Stuck("nothing is ready and nothing will ever be: a task waits for ever")
         if timeout > 0:
+            self._turns = 0
             self.now = max(self.now, self._scheduled[0].when())
         return []
 

@@ -1,0 +1,162 @@
+"""The whole chain in virtual time: a few hundred seeds, the same each time, and it notices bugs."""
+
+import os
+import subprocess
+import sys
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from controller.loop import Controller
+from controller.selection import Selector
+from controller.touch import TouchFrame
+from drivers.backends.modbus_link import ModbusLink
+from sim.amplifier import SimulatedAmplifier
+from sim.faults import Episode
+from sim.serial_end import SerialEnd
+from soak import outcomes, shrink
+from soak_chain import run_plan
+from soak_plan import (
+    AMPLIFIER_FAULTS,
+    KINDS,
+    TELEGRAM_FAULTS,
+    Ask,
+    Hand,
+    Line,
+    Plan,
+    Trouble,
+    make_plan,
+)
+
+SEEDS = 240
+SOAK = Path(__file__).parent / "support" / "soak.py"
+
+
+def test_hundreds_of_seeds_break_no_rule() -> None:
+    """Every wire, every fault, every gesture: silence in time, nothing beyond, touches are felt.
+
+    What was tried is counted, so that seeds under which nothing happens would show.
+    """
+    totals: Counter[str] = Counter()
+    broken = {}
+    for outcome in outcomes(iter(range(SEEDS)), short=True):
+        totals.update(outcome.counts)
+        if outcome.violations:
+            broken[f"{SOAK.name} --short --seed {outcome.seed}"] = outcome.violations
+    assert broken == {}
+    assert all(totals[f"fault {fault}"] for fault in (*TELEGRAM_FAULTS, *AMPLIFIER_FAULTS))
+    assert all(totals[f"on {kind}"] >= SEEDS / 10 for kind in KINDS)
+    assert totals["patterns"] > 10 * SEEDS
+    assert totals["touches that must be felt"] > SEEDS / 10
+    assert totals["links lost"] > SEEDS / 20
+
+
+@pytest.mark.parametrize("wire", KINDS)
+def test_a_seed_is_the_same_in_every_process(wire: str) -> None:
+    """Not a byte differs, however strings are hashed there."""
+    command = [sys.executable, SOAK, "--short", "--wire", wire, "--seed", "11"]
+    said = {
+        subprocess.run(
+            command,
+            env={**os.environ, "PYTHONHASHSEED": hash_seed},
+            capture_output=True,
+            text=True,
+            check=True,
+        ).stdout
+        for hash_seed in ("1", "77")
+    }
+    (line,) = said
+    assert f"seed 11 on {wire}" in line
+    here = run_plan(make_plan(11, wire, short=True))
+    assert line.split()[-1] == here.digest
+    assert run_plan(make_plan(12, wire, short=True)).digest != here.digest
+
+
+def test_a_trace_says_all_that_is_hashed(tmp_path: Path) -> None:
+    """Touches, bytes both ways, the amplifier's states and patterns, each with its time."""
+    path = tmp_path / "trace.txt"
+    with path.open("w") as file:
+        run_plan(held(wire="serial"), trace=file)
+    words = {tuple(line.split()[1:2]) for line in path.read_text().splitlines()}
+    assert words >= {("touch",), ("bytes",), ("amplifier",), ("pattern",), ("operator",)}
+    times = [float(line.split()[0]) for line in path.read_text().splitlines()]
+    assert times == sorted(times)
+
+
+def held(*troubles: Trouble, wire: str = "serial", asks: tuple[Ask, ...] = ()) -> Plan:
+    """A finger that stays for a second on the plate of one armed amplifier."""
+    frames = [(number * 0.05, 0.0, ((1, 0.3, 0.4),)) for number in range(20)]
+    hand = Hand(1.5, "hold", "panel", (*frames, (1.0, 0.0, ())))
+    actions = (Ask(0.5, "ready"), hand, *troubles, *asks)
+    ordered = tuple(sorted(actions, key=lambda action: action.at))
+    return Plan(3, (Line(wire, KINDS[wire][0]),), 1, ordered, 4.0, 4.0)
+
+
+def _never(*_: Any) -> float:
+    return float("inf")
+
+
+def _deaf_to_lifts(deliver: Callable[..., None]) -> Callable[..., None]:
+    def deafly(controller: Controller, frame: TouchFrame) -> None:
+        if frame.touches:
+            deliver(controller, frame)
+
+    return deafly
+
+
+BUGS: dict[str, tuple[Any, str, Any, Plan, str]] = {
+    "an amplifier without a watchdog": (
+        SimulatedAmplifier,
+        "_watchdog_end",
+        property(_never),
+        held(Trouble(2.0, 0, Episode("unplug", lasts=1.5))),
+        "after it was fed",
+    ),
+    "lifts that get lost": (
+        Controller,
+        "deliver",
+        _deaf_to_lifts(Controller.deliver),
+        held(),
+        "after the last finger",
+    ),
+    "a choice that fails": (Selector, "select", lambda *_: 1 / 0, held(), "logged"),
+    "an answer nobody takes": (
+        ModbusLink,
+        "_received",
+        lambda link, data: None,
+        held(wire="modbus-tcp"),
+        "could not be opened",
+    ),
+    "a far end that stumbles": (
+        SerialEnd,
+        "_answer",
+        lambda end, frame, station: 1 / 0,
+        held(),
+        "unhandled",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", BUGS)
+def test_bugs_are_noticed(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What breaks a rule is told; the same plan breaks none without the bug."""
+    owner, attribute, bug, plan, violation = BUGS[name]
+    assert run_plan(plan).violations == []
+    monkeypatch.setattr(owner, attribute, bug)
+    assert violation in "; ".join(run_plan(plan).violations)
+
+
+def test_what_is_not_needed_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a plan that fails, shrinking leaves what makes it fail: to arm, and the finger."""
+    plan = held(
+        Trouble(3.7, 0, Episode("delay", lasts=0.1, delay=0.002)),
+        asks=(Ask(3.8, "disarm"), Ask(3.9, "clear")),
+    )
+    monkeypatch.setattr(Controller, "deliver", _deaf_to_lifts(Controller.deliver))
+    smaller, kept = shrink(plan)
+    assert [type(action) for action in smaller.actions] == [Ask, Hand]
+    assert [plan.actions[number] for number in kept] == list(smaller.actions)
+    assert smaller.actions[0] == Ask(0.5, "ready")

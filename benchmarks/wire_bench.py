@@ -8,6 +8,7 @@ import sys
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from drivers.amplifier import Amplifier
@@ -15,6 +16,7 @@ from drivers.command import CommandSet, DriveCommand
 from drivers.guard import Guard, GuardLimits, SafeCommand
 from drivers.protocol.messages import Capabilities
 from drivers.registry import open_backend
+from drivers.simultaneous import at_one_moment
 
 CHANNELS = 4
 CALM = 2.0  # s; the longest watchdog
@@ -106,3 +108,22 @@ async def all_at_once(urls: Sequence[str], count: int) -> list[float]:
         await amplifier.disarm()
         await amplifier.close()
     return times
+
+
+async def sent_apart(urls: Sequence[str], count: int) -> list[float]:
+    """How far apart [s] the commits of each of so many starts go out, the first to the last."""
+    amplifiers = [Amplifier(open_backend(url), reply_timeout=1.0) for url in urls]
+    for amplifier in amplifiers:
+        await amplifier.open()
+        await amplifier.arm(CALM)
+    apart = []
+    for safe in make_sets(amplifiers[0].capabilities, count, channels=1):
+        await asyncio.gather(*(amplifier.stage(safe) for amplifier in amplifiers))
+        commits = [(one, partial(one.commit, safe.token)) for one in amplifiers]
+        await asyncio.gather(*at_one_moment(commits))
+        sent = [amplifier.last_sent for amplifier in amplifiers]
+        apart.append(max(sent) - min(sent))
+    for amplifier in amplifiers:
+        await amplifier.disarm()
+        await amplifier.close()
+    return apart

@@ -19,6 +19,8 @@ from model.transient import FIRST
 MOMENTS = 12
 """How often an onset is looked at; not evenly, so that no beat goes unseen at all of them."""
 
+AT_ONCE = 32  # frequencies that are solved together: some ten megabytes
+
 
 class RampedOnsets:
     """Onsets of a plate at each of some frequencies, along a raised cosine."""
@@ -28,9 +30,9 @@ class RampedOnsets:
         # Towards the end, where the target has its full level; the first is half way up the ramp.
         times = FIRST - (FIRST - ramp / 2) * np.linspace(1, 0, MOMENTS) ** 1.2
         self._eras = len(plate.eras)
-        self._parts = _ramp_answers(plate, 2 * np.pi * frequencies, times, ramp).astype(
-            np.complex64
-        )
+        shares = np.split(2 * np.pi * frequencies, range(AT_ONCE, len(frequencies), AT_ONCE))
+        parts = [_ramp_answers(plate, omega, times, ramp) for omega in shares]
+        self._parts = np.concatenate(parts, dtype=np.complex64, casting="same_kind")
 
     def contrast(
         self,

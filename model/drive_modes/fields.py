@@ -75,13 +75,20 @@ class Fields:
 
     def at(self, frequencies: NDArray[np.int64]) -> "Fields":
         """The same at some of the frequencies, by index (n,)."""
-        return Fields(
+        some = Fields(
             targets=tuple(field[frequencies] for field in self.targets),
             quiet=self.quiet[frequencies],
             is_alone=self.is_alone,
             threshold=self.threshold[frequencies],
             wanted=self.wanted,
         )
+        # What was worked out already is not worked out anew, round by round.
+        known, also = vars(self), vars(some)
+        if "quiet_power" in known:
+            also["quiet_power"] = self.quiet_power[frequencies]
+        if "mean_targets" in known:
+            also["mean_targets"] = self.mean_targets[:, frequencies]
+        return some
 
     @cached_property
     def quiet_power(self) -> Single:

@@ -37,6 +37,9 @@ async def test_a_running_daemon_is_measured(tmp_path: Path) -> None:
     assert read["era_link_frames_out_total", "main"] == status.amplifiers[0].statistics.frames_out
     assert read["era_amplifier_temperature_celsius", "main"] == pytest.approx(25)
     assert read["era_amplifier_high_voltage", "main"] == 0
+    round_trip = status.amplifiers[0].statistics.round_trip_ms
+    assert round_trip is not None
+    assert read["era_amplifier_round_trip_seconds", "main"] == pytest.approx(round_trip / 1000)
     assert read["era_touch_to_wire_seconds_bucket", "+Inf"] == 0
     histogram = [(1.0, 2), (5.0, 3), (100.0, 4)]
     latency = status.latency_ms.model_copy(update={"count": 9, "histogram": histogram})

@@ -116,6 +116,14 @@ def test_a_lost_link_stops_the_others_and_reconnects(state: State) -> None:
     assert not after.assume_energised(ENERGISED_UNTIL)
 
 
+@pytest.mark.parametrize("state", [State.SWITCHED_ON, State.OPERATION_ENABLED, *LATCHED])
+def test_a_link_that_was_lost_while_energised_comes_back_latched(state: State) -> None:
+    """Nothing is armed again before somebody has acknowledged that it was lost."""
+    lost, _ = step(Machine(state, latched=state in LATCHED), Event(Kind.LINK_LOST), LOST_AT)
+    back, _ = step(lost, Event(Kind.REOPENED), ENERGISED_UNTIL)
+    assert back.state is State.FAULT
+
+
 @pytest.mark.parametrize("kind", [Kind.REOPENED, Kind.TICK])
 @pytest.mark.parametrize("state", set(State) - {State.COMM_LOST})
 def test_only_a_lost_link_can_come_back(state: State, kind: Kind) -> None:

@@ -158,8 +158,8 @@ def test_the_control_loop_says_that_it_is_alive(
             daemon.far_end.answer = unreachable
             await asyncio.sleep(60)
             assert daemon.state is DaemonState.COMM_LOST
-            gaps = [b - a for a, b in zip(daemon.alive, daemon.alive[1:], strict=False)]
-            assert max(gaps) <= 0.6
+            moments = [*daemon.alive, asyncio.get_running_loop().time()]
+            assert max(b - a for a, b in itertools.pairwise(moments)) <= 0.6
             daemon.far_end.answer = lambda request: None
             await asyncio.sleep(6)
             assert daemon.state is DaemonState.FAULT
@@ -216,6 +216,28 @@ def test_comm_lost_lasts_as_long_as_a_lost_amplifier_may_play(
             assert daemon.supervisor.machine.assume_energised(lost + 0.2)
             await asyncio.sleep(0.25)
             assert daemon.state is DaemonState.FAULT
+
+    run_virtual(scenario())
+
+
+def test_an_amplifier_that_comes_back_armed_is_disarmed(
+    run_virtual: Run, make_bench: Callable[..., Any]
+) -> None:
+    """Lost for less than its watchdog, it may be as it was: it is told before anything else."""
+
+    async def scenario() -> None:
+        async with watched(make_bench) as daemon:
+            await daemon.supervisor.handle(ARM)
+            daemon.far_end.answer = unreachable
+            await asyncio.sleep(0.2)
+            assert daemon.state is DaemonState.COMM_LOST
+            daemon.far_end.state = State.OPERATION_ENABLED
+            daemon.far_end.asked.clear()
+            daemon.far_end.answer = lambda request: None
+            await asyncio.sleep(1)
+            assert daemon.state is DaemonState.FAULT
+            assert daemon.far_end.requests(Disarm)
+            assert daemon.far_end.state is State.SWITCH_ON_DISABLED
 
     run_virtual(scenario())
 

@@ -6,25 +6,21 @@ answer, and what is said about them holds for all of that time.
 
 import math
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
-from sim.witness.fade import Fade
+from sim.witness.achieved import check_achieved
+from sim.witness.outputs import Outputs
 from sim.witness.plan import AmplifierPlan, Times
-from sim.witness.seen import FEEDING, Answered, Asked, Condition, Drive, Kind
+from sim.witness.seen import FEEDING, Answered, Asked, Complain, Condition, Drive, Kind
 
 SILENCING_RAMP = 0.005  # s; along which the watchdog and faults silence
-_LEVEL = 0.002  # of full stroke; what rounding and the last bit of a fade may make
 _LEFT = 0.003  # s; the same of the watchdog's time
-_FINE = 0.011  # Hz and degrees; one step of the wire
 _REMEMBERED = 16  # tokens since Arm
 _WARM = 60.0  # °C; from here on an amplifier may play less than it was told
 _ENABLED, _STOPPED, _REACTING, _FAULT = 4, 5, 6, 7
 _OFF = (0, 1, 2)
 _LATCHED = (_STOPPED, _REACTING, _FAULT)
 _SILENT = (*_OFF, _FAULT)  # in which no level may be left
-
-Complain = Callable[[str, float, str], None]
-"""Is told of a broken rule: its name, when [s], one sentence."""
 
 NAMES = (
     "NOT_READY",
@@ -56,17 +52,7 @@ class Follower:
         self._token: int | None = None
         self._played: deque[int] = deque(maxlen=_REMEMBERED)
         self._staged: Asked | None = None
-        self._cause = "nothing"
-        self._fades: dict[int, Fade] = {}
-        self._drives: Mapping[int, Drive] = {}
-        self._levels_before: Mapping[int, float] = {}
-        self._endings: dict[int, int] = {}
-        self._durations: dict[int, float] = {}  # of envelopes, by slot
-        self._ends: tuple[float, float] | None = None
-        self._ramp = 0.0
-        self._is_warm = False
-        # Of sensors that find too little, while it may be in a fault of its own that nobody knows.
-        self._suspicions: list[tuple[str, float, str]] = []
+        self._outputs = Outputs(name, plan, slack=times.slack, complain=complain)
 
     @property
     def is_enabled(self) -> bool:
@@ -82,15 +68,14 @@ class Follower:
         """What it does now is not known until it says so."""
         self.state = self._token = None
         self._fed = (-math.inf, math.inf)
-        self._ends = None
         self._staged = None
-        self._free(math.inf)
+        self._outputs.free(math.inf)
 
     def restarted(self, time: float) -> None:
         """It has got its supply anew: disarmed and silent."""
         self.lose_track()
-        self.state, self._token, self._cause = 1, 0, "its restart"
-        self._fades = {}
+        self.state, self._token = 1, 0
+        self._outputs.rest("its restart")
         self._seen_at = time
 
     def fed(self, time: float) -> None:
@@ -109,10 +94,7 @@ class Follower:
 
     def pass_to(self, time: float) -> None:
         """Let happen what it must have done by itself until now."""
-        if self._ends is not None and time > self._ends[1] + self._slack:
-            begin, self._ends = self._ends, None
-            durations = [self._duration(slot) for slot in self._endings.values()]
-            self._silence(begin, self._ramp, "the end of valid_for", free=max(durations, default=0))
+        self._outputs.pass_to(time)
         if self.state == _ENABLED and time > self._fed[1] + self._watchdog + self._slack:
             begin = (self._fed[0] + self._watchdog, self._fed[1] + self._watchdog)
             self._silence(begin, SILENCING_RAMP, "the watchdog")
@@ -145,8 +127,7 @@ class Follower:
             case Kind.CLEAR if self.state in (_STOPPED, _FAULT, _REACTING):
                 self._cleared(answer)
             case Kind.ENVELOPE if asked.shape is not None:
-                shape = asked.shape
-                self._durations[shape.slot] = shape.step * (len(shape.levels) + 1)
+                self._outputs.load(asked.shape)
             case _:
                 pass
         if answer.condition is not None:
@@ -194,7 +175,8 @@ class Follower:
         if said is None:
             self.state = None
         elif said.state in _OFF and not (self.state == _REACTING and self._is_reported):
-            self.state, self._fault, self._cause = 1, 0, "Clear"
+            self.state, self._fault = 1, 0
+            self._outputs.cause = "Clear"
 
     def _committed(self, asked: Asked, answer: Answered, begin: float, end: float) -> None:
         if asked.token == self._token:
@@ -219,92 +201,7 @@ class Follower:
         drives = answer.achieved if answer.achieved is not None else asked.drives
         self._play(asked, drives, begin, end)
         if answer.is_as_asked is False and answer.achieved is None:
-            self._free(math.inf)  # only an object tells what it plays
-
-    def _play(self, asked: Asked, drives: Mapping[int, Drive], begin: float, end: float) -> None:
-        self._token, self._staged = asked.token, None
-        self._played.append(asked.token)
-        self._levels_before = {channel: fade.after for channel, fade in self._fades.items()}
-        for channel in {*self._plan.channels, *drives, *self._fades}:
-            drive = drives.get(channel)
-            level = drive.level if drive is not None else 0.0
-            fade = self._fades.get(channel, Fade()).to(level, begin=(begin, end), ramp=asked.ramp)
-            shaped = self._shaping(channel, drive)
-            self._fades[channel] = fade._replace(free_until=end + shaped) if shaped else fade
-        self._drives, self._cause, self._ramp = drives, "set", asked.ramp
-        self._endings = {channel: drive.ending for channel, drive in drives.items() if drive.ending}
-        ends = asked.valid_for > 0
-        self._ends = (begin + asked.valid_for, end + asked.valid_for) if ends else None
-
-    def _shaping(self, channel: int, drive: Drive | None) -> float:
-        """How long an envelope shapes what a channel does now [s]; 0 for none."""
-        if drive is not None and drive.onset:
-            return self._duration(drive.onset)
-        is_silent = drive is None or drive.level == 0
-        skips = drive is not None and drive.skip_ending
-        if is_silent and not skips and channel in self._endings:
-            return self._duration(self._endings[channel])
-        return 0.0
-
-    def _duration(self, slot: int) -> float:
-        return self._durations.get(slot, 33 * 0.1)  # the longest there is
-
-    def _silence(
-        self, begin: tuple[float, float], ramp: float, cause: str, *, free: float = 0.0
-    ) -> None:
-        for channel in {*self._plan.channels, *self._fades}:
-            fade = self._fades.get(channel, Fade()).to(0.0, begin=begin, ramp=ramp)
-            self._fades[channel] = fade._replace(free_until=begin[1] + free) if free else fade
-        self._drives, self._cause = {}, cause
-        self._staged = self._ends = None
-        self._endings = {}
-
-    def _free(self, until: float) -> None:
-        for channel in {*self._plan.channels, *self._fades}:
-            fade = self._fades.get(channel, Fade())
-            self._fades[channel] = fade._replace(free_until=until, before=(0.0, 1.0))
-
-    def _check_achieved(self, asked: Asked, answer: Answered, time: float) -> None:
-        """What it says that a set plays is the set: whole, and no channel more than another."""
-        if answer.token != asked.token and answer.token:
-            what = f"{self._name} answered set {asked.token} with set {answer.token}"
-            self._complain("credit", time, what)
-        if answer.achieved is None:
-            return
-        if answer.achieved.keys() != asked.drives.keys():
-            self._complain(
-                "commit",
-                time,
-                f"{self._name} plays channels {sorted(answer.achieved)} of a set that names "
-                f"{sorted(asked.drives)}",
-            )
-            return
-        shares = []
-        for channel, drive in asked.drives.items():
-            played = answer.achieved[channel]
-            turn = math.remainder(played.phase - drive.phase, 360.0)
-            if drive.level > 0:
-                shares.append(played.level / drive.level)
-            is_other = (drive.level == 0) != (played.level == 0)
-            if drive.level > 0 and (
-                abs(played.frequency - drive.frequency) > _FINE or abs(turn) > _FINE
-            ):
-                is_other = True
-            if is_other:
-                self._complain(
-                    "plays",
-                    time,
-                    f"{self._name} makes {played.frequency:g} Hz, level {played.level:g}, "
-                    f"{played.phase:g} degrees of {drive.frequency:g} Hz, {drive.level:g}, "
-                    f"{drive.phase:g} on channel {channel}",
-                )
-        if shares and max(shares) - min(shares) > 0.01:
-            what = f"{self._name} plays the channels of a set at different shares of their levels"
-            self._complain("commit", time, what)
-        elif shares and not self._is_warm and abs(shares[0] - 1) > 0.01:
-            self._complain(
-                "plays", time, f"{self._name} plays {shares[0]:.3g} of the levels it was told"
-            )
+            self._outputs.free(math.inf)  # only an object tells what it plays
 
     # what it says
 
@@ -312,7 +209,7 @@ class Follower:
         """How it says it is, at some time between two [s]."""
         self.pass_to(begin)
         if condition.temperature is not None:
-            self._is_warm = condition.temperature >= _WARM
+            self._outputs.is_warm = condition.temperature >= _WARM
         self._check_condition(condition, begin, end)
         self._seen_at = end
 
@@ -337,7 +234,8 @@ class Follower:
         if said.watchdog_left is not None:
             self._check_left(said, begin, end)
         if said.levels is not None:
-            self._check_levels(said.levels, begin, end)
+            may_be_off = self._may_trip(end)
+            self._outputs.check_levels(said.levels, begin, end, may_be_off=may_be_off)
         if said.high_voltage is not None:
             must = {_ENABLED: True, _FAULT: False, **dict.fromkeys(_OFF, False)}.get(said.state)
             if must is not None and must != said.high_voltage:
@@ -352,9 +250,9 @@ class Follower:
         """The first that is known of it."""
         self.state, self._fault, self._is_reported = said.state, said.fault, True
         if said.state in _SILENT:
-            self._fades, self._cause = {}, f"{NAMES[said.state]}"
+            self._outputs.rest(NAMES[said.state])
         else:
-            self._free(math.inf)
+            self._outputs.free(math.inf)
             self._fed = (-math.inf, time)
 
     def _check_state(self, said: Condition, begin: float, end: float) -> None:
@@ -375,10 +273,7 @@ class Follower:
             )
         if now in (_REACTING, _FAULT):
             self._fault = said.fault
-        else:
-            for suspicion in self._suspicions:
-                self._complain(*suspicion)
-        self._suspicions.clear()
+        self._outputs.judge_suspicions(is_enabled=now not in (_REACTING, _FAULT))
         self.state, self._is_reported = now, True
 
     def _check_trip(self, said: Condition, end: float) -> None:
@@ -434,57 +329,29 @@ class Follower:
     def plays(self, levels: Sequence[float], frequencies: Mapping[int, float], time: float) -> None:
         """What a sensor finds on its channels: levels, and where it is known the frequency [Hz]."""
         self.pass_to(time)
-        self._check_levels(levels, time, time, of_sensor=True)
-        for channel, frequency in frequencies.items():
-            drive = self._drives.get(channel)
-            is_settled = time > self._fades.get(channel, Fade()).settled_from
-            is_told = drive is not None and drive.level > 0 and is_settled
-            if drive is not None and is_told and abs(frequency - drive.frequency) > _FINE:
-                self._complain(
-                    "plays",
-                    time,
-                    f"channel {channel} of {self._name} vibrates at {frequency:g} Hz; it was told "
-                    f"{drive.frequency:g} Hz",
-                )
+        self._outputs.check_sensors(
+            levels,
+            frequencies,
+            time,
+            may_be_off=self._may_trip(time),
+            is_enabled=self.is_enabled,
+        )
+
+    def _play(self, asked: Asked, drives: Mapping[int, Drive], begin: float, end: float) -> None:
+        self._token, self._staged = asked.token, None
+        self._played.append(asked.token)
+        self._outputs.play(asked, drives, begin, end)
+
+    def _silence(self, begin: tuple[float, float], ramp: float, cause: str) -> None:
+        self._staged = None
+        self._outputs.silence(begin, ramp, cause)
+
+    def _check_achieved(self, asked: Asked, answer: Answered, time: float) -> None:
+        is_warm = self._outputs.is_warm
+        check_achieved(self._name, asked, answer, time, is_warm=is_warm, complain=self._complain)
 
     def _may_trip(self, time: float) -> bool:
         return self.state == _ENABLED and time > self._fed[0] + self._watchdog - self._slack
-
-    def _check_levels(
-        self, levels: Sequence[float], begin: float, end: float, *, of_sensor: bool = False
-    ) -> None:
-        for channel, level in enumerate(levels):
-            fade = self._fades.get(channel, Fade())
-            low, high = fade.within(begin - self._slack, end + self._slack)
-            is_low = False
-            if level > high + _LEVEL:
-                wrong = f"at most {high:.4f}"
-            elif level < low - _LEVEL and not (self._is_warm or self._may_trip(end)):
-                is_low = True
-                wrong = f"at least {low:.4f}"
-            else:
-                continue
-            is_settled = begin > fade.settled_from
-            found = (
-                self._rule_of_level(channel, level, is_settled=is_settled),
-                end,
-                f"channel {channel} of {self._name} has level {level:.4f}; it must be {wrong}, "
-                f"{'' if is_settled else 'fading '}after {self._cause}",
-            )
-            if is_low and of_sensor and self.is_enabled:
-                self._suspicions.append(found)
-            else:
-                self._complain(*found)
-
-    def _rule_of_level(self, channel: int, level: float, *, is_settled: bool) -> str:
-        if self._cause == "the watchdog":
-            return "watchdog"
-        if not is_settled:
-            return "ramp"
-        if self._cause != "set":
-            return "silent"
-        before = self._levels_before.get(channel, 0.0)
-        return "commit" if abs(level - before) < _LEVEL else "plays"
 
     def _named(self) -> str:
         return NAMES[self.state] if self.state is not None else "some state"

@@ -9,9 +9,9 @@ from collections import deque
 from collections.abc import Callable, Collection, Hashable, Mapping
 from dataclasses import dataclass, field
 
-from sim.witness.follower import Complain, Follower
+from sim.witness.follower import Follower
 from sim.witness.plan import AmplifierPlan, Times
-from sim.witness.seen import FEEDING, Asked, Drive, Kind
+from sim.witness.seen import FEEDING, Asked, Complain, Drive, Kind
 
 _REMEMBERED = 16  # tokens since Arm
 _STEP = 0.6  # of a step of the wire: what rounding may make

@@ -3,13 +3,16 @@
 A frame becomes one of the meanings below; what is none of them was damaged.
 """
 
-from collections.abc import Hashable, Mapping
+from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass, field
 from enum import Enum
 from typing import Literal, TypeAlias
 
 Toward: TypeAlias = Literal["amplifier", "host"]
 """Which way bytes go."""
+
+Complain: TypeAlias = Callable[[str, float, str], None]
+"""Is told of a broken rule: its name, when [s], one sentence."""
 
 Data: TypeAlias = bytes
 """What goes over a wire."""

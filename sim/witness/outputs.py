@@ -1,0 +1,174 @@
+"""What the channels of one amplifier must play, and whether they do."""
+
+from collections.abc import Mapping, Sequence
+
+from sim.witness.fade import Fade
+from sim.witness.plan import AmplifierPlan
+from sim.witness.seen import Asked, Complain, Drive, Shape
+
+LEVEL = 0.002
+"""Of full stroke: what rounding and the last bit of a fade may make."""
+
+_FINE = 0.011  # Hz; one step of the wire
+_LONGEST = 3.3  # s; that an envelope can take
+
+
+class Outputs:
+    """The channels of an amplifier by its name; times [s] within bounds, as of `Fade`.
+
+    cause: what they do what they do for; is_warm: it may play less than it was told.
+    """
+
+    def __init__(self, name: str, plan: AmplifierPlan, *, slack: float, complain: Complain) -> None:
+        self._name = name
+        self._plan = plan
+        self._slack = slack
+        self._complain = complain
+        self.cause = "nothing"
+        self.is_warm = False
+        self._fades: dict[int, Fade] = {}
+        self._drives: Mapping[int, Drive] = {}
+        self._levels_before: Mapping[int, float] = {}
+        self._endings: dict[int, int] = {}
+        self._durations: dict[int, float] = {}  # of envelopes, by slot
+        self._ends: tuple[float, float] | None = None
+        self._ramp = 0.0
+        # Of sensors that find too little, while it may be in a fault of its own that nobody knows.
+        self._suspicions: list[tuple[str, float, str]] = []
+
+    def pass_to(self, time: float) -> None:
+        """Let a set end whose time is over."""
+        if self._ends is not None and time > self._ends[1] + self._slack:
+            begin, self._ends = self._ends, None
+            durations = [self._duration(slot) for slot in self._endings.values()]
+            free = max(durations, default=0.0)
+            self.silence(begin, self._ramp, "the end of valid_for", free=free)
+
+    def rest(self, cause: str) -> None:
+        """They have been silent for as long as matters."""
+        self._fades, self._drives, self.cause = {}, {}, cause
+        self._ends = None
+
+    def load(self, shape: Shape) -> None:
+        """An envelope is in its slot."""
+        self._durations[shape.slot] = shape.step * (len(shape.levels) + 1)
+
+    def judge_suspicions(self, *, is_enabled: bool) -> None:
+        """It says how it is: what sensors found before is wrong, unless it is in a fault."""
+        if is_enabled:
+            for suspicion in self._suspicions:
+                self._complain(*suspicion)
+        self._suspicions.clear()
+
+    def play(self, asked: Asked, drives: Mapping[int, Drive], begin: float, end: float) -> None:
+        """A set is played, taken over within two times [s]."""
+        self._levels_before = {channel: fade.after for channel, fade in self._fades.items()}
+        for channel in {*self._plan.channels, *drives, *self._fades}:
+            drive = drives.get(channel)
+            level = drive.level if drive is not None else 0.0
+            fade = self._fades.get(channel, Fade()).to(level, begin=(begin, end), ramp=asked.ramp)
+            shaped = self._shaping(channel, drive)
+            self._fades[channel] = fade._replace(free_until=end + shaped) if shaped else fade
+        self._drives, self.cause, self._ramp = drives, "set", asked.ramp
+        self._endings = {channel: drive.ending for channel, drive in drives.items() if drive.ending}
+        ends = asked.valid_for > 0
+        self._ends = (begin + asked.valid_for, end + asked.valid_for) if ends else None
+
+    def silence(
+        self, begin: tuple[float, float], ramp: float, cause: str, *, free: float = 0.0
+    ) -> None:
+        """All fall silent along a ramp [s]; until `free` after that nothing is known."""
+        for channel in {*self._plan.channels, *self._fades}:
+            fade = self._fades.get(channel, Fade()).to(0.0, begin=begin, ramp=ramp)
+            self._fades[channel] = fade._replace(free_until=begin[1] + free) if free else fade
+        self._drives, self.cause = {}, cause
+        self._ends = None
+        self._endings = {}
+
+    def free(self, until: float) -> None:
+        """Nobody knows what they play until a time [s]."""
+        for channel in {*self._plan.channels, *self._fades}:
+            fade = self._fades.get(channel, Fade())
+            self._fades[channel] = fade._replace(free_until=until, before=(0.0, 1.0))
+
+    def check_sensors(
+        self,
+        levels: Sequence[float],
+        frequencies: Mapping[int, float],
+        time: float,
+        *,
+        may_be_off: bool,
+        is_enabled: bool,
+    ) -> None:
+        """What a sensor finds on its channels: levels, and where it is known the frequency [Hz]."""
+        self.check_levels(levels, time, time, may_be_off=may_be_off, of_sensor=is_enabled)
+        for channel, frequency in frequencies.items():
+            drive = self._drives.get(channel)
+            is_settled = time > self._fades.get(channel, Fade()).settled_from
+            is_told = drive is not None and drive.level > 0 and is_settled
+            if drive is not None and is_told and abs(frequency - drive.frequency) > _FINE:
+                self._complain(
+                    "plays",
+                    time,
+                    f"channel {channel} of {self._name} vibrates at {frequency:g} Hz; it was told "
+                    f"{drive.frequency:g} Hz",
+                )
+
+    def check_levels(
+        self,
+        levels: Sequence[float],
+        begin: float,
+        end: float,
+        *,
+        may_be_off: bool,
+        of_sensor: bool = False,
+    ) -> None:
+        """Complain of levels that they cannot have at some time between two [s].
+
+        may_be_off: whether its watchdog may have run out by now.
+        """
+        for channel, level in enumerate(levels):
+            fade = self._fades.get(channel, Fade())
+            low, high = fade.within(begin - self._slack, end + self._slack)
+            is_low = False
+            if level > high + LEVEL:
+                wrong = f"at most {high:.4f}"
+            elif level < low - LEVEL and not (self.is_warm or may_be_off):
+                is_low = True
+                wrong = f"at least {low:.4f}"
+            else:
+                continue
+            is_settled = begin > fade.settled_from
+            found = (
+                self._rule_of_level(channel, level, is_settled=is_settled),
+                end,
+                f"channel {channel} of {self._name} has level {level:.4f}; it must be {wrong}, "
+                f"{'' if is_settled else 'fading '}after {self.cause}",
+            )
+            if is_low and of_sensor:
+                self._suspicions.append(found)
+            else:
+                self._complain(*found)
+
+    def _rule_of_level(self, channel: int, level: float, *, is_settled: bool) -> str:
+        if self.cause == "the watchdog":
+            return "watchdog"
+        if not is_settled:
+            return "ramp"
+        if self.cause != "set":
+            return "silent"
+        before = self._levels_before.get(channel, 0.0)
+        return "commit" if abs(level - before) < LEVEL else "plays"
+
+    def _shaping(self, channel: int, drive: Drive | None) -> float:
+        """How long an envelope shapes what a channel does now [s]; 0 for none."""
+        if drive is not None and drive.onset:
+            return self._duration(drive.onset)
+        is_silent = drive is None or drive.level == 0
+        skips = drive is not None and drive.skip_ending
+        if is_silent and not skips and channel in self._endings:
+            return self._duration(self._endings[channel])
+        return 0.0
+
+    def _duration(self, slot: int) -> float:
+        return self._durations.get(slot, 33 * 0.1)  # the longest there is

@@ -5,57 +5,15 @@ a duty and looked at when the time is over.
 """
 
 import math
-from collections import deque
-from collections.abc import Callable, Collection, Hashable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Collection, Hashable, Mapping
 
-from sim.witness.follower import Follower
-from sim.witness.plan import AmplifierPlan, Times
-from sim.witness.seen import FEEDING, Asked, Complain, Drive, Kind
+from sim.witness.plan import Times
+from sim.witness.seen import FEEDING, Asked, Drive, Kind
+from sim.witness.set_rules import Expected, check_set, check_shape
+from sim.witness.side import Duty, Side
 
-_REMEMBERED = 16  # tokens since Arm
-_STEP = 0.6  # of a step of the wire: what rounding may make
 _SETS = (Kind.APPLY, Kind.STAGE)
 _UNCOUNTED = (Kind.LOOK, Kind.HELLO, Kind.CAPABILITIES)
-
-Expected = Mapping[str, Mapping[int, tuple[float, float, float]]]
-"""What a touch should give, by amplifier and channel: Hz, level, degrees."""
-
-
-@dataclass
-class Duty:
-    """What must have happened when a time [s] is over; is_done is asked then."""
-
-    due: float
-    is_done: Callable[[], bool]
-    invariant: str
-    wire: str
-    sentence: str
-
-
-@dataclass
-class Side:
-    """A host's side of one amplifier; complain: see `Complain`."""
-
-    name: str
-    plan: AmplifierPlan
-    follower: Follower
-    complain: Complain
-    is_troubled: Callable[[], bool]
-    pending: dict[Hashable, tuple[float, Asked]] = field(default_factory=dict)
-    overdue: set[Hashable] = field(default_factory=set)
-    vibrates: bool = False  # the last that it was told
-    vibrated_at: float = -math.inf  # when a set that vibrates was granted last
-    staged: dict[int, Asked] = field(default_factory=dict)
-    tokens: deque[tuple[int, Asked]] = field(default_factory=lambda: deque(maxlen=_REMEMBERED))
-    levels: dict[int, Drive] = field(default_factory=dict)
-    is_identified: bool | None = None
-    is_open: bool = True
-    is_stopped: bool = False
-    stop_wished: float | None = None
-    last_life: float | None = None
-    last_token: int = 0
-    overtaken: float = -math.inf  # when silence went before whatever was waited for
 
 
 class Host:
@@ -143,7 +101,7 @@ class Host:
         if asked.kind in _SETS:
             self._check_set(side, time, asked)
         if asked.kind is Kind.ENVELOPE and asked.shape is not None:
-            self._check_shape(side, time, max(asked.shape.levels, default=0.0))
+            check_shape(side, time, max(asked.shape.levels, default=0.0))
         self._note(side, time, asked)
 
     def granted(self, side: Side, time: float, asked: Asked) -> None:
@@ -236,48 +194,9 @@ class Host:
             side.complain("identified", time, f"{side.name} is armed without being asked who it is")
 
     def _check_set(self, side: Side, time: float, asked: Asked) -> None:
-        self._check_token(side, time, asked)
-        for channel, drive in asked.drives.items():
-            if drive.vibrates:
-                self._check_limits(side, time, channel, drive, asked.ramp)
+        check_set(side, time, asked, self._expected)
         if asked.vibrates:
             self._check_justified(side, time)
-            if self._expected is not None:
-                self._check_expected(side, time, asked)
-
-    def _check_limits(
-        self, side: Side, time: float, channel: int, drive: Drive, ramp: float
-    ) -> None:
-        limits = side.plan.channels.get(channel)
-        what = f"channel {channel} of {side.name} is told {drive.frequency:g} Hz at {drive.level:g}"
-        if limits is None:
-            side.complain("limits", time, f"{what}, but there is no such channel")
-            return
-        fine = 0.01 * _STEP
-        if not limits.frequency_min - fine <= drive.frequency <= limits.frequency_max + fine:
-            side.complain(
-                "limits",
-                time,
-                f"{what}; allowed are {limits.frequency_min:g} to {limits.frequency_max:g} Hz",
-            )
-        if drive.level > limits.level + 1e-4 * _STEP:
-            side.complain("limits", time, f"{what}; allowed is a level of {limits.level:g}")
-        before = side.levels.get(channel)
-        goes_on = before is not None and before.frequency == drive.frequency
-        rise = drive.level - (before.level if before is not None and goes_on else 0.0)
-        if not drive.onset and rise > limits.slew * ramp + 1e-4 * _STEP:
-            side.complain(
-                "limits", time, f"{what} within {ramp:g} s; allowed is {limits.slew:g} a second"
-            )
-
-    def _check_shape(self, side: Side, time: float, level: float) -> None:
-        highest = max((limits.level for limits in side.plan.channels.values()), default=0.0)
-        if level > highest + 1e-4 * _STEP:
-            side.complain(
-                "limits",
-                time,
-                f"an envelope of {side.name} goes to level {level:g}; allowed is {highest:g}",
-            )
 
     def _check_justified(self, side: Side, time: float) -> None:
         if side.is_stopped:
@@ -294,40 +213,6 @@ class Host:
                 f"{side.name} is told to vibrate although nobody touches the plate since "
                 f"{self._lifted:.4f} s",
             )
-
-    def _check_expected(self, side: Side, time: float, asked: Asked) -> None:
-        wanted = (self._expected or {}).get(side.name, {})
-        told = {
-            channel: (drive.frequency, drive.level, drive.phase)
-            for channel, drive in asked.drives.items()
-            if drive.vibrates
-        }
-        same = told.keys() == wanted.keys() and all(
-            abs(told[channel][0] - frequency) < 0.01 * _STEP
-            and abs(told[channel][1] - level) < 1e-4 * _STEP
-            and abs(math.remainder(told[channel][2] - phase, 360.0)) < 0.01 * _STEP
-            for channel, (frequency, level, phase) in wanted.items()
-        )
-        if not same:
-            side.complain(
-                "pattern",
-                time,
-                f"{side.name} is told {_listed(told)}; the touch asks for {_listed(wanted)}",
-            )
-
-    def _check_token(self, side: Side, time: float, asked: Asked) -> None:
-        for place, (token, other) in enumerate(side.tokens):
-            is_last = place == len(side.tokens) - 1
-            if token == asked.token and not (is_last and other.drives == asked.drives):
-                side.complain(
-                    "token",
-                    time,
-                    f"set {token} is sent to {side.name} again "
-                    + ("with other contents" if is_last else "after others"),
-                )
-                return
-        if not any(token == asked.token for token, _ in side.tokens):
-            side.tokens.append((asked.token, asked))
 
     # what is remembered
 
@@ -436,13 +321,3 @@ class Host:
             or self._hung is not None
             or any(side.follower.is_in_fault or not side.is_open for side in self._sides.values())
         )
-
-
-def _listed(channels: Mapping[int, tuple[float, float, float]]) -> str:
-    return (
-        ", ".join(
-            f"{channel}: {frequency:g} Hz {level:g} {phase:g} degrees"
-            for channel, (frequency, level, phase) in sorted(channels.items())
-        )
-        or "nothing"
-    )

@@ -7,7 +7,7 @@ from typing import Any, Literal, Protocol
 
 from sim.witness.can_decoder import CanDecoder
 from sim.witness.follower import Follower
-from sim.witness.host import Expected, Host, Side
+from sim.witness.host import Host
 from sim.witness.modbus_decoder import ModbusDecoder
 from sim.witness.plan import Plan, plan_of
 from sim.witness.seen import (
@@ -25,6 +25,8 @@ from sim.witness.seen import (
     Toward,
 )
 from sim.witness.serial_decoder import SerialDecoder
+from sim.witness.set_rules import Expected
+from sim.witness.side import Side
 from sim.witness.violation import Report, Violation
 
 _RECOVERY = 0.5  # s; after a fault of a wire nobody can say at once what is owed

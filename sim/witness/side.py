@@ -1,0 +1,48 @@
+"""What is remembered of a host: for each amplifier, and of what it owes."""
+
+import math
+from collections import deque
+from collections.abc import Callable, Hashable
+from dataclasses import dataclass, field
+
+from sim.witness.follower import Follower
+from sim.witness.plan import AmplifierPlan
+from sim.witness.seen import Asked, Complain, Drive
+
+_REMEMBERED = 16  # tokens since Arm
+
+
+@dataclass
+class Duty:
+    """What must have happened when a time [s] is over; is_done is asked then."""
+
+    due: float
+    is_done: Callable[[], bool]
+    invariant: str
+    wire: str
+    sentence: str
+
+
+@dataclass
+class Side:
+    """A host's side of one amplifier; complain: see `Complain`."""
+
+    name: str
+    plan: AmplifierPlan
+    follower: Follower
+    complain: Complain
+    is_troubled: Callable[[], bool]
+    pending: dict[Hashable, tuple[float, Asked]] = field(default_factory=dict)
+    overdue: set[Hashable] = field(default_factory=set)
+    vibrates: bool = False  # the last that it was told
+    vibrated_at: float = -math.inf  # when a set that vibrates was granted last
+    staged: dict[int, Asked] = field(default_factory=dict)
+    tokens: deque[tuple[int, Asked]] = field(default_factory=lambda: deque(maxlen=_REMEMBERED))
+    levels: dict[int, Drive] = field(default_factory=dict)
+    is_identified: bool | None = None
+    is_open: bool = True
+    is_stopped: bool = False
+    stop_wished: float | None = None
+    last_life: float | None = None
+    last_token: int = 0
+    overtaken: float = -math.inf  # when silence went before whatever was waited for

@@ -26,7 +26,7 @@ URLs:
   serial:///dev/ttyUSB0?baud=921600&address=1   a serial port, on Windows serial:///COM3
   serial://HOST:PORT  rfc2217://HOST:PORT       a serial server
   hwgrep://VENDOR:PRODUCT                       the serial port of a USB adapter
-  modbus+tcp://HOST:PORT/UNIT                   Modbus over TCP
+  modbus+tcp://HOST:PORT/UNIT                   Modbus over TCP, behind a gateway ?baud=19200
   modbus+rtu:///dev/ttyS1?baud=115200#UNIT      Modbus on a serial port
   can+socketcan://can0#NODE                     CAN on an interface of the system
   can+slcan:///dev/ttyACM0?bitrate=500000#NODE  CAN on a serial adapter

@@ -61,20 +61,20 @@ class ModbusBackend(WireBackend):
 
     def round_trip(self, channels: int) -> float:
         """Time [s] on a serial line of an apply of so many channels and its answer; else 0."""
-        if not self._url.device:
+        if not self._url.baud:
             return 0.0
         bits = self._url.bits_per_byte
         return round_trip_time(channels, baud=self._url.baud, bits_per_byte=bits)
 
     def commit_time(self) -> float:
         """Time [s] on a serial line until a commit has arrived; else 0."""
-        if not self._url.device:
+        if not self._url.baud:
             return 0.0
         return commit_time(baud=self._url.baud, bits_per_byte=self._url.bits_per_byte)
 
     def loading_time(self, knots: int) -> float:
         """Time [s] on a serial line of loading an envelope; else 0."""
-        if not self._url.device:
+        if not self._url.baud:
             return 0.0
         bits = self._url.bits_per_byte
         return loading_time(knots, baud=self._url.baud, bits_per_byte=bits)

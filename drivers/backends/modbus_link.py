@@ -171,8 +171,8 @@ class ModbusLink:
             await asyncio.sleep(wait)
 
     def _time_of(self, size: int) -> float:
-        """Time [s] that so many bytes take on a serial line."""
-        return size * self.line.bits_per_byte / self.line.baud if self.line.device else 0.0
+        """Time [s] that so many bytes take on a serial line, be it behind a gateway."""
+        return size * self.line.bits_per_byte / self.line.baud if self.line.baud else 0.0
 
     def _received(self, data: bytes) -> None:
         for answer in self._reader.feed(data, self._telegram):

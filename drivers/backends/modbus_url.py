@@ -8,7 +8,7 @@ from drivers.errors import CommandError
 from drivers.protocol.definition import PROTOCOL
 
 _MAP = PROTOCOL.modbus
-_TCP_FORM = "modbus+tcp://HOST:PORT/UNIT"
+_TCP_FORM = "modbus+tcp://HOST:PORT/UNIT (behind a gateway: ?baud=19200, that of its line)"
 _RTU_FORM = "modbus+rtu:///dev/ttyS1?baud=115200#UNIT"
 _BAUD_MAX = 12_000_000  # the fastest USB adapters
 _PARITIES = {"even": "E", "odd": "O", "none": "N"}
@@ -19,14 +19,15 @@ class ModbusUrl:
     """Where a Modbus amplifier is: a host and port, or a serial device; and its unit there.
 
     is_rtu: whether its frames are those of RTU, which a serial server passes on as well. baud,
-    parity (as pyserial names it) and stop bits are of a serial device.
+    parity (as pyserial names it) and stop bits are of a serial device, or of the line behind a
+    gateway or server; baud is 0 where nothing is known of such a line.
     """
 
     is_rtu: bool
     host: str = ""
     port: int = 0
     device: str = ""
-    baud: int = _MAP["baud"]
+    baud: int = 0
     parity: str = "E"
     stop: int = 1
     unit: int = 0
@@ -62,10 +63,16 @@ class ModbusUrl:
 
 
 def _tcp(parts: SplitResult, url: str) -> ModbusUrl:
-    if not parts.hostname or parts.query or parts.fragment:
+    options = dict(parse_qsl(parts.query, keep_blank_values=True))
+    if not parts.hostname or options.keys() - {"baud"} or parts.fragment:
         raise CommandError(f"{url!r}: a Modbus TCP URL has a host, a port and a unit: {_TCP_FORM}")
-    unit = _unit(unquote(parts.path).strip("/"), url)
-    return ModbusUrl(False, host=parts.hostname, port=parts.port or _MAP["tcp_port"], unit=unit)
+    return ModbusUrl(
+        False,
+        host=parts.hostname,
+        port=parts.port or _MAP["tcp_port"],
+        baud=_baud(options, 0, url),
+        unit=_unit(unquote(parts.path).strip("/"), url),
+    )
 
 
 def _rtu(parts: SplitResult, url: str) -> ModbusUrl:
@@ -93,11 +100,16 @@ def _rtu(parts: SplitResult, url: str) -> ModbusUrl:
         host=parts.hostname or "",
         port=parts.port or 0,
         device=device,
-        baud=_whole(options.get("baud", str(_MAP["baud"])), "baud", high=_BAUD_MAX, url=url),
+        baud=_baud(options, _MAP["baud"] if device else 0, url),
         parity=_PARITIES[parity],
         stop=_whole(options.get("stop", "1"), "stop", high=2, url=url),
         unit=_unit(parts.fragment, url),
     )
+
+
+def _baud(options: dict[str, str], default: int, url: str) -> int:
+    text = options.get("baud")
+    return default if text is None else _whole(text, "baud", high=_BAUD_MAX, url=url)
 
 
 def _unit(text: str, url: str) -> int:

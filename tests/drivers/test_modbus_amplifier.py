@@ -91,15 +91,39 @@ async def backend(far: Peer) -> AsyncIterator[ModbusBackend]:
             "modbus+rtu:///dev/ttyS1?baud=19200&parity=none&stop=2#9",
             ModbusUrl(True, device="/dev/ttyS1", baud=19200, parity="N", stop=2, unit=9),
         ),
-        ("modbus+rtu:///dev/ttyS1", ModbusUrl(True, device="/dev/ttyS1", unit=1)),
-        ("modbus+rtu:///COM3", ModbusUrl(True, device="COM3", unit=1)),
+        ("modbus+rtu:///dev/ttyS1", ModbusUrl(True, device="/dev/ttyS1", baud=115200, unit=1)),
+        ("modbus+rtu:///COM3", ModbusUrl(True, device="COM3", baud=115200, unit=1)),
+        ("modbus+tcp://gw/3?baud=9600", ModbusUrl(False, host="gw", port=502, baud=9600, unit=3)),
         ("modbus+rtu://srv:4001#2", ModbusUrl(True, host="srv", port=4001, unit=2)),
     ],
 )
 def test_urls_are_taken_apart(url: str, expected: ModbusUrl) -> None:
-    """Host, port and unit; device, speed, parity, stop bits and unit; with the usual defaults."""
+    """Host, port and unit; device, speed, parity, stop bits and unit; with the usual defaults.
+
+    Of the line behind a gateway or a server nothing is known unless it is said.
+    """
     assert ModbusUrl.parse(url) == expected
-    assert expected.baud in (115200, 19200)
+
+
+async def test_a_slow_line_behind_a_gateway_is_waited_for() -> None:
+    """Told of 9600 baud, it waits for what they take: 0.13 s for a set of four and its answer."""
+    async with peer(is_rtu=False) as far:
+        backend = ModbusBackend(f"{far.url}?baud=9600")
+        assert backend.round_trip(4) == pytest.approx(0.12948, abs=1e-5)
+        await backend.open()
+        try:
+            at_once = far.answer
+            loop = asyncio.get_running_loop()
+
+            def later(request: Telegram) -> None:
+                pdu = at_once(request)
+                assert pdu is not None
+                loop.call_later(0.035, far.send, request, pdu)
+
+            far.answer = later
+            assert await backend.exchange(Ping(), timeout=0.001) == ARMED
+        finally:
+            await backend.close()
 
 
 @pytest.mark.parametrize(
@@ -108,7 +132,8 @@ def test_urls_are_taken_apart(url: str, expected: ModbusUrl) -> None:
         ("modbus+tcp://", "a host, a port and a unit"),
         ("modbus+tcp://h:99999/1", "no Modbus URL"),
         ("modbus+tcp://h/0", "unit is '0'; it must be a whole number from 1 to 247"),
-        ("modbus+tcp://h/1?baud=5", "a host, a port and a unit"),
+        ("modbus+tcp://h/1?speed=5", "a host, a port and a unit"),
+        ("modbus+tcp://h/1?baud=0", "baud is .0.; it must be a whole number"),
         ("modbus+tcp://h/one", "unit is 'one'"),
         ("modbus+rtu://", "names no port"),
         ("modbus+rtu://h#1", "names no host and port"),

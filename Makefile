@@ -7,7 +7,7 @@ PYTHON ?= $(shell for python in $(PYTHONS); do \
 BIN := .venv/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet --editable
 
-.PHONY: demo test lint format fuzz soak bench bench-localization bench-plant bench-wires clean
+.PHONY: demo test lint format docs fuzz soak bench bench-localization bench-plant bench-wires clean
 .NOTPARALLEL:
 
 demo: .venv/installed
@@ -48,8 +48,13 @@ bench-plant: .venv/installed
 bench-wires: .venv/installed-test
 	$(BIN)/python -m benchmarks.wires
 
+# The pages as a site, with warnings as errors; nothing in it comes from elsewhere.
+docs: .venv/installed-docs
+	$(BIN)/sphinx-build -b html -W --keep-going -q docs docs/_build/html
+	@echo "Next: open docs/_build/html/index.html"
+
 clean:
-	rm -rf .venv .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache out
+	rm -rf .venv docs/_build .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache out
 
 # A half-made environment is taken away, or the next run would take it for a whole one.
 $(BIN)/python:
@@ -65,6 +70,10 @@ $(BIN)/python:
 
 .venv/installed-test: $(BIN)/python pyproject.toml
 	$(PIP) '.[test]'
+	touch $@ .venv/installed
+
+.venv/installed-docs: $(BIN)/python pyproject.toml
+	$(PIP) '.[docs]'
 	touch $@ .venv/installed
 
 .venv/installed-peers: $(BIN)/python pyproject.toml

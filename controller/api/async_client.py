@@ -36,6 +36,7 @@ from controller.api.replies import (
     Unreachable,
     error_of,
     notification_of,
+    result_of,
     touch_points,
 )
 from controller.api.socket_path import find_socket
@@ -195,7 +196,7 @@ class AsyncClient:
             self._calls.pop(number, None)
         if "error" in said:
             raise error_of(said)
-        return result.model_validate_json(json.dumps(said["result"]))
+        return result_of(said, result)
 
     async def _read_all(self) -> None:
         """Give every line to whoever waits for it, until the connection ends."""

@@ -37,6 +37,7 @@ from controller.api.replies import (
     Unreachable,
     error_of,
     notification_of,
+    result_of,
     touch_points,
 )
 from controller.api.socket_path import find_socket
@@ -205,7 +206,7 @@ class Client:
             raise Unreachable.at(self.path, error) from error
         if "error" in said:
             raise error_of(said)
-        return result.model_validate_json(json.dumps(said["result"]))
+        return result_of(said, result)
 
     def _read(self) -> dict[str, Any]:
         """The next line; raises OSError."""

@@ -1,13 +1,18 @@
 """What both clients make of the daemon's lines."""
 
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
+
+from pydantic import ValidationError
 
 from controller.api.jsonrpc import ErrorCode, RpcError
-from controller.api.parts import TouchPoint
+from controller.api.parts import Message, TouchPoint
 from drivers.errors import LinkError
+
+_ResultT = TypeVar("_ResultT", bound=Message)
 
 
 class Unreachable(LinkError):
@@ -53,6 +58,17 @@ def error_of(said: Mapping[str, Any]) -> RpcError:
         where=data.get("where"),
         remedy=data.get("remedy"),
     )
+
+
+def result_of(said: Mapping[str, Any], model: type[_ResultT]) -> _ResultT:
+    """The result that a line tells; keys of a later minor version are ignored."""
+    try:
+        return model.model_validate_json(json.dumps(said["result"]), extra="ignore")
+    except (KeyError, ValidationError) as error:
+        raise Unreachable(
+            "the daemon answered something that this program does not understand; update the older "
+            "of the two"
+        ) from error
 
 
 def touch_points(places: Sequence[tuple[float, float]]) -> list[TouchPoint]:

@@ -1,0 +1,165 @@
+"""Both Python clients against a daemon over a wire, and against what is no daemon."""
+
+import asyncio
+import contextlib
+import re
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import controller
+from controller.api.async_client import AsyncClient
+from controller.api.client import Client
+from controller.api.jsonrpc import ErrorCode, RpcError
+from controller.api.replies import Unreachable
+from daemon_bench import PLACE, running_daemon, until_state
+
+PAGE = Path(controller.__file__).parent.parent / "docs" / "api.md"
+READY, ENABLED = "READY_TO_SWITCH_ON", "OPERATION_ENABLED"
+
+
+async def test_the_waiting_client_does_all_there_is(tmp_path: Path) -> None:
+    """Armed for longer than a lease, touched, told of it, stopped, cleared: from another thread."""
+    async with running_daemon(tmp_path) as bench:
+
+        def study() -> list[str]:
+            seen = []
+            with Client.connect(bench.socket, name="study") as era:
+                era.subscribe("pattern", "state")
+                with era.armed("study", lease_s=1):
+                    end = time.monotonic() + 1.3
+                    while time.monotonic() < end:
+                        era.touch([PLACE])
+                        time.sleep(0.03)
+                    seen.append(era.status().state)
+                era.unsubscribe("pattern")
+                era.stop()
+                with pytest.raises(RpcError) as caught:
+                    era.arm("study")
+                assert caught.value.code is ErrorCode.WRONG_STATE
+                assert caught.value.data.remedy is not None
+                era.clear()
+                seen.append(era.status().state)
+                seen += [told.topic for told in era.events(timeout=0.2)]
+            return seen
+
+        async with await bench.client() as era:
+            await until_state(era, READY)
+        seen = await asyncio.to_thread(study)
+        assert seen[:2] == [ENABLED, READY]
+        assert "pattern" in seen[2:]
+        assert seen.count("state") >= 6
+
+
+async def test_the_asyncio_client_keeps_its_lease(tmp_path: Path) -> None:
+    """Armed for longer than a lease of a second, then disarmed by the end of the block."""
+    async with running_daemon(tmp_path) as bench, await bench.client() as era:
+        await until_state(era, READY)
+        async with era.armed("me", lease_s=1):
+            await asyncio.sleep(1.3)
+            assert (await era.status()).state == ENABLED
+        await until_state(era, READY)
+        answers = await asyncio.gather(*(era.status() for _ in range(50)))
+        assert {answer.state for answer in answers} == {READY}
+
+
+async def test_a_daemon_that_ends_is_told_to_whoever_waits(tmp_path: Path) -> None:
+    """Calls raise Unreachable, events come to their end."""
+    async with running_daemon(tmp_path) as bench:
+        era = await bench.client()
+        await until_state(era, READY)
+        await era.subscribe("state")
+        listening = asyncio.create_task(_all_events(era))
+    assert await asyncio.wait_for(listening, 20) >= 1
+    with pytest.raises(Unreachable):
+        await era.status()
+    await era.close()
+
+
+async def _all_events(era: AsyncClient) -> int:
+    return len([told async for told in era.events()])
+
+
+async def test_the_example_of_the_page_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The Python lines of docs/api.md, as they stand there, with the socket in its usual place."""
+    found = re.search(r"## In Python\n\n((?:    .*\n|\n)+)", PAGE.read_text("utf-8"))
+    assert found is not None
+    code = re.sub(r"^    ", "", found[1], flags=re.MULTILINE)
+    async with running_daemon(tmp_path) as bench:
+        monkeypatch.setattr("controller.api.client.find_socket", lambda path: bench.socket)
+        async with await bench.client() as era:
+            await until_state(era, READY)
+            running = asyncio.create_task(asyncio.to_thread(exec, code, {}))
+            await running
+            await until_state(era, READY)
+
+
+@contextlib.contextmanager
+def answering(path: Path, *lines: bytes) -> Iterator[None]:
+    """Somebody at a socket who says these lines to the first who asks, and hangs up."""
+    with socket.socket(socket.AF_UNIX) as server:
+        server.bind(str(path))
+        server.listen()
+
+        def answer() -> None:
+            with contextlib.suppress(OSError):
+                client, _ = server.accept()
+                with client:
+                    client.recv(1000)
+                    client.sendall(b"".join(lines))
+
+        thread = threading.Thread(target=answer)
+        thread.start()
+        yield
+        thread.join()
+
+
+HELLO = (
+    b'{"jsonrpc":"2.0","id":1,"result":{"api_version":"2.0","software_version":"9","rig":'
+    b'{"length_m":1,"width_m":1,"eras":[],"simulated":true,"frequency_hz":[]},"table":'
+    b'{"fingerprint":"","mode":"","frequencies_hz":[],"cells_x":1,"cells_y":1},"rig_text":"",'
+    b'"layout":null}}\n'
+)
+
+
+@pytest.mark.parametrize(
+    ("lines", "message"),
+    [
+        ((HELLO,), r"speaks version 2\.0 of the API"),
+        ((b'{"jsonrpc":"2.0","id":1,"result":{"api_version":"2.0"}}\n',), "does not understand"),
+        ((), "is gone"),
+        ((b'{"jso',), "is gone"),
+    ],
+)
+async def test_whoever_answers_otherwise_is_no_daemon_of_ours(
+    tmp_path: Path, lines: tuple[bytes, ...], message: str
+) -> None:
+    """Another major version, or a connection that ends: one error for both clients."""
+    with answering(tmp_path / "a", *lines), pytest.raises(Unreachable, match=message):
+        await asyncio.to_thread(Client.connect, tmp_path / "a")
+    with answering(tmp_path / "b", *lines), pytest.raises(Unreachable, match=message):
+        await AsyncClient.connect(tmp_path / "b")
+
+
+def test_keys_of_a_later_minor_version_are_ignored(tmp_path: Path) -> None:
+    """What this program does not know of yet does not disturb it."""
+    later = HELLO.replace(b'"2.0","software', b'"1.7","news":[1],"software').replace(
+        b'"length_m"', b'"mood":"good","length_m"'
+    )
+    with answering(tmp_path / "s", later), Client.connect(tmp_path / "s") as era:
+        assert era.path == tmp_path / "s"
+
+
+def test_a_daemon_that_does_not_answer_is_given_up(tmp_path: Path) -> None:
+    """After the timeout, with what to do about it."""
+    with socket.socket(socket.AF_UNIX) as server:
+        server.bind(str(tmp_path / "s"))
+        server.listen()
+        with pytest.raises(Unreachable, match="does not answer"):
+            Client.connect(tmp_path / "s", timeout=0.05)

@@ -22,6 +22,7 @@ from drivers.statistics import WireCounters
 
 HEARTBEATS_BORNE = 3  # of the amplifier's that may be missing before it counts as lost
 _LATE = 0.005  # s; by so much a timer is late, and a loss is to be told by the third heartbeat
+_SHORTEST = 1e-4  # s; of a pause
 _HOST_HEARTBEAT = CANOPEN["heartbeat_ms"] / 1000  # s; as every host sends it while it is armed
 _OPERATIONAL = CANOPEN["nmt_states"]["OPERATIONAL"]
 _BOOT_UP = CANOPEN["nmt_states"]["BOOT_UP"]
@@ -163,7 +164,8 @@ class NodeWatch:
         limit = HEARTBEATS_BORNE * self._url.heartbeat - _LATE
         was_held_up = now - self._look_due > self._url.heartbeat / 2
         if silent < limit or was_held_up:
-            pause = limit - silent if silent < limit else self._url.heartbeat
+            # A rest that rounding leaves must not be looked at again in this very moment.
+            pause = max(limit - silent, _SHORTEST) if silent < limit else self._url.heartbeat
             self._look_due = now + pause
             self._next_look = asyncio.get_running_loop().call_later(pause, self._look)
             return

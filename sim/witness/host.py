@@ -304,7 +304,8 @@ class Host:
         """Whether it was told to be silent after a lift, or has a good reason not to be."""
         is_touched_again = self._touched >= lifted
         told = not side.vibrates or side.follower.is_in_fault or not side.is_open
-        return told or is_touched_again or self._hung is not None
+        has_given_up = side.last_life is None  # since some trouble
+        return told or is_touched_again or has_given_up or self._hung is not None
 
     def _can_play(self) -> bool:
         sides = self._sides.values()

@@ -5,7 +5,9 @@ virtual time.
 """
 
 import inspect
+import re
 from collections.abc import Awaitable, Callable
+from pathlib import Path
 
 import pytest
 
@@ -16,7 +18,7 @@ from witnessed_chain import WITNESSED, Chain, play
 SCENARIOS: dict[str, Callable[[Chain], Awaitable[None]]] = {
     name: scenario
     for name, scenario in inspect.getmembers(witness_scenarios, inspect.iscoroutinefunction)
-    if not name.startswith("_") and name != "rough"
+    if not name.startswith("_") and name not in ("rough", "lossy")
 }
 RULES = {
     *("limits", "garbage", "enabled", "justified", "pattern", "lift", "touch", "commit", "token"),
@@ -58,11 +60,19 @@ def test_two_amplifiers_break_no_rule(wire: str) -> None:
 
 
 @pytest.mark.parametrize("seed", range(3))
-@pytest.mark.parametrize("wire", ["serial", "modbus-rtu"])
+@pytest.mark.parametrize("wire", ["serial", "modbus-rtu", "slcan"])
 def test_noise_is_nobodys_fault(wire: str, seed: int) -> None:
     """Lost and damaged frames on a line are borne by both sides as the pages say."""
-    outcome = play(wire, witness_scenarios.rough, seed=seed)
+    scenario = witness_scenarios.lossy if wire == "slcan" else witness_scenarios.rough
+    outcome = play(wire, scenario, seed=seed)
     assert [str(one) for one in outcome.found] == []
+
+
+@pytest.mark.parametrize("seed", [3, 8])
+def test_a_node_that_is_hardly_heard_is_not_looked_at_for_ever(seed: int) -> None:
+    """Nothing asks itself again and again in one moment, which the loop here calls stuck."""
+    outcome = play("slcan", witness_scenarios.rough, seed=seed)
+    assert outcome.frames > 5
 
 
 @pytest.mark.parametrize("name", BUGS)
@@ -75,6 +85,13 @@ def test_a_planted_bug_is_found(name: str, monkeypatch: pytest.MonkeyPatch) -> N
     assert broken, [str(one) for one in found[:5]]
     assert broken[0].frames
     assert len(broken[0].sentence) > 20
+
+
+def test_the_page_lists_every_rule() -> None:
+    """docs/witness.md has a row for each rule, and no other."""
+    page = (Path(__file__).parents[2] / "docs" / "witness.md").read_text(encoding="utf-8")
+    rules = page.partition("## The rules")[2].partition("## In tests")[0]
+    assert set(re.findall(r"^\| (\w+) \|", rules, flags=re.M)) - {"name"} == RULES
 
 
 def test_bugs_are_planted_everywhere() -> None:

@@ -309,13 +309,22 @@ async def touched_beside(chain: Chain) -> None:
 
 async def rough(chain: Chain) -> None:
     """Every twelfth frame is lost and as many have a bit flipped, while fingers come and go."""
+    await _spoilt(chain, flips=True)
+
+
+async def lossy(chain: Chain) -> None:
+    """The same where only losses are possible: the text of a CAN adapter has no checksum."""
+    await _spoilt(chain, flips=False)
+
+
+async def _spoilt(chain: Chain, *, flips: bool) -> None:
     dice = random.Random(chain.loop.dice.random())
 
     def spoil(toward: str, data: bytes) -> bytes | None:
         fate = dice.random()
         if fate < 1 / 12:
             return None
-        if fate < 1 / 6:
+        if flips and fate < 1 / 6:
             at, bit = dice.randrange(len(data)), dice.randrange(8)
             return data[:at] + bytes([data[at] ^ 1 << bit]) + data[at + 1 :]
         return data

@@ -120,13 +120,16 @@ class Gateway:
 
 async def _body(request: Request) -> dict[str, Any]:
     """The JSON object in a request's body; raises RpcError and HTTPException."""
-    if request.headers.get("content-type", "").partition(";")[0].strip() != "application/json":
+    media = request.headers.get("content-type", "").partition(";")[0].strip().lower()
+    if media not in ("application/json", ""):
         raise HTTPException(415, "send application/json")
     body = b""
     async for chunk in request.stream():
         body += chunk
         if len(body) > LARGEST_BODY:
             raise HTTPException(413, f"a request has at most {LARGEST_BODY} bytes")
+    if body and not media:  # what has no parameters needs no type either
+        raise HTTPException(415, "send application/json")
     try:
         params = json.loads(body or b"{}")
     except (ValueError, RecursionError) as error:

@@ -29,12 +29,14 @@ from controller.api.messages import (
     EffectsResult,
     HelloResult,
     RenewResult,
+    StatusResult,
     SubscribeParams,
 )
 from controller.api.parts import (
     API_VERSION,
     EffectDescription,
     EraPlace,
+    LatencySummary,
     Message,
     Nothing,
     RigSummary,
@@ -91,7 +93,10 @@ class ScriptedDaemon:
         return [method for method, _ in self.asked]
 
     async def _serve(self) -> None:
-        self._hub = Hub({"state": _ready}, clock=time.monotonic)
+        self._hub = Hub(
+            {"state": _ready, "amplifiers": lambda: None, "latency": lambda: None},
+            clock=time.monotonic,
+        )
         server = ApiServer(
             {name: self._handler(name) for name in METHODS},
             left=self._hub.forget,
@@ -132,7 +137,7 @@ class ScriptedDaemon:
             case "play":
                 raise RpcError(ErrorCode.REFUSED, "there is no such effect", remedy="see effects")
             case "status":
-                raise RpcError(ErrorCode.WRONG_STATE, "it is only a script")
+                return _status()
             case _:
                 return Nothing()
 
@@ -162,6 +167,29 @@ class ScriptedDaemon:
 def _ready() -> StateEvent:
     return StateEvent(
         old="READY_TO_SWITCH_ON", new="READY_TO_SWITCH_ON", cause="it is a script", remedy=None
+    )
+
+
+def _status() -> StatusResult:
+    return StatusResult(
+        time_s=1.0,
+        unix_time_s=1.0,
+        state="READY_TO_SWITCH_ON",
+        cause="it is a script",
+        remedy=None,
+        phase="disarmed",
+        assume_energised=False,
+        armed_by=None,
+        lease_left_s=None,
+        contacts=[],
+        drive={},
+        predicted_contrast_db=None,
+        robust_contrast_db=None,
+        predicted_level_db_sl=None,
+        amplifiers=[],
+        latency_ms=LatencySummary(count=0, median=None, p99=None, p999=None, histogram=[]),
+        rejected_touches={},
+        uptime_s=1.0,
     )
 
 

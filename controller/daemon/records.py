@@ -114,6 +114,10 @@ class RecordedBackend(Backend):
         """Of the inner one."""
         return self._inner.round_trip(channels)
 
+    def commit_time(self) -> float:
+        """Of the inner one."""
+        return self._inner.commit_time()
+
     def loading_time(self, knots: int) -> float:
         """Of the inner one."""
         return self._inner.loading_time(knots)

@@ -11,11 +11,14 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from typer.testing import CliRunner
 
 from controller.daemon.latency import Latencies
 from controller.daemon.log import JsonFormatter, LogHandler, LogThread, RateLimit
 from controller.daemon.notify import ServiceManager
-from controller.daemon.records import KEPT, Record, Recorder, write_dump
+from controller.daemon.records import KEPT, Record, RecordedBackend, Recorder, write_dump
+from controller.daemon_cli import app
+from drivers.backend import Backend
 from drivers.protocol.messages import Arm, Fault, State, Status
 
 
@@ -241,3 +244,33 @@ def test_percentiles_are_latencies_that_were() -> None:
     counts = dict(summary.histogram)
     assert (counts[1.0], counts[5.0], counts[50.0], counts[100.0]) == (1, 1, 30, 950)
     assert sum(counts.values()) == summary.count == 1000
+
+
+def test_a_recorded_backend_hides_nothing_of_the_one_within() -> None:
+    """Every member of a backend is passed on: one that were not would answer by its default."""
+    members = {name for name in vars(Backend) if not name.startswith("_")}
+    assert members <= vars(RecordedBackend).keys()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "place"),
+    [
+        ([], None),
+        (["--dashboard"], "127.0.0.1:8137"),
+        (["--dashboard", "127.0.0.1:9000"], "127.0.0.1:9000"),
+        (["--dashboard=localhost:9000"], "localhost:9000"),
+    ],
+)
+def test_the_dashboard_may_be_asked_for_without_a_place(
+    monkeypatch: pytest.MonkeyPatch, arguments: list[str], place: str | None
+) -> None:
+    """Before and behind the configuration; the usual place is the gateway's own."""
+    asked: list[tuple[str, str | None]] = []
+    monkeypatch.setattr(
+        "controller.daemon.run.run_daemon",
+        lambda config, *, dashboard: asked.append((config.name, dashboard)),
+    )
+    for line in (["daemon", "d.yaml", *arguments], ["daemon", *arguments, "d.yaml"]):
+        result = CliRunner().invoke(app, line)
+        assert result.exit_code == 0, result.output
+    assert asked == [("d.yaml", place)] * 2

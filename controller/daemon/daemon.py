@@ -58,6 +58,7 @@ class Daemon:
         dashboard: str | None,
     ) -> None:
         self._config = config
+        self._begun_with = config
         self._log = log
         self._manager = manager
         self._dashboard = dashboard
@@ -90,6 +91,7 @@ class Daemon:
             wishes=self._meaning,
             timing=Timing(table),
             mode=config.section.mode,
+            envelope_time=config.section.touch_wait,
         )
         self._touches = ApiTouches(config.rig.plate, self._deliver)
         self._inputs = TouchInputs(self._deliver, failed=self._input_failed)
@@ -163,7 +165,7 @@ class Daemon:
         if plan.refused is not None:
             _logger.error("the configuration is left as it was: %s", plan.refused)
             return
-        for key in plan.restart:
+        for key in plan_reload(self._begun_with, new, is_armed=False).restart:
             _logger.warning("%s has changed: restart the daemon to take it over", key)
         for key in plan.apply:
             match key:

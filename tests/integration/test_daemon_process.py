@@ -7,124 +7,26 @@ time.monotonic(), the same for all processes.
 import asyncio
 import contextlib
 import json
-import os
 import signal
 import socket
-import sys
 import time
-from collections.abc import AsyncIterator, Sequence
-from contextlib import asynccontextmanager
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
 
-from controller.api.async_client import AsyncClient
-from daemon_bench import PATIENCE, PLACE, daemon_table, far_end, until, until_state, write_daemon
+from daemon_bench import PATIENCE, daemon_table, far_end, until, until_state, write_daemon
+from daemon_process import (
+    ERA,
+    REACTION,
+    WATCHDOG,
+    DaemonProcess,
+    daemon_process,
+    playing,
+    run_era,
+)
 from drivers.protocol.messages import Fault, State
 from model.table_file import save_table
-from wires import FarSide
-
-ERA = Path(sys.executable).with_name("era")
-WATCHDOG, REACTION = 0.25, 0.005  # s; what an amplifier may take to be silent
-
-
-@dataclass
-class DaemonProcess:
-    """A daemon that serves."""
-
-    process: asyncio.subprocess.Process
-    socket: Path
-    far: FarSide
-    log: list[dict[str, object]]
-
-    async def client(self) -> AsyncClient:
-        """A client of it."""
-        return await AsyncClient.connect(self.socket, name="test", timeout=PATIENCE)
-
-    async def status(self) -> int:
-        """Its exit status, once it has one."""
-        return await asyncio.wait_for(self.process.wait(), PATIENCE)
-
-    def said(self, text: str) -> bool:
-        """Whether a text stands in its log."""
-        return any(text in json.dumps(line) for line in self.log)
-
-
-@asynccontextmanager
-async def daemon_process(
-    folder: Path,
-    far: FarSide,
-    more: str = "",
-    *,
-    options: Sequence[str] = (),
-    environment: dict[str, str] | None = None,
-) -> AsyncIterator[DaemonProcess]:
-    """`era daemon` of a file with these further lines; killed with the context at the latest."""
-    save_table(daemon_table(), folder / "table.npz")
-    config = write_daemon(folder, {"main": far.url}, f"table: table.npz\n{more}")
-    process = await asyncio.create_subprocess_exec(
-        *(ERA, "daemon", str(config), *options),
-        stdin=asyncio.subprocess.DEVNULL,
-        stdout=asyncio.subprocess.PIPE,
-        stderr=asyncio.subprocess.PIPE,
-        env={**os.environ, **(environment or {})},
-    )
-    assert process.stderr is not None
-    made = DaemonProcess(process, folder / "era.sock", far, [])
-    reading = asyncio.create_task(_read_log(process.stderr, made.log))
-    try:
-        await until(lambda: made.said("serving at") or process.returncode is not None)
-        assert process.returncode is None, made.log
-        yield made
-    finally:
-        with contextlib.suppress(ProcessLookupError):
-            process.kill()
-        await process.wait()
-        await reading
-
-
-async def _read_log(stream: asyncio.StreamReader, log: list[dict[str, object]]) -> None:
-    while line := await stream.readline():
-        try:
-            log.append(json.loads(line))
-        except ValueError:
-            log.append({"no json": line.decode()})
-
-
-async def run_era(*arguments: object) -> tuple[int, str, str]:
-    """Another `era` command: its exit status, and both outputs."""
-    process = await asyncio.create_subprocess_exec(
-        *(ERA, *map(str, arguments)),
-        stdin=asyncio.subprocess.DEVNULL,
-        stdout=asyncio.subprocess.PIPE,
-        stderr=asyncio.subprocess.PIPE,
-    )
-    out, err = await asyncio.wait_for(process.communicate(), 3 * PATIENCE)
-    assert process.returncode is not None
-    return process.returncode, out.decode(), err.decode()
-
-
-@asynccontextmanager
-async def playing(daemon: DaemonProcess) -> AsyncIterator[AsyncClient]:
-    """A client whose finger is felt, for as long as the daemon lives."""
-    async with await daemon.client() as era:
-        await until_state(era, "READY_TO_SWITCH_ON")
-        await era.arm("test", lease_s=60)
-
-        async def hold() -> None:
-            with contextlib.suppress(ConnectionError):
-                while True:
-                    await era.touch([PLACE])
-                    await asyncio.sleep(0.03)
-
-        holding = asyncio.create_task(hold())
-        try:
-            await until(lambda: any(daemon.far.station.status().levels))
-            yield era
-        finally:
-            holding.cancel()
-            await asyncio.gather(holding, return_exceptions=True)
 
 
 def no_lines_beside_json(daemon: DaemonProcess) -> Sequence[object]:

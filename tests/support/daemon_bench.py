@@ -2,7 +2,7 @@
 
 import asyncio
 import time
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from functools import cache
@@ -44,10 +44,20 @@ def daemon_table() -> LocalizationTable:
     return small_table()
 
 
-def write_daemon(folder: Path, urls: dict[str, str], more: str = "") -> Path:
-    """A rig at these URLs and a daemon's file beside it; more: further lines of that."""
+def write_daemon(
+    folder: Path,
+    urls: dict[str, str],
+    more: str = "",
+    *,
+    changes: Sequence[tuple[str, str]] = (),
+) -> Path:
+    """A rig at these URLs and a daemon's file beside it.
+
+    more: further lines of that; changes: of the rig's text, before the URLs.
+    """
     write_rig(
         folder / "rig.yaml",
+        *changes,
         *(
             (f'{name}: {{url: "sim://"}}', f'{name}: {{url: "{url}"}}')
             for name, url in urls.items()

@@ -1,0 +1,139 @@
+"""`era daemon` as users run it: a process over real wires, and a client whose finger is felt.
+
+The far end is in the test's own process, so that its amplifier's clock can be read: it is
+time.monotonic(), the same for all processes.
+"""
+
+import asyncio
+import contextlib
+import json
+import os
+import sys
+from collections.abc import AsyncIterator, Sequence
+from contextlib import asynccontextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from controller.api.async_client import AsyncClient
+from daemon_bench import PATIENCE, PLACE, daemon_table, until, until_state, write_daemon
+from model.table_file import save_table
+from wires import FarSide
+
+ERA = Path(sys.executable).with_name("era")
+WATCHDOG, REACTION = 0.25, 0.005  # s; what an amplifier may take to be silent
+
+
+@dataclass
+class DaemonProcess:
+    """A daemon that serves, or is about to."""
+
+    process: asyncio.subprocess.Process
+    socket: Path
+    far: FarSide
+    log: list[dict[str, object]] = field(default_factory=list)
+
+    async def client(self) -> AsyncClient:
+        """A client of it."""
+        return await AsyncClient.connect(self.socket, name="test", timeout=PATIENCE)
+
+    async def status(self) -> int:
+        """Its exit status, once it has one."""
+        return await asyncio.wait_for(self.process.wait(), PATIENCE)
+
+    def said(self, text: str) -> bool:
+        """Whether a text stands in its log."""
+        return any(text in json.dumps(line) for line in self.log)
+
+    async def serves(self) -> None:
+        """Wait until it does; fails where it ends instead."""
+        await until(lambda: self.said("serving at") or self.process.returncode is not None)
+        assert self.process.returncode is None, self.log
+
+
+@asynccontextmanager
+async def daemon_process(
+    folder: Path,
+    far: FarSide,
+    more: str = "",
+    *,
+    program: Sequence[str | Path] = (ERA,),
+    options: Sequence[str] = (),
+    environment: dict[str, str] | None = None,
+    changes: Sequence[tuple[str, str]] = (),
+    waits: bool = True,
+) -> AsyncIterator[DaemonProcess]:
+    """`era daemon` of a file with these further lines; killed with the context at the latest.
+
+    program: what stands before `daemon`; changes: of the rig's text; waits: until it serves.
+    """
+    save_table(daemon_table(), folder / "table.npz")
+    config = write_daemon(folder, dict(far.urls), f"table: table.npz\n{more}", changes=changes)
+    process = await asyncio.create_subprocess_exec(
+        *(*program, "daemon", str(config), *options),
+        stdin=asyncio.subprocess.DEVNULL,
+        stdout=asyncio.subprocess.PIPE,
+        stderr=asyncio.subprocess.PIPE,
+        env={**os.environ, **(environment or {})},
+    )
+    assert process.stderr is not None
+    made = DaemonProcess(process, folder / "era.sock", far)
+    reading = asyncio.create_task(_read_log(process.stderr, made.log))
+    try:
+        if waits:
+            await made.serves()
+        yield made
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            process.kill()
+        await process.wait()
+        await reading
+
+
+async def _read_log(stream: asyncio.StreamReader, log: list[dict[str, object]]) -> None:
+    while line := await stream.readline():
+        try:
+            log.append(json.loads(line))
+        except ValueError:
+            log.append({"no json": line.decode()})
+
+
+async def run_era(*arguments: object) -> tuple[int, str, str]:
+    """Another `era` command: its exit status, and both outputs."""
+    process = await asyncio.create_subprocess_exec(
+        *(ERA, *map(str, arguments)),
+        stdin=asyncio.subprocess.DEVNULL,
+        stdout=asyncio.subprocess.PIPE,
+        stderr=asyncio.subprocess.PIPE,
+    )
+    out, err = await asyncio.wait_for(process.communicate(), 3 * PATIENCE)
+    assert process.returncode is not None
+    return process.returncode, out.decode(), err.decode()
+
+
+@asynccontextmanager
+async def playing(daemon: DaemonProcess) -> AsyncIterator[AsyncClient]:
+    """A client whose finger is felt, for as long as the daemon lives."""
+    async with await daemon.client() as era:
+        await until_state(era, "READY_TO_SWITCH_ON")
+        await era.arm("test", lease_s=60)
+        async with holding(era):
+            await until(lambda: any(daemon.far.station.status().levels))
+            yield era
+
+
+@asynccontextmanager
+async def holding(era: AsyncClient) -> AsyncIterator[None]:
+    """A finger that is down, for as long as the daemon lives."""
+
+    async def hold() -> None:
+        with contextlib.suppress(ConnectionError):
+            while True:
+                await era.touch([PLACE])
+                await asyncio.sleep(0.03)
+
+    task = asyncio.create_task(hold())
+    try:
+        yield
+    finally:
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)

@@ -56,8 +56,9 @@ async def told_to_end(folder: Path, number: signal.Signals) -> float:
             daemon.process.send_signal(number)
             assert await daemon.status() == 0
             end = time.monotonic()
-        assert far.station.status().state is State.SWITCH_ON_DISABLED
-        assert far.silent_from() <= end
+        status = far.station.status()
+        assert (status.state, status.high_voltage) == (State.SWITCH_ON_DISABLED, False)
+        assert not any(status.levels)
         assert not daemon.socket.exists()
         assert daemon.said("OPERATION_ENABLED -> NOT_READY")
         assert not no_lines_beside_json(daemon)

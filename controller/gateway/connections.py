@@ -11,11 +11,15 @@ from uvicorn.protocols.http.h11_impl import H11Protocol, RequestResponseCycle
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 from websockets.frames import CloseCode, Frame
 
+from controller.gateway.rate import Rate
+
 MOST_WAITING = 128  # connections that have not sent a whole request yet
 REQUEST_PATIENCE = 5.0  # s; a connection without a whole request by then is closed
 UNREAD_PATIENCE = 5.0  # s; for whoever asks over HTTP and does not read the answer
 MOST_UNREAD = 1 << 18  # bytes for one WebSocket; answers are bounded before, pongs are not
 MOST_FRAGMENTS = 64  # of one message; a browser sends a message of 64 KiB in one or two
+CONTROLS_PER_SECOND = 100.0  # pings and pongs of one WebSocket; it needs one in ten seconds
+_SLICE = 1 << 12  # bytes that are looked at before it is asked again whether to go on
 PARTING = 1.0  # s; for the last words to a WebSocket that is left
 
 
@@ -96,12 +100,26 @@ class HttpConnection(H11Protocol):
 class WebSocketConnection(WebSocketsSansIOProtocol):
     """A WebSocket whose every buffer has an end, and which ends when the gateway leaves it."""
 
+    _controls: Rate | None = None
+
     def data_received(self, data: bytes) -> None:
         """Take what was sent, unless what it was sent before lies unread."""
-        if self.transport.get_write_buffer_size() > MOST_UNREAD:
-            self.transport.abort()
-            return
-        super().data_received(data)
+        for at in range(0, len(data), _SLICE):
+            if self.transport.get_write_buffer_size() > MOST_UNREAD:
+                self.transport.abort()
+            if self.transport.is_closing():
+                return
+            super().data_received(data[at : at + _SLICE])
+
+    def handle_ping(self) -> None:
+        """Answer a ping, but not a flood of them."""
+        if self._may_go_on():
+            super().handle_ping()
+
+    def handle_pong(self, event: Frame) -> None:
+        """Take a pong; many come from nobody who was asked."""
+        if self._may_go_on():
+            super().handle_pong(event)
 
     def handle_cont(self, event: Frame) -> None:
         """A further fragment of a message; empty ones have no size that could be bounded."""
@@ -122,6 +140,15 @@ class WebSocketConnection(WebSocketsSansIOProtocol):
         """It does not answer: it need not be waited for."""
         super().keepalive_timeout()
         self.transport.abort()
+
+    def _may_go_on(self) -> bool:
+        """Whether it keeps within the rate of control frames; otherwise it is left."""
+        if self._controls is None:
+            self._controls = Rate(CONTROLS_PER_SECOND, clock=self.loop.time)
+        is_fine = self._controls.take()
+        if not is_fine:
+            self.transport.abort()
+        return is_fine
 
     async def run_asgi(self) -> None:
         """Serve it; then it ends, whether it reads the last words or not."""

@@ -47,6 +47,7 @@ class _Server(uvicorn.Server):
     def _abort(self) -> None:
         for connection in list(self.server_state.connections):
             connection.transport.abort()
+        self.force_exit = True  # an abort of TLS may wait for the other side
 
 
 async def serve(settings: Settings, *, announce: Callable[[int], None]) -> None:

@@ -106,6 +106,7 @@ class Session:
                 await self._socket.close(UNSUPPORTED_DATA, "send text frames")
                 return
             self._take(said["text"])
+            await asyncio.sleep(0)  # what waits already would be taken before anything else is done
 
     def _take(self, text: str) -> None:
         """Begin what was asked for, or say why not."""

@@ -308,18 +308,14 @@ def test_browsers_fingers_are_kept_apart_and_lifted_when_they_leave(
 
 def test_a_stop_overtakes_what_waits(gateway: GatewayProcess, daemon: ScriptedDaemon) -> None:
     """Sixteen requests to arm are under way, more are refused; a stop is answered all the same."""
-    daemon.hold(is_held=True)
-    try:
-        with RawWebSocket(gateway) as ws:
-            for id in range(17):
-                ws.ask("arm", PARAMETERS["arm"], id=id)
-            error = ws.answer(16)["error"]
-            assert isinstance(error, dict)
-            assert error["code"] == 1005
-            ws.ask("stop", {}, id=99)
-            assert ws.answer(99)["result"] == {}
-    finally:
-        daemon.hold(is_held=False)
+    with daemon.holding(), RawWebSocket(gateway) as ws:
+        for id in range(17):
+            ws.ask("arm", PARAMETERS["arm"], id=id)
+        error = ws.answer(16)["error"]
+        assert isinstance(error, dict)
+        assert error["code"] == 1005
+        ws.ask("stop", {}, id=99)
+        assert ws.answer(99)["result"] == {}
 
 
 def test_a_request_without_id_gets_no_answer(

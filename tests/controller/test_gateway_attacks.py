@@ -375,6 +375,8 @@ MISUSES: dict[str, tuple[Misuse, set[int]]] = {
     ),
     "fragment of nothing": (lambda ws: ws.send(b"{}", first=0x80), {1002}),
     "long ping": (lambda ws: ws.send(b"x" * 126, first=0x89), {1002}),
+    "flood of pings": (lambda ws: ws.connection.sendall(frame(b"", first=0x89) * 10_000), {0}),
+    "flood of pongs": (lambda ws: ws.connection.sendall(frame(b"", first=0x8A) * 10_000), {0}),
     "no UTF-8": (texts(b"\xff\xfe"), {1007}),
 }
 

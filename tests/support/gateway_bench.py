@@ -82,10 +82,14 @@ class ScriptedDaemon:
         """Tell whoever has subscribed."""
         self._loop.call_soon_threadsafe(self._hub.publish, topic, lambda: event)
 
-    def hold(self, *, is_held: bool) -> None:
-        """Whether `arm` gets no answer for now."""
-        change = self._answers.clear if is_held else self._answers.set
-        self._loop.call_soon_threadsafe(change)
+    @contextmanager
+    def holding(self) -> Iterator[None]:
+        """Within it `arm` gets no answer."""
+        self._loop.call_soon_threadsafe(self._answers.clear)
+        try:
+            yield
+        finally:
+            self._loop.call_soon_threadsafe(self._answers.set)
 
     @property
     def methods(self) -> list[str]:

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from controller.daemon.config import DaemonConfig
 
-RESTART = ("socket", "log.file", "metrics", "dashboard")
+RESTART = ("touch_wait", "socket", "log.file", "metrics", "dashboard")
 """Keys that hold from the start to the end of a daemon."""
 
 BASIS = ("rig", "table", "mode", "serial_numbers")
@@ -52,6 +52,7 @@ def _changed(old: DaemonConfig, new: DaemonConfig) -> list[str]:
         "table": old.table != new.table,
         "mode": old.section.mode != new.section.mode,
         "serial_numbers": old.section.serial_numbers != new.section.serial_numbers,
+        "touch_wait": old.section.touch_wait != new.section.touch_wait,
         "layout": old.meaning != new.meaning,
         "touch": old.touch != new.touch,
         "longest_lease": old.section.longest_lease != new.section.longest_lease,

@@ -6,6 +6,7 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, Field, Strict
 
 from controller.api.parts import LONGEST_LEASE, SHORTEST_LEASE
+from controller.envelopes import ENVELOPE_TIME
 from model.config import Quantity, Section
 from model.drive_modes import MODES
 from model.perception import STRONG_DB_SL
@@ -32,6 +33,9 @@ def loopback_address(text: str) -> str:
         )
     return text
 
+
+LONGEST_WAIT = 0.1
+"""How long [s] a touch may wait for its shaped onset at most: later it is no answer to it."""
 
 Port = Annotated[int, Field(ge=0, le=65535)]
 File = Annotated[str, Field(min_length=1, max_length=4096, pattern=r"^[^\x00]*$")]
@@ -75,6 +79,7 @@ class DaemonSection(Section):
     table: File | None = None
     mode: Annotated[str, AfterValidator(_mode)] | None = None
     level_db_sl: LevelDbSl = STRONG_DB_SL
+    touch_wait: Annotated[float, Quantity(TIME, least=0, most=LONGEST_WAIT)] = ENVELOPE_TIME
     layout: File | None = None
     touch: Annotated[list[TouchSection], Field(max_length=16, default_factory=list)]
     serial_numbers: Annotated[dict[Identifier, str], Field(max_length=64, default_factory=dict)]

@@ -44,6 +44,7 @@ def test_a_file_that_names_a_rig_only_is_enough(folder: Path) -> None:
     assert config.touch == ()
     assert (config.table, config.layout, config.dump_folder, config.log_file) == (None,) * 4
     assert config.section.longest_lease == 60.0
+    assert config.section.touch_wait == 0.030
     assert config.socket == default_socket()
     assert config.rig_text == example_rig_path().read_text("utf-8")
 
@@ -81,7 +82,8 @@ def test_everything_that_is_wrong_is_said_at_once(folder: Path) -> None:
         "log: {level: loud}\n"
         "dashboard: 0.0.0.0:80\n"
         "metrics: 65536\n"
-        "longest_lease: 61 s\n",
+        "longest_lease: 61 s\n"
+        "touch_wait: 101 ms\n",
     )
     assert problems(path) == [
         (1, "rig"),
@@ -97,6 +99,7 @@ def test_everything_that_is_wrong_is_said_at_once(folder: Path) -> None:
         (12, "dashboard"),
         (13, "metrics"),
         (14, "longest_lease"),
+        (15, "touch_wait"),
     ]
 
 

@@ -27,7 +27,7 @@ from daemon_bench import (
     until_state,
 )
 from drivers.amplifier import Amplifier
-from drivers.protocol.messages import State
+from drivers.protocol.messages import Apply, LoadEnvelope, State
 from drivers.registry import open_backend
 from model.errors import InputError
 from model.rig_file import load_rig
@@ -105,6 +105,23 @@ async def test_touches_are_felt_while_armed_and_only_then(tmp_path: Path) -> Non
         await until(lambda: not any(bench.far.station.status().levels))
         assert (await told_of(era, "silence")).data["reason"]
         assert (await era.status()).drive == {}
+
+
+@pytest.mark.parametrize(("wait", "is_shaped"), [("30 ms", True), ("0 ms", False)])
+async def test_a_touch_waits_for_its_onset_only_where_it_may(
+    tmp_path: Path, wait: str, is_shaped: bool
+) -> None:
+    """By default its envelopes are loaded before it is felt; without time to wait none are."""
+    async with (
+        running_daemon(tmp_path, f"touch_wait: {wait}\n") as bench,
+        await bench.client() as era,
+    ):
+        await until_state(era, READY)
+        await era.arm("me", lease_s=30)
+        async with holding(era, bench):
+            asked = [type(each.what) for each in bench.daemon._recorder.last() if each.way == "out"]
+            assert Apply in asked
+            assert (LoadEnvelope in asked) is is_shaped
 
 
 async def test_a_client_that_is_gone_leaves_no_finger(

@@ -308,8 +308,14 @@ class AmplifierGroup:
 
 
 async def _gathered(requests: Iterable[Coroutine[Any, Any, _T]]) -> list[_T]:
-    """Wait for all, then raise the gravest of what they raised: a lost link before a refusal."""
-    results = await asyncio.gather(*requests, return_exceptions=True)
+    """Wait for all, then raise the gravest of what they raised: a lost link before a refusal.
+
+    A single one goes out at once, without a turn of the event loop in between.
+    """
+    pending = list(requests)
+    if len(pending) == 1:
+        return [await pending[0]]
+    results = await asyncio.gather(*pending, return_exceptions=True)
     failures = [result for result in results if isinstance(result, BaseException)]
     if failures:
         raise next((error for error in failures if isinstance(error, LinkError)), failures[0])

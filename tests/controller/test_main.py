@@ -280,6 +280,15 @@ def test_every_package_of_the_project_can_be_loaded(
     for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
         monkeypatch.setenv(variable, "1")  # main sets them; so they are put back after the test
     installed = {point.name for point in entry_points(group=GROUP)}
-    assert installed == {"controller", "daemon", "deploy", "drivers", "gateway", "model", "sim"}
+    assert installed == {
+        "controller",
+        "daemon",
+        "deploy",
+        "drivers",
+        "gateway",
+        "model",
+        "report",
+        "sim",
+    }
     assert main() == 0
     assert capsys.readouterr().err == ""

@@ -1,0 +1,1 @@
+"""What a bug report should hold, gathered in one file."""

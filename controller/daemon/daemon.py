@@ -75,6 +75,7 @@ class Daemon:
             name: Amplifier(backend, serial_number=config.section.serial_numbers.get(name))
             for name, backend in backends.items()
         }
+        self._amplifiers = amplifiers
         self._supervisor = Supervisor(
             amplifiers,
             state_changed=self._state_changed,
@@ -222,7 +223,6 @@ class Daemon:
             pattern_applied=self._pattern_applied,
             silenced=self._silenced,
             refused=lambda reason: _logger.warning("refused: %s", reason),
-            link_lost=lambda what: self._link_told("lost", what),
         )
 
     def _contacts_changed(self, contacts: tuple[Contact, ...], change: Change) -> None:
@@ -258,10 +258,13 @@ class Daemon:
         kinds: Mapping[str, str] = {"lost": "error", "retry": "warning", "reopened": "info"}
         _logger.log(getattr(logging, kinds[event].upper()), "link %s: %s", event, message)
         remedy = None if event == "reopened" else "look at cables and supply"
+        # When it is tried again all have been closed.
+        lost = [name for name, amplifier in self._amplifiers.items() if amplifier.lost]
+        name = lost[0] if event == "lost" and len(lost) == 1 else None
         self._service.hub.publish(
             "link",
             lambda: LinkEvent.model_validate(
-                {"event": event, "amplifier": None, "message": message, "remedy": remedy}
+                {"event": event, "amplifier": name, "message": message, "remedy": remedy}
             ),
         )
 

@@ -35,9 +35,9 @@ class Supervisor:
     """Keeps a controller's amplifiers open, armed only as the state table allows, and silent else.
 
     controller: made with `observe(observer)` of this; amplifiers: the same as the controller's.
-    state_changed is told of every change, old and new; link_told of each attempt to come back, with
-    what came of it; alive is called whenever the control loop, or what stands in for it while there
-    is no link, has run.
+    state_changed is told of every change, old and new; link_told, with a message, that the link is
+    lost, of each attempt to come back (retry), and that it is reopened; alive is called whenever
+    the control loop, or what stands in for it while there is no link, has run.
     """
 
     def __init__(
@@ -221,6 +221,8 @@ class Supervisor:
         return {name: await each.status() for name, each in self._amplifiers.items()}
 
     async def _lost(self, error: LinkError) -> None:
+        if self.machine.state is not State.COMM_LOST:  # told already
+            self._link_told("lost", str(error))
         remedy = "look at cables and supply; the daemon tries again by itself, and stays disarmed"
         await self.handle(Event(Kind.LINK_LOST, str(error), remedy))
 

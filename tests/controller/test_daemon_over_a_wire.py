@@ -232,7 +232,8 @@ async def test_a_cut_link_is_told_and_comes_back_disarmed(tmp_path: Path) -> Non
         assert status.assume_energised
         assert status.armed_by is None
         assert "cables" in (status.remedy or "")
-        assert (await told_of(era, "link")).data["event"] in ("lost", "retry")
+        told = (await told_of(era, "link")).data
+        assert (told["event"], told["amplifier"]) == ("lost", "main")
         assert await refusal(era.arm("me")) is ErrorCode.WRONG_STATE
         assert await refusal(era.clear()) is ErrorCode.LINK
         await era.stop()
@@ -249,8 +250,10 @@ async def test_a_cut_link_is_noticed_while_disarmed(tmp_path: Path) -> None:
     """Nobody has to arm to find out; back again, nothing has to be acknowledged."""
     async with running_daemon(tmp_path) as bench, await bench.client() as era:
         await until_state(era, READY)
+        await era.subscribe("link")
         bench.far.station.befall(Episode("hang"))
         await until_state(era, "COMM_LOST")
+        assert (await told_of(era, "link")).data["event"] == "lost"
         bench.far.station.recover()
         await until_state(era, READY)
 

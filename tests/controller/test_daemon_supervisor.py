@@ -188,7 +188,8 @@ def test_a_lost_link_is_tried_again_with_growing_pauses(
             pauses = [round(b - a, 3) for a, b in itertools.pairwise(tries)]
             assert pauses[-2:] == [5.0, 5.0]
             assert pauses[0] < 1
-            assert set(daemon.links) == {"retry"}
+            assert daemon.links[0] == "lost"
+            assert set(daemon.links[1:]) == {"retry"}
             daemon.far_end.answer = lambda request: None
             daemon.far_end.asked.clear()
             await asyncio.sleep(6)

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field, replace
 from pythonosc.osc_bundle_builder import IMMEDIATELY, OscBundleBuilder
 from pythonosc.osc_message_builder import OscMessageBuilder
 
+from controller.sources.datagrams import Datagrams, Peer, listen
 from controller.sources.osc import OscError, osc_messages
 from controller.tally import Tally
 from controller.touch import Touch, TouchFrame, TouchSource
@@ -176,27 +177,25 @@ class TuioSource(TouchSource):
         self.host, self._port = _host_and_port(url)
         self.tally = Tally(_logger)
         self._url = url
-        self._transport: asyncio.DatagramTransport | None = None
+        self._line: Datagrams | None = None
         self._reader = TuioReader(self.tally)
         self._deliver: Callable[[TouchFrame], None] | None = None
 
     @property
     def port(self) -> int:
         """The UDP port that is bound; before `open` the one that was asked for."""
-        if self._transport is None:
-            return self._port
-        return int(self._transport.get_extra_info("sockname")[1])
+        return self._port if self._line is None else self._line.port
 
     async def open(self) -> None:
         """Bind the port, unless it is; `run` does it by itself. Raises InputError if it is taken.
 
         What arrives before `run` is dropped.
         """
-        if self._transport is not None:
+        if self._line is not None:
             return
         try:
-            self._transport, _ = await asyncio.get_running_loop().create_datagram_endpoint(
-                lambda: _Listener(self._received), local_addr=(self.host, self._port)
+            self._line = await listen(
+                self.host, self._port, self._received, largest=_LARGEST_DATAGRAM
             )
         except OSError as error:
             raise InputError(
@@ -212,28 +211,17 @@ class TuioSource(TouchSource):
             await asyncio.get_running_loop().create_future()
         finally:
             self._deliver = None
-            if self._transport is not None:
-                self._transport.close()
-                self._transport = None
+            if self._line is not None:
+                self._line.close()
+                self._line = None
 
-    def _received(self, datagram: bytes, peer: tuple[str, int]) -> None:
-        """Read one datagram; the frame's time is that of its arrival here."""
+    def _received(self, datagram: bytes, peer: Peer, arrived: float) -> None:
+        """Read one datagram; the frame's time is that of its arrival."""
         if self._deliver is None:
             return
-        frame = self._reader.read(datagram, peer, now=asyncio.get_running_loop().time())
+        frame = self._reader.read(datagram, peer, now=arrived)
         if frame is not None:
             self._deliver(frame)
-
-
-class _Listener(asyncio.DatagramProtocol):
-    """The UDP end."""
-
-    def __init__(self, received: Callable[[bytes, tuple[str, int]], None]) -> None:
-        self._received = received
-
-    def datagram_received(self, data: bytes, addr: tuple[str, int]) -> None:
-        """Hand one datagram on with the host and port that it came from."""
-        self._received(data, (addr[0], addr[1]))
 
 
 def _host_and_port(url: str) -> tuple[str, int]:

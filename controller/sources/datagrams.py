@@ -1,0 +1,123 @@
+"""Datagrams as they come in: all that have arrived at once, each with when it did.
+
+An event loop's own endpoint reads one datagram in a turn, and knows only when it did so: a command
+would be decided by what is old by then, and the time that a datagram has waited would not be seen.
+Here a turn takes what is there, for a quarter of a millisecond at most, and the system says when
+each came, where it does that (Linux). Where the loop watches no sockets (Windows), its endpoint
+serves.
+"""
+
+import asyncio
+import contextlib
+import socket
+import struct
+import sys
+import time
+from collections.abc import Callable
+from typing import TypeAlias
+
+TURN = 0.00025  # s; as long as everybody else waits at most for a sender that floods
+
+Peer: TypeAlias = tuple[str, int]
+Received: TypeAlias = Callable[[bytes, Peer, float], None]
+"""Told of a datagram, the host and port it came from, and when [s], by the event loop's clock."""
+
+_TIMESTAMPS = 35  # SO_TIMESTAMPNS and SCM_TIMESTAMPNS of Linux, which Python does not name
+_TIMESPEC = struct.Struct("@ll")
+_LONGEST_WAIT = 1.0  # s; a system's clock that was set meanwhile must not make touches old
+
+
+class Datagrams:
+    """Listens on a UDP port until it is closed; see `listen`."""
+
+    def __init__(self, line: socket.socket, received: Received, *, largest: int) -> None:
+        self._line = line
+        self._received = received
+        self._most = largest + 1  # so that a larger one is known by its size
+        self._loop = asyncio.get_running_loop()
+        self._latest = self._loop.time()
+        self._transport: asyncio.DatagramTransport | None = None
+
+    @property
+    def port(self) -> int:
+        """The port that is bound."""
+        return int(self._line.getsockname()[1])
+
+    async def begin(self) -> None:
+        """Listen from now on."""
+        if sys.platform == "linux":
+            with contextlib.suppress(OSError):
+                self._line.setsockopt(socket.SOL_SOCKET, _TIMESTAMPS, 1)
+        try:
+            self._loop.add_reader(self._line, self._readable)
+        except NotImplementedError:
+            self._transport, _ = await self._loop.create_datagram_endpoint(
+                lambda: _Endpoint(self._received, self._loop), sock=self._line
+            )
+
+    def close(self) -> None:
+        """Listen no more."""
+        if self._transport is not None:
+            self._transport.close()
+            return
+        self._loop.remove_reader(self._line)
+        self._line.close()
+
+    def _readable(self) -> None:
+        """Take what has arrived."""
+        end = time.perf_counter() + TURN
+        while self._line.fileno() >= 0:  # whoever receives may close it
+            try:
+                data, ancillary, _, peer = self._line.recvmsg(self._most, _ANCILLARY)
+            except OSError:  # there is nothing more, or what was sent from here was refused
+                return
+            self._received(data, (str(peer[0]), int(peer[1])), self._arrival(ancillary))
+            if time.perf_counter() >= end:
+                return
+
+    def _arrival(self, ancillary: list[tuple[int, int, bytes]]) -> float:
+        """When a datagram arrived, never before the one that was read before it."""
+        waited = 0.0
+        for level, kind, content in ancillary:
+            if (level, kind) == (socket.SOL_SOCKET, _TIMESTAMPS) and len(content) == _TIMESPEC.size:
+                seconds, nanoseconds = _TIMESPEC.unpack(content)
+                waited = time.time() - seconds - nanoseconds * 1e-9
+        if not 0 <= waited <= _LONGEST_WAIT:
+            waited = 0.0
+        self._latest = max(self._latest, self._loop.time() - waited)
+        return self._latest
+
+
+_ANCILLARY = 64  # bytes; room for a timestamp and its header
+
+
+async def listen(host: str, port: int, received: Received, *, largest: int) -> Datagrams:
+    """Listen on a host and UDP port, 0 for any that is free; raises OSError.
+
+    largest: bytes of the longest datagram; of one that is longer a byte more is handed on.
+    """
+    loop = asyncio.get_running_loop()
+    found = await loop.getaddrinfo(host, port, type=socket.SOCK_DGRAM)
+    family, kind, protocol, _, address = found[0]
+    line = socket.socket(family, kind, protocol)
+    try:
+        line.setblocking(False)
+        line.bind(address)
+        made = Datagrams(line, received, largest=largest)
+        await made.begin()
+    except BaseException:
+        line.close()
+        raise
+    return made
+
+
+class _Endpoint(asyncio.DatagramProtocol):
+    """What stands in where the loop watches no sockets."""
+
+    def __init__(self, received: Received, loop: asyncio.AbstractEventLoop) -> None:
+        self._received = received
+        self._loop = loop
+
+    def datagram_received(self, data: bytes, addr: tuple[str, int]) -> None:
+        """Hand one datagram on."""
+        self._received(data, (addr[0], addr[1]), self._loop.time())

@@ -84,6 +84,7 @@ class Faults:
             hit = self._is_on(episode, time) and episode.toward in (None, toward)
             if hit and self._random.random() < episode.share:
                 arriving = self._befallen(episode, arriving, toward)
+                arriving = [(delay, data) for delay, data in arriving if data]  # cut to nothing
         return arriving
 
     def _befallen(

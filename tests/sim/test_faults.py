@@ -7,7 +7,7 @@ import pytest
 
 from model.errors import InputError
 from sim.fault_file import load_faults
-from sim.faults import Episode, Faults
+from sim.faults import Episode, FaultKind, Faults
 from sim.line import Line
 
 TELEGRAM = bytes(range(40))
@@ -124,3 +124,12 @@ async def test_a_closed_line_delivers_nothing_more() -> None:
     line.close()
     await asyncio.sleep(0.02)
     assert arrived == []
+
+
+def test_a_telegram_may_be_cut_and_flipped_by_several_faults_at_once() -> None:
+    """What is cut to nothing does not arrive, and nothing stumbles over it."""
+    kinds: tuple[FaultKind, ...] = ("truncate", "truncate", "corrupt", "torn_commit")
+    faults = Faults([Episode(kind) for kind in kinds])
+    arrived = [faults.pass_on(b"ab", toward="amplifier", time=1.0) for _ in range(200)]
+    assert {len(data) for telegrams in arrived for _, data in telegrams} <= {1}
+    assert [] in arrived

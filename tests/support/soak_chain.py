@@ -144,6 +144,7 @@ class _Run:
         self.asking = 0
         self.is_ending = False
         self.stalled_for = 0.0
+        self.is_reopening = False
         self.running: asyncio.Task[None] | None = None
         self.controller: Controller | None = None
         self.tasks: list[asyncio.Task[Any]] = []
@@ -308,7 +309,9 @@ class _Run:
                 await self._call("arm", controller.arm)
             at = self.loop.time() - START
             is_calm = self.plan.is_calm(ask.at - 0.1, at)
-            if is_calm and controller.phase is not Phase.ARMED:
+            if controller.phase is Phase.LOST and controller is self.controller:
+                self._reopen()
+            elif is_calm and controller.phase is not Phase.ARMED:
                 self.checks.violate("could not be armed, and nothing was wrong")
         else:
             await self._call(ask.what, getattr(controller, ask.what))
@@ -338,6 +341,13 @@ class _Run:
             self.stalled_for = lasts
             self.running.cancel()
 
+    def _reopen(self) -> None:
+        """A loss while disarmed shows when somebody asks; the control loop goes on all the same."""
+        if self.running is not None:
+            self.note("reopen")
+            self.is_reopening = True
+            self.running.cancel()
+
     async def _serve(self) -> None:
         """Open, run, and open again after a loss, as a daemon does."""
         pauses: Iterator[float] = iter(_PAUSES)
@@ -365,6 +375,9 @@ class _Run:
                 await self.running
                 return
             except asyncio.CancelledError:
+                if self.is_reopening:
+                    self.is_reopening = False
+                    return
                 if not self.stalled_for:
                     self.running.cancel()
                     raise

@@ -26,6 +26,11 @@ lint: .venv/installed-test
 fuzz: .venv/installed-test
 	$(BIN)/python tests/support/mutation.py
 
+# Two hundred daemons killed at random moments, over every wire, and when all was silent;
+# `make test` takes fifteen. Others: make kill-test KILLS='--kills 20 --seed 7'
+kill-test: .venv/installed-test
+	$(BIN)/python tests/support/kills.py $(KILLS)
+
 # The whole chain in virtual time, thousands of seeds; `make test` takes a few hundred short ones.
 # Others: make soak SOAK='--hours 10 --wire serial', or one again: make soak SOAK='--seed 17'
 soak: .venv/installed-test

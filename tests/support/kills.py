@@ -1,0 +1,209 @@
+"""Daemons that are killed at random moments: when does every channel fall silent?
+
+    python tests/support/kills.py [--kills 200] [--seed 1]
+
+Each is `era daemon`, a process of its own, over a real wire; a client arms it, moves fingers about,
+lifts them, disarms, stops. The amplifiers stay the same from one daemon to the next, which must
+find what the one before has left. Prints a row a wire; exit status 1 where anything was too late.
+"""
+
+import argparse
+import asyncio
+import contextlib
+import random
+import signal
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from controller.api.async_client import AsyncClient
+from controller.api.jsonrpc import RpcError
+from controller.api.replies import Unreachable
+from daemon_bench import PATIENCE, until, until_state
+from daemon_process import REACTION, WATCHDOG, DaemonProcess, daemon_process
+from drivers.protocol.messages import State
+from journal import Journal, energised, loudness
+from model.rig_file import load_rig
+from rig_files import TWO_AMPLIFIERS, write_rig
+from sim.wires import Wire
+from wires import WIRES, far_side
+
+READY = "READY_TO_SWITCH_ON"
+LIMIT = WATCHDOG + REACTION  # s; on the amplifier's clock, from its last sign of life
+UNDER_WAY = 3  # requests that were on the wire when the daemon died: one, a stop and its repetition
+STARTING = 0.1  # share of the daemons that are killed before they serve
+LONGEST_LIFE = 0.8  # s; from when it was armed first
+_AT_ONCE = 3  # wires side by side: also what loads the machine
+
+PLACES: Sequence[tuple[str, Wire, Sequence[tuple[str, str]]]] = (
+    ("serial", WIRES["serial"], ()),
+    ("serial, two amplifiers", Wire("serial"), TWO_AMPLIFIERS),
+    *((name, wire, ()) for name, wire in WIRES.items() if name != "serial"),
+)
+"""Wires by their names, and what is changed in the rig for them."""
+
+
+@dataclass(frozen=True)
+class Kill:
+    """What a killed daemon left: how loud it was, and when all of it was over.
+
+    after_feed, after_death [s]: from the amplifier's last sign of life, and from when the process
+    was gone, to silence on every channel; None where nothing was energised. late: requests that an
+    amplifier got after the death; faults: those that the amplifiers told; left: what still played.
+    """
+
+    wire: str
+    level: float
+    energised: int
+    after_feed: float | None
+    after_death: float | None
+    late: int
+    trips: int
+    left: float
+
+    @property
+    def is_good(self) -> bool:
+        """Whether every channel was silent in time, by the watchdog, and nothing came after."""
+        in_time = self.after_feed is None or self.after_feed <= LIMIT + 1e-9
+        return in_time and self.late <= UNDER_WAY * max(self.energised, 1) and self.left == 0
+
+
+async def kill_daemons(
+    place: tuple[str, Wire, Sequence[tuple[str, str]]], kills: int, *, seed: int
+) -> list[Kill]:
+    """So many daemons, one after the other, at the same amplifiers."""
+    name, wire, changes = place
+    chance = random.Random(seed)
+    with tempfile.TemporaryDirectory(prefix="era-kills-") as made:
+        folder = Path(made)
+        rig = load_rig(write_rig(folder / "bench.yaml", *changes))
+        async with far_side(wire, rig) as far:
+            journal = Journal(far)
+            done = []
+            for _ in range(kills):
+                starts = chance.random() < STARTING
+                async with daemon_process(folder, far, changes=changes, waits=not starts) as daemon:
+                    armed = asyncio.Event()
+                    living = asyncio.create_task(
+                        _live(daemon, random.Random(chance.random()), armed)
+                    )
+                    if not starts:
+                        await asyncio.wait_for(armed.wait(), PATIENCE)
+                    await asyncio.sleep(chance.uniform(0.0, LONGEST_LIFE))
+                    done.append(await _kill(name, daemon, journal))
+                    living.cancel()
+                    await asyncio.gather(living, return_exceptions=True)
+            return done
+
+
+async def _kill(wire: str, daemon: DaemonProcess, journal: Journal) -> Kill:
+    far = daemon.far
+    daemon.process.send_signal(signal.SIGKILL)
+    level, alive = loudness(far), energised(far)
+    await daemon.process.wait()
+    dead = time.monotonic()
+    alive = sorted({*alive, *energised(far)})
+    await until(lambda: not energised(far))
+    ends = []
+    for name in alive:
+        fed = journal.last_fed(name)
+        tones = [one.silent_from for each in far.bench.amplifiers[name].outputs for one in each]
+        ends.append((max(tones, default=fed), fed))
+    await asyncio.sleep(0.05)  # what was still to come would have come
+    return Kill(
+        wire,
+        level,
+        len(alive),
+        max((end - fed for end, fed in ends), default=None),
+        max((end - dead for end, _ in ends), default=None),
+        len(journal.since(dead)),
+        sum(far.stations[name].status().state is State.FAULT for name in alive),
+        loudness(far),
+    )
+
+
+async def _live(daemon: DaemonProcess, chance: random.Random, armed: asyncio.Event) -> None:
+    """What happens to a daemon all day, in a hurry, until it is dead."""
+    with contextlib.suppress(ConnectionError, Unreachable, AssertionError):
+        await daemon.serves()
+        async with await daemon.client() as era:
+            while True:
+                try:
+                    await _once(era, chance, armed)
+                except RpcError:  # lost, or in a fault: as anybody would, acknowledge and go on
+                    await asyncio.sleep(0.02)
+
+
+async def _once(era: AsyncClient, chance: random.Random, armed: asyncio.Event) -> None:
+    if await until_state(era, READY, "FAULT", "QUICK_STOP_ACTIVE") != READY:
+        await era.clear()
+        return
+    await era.arm("life", lease_s=2)
+    armed.set()
+    end = time.monotonic() + chance.uniform(0.2, 1.0)
+    while time.monotonic() < end:
+        places = [
+            (chance.uniform(0.02, 0.28), chance.uniform(0.02, 0.2))
+            for _ in range(chance.choice((1, 1, 1, 2, 2, 0)))
+        ]
+        await era.touch(places)
+        await asyncio.sleep(chance.uniform(0.0, 0.05))
+    await era.touch([])
+    await chance.choice((era.disarm, era.stop))()
+
+
+async def kill_everywhere(kills: int, *, seed: int) -> list[Kill]:
+    """So many kills, half of them over a serial line, the others shared among the other places."""
+    others = len(PLACES) - 1
+    shares = [kills - kills // 2, *(kills // 2 // others for _ in range(others))]
+    shares[0] += kills - sum(shares)
+    free = asyncio.Semaphore(_AT_ONCE)
+
+    async def at(number: int) -> list[Kill]:
+        async with free:
+            return await kill_daemons(PLACES[number], shares[number], seed=seed + number)
+
+    return [kill for each in await asyncio.gather(*map(at, range(len(PLACES)))) for kill in each]
+
+
+def table(kills: Iterable[Kill]) -> str:
+    """A row a wire."""
+    kills = list(kills)
+    rows = [
+        "| wire | kills | energised | playing | silent after the last sign of life, at most "
+        "| after the process was gone, at most | too late |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for wire in (*Counter(kill.wire for kill in kills), "all"):
+        of = [kill for kill in kills if wire in (kill.wire, "all")]
+        fed = [kill.after_feed for kill in of if kill.after_feed is not None]
+        dead = [kill.after_death for kill in of if kill.after_death is not None]
+        rows.append(
+            f"| {wire} | {len(of)} | {sum(kill.energised > 0 for kill in of)} "
+            f"| {sum(kill.level > 0 for kill in of)} "
+            f"| {1e3 * max(fed, default=0):.1f} ms | {1e3 * max(dead, default=0):.1f} ms "
+            f"| {sum(not kill.is_good for kill in of)} |"
+        )
+    return "\n".join(rows)
+
+
+def main() -> int:
+    """The command."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--kills", type=int, default=200)
+    parser.add_argument("--seed", type=int, default=1)
+    given = parser.parse_args()
+    kills = asyncio.run(kill_everywhere(given.kills, seed=given.seed))
+    sys.stdout.write(f"{table(kills)}\n")
+    bad = [kill for kill in kills if not kill.is_good]
+    for kill in bad:
+        sys.stdout.write(f"{kill}\n")
+    return 1 if bad else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

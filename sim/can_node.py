@@ -39,7 +39,6 @@ from sim.can_sets import (
     APPLY,
     ARM,
     COMMIT,
-    DISARM,
     SETS,
     STATUS,
     STOP,
@@ -203,8 +202,8 @@ class CanNode:
             self._waiting = order
         elif own:
             self._carry_out(order, lambda: self._plain_request(order))
-        elif order.action == STOP and _Q.ramp.holds(ramp):
-            self._station.broadcast(Stop(ramp / 1000))
+        elif order.action == STOP:
+            self._station.broadcast(Stop(_nearest_ramp(ramp)))
 
     def _sync(self) -> None:
         order, self._waiting = self._waiting, None
@@ -241,9 +240,7 @@ class CanNode:
             self._answer(order, 0, 255, False, self._status_blocks(order, reply))
 
     def _plain_request(self, order: Order) -> Request:
-        ramp = order.ramp / 1000
-        if order.action in (DISARM, STOP) and not _Q.ramp.holds(order.ramp):
-            raise Refused(NakCode.BAD_VALUE)
+        ramp = _nearest_ramp(order.ramp)
         match order.action:
             case 4:  # arm; its token is the number of the host
                 if not _Q.watchdog.holds(order.time) or not 1 <= order.token <= 127:
@@ -340,3 +337,8 @@ class CanNode:
         elif self._state == _OPERATIONAL:
             data = struct.pack("<BBBBHH", 0, STATUS, event.state, channel, 0, 0)
             self._send(CanFrame(IDS["answer"] + self._node, data))
+
+
+def _nearest_ramp(ramp: int) -> float:
+    """The nearest ramp [s] in range: silence is never refused for its ramp."""
+    return min(ramp, _Q.ramp.maximum) / _Q.ramp.per_unit

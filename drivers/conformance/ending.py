@@ -67,10 +67,16 @@ async def heartbeats(bench: Bench) -> None:
 
 
 async def valid_for(bench: Bench) -> None:
-    """It ends a vibration by itself after valid_for, and stays armed."""
+    """It ends a vibration by itself after valid_for, stays armed, and keeps what is staged."""
     await bench.arm()
-    await bench.amplifier.apply(bench.tones(1.0, valid_for=0.05))
+    ending, staged = bench.tones(1.0, valid_for=0.05), bench.tones(0.5)
+    await bench.amplifier.apply(ending)
+    await bench.amplifier.stage(staged)
     status = await bench.until(
         lambda status: not any(status.levels), what="the end of a vibration", feed=True
     )
     expect(status.state is State.OPERATION_ENABLED, f"then it is in {status.state.name}")
+    await bench.amplifier.apply(ending)
+    await bench.expect_levels(why="a set that has ended was applied again")
+    await bench.amplifier.commit(staged.token)
+    await bench.expect_levels(0.5, why="a set was committed that was staged before another ended")

@@ -54,6 +54,11 @@ class Cursor:
         """A value in its unit."""
         return quantity.from_wire(self.integer(quantity))
 
+    def nearest(self, quantity: Quantity) -> float:
+        """A value in its unit, the nearest in range: for what must never be refused."""
+        value = self._raw(quantity.struct_code)
+        return quantity.from_wire(min(max(value, quantity.minimum), quantity.maximum))
+
     def one_of(self, kind: type[EnumT]) -> EnumT:
         """A member of an enumeration, one byte."""
         value = self._raw("B")

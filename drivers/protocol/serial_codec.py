@@ -92,7 +92,7 @@ _ARM = _Layout(
 _DISARM = _Layout(
     Disarm,
     lambda disarm: pack((_Q.ramp, disarm.ramp)),
-    lambda cursor: Disarm(ramp=cursor.number(_Q.ramp)),
+    lambda cursor: Disarm(ramp=cursor.nearest(_Q.ramp)),
 )
 _STAGE = _Layout(
     Stage,
@@ -112,7 +112,7 @@ _APPLY = _Layout(
 _STOP = _Layout(
     Stop,
     lambda stop: pack((_Q.ramp, stop.ramp)),
-    lambda cursor: Stop(ramp=cursor.number(_Q.ramp)),
+    lambda cursor: Stop(ramp=cursor.nearest(_Q.ramp)),
 )
 _LOAD_ENVELOPE = _Layout(
     LoadEnvelope,

@@ -157,6 +157,26 @@ def test_a_broadcast_plays_what_its_token_names(bench: Bench) -> None:
     assert bench.state is State.QUICK_STOP_ACTIVE
 
 
+@pytest.mark.parametrize(
+    ("id", "order", "state"),
+    [
+        (ORDER, "0000 FFFF 0000 06 02", State.QUICK_STOP_ACTIVE),
+        (ORDER, "0000 FFFF 0000 05 02", State.SWITCHED_ON),
+        (0x480, "0000 FFFF 0000 06 00", State.QUICK_STOP_ACTIVE),
+    ],
+)
+def test_silence_is_never_refused_for_its_ramp(
+    bench: Bench, id: int, order: str, state: State
+) -> None:
+    """A stop, a disarm and a broadcast stop along 65.5 s are carried out along the longest ramp."""
+    bench.tell(0x201, command(0, 1))
+    bench.tell(ORDER, apply(9, 1, 1))
+    bench.sync()
+    said = bench.tell(id, order)
+    assert bench.state is state
+    assert all(frame.data[1] >> 4 == 0 for frame in said if frame.id == ANSWER)
+
+
 def test_the_host_s_heartbeat_feeds_and_no_other_does(bench: Bench) -> None:
     """127 armed it: its heartbeat is a sign of life, that of 126 and a status are none."""
     for feeding, id in ((False, 0x77E), (True, 0x77F)):

@@ -10,6 +10,7 @@ from model.arrays import FloatArray
 from model.errors import InputError
 from model.localization import Grid
 from model.rig import Rig
+from model.studies.solve import code_version
 from model.table import PAPER_FREQUENCIES, PAPER_GRID, LocalizationTable
 from model.table_build import build_table
 from model.table_file import FORMAT_VERSION, load_table, save_table
@@ -26,14 +27,18 @@ def cached_table(
 ) -> tuple[LocalizationTable, Path | None]:
     """The table of a rig, from the user's cache folder or built and kept there; and its file.
 
-    A damaged or old cache file is built anew. Where nothing can be written the table is built all
-    the same and the file is None.
+    A damaged cache file, and one that other code has made, is built anew. Where nothing can be
+    written the table is built all the same and the file is None.
     """
     path = _cache_path(rig, frequencies, grid, mode)
     try:
-        return load_table(path, fingerprint=rig.fingerprint), path
+        kept = load_table(path, fingerprint=rig.fingerprint)
     except InputError as reason:
         _logger.info("building the localization table: %s", reason)
+    else:
+        if kept.code_version == code_version():
+            return kept, path
+        _logger.info("building the localization table: %s made the one kept", kept.code_version)
     table = build_table(rig, frequencies=frequencies, grid=grid, mode=mode)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -2,9 +2,11 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
-from model import table_cache
+from model import table_build_parts, table_cache
+from model.localization import Grid
 from model.table_cache import cached_table
 from paper_plate import make_paper_rig
 
@@ -64,6 +66,29 @@ def test_a_damaged_cache_is_built_anew(rig, builds):
     assert len(builds) == 2
     assert cached_table(rig)[1] == path
     assert len(builds) == 2
+
+
+def test_what_other_code_made_is_built_anew(rig, builds, monkeypatch):
+    """A table that an older model left behind is not what this one would say, so it is replaced."""
+    with monkeypatch.context() as older:
+        older.setattr(table_build_parts, "code_version", lambda: "0.0.1+000000000000")
+        table, path = cached_table(rig)
+        assert table.code_version == "0.0.1+000000000000"
+    table, again = cached_table(rig)
+    assert (len(builds), again) == (2, path)
+    assert table.code_version != "0.0.1+000000000000"
+    assert cached_table(rig)[0].code_version == table.code_version
+    assert len(builds) == 2
+
+
+def test_every_choice_has_a_table_of_its_own(rig, builds):
+    """Other frequencies, as many of them, another grid and another mode are not mixed up."""
+    low, high = np.array([100.0, 200.0]), np.array([100.0, 300.0])
+    cached_table(rig, frequencies=low)
+    assert cached_table(rig, frequencies=high)[0].frequencies.tolist() == [100.0, 300.0]
+    assert cached_table(rig, frequencies=low, grid=Grid(3, 2))[0].grid == Grid(3, 2)
+    assert cached_table(rig, frequencies=low, mode="phased")[0].mode == "phased"
+    assert len(builds) == 4
 
 
 def test_without_a_place_to_keep_it_the_table_is_built_all_the_same(rig, cache, builds):

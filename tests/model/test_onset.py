@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from model.drive_excitation import excitation_of
-from model.drive_modes import best_drive
+from model.drive_modes import best_drive, find_drives
 from model.drive_modes.fields import Drive, judge
 from model.envelope import ramped_onset
 from model.onset import RampedOnsets
+from model.pattern import ONSET_RAMP
 from model.question import Question
 from model.table_build import build_table
 from model.timing import Timing
@@ -82,6 +83,58 @@ def test_a_plain_ramp_takes_the_pattern_of_the_better_onset(mode):
 def plain_with(pattern, excitation):
     """The same pattern of another excitation."""
     return replace(pattern, excitation=excitation)
+
+
+@pytest.mark.parametrize(
+    ("softer", "frequencies"),
+    [
+        ((), (0.0, np.inf)),
+        ((0.0, 0.0), (0.0, np.inf)),
+        ((0.0, 9.0), (0.0, np.inf)),
+        ((), (170.0, 400.0)),
+    ],
+)
+def test_a_decibel_of_the_score_counts_as_much_as_three_of_the_onset(softer, frequencies):
+    """Of the drives nearly as good none is ahead in score and a third of the transient contrast.
+
+    That is worked out sample by sample; the table's own prediction may be wrong by half a decibel.
+    One target and two, one of them softer, and amplifiers that do not play every frequency.
+    """
+    table = smooth_table()
+    transients = Transients(table.in_time)
+    usable = np.flatnonzero((frequencies[0] <= FREQUENCIES) & (frequencies[1] >= FREQUENCIES))
+    count = max(1, len(softer))
+    chosen_among = 0
+    for places in contact_sets(12, fingers=count + 2, seed=31):
+        question = Question(
+            tuple(places[:count]),
+            tuple(places[count:]),
+            mode="phased",
+            softer_db=softer,
+            frequencies=frequencies,
+        )
+        near = find_drives(table.fields(question).at(usable), "phased").near()
+
+        def worth(excitation, score, question=question):
+            bases = ramped_onset(excitation, table.eras, ramp=ONSET_RAMP)
+            contrast = min(
+                transients.contrast_db(bases, targets=[target], quiet=question.quiet) + louder
+                for target, louder in zip(question.targets, softer or (0.0,), strict=True)
+            )
+            return 20 * np.log10(score) + contrast / 3
+
+        values, phases = [], []
+        for row, weight, score in zip(near.frequencies, near.weights, near.score, strict=True):
+            tones = excitation_of(Drive.at(row, weight), table.eras, FREQUENCIES[usable], gain=1.0)
+            values.append(worth(tones, score))
+            phases.append({name: (tone.frequency, tone.phase) for name, tone in tones.items()})
+        if len(values) < 2:
+            continue
+        chosen_among += 1
+        answered = table.ask(question).excitation
+        at = phases.index({name: (tone.frequency, tone.phase) for name, tone in answered.items()})
+        assert values[at] >= max(values) - 0.2
+    assert chosen_among >= 6
 
 
 @pytest.mark.parametrize("mode", ["switched", "signed", "phased"])

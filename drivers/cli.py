@@ -75,13 +75,15 @@ def discover(
     usable = [one for place in places if place.remedy is None for one in place.urls]
     found = asyncio.run(ask([*(url or []), *(usable if probe else [])]))
     who = {one.url: one.identity for one in found if one.identity is not None}
+    unusable = {one.url: one.problem for one in found if not one.was_asked}
     rows = [
         {
             "place": place.place,
             "description": place.description,
             "urls": list(place.urls),
             "answers": [one for one in place.urls if one in who],
-            "remedy": place.remedy,
+            "remedy": place.remedy
+            or next((unusable[one] for one in place.urls if one in unusable), None),
         }
         for place in places
     ]

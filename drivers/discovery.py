@@ -11,7 +11,7 @@ from pathlib import Path
 from serial.tools.list_ports import comports
 
 from drivers.amplifier import Amplifier
-from drivers.errors import DriverError
+from drivers.errors import DriverError, FrameError, LinkTimeout
 from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.messages import Identity
 from drivers.registry import known_schemes, open_backend
@@ -20,6 +20,7 @@ _NETWORK = Path("/sys/class/net")
 _CAN_TYPE = "280"  # ARPHRD_CAN of Linux
 _SPEEDS = (PROTOCOL.serial.baud, 115_200)
 _MODBUS = PROTOCOL.modbus
+_GROUP_MAY = 0o060  # read and write
 
 
 @dataclass(frozen=True)
@@ -34,11 +35,15 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Found:
-    """What came of asking at a URL: who answered, or why nobody did."""
+    """What came of asking at a URL: who answered, or why nobody did.
+
+    was_asked: whether the port could be used at all, so that the problem is the silence there.
+    """
 
     url: str
     identity: Identity | None
     problem: str | None = None
+    was_asked: bool = True
 
 
 def candidates() -> list[Candidate]:
@@ -56,7 +61,8 @@ async def _ask(url: str) -> Found:
         amplifier = Amplifier(open_backend(url))
         await amplifier.open()
     except DriverError as problem:
-        return Found(url, None, str(problem))
+        was_asked = isinstance(problem, LinkTimeout | FrameError)
+        return Found(url, None, str(problem), was_asked=was_asked)
     identity = amplifier.identity
     await amplifier.close()
     return Found(url, identity)
@@ -77,10 +83,17 @@ def _absolute(path: str) -> str:
 def _why_not_usable(path: str) -> str | None:
     if not path.startswith("/") or os.access(path, os.R_OK | os.W_OK):
         return None
-    group = Path(path).group()
+    momentary = f"sudo chmod a+rw {path}"
+    try:
+        is_for_group = Path(path).stat().st_mode & _GROUP_MAY == _GROUP_MAY
+        group = Path(path).group()
+    except (OSError, KeyError):  # it has just gone; or a group that has no name
+        is_for_group = False
+    if not is_for_group:
+        return f"this user may not use it, nor may its group; for a moment only: {momentary}"
     return (
         f"this user may not use it: sudo usermod -aG {group} $USER, then log in again "
-        f"(for a moment only: sudo chmod a+rw {path})"
+        f"(for a moment only: {momentary})"
     )
 
 

@@ -2,8 +2,9 @@
 
 import re
 from dataclasses import dataclass
-from urllib.parse import parse_qsl, unquote, urlsplit
+from urllib.parse import unquote, urlsplit
 
+from drivers.backends.url_options import options_of, whole_number
 from drivers.errors import CommandError
 from drivers.protocol.can_frame import CANOPEN
 
@@ -56,12 +57,7 @@ class CanUrl:
             port = parts.port if parts.scheme == "can+socketcand" else None
         except ValueError as problem:
             raise CommandError(f"{url!r} is no CAN URL: {problem}; use {_FORMS}") from None
-        options = dict(parse_qsl(parts.query, keep_blank_values=True))
-        unknown = sorted(options.keys() - _OPTIONS.keys())
-        if unknown:
-            raise CommandError(
-                f"{url!r}: unknown option {', '.join(unknown)}; a CAN URL has {', '.join(_OPTIONS)}"
-            )
+        options = options_of(parts.query, known=_OPTIONS, url=url, kind="a CAN")
         interface, host = parts.scheme.removeprefix("can+"), ""
         match interface:
             case "socketcan" | "virtual":
@@ -94,11 +90,7 @@ def _node(text: str, url: str) -> int:
     highest = int(CANOPEN["node_max"])
     if not text:
         return int(CANOPEN["node"])
-    if not (text.isascii() and text.isdigit() and 1 <= int(text) <= highest):
-        raise CommandError(
-            f"{url!r}: the node after # is {text!r}; it must be a whole number from 1 to {highest}"
-        )
-    return int(text)
+    return whole_number(text, "the node after #", high=highest, url=url)
 
 
 def _whole(options: dict[str, str], name: str, *, default: int, url: str) -> int:
@@ -106,8 +98,4 @@ def _whole(options: dict[str, str], name: str, *, default: int, url: str) -> int
     if text is None:
         return default
     low, high = _OPTIONS[name]
-    if not (text.isascii() and text.isdigit() and low <= int(text) <= high):
-        raise CommandError(
-            f"{url!r}: {name} is {text!r}; it must be a whole number from {low} to {high}"
-        )
-    return int(text)
+    return whole_number(text, name, low=low, high=high, url=url)

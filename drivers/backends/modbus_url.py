@@ -2,8 +2,9 @@
 
 import re
 from dataclasses import dataclass, replace
-from urllib.parse import SplitResult, parse_qsl, unquote, urlsplit
+from urllib.parse import SplitResult, unquote, urlsplit
 
+from drivers.backends.url_options import options_of, whole_number
 from drivers.errors import CommandError
 from drivers.protocol.definition import PROTOCOL
 
@@ -63,8 +64,8 @@ class ModbusUrl:
 
 
 def _tcp(parts: SplitResult, url: str) -> ModbusUrl:
-    options = dict(parse_qsl(parts.query, keep_blank_values=True))
-    if not parts.hostname or options.keys() - {"baud"} or parts.fragment:
+    options = options_of(parts.query, known=("baud",), url=url, kind="a Modbus TCP")
+    if not parts.hostname or parts.fragment:
         raise CommandError(f"{url!r}: a Modbus TCP URL has a host, a port and a unit: {_TCP_FORM}")
     return ModbusUrl(
         False,
@@ -76,13 +77,8 @@ def _tcp(parts: SplitResult, url: str) -> ModbusUrl:
 
 
 def _rtu(parts: SplitResult, url: str) -> ModbusUrl:
-    options = dict(parse_qsl(parts.query, keep_blank_values=True))
-    unknown = sorted(options.keys() - {"baud", "parity", "stop"})
-    if unknown:
-        raise CommandError(
-            f"{url!r}: unknown option {', '.join(unknown)}; a Modbus RTU URL has baud, parity and "
-            "stop"
-        )
+    known = ("baud", "parity", "stop")
+    options = options_of(parts.query, known=known, url=url, kind="a Modbus RTU")
     device = unquote(parts.path)
     if re.fullmatch(r"/COM\d+", device, re.IGNORECASE):
         device = device[1:]
@@ -102,24 +98,16 @@ def _rtu(parts: SplitResult, url: str) -> ModbusUrl:
         device=device,
         baud=_baud(options, _MAP["baud"] if device else 0, url),
         parity=_PARITIES[parity],
-        stop=_whole(options.get("stop", "1"), "stop", high=2, url=url),
+        stop=whole_number(options.get("stop", "1"), "stop", high=2, url=url),
         unit=_unit(parts.fragment, url),
     )
 
 
 def _baud(options: dict[str, str], default: int, url: str) -> int:
     text = options.get("baud")
-    return default if text is None else _whole(text, "baud", high=_BAUD_MAX, url=url)
+    return default if text is None else whole_number(text, "baud", high=_BAUD_MAX, url=url)
 
 
 def _unit(text: str, url: str) -> int:
     unit: int = _MAP["unit"]
-    return _whole(text, "unit", high=_MAP["unit_max"], url=url) if text else unit
-
-
-def _whole(text: str, name: str, *, high: int, url: str) -> int:
-    if not (text.isascii() and text.isdigit() and len(text) < 10 and 1 <= int(text) <= high):
-        raise CommandError(
-            f"{url!r}: {name} is {text!r}; it must be a whole number from 1 to {high}"
-        )
-    return int(text)
+    return whole_number(text, "unit", high=_MAP["unit_max"], url=url) if text else unit

@@ -8,8 +8,9 @@ hwgrep://0403:6001                              the port whose description fits 
 
 import re
 from dataclasses import dataclass
-from urllib.parse import parse_qsl, unquote, urlsplit
+from urllib.parse import unquote, urlsplit
 
+from drivers.backends.url_options import options_of, whole_number
 from drivers.errors import CommandError
 from drivers.protocol.definition import PROTOCOL
 
@@ -38,12 +39,12 @@ class SerialUrl:
             number = None if parts.scheme == "hwgrep" else parts.port
         except ValueError as problem:
             raise CommandError(f"{url!r} is no serial URL: {problem}; use {_FORM}") from None
-        options = dict(parse_qsl(parts.query, keep_blank_values=True))
-        unknown = sorted(options.keys() - {"baud", "address"})
-        if unknown:
+        if parts.fragment:
             raise CommandError(
-                f"{url!r}: unknown option {', '.join(unknown)}; a serial URL has baud and address"
+                f"{url!r}: a serial URL has no #; the address on the line is ?address="
+                f"{parts.fragment}"
             )
+        options = options_of(parts.query, known=("baud", "address"), url=url, kind="a serial")
         path = unquote(parts.path)
         if parts.scheme == "hwgrep":
             pattern = unquote(parts.netloc) + path
@@ -64,19 +65,8 @@ class SerialUrl:
         line = PROTOCOL.serial
         return cls(
             port=port,
-            baud=_whole(options, "baud", default=line.baud, high=_BAUD_MAX, url=url),
-            address=_whole(
-                options, "address", default=line.address, high=line.address_max, url=url
+            baud=whole_number(options.get("baud", str(line.baud)), "baud", high=_BAUD_MAX, url=url),
+            address=whole_number(
+                options.get("address", str(line.address)), "address", high=line.address_max, url=url
             ),
         )
-
-
-def _whole(options: dict[str, str], name: str, *, default: int, high: int, url: str) -> int:
-    text = options.get(name)
-    if text is None:
-        return default
-    if not (text.isascii() and text.isdigit() and 1 <= int(text) <= high):
-        raise CommandError(
-            f"{url!r}: {name} is {text!r}; it must be a whole number from 1 to {high}"
-        )
-    return int(text)

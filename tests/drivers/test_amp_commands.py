@@ -7,6 +7,7 @@ import sys
 import threading
 from collections.abc import Coroutine, Iterator
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, TypeVar
 
 import pytest
@@ -225,6 +226,28 @@ def test_discover_tells_how_to_mend_permissions(monkeypatch: pytest.MonkeyPatch)
     (place,) = [one for one in candidates() if one.place == "/dev/null"]
     assert "usermod -aG" in (place.remedy or "")
     assert "chmod a+rw /dev/null" in (place.remedy or "")
+
+
+def test_discover_suggests_no_group_that_may_not_either(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """A port that only its owner may use is not mended by joining its group."""
+    port = tmp_path / "tty"
+    port.touch(mode=0o600)
+    monkeypatch.setattr("drivers.discovery.comports", lambda: [ListPortInfo(str(port))])
+    monkeypatch.setattr("drivers.discovery.os.access", lambda path, mode: False)
+    (place,) = [one for one in candidates() if one.place == str(port)]
+    assert "usermod" not in (place.remedy or "")
+    assert f"chmod a+rw {port}" in (place.remedy or "")
+
+
+def test_discover_says_why_a_port_could_not_be_asked(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A port that cannot be opened is told with the reason, one where nobody answers without."""
+    monkeypatch.setattr("drivers.discovery.comports", lambda: [ListPortInfo("/dev/no-such-port")])
+    monkeypatch.setattr("drivers.discovery.os.access", lambda path, mode: True)
+    result = CliRunner().invoke(app, ["amp", "discover"])
+    assert result.exit_code == 0, result.output
+    assert "there is no such port" in result.stdout
 
 
 def test_identify_says_what_the_wire_allows(background: BackgroundFarEnd) -> None:

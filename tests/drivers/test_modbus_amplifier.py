@@ -132,7 +132,7 @@ async def test_a_slow_line_behind_a_gateway_is_waited_for() -> None:
         ("modbus+tcp://", "a host, a port and a unit"),
         ("modbus+tcp://h:99999/1", "no Modbus URL"),
         ("modbus+tcp://h/0", "unit is '0'; it must be a whole number from 1 to 247"),
-        ("modbus+tcp://h/1?speed=5", "a host, a port and a unit"),
+        ("modbus+tcp://h/1?speed=5", "unknown option speed; a Modbus TCP URL has baud"),
         ("modbus+tcp://h/1?baud=0", "baud is .0.; it must be a whole number"),
         ("modbus+tcp://h/one", "unit is 'one'"),
         ("modbus+rtu://", "names no port"),

@@ -343,6 +343,9 @@ def test_urls_are_understood(url: str, expected: SerialUrl) -> None:
         ("serial:///dev/x?baud=", "baud is ''"),
         ("serial:///dev/x?address=248", "from 1 to 247"),
         ("serial:///dev/x?speed=9600", "unknown option speed"),
+        ("serial:///dev/x?baud=9600&baud=1200", "given twice"),
+        (f"serial:///dev/x?baud={'9' * 5000}", "baud is '999"),
+        ("serial:///dev/x#7", "the address on the line is .address=7"),
     ],
 )
 def test_bad_urls_are_refused(url: str, problem: str) -> None:

@@ -1,5 +1,6 @@
 """What every kind of effect is: parameters in a layout, and how it goes at a finger."""
 
+import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Annotated, ClassVar, Literal, TypeAlias
@@ -85,3 +86,7 @@ class Effect(Section, ABC):
     def level_db_sl(self) -> float | None:
         """The level; None for as strong as the neighbours allow."""
         return None if isinstance(self.level, str) else self.level
+
+    def strongest_db_sl(self, level_db_sl: float | None) -> float:
+        """The highest level [dB SL] that is felt of a play at a level; infinite for None."""
+        return math.inf if level_db_sl is None else level_db_sl

@@ -73,9 +73,14 @@ class Layout:
     @property
     def strongest_db_sl(self) -> float:
         """The highest level that anything in it can have; infinite for what neighbours allow."""
-        levels = [effect.level_db_sl for effect in self.effects.values()]
-        levels += [region.level_db_sl for region in self.regions if region.has_level]
-        return max((math.inf if level is None else level for level in levels), default=-math.inf)
+        levels = [effect.strongest_db_sl(effect.level_db_sl) for effect in self.effects.values()]
+        levels += [
+            self.effects[name].strongest_db_sl(region.level_db_sl)
+            for region in self.regions
+            for name in (region.on_press, region.on_move, region.on_release)
+            if region.has_level and name is not None
+        ]
+        return max(levels, default=-math.inf)
 
     def drawn(self) -> dict[str, Any]:
         """As JSON, for whoever draws it."""

@@ -90,7 +90,8 @@ def load_layout(path: Path, plate: Plate | None, *, level_db_sl: float = STRONG_
 
 def is_layout_document(document: Document) -> bool:
     """Whether a configuration file is a surface layout."""
-    return bool(document.data.keys() & {"regions", "elsewhere"}) and "plate" not in document.data
+    own = {"effects", "regions", "elsewhere", "most_at_once"}
+    return bool(document.data.keys() & own) and not document.data.keys() & {"plate", "rig"}
 
 
 def _effects(validation: Validation, level_db_sl: float) -> dict[str, Effect | None]:

@@ -3,7 +3,9 @@
 import math
 from collections import deque
 from itertools import pairwise
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal, Self
+
+from pydantic import model_validator
 
 from controller.contacts import Contact
 from controller.effects.effect import Course, Effect, Feeling, Nothing
@@ -17,6 +19,8 @@ _MEMORY = 0.060
 _REST = 0.080
 # Levels of a texture are this far apart [dB], so that not every report is another command.
 _LEVEL_STEP = 2.0
+# A level is left when the speed asks for one this far [dB] from it, so that none flutters.
+_LEVEL_HOLD = 1.5
 # Reports that come together are taken to be this far apart [s]; no panel is faster.
 _SHORTEST_REPORT = 0.002
 # A finger this far [m] from where it was has moved; less is the panel's noise.
@@ -38,6 +42,14 @@ class Texture(Effect):
     fast: Annotated[float, Quantity(SPEED, above=0, most=5)] = 0.20
     range: Annotated[float, Quantity(RATIO, least=0, most=40)] = 14.0
 
+    @model_validator(mode="after")
+    def _check_speeds(self) -> Self:
+        if self.fast <= self.slow:
+            raise ValueError(
+                f"fast is {self.fast:g} m/s and must be above slow, which is {self.slow:g} m/s"
+            )
+        return self
+
     def begin(self, contact: Contact, now: float, *, level_db_sl: float | None) -> Course:
         """From rest."""
         return _Texture(self, contact, now, level_db_sl)
@@ -52,10 +64,14 @@ class _Texture(Course):
         self._texture = texture
         self._level = level_db_sl
         self._path = deque([(now, contact.x, contact.y)])
+        self._below: float | None = None  # what the level was less than at `fast` [dB]
 
     def feel(self, contact: Contact, now: float) -> Feeling | Nothing | None:
         """By the speed over the last 60 ms; a finger that is not reported elsewhere rests."""
-        if math.dist((contact.x, contact.y), self._path[-1][1:]) >= _NOISE:
+        before, *place = self._path[-1]
+        if math.dist((contact.x, contact.y), place) >= _NOISE:
+            if now - before >= _REST:  # it has rested there until now
+                self._path = deque([(now - _MEMORY, place[0], place[1])])
             self._path.append((now, contact.x, contact.y))
         while len(self._path) > 2 and now - self._path[1][0] >= _MEMORY:
             self._path.popleft()
@@ -79,8 +95,10 @@ class _Texture(Course):
             return None
         slow, fast = self._texture.slow, self._texture.fast
         share = math.log(min(speed, fast) / slow) / math.log(fast / slow)
-        below = round((1 - share) * self._texture.range / _LEVEL_STEP) * _LEVEL_STEP
-        return self._level - below
+        below = (1 - share) * self._texture.range
+        if self._below is None or abs(below - self._below) > _LEVEL_HOLD:
+            self._below = round(below / _LEVEL_STEP) * _LEVEL_STEP
+        return self._level - self._below
 
 
 class Detents(Effect):

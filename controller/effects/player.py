@@ -1,5 +1,6 @@
 """From contacts to wishes by a surface layout: who feels which effect, and who gives way."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -7,6 +8,10 @@ from controller.contacts import Contact, ContactKey
 from controller.effects.effect import Course, Effect, Feeling
 from controller.effects.layout import Layout, Region
 from controller.wishes import NOBODY_TOUCHES, Target, Wish
+
+# A finger that rests on an edge must not go in and out with the noise of its sensor, so it stays in
+# the region that it came into until it is this far [m] from where it did.
+_NOISE = 0.001
 
 ASKED = 1_000_000
 """The priority of an effect that was asked for by name: above all regions."""
@@ -24,9 +29,10 @@ class _Play:
 
 @dataclass
 class _Finger:
-    """Where a finger is, and what plays for it."""
+    """The region that a finger is in, where it came into that, and what plays for it."""
 
     region: Region | None
+    entered: tuple[float, float]
     plays: list[_Play] = field(default_factory=list)
 
 
@@ -72,13 +78,17 @@ class EffectPlayer:
     def play(self, name: str, contact: Contact, now: float, *, level_db_sl: float | None) -> None:
         """Begin a named effect at a finger; level [dB SL] in place of its own, unless None.
 
+        One that was asked for there before begins anew.
+
         Raises KeyError for an effect that the layout does not have.
         """
         effect = self.layout.effects[name]
         level = effect.level_db_sl if level_db_sl is None else level_db_sl
-        finger = self._fingers.setdefault(
-            contact.key, _Finger(self.layout.region_at(contact.x, contact.y))
-        )
+        finger = self._fingers.get(contact.key) or self._come(contact, now)
+        # It begins anew; nobody can pile up plays that way.
+        finger.plays = [
+            play for play in finger.plays if (play.name, play.priority) != (name, ASKED)
+        ]
         self._begin(finger, name, contact, now, level=level, priority=ASKED)
 
     def _follow(self, contacts: Sequence[Contact], now: float) -> None:
@@ -87,17 +97,28 @@ class EffectPlayer:
         for key in [key for key in self._fingers if key not in keys]:
             del self._fingers[key]
         for contact in contacts:
-            region = self.layout.region_at(contact.x, contact.y)
             finger = self._fingers.get(contact.key)
             if finger is None:
-                self._fingers[contact.key] = finger = _Finger(region)
-                self._enter(finger, contact, now)
-            elif finger.region is not region:
-                left, finger.region = finger.region, region
+                self._come(contact, now)
+                continue
+            place = (contact.x, contact.y)
+            if math.dist(place, finger.entered) < _NOISE:
+                continue
+            region = self.layout.region_at(*place)
+            if finger.region is not region:
+                left, finger.region, finger.entered = finger.region, region, place
                 finger.plays = [play for play in finger.plays if play.priority == ASKED]
                 self._enter(finger, contact, now)
                 if left is not None and left.on_release is not None:
                     self._begin_of(finger, left, left.on_release, contact, now)
+
+    def _come(self, contact: Contact, now: float) -> _Finger:
+        """Take in a finger that was not there, and begin what there is for it."""
+        place = (contact.x, contact.y)
+        finger = _Finger(self.layout.region_at(*place), place)
+        self._fingers[contact.key] = finger
+        self._enter(finger, contact, now)
+        return finger
 
     def _enter(self, finger: _Finger, contact: Contact, now: float) -> None:
         """Begin what a region, or the plate outside of all, has for a finger that comes."""

@@ -80,7 +80,7 @@ class _Rising(Course):
 
     def feel(self, contact: Contact, now: float) -> Feeling | Nothing | None:
         """The level of the step that is on."""
-        index = int((now - self.start) / self.step)
+        index = max(0, int((now - self.start) / self.step))
         if index >= len(self.levels) - 1 and self.holds:
             return Feeling(self.levels[-1])
         if index >= len(self.levels):
@@ -111,3 +111,7 @@ class Ramp(Effect):
     def ends(self) -> bool:
         """Unless it holds its last level."""
         return not self.hold
+
+    def strongest_db_sl(self, level_db_sl: float | None) -> float:
+        """One that falls begins with its strongest."""
+        return max(self.start_level, super().strongest_db_sl(level_db_sl))

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from controller.contacts import Contact, ContactKey
-from controller.effects.effect import Effect, Feeling, Nothing
+from controller.effects.effect import Course, Effect, Feeling, Nothing
 from controller.effects.kinds import effect_kind, effect_kinds
 from controller.effects.layout import Layout, Region
 from controller.effects.moving import Detents, Texture
@@ -99,6 +99,70 @@ def test_texture_by_speed() -> None:
     assert isinstance(felt, Nothing)
 
 
+def test_texture_begins_with_the_stroke() -> None:
+    """After a rest of seconds the first report elsewhere counts against the last 60 ms.
+
+    3 mm within them are 5 cm/s, which is halfway between slow and fast along the logarithm.
+    """
+    course = Texture(slow=0.01, fast=0.25, range=16.0).begin(finger(1, 0.0), 0, level_db_sl=20)
+    course.feel(finger(1, 0.001), 0.01)
+    assert course.feel(finger(1, 0.001), 0.2) == Nothing()
+    felt = course.feel(finger(1, 0.004), 5.0)
+    assert isinstance(felt, Feeling)
+    assert felt.level_db_sl == 12.0
+
+
+def test_texture_does_not_flutter() -> None:
+    """Speeds around the border of two levels, 1 dB from each, keep the one that was first."""
+    course = Texture(slow=0.01, fast=0.1, range=20.0).begin(finger(1, 0), 0, level_db_sl=20)
+    levels, way = set(), 0.0
+    for step in range(1, 60):
+        # By turns 0.8 dB and 1.2 dB below `fast`: on both sides of the border at 1 dB.
+        way += 0.01 * 0.1 * 10 ** -((0.8 if step // 10 % 2 else 1.2) / 20)
+        felt = course.feel(finger(1, way), 0.01 * step)
+        assert isinstance(felt, Feeling)
+        levels.add(felt.level_db_sl)
+    assert len(levels) == 1
+
+
+def test_a_finger_on_an_edge() -> None:
+    """Noise of half a millimetre across an edge is no crossing; a millimetre of way is."""
+    regions = (Region("left", LEFT, on_press="tick"), Region("right", RIGHT, on_press="tock"))
+    effects: dict[str, Effect] = {"tick": Click(level=10.0), "tock": Click(level=15.0)}
+    player = EffectPlayer(Layout(regions, effects, elsewhere=None))
+    assert wanted(player, [finger(1, 0.0999)], 0.0) == {1: 10.0}
+    for step in range(1, 20):
+        assert wanted(player, [finger(1, 0.0999 + 0.0005 * (step % 2))], 0.1 * step) == {}
+    assert wanted(player, [finger(1, 0.1009)], 2.0) == {1: 15.0}
+    for step in range(1, 20):
+        assert wanted(player, [finger(1, 0.1009 - 0.0009 * (step % 2))], 2 + 0.1 * step) == {}
+
+
+def test_times_that_run_backwards() -> None:
+    """A ramp that is asked about a moment before it began is at its first level, not at its last.
+
+    No other effect asks for more than its level then, either.
+    """
+    assert Ramp(start_level=6.0).begin(finger(1), 5.0, level_db_sl=20.0).feel(
+        finger(1), 4.0
+    ) == Feeling(6.0, until=5.125)
+    for effect in (Click(), Buzz(), Texture(), Detents()):
+        course = effect.begin(finger(1), 5.0, level_db_sl=20.0)
+        for now, x in ((4.0, 0.2), (3.0, 0.1)):
+            felt = course.feel(finger(1, x), now)
+            assert not isinstance(felt, Feeling) or (felt.level_db_sl or 0) <= 20.0
+
+
+def test_strongest_level_of_a_layout() -> None:
+    """What may be felt at all: a ramp's first level too, also where a region lowers its last."""
+    falling = Ramp(start_level=40.0, level=12.0)
+    assert Layout(effects={"fall": falling}).strongest_db_sl == 40.0
+    region = Region("pad", LEFT, on_press="soft", level_db_sl=30.0, has_level=True)
+    assert Layout((region,), {"soft": Click(level=10.0)}).strongest_db_sl == 30.0
+    free = Region("pad", LEFT, on_press="soft", level_db_sl=None, has_level=True)
+    assert Layout((free,), {"soft": Click(level=10.0)}).strongest_db_sl == float("inf")
+
+
 def test_detents_click_once_each() -> None:
     """Detents lie at 5, 15, 25 mm from where the finger came down, 10 mm apart.
 
@@ -180,6 +244,41 @@ def test_effects_by_name() -> None:
     assert wanted(player, [here, other], 0.16) == {2: 20.0}
     with pytest.raises(KeyError):
         player.play("nothing", here, 0.2, level_db_sl=None)
+
+
+def test_asking_again_begins_anew() -> None:
+    """An effect that never ends, asked for a thousand times, is one; it goes with its finger."""
+    felt = 0
+
+    class Felt(Course):
+        """Counts."""
+
+        def feel(self, contact: Contact, now: float) -> Feeling | Nothing | None:
+            nonlocal felt
+            felt += 1
+            return Feeling(20.0)
+
+    class Endless(Buzz):
+        """Never ends."""
+
+        def begin(self, contact: Contact, now: float, *, level_db_sl: float | None) -> Course:
+            return Felt()
+
+    player = EffectPlayer(Layout(effects={"hum": Endless()}, elsewhere=None))
+    for number in range(1000):
+        player.play("hum", finger(1), 0.001 * number, level_db_sl=None)
+    assert wanted(player, [finger(1)], 2.0) == {1: 20.0}
+    assert felt == 1
+    assert wanted(player, [], 3.0) == {}
+    assert wanted(player, [finger(1)], 4.0) == {}
+
+
+def test_asking_at_a_finger_that_was_not_looked_at_yet() -> None:
+    """What its place has for it begins all the same, and goes on when the other is over."""
+    player = EffectPlayer(Layout(effects={"buzz": Buzz(), "alert": Click(duration=0.1)}))
+    player.play("alert", finger(1), 0.0, level_db_sl=12.0)
+    assert wanted(player, [finger(1)], 0.0) == {1: 12.0}
+    assert wanted(player, [finger(1)], 0.2) == {1: 20.0}
 
 
 @given(

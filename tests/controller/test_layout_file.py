@@ -91,6 +91,10 @@ def test_later_regions_lie_on_top(tmp_path: Path) -> None:
             "regions:\n  a: {circle: {at: [0.1, 0.1], radius: 1 cm}, on_release: buzz}\n",
             ["regions.a.on_release", "would never end"],
         ),
+        (
+            "effects:\n  cloth: {kind: texture, slow: 20 cm/s}\n",
+            ["layout.yaml:2:", "effects.cloth", "fast is 0.2 m/s and must be above slow"],
+        ),
         ("elsewhere: nowhere\n", ["elsewhere", "there is no effect 'nowhere'"]),
         ("most_at_once: 0\n", ["most_at_once"]),
         ("region: {}\n", ["region", "did you mean regions?"]),

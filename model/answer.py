@@ -112,8 +112,10 @@ def _too_loud(question: Question, mode: str, *, most: float) -> str:
     where = " and ".join(f"({x:g}, {y:g})" for x, y in question.targets)
     most = 20 * math.log10(most)
     # Rounded down, so that it can be asked for.
-    # Of several targets the phases of all are tried for, not gone through.
-    sure = mode == "switched" or len(question.targets) == 1
+    # Not all is gone through: phases of several targets, and of one that weights above zero reach,
+    # are tried, and of more than two ERAs with frequencies of their own some patterns are.
+    alone = len(question.targets) == 1
+    sure = question.eras_at_most <= 2 if mode == "switched" else alone and mode != "graded"
     what = "the most that can be had there is" if sure else "the most that was found there is"
     return (
         f"no pattern reaches {question.level_db_sl:g} dB SL at {where} m in mode {mode}; "

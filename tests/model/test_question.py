@@ -57,7 +57,9 @@ def test_questions_that_nobody_can_answer_are_refused(question, says):
         (Question((TARGET,), eras_at_most=3, mode="graded"), "matter of mode switched"),
         (Question((TARGET,), QUIET, level_db_sl=120.0, mode="phased"), "most that can be had"),
         (Question((TARGET, (0.2, 0.1)), level_db_sl=120.0, mode="phased"), "most that was found"),
-        (Question((TARGET,), QUIET, level_db_sl=120.0, eras_at_most=4), "most that can be had"),
+        (Question((TARGET,), QUIET, level_db_sl=120.0, mode="graded"), "most that was found"),
+        (Question((TARGET, (0.2, 0.1)), level_db_sl=120.0), "most that can be had"),
+        (Question((TARGET,), QUIET, level_db_sl=120.0, eras_at_most=4), "most that was found"),
     ],
 )
 def test_a_table_says_why_it_has_no_answer(question, says):

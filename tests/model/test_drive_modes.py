@@ -7,9 +7,17 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from model.drive_modes import MODES, best_drive, coherent, fields, loudest, playable_modes
+from model.drive_modes import (
+    MODES,
+    Choice,
+    best_drive,
+    coherent,
+    fields,
+    loudest,
+    playable_modes,
+)
 from model.drive_modes import switched as switched_mode
-from model.drive_modes.fields import ERROR_SHARE, SILENT, Drive, Fields, judge
+from model.drive_modes.fields import ERROR_SHARE, SILENT, Drive, Fields, Outcome, judge
 from model.drive_modes.phased import PHASED
 from model.question import Question
 from model.table_build import build_table
@@ -110,6 +118,42 @@ def test_what_a_drive_does_is_equation_28():
     assert outcome.sensation == pytest.approx(felt, rel=1e-5)
 
 
+def test_what_a_quiet_finger_feels_of_two_tones_is_their_power():
+    """Multiples of threshold add as squares: 3 at one frequency and 4 at another are felt as 5."""
+    quiet = np.zeros((2, 2, 1), dtype=np.complex64)
+    quiet[0, 0], quiet[1, 1] = 3.0, 40.0j
+    given = Fields(
+        (np.ones((2, 2, 1), dtype=np.complex64),), quiet, False, np.array([1.0, 10.0]), 1e-6
+    )
+    outcome = judge(given, Drive(np.array([0, 1]), np.ones(2, dtype=np.complex64)))
+    assert outcome.quiet_sensation == pytest.approx(5.0)
+    assert outcome.quiet_peak == pytest.approx(43.0)
+
+
+@pytest.mark.parametrize(
+    ("scores", "near"),
+    [
+        ([1.2, 2.0, 1.9, 1.41, 1.42], [1, 2, 4]),  # 3 dB below 2 is 1.416
+        ([1.9, 1.7, 2.0, 1.8, 1.6, 1.5], [2, 0, 3, 1]),
+        ([1.99, 1.9], []),  # the best is none of them: it has several frequencies
+    ],
+)
+def test_what_is_near_the_best_is_within_three_decibels(scores, near):
+    """The best first, four at the most; none where the best drive is not among them."""
+    frequencies = np.arange(10, 10 + len(scores))
+    choice = Choice(
+        Drive(np.array([0, 1]), np.ones(2, dtype=np.complex64)),
+        Outcome(peak=1.0, sensation=1.0, quiet_peak=0.4, quiet_sensation=0.4, score=2.0),
+        frequencies,
+        np.repeat(frequencies[:, None], 2, axis=1).astype(np.complex64),
+        np.array(scores, dtype=np.float32),
+    )
+    found = choice.near()
+    assert (found.frequencies - 10).tolist() == near
+    assert found.weights[:, 0].tolist() == found.frequencies.tolist()
+    assert found.score == pytest.approx([scores[place] for place in near])
+
+
 def test_phased_for_one_quiet_point_is_the_closed_form():
     """With one point at the target and one quiet, the best score is sqrt(h^H R^-1 h)."""
     for seed in range(5):
@@ -194,7 +238,7 @@ def test_more_freedom_is_never_worse(level):
     of one target `phased` leaves them out elsewhere and may miss half a decibel.
     """
     held_back = 0
-    for quiet, targets in ((1, 1), (3, 1), (7, 1), (2, 2)):
+    for quiet, targets in ((1, 1), (3, 1), (7, 1), (2, 2), (3, 2)):
         for places in contact_sets(10, fingers=quiet + targets, seed=quiet):
             given = fields_on_plate(places, targets=targets, level=level)
             found = [best_drive(given, mode) for mode in MODES]

@@ -65,6 +65,7 @@ class Daemon:
         self._loop = asyncio.get_running_loop()
         self._reloads: set[asyncio.Task[None]] = set()
         self._reloading = asyncio.Lock()
+        self._reload_is_due = False
         self._ended = asyncio.Event()
         self._end_cause = "the daemon ends"
         self._latencies = Latencies()
@@ -151,13 +152,15 @@ class Daemon:
     async def reload(self) -> None:
         """Read the configuration again, and take over what can be taken over."""
         async with self._reloading:
+            self._reload_is_due = False  # whoever asks from here on means what is there then
             self._manager.reloading()
             try:
                 new = await asyncio.to_thread(load_daemon_config, self._config.source)
+                await self._take_over(new)
             except InputError as error:
                 _logger.error("the configuration is left as it was: %s", error)
-            else:
-                await self._take_over(new)
+            except Exception:  # whoever waits for the reload must hear of its end
+                _logger.exception("the configuration could not be taken over")
             self._manager.ready(self._status_line())
 
     async def _take_over(self, new: DaemonConfig) -> None:
@@ -188,6 +191,8 @@ class Daemon:
     async def _close(self, running: "asyncio.Task[None] | None") -> None:
         """Silence first; then everything else, as far as it comes."""
         self._manager.stopping()
+        for reload in self._reloads:  # or it would start what is to end
+            reload.cancel()
         try:
             await self._supervisor.close(self._end_cause)
         finally:
@@ -301,6 +306,10 @@ class Daemon:
             self._loop.call_soon_threadsafe(publish)
 
     def _reload_soon(self) -> None:
+        """Reload; while another one goes on, once after it, however often that is asked for."""
+        if self._reload_is_due:
+            return
+        self._reload_is_due = True
         task = asyncio.ensure_future(self.reload())
         self._reloads.add(task)
         task.add_done_callback(self._reloads.discard)

@@ -126,17 +126,24 @@ class RecordedBackend(Backend):
 def write_dump(folder: Path, records: Iterable[Record], *, cause: str, keep: int) -> Path:
     """Write records to a new file, and take away the oldest beyond `keep`; raises OSError.
 
-    To be called in a thread of its own: a disk may be slow.
+    Where there is no room for all of it, nothing is left of it. To be called in a thread of its
+    own: a disk may be slow.
     """
     folder.mkdir(parents=True, exist_ok=True)
     stamp = time.strftime("%Y%m%dT%H%M%S", time.gmtime())
     path = folder / f"{_PREFIX}{stamp}-{time.monotonic_ns() % 10**9:09d}.jsonl"
-    with path.open("x", encoding="utf-8") as stream:
-        path.chmod(0o600)
-        stream.write(json.dumps({"cause": cause, "unix_time_s": time.time()}) + "\n")
-        for record in records:
-            stream.write(json.dumps(_as_json(record)) + "\n")
-    for old in sorted(folder.glob(f"{_PREFIX}*.jsonl"))[:-keep]:
+    try:
+        with path.open("x", encoding="utf-8") as stream:
+            path.chmod(0o600)
+            stream.write(json.dumps({"cause": cause, "unix_time_s": time.time()}) + "\n")
+            for record in records:
+                stream.write(json.dumps(_as_json(record)) + "\n")
+    except OSError:
+        path.unlink(missing_ok=True)
+        raise
+    # By its name this one may be the oldest: clocks are set, and some boards begin in 1970.
+    others = sorted(each for each in folder.glob(f"{_PREFIX}*.jsonl") if each != path)
+    for old in others[: max(0, len(others) + 1 - keep)]:
         old.unlink(missing_ok=True)
     return path
 

@@ -7,11 +7,9 @@ time.monotonic(), the same for all processes.
 import asyncio
 import contextlib
 import json
-import math
 import signal
 import socket
 import time
-from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
@@ -19,91 +17,12 @@ import pytest
 from daemon_bench import PATIENCE, daemon_table, far_end, until, until_state, write_daemon
 from daemon_process import (
     ERA,
-    REACTION,
-    WATCHDOG,
-    DaemonProcess,
     daemon_process,
     playing,
     run_era,
 )
-from drivers.protocol.messages import Fault, State
+from drivers.protocol.messages import State
 from model.table_file import save_table
-
-
-def no_lines_beside_json(daemon: DaemonProcess) -> Sequence[object]:
-    """Lines of the log that are not JSON."""
-    return [line for line in daemon.log if "no json" in line]
-
-
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-async def test_told_to_end_it_is_silent_disarmed_and_gone_within_a_second(
-    tmp_path: Path, number: signal.Signals
-) -> None:
-    """Silent, read back, disarmed, exit status 0, within 1 s of the signal; nothing is left."""
-    took = math.inf
-    for _ in range(3):  # a machine that is busy with something else may need another
-        took = min(took, await told_to_end(tmp_path, number))
-        if took < 1.0:
-            break
-    assert took < 1.0
-
-
-async def told_to_end(folder: Path, number: signal.Signals) -> float:
-    """How long [s] a daemon that plays takes to end, which it does in order."""
-    async with far_end(folder) as far, daemon_process(folder, far) as daemon:
-        async with playing(daemon):
-            begin = time.monotonic()
-            daemon.process.send_signal(number)
-            assert await daemon.status() == 0
-            end = time.monotonic()
-        status = far.station.status()
-        assert (status.state, status.high_voltage) == (State.SWITCH_ON_DISABLED, False)
-        assert not any(status.levels)
-        assert not daemon.socket.exists()
-        assert daemon.said("OPERATION_ENABLED -> NOT_READY")
-        assert not no_lines_beside_json(daemon)
-        return end - begin
-
-
-async def test_killed_while_playing_the_amplifier_falls_silent_in_time(tmp_path: Path) -> None:
-    """SIGKILL: silent within the watchdog time + 5 ms of the last sign of life, then a fault.
-
-    Another daemon at the same place starts, disarmed, and needs the fault acknowledged.
-    """
-    async with far_end(tmp_path) as far:
-        async with daemon_process(tmp_path, far) as daemon, playing(daemon):
-            daemon.process.kill()
-            await daemon.process.wait()
-            dead = time.monotonic()
-            await until(lambda: far.station.status().state is State.FAULT)
-            fed = far.amplifier._fed
-            # What it had sent may have lain in the pseudo-terminal for a moment.
-            assert fed <= dead + 0.05
-            assert far.silent_from() - fed <= WATCHDOG + REACTION + 1e-9
-            assert far.amplifier.fault is Fault.WATCHDOG
-        assert daemon.socket.exists()  # nobody could take it away
-        async with daemon_process(tmp_path, far) as daemon, await daemon.client() as era:
-            await until_state(era, "FAULT")
-            assert far.station.status().state is State.FAULT
-            await era.clear()
-            await until_state(era, "READY_TO_SWITCH_ON")
-
-
-async def test_stopped_and_resumed_it_replays_nothing(tmp_path: Path) -> None:
-    """SIGSTOP for longer than the watchdog: silent in time; resumed, a fault and no level."""
-    async with (
-        far_end(tmp_path) as far,
-        daemon_process(tmp_path, far) as daemon,
-        playing(daemon) as era,
-    ):
-        daemon.process.send_signal(signal.SIGSTOP)
-        await until(lambda: far.station.status().state is State.FAULT)
-        assert far.silent_from() - far.amplifier._fed <= WATCHDOG + REACTION + 1e-9
-        daemon.process.send_signal(signal.SIGCONT)
-        assert await until_state(era, "FAULT", "COMM_LOST")
-        await asyncio.sleep(0.1)
-        assert not any(far.station.status().levels)
-        assert far.amplifier.fault is Fault.WATCHDOG
 
 
 async def test_a_second_daemon_is_refused_and_disturbs_nothing(tmp_path: Path) -> None:

@@ -7,19 +7,25 @@ time.monotonic(), the same for all processes.
 import asyncio
 import contextlib
 import json
+import math
 import os
 import sys
+import time
 from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from best_of import best_of
 from controller.api.async_client import AsyncClient
+from controller.api.jsonrpc import RpcError
 from daemon_bench import PATIENCE, PLACE, daemon_table, until, until_state, write_daemon
+from journal import Journal, loudness
 from model.table_file import save_table
 from wires import FarSide
 
 ERA = Path(sys.executable).with_name("era")
+READY, ENABLED = "READY_TO_SWITCH_ON", "OPERATION_ENABLED"
 WATCHDOG, REACTION = 0.25, 0.005  # s; what an amplifier may take to be silent
 
 
@@ -137,3 +143,54 @@ async def holding(era: AsyncClient) -> AsyncIterator[None]:
     finally:
         task.cancel()
         await asyncio.gather(task, return_exceptions=True)
+
+
+async def ready(era: AsyncClient) -> None:
+    """Wait until it may be armed; a stop, a loss or a fault is acknowledged, whatever it was."""
+    while await until_state(era, READY, "FAULT", "QUICK_STOP_ACTIVE") != READY:
+        with contextlib.suppress(RpcError):  # its cause may not be gone yet
+            await era.clear()
+
+
+async def play(era: AsyncClient, far: FarSide) -> None:
+    """Armed, and heard for the finger that somebody holds down: again where it has been lost."""
+    while True:
+        with contextlib.suppress(RpcError, AssertionError):
+            if (await era.status()).state != ENABLED:
+                await ready(era)
+                await era.arm("test", lease_s=60)
+            await until(lambda: loudness(far) > 0, patience=2.0)
+            return
+
+
+@dataclass
+class Window:
+    """How the daemon did for a while; widest_gap [s]: between two signs of life on the wire."""
+
+    widest_gap: float
+    states: set[str]
+
+
+async def watch(
+    daemon: DaemonProcess, era: AsyncClient, journal: Journal, seconds: float
+) -> Window:
+    """Look on while fingers are held down."""
+    begin = time.monotonic()
+    states = set()
+    while time.monotonic() < begin + seconds:
+        states.add((await era.status()).state)
+        await asyncio.sleep(0.05)
+    return Window(journal.widest_gap(begin, time.monotonic()), states)
+
+
+async def plays_on(
+    daemon: DaemonProcess, era: AsyncClient, journal: Journal, *, seconds: float = 1.0
+) -> float:
+    """The widest gap [s] of a while without any loss; best of some, for a machine that is busy."""
+
+    async def attempt() -> float:
+        await play(era, daemon.far)
+        window = await watch(daemon, era, journal, seconds)
+        return window.widest_gap if window.states == {ENABLED} else math.inf
+
+    return await best_of(attempt, WATCHDOG)

@@ -1,5 +1,6 @@
 """What a far end is asked, and how loud it is, moment by moment on the amplifiers' own clock."""
 
+import math
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -87,6 +88,14 @@ def energised(far: FarSide) -> list[str]:
     statuses = {name: station.status() for name, station in far.stations.items()}
     alive = (State.OPERATION_ENABLED, State.SWITCHED_ON, State.FAULT_REACTION_ACTIVE)
     return [name for name, one in statuses.items() if one.state in alive or any(one.levels)]
+
+
+def silent_from(far: FarSide) -> float:
+    """When [s] every channel of every amplifier is silent, or was; -inf where none ever played."""
+    for station in far.stations.values():
+        station.status()
+    outputs = (output for one in far.bench.amplifiers.values() for output in one.outputs)
+    return max((tone.silent_from for output in outputs for tone in output), default=-math.inf)
 
 
 def loudness(far: FarSide) -> float:

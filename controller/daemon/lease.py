@@ -1,7 +1,7 @@
 """Who has armed, and for how long: one lease at a time, renewed by its owner or over."""
 
 import secrets
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from controller.api.jsonrpc import ErrorCode, RpcError
 
@@ -43,6 +43,16 @@ class LeaseBook:
         self._lease = Lease(owner, secrets.token_hex(16), lasts, now + lasts)
         return self._lease
 
+    def begin(self, token: str, *, now: float) -> Lease:
+        """The lease that was granted, as long as it lasts from now on, also if it was over by then.
+
+        Raises RpcError where it was ended.
+        """
+        if self._lease is None or self._lease.token != token:
+            raise RpcError(ErrorCode.LEASE, "the lease was ended meanwhile", remedy="arm again")
+        self._lease = replace(self._lease, ends=now + self._lease.lasts)
+        return self._lease
+
     def renew(self, token: str, *, now: float) -> Lease:
         """The same lease from now on; raises RpcError where it is over, or another's."""
         held = self.held(now)
@@ -52,8 +62,7 @@ class LeaseBook:
             )
         if not secrets.compare_digest(held.token.encode(), token.encode()):
             raise RpcError(ErrorCode.LEASE, f"the lease that runs is {held.owner!a}'s, not yours")
-        self._lease = Lease(held.owner, held.token, held.lasts, now + held.lasts)
-        return self._lease
+        return self.begin(held.token, now=now)
 
     def end(self) -> None:
         """No lease runs any more."""

@@ -207,6 +207,8 @@ class Service:
         machine, now = self._supervisor.machine, clock.now()
         if machine.state not in (State.READY_TO_SWITCH_ON, *_ARMABLE):
             raise _wrong_state(machine)
+        if machine.state is State.SWITCHED_ON:
+            raise RpcError(ErrorCode.LEASE, "somebody else is arming", remedy="wait, or disarm")
         lasts = min(params.lease_s, self.longest_lease)
         lease = self._lease.grant(params.owner, lasts=lasts, now=now)
         try:
@@ -219,8 +221,8 @@ class Service:
         if self._supervisor.machine.state is not State.OPERATION_ENABLED:
             self._end_lease(lease.token)
             raise _wrong_state(self._supervisor.machine)
-        # Arming took a moment: the lease counts from when it was done.
-        lease = self._lease.renew(lease.token, now=clock.now())
+        # Arming took a moment, longer perhaps than the lease: that counts from when it was done.
+        lease = self._lease.begin(lease.token, now=clock.now())
         self._watch_lease()
         return ArmResult(lease=lease.token, lease_s=lease.lasts)
 

@@ -1,0 +1,95 @@
+"""What may happen while a daemon arms, and while it reads its configuration again."""
+
+import asyncio
+import contextlib
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from controller.api.jsonrpc import ErrorCode, RpcError
+from daemon_bench import running_daemon, until, until_state
+from drivers.protocol.messages import State
+
+READY, ENABLED = "READY_TO_SWITCH_ON", "OPERATION_ENABLED"
+
+
+async def test_arming_that_takes_longer_than_the_lease(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The lease then lasts from when it is armed, and with it the armed state: never without one.
+
+    Meanwhile nobody else gets a lease.
+    """
+    async with running_daemon(tmp_path) as bench, await bench.client() as era:
+        await until_state(era, READY)
+        daemon = bench.daemon
+        arm, book = daemon._controller.arm, daemon._service._lease
+        goes_on = asyncio.Event()
+
+        async def slow() -> None:
+            await goes_on.wait()
+            assert book._lease is not None
+            book._lease = replace(book._lease, ends=0.0)  # as if the time had passed
+            await arm()
+
+        monkeypatch.setattr(daemon._controller, "arm", slow)
+        arming = asyncio.ensure_future(era.arm("me", lease_s=1))
+        await until_state(era, "SWITCHED_ON")
+        async with await bench.client("other") as other:
+            with pytest.raises(RpcError) as caught:
+                await other.arm("you")
+            assert caught.value.code is ErrorCode.LEASE
+        goes_on.set()
+        lease = await arming
+        status = await era.status()
+        assert (status.state, status.armed_by) == (ENABLED, "me")
+        assert 0.5 < (status.lease_left_s or 0) <= 1
+        await era.renew(lease.lease)
+        await until_state(era, READY)
+        assert bench.far.station.status().state is State.SWITCH_ON_DISABLED
+
+
+async def test_a_reload_that_fails_in_an_unheard_of_way_is_over_all_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The service manager is told that it is over, and the next one works."""
+    async with running_daemon(tmp_path) as bench:
+        told: list[str] = []
+        manager = bench.daemon._manager
+        monkeypatch.setattr(manager, "reloading", lambda: told.append("begins"))
+        monkeypatch.setattr(manager, "ready", lambda status: told.append("is over"))
+
+        def broken(path: Path) -> None:
+            raise RuntimeError("a disk that makes things up")
+
+        with monkeypatch.context() as patched:
+            patched.setattr("controller.daemon.daemon.load_daemon_config", broken)
+            await bench.daemon.reload()
+        await bench.daemon.reload()
+        assert told == ["begins", "is over"] * 2
+
+
+async def test_an_end_during_a_reload_starts_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Touch sources of a configuration that is still being read are not opened after the end."""
+    async with running_daemon(tmp_path) as bench:
+        daemon = bench.daemon
+        reads = asyncio.Event()
+
+        async def slowly(load: object, path: Path) -> object:
+            reads.set()
+            await asyncio.sleep(3600)
+            raise AssertionError("it was waited for")
+
+        with monkeypatch.context() as patched:
+            patched.setattr("controller.daemon.daemon.asyncio.to_thread", slowly)
+            daemon._reload_soon()
+            await reads.wait()
+        (reload,) = daemon._reloads
+        daemon.end("the test is over")
+        await until(reload.done)
+        with contextlib.suppress(asyncio.CancelledError):
+            await reload
+        assert reload.cancelled()

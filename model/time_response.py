@@ -41,6 +41,8 @@ from model.errors import InputError
 from model.plate import Plate
 from model.point_load import PointLoad, load_positions
 
+_ANSWERED_MAX = 1024  # unit answers that are kept, some kilobytes each
+
 
 class Reduced(Protocol):
     """A free plate in few coordinates, its mass the identity and its stiffness diag(omega²).
@@ -101,11 +103,31 @@ class PlateInTime:
 
     def answers(self, era: int, terms: Sequence[Term]) -> list[Answer]:
         """The particular solutions for terms of one ERA's base, one each."""
-        s = 1j * np.array([term.omega for term in terms])
-        c0, c1 = [term.c0 for term in terms], [term.c1 for term in terms]
-        a0, a1 = self.particular([era] * len(terms), s, c0, c1)
-        b0, b1 = a0 @ self.displacement.T, a1 @ self.displacement.T
-        return [Answer(term, *both) for term, *both in zip(terms, b0, b1, strict=True)]
+        answers = []
+        for term in terms:
+            still, growing = self._unit_answers(era, term.omega)
+            answers.append(
+                Answer(term, still * term.c0 + growing * term.c1, still * term.c1)
+                if term.c1
+                else Answer(term, still * term.c0, np.zeros_like(still))
+            )
+        return answers
+
+    def _unit_answers(self, era: int, omega: float) -> tuple[ComplexArray, ComplexArray]:
+        """b0 (r,) each for a base that moves with c0 = 1 m, and with c1 = 1 m/s."""
+        key = (era, omega)
+        if key not in self._answered:
+            a0, _ = self.particular([era] * 2, np.full(2, 1j * omega), [1.0, 0.0], [0.0, 1.0])
+            still, growing = a0 @ self.displacement.T
+            if len(self._answered) >= _ANSWERED_MAX:
+                self._answered.clear()
+            self._answered[key] = still, growing
+        return self._answered[key]
+
+    @cached_property
+    def _answered(self) -> dict[tuple[int, float], tuple[ComplexArray, ComplexArray]]:
+        # A table has few frequencies, and so have the ramps that their fades take.
+        return {}
 
     def particular(
         self,

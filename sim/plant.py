@@ -6,6 +6,7 @@ free vibration that every change leaves behind.
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -62,12 +63,16 @@ class Plant:
 
     def set_input(self, era: int, terms: Sequence[Term]) -> None:
         """From now on the base of this ERA moves as these terms say; terms may start later."""
-        before = [answer for answer in self._active() if answer in self._answers[era]]
-        self._answers[era] = self._now.plate.answers(
-            era, [term for term in terms if term.end > self.time]
-        )
-        after = [answer for answer in self._active() if answer in self._answers[era]]
-        self._exchange(before, after)
+        # A term that goes on as it is leaves nothing behind: only the others are exchanged.
+        known = {answer.term: answer for answer in self._answers[era]}
+        wanted = _united([term for term in terms if term.end > self.time])
+        new = self._now.plate.answers(era, [term for term in wanted if term not in known])
+        gone = [answer for term, answer in known.items() if term not in wanted]
+        self._answers[era] = [
+            *(answer for term, answer in known.items() if term in wanted),
+            *new,
+        ]
+        self._exchange(self._active_of(gone), self._active_of(new))
 
     def set_contacts(self, contacts: Sequence[PointLoad]) -> None:
         """From now on these fingers load the plate and no others, each from its rest plane.
@@ -118,17 +123,17 @@ class Plant:
 
     def skip(self, to_time: float) -> None:
         """Let the plate vibrate until to_time [s] without looking at it."""
+        if to_time <= self.time:
+            return
         for boundary in self._boundaries(to_time):
             self._pass(boundary)
         self._coast(to_time)
 
     def _active(self) -> list[Answer]:
-        return [
-            answer
-            for answers in self._answers
-            for answer in answers
-            if answer.term.start <= self.time < answer.term.end
-        ]
+        return [answer for answers in self._answers for answer in self._active_of(answers)]
+
+    def _active_of(self, answers: Sequence[Answer]) -> list[Answer]:
+        return [answer for answer in answers if answer.term.start <= self.time < answer.term.end]
 
     def _boundaries(self, to_time: float) -> list[float]:
         moments = {
@@ -192,6 +197,19 @@ class Plant:
             else:
                 into[:] = 0
             forced.add(block, into)
+
+
+def _united(terms: Sequence[Term]) -> list[Term]:
+    """The same motion in terms that differ in when they hold, or in frequency."""
+    united: dict[tuple[float, float, float], Term] = {}
+    for term in terms:
+        key = (term.start, term.end, term.omega)
+        same = united.get(key)
+        if same is not None:
+            united[key] = replace(term, c0=same.c0 + term.c0, c1=same.c1 + term.c1)
+        else:
+            united[key] = term
+    return list(united.values())
 
 
 class _Forced:

@@ -1,30 +1,48 @@
 """Several amplifiers on one wire: their own replies, and one commit for all."""
 
 import asyncio
+import contextlib
+import time
 from collections.abc import AsyncIterator
 from dataclasses import replace
 
 import pytest
+import serial
 
 from drivers.amplifier import Amplifier
 from drivers.command import CommandSet, DriveCommand
+from drivers.errors import LinkError
 from drivers.guard import Guard, GuardLimits, SafeCommand
 from drivers.protocol.messages import State
 from drivers.registry import open_backend
+from drivers.supervision import reopen
 from model.rig import Channel, Rig
+from sim.faults import Episode
+from sim.wires import Wire
 from wires import SHARED_WIRES, FarSide, far_side
 
 
 @pytest.fixture(params=list(SHARED_WIRES))
-async def far(request: pytest.FixtureRequest, coarse_rig: Rig) -> AsyncIterator[FarSide]:
-    """The paper's plate with its ERAs on two amplifiers, behind one wire."""
+def wire(request: pytest.FixtureRequest) -> Wire:
+    """Each wire that several can share."""
+    return SHARED_WIRES[request.param]
+
+
+@pytest.fixture
+def two_amplifiers(coarse_rig: Rig) -> Rig:
+    """The paper's plate with its ERAs on two amplifiers."""
     wiring = {
         name: Channel("west" if number % 2 else "east", number // 2)
         for number, name in enumerate(coarse_rig.wiring)
     }
     urls = {"east": "sim://", "west": "sim://"}
-    rig = replace(coarse_rig, wiring=wiring, amplifiers=urls)
-    async with far_side(SHARED_WIRES[request.param], rig) as far:
+    return replace(coarse_rig, wiring=wiring, amplifiers=urls)
+
+
+@pytest.fixture
+async def far(wire: Wire, two_amplifiers: Rig) -> AsyncIterator[FarSide]:
+    """Both amplifiers behind one wire."""
+    async with far_side(wire, two_amplifiers) as far:
         yield far
 
 
@@ -67,6 +85,70 @@ async def test_they_may_be_opened_at_once(far: FarSide) -> None:
     for name, amplifier in both.items():
         assert amplifier.identity.serial_number == f"SIM-{name}"
         await amplifier.close()
+
+
+async def test_one_may_be_opened_while_the_other_is_closed(
+    far: FarSide, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The port that the one still closes, which may take a while, is not in the other's way."""
+    close = serial.Serial.close
+
+    def slowly(port: serial.Serial) -> None:
+        time.sleep(0.01)
+        close(port)
+
+    monkeypatch.setattr(serial.Serial, "close", slowly)
+    east, west = (Amplifier(open_backend(url), reply_timeout=1.0) for url in far.urls.values())
+    await east.open()
+    for number in range(12):
+        closing = asyncio.create_task(east.close())
+        await asyncio.sleep(number / 1000)  # somewhere in it
+        await west.open()
+        await closing
+        assert west.identity.serial_number != east.identity.serial_number
+        await west.status()
+        east, west = west, east
+    await east.close()
+
+
+async def test_a_close_that_is_cancelled_is_a_close(far: FarSide) -> None:
+    """Given up half way, it holds neither the wire nor the amplifier's number back for good."""
+    amplifier = Amplifier(open_backend(far.url), reply_timeout=1.0)
+    await amplifier.open()
+    closing = asyncio.create_task(amplifier.close())
+    await asyncio.sleep(0)
+    closing.cancel()
+    with contextlib.suppress(asyncio.CancelledError):
+        await closing
+    other = Amplifier(open_backend(far.url), reply_timeout=1.0)
+    await reopen(other, waits=iter([0.01] * 200))
+    await other.close()
+
+
+async def test_one_comes_back_while_the_other_is_left_lost(wire: Wire, two_amplifiers: Rig) -> None:
+    """After a loss of the wire each is lost until it is opened itself, in any order."""
+    async with far_side(replace(wire, unpluggable=True), two_amplifiers) as far:
+        east, west = (Amplifier(open_backend(url), reply_timeout=1.0) for url in far.urls.values())
+        await east.open()
+        await west.open()
+        for station in far.stations.values():
+            station.befall(Episode("unplug"))
+        for one in (east, west):
+            async with asyncio.timeout(10):
+                while not one.lost:
+                    with contextlib.suppress(LinkError):
+                        await one.status()
+        for station in far.stations.values():
+            station.recover()
+        await reopen(east, waits=iter([0.01] * 200))
+        with pytest.raises(LinkError):
+            await west.status()
+        await reopen(west, waits=iter([0.01] * 200))
+        assert (
+            (await east.status()).state is (await west.status()).state is State.SWITCH_ON_DISABLED
+        )
+        await east.close()
+        await west.close()
 
 
 async def test_one_commit_is_played_by_all_at_one_moment(

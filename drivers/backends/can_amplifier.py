@@ -119,12 +119,14 @@ class CanBackend(WireBackend):
         if wire is None or worker is None or self._objects is None:
             return
         self._objects.abandon()
-        await worker.close()
-        self._node.leave(wire)
-        wire.give_back(self._url.node)
-        with contextlib.suppress(ValueError):
-            wire.on_loss.remove(self._lose)
-        await release(wire)
+        try:
+            await worker.close()
+        finally:  # also where this is cancelled
+            self._node.leave(wire)
+            wire.give_back(self._url.node)
+            with contextlib.suppress(ValueError):
+                wire.on_loss.remove(self._lose)
+            await release(wire)
 
     async def exchange(self, request: Request, *, timeout: float) -> Reply:
         """Send a request and wait for its answer; LinkTimeout, LinkError or FrameError.

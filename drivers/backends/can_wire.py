@@ -43,7 +43,7 @@ class CanWire:
         self._nodes: set[int] = set()
         self.bad = 0
         self.loss: str | None = None
-        self.opening = asyncio.Lock()
+        self.changing = asyncio.Lock()  # held while it is opened or closed
         self._loop = loop
         self._adapter: Adapter | None = None
 
@@ -51,6 +51,11 @@ class CanWire:
     def is_open(self) -> bool:
         """Whether it is there."""
         return self._adapter is not None and self.loss is None
+
+    @property
+    def is_used(self) -> bool:
+        """Whether somebody has acquired it and not released it since."""
+        return self.users > 0
 
     def claim(self, node: int) -> None:
         """Use the bus for a node; LinkError where this program does so already."""
@@ -67,6 +72,7 @@ class CanWire:
 
     async def open(self) -> None:
         """Open the adapter and start reading; raises LinkError."""
+        self.loss = None
         self._adapter = await open_adapter(self.url, on_frame=self._take, on_loss=self._lose)
 
     async def close(self) -> None:
@@ -113,7 +119,7 @@ async def acquire(url: CanBusUrl) -> CanWire:
     wire = _WIRES.setdefault(_key(url, loop), CanWire(url, loop))
     wire.users += 1
     try:
-        async with wire.opening:
+        async with wire.changing:
             if not wire.is_open:
                 await wire.open()
     except BaseException:
@@ -125,7 +131,8 @@ async def acquire(url: CanBusUrl) -> CanWire:
 async def release(wire: CanWire) -> None:
     """Leave a bus; the last to leave closes it."""
     wire.users -= 1
-    if wire.users == 0:
-        if _WIRES.get(_key(wire.url, wire._loop)) is wire:
+    async with wire.changing:  # who comes meanwhile waits until the adapter is free
+        if not wire.is_used:
+            await wire.close()
+        if not wire.is_used and _WIRES.get(_key(wire.url, wire._loop)) is wire:
             del _WIRES[_key(wire.url, wire._loop)]
-        await wire.close()

@@ -48,6 +48,7 @@ class SerialBackend(WireBackend):
         self._answered: Frame | None = None  # the reply to the last request, once it is there
         self._is_contradicted = False  # by another reply to that
         self._why_closed = f"{self._url.port} is not open"
+        self._loss: str | None = None  # until it is opened anew, even if others have the line back
 
     @property
     def counters(self) -> WireCounters:
@@ -80,6 +81,7 @@ class SerialBackend(WireBackend):
             return
         line = shared_line(self._url.port, baud=self._url.baud)
         self._counters = WireCounters()
+        self._loss = None
         await line.join(self._url.address, self._received, self._lost)
         self._line = line
 
@@ -100,7 +102,6 @@ class SerialBackend(WireBackend):
         need longer.
         """
         line = self._open_line()
-        line.raise_if_lost()
         async with contextlib.nullcontext() if len(line.addresses) == 1 else line.turn:
             reply = await self._exchange(line, request, timeout)
             if isinstance(request, Hello):
@@ -149,8 +150,8 @@ class SerialBackend(WireBackend):
         return encode_request(request, address=address, sequence=self._sequence)
 
     def _open_line(self) -> SerialLine:
-        if self._line is None:
-            raise LinkError(self._why_closed)
+        if self._line is None or self._loss is not None:
+            raise LinkError(self._loss or self._why_closed)
         return self._line
 
     def _received(self, frame: Frame) -> None:
@@ -186,6 +187,7 @@ class SerialBackend(WireBackend):
         self._on_event(event)
 
     def _lost(self, what: str) -> None:
+        self._loss = what
         was_waiting = bool(self._pending)
         self._fail(LinkError(what))
         if not was_waiting:

@@ -26,7 +26,7 @@ class SerialLine:
         self._users: dict[int, tuple[Callable[[Frame], None], Callable[[str], None]]] = {}
         self._loss: str | None = None
         self._port: Port | None = None
-        self._opening = asyncio.Lock()
+        self._changing = asyncio.Lock()  # held while the port is opened or closed
 
     @property
     def baud(self) -> int:
@@ -43,6 +43,11 @@ class SerialLine:
         """Those in use."""
         return tuple(self._users)
 
+    @property
+    def is_idle(self) -> bool:
+        """Whether nobody uses it, and its port is closed."""
+        return not self._users and self._port is None and not self._changing.locked()
+
     def raise_if_lost(self) -> None:
         """Raise LinkError where the port is gone."""
         if self._loss is not None:
@@ -53,6 +58,7 @@ class SerialLine:
     ) -> None:
         """Use the line for the amplifier at an address; the first to come opens the port.
 
+        So does the first to come back after a loss; the others are lost until they come, too.
         Raises LinkError: where the port cannot be opened, and for an address that is in use.
         """
         if address in self._users:
@@ -62,7 +68,9 @@ class SerialLine:
             )
         self._users[address] = (on_frame, on_loss)
         try:
-            async with self._opening:  # who comes meanwhile waits for the port, too
+            async with self._changing:  # who comes meanwhile waits for the port, too
+                if self._loss is not None:
+                    await self._close()
                 if self._port is None:
                     await self._open()
         except BaseException:
@@ -72,8 +80,9 @@ class SerialLine:
     async def leave(self, address: int) -> None:
         """No longer use it; the last to go closes the port."""
         self._users.pop(address, None)
-        if not self._users:
-            await self._close()
+        async with self._changing:
+            if not self._users:  # nobody has come meanwhile
+                await self._close()
 
     def send(self, data: bytes) -> None:
         """Put a frame on the line; raises LinkTimeout where it is stuck, LinkError."""
@@ -121,7 +130,7 @@ def shared_line(port: str, *, baud: int) -> SerialLine:
     Raises LinkError where it is in use at another speed.
     """
     key = (port, asyncio.get_running_loop())
-    for known in [known for known, line in _LINES.items() if not line.addresses]:
+    for known in [known for known, line in _LINES.items() if line.is_idle]:
         del _LINES[known]
     line = _LINES.setdefault(key, SerialLine(port, baud=baud))
     if line.baud != baud:

@@ -141,22 +141,25 @@ class _Best:
 
         fields: at these frequencies only.
         """
+        # A touch waits for this, round by round: every call of numpy that is spared counts.
         row = weights[:, None, :]
-        reached = (row @ fields.quiet)[:, 0]
-        wrong = ((row.real**2 + row.imag**2) @ fields.quiet_power)[:, 0]
-        likely = reached.real**2 + reached.imag**2 + np.float32(ERROR_SHARE**2) * wrong
-        power = likely.mean(axis=-1) if fields.is_alone else likely.max(axis=-1)
+        wrong = (_squared(weights)[:, None, :] @ fields.quiet_power)[:, 0]
+        likely = _squared((row @ fields.quiet)[:, 0]) + np.float32(ERROR_SHARE**2) * wrong
+        power = likely.mean(axis=-1) if fields.is_alone else np.maximum.reduce(likely, axis=-1)
         peak = _peak(fields, weights)
         reaches = peak >= fields.wanted * fields.threshold
         score = peak / np.sqrt(power + _TINY * peak**2)
-        if not reaches.all():
+        count = int(np.count_nonzero(reaches))
+        if count < len(reaches):
             self.refused = max(self.refused, float(score[~reaches].max()))
             score = np.where(reaches, score, 0)
-        better = score > self.scores[frequencies]
-        self.scores[frequencies[better]] = score[better]
-        self.weights[frequencies[better]] = weights[better]
-        self.score = max(self.score, float(score.max()))
-        self.reaches = self.reaches or bool(reaches.any())
+        better = np.flatnonzero(score > self.scores[frequencies])
+        if len(better) > 0:
+            at = frequencies[better]
+            self.scores[at] = score[better]
+            self.weights[at] = weights[better]
+            self.score = max(self.score, float(score.max()))
+        self.reaches = self.reaches or count > 0
         return np.asarray(likely, dtype=np.float32)
 
 
@@ -181,20 +184,28 @@ def _raised(weights: SingleComplex, gain: float) -> SingleComplex:
 def _peak(fields: Fields, weights: SingleComplex) -> Single:
     """Peak acceleration (n,) at the lesser target, mean over its points, for weights (n, eras)."""
     row = weights[:, None, :]
-    each = [np.abs(row @ field)[:, 0].mean(axis=-1) for field in fields.targets]
+    each = [
+        np.add.reduce(np.abs((row @ field)[:, 0]), axis=-1) / np.float32(field.shape[-1])
+        for field in fields.targets
+    ]
     return each[0] if len(each) == 1 else np.asarray(np.min(each, axis=0))
 
 
 def _quiet_form(fields: Fields, shares: Single, *, sigma: float) -> SingleComplex:
     """R (n, eras, eras) for shares (n, q) of the quiet points."""
-    weighted = fields.quiet * shares[:, None, :]
-    R = weighted.conj() @ fields.quiet.transpose(0, 2, 1)
-    wrong = (fields.quiet_power @ shares[:, :, None])[:, :, 0]
+    R = np.asarray(fields.quiet_conjugate @ (fields.quiet * shares[:, None, :]).transpose(0, 2, 1))
+    diagonal = R.reshape(len(R), -1)[:, :: R.shape[1] + 1]
+    wrong = diagonal.real
     # An ERA that does not move the quiet points must still have a weight that is a number.
-    floor = _TINY * wrong.max(axis=-1, keepdims=True) + np.float32(1e-20)
-    diagonal = np.arange(R.shape[1])
-    R[:, diagonal, diagonal] += sigma**2 * wrong + floor
-    return np.asarray(R)
+    floor = _TINY * np.maximum.reduce(wrong, axis=-1, keepdims=True) + np.float32(1e-20)
+    diagonal += np.float32(sigma**2) * wrong + floor
+    return R
+
+
+def _squared(values: SingleComplex) -> Single:
+    """The squared magnitude."""
+    real, imaginary = values.real, values.imag
+    return np.asarray(real * real + imaginary * imaginary)
 
 
 @lru_cache(maxsize=16)
@@ -224,10 +235,10 @@ def _ascend(
     _, n, eras = targets.shape
     conjugate = targets.conj()
     if len(starts) == 1 and ascents == 1:
-        c = conjugate.sum(axis=0)
+        c = conjugate[0] if len(targets) == 1 else conjugate.sum(axis=0)
         w = solve(R, c)
         # Of the solution w^H R w is |c^H w|.
-        value = np.sqrt(np.abs((c.conj() * w).sum(axis=-1)))
+        value = np.sqrt(np.abs(np.add.reduce(c.conj() * w, axis=-1)))
     else:
         s = len(starts)
         turned = np.repeat(starts[:, :, None], n, axis=2)
@@ -247,5 +258,5 @@ def _ascend(
         best = every.argmax(axis=0)
         w = np.concatenate(tried)[best, np.arange(n)]
         value = every[best, np.arange(n)]
-    size = np.abs(w).max(axis=-1, keepdims=True)
+    size = np.maximum.reduce(np.abs(w), axis=-1, keepdims=True)
     return np.asarray(w / np.maximum(size, 1e-30), dtype=np.complex64), value

@@ -84,6 +84,8 @@ class Fields:
         )
         # What was worked out already is not worked out anew, round by round.
         known, also = vars(self), vars(some)
+        if "quiet_conjugate" in known:
+            also["quiet_conjugate"] = self.quiet_conjugate[frequencies]
         if "quiet_power" in known:
             also["quiet_power"] = self.quiet_power[frequencies]
         if "mean_targets" in known:
@@ -94,6 +96,11 @@ class Fields:
     def quiet_power(self) -> Single:
         """Squared magnitude at the quiet points, (f, eras, q)."""
         return np.asarray(self.quiet.real**2 + self.quiet.imag**2)
+
+    @cached_property
+    def quiet_conjugate(self) -> SingleComplex:
+        """The conjugate of the fields at the quiet points, (f, eras, q)."""
+        return np.asarray(self.quiet.conj())
 
     @cached_property
     def mean_targets(self) -> SingleComplex:

@@ -1,6 +1,6 @@
 """What the daemon tells subscribers unasked: notifications of the method `event`, by topic."""
 
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 from pydantic import Field
 
@@ -80,6 +80,12 @@ class LinkEvent(Message):
     remedy: str | None
 
 
+class LayoutEvent(Message):
+    """What touches mean is another now: the layout as `hello` tells it; `effects` may be others."""
+
+    layout: dict[str, Any] | None = Field(description="the surface layout, null without one")
+
+
 class TopicData(NamedTuple):
     """Data and meaning of a topic."""
 
@@ -96,6 +102,7 @@ TOPICS: dict[Topic, TopicData] = {
     "latency": TopicData(LatencyEvent, "how fast touches become commands, at rate_hz"),
     "log": TopicData(LogEvent, "what the daemon writes to its log, from info upwards"),
     "link": TopicData(LinkEvent, "links to amplifiers that are lost or come back"),
+    "layout": TopicData(LayoutEvent, "touches mean something else from now on, and what"),
 }
 """Every topic, by name."""
 

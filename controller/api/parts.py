@@ -28,7 +28,7 @@ PhaseName: TypeAlias = Literal["closed", "disarmed", "armed", "lost"]
 """How the amplifiers stand, all of them together."""
 
 Topic: TypeAlias = Literal[
-    "state", "contacts", "pattern", "silence", "amplifiers", "latency", "log", "link"
+    "state", "contacts", "pattern", "silence", "amplifiers", "latency", "log", "link", "layout"
 ]
 
 _ONE_LINE = r"^[^\x00-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069]+$"

@@ -177,7 +177,7 @@ class Daemon:
                     await self._inputs.exchange(new.touch)
                 case "layout":
                     self._meaning.exchange(new.meaning)
-                    self._service.layout = new.layout
+                    self._service.layout_changed(new.layout)
                     self._controller.reconsider()
                 case "longest_lease":
                     self._service.longest_lease = new.section.longest_lease

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from importlib.metadata import version
 
 from controller.api.connection import Connection
-from controller.api.events import AmplifiersEvent, LatencyEvent, StateEvent
+from controller.api.events import AmplifiersEvent, LatencyEvent, LayoutEvent, StateEvent
 from controller.api.hub import Hub
 from controller.api.jsonrpc import ErrorCode, RpcError
 from controller.api.messages import (
@@ -41,6 +41,7 @@ from controller.daemon.records import RecordedBackend
 from controller.daemon.states import Event, Kind, Machine, State
 from controller.daemon.supervisor import Supervisor
 from controller.daemon.view import Scene, amplifier_statuses
+from controller.effects.layout import Layout
 from controller.loop import Controller
 from drivers import clock
 from drivers.amplifier import Amplifier
@@ -76,7 +77,7 @@ class Service:
         meaning: Meaning,
     ) -> None:
         self.longest_lease = config.section.longest_lease
-        self.layout = config.layout
+        self._layout = config.layout
         self._config = config
         self._table = table
         self._controller = controller
@@ -100,6 +101,7 @@ class Service:
                 "silence": scene.silence_event,
                 "amplifiers": lambda: AmplifiersEvent(amplifiers=self._amplifier_statuses()),
                 "latency": lambda: LatencyEvent(latency_ms=latencies.summary()),
+                "layout": self._layout_event,
             },
             clock=clock.now,
         )
@@ -132,6 +134,11 @@ class Service:
                 old=old.state.value, new=new.state.value, cause=new.cause, remedy=new.remedy
             ),
         )
+
+    def layout_changed(self, layout: Layout | None) -> None:
+        """Tell clients of another surface layout, or of other effects without one."""
+        self._layout = layout
+        self.hub.publish("layout", self._layout_event)
 
     def left(self, client: Connection) -> None:
         """A client is gone: its fingers are lifted."""
@@ -200,7 +207,7 @@ class Service:
                 cells_y=table.grid.ny,
             ),
             rig_text=self._config.rig_text,
-            layout=None if self.layout is None else self.layout.drawn(),
+            layout=self._layout_event().layout,
         )
 
     async def _arm(self, client: Connection, params: ArmParams) -> ArmResult:
@@ -309,6 +316,9 @@ class Service:
         return StateEvent(
             old=now.state.value, new=now.state.value, cause=now.cause, remedy=now.remedy
         )
+
+    def _layout_event(self) -> LayoutEvent:
+        return LayoutEvent(layout=None if self._layout is None else self._layout.drawn())
 
     def _amplifier_statuses(self) -> list[AmplifierStatus]:
         return amplifier_statuses(self._amplifiers, self._backends, self._config.urls)

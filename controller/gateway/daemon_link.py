@@ -29,7 +29,7 @@ class DaemonLink:
     """Reaches the daemon at a socket, again and again; see `run`.
 
     on_hello: told of the daemon at each new connection, and None when it is lost; on_event: told of
-    each notification.
+    each notification. hello: how the daemon has introduced itself, None while it is away.
     """
 
     def __init__(
@@ -43,15 +43,15 @@ class DaemonLink:
         self._on_hello = on_hello
         self._on_event = on_event
         self._client: AsyncClient | None = None
-        self._hello: HelloResult | None = None
+        self.hello: HelloResult | None = None
 
     async def run(self) -> None:
         """Connect, listen, and connect again after a loss, until cancelled."""
         while True:
             client = await self._connect()
             try:
-                self._hello = await client.hello(_NAME)
-                self._on_hello(self._hello)
+                self.hello = await client.hello(_NAME)
+                self._on_hello(self.hello)
                 self._client = client
                 await client.subscribe(*TOPICS, rate_hz=_RATE)
                 async for told in client.events():
@@ -63,20 +63,20 @@ class DaemonLink:
                 _logger.warning("%s; %s", _FOREIGN, _UPDATE)
                 await asyncio.sleep(_LONGEST_PAUSE)
             finally:
-                self._client = self._hello = None
+                self._client = self.hello = None
                 self._on_hello(None)
                 await client.close()
 
     async def call(self, method: str, params: Message) -> dict[str, Any]:
         """Ask the daemon; its result as JSON. Raises RpcError, its own or that it is not there."""
-        if self._client is None or self._hello is None:
+        if self._client is None or self.hello is None:
             raise RpcError(
                 ErrorCode.LINK,
                 "the daemon does not answer",
                 remedy="see whether `era daemon` runs; the gateway connects by itself then",
             )
         if method == "hello":  # or anybody could give the gateway another name in the daemon's log
-            return self._hello.model_dump(mode="json")
+            return self.hello.model_dump(mode="json")
         try:
             result = await self._client.call(method, params, METHODS[method].result)
         except Unreachable as error:

@@ -19,7 +19,7 @@ from controller.gateway.topics import FIELD, HELLO
 from model.errors import InputError
 from model.rig_file import parse_rig
 
-_KEPT = frozenset({"state", "contacts", "pattern", "silence", "amplifiers", "latency"})
+_KEPT = frozenset({"state", "contacts", "pattern", "silence", "amplifiers", "latency", "layout"})
 _NO_FIELD = bytes(8 + 4)  # no columns, no rows, no frequencies, scale 0
 
 _logger = logging.getLogger(__name__)
@@ -69,9 +69,18 @@ class Picture:
             drive = told.data.get("drive", {})
             self._drive = {name: Tone.model_validate(tone) for name, tone in drive.items()}
             self._wanted.set()
+        if topic == "layout":
+            self._exchange(told.data["layout"])
         if topic in _KEPT:
             self._frames[topic] = frame
         self._tell(topic, frame)
+
+    def _exchange(self, layout: dict[str, Any] | None) -> None:
+        """Say hello again if touches mean something else; at first it is what hello has said."""
+        hello = self.daemon.hello
+        if hello is not None and ("layout" in self._frames or layout != hello.layout):
+            self.daemon.hello = hello.model_copy(update={"layout": layout})
+            self._show(HELLO, _event_frame(HELLO, self.daemon.hello.model_dump(mode="json")))
 
     def _show(self, topic: str, frame: str | bytes) -> None:
         self._frames[topic] = frame

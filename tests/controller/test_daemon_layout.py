@@ -85,6 +85,30 @@ async def test_regions_and_effects_by_name(tmp_path: Path) -> None:
         await asyncio.gather(touching, return_exceptions=True)
 
 
+async def test_clients_are_told_of_another_layout(tmp_path: Path) -> None:
+    """At first what is so now, then every exchange; hello tells the same from then on."""
+    path = tmp_path / "layout.yaml"
+    path.write_text(LAYOUT, encoding="utf-8")
+    async with (
+        running_daemon(tmp_path, "layout: layout.yaml\n") as bench,
+        await bench.client() as era,
+    ):
+        await until_state(era, READY)
+        await era.subscribe("layout")
+        events = era.events()
+
+        async def told() -> dict[str, object]:
+            async with asyncio.timeout(20):
+                return dict((await anext(events)).data["layout"])
+
+        assert await told() == (await era.hello("test")).layout
+        path.write_text(LAYOUT.replace("pad:", "field:"), encoding="utf-8")
+        await bench.daemon.reload()
+        layout = await told()
+        assert [region["name"] for region in layout["regions"]] == ["field", "quiet"]  # type: ignore[attr-defined]
+        assert (await era.hello("test")).layout == layout
+
+
 async def test_another_layout_while_it_runs(tmp_path: Path) -> None:
     """A weaker layout is taken over while armed, a stronger or broken one is not."""
     path = tmp_path / "layout.yaml"

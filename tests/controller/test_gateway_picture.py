@@ -1,0 +1,59 @@
+"""What browsers are shown of the daemon, from what it tells the gateway."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+from controller.api.messages import HelloResult
+from controller.api.parts import API_VERSION, RigSummary, TableSummary
+from controller.api.replies import Notification
+from controller.gateway.picture import Picture
+
+
+def hello(layout: dict[str, Any] | None) -> HelloResult:
+    """A daemon with a layout."""
+    return HelloResult(
+        api_version=API_VERSION,
+        software_version="1",
+        rig=RigSummary(
+            length_m=0.3, width_m=0.2, eras=[], simulated=True, frequency_hz=[40.0, 500.0]
+        ),
+        table=TableSummary(
+            fingerprint="0", mode="switched", frequencies_hz=[110.0], cells_x=4, cells_y=3
+        ),
+        rig_text="",
+        layout=layout,
+    )
+
+
+def test_another_layout_is_another_hello(tmp_path: Path) -> None:
+    """Not at the first telling, which is what hello has said; then whatever is told, each time.
+
+    What else was shown stays, and the gateway answers hello by the new one.
+    """
+    shown: list[Any] = []
+
+    def tell(topic: str, frame: str | bytes) -> None:
+        if topic == "hello":
+            said = json.loads(frame)["params"]["data"]
+            shown.append(None if said is None else said["layout"])
+
+    picture = Picture(tmp_path / "nowhere", tell=tell)
+    one, other = {"regions": [{"name": "a"}]}, {"regions": [{"name": "b"}]}
+    picture.daemon.hello = hello(one)
+    picture._hello(picture.daemon.hello)
+    picture._event(Notification("state", 1.0, 0, {"new": "FAULT"}))
+    picture._event(Notification("layout", 1.0, 0, {"layout": one}))
+    assert shown == [one]
+    picture._event(Notification("layout", 2.0, 0, {"layout": other}))
+    picture._event(Notification("layout", 3.0, 0, {"layout": other}))  # other effects
+    assert shown == [one, other, other]
+    assert picture.daemon.hello.layout == other
+    assert picture.current("state") is not None
+
+    # Exchanged between hello and the subscription: the first telling is news already.
+    shown.clear()
+    picture.daemon.hello = hello(one)
+    picture._hello(picture.daemon.hello)
+    picture._event(Notification("layout", 4.0, 0, {"layout": None}))
+    assert shown == [one, None]

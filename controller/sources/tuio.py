@@ -8,13 +8,13 @@ whole or, if anything in it is malformed, not at all.
 import asyncio
 import logging
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 from pythonosc.osc_bundle_builder import IMMEDIATELY, OscBundleBuilder
 from pythonosc.osc_message_builder import OscMessageBuilder
 
-from controller.sources.datagrams import Datagrams, Peer, listen
+from controller.sources.datagrams import Datagram, Datagrams, Peer, listen
 from controller.sources.osc import OscError, osc_messages
 from controller.tally import Tally
 from controller.touch import Touch, TouchFrame, TouchSource
@@ -28,6 +28,7 @@ DEFAULT_PORT = 3333  # registered for TUIO
 _LARGEST_DATAGRAM = 8 * 1024
 _LONGEST_NAME = 100
 _MOST_SENDERS = 16
+_SOURCE = b"source\0\0"  # as OSC writes that text
 # The reference client takes a number that fell by more than 100 for a sender that began anew. One
 # that began anew within its first 100 frames is known by the pause: reordering is never this late.
 _LATE_FRAMES = 100
@@ -148,6 +149,40 @@ def _read_bundle(datagram: bytes) -> _Bundle:
     return bundle
 
 
+def without_moot(waiting: Sequence[Datagram]) -> list[Datagram]:
+    """Those that wait, in their order, without what a sender's newest bundle makes moot.
+
+    It does where it places every cursor that is alive: whatever came before says nothing more.
+    """
+    is_complete: dict[tuple[Peer, bytes], bool] = {}
+    kept = []
+    for each in reversed(waiting):
+        sender = (each.peer, _named_in(each.data))
+        if sender not in is_complete:
+            is_complete[sender] = len(is_complete) < _MOST_SENDERS and _says_all(each.data)
+        elif is_complete[sender]:
+            continue
+        kept.append(each)
+    return kept[::-1]
+
+
+def _named_in(datagram: bytes) -> bytes:
+    """The name in a datagram's source message as it stands there, without reading the rest."""
+    _, found, rest = datagram.partition(_SOURCE)
+    return rest.partition(b"\0")[0] if found else b""
+
+
+def _says_all(datagram: bytes) -> bool:
+    """Whether a bundle says which cursors are alive, and where every one of them is."""
+    if len(datagram) > _LARGEST_DATAGRAM:
+        return False
+    try:
+        bundle = _read_bundle(datagram)
+    except OscError:
+        return False
+    return bundle.alive is not None and set(bundle.alive) <= bundle.positions.keys()
+
+
 def tuio_datagram(frame: TouchFrame, sequence: int) -> bytes:
     """A frame as a sender of the frame's source name would put it on the wire, fully repeated."""
     bundle = OscBundleBuilder(IMMEDIATELY)
@@ -195,7 +230,11 @@ class TuioSource(TouchSource):
             return
         try:
             self._line = await listen(
-                self.host, self._port, self._received, largest=_LARGEST_DATAGRAM
+                self.host,
+                self._port,
+                self._received,
+                largest=_LARGEST_DATAGRAM,
+                thin=without_moot,
             )
         except OSError as error:
             raise InputError(

@@ -1,0 +1,114 @@
+"""Bundles that wait in a queue: which of them are moot, and that leaving them out loses nothing."""
+
+import asyncio
+import logging
+import socket
+
+from hypothesis import given
+from hypothesis import strategies as st
+from pythonosc.osc_bundle_builder import IMMEDIATELY, OscBundleBuilder
+from pythonosc.osc_message_builder import OscMessageBuilder
+
+from controller.sources.datagrams import MANY, Datagram, Peer, listen
+from controller.sources.tuio import TuioReader, tuio_datagram, without_moot
+from controller.tally import Tally
+from controller.touch import Touch, TouchFrame
+
+HERE, THERE = ("127.0.0.1", 5001), ("127.0.0.1", 5002)
+
+
+def partial(source: str, alive: list[int], places: dict[int, float]) -> bytes:
+    """A bundle that names cursors and places only some of them, as TUIO 1.1 allows."""
+    bundle = OscBundleBuilder(IMMEDIATELY)
+    messages: list[list[tuple[str, object]]] = [
+        [("s", "source"), ("s", source)],
+        [("s", "alive"), *(("i", id) for id in alive)],
+        *(
+            [("s", "set"), ("i", id), *(("f", each) for each in (x, x, 0.0, 0.0, 0.0))]
+            for id, x in places.items()
+        ),
+    ]
+    for message in messages:
+        builder = OscMessageBuilder("/tuio/2Dcur")
+        for kind, value in message:
+            builder.add_arg(value, kind)
+        bundle.add_content(builder.build())
+    return bytes(bundle.build().dgram)
+
+
+def full(source: str, *ids: int) -> bytes:
+    """A bundle that places all."""
+    return tuio_datagram(TouchFrame(source, 0.0, tuple(Touch(id, 0.5, 0.5) for id in ids)), -1)
+
+
+def waiting(*said: tuple[bytes, Peer]) -> list[Datagram]:
+    """Datagrams in the order in which they came."""
+    return [Datagram(data, peer, float(number)) for number, (data, peer) in enumerate(said)]
+
+
+def test_the_newest_complete_bundle_of_each_sender_is_enough() -> None:
+    """Another name, or another port, is another sender; the order stays."""
+    all_of_it = waiting(
+        (full("a", 1), HERE), (full("b", 1), HERE), (full("a", 2), THERE), (full("a"), HERE)
+    )
+    assert without_moot(all_of_it) == all_of_it[1:]
+
+
+def test_what_a_later_bundle_does_not_repeat_is_kept() -> None:
+    """A cursor that is alive but not placed again is where an older bundle has put it."""
+    all_of_it = waiting(
+        (full("a", 1, 2), HERE), (partial("a", [1, 2], {1: 0.1}), HERE), (b"no bundle", HERE)
+    )
+    assert without_moot(all_of_it) == all_of_it
+    assert without_moot(all_of_it[:2]) == all_of_it[:2]
+
+
+bundles = st.builds(
+    lambda source, alive, placed: partial(
+        source, alive, {id: 0.1 * id for id in alive if id in placed}
+    ),
+    st.sampled_from("ab"),
+    st.lists(st.integers(1, 4), unique=True, max_size=3),
+    st.sets(st.integers(1, 4)),
+)
+
+
+@given(st.lists(st.tuples(bundles, st.sampled_from([HERE, THERE])), max_size=12))
+def test_who_reads_the_rest_knows_the_same(said: list[tuple[bytes, Peer]]) -> None:
+    """What fingers there are in the end does not depend on whether moot bundles were read.
+
+    Each sender speaks from one port here: one that speaks from two contradicts itself.
+    """
+    said = [(data, peer) for data, peer in said if (peer == HERE) == (b"a\0\0\0" in data)]
+    frames: list[dict[str, tuple[Touch, ...]]] = []
+    for each in (waiting(*said), without_moot(waiting(*said))):
+        reader = TuioReader(Tally(logging.getLogger(__name__)))
+        frames.append({})
+        for data, peer, arrived in each:
+            frame = reader.read(data, peer, now=arrived)
+            if frame is not None:
+                frames[-1][frame.source] = frame.touches
+    assert frames[0] == frames[1]
+
+
+async def test_of_a_queue_the_newest_is_handed_on_first_of_all() -> None:
+    """Two hundred frames that came while the loop was busy are one: that all fingers are up."""
+    received: list[bytes] = []
+    done = asyncio.Event()
+    up = full("a")
+
+    def take(data: bytes, peer: Peer, arrived: float) -> None:
+        received.append(data)
+        if data == up:
+            done.set()
+
+    line = await listen("127.0.0.1", 0, take, largest=8192, thin=without_moot)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        for number in range(200):
+            sender.sendto(full("a", number), ("127.0.0.1", line.port))
+        sender.sendto(up, ("127.0.0.1", line.port))
+        async with asyncio.timeout(20):
+            await done.wait()
+    line.close()
+    assert len(received) <= MANY
+    assert received[-1] == up

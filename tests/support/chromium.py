@@ -43,6 +43,10 @@ def chromium() -> str:
     pytest.skip(reason)
 
 
+class Navigated(Exception):
+    """The page was left while it was asked something."""
+
+
 class Page:
     """One tab; everything that it writes to its console as a warning or error is kept."""
 
@@ -65,6 +69,8 @@ class Page:
         await self._socket.send(json.dumps({"id": number, "method": method, "params": params}))
         async with asyncio.timeout(WAITING):
             said = await answer
+        if "navigated" in said.get("error", {}).get("message", ""):
+            raise Navigated
         assert "error" not in said, f"{method}: {said['error']}"
         return dict(said["result"])
 
@@ -81,7 +87,10 @@ class Page:
         value = None
         try:
             async with asyncio.timeout(WAITING):
-                while not accepts(value := await self.evaluate(expression)):  # noqa: ASYNC110
+                while True:
+                    with contextlib.suppress(Navigated):
+                        if accepts(value := await self.evaluate(expression)):
+                            break
                     await asyncio.sleep(0.05)
         except TimeoutError:
             pytest.fail(f"{expression} stayed {value!r}; the page complains of {self.complaints}")
@@ -101,7 +110,10 @@ class Page:
             mobile=is_phone,
         )
         await self.call("Emulation.setTouchEmulationEnabled", enabled=True, maxTouchPoints=10)
+        # Another fragment alone would not load the page anew.
+        await self.call("Page.navigate", url="about:blank")
         await self.call("Page.navigate", url=url)
+        await self.until("location.protocol !== 'about:' && document.readyState === 'complete'")
 
     async def dark(self, is_dark: bool) -> None:
         """Prefer dark or light colours."""
@@ -113,10 +125,10 @@ class Page:
         fingers = [{"x": x, "y": y, "id": id} for id, (x, y) in enumerate(points)]
         await self.call("Input.dispatchTouchEvent", type=kind, touchPoints=fingers)
 
-    async def mouse(self, kind: str, x: float, y: float) -> None:
+    async def mouse(self, kind: str, x: float, y: float, *, button: str = "left") -> None:
         """Real mouse events: mousePressed, mouseMoved, mouseReleased."""
         await self.call(
-            "Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1
+            "Input.dispatchMouseEvent", type=kind, x=x, y=y, button=button, clickCount=1
         )
 
     async def press(self, key: str, code: str | None = None) -> None:

@@ -20,6 +20,7 @@ const log = at("log");
 let link;
 let lease = null;
 let state = null;
+let daemon;  // undefined until it is told; null while it is away
 
 const overlay = new PlateOverlay(at("plate"), at("overlay"));
 const picture = new FieldPicture(at("field"), at("scale"), (low, high) => {
@@ -48,9 +49,10 @@ async function ask(method, params) {
 async function stop() {
   lease = null;
   try {
+    if (!link) throw new Error("no token");
     await link.stop();
   } catch {
-    complain(new Error("The stop could not be delivered: the gateway does not answer. Switch the amplifiers off by hand."));
+    complain(new Error("The stop was not delivered. Switch the amplifiers off by hand."));
   }
 }
 
@@ -78,8 +80,21 @@ function showButtons() {
   at("clear").disabled = !isThere || !["QUICK_STOP_ACTIVE", "FAULT"].includes(state);
 }
 
+// What everybody should know before they look at anything else.
+function showBanner() {
+  let text = "";
+  if (!link?.isOpen) text = "The gateway does not answer. Amplifiers may still be energised.";
+  else if (daemon === null) text = "The daemon does not answer. Amplifiers may still be energised.";
+  else if (state === "COMM_LOST") text = "The link to an amplifier is lost. It may still be energised.";
+  else if (daemon?.rig.simulated) text = "Simulated amplifiers: nothing vibrates but numbers.";
+  at("banner").hidden = !text;
+  at("banner").textContent = text;
+  at("banner").classList.toggle("grave", !text.startsWith("Simulated"));
+}
+
 function showState(next, cause) {
   state = next;
+  showBanner();
   if (state !== "OPERATION_ENABLED") lease = null;
   at("state").textContent = STATES[state] ?? "daemon away";
   at("state").dataset.state = state ?? "away";
@@ -98,12 +113,9 @@ function summarise({ contacts, predicted_contrast_db, robust_contrast_db, predic
 }
 
 const HANDLERS = {
-  hello(daemon) {
-    const banner = at("banner");
-    banner.hidden = daemon !== null && !daemon.rig.simulated;
-    banner.textContent = daemon === null
-      ? "The daemon does not answer. Amplifiers may still be energised."
-      : "Simulated amplifiers: nothing vibrates but numbers.";
+  hello(said) {
+    daemon = said;
+    showBanner();
     if (daemon === null) {
       showState(null, "the gateway looks for it");
       overlay.show({ contacts: [], drive: {} });
@@ -134,18 +146,25 @@ const HANDLERS = {
     at("summary").textContent = contacts.length ? `silent: ${reason}` : "";
   },
   amplifiers({ amplifiers }) {
-    showAmplifiers(at("amplifiers"), amplifiers);
+    showAmplifiers(at("amplifiers"), amplifiers, overlay.rig?.eras ?? []);
   },
   latency({ latency_ms }) {
     showLatency(at("latency-numbers"), at("latency"), latency_ms);
   },
   log({ level, message, cause, remedy }) {
+    if (isTransition(message)) return;  // is told by the topic state, in words
     addEvent(log, level, cause ? `${message}: ${cause}` : message, remedy);
   },
   link({ event, amplifier, message, remedy }) {
     addEvent(log, event === "reopened" ? "info" : "error", amplifier ? `${amplifier}: ${message}` : message, remedy);
   },
 };
+
+// Whether a line of the daemon's log is its change of state, such as "SWITCHED_ON -> FAULT".
+function isTransition(message) {
+  const parts = message.split(" -> ");
+  return parts.length === 2 && parts.every((part) => part in STATES);
+}
 
 function play(effect) {
   const { rig, cursor } = overlay;
@@ -160,22 +179,21 @@ function connected(isConnected) {
     addEvent(log, "info", "connected to the gateway");
     return;
   }
-  if (!link?.wasOpen) {
-    at("door").hidden = false;
-    at("door-problem").textContent = link
-      ? "The gateway cannot be reached with this token. It tries again by itself." : "";
-    return;
-  }
   lease = null;
+  daemon = undefined;
   showState(null, "the gateway does not answer; it is tried again");
-  at("banner").hidden = false;
-  at("banner").textContent = "The gateway does not answer. Amplifiers may still be energised.";
+  if (!link?.wasOpen) showDoor("The gateway cannot be reached. It is tried again.");
+}
+
+function showDoor(problem) {
+  at("door").hidden = false;
+  at("door-problem").textContent = problem;
 }
 
 function enter(token) {
-  sessionStorage.setItem(TOKEN_KEY, token);
   link = new Link(token, TOPICS, {
     connected,
+    refused: () => showDoor("The gateway has another token: open the URL that it printed when it started."),
     event: ({ topic, data }) => HANDLERS[topic]?.(data),
     field: (buffer) => picture.show(decodeField(buffer)),
   });
@@ -200,8 +218,17 @@ window.addEventListener("keydown", (event) => {
 }, { capture: true });
 window.addEventListener("keyup", (event) => event.code === "Space" && event.target.id !== "token" && event.preventDefault(), { capture: true });
 
-const given = new URLSearchParams(location.hash.slice(1)).get("token");
-if (given) history.replaceState(null, "", location.pathname);
-const token = given ?? sessionStorage.getItem(TOKEN_KEY);
+// The URL's token is kept by the tab alone, where nobody looks over a shoulder.
+function takeToken() {
+  const given = new URLSearchParams(location.hash.slice(1)).get("token");
+  if (!given) return false;
+  history.replaceState(null, "", location.pathname);
+  sessionStorage.setItem(TOKEN_KEY, given);
+  return true;
+}
+
+window.addEventListener("hashchange", () => takeToken() && location.reload());
+takeToken();
+const token = sessionStorage.getItem(TOKEN_KEY);
 if (token) enter(token);
-else at("door").hidden = false;
+else showDoor("");

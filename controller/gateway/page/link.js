@@ -12,8 +12,8 @@ export class RpcError extends Error {
 }
 
 export class Link {
-  // token: the gateway's; topics: what to be told of; handlers: connected(isConnected, wasRefused),
-  // event(params), field(ArrayBuffer).
+  // token: the gateway's; topics: what to be told of; handlers: connected(isConnected), refused() for
+  // the sake of the token, event(params), field(ArrayBuffer).
   constructor(token, topics, handlers) {
     this.token = token;
     this.topics = topics;
@@ -22,6 +22,7 @@ export class Link {
     this.lastId = 0;
     this.attempt = 0;
     this.wasOpen = false;
+    this.isHeard = false;  // since the last attempt to connect
     this.connect();
   }
 
@@ -42,7 +43,7 @@ export class Link {
 
   opened() {
     this.attempt = 0;
-    this.wasOpen = true;
+    this.isHeard = this.wasOpen = true;
     this.call("subscribe", { topics: this.topics, rate_hz: 10 }).catch(() => {});
     this.handlers.connected(true);
   }
@@ -53,6 +54,8 @@ export class Link {
     }
     this.waiting.clear();
     this.handlers.connected(false);
+    if (!this.isHeard) this.ask();
+    this.isHeard = false;
     const pause = PAUSES_MS[Math.min(this.attempt++, PAUSES_MS.length - 1)];
     setTimeout(() => this.connect(), pause);
   }
@@ -98,13 +101,21 @@ export class Link {
 
   // Stop by every way there is; a promise that one of them was answered.
   stop() {
-    const headers = { Authorization: `Bearer ${this.token}`, "Content-Type": "application/json" };
-    const url = new URL("api/v1/stop", location.href);
-    url.hash = "";
-    const overHttp = fetch(url, { method: "POST", headers, body: "{}", keepalive: true })
-      .then((answer) => {
-        if (!answer.ok) throw new Error("the stop was not carried out");
-      });
+    const overHttp = this.post("stop").then((answer) => {
+      if (!answer.ok) throw new Error("the stop was not carried out");
+    });
     return Promise.any([this.call("stop"), overHttp]);
+  }
+
+  // Whether it is for the token that no WebSocket is let in: browsers do not tell.
+  ask() {
+    this.post("effects").then(({ status }) => status === 401 && this.handlers.refused()).catch(() => {});
+  }
+
+  post(method) {
+    const headers = { Authorization: `Bearer ${this.token}`, "Content-Type": "application/json" };
+    const url = new URL(`api/v1/${method}`, location.href);
+    url.hash = "";
+    return fetch(url, { method: "POST", headers, body: "{}", keepalive: true });
   }
 }

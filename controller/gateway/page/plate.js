@@ -2,6 +2,7 @@
 
 const SVG = "http://www.w3.org/2000/svg";
 const FINGERTIP_M = 0.0065;  // radius
+const SMALL_PX = 480;  // a plate that has no room for every label
 
 function element(name, attributes, text) {
   const made = document.createElementNS(SVG, name);
@@ -27,7 +28,7 @@ export class PlateOverlay {
   setUp({ rig, layout }) {
     this.rig = rig;
     this.regions = layout?.regions ?? [];
-    this.plate.style.aspectRatio = `${rig.length_m} / ${rig.width_m}`;
+    this.plate.style.setProperty("--ratio", rig.length_m / rig.width_m);
     this.svg.setAttribute("viewBox", `0 0 ${rig.length_m} ${rig.width_m}`);
     this.redraw();
   }
@@ -56,6 +57,7 @@ export class PlateOverlay {
   redraw() {
     if (!this.rig || !this.plate.clientWidth) return;
     this.px = this.rig.length_m / this.plate.clientWidth;  // metres of one pixel
+    this.isSmall = this.plate.clientWidth < SMALL_PX;
     const [regions, eras, contacts, cursor] = this.layers;
     regions.replaceChildren(...this.regions.flatMap((region) => this.region(region)));
     eras.replaceChildren(...this.rig.eras.flatMap((era) => this.era(era)));
@@ -71,12 +73,12 @@ export class PlateOverlay {
     return element("circle", { class: name, cx: x_m, cy: this.up(y_m), r: radius });
   }
 
-  label(x, y, text) {
+  label(x, y, text, name = "label") {
     const size = 12 * this.px;
     const room = 0.62 * size * text.length;  // about as wide as the text
     const anchor = x < room / 2 ? "start" : x > this.rig.length_m - room / 2 ? "end" : "middle";
     const height = Math.min(this.rig.width_m - size / 2, Math.max(size, y));
-    return element("text", { class: "label", x, y: height, "font-size": size, "text-anchor": anchor }, text);
+    return element("text", { class: name, x, y: height, "font-size": size, "text-anchor": anchor }, text);
   }
 
   region({ name, shape, x_m, y_m, width_m, height_m, radius_m, points_m }) {
@@ -84,16 +86,19 @@ export class PlateOverlay {
     let at;
     if (shape === "circle") {
       outline = this.circle({ x_m, y_m }, "region", radius_m);
-      at = [x_m, this.up(y_m)];
+      at = [x_m, this.up(y_m + radius_m)];
     } else if (shape === "polygon") {
       const corners = points_m.map(([x, y]) => [x, this.up(y)]);
       outline = element("polygon", { class: "region", points: corners.map((corner) => corner.join(",")).join(" ") });
-      at = [0, 1].map((axis) => corners.reduce((sum, corner) => sum + corner[axis], 0) / corners.length);
+      const [xs, ys] = [0, 1].map((axis) => corners.map((corner) => corner[axis]));
+      at = [(Math.min(...xs) + Math.max(...xs)) / 2, Math.min(...ys)];
     } else {
       outline = element("rect", { class: "region", x: x_m, y: this.up(y_m + height_m), width: width_m, height: height_m });
-      at = [x_m + width_m / 2, this.up(y_m + height_m / 2)];
+      at = [x_m + width_m / 2, this.up(y_m + height_m)];
     }
-    return [outline, this.label(...at, name)];
+    if (this.isSmall && this.contacts.length) return [outline];
+    // On the upper edge, where fingers that are put into the middle do not hide it.
+    return [outline, this.label(at[0], at[1] + 4 * this.px, name, "label name")];
   }
 
   era({ name, x_m, y_m }) {
@@ -104,19 +109,25 @@ export class PlateOverlay {
     const square = element("rect", {
       class: tone ? "era driven" : "era", x: x - side / 2, y: y - side / 2, width: side, height: side, "data-era": name,
     });
-    const text = tone ? `${name} ${tone.frequency_hz.toFixed(0)} Hz ${(100 * tone.level).toFixed(0)} %` : name;
+    const parts = [name];
+    if (tone && !this.isSmall) parts.push(`${tone.frequency_hz.toFixed(0)} Hz`);
+    if (tone) parts.push(`${(100 * tone.level).toFixed(0)} %`);
     const below = y < this.rig.width_m / 2;
-    return [square, this.label(x, below ? y + 2 * side : y - side, text)];
+    return [square, this.label(x, below ? y + 2 * side : y - side, parts.join(" "))];
   }
 
   contact(contact) {
     const { x_m, y_m, role, level_db_sl, contrast_db } = contact;
     const ring = this.circle(contact, `contact ${role ?? ""}`, Math.max(FINGERTIP_M, 10 * this.px));
     ring.setAttribute("data-role", role ?? "");
-    const parts = [];
-    if (level_db_sl !== null && level_db_sl !== undefined) parts.push(`${shown(level_db_sl)} dB SL`);
-    if (role === "target" && contrast_db !== null && contrast_db !== undefined) parts.push(`${shown(contrast_db)} dB over others`);
-    if (role === "quiet" && !parts.length) parts.push("quiet");
-    return [ring, this.label(x_m, this.up(y_m) - Math.max(FINGERTIP_M, 10 * this.px) - 4 * this.px, parts.join(", "))];
+    const isKnown = (value) => value !== null && value !== undefined;
+    const away = Math.max(FINGERTIP_M, 10 * this.px);
+    const above = isKnown(level_db_sl) ? `${shown(level_db_sl)} dB SL` : role === "quiet" ? "quiet" : "";
+    const below = role === "target" && isKnown(contrast_db) ? `${shown(contrast_db)} dB over others` : "";
+    return [
+      ring,
+      this.label(x_m, this.up(y_m) - away - 4 * this.px, above),
+      this.label(x_m, this.up(y_m) + away + 13 * this.px, below),
+    ];
   }
 }

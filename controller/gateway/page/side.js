@@ -13,20 +13,25 @@ function element(name, text, className) {
   return made;
 }
 
-function tile(amplifier) {
+// eras: those of the rig, for the names of what its channels move.
+function tile(amplifier, eras) {
   const { name, state, fault, levels, temperature_c, high_voltage, high_voltage_v, reply_age_s, lost } = amplifier;
   const faulty = lost || (fault && fault !== "NONE");
   const made = element("article", undefined, faulty ? "tile bad" : "tile");
   const title = element("h3");
   title.append(element("span", name), element("span", lost ? "lost" : faulty ? fault : (state ?? "unknown")));
   made.append(title);
+  const channels = element("div", undefined, "channels");
   levels.forEach((level, channel) => {
+    const era = eras.find((each) => each.amplifier === name && each.channel === channel);
     const meter = element("meter");
+    const percent = `${(100 * level).toFixed(0)} %`;
     meter.max = 1;
     meter.value = level;
-    meter.ariaLabel = `channel ${channel}: ${(100 * level).toFixed(0)} %`;
-    made.append(meter);
+    meter.ariaLabel = `channel ${channel}${era ? `, ERA ${era.name}` : ""}: ${percent}`;
+    channels.append(element("span", era?.name ?? `${channel}`), meter, element("span", percent));
   });
+  made.append(channels);
   const list = element("dl");
   const voltage = high_voltage_v === null ? (high_voltage === null ? "–" : high_voltage ? "on" : "off") : `${shown(high_voltage_v)} V`;
   const age = reply_age_s === null ? "–" : reply_age_s > OLD_REPLY_S ? `${shown(reply_age_s, 1)} s (old)` : `${shown(1000 * reply_age_s)} ms`;
@@ -37,8 +42,8 @@ function tile(amplifier) {
   return made;
 }
 
-export function showAmplifiers(into, amplifiers) {
-  into.replaceChildren(...amplifiers.map(tile));
+export function showAmplifiers(into, amplifiers, eras) {
+  into.replaceChildren(...amplifiers.map((amplifier) => tile(amplifier, eras)));
 }
 
 export function showLatency(numbers, svg, { count, median, p99, p999, histogram }) {

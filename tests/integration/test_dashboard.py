@@ -1,0 +1,461 @@
+"""The dashboard in a real browser, before a real daemon over a simulated amplifier.
+
+One browser and one daemon for all; every test loads the page anew, touches it as a hand or a
+keyboard does, and asks the daemon itself what came of it.
+"""
+
+import asyncio
+import logging
+from collections.abc import AsyncIterator, Iterator
+from pathlib import Path
+
+import pytest
+import pytest_asyncio
+
+import dashboard_pictures
+from chromium import Page, open_page
+from controller.api.client import Client
+from controller.effects.layout_kind import LAYOUT
+from dashboard_pictures import (
+    PLACES,
+    SCREENS,
+    STATE,
+    Screen,
+    fingers_down,
+    on_plate,
+    open_dashboard,
+)
+from gateway_bench import (
+    TOKEN,
+    GatewayProcess,
+    gateway_process,
+    real_daemon,
+    wait_for,
+    wait_for_state,
+)
+
+pytestmark = pytest.mark.asyncio(loop_scope="module")
+
+READY, ENABLED, STOPPED = "READY_TO_SWITCH_ON", "OPERATION_ENABLED", "QUICK_STOP_ACTIVE"
+LENGTH, WIDTH = 0.3048, 0.2286  # m; 12 by 9 inches, as in the rig's file
+DESKTOP, PHONE = SCREENS[0], SCREENS[2]
+PROBES = (Path(dashboard_pictures.__file__).with_name("page_probes.js")).read_text(encoding="utf-8")
+
+_logger = logging.getLogger(__name__)  # what was measured; shown by pytest --log-cli-level=info
+
+
+@pytest.fixture(scope="module")
+def daemon(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """A daemon with the example's surface layout."""
+    folder = tmp_path_factory.mktemp("daemon")
+    (folder / "layout.yaml").write_text(LAYOUT.example(), encoding="utf-8")
+    with real_daemon(folder, "layout: layout.yaml\n") as path:
+        yield path
+
+
+@pytest.fixture(scope="module")
+def gateway(daemon: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[GatewayProcess]:
+    """Its gateway."""
+    with gateway_process(tmp_path_factory.mktemp("gateway"), daemon) as made:
+        yield made
+
+
+@pytest_asyncio.fixture(scope="module", loop_scope="module")
+async def browser(tmp_path_factory: pytest.TempPathFactory) -> AsyncIterator[Page]:
+    """A browser's tab."""
+    async with open_page(tmp_path_factory.mktemp("profile")) as page:
+        yield page
+
+
+@pytest.fixture
+def era(daemon: Path) -> Iterator[Client]:
+    """The daemon itself, ready to be armed; disarmed afterwards."""
+    with Client.connect(daemon, name="test") as client:
+        yield client
+        if client.status().state == STOPPED:
+            client.clear()
+        client.disarm()
+        wait_for_state(client, READY)
+
+
+@pytest_asyncio.fixture(loop_scope="module")
+async def page(browser: Page, gateway: GatewayProcess, era: Client) -> Page:
+    """The dashboard on a desktop, connected."""
+    wait_for_state(era, READY)
+    browser.complaints.clear()
+    await browser.dark(False)
+    await open_dashboard(browser, gateway, DESKTOP)
+    await browser.until(f"{STATE} === 'READY_TO_SWITCH_ON'")
+    return browser
+
+
+async def until_state(era: Client, *states: str) -> None:
+    """Wait for the daemon while the browser goes on."""
+    await asyncio.to_thread(wait_for_state, era, *states)
+
+
+async def contacts(era: Client, count: int) -> list[tuple[float, float]]:
+    """Where the daemon sees fingers, as soon as there are so many."""
+    await asyncio.to_thread(wait_for, lambda: len(era.status().contacts) == count)
+    return [(contact.x_m, contact.y_m) for contact in era.status().contacts]
+
+
+async def arm(page: Page, era: Client) -> None:
+    """By the button."""
+    await page.click("#arm")
+    await until_state(era, ENABLED)
+    await page.until(f"{STATE} === 'OPERATION_ENABLED'")
+
+
+async def test_the_page_shows_the_rig_without_a_complaint(page: Page) -> None:
+    """Its ERAs and regions, a banner that all is simulated, its amplifier; nothing in the console,
+    and nothing was asked of anybody but the gateway.
+    """
+    assert await page.evaluate("document.querySelector('#banner').innerText") == (
+        "Simulated amplifiers: nothing vibrates but numbers."
+    )
+    names = await page.evaluate(
+        "[...document.querySelectorAll('#overlay text')].map(e => e.textContent)"
+    )
+    assert set(names) == {"SW", "SE", "NE", "NW", "keypad", "slider", "knob", "patch"}
+    shapes = await page.evaluate("[...document.querySelectorAll('.region')].map(e => e.tagName)")
+    assert sorted(shapes) == ["circle", "polygon", "rect", "rect"]
+    tile = await page.until("document.querySelector('.tile')?.innerText")
+    assert "main" in tile
+    assert "°C" in tile
+    assert "ms ago" in tile
+    await page.until(
+        "[...document.querySelectorAll('#effects button')].map(e => e.textContent).join()",
+        lambda names: names == "buzz,click,cloth,notches,soft,swell",
+    )
+    origins = await page.evaluate(
+        "[...new Set(performance.getEntriesByType('resource').map(e => new URL(e.name).origin))]"
+        ".filter(origin => origin !== location.origin)"
+    )
+    assert origins == []
+    assert await page.evaluate("location.hash") == ""  # the token is not to be seen
+    assert page.complaints == []
+
+
+async def test_the_plate_is_on_scale_on_every_screen(page: Page, gateway: GatewayProcess) -> None:
+    """As long and wide as in metres, wholly to be seen, and nothing sticks out of the screen."""
+    for screen in SCREENS:
+        await open_dashboard(page, gateway, screen)
+        width, height, overflow = await page.evaluate(
+            "(({width, height}) => [width, height, document.documentElement.scrollWidth - "
+            "innerWidth])(document.querySelector('#plate').getBoundingClientRect())"
+        )
+        assert width / height == pytest.approx(LENGTH / WIDTH, rel=0.02), screen
+        assert height < screen.height, screen
+        assert overflow <= 0, screen
+
+
+async def test_the_field_is_drawn_and_frames_go_on(page: Page, era: Client) -> None:
+    """While a finger is felt: many colours on the plate, and a frame for each of the screen's."""
+    await arm(page, era)
+    async with fingers_down(page, PLACES[1]):
+        colours = f"({PROBES}).colours('#field')"
+        assert await page.until(colours, lambda count: count > 50)
+        await page.click("#motion")
+        frames, seconds = await page.evaluate(f"({PROBES}).frames()")
+        _logger.info("%.1f frames/s in motion", frames / seconds)
+        assert frames > 10
+        await page.click("#motion")
+        assert await page.evaluate("document.querySelector('#scale-low').textContent") == "0"
+    assert await page.until(colours, lambda count: count == 1)  # still again
+
+
+async def test_fingers_on_the_glass_are_the_daemons_contacts(page: Page, era: Client) -> None:
+    """Two at once, where they are in metres, moved and lifted; the last one is the target."""
+    await arm(page, era)
+    async with fingers_down(page, *PLACES):
+        seen = await contacts(era, 2)
+        for (x, y), (right, down) in zip(seen, PLACES, strict=True):
+            assert x == pytest.approx(right * LENGTH, abs=1e-3)
+            assert y == pytest.approx((1 - down) * WIDTH, abs=1e-3)
+        await page.until("document.querySelectorAll('.contact').length === 2")
+        await page.until("document.querySelectorAll('.contact.target').length === 1")
+        summary = await page.until(
+            "document.querySelector('#summary').textContent", lambda text: "dB over" in text
+        )
+        assert summary.startswith("2 fingers: target feels ")
+        await page.touch("touchMove", await on_plate(page, (0.2, 0.7), (0.6, 0.5)))
+        await asyncio.to_thread(
+            wait_for, lambda: abs(era.status().contacts[1].x_m - 0.6 * LENGTH) < 1e-3
+        )
+    assert await contacts(era, 0) == []
+    await page.until("document.querySelectorAll('.contact').length === 0")
+    told = await page.until(
+        "document.querySelector('#latency-numbers').textContent", lambda text: "median" in text
+    )
+    assert " ms" in told
+    assert await page.evaluate("document.querySelectorAll('#latency rect').length") > 5
+    assert page.complaints == []
+
+
+async def test_touches_that_the_browser_takes_away_are_lifted(page: Page, era: Client) -> None:
+    """As when a phone call comes, or another window."""
+    for end in ("touchCancel", "blur"):
+        await page.touch("touchStart", await on_plate(page, (0.5, 0.5)))
+        await contacts(era, 1)
+        if end == "blur":
+            await page.evaluate("window.dispatchEvent(new Event('blur'))")
+            await contacts(era, 0)
+            await page.touch("touchEnd", [])
+        else:
+            await page.touch(end, [])
+            await contacts(era, 0)
+
+
+async def test_the_mouse_is_a_finger_while_its_button_is_down(page: Page, era: Client) -> None:
+    """It hovers without effect, and is lifted wherever the button is let go."""
+    ((x, y),) = await on_plate(page, (0.25, 0.5))
+    await page.mouse("mouseMoved", x, y, button="none")
+    assert await contacts(era, 0) == []
+    await page.mouse("mousePressed", x, y)
+    ((seen, _),) = await contacts(era, 1)
+    assert seen == pytest.approx(0.25 * LENGTH, abs=1e-3)
+    await page.mouse("mouseMoved", x + 2000, y)  # dragged off the plate: at its edge
+    await asyncio.to_thread(wait_for, lambda: era.status().contacts[0].x_m > LENGTH - 1e-3)
+    await page.mouse("mouseReleased", x + 2000, y)
+    assert await contacts(era, 0) == []
+
+
+async def test_the_keyboard_is_a_finger(page: Page, era: Client) -> None:
+    """Enter puts it down in the middle, arrows move it by 5 mm, Enter or leaving lifts it."""
+    await page.evaluate("document.querySelector('#plate').focus()")
+    await page.press("Enter")
+    assert await contacts(era, 1) == [pytest.approx((LENGTH / 2, WIDTH / 2))]
+    await page.press("ArrowRight")
+    await page.press("ArrowUp")
+    moved = pytest.approx((LENGTH / 2 + 0.005, WIDTH / 2 + 0.005))
+    await asyncio.to_thread(
+        wait_for, lambda: [(c.x_m, c.y_m) for c in era.status().contacts] == [moved]
+    )
+    await page.press("Enter")
+    assert await contacts(era, 0) == []
+    await page.press("Enter")
+    await contacts(era, 1)
+    await page.press("Tab")
+    assert await contacts(era, 0) == []
+
+
+async def test_arm_disarm_stop_and_clear_by_their_buttons(page: Page, era: Client) -> None:
+    """Each is there when the daemon allows it; after a stop the log says what to do."""
+    enabled = (
+        "['arm', 'disarm', 'clear', 'stop'].filter(id => !document.getElementById(id).disabled)"
+    )
+    await page.until(f"{enabled}.join()", lambda text: text == "arm,stop")
+    await arm(page, era)
+    assert era.status().armed_by == "dashboard"
+    await page.until(f"{enabled}.join()", lambda text: text == "disarm,stop")
+    await page.click("#disarm")
+    await until_state(era, READY)
+    await page.until(f"{enabled}.join()", lambda text: text == "arm,stop")
+    await arm(page, era)
+    await page.click("#stop")
+    await until_state(era, STOPPED)
+    await page.until(f"{enabled}.join()", lambda text: text == "clear,stop")
+    event = await page.until(
+        "document.querySelector('#log li')?.innerText", lambda text: "stopped" in text
+    )
+    assert "clear (era clear), then arm again" in event
+    await page.click("#clear")
+    await until_state(era, READY)
+    assert page.complaints == []
+
+
+async def test_the_lease_is_renewed_while_the_page_is_open(page: Page, era: Client) -> None:
+    """And runs out when it is closed: nobody is there to feel or to stop."""
+    await arm(page, era)
+
+    def left() -> float:
+        return era.status().lease_left_s or 0.0
+
+    await asyncio.to_thread(wait_for, lambda: left() < 4.2)
+    await asyncio.to_thread(wait_for, lambda: left() > 4.5)  # by itself it only falls
+    await page.call("Page.navigate", url="about:blank")
+    await until_state(era, READY)
+
+
+@pytest.mark.parametrize(
+    "focus", ["body", "#disarm", "#motion", "#log", "#plate", "#effects button"]
+)
+async def test_the_space_bar_stops_from_anywhere(page: Page, era: Client, focus: str) -> None:
+    """Whatever has the focus, and it does nothing else there."""
+    await arm(page, era)
+    await page.evaluate(f"document.querySelector({focus!r}).focus()")
+    scrolled = await page.evaluate("scrollY")
+    await page.press(" ", "Space")
+    await until_state(era, STOPPED)
+    assert await page.evaluate("document.querySelector('#motion').checked") is False
+    assert "disarmed" not in await page.evaluate("document.querySelector('#log').innerText")
+    assert await page.evaluate("scrollY") == scrolled
+
+
+async def test_stop_is_uncovered_on_every_screen_wherever_it_is_scrolled(
+    page: Page, gateway: GatewayProcess
+) -> None:
+    """All of it within the screen, nothing before any of its corners, large enough for a thumb."""
+    uncovered = f"({PROBES}).isUncovered('#stop')"
+    for screen in (*SCREENS, Screen("wide", 1920, 1080), Screen("narrow", 360, 640)):
+        await open_dashboard(page, gateway, screen)
+        bottom = await page.evaluate("document.documentElement.scrollHeight")
+        for scrolled in range(0, bottom, max(200, screen.height // 2)):
+            await page.evaluate(f"window.scrollTo(0, {scrolled})")
+            assert await page.evaluate(uncovered), (screen, scrolled)
+    await page.evaluate("document.querySelector('.skip').focus()")
+    assert await page.evaluate(uncovered)
+
+
+async def test_what_a_thumb_shall_hit_is_large_enough(page: Page, gateway: GatewayProcess) -> None:
+    """Every button and switch is 44 pixels wide and high on a phone."""
+    await open_dashboard(page, gateway, PHONE)
+    small = await page.evaluate(
+        "[...document.querySelectorAll('button, .switch, input:not([type=checkbox])')]"
+        ".filter(e => e.checkVisibility()).map(e => [e, e.getBoundingClientRect()])"
+        ".filter(([e, b]) => b.width < 44 || b.height < 44).map(([e, b]) => e.outerHTML + b.height)"
+    )
+    assert small == []
+
+
+@pytest.mark.parametrize("is_dark", [False, True])
+async def test_text_stands_out_from_its_ground(page: Page, era: Client, is_dark: bool) -> None:
+    """By the formula of WCAG 2.2 at least 4.5 to 1, in both schemes, ready, armed and stopped."""
+    await page.dark(is_dark)
+    looked = 0
+    for click, state in ((None, READY), ("#arm", ENABLED), ("#stop", STOPPED)):
+        if click:
+            await page.click(click)
+        await page.until(f"{STATE} === '{state}'")
+        ratios = await page.evaluate(f"({PROBES}).contrasts()")
+        looked += len(ratios)
+        assert [each for each in ratios if each[0] < 4.5] == []
+    assert looked > 60
+
+
+async def test_everything_has_a_role_and_a_name_in_a_sensible_order(page: Page) -> None:
+    """As a screen reader is told, and as Tab goes: to the plate, the buttons, stop, then beside."""
+    await page.until(
+        "document.querySelector('meter')?.ariaLabel", lambda name: "ERA" in (name or "")
+    )
+    await page.call("Accessibility.enable")
+    nodes = (await page.call("Accessibility.getFullAXTree"))["nodes"]
+    named = {
+        (node["role"]["value"], node["name"]["value"])
+        for node in nodes
+        if not node.get("ignored") and node.get("name", {}).get("value")
+    }
+    roles = {
+        "button",
+        "checkbox",
+        "application",
+        "link",
+        "meter",
+        "list",
+        "region",
+        "main",
+        "image",
+    }
+    for node in nodes:
+        if not node.get("ignored") and node["role"]["value"] in roles - {"main", "list"}:
+            assert node["name"]["value"], node
+    assert {
+        ("button", "Stop"),
+        ("button", "Arm"),
+        ("button", "Disarm"),
+        ("button", "Clear"),
+        ("checkbox", "in motion"),
+        ("list", "Events, the newest first"),
+        ("region", "Amplifiers"),
+        ("region", "Touch to wire"),
+        ("meter", "channel 0, ERA SW: 0 %"),
+    } <= {(role, name.removesuffix(" space")) for role, name in named}
+    order = []
+    await page.evaluate("document.activeElement.blur()")
+    for _ in range(7):
+        await page.press("Tab")
+        order.append(
+            await page.evaluate("document.activeElement.id || document.activeElement.className")
+        )
+    assert order[:5] == ["skip", "arm", "stop", "plate", "motion"]
+    live = await page.evaluate(
+        "[...document.querySelectorAll('[role=alert], [role=status]')].map(e => e.id)"
+    )
+    assert {"banner", "problem"} <= set(live)
+
+
+async def test_nothing_moves_by_itself_where_less_motion_is_asked_for(
+    page: Page, era: Client
+) -> None:
+    """No animation; the picture of a steady vibration stays as it is."""
+    await page.call(
+        "Emulation.setEmulatedMedia",
+        features=[{"name": "prefers-reduced-motion", "value": "reduce"}],
+    )
+    await arm(page, era)
+    async with fingers_down(page, PLACES[1]):
+        await page.until("document.querySelectorAll('.era.driven').length")
+        await asyncio.sleep(1.0)  # the swell rises for 0.6 s
+        drawn = "document.querySelector('#field').toDataURL()"
+        assert await page.evaluate(drawn) == (
+            await asyncio.sleep(0.3) or await page.evaluate(drawn)
+        )
+    assert await page.evaluate("document.getAnimations().length") == 0
+
+
+async def test_what_others_are_called_is_text(page: Page, era: Client) -> None:
+    """A name that is HTML is shown as it is, and made into nothing."""
+    name = "<img src=x onerror=alert(1)><b>bold</b>"
+    era.arm(name, lease_s=5)
+    await page.until(f"{STATE} === 'OPERATION_ENABLED'")
+    assert await page.evaluate("document.querySelector('#cause').innerText") == f"armed by '{name}'"
+    assert name in await page.evaluate("document.querySelector('#log').innerText")
+    assert await page.evaluate("document.querySelectorAll('img, b').length") == 0
+    assert page.complaints == []
+
+
+async def test_the_door_lets_in_with_the_token_alone(
+    browser: Page, gateway: GatewayProcess, era: Client
+) -> None:
+    """Without one it asks; with a wrong one it says so; with the right one the page is there."""
+    await browser.show(gateway.url)
+    await browser.evaluate("sessionStorage.clear()")
+    await browser.show(gateway.url)
+    await browser.until("!document.querySelector('#door').hidden")
+    assert await browser.evaluate("document.querySelector('#main').hidden") is True
+    for token, shown in (("wrong" * 5, "#door-problem"), (TOKEN, "#main")):
+        await browser.evaluate(
+            f"document.querySelector('#token').value = '{token}';"
+            "setTimeout(() => document.querySelector('#door button').click()); 1"
+        )
+        if shown == "#main":
+            await browser.until("document.querySelector('#main')?.hidden === false")
+        else:
+            await browser.until(
+                "document.querySelector('#door-problem')?.innerText",
+                lambda text: "has another token" in (text or ""),
+            )
+
+
+async def test_it_comes_back_after_gateway_and_daemon(browser: Page, tmp_path: Path) -> None:
+    """Each is taken away and started again: the page says so, and goes on by itself."""
+    banner = "document.querySelector('#banner').innerText"
+    with gateway_process(tmp_path, tmp_path / "era.sock") as first:
+        with real_daemon(tmp_path):
+            await open_dashboard(browser, first, DESKTOP)
+        await browser.until(banner, lambda text: "daemon does not answer" in text)
+        assert await browser.evaluate("document.querySelector('#arm').disabled") is True
+        with real_daemon(tmp_path):
+            await browser.until(f"{STATE} === 'READY_TO_SWITCH_ON'")
+            port = first.port
+            first.process.kill()
+            await browser.until(banner, lambda text: "gateway does not answer" in text)
+            await browser.press(" ", "Space")
+            await browser.until(
+                "document.querySelector('#problem').innerText", lambda text: "off by hand" in text
+            )
+            listen = ("--listen", f"127.0.0.1:{port}")
+            with gateway_process(tmp_path, tmp_path / "era.sock", *listen):
+                await browser.until(f"{STATE} === 'READY_TO_SWITCH_ON'")
+                await browser.until(banner, lambda text: "Simulated" in text)

@@ -1,0 +1,112 @@
+"""`python tests/support/dashboard_pictures.py FOLDER`: the dashboard as it looks, on every screen.
+
+A daemon over a simulated amplifier with the example's surface layout, armed, two fingers on the
+plate: on a desktop, a tablet and a phone, in light and dark.
+"""
+
+import asyncio
+import sys
+import tempfile
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from chromium import Page, open_page
+from controller.effects.layout_kind import LAYOUT
+from gateway_bench import GatewayProcess, gateway_process, real_daemon
+
+
+@dataclass(frozen=True)
+class Screen:
+    """A screen's size in CSS pixels, and whether it is held in a hand."""
+
+    name: str
+    width: int
+    height: int
+    is_phone: bool = False
+
+
+SCREENS = (
+    Screen("desktop", 1280, 860),
+    Screen("tablet", 820, 1180, is_phone=True),
+    Screen("phone", 390, 844, is_phone=True),
+    Screen("phone_across", 844, 390, is_phone=True),
+    Screen("small_phone", 320, 568, is_phone=True),
+)
+STATE = "document.querySelector('#state').dataset.state"
+PLACES = ((0.2, 0.7), (0.72, 0.74))
+"""On the keypad and on the knob of the example's layout, as `on_plate` has it."""
+
+
+async def open_dashboard(page: Page, gateway: GatewayProcess, screen: Screen) -> None:
+    """Show the dashboard by the URL that the gateway prints, and wait until it is connected."""
+    await page.show(
+        f"{gateway.url}#token={gateway.token}",
+        width=screen.width,
+        height=screen.height,
+        is_phone=screen.is_phone,
+    )
+    await page.until(STATE, lambda state: state not in (None, "away", "NOT_READY"))
+    await page.until("document.querySelectorAll('#layer-eras rect').length")
+
+
+async def on_plate(page: Page, *shares: tuple[float, float]) -> list[tuple[float, float]]:
+    """Places on the plate, given in parts of its width and height from its upper left corner, as
+    places on the screen."""
+    await page.evaluate("document.querySelector('#plate').scrollIntoView({block: 'nearest'})")
+    box = await page.evaluate(
+        "(({x, y, width, height}) => [x, y, width, height])"
+        "(document.querySelector('#plate').getBoundingClientRect())"
+    )
+    return [(box[0] + x * box[2], box[1] + y * box[3]) for x, y in shares]
+
+
+@asynccontextmanager
+async def fingers_down(page: Page, *shares: tuple[float, float]) -> AsyncIterator[None]:
+    """Real touches of the plate, for as long as it takes."""
+    await page.touch("touchStart", await on_plate(page, *shares))
+    try:
+        yield
+    finally:
+        await page.touch("touchEnd", [])
+
+
+async def _take(folder: Path) -> None:
+    with tempfile.TemporaryDirectory() as scratch:
+        work = Path(scratch)
+        (work / "layout.yaml").write_text(LAYOUT.example(), encoding="utf-8")
+        with (
+            real_daemon(work, "layout: layout.yaml\n") as daemon,
+            gateway_process(work, daemon) as gateway,
+        ):
+            async with open_page(work / "profile") as page:
+                for screen in SCREENS:
+                    for is_dark in (False, True):
+                        await page.dark(is_dark)
+                        await _take_one(page, gateway, screen, folder, is_dark=is_dark)
+
+
+async def _take_one(
+    page: Page, gateway: GatewayProcess, screen: Screen, folder: Path, *, is_dark: bool
+) -> None:
+    await open_dashboard(page, gateway, screen)
+    await page.until("!document.querySelector('#arm').disabled")
+    await page.click("#arm")
+    await page.until(f"{STATE} === 'OPERATION_ENABLED'")
+    async with fingers_down(page, *PLACES):
+        await page.until("document.querySelectorAll('.contact').length === 2")
+        await page.until("document.querySelectorAll('.contact.target').length")
+        await asyncio.sleep(1.0)
+        name = f"dashboard_{screen.name}_{'dark' if is_dark else 'light'}"
+        await page.screenshot(folder / f"{name}.png")
+        if screen.is_phone:
+            await page.evaluate("window.scrollTo(0, document.body.scrollHeight)")
+            await asyncio.sleep(0.3)
+            await page.screenshot(folder / f"{name}_below.png")
+    await page.click("#disarm")
+    await page.until(f"{STATE} === 'READY_TO_SWITCH_ON'")
+
+
+if __name__ == "__main__":
+    asyncio.run(_take(Path(sys.argv[1])))

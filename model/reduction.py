@@ -47,7 +47,7 @@ class Origin:
         return moments
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ReducedPlate:
     """The free plate in coordinates where its mass is the identity and its stiffness is diagonal.
 

@@ -6,17 +6,21 @@ through the rig's wiring, level 1 being the ERA's full stroke, with what imperfe
 
 from collections import OrderedDict, deque
 from collections.abc import Collection, Mapping
+from functools import lru_cache
 from typing import Protocol
 
 import numpy as np
 
 from drivers.protocol.messages import Reply, Request
+from model.actuator import Era
 from model.arrays import FloatArray
 from model.assembly import era_positions
 from model.base_motion import Term
 from model.finger_load import FingerLoad
-from model.point_load import load_positions
-from model.reduction import reduce_plate
+from model.mesh import Mesh
+from model.plate import Plate
+from model.point_load import PointLoad, load_positions
+from model.reduction import ReducedPlate, reduce_plate
 from model.rig import Rig
 from sim.amplifier import SimulatedAmplifier
 from sim.base_motion import terms_of
@@ -67,13 +71,12 @@ class Bench:
         self.finger_load = finger_load
         self.imperfections = imperfections
         self.taps: list[Tap] = []
-        reduced = reduce_plate(
-            rig.plate,
-            rig.mesh,
-            np.vstack([era_positions(rig.eras), load_positions(rig.loads)]),
-            frequency_max=rig.limits.frequency_max,
+        reduced = _reduced(
+            rig.plate, rig.mesh, tuple(rig.eras), tuple(rig.loads), rig.limits.frequency_max
         )
         self.fingers = Fingers(reduced)
+        self._time = now
+        # It is moved when its drive changes or somebody listens: in between it needs no attention.
         self._plant = Plant(reduced, rig.eras, loads=rig.loads, time=now)
         self.amplifiers: Mapping[str, SimulatedAmplifier] = {
             name: SimulatedAmplifier(name, channels=_channel_count(rig, name))
@@ -90,8 +93,8 @@ class Bench:
 
     @property
     def time(self) -> float:
-        """How far the plate has been moved [s]."""
-        return self._plant.time
+        """How far everything has been moved [s]."""
+        return self._time
 
     def advance(self, now: float) -> None:
         """Let everything happen that happens until now [s], each thing at its own moment."""
@@ -133,6 +136,7 @@ class Bench:
         self.advance(now)
         load = self.finger_load
         if load is not None:
+            self._plant.skip(self._time)
             before = self._plant.reduced
             self._plant.set_contacts(
                 [load.at(*at) for name, at in positions.items() if name not in observers]
@@ -167,9 +171,10 @@ class Bench:
     def _move_plant(self, to_time: float, *, watched: bool) -> None:
         if to_time <= self.time:
             return
+        since, self._time = self._time, to_time
         if not (watched and (self.fingers.layout.positions or self.taps)):
-            self._plant.skip(to_time)
             return
+        self._plant.skip(since)
         heard = [self.fingers.layout.shapes, *(tap.shapes for tap in self.taps)]
         times, accelerations = self._plant.advance(
             to_time, sample_rate=self.sample_rate, shapes=np.concatenate(heard)
@@ -192,6 +197,7 @@ class Bench:
             while coming and coming[0][0] <= self.time:
                 _, playing = coming.popleft()
                 told = self._told[index]
+                self._plant.skip(self._time)
                 self._plant.set_input(index, self._motion(index, playing))
                 self._played.extend((tone, self.time) for tone in told if tone not in playing)
                 self._told[index] = playing
@@ -217,6 +223,18 @@ class Bench:
         return sorted(
             {tone.frequency for tone, end in ended + present if tone.start < until and end > since}
         )
+
+
+@lru_cache(maxsize=2)  # benches are made one after the other, of one rig
+def _reduced(
+    plate: Plate,
+    mesh: Mesh,
+    eras: tuple[Era, ...],
+    loads: tuple[PointLoad, ...],
+    frequency_max: float,
+) -> ReducedPlate:
+    points = np.vstack([era_positions(eras), load_positions(loads)])
+    return reduce_plate(plate, mesh, points, frequency_max=frequency_max)
 
 
 def _channel_count(rig: Rig, amplifier: str) -> int:

@@ -9,6 +9,7 @@ before. Structural damping stays that of the plate on its ERAs.
 from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import TypeAlias, TypeVar
 
 import numpy as np
@@ -84,16 +85,28 @@ class ContactPlates:
         points = (*resting, *sorted(recent))
         key = (points, contacts)
         if key not in self._solved:
-            reduced = self._reduced_at(points)
-            plate = plate_in_time(reduced, self._eras, loads=self._loads, contacts=contacts)
-            _keep(self._solved, key, Carried(contacts, reduced, plate))
+            _keep(self._solved, key, self._solve(points, contacts))
         self._solved.move_to_end(key)
         return self._solved[key]
+
+    def _solve(self, points: tuple[_Point, ...], contacts: tuple[PointLoad, ...]) -> Carried:
+        if not points:
+            return Carried(contacts, self._bare, _bare_plate(self._bare, self._eras, self._loads))
+        reduced = self._reduced_at(points)
+        plate = plate_in_time(reduced, self._eras, loads=self._loads, contacts=contacts)
+        return Carried(contacts, reduced, plate)
 
     def _reduced_at(self, points: tuple[_Point, ...]) -> ReducedPlate:
         if points not in self._reduced:
             _keep(self._reduced, points, self._bare.with_forces_at(np.array(points)))
         return self._reduced[points]
+
+
+@lru_cache(maxsize=2)  # benches are made one after the other, of one rig
+def _bare_plate(
+    reduced: ReducedPlate, eras: tuple[Era, ...], loads: tuple[PointLoad, ...]
+) -> PlateInTime:
+    return plate_in_time(reduced, eras, loads=loads)
 
 
 def _keep(kept: OrderedDict[_Key, _Value], key: _Key, value: _Value) -> None:

@@ -98,6 +98,8 @@ def level_of(playing: Output, time: float) -> float:
 
     Tones of one frequency add as complex amplitudes, magnitudes add across frequencies.
     """
+    if len(playing) < 2:  # which is most of the time
+        return sum(abs(tone.amplitude(time)) for tone in playing)
     amplitudes: dict[float, complex] = defaultdict(complex)
     for tone in playing:
         turn = cmath.exp(-2j * math.pi * tone.frequency * tone.origin)

@@ -45,7 +45,8 @@ _WAITING_MAX = 256  # answers; a bus that is flooded with them must not fill the
 _RESYNCHRONISE = 5  # tries
 _BLOCK_FROM = 15  # bytes; shorter ones are sooner sent in segments
 _ABORTED_COMMAND = 0x0504_0001  # the amplifier takes no block transfers
-_ABANDON = struct.pack("<BHBL", 0x80, 0, 0, 0x0504_0000)
+_TIMED_OUT = 0x0504_0000  # one of the two sides has waited too long
+_ABANDON = struct.pack("<BHBL", 0x80, 0, 0, _TIMED_OUT)
 
 _T = TypeVar("_T")
 
@@ -207,6 +208,11 @@ class ObjectClient:
                 self._resynchronise()
             result = work()
         except SdoAbortedError as abort:
+            if abort.code == _TIMED_OUT:
+                raise LinkTimeout(
+                    f"node {self._node} and this host took too long over an object; check that "
+                    "the bus is not overloaded"
+                ) from abort
             self._broken = False
             raise FrameError(f"node {self._node} refused to tell an object: {abort}") from abort
         except SdoCommunicationError as problem:

@@ -21,6 +21,7 @@ from drivers.command import CommandSet, DriveCommand, Envelope, Knot
 from drivers.errors import CommandError, LinkError
 from drivers.guard import Guard, GuardLimits, SafeCommand
 from drivers.protocol.can_frame import CanFrame
+from drivers.protocol.canopen_objects import index_of
 from drivers.protocol.messages import Apply, Event, Fault, Ping, State
 from model.rig import Rig
 from sim.bench import Bench
@@ -283,6 +284,28 @@ async def test_envelopes_are_loaded_in_blocks_or_segments(
         await amplifier.arm(2.0)
         achieved = await amplifier.apply(tones(amplifier, 0.5, onset=7))
         assert achieved.commands[0].onset == 7
+
+
+async def test_an_object_that_was_given_up_for_its_time_is_asked_for_again(
+    virtual: Virtual, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A node that waited too long for a frame of a busy host says so (0504 0000 h, CiA 301)."""
+    from sim import can_sdo
+
+    begin = can_sdo.SdoServer._begin_upload
+    given_up: list[bytes] = []
+
+    def give_up_once(server: can_sdo.SdoServer, data: bytes) -> None:
+        is_capability = data[1:3] == index_of("capabilities").to_bytes(2, "little")
+        if is_capability and not given_up:
+            given_up.append(data)
+            raise can_sdo.SdoAbort(0x0504_0000)
+        begin(server, data)
+
+    monkeypatch.setattr(can_sdo.SdoServer, "_begin_upload", give_up_once)
+    async with opened(virtual.url()) as amplifier:
+        assert amplifier.capabilities.channels == 4
+    assert given_up
 
 
 class Telling(CanBackend):

@@ -41,6 +41,7 @@ from model.rig_file import load_rig
 from rig_files import TWO_AMPLIFIERS, write_rig
 from sim.faults import Episode
 from sim.wires import Wire
+from tuio_panel import free_port, panel
 from wires import WIRES, far_side
 
 
@@ -95,18 +96,6 @@ def limited(pid: int, what: int, limit: int) -> tuple[int, int]:
 def descriptors(pid: int) -> list[int]:
     """Those that a process has open."""
     return [int(name) for name in os.listdir(f"/proc/{pid}/fd")]  # noqa: PTH208
-
-
-def free_port() -> int:
-    """A UDP port that nobody listens at."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
-        free.bind(("127.0.0.1", 0))
-        return int(free.getsockname()[1])
-
-
-def panel(port: int) -> str:
-    """The lines of a daemon's file for a TUIO panel."""
-    return f'touch: [{{name: panel, url: "tuio:127.0.0.1:{port}"}}]\n'
 
 
 async def test_paused_for_longer_than_the_watchdog_nothing_old_is_replayed(tmp_path: Path) -> None:

@@ -1,0 +1,176 @@
+"""Bad company for a daemon, each a process of its own: `python tests/support/floods.py KIND ...`.
+
+    tuio PORT RATE SECONDS    fingers that move, then all lifted; prints when [s] they were
+    idle SOCKET COUNT         connections that say nothing
+    unreading SOCKET COUNT    connections that ask for everything and read nothing
+    garbage SOCKET SEED       what is no request, as fast as it goes, again and again
+    asking SOCKET COUNT       as many requests as are answered, on so many connections
+
+All but the first go on until their standard input ends; each says `ready` when it is under way.
+"""
+
+import asyncio
+import contextlib
+import json
+import random
+import resource
+import select
+import socket
+import sys
+import time
+from collections.abc import AsyncIterator, Callable, Sequence
+from contextlib import asynccontextmanager
+
+from controller.sources.tuio import tuio_datagram
+from controller.touch import Touch, TouchFrame
+
+_SUBSCRIBE = {
+    "topics": ["state", "contacts", "pattern", "silence", "amplifiers", "latency", "log", "link"],
+    "rate_hz": 60,
+}
+
+
+@asynccontextmanager
+async def flood(kind: str, *arguments: object) -> AsyncIterator[asyncio.subprocess.Process]:
+    """One of them, under way; ended with the context."""
+    process = await asyncio.create_subprocess_exec(
+        *(sys.executable, "-P", __file__, kind, *map(str, arguments)),
+        stdin=asyncio.subprocess.PIPE,
+        stdout=asyncio.subprocess.PIPE,
+    )
+    assert process.stdout is not None
+    try:
+        assert await process.stdout.readline() == b"ready\n"
+        yield process
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            process.kill()
+        await process.wait()
+
+
+def _say(text: str) -> None:
+    sys.stdout.write(f"{text}\n")
+    sys.stdout.flush()
+
+
+def _is_over() -> bool:
+    return bool(select.select([sys.stdin], [], [], 0)[0])
+
+
+def _tuio(port: str, rate: str, seconds: str) -> None:
+    chance = random.Random(3)
+    count = 997  # frames that are told apart, again and again
+
+    def frame(number: int) -> bytes:
+        fingers = 1 + number % 3
+        touches = (Touch(n, chance.uniform(0.1, 0.9), chance.uniform(0.1, 0.9)) for n in range(3))
+        return tuio_datagram(TouchFrame("flood", 0.0, tuple(touches)[:fingers]), -1)
+
+    datagrams = [frame(number) for number in range(count)]
+    lifted = tuio_datagram(TouchFrame("flood", 0.0, ()), -1)
+    to = ("127.0.0.1", int(port))
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        _say("ready")
+        begin = time.monotonic()
+        sent = 0
+        while (passed := time.monotonic() - begin) < float(seconds):
+            while sent < passed * float(rate):
+                sender.sendto(datagrams[sent % count], to)
+                sent += 1
+            time.sleep(0.0002)
+        up = time.monotonic()
+        sender.sendto(lifted, to)
+    _say(json.dumps({"up_s": up, "sent": sent}))
+
+
+def _connect(path: str) -> socket.socket:
+    connection = socket.socket(socket.AF_UNIX)
+    connection.connect(path)
+    return connection
+
+
+def _idle(path: str, count: str) -> None:
+    resource.setrlimit(resource.RLIMIT_NOFILE, (resource.getrlimit(resource.RLIMIT_NOFILE)[1],) * 2)
+    connections = []
+    _say("ready")
+    while len(connections) < int(count):
+        connections.append(_connect(path))
+    _say(str(len(connections)))
+    sys.stdin.read()
+
+
+def _unreading(path: str, count: str) -> None:
+    connections = [_connect(path) for _ in range(int(count))]
+    lines = [
+        {"jsonrpc": "2.0", "id": 1, "method": "subscribe", "params": _SUBSCRIBE},
+        *(
+            {"jsonrpc": "2.0", "id": n, "method": "hello", "params": {"client": "x"}}
+            for n in (2, 3)
+        ),
+    ]
+    for connection in connections:
+        connection.sendall(b"".join(json.dumps(line).encode() + b"\n" for line in lines))
+    _say("ready")
+    sys.stdin.read()
+
+
+def _garbage(path: str, seed: str) -> None:
+    chance = random.Random(int(seed))
+    deep = 20_000
+    makers: Sequence[Callable[[], bytes]] = (
+        lambda: chance.randbytes(chance.randrange(1, 5000)),
+        lambda: b"[" * deep + b"\n",
+        lambda: b'{"a":' * deep + b"\n",
+        lambda: b"9" * 60_000 + b"\n",
+        lambda: b"x" * 70_000,
+        lambda: (
+            b'{"jsonrpc":"2.0","id":1,"method":"arm","params":{"owner":"\\ud800","lease_s":NaN}}\n'
+        ),
+        lambda: b'{"jsonrpc":"2.0","id":1e999,"method":"touch","params":{}}\n',
+        lambda: (
+            b'{"jsonrpc":"2.0","id":1,"method":"touch","params":{"source":"g","touches":'
+            b'[{"id":1,"x_m":1e999,"y_m":NaN}]}}\n'
+        ),
+        lambda: (
+            b'{"jsonrpc":"2.0","id":1,"method":"renew","params":{"lease":"%d"}}\n'
+            % chance.getrandbits(128)
+        ),
+        lambda: b"\xff\xfe\x00\n" * 100,
+        lambda: b"!!python/object/apply:os.system [exit]\n" * 10,
+        lambda: b"cos\nsystem\n(S'exit'\ntR.\n",
+    )
+    _say("ready")
+    while not _is_over():
+        with contextlib.suppress(OSError), _connect(path) as connection:
+            connection.settimeout(1.0)
+            for _ in range(20):
+                connection.sendall(chance.choice(makers)())
+
+
+def _asking(path: str, count: str) -> None:
+    connections = [_connect(path) for _ in range(int(count))]
+    many = b'{"jsonrpc":"2.0","id":1,"method":"status"}\n' * 50
+    for connection in connections:
+        connection.setblocking(False)
+    _say("ready")
+    while not _is_over():
+        readable, writable, _ = select.select(connections, connections, [], 0.1)
+        with contextlib.suppress(BlockingIOError):
+            for connection in readable:
+                connection.recv(1 << 16)
+            for connection in writable:
+                connection.send(many)
+
+
+_KINDS = {
+    "tuio": _tuio,
+    "idle": _idle,
+    "unreading": _unreading,
+    "garbage": _garbage,
+    "asking": _asking,
+}
+
+
+if __name__ == "__main__":
+    with contextlib.suppress(KeyboardInterrupt, OSError):  # the daemon may be gone first
+        _KINDS[sys.argv[1]](*sys.argv[2:])

@@ -37,6 +37,7 @@ from model.errors import InputError
 from model.table import LocalizationTable
 from model.timing import Timing
 
+_END_PATIENCE = 0.2  # s; by then whoever can be silenced has been
 _DUMP_PAUSE = 1.0  # s; between two dumps, for faults come in company
 
 _logger = logging.getLogger(__name__)
@@ -128,7 +129,8 @@ class Daemon:
         loop.add_signal_handler(signal.SIGHUP, self._reload_soon)
         running: asyncio.Task[None] | None = None
         try:
-            await self._supervisor.open(self._controller)
+            if not await self._opened():
+                return
             await self._server.open(place.bound())
             await self._inputs.exchange(self._config.touch)
             self._log.listener = self._tell_log
@@ -142,7 +144,21 @@ class Daemon:
             ended.cancel()
         finally:
             await self._close(running)
-        await running
+        if not running.cancelled():
+            running.result()
+
+    async def _opened(self) -> bool:
+        """Open the amplifiers; False where the daemon is told to end before they all answered."""
+        opening = asyncio.create_task(self._supervisor.open(self._controller))
+        ended = asyncio.create_task(self._ended.wait())
+        await asyncio.wait({opening, ended}, return_when=asyncio.FIRST_COMPLETED)
+        ended.cancel()
+        if opening.done():
+            opening.result()
+            return True
+        opening.cancel()
+        await asyncio.wait({opening})
+        return False
 
     def end(self, cause: str) -> None:
         """End in order; from a signal, or from whoever runs the daemon."""
@@ -197,7 +213,10 @@ class Daemon:
             await self._supervisor.close(self._end_cause)
         finally:
             if running is not None:
-                await asyncio.wait({running})
+                _, late = await asyncio.wait({running}, timeout=_END_PATIENCE)
+                for task in late:  # it waits for an amplifier that does not answer
+                    task.cancel()
+                    await asyncio.wait({task})
             self._log.listener = None
             for step in (self._inputs.close(), self._companions.close(), self._server.close()):
                 with contextlib.suppress(OSError):

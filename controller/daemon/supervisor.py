@@ -2,9 +2,10 @@
 
 import asyncio
 import logging
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Awaitable, Callable, Coroutine, Mapping
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 from controller.amplifiers import Phase
 from controller.daemon.states import Action, Event, Kind, Machine, State, step
@@ -238,7 +239,7 @@ class Supervisor:
             if self.machine.state is not State.COMM_LOST:
                 return
             try:
-                await controller.open()
+                await self._attended(controller.open())
                 await controller.disarm()  # one was lost for less than its watchdog, perhaps
             except (DriverError, InputError) as error:
                 self._link_told("retry", str(error))
@@ -248,6 +249,18 @@ class Supervisor:
                 await self._quietly(self.handle(Event(Kind.REOPENED)))
                 return
             await self._pause(pause)
+
+    async def _attended(self, work: Coroutine[Any, Any, None]) -> None:
+        """Wait for something that may take seconds, such as a connection; the loop runs on."""
+        task = asyncio.create_task(work)
+        try:
+            while not (await asyncio.wait({task}, timeout=_TICK))[0]:
+                self._alive()
+        except asyncio.CancelledError:
+            task.cancel()
+            await asyncio.gather(task, return_exceptions=True)
+            raise
+        task.result()
 
     async def _pause(self, seconds: float) -> None:
         end = clock.now() + seconds

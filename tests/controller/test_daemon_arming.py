@@ -1,4 +1,4 @@
-"""What may happen while a daemon arms, and while it reads its configuration again."""
+"""What may happen while a daemon arms, reads its configuration again, or waits for amplifiers."""
 
 import asyncio
 import contextlib
@@ -8,8 +8,14 @@ from pathlib import Path
 import pytest
 
 from controller.api.jsonrpc import ErrorCode, RpcError
-from daemon_bench import running_daemon, until, until_state
+from controller.daemon.config import load_daemon_config
+from controller.daemon.daemon import Daemon
+from controller.daemon.log import LogThread
+from controller.daemon.notify import ServiceManager
+from controller.daemon.place import Place
+from daemon_bench import daemon_table, far_end, running_daemon, until, until_state, write_daemon
 from drivers.protocol.messages import State
+from sim.faults import Episode
 
 READY, ENABLED = "READY_TO_SWITCH_ON", "OPERATION_ENABLED"
 
@@ -93,3 +99,62 @@ async def test_an_end_during_a_reload_starts_nothing(
         with contextlib.suppress(asyncio.CancelledError):
             await reload
         assert reload.cancelled()
+
+
+async def test_an_end_while_an_amplifier_is_waited_for(tmp_path: Path) -> None:
+    """It does not answer when the daemon starts: being told to end ends that at once."""
+    async with far_end(tmp_path) as far:
+        far.station.befall(Episode("hang"))
+        config = load_daemon_config(write_daemon(tmp_path, {"main": far.url}))
+        place, log = Place(config.socket), LogThread(tmp_path / "log")
+        daemon = Daemon(config, daemon_table(), log=log, manager=ServiceManager({}), dashboard=None)
+        running = asyncio.create_task(daemon.run(place))
+        try:
+            await asyncio.sleep(0.1)
+            begin = asyncio.get_running_loop().time()
+            daemon.end("told to end")
+            await asyncio.wait_for(running, 20)
+            assert asyncio.get_running_loop().time() - begin < 1.0
+        finally:
+            log.close()
+            place.leave()
+
+
+async def test_an_end_while_a_lost_amplifier_is_tried_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A connection that never comes about does not hold up the end."""
+    async with running_daemon(tmp_path) as bench, await bench.client() as era:
+        await until_state(era, READY)
+        tries = asyncio.Event()
+
+        async def endless() -> None:
+            tries.set()
+            await asyncio.Event().wait()
+
+        monkeypatch.setattr(bench.daemon._controller, "open", endless)
+        bench.far.station.befall(Episode("hang"))
+        await asyncio.wait_for(tries.wait(), 20)
+
+
+async def test_the_service_manager_hears_of_a_daemon_that_waits_for_an_amplifier(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An attempt to come back may take longer than the service manager's patience of 2 s."""
+    async with running_daemon(tmp_path) as bench, await bench.client() as era:
+        await until_state(era, READY)
+        alive, tries = 0, asyncio.Event()
+
+        async def endless() -> None:
+            tries.set()
+            await asyncio.Event().wait()
+
+        def count() -> None:
+            nonlocal alive
+            alive += 1
+
+        monkeypatch.setattr(bench.daemon._controller, "open", endless)
+        bench.far.station.befall(Episode("hang"))
+        await asyncio.wait_for(tries.wait(), 20)
+        monkeypatch.setattr(bench.daemon._supervisor, "_alive", count)
+        await until(lambda: alive >= 3)

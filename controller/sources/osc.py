@@ -5,6 +5,8 @@ it loop for ever and deep nesting overflows the stack. So the bundle is opened h
 argument types that it would write to the root logger about are refused before it sees them.
 """
 
+from functools import lru_cache
+
 from pythonosc.osc_message import OscMessage
 from pythonosc.osc_message import ParseError as MessageError
 
@@ -58,6 +60,8 @@ def _elements(datagram: bytes) -> list[bytes]:
     return elements
 
 
+# Most of what a panel says it has said before: its name, who is down, fingers that rest.
+@lru_cache(maxsize=256)
 def _arguments(message: bytes, offset: int) -> tuple[str | int | float, ...]:
     """Arguments of one message whose type tags begin at an offset."""
     end = message.find(b"\0", offset)

@@ -240,7 +240,7 @@ class Amplifier:
         await self._link.broadcast(Commit(token=token), Kind.APPLY)
 
     async def stop_on_bus(self, ramp: float = STOP_RAMP) -> None:
-        """Quick stop of every amplifier of the bus; goes out at once, and nobody answers."""
+        """Quick stop of every amplifier of the bus, before all that waits there; nobody answers."""
         await self._link.backend.broadcast(Stop(ramp=self._ramp(ramp)))
 
     def _told(self, event: Event) -> None:

@@ -9,7 +9,9 @@ An amplifier cannot speak unasked here: events are what its answers show to have
 """
 
 import asyncio
+from dataclasses import dataclass
 
+from drivers.backends.line_turns import kind_on_line
 from drivers.backends.modbus_frames import Answer
 from drivers.backends.modbus_link import ModbusLink
 from drivers.backends.modbus_url import ModbusUrl
@@ -34,10 +36,19 @@ from drivers.protocol.messages import (
 )
 from drivers.protocol.modbus_map import Exchange, Read, Write
 from drivers.protocol.modbus_timing import commit_time, loading_time, round_trip_time
+from drivers.turns import Kind
 
 _ILLEGAL_FUNCTION = 1
 _GATEWAY = (10, 11)  # a gateway has no path to the amplifier, or heard nothing from it
 _TAGS = (1 << 16) - 1
+
+
+@dataclass(frozen=True)
+class _Asked:
+    """How a request stands to others on the line, and how long each transaction may take [s]."""
+
+    kind: Kind
+    timeout: float
 
 
 class ModbusBackend(WireBackend):
@@ -102,13 +113,14 @@ class ModbusBackend(WireBackend):
         """
         if isinstance(request, Arm) and not self._url.device:
             self._sole_host.claim()
+        asked = _Asked(kind_on_line(request), timeout)
         records = 0
         while True:
             tag = self._next_tag()
             exchange = self._exchange_of(request, tag, records)
-            answer = await self._carry_out(exchange, tag, timeout)
+            answer = await self._carry_out(exchange, tag, asked)
             if answer.exception:
-                return await self._refusal(answer, tag, timeout)
+                return await self._refusal(answer, tag, asked)
             self._look_at(request, answer)
             beyond = modbus_map.faults_beyond(request, answer.registers)
             if records or not beyond:
@@ -122,9 +134,9 @@ class ModbusBackend(WireBackend):
         return reply
 
     async def broadcast(self, request: Broadcast) -> None:
-        """Write a commit or a stop to all units of the line at once; nobody answers."""
+        """Write a commit or a stop to all units of the line; a stop goes before all that wait."""
         link = self._opened()
-        await link.broadcast(modbus_map.to_broadcast(request))
+        await link.broadcast(modbus_map.to_broadcast(request), kind_on_line(request))
         self._last_sent = link.last_sent
 
     async def _check_alone(self) -> None:
@@ -149,20 +161,20 @@ class ModbusBackend(WireBackend):
             options["records"] = records
         return modbus_map.to_exchange(request, tag=tag, **options)
 
-    async def _carry_out(self, exchange: Exchange, tag: int, timeout: float) -> Answer:
+    async def _carry_out(self, exchange: Exchange, tag: int, asked: "_Asked") -> Answer:
         read, write = exchange.read, exchange.write
         if write is None:
-            return await self._transact(read, None, timeout, tag=None)
+            return await self._transact(read, None, asked, tag=None)
         if self._can_read_back:
-            answer = await self._transact(read, write, timeout, tag=tag)
+            answer = await self._transact(read, write, asked, tag=tag)
             if answer.exception != _ILLEGAL_FUNCTION:
                 return answer
             self._can_read_back = False
-        answer = await self._transact(None, write, timeout, tag=None)
-        return answer if answer.exception else await self._transact(read, None, timeout, tag=tag)
+        answer = await self._transact(None, write, asked, tag=None)
+        return answer if answer.exception else await self._transact(read, None, asked, tag=tag)
 
     async def _transact(
-        self, read: Read | None, write: Write | None, timeout: float, *, tag: int | None
+        self, read: Read | None, write: Write | None, asked: "_Asked", *, tag: int | None
     ) -> Answer:
         def accept(answer: Answer) -> bool:
             if answer.exception or read is None:
@@ -172,7 +184,12 @@ class ModbusBackend(WireBackend):
         link = self._opened()
         try:
             answer = await link.transact(
-                read, write, unit=self._url.unit, timeout=timeout, accept=accept
+                read,
+                write,
+                unit=self._url.unit,
+                kind=asked.kind,
+                timeout=asked.timeout,
+                accept=accept,
             )
         finally:
             self._last_sent = link.last_sent
@@ -183,14 +200,14 @@ class ModbusBackend(WireBackend):
             )
         return answer
 
-    async def _refusal(self, answer: Answer, tag: int, timeout: float) -> Nak:
+    async def _refusal(self, answer: Answer, tag: int, asked: "_Asked") -> Nak:
         """Why a write was refused; exceptions that only one refusal leads to need no asking."""
         if answer.exception == _ILLEGAL_FUNCTION:
             return Nak(NakCode.UNKNOWN_TYPE)
         only = modbus_map.nak_of_exception(answer.exception)
         if only is not None and only.code is NakCode.BUSY:
             return only
-        told = await self._transact(modbus_map.refusal_read(), None, timeout, tag=None)
+        told = await self._transact(modbus_map.refusal_read(), None, asked, tag=None)
         nak = None if told.exception else modbus_map.to_nak(told.registers, tag=tag)
         if nak is not None:
             return nak

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from weakref import WeakKeyDictionary
 
 from drivers import clock
+from drivers.backends.line_turns import in_turn
 from drivers.backends.modbus_frames import Answer, AnswerReader, Telegram, make_telegram
 from drivers.backends.modbus_stream import Stream, open_stream
 from drivers.backends.modbus_url import ModbusUrl
@@ -19,6 +20,7 @@ from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.modbus_map import Read, Write
 from drivers.protocol.modbus_timing import silence
 from drivers.statistics import WireCounters
+from drivers.turns import Kind, Turns
 
 _REACTION = PROTOCOL.reaction
 _BROADCAST: int = PROTOCOL.modbus["broadcast"]
@@ -39,7 +41,7 @@ class ModbusLink:
         self.last_sent = 0.0
         self._stream: Stream | None = None
         self._opening = asyncio.Lock()
-        self._turn = asyncio.Lock()
+        self._turns = Turns()
         self._reader = AnswerReader(is_rtu=line.is_rtu, counters=self.counters)
         self._users: dict[int, Callable[[str], None]] = {}  # by their units
         self.is_contradicted = False  # whether the last answer was followed by another
@@ -101,16 +103,18 @@ class ModbusLink:
         write: Write | None,
         *,
         unit: int,
+        kind: Kind = Kind.ORDINARY,
         timeout: float,
         accept: Callable[[Answer], bool],
     ) -> Answer:
         """Write, read, or both in one transaction, and wait for the answer.
 
-        accept: whether an answer in the right form is the right one. timeout [s]: for all of it;
-        longer where a slow line and an amplifier that reacts in time need longer. Raises
-        LinkTimeout, LinkError.
+        kind: how this stands to what others ask on the line (see `kind_on_line`); accept: whether
+        an answer in the right form is the right one. timeout [s]: for all of it; longer where a
+        slow line and an amplifier that reacts in time need longer. Raises LinkTimeout, LinkError.
         """
-        async with self._turn:
+
+        async def exchange() -> Answer:
             await self._await_silence()
             telegram = self._make(read, write, unit=unit)
             self._telegram, self._accept = telegram, accept
@@ -133,9 +137,11 @@ class ModbusLink:
             finally:
                 self._answer = None
 
-    async def broadcast(self, write: Write) -> None:
-        """Write to all units; nobody answers."""
-        async with self._turn:
+        return await in_turn(self._turns, kind, exchange)
+
+    async def broadcast(self, write: Write, kind: Kind) -> None:
+        """Write to all units, in the turn of this kind; nobody answers."""
+        async with self._turns.take(kind):
             await self._await_silence()
             self._telegram = None
             telegram = self._make(None, write, unit=_BROADCAST)

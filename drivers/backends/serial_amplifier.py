@@ -5,9 +5,9 @@ line, each at its own address.
 """
 
 import asyncio
-import contextlib
 from dataclasses import dataclass, replace
 
+from drivers.backends.line_turns import in_turn, kind_on_line
 from drivers.backends.serial_line import SerialLine, shared_line
 from drivers.backends.serial_url import SerialUrl
 from drivers.backends.stand_in import number_below
@@ -15,7 +15,7 @@ from drivers.backends.waiting import SETTLE, reply_within
 from drivers.backends.wire_backend import WireBackend
 from drivers.errors import DriverError, LinkError, LinkTimeout
 from drivers.protocol.definition import PROTOCOL
-from drivers.protocol.messages import Broadcast, Hello, Reply, Request
+from drivers.protocol.messages import Broadcast, Hello, Reply, Request, Stop
 from drivers.protocol.serial_codec import decode_event, decode_reply, encode_request, is_event
 from drivers.protocol.serial_frame import Frame, encode_frame
 from drivers.protocol.serial_timing import (
@@ -25,6 +25,7 @@ from drivers.protocol.serial_timing import (
     round_trip_time,
 )
 from drivers.statistics import WireCounters
+from drivers.turns import Kind
 
 
 @dataclass
@@ -102,15 +103,26 @@ class SerialBackend(WireBackend):
         need longer.
         """
         line = self._open_line()
-        async with contextlib.nullcontext() if len(line.addresses) == 1 else line.turn:
+
+        async def exchange() -> Reply:
             reply = await self._exchange(line, request, timeout)
             if isinstance(request, Hello):
                 await self._check_alone()
             return reply
 
+        if len(line.addresses) == 1:
+            return await exchange()
+        return await in_turn(line.turns, kind_on_line(request), exchange)
+
     async def broadcast(self, request: Broadcast) -> None:
-        """Send a commit or a stop to every amplifier of the line, whoever is waited for there."""
-        self._open_line().send(encode_frame(self._frame(request, PROTOCOL.serial.broadcast)))
+        """Send a commit to every amplifier of the line in its turn, or a stop at once."""
+        line = self._open_line()
+        data = encode_frame(self._frame(request, PROTOCOL.serial.broadcast))
+        if isinstance(request, Stop):
+            line.send(data)
+            return
+        async with line.turns.take(Kind.ORDINARY):
+            line.send(data)
 
     async def _check_alone(self) -> None:
         """Leave a second amplifier of this address the time to answer; LinkError where one does."""

@@ -8,17 +8,18 @@ from drivers.backends.serial_port import open_port
 from drivers.backends.stand_in import Port
 from drivers.errors import LinkError
 from drivers.protocol.serial_frame import Frame, FrameReader
+from drivers.turns import Turns
 
 
 class SerialLine:
     """A port as pyserial names it, at a speed [baud]; see `shared_line`.
 
-    turn: held during an exchange, for no two amplifiers may answer at once on one pair of wires.
+    turns: for exchanges, for no two amplifiers may answer at once on one pair of wires.
     """
 
     def __init__(self, port: str, *, baud: int) -> None:
         self.port = port
-        self.turn = asyncio.Lock()
+        self.turns = Turns()
         self.last_sent = 0.0
         self.frames_out = 0
         self._baud = baud

@@ -10,7 +10,7 @@ from controller.daemon.sections import CalibrationSection, DaemonSection, TouchS
 from controller.effects.layout import Layout, usual_effects
 from controller.effects.layout_file import load_layout
 from controller.touch import TouchSource
-from controller.touch_calibration import CalibratedSource, TouchCalibration, turned
+from controller.touch_calibration import CalibratedSource, TouchCalibration, fitted, turned
 from controller.touch_registry import open_source
 from drivers.errors import CommandError
 from drivers.registry import open_backend
@@ -20,6 +20,9 @@ from model.errors import InputError
 from model.perception import STRONG_DB_SL
 from model.rig import Rig
 from model.rig_file import load_rig
+
+API_SOURCES = "api"
+"""What the sources of clients of the API are called, before the colon; nothing else is."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +72,7 @@ def load_daemon_config(path: Path) -> DaemonConfig:
     rig_file = _file(document, "rig")
     rig, rig_text = _rig(validation, rig_file)
     urls = _urls(validation, rig, rig_file)
-    touch = _touch(validation, document)
+    touch = _touch(validation, document, rig)
     table = _file(document, "table")
     if table is not None and not table.is_file():
         validation.add(("table",), f"there is no file {table}; check its name and folder")
@@ -164,7 +167,7 @@ def _urls(validation: Validation, rig: Rig | None, rig_file: Path | None) -> dic
     return urls
 
 
-def _touch(validation: Validation, document: Document) -> tuple[TouchInput, ...]:
+def _touch(validation: Validation, document: Document, rig: Rig | None) -> tuple[TouchInput, ...]:
     """The touch sources that are in order; a source is made once, to know that it can be."""
     listed = document.data.get("touch")
     inputs: list[TouchInput] = []
@@ -177,8 +180,11 @@ def _touch(validation: Validation, document: Document) -> tuple[TouchInput, ...]
         if any(section.name == other.name for other in inputs):
             validation.add((*here, "name"), f"two sources are called {section.name}; rename one")
             continue
+        if section.name == API_SOURCES:
+            validation.add((*here, "name"), f"{API_SOURCES} is what programs are called; rename it")
         try:
-            made = TouchInput(section.name, section.url, _calibration(section.calibration))
+            calibration = _calibration(section.calibration, rig)
+            made = TouchInput(section.name, section.url, calibration)
         except InputError as error:
             validation.add((*here, "calibration"), str(error))
             continue
@@ -190,12 +196,23 @@ def _touch(validation: Validation, document: Document) -> tuple[TouchInput, ...]
     return tuple(inputs)
 
 
-def _calibration(section: CalibrationSection) -> TouchCalibration:
-    if section.matrix is None:
+def _calibration(section: CalibrationSection, rig: Rig | None) -> TouchCalibration:
+    is_turned = bool(section.turned or section.mirror)
+    if is_turned + (section.matrix is not None) + (section.points is not None) > 1:
+        raise InputError("give turned and mirror, or a matrix, or points, and no two of them")
+    if section.matrix is not None:
+        return TouchCalibration(section.matrix)
+    if section.points is None or rig is None:  # without its plate a rig is refused anyway
         return turned(section.turned, mirror=section.mirror)
-    if section.turned or section.mirror:
-        raise InputError("give turned and mirror, or a matrix in their place, not both")
-    return TouchCalibration(section.matrix)
+    plate = rig.plate
+    return fitted(
+        [
+            (x / plate.length, 1 - y / plate.width)
+            for x, y in (each.shown for each in section.points)
+        ],
+        [each.at for each in section.points],
+        plate,
+    )
 
 
 def _check_serial_numbers(validation: Validation, rig: Rig | None) -> None:

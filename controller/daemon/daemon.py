@@ -270,7 +270,7 @@ class Daemon:
             self._controller.deliver(frame)
 
     def _input_failed(self, name: str, error: Exception) -> None:
-        _logger.error("touch source %s has failed: %s", name, error)
+        _logger.error("touch source %s has failed, and is tried again: %s", name, error)
 
     def _state_changed(self, old: Machine, new: Machine) -> None:
         self._service.state_changed(old, new)

@@ -6,11 +6,13 @@ from collections.abc import Callable, Iterable
 from dataclasses import replace
 
 from controller.api.messages import TouchParams
-from controller.daemon.config import TouchInput
+from controller.daemon.config import API_SOURCES, TouchInput
 from controller.touch import Touch, TouchFrame
+from drivers.supervision import pauses
 from model.errors import InputError
 from model.plate import Plate
 
+_FIRST_PAUSE, _LONGEST_PAUSE = 1.0, 30.0  # s; before a source that failed is begun again
 MOST_SOURCES = 64  # of one client, with fingers down: a gateway has many guests
 
 _logger = logging.getLogger(__name__)
@@ -20,7 +22,8 @@ class TouchInputs:
     """Runs touch sources side by side, and exchanges them while others run on.
 
     deliver takes their frames, whose source names begin with the name in the configuration; failed
-    is told where one ends with an error. What a source that is gone said last expires by itself.
+    is told where one ends with an error, and it is begun again after a pause that grows. What a
+    source that is gone said last expires by itself.
     """
 
     def __init__(
@@ -54,11 +57,15 @@ class TouchInputs:
             source = frame.source if frame.source.isprintable() else ascii(frame.source)
             self._deliver(replace(frame, source=f"{given.name}:{source}"))
 
-        try:
-            await given.make().run(named)
-            _logger.info("touch source %s has come to its end", given.name)
-        except Exception as error:
-            self._failed(given.name, error)
+        for pause in pauses(first=_FIRST_PAUSE, longest=_LONGEST_PAUSE):
+            try:
+                await given.make().run(named)
+            except Exception as error:
+                self._failed(given.name, error)
+            else:
+                _logger.info("touch source %s has come to its end", given.name)
+                return
+            await asyncio.sleep(pause)  # a panel may be plugged in later, a port become free
 
 
 class ApiTouches:
@@ -76,7 +83,7 @@ class ApiTouches:
 
         Two clients with the same source name are two sources.
         """
-        source = f"api:{client_name}:{params.source}"
+        source = f"{API_SOURCES}:{client_name}:{params.source}"
         mine = self._sources.setdefault(client, set())
         if not params.touches:
             mine.discard(source)

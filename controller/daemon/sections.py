@@ -11,10 +11,13 @@ from model.config import Quantity, Section
 from model.drive_modes import MODES
 from model.perception import STRONG_DB_SL
 from model.rig_sections import Identifier
-from model.units import RATIO, TIME
+from model.units import LENGTH, RATIO, TIME
 
 _NUMBER = Annotated[float, Quantity(RATIO, least=-10, most=10)]
 _ROW = Annotated[tuple[_NUMBER, _NUMBER, _NUMBER], Strict(strict=False)]  # a list in the file
+
+_LENGTH = Annotated[float, Quantity(LENGTH, least=-10, most=10)]
+_POINT = Annotated[tuple[_LENGTH, _LENGTH], Strict(strict=False)]
 
 
 def _mode(text: str) -> str:
@@ -42,12 +45,20 @@ File = Annotated[str, Field(min_length=1, max_length=4096, pattern=r"^[^\x00]*$"
 LevelDbSl = Annotated[float, Quantity(RATIO, least=-20, most=60)]
 
 
+class CalibrationPoint(Section):
+    """Where `era status` shows a finger without a calibration, and where it really is."""
+
+    shown: _POINT
+    at: _POINT
+
+
 class CalibrationSection(Section):
-    """How a sensor lies on the plate: turned clockwise, mirrored after that, or by a matrix."""
+    """How a sensor lies on the plate: turned clockwise, then mirrored; a matrix; or points."""
 
     turned: Literal[0, 90, 180, 270] = 0
     mirror: Literal["x", "y"] | None = None
     matrix: Annotated[tuple[_ROW, _ROW], Strict(strict=False)] | None = None
+    points: Annotated[list[CalibrationPoint], Field(min_length=3, max_length=64)] | None = None
 
 
 class TouchSection(Section):

@@ -135,6 +135,54 @@ def test_calibrations_put_touches_where_the_plate_is(folder: Path) -> None:
     assert b.place(Touch(1, 1.0, 0.5)) == Touch(1, 0.75, 0.5)
 
 
+def test_a_calibration_by_points(folder: Path) -> None:
+    """A panel mounted upside down and 1 cm too far to the east, by three corners in plate metres.
+
+    The plate is 0.3048 m by 0.2286 m: (x, y) is shown at (0.3048 - x + 0.01, 0.2286 - y).
+    """
+    path = written(
+        folder,
+        "rig: rig.yaml\n"
+        "touch:\n"
+        '  - {name: a, url: "tuio:3333", calibration: {points: [\n'
+        "     {shown: [304.8 mm, 21.86 cm], at: [1 cm, 1 cm]},\n"
+        "     {shown: [2.48 cm, 21.86 cm], at: [29 cm, 1 cm]},\n"
+        "     {shown: [304.8 mm, 0.0286], at: [1 cm, 20 cm]}]}}\n",
+    )
+    (source,) = load_daemon_config(path).touch
+    placed = source.calibration.place(Touch(1, 0.0, 1.0))  # what is shown at the south-west corner
+    assert (placed.x * 0.3048, (1 - placed.y) * 0.2286) == pytest.approx((0.3148, 0.2286))
+
+
+@pytest.mark.parametrize(
+    ("calibration", "where", "words"),
+    [
+        ("{points: [{shown: [0, 0], at: [0, 0]}]}", "calibration.points", "at least 3"),
+        ("{turned: 90, points: [A, B, C]}", "calibration", "no two of them"),
+        ("{points: [A, B, {shown: [0.2, 0.2], at: [0.2, 0.2]}]}", "calibration", "on a line"),
+        ("{points: [A, B, C, {shown: [0.1, 0.2], at: [0.1, 0.1]}]}", "calibration", "fits point"),
+        ("{points: [A, B, {shown: [0.2 s, 0], at: [0, 0]}]}", "points[2].shown[0]", "length"),
+    ],
+)
+def test_calibrations_by_points_that_say_too_little(
+    folder: Path, calibration: str, where: str, words: str
+) -> None:
+    """Each is refused with its key and the reason."""
+    for name, x, y in (("A", 0, 0), ("B", 0.1, 0.1), ("C", 0.2, 0)):
+        calibration = calibration.replace(name, f"{{shown: [{x}, {y}], at: [{x}, {y}]}}")
+    text = f'rig: rig.yaml\ntouch: [{{name: a, url: "tuio:3333", calibration: {calibration}}}]\n'
+    with pytest.raises(ConfigError) as caught:
+        load_daemon_config(written(folder, text))
+    assert where in str(caught.value)
+    assert words in str(caught.value)
+
+
+def test_no_source_is_called_like_programs(folder: Path) -> None:
+    """Contacts of `api` are those of the API's clients, and nobody else's."""
+    path = written(folder, 'rig: rig.yaml\ntouch: [{name: api, url: "tuio:3333"}]\n')
+    assert problems(path) == [(2, "touch[0].name")]
+
+
 @pytest.mark.parametrize(
     "text", ["rig: [1]\n", "rig: rig.yaml\ntouch: 3\n", "rig: rig.yaml\ntouch: [3]\n"]
 )

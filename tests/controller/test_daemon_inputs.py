@@ -129,3 +129,36 @@ async def test_sources_run_under_their_names_and_are_exchanged(
     assert panels["a:"].ended == []
     await inputs.close()
     assert (panels["a:"].ended, panels["c:"].ended) == (["x\x1b[2J"], ["z"])
+
+
+async def test_a_source_that_fails_is_begun_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """After a pause that grows, until it works; one that has come to its end is not."""
+    errors: list[Exception | None] = [InputError("not plugged in"), OSError("gone"), None]
+    runs: list[str] = []
+
+    class Late(TouchSource):
+        async def run(self, deliver: Callable[[TouchFrame], None]) -> None:
+            runs.append("run")
+            error = errors.pop(0)
+            if error is not None:
+                raise error
+
+    paused: list[float] = []
+    sleep = asyncio.sleep
+
+    async def pause(seconds: float) -> None:
+        paused.append(seconds)
+        await sleep(0)
+
+    monkeypatch.setattr("controller.daemon.config.open_source", lambda url: Late())
+    monkeypatch.setattr("controller.daemon.inputs.asyncio.sleep", pause)
+    failed: list[str] = []
+    inputs = TouchInputs(
+        lambda frame: None, failed=lambda name, error: failed.append(f"{name}: {error}")
+    )
+    await inputs.exchange([TouchInput("left", "a:", TouchCalibration())])
+    for _ in range(20):
+        await sleep(0)
+    assert failed == ["left: not plugged in", "left: gone"]
+    assert (len(runs), paused) == (3, [1.0, 2.0])
+    await inputs.close()

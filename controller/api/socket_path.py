@@ -25,4 +25,15 @@ def find_socket(given: Path | None) -> Path:
     if given is not None:
         return given
     own = default_socket()
-    return SYSTEM_SOCKET if SYSTEM_SOCKET.exists() and not own.exists() else own
+    return own if own.exists() or not _is_there(SYSTEM_SOCKET) else SYSTEM_SOCKET
+
+
+def _is_there(path: Path) -> bool:
+    """Whether there is a socket; also in a folder of others: connecting tells that it is theirs."""
+    try:
+        path.stat()
+    except PermissionError:
+        return True
+    except OSError:
+        return False
+    return True

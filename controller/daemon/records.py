@@ -4,6 +4,7 @@ They are what the frames meant, on whatever wire, with their times; the file is 
 """
 
 import json
+import os
 import time
 from collections import deque
 from collections.abc import Callable, Iterable
@@ -18,7 +19,8 @@ from drivers.protocol.messages import Broadcast, Event, Reply, Request, Status
 from drivers.statistics import WireCounters
 
 KEPT = 400  # messages over all links: the last seconds under load, ten at rest
-_PREFIX = "era-fault-"
+DUMPS = "era-fault-*.jsonl"
+"""What the files with the last messages are called."""
 
 
 class Record(NamedTuple):
@@ -131,10 +133,10 @@ def write_dump(folder: Path, records: Iterable[Record], *, cause: str, keep: int
     """
     folder.mkdir(parents=True, exist_ok=True)
     stamp = time.strftime("%Y%m%dT%H%M%S", time.gmtime())
-    path = folder / f"{_PREFIX}{stamp}-{time.monotonic_ns() % 10**9:09d}.jsonl"
+    path = folder / DUMPS.replace("*", f"{stamp}-{time.monotonic_ns() % 10**9:09d}")
+    opened = open(path, "x", encoding="utf-8", opener=_for_the_owner)  # noqa: SIM115
     try:
-        with path.open("x", encoding="utf-8") as stream:
-            path.chmod(0o600)
+        with opened as stream:
             stream.write(json.dumps({"cause": cause, "unix_time_s": time.time()}) + "\n")
             for record in records:
                 stream.write(json.dumps(_as_json(record)) + "\n")
@@ -142,10 +144,15 @@ def write_dump(folder: Path, records: Iterable[Record], *, cause: str, keep: int
         path.unlink(missing_ok=True)
         raise
     # By its name this one may be the oldest: clocks are set, and some boards begin in 1970.
-    others = sorted(each for each in folder.glob(f"{_PREFIX}*.jsonl") if each != path)
+    others = sorted(each for each in folder.glob(DUMPS) if each != path)
     for old in others[: max(0, len(others) + 1 - keep)]:
         old.unlink(missing_ok=True)
     return path
+
+
+def _for_the_owner(path: str, flags: int) -> int:
+    """Open a file that nobody else could open before it had something in it."""
+    return os.open(path, flags, 0o600)
 
 
 def _as_json(record: Record) -> dict[str, object]:

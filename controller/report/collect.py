@@ -14,6 +14,7 @@ from packaging.requirements import Requirement
 from controller.api.client import Client
 from controller.api.jsonrpc import RpcError
 from controller.daemon.config import is_daemon_document
+from controller.daemon.records import DUMPS
 from controller.report.redaction import redacted
 from drivers.errors import LinkError
 from model.document import read_document
@@ -104,7 +105,7 @@ def _with_named(path: Path, missing: list[str]) -> Iterable[Path]:
     dumps = document.data.get("dumps")
     folder = dumps.get("folder") if isinstance(dumps, dict) else None
     if isinstance(folder, str):
-        found = (path.parent / Path(folder).expanduser()).glob("*")
+        found = (path.parent / Path(folder).expanduser()).glob(DUMPS)
         yield from sorted(found, key=lambda file: file.name)[-MOST_DUMPS:]
 
 

@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import os
 import re
 import socket
 import threading
@@ -16,6 +17,7 @@ from controller.api.async_client import AsyncClient
 from controller.api.client import Client
 from controller.api.jsonrpc import ErrorCode, RpcError
 from controller.api.replies import Unreachable
+from controller.api.socket_path import SYSTEM_SOCKET, find_socket
 from daemon_bench import PLACE, running_daemon, until_state
 
 PAGE = Path(controller.__file__).parent.parent / "docs" / "api.md"
@@ -163,3 +165,16 @@ def test_a_daemon_that_does_not_answer_is_given_up(tmp_path: Path) -> None:
         server.listen()
         with pytest.raises(Unreachable, match="does not answer"):
             Client.connect(tmp_path / "s", timeout=0.05)
+
+
+def test_a_daemon_of_others_is_named_as_such(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where one may not even look into its folder, connecting is what tells whose it is."""
+
+    def forbidden(path: Path, **options: bool) -> os.stat_result:
+        if path == SYSTEM_SOCKET:
+            raise PermissionError(13, "Permission denied", str(path))
+        raise FileNotFoundError(2, "No such file or directory", str(path))
+
+    monkeypatch.setattr(Path, "stat", forbidden)
+    assert find_socket(None) == SYSTEM_SOCKET
+    assert "belongs to somebody else" in str(Unreachable.at(SYSTEM_SOCKET, PermissionError()))

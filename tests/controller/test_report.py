@@ -43,6 +43,8 @@ def test_home_that_is_everywhere() -> None:
 def test_everything_that_a_daemon_names(tmp_path: Path) -> None:
     """Its rig and layout, and the last of its dumps; a table is left where it is.
 
+    So is whatever else lies where the dumps are.
+
     What is not there is said, and nothing fails for it.
     """
     (tmp_path / "rig.yaml").write_text(example_rig_path().read_text("utf-8"), "utf-8")
@@ -52,9 +54,10 @@ def test_everything_that_a_daemon_names(tmp_path: Path) -> None:
     (tmp_path / "t.npz").write_bytes(b"x" * 100)
     (tmp_path / "dumps").mkdir()
     for number in range(MOST_DUMPS + 2):
-        (tmp_path / "dumps" / f"2026-{number}.json").write_text(str(number), "utf-8")
+        (tmp_path / "dumps" / f"era-fault-2026-{number}.jsonl").write_text(str(number), "utf-8")
+    (tmp_path / "dumps" / "letter.txt").write_text("dear", "utf-8")
     report = collect([tmp_path / "d.yaml"], socket=tmp_path / "no.sock", home=HOME)
-    dumps = [f"2026-{number}.json" for number in range(2, MOST_DUMPS + 2)]
+    dumps = [f"era-fault-2026-{number}.jsonl" for number in range(2, MOST_DUMPS + 2)]
     assert set(report.files) == {"d.yaml", "rig.yaml", *dumps, "versions.json"}
     layout, daemon = report.missing
     assert "none.yaml" in layout

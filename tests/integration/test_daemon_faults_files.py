@@ -1,0 +1,225 @@
+"""Files that are corrupt, foreign, bombs or programs, wherever the daemon reads one.
+
+Refused with file, line and key before anything is touched; a daemon that runs keeps all it has.
+"""
+
+import asyncio
+import io
+import os
+import pickle
+import random
+import signal
+import socket
+import time
+import zipfile
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from controller.daemon.run import check_daemon
+from daemon_bench import daemon_table, far_end, until, write_daemon
+from daemon_process import ENABLED, WATCHDOG, daemon_process, holding, play, run_era
+from journal import Journal, loudness
+from model.errors import InputError
+from model.table_file import save_table
+
+SOON = 5.0  # s; a bomb would take minutes, and gigabytes
+
+
+class Opened:
+    """What a pickle would do."""
+
+    def __reduce__(self) -> tuple[object, tuple[str]]:
+        return os.system, ("touch pickled",)
+
+
+BOMB = "\n".join(
+    ["a0: &a0 [x, x, x, x, x, x, x, x, x]"]
+    + [f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 9)}]" for n in range(1, 12)]
+)
+LAYOUT = """effects: {hum: {kind: buzz}}
+regions:
+  pad: {rectangle: {start: [1 cm, 1 cm], end: [20 cm, 18 cm]}, on_press: hum}
+"""
+
+
+def in_text(text: str, old: str, new: str) -> bytes:
+    """A text with a change, which must find something."""
+    assert old in text
+    return text.replace(old, new).encode()
+
+
+ANYWHERE = [
+    pytest.param(b"", "is empty", id="empty"),
+    pytest.param(pickle.dumps({"rig": Opened()}), "is no UTF-8|not allowed", id="pickle"),
+    pytest.param(BOMB.encode(), ":1: a0: anchors and aliases", id="aliases"),
+    pytest.param(
+        b"x: !!python/object/apply:os.system ['touch pickled']\n",
+        ":1: x: tags are not used",
+        id="tag",
+    ),
+    pytest.param(b"a: " + b"[" * 100_000, ":1: a.*nested too deeply", id="nested"),
+    pytest.param(b"a: 1\n" + b"#" * (1 << 22), "larger than 1 MiB", id="large"),
+    pytest.param(b"a: 1\na: 2\n", ":2: a: .*stands twice", id="twice"),
+    pytest.param(random.Random(5).randbytes(3000), "is no UTF-8|not allowed", id="noise"),
+    pytest.param(None, "larger than 1 MiB", id="a device without end"),
+]
+
+
+@pytest.mark.parametrize("role", ["daemon.yaml", "rig.yaml", "layout.yaml"])
+@pytest.mark.parametrize(("content", "says"), ANYWHERE)
+def test_what_is_no_plain_data_is_refused_wherever_it_stands(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, role: str, content: bytes | None, says: str
+) -> None:
+    """As the configuration itself, as the rig, as the layout: with its name, at once, unopened."""
+    monkeypatch.chdir(tmp_path)
+    path = write_daemon(tmp_path, {"main": "sim://"}, "layout: layout.yaml\n")
+    (tmp_path / "layout.yaml").write_text(LAYOUT, encoding="utf-8")
+    assert "good" in check_daemon(path)
+    (tmp_path / role).unlink()
+    if content is None:
+        (tmp_path / role).symlink_to("/dev/zero")
+    else:
+        (tmp_path / role).write_bytes(content)
+    begin = time.process_time()
+    with pytest.raises(InputError, match=says) as refused:
+        check_daemon(path)
+    assert time.process_time() - begin < SOON
+    assert str(tmp_path / role) in str(refused.value)
+    assert not (tmp_path / "pickled").exists()
+
+
+@pytest.mark.parametrize(
+    ("role", "old", "new", "says"),
+    [
+        ("rig.yaml", "stroke: 100 um", "stroke: .nan", r"rig.yaml:\d+: eras.SW.stroke: "),
+        ("rig.yaml", "thickness: 1.5 mm", "thickness: .inf", r"rig.yaml:\d+: plate.thickness: "),
+        ("rig.yaml", "stiffness: 17000", "stiffness: -1", r"rig.yaml:\d+: eras.SW.stiffness: "),
+        ("daemon.yaml", "socket:", "level_db_sl: .nan\nsocket:", r"yaml:2: level_db_sl: "),
+        ("daemon.yaml", "socket:", "level_db_sl: 1000\nsocket:", r"yaml:2: level_db_sl: "),
+        ("daemon.yaml", "socket:", "longest_lease: 1e999\nsocket:", r"yaml:2: longest_lease: "),
+        ("daemon.yaml", "socket:", "levl_db_sl: 3\nsocket:", r"yaml:2: levl_db_sl: "),
+        ("layout.yaml", "18 cm]}", ".nan]}", r"layout.yaml:3: regions.pad.rectangle"),
+        ("layout.yaml", "18 cm]}", "18 km]}", r"layout.yaml:3: regions.pad.rectangle"),
+        (
+            "layout.yaml",
+            "on_press: hum",
+            "on_press: os.system",
+            r"layout.yaml:3: .*pad.on_press",
+        ),
+        ("layout.yaml", "kind: buzz", "kind: os.system", r"layout.yaml:1: effects.hum.kind"),
+    ],
+)
+def test_entries_beyond_all_limits_are_refused_by_line_and_key(
+    tmp_path: Path, role: str, old: str, new: str, says: str
+) -> None:
+    """Not a number, infinite, negative, too large, unknown: where it stands, and what it is."""
+    path = write_daemon(tmp_path, {"main": "sim://"}, "layout: layout.yaml\n")
+    (tmp_path / "layout.yaml").write_text(LAYOUT, encoding="utf-8")
+    (tmp_path / role).write_bytes(in_text((tmp_path / role).read_text("utf-8"), old, new))
+    with pytest.raises(InputError, match=says):
+        check_daemon(path)
+
+
+def bomb() -> bytes:
+    """A file of a few kilobytes that says that it unfolds to gigabytes."""
+    made = io.BytesIO()
+    with zipfile.ZipFile(made, "w", zipfile.ZIP_DEFLATED, compresslevel=9) as file:
+        file.writestr("header.npy", bytes(200 << 20))
+    return made.getvalue()
+
+
+@pytest.mark.parametrize("content", [pickle.dumps(Opened()), bomb()], ids=["pickle", "bomb"])
+def test_tables_that_are_none(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, content: bytes
+) -> None:
+    """Refused with the file's name and what to do, and nothing in it is run or unfolded."""
+    monkeypatch.chdir(tmp_path)
+    path = write_daemon(tmp_path, {"main": "sim://"}, "table: table.npz\n")
+    save_table(daemon_table(), tmp_path / "table.npz")
+    assert "3 frequencies" in check_daemon(path)
+    (tmp_path / "table.npz").write_bytes(content)
+    begin = time.process_time()
+    with pytest.raises(InputError, match=r"table\.npz.*build") as refused:
+        check_daemon(path)
+    assert time.process_time() - begin < SOON
+    assert refused.value.__cause__ is not None
+    assert not (tmp_path / "pickled").exists()
+
+
+def test_a_table_of_another_plate_or_of_no_numbers(tmp_path: Path) -> None:
+    """A tenth of a millimetre makes another plate; with a checksum that is right, NaN is none."""
+    path = write_daemon(tmp_path, {"main": "sim://"}, "table: table.npz\n")
+    good = daemon_table()
+    spoilt = good.acceleration.copy()
+    spoilt[3, 0, 1] = np.nan
+    save_table(replace(good, acceleration=spoilt), tmp_path / "table.npz")
+    with pytest.raises(InputError, match=r"table\.npz: acceleration holds values that are not num"):
+        check_daemon(path)
+    save_table(good, tmp_path / "table.npz")
+    rig = tmp_path / "rig.yaml"
+    rig.write_bytes(in_text(rig.read_text("utf-8"), "thickness: 1.5 mm", "thickness: 1.6 mm"))
+    with pytest.raises(InputError, match=r"table\.npz was built for another plate"):
+        check_daemon(path)
+
+
+async def test_a_daemon_that_runs_keeps_what_it_has(tmp_path: Path) -> None:
+    """Every such file in turn and SIGHUP: it plays on by the old ones, and nothing is taken over.
+
+    Not even what is good in the same reading. A start with such a file is refused with exit status
+    2, and no amplifier is asked anything.
+    """
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
+        manager.bind(str(tmp_path / "notify"))
+        environment = {"NOTIFY_SOCKET": str(tmp_path / "notify")}
+        readies: list[float] = []
+        loop = asyncio.get_running_loop()
+
+        def hear() -> None:
+            if manager.recv(4096).startswith(b"READY=1"):
+                readies.append(loop.time())
+
+        loop.add_reader(manager, hear)
+        layout = tmp_path / "layout.yaml"
+        layout.write_text(LAYOUT, encoding="utf-8")
+        async with (
+            far_end(tmp_path) as far,
+            daemon_process(
+                tmp_path, far, "layout: layout.yaml\n", environment=environment
+            ) as daemon,
+        ):
+            journal = Journal(far)
+            config = tmp_path / "daemon.yaml"
+            good = config.read_text("utf-8")
+            async with await daemon.client() as era, holding(era):
+                await play(era, far)
+                effects = await era.effects()
+                config.write_text(f"{good}longest_lease: 5 s\n", encoding="utf-8")
+                for parameters in ANYWHERE:
+                    content = parameters.values[0]
+                    if isinstance(content, bytes):
+                        layout.write_bytes(content)
+                        count = len(readies)
+                        os.kill(daemon.process.pid, signal.SIGHUP)
+                        await until(lambda count=count: len(readies) > count)
+                await play(era, far)
+                assert await era.effects() == effects
+                await era.disarm()
+                await until(lambda: loudness(far) == 0)
+                await play(era, far)
+                status = await era.status()
+                assert status.state == ENABLED
+                assert status.lease_left_s is not None
+                assert status.lease_left_s > 5  # that of before
+            daemon.process.kill()
+            await daemon.process.wait()
+            await until(lambda: loudness(far) == 0)
+            dead = time.monotonic()
+            exit_status, _, err = await run_era("daemon", config)
+            assert exit_status == 2
+            assert str(layout) in err
+            assert "Traceback" not in err
+            assert not journal.since(dead + WATCHDOG)
+        loop.remove_reader(manager)

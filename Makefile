@@ -7,7 +7,8 @@ PYTHON ?= $(shell for python in $(PYTHONS); do \
 BIN := .venv/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet --editable
 
-.PHONY: demo test lint format docs fuzz soak bench bench-localization bench-plant bench-wires clean
+.PHONY: demo test lint format docs fuzz soak bench bench-latency bench-localization bench-plant \
+	bench-wires clean
 .NOTPARALLEL:
 
 demo: .venv/installed
@@ -31,6 +32,10 @@ fuzz: .venv/installed-test
 kill-test: .venv/installed-test
 	$(BIN)/python tests/support/kills.py $(KILLS)
 
+# What befalls the daemon, each by the real process, with the figures that were measured.
+fault-test: .venv/installed-test
+	$(BIN)/pytest -q -s tests/integration/test_daemon_faults_*.py
+
 # The whole chain in virtual time, thousands of seeds; `make test` takes a few hundred short ones.
 # Others: make soak SOAK='--hours 10 --wire serial', or one again: make soak SOAK='--seed 17'
 soak: .venv/installed-test
@@ -43,6 +48,10 @@ format: .venv/installed-test
 # What the machine does beside it shows in the times: leave it alone meanwhile.
 bench: .venv/installed-peers
 	$(BIN)/python -m benchmarks.plate
+
+# Ten minutes, on a machine that is left alone.
+bench-latency: .venv/installed-test
+	$(BIN)/python -m benchmarks.latency --report
 
 bench-localization: .venv/installed
 	$(BIN)/python -m benchmarks.localization --report

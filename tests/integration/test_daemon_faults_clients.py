@@ -12,7 +12,7 @@ import pytest
 from controller.api.jsonrpc import RpcError
 from controller.api.replies import Unreachable
 from daemon_bench import PATIENCE, far_end, until
-from daemon_process import DaemonProcess, daemon_process, holding, play, plays_on, ready
+from daemon_process import DaemonProcess, daemon_process, holding, play, plays_on
 from floods import flood
 from journal import Journal, loudness
 
@@ -49,15 +49,14 @@ async def test_two_thousand_idle_and_ten_that_do_not_read(tmp_path: Path) -> Non
                 flood("unreading", daemon.socket, 10),
                 flood("idle", daemon.socket, 2000) as idle,
             ):
-                await plays_on(daemon, era, journal)
+                await plays_on("clients pour in", daemon, era, journal)
                 assert idle.stdout is not None
                 line = await asyncio.wait_for(idle.stdout.readline(), 3 * PATIENCE)
                 assert int(line) == 2000
-                await plays_on(daemon, era, journal)
+                await plays_on("2000 idle, 10 unreading", daemon, era, journal)
                 await stopped_by_somebody_else(daemon)
                 assert resident(daemon.process.pid) - before < GROWTH
-            await ready(era)
-            await plays_on(daemon, era, journal)
+            await play(era, far)
 
 
 @pytest.mark.parametrize("kind", ["garbage", "asking"])
@@ -69,10 +68,9 @@ async def test_clients_that_flood(tmp_path: Path, kind: str) -> None:
             await play(era, far)
             before = resident(daemon.process.pid)
             async with flood(kind, daemon.socket, 4), flood(kind, daemon.socket, 5):
-                await plays_on(daemon, era, journal)
+                await plays_on(f"clients flood: {kind}", daemon, era, journal)
                 await stopped_by_somebody_else(daemon)
-            await ready(era)
-            await plays_on(daemon, era, journal)
+            await play(era, far)
             assert resident(daemon.process.pid) - before < GROWTH
         assert not daemon.said("Traceback")
         assert not daemon.said("no json")

@@ -109,7 +109,7 @@ async def test_ten_thousand_touches_a_second_and_the_last_finger_up(tmp_path: Pa
             await test.era.disarm()
             return silent - float(told["up_s"])
 
-        await best_of(attempt, UP_TO_ZERO)
+        await best_of("from the last finger up to zero on the wire, at 10 kHz", attempt, UP_TO_ZERO)
 
 
 async def test_the_last_finger_up_is_zero_on_the_wire(tmp_path: Path) -> None:
@@ -120,7 +120,7 @@ async def test_the_last_finger_up_is_zero_on_the_wire(tmp_path: Path) -> None:
             await test.played(Touch(1, 0.4, 0.5))
             return -test.say() + await test.silence()
 
-        await best_of(attempt, UP_TO_ZERO)
+        await best_of("from the last finger up to zero on the wire", attempt, UP_TO_ZERO)
 
 
 async def test_a_finger_that_is_never_lifted_is_lifted_by_its_lease(tmp_path: Path) -> None:
@@ -134,7 +134,7 @@ async def test_a_finger_that_is_never_lifted_is_lifted_by_its_lease(tmp_path: Pa
             assert silent - last >= LEASE - 0.02  # which was heard
             return silent - last
 
-        await best_of(attempt, LEASE + UP_TO_ZERO)
+        await best_of("from the last word of a finger to zero", attempt, LEASE + UP_TO_ZERO)
 
 
 async def test_touches_that_make_no_sense_are_counted_and_not_felt(tmp_path: Path) -> None:

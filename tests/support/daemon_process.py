@@ -184,13 +184,16 @@ async def watch(
 
 
 async def plays_on(
-    daemon: DaemonProcess, era: AsyncClient, journal: Journal, *, seconds: float = 1.0
+    what: str, daemon: DaemonProcess, era: AsyncClient, journal: Journal, *, seconds: float = 1.0
 ) -> float:
-    """The widest gap [s] of a while without any loss; best of some, for a machine that is busy."""
+    """The widest gap [s] of a while without any loss; best of some, for a machine that is busy.
+
+    what: befalls it meanwhile, by which the figure is told.
+    """
 
     async def attempt() -> float:
         await play(era, daemon.far)
         window = await watch(daemon, era, journal, seconds)
         return window.widest_gap if window.states == {ENABLED} else math.inf
 
-    return await best_of(attempt, WATCHDOG)
+    return await best_of(f"between signs of life, {what}", attempt, WATCHDOG)

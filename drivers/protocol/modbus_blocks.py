@@ -199,9 +199,11 @@ def loaded(registers: Sequence[int]) -> Loaded:
     )
 
 
-def refusal(registers: Sequence[int]) -> tuple[Nak, int]:
-    """Why a write was refused, and its tag."""
+def refusal(registers: Sequence[int]) -> tuple[Nak, int] | None:
+    """Why a write was refused, and its tag; None where none has been."""
     found, _ = _fields(_MAP["input"]["refusal"]["registers"], registers)
+    if not found["nak"]:
+        return None
     return Nak(_one_of(NakCode, found["nak"]), _channel(found["channel"])), found["refused_tag"]
 
 

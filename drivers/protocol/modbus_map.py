@@ -123,8 +123,8 @@ def to_broadcast(request: Broadcast) -> Write:
 
 def to_nak(registers: Sequence[int], *, tag: int) -> Nak | None:
     """The refusal of the write that carried this tag; None where it is that of another."""
-    nak, refused_tag = modbus_blocks.refusal(registers)
-    return nak if refused_tag == tag else None
+    told = modbus_blocks.refusal(registers)
+    return told[0] if told is not None and told[1] == tag else None
 
 
 def refusal_read() -> Read:

@@ -405,6 +405,19 @@ async def test_two_amplifiers_of_one_number_are_refused(virtual: Virtual) -> Non
     await amplifier.close()
 
 
+async def test_a_late_answer_is_no_second_amplifier(virtual: Virtual) -> None:
+    """What is told of another object, while a second amplifier is listened for, is of the first."""
+    late = CanFrame(0x581, bytes.fromhex("4F 01 10 00 00 00 00 00"))  # of the error register
+
+    def hear(frame: CanFrame) -> None:
+        if frame.id == 0x601 and frame.data[:4] == bytes.fromhex("40 18 10 04"):
+            virtual.gateway.say(late)
+
+    virtual.gateway.bus.join(hear)
+    async with opened(virtual.url()) as amplifier:
+        assert amplifier.identity.serial_number == virtual.far.amplifier.identity.serial_number
+
+
 async def test_a_second_host_does_not_arm(virtual: Virtual) -> None:
     """Another program's heartbeat for this amplifier is heard before arming."""
     async with opened(virtual.url()) as amplifier:

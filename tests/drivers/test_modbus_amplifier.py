@@ -290,6 +290,20 @@ async def test_a_late_refusal_is_not_credited_to_the_next_request(
     assert await backend.exchange(Arm(0.25), timeout=PATIENCE) == ARMED
 
 
+async def test_an_exception_without_a_refusal_is_no_answer(
+    far: Peer, backend: ModbusBackend
+) -> None:
+    """An exception before anything was refused: what was written is asked for again."""
+
+    def answer(request: object) -> bytes | None:
+        pdu = far.requests[-1].pdu
+        return far.unit.answer(pdu) if pdu[0] == 4 else bytes([pdu[0] | 0x80, 3])
+
+    far.answer = answer
+    with pytest.raises(LinkTimeout, match="names no reason"):
+        await backend.exchange(Arm(0.25), timeout=PATIENCE)
+
+
 def off_by(place: int, bit: int = 1) -> Callable[[bytes], bytes]:
     """The same answer with one bit of a byte the other way round."""
 

@@ -111,7 +111,7 @@ def arm(
                 typer.echo(f"armed {how}; era stop stops everything at once")
             while not once:
                 time.sleep(granted.lease_s / 3)
-                era.renew(granted.lease)
+                _renew(era, granted.lease)
         except KeyboardInterrupt:
             era.disarm()
             if not as_json:
@@ -210,6 +210,20 @@ def _client(socket: Path | None) -> "Iterator[Client]":
             raise CommandRefused(str(error)) from error
 
 
+def _renew(era: "Client", lease: str) -> None:
+    """Keep a lease; where it was ended, say by what."""
+    from controller.api.jsonrpc import ErrorCode, RpcError
+
+    try:
+        era.renew(lease)
+    except RpcError as error:
+        if error.code is not ErrorCode.LEASE:
+            raise
+        told = era.status()
+        remedy = f"; {told.remedy}" if told.remedy else ""
+        raise CommandRefused(f"not armed any more, {told.state}: {told.cause}{remedy}") from error
+
+
 def _tell_state(era: "Client", *, as_json: bool) -> None:
     told = era.status()
     if as_json:
@@ -230,9 +244,10 @@ def _shown(told: "StatusResult") -> str:
     for contact in told.contacts:
         level = "" if contact.level_db_sl is None else f" {contact.level_db_sl:.1f} dB SL"
         contrast = "" if contact.contrast_db is None else f", contrast {contact.contrast_db:.1f} dB"
+        effect = "" if contact.effect is None else f", effect {contact.effect}"
         lines.append(
             f"  finger {contact.source} {contact.id} at {contact.x_m:.3f}, {contact.y_m:.3f} m: "
-            f"{contact.role or 'nothing is played'}{level}{contrast}"
+            f"{contact.role or 'nothing is played'}{level}{contrast}{effect}"
         )
     for era, tone in told.drive.items():
         lines.append(

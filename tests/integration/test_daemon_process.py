@@ -61,6 +61,7 @@ async def test_the_commands_do_what_they_say(tmp_path: Path) -> None:
         status, out, _ = await run_era("touch", "0.1,0.1", "0.25,0.2", "--for", 0.5, *where)
         assert status == 0
         assert "target 20.0 dB SL" in out
+        assert "effect buzz" in out
         status, _, err = await run_era("arm", "--once", *where)
         assert status == 1
         assert "armed by 'era arm'" in err
@@ -73,6 +74,19 @@ async def test_the_commands_do_what_they_say(tmp_path: Path) -> None:
         status, out, _ = await run_era("clear", *where)
         assert (status, out.partition(":")[0]) == (0, "READY_TO_SWITCH_ON")
         assert far.station.status().state is State.SWITCH_ON_DISABLED
+        arming = await asyncio.create_subprocess_exec(
+            *(ERA, "arm", "--lease", "1", *map(str, where)),
+            stdout=asyncio.subprocess.PIPE,
+            stderr=asyncio.subprocess.PIPE,
+        )
+        assert arming.stdout is not None
+        await asyncio.wait_for(arming.stdout.readline(), PATIENCE)
+        async with await daemon.client() as era:
+            await era.disarm()
+        _, told = await asyncio.wait_for(arming.communicate(), PATIENCE)
+        assert arming.returncode == 1
+        assert b"not armed any more, " in told
+        assert b"disarmed by 'test'" in told or b"all amplifiers are sound" in told
     status, _, err = await run_era("status", *where)
     assert status == 3
     assert "no daemon runs at" in err

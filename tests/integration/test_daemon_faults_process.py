@@ -267,8 +267,14 @@ async def test_hangups_in_a_loop_change_nothing(tmp_path: Path) -> None:
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
         manager.bind(str(tmp_path / "notify"))
         environment = {"NOTIFY_SOCKET": str(tmp_path / "notify")}
-        heard = []
-        asyncio.get_running_loop().add_reader(manager, lambda: heard.append(manager.recv(4096)))
+        heard: list[bytes] = []
+
+        def hear() -> None:
+            said = manager.recv(4096)
+            if said.startswith((b"READY", b"RELOADING")):
+                heard.append(said)
+
+        asyncio.get_running_loop().add_reader(manager, hear)
         async with held(tmp_path, environment=environment) as test:
             before = len(descriptors(test.pid))
 

@@ -1,22 +1,21 @@
 """Adapters to CAN as python-can knows them, made fit for a bus that may go away or talk nonsense.
 
-python-can's socketcand never notices that its server has hung up, and both it and slcan stumble
-for ever over text that makes no frame. So their text is read here (see `drivers.protocol.can_text`)
-and the frames of a request are written at once.
+python-can's socketcand never notices that its server has hung up, waits for ever for one that says
+nothing, and both it and slcan stumble for ever over text that makes no frame. So their text is read
+here (see `drivers.protocol.can_text`) and the frames of a request are written at once.
 """
 
 import contextlib
+import re
 import select
 import socket
 import time
 from abc import abstractmethod
 from collections import deque
 from collections.abc import Iterable, Sequence
-from typing import cast
 
 import can
 from can.interfaces.slcan import slcanBus
-from can.interfaces.socketcand.socketcand import SocketCanDaemonBus
 from can.interfaces.virtual import VirtualBus
 
 from drivers.backends.can_url import CanBusUrl
@@ -32,14 +31,15 @@ _SEND_TIMEOUT = 0.02  # s; a frame fits into any driver's buffer unless the bus 
 _SERIAL_TIMEOUT = 0.05  # s; how long a read of the serial port waits
 _CONNECT_TIMEOUT = 2.0  # s
 _READ_MAX = 4096
-_HANDSHAKES = 3  # a frame right after the greeting makes python-can take it for a wrong one
+_HANDSHAKE = (("", b"< hi"), ("< open {channel} >", b"< ok"), ("< rawmode >", b"< ok"))
+_IS_FRAME = re.compile(rb"\s*< (fd)?frame ")
 
 
 def open_bus(url: CanBusUrl) -> can.BusABC:
     """The adapter to a bus, open; raises can.CanError, OSError or ValueError."""
     match url.interface:
         case "socketcand":
-            return _open_socketcand(url)
+            return _Socketcand(url)
         case "slcan":
             return _Slcan(url)
         case "socketcan":
@@ -87,21 +87,56 @@ class _TextBus(can.BusABC):
         """Wait for text for so long [s] and take it."""
 
 
-class _Socketcand(_TextBus, SocketCanDaemonBus):
+class _Socketcand(_TextBus):
     """A server of the socketcand daemon."""
 
     def __init__(self, url: CanBusUrl) -> None:
         self._begin()
         self._reader = SocketcandReader()
-        SocketCanDaemonBus.__init__(  # type: ignore[no-untyped-call]
-            self, url.channel, url.host, url.port, tcp_tune=True
-        )
-        # Nobody reads without waiting for a byte first, so this only limits how long sending takes.
-        self._connection.settimeout(_SEND_TIMEOUT)
+        self.channel_info = f"socketcand on {url.channel}@{url.host}:{url.port}"
+        self._connection = socket.create_connection((url.host, url.port), timeout=_CONNECT_TIMEOUT)
+        try:
+            self._connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            self._shake_hands(url.channel)
+            # Nobody reads without waiting for a byte first, so this only limits how long sending
+            # takes.
+            self._connection.settimeout(_SEND_TIMEOUT)
+            can.BusABC.__init__(self, channel=url.channel)
+        except BaseException:
+            self._connection.close()
+            raise
 
-    @property
-    def _connection(self) -> socket.socket:
-        return cast(socket.socket, self._SocketCanDaemonBus__socket)  # type: ignore[attr-defined]
+    def _shake_hands(self, channel: str) -> None:
+        """Open the bus there, in raw mode; frames may come as soon as the server says hi."""
+        text = b""
+        for say, expected in _HANDSHAKE:
+            self._connection.sendall(say.format(channel=channel).encode())
+            element, text = self._element(text)
+            while _IS_FRAME.match(element):
+                element, text = self._element(text)
+            if element.strip() != expected:
+                raise can.CanInitializationError(f"instead of {expected!r} it says {element!r}")
+        self._take(self._reader.feed(text))
+
+    def _element(self, text: bytes) -> tuple[bytes, bytes]:
+        """The next element that the server says, without its end, and what follows it."""
+        deadline = time.monotonic() + _CONNECT_TIMEOUT
+        while b">" not in text:
+            data = self._connection.recv(_READ_MAX)
+            text += data
+            if not data or len(text) > _READ_MAX or time.monotonic() > deadline:
+                raise can.CanInitializationError(f"no socketcand server says {text!r}")
+        element, _, rest = text.partition(b">")
+        return element, rest
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        """Send one; see `send_frames`."""
+        self.send_frames([CanFrame(msg.arbitration_id, bytes(msg.data), fd=msg.is_fd)])
+
+    def shutdown(self) -> None:
+        """Close the connection."""
+        super().shutdown()
+        self._connection.close()
 
     def wake(self) -> None:
         """End the connection."""
@@ -181,15 +216,3 @@ def _message(frame: CanFrame) -> can.Message:
         data=frame.data,
         timestamp=time.time(),
     )
-
-
-def _open_socketcand(url: CanBusUrl) -> _Socketcand:
-    # python-can would try for ten seconds, and wait for a greeting for ever.
-    with socket.create_connection((url.host, url.port), timeout=_CONNECT_TIMEOUT) as probe:
-        greeting = probe.recv(64)
-    if not greeting.startswith(b"< hi >"):
-        raise can.CanInitializationError(f"it greets with {greeting!r}: no socketcand server")
-    for _ in range(_HANDSHAKES - 1):
-        with contextlib.suppress(can.CanError):
-            return _Socketcand(url)
-    return _Socketcand(url)

@@ -1,6 +1,7 @@
 """The CAN backend: what is its own, beside the contract that holds on every wire."""
 
 import asyncio
+import contextlib
 import gc
 import itertools
 import threading
@@ -366,6 +367,74 @@ async def test_a_boot_up_is_noticed_before_the_first_heartbeat(virtual: Virtual)
         await eventually(lambda: amplifier.lost)
     finally:
         await amplifier.close()
+
+
+def descriptors() -> int:
+    """How many are open."""
+    return len(list(Path("/dev/fd").iterdir()))
+
+
+async def served(*says: bytes) -> tuple[str | None, int]:
+    """What comes of opening a bus of a server that says this, an answer to each element that it
+    hears; and how many descriptors are left."""
+
+    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        with contextlib.suppress(asyncio.IncompleteReadError):
+            for say in says:
+                writer.write(say)
+                await reader.readuntil(b">")
+            await reader.read()
+        writer.close()
+
+    server = await asyncio.start_server(serve, "127.0.0.1", 0)
+    async with server:
+        host, port = server.sockets[0].getsockname()
+        before = descriptors()
+        backend = CanBackend(f"can+socketcand://{host}:{port}/can0#1")
+        problem = None
+        try:
+            await backend.open()
+        except LinkError as error:
+            problem = str(error)
+        await backend.close()
+        for _ in range(1000):  # the server's side of it goes when the server has noticed
+            left = descriptors() - before
+            if not left:
+                break
+            await asyncio.sleep(0.001)
+    return problem, left
+
+
+@pytest.mark.parametrize(
+    "says",
+    [
+        (b"< hi >", b"< ok >", b"< ok >"),
+        (b"< hi >< frame 701 1.0 05 >", b"< frame 701 1.5 05 >< ok >", b"< ok >< frame 701 2 05 >"),
+    ],
+)
+async def test_a_server_may_pass_frames_on_at_once(says: tuple[bytes, ...]) -> None:
+    """The bus is open, whatever others say on it meanwhile; closed, nothing is left."""
+    assert await served(*says) == (None, 0)
+
+
+@pytest.mark.parametrize(
+    "says",
+    [
+        (b"",),
+        (b"< hi >",),
+        (b"SSH-2.0-x\r\n",),
+        (b"< hi >", b"< error could not open bus >"),
+        (b"<" * 5000,),
+    ],
+)
+async def test_a_server_that_opens_no_bus_is_told(
+    says: tuple[bytes, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One that is silent, stuck, another one, or has no such bus: an error, and nothing is left."""
+    monkeypatch.setattr("drivers.backends.can_interfaces._CONNECT_TIMEOUT", 0.1)
+    problem, left = await served(*says)
+    assert "check address and port" in (problem or "")
+    assert left == 0
 
 
 async def test_a_server_that_hangs_up_is_noticed_at_once(coarse_rig: Rig) -> None:

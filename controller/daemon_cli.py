@@ -249,6 +249,8 @@ def _shown(told: "StatusResult") -> str:
             f"  finger {contact.source} {contact.id} at {contact.x_m:.3f}, {contact.y_m:.3f} m: "
             f"{contact.role or 'nothing is played'}{level}{contrast}{effect}"
         )
+    if told.silent_because is not None and told.contacts:
+        lines.append(f"  silent: {told.silent_because}")
     for era, tone in told.drive.items():
         lines.append(
             f"  ERA {era}: {tone.frequency_hz:g} Hz, level {tone.level:.3f}, {tone.phase_deg:g} deg"

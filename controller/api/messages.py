@@ -65,6 +65,7 @@ class StatusResult(Message):
     lease_left_s: float | None
     contacts: list[ContactStatus] = Field(description="in order of arrival, the newest last")
     drive: dict[str, Tone] = Field(description="by ERA, silent ones left out")
+    silent_because: str | None = Field(None, description="why nothing is played though armed")
     predicted_contrast_db: float | None
     robust_contrast_db: float | None
     predicted_level_db_sl: float | None
@@ -114,12 +115,14 @@ class EffectsResult(Message):
 
 
 class PlayParams(Message):
-    """Play an effect once, as if a finger were there."""
+    """Play an effect at the finger that is nearest to a place, once; it ends with the finger."""
 
     effect: Name
-    x_m: float
+    x_m: float = Field(description="a finger must be within 20 mm of the place")
     y_m: float
-    level_db_sl: float | None = Field(None, description="as the effect has it if left out")
+    level_db_sl: float | None = Field(
+        None, description="at most the effect's own, which it has if this is left out"
+    )
 
 
 class SubscribeParams(Message):
@@ -155,7 +158,7 @@ METHODS: dict[str, Method] = {
     "clear": Method(Nothing, Nothing, "acknowledge a stop, or a fault whose cause is gone"),
     "touch": Method(TouchParams, Nothing, "all fingers of this client, as a touch source"),
     "effects": Method(Nothing, EffectsResult, "which effects there are"),
-    "play": Method(PlayParams, Nothing, "play an effect at a place"),
+    "play": Method(PlayParams, Nothing, "play an effect at a finger; only while armed"),
     "subscribe": Method(SubscribeParams, Nothing, "be told of topics from now on"),
     "unsubscribe": Method(UnsubscribeParams, Nothing, "be told of them no more"),
 }

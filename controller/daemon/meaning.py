@@ -27,8 +27,8 @@ class Meaning:
         return self._player.wish(contacts, now)
 
     def exchange(self, layout: Layout) -> None:
-        """From the next change of contacts on, touches mean this."""
-        self._player = EffectPlayer(layout)
+        """From now on touches mean this; nothing that is over in a moment is felt again."""
+        self._player = EffectPlayer(layout, known=self._player.fingers)
 
     def effect_of(self, key: ContactKey) -> str | None:
         """The effect that plays for a finger, None for none."""

@@ -41,6 +41,11 @@ class Scene:
         """The amplifiers were silenced by something else than the control loop."""
         self.applied = None
 
+    @property
+    def silent_because(self) -> str | None:
+        """Why the control loop plays nothing; None where it plays, or has decided nothing yet."""
+        return None if self.silenced is None else self.silenced.reason
+
     def contact_statuses(self) -> list[ContactStatus]:
         """All contacts, with what was decided about each."""
         return [

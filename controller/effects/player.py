@@ -1,7 +1,7 @@
 """From contacts to wishes by a surface layout: who feels which effect, and who gives way."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field
 
 from controller.contacts import Contact, ContactKey
@@ -44,10 +44,14 @@ class EffectPlayer:
     the one whose play began last, or as many of the last as the layout allows; all others are
     quiet. An effect of a slider that is quiet at the moment (no detent passed, no movement) asks
     for nothing and stands in nobody's way.
+
+    known: fingers that have felt their press already, by another layout. For them begins what lasts
+    and what moves, and nothing that would be felt as another press.
     """
 
-    def __init__(self, layout: Layout) -> None:
+    def __init__(self, layout: Layout, *, known: Iterable[ContactKey] = ()) -> None:
         self.layout = layout
+        self._known = set(known)
         self._fingers: dict[ContactKey, _Finger] = {}
         self._number = 0
 
@@ -69,6 +73,11 @@ class EffectPlayer:
             "no effect plays for the fingers that are there",
             until=min(ends, default=None),
         )
+
+    @property
+    def fingers(self) -> Collection[ContactKey]:
+        """Those that were on the plate when it was last looked."""
+        return self._fingers.keys() | self._known
 
     def effect_of(self, key: ContactKey) -> str | None:
         """The name of the effect that a finger has, None for none."""
@@ -94,6 +103,7 @@ class EffectPlayer:
     def _follow(self, contacts: Sequence[Contact], now: float) -> None:
         """Begin and end what the fingers' ways through the regions begin and end."""
         keys = {contact.key for contact in contacts}
+        self._known &= keys
         for key in [key for key in self._fingers if key not in keys]:
             del self._fingers[key]
         for contact in contacts:
@@ -118,7 +128,14 @@ class EffectPlayer:
         finger = _Finger(self.layout.region_at(*place), place)
         self._fingers[contact.key] = finger
         self._enter(finger, contact, now)
+        if contact.key in self._known:
+            self._known.discard(contact.key)
+            finger.plays = [play for play in finger.plays if self._goes_on(play)]
         return finger
+
+    def _goes_on(self, play: _Play) -> bool:
+        effect = self.layout.effects[play.name]
+        return effect.moves or not effect.ends
 
     def _enter(self, finger: _Finger, contact: Contact, now: float) -> None:
         """Begin what a region, or the plate outside of all, has for a finger that comes."""

@@ -70,6 +70,7 @@ async def test_regions_and_effects_by_name(tmp_path: Path) -> None:
         touching = asyncio.create_task(keep_touching(era, ON_QUIET))
         assert await contacts_as(era, None) == [None]
         await until(lambda: not any(bench.far.station.status().levels))
+        assert "no effect plays" in ((await era.status()).silent_because or "")
 
         for effect, place, level in (
             ("alert", ON_PAD, None),  # nobody is there
@@ -81,6 +82,7 @@ async def test_regions_and_effects_by_name(tmp_path: Path) -> None:
             assert caught.value.code is ErrorCode.REFUSED
         await era.play("alert", ON_QUIET, level_db_sl=12)
         assert await contacts_as(era, "alert") == [pytest.approx(12, abs=0.5)]
+        assert (await era.status()).silent_because is None
         touching.cancel()
         await asyncio.gather(touching, return_exceptions=True)
 

@@ -281,6 +281,25 @@ def test_asking_at_a_finger_that_was_not_looked_at_yet() -> None:
     assert wanted(player, [finger(1)], 0.2) == {1: 20.0}
 
 
+def test_another_layout_is_no_other_press() -> None:
+    """A finger that is down feels what lasts and what moves by the new one, but no second click.
+
+    One that comes later feels all, also under the name of one that has lifted.
+    """
+    effects: dict[str, Effect] = {"buzz": Buzz(level=10.0), "click": Click(), "dots": Detents()}
+    clicks = Region("left", LEFT, on_press="click", on_move="dots")
+    before = EffectPlayer(Layout((clicks,), effects))
+    fingers = [finger(1, 0.05), finger(2, 0.15)]
+    assert wanted(before, fingers, 0.0) == {2: 10.0}
+    after = EffectPlayer(Layout((clicks,), effects, most_at_once=2), known=before.fingers)
+    again = EffectPlayer(after.layout, known=after.fingers)  # exchanged twice before it is asked
+    for player in (after, again):
+        assert wanted(player, fingers, 1.0) == {2: 10.0}
+        assert wanted(player, [finger(1, 0.056), finger(2, 0.15)], 1.1) == {1: 20.0, 2: 10.0}
+        assert wanted(player, [], 2.0) == {}
+        assert wanted(player, [finger(1, 0.05)], 3.0) == {1: 20.0}
+
+
 @given(
     steps=st.lists(
         st.tuples(

@@ -1,0 +1,46 @@
+"""Latencies drawn: how often each is, and how rarely one is longer."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from benchmarks.latency_run import Found
+
+OURS, PLAIN = "#d62728", "#1f77b4"
+SHORTEST, LONGEST = 0.03, 100.0  # ms
+SHARES = (0.5, 0.01, 0.001)  # of the targets: half is longer, one in a hundred, one in a thousand
+
+
+def draw(found: Sequence[Found], file: Path, *, targets: Sequence[float]) -> None:
+    """Left a histogram of the daemon and the plain exchange, loaded; right how many are longer.
+
+    targets [ms]: median, 99th percentile, 99.9th.
+    """
+    figure = Figure(figsize=(10, 4.2), layout="constrained")
+    FigureCanvasAgg(figure)
+    left, right = figure.subplots(1, 2)
+    edges = np.geomspace(SHORTEST, LONGEST, 100)
+    for one in found:
+        color = PLAIN if one.own is None else OURS
+        times = np.sort(1e3 * one.matched.newest)
+        style = "-" if one.case.is_loaded else ":"
+        if one in found[:2]:
+            weights = np.full(len(times), 100 / max(1, len(times)))
+            kept = np.clip(times, SHORTEST, LONGEST)
+            left.hist(kept, edges, weights=weights, color=color, alpha=0.6, label=one.case.name)
+        if one in found[:4]:
+            longer = 1 - np.arange(len(times)) / max(1, len(times))
+            right.plot(times, longer, style, color=color, lw=1.5, label=one.case.name)
+    right.plot(targets, SHARES, "kv", ms=6, label="targets")
+    left.set(xscale="log", xlim=(SHORTEST, LONGEST), ylabel="share of commands / %")
+    right.set(xscale="log", yscale="log", xlim=(SHORTEST, LONGEST), ylabel="share that is longer")
+    for axes in (left, right):
+        axes.set_xlabel("touch sent to last byte on the wire / ms")
+        axes.grid(alpha=0.3)
+        axes.legend(fontsize=8)
+        axes.set_xticks([0.1, 1, 10, 100], ["0.1", "1", "10", "100"])
+    file.parent.mkdir(exist_ok=True)
+    figure.savefig(file, dpi=110)

@@ -33,21 +33,32 @@ class Fade(NamedTuple):
         if time < self.free_until:
             return FREE
         early, late = (self._gain(time - begin) for begin in self.begin)
-        low = max(
-            0.0,
-            self.before[0] * (1 - early) - self.after * early,
-            self.after * late - self.before[1] * (1 - late),
-        )
+        low = max(0.0, *self._left(time))
         return low, self.before[1] * (1 - late) + self.after * early
 
     def within(self, begin: float, end: float) -> tuple[float, float]:
         """Lowest and highest level at some time of a span [s]."""
         lows, highs = zip(self.at(begin), self.at(end), strict=True)
-        return min(lows), max(highs)
+        # Where the one outweighs the other first and then is outweighed, they may cancel between.
+        is_crossed = self._left(begin)[0] > 0 and self._left(end)[1] > 0
+        return 0.0 if is_crossed else min(lows), max(highs)
+
+    def _left(self, time: float) -> tuple[float, float]:
+        """What is left at least where they cancel: of what was played, of what shall be."""
+        early, late = (self._gain(time - begin) for begin in self.begin)
+        return (
+            self.before[0] * (1 - early) - self.after * early,
+            self.after * late - self.before[1] * (1 - late),
+        )
 
     def to(self, after: float, *, begin: tuple[float, float], ramp: float) -> "Fade":
-        """What follows where it is told to go to a level."""
-        return Fade(begin, ramp, self.within(*begin), after)
+        """What follows where it is told to go to a level.
+
+        What was fading out when it is told so may be gone before this ramp is over, and what added
+        to it then stands alone: of a fade that is cut short only the highest level is known.
+        """
+        low, high = self.within(*begin)
+        return Fade(begin, ramp, (0.0 if begin[0] < self.settled_from else low, high), after)
 
     def _gain(self, elapsed: float) -> float:
         """Share of what shall be played."""

@@ -35,16 +35,29 @@ NAMES = (
 
 
 class Follower:
-    """What one amplifier must be doing. state: None while nobody knows."""
+    """What one amplifier must be doing. state: None while nobody knows.
 
-    def __init__(self, name: str, plan: AmplifierPlan, *, times: Times, complain: Complain) -> None:
+    insist: is told of what no fault of a wire excuses, complain of everything else.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        plan: AmplifierPlan,
+        *,
+        times: Times,
+        complain: Complain,
+        insist: Complain,
+    ) -> None:
         self._name = name
         self._plan = plan
         self._slack = times.slack
         self._complain = complain
+        self._insist = insist
         self.state: int | None = None
         self._fault = 0
         self._is_reported = True  # the state, by the amplifier itself
+        self.is_answered = True  # and in an answer to its host
         self._watchdog = math.inf
         self._fed = (-math.inf, math.inf)
         self._fed_before = math.inf
@@ -99,6 +112,7 @@ class Follower:
             begin = (self._fed[0] + self._watchdog, self._fed[1] + self._watchdog)
             self._silence(begin, SILENCING_RAMP, "the watchdog")
             self.state, self._fault, self._is_reported = _REACTING, 1, False
+            self.is_answered = False
 
     # what it grants
 
@@ -195,7 +209,7 @@ class Follower:
         if asked.token == self._token:
             return
         if asked.token in self._played:
-            self._complain(
+            self._insist(
                 "token", end, f"{self._name} took set {asked.token} a second time after others"
             )
         drives = answer.achieved if answer.achieved is not None else asked.drives
@@ -212,10 +226,13 @@ class Follower:
             self._outputs.is_warm = condition.temperature >= _WARM
         self._check_condition(condition, begin, end)
         self._seen_at = end
+        self.is_answered = True
 
     def told(self, state: int, fault: int, time: float) -> None:
         """What it says unasked."""
+        was_answered = self.is_answered and state == self.state
         self.said(Condition(state, fault), time, time)
+        self.is_answered = was_answered
 
     def _check_condition(self, said: Condition, begin: float, end: float) -> None:
         if self.state is None:

@@ -83,6 +83,9 @@ class Host:
     def hang(self, time: float | None) -> None:
         """The control loop hangs from a time [s] on; None: it runs again."""
         self._hung = time
+        if time is None:
+            for side in self._sides.values():
+                side.last_life = None  # it owes the next after it has run
 
     # what it sends
 
@@ -110,7 +113,11 @@ class Host:
             case Kind.HELLO:
                 side.is_identified = True
             case Kind.ARM:
+                if side.is_stopped:
+                    what = f"{side.name} is armed although its stop is not cleared"
+                    side.complain("stop", time, what)
                 side.tokens.clear()
+                side.armed_at = time
                 side.last_life = time
             case Kind.CLEAR:
                 side.is_stopped = False
@@ -140,7 +147,11 @@ class Host:
             side.overtaken = time  # what it overtakes is waited for no more
             return
         for at, other in side.pending.values():
-            if at > side.overtaken and time - at < self._times.reply - self._times.slack:
+            # After a last lift it is waited for no more, though a finger may have come since.
+            if (
+                at > max(side.overtaken, self._lifted)
+                and time - at < self._times.reply - self._times.slack
+            ):
                 side.complain(
                     "credit",
                     time,
@@ -151,7 +162,8 @@ class Host:
 
     def _check_stop(self, side: Side, time: float, asked: Asked) -> None:
         is_other = asked.kind is not Kind.STOP and asked.kind not in _UNCOUNTED
-        if side.stop_wished is not None and is_other:
+        # What was asked before it, at the same moment, may go before it.
+        if side.stop_wished is not None and time > side.stop_wished and is_other:
             side.complain(
                 "stop",
                 time,
@@ -159,8 +171,6 @@ class Host:
                 f"told is {asked.kind.value}",
             )
             side.stop_wished = None
-        if side.is_stopped and asked.kind is Kind.ARM:
-            side.complain("stop", time, f"{side.name} is armed although its stop is not cleared")
 
     def _check_life(self, side: Side, time: float, asked: Asked) -> None:
         hung = self._hung
@@ -178,7 +188,9 @@ class Host:
         if side.is_troubled():
             side.last_life = None  # who has given an amplifier up owes it nothing
         last = side.last_life
-        is_owed = side.is_open and side.follower.is_enabled and self._hung is None
+        is_ending = self._silence_wished >= side.armed_at  # heartbeats would only be in the way
+        is_running = self._hung is None and not is_ending
+        is_owed = side.is_open and side.follower.is_enabled and is_running
         if last is None or not is_owed:
             return
         if time > last + self._times.heartbeat + self._times.slack:
@@ -188,7 +200,9 @@ class Host:
             )
 
     def _check_arm(self, side: Side, time: float) -> None:
-        if self._arm_wished is False:
+        # What was begun may be sent yet, and is followed by what withdraws it.
+        is_withdrawn = time > self._silence_wished + self._times.stop
+        if self._arm_wished is False and is_withdrawn:
             side.complain("armed", time, f"{side.name} is armed although nobody wished it")
         if side.is_identified is False:
             side.complain("identified", time, f"{side.name} is armed without being asked who it is")
@@ -201,7 +215,7 @@ class Host:
     def _check_justified(self, side: Side, time: float) -> None:
         if side.is_stopped:
             side.complain("stop", time, f"{side.name} is told to vibrate after its stop")
-        elif side.follower.state is not None and not side.follower.is_enabled:
+        elif self._knows_of_disarmed(side):
             side.complain(
                 "enabled", time, f"{side.name} is told to vibrate although it is not enabled"
             )
@@ -214,6 +228,15 @@ class Host:
                 f"{self._lifted:.4f} s",
             )
 
+    def _knows_of_disarmed(self, side: Side) -> bool:
+        """Whether an amplifier is not enabled, and an answer has said so, or the host has done it.
+
+        A fault that it tells unasked may be on its way while a set goes to it, which it refuses.
+        """
+        follower = side.follower
+        is_enabled = follower.state is None or follower.is_enabled
+        return not is_enabled and (follower.is_answered or not follower.is_in_fault)
+
     # what is remembered
 
     def _note(self, side: Side, time: float, asked: Asked) -> None:
@@ -222,6 +245,7 @@ class Host:
                 side.staged = {asked.token: asked}
             case Kind.APPLY | Kind.COMMIT:
                 is_new = asked.token != side.last_token
+                side.told.append(asked.token)
                 drives = self._drives(side, asked)
                 side.vibrates = self._vibrates(side, asked)
                 side.last_token = asked.token
@@ -279,7 +303,7 @@ class Host:
             self._owe(
                 Duty(
                     time + self._times.together,
-                    lambda side=side: side.last_token == token or not first.vibrates,  # type: ignore[misc]
+                    lambda side=side: token in side.told or not first.vibrates,  # type: ignore[misc]
                     "commit",
                     side.plan.wire,
                     f"{first.name} was told at {time:.4f} s to play set {token}, and "

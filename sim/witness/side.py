@@ -42,7 +42,14 @@ class Side:
     is_identified: bool | None = None
     is_open: bool = True
     is_stopped: bool = False
+    armed_at: float = -math.inf  # as it was granted last
     stop_wished: float | None = None
     last_life: float | None = None
     last_token: int = 0
+    told: deque[int] = field(default_factory=lambda: deque(maxlen=_REMEMBERED))  # to play
     overtaken: float = -math.inf  # when silence went before whatever was waited for
+
+    def forget_pending(self) -> None:
+        """Nobody waits for an answer any more."""
+        self.pending.clear()
+        self.overdue.clear()

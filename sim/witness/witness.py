@@ -101,7 +101,17 @@ class Witness:
         def complain(invariant: str, time: float, sentence: str) -> None:
             self._report.add(invariant, plan.wire, time, sentence)
 
-        follower = Follower(name, plan, times=self._plan.times, complain=complain)
+        def complain_unless_troubled(invariant: str, time: float, sentence: str) -> None:
+            if not self._is_troubled(plan.wire):
+                complain(invariant, time, sentence)
+
+        follower = Follower(
+            name,
+            plan,
+            times=self._plan.times,
+            complain=complain_unless_troubled,
+            insist=complain,
+        )
         return Side(name, plan, follower, complain, lambda: self._is_troubled(plan.wire))
 
     @property
@@ -134,7 +144,7 @@ class Witness:
         self._wires[link].begin()
         for side in self._wires[link].sides.values():
             side.is_open, side.is_identified, side.vibrates = True, False, False
-            side.pending.clear()
+            side.forget_pending()
             side.follower.lose_track()
 
     def closed(self, link: str, time: float) -> None:
@@ -142,7 +152,7 @@ class Witness:
         self._pass_to(time)
         for side in self._wires[link].sides.values():
             side.is_open = False
-            side.pending.clear()
+            side.forget_pending()
             side.stop_wished = side.last_life = None
 
     def contacts(
@@ -173,6 +183,9 @@ class Witness:
         """Faults are put on a wire or its amplifiers from now on, or no more."""
         self._pass_to(time)
         self._wires[link].troubled_until = math.inf if are_on else time + _RECOVERY
+        if not are_on:  # what amplifiers did meanwhile need not have been seen
+            for side in self._wires[link].sides.values():
+                side.follower.lose_track()
 
     def levels(
         self,
@@ -249,6 +262,7 @@ class Witness:
                 self._unanswered(side, time, meaning)
             else:
                 side.pending[meaning.key] = (time, meaning)
+                side.overdue.discard(meaning.key)
                 if not meaning.problem and meaning.kind is not Kind.LOOK:
                     self._may_feed(side, time, meaning)
 
@@ -321,6 +335,8 @@ class Witness:
         elif asked.problem:
             rule = "commit" if asked.problem.startswith("torn") else "garbage"
             side.complain(rule, time, f"{side.name} took {asked.kind.value}: {asked.problem}")
+        if asked.kind is Kind.HELLO:
+            self._host.granted(side, time, asked)
         if was_lost or asked.problem:
             return
         if answer.refusal:

@@ -20,6 +20,7 @@ from controller.loop import Controller
 from controller.observer import Applied, Observer
 from controller.touch import Touch, TouchFrame
 from drivers.amplifier import Amplifier
+from drivers.backend import Backend
 from drivers.backends.stand_in import STAND_IN
 from drivers.errors import DriverError
 from drivers.protocol.messages import Reply, Request
@@ -33,9 +34,11 @@ from sim.faults import Faults
 from sim.pseudo_terminal import TERMINAL_MAKER
 from sim.station import Station
 from sim.wires import Wire, open_wires
+from sim.witness.witness import Wish
 from small_table import small_table
 from soak_checks import RELEASE, Checks, Touched
 from soak_plan import Ask, Hand, Plan, Trouble
+from soak_witness import SoakWitness
 from virtual_loop import START, Stuck, VirtualLoop, run_virtual
 
 _ON_THE_WIRE = 0.002  # s; through driver, adapter and back
@@ -107,6 +110,7 @@ def run_plan(plan: Plan, *, trace: TextIO | None = None) -> Outcome:
         counts["pieces on the wires"] += 1
         counts["bytes on the wires"] += len(data)
         run.note("bytes", link, toward, data.hex())
+        run.witness.seen(link, toward, data)
 
     with _errors_of(run):
         try:
@@ -171,15 +175,16 @@ class _Run:
         }
         async with open_wires(wires, [*stations.values()]) as urls:
             self.urls = urls
-            watching = asyncio.create_task(self.checks.watch())
+            self.witness = SoakWitness(
+                loop, urls, channels=_channels(self.rig), release=self._release()
+            )
+            self.checks.sense = self.witness.sense
             self.serving = asyncio.create_task(self._serve())
             await self._play(stations)
             await self._end()
             self.checks.look()
-            watching.cancel()
-            await asyncio.gather(watching, return_exceptions=True)
-            if watching.done() and not watching.cancelled():
-                self.violations.append(f"the watch ended: {watching.exception()!r}")
+            self.violations += self.witness.found()
+            self.counts["frames seen by the witness"] = self.witness.frames
             for station in stations.values():
                 station.close()
         self.checks.close()
@@ -231,6 +236,7 @@ class _Run:
                 case Trouble(number=number, episode=episode):
                     self.counts[f"fault {episode.fault}"] += 1
                     self.note("fault", by_number[number].name, episode)
+                    self.witness.befalls(episode)
                     by_number[number].befall(episode)
                     if episode.fault == "unplug":
                         self._expect_loss(number)
@@ -256,21 +262,27 @@ class _Run:
             self.counts["touch frames"] += 1
             was_touched = self.touched.is_touched(now)
             self.touched.frame(hand.source, now + stamp, touches, now)
+            is_new = not was_touched and self.touched.is_touched(now) and hand.gesture == "hold"
+            must_be_felt = is_new and self._must_be_felt()
+            self.witness.touched(hand.source, now + stamp, touches, must_be_felt=must_be_felt)
             if self.controller is not None:
                 frame = TouchFrame(
                     hand.source, now + stamp, tuple(Touch(*touch) for touch in touches)
                 )
                 self.controller.deliver(frame)
             self.checks.lifted()
-            if not was_touched and self.touched.is_touched(now) and hand.gesture == "hold":
+            if must_be_felt:
                 self._expect_pattern()
+
+    def _must_be_felt(self) -> bool:
+        """Whether a finger that comes to an untouched plate now must be felt soon."""
+        at = self.loop.time() - START
+        is_armed = self.controller is not None and self.controller.phase is Phase.ARMED
+        return is_armed and self.plan.is_calm(at - 0.1, at + _PATTERN)
 
     def _expect_pattern(self) -> None:
         """A finger has come to an untouched plate: it must be felt soon."""
         at = self.loop.time() - START
-        is_armed = self.controller is not None and self.controller.phase is Phase.ARMED
-        if not (is_armed and self.plan.is_calm(at - 0.1, at + _PATTERN)):
-            return
         before = self.counts["patterns"]
         self.counts["touches that must be felt"] += 1
 
@@ -316,8 +328,9 @@ class _Run:
         else:
             await self._call(ask.what, getattr(controller, ask.what))
 
-    async def _call(self, name: str, call: Callable[[], Coroutine[Any, Any, None]]) -> None:
+    async def _call(self, name: Wish, call: Callable[[], Coroutine[Any, Any, None]]) -> None:
         """What an operator asks; a refusal is an answer, too."""
+        self.witness.wish(name)
         self.asking += name == "arm"
         try:
             await call()
@@ -331,6 +344,7 @@ class _Run:
         """The host's process dies; another comes up."""
         self.machine.kill_host()
         self.loop.kill_hosts()
+        self.witness.closes()
         self.serving.cancel()
         await asyncio.gather(self.serving, return_exceptions=True)
         self.serving = asyncio.create_task(self._serve())
@@ -353,6 +367,7 @@ class _Run:
         pauses: Iterator[float] = iter(_PAUSES)
         while not self.is_ending:
             controller = self._make_controller()
+            self.witness.opens()
             try:
                 await controller.open()
                 pauses = iter(_PAUSES)
@@ -365,6 +380,7 @@ class _Run:
             finally:
                 self.controller = None
                 await controller.close()
+                self.witness.closes()
             await asyncio.sleep(next(pauses, _PAUSES[-1]))
 
     async def _run_on(self, controller: Controller) -> None:
@@ -384,13 +400,16 @@ class _Run:
                 lasts, self.stalled_for = self.stalled_for, 0.0
             finally:
                 self.running = None
+            await asyncio.sleep(_ON_THE_WIRE)
+            self.witness.hang(True)
             await asyncio.sleep(lasts)
+            self.witness.hang(False)
 
     def _make_controller(self) -> Controller:
         return Controller(
             self.rig,
             _table(),
-            amplifiers={name: Amplifier(open_backend(url)) for name, url in self.urls.items()},
+            amplifiers={name: Amplifier(_backend(url)) for name, url in self.urls.items()},
             observer=Observer(
                 pattern_applied=self._applied,
                 refused=lambda why: self.note("told refused", why),
@@ -406,6 +425,7 @@ class _Run:
     async def _end(self) -> None:
         """Close everything; then nothing plays, and nobody is left."""
         self.is_ending = True
+        self.witness.wish("disarm")
         if self.controller is not None:
             await self.controller.close()
         else:
@@ -427,6 +447,22 @@ class _Run:
     def _unhandled(self, loop: Any, context: dict[str, Any]) -> None:
         error = context.get("exception")
         self.checks.violate(f"unhandled: {context['message']} {error!r}")
+
+
+def _channels(rig: Rig) -> int:
+    """How many channels each amplifier has."""
+    return 1 + max(channel.number for channel in rig.wiring.values())
+
+
+_BACKENDS: dict[str, type[Backend]] = {}
+
+
+def _backend(url: str) -> Backend:
+    """A backend for a URL; to look among all that is installed for each run would take long."""
+    scheme = url.partition("://")[0]
+    if scheme not in _BACKENDS:
+        _BACKENDS[scheme] = type(open_backend(url))
+    return _BACKENDS[scheme](url)
 
 
 @contextmanager

@@ -20,7 +20,9 @@ from drivers.protocol.messages import (
     Request,
     State,
 )
+from sim.amplifier import SimulatedAmplifier
 from sim.bench import Bench
+from sim.waveform import level_of
 from soak_plan import Plan
 
 AUDIBLE = 1e-3  # of full stroke; below it a ramp counts as ended
@@ -31,7 +33,7 @@ RELEASE = 0.020  # s; from the last finger up to zero
 RELEASE_WITH_FAULTS = 3 * 0.15 + WATCHDOG + 0.1
 TOGETHER = 0.6  # s; until all are silent after one of them has a fault
 STEP = 0.010  # s; how often is looked while something vibrates
-IDLE_STEP = 0.100
+IDLE_STEP = 1.0
 _NOT_FEEDING = (Hello, GetCaps, GetStatus, GetFaults)
 _FAULTED = (State.FAULT, State.FAULT_REACTION_ACTIVE)
 _PLAYING = (
@@ -93,11 +95,16 @@ class Checks:
         self._touched = touched
         self._arming = arming
         self._fed = dict.fromkeys(bench.amplifiers, -math.inf)
-        self._due: dict[str, asyncio.TimerHandle] = {}
+        self.sense: Callable[[str, SimulatedAmplifier], None] = lambda name, amplifier: None
+        """Is told of every amplifier whenever it is looked at."""
+        self._starving: dict[str, asyncio.TimerHandle] = {}
+        self._releasing: asyncio.TimerHandle | None = None
+        self._is_closed = False
         self._tokens: dict[str, set[int]] = {name: set() for name in bench.amplifiers}
         self._token = dict.fromkeys(bench.amplifiers, 0)
         self._faulted: dict[str, float] = {}
         self._loop = asyncio.get_running_loop()
+        self._next = self._loop.call_later(IDLE_STEP, self._watch)
         for name, amplifier in bench.amplifiers.items():
             amplifier.listeners.append(lambda event, at, name=name: self._told(name, event, at))
 
@@ -106,34 +113,26 @@ class Checks:
         if len(self.violations) < 20:
             self.violations.append(f"{self._loop.time() - self._begin:.6f} {what}")
 
-    async def watch(self) -> None:
-        """Move the bench and look, until cancelled."""
-        while True:
-            is_quiet = self.look()
-            await asyncio.sleep(IDLE_STEP if is_quiet else STEP)
-
-    def look(self) -> bool:
-        """Look now; whether all is quiet."""
+    def look(self) -> None:
+        """Move the bench until now, and look."""
         now = self._loop.time()
         self._bench.advance(now)
-        levels = {
-            name: max(amplifier.status(now).levels, default=0.0)
-            for name, amplifier in self._bench.amplifiers.items()
-        }
-        loud = {name: level for name, level in levels.items() if not level <= AUDIBLE}
-        for name, level in loud.items():
-            self._check_loud(name, level, now)
+        loud = {}
+        for name, amplifier in self._bench.amplifiers.items():
+            level = max((level_of(output, now) for output in amplifier.outputs), default=0.0)
+            if not level <= AUDIBLE:
+                loud[name] = level
+                self._check_loud(name, level, now)
+            self.sense(name, amplifier)
         if loud:
             self._check_touched(loud, now)
-        return not loud and not any(
-            amplifier.state is State.OPERATION_ENABLED
-            for amplifier in self._bench.amplifiers.values()
-        )
 
     def lifted(self) -> None:
         """The last finger has gone, or will have when its lease ends: look when zero is due."""
+        if self._releasing is not None:
+            self._releasing.cancel()
         due = max(self._touched.last, self._loop.time()) + self._release + 1e-6
-        self._loop.call_at(due, self.look)
+        self._releasing = self._loop.call_at(due, self.look)
 
     def exchanged(self, name: str, request: Request, reply: Reply | None) -> None:
         """An amplifier was asked something, and answered or not."""
@@ -156,14 +155,41 @@ class Checks:
         self._check_limits(name)
         if not isinstance(request, _NOT_FEEDING):
             self._fed[name] = now
-            if name in self._due:
-                self._due[name].cancel()
-            self._due[name] = self._loop.call_at(now + WATCHDOG + 1e-6, self.look)
+            if name not in self._starving:
+                self._expect_silence(name)
+        if self._plays() and self._next.when() > now + STEP:
+            self._watch()
 
     def close(self) -> None:
         """Look no more."""
-        for timer in self._due.values():
+        self._is_closed = True
+        self._next.cancel()
+        for timer in self._starving.values():
             timer.cancel()
+
+    def _watch(self) -> None:
+        """Look again and again, as often as what plays makes it worth it."""
+        self._next.cancel()
+        self.look()
+        self._next = self._loop.call_later(STEP if self._plays() else IDLE_STEP, self._watch)
+
+    def _plays(self) -> bool:
+        now = self._loop.time()
+        return any(
+            tone.silent_from > now
+            for amplifier in self._bench.amplifiers.values()
+            for output in amplifier.outputs
+            for tone in output
+        )
+
+    def _expect_silence(self, name: str) -> None:
+        """Look when the watchdog of an amplifier must have silenced it, if nobody feeds it."""
+        due = self._fed[name] + WATCHDOG + 1e-6
+        if self._loop.time() >= due:
+            self._starving.pop(name, None)
+            self.look()
+        elif not self._is_closed:
+            self._starving[name] = self._loop.call_at(due, self._expect_silence, name)
 
     def _told(self, name: str, event: Event, at: float) -> None:
         if event.state in _FAULTED:

@@ -170,9 +170,8 @@ async def late_copy(chain: Chain) -> None:
         return data
 
     await chain.arm()
-    chain.touch(1)
-    await asyncio.sleep(0)
     chain.between.mangle = keep
+    chain.touch(1)
     await chain.rest(0.03)
     chain.touch(1, 2)
     await chain.rest(0.1)

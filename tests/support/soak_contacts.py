@@ -1,0 +1,40 @@
+"""Which fingers are on the plate, by the touch frames alone and docs/touch.md."""
+
+import math
+from collections.abc import Sequence
+from typing import TypeAlias
+
+LEASE = 0.150  # s; a source without news for so long has lost its fingers
+
+FrameTouches: TypeAlias = Sequence[tuple[int, float, float]]
+"""Of one frame: id, x, y, where 0 to 1 is the plate."""
+
+
+class SourceContacts:
+    """The contacts of every source, by source and id; times [s]."""
+
+    def __init__(self) -> None:
+        self._now: dict[str, tuple[float, frozenset[tuple[str, int]]]] = {}
+
+    def frame(self, source: str, stamp: float, touches: FrameTouches, now: float) -> None:
+        """A frame has been delivered, and replaces what its source has said before."""
+        last = {number: (x, y) for number, x, y in touches}
+        numbers = frozenset(
+            (source, number)
+            for number, (x, y) in last.items()
+            if 0 <= x <= 1 and 0 <= y <= 1  # NaN is not
+        )
+        is_heard = math.isfinite(stamp)
+        self._now[source] = (
+            min(stamp, now) + LEASE if is_heard else -math.inf,
+            numbers if is_heard else frozenset(),
+        )
+
+    def at(self, now: float) -> frozenset[tuple[str, int]]:
+        """All that are on the plate."""
+        return frozenset().union(*(keys for end, keys in self._now.values() if now < end))
+
+    def next_end(self, now: float) -> float:
+        """When the first source is overdue if nothing more is heard; infinity if none can be."""
+        ends = [end for end, keys in self._now.values() if keys and end > now]
+        return min(ends, default=math.inf)

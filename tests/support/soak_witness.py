@@ -1,0 +1,134 @@
+"""The witness in a soak run: it is shown every piece of bytes, and told what people do.
+
+What it knows comes from the wires, the touches, the operator and the faults of the plan; nothing
+from the controller but when it opens its links and closes them.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from sim.amplifier import SimulatedAmplifier
+from sim.faults import Episode
+from sim.waveform import level_of
+from sim.witness.place import place_of
+from sim.witness.witness import Wish, Witness
+from soak_contacts import FrameTouches, SourceContacts
+from virtual_loop import START, VirtualLoop
+
+_CHANNEL = {"frequency_hz": [40, 500], "level": 1.0}
+"""The paper's rig: its band and its levels, written by hand."""
+
+_TOUCH = 0.19  # s; from a touch to its pattern
+_RAMP = 0.040  # s; along which what plays may fall silent after the last lift
+_ENDED = 1e-6  # s; after a lease has ended
+
+
+class SoakWitness:
+    """A witness on all wires of a run, by amplifiers' URLs; channels: how many each has.
+
+    release [s]: from the last lift to the command of silence, on the slowest wire of them.
+    """
+
+    def __init__(
+        self, loop: VirtualLoop, urls: Mapping[str, str], *, channels: int, release: float
+    ) -> None:
+        places = {name: place_of(url) for name, url in urls.items()}
+        plan: dict[str, Any] = {
+            "wires": {place.place: place.kind for place in places.values()},
+            "amplifiers": {
+                name: {
+                    "wire": place.place,
+                    "address": place.address,
+                    "channels": dict.fromkeys(range(channels), _CHANNEL),
+                }
+                for name, place in places.items()
+            },
+            "times_s": {"lift": release, "release": release + _RAMP, "touch": _TOUCH},
+        }
+        self._loop = loop
+        self._witness = Witness(plan)
+        self._open: set[str] = set()
+        self._contacts = SourceContacts()
+        self._troubles = 0
+        self._witness.contacts(loop.time(), ())
+        self.closes()
+
+    def seen(self, link: str, toward: str, data: bytes) -> None:
+        """Bytes go out; what comes to a link that no host has open is heard by nobody."""
+        if link in self._open:
+            self._witness.bytes(link, toward, self._loop.time(), data)  # type: ignore[arg-type]
+
+    def opens(self) -> None:
+        """A host is about to open all wires."""
+        for link in self._witness.wires:
+            self._open.add(link)
+            self._witness.opened(link, self._loop.time())
+
+    def closes(self) -> None:
+        """The host has closed all, or died."""
+        for link in self._witness.wires:
+            self._open.discard(link)
+            self._witness.closed(link, self._loop.time())
+
+    def wish(self, what: Wish) -> None:
+        """An operator wants this."""
+        self._witness.wish(self._loop.time(), what)
+
+    def hang(self, is_hung: bool) -> None:
+        """The control loop stands still from now on, or goes on."""
+        self._witness.hang(self._loop.time(), is_hung)
+
+    def touched(
+        self, source: str, stamp: float, touches: FrameTouches, *, must_be_felt: bool
+    ) -> None:
+        """A frame is about to be delivered; stamp [s]: of which time it says that it is."""
+        now = self._loop.time()
+        self._contacts.frame(source, stamp, touches, now)
+        self._witness.contacts(now, self._contacts.at(now), is_answerable=must_be_felt)
+        if (end := self._contacts.next_end(now)) < math.inf:
+            self._loop.call_at(end + _ENDED, self._look_at_leases)
+
+    def befalls(self, episode: Episode) -> None:
+        """A fault begins. What it does to one wire, a controller of all may show on each."""
+        self._troubles += 1
+        self._tell_trouble()
+        lasts = episode.lasts + (episode.delay if episode.fault == "delay" else 0.0)
+        self._loop.call_later(lasts, self._over)
+
+    def sense(self, name: str, amplifier: SimulatedAmplifier) -> None:
+        """What sensors find on an amplifier's channels just now."""
+        now = self._loop.time()
+        levels = [min(level_of(output, now), 1.0) for output in amplifier.outputs]
+        frequencies = {
+            channel: tone.frequency
+            for channel, output in enumerate(amplifier.outputs)
+            for tone in output
+            if tone.lasts
+        }
+        self._witness.levels(now, name, levels, frequencies=frequencies)
+
+    def found(self) -> Sequence[str]:
+        """What it has found until now, with the frames around it."""
+        return [
+            f"{one.time - START:.6f} {one.wire} {one.invariant}: {one.sentence}"
+            + "".join(f"\n        {frame}" for frame in one.frames)
+            for one in self._witness.finish(self._loop.time())
+        ]
+
+    @property
+    def frames(self) -> int:
+        """How many it has seen."""
+        return self._witness.frames
+
+    def _look_at_leases(self) -> None:
+        now = self._loop.time()
+        self._witness.contacts(now, self._contacts.at(now))
+
+    def _over(self) -> None:
+        self._troubles -= 1
+        self._tell_trouble()
+
+    def _tell_trouble(self) -> None:
+        for link in self._witness.wires:
+            self._witness.faults(self._loop.time(), link, are_on=self._troubles > 0)

@@ -46,7 +46,7 @@ def find_switched(fields: Fields, least: float) -> Drive | None:
         return None
     quiet = magnitudes_of_sources(fields.quiet)
     powers = _powers(felt, fields)
-    power = np.min([rows.mean(axis=1) for rows in powers], axis=0)
+    power = np.array([rows.mean(axis=1) for rows in powers])
     loud = quiet.mean(axis=1) if fields.is_alone else quiet @ _shares(quiet)
 
     def value(one: IntArray, other: IntArray) -> Single:
@@ -67,8 +67,9 @@ def find_switched(fields: Fields, least: float) -> Drive | None:
     if alone.max() > contrast:
         contrast, best = float(alone.max()), (int(alone.argmax()), nothing)
     one, other = _pairs(peak - contrast * loud, fields)
-    # The mean of a root is at most the root of the mean.
-    reaches = power[one] + power[other] >= fields.wanted**2
+    # The mean of a root is at most the root of the mean; one source may serve one target, the other
+    # the other.
+    reaches = (power[:, one] + power[:, other] >= fields.wanted**2).all(axis=0)
     one, other = one[reaches], other[reaches]
     bound = (peak[one] + peak[other]) / (loud[one] + loud[other])
     closer = fields.is_alone

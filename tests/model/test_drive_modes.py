@@ -74,7 +74,7 @@ def contrast_by_hand(given, drive_index, weights):
 
 @pytest.mark.parametrize("is_alone", [False, True])
 @pytest.mark.parametrize("targets", [1, 2])
-@pytest.mark.parametrize("wanted", [1e-6, 1.4])
+@pytest.mark.parametrize("wanted", [1e-6, 1.4, 2.0])
 def test_switched_finds_the_best_of_all_patterns(is_alone, targets, wanted, monkeypatch):
     """One or two ERAs of three at five frequencies, every pattern tried by hand."""
     monkeypatch.setattr(switched_mode, "AT_ONCE", 3)
@@ -162,6 +162,20 @@ def test_phased_for_one_quiet_point_is_the_closed_form():
         for f in range(F):
             q, t = given.quiet[f, :, 0].astype(complex), given.targets[0][f, :, 0]
             R = np.outer(q.conj(), q) + ERROR_SHARE**2 * np.diag(np.abs(q) ** 2)
+            best = max(best, np.sqrt((t @ np.linalg.solve(R, t.conj())).real))
+        drive = MODES["phased"].find(given, 0.0)
+        assert judge(given, drive).score == pytest.approx(best, rel=1e-3)
+
+
+def test_phased_for_a_lone_finger_is_the_closed_form():
+    """What is around it counts by its mean power, so at every frequency it is h^H R^-1 h."""
+    for seed in range(5):
+        given = random_fields(seed, points=1, is_alone=True)
+        best = 0.0
+        for f in range(F):
+            q, t = given.quiet[f].astype(complex), given.targets[0][f, :, 0]
+            power = (np.abs(q) ** 2).mean(axis=1)
+            R = q.conj() @ q.T / q.shape[1] + ERROR_SHARE**2 * np.diag(power)
             best = max(best, np.sqrt((t @ np.linalg.solve(R, t.conj())).real))
         drive = MODES["phased"].find(given, 0.0)
         assert judge(given, drive).score == pytest.approx(best, rel=1e-3)

@@ -153,9 +153,11 @@ def test_amplifiers_with_envelopes_get_the_best_steady_pattern(mode):
             assert tone.phase == pytest.approx(tones[name].phase)
 
 
-def test_a_plate_on_two_eras_has_answers_all_the_same():
+@pytest.mark.parametrize("count", [1, 2])
+def test_a_plate_on_one_or_two_eras_has_answers_all_the_same(count):
     """It would tip over, so it has no motion in time to choose by; contrast it has."""
     rig = smooth_rig()
-    table = build_table(replace(rig, eras=rig.eras[:2]), frequencies=FREQUENCIES[::3])
-    question = Question(((0.09, 0.07),), ((0.25, 0.18),), mode="phased")
-    assert table.ask(question).contrast_db > 0
+    table = build_table(replace(rig, eras=rig.eras[:count]), frequencies=FREQUENCIES[::3])
+    for mode in ("switched", "phased"):
+        question = Question(((0.09, 0.07),), ((0.25, 0.18),), mode=mode)
+        assert table.ask(question).contrast_db > 0

@@ -202,3 +202,19 @@ def test_a_lone_finger_is_told_from_the_plate_around_it(mode):
     ratio = 20 * np.log10(peak[:count].mean() / np.sqrt((peak[count:] ** 2).mean()))
     assert pattern.surroundings_contrast_db == pytest.approx(ratio, abs=0.01)
     assert pattern.contrast_db is None
+
+
+def test_two_fingers_alone_are_told_from_what_is_near_neither():
+    """Both are targets; only cells beyond 5 cm of the one and of the other are around them."""
+    table = smooth_table()
+    places = (TARGET, QUIET[0])
+    pattern = table.ask(Question(places, mode="phased"))
+    centres = table.cell_centres
+    far = centres[[min(math.dist(centre, each) for each in places) > 0.05 for centre in centres]]
+    discs = [fingertip_points(*each, table.plate) for each in places]
+    peaks = [
+        table.amplitudes(pattern.excitation, points)[1].sum(axis=0) for points in (*discs, far)
+    ]
+    felt = min(peak.mean() for peak in peaks[:2])
+    ratio = 20 * np.log10(felt / np.sqrt((peaks[2] ** 2).mean()))
+    assert pattern.surroundings_contrast_db == pytest.approx(ratio, abs=0.01)

@@ -34,8 +34,11 @@ MEMBERS = Ensemble(
 )
 
 
-def directly(rig, pattern, member):
-    """Contrast [dB] by the sparse direct solve of that plate with the fingers on it."""
+def directly(rig, pattern, member, *, targets=1):
+    """Contrast [dB] by the sparse direct solve of that plate with the fingers on it.
+
+    targets: how many of the places are; the lesser one counts.
+    """
     scale, damping = MEMBERS.thickness[member], MEMBERS.damping[member]
     plate = replace(
         rig.plate,
@@ -60,8 +63,9 @@ def directly(rig, pattern, member):
     )
     weights = bases / [era.stroke for era in rig.eras] * MEMBERS.drive[member]
     peak = np.abs(np.einsum("fe,fep->fp", weights, unit)).sum(axis=0)
-    count = len(discs[0])
-    return 20 * np.log10(peak[:count].mean() / peak[count:].max())
+    peaks = np.split(peak, np.cumsum([len(disc) for disc in discs])[:-1])
+    felt = min(each.mean() for each in peaks[:targets])
+    return 20 * np.log10(felt / max(each.max() for each in peaks[targets:]))
 
 
 @pytest.mark.parametrize("mode", ["switched", "phased"])
@@ -73,6 +77,15 @@ def test_each_plate_is_what_the_direct_solver_says(mode):
     solved = [directly(smooth_rig(), pattern, member) for member in range(3)]
     np.testing.assert_allclose(found, solved, atol=0.1)
     assert np.ptp(solved) > 0.3  # the plates do differ
+
+
+def test_of_two_targets_the_lesser_one_counts():
+    """The second of them is a target too and no quiet finger, on each plate as solved directly."""
+    question = Question((TARGET, QUIET[0]), QUIET[1:], mode="switched")
+    pattern = smooth_table().ask(question)
+    found = ensemble_contrast_db(smooth_table(), question, pattern.excitation, MEMBERS)
+    solved = [directly(smooth_rig(), pattern, member, targets=2) for member in range(3)]
+    np.testing.assert_allclose(found, solved, atol=0.1)
 
 
 def test_what_was_measured_of_a_rig_counts_on_each_plate():

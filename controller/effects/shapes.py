@@ -3,9 +3,12 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Protocol, TypeAlias
 
 Point: TypeAlias = tuple[float, float]
+
+_SIDE = 1e-9  # m; a point this near to a side lies on it
 
 
 class Shape(Protocol):
@@ -81,6 +84,8 @@ class Polygon:
 
     def contains(self, x: float, y: float) -> bool:
         """Whether a point is within: a ray to the east crosses the sides an odd number of times."""
+        if not self._box.contains(x, y):
+            return False
         is_within = False
         for (x0, y0), (x1, y1) in zip(self.points, (*self.points[1:], self.points[0]), strict=True):
             if _is_on_side(x, y, (x0, y0), (x1, y1)):
@@ -88,6 +93,17 @@ class Polygon:
             if (y0 > y) != (y1 > y) and x < x0 + (y - y0) / (y1 - y0) * (x1 - x0):
                 is_within = not is_within
         return is_within
+
+    @cached_property
+    def _box(self) -> Rectangle:
+        """What all of it lies in: most fingers are outside, and looking at every side is slow."""
+        xs, ys = zip(*self.points, strict=True)
+        return Rectangle(
+            min(xs) - _SIDE,
+            min(ys) - _SIDE,
+            max(xs) - min(xs) + 2 * _SIDE,
+            max(ys) - min(ys) + 2 * _SIDE,
+        )
 
     def corners(self) -> Sequence[Point]:
         """All of them."""
@@ -105,4 +121,4 @@ def _is_on_side(x: float, y: float, start: Point, end: Point) -> bool:
         return (x, y) == start
     along = ((x - start[0]) * (end[0] - start[0]) + (y - start[1]) * (end[1] - start[1])) / length
     across = ((x - start[0]) * (end[1] - start[1]) - (y - start[1]) * (end[0] - start[0])) / length
-    return abs(across) <= 1e-9 and -1e-9 <= along <= length + 1e-9
+    return abs(across) <= _SIDE and -_SIDE <= along <= length + _SIDE

@@ -213,6 +213,18 @@ def test_priority_and_the_newest() -> None:
     assert wanted(player, [first, urgent], 0.3) == {1: 20.0}
 
 
+def test_the_first_end_is_when_to_look_again() -> None:
+    """Of a click of 40 ms and a detent of 30 ms at two fingers it is after the detent."""
+    slider = Region("slider", LEFT, on_move="dots")
+    effects: dict[str, Effect] = {"dots": Detents(duration=0.03), "click": Click(duration=0.04)}
+    player = EffectPlayer(Layout((slider,), effects, elsewhere="click"))
+    player.wish([finger(1, 0.05)], 0.0)
+    fingers = [finger(1, 0.056), finger(2, 0.15)]
+    assert player.wish(fingers, 1.0).until == pytest.approx(1.03)
+    assert player.wish(fingers, 1.03).until == pytest.approx(1.04)
+    assert player.wish(fingers, 1.04).until is None
+
+
 def test_several_at_once() -> None:
     """Where the layout allows two, the two newest of the highest priority feel their own levels."""
     region = Region("left", LEFT, on_press="soft", on_move=None)

@@ -30,10 +30,11 @@ _CLOSE = (1e-4, 2e-3)  # of full stroke, and of the level: steps on the wire, an
 
 @dataclass(frozen=True)
 class Command:
-    """A set as it arrived at the far end: when [s], its frame's number, and what it plays."""
+    """A set as it arrived at the far end: when [s], its frame's number, token and what it plays."""
 
     time: float
     sequence: int
+    token: int
     commands: tuple[DriveCommand, ...]
 
     @classmethod
@@ -42,7 +43,8 @@ class Command:
         when, sequence, payload = line
         request = decode_request(Frame(kind, 1, int(sequence), bytes.fromhex(str(payload))))
         assert isinstance(request, Apply)
-        return cls(int(when) * 1e-9, int(sequence), request.command_set.commands)
+        wanted = request.command_set
+        return cls(int(when) * 1e-9, int(sequence), wanted.token, wanted.commands)
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import os
 import resource
 import signal
 import socket
@@ -18,6 +19,8 @@ from model.errors import InputError
 
 _MOST_CONCURRENT = 256  # requests and connections; beyond it 503
 _LARGEST_MESSAGE = 1 << 16
+_MOST_SENT = 1 << 17  # bytes that the system keeps of what a connection has not read
+_NICER = 10  # than whoever starts it: the daemon's control loop goes first where both want to run
 _ENDING = 0.3  # s; for connections to end by themselves
 
 
@@ -52,6 +55,7 @@ class _Server(uvicorn.Server):
 
 async def serve(settings: Settings, *, announce: Callable[[int], None]) -> None:
     """Serve until SIGINT or SIGTERM; announce is told the port. Raises InputError."""
+    os.nice(_NICER)
     _allow_many_descriptors()
     _check_certificate(settings)
     gateway = Gateway(settings)
@@ -111,6 +115,8 @@ def _listen(settings: Settings) -> socket.socket:
     listening = socket.socket(family, socket.SOCK_STREAM)
     try:
         listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        # Of each connection that comes; the system's own bound is some megabytes.
+        listening.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _MOST_SENT)
         listening.bind((settings.host, settings.port))
     except OSError as error:
         listening.close()

@@ -72,7 +72,7 @@ def era(daemon: Path) -> Iterator[Client]:
     """The daemon itself, ready to be armed; disarmed afterwards."""
     with Client.connect(daemon, name="test") as client:
         yield client
-        if client.status().state == STOPPED:
+        if client.status().state in (STOPPED, "FAULT"):
             client.clear()
         client.disarm()
         wait_for_state(client, READY)
@@ -265,8 +265,8 @@ async def test_arm_disarm_stop_and_clear_by_their_buttons(page: Page, era: Clien
     assert page.complaints == []
 
 
-async def test_the_lease_is_renewed_while_the_page_is_open(page: Page, era: Client) -> None:
-    """And runs out when it is closed: nobody is there to feel or to stop."""
+async def test_it_is_armed_while_the_page_is_open(page: Page, era: Client) -> None:
+    """The lease is renewed meanwhile; who closes the page disarms, for they could not stop."""
     await arm(page, era)
 
     def left() -> float:
@@ -276,6 +276,7 @@ async def test_the_lease_is_renewed_while_the_page_is_open(page: Page, era: Clie
     await asyncio.to_thread(wait_for, lambda: left() > 4.5)  # by itself it only falls
     await page.call("Page.navigate", url="about:blank")
     await until_state(era, READY)
+    assert era.status().cause == "disarmed by 'gateway'"
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,8 @@
 """`python tests/support/dashboard_pictures.py FOLDER`: the dashboard as it looks, on every screen.
 
 A daemon over a simulated amplifier with the example's surface layout, armed, two fingers on the
-plate: on a desktop, a tablet and a phone, in light and dark.
+plate: on a desktop, a tablet and a phone, in light and dark. docs/pictures/dashboard.png is
+dashboard_desktop_light.png of these.
 """
 
 import asyncio

@@ -199,6 +199,9 @@ function enter(token) {
   });
 }
 
+// Whoever leaves the page cannot stop any more.
+window.addEventListener("pagehide", () => lease && link.post("disarm").catch(() => {}));
+
 at("arm").addEventListener("click", arm);
 at("disarm").addEventListener("click", () => ask("disarm"));
 at("clear").addEventListener("click", () => ask("clear"));

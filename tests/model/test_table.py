@@ -452,9 +452,27 @@ def not_a_number(header, arrays):
     arrays["acceleration"][0, 0, 0] = np.nan
 
 
+def another_plates_fingerprint(header, arrays):
+    """So that it would serve a rig that it was not built for."""
+    header["fingerprint"] = "0" * 64
+
+
+def raster_of_another_size(header, arrays):
+    """Fingers would be looked for elsewhere."""
+    header["raster"]["length"] *= 1.1
+
+
+def unknown_mode(header, arrays):
+    """What no question could be answered in."""
+    header["mode"] = "loud"
+
+
 @pytest.mark.parametrize(
     ("change", "says"),
     [
+        (another_plates_fingerprint, "fingerprint is not that of the plate"),
+        (raster_of_another_size, "raster is not of the plate's size"),
+        (unknown_mode, "unknown drive mode 'loud'"),
         (raster_that_is_no_count, "bad header .raster.nx"),
         (nothing_moves, "acceleration is zero everywhere"),
         (more_than_any_plate, r"values up to 1e\+30"),

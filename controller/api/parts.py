@@ -1,6 +1,6 @@
 """What several messages of the API are made of; every number's key carries its unit."""
 
-from typing import Annotated, Literal, TypeAlias
+from typing import Annotated, Any, Literal, TypeAlias
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -169,4 +169,4 @@ class EffectDescription(Message):
     name: str
     kind: str
     description: str
-    parameters: dict[str, float | str | bool | None]
+    parameters: dict[str, Any] = Field(description="by their names in a layout, in SI units")

@@ -42,7 +42,7 @@ class Meaning:
                     name=name,
                     kind=effect.kind,
                     description=(type(effect).__doc__ or "").partition("\n")[0],
-                    parameters=effect.model_dump(),
+                    parameters=effect.model_dump(mode="json"),
                 )
                 for name, effect in sorted(self._player.layout.effects.items())
             ]

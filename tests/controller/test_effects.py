@@ -7,6 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from controller.contacts import Contact, ContactKey
+from controller.daemon.meaning import Meaning
 from controller.effects.effect import Course, Effect, Feeling, Nothing
 from controller.effects.kinds import effect_kind, effect_kinds
 from controller.effects.layout import Layout, Region
@@ -374,6 +375,21 @@ def test_shapes(
     """Edges and corners belong to a shape."""
     assert [shape.contains(*point) for point in inside] == [True] * len(inside)
     assert [shape.contains(*point) for point in outside] == [False] * len(outside)
+
+
+def test_effects_of_plug_ins_are_listed() -> None:
+    """Whatever parameters they have, as JSON; they disturb the list of the others in nothing."""
+
+    class Rhythm(Buzz):
+        """Beats of one's own."""
+
+        beats: tuple[float, ...] = (0.1, 0.2)
+        count: int = 3
+
+    listed = Meaning(Layout(effects={"buzz": Buzz(), "rhythm": Rhythm()})).effects().effects
+    (_, rhythm) = (each.model_dump(mode="json") for each in listed)
+    assert rhythm["description"] == "Beats of one's own."
+    assert (rhythm["parameters"]["beats"], rhythm["parameters"]["count"]) == ([0.1, 0.2], 3)
 
 
 def test_kinds() -> None:

@@ -26,6 +26,7 @@ from wires import FarSide
 
 ERA = Path(sys.executable).with_name("era")
 READY, ENABLED = "READY_TO_SWITCH_ON", "OPERATION_ENABLED"
+STARTING = 60.0  # s; for a loaded machine
 WATCHDOG, REACTION = 0.25, 0.005  # s; what an amplifier may take to be silent
 
 
@@ -52,7 +53,10 @@ class DaemonProcess:
 
     async def serves(self) -> None:
         """Wait until it does; fails where it ends instead."""
-        await until(lambda: self.said("serving at") or self.process.returncode is not None)
+        await until(
+            lambda: self.said("serving at") or self.process.returncode is not None,
+            patience=STARTING,
+        )
         assert self.process.returncode is None, self.log
 
 
@@ -154,13 +158,15 @@ async def ready(era: AsyncClient) -> None:
 
 async def play(era: AsyncClient, far: FarSide) -> None:
     """Armed, and heard for the finger that somebody holds down: again where it has been lost."""
-    while True:
+    end = time.monotonic() + STARTING
+    while time.monotonic() < end:
         with contextlib.suppress(RpcError, AssertionError):
             if (await era.status()).state != ENABLED:
                 await ready(era)
                 await era.arm("test", lease_s=60)
             await until(lambda: loudness(far) > 0, patience=2.0)
             return
+    raise AssertionError("nothing is ever played")
 
 
 @dataclass

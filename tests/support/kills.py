@@ -16,15 +16,15 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from controller.api.async_client import AsyncClient
 from controller.api.jsonrpc import RpcError
 from controller.api.replies import Unreachable
-from daemon_bench import PATIENCE, until, until_state
-from daemon_process import REACTION, WATCHDOG, DaemonProcess, daemon_process
+from daemon_bench import until, until_state
+from daemon_process import REACTION, STARTING, WATCHDOG, DaemonProcess, daemon_process
 from drivers.protocol.messages import State
 from journal import Journal, energised, loudness
 from model.rig_file import load_rig
@@ -35,7 +35,7 @@ from wires import WIRES, far_side
 READY = "READY_TO_SWITCH_ON"
 LIMIT = WATCHDOG + REACTION  # s; on the amplifier's clock, from its last sign of life
 UNDER_WAY = 3  # requests that were on the wire when the daemon died: one, a stop and its repetition
-STARTING = 0.1  # share of the daemons that are killed before they serve
+EARLY = 0.1  # share of the daemons that are killed before they serve
 LONGEST_LIFE = 0.8  # s; from when it was armed first
 _AT_ONCE = 3  # wires side by side: also what loads the machine
 
@@ -73,9 +73,13 @@ class Kill:
 
 
 async def kill_daemons(
-    place: tuple[str, Wire, Sequence[tuple[str, str]]], kills: int, *, seed: int
+    place: tuple[str, Wire, Sequence[tuple[str, str]]],
+    kills: int,
+    *,
+    seed: int,
+    tell: Callable[[Kill], None] | None,
 ) -> list[Kill]:
-    """So many daemons, one after the other, at the same amplifiers."""
+    """So many daemons, one after the other, at the same amplifiers; tell is told of each."""
     name, wire, changes = place
     chance = random.Random(seed)
     with tempfile.TemporaryDirectory(prefix="era-kills-") as made:
@@ -85,18 +89,20 @@ async def kill_daemons(
             journal = Journal(far)
             done = []
             for _ in range(kills):
-                starts = chance.random() < STARTING
+                starts = chance.random() < EARLY
                 async with daemon_process(folder, far, changes=changes, waits=not starts) as daemon:
                     armed = asyncio.Event()
                     living = asyncio.create_task(
                         _live(daemon, random.Random(chance.random()), armed)
                     )
                     if not starts:
-                        await asyncio.wait_for(armed.wait(), PATIENCE)
+                        await asyncio.wait_for(armed.wait(), STARTING)
                     await asyncio.sleep(chance.uniform(0.0, LONGEST_LIFE))
                     done.append(await _kill(name, daemon, journal))
                     living.cancel()
                     await asyncio.gather(living, return_exceptions=True)
+                    if tell is not None:
+                        tell(done[-1])
             return done
 
 
@@ -156,7 +162,9 @@ async def _once(era: AsyncClient, chance: random.Random, armed: asyncio.Event) -
     await chance.choice((era.disarm, era.stop))()
 
 
-async def kill_everywhere(kills: int, *, seed: int) -> list[Kill]:
+async def kill_everywhere(
+    kills: int, *, seed: int, tell: Callable[[Kill], None] | None = None
+) -> list[Kill]:
     """So many kills, half of them over a serial line, the others shared among the other places."""
     others = len(PLACES) - 1
     shares = [kills - kills // 2, *(kills // 2 // others for _ in range(others))]
@@ -165,9 +173,13 @@ async def kill_everywhere(kills: int, *, seed: int) -> list[Kill]:
 
     async def at(number: int) -> list[Kill]:
         async with free:
-            return await kill_daemons(PLACES[number], shares[number], seed=seed + number)
+            return await kill_daemons(PLACES[number], shares[number], seed=seed + number, tell=tell)
 
-    return [kill for each in await asyncio.gather(*map(at, range(len(PLACES)))) for kill in each]
+    done = await asyncio.gather(*map(at, range(len(PLACES))), return_exceptions=True)
+    for each in done:  # once all have come to their end
+        if isinstance(each, BaseException):
+            raise each
+    return [kill for each in done for kill in each]
 
 
 def table(kills: Iterable[Kill]) -> str:
@@ -197,7 +209,13 @@ def main() -> int:
     parser.add_argument("--kills", type=int, default=200)
     parser.add_argument("--seed", type=int, default=1)
     given = parser.parse_args()
-    kills = asyncio.run(kill_everywhere(given.kills, seed=given.seed))
+    dots = sys.stderr.write if sys.stderr.isatty() else None
+
+    def tell(kill: Kill) -> None:
+        if dots is not None:
+            dots("." if kill.is_good else "!")
+
+    kills = asyncio.run(kill_everywhere(given.kills, seed=given.seed, tell=tell))
     sys.stdout.write(f"{table(kills)}\n")
     bad = [kill for kill in kills if not kill.is_good]
     for kill in bad:

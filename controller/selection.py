@@ -153,10 +153,9 @@ class Selector:
         if not targets:
             return Selection((), quiet, None, wish.reason)
         try:
-            question = self._question(targets, quiet)
-            pattern = self._table.ask(question)
-            if all(target.level_db_sl is None for _, target in targets):
-                pattern = strongest(pattern, self.means.largest)
+            question, pattern = self._ask(
+                self._question(targets, quiet), [target for _, target in targets]
+            )
             felt = self._felt(targets, quiet, pattern)
         except InputError as error:
             return Selection(targets, quiet, None, str(error))
@@ -164,6 +163,20 @@ class Selector:
             _logger.exception("the table failed, all channels fall silent")
             return Selection(targets, quiet, None, f"{type(error).__name__}: {error}")
         return Selection(targets, quiet, pattern, None, question, felt)
+
+    def _ask(self, question: Question, targets: Sequence[Target]) -> tuple[Question, Pattern]:
+        """The pattern, and what the table was asked in the end; raises InputError."""
+        largest = self.means.largest
+        if all(target.level_db_sl is None for target in targets):
+            return question, strongest(self._table.ask(question), largest)
+        try:
+            return question, self._table.ask(question)
+        except InputError:
+            if not all(target.or_less for target in targets):
+                raise
+        wanted = question.level_db_sl
+        question = replace(question, level_db_sl=min(wanted, FELT_DB_SL))
+        return question, strongest(self._table.ask(question), largest, at_most=wanted)
 
     def _question(
         self, targets: tuple[tuple[Contact, Target], ...], quiet: tuple[Contact, ...]
@@ -209,18 +222,20 @@ class Selector:
         )
 
 
-def strongest(pattern: Pattern, largest: Mapping[str, float]) -> Pattern:
+def strongest(
+    pattern: Pattern, largest: Mapping[str, float], *, at_most: float = MOST_DB_SL
+) -> Pattern:
     """The pattern turned up or down to as strong as the neighbours allow.
 
     No quiet finger is aware of it then, no ERA exceeds its largest amplitude [m], by its name, and
-    no target is beyond MOST_DB_SL. Raises InputError where that leaves nothing to be felt.
+    no target is beyond a level [dB SL]. Raises InputError where that leaves nothing to be felt.
     """
     room = [
         20 * math.log10(largest[name] / tone.amplitude)
         for name, tone in pattern.excitation.items()
         if tone.amplitude > 0
     ]
-    gain = min([MOST_DB_SL - pattern.level_db_sl, *room])
+    gain = min([at_most - pattern.level_db_sl, *room])
     if pattern.quiet_level_db_sl is not None:
         gain = min(gain, UNAWARE_DB_SL - pattern.quiet_level_db_sl)
     level = pattern.level_db_sl + gain

@@ -19,11 +19,13 @@ class Target:
     """A contact that shall feel something.
 
     level_db_sl: how strongly; None for as strongly as the neighbours allow. Among targets with a
-    level one without feels it as the strongest of them does.
+    level one without feels it as the strongest of them does. or_less: where the plate cannot reach
+    the level, as strongly as the neighbours allow instead of nothing.
     """
 
     key: ContactKey
     level_db_sl: float | None = STRONG_DB_SL
+    or_less: bool = False
 
 
 @dataclass(frozen=True)

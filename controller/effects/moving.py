@@ -81,7 +81,7 @@ class _Texture(Course):
         speed = self._speed(contact, now)
         if speed < self._texture.slow:
             return Nothing(until=rests_from)
-        return Feeling(self._level_at(speed), until=rests_from)
+        return Feeling(self._level_at(speed), until=rests_from, or_less=True)
 
     def _speed(self, contact: Contact, now: float) -> float:
         """Speed [m/s] along the path that is remembered, to where the finger is."""

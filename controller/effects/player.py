@@ -69,7 +69,10 @@ class EffectPlayer:
         asking.sort(key=lambda one: one[:2], reverse=True)
         chosen = [one for one in asking if one[0] == asking[0][0]][: self.layout.most_at_once]
         return Wish(
-            tuple(Target(contact.key, feeling.level_db_sl) for _, _, contact, feeling in chosen),
+            tuple(
+                Target(contact.key, feeling.level_db_sl, or_less=feeling.or_less)
+                for _, _, contact, feeling in chosen
+            ),
             "no effect plays for the fingers that are there",
             until=min(ends, default=None),
         )

@@ -82,10 +82,12 @@ class _Rising(Course):
         """The level of the step that is on."""
         index = max(0, int((now - self.start) / self.step))
         if index >= len(self.levels) - 1 and self.holds:
-            return Feeling(self.levels[-1])
+            return Feeling(self.levels[-1], or_less=True)
         if index >= len(self.levels):
             return None
-        return Feeling(self.levels[index], until=self.start + (index + 1) * self.step)
+        # A rise that broke off at what the plate can do would be felt as an end.
+        until = self.start + (index + 1) * self.step
+        return Feeling(self.levels[index], until, or_less=True)
 
 
 class Ramp(Effect):

@@ -19,6 +19,7 @@ from model.pattern import Pattern
 from model.perception import detection_threshold
 from model.plate import Material, Plate
 from model.question import Question
+from small_table import small_table
 
 MEANS = Means("phased", ("switched", "phased"), (45.0, 300.0), {"SW": 1e-4}, PLAIN)
 
@@ -32,6 +33,7 @@ class Table:
     def __init__(self) -> None:
         self.asked: list[Question] = []
         self.refuse_below = 0.0
+        self.most = math.inf
         self.error: Exception | None = None
         self.quiet_level: float | None = None
 
@@ -45,6 +47,8 @@ class Table:
             raise self.error
         if question.targets[0][0] < self.refuse_below:
             raise InputError("nothing is felt there")
+        if question.level_db_sl > self.most:
+            raise InputError("too loud")
         tone = Tone(100.0 + len(self.asked), 1e-6)
         return Pattern({"SW": tone}, 0.02, question.level_db_sl, None, self.quiet_level)
 
@@ -155,6 +159,47 @@ def test_what_cannot_be_felt_alone_is_not_played() -> None:
     pattern = Pattern({"SW": Tone(100.0, 1e-6)}, 0.02, 12.0, None, 3.0)
     with pytest.raises(InputError, match="felt by another finger too"):
         strongest(pattern, {"SW": 1.0})
+
+
+class OrLess:
+    """Wishes one level at contact 1, or less where that cannot be had."""
+
+    def __init__(self, level: float) -> None:
+        self.level = level
+
+    def wish(self, contacts: Sequence[Contact], now: float) -> Wish:
+        """As `Wishes`."""
+        return Wish((Target(ContactKey("a", 1), self.level, or_less=True),))
+
+
+def test_a_level_or_less(table: Table) -> None:
+    """Beyond what can be had: as strong as neighbours and stroke allow, and never above the level.
+
+    12 dB SL at 1 um, a stroke of 2 um: 6 dB more; at the quiet finger there are -17 dB, 7 dB less
+    than it may have.
+    """
+    table.most, table.quiet_level = 15.0, -17.0
+    means = replace(MEANS, largest={"SW": 2e-6})
+    contacts = (at(1, 0.1), at(2, 0.2))
+    for wanted, level in ((14.0, 14.0), (30.0, 12 + 20 * math.log10(2)), (17.0, 17.0)):
+        selection = Selector(table, OrLess(wanted), means).select(contacts, 0.0)
+        assert selection.pattern is not None
+        assert selection.felt[0].level_db_sl == pytest.approx(level)
+        assert selection.question is table.asked[-1]
+    table.most = 11.0
+    selection = Selector(table, OrLess(30.0), means).select(contacts, 0.0)
+    assert (selection.pattern, selection.reason) == (None, "too loud")
+
+
+def test_a_level_or_less_on_a_plate() -> None:
+    """60 dB SL is more than the paper's ERAs can do: what they can is played, at full stroke."""
+    table, full = small_table(), dict.fromkeys(("SW", "SE", "NE", "NW"), 0.0001)
+    means = Means("switched", ("switched",), (40.0, 500.0), full, PLAIN)
+    selection = Selector(table, OrLess(60.0), means).select((at(1, 0.1),), 0.0)
+    assert selection.pattern is not None
+    assert 12 < selection.felt[0].level_db_sl < 60
+    loudest = max(tone.amplitude for tone in selection.pattern.excitation.values())
+    assert loudest == pytest.approx(1e-4)
 
 
 def test_nothing_wanted(table: Table) -> None:

@@ -100,7 +100,7 @@ def _may_be_better(fields: Fields, means: Single, least: float) -> bool:
     step = max(1, fields.quiet.shape[2] // BOUND_POINTS)
     few = magnitudes_of_sources(np.ascontiguousarray(fields.quiet[:, :, ::step]))
     gain = means.mean(axis=0) - least * few @ _shares(few)
-    if not _any_pair(gain, fields) and not (gain > 0).any():
+    if gain.max() <= 0:  # and so no two of them have a sum above zero
         return False
     if means.shape[1] < FEW_SOURCES:
         peak = sums_of_sources(means, fields.era_count).min(axis=0)
@@ -110,13 +110,6 @@ def _may_be_better(fields: Fields, means: Single, least: float) -> bool:
     one, other = _pairs(gain, fields)
     loud = (few[one] + few[other]).max(axis=1, initial=0.0)
     return bool(((means[:, one] + means[:, other]).min(axis=0) > least * loud).any())
-
-
-def _any_pair(gain: Single, fields: Fields) -> bool:
-    """Whether two ERAs at any two frequencies have gains (sources,) with a sum above zero."""
-    count, eras = fields.frequency_count, fields.era_count
-    most = np.sort(np.maximum.reduce(gain[: eras * count].reshape(eras, count), axis=1))
-    return bool(most[-2:].sum() > 0)
 
 
 def _pairs(gain: Single, fields: Fields) -> tuple[IntArray, IntArray]:

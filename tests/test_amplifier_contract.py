@@ -14,7 +14,7 @@ from drivers.command import CommandSet, DriveCommand, Envelope, Knot
 from drivers.conformance import CHECKS, Check, run_check
 from drivers.protocol.messages import Apply, LoadEnvelope, Stage, State
 from drivers.registry import open_backend
-from wires import PROCESS_WIRES
+from wires import PROCESS_WIRES, patient
 
 PAPER_PLATE = Path(drivers.__file__).parent.parent / "examples" / "paper_plate.yaml"
 REPLY_TIMEOUT = 2.0  # s; on a busy machine a far end may be late, and is not wrong for it
@@ -44,7 +44,7 @@ def url(request: pytest.FixtureRequest, rig: Path) -> Iterator[str]:
         assert process.stdout is not None
         name, _, url = process.stdout.readline().strip().partition(": ")
         assert name == "main"
-        yield url
+        yield patient(url)
         process.terminate()
 
 

@@ -19,7 +19,7 @@ from drivers.supervision import reopen
 from model.rig import Channel, Rig
 from sim.faults import Episode
 from sim.wires import Wire
-from wires import SHARED_WIRES, FarSide, far_side
+from wires import SHARED_WIRES, FarSide, far_side, patient
 
 
 @pytest.fixture(params=list(SHARED_WIRES))
@@ -49,9 +49,13 @@ async def far(wire: Wire, two_amplifiers: Rig) -> AsyncIterator[FarSide]:
 @pytest.fixture
 async def amplifiers(far: FarSide) -> AsyncIterator[dict[str, Amplifier]]:
     """Both of them, armed."""
-    both = {name: Amplifier(open_backend(url), reply_timeout=1.0) for name, url in far.urls.items()}
+    both = {
+        name: Amplifier(open_backend(patient(url)), reply_timeout=1.0)
+        for name, url in far.urls.items()
+    }
     for amplifier in both.values():
         await amplifier.open()
+    for amplifier in both.values():  # once all are there, for opening may take as long as watchdogs
         await amplifier.arm(2.0)
     yield both
     for amplifier in both.values():
@@ -80,7 +84,10 @@ async def test_each_answers_for_itself(amplifiers: dict[str, Amplifier]) -> None
 
 async def test_they_may_be_opened_at_once(far: FarSide) -> None:
     """Who comes while another opens their wire waits for it, and each answers for itself."""
-    both = {name: Amplifier(open_backend(url), reply_timeout=1.0) for name, url in far.urls.items()}
+    both = {
+        name: Amplifier(open_backend(patient(url)), reply_timeout=1.0)
+        for name, url in far.urls.items()
+    }
     await asyncio.gather(*(amplifier.open() for amplifier in both.values()))
     for name, amplifier in both.items():
         assert amplifier.identity.serial_number == f"SIM-{name}"
@@ -98,7 +105,9 @@ async def test_one_may_be_opened_while_the_other_is_closed(
         close(port)
 
     monkeypatch.setattr(serial.Serial, "close", slowly)
-    east, west = (Amplifier(open_backend(url), reply_timeout=1.0) for url in far.urls.values())
+    east, west = (
+        Amplifier(open_backend(patient(url)), reply_timeout=1.0) for url in far.urls.values()
+    )
     await east.open()
     for number in range(12):
         closing = asyncio.create_task(east.close())
@@ -113,14 +122,14 @@ async def test_one_may_be_opened_while_the_other_is_closed(
 
 async def test_a_close_that_is_cancelled_is_a_close(far: FarSide) -> None:
     """Given up half way, it holds neither the wire nor the amplifier's number back for good."""
-    amplifier = Amplifier(open_backend(far.url), reply_timeout=1.0)
+    amplifier = Amplifier(open_backend(patient(far.url)), reply_timeout=1.0)
     await amplifier.open()
     closing = asyncio.create_task(amplifier.close())
     await asyncio.sleep(0)
     closing.cancel()
     with contextlib.suppress(asyncio.CancelledError):
         await closing
-    other = Amplifier(open_backend(far.url), reply_timeout=1.0)
+    other = Amplifier(open_backend(patient(far.url)), reply_timeout=1.0)
     await reopen(other, waits=iter([0.01] * 200))
     await other.close()
 
@@ -128,7 +137,9 @@ async def test_a_close_that_is_cancelled_is_a_close(far: FarSide) -> None:
 async def test_one_comes_back_while_the_other_is_left_lost(wire: Wire, two_amplifiers: Rig) -> None:
     """After a loss of the wire each is lost until it is opened itself, in any order."""
     async with far_side(replace(wire, unpluggable=True), two_amplifiers) as far:
-        east, west = (Amplifier(open_backend(url), reply_timeout=1.0) for url in far.urls.values())
+        east, west = (
+            Amplifier(open_backend(patient(url)), reply_timeout=1.0) for url in far.urls.values()
+        )
         await east.open()
         await west.open()
         for station in far.stations.values():

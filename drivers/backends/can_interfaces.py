@@ -19,6 +19,7 @@ from can.interfaces.slcan import slcanBus
 from can.interfaces.virtual import VirtualBus
 
 from drivers.backends.can_url import CanBusUrl
+from drivers.backends.serial_write import write_all
 from drivers.protocol.can_frame import CanFrame
 from drivers.protocol.can_text import (
     SlcanReader,
@@ -197,7 +198,7 @@ class _Slcan(_TextBus, slcanBus):
         """Send all at once, without python-can's wait until the last byte is out."""
         begin = b"\r" if self._is_cut else b""  # so that what was left half sent ends here
         self._is_cut = True
-        self.serialPortOrig.write(begin + b"".join(map(slcan_line, frames)))
+        write_all(self.serialPortOrig, begin + b"".join(map(slcan_line, frames)))
         self._is_cut = False
 
     def _read_text(self, timeout: float | None) -> None:

@@ -13,6 +13,7 @@ from typing import Protocol, cast
 import serial
 
 from drivers.backends.modbus_url import ModbusUrl
+from drivers.backends.serial_write import write_all
 from drivers.backends.stand_in import STAND_IN
 from drivers.errors import LinkError, LinkTimeout
 
@@ -131,7 +132,7 @@ class _SerialPort:
         if self._descriptor is None:
             raise LinkError(f"serial port {self._name} is closed")
         try:
-            self._port.write(data)
+            write_all(self._port, data)
         except serial.SerialTimeoutException:
             raise LinkTimeout(
                 f"{self._name} takes no more bytes; check flow control and the adapter"

@@ -14,6 +14,7 @@ from typing import final
 
 import serial
 
+from drivers.backends.serial_write import descriptor, write_all
 from drivers.backends.stand_in import STAND_IN, Port
 from drivers.errors import LinkError, LinkTimeout
 
@@ -58,7 +59,7 @@ class _SerialPort:
         self._is_lost = False
         self._closing = threading.Event()
         self._thread: threading.Thread | None = None
-        self._descriptor = _descriptor(port)
+        self._descriptor = descriptor(port)
         if self._descriptor is not None:
             self._loop.add_reader(self._descriptor, self._readable)
             return
@@ -68,12 +69,7 @@ class _SerialPort:
     def write(self, data: bytes) -> None:
         """Send bytes; raises LinkTimeout where the line is stuck, LinkError."""
         try:
-            if self._descriptor is not None:
-                with contextlib.suppress(BlockingIOError):  # its buffer is full: wait a little
-                    data = data[os.write(self._descriptor, data) :]
-                if not data:
-                    return
-            self._port.write(data)
+            write_all(self._port, data)
         except serial.SerialTimeoutException:
             raise LinkTimeout(
                 f"{self._name} takes no more bytes; check flow control and the adapter"
@@ -113,9 +109,9 @@ class _SerialPort:
             self._lose(self._what_was_lost("it hung up"))
 
     def _ignore(self) -> None:
-        descriptor, self._descriptor = self._descriptor, None
-        if descriptor is not None:
-            self._loop.remove_reader(descriptor)
+        watched, self._descriptor = self._descriptor, None
+        if watched is not None:
+            self._loop.remove_reader(watched)
 
     def _read(self) -> None:
         """Read until the port is closed or lost; runs in the reader thread."""
@@ -165,15 +161,6 @@ def _open_port(name: str, baud: int) -> serial.Serial:
         port.set_low_latency_mode(True)
     port.reset_input_buffer()
     return port
-
-
-def _descriptor(port: serial.Serial) -> int | None:
-    if os.name != "posix":
-        return None
-    try:
-        return int(port.fileno())
-    except (OSError, AttributeError):  # UnsupportedOperation is one of OSError
-        return None
 
 
 def _close_port(port: serial.Serial) -> None:

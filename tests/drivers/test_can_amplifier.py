@@ -622,15 +622,14 @@ async def test_an_adapter_that_takes_no_more_for_a_moment_is_not_lost(
     """A write that times out half-way is a missing answer: it is asked again, and understood."""
     async with far_side(Wire(kind="slcan"), coarse_rig) as far, opened(far.url) as amplifier:
         await amplifier.arm(2.0)
-        port = amplifier._link.backend._wire._adapter._bus.serialPortOrig
-        write = port.write
+        write_all = "drivers.backends.can_interfaces.write_all"
 
-        def half(data: bytes) -> None:
-            write(data[: len(data) // 2])
-            monkeypatch.setattr(port, "write", write)
+        def half(port: serial.Serial, data: bytes) -> None:
+            port.write(data[: len(data) // 2])
+            monkeypatch.undo()
             raise serial.SerialTimeoutException("Write timeout")
 
-        monkeypatch.setattr(port, "write", half)
+        monkeypatch.setattr(write_all, half)
         safe = tones(amplifier, 0.3)
         assert (await amplifier.apply(safe)).token == safe.token
         assert amplifier.statistics.retries >= 1

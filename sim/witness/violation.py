@@ -36,13 +36,15 @@ class Report:
     def __init__(self) -> None:
         self.dropped = 0
         self._found: list[Violation] = []
-        self._frames: dict[str, deque[str]] = {}
+        self._frames: dict[str, deque[tuple[float, Toward, bytes]]] = {}
         self._open: dict[int, int] = {}  # by number in the list: frames that are still wanted
 
     def frame(self, wire: str, time: float, toward: Toward, raw: bytes) -> None:
         """A frame has passed."""
+        self._frames.setdefault(wire, deque(maxlen=_BEFORE)).append((time, toward, raw))
+        if not self._open:
+            return
         line = shown(time, toward, raw)
-        self._frames.setdefault(wire, deque(maxlen=_BEFORE)).append(line)
         for number in [number for number in self._open if self._found[number].wire == wire]:
             one = self._found[number]
             self._found[number] = replace(one, frames=(*one.frames, line))
@@ -55,7 +57,7 @@ class Report:
         if len(self._found) >= _MOST:
             self.dropped += 1
             return
-        frames = tuple(self._frames.get(wire, ()))
+        frames = tuple(shown(*frame) for frame in self._frames.get(wire, ()))
         self._open[len(self._found)] = _AFTER
         self._found.append(Violation(invariant, wire, time, sentence, frames))
 

@@ -1,11 +1,12 @@
 """Soak: the whole chain in virtual time, thousands of times, each time by another number.
 
-python tests/support/soak.py --seeds 4000 --workers 2
-python tests/support/soak.py --seed 17 --trace trace.txt         one of them again, all of it
-python tests/support/soak.py --seed 17 --shrink                  what of its plan is needed
+python tests/support/soak.py --seeds 4000 --long 500             short ones and long ones
+python tests/support/soak.py --seed 17 --trace trace.txt         one of the long again, all of it
+python tests/support/soak.py --seed 17 --short --shrink          what of a short one is needed
 """
 
 import argparse
+import math
 import os
 import resource
 import sys
@@ -26,6 +27,7 @@ from soak_chain import Outcome, run_plan  # noqa: E402
 from soak_plan import KINDS, Plan, make_plan  # noqa: E402
 
 _AHEAD = 4  # runs that wait for a process, for each
+_TOLD_EVERY = 250  # runs
 
 
 def run_seed(seed: int, wire: str | None = None, *, short: bool = False) -> Outcome:
@@ -34,27 +36,30 @@ def run_seed(seed: int, wire: str | None = None, *, short: bool = False) -> Outc
 
 
 def outcomes(
-    seeds: Iterator[int],
+    seeds: Iterator[tuple[int, bool]],
     *,
     wire: str | None = None,
-    short: bool = False,
     workers: int = 2,
-    hours: float | None = None,
-) -> Iterator[Outcome]:
-    """Run seeds on processes of their own, until they or the virtual hours have run out."""
+    hours: float = math.inf,
+    minutes: float = math.inf,
+) -> Iterator[tuple[Outcome, bool]]:
+    """Run seeds on processes of their own, until they, virtual hours or minutes have run out.
+
+    seeds: each with whether it is short; so are the outcomes.
+    """
     virtual = 0.0
-    running: set[Future[Outcome]] = set()
+    begin = time.monotonic()
+    running: dict[Future[Outcome], bool] = {}
     with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
         while True:
-            if hours is None or virtual < 3600 * hours:
-                for seed in islice(seeds, _AHEAD * workers - len(running)):
-                    running.add(pool.submit(run_seed, seed, wire, short=short))
+            if virtual < 3600 * hours and time.monotonic() - begin < 60 * minutes:
+                for seed, short in islice(seeds, _AHEAD * workers - len(running)):
+                    running[pool.submit(run_seed, seed, wire, short=short)] = short
             if not running:
                 return
-            done, running = wait(running, return_when=FIRST_COMPLETED)
-            for future in done:
+            for future in wait(running, return_when=FIRST_COMPLETED).done:
                 virtual += future.result().virtual
-                yield future.result()
+                yield future.result(), running.pop(future)
 
 
 def shrink(plan: Plan) -> tuple[Plan, list[int]]:
@@ -78,14 +83,15 @@ def _only(plan: Plan, kept: Sequence[int]) -> Plan:
     return replace(plan, actions=tuple(plan.actions[number] for number in kept))
 
 
-def report(found: Iterator[Outcome], *, again: str) -> int:
+def report(found: Iterator[tuple[Outcome, bool]], *, again: str) -> int:
     """Print what comes of runs, the failed ones as they come; exit status."""
     begin = time.perf_counter()
     totals: Counter[str] = Counter()
-    runs = failed = 0
+    runs: Counter[bool] = Counter()
+    failed = 0
     virtual = busy = 0.0
-    for outcome in found:
-        runs += 1
+    for outcome, short in found:
+        runs[short] += 1
         virtual += outcome.virtual
         busy += outcome.busy
         totals.update(outcome.counts)
@@ -94,27 +100,34 @@ def report(found: Iterator[Outcome], *, again: str) -> int:
             _say(f"seed {outcome.seed} failed:")
             for violation in outcome.violations:
                 _say(f"    {violation}")
-            _say(f"    again: {again} --seed {outcome.seed} --trace seed-{outcome.seed}.txt")
+            one = f"--seed {outcome.seed}" + " --short" * short
+            _say(f"    again: {again} {one} --trace seed-{outcome.seed}.txt")
+        if sum(runs.values()) % _TOLD_EVERY == 0:
+            _say(f"    {sum(runs.values())} seeds, {virtual / 3600:.1f} h, {failed} failed")
     wall = time.perf_counter() - begin
-    peak = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024
-    _say(f"seeds                     {runs}")
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    busy_cpu = used.ru_utime + used.ru_stime
+    _say(f"seeds                     {runs[True]} short, {runs[False]} long")
     _say(f"virtual time              {virtual / 3600:.2f} h, of which busy {busy / 3600:.2f} h")
     for name, count in sorted(totals.items()):
         _say(f"{name:<25} {count}")
     _say(f"runs with violations      {failed}")
     _say(f"wall time                 {wall:.1f} s, {virtual / max(wall, 1e-9):.0f} times faster")
-    _say(f"most memory of a process  {peak:.0f} MB")
+    _say(f"processor time            {busy_cpu:.1f} s, {virtual / busy_cpu:.0f} times faster")
+    _say(f"most memory of a process  {used.ru_maxrss / 1024:.0f} MB")
     return 1 if failed else 0
 
 
 def main() -> int:
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--seeds", type=int, default=4000, help="how many")
-    parser.add_argument("--first", type=int, default=0, help="the first of them")
-    parser.add_argument("--hours", type=float, help="end after so many virtual hours")
+    parser.add_argument("--seeds", type=int, default=4000, help="how many short ones")
+    parser.add_argument("--long", type=int, default=500, help="how many long ones")
+    parser.add_argument("--first", type=int, default=0, help="the first of each")
+    parser.add_argument("--hours", type=float, default=math.inf, help="of virtual time at most")
+    parser.add_argument("--minutes", type=float, default=math.inf, help="of real time at most")
     parser.add_argument("--wire", choices=tuple(KINDS), help="on this kind of wire only")
-    parser.add_argument("--short", action="store_true", help="one scene each, as in make test")
+    parser.add_argument("--short", action="store_true", help="with --seed: the short one")
     parser.add_argument("--workers", type=int, default=2, help="processes")
     parser.add_argument("--seed", type=int, help="run only this one, and print its plan's hash")
     parser.add_argument("--trace", type=Path, help="with --seed: write everything that happens")
@@ -122,15 +135,14 @@ def main() -> int:
     parser.add_argument("--keep", help="with --seed: only these actions of its plan, as 3,17,42")
     options = parser.parse_args()
     if options.seed is None:
-        seeds = iter(range(options.first, options.first + options.seeds))
         found = outcomes(
-            seeds,
+            _seeds(options.first, short=options.seeds, long=options.long),
             wire=options.wire,
-            short=options.short,
             workers=options.workers,
             hours=options.hours,
+            minutes=options.minutes,
         )
-        return report(found, again=_again(options.wire, options.short))
+        return report(found, again=_again(options.wire))
     plan = make_plan(options.seed, options.wire, short=options.short)
     if options.keep is not None:
         plan = _only(plan, [int(number) for number in options.keep.split(",") if number])
@@ -151,9 +163,21 @@ def main() -> int:
     return 1 if outcome.violations else 0
 
 
-def _again(wire: str | None, short: bool) -> str:
+def _seeds(first: int, *, short: int, long: int) -> Iterator[tuple[int, bool]]:
+    """So many of each, evenly mixed, and whether each is short."""
+    given = 0
+    for number in range(short):
+        yield first + number, True
+        while given * short < (number + 1) * long:
+            yield first + given, False
+            given += 1
+    for number in range(given, long):
+        yield first + number, False
+
+
+def _again(wire: str | None) -> str:
     """The command that runs a seed again, without it."""
-    options = f" --wire {wire}" * bool(wire) + " --short" * short
+    options = f" --wire {wire}" * bool(wire)
     return f"{Path(sys.executable).name} tests/support/soak.py{options}"
 
 

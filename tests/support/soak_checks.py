@@ -32,7 +32,7 @@ RELEASE = 0.020  # s; from the last finger up to zero
 # s; three unanswered requests, then the watchdog, and a heartbeat that was on its way.
 RELEASE_WITH_FAULTS = 3 * 0.15 + WATCHDOG + 0.1
 TOGETHER = 0.6  # s; until all are silent after one of them has a fault
-STEP = 0.010  # s; how often is looked while something vibrates
+STEP = 0.020  # s; how often is looked while something vibrates
 IDLE_STEP = 1.0
 _NOT_FEEDING = (Hello, GetCaps, GetStatus, GetFaults)
 _FAULTED = (State.FAULT, State.FAULT_REACTION_ACTIVE)
@@ -42,6 +42,9 @@ _PLAYING = (
     State.QUICK_STOP_ACTIVE,
     State.SWITCHED_ON,
 )
+
+
+Sense = Callable[[str, SimulatedAmplifier, Sequence[float]], None]
 
 
 class Touched:
@@ -95,8 +98,8 @@ class Checks:
         self._touched = touched
         self._arming = arming
         self._fed = dict.fromkeys(bench.amplifiers, -math.inf)
-        self.sense: Callable[[str, SimulatedAmplifier], None] = lambda name, amplifier: None
-        """Is told of every amplifier whenever it is looked at."""
+        self.sense: Sense = lambda name, amplifier, levels: None
+        """Is told of every amplifier, and what level its channels have, when it is looked at."""
         self._starving: dict[str, asyncio.TimerHandle] = {}
         self._releasing: asyncio.TimerHandle | None = None
         self._is_closed = False
@@ -119,11 +122,12 @@ class Checks:
         self._bench.advance(now)
         loud = {}
         for name, amplifier in self._bench.amplifiers.items():
-            level = max((level_of(output, now) for output in amplifier.outputs), default=0.0)
+            levels = [min(level_of(output, now), 1.0) for output in amplifier.outputs]
+            level = max(levels, default=0.0)
             if not level <= AUDIBLE:
                 loud[name] = level
                 self._check_loud(name, level, now)
-            self.sense(name, amplifier)
+            self.sense(name, amplifier, levels)
         if loud:
             self._check_touched(loud, now)
 

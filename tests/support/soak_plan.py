@@ -2,7 +2,7 @@
 
 A plan is scenes one after the other: calm ones, in which everything must work, and rough ones, in
 which wires and amplifiers fail and the operator does as he likes; between some of them the plate is
-disarmed and alone for minutes.
+disarmed and alone for up to an hour.
 """
 
 import math
@@ -145,7 +145,7 @@ def make_plan(seed: int, wire: str | None = None, *, short: bool = False) -> Pla
         busy += 1.0 + length + SETTLED
         if not short and dice.random() < 0.3:
             actions.append(Ask(time, "disarm"))
-            time += 60 * dice.uniform(0.5, 10)
+            time += 60 * dice.uniform(2, 60)
     ordered = tuple(sorted(actions, key=lambda action: action.at))
     return Plan(seed, tuple(lines), amplifiers, ordered, time, busy)
 

@@ -10,7 +10,6 @@ from typing import Any
 
 from sim.amplifier import SimulatedAmplifier
 from sim.faults import Episode
-from sim.waveform import level_of
 from sim.witness.place import place_of
 from sim.witness.witness import Wish, Witness
 from soak_contacts import FrameTouches, SourceContacts
@@ -96,10 +95,9 @@ class SoakWitness:
         lasts = episode.lasts + (episode.delay if episode.fault == "delay" else 0.0)
         self._loop.call_later(lasts, self._over)
 
-    def sense(self, name: str, amplifier: SimulatedAmplifier) -> None:
+    def sense(self, name: str, amplifier: SimulatedAmplifier, levels: Sequence[float]) -> None:
         """What sensors find on an amplifier's channels just now."""
         now = self._loop.time()
-        levels = [min(level_of(output, now), 1.0) for output in amplifier.outputs]
         frequencies = {
             channel: tone.frequency
             for channel, output in enumerate(amplifier.outputs)

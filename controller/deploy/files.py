@@ -85,8 +85,9 @@ LogsDirectory={NAME}
 Environment=XDG_RUNTIME_DIR=/run XDG_CACHE_HOME=/var/cache/{NAME}
 Environment=OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 PYTHONNOUSERSITE=1
 
-# Touches go before everything that is not urgent.
+# Touches go before everything that is not urgent; nice alone counts within a session only.
 Nice=-10
+CPUWeight=1000
 OOMScoreAdjust=-500
 LimitNOFILE=4096
 TasksMax=64

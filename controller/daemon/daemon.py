@@ -281,6 +281,8 @@ class Daemon:
     def _link_told(self, event: str, message: str) -> None:
         kinds: Mapping[str, str] = {"lost": "error", "retry": "warning", "reopened": "info"}
         _logger.log(getattr(logging, kinds[event].upper()), "link %s: %s", event, message)
+        if event != "retry":  # fingers are not followed without a link, and begin anew with one
+            self._contacts_changed((), Change())
         remedy = None if event == "reopened" else "look at cables and supply"
         # When it is tried again all have been closed.
         lost = [name for name, amplifier in self._amplifiers.items() if amplifier.lost]

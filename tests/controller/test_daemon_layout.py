@@ -87,6 +87,25 @@ async def test_regions_and_effects_by_name(tmp_path: Path) -> None:
         await asyncio.gather(touching, return_exceptions=True)
 
 
+async def test_a_click_is_over_on_the_wire_while_its_finger_rests(tmp_path: Path) -> None:
+    """The amplifier plays, then falls silent, though nothing has come from the finger but rest."""
+    text = LAYOUT.replace("on_press: hum", "on_press: click")
+    (tmp_path / "layout.yaml").write_text(text, encoding="utf-8")
+    async with (
+        running_daemon(tmp_path, "layout: layout.yaml\n") as bench,
+        await bench.client() as era,
+    ):
+        await until_state(era, READY)
+        await era.arm("me", lease_s=60)
+        touching = asyncio.create_task(keep_touching(era, ON_PAD))
+        await until(lambda: any(bench.far.station.status().levels))
+        await until(lambda: not any(bench.far.station.status().levels))
+        status = await era.status()
+        assert (status.state, len(status.contacts), status.drive) == (ENABLED, 1, {})
+        touching.cancel()
+        await asyncio.gather(touching, return_exceptions=True)
+
+
 async def test_clients_are_told_of_another_layout(tmp_path: Path) -> None:
     """At first what is so now, then every exchange; hello tells the same from then on."""
     path = tmp_path / "layout.yaml"

@@ -9,6 +9,7 @@ import pytest
 from controller.sources.tuio import tuio_datagram
 from controller.touch import Touch, TouchFrame
 from daemon_bench import running_daemon, until_state
+from sim.faults import Episode
 
 
 def free_port() -> int:
@@ -53,3 +54,22 @@ async def test_two_panels_and_a_program(tmp_path: Path) -> None:
             "right": pytest.approx((0.2286, 0.05715)),
             "api": pytest.approx((0.15, 0.1)),
         }
+
+
+async def test_a_finger_that_lifts_while_the_link_is_lost(tmp_path: Path) -> None:
+    """Nobody follows it meanwhile, so it is not shown, nor is it there when the link is back."""
+    async with running_daemon(tmp_path) as bench, await bench.client() as era:
+        await until_state(era, "READY_TO_SWITCH_ON")
+        await era.touch([(0.1, 0.1)])
+        await asyncio.sleep(0.05)
+        assert len((await era.status()).contacts) == 1
+        await era.touch([(0.1, 0.1)])
+        bench.far.station.befall(Episode("hang"))
+        while (await era.status()).state != "COMM_LOST":
+            await era.touch([(0.1, 0.1)])
+            await asyncio.sleep(0.03)
+        await era.touch([])
+        assert (await era.status()).contacts == []
+        bench.far.station.recover()
+        await until_state(era, "READY_TO_SWITCH_ON")
+        assert (await era.status()).contacts == []

@@ -243,6 +243,32 @@ async def test_a_flood_leaves_the_loop_to_others(served: Served) -> None:
     assert turns > 50
 
 
+async def test_what_a_touch_sets_off_goes_before_the_next_turn(
+    served: Served, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Between two turns there is room for what came in and for what that has woken."""
+    monkeypatch.setattr("controller.api.server.TURN", 0.0)  # a line each
+    loop = asyncio.get_running_loop()
+    order: list[str] = []
+
+    class Asked(list[str]):
+        def append(self, name: str) -> None:
+            order.append(name)
+            if order == ["status"]:
+                loop.call_soon(comes_in)
+
+    def comes_in() -> None:
+        order.append("touch")
+        loop.call_soon(order.append, "command")
+
+    served.asked = Asked()
+    wire = await served.connect()
+    for number in range(3):
+        wire.ask("status", id=number)
+    await until(lambda: order.count("status") == 3)
+    assert order[:4] == ["status", "touch", "command", "status"]
+
+
 async def test_thirty_two_clients_and_no_more(served: Served) -> None:
     """The next is told that it is too busy; a place that is given up is free again."""
     wires = [await served.connect() for _ in range(MOST_CONNECTIONS)]

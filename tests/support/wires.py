@@ -3,11 +3,11 @@
 The far ends run in the test's own event loop, so that a test can look into the amplifier's clock.
 """
 
-import time
 from collections.abc import AsyncIterator, Mapping, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 
+from drivers import clock
 from model.rig import Rig
 from sim.amplifier import SimulatedAmplifier
 from sim.bench import Bench
@@ -69,7 +69,7 @@ class FarSide:
 
     def silent_from(self) -> float:
         """When the amplifier is silent for good [s], or infinity, by its own clock."""
-        self.bench.advance(time.monotonic())
+        self.bench.advance(clock.now())
         ends = [tone.silent_from for output in self.amplifier.outputs for tone in output]
         return max(ends, default=self.bench.time)
 
@@ -77,9 +77,9 @@ class FarSide:
 @asynccontextmanager
 async def far_side(wire: Wire, rig: Rig, *, seed: int = 0) -> AsyncIterator[FarSide]:
     """The amplifiers of a rig behind a wire, without faults until a test lets them befall."""
-    bench = Bench(rig, now=time.monotonic())
+    bench = Bench(rig, now=clock.now())
     stations: Sequence[Station] = [
-        Station(bench, name, number=number, faults=Faults(begin=time.monotonic(), seed=seed))
+        Station(bench, name, number=number, faults=Faults(begin=clock.now(), seed=seed))
         for number, name in enumerate(bench.amplifiers, start=1)
     ]
     async with open_wire(wire, stations) as urls:

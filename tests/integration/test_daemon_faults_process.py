@@ -24,11 +24,12 @@ from best_of import best_of
 from controller.api.async_client import AsyncClient
 from controller.sources.tuio import tuio_datagram
 from controller.touch import Touch, TouchFrame
-from daemon_bench import far_end, until, until_state
+from daemon_bench import PATIENCE, far_end, until, until_state
 from daemon_process import (
     REACTION,
     WATCHDOG,
     DaemonProcess,
+    armed,
     daemon_process,
     holding,
     play,
@@ -124,7 +125,7 @@ async def test_paused_for_longer_than_the_watchdog_nothing_old_is_replayed(tmp_p
             await until_state(era, "FAULT")
             await ready(era)
             await asyncio.sleep(0.2)  # longer than any lease of those fingers
-            await era.arm("test", lease_s=60)
+            await armed(era)
             await until(lambda: len(journal.since(resumed)) > 5)
             await asyncio.sleep(0.2)
             assert not journal.raising_since(resumed)
@@ -137,8 +138,7 @@ async def test_paused_for_a_moment_a_finger_that_is_gone_is_not_felt(tmp_path: P
     async with far_end(tmp_path) as far, daemon_process(tmp_path, far, panel(port)) as daemon:
         journal = Journal(far)
         async with await daemon.client() as era:
-            await ready(era)
-            await era.arm("test", lease_s=60)
+            await armed(era)
             with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
                 begin = time.monotonic()
                 os.kill(daemon.process.pid, signal.SIGSTOP)
@@ -167,12 +167,16 @@ async def test_a_wall_clock_that_jumps_is_not_noticed(tmp_path: Path) -> None:
             assert 0 < 60 - status.lease_left_s <= time.monotonic() - begin + 60
             assert not status.rejected_touches
         await test.era.disarm()
-        await ready(test.era)
-        armed = time.monotonic()
-        await test.era.arm("test", lease_s=1)
-        os.kill(test.pid, signal.SIGUSR1)
-        await until_state(test.era, "READY_TO_SWITCH_ON")
-        assert time.monotonic() - armed >= 1.0
+        cause = ""
+        while "has not renewed" not in cause:  # a machine that is busy may lose the link instead
+            await ready(test.era)
+            begin = time.monotonic()
+            await test.era.arm("test", lease_s=1)
+            os.kill(test.pid, signal.SIGUSR1)
+            await until_state(test.era, "READY_TO_SWITCH_ON", "FAULT")
+            assert time.monotonic() - begin < PATIENCE
+            cause = " ".join(str(line.get("cause")) for line in test.daemon.log[-4:])
+        assert time.monotonic() - begin >= 1.0
 
 
 async def test_a_full_disk_costs_log_lines_and_nothing_else(tmp_path: Path) -> None:

@@ -30,6 +30,10 @@ STARTING = 60.0  # s; for a loaded machine
 WATCHDOG, REACTION = 0.25, 0.005  # s; what an amplifier may take to be silent
 
 
+class NotServing(AssertionError):
+    """A daemon has ended before it served: a bug, or no answer in time on a loaded machine."""
+
+
 @dataclass
 class DaemonProcess:
     """A daemon that serves, or is about to."""
@@ -52,12 +56,13 @@ class DaemonProcess:
         return any(text in json.dumps(line) for line in self.log)
 
     async def serves(self) -> None:
-        """Wait until it does; fails where it ends instead."""
+        """Wait until it does; raises NotServing where it ends instead."""
         await until(
             lambda: self.said("serving at") or self.process.returncode is not None,
             patience=STARTING,
         )
-        assert self.process.returncode is None, self.log
+        if self.process.returncode is not None:
+            raise NotServing(str(self.log))
 
 
 @asynccontextmanager
@@ -156,14 +161,22 @@ async def ready(era: AsyncClient) -> None:
             await era.clear()
 
 
+async def armed(era: AsyncClient) -> None:
+    """Armed; again where the link is lost just then, as it may be on a loaded machine."""
+    end = time.monotonic() + STARTING
+    while (await era.status()).state != ENABLED:
+        assert time.monotonic() < end, "it cannot be armed"
+        await ready(era)
+        with contextlib.suppress(RpcError):
+            await era.arm("test", lease_s=60)
+
+
 async def play(era: AsyncClient, far: FarSide) -> None:
     """Armed, and heard for the finger that somebody holds down: again where it has been lost."""
     end = time.monotonic() + STARTING
     while time.monotonic() < end:
-        with contextlib.suppress(RpcError, AssertionError):
-            if (await era.status()).state != ENABLED:
-                await ready(era)
-                await era.arm("test", lease_s=60)
+        await armed(era)
+        with contextlib.suppress(AssertionError):
             await until(lambda: loudness(far) > 0, patience=2.0)
             return
     raise AssertionError("nothing is ever played")

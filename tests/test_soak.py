@@ -14,6 +14,8 @@ from controller.loop import Controller
 from controller.selection import Selector
 from controller.touch import TouchFrame
 from drivers.backends.modbus_link import ModbusLink
+from planted_bugs import BUGS as BUGS_OF_THE_WITNESS
+from planted_bugs import plant
 from sim.amplifier import SimulatedAmplifier
 from sim.faults import Episode
 from sim.serial_end import SerialEnd
@@ -150,6 +152,37 @@ def test_bugs_are_noticed(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     assert run_plan(plan).violations == []
     monkeypatch.setattr(owner, attribute, bug)
     assert violation in "; ".join(run_plan(plan).violations)
+
+
+STOPPED = held(asks=(Ask(1.8, "stop"), Ask(2.6, "ready")))
+STALLED = held(asks=(Ask(1.8, "stall", 0.6),))
+
+WITNESSED = {
+    "heartbeats are too rare": held(),
+    "every set has the same token": held(),
+    "nobody is identified": held(),
+    "a commit is torn": held(),
+    "a ramp is ignored": held(),
+    "its channels vibrate at half the frequency": held(),
+    "every answer is sent twice": held(),
+    "a command has the sequence number before": held(wire="socketcand"),
+    "a stop is sent as a disarm": STOPPED,
+    "a stop is not latched": STOPPED,
+    "looking on feeds the watchdog": held(),
+    "the watchdog is 20 ms early": STALLED,
+}
+
+
+@pytest.mark.parametrize("name", WITNESSED)
+def test_the_witness_finds_planted_bugs_in_the_soak(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is shown the wires of every run: by its rule a run fails that is fine without the bug."""
+    plan = WITNESSED[name]
+    assert run_plan(plan).violations == []
+    plant(BUGS_OF_THE_WITNESS[name], monkeypatch)
+    found = run_plan(plan).violations
+    assert any(f" {BUGS_OF_THE_WITNESS[name].breaks}: " in violation for violation in found), found
 
 
 def test_what_is_not_needed_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:

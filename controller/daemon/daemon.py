@@ -315,7 +315,8 @@ class Daemon:
         """Tell subscribers of a line of the log; called in any thread."""
         told = {
             "level": "error" if record.levelno >= logging.ERROR else record.levelname.lower(),
-            "message": record.getMessage()[:1000],
+            # A file's name may hold bytes that are no text, and JSON has none of these.
+            "message": record.getMessage()[:1000].encode(errors="backslashreplace").decode(),
             "cause": getattr(record, "cause", None),
             "remedy": getattr(record, "remedy", None),
         }

@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import logging
 from dataclasses import replace
 from pathlib import Path
 
@@ -158,3 +159,17 @@ async def test_the_service_manager_hears_of_a_daemon_that_waits_for_an_amplifier
         await asyncio.wait_for(tries.wait(), 20)
         monkeypatch.setattr(bench.daemon._supervisor, "_alive", count)
         await until(lambda: alive >= 3)
+
+
+async def test_a_name_that_is_no_text_is_told_all_the_same(tmp_path: Path) -> None:
+    """A line of the log with a file's name that is not UTF-8 reaches subscribers, escaped."""
+    async with running_daemon(tmp_path) as bench, await bench.client() as era:
+        await era.subscribe("log")
+        record = logging.makeLogRecord({"msg": "written to %s", "args": ("/tmp/\udcff",)})
+        record.levelno, record.levelname = logging.WARNING, "WARNING"
+        bench.daemon._tell_log(record)
+        async with asyncio.timeout(20):
+            async for told in era.events():
+                if told.topic == "log" and "written" in told.data["message"]:
+                    assert told.data["message"] == r"written to /tmp/\udcff"
+                    break

@@ -79,8 +79,9 @@ class Place:
 
 def _check_folder(folder: Path) -> None:
     """Refuse a folder in which somebody else could put a socket of theirs for ours."""
-    status = folder.stat()
-    if status.st_uid not in (0, os.getuid()) or status.st_mode & stat.S_IWOTH:
+    status, link = folder.stat(), folder.lstat()  # whoever owns a link can turn it elsewhere
+    is_theirs = not {status.st_uid, link.st_uid} <= {0, os.getuid()}
+    if is_theirs or status.st_mode & stat.S_IWOTH:
         raise InputError(
             f"{folder}: others may write here, or it is theirs; name another path with socket: in "
             "the daemon's file, in a folder of your own"

@@ -70,6 +70,20 @@ def test_a_folder_where_others_may_write_is_refused(tmp_path: Path) -> None:
         Place(folder / "era.sock")
 
 
+def test_a_link_of_somebody_elses_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It leads to a folder of ours today, and to theirs, with their socket in it, tomorrow."""
+    (tmp_path / "ours").mkdir()
+    link = tmp_path / "link"
+    link.symlink_to("ours")
+    Place(link / "era.sock").leave()
+    theirs = os.stat_result((0o120777, *link.lstat()[1:4], os.getuid() + 1, *link.lstat()[5:10]))
+    monkeypatch.setattr(Path, "lstat", lambda path: theirs)
+    with pytest.raises(InputError, match="or it is theirs"):
+        Place(link / "era.sock")
+
+
 def test_a_path_that_is_too_long_is_said_to_be(tmp_path: Path) -> None:
     """The system's own error would name no length."""
     with pytest.raises(InputError, match="at most 107 bytes"):

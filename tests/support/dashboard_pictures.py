@@ -98,7 +98,8 @@ async def _take_one(
     async with fingers_down(page, *PLACES):
         await page.until("document.querySelectorAll('.contact').length === 2")
         await page.until("document.querySelectorAll('.contact.target').length")
-        await asyncio.sleep(1.0)
+        await page.until("document.querySelector('#summary').textContent.includes('22 dB SL')")
+        await asyncio.sleep(0.3)  # for the field, which is solved after it is told
         name = f"dashboard_{screen.name}_{'dark' if is_dark else 'light'}"
         await page.screenshot(folder / f"{name}.png")
         if screen.is_phone:

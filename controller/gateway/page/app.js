@@ -18,7 +18,7 @@ const STATES = {
 const at = (id) => document.getElementById(id);
 const log = at("log");
 let link;
-let lease = null;
+let lease = null;  // ends with a refusal to renew: states may be told later than the answer to arm
 let state = null;
 let daemon;  // undefined until it is told; null while it is away
 
@@ -95,7 +95,6 @@ function showBanner() {
 function showState(next, cause) {
   state = next;
   showBanner();
-  if (state !== "OPERATION_ENABLED") lease = null;
   at("state").textContent = STATES[state] ?? "daemon away";
   at("state").dataset.state = state ?? "away";
   at("state").title = state ?? "";
@@ -203,7 +202,10 @@ function enter(token) {
 window.addEventListener("pagehide", () => lease && link.post("disarm").catch(() => {}));
 
 at("arm").addEventListener("click", arm);
-at("disarm").addEventListener("click", () => ask("disarm"));
+at("disarm").addEventListener("click", () => {
+  lease = null;
+  ask("disarm");
+});
 at("clear").addEventListener("click", () => ask("clear"));
 at("stop").addEventListener("click", stop);
 at("motion").addEventListener("change", ({ target }) => picture.setMotion(target.checked));

@@ -3,7 +3,7 @@
 import asyncio
 import contextlib
 import time
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Awaitable, Callable
 from dataclasses import replace
 
 import pytest
@@ -177,8 +177,11 @@ async def test_one_commit_is_played_by_all_at_one_moment(
     assert max(origins) - min(origins) < 0.005
 
 
+@pytest.mark.parametrize("silence", [Amplifier.stop, Amplifier.disarm])
 async def test_a_stop_waits_for_no_other_that_is_stuck(
-    far: FarSide, amplifiers: dict[str, Amplifier]
+    far: FarSide,
+    amplifiers: dict[str, Amplifier],
+    silence: Callable[[Amplifier, float], Awaitable[Status]],
 ) -> None:
     """One that does not answer for a second holds the stop of the other up by no more than 8 ms,
     and 10 ms where its answer could run into it; what it was asked is asked again. The machine can
@@ -191,7 +194,7 @@ async def test_a_stop_waits_for_no_other_that_is_stuck(
         stuck = [asyncio.create_task(west.heartbeat()) for _ in range(3)]
         await asyncio.sleep(0.005)  # the first is on the line
         begin = now()
-        await east.stop(0.0)
+        await silence(east, 0.0)
         took.append(now() - begin)
         far.stations["west"].recover()
         assert all(isinstance(status, Status) for status in await asyncio.gather(*stuck))

@@ -17,9 +17,10 @@ import serial
 
 from drivers.amplifier import Amplifier
 from drivers.backends.can_amplifier import CanBackend
+from drivers.backends.can_orders import PendingOrders
 from drivers.backends.can_url import CanUrl
 from drivers.command import CommandSet, DriveCommand, Envelope, Knot
-from drivers.errors import CommandError, LinkError
+from drivers.errors import CommandError, CommandRefused, LinkError
 from drivers.guard import Guard, GuardLimits, SafeCommand
 from drivers.protocol.can_frame import CanFrame
 from drivers.protocol.canopen_objects import index_of
@@ -485,6 +486,26 @@ async def test_a_late_answer_is_no_second_amplifier(virtual: Virtual) -> None:
     virtual.gateway.bus.join(hear)
     async with opened(virtual.url()) as amplifier:
         assert amplifier.identity.serial_number == virtual.far.amplifier.identity.serial_number
+
+
+def test_orders_are_numbered_from_1_to_255() -> None:
+    """255 numbers and then the first again: 0 is nobody's."""
+    orders = PendingOrders()
+    numbers = [orders.next_sequence() for _ in range(3 * 255)]
+    assert sorted(numbers) == sorted([*range(1, 256)] * 3)
+    assert numbers[:255] == numbers[255:510]
+
+
+async def test_a_channel_that_it_has_not_is_not_sent(virtual: Virtual) -> None:
+    """Its frame would be a command for the next node: refused here, and nothing goes out."""
+    async with opened(virtual.url()) as amplifier:
+        await amplifier.arm(2.0)
+        guard = Guard(LIMITS, replace(amplifier.capabilities, channels=16))
+        wanted = CommandSet(1, (DriveCommand(4, 110.0, 0.2),), ramp=0.0, valid_for=0.0)
+        before = amplifier.statistics.frames_out
+        with pytest.raises(CommandRefused, match="no such channel"):
+            await amplifier.apply(guard.check(wanted))
+        assert amplifier.statistics.frames_out == before
 
 
 async def test_a_second_host_does_not_arm(virtual: Virtual) -> None:

@@ -97,6 +97,15 @@ def test_vibration_ends_when_its_time_is_over() -> None:
     assert strict.check(playing(7, 0.5)).valid_for == 2.0
 
 
+def test_a_vibration_that_goes_on_has_begun_when_it_began() -> None:
+    """Of 2 s of on-time, a set every half second leaves half a second less each time."""
+    clock = Clock()
+    strict = guard(clock, on_time=2.0)
+    for token, left in enumerate((2.0, 1.5, 1.0, 0.5), start=1):
+        assert strict.check(playing(token, 0.5)).valid_for == pytest.approx(left)
+        clock.now += 0.5
+
+
 def test_a_share_of_the_time_is_silent() -> None:
     """A tenth of ten seconds: 1 s, then a rest until the window has moved on."""
     clock = Clock()

@@ -290,6 +290,13 @@ async def test_a_late_refusal_is_not_credited_to_the_next_request(
     assert await backend.exchange(Arm(0.25), timeout=PATIENCE) == ARMED
 
 
+async def test_numbers_begin_again_after_the_last(far: Peer, backend: ModbusBackend) -> None:
+    """Transactions and tags have 16 bits: the next after the last of them is understood as well."""
+    backend._opened()._transaction = backend._tag = 0xFFFF - 1
+    for _ in range(3):
+        assert await backend.exchange(Arm(0.25), timeout=PATIENCE) == ARMED
+
+
 async def test_an_exception_without_a_refusal_is_no_answer(
     far: Peer, backend: ModbusBackend
 ) -> None:

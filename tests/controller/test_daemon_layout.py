@@ -41,7 +41,7 @@ async def contacts_as(era: AsyncClient, *effects: str | None) -> list[float | No
             await asyncio.sleep(0.01)
 
 
-async def test_regions_and_effects_by_name(tmp_path: Path) -> None:
+async def test_regions_and_effects_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A region's effect plays at its level; where there is none, nothing, until one is asked for.
 
     Asking needs a finger, an effect that exists, and at most the effect's own level.
@@ -80,7 +80,13 @@ async def test_regions_and_effects_by_name(tmp_path: Path) -> None:
             with pytest.raises(RpcError) as caught:
                 await era.play(effect, place, level_db_sl=level)
             assert caught.value.code is ErrorCode.REFUSED
+        asked: list[str] = []
+        reconsider = bench.daemon._controller.reconsider
+        monkeypatch.setattr(
+            bench.daemon._controller, "reconsider", lambda: (asked.append("now"), reconsider())
+        )
         await era.play("alert", ON_QUIET, level_db_sl=12)
+        assert asked == ["now"]  # not with the next heartbeat
         assert await contacts_as(era, "alert") == [pytest.approx(12, abs=0.5)]
         assert (await era.status()).silent_because is None
         touching.cancel()

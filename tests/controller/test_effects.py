@@ -79,6 +79,21 @@ def test_ramp_that_holds() -> None:
         assert felt == Feeling(level, or_less=True)
 
 
+def test_ramp_that_holds_rises_first() -> None:
+    """8, 10, 12 dB for a tenth of a second each, then 12 for good."""
+    course = Ramp(start_level=8.0, duration=0.3, hold=True, level=12.0).begin(
+        finger(1), 0.0, level_db_sl=12.0
+    )
+    felt = [course.feel(finger(1), now) for now in (0.0, 0.11, 0.21, 9.0)]
+    assert [one.level_db_sl for one in felt if isinstance(one, Feeling)] == [8.0, 10.0, 12.0, 12.0]
+    assert [one.until for one in felt if isinstance(one, Feeling)] == [
+        pytest.approx(0.1),
+        pytest.approx(0.2),
+        None,
+        None,
+    ]
+
+
 def test_texture_by_speed() -> None:
     """At `fast` the level, at the geometric mean of slow and fast half of the range less.
 
@@ -257,6 +272,17 @@ def test_effects_by_name() -> None:
     assert wanted(player, [here, other], 0.16) == {2: 20.0}
     with pytest.raises(KeyError):
         player.play("nothing", here, 0.2, level_db_sl=None)
+
+
+def test_what_was_asked_for_goes_with_its_finger() -> None:
+    """Through other regions too, unlike what a region has for it."""
+    regions = (Region("left", LEFT, on_press="hum"), Region("right", RIGHT))
+    effects: dict[str, Effect] = {"hum": Buzz(level=9.0), "alert": Buzz(level=18.0)}
+    player = EffectPlayer(Layout(regions, effects, elsewhere=None))
+    assert wanted(player, [finger(1, 0.05)], 0.0) == {1: 9.0}
+    player.play("alert", finger(1, 0.05), 0.1, level_db_sl=None)
+    assert wanted(player, [finger(1, 0.15)], 0.2) == {1: 18.0}
+    assert player.effect_of(finger(1).key) == "alert"
 
 
 def test_asking_again_begins_anew() -> None:

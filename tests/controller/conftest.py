@@ -11,6 +11,7 @@ from typing import Any, TypeVar
 import numpy as np
 import pytest
 
+import virtual_loop
 from controller.loop import Controller
 from controller.observer import Applied, Observer, Silenced
 from controller.touch import Touch, TouchFrame, TouchSource
@@ -52,9 +53,9 @@ T = TypeVar("T")
 
 
 class _Selector(selectors.DefaultSelector):
-    """Real sockets, but waiting for a timer costs no time: the clock jumps to it."""
+    """Waiting for a timer costs no time, waiting for the machine does: the clock jumps."""
 
-    now = 1000.0
+    now = virtual_loop.START
 
     def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
         ready = super().select(0)
@@ -64,8 +65,8 @@ class _Selector(selectors.DefaultSelector):
         return ready
 
 
-class VirtualLoop(asyncio.SelectorEventLoop):
-    """asyncio's own loop on a virtual clock that starts at 1000 s."""
+class _LoopOfTheMachine(asyncio.SelectorEventLoop):
+    """asyncio's own loop with the machine's sockets and pipes, on a virtual clock."""
 
     def __init__(self) -> None:
         self._virtual = _Selector()
@@ -77,12 +78,22 @@ class VirtualLoop(asyncio.SelectorEventLoop):
 
 
 @pytest.fixture
+def run_virtual_on_sockets() -> Callable[[Coroutine[Any, Any, T]], T]:
+    """As run_virtual, for what must have real sockets and pipes."""
+
+    def run(coroutine: Coroutine[Any, Any, T]) -> T:
+        with asyncio.Runner(loop_factory=_LoopOfTheMachine) as runner:
+            return runner.run(coroutine)
+
+    return run
+
+
+@pytest.fixture
 def run_virtual() -> Callable[[Coroutine[Any, Any, T]], T]:
     """Run a coroutine to its end in virtual time."""
 
     def run(coroutine: Coroutine[Any, Any, T]) -> T:
-        with asyncio.Runner(loop_factory=VirtualLoop) as runner:
-            return runner.run(coroutine)
+        return virtual_loop.run_virtual(coroutine)
 
     return run
 

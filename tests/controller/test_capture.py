@@ -93,7 +93,7 @@ def test_only_readable_captures_are_written(tmp_path: Path, datagrams: list[Data
     assert not path.exists()
 
 
-def test_replay_over_udp(run_virtual: Callable[..., None]) -> None:
+def test_replay_over_udp(run_virtual_on_sockets: Callable[..., None]) -> None:
     """Datagrams arrive unchanged, each at its own time."""
 
     async def scenario() -> None:
@@ -111,10 +111,10 @@ def test_replay_over_udp(run_virtual: Callable[..., None]) -> None:
             await replay
         assert received == [(b"one", 0.0), (b"two", 0.25), (b"three", 1.0)]
 
-    run_virtual(scenario())
+    run_virtual_on_sockets(scenario())
 
 
-def test_replay_to_nobody(run_virtual: Callable[..., None]) -> None:
+def test_replay_to_nobody(run_virtual_on_sockets: Callable[..., None]) -> None:
     """A port where nobody listens is told at the next datagram."""
 
     async def scenario() -> None:
@@ -124,4 +124,4 @@ def test_replay_to_nobody(run_virtual: Callable[..., None]) -> None:
         with pytest.raises(LinkError, match=f"nobody listens on UDP 127.0.0.1:{port}"):
             await replay_capture([Datagram(t, b"x") for t in (0.0, 0.1, 0.2)], "127.0.0.1", port)
 
-    run_virtual(scenario())
+    run_virtual_on_sockets(scenario())

@@ -112,7 +112,7 @@ async def follow(
     return seen
 
 
-def test_fingers_come_move_and_go(run_virtual: RunVirtual) -> None:
+def test_fingers_come_move_and_go(run_virtual_on_sockets: RunVirtual) -> None:
     """Each report is a frame, in shares of the panel's axes, y downwards as the kernel counts."""
     panel = PipePanel()
 
@@ -121,7 +121,7 @@ def test_fingers_come_move_and_go(run_virtual: RunVirtual) -> None:
             os.write(panel.into, raw(words))
             await asyncio.sleep(0.01)
 
-    seen = run_virtual(follow([panel], play))
+    seen = run_virtual_on_sockets(follow([panel], play))
     assert [touches for _, touches in seen] == [
         {},
         {7: (0.25, 0.2)},
@@ -131,7 +131,7 @@ def test_fingers_come_move_and_go(run_virtual: RunVirtual) -> None:
     ]
 
 
-def test_fingers_that_were_there_before(run_virtual: RunVirtual) -> None:
+def test_fingers_that_were_there_before(run_virtual_on_sockets: RunVirtual) -> None:
     """What rests on the panel when it is opened is there at once, by the kernel's own state."""
     panel = PipePanel()
     panel.state = {0: EMPTY, 1: SlotState(5, 500, 250)}
@@ -141,11 +141,11 @@ def test_fingers_that_were_there_before(run_virtual: RunVirtual) -> None:
         os.write(panel.into, raw("x 600"))
         await asyncio.sleep(0.01)
 
-    seen = run_virtual(follow([panel], play))
+    seen = run_virtual_on_sockets(follow([panel], play))
     assert [touches for _, touches in seen] == [{5: (0.5, 0.5)}, {5: (0.6, 0.5)}]
 
 
-def test_a_resting_finger_is_told_again(run_virtual: RunVirtual) -> None:
+def test_a_resting_finger_is_told_again(run_virtual_on_sockets: RunVirtual) -> None:
     """Every 50 ms the kernel is asked, well within the 150 ms after which a contact counts as gone.
 
     If it knows of a lift that no event told, the finger is lifted then.
@@ -159,7 +159,7 @@ def test_a_resting_finger_is_told_again(run_virtual: RunVirtual) -> None:
         panel.state = {0: EMPTY, 1: EMPTY}
         await asyncio.sleep(0.2)
 
-    seen = run_virtual(follow([panel], play))
+    seen = run_virtual_on_sockets(follow([panel], play))
     assert seen == [
         (0.0, {}),
         (0.0, {7: (0.0, 0.0)}),
@@ -169,7 +169,7 @@ def test_a_resting_finger_is_told_again(run_virtual: RunVirtual) -> None:
     ]
 
 
-def test_lost_events(run_virtual: RunVirtual) -> None:
+def test_lost_events(run_virtual_on_sockets: RunVirtual) -> None:
     """After SYN_DROPPED the kernel's state counts, as its documentation asks for."""
     panel = PipePanel()
 
@@ -180,12 +180,12 @@ def test_lost_events(run_virtual: RunVirtual) -> None:
         os.write(panel.into, raw("x 900", dropped=True))
         await asyncio.sleep(0.01)
 
-    seen = run_virtual(follow([panel], play))
+    seen = run_virtual_on_sockets(follow([panel], play))
     assert [touches for _, touches in seen][-1] == {9: (1.0, 0.0)}
 
 
 @pytest.mark.parametrize("notices", ["by reading", "by asking"])
-def test_a_panel_that_is_pulled_out(run_virtual: RunVirtual, notices: str) -> None:
+def test_a_panel_that_is_pulled_out(run_virtual_on_sockets: RunVirtual, notices: str) -> None:
     """Its fingers are lifted when it goes; it is waited for, and followed when it is back."""
     first, second = PipePanel(), PipePanel()
     first.state = {0: SlotState(7, 0, 0), 1: EMPTY}
@@ -202,7 +202,7 @@ def test_a_panel_that_is_pulled_out(run_virtual: RunVirtual, notices: str) -> No
         os.write(second.into, raw("id 8 x 1000 y 0"))
         await asyncio.sleep(0.01)
 
-    seen = run_virtual(follow(panels, play))
+    seen = run_virtual_on_sockets(follow(panels, play))
     assert [touches for _, touches in seen] == [{7: (0.0, 0.0)}, {}, {}, {8: (1.0, 0.0)}]
     assert seen[1][0] <= 0.06
 

@@ -269,7 +269,7 @@ def test_tuio_datagram_is_the_inverse(places: dict[int, tuple[float, float]]) ->
     assert result == TouchFrame("tuio:192.0.2.7/table@a", 2.0, wanted)
 
 
-def test_over_udp(run_virtual: Callable[..., list[TouchFrame]]) -> None:
+def test_over_udp(run_virtual_on_sockets: Callable[..., list[TouchFrame]]) -> None:
     """A datagram to the bound port becomes a frame at the loop's time; port 0 takes a free one."""
 
     async def scenario() -> list[TouchFrame]:
@@ -289,10 +289,10 @@ def test_over_udp(run_virtual: Callable[..., list[TouchFrame]]) -> None:
         assert received[0].time == asyncio.get_running_loop().time()
         return received
 
-    assert touches(run_virtual(scenario())[0]) == [(1, 0.25, 0.5)]
+    assert touches(run_virtual_on_sockets(scenario())[0]) == [(1, 0.25, 0.5)]
 
 
-def test_a_port_that_is_taken(run_virtual: Callable[..., None]) -> None:
+def test_a_port_that_is_taken(run_virtual_on_sockets: Callable[..., None]) -> None:
     """The error names the port and what to do."""
 
     async def scenario() -> None:
@@ -302,7 +302,7 @@ def test_a_port_that_is_taken(run_virtual: Callable[..., None]) -> None:
             with pytest.raises(InputError, match=f"127.0.0.1:{port}.*another port"):
                 await TuioSource(f"tuio:127.0.0.1:{port}").open()
 
-    run_virtual(scenario())
+    run_virtual_on_sockets(scenario())
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,72 @@
+"""Two amplifiers on two different wires under one plate, from a touch stream through the daemon.
+
+Commits on two wires are apart by what the system makes of them, so a pattern is asked for whose
+ERAs play different frequencies, one on each amplifier: it loses nothing by that.
+"""
+
+import asyncio
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from felt_as_asked import CHECKS, Truth
+from model.localization import Grid
+from model.rig_file import load_rig
+from model.table_build import build_table
+from model.table_file import save_table
+from rig_files import TWO_AMPLIFIERS, write_rig
+from touch_stream import Stream
+from whole_chain import Played, running_chain
+
+STREAM = Stream(
+    {"A": (0.07, 0.06), "B": (0.16, 0.14), "C": (0.28, 0.04)},
+    [
+        (0.1, {1: "B", 2: "C"}),  # SW on one amplifier, NW on the other
+        (1.0, {}),
+        (1.3, {3: "A"}),  # SW and NE
+        (2.0, {}),
+        (2.3, {}),
+    ],
+)
+WIRES = {"main": "serial", "side": "modbus-tcp"}
+
+
+@pytest.fixture(scope="module")
+def truth(tmp_path_factory: pytest.TempPathFactory) -> Truth:
+    """The rig as it is meant, and its table, asked without any of the chain."""
+    rig = load_rig(write_rig(tmp_path_factory.mktemp("truth") / "rig.yaml", *TWO_AMPLIFIERS))
+    table = build_table(rig, frequencies=np.arange(80.0, 321.0, 40.0), grid=Grid(4, 3))
+    return Truth(rig, table, STREAM, mode="switched")
+
+
+@pytest.fixture(scope="module")
+def played(truth: Truth, tmp_path_factory: pytest.TempPathFactory) -> Played:
+    """What came of the stream."""
+    folder = tmp_path_factory.mktemp("chain")
+    save_table(truth.table, folder / "table.npz")
+    return asyncio.run(play(folder))
+
+
+async def play(folder: Path) -> Played:
+    """Through a daemon, over both wires."""
+    chain = running_chain(
+        folder, WIRES, table=folder / "table.npz", rig_changes=TWO_AMPLIFIERS, mode="switched"
+    )
+    async with chain as running:
+        return await running.play(STREAM)
+
+
+def test_both_amplifiers_have_a_part_in_each_pattern(played: Played, truth: Truth) -> None:
+    """Two tones of different frequencies, on ERAs of different amplifiers."""
+    for heard in played.heard:
+        for told in heard.told:
+            drive = told["drive"]
+            assert {truth.rig.wiring[era].amplifier for era in drive} == {"main", "side"}
+            assert len({tone["frequency_hz"] for tone in drive.values()}) == 2
+
+
+@pytest.mark.parametrize("check", CHECKS)
+def test_what_fingers_feel_is_what_was_asked_for(played: Played, truth: Truth, check: str) -> None:
+    """As over one wire."""
+    CHECKS[check](played, truth)

@@ -1,0 +1,47 @@
+"""`era` with a bug planted in it: python planted_daemon.py BUG daemon daemon.yaml."""
+
+import sys
+
+import pytest
+
+from planted_bugs import Bug, Edit, plant
+
+_DRIVE = "controller.routing:_drive"
+BUGS = {
+    "levels are of three quarters of the stroke": Bug(
+        "level", (Edit(_DRIVE, "rig.era(name).stroke", "(0.75 * rig.era(name).stroke)"),)
+    ),
+    "phases have the other sign": Bug(
+        "phase", (Edit(_DRIVE, "_wrapped_degrees(tone.phase)", "_wrapped_degrees(-tone.phase)"),)
+    ),
+    "frequencies are a step too high": Bug(
+        "frequency",
+        (
+            Edit(_DRIVE, "frequency=tone.frequency,", "frequency=tone.frequency + 40,"),
+            Edit(
+                "controller.routing:route",
+                "frequency=onset[name].frequency",
+                "frequency=onset[name].frequency + 40",
+                also=("controller.orders",),
+            ),
+        ),
+    ),
+    "the last up is dropped": Bug(
+        "lift",
+        (
+            Edit(
+                "controller.contacts:ContactTracker._lift",
+                "self._contacts.pop(key) for key in tuple(keys)",
+                "self._contacts[key] for key in tuple(keys)",
+            ),
+        ),
+    ),
+}
+"""By name. The daemon believes in what it does: only who felt it can tell."""
+
+
+if __name__ == "__main__":
+    from controller.main import main
+
+    plant(BUGS[sys.argv.pop(1)], pytest.MonkeyPatch())
+    sys.exit(main())

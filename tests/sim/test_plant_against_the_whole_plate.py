@@ -76,9 +76,7 @@ def apart(found: FloatArray, expected: FloatArray) -> float:
     return float(np.linalg.norm(found - expected) / np.linalg.norm(expected))
 
 
-def test_ramps_follow_a_stepping_solver(
-    rig: Rig, whole: WholePlate, reduced: ReducedPlate
-) -> None:
+def test_ramps_follow_a_stepping_solver(rig: Rig, whole: WholePlate, reduced: ReducedPlate) -> None:
     """Without a finger: within 0.1 % of Newmark's method, over the plate, nothing filtered."""
     plant = Plant(reduced, rig.eras)
     set_bases(plant, BASES[:3])

@@ -2,7 +2,8 @@
 
 import asyncio
 import logging
-from collections.abc import Coroutine, Iterable, Mapping, Sequence
+from collections.abc import Coroutine, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from enum import Enum, auto
 from functools import partial
 from typing import Any, TypeVar
@@ -44,9 +45,11 @@ class AmplifierGroup:
     def __init__(self, amplifiers: Mapping[str, Amplifier]) -> None:
         self.phase = Phase.CLOSED
         self.loading_time = 0.0  # s; that of the last envelopes
+        self.is_torn = False  # whether a set may have been committed by some of them only
         self._amplifiers = dict(amplifiers)
         self._closing = asyncio.Lock()  # who closes again must not hang up on who still silences
         self._silencings = 0  # how often they were disarmed, stopped or closed
+        self._being_silenced = 0  # by how many who stop or disarm them just now
         self._may_be_armed = False  # since they were opened
         self._read_backs = ReadBacks()
         self._limit: asyncio.Timeout | None = None  # of a play or heartbeat that is under way
@@ -82,6 +85,11 @@ class AmplifierGroup:
                 "the amplifiers cannot be armed: they are closed, or one of them was lost; "
                 "close what is left and open all again"
             )
+        if self._being_silenced:  # the order of the frames would decide how it ends
+            raise CommandRefused(
+                "the amplifiers are just being stopped or disarmed; arm again if that is still "
+                "wanted"
+            )
         before = self._silencings
         self._may_be_armed = True
         try:
@@ -96,6 +104,7 @@ class AmplifierGroup:
             await _to_the_end(self._each(amplifier.disarm() for amplifier in self._all))
             raise
         self._read_backs.forget()
+        self.is_torn = False
         self.phase = Phase.ARMED
 
     async def play(
@@ -135,7 +144,8 @@ class AmplifierGroup:
         """Silent along a short ramp, then high voltage off."""
         self._leave_armed()
         try:
-            await self._together(amplifier.disarm() for amplifier in self._all)
+            with self._silencing():
+                await self._together(amplifier.disarm() for amplifier in self._all)
         except BaseException:
             await self.stop()
             raise
@@ -143,7 +153,8 @@ class AmplifierGroup:
     async def stop(self) -> None:
         """Quick stop of every amplifier that can be reached; latched until `clear`."""
         self._leave_armed()
-        await _to_the_end(self._each(amplifier.stop() for amplifier in self._all))
+        with self._silencing():
+            await _to_the_end(self._each(amplifier.stop() for amplifier in self._all))
 
     async def clear(self) -> None:
         """Acknowledge stops, and faults whose cause is gone."""
@@ -193,18 +204,21 @@ class AmplifierGroup:
             applied = await self._together(
                 self._amplifiers[name].apply(safe) for name, safe in commands.items()
             )
+            self.is_torn = False
             return dict(zip(commands, applied, strict=True))
         achieved = await self._together(
             self._amplifiers[name].stage(safe) for name, safe in commands.items()
         )
         if self.phase is not Phase.ARMED:
             return None  # a commit now would undo the silence that came in between
+        self.is_torn = True
         await self._together(self._commits(commands))
         for name, status in (await self._statuses()).items():
             if status.token != commands[name].token:
                 raise CommandRefused(
                     f"amplifier {name} plays set {status.token} instead of {commands[name].token}"
                 )
+        self.is_torn = False
         return dict(zip(commands, achieved, strict=True))
 
     async def _load(self, name: str, envelopes: Sequence[SafeEnvelope]) -> None:
@@ -299,6 +313,15 @@ class AmplifierGroup:
     async def _close_wires(self) -> None:
         """Close every wire, whatever the others say."""
         await _to_the_end(self._each(amplifier.close() for amplifier in self._all))
+
+    @contextmanager
+    def _silencing(self) -> Iterator[None]:
+        """Nobody can arm meanwhile."""
+        self._being_silenced += 1
+        try:
+            yield
+        finally:
+            self._being_silenced -= 1
 
     def _leave_armed(self) -> None:
         """Nothing more is played from here on; lost or closed amplifiers stay that."""

@@ -8,7 +8,7 @@ from typing import ParamSpec
 
 from controller.amplifiers import AmplifierGroup, Phase
 from controller.contacts import Change
-from controller.decision import Decider, Decision
+from controller.decision import RELEASE_RAMP, Decider, Decision
 from controller.envelopes import ENVELOPE_TIME
 from controller.guards import make_guards
 from controller.means import Means, means_of
@@ -242,6 +242,11 @@ class Controller:
         if order is not None:
             achieved = None
             try:
+                if self._group.is_torn and order.pattern is not None:
+                    # Half of a set is none: silence goes before whatever shall be played instead.
+                    silence = self._decider.silence(ramp=RELEASE_RAMP).commands
+                    if await self._group.play(silence) is None:
+                        return
                 achieved = await self._group.play(order.commands, envelopes=order.envelopes)
             finally:
                 if achieved is None:  # whoever goes on from here must not count on it

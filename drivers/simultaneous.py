@@ -36,6 +36,6 @@ async def _commit_at(moment: float, commit: Callable[[], Awaitable[object]]) -> 
     before = None
     while (left := moment - clock.now()) > 0:
         # A clock that stands still while others run is virtual, and its timers are exact.
-        await sleep(left - _SLACK if left > _SLACK else left if left == before else 0)
+        await sleep(left if left == before else max(0.0, left - _SLACK))
         before = left
     return await commit()

@@ -58,11 +58,13 @@ class Follower:
         self._fault = 0
         self._is_reported = True  # the state, by the amplifier itself
         self.is_answered = True  # and in an answer to its host
+        self.faulted_at = -math.inf  # when it was seen to go into a fault last
         self._watchdog = math.inf
         self._fed = (-math.inf, math.inf)
         self._fed_before = math.inf
         self._seen_at = -math.inf  # when it last said how it is
         self._token: int | None = None
+        self._token_before: tuple[int | None, float] = (None, -math.inf)  # and until when it counts
         self._played: deque[int] = deque(maxlen=_REMEMBERED)
         self._staged: Asked | None = None
         self._outputs = Outputs(name, plan, slack=times.slack, complain=complain)
@@ -113,6 +115,7 @@ class Follower:
             self._silence(begin, SILENCING_RAMP, "the watchdog")
             self.state, self._fault, self._is_reported = _REACTING, 1, False
             self.is_answered = False
+            self.faulted_at = time
 
     # what it grants
 
@@ -162,6 +165,7 @@ class Follower:
             and asked.token == self._staged.token
             and self.state == _ENABLED
         ):
+            self._token_before = (self._token, soon[1])
             self._play(self._staged, self._staged.drives, *soon)
 
     def _check_state_allows(self, asked: Asked, end: float) -> None:
@@ -239,7 +243,9 @@ class Follower:
             self._adopt(said, end)
         else:
             self._check_state(said, begin, end)
-        if said.token is not None:
+        before, until = self._token_before
+        was_earlier = end <= until and said.token == before  # than a commit that nobody answers
+        if said.token is not None and not was_earlier:
             if self._token not in (None, said.token):
                 self._complain(
                     "token",
@@ -281,6 +287,7 @@ class Follower:
             **dict.fromkeys(_OFF, _OFF),
         }.get(here or 0, (here,))
         if trips:
+            self.faulted_at = end
             self._check_trip(said, end)
         elif now not in follows:
             self._complain(self._rule_against(now), end, self._what_is_wrong(now))

@@ -13,6 +13,7 @@ from sim.witness.set_rules import Expected, check_set, check_shape
 from sim.witness.side import Duty, Side
 
 _SETS = (Kind.APPLY, Kind.STAGE)
+_BEGUN = 0.020  # s; for so long what was wished first may go before what was wished next
 _UNCOUNTED = (Kind.LOOK, Kind.HELLO, Kind.CAPABILITIES)
 
 
@@ -28,6 +29,8 @@ class Host:
         self._touched = -math.inf  # by whoever came last
         self._hung: float | None = None
         self._arm_wished: bool | None = None  # None: wishes are not told
+        self._wished = -math.inf  # when anything was last
+        self._disarm_wished = -math.inf
         self._silence_wished = -math.inf
         self._expected: Expected | None = None
 
@@ -72,6 +75,9 @@ class Host:
 
     def wish(self, time: float, what: str) -> None:
         """Somebody wants it to arm, disarm, stop or clear."""
+        self._wished = time
+        if what == "disarm":
+            self._disarm_wished = time
         self._arm_wished = what == "arm" or (self._arm_wished is True and what == "clear")
         if what in ("stop", "disarm"):
             self._silence_wished = time
@@ -136,7 +142,7 @@ class Host:
                     side.complain(duty.invariant, duty.due, duty.sentence)
         for side in self._sides.values():
             self._check_pulse(side, time)
-            if side.follower.is_in_fault and self._arm_wished:
+            if side.follower.faulted_at > self._wished and self._arm_wished:
                 self._arm_wished = False  # a fault ends what was wished before it
 
     # rules
@@ -164,6 +170,8 @@ class Host:
         is_other = asked.kind is not Kind.STOP and asked.kind not in _UNCOUNTED
         # What was asked before it, at the same moment, may go before it.
         if side.stop_wished is not None and time > side.stop_wished and is_other:
+            if asked.kind is Kind.DISARM and side.stop_wished < self._disarm_wished + _BEGUN:
+                return  # which silences as well
             side.complain(
                 "stop",
                 time,
@@ -260,7 +268,8 @@ class Host:
                 side.staged = {}
                 if asked.kind is Kind.STOP:
                     side.is_stopped, side.stop_wished = True, None
-                    self._arm_wished = self._arm_wished and False
+                    if self._arm_wished:
+                        self._arm_wished, self._silence_wished = False, time
             case _:
                 pass
 

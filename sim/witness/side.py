@@ -34,6 +34,7 @@ class Side:
     is_troubled: Callable[[], bool]
     pending: dict[Hashable, tuple[float, Asked]] = field(default_factory=dict)
     overdue: set[Hashable] = field(default_factory=set)
+    abandoned: set[Hashable] = field(default_factory=set)  # asked by a host that has hung up since
     vibrates: bool = False  # the last that it was told
     vibrated_at: float = -math.inf  # when a set that vibrates was granted last
     staged: dict[int, Asked] = field(default_factory=dict)
@@ -50,6 +51,8 @@ class Side:
     overtaken: float = -math.inf  # when silence went before whatever was waited for
 
     def forget_pending(self) -> None:
-        """Nobody waits for an answer any more."""
+        """Nobody waits for an answer any more, though some may come yet."""
+        if self.pending:
+            self.abandoned = set(self.pending)
         self.pending.clear()
         self.overdue.clear()

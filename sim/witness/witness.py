@@ -152,6 +152,8 @@ class Witness:
         self._pass_to(time)
         for side in self._wires[link].sides.values():
             side.is_open = False
+            if any(asked.kind in MOVING for _, asked in side.pending.values()):
+                side.follower.lose_track()  # it may have carried out what nobody hears it answer
             side.forget_pending()
             side.stop_wished = side.last_life = None
 
@@ -319,7 +321,9 @@ class Witness:
             return
         at, asked = side.pending.pop(answer.key, (math.inf, None))
         if asked is None:
-            if not self._is_troubled(link):
+            was_abandoned = answer.key in side.abandoned
+            side.abandoned.discard(answer.key)
+            if not (was_abandoned or self._is_troubled(link)):
                 why = f": {answer.problem}" if answer.problem else ""
                 what = f"{side.name} answers what nobody has asked it, or asks no more{why}"
                 side.complain("credit", time, what)

@@ -19,6 +19,7 @@ _CHANNEL = {"frequency_hz": [40, 500], "level": 1.0}
 """The paper's rig: its band and its levels, written by hand."""
 
 _TOUCH = 0.19  # s; from a touch to its pattern
+_HEARTBEAT = 0.055  # s; between two signs of life, and as long as what is on the wire takes
 _RAMP = 0.040  # s; along which what plays may fall silent after the last lift
 _ENDED = 1e-6  # s; after a lease has ended
 
@@ -43,7 +44,13 @@ class SoakWitness:
                 }
                 for name, place in places.items()
             },
-            "times_s": {"lift": release, "release": release + _RAMP, "touch": _TOUCH},
+            "times_s": {
+                "lift": release,
+                "release": release + _RAMP,
+                "touch": _TOUCH,
+                "stop": release,
+                "heartbeat": _HEARTBEAT + release,
+            },
         }
         self._loop = loop
         self._witness = Witness(plan)

@@ -5,6 +5,7 @@ twice in it with the same chance runs twice the same, byte for byte.
 """
 
 import asyncio
+import math
 import random
 from asyncio.base_events import BaseEventLoop
 from collections.abc import Callable, Coroutine
@@ -31,6 +32,7 @@ class VirtualLoop(BaseEventLoop):
     def __init__(self, dice: random.Random | None = None, seen: Seen | None = None) -> None:
         super().__init__()
         self.now = START
+        self._clock_resolution = math.ulp(START)
         self._turns = 0
         self.dice = dice or random.Random(0)
         self.seen: Seen = seen or (lambda link, toward, data: None)
@@ -53,6 +55,7 @@ class VirtualLoop(BaseEventLoop):
         if timeout > 0:
             self._turns = 0
             self.now = max(self.now, self._scheduled[0].when())
+            self._clock_resolution = math.ulp(self.now)  # no timer comes early
         return []
 
     def _process_events(self, event_list: list[Any]) -> None:

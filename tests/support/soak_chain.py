@@ -300,7 +300,11 @@ class _Run:
         if number and len(self.plan.lines) == 1:
             return  # a shared line is unplugged at its first amplifier
 
+        running = self.running
+
         def look() -> None:
+            if running is None or self.running is not running:
+                return  # it stood still for a while, or stands
             if self.controller is controller and controller.phase is Phase.ARMED:
                 self.checks.violate("a wire is out and the controller still armed")
 

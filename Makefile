@@ -15,7 +15,7 @@ demo: .venv/installed
 	$(BIN)/era demo
 
 test: lint
-	$(BIN)/pytest
+	$(BIN)/pytest --numprocesses 2 --dist loadfile
 
 lint: .venv/installed-test
 	$(BIN)/ruff check .

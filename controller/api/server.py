@@ -31,6 +31,8 @@ from model.errors import InputError
 MOST_CONNECTIONS = 32
 SILENCE = 1.0  # s; who has said nothing for so long gives way when all places are taken
 TURN = 0.00025  # s; so long a touch waits for clients that flood
+_AT_ONCE = 4  # connections that are taken in a turn
+_QUEUE = 64  # that wait for it
 MOST_PENDING = 8  # requests of one client that take long; a stop is always taken
 
 Handler: TypeAlias = Callable[[Connection, Any], Message | Awaitable[Message]]
@@ -70,7 +72,8 @@ class ApiServer:
     async def open(self, bound: socket.socket) -> None:
         """Listen on a Unix socket that is bound; who may open it is up to whoever bound it."""
         loop = asyncio.get_running_loop()
-        self._server = await loop.create_unix_server(self._connection, sock=bound, backlog=64)
+        self._server = await loop.create_unix_server(self._connection, sock=bound, backlog=_AT_ONCE)
+        bound.listen(_QUEUE)  # asyncio takes as many in a turn as it was told may wait
 
     async def close(self) -> None:
         """Listen no more, and leave all clients after what was said to them."""

@@ -2,10 +2,10 @@
 
 An event loop's own endpoint reads one datagram in a turn, and knows only when it did so: a command
 would be decided by what is old by then, and the time that a datagram has waited would not be seen.
-Here a turn takes what is there, hands it on for a quarter of a millisecond at most, and the system
-says when each came, where it does that (Linux). Where more come than can be handed on, the newest
-are what counts: the system would keep the oldest. Where the loop watches no sockets (Windows), its
-endpoint serves.
+Here a turn takes what is there and hands it on: a few all at once, for what came together is
+decided together, of many as much as a quarter of a millisecond allows. The system says when each
+came, where it does that (Linux). Where more come than can be handed on, the newest are what counts:
+the system would keep the oldest. Where the loop watches no sockets (Windows), its endpoint serves.
 """
 
 import asyncio
@@ -18,7 +18,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from typing import NamedTuple, TypeAlias
 
-TURN = 0.00025  # s; as long as everybody else waits at most for a sender that floods
+TURN = 0.00025  # s; as long as everybody else waits for a sender that floods
 MANY = 16  # that wait: more than a panel sends in a turn; now those are left out that are moot
 _MOST = 512  # that are read in a turn, and that wait; the oldest go first
 
@@ -99,12 +99,12 @@ class Datagrams:
             self._hand_on()
 
     def _hand_on(self) -> None:
-        """Hand on what waits until the turn is over; the rest follows in the next ones."""
+        """Hand on what waits, of many until the turn is over; the rest follows in the next ones."""
         self._is_due = False
         end = time.perf_counter() + TURN
         while self._waiting and self._line.fileno() >= 0:  # whoever receives may close it
             self._received(*self._waiting.popleft())
-            if time.perf_counter() >= end:
+            if len(self._waiting) > MANY and time.perf_counter() >= end:
                 break
         if self._waiting and self._line.fileno() >= 0:
             self._is_due = True

@@ -63,7 +63,7 @@ class Held:
         self.daemon, self.era, self.journal = daemon, era, journal
         self.far, self.pid = daemon.far, daemon.process.pid
 
-    async def plays_on(self, what: str, *, seconds: float = 1.0) -> float:
+    async def plays_on(self, what: str, *, seconds: float = 0.6) -> float:
         """The widest gap [s] between signs of life while it plays for a while."""
         return await plays_on(what, self.daemon, self.era, self.journal, seconds=seconds)
 
@@ -288,7 +288,7 @@ async def test_hangups_in_a_loop_change_nothing(tmp_path: Path) -> None:
                         with (tmp_path / "daemon.yaml").open("a", encoding="utf-8") as file:
                             file.write("longest_lease: 5 s\n")
                     os.kill(test.pid, signal.SIGHUP)
-                    await asyncio.sleep(0.005)
+                    await asyncio.sleep(0.001)
 
             hanging_up = asyncio.create_task(hang_up())
             await test.plays_on("200 SIGHUPs")
@@ -362,7 +362,7 @@ async def test_told_to_end_over_a_dead_link_it_ends_all_the_same(tmp_path: Path)
     await best_of("from SIGTERM to the exit, amplifier hung", attempt, 1.0)
 
 
-@pytest.mark.parametrize("wire", list(WIRES))
+@pytest.mark.parametrize("wire", ["serial", "modbus+tcp", "can+slcan"])  # links alone: all
 async def test_a_cut_cable_is_told_in_time(tmp_path: Path, wire: str) -> None:
     """Clients hear COMM_LOST within three heartbeats of the cut; the amplifier is silent in time.
 

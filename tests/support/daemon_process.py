@@ -203,7 +203,7 @@ async def watch(
 
 
 async def plays_on(
-    what: str, daemon: DaemonProcess, era: AsyncClient, journal: Journal, *, seconds: float = 1.0
+    what: str, daemon: DaemonProcess, era: AsyncClient, journal: Journal, *, seconds: float = 0.6
 ) -> float:
     """The widest gap [s] of a while without any loss; best of some, for a machine that is busy.
 

@@ -419,3 +419,66 @@ def test_a_rig_that_does_not_fit(run_virtual: Run, make_bench: MakeBench) -> Non
         assert not bench.far_end.is_open
 
     run_virtual(scenario())
+
+
+@pytest.mark.parametrize("order", ["stop", "disarm"])
+def test_nobody_arms_what_is_just_being_silenced(
+    order: str, run_virtual: Run, make_bench: MakeBench
+) -> None:
+    """An Arm at the same moment is refused, not sent: which came first would be a matter of luck.
+
+    Once the amplifiers are silenced and cleared they can be armed.
+    """
+
+    async def scenario() -> None:
+        bench = make_bench("a", "b")
+        await bench.controller.open()
+        for far_end in bench.far_ends:
+            far_end.delay = 0.02
+        silencing = asyncio.create_task(getattr(bench.controller, order)())
+        await asyncio.sleep(0)
+        with pytest.raises(CommandRefused, match="just being stopped or disarmed"):
+            await bench.controller.arm()
+        await silencing
+        assert bench.controller.phase is Phase.DISARMED
+        assert [far_end.requests(Arm) for far_end in bench.far_ends] == [[], []]
+        await bench.controller.clear()
+        await bench.controller.arm()
+        assert bench.controller.phase is Phase.ARMED
+        await bench.controller.close()
+
+    run_virtual(scenario())
+
+
+def test_a_half_committed_set_is_silenced_before_another(
+    run_virtual: Run, make_bench: MakeBench
+) -> None:
+    """A lift ends the wait for commits, and a finger comes before zero goes out: zero goes first.
+
+    Some amplifiers may play the set that was given up and others not, which is no pattern at all.
+    """
+
+    async def scenario() -> None:
+        bench = make_bench("a", "b")
+        await bench.controller.open()
+        await bench.controller.arm()
+        task = asyncio.create_task(bench.controller.run())
+        await asyncio.sleep(0.01)
+        for far_end in bench.far_ends:
+            far_end.delay = 0.02
+        bench.touch(FINGER)
+        await asyncio.sleep(0.025)  # staged after 20 ms, and the commits wait for their answers
+        assert [len(far_end.requests(Commit)) for far_end in bench.far_ends] == [1, 1]
+        bench.touch()
+        await asyncio.sleep(0.004)
+        bench.touch(OTHER)
+        await bench.hold(OTHER, seconds=0.2)
+        for far_end in bench.far_ends:
+            first, *sets = far_end.requests(Stage, Commit, Apply)
+            assert first.command_set.is_silent  # as after every Arm
+            assert [type(one) for one in sets] == [Stage, Commit, Apply, Stage, Commit]
+            assert sets[2].command_set.is_silent
+        await bench.controller.close()
+        await task
+
+    run_virtual(scenario())

@@ -78,3 +78,17 @@ def test_the_time_of_a_commit_is_arithmetic() -> None:
     assert modbus.commit_time() == pytest.approx((19 + 3.5) * 11 / 19_200)
     assert ModbusBackend("modbus+tcp://h/1").commit_time() == 0
     assert CanBackend("can+socketcan://can0#1").commit_time() == pytest.approx((135 + 55) / 500_000)
+
+
+def test_a_rest_that_the_clock_cannot_count_is_waited_for() -> None:
+    """2 ms and 0.4 ps to wait, on a clock whose steps are 0.9 ps: it goes out after 2 ms."""
+
+    async def work() -> None:
+        loop = asyncio.get_running_loop()
+        assert isinstance(loop, VirtualLoop)
+        loop.now = begin = 4552.311810074659
+        wires = [Wire(0.0), Wire(0.0020000000004)]
+        await asyncio.gather(*at_one_moment([(wire, wire.commit) for wire in wires]))
+        assert [wire.sent[0] - begin for wire in wires] == pytest.approx([0.002, 0.0])
+
+    in_virtual_time(work)

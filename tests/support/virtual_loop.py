@@ -30,9 +30,8 @@ class VirtualLoop(BaseEventLoop):
     """The loop; dice: by which connections take their time, seen: who watches their bytes."""
 
     def __init__(self, dice: random.Random | None = None, seen: Seen | None = None) -> None:
-        super().__init__()
         self.now = START
-        self._clock_resolution = math.ulp(START)
+        super().__init__()
         self._turns = 0
         self.dice = dice or random.Random(0)
         self.seen: Seen = seen or (lambda link, toward, data: None)
@@ -43,6 +42,15 @@ class VirtualLoop(BaseEventLoop):
     def time(self) -> float:
         """Virtual seconds."""
         return self.now
+
+    @property
+    def _clock_resolution(self) -> float:
+        """The least that it can go on: no timer comes early."""
+        return math.ulp(self.now)
+
+    @_clock_resolution.setter
+    def _clock_resolution(self, of_the_machine: float) -> None:
+        """What the machine's clock has does not matter."""
 
     def select(self, timeout: float | None) -> list[Any]:
         """Nobody from outside has anything to say: go to the next moment."""
@@ -55,7 +63,6 @@ class VirtualLoop(BaseEventLoop):
         if timeout > 0:
             self._turns = 0
             self.now = max(self.now, self._scheduled[0].when())
-            self._clock_resolution = math.ulp(self.now)  # no timer comes early
         return []
 
     def _process_events(self, event_list: list[Any]) -> None:

@@ -296,7 +296,7 @@ class Host:
         self._owe(
             Duty(
                 time + self._times.stop,
-                lambda: side.stop_wished is None or not side.is_open,
+                lambda: side.stop_wished != time or not side.is_open,
                 "stop",
                 side.plan.wire,
                 f"a stop was wished at {time:.4f} s, and {self._times.stop * 1e3:g} ms later "

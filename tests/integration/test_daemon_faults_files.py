@@ -20,7 +20,7 @@ import pytest
 
 from controller.daemon.run import check_daemon
 from daemon_bench import daemon_table, far_end, until, write_daemon
-from daemon_process import ENABLED, WATCHDOG, daemon_process, holding, play, run_era
+from daemon_process import ENABLED, WATCHDOG, daemon_process, disarmed, holding, play, run_era
 from journal import Journal, loudness
 from model.errors import InputError
 from model.table_file import save_table
@@ -206,7 +206,7 @@ async def test_a_daemon_that_runs_keeps_what_it_has(tmp_path: Path) -> None:
                         await until(lambda count=count: len(readies) > count)
                 await play(era, far)
                 assert await era.effects() == effects
-                await era.disarm()
+                await disarmed(era)
                 await until(lambda: loudness(far) == 0)
                 await play(era, far)
                 status = await era.status()

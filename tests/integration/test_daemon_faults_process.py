@@ -31,6 +31,7 @@ from daemon_process import (
     DaemonProcess,
     armed,
     daemon_process,
+    disarmed,
     holding,
     play,
     plays_on,
@@ -166,7 +167,7 @@ async def test_a_wall_clock_that_jumps_is_not_noticed(tmp_path: Path) -> None:
             assert status.lease_left_s is not None
             assert 0 < 60 - status.lease_left_s <= time.monotonic() - begin + 60
             assert not status.rejected_touches
-        await test.era.disarm()
+        await disarmed(test.era)
         cause = ""
         while "has not renewed" not in cause:  # a machine that is busy may lose the link instead
             await ready(test.era)
@@ -203,7 +204,7 @@ async def test_a_full_disk_costs_log_lines_and_nothing_else(tmp_path: Path) -> N
             assert (tmp_path / "era.log").stat().st_size == size
             assert not list((tmp_path / "dumps").glob("*"))
             resource.prlimit(pid, resource.RLIMIT_FSIZE, before)
-            await era.disarm()
+            await disarmed(era)
             await until(lambda: (tmp_path / "era.log").stat().st_size > size)
 
 
@@ -299,9 +300,11 @@ async def test_hangups_in_a_loop_change_nothing(tmp_path: Path) -> None:
                 seen = len(heard)
                 await asyncio.sleep(0.5)
                 quiet = seen == len(heard) and heard[-1].startswith(b"READY")
-            await test.era.disarm()
-            await ready(test.era)
-            assert (await test.era.arm("test", lease_s=60)).lease_s == 5
+            await disarmed(test.era)
+            await armed(test.era)
+            lasts = (await test.era.status()).lease_left_s
+            assert lasts is not None
+            assert lasts <= 5
         asyncio.get_running_loop().remove_reader(manager)
     assert 1 <= sum(b"RELOADING=1" in each for each in heard) <= 100
 

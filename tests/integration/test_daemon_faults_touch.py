@@ -14,7 +14,7 @@ from controller.api.async_client import AsyncClient
 from controller.sources.tuio import tuio_datagram
 from controller.touch import Touch, TouchFrame
 from daemon_bench import PATIENCE, far_end, until
-from daemon_process import DaemonProcess, armed, daemon_process, play
+from daemon_process import DaemonProcess, armed, daemon_process, disarmed, play
 from floods import flood
 from journal import Journal, loudness, silent_from
 from tuio_panel import free_port, panel
@@ -103,7 +103,7 @@ async def test_ten_thousand_touches_a_second_and_the_last_finger_up(tmp_path: Pa
             await asyncio.sleep(0.2)
             assert loudness(test.far) == 0
             assert len(test.journal.raising_since(begin)) < told["sent"] / 10
-            await test.era.disarm()
+            await disarmed(test.era)
             return silent - float(told["up_s"])
 
         await best_of("from the last finger up to zero on the wire, at 10 kHz", attempt, UP_TO_ZERO)

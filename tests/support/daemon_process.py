@@ -161,6 +161,13 @@ async def ready(era: AsyncClient) -> None:
             await era.clear()
 
 
+async def disarmed(era: AsyncClient) -> None:
+    """Disarmed and ready; where the link is lost just then, that disarms, too."""
+    with contextlib.suppress(RpcError):
+        await era.disarm()
+    await ready(era)
+
+
 async def armed(era: AsyncClient) -> None:
     """Armed; again where the link is lost just then, as it may be on a loaded machine."""
     end = time.monotonic() + STARTING

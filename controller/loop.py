@@ -161,8 +161,8 @@ class Controller:
         """Run the loop until `close` or cancellation; raises LinkError when an amplifier is lost.
 
         By then all others have been stopped. A source that fails or ends does not end the loop.
-        While they are disarmed nothing is asked of them here: a link that is lost then shows in what
-        is asked next, which raises, and in `phase`; the daemon's supervisor looks at both.
+        While they are disarmed nothing is asked of them here: a link that is lost then shows in
+        what is asked next, which raises, and in `phase`; the daemon's supervisor looks at both.
         """
         listening = [asyncio.create_task(self._listen(source)) for source in self._sources]
         try:

@@ -15,7 +15,8 @@ demo: .venv/installed
 	$(BIN)/era demo
 
 test: lint
-	$(BIN)/pytest --numprocesses 2 --dist loadfile
+	$(BIN)/pytest -m 'not alone' --numprocesses 2 --dist loadfile
+	$(BIN)/pytest -m alone
 
 lint: .venv/installed-test
 	$(BIN)/ruff check .

@@ -16,6 +16,8 @@ from daemon_process import DaemonProcess, daemon_process, holding, play, plays_o
 from floods import flood
 from journal import Journal, loudness
 
+pytestmark = pytest.mark.alone
+
 GROWTH = 64  # MiB; 32 clients with 256 KiB each to read, and as much to be parsed, are less
 
 

@@ -1,6 +1,10 @@
 """The daemon is killed at random moments, over every wire: every channel is silent in time."""
 
+import pytest
+
 from kills import PLACES, kill_everywhere
+
+pytestmark = pytest.mark.alone
 
 KILLS = 15  # `make kill-test` takes two hundred
 

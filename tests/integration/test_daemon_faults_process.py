@@ -46,6 +46,8 @@ from sim.wires import Wire
 from tuio_panel import free_port, panel
 from wires import WIRES, far_side
 
+pytestmark = pytest.mark.alone
+
 
 @asynccontextmanager
 async def held(folder: Path, more: str = "", **options: object) -> AsyncIterator["Held"]:

@@ -9,6 +9,8 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
 
+import pytest
+
 from best_of import best_of
 from controller.api.async_client import AsyncClient
 from controller.sources.tuio import tuio_datagram
@@ -18,6 +20,8 @@ from daemon_process import DaemonProcess, armed, daemon_process, disarmed, play
 from floods import flood
 from journal import Journal, loudness, silent_from
 from tuio_panel import free_port, panel
+
+pytestmark = pytest.mark.alone
 
 UP_TO_ZERO = 0.020  # s; from the last finger up to zero on the wire
 LEASE = 0.150  # s; without news a finger counts as lifted

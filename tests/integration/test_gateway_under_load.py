@@ -38,6 +38,8 @@ from gateway_bench import (
     wait_for_state,
 )
 
+pytestmark = pytest.mark.alone
+
 ENABLED = "OPERATION_ENABLED"
 WATCHDOG = 0.25  # s; of the amplifiers, by default
 LATE = 0.06  # s; of a process that does nothing, on a machine that is busy with something else

@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+pytestmark = pytest.mark.alone
+
 ROOT = Path(__file__).parents[2]
 TOUCHES = 200
 ATTEMPTS = 6  # on a machine so busy that the daemon loses its amplifier, as it must, nothing counts

@@ -25,6 +25,8 @@ from rig_files import write_rig
 from touch_stream import Stream
 from whole_chain import Chain, Played, running_chain
 
+pytestmark = pytest.mark.alone
+
 PLACES = {
     "A": (0.07, 0.06),
     "B": (0.04, 0.17),

@@ -45,6 +45,9 @@ def demo(
     ] = None,
     out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for the picture.")] = Path("out"),
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object, nothing else.")] = False,
+    dashboard: Annotated[
+        bool, typer.Option("--dashboard", help="Touch it yourself, on a page in the browser.")
+    ] = False,
 ) -> None:
     """Recorded touches in, felt vibrations out: the whole chain over a simulated plate."""
     import asyncio
@@ -62,11 +65,20 @@ def demo(
 
     if wire not in WIRES:
         raise InputError(f"--wire {wire}: there is no such wire yet; choose {' or '.join(WIRES)}")
+    if dashboard and (touches is not None or as_json):
+        raise InputError("--dashboard takes its touches from the page; leave --touches, --json out")
     recorded = read_touches(touches or example_touches_path())
     rig_file = example_rig_path()
     rig = load_rig(rig_file)
     started = time.perf_counter()
     table, table_file = cached_table(rig)
+    if dashboard:
+        from controller.daemon_cli import DASHBOARD
+        from controller.demo.live import run_live
+
+        print("Open the URL below, press Arm, and touch the plate; Ctrl-C ends it.", flush=True)
+        asyncio.run(run_live(rig_file, table, wire=wire, dashboard=DASHBOARD))
+        return
     if not as_json:
         print(
             f"{rig_file.name}: {len(table.patterns)} patterns of {len(rig.eras)} ERAs on a mesh "

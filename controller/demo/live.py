@@ -1,0 +1,52 @@
+"""The demonstration to be touched: simulated amplifiers, a daemon, and its page in a browser."""
+
+import tempfile
+from dataclasses import replace
+from importlib.util import find_spec
+from pathlib import Path
+
+from controller.daemon.config import load_daemon_config
+from controller.daemon.daemon import Daemon
+from controller.daemon.log import start_log
+from controller.daemon.notify import ServiceManager
+from controller.daemon.place import Place
+from controller.demo.far_end import open_far_end
+from model.errors import InputError
+from model.rig_file import load_rig
+from model.table import LocalizationTable
+
+
+async def run_live(rig_file: Path, table: LocalizationTable, *, wire: str, dashboard: str) -> None:
+    """Serve the page of a rig over a wire until Ctrl-C; it starts disarmed, as every daemon.
+
+    wire: as for `run_demo`; dashboard: HOST:PORT of the loopback. The daemon listens where daemons
+    do, so that `era status` and its like reach it. Raises InputError where one runs already, or
+    where the gateway is not installed, and LinkError.
+    """
+    if find_spec("uvicorn") is None or find_spec("starlette") is None:
+        raise InputError(
+            "the page needs the gateway, which is not installed; "
+            "install it with  pip install 'era-haptics[gateway]'"
+        )
+    rig = load_rig(rig_file)
+    with tempfile.TemporaryDirectory(prefix="era-") as folder:
+        file = Path(folder) / "daemon.yaml"
+        file.write_text(f"rig: {rig_file}\nlog: {{level: warning}}\n", encoding="utf-8")
+        config = load_daemon_config(file)
+        place = Place(config.socket)
+        try:
+            log = start_log(None, level=config.section.log.level)
+            try:
+                async with open_far_end(rig_file, rig.amplifiers, wire=wire) as far_end:
+                    daemon = Daemon(
+                        replace(config, urls=far_end.urls),
+                        table,
+                        log=log,
+                        manager=ServiceManager(),
+                        dashboard=dashboard,
+                    )
+                    await daemon.run(place)
+            finally:
+                log.close()
+        finally:
+            place.leave()

@@ -1,0 +1,49 @@
+"""The demonstration to be touched."""
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+from typer.testing import CliRunner
+
+from controller.api.client import Client
+from controller.cli import app
+from model.errors import InputError
+
+LIVE = """\
+import asyncio
+from controller.demo.live import run_live
+from model.rig_file import example_rig_path
+from small_table import small_table
+asyncio.run(run_live(example_rig_path(), small_table(), wire="serial", dashboard="127.0.0.1:0"))
+"""
+
+
+def test_page_and_daemon(tmp_path: Path) -> None:
+    """It says where its page is, its daemon is disarmed and answers; Ctrl-C leaves nothing."""
+    support = Path(__file__).parents[1] / "support"
+    environment = os.environ | {"XDG_RUNTIME_DIR": str(tmp_path), "PYTHONPATH": str(support)}
+    socket = tmp_path / "era-haptics" / "daemon.sock"
+    with subprocess.Popen(
+        [sys.executable, "-c", LIVE], env=environment, stdout=subprocess.PIPE, text=True
+    ) as process:
+        try:
+            assert process.stdout is not None
+            assert process.stdout.readline().startswith("dashboard: http://127.0.0.1:")
+            with Client.connect(socket, timeout=20) as daemon:
+                assert daemon.hello("test").rig.simulated
+                assert daemon.status().state != "OPERATION_ENABLED"
+            process.send_signal(signal.SIGINT)
+            assert process.wait(20) == 0
+        finally:
+            process.kill()
+    assert not socket.exists()
+
+
+def test_touches_come_from_the_page() -> None:
+    """A recording, or JSON of its rows, is refused beside it."""
+    for option in (["--touches", "x.tuio"], ["--json"]):
+        done = CliRunner().invoke(app, ["demo", "--dashboard", *option])
+        assert isinstance(done.exception, InputError)

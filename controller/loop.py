@@ -136,6 +136,7 @@ class Controller:
         await self._group.arm()
         decider.forget()
         self._heartbeat_due = self._clock()
+        self._expire()  # and from now on: fingers may have rested since before
         self._wake.set()
 
     async def disarm(self) -> None:

@@ -479,3 +479,28 @@ def test_a_finger_that_is_overdue_amid_a_slow_answer_is_silenced_as_one_that_lif
             assert silenced[0] - over == pytest.approx(0.008, abs=1e-4)
 
     run_virtual(scenario())
+
+
+def test_a_finger_from_before_the_arming_that_gets_overdue_amid_a_slow_answer(
+    run_virtual: Run, running: Running
+) -> None:
+    """Its lease is watched from the arming on: 8 ms after it has ended, zero goes out."""
+
+    async def scenario() -> None:
+        loop = asyncio.get_running_loop()
+        async with running() as bench:
+            await bench.controller.disarm()
+            bench.touch(FINGER)
+            over = loop.time() + 0.15
+            await asyncio.sleep(0.13)
+            await bench.controller.arm()
+            bench.far_end.delay = 0.04
+            await asyncio.sleep(0.2)
+            silenced = [
+                time
+                for time, request in bench.far_end.asked
+                if isinstance(request, Apply) and request.command_set.is_silent and time >= over
+            ]
+            assert silenced[0] - over == pytest.approx(0.008, abs=1e-4)
+
+    run_virtual(scenario())

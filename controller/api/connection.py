@@ -10,6 +10,7 @@ from collections.abc import Callable
 from typing import cast
 
 from controller.api.jsonrpc import LONGEST_LINE, ErrorCode, RpcError, error_line
+from controller.rate import Rate
 
 OUTGOING_LIMIT = 1 << 18  # bytes that a client has not read
 _NOTIFICATION_LIMIT = OUTGOING_LIMIT // 2  # the rest is for answers
@@ -44,8 +45,7 @@ class Connection(asyncio.Protocol):
         self._is_at_end = False
         self._lost = 0
         self._losing_since: float | None = None
-        self._allowance = REQUEST_RATE
-        self._allowed_at = self.heard_at
+        self._rate = Rate(REQUEST_RATE, clock=clock)
 
     @property
     def is_open(self) -> bool:
@@ -107,14 +107,7 @@ class Connection(asyncio.Protocol):
 
     def may_ask(self) -> bool:
         """Whether another request is within the rate; counts it."""
-        now = self._clock()
-        gained = REQUEST_RATE * (now - self._allowed_at)
-        self._allowed_at = now
-        self._allowance = min(REQUEST_RATE, self._allowance + gained)
-        if self._allowance < 1:
-            return False
-        self._allowance -= 1
-        return True
+        return self._rate.take()
 
     def answer(self, line: bytes) -> None:
         """Send an answer; a client that has not read for long is left instead."""

@@ -60,7 +60,7 @@ class Layout:
     """
 
     regions: tuple[Region, ...] = ()
-    effects: Mapping[str, Effect] = field(default_factory=lambda: usual_effects())
+    effects: Mapping[str, Effect] = field(default_factory=usual_effects)
     elsewhere: str | None = BUZZ
     most_at_once: int = 1
 

@@ -21,9 +21,9 @@ from controller.api.messages import METHODS, TouchParams
 from controller.gateway.access import LARGEST_BODY, SUBPROTOCOL, Access
 from controller.gateway.openapi import NOT_OVER_HTTP, STATUS_OF, openapi
 from controller.gateway.picture import Picture
-from controller.gateway.rate import Rate
 from controller.gateway.session import TRY_AGAIN_LATER, Session, told_apart
 from controller.gateway.settings import Settings
+from controller.rate import Rate
 
 MOST_SESSIONS = 32
 HTTP_REQUESTS_PER_SECOND = 500.0  # of everybody together; a stop is not counted

@@ -11,7 +11,7 @@ from uvicorn.protocols.http.h11_impl import H11Protocol, RequestResponseCycle
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 from websockets.frames import CloseCode, Frame
 
-from controller.gateway.rate import Rate
+from controller.rate import Rate
 
 MOST_WAITING = 128  # connections that have not sent a whole request yet
 REQUEST_PATIENCE = 5.0  # s; a connection without a whole request by then is closed

@@ -21,8 +21,8 @@ from controller.api.jsonrpc import (
 from controller.api.messages import METHODS, SubscribeParams, TouchParams, UnsubscribeParams
 from controller.api.parts import Message
 from controller.gateway.outbox import Outbox
-from controller.gateway.rate import Rate
 from controller.gateway.topics import OWN
+from controller.rate import Rate
 
 REQUESTS_PER_SECOND = 200.0  # touches and stop are not counted
 MOST_PENDING = 16

@@ -13,15 +13,14 @@ MOST_EVENTS = 256
 class Outbox:
     """Answers in order, events in order, and of everything that changes all the time the newest.
 
-    Answers go first. Where more wait than is allowed, the oldest event is lost and counted; too
+    Answers go first. Where more wait than is allowed, the oldest event is lost; too
     many answers overflow: their reader asks faster than it reads, and is to be left.
     """
 
     def __init__(self) -> None:
-        self.lost = 0  # events, since the beginning
         self.is_overflowing = False
         self._answers: deque[Frame] = deque()
-        self._events: deque[Frame] = deque()
+        self._events: deque[Frame] = deque(maxlen=MOST_EVENTS)
         self._newest: OrderedDict[str, Frame] = OrderedDict()
         self._filled = asyncio.Event()
 
@@ -35,9 +34,6 @@ class Outbox:
 
     def event(self, frame: Frame) -> None:
         """What happened."""
-        if len(self._events) >= MOST_EVENTS:
-            self._events.popleft()
-            self.lost += 1
         self._events.append(frame)
         self._filled.set()
 

@@ -23,11 +23,11 @@ from sim.witness.seen import (
 )
 
 _CONTROL, _HEARTBEAT, _LOOK, _SET, _ENVELOPE = 0, 8, 10, 14, 100
-_STATUS, _CAPABILITIES, _IDENTITY, _ACHIEVED, _FAULTS = 1000, 1040, 1064, 1140, 1220
+_STATUS, _REFUSAL, _CAPABILITIES, _IDENTITY, _ACHIEVED, _FAULTS = 1000, 1032, 1040, 1064, 1140, 1220
 _WORDS = {15: Kind.ARM, 0: Kind.DISARM, 2: Kind.STOP, 128: Kind.CLEAR}
 _READ_KINDS = {_IDENTITY: Kind.HELLO, _CAPABILITIES: Kind.CAPABILITIES, _FAULTS: Kind.FAULTS}
 _TAGGED = (_CONTROL, _SET, _ENVELOPE)
-_READ_TAGS = (*_TAGGED, _STATUS, 1032, _CAPABILITIES, _IDENTITY, _ACHIEVED, _FAULTS)
+_READ_TAGS = (*_TAGGED, _STATUS, _REFUSAL, _CAPABILITIES, _IDENTITY, _ACHIEVED, _FAULTS)
 
 
 @dataclass(frozen=True, slots=True)
@@ -244,7 +244,7 @@ def _shape(body: list[int]) -> Shape:
 
 
 def _of_read(unit: int, pdu: bytes, asked: _Open) -> Answered:
-    """What the registers that were read say; key None where they belong to another write."""
+    """What the registers that were read say; key None where they answer another write."""
     if asked.read_from is None:
         return Answered(unit, asked.key)
     words = struct.unpack(f">{pdu[1] // 2}H", pdu[2:])
@@ -256,7 +256,11 @@ def _of_read(unit: int, pdu: bytes, asked: _Open) -> Answered:
         raise OutOfRange("the check of a block is wrong")
     constant = asked.read_from in (_CAPABILITIES, _IDENTITY)
     if asked.tag is not None and words[0] != asked.tag and not constant:
-        return Answered(unit, problem=f"it carries tag {words[0]} instead of {asked.tag}")
+        problem = f"it carries tag {words[0]} instead of {asked.tag}"
+        # A write that was damaged on its way is refused before its tag is read; the refusal that
+        # is told then is an earlier write's, but it is what was asked for.
+        is_earlier = asked.read_from == _REFUSAL and words[4] != asked.tag
+        return Answered(unit, asked.key if is_earlier else None, problem=problem)
     body = words[2:]
     if asked.read_from == _STATUS:
         return Answered(unit, asked.key, condition=_condition(body))

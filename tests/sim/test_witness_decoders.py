@@ -21,6 +21,7 @@ from sim.witness.seen import (
     Toward,
 )
 from sim.witness.serial_decoder import SerialDecoder
+from sim.witness.witness import Witness
 
 DOCS = Path(__file__).parents[2] / "docs"
 # As the pages put it in words: 110 Hz, 0.2, 0 degrees; 250.5 Hz, 1, -90 degrees, keeping phase.
@@ -150,3 +151,61 @@ def test_frames_come_in_pieces() -> None:
     pieces = [one for byte in text for one in reader.feed(bytes([byte]))]
     assert [one.frame for one in pieces] == [None, CanFrame(0x181, b"\x01\x04", False)]
     assert SlcanText("host").feed(b"t18120104\rz\r\a")[0].frame == pieces[1].frame
+
+
+def _over_tcp(number: int, pdu: str) -> bytes:
+    """A telegram of unit 1, with its header."""
+    body = bytes.fromhex("01" + pdu)
+    return number.to_bytes(2, "big") + b"\0\0" + len(body).to_bytes(2, "big") + body
+
+
+# docs/wire-modbus.md: a Ping with tag 22, refused with exception 2, and the block refusal that is
+# read then: tag, no check, BUSY, no channel, refused_tag.
+PING = _over_tcp(1, "17 03E8 000E 0008 0001 02 0016")
+REFUSED = _over_tcp(1, "97 02")
+WHY = _over_tcp(2, "04 0408 0005")
+EARLIER = _over_tcp(2, "04 0A 0015 0000 0007 00FF 0003")
+
+
+def test_a_refusal_of_an_earlier_write_answers_who_reads_it() -> None:
+    """A write damaged on its way leaves no tag; one refused now is not told under an older tag."""
+    for told, is_answer in ((EARLIER, True), (EARLIER[:-2] + b"\0\x16", False)):
+        decoder = ModbusDecoder(over_tcp=True)
+        decoder.feed("amplifier", 0.0, PING)
+        decoder.feed("host", 0.001, REFUSED)
+        ((_, asked),) = decoder.feed("amplifier", 0.002, WHY)
+        ((_, answer),) = decoder.feed("host", 0.003, told)
+        assert isinstance(asked, Asked)
+        assert isinstance(answer, Answered)
+        assert answer.problem == "it carries tag 21 instead of 22"
+        assert (answer.key == asked.key) is is_answer
+
+
+@pytest.mark.parametrize("are_on", [False, True])
+def test_a_refusal_of_an_earlier_write_is_wrong_where_nothing_damages(are_on: bool) -> None:
+    """Faults excuse it, and who goes on then asks nothing amid it; without faults it is told of."""
+    plan = {
+        "wires": {"line": "modbus-tcp"},
+        "amplifiers": {
+            "main": {
+                "wire": "line",
+                "address": 1,
+                "channels": {0: {"frequency_hz": [40, 500], "level": 1.0}},
+            }
+        },
+    }
+    witness = Witness(plan)
+    if are_on:
+        witness.faults(0.0, "line", are_on=True)
+    again = PING[:1] + b"\3" + PING[2:-1] + b"\x17"
+    pieces: tuple[tuple[float, Toward, bytes], ...] = (
+        (0.001, "amplifier", PING),
+        (0.002, "host", REFUSED),
+        (0.003, "amplifier", WHY),
+        (0.004, "host", EARLIER),
+        (0.005, "amplifier", again),
+    )
+    for time, toward, data in pieces:
+        witness.bytes("line", toward, time, data)
+    found = [violation.invariant for violation in witness.finish(0.010)]
+    assert found == ([] if are_on else ["answer"])

@@ -183,6 +183,8 @@ class Follower:
     def _stopped(self, asked: Asked, begin: float, end: float) -> None:
         self._silence((begin, end), asked.ramp, asked.kind.value)
         if asked.kind is Kind.STOP:
+            if self.state is None:  # it may have been in a fault for long
+                self._fed = (-math.inf, end)
             self.state = self.state if self.state in (_REACTING, _FAULT) else _STOPPED
         elif self.state == _ENABLED:
             self.state = 3

@@ -109,7 +109,7 @@ class AnswerReader:
             fault=_FAULTS[values["fault"]],
             token=values["active_token"],
             exact=bool(values["exact"]),
-            refusal=_refusal(result, blamed),
+            refusal=_refusal(result, _STATES[values["state"]], blamed),
             channel=blamed,
             status=status,
         )
@@ -166,11 +166,15 @@ def plain_reply(answer: Answer) -> Reply | None:
     return answer.refusal or answer.status
 
 
-def _refusal(result: int, channel: int | None) -> Nak | None:
+def _refusal(result: int, state: State, channel: int | None) -> Nak | None:
     if result == 0:
         return None
-    # A frame of the set was lost: the amplifier has done nothing, and can be asked again.
-    return Nak(NakCode.BUSY if result == _TORN else _NAKS[result], channel)
+    if result != _TORN:
+        return Nak(_NAKS[result], channel)
+    # A frame of the set was lost: the amplifier has done nothing, and can be asked again, unless it
+    # says at once that it would refuse the whole set as well.
+    is_armed = state is State.OPERATION_ENABLED
+    return Nak(NakCode.BUSY if is_armed else NakCode.WRONG_STATE, channel)
 
 
 def _unpack(layout: str, data: bytes) -> dict[str, int]:

@@ -195,6 +195,13 @@ def test_refusals_say_why_and_which_channel(result: int, nak: Nak) -> None:
     assert answer.refusal == nak
 
 
+@pytest.mark.parametrize("both", [0x01, 0x05, 0x17])  # disarmed, stopped, the watchdog's fault
+def test_a_torn_set_is_not_asked_again_where_no_set_is_taken(both: int) -> None:
+    """What says that it is not armed would refuse the whole set, too."""
+    (answer,) = feed((0x181, bytes([7, 0xF1, both, 0xFF, 0, 0, 0, 0])))
+    assert answer.refusal == Nak(NakCode.WRONG_STATE)
+
+
 def test_what_nobody_asked_for_is_an_event() -> None:
     """An answer with sequence 0, and an emergency."""
     (answer,) = feed((0x181, bytes([0, 0, 5, 0xFF, 0, 0, 0, 0])))

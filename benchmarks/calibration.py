@@ -19,8 +19,8 @@ from model.rig import Rig
 from model.rig_file import load_rig
 from model.table import LocalizationTable
 from model.table_build import build_table
-from sim.sensors import scanning_grid
-from sim.stepped_sine import record_responses
+from sim.sensors.accelerometer import scanning_grid
+from sim.sensors.stepped_sine import record_responses
 
 RIG = Path(__file__).parent.parent / "examples" / "paper_plate.yaml"
 GRIDS = ((2, 2), (3, 2), (4, 3), (6, 4))

@@ -19,8 +19,8 @@ from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.serial_codec import decode_request, encode_reply
 from drivers.protocol.serial_frame import Frame, FrameReader, encode_frame
 from model.rig_file import load_rig
-from sim.amplifier import SimulatedAmplifier
-from sim.pseudo_terminal import make_terminal
+from sim.amplifier.amplifier import SimulatedAmplifier
+from sim.transport.pseudo_terminal import make_terminal
 
 
 async def main() -> None:

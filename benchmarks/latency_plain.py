@@ -25,7 +25,7 @@ from drivers.backends.serial_url import SerialUrl
 from drivers.protocol.messages import Apply, Arm
 from drivers.protocol.serial_codec import encode_request
 from drivers.protocol.serial_frame import encode_frame
-from sim.amplifier import capabilities
+from sim.amplifier.amplifier import capabilities
 
 SETS = 100
 

@@ -26,7 +26,7 @@ from drivers.protocol.messages import Capabilities
 from model.rig import Rig
 from model.rig_file import example_rig_path, load_rig
 from model.table import LocalizationTable
-from sim.amplifier import capabilities
+from sim.amplifier.amplifier import capabilities
 
 FLOOD_RATE = 10_000  # Hz
 WORKERS = 2  # programs at work in the loaded case, one for each core

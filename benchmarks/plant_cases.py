@@ -18,8 +18,8 @@ from model.fingertip import fingertip_points
 from model.reduction import ReducedPlate, reduce_plate
 from model.rig import Channel, Rig
 from model.rig_file import load_rig
-from sim.bench import SAMPLE_RATE, Bench
-from sim.plant import Plant
+from sim.bench.bench import SAMPLE_RATE, Bench
+from sim.plant.plant import Plant
 
 FREQUENCIES = (110.0, 110.0, 250.0, 320.0)
 ONSETS = 0.5  # s between two new tones: a plate that only hums steadily would be no fair case

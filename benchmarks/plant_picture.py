@@ -18,7 +18,7 @@ from model.base_motion import fade
 from model.finger_load import finger_loads
 from model.reduction import reduce_plate
 from model.rig_file import load_rig
-from sim.plant import Plant
+from sim.plant.plant import Plant
 
 RIG = Path(__file__).parent.parent / "examples" / "paper_plate.yaml"
 FREQUENCY = 110.0  # Hz

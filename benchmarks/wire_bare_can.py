@@ -11,7 +11,7 @@ from drivers.guard import SafeCommand
 from drivers.protocol.can_frame import CanFrame, cob_id
 from drivers.protocol.canopen_map import encode_order
 from drivers.protocol.messages import Apply, Arm
-from sim.can_sets import Order, SetBuffer
+from sim.far_ends.can_bus.sets import Order, SetBuffer
 
 CALM = 2.0  # s; the longest watchdog
 

@@ -39,7 +39,7 @@ from drivers.protocol.messages import (
 from drivers.protocol.modbus_map import to_exchange
 from drivers.protocol.serial_codec import decode_request, encode_request
 from drivers.protocol.serial_frame import FrameReader, encode_frame
-from sim.modbus_unit import ModbusUnit
+from sim.far_ends.modbus.unit import ModbusUnit
 
 ROOT = Path(__file__).parent.parent
 PAGE = ROOT / "docs" / "wire-benchmarks.md"

@@ -1,6 +1,6 @@
 """From physics to electricity: which amplifier channel plays what, by the rig's wiring.
 
-`sim/plant.py` translates the other way by the same wiring.
+`sim/plant/plant.py` translates the other way by the same wiring.
 """
 
 import math

@@ -16,8 +16,8 @@ import numpy as np
 from model.calibration.responses_file import write_responses_csv, write_responses_uff
 from model.rig import Rig
 from model.rig_file import load_rig
-from sim.sensors import Accelerometer, scanning_grid
-from sim.stepped_sine import record_responses
+from sim.sensors.accelerometer import Accelerometer, scanning_grid
+from sim.sensors.stepped_sine import record_responses
 
 FREQUENCIES = np.arange(40.0, 501.0, 10.0)
 SEED = 1

@@ -8,7 +8,7 @@ def main() -> int:
     """Run the command line; returns the exit status."""
     for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(variable, "1")  # before numpy loads: two are slower here, and erratic
-    from sim.endings import gone_when_told
+    from sim.process.endings import gone_when_told
 
     try:
         with gone_when_told():  # while all the rest loads

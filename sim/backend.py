@@ -18,10 +18,10 @@ from drivers.protocol.messages import Apply, Event, LoadEnvelope, Reply, Request
 from drivers.statistics import WireCounters
 from model.errors import InputError
 from model.rig_file import load_rig
-from sim.bench import Bench
-from sim.control import control_socket
-from sim.real_time import Exchange, exchange_with, keep_time
-from sim.site import Site
+from sim.bench.bench import Bench
+from sim.bench.real_time import Exchange, exchange_with, keep_time
+from sim.control.server import control_socket
+from sim.control.site import Site
 
 _FORM = "sim://RIG.yaml, with ?control=PATH and &amplifier=NAME where they are wanted"
 

@@ -12,11 +12,11 @@ from model.errors import InputError
 from sim.witness_cli import witness
 
 if TYPE_CHECKING:
-    from sim.process import FarEnd
-    from sim.sensors import Accelerometer
-    from sim.site import Site
-    from sim.view import PlateMap
-    from sim.wires import Wire
+    from sim.control.site import Site
+    from sim.far_ends.wires import Wire
+    from sim.process.far_end import FarEnd
+    from sim.process.view import PlateMap
+    from sim.sensors.accelerometer import Accelerometer
 
 app = typer.Typer(pretty_exceptions_enable=False)
 app.command()(witness)
@@ -108,7 +108,7 @@ def sim(
     ] = False,
 ) -> None:
     """Simulate a rig behind real wires until SIGTERM or Ctrl-C; prints a URL per amplifier."""
-    from sim.endings import gone_when_told
+    from sim.process.endings import gone_when_told
 
     with gone_when_told():  # until there is something to end in order
         _simulate(
@@ -156,10 +156,10 @@ def _simulate(
     from model.finger_load import parse_finger_load
     from model.points import parse_point
     from model.rig_file import load_rig
-    from sim.fault_file import FaultFile, load_faults
-    from sim.process import FarEnd
-    from sim.wire_choice import choose_wires
-    from sim.wires import Wire
+    from sim.far_ends.wire_choice import choose_wires
+    from sim.far_ends.wires import Wire
+    from sim.faults.file import FaultFile, load_faults
+    from sim.process.far_end import FarEnd
 
     given = {kind: option for kind, option in common.items() if option is not None}
     if len(given) > 1:
@@ -210,7 +210,7 @@ def _of_kind(plain: "Wire", kind: str, port: int) -> "Wire":
 
 def _sensor(text: str) -> "Accelerometer":
     from model.points import parse_point
-    from sim.sensors import Accelerometer
+    from sim.sensors.accelerometer import Accelerometer
 
     name, equals, place = text.partition("=")
     if not (name and equals):
@@ -221,8 +221,8 @@ def _sensor(text: str) -> "Accelerometer":
 def _run(far_end: "FarEnd", *, virtual_time: bool) -> None:
     import asyncio
 
-    from sim.process import run_far_end
-    from sim.virtual_time import SteppedLoop
+    from sim.process.far_end import run_far_end
+    from sim.process.virtual_time import SteppedLoop
 
     view = _LiveView() if sys.stdout.isatty() else None
     factory = SteppedLoop if virtual_time else None
@@ -252,7 +252,7 @@ class _LiveView:
         self._plate: PlateMap | None = None
 
     def __call__(self, site: "Site") -> None:
-        from sim.view import PlateMap, draw
+        from sim.process.view import PlateMap, draw
 
         if self._plate is None:
             self._plate = PlateMap(site.bench)

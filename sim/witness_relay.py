@@ -16,7 +16,7 @@ from typing import cast
 import serial
 
 from drivers.errors import LinkError
-from sim.pseudo_terminal import PseudoTerminal
+from sim.transport.pseudo_terminal import PseudoTerminal
 from sim.witness.place import Place
 from sim.witness.seen import Toward
 from sim.witness.witness import Witness

@@ -29,9 +29,9 @@ from drivers.supervision import reopen
 from drivers.watchdog import HEARTBEAT, HEARTBEATS_BORNE
 from memory_machine import MemoryMachine
 from model.rig import Rig
-from sim.faults import Episode, FaultKind
-from sim.pseudo_terminal import TERMINAL_MAKER
-from sim.wires import Wire
+from sim.far_ends.wires import Wire
+from sim.faults.episodes import Episode, FaultKind
+from sim.transport.pseudo_terminal import TERMINAL_MAKER
 from virtual_loop import VirtualLoop, run_virtual
 from wires import WIRES, FarSide, far_side, patient
 

@@ -16,9 +16,9 @@ from controller.touch import TouchFrame
 from drivers.backends.modbus_link import ModbusLink
 from planted_bugs import BUGS as BUGS_OF_THE_WITNESS
 from planted_bugs import plant
-from sim.amplifier import SimulatedAmplifier
-from sim.faults import Episode
-from sim.serial_end import SerialEnd
+from sim.amplifier.amplifier import SimulatedAmplifier
+from sim.far_ends.serial_end import SerialEnd
+from sim.faults.episodes import Episode
 from soak import outcomes, shrink
 from soak_chain import run_plan
 from soak_plan import (

@@ -16,7 +16,7 @@ from drivers.errors import DriverError, LinkTimeout
 from drivers.protocol.messages import Reply, Request, State
 from model.excitation import Tone
 from shaped_link import Shapes
-from sim.amplifier import SimulatedAmplifier
+from sim.amplifier.amplifier import SimulatedAmplifier
 
 PAUSES = (0.0, 0.001, 0.004, 0.02, 0.06)
 WATCHDOG = 0.25 + 0.005  # s; what an amplifier needs to fall silent by itself

@@ -16,7 +16,7 @@ from controller.daemon.notify import ServiceManager
 from controller.daemon.place import Place
 from daemon_bench import daemon_table, far_end, running_daemon, until, until_state, write_daemon
 from drivers.protocol.messages import State
-from sim.faults import Episode
+from sim.faults.episodes import Episode
 
 READY, ENABLED = "READY_TO_SWITCH_ON", "OPERATION_ENABLED"
 

@@ -31,7 +31,7 @@ from drivers.protocol.messages import Apply, LoadEnvelope, State
 from drivers.registry import open_backend
 from model.errors import InputError
 from model.rig_file import load_rig
-from sim.faults import Episode
+from sim.faults.episodes import Episode
 
 READY = "READY_TO_SWITCH_ON"
 ENABLED = "OPERATION_ENABLED"

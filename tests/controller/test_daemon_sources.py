@@ -9,7 +9,7 @@ import pytest
 from controller.sources.tuio import tuio_datagram
 from controller.touch import Touch, TouchFrame
 from daemon_bench import running_daemon, until_state
-from sim.faults import Episode
+from sim.faults.episodes import Episode
 
 
 def free_port() -> int:

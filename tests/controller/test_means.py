@@ -20,7 +20,7 @@ from model.mesh import Mesh
 from model.pattern import Pattern
 from model.plate import Material, Plate
 from model.rig import Channel, Limits, Rig
-from sim.amplifier import capabilities
+from sim.amplifier.amplifier import capabilities
 
 FINE = capabilities(4)
 BOTH, ONSETS, ENDINGS = Shaping(True, True), Shaping(True, False), Shaping(False, True)

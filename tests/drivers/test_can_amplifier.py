@@ -26,13 +26,13 @@ from drivers.protocol.can_frame import CanFrame
 from drivers.protocol.canopen_objects import index_of
 from drivers.protocol.messages import Apply, Event, Fault, Ping, State
 from model.rig import Rig
-from sim.bench import Bench
-from sim.can_bus import CanBus
-from sim.can_end import nodes_on
-from sim.can_node import CanNode
-from sim.faults import Episode
-from sim.station import Station
-from sim.wires import Wire
+from sim.bench.bench import Bench
+from sim.bench.station import Station
+from sim.far_ends.can_bus.bus import CanBus
+from sim.far_ends.can_bus.ends import nodes_on
+from sim.far_ends.can_bus.node import CanNode
+from sim.far_ends.wires import Wire
+from sim.faults.episodes import Episode
 from wires import FarSide, far_side
 
 PATIENCE = 5.0  # s; for a loaded machine, not an expectation
@@ -271,12 +271,12 @@ async def test_envelopes_are_loaded_in_blocks_or_segments(
 ) -> None:
     """131 bytes: by block transfer, or in segments where the amplifier refuses blocks."""
     if not takes_blocks:
-        from sim import can_sdo
+        from sim.far_ends.can_bus import sdo
 
         def refuse(self: object, data: bytes) -> None:
-            raise can_sdo.SdoAbort(can_sdo.UNKNOWN_COMMAND)
+            raise sdo.SdoAbort(sdo.UNKNOWN_COMMAND)
 
-        monkeypatch.setattr(can_sdo.SdoServer, "_block_command", refuse)
+        monkeypatch.setattr(sdo.SdoServer, "_block_command", refuse)
     async with opened(virtual.url()) as amplifier:
         guard = Guard(LIMITS, amplifier.capabilities)
         await amplifier.load_envelope(guard.check_envelope(SHAPE))
@@ -292,19 +292,19 @@ async def test_an_object_that_was_given_up_for_its_time_is_asked_for_again(
     virtual: Virtual, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A node that waited too long for a frame of a busy host says so (0504 0000 h, CiA 301)."""
-    from sim import can_sdo
+    from sim.far_ends.can_bus import sdo
 
-    begin = can_sdo.SdoServer._begin_upload
+    begin = sdo.SdoServer._begin_upload
     given_up: list[bytes] = []
 
-    def give_up_once(server: can_sdo.SdoServer, data: bytes) -> None:
+    def give_up_once(server: sdo.SdoServer, data: bytes) -> None:
         is_capability = data[1:3] == index_of("capabilities").to_bytes(2, "little")
         if is_capability and not given_up:
             given_up.append(data)
-            raise can_sdo.SdoAbort(0x0504_0000)
+            raise sdo.SdoAbort(0x0504_0000)
         begin(server, data)
 
-    monkeypatch.setattr(can_sdo.SdoServer, "_begin_upload", give_up_once)
+    monkeypatch.setattr(sdo.SdoServer, "_begin_upload", give_up_once)
     async with opened(virtual.url()) as amplifier:
         assert amplifier.capabilities.channels == 4
     assert given_up

@@ -27,7 +27,7 @@ from drivers.protocol.messages import (
     Status,
     Stop,
 )
-from sim.amplifier import SimulatedAmplifier
+from sim.amplifier.amplifier import SimulatedAmplifier
 
 Answer = Callable[[SimulatedAmplifier, Request, float], Reply]
 

@@ -56,9 +56,9 @@ from modbus_session import (
     TRIPPED,
     ScriptedStation,
 )
-from sim.modbus_frames import Request as Telegram
-from sim.modbus_unit import ModbusUnit
-from sim.pseudo_terminal import PseudoTerminal
+from sim.far_ends.modbus.frames import Request as Telegram
+from sim.far_ends.modbus.unit import ModbusUnit
+from sim.transport.pseudo_terminal import PseudoTerminal
 
 PATIENCE = 5.0  # s; for what is expected to come
 SHORT = 0.02  # s; for what is expected not to come

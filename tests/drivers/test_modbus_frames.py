@@ -12,8 +12,8 @@ from drivers.protocol import modbus_map
 from drivers.protocol.messages import Apply, Ping, Status
 from drivers.statistics import WireCounters
 from modbus_session import ARMED, SET, ScriptedStation
-from sim.modbus_frames import PAUSE, Request, RtuReader, TcpReader, rtu_frame, tcp_frame
-from sim.modbus_unit import ModbusUnit
+from sim.far_ends.modbus.frames import PAUSE, Request, RtuReader, TcpReader, rtu_frame, tcp_frame
+from sim.far_ends.modbus.unit import ModbusUnit
 
 
 def asked_and_answered(is_rtu: bool) -> tuple[Telegram, bytes]:

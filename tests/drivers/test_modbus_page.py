@@ -13,10 +13,10 @@ from drivers.protocol.messages import Apply, Commit, LoadEnvelope, Nak, Ping, Re
 from drivers.protocol.modbus_map import Exchange, Read, Write
 from drivers.statistics import WireCounters
 from modbus_session import EXAMPLES, ScriptedStation
-from sim.modbus_frames import Request as Asked
-from sim.modbus_frames import rtu_frame, tcp_frame
-from sim.modbus_unit import ModbusUnit
-from sim.modbus_words import checksum
+from sim.far_ends.modbus.frames import Request as Asked
+from sim.far_ends.modbus.frames import rtu_frame, tcp_frame
+from sim.far_ends.modbus.unit import ModbusUnit
+from sim.far_ends.modbus.words import checksum
 
 PAGE = (Path(drivers.__file__).parent.parent / "docs" / "wire-modbus.md").read_text("utf-8")
 FRAMES = {

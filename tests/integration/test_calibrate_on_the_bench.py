@@ -15,8 +15,8 @@ from model.errors import InputError
 from model.rig import Rig
 from model.rig_file import example_rig_path, load_rig
 from perturbed_plate import FREQUENCIES, perturbed
-from sim.sensors import Accelerometer, scanning_grid
-from sim.stepped_sine import record_responses
+from sim.sensors.accelerometer import Accelerometer, scanning_grid
+from sim.sensors.stepped_sine import record_responses
 
 MESH = "16x12"
 SENSOR = Accelerometer("", 0, 0, noise_density=5e-3, reach=200.0, resolution=1e-3)

@@ -41,8 +41,8 @@ from drivers.protocol.messages import Apply, Disarm, Fault, GetStatus, State
 from journal import Journal, energised, loudness, silent_from
 from model.rig_file import load_rig
 from rig_files import TWO_AMPLIFIERS, write_rig
-from sim.faults import Episode
-from sim.wires import Wire
+from sim.far_ends.wires import Wire
+from sim.faults.episodes import Episode
 from tuio_panel import free_port, panel
 from wires import WIRES, far_side
 

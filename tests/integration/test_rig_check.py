@@ -21,8 +21,8 @@ from model.calibration.responses_file import write_responses_csv, write_response
 from model.errors import InputError
 from model.rig_file import load_rig
 from rig_files import TWO_AMPLIFIERS, write_rig
-from sim.sensors import Accelerometer, scanning_grid
-from sim.stepped_sine import record_responses
+from sim.sensors.accelerometer import Accelerometer, scanning_grid
+from sim.sensors.stepped_sine import record_responses
 
 QUICK = ("--frequencies", "61:461:80", "--settle", "0.5", "--listen", "0.1", "--grid", "3x3")
 MESH = "12x9"

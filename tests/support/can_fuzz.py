@@ -35,12 +35,12 @@ from drivers.protocol.messages import (
     State,
     Status,
 )
-from sim.amplifier import SimulatedAmplifier
-from sim.can_bus import CanBus
-from sim.can_node import CanNode
-from sim.faults import Faults
-from sim.slcan_end import SlcanAdapter
-from sim.socketcand_end import SocketcandEnd, _Client
+from sim.amplifier.amplifier import SimulatedAmplifier
+from sim.far_ends.can_bus.bus import CanBus
+from sim.far_ends.can_bus.node import CanNode
+from sim.far_ends.can_bus.slcan_adapter import SlcanAdapter
+from sim.far_ends.can_bus.socketcand_server import SocketcandEnd, _Client
+from sim.faults.episodes import Faults
 
 _FD = 0x8000
 _FD_LENGTHS = (8, 12, 16, 20, 24, 32, 48, 64)

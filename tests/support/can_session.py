@@ -26,7 +26,7 @@ from drivers.protocol.messages import (
     Stage,
     Stop,
 )
-from sim.can_node import CanNode
+from sim.far_ends.can_bus.node import CanNode
 
 NODE = 1
 

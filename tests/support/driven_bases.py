@@ -6,8 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 from model.base_motion import Term, fade
-from sim.base_motion import terms_of
-from sim.shaped_tone import ShapedTone
+from sim.plant.base_motion import terms_of
+from sim.waveform.shaped_tone import ShapedTone
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 import numpy as np
 
 from model.point_load import load_positions
-from sim.plant import Plant
+from sim.plant.plant import Plant
 
 
 def held_by_fingers(plant: Plant) -> float:

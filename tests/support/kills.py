@@ -36,7 +36,7 @@ from drivers.protocol.messages import State
 from journal import Journal, energised, loudness
 from model.rig_file import load_rig
 from rig_files import TWO_AMPLIFIERS, write_rig
-from sim.wires import Wire
+from sim.far_ends.wires import Wire
 from wires import WIRES, far_side
 
 READY = "READY_TO_SWITCH_ON"

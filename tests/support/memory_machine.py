@@ -25,7 +25,7 @@ from drivers.protocol.can_text import (
     slcan_line,
     socketcand_element,
 )
-from sim.pseudo_terminal import Terminal
+from sim.transport.pseudo_terminal import Terminal
 from virtual_loop import VirtualLoop
 
 T = TypeVar("T")

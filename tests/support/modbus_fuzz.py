@@ -8,11 +8,11 @@ from drivers.errors import FrameError
 from drivers.protocol import modbus_map
 from drivers.protocol.messages import Arm, Clear, Reply, Request, State
 from drivers.statistics import WireCounters
-from sim.amplifier import SimulatedAmplifier
-from sim.modbus_frames import PAUSE, RtuReader, TcpReader, rtu_frame, tcp_frame
-from sim.modbus_frames import Request as Asked
-from sim.modbus_unit import ModbusUnit
-from sim.shaped_tone import ShapedTone
+from sim.amplifier.amplifier import SimulatedAmplifier
+from sim.far_ends.modbus.frames import PAUSE, RtuReader, TcpReader, rtu_frame, tcp_frame
+from sim.far_ends.modbus.frames import Request as Asked
+from sim.far_ends.modbus.unit import ModbusUnit
+from sim.waveform.shaped_tone import ShapedTone
 
 _REVIVAL = (
     10  # telegrams, after which it is armed again, for most of what comes stops or disarms it

@@ -7,8 +7,8 @@ from contextlib import asynccontextmanager
 from typing import TypeAlias, cast
 
 from modbus_session import ScriptedStation
-from sim.modbus_frames import Request, RtuReader, TcpReader, rtu_frame, tcp_frame
-from sim.modbus_unit import ModbusUnit
+from sim.far_ends.modbus.frames import Request, RtuReader, TcpReader, rtu_frame, tcp_frame
+from sim.far_ends.modbus.unit import ModbusUnit
 
 Answer: TypeAlias = bytes | None
 """A PDU, or nothing."""

@@ -74,7 +74,7 @@ def _bug(breaks: str, *edits: Edit, **where: Any) -> Bug:
 _TWO = ("a", "b")
 
 _WITHOUT = "tuple(rule for rule in _RULES if rule is not {})"
-_FAR = "sim.amplifier:SimulatedAmplifier"
+_FAR = "sim.amplifier.amplifier:SimulatedAmplifier"
 
 CONTROLLER: dict[str, Bug] = {
     "an up is dropped": _bug(
@@ -360,7 +360,7 @@ FAR_ENDS: dict[str, Bug] = {
         scenario=scenarios.hung,
     ),
     "looking on feeds the watchdog": _bug(
-        "watchdog", Edit("sim.amplifier:_NOT_FEEDING", "", "()"), scenario=scenarios.hung
+        "watchdog", Edit("sim.amplifier.amplifier:_NOT_FEEDING", "", "()"), scenario=scenarios.hung
     ),
     "the time left is told in hundredths": _bug(
         "watchdog",
@@ -391,7 +391,7 @@ FAR_ENDS: dict[str, Bug] = {
     "a commit is torn": _bug(
         "commit",
         Edit(
-            "sim.channels:Channels.play",
+            "sim.amplifier.channels:Channels.play",
             "for channel, playing in enumerate(self._outputs):",
             "for channel, playing in list(enumerate(self._outputs))[:1]:",
         ),
@@ -399,16 +399,16 @@ FAR_ENDS: dict[str, Bug] = {
     "channels are swapped in the amplifier": _bug(
         "plays",
         Edit(
-            "sim.channels:Channels.play",
+            "sim.amplifier.channels:Channels.play",
             "commands.get(channel,",
             "commands.get((1, 0, 2)[channel],",
         ),
     ),
     "a ramp is ignored": _bug(
-        "ramp", Edit("sim.channels:Channels.play", "ramp=ramp,", "ramp=0.0,")
+        "ramp", Edit("sim.amplifier.channels:Channels.play", "ramp=ramp,", "ramp=0.0,")
     ),
     "a stop is abrupt": _bug(
-        "ramp", Edit("sim.channels:Channels.silence", "ramp=ramp", "ramp=0.0")
+        "ramp", Edit("sim.amplifier.channels:Channels.silence", "ramp=ramp", "ramp=0.0")
     ),
     "a disarmed amplifier plays on": _bug(
         "silent",
@@ -422,7 +422,7 @@ FAR_ENDS: dict[str, Bug] = {
     "a fault lets one channel play on": _bug(
         "silent",
         Edit(
-            "sim.channels:Channels.silence",
+            "sim.amplifier.channels:Channels.silence",
             "for output in self._outputs]",
             "for output in self._outputs[:1]] + self._outputs[1:]",
         ),
@@ -450,7 +450,7 @@ FAR_ENDS: dict[str, Bug] = {
     "every answer is sent twice": _bug(
         "credit",
         Edit(
-            "sim.serial_end:SerialEnd._to_host",
+            "sim.far_ends.serial_end:SerialEnd._to_host",
             "self._terminal.write(data)",
             "self._terminal.write(data); self._terminal.write(data)",
         ),
@@ -458,7 +458,7 @@ FAR_ENDS: dict[str, Bug] = {
     "a request is left unanswered": _bug(
         "answer",
         Edit(
-            "sim.serial_end:SerialEnd._to_host",
+            "sim.far_ends.serial_end:SerialEnd._to_host",
             "self._terminal.write(data)",
             "self._n = getattr(self, '_n', 0) + 1\n    if self._n != 9: self._terminal.write(data)",
         ),
@@ -466,14 +466,18 @@ FAR_ENDS: dict[str, Bug] = {
     "its channels vibrate at half the frequency": _bug(
         "plays",
         Edit(
-            "sim.channels:Channels.play",
+            "sim.amplifier.channels:Channels.play",
             "frequency=command.frequency",
             "frequency=command.frequency / 2",
         ),
     ),
     "it plays a tenth of the level": _bug(
         "plays",
-        Edit("sim.channels:Channels.play", "level=command.level,", "level=command.level / 10,"),
+        Edit(
+            "sim.amplifier.channels:Channels.play",
+            "level=command.level,",
+            "level=command.level / 10,",
+        ),
     ),
     "it says that nothing plays": _bug(
         "plays",
@@ -481,13 +485,13 @@ FAR_ENDS: dict[str, Bug] = {
     ),
     "a torn set is played": _bug(
         "commit",
-        Edit("sim.can_sets:SetBuffer.command_set", "len(own) != order.count", "False"),
+        Edit("sim.far_ends.can_bus.sets:SetBuffer.command_set", "len(own) != order.count", "False"),
         scenario=scenarios.torn,
         wire="slcan",
     ),
     "it takes sets while it is disarmed": _bug(
         "enabled",
-        Edit("sim.amplifier:next_state", "", "lambda state, request: state"),
+        Edit("sim.amplifier.amplifier:next_state", "", "lambda state, request: state"),
         scenario=scenarios.strangers_set,
     ),
     "it says that it is only switched on": _bug(
@@ -501,7 +505,7 @@ FAR_ENDS: dict[str, Bug] = {
     "an answer comes without its levels": _bug(
         "answer",
         Edit(
-            "sim.can_node:CanNode._answer",
+            "sim.far_ends.can_bus.node:CanNode._answer",
             "for group, block in enumerate(blocks[1:]):\n        self._send(",
             "for group, block in enumerate(blocks[2:]):\n        self._send(",
         ),

@@ -11,7 +11,7 @@ from drivers.protocol.messages import Reply, Request
 from model.envelope import Envelope
 from model.pattern import Pattern
 from model.question import Question
-from sim.amplifier import SimulatedAmplifier
+from sim.amplifier.amplifier import SimulatedAmplifier
 
 
 class Shapes:

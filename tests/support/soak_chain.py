@@ -29,11 +29,11 @@ from memory_machine import MemoryMachine
 from model.rig import Channel, Rig
 from model.table import LocalizationTable
 from paper_plate import make_paper_rig
-from sim.bench import Bench
-from sim.faults import Faults
-from sim.pseudo_terminal import TERMINAL_MAKER
-from sim.station import Station
-from sim.wires import Wire, open_wires
+from sim.bench.bench import Bench
+from sim.bench.station import Station
+from sim.far_ends.wires import Wire, open_wires
+from sim.faults.episodes import Faults
+from sim.transport.pseudo_terminal import TERMINAL_MAKER
 from sim.witness.witness import Wish
 from small_table import small_table
 from soak_checks import RELEASE, Checks, Touched

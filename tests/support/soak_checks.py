@@ -20,9 +20,9 @@ from drivers.protocol.messages import (
     Request,
     State,
 )
-from sim.amplifier import SimulatedAmplifier
-from sim.bench import Bench
-from sim.waveform import level_of
+from sim.amplifier.amplifier import SimulatedAmplifier
+from sim.bench.bench import Bench
+from sim.waveform.output import level_of
 from soak_plan import Plan
 
 AUDIBLE = 1e-3  # of full stroke; below it a ramp counts as ended

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import TypeAlias
 
-from sim.faults import Episode, FaultKind
+from sim.faults.episodes import Episode, FaultKind
 
 KINDS: Mapping[str, Sequence[int | None]] = {
     "serial": (115_200, 921_600),
@@ -50,7 +50,7 @@ GESTURES = ("tap", "hold", "drag", "chord", "vanish", "flood", "wrong")
 
 @dataclass(frozen=True)
 class Line:
-    """A wire: kind as `sim.wires` has it, and speed [bit/s]."""
+    """A wire: kind as `sim.far_ends.wires` has it, and speed [bit/s]."""
 
     kind: str
     speed: int | None

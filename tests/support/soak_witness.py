@@ -8,8 +8,8 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from sim.amplifier import SimulatedAmplifier
-from sim.faults import Episode
+from sim.amplifier.amplifier import SimulatedAmplifier
+from sim.faults.episodes import Episode
 from sim.witness.place import place_of
 from sim.witness.witness import Wish, Witness
 from soak_contacts import FrameTouches, SourceContacts

@@ -9,11 +9,11 @@ from dataclasses import dataclass
 
 from drivers import clock
 from model.rig import Rig
-from sim.amplifier import SimulatedAmplifier
-from sim.bench import Bench
-from sim.faults import Faults
-from sim.station import Station
-from sim.wires import Wire, open_wire
+from sim.amplifier.amplifier import SimulatedAmplifier
+from sim.bench.bench import Bench
+from sim.bench.station import Station
+from sim.far_ends.wires import Wire, open_wire
+from sim.faults.episodes import Faults
 
 WIRES: Mapping[str, Wire] = {
     "serial": Wire("serial", unpluggable=True),
@@ -22,7 +22,7 @@ WIRES: Mapping[str, Wire] = {
     "can+socketcand": Wire("socketcand", unpluggable=True),
     "can+slcan": Wire("slcan", unpluggable=True),
 }
-"""Each is far end and backend by one scheme; see `sim.wires`."""
+"""Each is far end and backend by one scheme; see `sim.far_ends.wires`."""
 
 SHARED_WIRES: Mapping[str, Wire] = {
     "serial": Wire("serial", shared=True),

@@ -31,11 +31,11 @@ from model.pattern import Pattern
 from model.plate import Material, Plate
 from model.question import Question
 from model.rig import Channel, Limits, Rig
-from sim.bench import Bench
-from sim.pseudo_terminal import TERMINAL_MAKER
-from sim.station import Station
-from sim.waveform import level_of
-from sim.wires import Wire, open_wire
+from sim.bench.bench import Bench
+from sim.bench.station import Station
+from sim.far_ends.wires import Wire, open_wire
+from sim.transport.pseudo_terminal import TERMINAL_MAKER
+from sim.waveform.output import level_of
 from sim.witness.violation import Violation
 from sim.witness.witness import Witness
 from virtual_loop import VirtualLoop, run_virtual

@@ -1,0 +1,351 @@
+"""One simulated amplifier: requests in, replies out, by a clock that is handed in.
+
+Everything happens at its own time: a watchdog that ran out between two calls ran out when it did,
+and what a channel plays is a description in time (`sim.waveform`), not samples. Nothing here reads
+a clock or knows a wire.
+
+Not modelled: the time high voltage takes to rise, and the voltage waveform behind a tone.
+"""
+
+import math
+from collections import deque
+from collections.abc import Callable, Sequence
+
+from drivers.command import CommandSet, Envelope
+from drivers.protocol.definition import PROTOCOL
+from drivers.protocol.messages import (
+    Achieved,
+    Apply,
+    Arm,
+    Capabilities,
+    Clear,
+    Commit,
+    Disarm,
+    Event,
+    Fault,
+    FaultList,
+    FaultRecord,
+    GetCaps,
+    GetFaults,
+    GetStatus,
+    Hello,
+    Identity,
+    Loaded,
+    LoadEnvelope,
+    Nak,
+    NakCode,
+    Reply,
+    Request,
+    Stage,
+    State,
+    Status,
+    Stop,
+)
+from sim.amplifier.channels import Channels, PlayableSet
+from sim.amplifier.heat import DERATE_ABOVE, DERATED, FAULT_ABOVE, GOOD_BELOW, Heat
+from sim.amplifier.quantiser import RefusedSet, quantise_envelope, quantise_set
+from sim.amplifier.states import ENABLED, next_state
+from sim.waveform.output import Output
+
+SILENCING_RAMP = 0.005  # s; a fault must be silent within 5 ms of the watchdog's expiry
+_Q = PROTOCOL.quantities
+_FAULTS_KEPT = 16
+_TOKENS_REMEMBERED = 16  # duplicates of old sets are older than a few exchanges at most
+_HIGH_VOLTAGE = 1800.0  # V
+_DISCHARGE = 0.02  # s; time constant of the supply once it is off
+_SLOTS = 63
+_NOT_FEEDING = (Hello, GetCaps, GetStatus, GetFaults)
+
+
+def capabilities(channels: int) -> Capabilities:
+    """What a simulated amplifier with so many channels can play."""
+    return Capabilities(
+        channels=channels,
+        frequency_min=10.0,  # the guard's floor: below it a plate only rocks
+        frequency_max=_Q.frequency.high,
+        frequency_step=_Q.frequency.step,
+        level_max=_Q.level.high,
+        level_step=_Q.level.step,
+        phase_step=_Q.phase.step,
+        ramp_max=_Q.ramp.high,
+        watchdog_min=_Q.watchdog.low,
+        watchdog_max=_Q.watchdog.high,
+        envelope_knots=_Q.envelope_knots.maximum,
+        envelope_slots=_SLOTS,
+        envelope_step_min=0.001,
+        envelope_step_max=_Q.envelope_step.high,
+        events=True,
+    )
+
+
+class SimulatedAmplifier:
+    """An amplifier by its name, with a number of channels; times are seconds of any one clock.
+
+    Whoever is in `listeners` is told of every change of state or fault, and when [s] it was.
+    """
+
+    def __init__(self, name: str, *, channels: int) -> None:
+        self.identity = Identity(
+            vendor="era-haptics",
+            product="simulated amplifier",
+            serial_number=f"SIM-{name}",
+            firmware="1",
+            protocol_version=PROTOCOL.version,
+        )
+        self.capabilities = capabilities(channels)
+        self.state = State.SWITCH_ON_DISABLED
+        self.fault = Fault.NONE
+        self.listeners: list[Callable[[Event, float], None]] = []
+        self._heat = Heat(since=-math.inf)
+        self._faults: deque[tuple[Fault, int | None, float]] = deque(maxlen=_FAULTS_KEPT)
+        self._start()
+
+    def _start(self) -> None:
+        """As when its supply comes back: nothing is remembered but the temperature and faults."""
+        self._channels = Channels(self.capabilities.channels)
+        self._slots: dict[int, Envelope] = {}
+        self._staged: PlayableSet | None = None
+        self._active: PlayableSet | None = None
+        self._tokens: deque[int] = deque(maxlen=_TOKENS_REMEMBERED)
+        self._watchdog = 0.0
+        self._fed = 0.0
+        self._vibration_end = math.inf
+        self._silent_from = -math.inf  # when the last silence that was ordered is reached
+        self._is_derated = False
+
+    @property
+    def outputs(self) -> Sequence[Output]:
+        """What each channel plays from now on, if nothing else happens."""
+        return self._channels.outputs
+
+    @property
+    def next_event(self) -> float:
+        """When something will happen by itself: the time up to which `outputs` holds."""
+        return min(
+            self._vibration_end, self._watchdog_end, self._silence_reached, self._too_warm_from
+        )
+
+    def tick(self, now: float) -> None:
+        """Let happen what is due by now, in its order and each thing at its own time."""
+        while (moment := self.next_event) <= now:
+            if moment == self._vibration_end:
+                self._channels.end(moment)
+                self._vibration_end = math.inf
+                self._warm(moment)
+            elif moment == self._watchdog_end:
+                self.trip(Fault.WATCHDOG, moment)
+            elif moment == self._silence_reached:
+                silent = self.state is State.FAULT_REACTION_ACTIVE
+                self._enter(State.FAULT if silent else State.SWITCH_ON_DISABLED, moment)
+            else:
+                self._too_warm(moment)
+        if self._is_derated and self._heat.at(now) < GOOD_BELOW:
+            self._is_derated = False
+
+    def handle(self, request: Request, now: float) -> Reply:
+        """Answer a request that arrives now [s]; a Nak means that nothing was applied."""
+        self.tick(now)
+        following = next_state(self.state, type(request))
+        if following is None:
+            return Nak(NakCode.WRONG_STATE)
+        reply = self._carry_out(request, following, now)
+        if not isinstance(request, _NOT_FEEDING) and not isinstance(reply, Nak):
+            self._fed = now
+        # A watchdog that is fed by this very request is full when its status is told.
+        return self.status(now) if reply is None else reply
+
+    def status(self, now: float) -> Status:
+        """How the amplifier is at a time [s] up to which it has been ticked."""
+        levels = self._channels.levels(now)
+        left = self._fed + self._watchdog - now if self.state in ENABLED else 0.0
+        is_on = self.state in (State.SWITCHED_ON, *ENABLED) or any(levels)
+        decayed = math.exp(min(0.0, (self._silent_from - now) / _DISCHARGE))
+        return Status(
+            state=self.state,
+            fault=self.fault,
+            token=self._active.token if self._active else 0,
+            high_voltage=is_on,
+            temperature=self._heat.at(now),
+            watchdog_left=left,
+            levels=levels,
+            voltage=_HIGH_VOLTAGE if is_on else round(_HIGH_VOLTAGE * decayed),
+        )
+
+    def trip(self, fault: Fault, moment: float, *, channel: int | None = None) -> None:
+        """A fault: silent within the shortest ramp, then high voltage off, latched.
+
+        Where nothing can play it is only noted among the faults.
+        """
+        self._faults.appendleft((fault, channel, moment))
+        if self.state in (*ENABLED, State.SWITCHED_ON, State.QUICK_STOP_ACTIVE):
+            self._silence(moment, ramp=SILENCING_RAMP)
+            self.fault = fault
+            self._enter(State.FAULT_REACTION_ACTIVE, moment, channel=channel)
+
+    def set_temperature(self, temperature: float, moment: float) -> None:
+        """Bring it to a temperature [°C] from outside; what follows from that follows."""
+        self._heat = Heat(moment, temperature, self._heat.final)
+        if temperature > DERATE_ABOVE and not self._is_derated:
+            self._too_warm(moment)
+        if temperature > FAULT_ABOVE:
+            self._too_warm(moment)
+
+    def restart(self, moment: float) -> None:
+        """Lose the supply and start anew: silent at once, disarmed, sets and envelopes gone."""
+        self._heat = Heat(moment, self._heat.at(moment))
+        self.fault = Fault.NONE
+        self._start()
+        self._enter(State.SWITCH_ON_DISABLED, moment)
+
+    def _carry_out(self, request: Request, following: State, now: float) -> Reply | None:
+        """Do what is asked in a state that allows it; None where the reply is the status."""
+        match request:
+            case Hello():
+                return self.identity
+            case GetCaps():
+                return self.capabilities
+            case GetFaults():
+                return FaultList(
+                    tuple(
+                        FaultRecord(fault, channel, now - at) for fault, channel, at in self._faults
+                    )
+                )
+            case Arm(watchdog=watchdog):
+                return self._arm(watchdog, now)
+            case Disarm(ramp=ramp) | Stop(ramp=ramp):
+                self._silence(now, ramp=self._stopping_ramp(ramp))
+                self._enter(following, now)
+                self.tick(now)
+            case Clear():
+                if self._silent_from <= now and not self._is_still_hot(now):
+                    self.fault = Fault.NONE
+                    self._enter(following, now)
+            case LoadEnvelope(envelope=envelope):
+                return self._load(envelope)
+            case Stage(command_set=wanted):
+                return self._stage(wanted)
+            case Commit(token=token):
+                return self._commit(token, now)
+            case Apply(command_set=wanted):
+                if self._active is not None and self._active.token == wanted.token:
+                    return Achieved(self._active.token, self._active.commands)
+                reply = self._stage(wanted)
+                return reply if isinstance(reply, Nak) else self._commit(wanted.token, now)
+            case _:  # GetStatus and Ping ask for nothing more
+                pass
+        return None
+
+    def _arm(self, watchdog: float, now: float) -> Reply | None:
+        low, high = self.capabilities.watchdog_min, self.capabilities.watchdog_max
+        if not low <= watchdog <= high:
+            return Nak(NakCode.BAD_VALUE)
+        # To arm means level zero, also for an amplifier that another host has left playing.
+        self._silence(now, ramp=SILENCING_RAMP)
+        self._watchdog = watchdog
+        self._fed = now
+        self._active = None
+        self._tokens.clear()
+        self._enter(State.OPERATION_ENABLED, now)
+        return None
+
+    def _load(self, envelope: Envelope) -> Reply:
+        try:
+            kept = quantise_envelope(envelope, self.capabilities)
+        except RefusedSet as refusal:
+            return refusal.nak
+        if kept.knots:
+            self._slots[kept.slot] = kept
+        else:
+            self._slots.pop(kept.slot, None)
+        return Loaded(slot=kept.slot, knots=len(kept.knots))
+
+    def _stage(self, wanted: CommandSet) -> Reply:
+        if wanted.token in self._tokens:  # a late copy, which must not oust what is staged now
+            return Nak(NakCode.BAD_TOKEN)
+        try:
+            staged = self._with_envelopes(quantise_set(wanted, self.capabilities))
+        except RefusedSet as refusal:
+            return refusal.nak
+        if self._is_derated:
+            staged = staged.derated(DERATED)
+        self._staged = staged
+        return Achieved(staged.token, staged.commands)
+
+    def _with_envelopes(self, wanted: CommandSet) -> PlayableSet:
+        """The set with the envelopes that it refers to, as they are loaded now."""
+        onsets: dict[int, Envelope] = {}
+        endings: dict[int, Envelope] = {}
+        for command in wanted.commands:
+            for slot, shapes in ((command.onset, onsets), (command.ending, endings)):
+                if slot and slot not in self._slots:
+                    raise RefusedSet(NakCode.NO_ENVELOPE, command.channel)
+                if slot:
+                    shapes[command.channel] = self._slots[slot]
+        return PlayableSet(wanted, onsets, endings)
+
+    def _commit(self, token: int, now: float) -> Reply:
+        if self._active is not None and self._active.token == token:
+            return Achieved(token, self._active.commands)
+        if self._staged is None or self._staged.token != token:
+            return Nak(NakCode.BAD_TOKEN)
+        self._active, self._staged = self._staged, None
+        wanted = self._active.command_set
+        self._channels.play(self._active, now)
+        self._warm(now)
+        self._tokens.append(token)
+        ends = wanted.valid_for > 0 and not wanted.is_silent
+        self._vibration_end = now + wanted.valid_for if ends else math.inf
+        return Achieved(token, wanted.commands)
+
+    def _stopping_ramp(self, ramp: float) -> float:
+        """A ramp that can be played: a stop is never refused for its ramp."""
+        if math.isnan(ramp):
+            return SILENCING_RAMP
+        return min(max(ramp, 0.0), self.capabilities.ramp_max)
+
+    def _silence(self, moment: float, *, ramp: float) -> None:
+        """Every channel falls silent within the ramp [s], and nothing staged is left."""
+        self._channels.silence(moment, ramp=ramp)
+        self._silent_from = self._channels.silent_from(moment)
+        self._vibration_end = math.inf
+        self._staged = None
+        self._warm(moment)
+
+    def _enter(self, state: State, moment: float, *, channel: int | None = None) -> None:
+        """Go to a state and tell who listens, where it is another or a fault was cleared."""
+        told = Event(state, self.fault, channel)
+        if state is not self.state:
+            self.state = state
+            for listener in self.listeners:
+                listener(told, moment)
+
+    @property
+    def _watchdog_end(self) -> float:
+        return self._fed + self._watchdog if self.state in ENABLED else math.inf
+
+    @property
+    def _silence_reached(self) -> float:
+        ending = (State.SWITCHED_ON, State.FAULT_REACTION_ACTIVE)
+        return self._silent_from if self.state in ending else math.inf
+
+    @property
+    def _too_warm_from(self) -> float:
+        if self.state not in ENABLED:
+            return math.inf
+        return self._heat.when(FAULT_ABOVE if self._is_derated else DERATE_ABOVE)
+
+    def _warm(self, moment: float) -> None:
+        self._heat = self._heat.driven(moment, load=self._channels.load)
+
+    def _too_warm(self, moment: float) -> None:
+        """Derate at the lower of two temperatures, trip at the higher."""
+        if self._is_derated:
+            self.trip(Fault.OVER_TEMPERATURE, moment)
+            return
+        self._is_derated = True
+        self._channels.derate(moment, DERATED)
+        self._warm(moment)
+
+    def _is_still_hot(self, now: float) -> bool:
+        """Whether the cause of an over-temperature fault is still there."""
+        return self.fault is Fault.OVER_TEMPERATURE and self._heat.at(now) >= GOOD_BELOW

@@ -1,0 +1,165 @@
+"""What the channels of a simulated amplifier play, and how one set gives way to the next."""
+
+import cmath
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+from drivers.command import CommandSet, DriveCommand, Envelope
+from sim.waveform.output import Output, end_along, fade_to, level_of, shape_to
+
+_DERATING_RAMP = 0.02  # s; no click
+
+
+@dataclass(frozen=True)
+class PlayableSet:
+    """A checked and rounded set with the envelopes it refers to, by channel."""
+
+    command_set: CommandSet
+    onsets: Mapping[int, Envelope] = field(default_factory=dict)
+    endings: Mapping[int, Envelope] = field(default_factory=dict)
+
+    @property
+    def token(self) -> int:
+        """The set's token."""
+        return self.command_set.token
+
+    @property
+    def commands(self) -> tuple[DriveCommand, ...]:
+        """The set's commands."""
+        return self.command_set.commands
+
+    def derated(self, factor: float) -> "PlayableSet":
+        """The same with every level, those of the knots included, at this share."""
+        return PlayableSet(
+            replace(
+                self.command_set,
+                commands=tuple(
+                    replace(command, level=command.level * factor) for command in self.commands
+                ),
+            ),
+            onsets=_derated(self.onsets, factor),
+            endings=_derated(self.endings, factor),
+        )
+
+
+class Channels:
+    """The outputs of so many channels, each silent at first; times in s of any one clock."""
+
+    def __init__(self, count: int) -> None:
+        self._outputs: list[Output] = [()] * count
+        self._endings: Mapping[int, Envelope] = {}
+        self._ramp = 0.0  # of the set that plays
+
+    @property
+    def outputs(self) -> Sequence[Output]:
+        """What each plays from now on, if nothing else happens."""
+        return tuple(self._outputs)
+
+    @property
+    def load(self) -> float:
+        """Mean over the channels of the squared level that each settles at."""
+        levels = [
+            sum(abs(tone.settled_amplitude) for tone in output if tone.lasts)
+            for output in self._outputs
+        ]
+        return sum(level**2 for level in levels) / max(len(levels), 1)
+
+    def levels(self, time: float) -> tuple[float, ...]:
+        """Level 0..1 that each has at a time."""
+        # The sum of two fades may round to a little above 1.
+        return tuple(min(level_of(output, time), 1.0) for output in self._outputs)
+
+    def silent_from(self, time: float) -> float:
+        """When all are silent, if nothing else happens; a time for those that are."""
+        return max([time, *(tone.silent_from for output in self._outputs for tone in output)])
+
+    def play(self, playable: PlayableSet, time: float) -> None:
+        """Take over a set; channels that it does not name fall silent."""
+        commands = {command.channel: command for command in playable.commands}
+        ramp = playable.command_set.ramp
+        for channel, playing in enumerate(self._outputs):
+            command = commands.get(channel, DriveCommand(channel, 0.0, 0.0))
+            onset, ending = playable.onsets.get(channel), self._endings.get(channel)
+            if onset is not None:
+                output = _shaped(playing, time, command, onset, ramp)
+            elif command.level == 0 and ending is not None and not command.skip_ending:
+                output = _ended(playing, time, ending, ramp)
+            else:
+                output = fade_to(
+                    playing,
+                    time,
+                    ramp=ramp,
+                    frequency=command.frequency,
+                    level=command.level,
+                    phase=math.radians(command.phase),
+                    keep_phase=command.keep_phase,
+                )
+            self._outputs[channel] = output
+        self._endings = playable.endings
+        self._ramp = ramp
+
+    def end(self, time: float) -> None:
+        """The vibration ends by itself: along its endings, or the ramp of its set."""
+        self._outputs = [
+            _ended(playing, time, self._endings[channel], self._ramp)
+            if channel in self._endings
+            else fade_to(playing, time, ramp=self._ramp)
+            for channel, playing in enumerate(self._outputs)
+        ]
+        self._endings = {}
+
+    def silence(self, time: float, *, ramp: float) -> None:
+        """Everything falls silent within the ramp, whatever endings there are."""
+        self._outputs = [fade_to(output, time, ramp=ramp) for output in self._outputs]
+        self._endings = {}
+
+    def derate(self, time: float, factor: float) -> None:
+        """What plays goes to this share of its level; phases run on."""
+        for channel, playing in enumerate(self._outputs):
+            tone = next((tone for tone in playing if tone.lasts), None)
+            if tone is not None:
+                level, phase = cmath.polar(tone.settled_amplitude)
+                self._outputs[channel] = fade_to(
+                    playing,
+                    time,
+                    ramp=_DERATING_RAMP,
+                    frequency=tone.frequency,
+                    level=level * factor,
+                    phase=phase,
+                    keep_phase=True,
+                )
+        self._endings = _derated(self._endings, factor)
+
+
+def _derated(envelopes: Mapping[int, Envelope], factor: float) -> dict[int, Envelope]:
+    return {
+        channel: replace(
+            envelope,
+            knots=tuple(replace(knot, level=knot.level * factor) for knot in envelope.knots),
+        )
+        for channel, envelope in envelopes.items()
+    }
+
+
+def _shaped(
+    playing: Output, time: float, command: DriveCommand, onset: Envelope, ramp: float
+) -> Output:
+    return shape_to(
+        playing,
+        time,
+        ramp=ramp,
+        step=onset.step,
+        knots=_amplitudes(onset),
+        frequency=command.frequency,
+        amplitude=cmath.rect(command.level, math.radians(command.phase)),
+        keep_phase=command.keep_phase,
+    )
+
+
+def _ended(playing: Output, time: float, ending: Envelope, ramp: float) -> Output:
+    return end_along(playing, time, ramp=ramp, step=ending.step, knots=_amplitudes(ending))
+
+
+def _amplitudes(envelope: Envelope) -> tuple[complex, ...]:
+    return tuple(cmath.rect(knot.level, math.radians(knot.phase)) for knot in envelope.knots)

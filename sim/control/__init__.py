@@ -1,0 +1,1 @@
+"""Control of a running far end from outside: fingers, sensors, faults and time, over a socket."""

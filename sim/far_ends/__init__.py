@@ -1,0 +1,1 @@
+"""The amplifiers' side of every wire: bytes on it, messages behind it."""

@@ -1,0 +1,97 @@
+"""The amplifiers' side of a CAN bus: nodes on it, and the adapter by which a host gets there."""
+
+import asyncio
+import contextlib
+from collections.abc import AsyncIterator, Mapping, Sequence
+from contextlib import AsyncExitStack, asynccontextmanager
+
+from drivers.protocol.definition import PROTOCOL
+from sim.bench.station import Station
+from sim.far_ends.can_bus.bus import CanBus, Stub
+from sim.far_ends.can_bus.node import CanNode
+from sim.far_ends.can_bus.slcan_adapter import SlcanEnd
+from sim.far_ends.can_bus.socketcand_server import BUS_NAME, SocketcandEnd
+
+_BITRATE: int = PROTOCOL.canopen["bitrate"]
+_PER_NODE: int = PROTOCOL.canopen["channels_per_node"]
+
+
+@asynccontextmanager
+async def nodes_on(
+    bus: CanBus, stations: Sequence[Station], *, bitrate: int | None = None
+) -> AsyncIterator[dict[str, int]]:
+    """Amplifiers as nodes of a bus; the node of each by its name.
+
+    bitrate [bit/s]: frames take as long as at this speed, None for no time.
+    """
+    with contextlib.ExitStack() as stack:
+        numbers = {}
+        number = 1
+        for station in stations:
+            node = _join(bus, station, number, bitrate=bitrate, stack=stack)
+            numbers[station.name] = number
+            node.start()
+            number += -(-station.capabilities.channels // _PER_NODE)
+        yield numbers
+
+
+@asynccontextmanager
+async def socketcand(
+    stations: Sequence[Station], *, port: int = 0, bitrate: int | None = None
+) -> AsyncIterator[Mapping[str, str]]:
+    """All amplifiers on one bus behind a socketcand server; their URLs by their names."""
+    bus = CanBus()
+    end = SocketcandEnd(bus, port=port)
+    opening: set[asyncio.Task[None]] = set()
+
+    def plug(is_plugged: bool) -> None:
+        if not is_plugged:
+            end.unplug()
+        else:
+            task = asyncio.get_running_loop().create_task(end.open())
+            opening.add(task)
+            task.add_done_callback(opening.discard)
+
+    async with AsyncExitStack() as stack:
+        await end.open()
+        stack.push_async_callback(end.close)
+        nodes = await stack.enter_async_context(nodes_on(bus, stations, bitrate=bitrate))
+        stations[0].on_plug(plug)
+        speed = f"?bitrate={bitrate}" if bitrate not in (None, _BITRATE) else ""
+        yield {
+            name: f"can+socketcand://127.0.0.1:{end.port}/{BUS_NAME}{speed}#{node}"
+            for name, node in nodes.items()
+        }
+        await asyncio.gather(*opening)
+
+
+@asynccontextmanager
+async def slcan(
+    stations: Sequence[Station], *, bitrate: int | None = None, unpluggable: bool = False
+) -> AsyncIterator[Mapping[str, str]]:
+    """All amplifiers on one bus behind a serial adapter; their URLs by their names."""
+    bus = CanBus()
+    end = SlcanEnd(bus, unpluggable=unpluggable)
+    async with AsyncExitStack() as stack:
+        stack.callback(end.close)
+        nodes = await stack.enter_async_context(nodes_on(bus, stations, bitrate=bitrate))
+        stations[0].on_plug(end.plug)
+        yield {
+            name: f"can+slcan://{end.path}?bitrate={bitrate or _BITRATE}#{node}"
+            for name, node in nodes.items()
+        }
+
+
+def _join(
+    bus: CanBus,
+    station: Station,
+    number: int,
+    *,
+    bitrate: int | None,
+    stack: contextlib.ExitStack,
+) -> CanNode:
+    stub = Stub(bus, lambda frame: node.receive(frame), faults=station.faults, bitrate=bitrate)
+    node = CanNode(station, number, send=stub.send)
+    stack.callback(stub.close)
+    stack.callback(node.close)
+    return node

@@ -1,0 +1,308 @@
+"""The object dictionary of a simulated amplifier: what an SDO client reads and writes.
+
+Indices and ranges are those of protocol.yaml; how they become bytes is written here anew, so that
+host and far end check each other.
+"""
+
+import struct
+import zlib
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any
+
+from drivers.command import Envelope, Knot
+from drivers.protocol.definition import PROTOCOL, Quantity
+from drivers.protocol.messages import Achieved, FaultList, GetFaults, LoadEnvelope, Nak, NakCode
+from sim.bench.station import Station
+from sim.far_ends.can_bus.sdo import (
+    BAD_LENGTH,
+    NO_OBJECT,
+    NO_SUBINDEX,
+    READ_ONLY,
+    WRITE_ONLY,
+    SdoAbort,
+)
+
+CANOPEN: Mapping[str, Any] = PROTOCOL.canopen
+IDS: Mapping[str, int] = CANOPEN["cob_ids"]
+_Q = PROTOCOL.quantities
+_INDEX = {name: declared["index"] for name, declared in CANOPEN["objects"].items()}
+_WIDTH = {"u8": "<B", "u16": "<H", "u32": "<L", "i16": "<h"}
+_ABORTS = {NakCode[name]: code for name, code in CANOPEN["aborts"].items()}
+_PDO_SYNCHRONOUS, _PDO_ASYNCHRONOUS = 0, 255
+_RPDO, _RPDO_MAP, _TPDO, _TPDO_MAP = 0x1400, 0x1600, 0x1800, 0x1A00
+_ORDER_PDO, _SLOTS_PDO = 16, 17  # RPDO 17 and 18 and so on, whatever the number of channels
+
+Read = Callable[[], bytes]
+Write = Callable[[bytes], None]
+
+
+def channel_ids(node: int, channels: int) -> dict[int, int]:
+    """The channel that each RPDO identifier of a node is for."""
+    return {
+        IDS["command"] + 0x100 * (channel % 4) + node + channel // 4: channel
+        for channel in range(channels)
+    }
+
+
+class ObjectDictionary:
+    """What one amplifier keeps under its indices; pdo_written: an RPDO's object was written.
+
+    host: the node whose heartbeat feeds the watchdog, 0 for none; heartbeat [ms]: its own.
+    """
+
+    def __init__(
+        self, station: Station, node: int, *, pdo_written: Callable[[int, bytes], None]
+    ) -> None:
+        self._station = station
+        self._node = node
+        self._pdo_written = pdo_written
+        self._channels = station.capabilities.channels
+        self.achieved = b""
+        self.blocks: dict[str, bytes] = {}  # the last that was sent of each TPDO
+        self.reset()
+        self._reads: dict[tuple[int, int], Read] = {}
+        self._writes: dict[tuple[int, int], Write] = {}
+        self._fill()
+
+    def reset(self) -> None:
+        """Communication as after the supply came."""
+        self.host = 0
+        self.watchdog = 0
+        self.heartbeat = int(CANOPEN["heartbeat_ms"])
+
+    def read(self, index: int, subindex: int) -> bytes:
+        """The value; raises SdoAbort."""
+        found = self._reads.get((index, subindex))
+        if found is None:
+            raise SdoAbort(self._missing(index, subindex, elsewhere=self._writes, code=WRITE_ONLY))
+        return found()
+
+    def write(self, index: int, subindex: int, data: bytes) -> None:
+        """Take a value over; raises SdoAbort."""
+        found = self._writes.get((index, subindex))
+        if found is None:
+            raise SdoAbort(self._missing(index, subindex, elsewhere=self._reads, code=READ_ONLY))
+        found(data)
+
+    def _missing(
+        self,
+        index: int,
+        subindex: int,
+        *,
+        elsewhere: Mapping[tuple[int, int], object],
+        code: int,
+    ) -> int:
+        if (index, subindex) in elsewhere:
+            return code
+        known = any(index == other for other, _ in (*self._reads, *self._writes))
+        return NO_SUBINDEX if known else NO_OBJECT
+
+    def _fill(self) -> None:
+        self._communication()
+        self._who_it_is()
+        self._how_it_is()
+        self._pdos()
+        for slot in range(1, 64):
+            self._writes[_INDEX["envelope"], slot] = partial(self._load, slot)
+        self._reads[_INDEX["envelope"], 0] = lambda: b"\x3f"
+
+    def _communication(self) -> None:
+        self._constant("device_type", 0, _pack("u32", CANOPEN["device_type"]))
+        self._reads[_INDEX["error_register"], 0] = self._error_register
+        self._constant("sync_cob_id", 0, _pack("u32", IDS["sync"]))
+        self._constant("emergency_cob_id", 0, _pack("u32", IDS["emergency"] + self._node))
+        consumer, producer = _INDEX["heartbeat_consumer"], _INDEX["heartbeat_producer"]
+        self._count(consumer, 1)
+        self._reads[consumer, 1] = lambda: _pack("u32", self.host << 16 | self.watchdog)
+        self._writes[consumer, 1] = self._set_consumer
+        self._reads[producer, 0] = lambda: _pack("u16", self.heartbeat)
+        self._writes[producer, 0] = self._set_producer
+
+    def _who_it_is(self) -> None:
+        numbers = [CANOPEN["vendor_id"], CANOPEN["product_code"], CANOPEN["revision"]]
+        self._record("identity", [_pack("u32", value) for value in numbers])
+        self._count(_INDEX["identity"], 4)
+        self._reads[_INDEX["identity"], 4] = self._serial_number
+        texts = ("vendor", "product", "serial_number", "firmware")
+        self._count(_INDEX["texts"], len(texts))
+        for subindex, text in enumerate(texts, start=1):
+            self._reads[_INDEX["texts"], subindex] = partial(self._text, text)
+        able = self._station.capabilities
+        kinds = CANOPEN["objects"]["capabilities"]["types"]
+        values = {**_fields(able), "protocol_version": self._station.identity.protocol_version}
+        self._record(
+            "capabilities",
+            [_scaled(_quantity(kind), values[name]) for name, kind in kinds.items()],
+        )
+
+    def _how_it_is(self) -> None:
+        status, index = self._station.status, _INDEX["status"]
+        self._count(index, 7)
+        self._reads[index, 1] = lambda: bytes([status().state])
+        self._reads[index, 2] = lambda: bytes([status().fault])
+        self._reads[index, 3] = lambda: _pack("u16", status().token)
+        self._reads[index, 4] = lambda: bytes([status().high_voltage])
+        self._reads[index, 5] = lambda: _scaled(_Q.voltage, status().voltage)
+        self._reads[index, 6] = lambda: _scaled(_Q.temperature, status().temperature)
+        self._reads[index, 7] = lambda: _scaled(_Q.watchdog_left, status().watchdog_left)
+        levels = _INDEX["channel_levels"]
+        self._count(levels, self._channels)
+        for channel in range(self._channels):
+            self._reads[levels, channel + 1] = partial(self._level, channel)
+        self._reads[_INDEX["achieved"], 0] = lambda: self.achieved
+        self._reads[_INDEX["faults"], 0] = self._faults
+
+    def _pdos(self) -> None:
+        """The PDOs, which are as they are, and the objects that they map."""
+        command, order, slots = _INDEX["command"], _INDEX["order"], _INDEX["slots"]
+        groups = -(-self._channels // 4)
+        self._count(command, self._channels)
+        self._count(slots, groups)
+        for cob_id, channel in channel_ids(self._node, self._channels).items():
+            self._received_pdo(channel, cob_id, command, channel + 1)
+        self._received_pdo(_ORDER_PDO, IDS["order"] + self._node, order, 0)
+        for group in range(groups):
+            self._received_pdo(_SLOTS_PDO + group, IDS["slots"] + self._node, slots, group + 1)
+        sent = [("answer", 0, 0), ("condition", 0, 0)]
+        sent += [("levels", group, group + 1) for group in range(groups)]
+        self._count(_INDEX["levels"], groups)
+        for number, (name, group, subindex) in enumerate(sent):
+            key = name if name != "levels" else f"levels {group}"
+            self._reads[_INDEX[name], subindex] = partial(self._block, key)
+            self._pdo(
+                _TPDO + number,
+                _TPDO_MAP + number,
+                IDS[name] + self._node + group,
+                _PDO_ASYNCHRONOUS,
+                _INDEX[name],
+                subindex,
+            )
+
+    def _received_pdo(self, number: int, cob_id: int, index: int, subindex: int) -> None:
+        is_command = index == _INDEX["command"]
+        kind = _PDO_SYNCHRONOUS if is_command else _PDO_ASYNCHRONOUS
+        self._pdo(_RPDO + number, _RPDO_MAP + number, cob_id, kind, index, subindex)
+        self._writes[index, subindex] = lambda data: self._write_pdo(cob_id, data)
+        self._reads[index, subindex] = partial(self._block, f"{cob_id}")
+
+    def _pdo(
+        self, parameter: int, mapping: int, cob_id: int, kind: int, index: int, subindex: int
+    ) -> None:
+        self._count(parameter, 2)
+        self._reads[parameter, 1] = lambda: _pack("u32", cob_id)
+        self._reads[parameter, 2] = lambda: bytes([kind])
+        self._count(mapping, 1)
+        self._reads[mapping, 1] = lambda: _pack("u32", index << 16 | subindex << 8 | 64)
+
+    def _write_pdo(self, cob_id: int, data: bytes) -> None:
+        if len(data) != 8:
+            raise SdoAbort(BAD_LENGTH)
+        self.blocks[f"{cob_id}"] = data
+        self._pdo_written(cob_id, data)
+
+    def _serial_number(self) -> bytes:
+        """A number that the text of it makes, and no other is likely to."""
+        return _pack("u32", zlib.crc32(self._station.identity.serial_number.encode()))
+
+    def _text(self, name: str) -> bytes:
+        text: str = getattr(self._station.identity, name)
+        return text.encode()
+
+    def _block(self, key: str) -> bytes:
+        return self.blocks.get(key, bytes(8))
+
+    def _level(self, channel: int) -> bytes:
+        return _scaled(_Q.level, self._station.status().levels[channel])
+
+    def _set_consumer(self, data: bytes) -> None:
+        value = _unpack("u32", data)
+        self.watchdog, self.host = value & 0xFFFF, value >> 16 & 0x7F
+
+    def _set_producer(self, data: bytes) -> None:
+        self.heartbeat = _unpack("u16", data)
+
+    def _error_register(self) -> bytes:
+        fault = self._station.status().fault
+        return bytes([CANOPEN["emergencies"][fault.name]["error_register"]])
+
+    def _faults(self) -> bytes:
+        reply = self._station.exchange(GetFaults())
+        records = reply.faults if isinstance(reply, FaultList) else ()
+        longest = _Q.age.maximum
+        return b"".join(
+            struct.pack(
+                "<BBL",
+                record.fault,
+                255 if record.channel is None else record.channel,
+                min(round(record.age * 1000), longest),
+            )
+            for record in records
+        )
+
+    def _load(self, slot: int, data: bytes) -> None:
+        if len(data) < 3 or len(data) != 3 + 4 * data[2]:
+            raise SdoAbort(BAD_LENGTH)
+        step, _ = struct.unpack_from("<HB", data)
+        pairs = list(struct.iter_unpack("<Hh", data[3:]))
+        if not _Q.envelope_step.holds(step) or not all(
+            _Q.level.holds(level) and _Q.phase.holds(phase) for level, phase in pairs
+        ):
+            raise SdoAbort(_ABORTS[NakCode.BAD_VALUE])
+        knots = tuple(Knot(level / 10_000, phase / 100) for level, phase in pairs)
+        reply = self._station.exchange(LoadEnvelope(Envelope(slot, step / 10_000, knots)))
+        if isinstance(reply, Nak):
+            raise SdoAbort(_ABORTS[reply.code])
+
+    def _constant(self, name: str, subindex: int, value: bytes) -> None:
+        self._reads[_INDEX[name], subindex] = lambda: value
+
+    def _record(self, name: str, values: list[bytes]) -> None:
+        self._count(_INDEX[name], len(values))
+        for subindex, value in enumerate(values, start=1):
+            self._constant(name, subindex, value)
+
+    def _count(self, index: int, count: int) -> None:
+        self._reads[index, 0] = lambda: bytes([count])
+
+
+def achieved_domain(achieved: Achieved) -> bytes:
+    """What a set plays, as the object of that name holds it."""
+    data = struct.pack("<HB", achieved.token, len(achieved.commands))
+    for command in achieved.commands:
+        flags = command.keep_phase | command.skip_ending << 1 | command.channel << 4
+        flags |= bool(command.onset or command.ending) << 2
+        data += struct.pack(
+            "<HHhBxBB",
+            _Q.frequency.to_wire(command.frequency),
+            _Q.level.to_wire(command.level),
+            _Q.phase.to_wire(command.phase),
+            flags,
+            command.onset,
+            command.ending,
+        )
+    return data
+
+
+def _fields(values: Any) -> dict[str, float]:
+    return {name: getattr(values, name) for name in values.__dataclass_fields__}
+
+
+def _quantity(name: str) -> Quantity:
+    found: Quantity = getattr(_Q, name)
+    return found
+
+
+def _scaled(quantity: Quantity, value: float) -> bytes:
+    return _pack(quantity.wire, quantity.to_wire(min(max(value, quantity.low), quantity.high)))
+
+
+def _pack(kind: str, value: int) -> bytes:
+    return struct.pack(_WIDTH[kind], value)
+
+
+def _unpack(kind: str, data: bytes) -> int:
+    if len(data) != struct.calcsize(_WIDTH[kind]):
+        raise SdoAbort(BAD_LENGTH)
+    (value,) = struct.unpack(_WIDTH[kind], data)
+    return int(value)

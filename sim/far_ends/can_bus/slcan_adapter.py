@@ -1,0 +1,127 @@
+"""A serial CAN adapter in numbers only: LAWICEL's ASCII commands on a pseudo-terminal.
+
+Commands end with CR and are answered with CR, or BELL where they make no sense; CAN FD frames as
+CANable adapters have them. Not modelled: acceptance masks, time stamps and polling, which are
+accepted and do nothing.
+"""
+
+import re
+from collections.abc import Callable
+
+from drivers.protocol.can_frame import CanFrame
+from sim.far_ends.can_bus.bus import CanBus
+from sim.transport.pseudo_terminal import make_terminal
+
+_CR, _BELL = b"\r", b"\x07"
+_LONGEST = 160  # characters; a CAN FD frame has 133
+_FD_LENGTHS = (0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64)
+_FRAME = re.compile(rb"([tdb])([0-7][0-9A-Fa-f]{2})([0-9A-Fa-f])((?:[0-9A-Fa-f]{2})*)")
+_REMOTE = re.compile(rb"r[0-7][0-9A-Fa-f]{2}[0-8]|R[01][0-9A-Fa-f]{7}[0-8]")
+_EXTENDED = re.compile(rb"[TDB][01][0-9A-Fa-f]{7}[0-9A-Fa-f](?:[0-9A-Fa-f]{2})*")
+_SETTING = re.compile(rb"S[0-9]|s[0-9A-Fa-f]{4,6}|Y[0-9]|[Mm][0-9A-Fa-f]{8}|[ZX][01]|W[0-9]|")
+
+
+class SlcanEnd:
+    """An adapter between a pseudo-terminal and a bus; unpluggable: see `make_terminal`."""
+
+    def __init__(self, bus: CanBus, *, unpluggable: bool = False) -> None:
+        self._adapter = SlcanAdapter(bus, lambda data: self._port.write(data))
+        self._port = make_terminal(self._adapter.receive, unpluggable=unpluggable)
+        self._port.listen()
+
+    @property
+    def path(self) -> str:
+        """The serial port of the adapter."""
+        return self._port.port
+
+    def plug(self, is_plugged: bool) -> None:
+        """Have the adapter plugged in, or pulled out."""
+        self._adapter.reset()
+        if is_plugged:
+            self._port.plug_in()
+            self._port.listen()
+        else:
+            self._port.unplug()
+
+    def close(self) -> None:
+        """Leave bus and port."""
+        self._adapter.close()
+        self._port.close()
+
+
+class SlcanAdapter:
+    """The adapter itself: text in, `write` called with text, frames to and from a bus."""
+
+    def __init__(self, bus: CanBus, write: Callable[[bytes], None]) -> None:
+        self._bus = bus
+        self._write = write
+        self._listener = self._hear  # one object, by which the bus knows it
+        self.refused = 0
+        self.reset()
+        bus.join(self._listener)
+
+    def reset(self) -> None:
+        """As after it was plugged in."""
+        self._rest = b""
+        self._is_open = self._may_send = False
+
+    def close(self) -> None:
+        """Leave the bus."""
+        self._bus.leave(self._listener)
+
+    def receive(self, data: bytes) -> None:
+        """Do what the host asks."""
+        *lines, self._rest = (self._rest + data).split(_CR)
+        for line in lines:
+            self._write(self._answer(line.strip(b"\n")))
+        if len(self._rest) > _LONGEST:
+            self._rest = b""
+            self._write(self._refuse())
+
+    def _answer(self, line: bytes) -> bytes:
+        match line:
+            case b"O" | b"L" if not self._is_open:
+                self._is_open, self._may_send = True, line == b"O"
+                return _CR
+            case b"C":  # also where it is closed already: hosts begin with it
+                self._is_open = False
+                return _CR
+            case b"V" | b"v":
+                return line + b"1013" + _CR
+            case b"N":
+                return b"NE0A1" + _CR
+            case b"F" if self._is_open:
+                return b"F00" + _CR
+        if self._is_open and self._may_send:
+            if _REMOTE.fullmatch(line) or _EXTENDED.fullmatch(line):
+                return (b"z" if line[:1] in b"rt" else b"Z") + _CR  # nobody here listens to these
+            if frame := _parse(line):
+                self._bus.send(frame, sender=self._listener)
+                return b"z" + _CR
+        if not self._is_open and _SETTING.fullmatch(line):
+            return _CR
+        return self._refuse()
+
+    def _refuse(self) -> bytes:
+        self.refused += 1
+        return _BELL
+
+    def _hear(self, frame: CanFrame) -> None:
+        if not self._is_open:
+            return
+        kind = "d" if frame.fd else "t"
+        length = _FD_LENGTHS.index(len(frame.data))
+        self._write(f"{kind}{frame.id:03X}{length:X}{frame.data.hex().upper()}\r".encode())
+
+
+def _parse(line: bytes) -> CanFrame | None:
+    """The frame of a command t, d or b; None for what is none."""
+    found = _FRAME.fullmatch(line)
+    if found is None:
+        return None
+    kind, identifier, length, data = found.groups()
+    is_fd = kind != b"t"
+    expected = _FD_LENGTHS[int(length, 16)]
+    if len(data) != 2 * expected or (not is_fd and expected > 8):
+        return None
+    return CanFrame(int(identifier, 16), bytes.fromhex(data.decode()), fd=is_fd)

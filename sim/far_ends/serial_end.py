@@ -1,0 +1,130 @@
+"""The amplifiers' side of a serial line: a pseudo-terminal in front of simulated amplifiers.
+
+Several share a line as on RS-485, each with its own address; then none speaks unasked. A line that
+is unplugged is another pseudo-terminal once it is there again: its URL names a link to it.
+
+Not modelled: noise, parity, two that speak at once.
+"""
+
+import contextlib
+from collections.abc import Sequence
+
+from drivers.protocol.definition import PROTOCOL
+from drivers.protocol.messages import Commit, Event, Nak, Reply, Stop
+from drivers.protocol.payload import Malformed
+from drivers.protocol.serial_codec import decode_request, encode_event, encode_reply
+from drivers.protocol.serial_frame import Frame, FrameCounters, FrameReader, encode_frame
+from sim.bench.station import Station
+from sim.transport.line import Line
+from sim.transport.pseudo_terminal import make_terminal
+
+
+class SerialEnd:
+    """A pseudo-terminal on which stations answer, each at the address that is its number.
+
+    baud: bytes take as long as at this speed; None for no time at all. unpluggable: the port is
+    named by a link that outlives the pseudo-terminal.
+    """
+
+    def __init__(
+        self, stations: Sequence[Station], *, baud: int | None = None, unpluggable: bool = False
+    ) -> None:
+        alone = len(stations) == 1
+        self._stations = {
+            PROTOCOL.serial.address if alone else station.number: station for station in stations
+        }
+        self._first = stations[0]
+        self._baud = baud or PROTOCOL.serial.baud
+        faults = self._first.faults
+        self._inward = Line(self._arrived, toward="amplifier", faults=faults, bits_per_second=baud)
+        self._outward = Line(self._to_host, toward="host", faults=faults, bits_per_second=baud)
+        self._events = 0
+        self._reader = FrameReader()
+        self._terminal = make_terminal(self._inward.send, unpluggable=unpluggable)
+        self._is_unpluggable = unpluggable
+
+    @property
+    def port(self) -> str:
+        """The path of the host's side."""
+        return self._terminal.port
+
+    @property
+    def dropped_replies(self) -> int:
+        """Replies that nobody made room for."""
+        return self._terminal.dropped
+
+    @property
+    def urls(self) -> dict[str, str]:
+        """The URL of each amplifier, by its name."""
+        first = PROTOCOL.serial.address
+        return {
+            station.name: f"serial://{self.port}?baud={self._baud}"
+            + (f"&address={number}" if number != first else "")
+            for number, station in self._stations.items()
+        }
+
+    @property
+    def counters(self) -> FrameCounters:
+        """What came in, frames by their fate."""
+        return self._reader.counters
+
+    def start(self) -> None:
+        """Answer from now on, in the running event loop."""
+        self._terminal.listen()
+        if self._is_unpluggable:
+            self._first.on_plug(self._plug)
+        if len(self._stations) == 1:
+            self._first.listen(self._tell)
+
+    def close(self) -> None:
+        """Hang up; to be called in the event loop that it was started in."""
+        self._still()
+        self._terminal.close()
+
+    def _still(self) -> None:
+        """Forget what is under way on the line."""
+        self._inward.close()
+        self._outward.close()
+
+    def _plug(self, is_plugged: bool) -> None:
+        """The line has come, or gone."""
+        if is_plugged:
+            self._terminal.plug_in()
+            self._terminal.listen()
+        else:
+            self._still()
+            self._terminal.unplug()
+
+    def _arrived(self, data: bytes) -> None:
+        for frame in self._reader.feed(data):
+            if frame.is_reply:  # an echo is no request
+                continue
+            if frame.address == PROTOCOL.serial.broadcast:
+                self._broadcast(frame)
+            elif frame.address in self._stations:
+                reply = self._answer(frame, self._stations[frame.address])
+                if reply is not None:
+                    self._outward.send(encode_frame(encode_reply(reply, frame)))
+
+    def _answer(self, frame: Frame, station: Station) -> Reply | None:
+        try:
+            request = decode_request(frame)
+        except Malformed as problem:
+            return Nak(problem.code, problem.channel) if station.is_answering else None
+        return station.exchange(request)
+
+    def _broadcast(self, frame: Frame) -> None:
+        with contextlib.suppress(Malformed):
+            request = decode_request(frame)
+            if isinstance(request, Commit | Stop):
+                for station in self._stations.values():
+                    station.broadcast(request)
+
+    def _tell(self, event: Event) -> None:
+        if self._first.is_answering:
+            self._events = (self._events + 1) & 0xFFFF
+            frame = encode_event(event, address=PROTOCOL.serial.address, sequence=self._events)
+            self._outward.send(encode_frame(frame))
+
+    def _to_host(self, data: bytes) -> None:
+        self._terminal.write(data)

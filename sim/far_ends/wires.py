@@ -1,0 +1,117 @@
+"""Which far end stands behind which wire.
+
+A far end is an asynchronous context in which stations answer on a real wire; it gives the URL of
+each amplifier by its name. A new one is a file of its own and one line in `_OPENERS`.
+"""
+
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
+from contextlib import AbstractAsyncContextManager, AsyncExitStack, asynccontextmanager
+from dataclasses import dataclass
+from typing import TypeAlias
+
+from sim.bench.station import Station
+
+
+@dataclass(frozen=True)
+class Wire:
+    """How simulated amplifiers are reached.
+
+    kind: a key of this module's table; speed [bit/s]: telegrams take as long as at this speed, None
+    for no time; port: where to listen on the loopback interface, 0 for any that is free; shared:
+    all amplifiers on one wire, told apart by their numbers, where the kind leaves the choice;
+    unpluggable: the URLs hold when the wire is unplugged and comes back; line: tells wires apart
+    that are alike otherwise.
+    """
+
+    kind: str
+    speed: int | None = None
+    port: int = 0
+    shared: bool = False
+    unpluggable: bool = False
+    line: str = ""
+
+
+FarEnd: TypeAlias = AbstractAsyncContextManager[Mapping[str, str]]
+
+
+def open_wire(wire: Wire, stations: Sequence[Station]) -> FarEnd:
+    """The far end of this wire with these stations on it; entering it may raise LinkError."""
+    return _OPENERS[wire.kind](wire, stations)
+
+
+@asynccontextmanager
+async def open_wires(
+    wires: Mapping[str, Wire], stations: Sequence[Station]
+) -> AsyncIterator[Mapping[str, str]]:
+    """The far ends of stations on several wires, by their names: those with equal ones on one.
+
+    Gives the URL of each by its name, in the stations' order. Raises LinkError.
+    """
+    lines: dict[Wire, list[Station]] = {}
+    for station in stations:
+        lines.setdefault(wires[station.name], []).append(station)
+    urls: dict[str, str] = {}
+    async with AsyncExitStack() as stack:
+        for wire, together in lines.items():
+            urls.update(await stack.enter_async_context(open_wire(wire, together)))
+        yield {station.name: urls[station.name] for station in stations}
+
+
+@asynccontextmanager
+async def _serial(wire: Wire, stations: Sequence[Station]) -> AsyncIterator[Mapping[str, str]]:
+    from sim.far_ends.serial_end import SerialEnd
+
+    lines = [list(stations)] if wire.shared else [[station] for station in stations]
+    urls = {}
+    async with AsyncExitStack() as stack:
+        for line in lines:
+            end = SerialEnd(line, baud=wire.speed, unpluggable=wire.unpluggable)
+            stack.callback(end.close)
+            end.start()
+            urls.update(end.urls)
+        yield urls
+
+
+@asynccontextmanager
+async def _modbus_tcp(wire: Wire, stations: Sequence[Station]) -> AsyncIterator[Mapping[str, str]]:
+    from sim.far_ends.modbus.end import ModbusTcpEnd
+
+    end = ModbusTcpEnd(stations, port=wire.port)
+    try:
+        await end.start()
+        yield end.urls
+    finally:
+        await end.close()
+
+
+@asynccontextmanager
+async def _modbus_rtu(wire: Wire, stations: Sequence[Station]) -> AsyncIterator[Mapping[str, str]]:
+    from sim.far_ends.modbus.end import ModbusRtuEnd
+
+    end = ModbusRtuEnd(stations, speed=wire.speed, unpluggable=wire.unpluggable)
+    try:
+        end.start()
+        yield end.urls
+    finally:
+        end.close()
+
+
+def _socketcand(wire: Wire, stations: Sequence[Station]) -> FarEnd:
+    from sim.far_ends.can_bus.ends import socketcand
+
+    return socketcand(stations, port=wire.port, bitrate=wire.speed)
+
+
+def _slcan(wire: Wire, stations: Sequence[Station]) -> FarEnd:
+    from sim.far_ends.can_bus.ends import slcan
+
+    return slcan(stations, bitrate=wire.speed, unpluggable=wire.unpluggable)
+
+
+_OPENERS: Mapping[str, Callable[[Wire, Sequence[Station]], FarEnd]] = {
+    "serial": _serial,
+    "modbus-tcp": _modbus_tcp,
+    "modbus-rtu": _modbus_rtu,
+    "socketcand": _socketcand,
+    "slcan": _slcan,
+}

@@ -1,0 +1,79 @@
+"""Faults on demand, read from a file:
+
+seed: 7                      # the same seed, the same faults
+faults:
+  - {fault: drop, at: 2, lasts: 10, share: 0.2}         # seconds from the begin
+  - {fault: unplug, at: 15, lasts: 0.5, amplifier: main}
+"""
+
+import math
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import ValidationError
+
+from model.config import Quantity, Section, Validation
+from model.document import read_document
+from model.errors import InputError
+from model.units import RATIO, TIME
+from sim.faults.episodes import Episode, FaultKind, Faults, Toward
+
+
+class _EpisodeSection(Section):
+    fault: FaultKind
+    at: Annotated[float, Quantity(TIME, least=0)] = 0.0
+    lasts: Annotated[float, Quantity(TIME, above=0)] = math.inf
+    amplifier: str | None = None
+    share: Annotated[float, Quantity(RATIO, above=0, most=1)] = 1.0
+    toward: Toward | None = None
+    delay: Annotated[float, Quantity(TIME, above=0, most=10)] = 0.1
+
+
+class _FaultSection(Section):
+    seed: int = 0
+    faults: list[_EpisodeSection]
+
+
+@dataclass(frozen=True)
+class FaultFile:
+    """What shall go wrong with the amplifiers of a rig."""
+
+    episodes: tuple[Episode, ...]
+    seed: int = 0
+
+    def of(self, amplifier: str, *, begin: float) -> Faults:
+        """What concerns one of them, counted from a time [s]."""
+        own = [episode for episode in self.episodes if episode.amplifier in (None, amplifier)]
+        return Faults(own, begin=begin, seed=self.seed)
+
+
+def load_faults(path: Path, *, amplifiers: Collection[str]) -> FaultFile:
+    """Read a fault file; raises ConfigError with every problem, by file, line and key."""
+    document = read_document(path)
+    validation = Validation(document, _FaultSection)
+    listed = document.data.get("faults")
+    for number, entry in enumerate(listed if isinstance(listed, list) else []):
+        name = entry.get("amplifier") if isinstance(entry, dict) else None
+        if isinstance(name, str) and name not in amplifiers:
+            known = ", ".join(sorted(amplifiers))
+            validation.add(
+                ("faults", number, "amplifier"), f"{name!r} is none of the rig's: {known}"
+            )
+    validation.finish()
+    section = _FaultSection.model_validate(document.data)
+    episodes = tuple(Episode(**episode.model_dump()) for episode in section.faults)
+    return FaultFile(episodes, seed=section.seed)
+
+
+def episode_of(told: Mapping[str, Any]) -> Episode:
+    """One fault from its keys, which are those of a file; InputError says what is wrong."""
+    try:
+        return Episode(**_EpisodeSection.model_validate(dict(told)).model_dump())
+    except ValidationError as error:
+        problems = (
+            f"{'.'.join(map(str, details['loc']))}: {details['msg']}"
+            for details in error.errors(include_url=False)
+        )
+        raise InputError("; ".join(problems)) from None

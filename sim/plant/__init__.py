@@ -1,0 +1,1 @@
+"""The plate in time, what moves it, and the fingers that rest on it."""

@@ -1,0 +1,45 @@
+"""What a finger felt over a window of time, at each point of its tip: peak and steady parts."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from model.arrays import FloatArray
+from sim.plant.finger import Record
+
+
+@dataclass(frozen=True)
+class Felt:
+    """points (p, 2) [m]; frequencies (f,) [Hz]; amplitude (f, p) [m/s²]; peak (p,) [m/s²]."""
+
+    points: FloatArray
+    frequencies: tuple[float, ...]
+    amplitude: FloatArray
+    peak: FloatArray
+
+
+def feel(record: Record, frequencies: Sequence[float]) -> Felt:
+    """Raw peak of each point, and the amplitude of each frequency [Hz] by least squares.
+
+    The fit of sines and cosines is a lock-in amplifier for several frequencies at once. It is
+    steady vibration only where the window leaves the transients out, and it separates frequencies
+    only if the window is longer than the inverse of their difference; a window with fewer samples
+    than the fit has unknowns gives the smallest amplitudes that fit.
+    """
+    times, samples = record.times, record.accelerations
+    if not len(times):
+        nothing = np.zeros(len(record.points))
+        return Felt(
+            record.points, tuple(frequencies), np.zeros((len(frequencies), len(nothing))), nothing
+        )
+    angles = 2 * np.pi * np.outer(times - times[0], np.asarray(frequencies, dtype=float))
+    basis = np.hstack([np.sin(angles), np.cos(angles)])
+    fit = np.linalg.lstsq(basis, samples, rcond=None)[0]
+    sine, cosine = np.split(fit, 2)
+    return Felt(
+        points=record.points,
+        frequencies=tuple(frequencies),
+        amplitude=np.hypot(sine, cosine),
+        peak=np.abs(samples).max(axis=0),
+    )

@@ -1,0 +1,90 @@
+"""What a person sees of a running far end: amplifiers, plate, fingers and sensors on the terminal.
+
+The plate is drawn as it vibrates: the darker a cell, the larger the peak acceleration there lately.
+"""
+
+import numpy as np
+from rich.console import Group, RenderableType
+from rich.table import Table
+from rich.text import Text
+
+from model.arrays import FloatArray
+from sim.bench.bench import Bench
+from sim.control.site import Site
+
+WINDOW = 0.2  # s; as long as a picture stays
+_GRAVITY = 9.8  # m/s²
+_SHADES = " ·-+*#@"
+_FULL = 5.0  # g; shown as the last shade, and what lies above
+_NOTHING = 0.002  # of it; what is less is not drawn
+_COLUMNS, _ROWS = 28, 10
+_FADING = 0.5  # of the peaks from one picture to the next
+
+
+class PlateMap:
+    """Peak accelerations over a lattice of the plate (rows, columns) [m/s²], fading with time."""
+
+    def __init__(self, bench: Bench) -> None:
+        plate = bench.rig.plate
+        x = (np.arange(_COLUMNS) + 0.5) / _COLUMNS * plate.length
+        y = (np.arange(_ROWS) + 0.5) / _ROWS * plate.width
+        self._bench = bench
+        self._points = np.array([[a, b] for b in y for a in x])
+        self._peaks = np.zeros(len(self._points))
+
+    @property
+    def shapes(self) -> FloatArray:
+        """Where it listens, in the coordinates that the plate has now."""
+        return self._bench.shapes_at(self._points)
+
+    def record(self, times: FloatArray, accelerations: FloatArray) -> None:
+        """Keep the largest of what is there, (n, p) [m/s²]."""
+        if len(times):
+            np.maximum(self._peaks, np.abs(accelerations).max(axis=0), out=self._peaks)
+
+    def take(self) -> FloatArray:
+        """The peaks, which fade by being looked at."""
+        peaks = self._peaks.copy()
+        self._peaks *= _FADING
+        return peaks.reshape(_ROWS, _COLUMNS)
+
+
+def draw(site: Site, plate: PlateMap) -> RenderableType:
+    """The present state of a far end."""
+    bench = site.bench
+    amplifiers = Table("amplifier", "state", "fault", "set", "level of each channel")
+    amplifiers.add_column("wire", overflow="fold")  # to be copied whole
+    for name, amplifier in bench.amplifiers.items():
+        status = amplifier.status(bench.time)
+        levels = "  ".join(f"{level:4.0%}" for level in status.levels)
+        amplifiers.add_row(
+            *(name, status.state.name, status.fault.name, str(status.token), levels),
+            site.urls.get(name, ""),
+        )
+    fingers = Table("finger", "at", "peak acceleration")
+    felt = bench.felt(bench.time - WINDOW, bench.time)
+    for name, (x, y) in bench.fingers.layout.positions.items():
+        peak = f"{felt[name].peak.max() / _GRAVITY:.2f} g" if name in felt else ""
+        fingers.add_row(name, f"{x * 1000:.0f}, {y * 1000:.0f} mm", peak)
+    said = [f"{bench.time:.1f} s"]
+    if site.recorder is not None:
+        full = ", full" if site.recorder.is_full else ""
+        said.append(f"recording {site.recorder.path}: {site.recorder.seconds:.1f} s{full}")
+    return Group(amplifiers, _picture(bench, plate.take()), fingers, Text("   ".join(said)))
+
+
+def _picture(bench: Bench, peaks: FloatArray) -> Text:
+    """The plate with y upwards; fingers are O, ERAs are E."""
+    share = np.maximum(peaks / (_FULL * _GRAVITY) - _NOTHING, 0)
+    shade = np.ceil(share * (len(_SHADES) - 1)).astype(int)
+    rows = [[_SHADES[min(cell, len(_SHADES) - 1)] for cell in row] for row in shade]
+    size = bench.rig.plate.length, bench.rig.plate.width
+    places = [((era.x, era.y), "E") for era in bench.rig.eras]
+    places += [(at, "O") for at in bench.fingers.layout.positions.values()]
+    for (x, y), mark in places:
+        column = min(int(x / size[0] * _COLUMNS), _COLUMNS - 1)
+        rows[min(int(y / size[1] * _ROWS), _ROWS - 1)][column] = mark
+    bar = "+" + "-" * _COLUMNS + "+"
+    lines = [bar, *(f"|{''.join(row)}|" for row in reversed(rows)), bar]
+    legend = f"peak acceleration: {_SHADES[1]} to {_SHADES[-1]} up to {_FULL:g} g; E era, O finger"
+    return Text("\n".join([*lines, legend]))

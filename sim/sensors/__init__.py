@@ -1,0 +1,1 @@
+"""Virtual accelerometers, recordings of what they read, and what their signals say."""

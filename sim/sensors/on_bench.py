@@ -1,0 +1,86 @@
+"""Virtual accelerometers on a running bench: what they read in the last ten seconds."""
+
+from collections import deque
+from collections.abc import Sequence
+
+import numpy as np
+
+from model.arrays import FloatArray
+from model.errors import InputError
+from sim.bench.bench import Bench
+from sim.plant.finger import KEPT
+from sim.sensors.accelerometer import Accelerometer, Recording, positions, read_sensors
+
+SENSORS_MAX = 64  # ten seconds of them take 50 MB
+
+
+class Accelerometers:
+    """The sensors on a bench, none at first; noise is the same for the same seed."""
+
+    def __init__(self, bench: Bench, *, seed: int = 0) -> None:
+        self._bench = bench
+        self._rng = np.random.default_rng(seed)
+        self._pieces: deque[Recording] = deque()
+        self.sensors: tuple[Accelerometer, ...] = ()
+
+    @property
+    def shapes(self) -> FloatArray:
+        """Where they listen, in the coordinates that the plate has now."""
+        return self._bench.shapes_at(positions(self.sensors))
+
+    def place(self, sensors: Sequence[Accelerometer]) -> None:
+        """From now on these sensors are there and no others; InputError changes nothing."""
+        if len(sensors) > SENSORS_MAX:
+            raise InputError(f"{len(sensors)} sensors are too many; at most {SENSORS_MAX}")
+        names = [sensor.name for sensor in sensors]
+        if len(set(names)) < len(names):
+            raise InputError("two sensors have one name; give each its own")
+        plate = self._bench.rig.plate
+        for sensor in sensors:
+            if not plate.contains(sensor.x, sensor.y):
+                raise InputError(
+                    f"sensor {sensor.name} is at ({sensor.x:g}, {sensor.y:g}) m, which is not on "
+                    f"the plate: it reaches from (0, 0) to ({plate.length:g}, {plate.width:g}) m"
+                )
+        self.sensors = tuple(sensors)
+        self._pieces.clear()
+        if self in self._bench.taps:
+            self._bench.taps.remove(self)
+        if sensors:
+            self._bench.taps.append(self)
+
+    def record(self, times: FloatArray, accelerations: FloatArray) -> None:
+        """Read what is there: (n,) [s], (n, s) [m/s²]."""
+        if not len(times):
+            return
+        self._pieces.append(
+            read_sensors(
+                self.sensors,
+                accelerations,
+                sample_rate=self._bench.sample_rate,
+                start=float(times[0]),
+                rng=self._rng,
+            )
+        )
+        while self._pieces[0].times[-1] < times[-1] - KEPT:
+            self._pieces.popleft()
+
+    def read(self, since: float, until: float) -> Recording:
+        """What they read in since <= t < until [s]; InputError where there is nothing."""
+        pieces = [
+            piece for piece in self._pieces if piece.times[-1] >= since and piece.start < until
+        ]
+        if not pieces:
+            raise InputError(
+                f"no sensor read anything from {since:g} to {until:g} s; place sensors first, and "
+                f"ask for no more than the last {KEPT:g} s"
+            )
+        first = pieces[0]
+        whole = Recording(
+            first.names,
+            first.points,
+            first.sample_rate,
+            first.start,
+            np.concatenate([piece.samples for piece in pieces]),
+        )
+        return whole.during(since, until)

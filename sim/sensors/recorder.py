@@ -1,0 +1,136 @@
+"""A recording that is being made: what sensors read and fingers feel, from now until its end.
+
+Samples wait in a file without a name beside the one that is wanted, which appears at the end and
+whole: a run that is killed leaves nothing behind. A recording that has become too long goes on no
+further, and says so.
+"""
+
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from model.arrays import FloatArray
+from model.errors import InputError
+from sim.bench.bench import Bench
+from sim.sensors.accelerometer import Accelerometer, Recording, positions, read_sensors
+from sim.sensors.recording_file import check_recordable, values_max, write_recording
+
+
+class Recorder:
+    """Records a bench to a file; its ending is its format.
+
+    sensors: read as they are, noise and all; fingers: their ids, the acceleration at the middle of
+    each, zero where it is not on the plate. Raises InputError for a place that cannot be written,
+    or nothing to record.
+    """
+
+    def __init__(
+        self,
+        bench: Bench,
+        path: Path,
+        *,
+        sensors: Sequence[Accelerometer],
+        fingers: Sequence[str],
+        seed: int = 0,
+    ) -> None:
+        self.path = path
+        self._bench = bench
+        self._sensors = tuple(sensors)
+        self._fingers = tuple(fingers)
+        names = [*(sensor.name for sensor in sensors), *(f"finger_{id}" for id in fingers)]
+        if not names:
+            raise InputError(
+                f"{path}: nothing to record: there is neither a sensor nor a finger on the plate; "
+                "add --sensor NAME=X,Y or --finger X,Y"
+            )
+        check_recordable(path, names, sample_rate=bench.sample_rate)
+        self._names = tuple(names)
+        self._room = values_max(path) // len(names)
+        at = [bench.fingers.layout.positions[id] for id in fingers]
+        self._points = np.concatenate([positions(sensors), np.array(at).reshape(-1, 2)])
+        self._rng = np.random.default_rng(seed)
+        try:
+            self._spool = tempfile.TemporaryFile(dir=path.parent)  # noqa: SIM115  lives on
+        except OSError as error:
+            raise InputError(
+                f"{path}: nothing can be written there: {error.strerror}; choose another folder"
+            ) from error
+        self._start = 0.0
+        self._count = 0
+        self._failure: OSError | None = None
+        bench.taps.append(self)
+
+    @property
+    def is_full(self) -> bool:
+        """Whether it has become too long, and records no more."""
+        return self._count >= self._room
+
+    @property
+    def seconds(self) -> float:
+        """How long it is [s]."""
+        return self._count / self._bench.sample_rate
+
+    @property
+    def shapes(self) -> FloatArray:
+        """Where it listens now: fingers move."""
+        layout = self._bench.fingers.layout
+        at_sensors = self._bench.shapes_at(positions(self._sensors))
+        rows = [
+            layout.shapes[layout.columns[id].start]
+            if id in layout.columns
+            else np.zeros(at_sensors.shape[1])
+            for id in self._fingers
+        ]
+        return np.vstack([at_sensors, *rows])
+
+    def record(self, times: FloatArray, accelerations: FloatArray) -> None:
+        """Keep what is read: (n,) [s], (n, p) [m/s²]."""
+        if not len(times) or self._failure is not None:
+            return
+        if not self._count:
+            self._start = float(times[0])
+        accelerations = accelerations[: self._room - self._count]
+        read = read_sensors(
+            self._sensors,
+            accelerations[:, : len(self._sensors)],
+            sample_rate=self._bench.sample_rate,
+            start=float(times[0]),
+            rng=self._rng,
+        )
+        together = np.hstack([read.samples, accelerations[:, len(self._sensors) :]])
+        try:
+            self._spool.write(np.ascontiguousarray(together, dtype=np.float64).tobytes())
+        except OSError as error:  # a full disk must not end the far end
+            self._failure = error
+        else:
+            self._count += len(accelerations)
+
+    def stop(self) -> None:
+        """Record no more; to be called where the bench is."""
+        if self in self._bench.taps:
+            self._bench.taps.remove(self)
+
+    def finish(self) -> None:
+        """Write the file and forget the samples; any thread may do it, once it has been stopped.
+
+        Raises InputError for a recording that has not even two samples, OSError.
+        """
+        with self._spool:
+            if self._failure is not None:
+                raise InputError(
+                    f"{self.path}: the recording broke off after {self.seconds:g} s, and is not "
+                    f"written: {self._failure.strerror}; make room"
+                )
+            self._spool.flush()
+            shape = (self._count, len(self._names))
+            samples = (
+                np.memmap(self._spool, np.float64, "r", shape=shape)
+                if self._count
+                else np.zeros(shape)
+            )
+            write_recording(
+                self.path,
+                Recording(self._names, self._points, self._bench.sample_rate, self._start, samples),
+            )

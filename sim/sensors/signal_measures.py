@@ -1,0 +1,130 @@
+"""What sensors' signals alone say of a vibration: its tones, contrast, and how it dies away."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from model.arrays import ComplexArray, FloatArray
+from model.errors import InputError
+from sim.sensors.accelerometer import Recording
+
+TRANSIENT = 0.1  # s from the onset; what decides what is felt of a short effect
+
+# T60 is read from -5 dB on, as in ISO 3382-1, and as deep as noise allows, for beats make steps: at
+# least to -25 dB, at most to -45 dB.
+_DECAY_FROM, _DECAY_TO, _DECAY_DEEPEST = -5.0, -25.0, -45.0
+_ABOVE_NOISE = 10.0  # dB
+_FLOOR_SHARE = 0.1  # of a decay's end, taken for the sensor's noise
+
+
+@dataclass(frozen=True, eq=False)
+class Spectrum:
+    """Peak amplitude [m/s²] by frequency (f,) [Hz], (f, s): a steady tone shows its own."""
+
+    frequencies: FloatArray
+    amplitude: FloatArray
+
+
+def tone_phasors(recording: Recording, frequencies: Sequence[float]) -> ComplexArray:
+    """Complex amplitude (f, s) [m/s²] of tones, Im[a exp(i omega t)], t on the plate's clock.
+
+    Least squares of all tones and a constant at once: a lock-in amplifier that separates tones
+    where the recording lasts longer than the inverse of their difference. Raises InputError for a
+    recording with fewer samples than unknowns.
+    """
+    count = len(frequencies)
+    if len(recording.samples) < 2 * count + 1:
+        raise InputError(
+            f"{len(recording.samples)} samples are too few to tell {count} tones; record longer"
+        )
+    angles = 2 * np.pi * np.outer(recording.times, np.asarray(frequencies, dtype=float))
+    basis = np.hstack([np.sin(angles), np.cos(angles), np.ones((len(angles), 1))])
+    found = np.linalg.lstsq(basis, recording.samples, rcond=None)[0]
+    return np.asarray(found[:count] + 1j * found[count : 2 * count])
+
+
+def spectrum(recording: Recording) -> Spectrum:
+    """Amplitude spectrum with a Hann window: a tone within its bins is at most 15 % low."""
+    count = len(recording.samples)
+    if count < 4:
+        raise InputError(f"{count} samples have no spectrum; record longer")
+    window = np.hanning(count + 1)[:-1]
+    level = recording.samples - recording.samples.mean(axis=0)
+    lines = np.fft.rfft(level * window[:, None], axis=0)
+    frequencies = np.asarray(np.fft.rfftfreq(count, 1 / recording.sample_rate))
+    return Spectrum(frequencies, np.asarray(2 * np.abs(lines) / window.sum(), dtype=float))
+
+
+def steady_contrast_db(
+    recording: Recording,
+    frequencies: Sequence[float],
+    *,
+    target: Sequence[str],
+    quiet: Sequence[str],
+) -> float:
+    """Contrast [dB] of steady tones: mean over the target's sensors to the loudest quiet one.
+
+    Magnitudes of different frequencies add (paper Eq. 28). The recording must leave transients out.
+    """
+    peak = np.abs(tone_phasors(recording, frequencies)).sum(axis=0)
+    return _contrast(recording, peak, target, quiet)
+
+
+def transient_contrast_db(
+    recording: Recording, *, onset: float, target: Sequence[str], quiet: Sequence[str]
+) -> float:
+    """The same of the peaks over the first 100 ms from an onset [s] on."""
+    peak = np.abs(recording.during(onset, onset + TRANSIENT).samples).max(axis=0)
+    return _contrast(recording, peak, target, quiet)
+
+
+def reverberation_time(recording: Recording, *, end: float) -> float:
+    """T60 [s]: how long the vibration takes to fall by 60 dB once the drive is silent at end [s].
+
+    Schroeder's backward integral of the squared signals, summed over the sensors, with the noise of
+    its last tenth taken off; a line through its level from -5 dB down to 10 dB above the noise.
+    (Beats of neighbouring modes, which bend a logarithmic envelope, are steps in the integral.)
+    Raises InputError where the recording ends, or noise begins, before the level has fallen by
+    25 dB.
+    """
+    power = (recording.during(end, math.inf).samples ** 2).sum(axis=1)
+    floor = power[-max(int(_FLOOR_SHARE * len(power)), 1) :].mean()
+    # Up to where the decay meets the noise: what comes after would only add its wander.
+    width = max(len(power) // 200, 1)
+    smooth = np.convolve(power, np.ones(width) / width, mode="same")
+    last = int(np.argmax(smooth <= 2 * floor)) or len(power)
+    left = np.cumsum((power[:last] - floor)[::-1])[::-1]
+    level = 10 * np.log10(np.maximum(left / left[0], 1e-30)) if left[0] > 0 else np.zeros(1)
+    range_db = 10 * math.log10(max(smooth.max() / max(floor, 1e-300), 1.0))
+    deepest = max(_DECAY_DEEPEST, _ABOVE_NOISE - range_db)
+    inside = (level <= _DECAY_FROM) & (level >= deepest)
+    if deepest > _DECAY_TO or inside.sum() < 3:
+        raise InputError(
+            f"the vibration falls by {range_db:.0f} dB from {end:g} s on before it is lost in "
+            f"noise or the recording ends; {_ABOVE_NOISE - _DECAY_TO:g} dB are needed: record "
+            "longer, or drive the plate harder"
+        )
+    times = np.arange(len(level))[inside] / recording.sample_rate
+    slope = np.polyfit(times, level[inside], 1)[0]
+    return float(-60 / slope)
+
+
+def _contrast(
+    recording: Recording, peak: FloatArray, target: Sequence[str], quiet: Sequence[str]
+) -> float:
+    loudest = peak[_columns(recording, quiet)].max()
+    felt = peak[_columns(recording, target)].mean()
+    return 20 * math.log10(max(felt, 1e-30) / max(loudest, 1e-30))
+
+
+def _columns(recording: Recording, names: Sequence[str]) -> list[int]:
+    unknown = [name for name in names if name not in recording.names]
+    if unknown or not names:
+        raise InputError(
+            f"no sensor {unknown[0]!r} was recorded"
+            if unknown
+            else "name a sensor for target and quiet each"
+        )
+    return [recording.names.index(name) for name in names]

@@ -1,0 +1,145 @@
+"""Warmth, high voltage, faults and restarts of the simulated amplifier, on a virtual clock."""
+
+import math
+
+import pytest
+
+from drivers.command import CommandSet, DriveCommand, Envelope, Knot
+from drivers.protocol.messages import (
+    Achieved,
+    Apply,
+    Arm,
+    Clear,
+    Disarm,
+    Event,
+    Fault,
+    FaultList,
+    FaultRecord,
+    GetFaults,
+    LoadEnvelope,
+    Nak,
+    NakCode,
+    State,
+)
+from sim.amplifier.amplifier import SimulatedAmplifier
+from sim.amplifier.heat import Heat
+
+
+def playing(token: int, level: float) -> CommandSet:
+    """Every channel at 110 Hz."""
+    commands = tuple(DriveCommand(channel, 110.0, level) for channel in range(4))
+    return CommandSet(token, commands, ramp=0.0, valid_for=0.0)
+
+
+def armed() -> SimulatedAmplifier:
+    """Four channels, enabled and silent."""
+    amplifier = SimulatedAmplifier("main", channels=4)
+    amplifier.handle(Arm(2.0), 0.0)
+    return amplifier
+
+
+def test_what_is_played_warms_it() -> None:
+    """First order with 120 s: 63 % of 30 K after that time at full stroke, a quarter at half."""
+    for level, rise in ((1.0, 30.0), (0.5, 7.5)):
+        amplifier = armed()
+        amplifier.handle(Apply(playing(1, level)), 0.0)
+        assert amplifier.status(0.0).temperature == 25.0
+        warm = amplifier.status(120.0).temperature
+        assert warm == pytest.approx(25 + rise * (1 - math.exp(-1)), abs=1e-9)
+
+
+def test_it_cools_down_when_it_is_silent() -> None:
+    """From the moment of silence on towards 25 °C, with the same time constant."""
+    amplifier = armed()
+    amplifier.handle(Apply(playing(1, 1.0)), 0.0)
+    hot = amplifier.status(1.0).temperature
+    amplifier.handle(Disarm(0.0), 1.0)
+    cooler = amplifier.status(121.0).temperature
+    assert cooler - 25 == pytest.approx((hot - 25) * math.exp(-1), rel=1e-9)
+
+
+def test_over_70_degrees_it_derates_and_over_85_it_trips() -> None:
+    """Half of the level, told by Achieved too; then silent in 5 ms, latched until it is cool."""
+    amplifier = armed()
+    amplifier.handle(Apply(playing(1, 0.8)), 0.0)
+    amplifier.set_temperature(71.0, 1.0)
+    assert amplifier.status(1.02).levels == pytest.approx((0.4,) * 4)
+    assert amplifier.state is State.OPERATION_ENABLED
+    reply = amplifier.handle(Apply(playing(2, 0.6)), 1.1)
+    assert isinstance(reply, Achieved)
+    assert reply.commands[0].level == pytest.approx(0.3)
+    assert amplifier.status(1.1).levels == pytest.approx((0.3,) * 4)
+    amplifier.set_temperature(86.0, 1.2)
+    amplifier.tick(1.2051)
+    now = amplifier.status(1.2051)
+    assert (now.state, now.fault, now.high_voltage) == (State.FAULT, Fault.OVER_TEMPERATURE, False)
+    assert now.levels == (0.0,) * 4
+    amplifier.handle(Clear(), 1.3)
+    assert amplifier.state is State.FAULT
+    amplifier.set_temperature(25.0, 1.4)
+    amplifier.handle(Clear(), 1.4)
+    assert amplifier.state is State.SWITCH_ON_DISABLED
+    amplifier.handle(Arm(2.0), 1.5)
+    reply = amplifier.handle(Apply(playing(3, 0.6)), 1.5)
+    assert isinstance(reply, Achieved)
+    assert reply.commands[0].level == 0.6
+
+
+@pytest.mark.parametrize("threshold", [70.0, 85.0])
+def test_a_threshold_is_crossed_when_it_is_crossed(threshold: float) -> None:
+    """From 64 °C in a place of 90 °C; one that is not on the way is never reached."""
+    heat = Heat(since=3.0, temperature=64.0, final=90.0)
+    assert heat.when(threshold) == pytest.approx(3 + 120 * math.log(26 / (90 - threshold)))
+    assert heat.when(95.0) == math.inf
+    assert heat.when(60.0) == math.inf
+
+
+def test_high_voltage_is_there_while_armed_and_discharges_afterwards() -> None:
+    """1800 V; 1800/e after 20 ms without it."""
+    amplifier = armed()
+    assert amplifier.status(0.1).voltage == 1800.0
+    amplifier.handle(Disarm(0.0), 1.0)
+    assert amplifier.status(1.02).voltage == round(1800 / math.e)
+    assert amplifier.status(2.0).voltage == 0.0
+    assert SimulatedAmplifier("main", channels=1).status(0.0).voltage == 0.0
+
+
+@pytest.mark.parametrize("fault", [Fault.OVER_VOLTAGE, Fault.ARC, Fault.CHANNEL])
+def test_a_fault_silences_and_latches(fault: Fault) -> None:
+    """Silent within 5 ms, high voltage off, listed with its channel, told to listeners in order."""
+    amplifier = armed()
+    events: list[tuple[Event, float]] = []
+    amplifier.listeners.append(lambda event, time: events.append((event, time)))
+    amplifier.handle(Apply(playing(1, 0.8)), 0.0)
+    amplifier.trip(fault, 1.0, channel=2)
+    amplifier.tick(1.0051)
+    now = amplifier.status(1.0051)
+    assert (now.state, now.fault, now.levels) == (State.FAULT, fault, (0.0,) * 4)
+    listed = amplifier.handle(GetFaults(), 2.0)
+    assert listed == FaultList((FaultRecord(fault, 2, 1.0),))
+    told = [event for event, _ in events]
+    assert told == [Event(State.FAULT_REACTION_ACTIVE, fault, 2), Event(State.FAULT, fault)]
+    assert [time for _, time in events] == pytest.approx([1.0, 1.005])
+    assert amplifier.handle(Arm(2.0), 2.0) == Nak(NakCode.WRONG_STATE)
+
+
+def test_a_fault_while_disarmed_is_only_noted() -> None:
+    """There is nothing to silence; the list of faults tells of it."""
+    amplifier = SimulatedAmplifier("main", channels=4)
+    amplifier.trip(Fault.ARC, 1.0)
+    assert amplifier.state is State.SWITCH_ON_DISABLED
+    listed = amplifier.handle(GetFaults(), 1.5)
+    assert listed == FaultList((FaultRecord(Fault.ARC, None, 0.5),))
+
+
+def test_a_restart_forgets_everything_but_is_silent_at_once() -> None:
+    """Without its supply nothing plays; then it is disarmed, without envelopes, tokens, faults."""
+    amplifier = armed()
+    amplifier.handle(LoadEnvelope(Envelope(1, 0.005, (Knot(0.5, 0.0),))), 0.0)
+    amplifier.handle(Apply(playing(1, 0.8)), 0.5)
+    amplifier.restart(1.0)
+    now = amplifier.status(1.0)
+    assert (now.state, now.token, now.levels) == (State.SWITCH_ON_DISABLED, 0, (0.0,) * 4)
+    amplifier.handle(Arm(2.0), 1.1)
+    shaped = CommandSet(1, (DriveCommand(0, 110.0, 0.5, onset=1),), ramp=0.0, valid_for=0.0)
+    assert amplifier.handle(Apply(shaped), 1.2) == Nak(NakCode.NO_ENVELOPE, 0)

@@ -1,0 +1,202 @@
+"""Envelopes in the simulated amplifier, against their definition and against the model's own."""
+
+import math
+
+import numpy as np
+import pytest
+
+from drivers.command import CommandSet, DriveCommand, Envelope, Knot
+from drivers.protocol.messages import (
+    Achieved,
+    Apply,
+    Arm,
+    Commit,
+    Disarm,
+    Loaded,
+    LoadEnvelope,
+    Nak,
+    NakCode,
+    Ping,
+    Stage,
+    Stop,
+)
+from model.base_motion import Term
+from model.envelope import Envelope as BaseEnvelope
+from sim.amplifier.amplifier import SimulatedAmplifier
+from sim.plant.base_motion import terms_of
+
+STROKE = 1e-4
+RISE = Envelope(1, 0.005, (Knot(0.2, 90.0), Knot(0.4, 0.0)))
+BRAKE = Envelope(2, 0.005, (Knot(0.5, 180.0), Knot(0.1, 0.0)))
+
+
+def armed() -> SimulatedAmplifier:
+    """Four channels, enabled, with two envelopes loaded."""
+    amplifier = SimulatedAmplifier("main", channels=4)
+    amplifier.handle(Arm(2.0), 0.0)
+    for envelope in (RISE, BRAKE):
+        loaded = amplifier.handle(LoadEnvelope(envelope), 0.0)
+        assert loaded == Loaded(envelope.slot, 2)
+    return amplifier
+
+
+def playing(
+    token: int, level: float, *, ramp: float = 0.0, valid_for: float = 0.0, **more: int
+) -> CommandSet:
+    """Channel 0 at 110 Hz."""
+    command = DriveCommand(0, 110.0, level, **more)
+    return CommandSet(token, (command,), ramp=ramp, valid_for=valid_for)
+
+
+def level(amplifier: SimulatedAmplifier, time: float) -> float:
+    """What channel 0 plays."""
+    amplifier.tick(time)
+    return amplifier.status(time).levels[0]
+
+
+def motion(terms: list[Term], times: np.ndarray) -> np.ndarray:
+    """The base's motion by the definition of a term."""
+    y = np.zeros(len(times))
+    for term in terms:
+        tau = times - term.start
+        value = (term.c0 + term.c1 * tau) * np.exp(1j * term.omega * tau)
+        y += np.where((times >= term.start) & (times < term.end), value.imag, 0.0)
+    return y
+
+
+def test_an_onset_goes_through_its_knots_to_the_command() -> None:
+    """From zero, one knot every 5 ms, the level of the command after a third step, then steady."""
+    amplifier = armed()
+    amplifier.handle(Apply(playing(1, 0.8, onset=1)), 1.0)
+    expected = {1.0: 0.0, 1.0025: 0.1, 1.005: 0.2, 1.01: 0.4, 1.015: 0.8, 1.5: 0.8}
+    # Half way from 0.2 at 90 degrees to 0.4 at 0: a straight line in the complex plane.
+    expected[1.0075] = abs(0.2j + 0.4) / 2
+    for moment, value in sorted(expected.items()):
+        assert level(amplifier, moment) == pytest.approx(value, abs=1e-9)
+
+
+def test_the_base_moves_as_the_model_says() -> None:
+    """The plant's terms are those of the model's own envelope with the destination as last knot."""
+    amplifier = armed()
+    amplifier.handle(Apply(playing(1, 0.8, onset=1)), 0.25)  # 27.5 periods: a phase of its own
+    terms = [term for tone in amplifier.outputs[0] for term in terms_of(tone, stroke=STROKE)]
+    knots = tuple(STROKE * value for value in (0.2j, 0.4 + 0j, 0.8 + 0j))
+    model = list(BaseEnvelope(110.0, 0j, knots, step=0.005).terms(begin=0.0))
+    times = np.linspace(0.0, 0.03, 500)
+    assert motion(terms, times + 0.25) == pytest.approx(motion(model, times), abs=1e-12)
+
+
+def test_an_ending_plays_when_the_next_set_is_silent() -> None:
+    """Through its knots to zero, whatever the ramp; the phase still counts from the first set."""
+    amplifier = armed()
+    amplifier.handle(Apply(playing(1, 0.8, ending=2)), 1.0)
+    amplifier.handle(Apply(CommandSet(2, (), ramp=0.5, valid_for=0.0)), 1.2)
+    (tone,) = amplifier.outputs[0]
+    assert level(amplifier, 1.205) == pytest.approx(0.5)
+    assert tone.amplitude(1.205) == pytest.approx(-0.5)
+    assert tone.origin == 1.0
+    assert level(amplifier, 1.21) == pytest.approx(0.1)
+    assert level(amplifier, 1.215) == 0.0
+    assert tone.silent_from == pytest.approx(1.215)
+
+
+def test_an_ending_can_be_skipped() -> None:
+    """With the flag the channel falls silent along the ramp."""
+    amplifier = armed()
+    amplifier.handle(Apply(playing(1, 0.8, ending=2)), 1.0)
+    amplifier.handle(Apply(playing(2, 0.0, ramp=0.02, skip_ending=True)), 1.2)
+    assert level(amplifier, 1.205) == pytest.approx(0.8 * (1 + math.cos(math.pi / 4)) / 2)
+    assert level(amplifier, 1.21) == pytest.approx(0.4)
+
+
+def test_a_vibration_that_ends_by_itself_uses_its_ending() -> None:
+    """valid_for leads into the ending."""
+    amplifier = armed()
+    amplifier.handle(Apply(playing(1, 0.8, ramp=0.5, valid_for=0.1, ending=2)), 1.0)
+    before = level(amplifier, 1.1 - 1e-9)
+    assert level(amplifier, 1.1) == pytest.approx(before, abs=1e-6)
+    assert level(amplifier, 1.105) == pytest.approx(0.5, abs=1e-6)
+    assert level(amplifier, 1.1151) == 0.0
+
+
+@pytest.mark.parametrize("request_", [Stop(0.005), Disarm(0.005)])
+def test_a_stop_knows_no_ending(request_: Stop | Disarm) -> None:
+    """Silent within the ramp of 5 ms, also in the midst of an onset, from what was reached."""
+    amplifier = armed()
+    amplifier.handle(Apply(playing(1, 0.8, onset=1, ending=2)), 1.0)
+    amplifier.handle(request_, 1.01)
+    assert level(amplifier, 1.0125) == pytest.approx(0.2)  # half of 0.4
+    assert level(amplifier, 1.0151) == 0.0
+
+
+def test_the_watchdog_knows_no_ending() -> None:
+    """5 ms after it ran out everything is silent."""
+    amplifier = armed()
+    amplifier.handle(Arm(0.1), 1.0)
+    amplifier.handle(Apply(playing(1, 0.8, ending=2)), 1.0)
+    assert level(amplifier, 1.1) == pytest.approx(0.8)
+    assert level(amplifier, 1.1051) == 0.0
+
+
+def test_an_onset_that_keeps_the_phase_goes_on_from_what_plays() -> None:
+    """Nothing jumps: it begins at the amplitude that the channel has, and counts its t on."""
+    amplifier = armed()
+    amplifier.handle(Apply(playing(1, 0.6)), 1.0)
+    command = DriveCommand(0, 110.0, 0.8, phase=0.0, keep_phase=True, onset=1)
+    amplifier.handle(Apply(CommandSet(2, (command,), ramp=0.0, valid_for=0.0)), 1.3)
+    (tone,) = amplifier.outputs[0]
+    assert (tone.origin, tone.amplitude(1.3)) == (1.0, 0.6)
+    assert level(amplifier, 1.305) == pytest.approx(0.2)
+
+
+def test_an_onset_may_lead_to_silence() -> None:
+    """An ERA that only helps during the onset has level 0 in its command."""
+    amplifier = armed()
+    amplifier.handle(Apply(playing(1, 0.0, onset=1)), 1.0)
+    assert level(amplifier, 1.01) == pytest.approx(0.4)
+    assert level(amplifier, 1.0151) == 0.0
+    amplifier.handle(Ping(), 2.0)
+    assert amplifier.outputs[0][0].silent_from == pytest.approx(1.015)
+
+
+def test_a_set_that_refers_to_an_empty_slot_is_refused_whole() -> None:
+    """NO_ENVELOPE with the channel; what plays and what is staged stays."""
+    amplifier = armed()
+    amplifier.handle(Apply(playing(1, 0.3)), 1.0)
+    outputs = amplifier.outputs
+    commands = (DriveCommand(0, 110.0, 0.5, onset=1), DriveCommand(2, 110.0, 0.5, ending=9))
+    reply = amplifier.handle(Apply(CommandSet(2, commands, 0.0, 0.0)), 1.1)
+    assert reply == Nak(NakCode.NO_ENVELOPE, 2)
+    assert amplifier.outputs == outputs
+    amplifier.handle(LoadEnvelope(Envelope(1, 0.005, ())), 1.2)
+    assert amplifier.handle(Apply(playing(3, 0.5, onset=1)), 1.2) == Nak(NakCode.NO_ENVELOPE, 0)
+
+
+def test_a_set_takes_its_envelopes_with_it() -> None:
+    """What is loaded into the slot after Stage changes nothing of what Commit plays."""
+    amplifier = armed()
+    staged = amplifier.handle(Stage(playing(1, 0.8, onset=1)), 1.0)
+    assert isinstance(staged, Achieved)
+    amplifier.handle(LoadEnvelope(Envelope(1, 0.005, (Knot(1.0, 0.0),))), 1.0)
+    amplifier.handle(Commit(1), 1.0)
+    assert level(amplifier, 1.005) == pytest.approx(0.2)
+
+
+@pytest.mark.parametrize(
+    "envelope",
+    [
+        Envelope(0, 0.005, (Knot(0.1, 0.0),)),
+        Envelope(64, 0.005, (Knot(0.1, 0.0),)),
+        Envelope(1, 0.0005, (Knot(0.1, 0.0),)),
+        Envelope(1, 0.2, (Knot(0.1, 0.0),)),
+        Envelope(1, 0.005, (Knot(0.1, 0.0),) * 33),
+        Envelope(1, 0.005, (Knot(1.1, 0.0),)),
+        Envelope(1, 0.005, (Knot(math.nan, 0.0),)),
+    ],
+)
+def test_an_envelope_that_cannot_be_kept_is_refused(envelope: Envelope) -> None:
+    """Slots, steps, numbers of knots and levels out of range; what was there stays."""
+    amplifier = armed()
+    assert amplifier.handle(LoadEnvelope(envelope), 1.0) == Nak(NakCode.BAD_VALUE)
+    amplifier.handle(Apply(playing(1, 0.8, onset=1)), 1.0)
+    assert level(amplifier, 1.005) == pytest.approx(0.2)

@@ -1,0 +1,354 @@
+"""One simulated amplifier on a virtual clock, against the protocol's own words."""
+
+import dataclasses
+import math
+
+import pytest
+
+from drivers.command import CommandSet, DriveCommand
+from drivers.protocol.messages import (
+    Achieved,
+    Apply,
+    Arm,
+    Capabilities,
+    Clear,
+    Commit,
+    Disarm,
+    Fault,
+    FaultList,
+    GetCaps,
+    GetFaults,
+    GetStatus,
+    Hello,
+    Identity,
+    Nak,
+    NakCode,
+    Ping,
+    Reply,
+    Request,
+    Stage,
+    State,
+    Status,
+    Stop,
+)
+from sim.amplifier.amplifier import SimulatedAmplifier
+
+
+def playing(
+    token: int, *levels: float, ramp: float = 0.0, valid_for: float = 0.0, frequency: float = 110.0
+) -> CommandSet:
+    """A set that plays these levels on the first channels, all at one frequency."""
+    commands = tuple(DriveCommand(channel, frequency, x) for channel, x in enumerate(levels))
+    return CommandSet(token, commands, ramp=ramp, valid_for=valid_for)
+
+
+def armed(at: float = 0.0, *, watchdog: float = 0.25) -> SimulatedAmplifier:
+    """Four channels, enabled and silent."""
+    amplifier = SimulatedAmplifier("main", channels=4)
+    assert isinstance(amplifier.handle(Arm(watchdog), at), Status)
+    return amplifier
+
+
+def status(amplifier: SimulatedAmplifier, now: float) -> Status:
+    """How it is, asked in a way that does not feed the watchdog."""
+    reply = amplifier.handle(GetStatus(), now)
+    assert isinstance(reply, Status)
+    return reply
+
+
+def refused(reply: Reply, code: NakCode, channel: int | None = None) -> None:
+    """Assert that this is a refusal for this reason."""
+    assert reply == Nak(code, channel)
+
+
+S = State
+# One row per state, one column per request; "!" is refused, "." stays as it is.
+REQUESTS: list[Request] = [
+    *(Hello(), GetCaps(), GetStatus(), GetFaults(), Ping()),
+    *(Arm(0.25), Disarm(0.01), Stage(playing(7, 0.5)), Commit(7), Apply(playing(7, 0.5))),
+    *(Stop(0.01), Clear()),
+]
+EXPECTED = {
+    #                        hello..ping     arm   disarm stage commit apply stop  clear
+    S.NOT_READY: [*"....." + "!", ".", "!", "!", "!", ".", "."],
+    S.SWITCH_ON_DISABLED: [*".....", S.OPERATION_ENABLED, ".", *"!!!", S.QUICK_STOP_ACTIVE, "."],
+    S.READY_TO_SWITCH_ON: [*".....", S.OPERATION_ENABLED, ".", *"!!!", S.QUICK_STOP_ACTIVE, "."],
+    S.SWITCHED_ON: [*".....", S.OPERATION_ENABLED, ".", *"!!!", S.QUICK_STOP_ACTIVE, "."],
+    S.OPERATION_ENABLED: [*"......", S.SWITCHED_ON, *"...", S.QUICK_STOP_ACTIVE, "."],
+    S.QUICK_STOP_ACTIVE: [*".....", "!", ".", *"!!!", ".", S.SWITCH_ON_DISABLED],
+    S.FAULT_REACTION_ACTIVE: [*".....", "!", ".", *"!!!", ".", "."],
+    S.FAULT: [*".....", "!", ".", *"!!!", ".", S.SWITCH_ON_DISABLED],
+}
+REPLIES = {
+    **{Hello: Identity, GetCaps: Capabilities, GetFaults: FaultList},
+    **{Stage: Achieved, Commit: Achieved, Apply: Achieved},
+}
+
+
+def brought_to(state: State, request: Request) -> SimulatedAmplifier:
+    """An amplifier in a state, reached by the protocol where the protocol leads there."""
+    amplifier = armed()
+    amplifier.handle(Apply(playing(5, 0.5)), 0.0)
+    if isinstance(request, Commit):
+        amplifier.handle(Stage(playing(7, 0.5)), 0.0)
+    match state:
+        case State.SWITCH_ON_DISABLED:
+            amplifier.handle(Disarm(0.0), 0.01)
+        case State.SWITCHED_ON:
+            amplifier.handle(Disarm(0.5), 0.01)
+        case State.QUICK_STOP_ACTIVE:
+            amplifier.handle(Stop(0.0), 0.01)
+        case State.FAULT_REACTION_ACTIVE:
+            amplifier.tick(0.251)
+        case State.FAULT:
+            amplifier.tick(0.256)
+        case State.NOT_READY | State.READY_TO_SWITCH_ON:  # never entered: passed through at once
+            amplifier = SimulatedAmplifier("main", channels=4)
+            amplifier.state = state
+        case _:
+            pass
+    assert amplifier.state is state
+    return amplifier
+
+
+@pytest.mark.parametrize("state", list(State), ids=lambda state: state.name)
+@pytest.mark.parametrize("column", range(12), ids=[type(r).__name__ for r in REQUESTS])
+def test_every_request_in_every_state(state: State, column: int) -> None:
+    """Each pair leads where the protocol says, or is refused and changes nothing."""
+    request, expected = REQUESTS[column], EXPECTED[state][column]
+    amplifier = brought_to(state, request)
+    now = 0.252 if state is State.FAULT_REACTION_ACTIVE else 0.26
+    now = 0.02 if state in (S.OPERATION_ENABLED, S.SWITCHED_ON) else now
+    before = status(amplifier, now)
+    reply = amplifier.handle(request, now)
+    if expected == "!":
+        refused(reply, NakCode.WRONG_STATE)
+        assert status(amplifier, now) == before
+    else:
+        assert isinstance(reply, REPLIES.get(type(request), Status))
+        assert amplifier.state is (state if expected == "." else expected)
+
+
+def test_arming_leaves_every_level_at_zero() -> None:
+    """Armed: enabled, high voltage on, silent, no token; watchdogs out of range are refused."""
+    amplifier = SimulatedAmplifier("main", channels=4)
+    assert not status(amplifier, 0.0).high_voltage
+    for watchdog in (0.0, 0.0999, 2.001, math.nan, math.inf):
+        refused(amplifier.handle(Arm(watchdog), 0.0), NakCode.BAD_VALUE)
+    amplifier.handle(Arm(0.25), 1.0)
+    now = status(amplifier, 1.1)
+    assert (now.state, now.token, now.high_voltage) == (S.OPERATION_ENABLED, 0, True)
+    assert now.levels == (0, 0, 0, 0)
+    assert now.watchdog_left == pytest.approx(0.15)
+
+
+def test_watchdog_trips_exactly_at_its_time_even_if_noticed_late() -> None:
+    """Playing until 0.25 s, half down 2.5 ms later, silent and in FAULT 5 ms later."""
+    amplifier = armed()
+    amplifier.handle(Apply(playing(1, 1.0)), 0.0)
+    assert amplifier.next_event == 0.25
+    assert status(amplifier, 0.2499).levels[0] == 1.0
+    late = armed()
+    late.handle(Apply(playing(1, 1.0)), 0.0)
+    tripped = status(late, 0.2525)
+    assert (tripped.state, tripped.fault) == (S.FAULT_REACTION_ACTIVE, Fault.WATCHDOG)
+    assert tripped.levels[0] == pytest.approx(0.5)
+    for one, moment in ((late, 0.2551), (amplifier, 7.0)):
+        done = status(one, moment)
+        assert (done.state, done.fault, done.levels[0]) == (S.FAULT, Fault.WATCHDOG, 0)
+        assert not done.high_voltage
+    faults = amplifier.handle(GetFaults(), 7.25)
+    assert isinstance(faults, FaultList)
+    assert faults.faults[0].age == pytest.approx(7.0)
+
+
+@pytest.mark.parametrize("request_", REQUESTS, ids=lambda request: type(request).__name__)
+def test_what_feeds_the_watchdog(request_: Request) -> None:
+    """Every good request feeds it but Hello, GetCaps, GetStatus and GetFaults."""
+    amplifier = armed()
+    if isinstance(request_, Commit):
+        amplifier.handle(Stage(playing(7, 0.5)), 0.0)
+    amplifier.handle(request_, 0.2)
+    amplifier.tick(0.3)
+    asking = isinstance(request_, Hello | GetCaps | GetStatus | GetFaults)
+    assert (amplifier.state is State.FAULT) == asking
+
+
+def test_refused_requests_do_not_feed_the_watchdog() -> None:
+    """A host that only sends nonsense does not keep the plate alive."""
+    amplifier = armed()
+    refused(amplifier.handle(Commit(99), 0.2), NakCode.BAD_TOKEN)
+    refused(amplifier.handle(Apply(playing(1, 1.5)), 0.2), NakCode.BAD_VALUE, 0)
+    assert status(amplifier, 0.25).fault is Fault.WATCHDOG
+
+
+def test_a_watchdog_fault_must_be_cleared_and_never_re_arms() -> None:
+    """FAULT takes no Arm; Clear leads to SWITCH_ON_DISABLED with the fault acknowledged."""
+    amplifier = armed()
+    refused(amplifier.handle(Arm(0.25), 1.0), NakCode.WRONG_STATE)
+    amplifier.handle(Clear(), 1.0)
+    cleared = status(amplifier, 1.0)
+    assert (cleared.state, cleared.fault) == (S.SWITCH_ON_DISABLED, Fault.NONE)
+
+
+BAD = [
+    (DriveCommand(4, 110.0, 0.5), NakCode.BAD_CHANNEL, 4),
+    (DriveCommand(-1, 110.0, 0.5), NakCode.BAD_CHANNEL, -1),
+    (DriveCommand(0, 110.0, 0.5), NakCode.BAD_CHANNEL, 0),  # named twice
+    (DriveCommand(1, 9.9, 0.5), NakCode.BAD_VALUE, 1),
+    (DriveCommand(1, 700.0, 0.5), NakCode.BAD_VALUE, 1),
+    (DriveCommand(1, math.nan, 0.5), NakCode.BAD_VALUE, 1),
+    (DriveCommand(1, 110.0, 1.0001), NakCode.BAD_VALUE, 1),
+    (DriveCommand(1, 110.0, -0.1), NakCode.BAD_VALUE, 1),
+    (DriveCommand(1, 110.0, math.nan), NakCode.BAD_VALUE, 1),
+    (DriveCommand(1, 110.0, 0.5, phase=math.inf), NakCode.BAD_VALUE, 1),
+]
+
+
+@pytest.mark.parametrize(("bad", "code", "channel"), BAD)
+def test_a_set_is_applied_whole_or_not_at_all(
+    bad: DriveCommand, code: NakCode, channel: int
+) -> None:
+    """One bad channel refuses the set; what was playing and what was staged stay as they were."""
+    amplifier = armed()
+    amplifier.handle(Apply(playing(1, 0.1, 0.2)), 0.0)
+    amplifier.handle(Stage(playing(2, 0.9)), 0.0)
+    outputs = amplifier.outputs
+    good = DriveCommand(0, 200.0, 1.0)
+    for request in (Apply, Stage):
+        refused(amplifier.handle(request(CommandSet(3, (good, bad), 0.0, 0.0)), 0.1), code, channel)
+    assert amplifier.outputs == outputs
+    assert status(amplifier, 0.1).token == 1
+    assert isinstance(amplifier.handle(Commit(2), 0.1), Achieved)
+
+
+@pytest.mark.parametrize(
+    ("token", "ramp", "valid_for", "code"),
+    [
+        (0, 0.0, 0.0, NakCode.BAD_TOKEN),
+        (65536, 0.0, 0.0, NakCode.BAD_TOKEN),
+        (1, -0.01, 0.0, NakCode.BAD_VALUE),
+        (1, 1.1, 0.0, NakCode.BAD_VALUE),
+        (1, math.nan, 0.0, NakCode.BAD_VALUE),
+        (1, 0.0, -1.0, NakCode.BAD_VALUE),
+        (1, 0.0, 61.0, NakCode.BAD_VALUE),
+    ],
+)
+def test_a_set_with_a_bad_head_is_refused(
+    token: int, ramp: float, valid_for: float, code: NakCode
+) -> None:
+    """Token, ramp and duration must be within the protocol's ranges."""
+    wanted = CommandSet(token, (DriveCommand(0, 110.0, 0.5),), ramp, valid_for)
+    refused(armed().handle(Apply(wanted), 0.1), code)
+
+
+def test_channels_of_a_set_that_are_not_named_fall_silent() -> None:
+    """A set is the whole plate's: what it does not name is silent after its ramp."""
+    amplifier = armed()
+    amplifier.handle(Apply(playing(1, 0.5, 0.6, 0.7)), 0.0)
+    amplifier.handle(Apply(playing(2, 0.5, ramp=0.02)), 0.1)
+    assert status(amplifier, 0.12).levels == (0.5, 0, 0, 0)
+
+
+def test_a_token_is_applied_once() -> None:
+    """A repeated Apply or Commit answers as the first did and leaves the phase running."""
+    amplifier = armed()
+    first = amplifier.handle(Apply(playing(1, 0.5)), 0.0)
+    outputs = amplifier.outputs
+    assert amplifier.handle(Apply(playing(1, 0.5)), 0.1) == first
+    assert amplifier.handle(Commit(1), 0.1) == first
+    assert amplifier.outputs == outputs
+    amplifier.handle(Apply(playing(2, 0.3)), 0.2)
+    refused(amplifier.handle(Apply(playing(1, 0.5)), 0.2), NakCode.BAD_TOKEN)
+    assert status(amplifier, 0.2).levels[0] == 0.3
+    amplifier.handle(Arm(0.25), 0.3)
+    amplifier.handle(Apply(playing(1, 0.5)), 0.3)
+    assert status(amplifier, 0.3).token == 1
+
+
+@pytest.mark.parametrize("late", [Stage, Apply])
+def test_a_late_copy_leaves_what_is_staged(late: type[Stage] | type[Apply]) -> None:
+    """A copy of an earlier set is refused, and the set that is staged meanwhile can be played."""
+    amplifier = armed()
+    for token in (1, 2):
+        amplifier.handle(Apply(playing(token, 0.1 * token)), 0.0)
+    amplifier.handle(Stage(playing(3, 0.3)), 0.0)
+    refused(amplifier.handle(late(playing(1, 0.1)), 0.0), NakCode.BAD_TOKEN)
+    assert isinstance(amplifier.handle(Commit(3), 0.0), Achieved)
+    assert status(amplifier, 0.0).levels[0] == pytest.approx(0.3)
+
+
+def test_nothing_moves_before_the_commit() -> None:
+    """Stage changes no output; Commit of its token does, of any other does not."""
+    amplifier = armed()
+    amplifier.handle(Stage(playing(3, 0.4)), 0.0)
+    refused(amplifier.handle(Commit(4), 0.1), NakCode.BAD_TOKEN)
+    assert status(amplifier, 0.1).levels[0] == 0
+    amplifier.handle(Commit(3), 0.1)
+    assert status(amplifier, 0.1).levels[0] == 0.4
+
+
+def test_vibration_ends_by_itself() -> None:
+    """After valid_for the set fades out along its ramp; its token stays and is not played again."""
+    amplifier = armed()
+    amplifier.handle(Apply(playing(1, 1.0, ramp=0.02, valid_for=0.1)), 0.0)
+    assert amplifier.next_event == pytest.approx(0.1)
+    assert status(amplifier, 0.0999).levels[0] == 1.0
+    assert status(amplifier, 0.11).levels[0] == pytest.approx(0.5)
+    ended = status(amplifier, 0.1201)
+    assert (ended.state, ended.token, ended.levels[0]) == (S.OPERATION_ENABLED, 1, 0)
+    amplifier.handle(Apply(playing(1, 1.0, ramp=0.02, valid_for=0.1)), 0.2)
+    assert status(amplifier, 0.24).levels[0] == 0
+
+
+def test_achieved_says_what_the_steps_leave() -> None:
+    """0.01 Hz, 1e-4 of full stroke, 0.01 degrees within half a turn, the protocol's steps."""
+    wanted = CommandSet(1, (DriveCommand(2, 110.00499, 0.123449, 270.0),), 0.0, 0.0)
+    reply = armed().handle(Apply(wanted), 0.0)
+    assert isinstance(reply, Achieved)
+    assert reply.commands == (DriveCommand(2, 110.0, 0.1234, -90.0),)
+    finer = dataclasses.replace(
+        wanted, token=2, commands=(DriveCommand(2, 110.00501, 0.123451, 12.3449),)
+    )
+    reply = armed().handle(Apply(finer), 0.0)
+    assert isinstance(reply, Achieved)
+    assert reply.commands == (DriveCommand(2, 110.01, 0.1235, 12.34),)
+
+
+def test_quick_stop_is_latched() -> None:
+    """Silent within its ramp, then it stays stopped until Clear, which needs level zero."""
+    amplifier = armed()
+    amplifier.handle(Apply(playing(1, 1.0)), 0.0)
+    amplifier.handle(Stop(0.05), 0.1)
+    assert status(amplifier, 0.125).levels[0] == pytest.approx(0.5)
+    amplifier.handle(Clear(), 0.125)
+    assert amplifier.state is State.QUICK_STOP_ACTIVE
+    refused(amplifier.handle(Apply(playing(2, 1.0)), 0.13), NakCode.WRONG_STATE)
+    stopped = status(amplifier, 10.0)
+    assert (stopped.state, stopped.levels[0]) == (S.QUICK_STOP_ACTIVE, 0)
+    assert stopped.fault is Fault.NONE
+    assert not stopped.high_voltage
+    amplifier.handle(Clear(), 10.0)
+    assert amplifier.state is State.SWITCH_ON_DISABLED
+
+
+@pytest.mark.parametrize("ramp", [math.nan, -1.0, 1e9])
+def test_a_stop_is_never_refused(ramp: float) -> None:
+    """Whatever ramp a stop asks for, the plate is silent within the longest allowed one."""
+    amplifier = armed(watchdog=2.0)
+    amplifier.handle(Apply(playing(1, 1.0)), 0.0)
+    assert isinstance(amplifier.handle(Stop(ramp), 0.1), Status)
+    assert status(amplifier, 1.1001).levels[0] == 0
+
+
+def test_disarm_ramps_down_before_high_voltage_goes() -> None:
+    """High voltage stays while a channel still plays, and is off afterwards."""
+    amplifier = armed()
+    amplifier.handle(Apply(playing(1, 1.0)), 0.0)
+    amplifier.handle(Disarm(0.05), 0.1)
+    during = status(amplifier, 0.125)
+    assert (during.state, during.high_voltage) == (S.SWITCHED_ON, True)
+    after = status(amplifier, 0.151)
+    assert (after.state, after.high_voltage, after.levels[0]) == (S.SWITCH_ON_DISABLED, False, 0)
+    # no host, no watchdog: a disarmed amplifier stays as it is
+    assert status(amplifier, 100.0).fault is Fault.NONE

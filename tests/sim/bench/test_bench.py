@@ -1,0 +1,136 @@
+"""A whole rig in numbers: from a request to what a finger feels, on a virtual clock."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from drivers.command import CommandSet, DriveCommand
+from drivers.protocol.messages import Achieved, Apply, Arm, Fault, Ping
+from model.assembly import assemble
+from model.fingertip import fingertip_points
+from model.harmonic import direct_acceleration
+from model.point_load import PointLoad
+from model.point_mass import PointMass
+from model.rig import Rig
+from sim.bench.bench import Bench
+
+START = 98765.4321  # as large as a clock may be
+
+
+def play(bench: Bench, token: int, *commands: DriveCommand, now: float, ramp: float = 0.02) -> None:
+    """Apply a set that lasts until the next one."""
+    reply = bench.exchange("main", Apply(CommandSet(token, commands, ramp, 0.0)), now=now)
+    assert isinstance(reply, Achieved)
+
+
+def keep_alive(bench: Bench, since: float, until: float) -> None:
+    """Advance with heartbeats, as a host does."""
+    for now in np.arange(since, until, 0.05):
+        bench.exchange("main", Ping(), now=float(now))
+    bench.advance(until)
+
+
+def test_what_a_finger_feels_is_what_the_model_predicts(coarse_rig: Rig) -> None:
+    """Steady state of two ERAs at two frequencies, against the sparse direct solve, within 1 %."""
+    bench = Bench(coarse_rig, now=START)
+    bench.place_fingers({"a": (0.08, 0.06), "b": (0.25, 0.2)}, now=START)
+    bench.exchange("main", Arm(0.25), now=START)
+    play(
+        bench,
+        1,
+        DriveCommand(0, 110.0, 1.0),
+        DriveCommand(2, 110.0, 0.5, phase=180.0),
+        DriveCommand(3, 230.0, 0.7),
+        now=START + 0.01,
+    )
+    keep_alive(bench, START + 0.05, START + 4.0)
+    felt = bench.felt(START + 3.5, START + 4.0)
+    matrices = assemble(coarse_rig.plate, coarse_rig.mesh)
+    for name, (x, y) in {"a": (0.08, 0.06), "b": (0.25, 0.2)}.items():
+        points = fingertip_points(x, y, coarse_rig.plate)
+        unit = direct_acceleration(matrices, coarse_rig.eras, np.array([110.0, 230.0]), points)
+        expected = np.abs([unit[0, 0] - 0.5 * unit[0, 2], 0.7 * unit[1, 3]])
+        assert felt[name].frequencies == (110.0, 230.0)
+        error = np.linalg.norm(felt[name].amplitude - expected) / np.linalg.norm(expected)
+        assert error < 0.01
+        np.testing.assert_array_equal(felt[name].points, points)
+
+
+def test_what_the_plate_carries_moves_with_it(coarse_rig: Rig) -> None:
+    """With 80 g on it, fingers feel what the sparse direct solve says, and not what they did."""
+    heavy = replace(coarse_rig, masses=(PointMass(0.1, 0.15, 0.05), PointMass(0.3048, 0.1, 0.03)))
+    points = fingertip_points(0.08, 0.06, heavy.plate)
+    matrices = assemble(heavy.plate, heavy.mesh)
+    frequency = np.array([210.0])
+    bare = direct_acceleration(matrices, heavy.eras, frequency, points)[0, 1]
+    loads = [PointLoad(0.1, 0.15, mass=0.05), PointLoad(0.3048, 0.1, mass=0.03)]
+    laden = direct_acceleration(matrices, heavy.eras, frequency, points, loads=loads)[0, 1]
+    bench = Bench(heavy, now=START)
+    bench.place_fingers({"a": (0.08, 0.06)}, now=START)
+    bench.exchange("main", Arm(0.25), now=START)
+    play(bench, 1, DriveCommand(1, 210.0, 1.0), now=START + 0.01)
+    keep_alive(bench, START + 0.05, START + 4.0)
+    (felt,) = bench.felt(START + 3.5, START + 4.0)["a"].amplitude
+    assert np.linalg.norm(felt - np.abs(laden)) < 0.01 * np.linalg.norm(felt)
+    assert np.linalg.norm(felt - np.abs(bare)) > 0.3 * np.linalg.norm(felt)
+
+
+def test_the_watchdog_silences_the_plate_at_its_own_time(coarse_rig: Rig) -> None:
+    """Noticed two seconds late, the plate has been ringing down since the watchdog ran out."""
+    prompt, late = Bench(coarse_rig, now=START), Bench(coarse_rig, now=START)
+    for bench in (prompt, late):
+        bench.place_fingers({"a": (0.1, 0.1)}, now=START)
+        bench.exchange("main", Arm(0.25), now=START)
+        play(bench, 1, DriveCommand(1, 110.0, 1.0), now=START + 0.1)
+    for step in range(1, 401):
+        prompt.advance(START + 0.1 + step * 0.005)
+    for bench in (prompt, late):
+        bench.advance(START + 2.1)
+        assert bench.amplifiers["main"].fault is Fault.WATCHDOG
+    window = START + 0.3, START + 0.5
+    np.testing.assert_allclose(
+        late.felt(*window)["a"].peak, prompt.felt(*window)["a"].peak, rtol=1e-4
+    )
+    driven = late.felt(START + 0.25, START + 0.35)["a"].peak.max()
+    assert late.felt(START + 1.9, START + 2.1)["a"].peak.max() < 0.02 * driven
+
+
+def test_frequencies_of_a_window_are_those_driven_in_it(coarse_rig: Rig) -> None:
+    """A tone counts while it fades in and out, not before or after."""
+    bench = Bench(coarse_rig, now=0.0)
+    bench.place_fingers({"a": (0.1, 0.1)}, now=0.0)
+    bench.exchange("main", Arm(2.0), now=0.0)
+    play(bench, 1, DriveCommand(0, 110.0, 1.0), DriveCommand(1, 200.0, 0.0), now=0.1)
+    play(bench, 2, DriveCommand(0, 150.0, 1.0), now=0.5)
+    bench.advance(1.0)
+
+    def frequencies(since: float, until: float) -> tuple[float, ...]:
+        return bench.felt(since, until)["a"].frequencies
+
+    assert frequencies(0.0, 0.09) == ()
+    assert frequencies(0.2, 0.4) == (110.0,)
+    assert frequencies(0.2, 0.6) == (110.0, 150.0)
+    assert frequencies(0.51, 0.6) == (110.0, 150.0)
+    assert frequencies(0.53, 0.6) == (150.0,)
+
+
+def test_a_long_pause_is_bridged_without_sampling_it(coarse_rig: Rig) -> None:
+    """A process that was paused for a day comes back to a silent plate, ten seconds recorded."""
+    bench = Bench(coarse_rig, now=0.0)
+    bench.place_fingers({"a": (0.1, 0.1)}, now=0.0)
+    bench.exchange("main", Arm(0.25), now=0.0)
+    play(bench, 1, DriveCommand(1, 110.0, 1.0), now=0.1)
+    bench.advance(86_400.0)
+    felt = bench.felt(86_400.0 - 9.9, 86_400.0)
+    assert felt["a"].peak.max() < 1e-9
+    assert bench.fingers.felt(0.0, 86_400.0)["a"].times[0] >= 86_390.0
+
+
+def test_a_clock_that_is_behind_moves_nothing_back(coarse_rig: Rig) -> None:
+    """A request stamped before the present is taken now."""
+    bench = Bench(coarse_rig, now=10.0)
+    bench.exchange("main", Arm(0.25), now=10.0)
+    play(bench, 1, DriveCommand(1, 110.0, 1.0), now=9.0)
+    assert bench.time == 10.0
+    assert bench.amplifiers["main"].status(10.02).levels[1] == pytest.approx(1.0)

@@ -1,0 +1,156 @@
+"""Fingers that load the plate of the bench, against the direct solve with what they weigh."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from drivers.command import CommandSet, DriveCommand
+from drivers.protocol.messages import Apply, Arm, Ping
+from model.arrays import FloatArray
+from model.assembly import assemble
+from model.errors import InputError
+from model.finger_load import FingerLoad, finger_loads, parse_finger_load
+from model.fingertip import fingertip_points
+from model.harmonic import direct_acceleration
+from model.point_load import PointLoad
+from model.rig import Rig
+from sim.bench.bench import Bench
+from sim.sensors.accelerometer import Accelerometer
+from sim.sensors.on_bench import Accelerometers
+
+A, B = (0.1, 0.07), (0.29, 0.2)
+FREQUENCY = 210.0
+
+
+def expected(rig: Rig, loads: tuple[PointLoad, ...]) -> FloatArray:
+    """Amplitudes [m/s²] under finger A by the direct solve, one ERA at full stroke."""
+    points = fingertip_points(*A, rig.plate)
+    matrices = assemble(rig.plate, rig.mesh)
+    answer = direct_acceleration(matrices, rig.eras, np.array([FREQUENCY]), points, loads=loads)
+    return np.asarray(np.abs(answer[0, 1]))
+
+
+def driven(bench: Bench, until: float) -> None:
+    """Keep the amplifier fed until a time [s]."""
+    for now in np.arange(bench.time, until, 1.0):
+        bench.exchange("main", Ping(), now=float(now))
+    bench.advance(until)
+
+
+def play(bench: Bench) -> None:
+    """One ERA at full stroke from now on."""
+    bench.exchange("main", Arm(2.0), now=bench.time)
+    wanted = CommandSet(1, (DriveCommand(1, FREQUENCY, 1.0),), 0.02, 0.0)
+    bench.exchange("main", Apply(wanted), now=bench.time)
+
+
+def apart(found: FloatArray, truth: FloatArray) -> float:
+    """Relative L2 distance."""
+    return float(np.linalg.norm(found - truth) / np.linalg.norm(truth))
+
+
+def test_fingers_load_the_plate_as_they_come_and_go(coarse_rig: Rig) -> None:
+    """What A feels alone, after B came, and after B went, each once the plate has settled."""
+    load = FingerLoad(2000.0, 3.0, 0.005)
+    bench = Bench(coarse_rig, now=0.0, finger_load=load)
+    bench.place_fingers({"a": A}, now=0.0)
+    play(bench)
+    for positions in ({"a": A}, {"a": A, "b": B}, {"a": A}):
+        bench.place_fingers(positions, now=bench.time)
+        driven(bench, bench.time + 4)
+        truth = expected(coarse_rig, tuple(load.at(*at) for at in positions.values()))
+        (amplitude,) = bench.felt(bench.time - 0.5, bench.time)["a"].amplitude
+        assert apart(amplitude, truth) < 0.005
+    assert apart(truth, expected(coarse_rig, (load.at(*A), load.at(*B)))) > 0.02
+
+
+def test_observers_and_fingers_that_only_feel_weigh_nothing(coarse_rig: Rig) -> None:
+    """By default no finger loads the plate; where fingers do, an observer beside them does not."""
+    bare = Bench(coarse_rig, now=0.0)
+    observed = Bench(coarse_rig, now=0.0, finger_load=FingerLoad(mass=0.02))
+    bare.place_fingers({"a": A, "b": B}, now=0.0)
+    observed.place_fingers({"a": A, "b": B}, now=0.0, observers={"a", "b"})
+    for bench in (bare, observed):
+        play(bench)
+        driven(bench, 4.0)
+        (amplitude,) = bench.felt(3.5, 4.0)["a"].amplitude
+        assert apart(amplitude, expected(coarse_rig, ())) < 0.01
+
+
+def test_sensors_go_on_reading_through_a_touch(coarse_rig: Rig) -> None:
+    """An accelerometer hears the whole time while a finger comes, at every sample, truly."""
+    load = FingerLoad(mass=0.005)
+    bench = Bench(coarse_rig, now=0.0, finger_load=load)
+    sensors = Accelerometers(bench)
+    sensors.place([Accelerometer("P1", 0.2, 0.03)])
+    play(bench)
+    driven(bench, 1.0)
+    bench.place_fingers({"b": B}, now=1.0)
+    driven(bench, 4.0)
+    recording = sensors.read(0.0, 4.0)
+    np.testing.assert_allclose(np.diff(recording.times), 1e-4, rtol=1e-6)
+    late = recording.times > 3.5
+    angle = 2 * np.pi * FREQUENCY * recording.times[late]
+    basis = np.column_stack([np.sin(angle), np.cos(angle)])
+    amplitude = np.hypot(*np.linalg.lstsq(basis, recording.samples[late, 0], rcond=None)[0])
+    answer = direct_acceleration(
+        assemble(coarse_rig.plate, coarse_rig.mesh),
+        coarse_rig.eras,
+        np.array([FREQUENCY]),
+        np.array([[0.2, 0.03]]),
+        loads=[load.at(*B)],
+    )
+    assert amplitude == pytest.approx(abs(answer[0, 1, 0]), rel=0.01)
+
+
+def test_a_finger_off_the_plate_changes_nothing(coarse_rig: Rig) -> None:
+    """It is refused, and those that were there go on resting where they are."""
+    bench = Bench(coarse_rig, now=0.0, finger_load=FingerLoad())
+    bench.place_fingers({"a": A}, now=0.0)
+    with pytest.raises(InputError, match="not on the plate"):
+        bench.place_fingers({"a": B, "c": (1.0, 1.0)}, now=0.1)
+    assert bench.fingers.layout.positions == {"a": A}
+
+
+def test_a_light_finger_is_that_of_the_robust_contrast() -> None:
+    """1 kN/m, 2 N s/m and 0.2 g, as the founding experiment's errors have it."""
+    assert finger_loads([A]) == (PointLoad(*A, 1000.0, 2.0, 0.0002),)
+    assert parse_finger_load("light", what="--finger-load") == FingerLoad(1000.0, 2.0, 0.0002)
+
+
+def test_a_finger_is_written_with_units_or_without() -> None:
+    """Stiffness, damping, mass; bare numbers are SI."""
+    wanted = FingerLoad(1500.0, 0.5, 0.0003)
+    assert parse_finger_load("1.5 kN/m, 0.5 N s/m, 0.3 g", what="--finger-load") == wanted
+    assert parse_finger_load("1500,0.5,0.0003", what="--finger-load") == wanted
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("heavy", "write light, or"),
+        ("1,2", "write light, or"),
+        ("1000,2,0.2 m", "0.2 m"),
+        ("-1000,2,0", "below zero"),
+        ("nan,2,0", "nan"),
+    ],
+)
+def test_what_is_no_finger_is_refused(text: str, words: str) -> None:
+    """The option is named, and what to write."""
+    with pytest.raises(InputError, match=f"--finger-load.*{words}"):
+        parse_finger_load(text, what="--finger-load")
+
+
+def test_a_heavier_finger_is_another(coarse_rig: Rig) -> None:
+    """The same place with another load is another contact, not the one that was solved before."""
+    heavy = replace(FingerLoad(), mass=0.02)
+    light, heavier = (expected(coarse_rig, (each.at(*A),)) for each in (FingerLoad(), heavy))
+    assert apart(heavier, light) > 0.05
+    for load, truth in ((FingerLoad(), light), (heavy, heavier)):
+        bench = Bench(coarse_rig, now=0.0, finger_load=load)
+        bench.place_fingers({"a": A}, now=0.0)
+        play(bench)
+        driven(bench, 4.0)
+        (amplitude,) = bench.felt(3.5, 4.0)["a"].amplitude
+        assert apart(amplitude, truth) < 0.01

@@ -1,0 +1,166 @@
+"""The control socket of the far end: what it takes, and what it refuses."""
+
+import asyncio
+import contextlib
+import json
+import socket
+import stat
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from drivers.command import CommandSet, DriveCommand
+from drivers.errors import LinkError
+from drivers.protocol.messages import Apply, Arm
+from model.rig import Rig
+from sim.bench.bench import Bench
+from sim.control.operations import carry_out
+from sim.control.server import LINE_MAX, control_socket
+from sim.control.site import Site
+
+
+@pytest.fixture
+def socket_path() -> Iterator[Path]:
+    """A path short enough for a Unix socket, wherever tests keep their files."""
+    with tempfile.TemporaryDirectory() as folder:
+        yield Path(folder) / "control"
+
+
+def mode(path: Path) -> int | None:
+    """Who may use a file, None where there is none."""
+    return stat.S_IMODE(path.stat().st_mode) if path.exists() else None
+
+
+def ask(bench: Bench, now: float, **request: Any) -> dict[str, Any]:
+    """One line of control."""
+    made = carry_out(Site(bench), json.dumps(request).encode(), now=now)
+    assert callable(made)
+    return made()
+
+
+def test_place_play_and_feel(coarse_rig: Rig) -> None:
+    """The answers have the shape that is promised, in units that their keys say."""
+    bench = Bench(coarse_rig, now=5.0)
+    placed = ask(bench, 5.1, op="fingers", fingers={"7": [0.1, 0.08], "x": [0, 0]})
+    assert placed == {"ok": True, "time_s": 5.1}
+    bench.exchange("main", Arm(2.0), now=5.2)
+    wanted = CommandSet(9, (DriveCommand(0, 110.0, 0.5),), ramp=0.0, valid_for=0.0)
+    bench.exchange("main", Apply(wanted), now=5.2)
+    felt = ask(bench, 6.0, op="felt", since_s=5.5, until_s=6.0)["fingers"]
+    assert felt.keys() == {"7", "x"}
+    assert felt["7"]["frequencies_hz"] == [110.0]
+    assert len(felt["7"]["points_m"]) == 19
+    assert felt["7"]["points_m"][0] == [0.1, 0.08]
+    assert len(felt["7"]["amplitude_m_s2"][0]) == len(felt["7"]["peak_m_s2"]) == 19
+    assert min(felt["7"]["peak_m_s2"]) > 0
+    state = ask(bench, 6.5, op="state")
+    assert state == {
+        "time_s": 6.5,
+        "fingers": {"7": [0.1, 0.08], "x": [0.0, 0.0]},
+        "amplifiers": {
+            "main": {
+                "state": "OPERATION_ENABLED",
+                "fault": "NONE",
+                "token": 9,
+                "high_voltage": True,
+                "levels": [0.5, 0.0, 0.0, 0.0],
+            }
+        },
+    }
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        b"\n",
+        b"\xff\xfe\n",
+        b"[1]\n",
+        b"{}\n",
+        b'{"op": "stop"}\n',
+        b'{"op": ["fingers"]}\n',
+        b'{"op": "fingers"}\n',
+        b'{"op": "fingers", "fingers": [[0.1, 0.1]]}\n',
+        b'{"op": "fingers", "fingers": {"b": 3}}\n',
+        b'{"op": "fingers", "fingers": {"b": [0.1]}}\n',
+        b'{"op": "fingers", "fingers": {"b": [0.1, NaN]}}\n',
+        b'{"op": "fingers", "fingers": {"b": [0.1, true]}}\n',
+        b'{"op": "fingers", "fingers": {"b": [0.1, "0.1"]}}\n',
+        b'{"op": "fingers", "fingers": {"b": [0.1, 0.5]}}\n',
+        b'{"op": "fingers", "fingers": {"b": [0.1, 1' + b"0" * 400 + b"]}}\n",
+        b'{"op": "felt", "since_s": 0}\n',
+        b'{"op": "felt", "since_s": 2, "until_s": 1}\n',
+        b'{"op": "felt", "since_s": "0", "until_s": 1}\n',
+        b"[" * 60_000 + b"\n",
+    ],
+)
+def test_malformed_lines_get_an_error_and_change_nothing(coarse_rig: Rig, line: bytes) -> None:
+    """Whatever the line, there is an answer, it says what is wrong, and no finger moves."""
+    bench = Bench(coarse_rig, now=1.0)
+    ask(bench, 1.0, op="fingers", fingers={"a": [0.1, 0.1]})
+    made = carry_out(Site(bench), line, now=1.0)
+    assert callable(made)
+    reply = made()
+    assert reply.keys() == {"error"}
+    assert len(reply["error"]) < 300
+    assert bench.fingers.layout.positions == {"a": (0.1, 0.1)}
+
+
+async def test_the_socket_is_its_owners_and_goes_with_the_bench(
+    coarse_rig: Rig, socket_path: Path
+) -> None:
+    """Mode 0600; several lines on one connection; no file is left behind."""
+    bench = Bench(coarse_rig, now=0.0)
+    async with control_socket(Site(bench), socket_path):
+        assert mode(socket_path) == 0o600
+        reader, writer = await asyncio.open_unix_connection(socket_path)
+        writer.write(b'{"op": "state"}\nnonsense\n{"op": "state"}\n')
+        replies = [json.loads(await reader.readline()) for _ in range(3)]
+        assert ["error" in reply for reply in replies] == [False, True, False]
+        with pytest.raises(LinkError, match="no other program"):
+            async with control_socket(Site(bench), socket_path):
+                pass
+        writer.close()
+        await writer.wait_closed()
+    assert mode(socket_path) is None
+
+
+async def test_an_endless_line_is_cut_off(coarse_rig: Rig, socket_path: Path) -> None:
+    """A line beyond the bound gets an error and the connection ends; others go on."""
+    bench = Bench(coarse_rig, now=0.0)
+    async with control_socket(Site(bench), socket_path):
+        reader, writer = await asyncio.open_unix_connection(socket_path)
+        writer.write(b" " * (2 * LINE_MAX))
+        assert "longer than" in json.loads(await reader.readline())["error"]
+        writer.close()
+        with contextlib.suppress(ConnectionError):  # it left with bytes of ours unread
+            await writer.wait_closed()
+        again, other = await asyncio.open_unix_connection(socket_path)
+        other.write(b'{"op": "state"}\n')
+        assert "amplifiers" in json.loads(await again.readline())
+        other.close()
+        await other.wait_closed()
+
+
+async def test_a_dead_socket_is_replaced(coarse_rig: Rig, socket_path: Path) -> None:
+    """A far end that was killed leaves a socket that nobody serves; the next one takes over."""
+    with socket.socket(socket.AF_UNIX) as dead:
+        dead.bind(str(socket_path))
+    async with control_socket(Site(Bench(coarse_rig, now=0.0)), socket_path):
+        _, writer = await asyncio.open_unix_connection(socket_path)
+        writer.close()
+        await writer.wait_closed()
+
+
+async def test_a_place_for_no_socket_is_an_error(coarse_rig: Rig, socket_path: Path) -> None:
+    """A missing folder, a path too long and a plain file are each refused with the path."""
+    bench = Bench(coarse_rig, now=0.0)
+    plain = socket_path.parent / "plain"
+    plain.write_text("kept")
+    for path in (socket_path / "deeper", socket_path.parent / ("x" * 200), plain):
+        with pytest.raises(LinkError, match="control socket"):
+            async with control_socket(Site(bench), path):
+                pass
+    assert plain.read_text() == "kept"

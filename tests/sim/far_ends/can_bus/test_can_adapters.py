@@ -1,0 +1,261 @@
+"""The far end's adapters against python-can's own interfaces, and against text by hand."""
+
+import asyncio
+import os
+import tty
+from collections.abc import AsyncIterator
+
+import can
+import pytest
+
+from drivers.protocol.can_frame import CanFrame
+from sim.far_ends.can_bus.bus import CanBus
+from sim.far_ends.can_bus.slcan_adapter import SlcanAdapter, SlcanEnd
+from sim.far_ends.can_bus.socketcand_server import SocketcandEnd
+
+PATIENCE = 5.0  # s; for a loaded machine, not an expectation
+FRAME = CanFrame(0x181, bytes.fromhex("0102030405060708"))
+
+
+def message(frame: CanFrame) -> can.Message:
+    """As python-can has it."""
+    return can.Message(
+        arbitration_id=frame.id, data=frame.data, is_fd=frame.fd, is_extended_id=False
+    )
+
+
+class Member:
+    """Somebody on the bus; `heard` is what came."""
+
+    def __init__(self, bus: CanBus) -> None:
+        self.heard: list[CanFrame] = []
+        self._bus = bus
+        self._arrived = asyncio.Event()
+        self._listener = self._hear
+        bus.join(self._listener)
+
+    def _hear(self, frame: CanFrame) -> None:
+        self.heard.append(frame)
+        self._arrived.set()
+
+    def send(self, frame: CanFrame) -> None:
+        """To all others."""
+        self._bus.send(frame, sender=self._listener)
+
+    async def hears(self, count: int) -> list[CanFrame]:
+        """Wait for so many frames."""
+        async with asyncio.timeout(PATIENCE):
+            while len(self.heard) < count:
+                self._arrived.clear()
+                await self._arrived.wait()
+        return self.heard
+
+
+@pytest.fixture
+def bus() -> CanBus:
+    """Nobody is on it yet."""
+    return CanBus()
+
+
+@pytest.fixture
+async def server(bus: CanBus) -> AsyncIterator[SocketcandEnd]:
+    """A socketcand server on a free port."""
+    end = SocketcandEnd(bus)
+    await end.open()
+    yield end
+    await end.close()
+
+
+async def test_python_can_s_socketcand_is_served(bus: CanBus, server: SocketcandEnd) -> None:
+    """Its own client opens the bus, sends, and hears what others send."""
+    member = Member(bus)
+
+    def connect() -> can.BusABC:
+        return can.Bus(
+            interface="socketcand",
+            channel="can0",
+            host="127.0.0.1",
+            port=server.port,
+            ignore_config=True,
+        )
+
+    client = await asyncio.to_thread(connect)
+    try:
+        for data in (b"", b"\x00", bytes(range(8))):
+            client.send(message(CanFrame(0x7FF, data)))
+        assert await member.hears(3) == [
+            CanFrame(0x7FF, data) for data in (b"", b"\x00", bytes(range(8)))
+        ]
+        member.send(FRAME)
+        received = await asyncio.to_thread(client.recv, PATIENCE)
+        assert received is not None
+        assert (received.arbitration_id, bytes(received.data)) == (0x181, FRAME.data)
+    finally:
+        client.shutdown()
+
+
+class Talk:
+    """A connection on which text is written by hand."""
+
+    def __init__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        self.reader, self.writer = reader, writer
+
+    async def says(self, text: str) -> None:
+        """The server says this next."""
+        async with asyncio.timeout(PATIENCE):
+            assert await self.reader.readexactly(len(text)) == text.encode()
+
+    async def ask(self, text: str, answer: str = "") -> None:
+        """Write, and read the answer."""
+        self.writer.write(text.encode())
+        await self.says(answer)
+
+
+@pytest.fixture
+async def talk(server: SocketcandEnd) -> AsyncIterator[Talk]:
+    """Greeted."""
+    talk = Talk(*await asyncio.open_connection("127.0.0.1", server.port))
+    await talk.says("< hi >")
+    yield talk
+    talk.writer.close()
+
+
+async def test_a_session_with_socketcand_as_its_protocol_says(bus: CanBus, talk: Talk) -> None:
+    """Greeting, open, raw mode, frames each way, echo; elements in pieces and in a row."""
+    member = Member(bus)
+    await talk.ask("< open can0 >", "< ok >")
+    await talk.ask("< rawmode >", "< ok >")
+    await talk.ask("< send 123 2 1 F")
+    await talk.ask("F >< send 7FF 0 >< echo >", "< echo >")
+    assert member.heard == [CanFrame(0x123, b"\x01\xff"), CanFrame(0x7FF, b"")]
+    member.send(FRAME)
+    async with asyncio.timeout(PATIENCE):
+        text = (await talk.reader.readuntil(b">")).decode()
+    assert text.startswith("< frame 181 ")
+    assert text.endswith(" 0102030405060708 >")
+
+
+@pytest.mark.parametrize(
+    "nonsense",
+    [
+        *("< send 123 3 1 2 >", "< send 800 0 >", "< send 00000123 0 >", "< send x 1 1 >"),
+        *("< send 123 9 1 2 3 4 5 6 7 8 9 >", "< fdsend 123 00 9 1 2 3 4 5 6 7 8 9 >", "<>", ">"),
+        *("a" * 2000, "< send 123 1 100 >", "\x00\xff< send"),
+    ],
+)
+async def test_nonsense_sends_nothing_and_ends_nothing(
+    bus: CanBus, talk: Talk, nonsense: str
+) -> None:
+    """Whatever is wrong with an element, no frame comes of it, and the next is understood."""
+    member = Member(bus)
+    await talk.ask("< open can0 >", "< ok >")
+    await talk.ask("< rawmode >", "< ok >")
+    await talk.ask(nonsense + " >")
+    async with asyncio.timeout(PATIENCE):
+        talk.writer.write(b"< send 123 1 5 >< echo >")
+        assert (await talk.reader.readuntil(b"< echo >")).endswith(b"< echo >")
+    assert member.heard == [CanFrame(0x123, b"\x05")]
+
+
+async def test_another_bus_is_refused(talk: Talk) -> None:
+    """There is one, and whoever asks for another is hung up on."""
+    await talk.ask("< open vcan7 >", "< error could not open bus >")
+    async with asyncio.timeout(PATIENCE):
+        assert await talk.reader.read() == b""
+
+
+async def test_a_client_that_reads_nothing_is_hung_up_on(bus: CanBus, talk: Talk) -> None:
+    """A flood of frames takes no memory: the connection ends, the bus goes on."""
+    member = Member(bus)
+    await talk.ask("< open can0 >", "< ok >")
+    await talk.ask("< rawmode >", "< ok >")
+    for number in range(300_000):
+        member.send(FRAME)
+        if number % 1000 == 0 and len(bus._members) == 1:
+            break
+        if number % 1000 == 0:
+            await asyncio.sleep(0)
+    await asyncio.sleep(0)
+    assert len(bus._members) == 1
+
+
+@pytest.fixture
+async def adapter(bus: CanBus) -> AsyncIterator[SlcanEnd]:
+    """A serial adapter."""
+    end = SlcanEnd(bus)
+    yield end
+    end.close()
+
+
+@pytest.mark.parametrize("is_fd", [False, True])
+async def test_python_can_s_slcan_is_served(bus: CanBus, adapter: SlcanEnd, is_fd: bool) -> None:
+    """Its own interface sets the bit rate, opens the channel, sends and hears."""
+    member = Member(bus)
+
+    def connect() -> can.BusABC:
+        return can.Bus(
+            interface="slcan",
+            channel=adapter.path,
+            bitrate=500_000,
+            sleep_after_open=0,
+            ignore_config=True,
+        )
+
+    client = await asyncio.to_thread(connect)
+    try:
+        sent = CanFrame(0x481, bytes(48 if is_fd else 8), fd=is_fd)
+        await asyncio.to_thread(client.send, message(sent))
+        assert await member.hears(1) == [sent]
+        member.send(sent)
+        received = None
+        async with asyncio.timeout(PATIENCE):
+            while received is None:
+                received = await asyncio.to_thread(client.recv, 1.0)
+        assert (received.arbitration_id, bytes(received.data)) == (sent.id, sent.data)
+        assert received.is_fd is is_fd
+    finally:
+        await asyncio.to_thread(client.shutdown)
+
+
+def answers(adapter_bus: CanBus, text: bytes) -> tuple[bytes, list[CanFrame]]:
+    """What an adapter writes to text, and what goes onto the bus."""
+    written: list[bytes] = []
+    adapter = SlcanAdapter(adapter_bus, written.append)
+    member = Member(adapter_bus)
+    adapter.receive(text)
+    adapter.close()
+    return b"".join(written), member.heard
+
+
+@pytest.mark.parametrize(
+    ("text", "written", "sent"),
+    [
+        (b"C\rS6\rO\rt1232AABB\rC\r", b"\r\r\rz\r\r", [CanFrame(0x123, b"\xaa\xbb")]),
+        (b"t1230\r", b"\x07", []),  # closed
+        (b"S6\rL\rt1230\r", b"\r\r\x07", []),  # listening only
+        (b"O\rS6\r", b"\r\x07", []),  # the bit rate of an open channel
+        (b"O\rt1233AABB\rt12391\rq\rt8000\r", b"\r\x07\x07\x07\x07", []),
+        (b"O\rT000001230\rr1230\r", b"\rZ\rz\r", []),  # nobody here has such identifiers
+        (b"V\rN\r", b"V1013\rNE0A1\r", []),
+        (b"O\r" + b"x" * 500, b"\r\x07", []),
+    ],
+)
+def test_the_adapter_answers_as_lawicel_s_do(
+    bus: CanBus, text: bytes, written: bytes, sent: list[CanFrame]
+) -> None:
+    """CR for what was done, BELL for what makes no sense, z and Z for frames that were sent."""
+    assert answers(bus, text) == (written, sent)
+
+
+async def test_a_host_may_come_and_go(bus: CanBus, adapter: SlcanEnd) -> None:
+    """The port outlives its users, and a closed channel passes nothing on."""
+    member = Member(bus)
+    for _ in range(3):
+        port = os.open(adapter.path, os.O_RDWR | os.O_NOCTTY)
+        tty.setraw(port)
+        os.write(port, b"C\rS6\rO\rt1230\rC\r")
+        await member.hears(1)
+        member.heard.clear()
+        os.close(port)
+    member.send(FRAME)
+    assert adapter._port.dropped == 0

@@ -1,0 +1,259 @@
+"""A node of the far end, with frames written by hand: NMT, sets, heartbeats, emergencies."""
+
+import struct
+from collections.abc import Callable
+
+import pytest
+
+from can_fuzz import Station
+from can_session import Timers
+from drivers.protocol.can_frame import CanFrame
+from drivers.protocol.messages import Fault, Ping, State
+from sim.far_ends.can_bus.node import CanNode
+
+ORDER, ANSWER, SYNC = 0x481, 0x181, CanFrame(0x080, b"")
+BAD_VALUE, BAD_CHANNEL, WRONG_STATE, BAD_TOKEN, TORN = 3, 4, 5, 6, 15
+
+
+class Bench:
+    """A node 1 with four channels, in operation and armed; `said` since it was last asked."""
+
+    def __init__(self) -> None:
+        self.station = Station()
+        self.said: list[CanFrame] = []
+        self.timers = Timers()
+        self.node = CanNode(self.station, 1, send=self.said.append)  # type: ignore[arg-type]
+        self.node.start(self.timers.call_later)
+
+    def tell(self, id: int, data: str) -> list[CanFrame]:
+        """Let the node hear a frame; what it says."""
+        self.said.clear()
+        self.node.receive(CanFrame(id, bytes.fromhex(data)))
+        return list(self.said)
+
+    def sync(self) -> CanFrame:
+        """A SYNC, and the one answer to it."""
+        (answer,) = self.tell(SYNC.id, "")
+        assert answer.id == ANSWER
+        return answer
+
+    def result(self) -> int:
+        """What the answer to a SYNC says."""
+        return self.sync().data[1] >> 4
+
+    @property
+    def state(self) -> State:
+        """Of the amplifier."""
+        return self.station.amplifier.state
+
+    @property
+    def levels(self) -> tuple[float, ...]:
+        """What it plays."""
+        return self.station.status().levels
+
+
+@pytest.fixture
+def bench() -> Bench:
+    """In operation and armed for 250 ms by host 127."""
+    bench = Bench()
+    bench.tell(0x000, "01 01")
+    bench.tell(ORDER, "7F00 0000 FA00 04 01")
+    assert bench.state is State.OPERATION_ENABLED
+    return bench
+
+
+def command(channel: int, sequence: int, *, level: int = 2000, flags: int = 0) -> str:
+    """The eight bytes of a command at 110 Hz."""
+    return struct.pack("<HHhBB", 11000, level, 0, flags | channel << 4, sequence).hex()
+
+
+def apply(token: int, count: int, sequence: int, *, ramp: int = 0, action: int = 1) -> str:
+    """The eight bytes of an order with a set."""
+    return struct.pack("<HHHBB", token, ramp, 0, action | count << 3, sequence).hex()
+
+
+def test_before_it_is_started_it_takes_no_orders() -> None:
+    """Pre-operational after boot-up: heartbeat and objects, but nothing that moves."""
+    bench = Bench()
+    assert bench.said == [CanFrame(0x701, b"\x00")]
+    assert bench.tell(ORDER, "7F00 0000 FA00 04 01") == []
+    assert bench.state is State.SWITCH_ON_DISABLED
+    assert len(bench.tell(0x601, "40 00 10 00 00000000")) == 1
+    bench.tell(0x000, "01 02")  # somebody else
+    assert bench.tell(ORDER, "7F00 0000 FA00 04 01") == []
+    bench.tell(0x000, "01 00")  # all
+    assert bench.tell(ORDER, "7F00 0000 FA00 04 01")[-1].id == ANSWER
+
+
+def test_a_set_is_played_at_its_sync_and_not_before(bench: Bench) -> None:
+    """Two commands and their order change nothing until SYNC; the answer says exact."""
+    for channel in (0, 2):
+        assert bench.tell(0x201 + 0x100 * channel, command(channel, 2)) == []
+    assert bench.tell(ORDER, apply(9, 2, 2)) == []
+    assert not any(bench.levels)
+    answer = bench.sync()
+    assert answer.data[:2] == bytes([2, 1 | 1 << 3])
+    assert bench.levels == pytest.approx((0.2, 0.0, 0.2, 0.0))
+
+
+@pytest.mark.parametrize(
+    "send",
+    [
+        lambda bench: bench.tell(ORDER, apply(9, 2, 2)),  # one command of two
+        lambda bench: (bench.tell(0x301, command(1, 1)), bench.tell(ORDER, apply(9, 2, 2))),
+        lambda bench: None,  # the order itself is lost
+        lambda bench: (
+            bench.tell(0x301, command(1, 2, flags=4)),  # shaped, but no slots come
+            bench.tell(ORDER, apply(9, 2, 2)),
+        ),
+        lambda bench: (
+            bench.tell(0x681, "0500 0000 0000 00 01"),  # slots of another set
+            bench.tell(0x301, command(1, 2, flags=4)),
+            bench.tell(ORDER, apply(9, 2, 2)),
+        ),
+    ],
+)
+def test_a_torn_set_is_not_played_and_is_told(bench: Bench, send: Callable[[Bench], None]) -> None:
+    """Whatever is missing or of another sequence number: torn, nothing plays, nothing is left."""
+    bench.tell(0x201, command(0, 2))
+    send(bench)
+    assert bench.result() == TORN
+    assert not any(bench.levels)
+    bench.tell(ORDER, apply(9, 1, 2))  # what came before the SYNC is forgotten
+    assert bench.result() == TORN
+
+
+@pytest.mark.parametrize(
+    ("frame", "order", "result", "channel"),
+    [
+        (command(0, 2, level=10001), apply(9, 1, 2), BAD_VALUE, 0),
+        (command(0, 2, flags=8), apply(9, 1, 2), BAD_VALUE, 0),
+        (command(3, 2), apply(9, 1, 2), BAD_CHANNEL, 3),  # on the identifier of channel 0
+        (command(0, 2), apply(0, 1, 2), BAD_TOKEN, 255),
+        (command(0, 2), apply(9, 1, 2, ramp=1001), BAD_VALUE, 255),
+    ],
+)
+def test_a_set_that_cannot_be_played_is_refused(
+    bench: Bench, frame: str, order: str, result: int, channel: int
+) -> None:
+    """Out of range, an unknown bit, the wrong channel, no token: the reason and the channel."""
+    bench.tell(0x201, frame)
+    bench.tell(ORDER, order)
+    answer = bench.sync()
+    assert (answer.data[1] >> 4, answer.data[3]) == (result, channel)
+    assert not any(bench.levels)
+
+
+def test_a_broadcast_plays_what_its_token_names(bench: Bench) -> None:
+    """Staged under 9: a commit of 8 to all leaves it, one of 9 plays it, and nobody answers."""
+    bench.tell(0x201, command(0, 2))
+    bench.tell(ORDER, apply(9, 1, 2, action=2))
+    assert bench.result() == 0
+    for token, level in ((8, 0.0), (9, 0.2)):
+        bench.tell(0x480, apply(token, 0, 0, action=3))
+        assert bench.tell(SYNC.id, "") == []
+        assert bench.levels[0] == pytest.approx(level)
+    bench.tell(0x480, "0000 0000 0000 06 00")
+    assert bench.state is State.QUICK_STOP_ACTIVE
+
+
+@pytest.mark.parametrize(
+    ("id", "order", "state"),
+    [
+        (ORDER, "0000 FFFF 0000 06 02", State.QUICK_STOP_ACTIVE),
+        (ORDER, "0000 FFFF 0000 05 02", State.SWITCHED_ON),
+        (0x480, "0000 FFFF 0000 06 00", State.QUICK_STOP_ACTIVE),
+    ],
+)
+def test_silence_is_never_refused_for_its_ramp(
+    bench: Bench, id: int, order: str, state: State
+) -> None:
+    """A stop, a disarm and a broadcast stop along 65.5 s are carried out along the longest ramp."""
+    bench.tell(0x201, command(0, 1))
+    bench.tell(ORDER, apply(9, 1, 1))
+    bench.sync()
+    said = bench.tell(id, order)
+    assert bench.state is state
+    assert all(frame.data[1] >> 4 == 0 for frame in said if frame.id == ANSWER)
+
+
+def test_the_host_s_heartbeat_feeds_and_no_other_does(bench: Bench) -> None:
+    """127 armed it: its heartbeat is a sign of life, that of 126 and a status are none."""
+    for feeding, id in ((False, 0x77E), (True, 0x77F)):
+        bench.station.asked.clear()
+        bench.tell(id, "05")
+        assert (Ping() in bench.station.asked) is feeding
+    bench.station.pass_time(0.2)
+    bench.tell(0x77F, "05")
+    bench.station.pass_time(0.2)
+    assert bench.state is State.OPERATION_ENABLED
+    bench.tell(ORDER, "0000 0000 0000 00 05")
+    bench.station.pass_time(0.051)
+    assert bench.station.amplifier.fault is Fault.WATCHDOG
+
+
+@pytest.mark.parametrize("nmt", ["02 01", "80 01", "82 01", "02 00"])
+def test_out_of_operation_it_is_stopped(bench: Bench, nmt: str) -> None:
+    """Stop, pre-operational, reset communication: a host that is not heard must not be needed."""
+    bench.tell(0x201, command(0, 2))
+    bench.tell(ORDER, apply(9, 1, 2))
+    bench.sync()
+    bench.tell(0x000, nmt)
+    assert bench.state is State.QUICK_STOP_ACTIVE
+    bench.station.pass_time(0.005)
+    assert not any(bench.levels)
+    assert bench.tell(ORDER, "0000 0000 0000 00 05") == []
+
+
+def test_stopped_it_is_deaf_to_objects_and_says_so(bench: Bench) -> None:
+    """NMT stopped: no SDO, but a heartbeat with that state."""
+    bench.tell(0x000, "02 01")
+    assert bench.tell(0x601, "40 00 10 00 00000000") == []
+    bench.said.clear()
+    bench.timers.ring()
+    assert bench.said == [CanFrame(0x701, b"\x04")]
+
+
+def test_a_reset_node_has_lost_everything(bench: Bench) -> None:
+    """Silent at once, disarmed, the host forgotten; a boot-up message."""
+    bench.tell(0x201, command(0, 2))
+    bench.tell(ORDER, apply(9, 1, 2))
+    bench.sync()
+    assert bench.tell(0x000, "81 01")[-1] == CanFrame(0x701, b"\x00")
+    assert bench.state is State.SWITCH_ON_DISABLED
+    assert not any(bench.levels)
+    assert bench.tell(0x601, "40 16 10 01 00000000")[0].data[4:] == bytes(4)
+
+
+def test_a_fault_is_an_emergency_until_it_is_cleared(bench: Bench) -> None:
+    """Code and register by the table of CiA 301, state, fault, channel; code 0 in the end."""
+    bench.said.clear()
+    bench.station.amplifier.trip(Fault.ARC, bench.station.now, channel=2)
+    bench.station.pass_time(0.01)
+    assert bench.said == [
+        CanFrame(0x081, bytes.fromhex("4023 03 46 02 000000")),
+        CanFrame(0x081, bytes.fromhex("4023 03 47 FF 000000")),
+    ]
+    assert CanFrame(0x081, bytes.fromhex("0000 00 01 FF 000000")) in bench.tell(
+        ORDER, "0000 0000 0000 07 05"
+    )
+
+
+def test_a_command_by_object_is_a_command(bench: Bench) -> None:
+    """2020sub1 and 2021 written by SDO, then SYNC: the same as by RPDO."""
+    for index, data in ((0x2020, command(0, 2)), (0x2021, apply(9, 1, 2))):
+        subindex = 1 if index == 0x2020 else 0
+        value = bytes.fromhex(data)
+        begin = struct.pack("<BHBL", 0x21, index, subindex, 8).hex()
+        assert bench.tell(0x601, begin)[0].data[0] == 0x60
+        assert bench.tell(0x601, "00" + value[:7].hex())[0].data[0] == 0x20
+        bench.tell(0x601, "1D" + value[7:].hex() + "00" * 6)
+    assert bench.result() == 0
+    assert bench.levels[0] == pytest.approx(0.2)
+
+
+def test_frames_of_other_lengths_are_dropped(bench: Bench) -> None:
+    """Short orders and commands, a SYNC of two bytes, a heartbeat-like nothing: no answer."""
+    for id in (ORDER, 0x201, 0x681, 0x000, 0x601, 0x080, 0x480):
+        assert bench.tell(id, "01 02 03 04 05") == []
+    assert not any(bench.levels)

@@ -1,0 +1,505 @@
+"""The amplifiers' side of Modbus: raw bytes, masters that are not ours, and what is damaged."""
+
+import asyncio
+import contextlib
+import os
+import re
+import socket
+import struct
+import time
+import tty
+from collections.abc import AsyncIterator
+
+import minimalmodbus
+import pytest
+from pymodbus.client import AsyncModbusTcpClient
+
+from drivers.errors import LinkError
+from drivers.protocol.definition import PROTOCOL
+from drivers.protocol.messages import Commit, Fault, NakCode, Ping, State, Stop
+from modbus_session import EXAMPLES, ScriptedStation
+from model.rig import Rig
+from model.rig_file import example_rig_path
+from sim.far_ends.modbus.end import ModbusRtuEnd, ModbusTcpEnd
+from sim.far_ends.modbus.frames import PAUSE, crc
+from sim.far_ends.wires import Wire
+from wires import FarSide, far_side
+
+PAGE = (example_rig_path().parent.parent / "docs" / "wire-modbus.md").read_text("utf-8")
+FRAMES = {
+    name: bytes.fromhex(data)
+    for name, data in re.findall(
+        r"^([\w ]+ (?:request|reply), (?:RTU|TCP)): `([0-9A-F ]+)`$", PAGE, re.MULTILINE
+    )
+}
+MAP = PROTOCOL.modbus
+STATUS, TOKEN, LEVELS = 1000, 1004, 1010  # of the vendor page
+PATIENCE = 5.0  # s; for what is expected to come
+
+
+class Master:
+    """Raw bytes to a far end and back."""
+
+    def __init__(self, url: str) -> None:
+        self.url = url
+        self.received = bytearray()
+        self._came = asyncio.Event()
+        self._fd = -1
+        self._writer: asyncio.StreamWriter | None = None
+        self._task: asyncio.Task[None] | None = None
+
+    async def open(self) -> None:
+        """Connect, or open the terminal."""
+        if self.url.startswith("modbus+tcp"):
+            host, _, port = self.url.removeprefix("modbus+tcp://").partition("/")[0].partition(":")
+            reader, self._writer = await asyncio.open_connection(host, int(port))
+            self._task = asyncio.create_task(self._read(reader))
+        else:
+            path = self.url.removeprefix("modbus+rtu://").partition("?")[0]
+            self._fd = os.open(path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
+            tty.setraw(self._fd)
+            asyncio.get_running_loop().add_reader(self._fd, self._readable)
+
+    def send(self, data: bytes) -> None:
+        """Put bytes on the wire."""
+        if self._writer is not None:
+            self._writer.write(data)
+        else:
+            os.write(self._fd, data)
+
+    async def receive(self, count: int) -> bytes:
+        """The next so many bytes."""
+        async with asyncio.timeout(PATIENCE):
+            while len(self.received) < count:
+                self._came.clear()
+                await self._came.wait()
+        data = bytes(self.received[:count])
+        del self.received[:count]
+        return data
+
+    async def close(self) -> None:
+        """Leave."""
+        if self._fd >= 0:
+            asyncio.get_running_loop().remove_reader(self._fd)
+            os.close(self._fd)
+        if self._writer is not None and self._task is not None:
+            self._writer.close()
+            with contextlib.suppress(OSError):
+                await self._writer.wait_closed()
+            await self._task
+
+    def _readable(self) -> None:
+        self.received += os.read(self._fd, 4096)
+        self._came.set()
+
+    async def _read(self, reader: asyncio.StreamReader) -> None:
+        with contextlib.suppress(OSError):
+            while data := await reader.read(4096):
+                self.received += data
+                self._came.set()
+
+
+@contextlib.asynccontextmanager
+async def scripted(wire: str, *stations: ScriptedStation) -> AsyncIterator[Master]:
+    """A raw master at a far end with scripted amplifiers."""
+    end = ModbusTcpEnd(stations) if wire == "TCP" else ModbusRtuEnd(stations)
+    if isinstance(end, ModbusTcpEnd):
+        await end.start()
+    else:
+        end.start()
+    master = Master(next(iter(end.urls.values())))
+    await master.open()
+    yield master
+    await master.close()
+    if isinstance(end, ModbusTcpEnd):
+        await end.close()
+    else:
+        end.close()
+
+
+@pytest.fixture
+async def tcp(coarse_rig: Rig) -> AsyncIterator[FarSide]:
+    """The paper's amplifier behind a TCP port."""
+    async with far_side(Wire("modbus-tcp"), coarse_rig) as far:
+        yield far
+
+
+@pytest.fixture
+async def rtu(coarse_rig: Rig) -> AsyncIterator[FarSide]:
+    """The paper's amplifier on a serial line."""
+    async with far_side(Wire("modbus-rtu"), coarse_rig) as far:
+        yield far
+
+
+every_wire = pytest.mark.parametrize("wire", ["RTU", "TCP"])
+
+
+@every_wire
+async def test_the_session_of_the_vendor_page(wire: str) -> None:
+    """Its request bytes, sent over a real wire, bring its reply bytes, one after the other."""
+    station = ScriptedStation()
+    async with scripted(wire, station) as master:
+        for name, example in EXAMPLES.items():
+            if name == "GetCaps":  # its tag is the one before it, and before it there is none
+                assert master.received == b""
+            station.tell(example)
+            master.send(FRAMES[f"{name} request, {wire}"])
+            reply = FRAMES[f"{name} reply, {wire}"]
+            assert await master.receive(len(reply)) == reply, name
+            if name == "Refused Apply":
+                master.send(FRAMES[f"Refusal request, {wire}"])
+                reply = FRAMES[f"Refusal reply, {wire}"]
+                assert await master.receive(len(reply)) == reply
+
+
+@every_wire
+async def test_two_requests_in_one_piece_and_one_in_many(wire: str) -> None:
+    """Both are answered in their order; slow bytes make one request all the same."""
+    arm, ping = (FRAMES[f"{name} request, {wire}"] for name in ("Arm", "Ping"))
+    expected = FRAMES[f"Arm reply, {wire}"]
+    station = ScriptedStation()
+    async with scripted(wire, station) as master:
+        station.tell(EXAMPLES["Arm"])
+        master.send(ping + arm)
+        replies = await master.receive(2 * len(expected))
+        assert replies[len(expected) :] == expected
+        for byte in arm:
+            master.send(bytes([byte]))
+            await asyncio.sleep(0.001)
+        assert await master.receive(len(expected)) == expected
+        assert master.received == b""
+
+
+@every_wire
+@pytest.mark.parametrize("damage", ["cut", "flipped", "garbage before", "length"])
+async def test_the_next_good_frame_is_understood(wire: str, damage: str) -> None:
+    """What is damaged has no effect and gets no answer but, over TCP, an exception."""
+    stop, ping = (FRAMES[f"{name} request, {wire}"] for name in ("Stop", "Ping"))
+    damaged = {
+        "cut": stop[:-4],
+        "flipped": stop[:-3] + bytes([stop[-3] ^ 0x40]) + stop[-2:],
+        "garbage before": b"\x17\x55\xaa\x00\xff\x31",
+        "length": stop[:5] + bytes([0xFF]) + stop[6:],
+    }[damage]
+    station = ScriptedStation()
+    async with scripted(wire, station) as master:
+        master.send(damaged)
+        await asyncio.sleep(PAUSE + 0.02)
+        station.tell(EXAMPLES["Ping"])
+        master.received.clear()
+        master.send(ping)
+        reply = FRAMES[f"Ping reply, {wire}"]
+        assert await master.receive(len(reply)) == reply
+        assert not any(isinstance(request, Stop) for request in station.asked)
+
+
+@every_wire
+async def test_frames_for_others_are_not_answered(wire: str) -> None:
+    """Another unit is silent: the first answer is that of the frame after it."""
+    ping = FRAMES[f"Ping request, {wire}"]
+    station = ScriptedStation()
+    async with scripted(wire, station) as master:
+        other = bytearray(ping)
+        other[0 if wire == "RTU" else 6] = 9
+        if wire == "RTU":
+            other[-2:] = struct.pack("<H", crc(bytes(other[:-2])))
+        master.send(bytes(other))
+        station.tell(EXAMPLES["Ping"])
+        master.send(ping)
+        reply = FRAMES[f"Ping reply, {wire}"]
+        assert await master.receive(len(reply)) == reply
+        assert station.asked.count(Ping()) == 1
+
+
+async def test_over_tcp_the_only_one_is_also_unit_255() -> None:
+    """As masters have it that know no units; where there are several, nobody is."""
+    ping = bytearray(FRAMES["Ping request, TCP"])
+    ping[6] = 255
+    station = ScriptedStation()
+    station.tell(EXAMPLES["Ping"])
+    async with scripted("TCP", station) as master:
+        master.send(bytes(ping))
+        reply = FRAMES["Ping reply, TCP"]
+        assert (await master.receive(len(reply)))[7:] == reply[7:]
+    pair = ScriptedStation(), ScriptedStation(number=2)
+    async with scripted("TCP", *pair) as master:
+        master.send(bytes(ping))
+        await asyncio.sleep(0.02)
+        assert master.received == b""
+        assert not pair[0].asked
+
+
+@every_wire
+async def test_a_broadcast_reaches_every_unit_and_nobody_answers(wire: str) -> None:
+    """Commit and stop to unit 0 are heard by all; a set to unit 0 by nobody."""
+    pair = ScriptedStation(), ScriptedStation(number=2)
+    async with scripted(wire, *pair) as master:
+        apply = bytearray(FRAMES[f"FC16 Apply request, {wire}"])
+        apply[0 if wire == "RTU" else 6] = 0
+        if wire == "RTU":
+            apply[-2:] = struct.pack("<H", crc(bytes(apply[:-2])))
+        master.send(bytes(apply))
+        for name in ("Broadcast Commit", "Broadcast Stop"):
+            master.send(FRAMES[f"{name} request, {wire}"])
+        master.send(FRAMES[f"Ping request, {wire}"])
+        await master.receive(len(FRAMES[f"Ping reply, {wire}"]))
+        assert master.received == b""
+    for station in pair:
+        assert station.heard == [Commit(513), Stop(0.005)]
+
+
+async def test_an_amplifier_that_hangs_says_nothing() -> None:
+    """Neither to requests nor to broadcasts."""
+    station = ScriptedStation()
+    station.is_answering = False
+    async with scripted("TCP", station) as master:
+        for name in ("Hello", "Arm", "Apply", "FC43 Identification"):
+            master.send(FRAMES[f"{name} request, TCP"])
+        await asyncio.sleep(0.02)
+        assert master.received == b""
+    assert station.asked == []
+
+
+EXCEPTIONS = {
+    "unknown function": ("07", "87 01"),
+    "unknown encapsulation": ("2B 0D 00 00", "AB 01"),
+    "identification code": ("2B 0E 05 00", "AB 03"),
+    "identification object": ("2B 0E 04 07", "AB 02"),
+    "register that is not there": ("04 05 3F 00 01", "84 02"),
+    "read beyond the end": ("04 03 E8 FF FF", "84 03"),
+    "read of nothing": ("04 03 E8 00 00", "84 03"),
+    "read of 126": ("03 03 E8 00 7E", "83 03"),
+    "short read": ("04 03 E8", "84 03"),
+    "write to a status": ("06 03 EA 00 04", "86 02"),
+    "write amid a set": ("06 00 11 00 04", "86 02"),
+    "write beyond a set": ("10 00 10 00 45 8A" + 69 * " 00 01", "90 02"),
+    "byte count": ("10 00 02 00 03 05 00 0F 00 FA 00", "90 03"),
+    "write of nothing": ("10 00 02 00 00 00", "90 03"),
+    "read and write, short": ("17 03 E8 00", "97 03"),
+    "controlword": ("06 00 02 00 07", "86 03"),
+    "watchdog": ("10 00 02 00 03 06 00 0F 00 63 00 00", "90 03"),
+    "token 0": ("06 00 10 00 00", "86 03"),
+    "two tokens": ("10 00 10 00 04 08 00 02 00 01 00 00 00 00", "90 03"),
+    "ragged set": ("10 00 10 00 05 0A 00 01 00 01 00 00 00 00 2A F8", "90 03"),
+    "ramp": ("10 00 10 00 04 08 00 01 00 01 03 E9 00 00", "90 03"),
+    "level": ("10 00 10 00 08 10 00 01 00 01 00 00 00 00 2A F8 27 11 00 00 00 00", "90 03"),
+    "reserved flag": ("10 00 10 00 08 10 00 01 00 01 00 00 00 00 2A F8 03 E8 00 00 00 04", "90 03"),
+    "disarmed": ("10 00 10 00 08 10 00 01 00 01 00 00 00 00 2A F8 03 E8 00 00 00 00", "90 04"),
+    "envelope length": ("10 00 66 00 03 06 00 05 00 32 00 02", "90 03"),
+    "envelope slot": ("10 00 66 00 03 06 00 00 00 32 00 00", "90 03"),
+}
+
+
+@pytest.mark.parametrize("read", ["03 E8 00 7E", "05 3F 00 01"], ids=["126", "not there"])
+async def test_what_cannot_be_read_back_is_not_written(tcp: FarSide, read: str) -> None:
+    """Function 23 is one transaction: with a range that cannot be read, nothing of it is done."""
+    master = Master(tcp.url)
+    await master.open()
+    pdu = bytes.fromhex(f"17 {read} 00 02 00 03 06 00 0F 00 FA 00 00")  # and ARM
+    master.send(struct.pack(">HHHB", 5, 0, len(pdu) + 1, 1) + pdu)
+    assert (await master.receive(9))[7] == 0x97
+    assert tcp.amplifier.state is State.SWITCH_ON_DISABLED
+    await master.close()
+
+
+@pytest.mark.parametrize(("request_", "answer"), EXCEPTIONS.values(), ids=EXCEPTIONS)
+async def test_what_cannot_be_is_an_exception(tcp: FarSide, request_: str, answer: str) -> None:
+    """The PDU gets the exception of the standard, and nothing has changed."""
+    master = Master(tcp.url)
+    await master.open()
+    before = tcp.station.status()
+    pdu, expected = bytes.fromhex(request_), bytes.fromhex(answer)
+    master.send(struct.pack(">HHHB", 77, 0, len(pdu) + 1, 1) + pdu)
+    assert await master.receive(9) == struct.pack(">HHHB", 77, 0, 3, 1) + expected
+    after = tcp.station.status()
+    assert (after.state, after.token, after.levels) == (before.state, before.token, before.levels)
+    await master.close()
+
+
+async def test_an_exception_does_not_feed_the_watchdog(tcp: FarSide) -> None:
+    """Refusals without end, of every kind: the watchdog trips at its time all the same."""
+    client = await foreign_client(tcp.url)
+    await client.write_registers(2, [MAP["controlwords"]["ARM"], 100, 0], device_id=1)
+    armed = time.monotonic()
+    refused = 0
+    while tcp.amplifier.state is State.OPERATION_ENABLED and time.monotonic() < armed + 5:
+        for address, words in ((16, [999]), (2, [7]), (1002, [4])):
+            refused += (await client.write_registers(address, words, device_id=1)).isError()
+        await client.read_input_registers(STATUS, count=26, device_id=1)
+    assert refused >= 3
+    assert tcp.amplifier.fault is Fault.WATCHDOG
+    assert tcp.amplifier._fed <= armed
+    client.close()
+
+
+async def foreign_client(url: str) -> AsyncModbusTcpClient:
+    """A client that is pymodbus's own."""
+    host, _, port = url.removeprefix("modbus+tcp://").partition("/")[0].partition(":")
+    client = AsyncModbusTcpClient(host, port=int(port), timeout=PATIENCE, retries=0)
+    assert await client.connect()
+    return client
+
+
+async def test_pymodbus_reads_who_it_is(tcp: FarSide) -> None:
+    """Device identification and the identity block say the same, as does protocol version 1."""
+    client = await foreign_client(tcp.url)
+    told = await client.read_device_information(read_code=3, object_id=0, device_id=1)
+    own = tcp.amplifier.identity
+    assert told.information == {
+        0: own.vendor.encode(),
+        1: own.product.encode(),
+        2: own.firmware.encode(),
+        0x80: own.serial_number.encode(),
+    }
+    one = await client.read_device_information(read_code=4, object_id=0x80, device_id=1)
+    assert one.information == {0x80: own.serial_number.encode()}
+    block = await client.read_holding_registers(1066, count=65, device_id=1)
+    texts = [
+        client.convert_from_registers(block.registers[at : at + 16], client.DATATYPE.STRING)
+        for at in range(1, 65, 16)
+    ]
+    assert block.registers[0] == 1
+    assert texts == [own.vendor, own.product, own.serial_number, own.firmware]
+    client.close()
+
+
+async def test_pymodbus_plays_a_set(tcp: FarSide) -> None:
+    """Arm, a set in one write, its heartbeat and read-back, stop: without tag and check."""
+    client = await foreign_client(tcp.url)
+    await client.write_registers(2, [MAP["controlwords"]["ARM"], 1000, 0], device_id=1)
+    channels = [11000, 2000, 0, 0, *4 * [0], *4 * [0], 25050, 10000, 0x10000 - 9000, 1]
+    written = await client.write_registers(16, [513, 513, 0, 0, *channels], device_id=1)
+    assert (written.address, written.count) == (16, 20)
+    both = await client.readwrite_registers(
+        read_address=1144, read_count=18, write_address=8, values=[4711], device_id=1
+    )
+    assert both.registers == [513, 4, *channels]
+    status = await client.read_input_registers(STATUS, count=14, device_id=1)
+    assert status.registers[0] == 4711
+    assert status.registers[2:5] == [State.OPERATION_ENABLED, Fault.NONE, 513]
+    assert status.registers[10:] == [2000, 0, 0, 10000]
+    played = tcp.amplifier.outputs[3][0]
+    assert (played.frequency, played.start) == (250.5, tcp.amplifier.outputs[0][0].start)
+    again = await client.write_register(16, 513, device_id=1)
+    assert not again.isError()
+    await client.write_register(2, MAP["controlwords"]["STOP"], device_id=1)
+    await asyncio.sleep(0.01)
+    status = await client.read_input_registers(STATUS, count=14, device_id=1)
+    assert status.registers[2] == State.QUICK_STOP_ACTIVE
+    assert status.registers[10:] == [0, 0, 0, 0]
+    client.close()
+
+
+async def test_pymodbus_is_told_why(tcp: FarSide) -> None:
+    """An exception, and in the refusal block the reason and the channel."""
+    client = await foreign_client(tcp.url)
+    await client.write_registers(2, [MAP["controlwords"]["ARM"], 1000, 0], device_id=1)
+    channels = [0] * 36 + [11000, 2000, 0, 0]  # the tenth channel
+    refused = await client.write_registers(16, [5, 5, 0, 0, *channels], device_id=1)
+    assert refused.exception_code == 3
+    told = await client.read_input_registers(1034, count=3, device_id=1)
+    assert told.registers == [NakCode.BAD_CHANNEL, 9, 0]
+    client.close()
+
+
+async def test_minimalmodbus_plays_a_set(rtu: FarSide) -> None:
+    """A master that is not ours drives the amplifier over the serial line, register by register."""
+    await asyncio.to_thread(play_with_minimalmodbus, rtu.url)
+    assert rtu.amplifier.state is State.SWITCH_ON_DISABLED
+    assert rtu.amplifier.fault is Fault.NONE
+
+
+def play_with_minimalmodbus(url: str) -> None:
+    """Identity, arm, set, heartbeat, read-back, refusal, disarm, clear."""
+    path = url.removeprefix("modbus+rtu://").partition("?")[0]
+    master = minimalmodbus.Instrument(path, 1)
+    assert master.serial is not None
+    master.serial.timeout = 0.5  # s; it waits so long for the rest of what is an exception
+    try:
+        assert master.read_string(1067, 16, functioncode=4).rstrip("\0") == "era-haptics"
+        assert master.read_register(1043, functioncode=4) == 4
+        assert master.read_register(1045, 2, functioncode=4) == pytest.approx(655.35)
+        master.write_registers(2, [MAP["controlwords"]["ARM"], 2000, 0])
+        master.write_registers(16, [7, 7, 0, 0, 11000, 5000, 0, 0])
+        master.write_register(8, 123, functioncode=6)
+        assert master.read_registers(STATUS, 5, functioncode=3)[2:] == [4, 0, 7]
+        assert master.read_register(LEVELS, 4, functioncode=4) == pytest.approx(0.5)
+        assert master.read_register(1007, 1, functioncode=4, signed=True) >= 25.0
+        with pytest.raises(minimalmodbus.IllegalRequestError):
+            master.write_register(16, 8, functioncode=6)
+        assert master.read_register(1034, functioncode=4) == NakCode.BAD_TOKEN
+        master.write_register(2, MAP["controlwords"]["DISARM"], functioncode=6)
+        time.sleep(0.02)
+        assert master.read_register(1002, functioncode=4) == State.SWITCH_ON_DISABLED
+    finally:
+        master.serial.close()
+
+
+async def test_a_function_that_is_unknown_ends_with_the_silence_after_it() -> None:
+    """Over RTU its length is not known: exception 1 comes once the line is silent."""
+    station = ScriptedStation()
+    async with scripted("RTU", station) as master:
+        body = bytes([1, 0x41, 1, 2, 3])
+        master.send(body + struct.pack("<H", crc(body)))
+        expected = bytes([1, 0xC1, 1])
+        assert await master.receive(5) == expected + struct.pack("<H", crc(expected))
+
+
+def test_the_crc_is_that_of_modbus() -> None:
+    """4B37 over the digits 1 to 9, the catalogue's check value of CRC-16/MODBUS."""
+    assert crc(b"123456789") == 0x4B37
+
+
+async def test_a_master_that_never_reads_is_hung_up_on() -> None:
+    """Its answers fill no memory, and others are served meanwhile."""
+    station = ScriptedStation()
+    end = ModbusTcpEnd([station])
+    await end.start()
+    host, _, port = end.urls["main"].removeprefix("modbus+tcp://").partition("/")[0].partition(":")
+    hello = FRAMES["Hello request, TCP"]
+    with socket.socket() as deaf:
+        deaf.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 2048)
+        deaf.setblocking(False)
+        loop = asyncio.get_running_loop()
+        await loop.sock_connect(deaf, (host, int(port)))
+
+        async def ask_on() -> None:
+            while True:
+                await loop.sock_sendall(deaf, hello * 50)
+                await asyncio.sleep(0)
+
+        with pytest.raises(OSError, match=r"reset|pipe"):
+            await asyncio.wait_for(ask_on(), PATIENCE)
+    assert not end.connections
+    master = Master(end.urls["main"])
+    await master.open()
+    master.send(hello)
+    await master.receive(len(FRAMES["Hello reply, TCP"]))
+    await master.close()
+    await end.close()
+
+
+async def test_a_crowd_of_masters_is_bounded() -> None:
+    """The seventeenth connection is hung up on at once; the first ones go on."""
+    end = ModbusTcpEnd([ScriptedStation()])
+    await end.start()
+    masters = [Master(end.urls["main"]) for _ in range(20)]
+    for master in masters:
+        await master.open()
+        await asyncio.sleep(0.001)
+    assert len(end.connections) == 16
+    masters[0].send(FRAMES["Hello request, TCP"])
+    await masters[0].receive(len(FRAMES["Hello reply, TCP"]))
+    for master in masters:
+        await master.close()
+    await end.close()
+
+
+async def test_a_port_that_is_taken_is_named() -> None:
+    """LinkError with the port and what to do."""
+    end = ModbusTcpEnd([ScriptedStation()])
+    await end.start()
+    port = int(re.findall(r":(\d+)/", end.urls["main"])[0])
+    with pytest.raises(LinkError, match=f"port {port} cannot be listened on.*0 for any"):
+        await ModbusTcpEnd([ScriptedStation()], port=port).start()
+    await end.close()

@@ -1,0 +1,165 @@
+"""The amplifier's side of a pseudo-terminal, with raw frames from the host's side."""
+
+import asyncio
+import contextlib
+import os
+import time
+import tty
+from collections.abc import AsyncIterator
+
+import pytest
+
+from drivers.protocol.definition import PROTOCOL
+from drivers.protocol.messages import (
+    GetStatus,
+    Hello,
+    Identity,
+    Nak,
+    NakCode,
+    Reply,
+    Request,
+    State,
+    Status,
+    Stop,
+)
+from drivers.protocol.serial_codec import decode_reply, encode_request
+from drivers.protocol.serial_frame import Frame, FrameReader, encode_frame
+from model.rig import Rig
+from sim.bench.bench import Bench
+from sim.bench.station import Station
+from sim.far_ends.serial_end import SerialEnd
+
+ADDRESS = PROTOCOL.serial.address
+
+
+class Host:
+    """The other side of the line."""
+
+    def __init__(self, url: str) -> None:
+        self.fd = os.open(url.removeprefix("serial://").partition("?")[0], os.O_RDWR | os.O_NOCTTY)
+        tty.setraw(self.fd)
+        os.set_blocking(self.fd, False)
+        self._reader = FrameReader()
+        self._frames: asyncio.Queue[Frame] = asyncio.Queue()
+        asyncio.get_running_loop().add_reader(self.fd, self._readable)
+
+    def _readable(self) -> None:
+        for frame in self._reader.feed(os.read(self.fd, 4096)):
+            self._frames.put_nowait(frame)
+
+    async def frame(self) -> Frame:
+        """The next frame from the amplifier."""
+        return await asyncio.wait_for(self._frames.get(), 5)
+
+    async def ask(self, request: Request, sequence: int = 1) -> Reply:
+        """A request and its reply."""
+        frame = encode_request(request, address=ADDRESS, sequence=sequence)
+        os.write(self.fd, encode_frame(frame))
+        return decode_reply(await self.frame(), frame)
+
+    def close(self) -> None:
+        """Leave."""
+        asyncio.get_running_loop().remove_reader(self.fd)
+        os.close(self.fd)
+
+
+@pytest.fixture
+async def end(coarse_rig: Rig) -> AsyncIterator[SerialEnd]:
+    """An amplifier on a line."""
+    end = SerialEnd([Station(Bench(coarse_rig, now=time.monotonic()), "main")])
+    end.start()
+    yield end
+    end.close()
+
+
+@pytest.fixture
+async def host(end: SerialEnd) -> AsyncIterator[Host]:
+    """A host on that line."""
+    host = Host(end.urls["main"])
+    yield host
+    host.close()
+
+
+async def test_requests_are_answered_over_the_line(host: Host) -> None:
+    """Hello brings the identity; the reply carries the request's sequence number and address."""
+    reply = await host.ask(Hello(), sequence=513)
+    assert isinstance(reply, Identity)
+    assert reply.serial_number == "SIM-main"
+    assert reply.protocol_version == PROTOCOL.version
+
+
+async def test_noise_before_a_frame_is_skipped(end: SerialEnd, host: Host) -> None:
+    """Garbage and a frame with a flipped bit have no effect; the next good frame is understood."""
+    good = encode_frame(encode_request(Stop(0.0), address=ADDRESS, sequence=4))
+    flipped = bytearray(good)
+    flipped[5] ^= 0x10
+    os.write(host.fd, b"\x00\x17garbage\x00" + bytes(flipped) + good[:6])
+    status = await host.ask(GetStatus())
+    assert isinstance(status, Status)
+    assert status.state is State.SWITCH_ON_DISABLED
+    assert end.counters.good == 1
+    assert end.counters.bad_crc + end.counters.truncated >= 2
+
+
+@pytest.mark.parametrize(
+    ("kind", "payload", "code"),
+    [
+        (PROTOCOL.types["arm"], b"", NakCode.BAD_LENGTH),
+        (PROTOCOL.types["arm"], b"\xff\xff", NakCode.BAD_VALUE),
+        (PROTOCOL.types["commit"], b"\x00\x00", NakCode.BAD_TOKEN),
+        (29, b"", NakCode.UNKNOWN_TYPE),
+    ],
+)
+async def test_frames_that_say_nonsense_are_refused(
+    host: Host, kind: int, payload: bytes, code: NakCode
+) -> None:
+    """A good frame with a bad content gets a Nak with the reason."""
+    frame = Frame(kind=kind, address=ADDRESS, sequence=9, payload=payload)
+    os.write(host.fd, encode_frame(frame))
+    reply = decode_reply(await host.frame(), frame)
+    assert isinstance(reply, Nak)
+    assert reply.code is code
+
+
+@pytest.mark.parametrize("address", [ADDRESS, 0])
+async def test_a_stop_is_carried_out_whatever_its_ramp(host: Host, address: int) -> None:
+    """Silence is never refused: a ramp of 65.5 s, which no set may have, is taken as longest."""
+    kind = PROTOCOL.types["stop"]
+    frame = Frame(kind=kind, address=address, sequence=9, payload=b"\xff\xff")
+    os.write(host.fd, encode_frame(frame))
+    frames = [await host.frame() for _ in range(2 if address else 1)]
+    assert all(frame.kind != 0x9F for frame in frames)  # neither of the event and the reply refuses
+    status = await host.ask(GetStatus(), sequence=10)
+    assert isinstance(status, Status)
+    assert status.state is State.QUICK_STOP_ACTIVE
+
+
+async def test_frames_for_others_and_echoes_are_not_answered(host: Host) -> None:
+    """Only requests to its own address get a reply: the first reply is that of the last frame."""
+    hello = encode_request(Hello(), address=ADDRESS + 1, sequence=1)
+    echo = Frame(kind=hello.kind | 0x80, address=ADDRESS, sequence=2, payload=b"")
+    os.write(host.fd, encode_frame(hello) + encode_frame(echo))
+    await host.ask(GetStatus(), sequence=3)
+
+
+async def test_a_host_may_come_and_go(end: SerialEnd) -> None:
+    """The amplifier stays on its line when a host leaves, and answers the next one."""
+    for _ in range(3):
+        host = Host(end.urls["main"])
+        assert isinstance(await host.ask(Hello()), Identity)
+        host.close()
+
+
+async def test_a_host_that_never_reads_holds_nothing_up(end: SerialEnd) -> None:
+    """Replies that nobody takes are dropped and counted; requests are still carried out."""
+    fd = os.open(
+        end.urls["main"].removeprefix("serial://").partition("?")[0], os.O_RDWR | os.O_NOCTTY
+    )
+    os.set_blocking(fd, False)  # or a full buffer would wait for a reader in this very thread
+    hello = encode_frame(encode_request(Hello(), address=ADDRESS, sequence=1))
+    async with asyncio.timeout(10):  # as long as the system takes to hand the bytes over
+        while not end.dropped_replies:
+            with contextlib.suppress(BlockingIOError):
+                os.write(fd, hello)
+            await asyncio.sleep(0)
+    os.close(fd)

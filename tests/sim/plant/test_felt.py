@@ -1,0 +1,95 @@
+"""What fingers keep and what is made of it, on signals made by hand."""
+
+import numpy as np
+import pytest
+
+from model.errors import InputError
+from model.fingertip import fingertip_points
+from model.mesh import Mesh
+from model.reduction import ReducedPlate
+from model.rig import Rig
+from sim.plant.felt import feel
+from sim.plant.finger import Fingers, Record
+
+
+def flat_plate(rig: Rig) -> ReducedPlate:
+    """A plate that can only move up and down."""
+    mesh = Mesh(2, 2, rig.plate.length, rig.plate.width)
+    return ReducedPlate(rig.plate, mesh, np.zeros(1), np.ones((mesh.node_count, 1)))
+
+
+def test_lock_in_separates_what_was_driven() -> None:
+    """Two tones and a transient at neither: the tones' own amplitudes, and the raw peak of all."""
+    times = 51234.5 + np.arange(3000) / 10_000
+    first = np.array([2.0, 0.5])
+    second = np.array([0.3, 0.0])
+    ringing = 0.4 * np.exp(-(times - times[0]) / 0.02) * np.sin(2 * np.pi * 163.3 * times)
+    samples = (
+        np.outer(np.sin(2 * np.pi * 110 * times + 1.0), first)
+        + np.outer(np.cos(2 * np.pi * 170 * times - 2.0), second)
+        + ringing[:, None]
+    )
+    felt = feel(Record(np.zeros((2, 2)), times, samples), [110.0, 170.0])
+    np.testing.assert_allclose(felt.amplitude, [first, second], atol=0.03)
+    np.testing.assert_allclose(felt.peak, np.abs(samples).max(axis=0))
+    clean = feel(Record(np.zeros((2, 2)), times, samples - ringing[:, None]), [110.0, 170.0])
+    np.testing.assert_allclose(clean.amplitude, [first, second], atol=1e-7)
+
+
+def test_nothing_driven_is_no_amplitude() -> None:
+    """Without a frequency there is a peak only."""
+    felt = feel(Record(np.zeros((1, 2)), np.arange(5.0), np.full((5, 1), -3.0)), [])
+    assert felt.amplitude.shape == (0, 1)
+    assert felt.peak == [3.0]
+
+
+def test_a_window_takes_the_last_place_of_each_finger(coarse_rig: Rig) -> None:
+    """Samples from before a move do not count, nor those outside the window."""
+    fingers = Fingers(flat_plate(coarse_rig))
+    fingers.place({"a": (0.1, 0.1), "b": (0.0, 0.0)})
+    old = len(fingers.layout.points)
+    assert old == 19 + len(fingertip_points(0.0, 0.0, coarse_rig.plate))
+    fingers.record(np.array([1.0, 2.0]), np.ones((2, old)))
+    fingers.place({"a": (0.2, 0.1), "b": (0.0, 0.0)})
+    fingers.record(np.array([3.0, 4.0]), np.full((2, old), 5.0))
+    felt = fingers.felt(1.5, 3.5)
+    assert felt["a"].times.tolist() == [3.0]
+    assert felt["b"].times.tolist() == [2.0, 3.0]
+    assert felt["b"].accelerations[:, 0].tolist() == [1.0, 5.0]
+    np.testing.assert_array_equal(felt["a"].points, fingertip_points(0.2, 0.1, coarse_rig.plate))
+    assert fingers.felt(4.5, 5.0) == {}
+
+
+def test_a_finger_lifted_within_the_window_is_judged_until_then(coarse_rig: Rig) -> None:
+    """One finger goes while another stays: both have their samples, each from its own time."""
+    fingers = Fingers(flat_plate(coarse_rig))
+    fingers.place({"a": (0.1, 0.1), "b": (0.2, 0.1)})
+    fingers.record(np.array([1.0, 2.0]), np.ones((2, 38)))
+    fingers.place({"b": (0.2, 0.1)})
+    fingers.record(np.array([3.0]), np.ones((1, 19)))
+    felt = fingers.felt(0.0, 4.0)
+    assert felt["a"].times.tolist() == [1.0, 2.0]
+    assert felt["b"].times.tolist() == [1.0, 2.0, 3.0]
+
+
+def test_old_records_are_forgotten(coarse_rig: Rig) -> None:
+    """Ten seconds are kept, also of fingers that were lifted since."""
+    fingers = Fingers(flat_plate(coarse_rig))
+    fingers.place({"a": (0.1, 0.1)})
+    fingers.record(np.array([0.0]), np.ones((1, 19)))
+    fingers.record(np.array([6.0]), np.ones((1, 19)))
+    fingers.place({})
+    fingers.record(np.array([11.0]), np.ones((1, 0)))
+    assert fingers.felt(-1.0, 20.0)["a"].times.tolist() == [6.0]
+
+
+def test_fingers_off_the_plate_are_refused_whole(coarse_rig: Rig) -> None:
+    """One finger beside the plate, and all of them stay where they were."""
+    fingers = Fingers(flat_plate(coarse_rig))
+    fingers.place({"a": (0.1, 0.1)})
+    for bad in [(0.4, 0.1), (float("nan"), 0.1), (0.1, -1e-3)]:
+        with pytest.raises(InputError, match="not on the plate"):
+            fingers.place({"b": (0.2, 0.2), "c": bad})
+    with pytest.raises(InputError, match="too many"):
+        fingers.place({str(k): (0.1, 0.1) for k in range(33)})
+    assert fingers.layout.positions == {"a": (0.1, 0.1)}

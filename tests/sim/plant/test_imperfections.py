@@ -1,0 +1,250 @@
+"""Amplifiers that are late, noisy and wrong in gain and phase, seen from the plate they move."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from drivers.command import CommandSet, DriveCommand
+from drivers.protocol.messages import Apply, Arm, Nak, Ping, Request, Stop
+from model.arrays import FloatArray
+from model.errors import InputError
+from model.rig import Channel, Rig
+from sim.bench.bench import Bench
+from sim.plant.imperfections import ChannelErrors, Imperfections, draw_imperfections, draw_noise
+
+AT = (0.08, 0.06)
+PERFECT = Imperfections()
+
+
+@pytest.fixture(scope="module")
+def two_amplifiers(coarse_rig: Rig) -> Rig:
+    """The paper's plate; two ERAs on one amplifier, two on another."""
+    wiring = {
+        era.name: Channel("left" if number < 2 else "right", number % 2)
+        for number, era in enumerate(coarse_rig.eras)
+    }
+    return replace(coarse_rig, wiring=wiring, amplifiers={"left": "sim://", "right": "sim://"})
+
+
+def ask(bench: Bench, name: str, request: Request, now: float) -> None:
+    """Hand over what must be carried out."""
+    reply = bench.exchange(name, request, now=now)
+    assert not isinstance(reply, Nak), reply
+
+
+def keep_alive(bench: Bench, until: float) -> None:
+    """Let time pass as under a host that feeds the watchdogs."""
+    while (now := bench.time + 1) < until:
+        for name in bench.amplifiers:
+            ask(bench, name, Ping(), now)
+    bench.advance(until)
+
+
+def played(
+    rig: Rig,
+    imperfections: Imperfections,
+    commands: Mapping[str, tuple[DriveCommand, ...]],
+    *,
+    until: float = 1.0,
+    stop: float | None = None,
+) -> tuple[FloatArray, FloatArray]:
+    """Times [s] and acceleration [m/s²] in the middle of a finger, commands coming at 0.01 s."""
+    bench = Bench(rig, now=0.0, imperfections=imperfections)
+    bench.place_fingers({"a": AT}, now=0.0)
+    for name, wanted in commands.items():
+        ask(bench, name, Arm(2.0), 0.0)
+        ask(bench, name, Apply(CommandSet(1, wanted, 0.02, 0.0)), 0.01)
+    if stop is not None:
+        for name in commands:
+            ask(bench, name, Stop(0.01), stop)
+    keep_alive(bench, until)
+    (record,) = bench.fingers.felt(0.0, until).values()
+    return record.times, record.accelerations[:, 0]
+
+
+def phasor(times: FloatArray, samples: FloatArray, frequency: float, *, since: float) -> complex:
+    """Complex amplitude of a frequency from a moment on, by least squares."""
+    late = times >= since
+    angle = 2 * np.pi * frequency * times[late]
+    basis = np.column_stack([np.sin(angle), np.cos(angle)])
+    sine, cosine = np.linalg.lstsq(basis, samples[late], rcond=None)[0]
+    return complex(sine, cosine)
+
+
+def test_gain_and_phase_are_those_of_the_channel(two_amplifiers: Rig) -> None:
+    """One channel 20 % too strong and 10 degrees ahead: its share of the vibration is, alone."""
+    errors = Imperfections({Channel("right", 1): ChannelErrors(1.2, math.radians(10))})
+    shares: list[complex] = []
+    for imperfections in (PERFECT, errors):
+        for name, channel in (("left", 0), ("right", 1)):
+            drive = {name: (DriveCommand(channel, 110.0, 0.5),)}
+            times, samples = played(two_amplifiers, imperfections, drive, until=3.0)
+            shares.append(phasor(times, samples, 110.0, since=2.5))
+    assert shares[2] == pytest.approx(shares[0], rel=1e-9)
+    turned = 1.2 * np.exp(1j * math.radians(10)) * shares[1]
+    assert abs(shares[3] - turned) < 1e-6 * abs(turned)
+
+
+@pytest.mark.parametrize("stop", [None, 0.4])
+def test_latency_delays_all_that_is_felt(two_amplifiers: Rig, stop: float | None) -> None:
+    """With 3 ms of latency the whole record, onset and stop, is the same 3 ms later."""
+    drive = {"left": (DriveCommand(0, 110.0, 0.5), DriveCommand(1, 171.0, 0.3, phase=40.0))}
+    _, prompt = played(two_amplifiers, PERFECT, drive, stop=stop)
+    _, late = played(two_amplifiers, Imperfections(latency=0.003), drive, stop=stop)
+    assert np.abs(prompt).max() > 1
+    assert_allclose(late[30:], prompt[:-30], rtol=0, atol=1e-8 * np.abs(prompt).max())
+    assert not late[:130].any()
+
+
+def test_skew_turns_the_phase_between_amplifiers(two_amplifiers: Rig) -> None:
+    """One amplifier 1 ms behind the other: at 110 Hz its share lags by 39.6 degrees."""
+    drive = {"right": (DriveCommand(0, 110.0, 0.5),)}
+    skewed = Imperfections(latency=0.002, skew={"right": 0.001, "left": -0.0005})
+    shares = [
+        phasor(*played(two_amplifiers, each, drive, until=3.0), 110.0, since=2.5)
+        for each in (Imperfections(latency=0.002), skewed)
+    ]
+    lag = np.degrees(np.angle(shares[0] / shares[1]))
+    assert lag == pytest.approx(360 * 110 * 0.001, abs=1e-4)
+    assert skewed.delay("left") == pytest.approx(0.0015)
+
+
+def test_commands_that_overtake_none_arrive_in_their_order(two_amplifiers: Rig) -> None:
+    """Two sets within the latency: both are played, each as long as it was meant to be."""
+    frequencies = []
+    for latency in (0.0, 0.05):
+        bench = Bench(two_amplifiers, now=0.0, imperfections=Imperfections(latency=latency))
+        bench.place_fingers({"a": AT}, now=0.0)
+        ask(bench, "left", Arm(2.0), 0.0)
+        for token, (frequency, now) in enumerate([(110.0, 0.1), (170.0, 0.12)], start=1):
+            wanted = CommandSet(token, (DriveCommand(0, frequency, 0.5),), 0.0, 0.0)
+            ask(bench, "left", Apply(wanted), now)
+        bench.advance(0.4)
+        windows = [(0.09, 0.0999), (0.1001, 0.1199), (0.1201, 0.15)]
+        frequencies.append(
+            [bench.felt(a + latency, b + latency)["a"].frequencies for a, b in windows]
+        )
+    assert frequencies[0] == [(), (110.0,), (170.0,)]
+    assert frequencies[1] == frequencies[0]
+
+
+def test_noise_is_as_loud_as_it_says_and_only_while_a_channel_plays(two_amplifiers: Rig) -> None:
+    """Its lines have together the rms that was asked for, lie all over the band, and end with it.
+
+    A tone on the neighbour brings none: the noise is the channel's own.
+    """
+    noise = draw_noise(seed=3, number=0)
+    lines = [term.omega / (2 * np.pi) for term in noise.terms(1e-6, start=0.5, end=2.0)]
+    assert lines == sorted(lines)
+    assert 10 <= lines[0] < 41
+    assert 969 < lines[-1] <= 1000
+    times = np.arange(0.5, 60.0, 0.00041)
+    motion = sum(
+        np.imag(term.c0 * np.exp(1j * term.omega * (times - term.start)))
+        for term in noise.terms(1e-6, start=0.5, end=np.inf)
+    )
+    assert np.std(motion) == pytest.approx(1e-6, rel=0.01)
+
+    noisy = Imperfections({Channel("left", 0): ChannelErrors(noise=0.02)})
+    drive = {"left": (DriveCommand(0, 110.0, 0.2),)}
+    times, loud = played(two_amplifiers, noisy, drive, until=3.0, stop=1.5)
+    _, again = played(two_amplifiers, noisy, drive, until=3.0, stop=1.5)
+    _, clean = played(two_amplifiers, PERFECT, drive, until=3.0, stop=1.5)
+    assert_allclose(again, loud, rtol=0, atol=0)
+    hiss = loud - clean
+    assert not hiss[times <= 0.01].any()
+    assert hiss[(times > 0.5) & (times < 1.5)].std() > 0.1
+    assert np.abs(hiss[times > 2.9]).max() < 1e-3 * np.abs(hiss).max()
+    _, other = played(two_amplifiers, noisy, {"left": (DriveCommand(1, 110.0, 0.2),)})
+    _, quiet = played(two_amplifiers, PERFECT, {"left": (DriveCommand(1, 110.0, 0.2),)})
+    assert_allclose(other, quiet, rtol=0, atol=0)
+
+
+def test_noise_runs_on_when_a_channel_is_told_something_else() -> None:
+    """Taken up at another moment it is the same noise, so that a new command does not repeat it."""
+    noise = draw_noise(seed=3, number=0)
+    at = [
+        [(term.c0 * np.exp(1j * term.omega * (1.0 - term.start))).imag for term in terms]
+        for terms in (noise.terms(1.0, start=0.5, end=2.0), noise.terms(1.0, start=0.83, end=2.0))
+    ]
+    assert_allclose(at[1], at[0], rtol=0, atol=1e-9)
+
+
+def test_another_seed_is_another_noise(two_amplifiers: Rig) -> None:
+    """The same seed is the same noise, whatever else is set; channels differ from each other."""
+    assert draw_noise(seed=3, number=0) == draw_noise(seed=3, number=0)
+    assert draw_noise(seed=3, number=0) != draw_noise(seed=4, number=0)
+    assert draw_noise(seed=3, number=0) != draw_noise(seed=3, number=1)
+    drawn = draw_imperfections(two_amplifiers, skew=0.002, latency=0.001, seed=5)
+    assert drawn == draw_imperfections(two_amplifiers, skew=0.002, latency=0.001, seed=5)
+    assert set(drawn.channels) == set(two_amplifiers.wiring.values())
+    assert all(0.001 <= drawn.delay(name) <= 0.003 for name in two_amplifiers.amplifiers)
+
+
+def test_drawn_errors_have_the_size_that_was_asked_for(two_amplifiers: Rig) -> None:
+    """Over five hundred benches gains spread by 5 % and phases by 5 degrees, about the truth."""
+    drawn = [draw_imperfections(two_amplifiers, seed=seed) for seed in range(500)]
+    errors = [each for one in drawn for each in one.channels.values()]
+    gains, phases = np.array([(each.gain, np.degrees(each.phase)) for each in errors]).T
+    assert (gains.mean(), gains.std()) == pytest.approx((1, 0.05), abs=0.004)
+    assert (phases.mean(), phases.std()) == pytest.approx((0, 5), abs=0.4)
+
+
+@pytest.mark.parametrize("keep_phase", [True, False])
+def test_phase_is_kept_or_reset_as_commanded(two_amplifiers: Rig, keep_phase: bool) -> None:
+    """A level that changes in mid-cycle: kept, the tone goes on; reset, it begins anew.
+
+    Late and wrong in phase by the same amount before and after, as hardware is.
+    """
+    bench = Bench(
+        two_amplifiers,
+        now=0.0,
+        imperfections=Imperfections({Channel("left", 0): ChannelErrors(0.9, 0.3)}, latency=0.0021),
+    )
+    bench.place_fingers({"a": AT}, now=0.0)
+    ask(bench, "left", Arm(2.0), 0.0)
+    change = 3.0 + 0.3 / 110.0  # three tenths of a cycle further than the first command
+    for token, (now, level, keep) in enumerate(
+        [(0.0, 0.5, False), (change, 0.25, keep_phase)], start=1
+    ):
+        command = DriveCommand(0, 110.0, level, keep_phase=keep)
+        keep_alive(bench, now)
+        ask(bench, "left", Apply(CommandSet(token, (command,), 0.0, 0.0)), now)
+    keep_alive(bench, 6.0)
+    (record,) = bench.fingers.felt(2.5, 6.0).values()
+    times, samples = record.times, record.accelerations[:, 0]
+    early = times < change
+    before = phasor(times[early], samples[early], 110.0, since=2.5)
+    after = phasor(times, samples, 110.0, since=5.5)
+    turned = np.angle(after / before) / (2 * np.pi)
+    assert abs(after) == pytest.approx(abs(before) / 2, rel=1e-3)
+    assert turned == pytest.approx(0.0 if keep_phase else -0.3, abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: ChannelErrors(gain=-0.1), "below zero"),
+        (lambda: ChannelErrors(noise=-1e-9), "below zero"),
+        (lambda: ChannelErrors(phase=math.nan), "finite"),
+        (lambda: Imperfections(latency=-0.001), "not be below zero"),
+        (lambda: Imperfections(latency=0.001, skew={"left": -0.002}), "not be below zero"),
+        (lambda: Imperfections(latency=math.inf), "not be below zero"),
+    ],
+)
+def test_what_cannot_be_is_refused(make, words: str) -> None:
+    """Gains below zero, times before the command, and what is no number."""
+    with pytest.raises(InputError, match=words):
+        make()
+
+
+def test_imperfections_of_what_is_not_there_are_refused(two_amplifiers: Rig) -> None:
+    """A channel without an ERA and an amplifier that the rig does not have are named."""
+    with pytest.raises(InputError, match="channel 7 of amplifier left"):
+        Imperfections({Channel("left", 7): ChannelErrors()}).check(two_amplifiers)
+    with pytest.raises(InputError, match="middle is no amplifier"):
+        Bench(two_amplifiers, now=0.0, imperfections=Imperfections(skew={"middle": 0.001}))

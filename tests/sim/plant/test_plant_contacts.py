@@ -1,0 +1,259 @@
+"""Fingers that load the plate while it vibrates: nothing jumps, nothing is gained or lost."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from driven_bases import Base, faded_base, shaped_base
+from finger_energy import held_by_fingers
+from model.arrays import FloatArray
+from model.assembly import era_positions
+from model.base_motion import Term
+from model.finger_load import FingerLoad, finger_loads
+from model.mesh import Mesh
+from model.point_load import PointLoad, load_positions
+from model.reduction import ReducedPlate, reduce_plate
+from model.rig import Rig
+from model.time_response import modal_matrices
+from sim.plant.plant import Plant
+
+STROKE = 1e-4
+BASES = (
+    faded_base(STROKE, 110.0, 0.3, rise=(0.0, 0.02), fall=(0.07, 0.08)),
+    faded_base(0.7 * STROKE, 250.0, -1.0, rise=(0.01, 0.03), fall=(0.09, 0.1)),
+    shaped_base(STROKE, 171.0, start=0.002, step=0.005, knots=(0, 0.5, 0.8j, -0.3, 0)),
+)
+FINGERS = finger_loads([(0.11, 0.07), (0.25, 0.15), (0.3048, 0.1)])
+
+
+@pytest.fixture(scope="module")
+def reduced(coarse_rig: Rig) -> ReducedPlate:
+    """The paper's plate on its own mesh."""
+    return reduce_plate(coarse_rig.plate, coarse_rig.mesh, era_positions(coarse_rig.eras))
+
+
+def vibrating(reduced: ReducedPlate, rig: Rig, *, until: float = 0.05) -> Plant:
+    """A plate that three bases move, at a moment [s]."""
+    plant = Plant(reduced, rig.eras)
+    for number, base in enumerate(BASES):
+        plant.set_input(number, base.terms)
+    plant.skip(until)
+    return plant
+
+
+def on_the_mesh(plant: Plant) -> tuple[FloatArray, FloatArray]:
+    """Displacement and velocity at all nodes."""
+    shapes = plant.reduced.shapes
+    return shapes @ plant.state[0], shapes @ plant.state[1]
+
+
+def stored(plant: Plant, rig: Rig) -> float:
+    """Energy [J] of the plate on springs at rest: its motion, its bending, and its springs."""
+    q, v = plant.state
+    M, _, K = modal_matrices(plant.reduced, rig.eras)
+    return float(q @ K @ q + v @ M @ v) / 2
+
+
+def test_displacement_and_velocity_run_through_every_change(
+    coarse_rig: Rig, reduced: ReducedPlate
+) -> None:
+    """Fingers come, press harder, move and go: the whole plate goes on from where it is."""
+    plant = vibrating(reduced, coarse_rig)
+    harder = FingerLoad(3000.0, 5.0, 0.001).at(FINGERS[0].x, FINGERS[0].y)
+    elsewhere = FingerLoad().at(0.2, 0.2)
+    changes: list[Sequence[PointLoad]] = [
+        FINGERS[:1], FINGERS, [harder, *FINGERS[1:]], [harder, elsewhere], [elsewhere], []
+    ]  # fmt: skip
+    for contacts in changes:
+        plant.skip(plant.time + 0.0031)
+        before, energy = on_the_mesh(plant), stored(plant, coarse_rig)
+        plant.set_contacts(contacts)
+        assert plant.contacts == tuple(contacts)
+        for old, new in zip(before, on_the_mesh(plant), strict=True):
+            assert_allclose(new, old, rtol=0, atol=1e-9 * np.abs(old).max())
+        assert stored(plant, coarse_rig) == pytest.approx(energy, rel=1e-9)
+
+
+def test_the_coordinates_of_a_finger_that_left_are_dropped_once_they_are_still(
+    coarse_rig: Rig, reduced: ReducedPlate
+) -> None:
+    """Half a second later the plate is as small as before, and nothing of it has jumped."""
+    plant = Plant(reduced, coarse_rig.eras)
+    plant.set_input(0, [Term(0.0, np.inf, 2 * np.pi * 207.0, STROKE)])
+    plant.set_contacts(FINGERS)
+    plant.skip(0.1)
+    size = len(plant.reduced.omega)
+    assert size == len(reduced.omega) + 3 * len(FINGERS)
+    plant.set_contacts(FINGERS[:1])
+    assert len(plant.reduced.omega) == size
+    plant.skip(0.6)
+    before = on_the_mesh(plant)
+    plant.set_contacts([])
+    plant.set_contacts(FINGERS[:1])
+    assert len(plant.reduced.omega) == len(reduced.omega) + 3
+    for old, new in zip(before, on_the_mesh(plant), strict=True):
+        assert_allclose(new, old, rtol=0, atol=1e-4 * np.abs(old).max())
+
+
+def test_a_finger_that_taps_gives_no_more_than_it_brought(
+    coarse_rig: Rig, reduced: ReducedPlate
+) -> None:
+    """While nothing drives, plate and finger together only lose, whatever the length of a tap.
+
+    What a finger brings is what its spring and mass hold at the moment at which it lands.
+    """
+    rng = np.random.default_rng(4)
+    plant = Plant(reduced, coarse_rig.eras)
+    plant.set_input(1, [Term(0.0, 0.4, 2 * np.pi * 110.0, STROKE)])
+    plant.skip(0.4)
+    start = stored(plant, coarse_rig)
+    for _ in range(60):
+        before = stored(plant, coarse_rig)
+        plant.set_contacts([FINGERS[rng.integers(3)]])
+        brought = held_by_fingers(plant)
+        plant.skip(plant.time + rng.uniform(0.0001, 0.01))
+        together = stored(plant, coarse_rig) + held_by_fingers(plant)
+        assert together < before + brought
+        plant.set_contacts([])
+        assert stored(plant, coarse_rig) <= together
+        plant.skip(plant.time + rng.uniform(0.0002, 0.004))
+    assert stored(plant, coarse_rig) < 0.1 * start
+
+
+def test_a_finger_quickens_the_ringing_down(coarse_rig: Rig, reduced: ReducedPlate) -> None:
+    """Half a second after the drive there is far less left under a finger than without one."""
+    left = []
+    for contacts in ([], FINGERS):
+        plant = Plant(reduced, coarse_rig.eras)
+        plant.set_input(1, [Term(0.0, 0.4, 2 * np.pi * 110.0, STROKE)])
+        plant.skip(0.4)
+        plant.set_contacts(contacts)
+        plant.skip(0.7)
+        left.append(stored(plant, coarse_rig))
+    assert left[1] < 0.1 * left[0]
+
+
+def test_bases_that_start_later_know_the_finger_that_came_before(
+    coarse_rig: Rig, reduced: ReducedPlate
+) -> None:
+    """It does not matter whether the drive or the finger is announced first."""
+    shapes, samples = reduced.at(np.array([[0.05, 0.2]])), []
+    for drive_first in (True, False):
+        plant = Plant(reduced, coarse_rig.eras)
+        if drive_first:
+            plant.set_input(0, [Term(0.02, 0.05, 1500.0, STROKE)])
+        plant.skip(0.01)
+        plant.set_contacts(FINGERS)
+        if not drive_first:
+            plant.set_input(0, [Term(0.02, 0.05, 1500.0, STROKE)])
+        shapes = plant.reduced.at(np.array([[0.05, 0.2]]))
+        samples.append(plant.advance(0.1, sample_rate=1e4, shapes=shapes)[1])
+    assert np.abs(samples[0]).max() > 1
+    assert_allclose(samples[1], samples[0], rtol=0, atol=1e-9 * np.abs(samples[0]).max())
+
+
+POINTS = np.array([[0.11, 0.07], [0.03, 0.2], [0.3, 0.02]])
+COMING: list[tuple[float, Sequence[PointLoad]]] = [
+    (0.013, FINGERS[:1]), (0.0305, FINGERS[:2]), (0.047, FINGERS[1:]), (0.06, []),
+]  # fmt: skip
+
+
+def run(
+    rig: Rig, reduced: ReducedPlate, bases: Sequence[Base | None], cuts: FloatArray
+) -> FloatArray:
+    """Accelerations at points while bases move and fingers come and go, time being cut so."""
+    plant = Plant(reduced, rig.eras)
+    for number, base in enumerate(bases):
+        if base is not None:
+            plant.set_input(number, base.terms)
+    samples, coming = [], dict(COMING)
+    for until in np.union1d([*coming, 0.1], cuts):
+        shapes = plant.reduced.at(POINTS)
+        samples.append(plant.advance(float(until), sample_rate=9600.0, shapes=shapes)[1])
+        if float(until) in coming:
+            plant.set_contacts(coming[float(until)])
+    return np.vstack(samples)
+
+
+def test_how_time_is_cut_makes_no_difference(coarse_rig: Rig, reduced: ReducedPlate) -> None:
+    """Cut at three hundred moments by chance, or not at all: the same samples to rounding."""
+    whole = run(coarse_rig, reduced, BASES, np.array([]))
+    cut = run(coarse_rig, reduced, BASES, np.random.default_rng(1).uniform(0, 0.1, 300))
+    assert_allclose(cut, whole, rtol=0, atol=1e-10 * np.abs(whole).max())
+
+
+def test_several_bases_do_what_each_does_alone_together(
+    coarse_rig: Rig, reduced: ReducedPlate
+) -> None:
+    """Superposition holds while fingers come and go, since the plate is linear throughout."""
+    together = run(coarse_rig, reduced, BASES, np.array([]))
+    alone = sum(
+        run(coarse_rig, reduced, [b if b is base else None for b in BASES], np.array([]))
+        for base in BASES
+    )
+    assert_allclose(alone, together, rtol=0, atol=1e-10 * np.abs(together).max())
+
+
+def test_a_set_of_fingers_is_solved_once(
+    coarse_rig: Rig, reduced: ReducedPlate, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A finger that taps on one spot again and again costs one solve, not one a tap."""
+    plant = Plant(reduced, coarse_rig.eras)
+    plant.set_contacts(FINGERS[:1])
+    plant.set_contacts([])
+    monkeypatch.setattr("sim.plant.contacts.plate_in_time", None)
+    for _ in range(5):
+        plant.skip(plant.time + 0.05)
+        plant.set_contacts(FINGERS[:1])
+        plant.skip(plant.time + 0.05)
+        plant.set_contacts([])
+
+
+def test_a_plate_of_which_only_coordinates_are_known_is_loaded_in_them(coarse_rig: Rig) -> None:
+    """Without its origin a plate keeps its coordinates; a rigid one sways on all its springs."""
+    # Three rigid motions of a plate of 1 kg: up and down, and two tilts.
+    mesh = Mesh(2, 2, coarse_rig.plate.length, coarse_rig.plate.width)
+    x, y = (mesh.nodes - mesh.nodes.mean(axis=0)).T
+    shapes = np.column_stack([np.ones(len(x)), 10 * x, 10 * y])
+    rigid = ReducedPlate(coarse_rig.plate, mesh, np.zeros(3), shapes)
+    plant = Plant(rigid, coarse_rig.eras)
+    plant.set_contacts([PointLoad(float(mesh.nodes[4, 0]), float(mesh.nodes[4, 1]), 1e4)])
+    assert len(plant.reduced.omega) == 3
+    w = 2 * np.pi * 5.0
+    plant.set_input(0, [Term(0.0, np.inf, w, STROKE)])
+    plant.skip(60.0)
+    _, samples = plant.advance(61.0, sample_rate=1e3, shapes=np.array([[1.0, 0.0, 0.0]]))
+    k, c = coarse_rig.eras[0].stiffness, coarse_rig.eras[0].damping
+    spring = k + 1j * w * c
+    expected = w**2 * abs(spring / (4 * spring + 1e4 - w**2)) * STROKE
+    assert np.abs(samples).max() == pytest.approx(expected, rel=1e-3)
+
+
+def test_fingers_lie_where_they_are_told(coarse_rig: Rig, reduced: ReducedPlate) -> None:
+    """The static deflection under a stiff finger is next to none: it holds the plate there."""
+    plant = Plant(reduced, coarse_rig.eras)
+    stiff = PointLoad(0.11, 0.07, stiffness=1e7, damping=1e3)
+    plant.set_contacts([stiff])
+    plant.set_input(0, [Term(0.0, np.inf, 2 * np.pi * 20.0, STROKE)])
+    plant.skip(30.0)
+    at = plant.reduced.at(np.vstack([load_positions([stiff]), [[0.2, 0.15]]]))
+    moved = []
+    for number in range(50):
+        plant.skip(30.0 + number / 1000)
+        moved.append(np.abs(at @ plant.state[0]))
+    held, free = np.max(moved, axis=0)
+    assert held < 0.01 * free
+
+
+def test_the_sampling_rate_may_change_in_between(coarse_rig: Rig, reduced: ReducedPlate) -> None:
+    """Every tenth sample at 10 kHz is the sample at 1 kHz, also right after the other rate."""
+    quick, mixed = (vibrating(reduced, coarse_rig) for _ in range(2))
+    shapes = reduced.at(POINTS)
+    _, expected = quick.advance(0.12, sample_rate=10_000.0, shapes=shapes)
+    mixed.advance(0.07, sample_rate=10_000.0, shapes=shapes)
+    times, found = mixed.advance(0.12, sample_rate=1000.0, shapes=shapes)
+    assert len(times) == 50
+    rows = np.round((times - 0.05) * 10_000).astype(int) - 1
+    assert_allclose(found, expected[rows], rtol=0, atol=1e-9 * np.abs(expected).max())

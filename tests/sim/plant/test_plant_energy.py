@@ -1,0 +1,118 @@
+"""The energy of the plant: what the bases put in is stored or lost."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+from scipy.integrate import simpson
+
+from driven_bases import STILL, faded_base, shaped_base
+from finger_energy import held_by_fingers
+from model.assembly import era_positions
+from model.finger_load import finger_loads
+from model.point_load import PointLoad, load_positions
+from model.reduction import reduce_plate
+from model.rig import Rig
+from model.time_response import modal_matrices
+from paper_plate import make_paper_rig
+from sim.plant.plant import Plant
+
+STROKE = 1e-4
+KNOTS_APART = 0.005  # s
+STEP = 1e-5  # s; the fastest motion of the reduced plate has some twenty of them in a period
+BASES = (
+    faded_base(STROKE, 110.0, 0.3, rise=(0.0, 0.02), fall=(0.07, 0.08)),
+    STILL,
+    faded_base(0.6 * STROKE, 250.0, -1.0, rise=(0.005, 0.015), fall=(0.08, 0.1)),
+    shaped_base(
+        STROKE, 110.0, start=0.0, step=KNOTS_APART, knots=(0, 0.3, 0.5j, -0.8, 0.4 - 0.2j, 0)
+    ),
+)
+FINGERS = finger_loads([(0.11, 0.07), (0.25, 0.15), (0.3048, 0.1)])
+PERIODS: list[tuple[float, Sequence[PointLoad]]] = [
+    (0.03, []),
+    (0.05, FINGERS[:1]),
+    (0.075, FINGERS[:2]),
+    (0.09, FINGERS[1:]),
+    (0.13, []),
+]
+"""Until when which fingers rest on the plate."""
+
+
+@dataclass(frozen=True, eq=False)
+class Books:
+    """Energies [J] of a stretch of time: put in by the bases, lost; stored at its begin and end."""
+
+    put_in: float
+    lost: float
+    begin: float
+    end: float
+
+
+@pytest.fixture(scope="module")
+def rig() -> Rig:
+    """The paper's plate; no two ERAs damp alike, one hardly at all."""
+    paper = make_paper_rig(12, 9)
+    unlike = zip(paper.eras, (0.1, 3.5, 10.0, 20.0), (0.0, 0.005, 0.01, 0.02), strict=True)
+    return replace(paper, eras=tuple(replace(era, damping=c, bolt_mass=m) for era, c, m in unlike))
+
+
+def kept_for(plant: Plant, rig: Rig, until: float) -> Books:
+    """Go on until a moment [s] and keep books, from displacements, velocities and spring laws."""
+    _, structural, _ = modal_matrices(plant.reduced, rig.eras)
+    at_eras = plant.reduced.at(era_positions(rig.eras))
+    structural = structural - (at_eras.T * [era.damping for era in rig.eras]) @ at_eras
+    at_fingers = plant.reduced.at(load_positions(plant.contacts))
+    k = np.array([era.stiffness for era in rig.eras])
+    c = np.array([era.damping for era in rig.eras])
+    bolts = np.array([era.bolt_mass for era in rig.eras])
+    finger = np.array(
+        [(each.stiffness, each.damping, each.mass) for each in plant.contacts]
+    ).reshape(-1, 3)
+    count = 2 * round((until - plant.time) / STEP / 2)
+    times = np.linspace(plant.time, until, count + 1)
+    power, loss, stored = np.empty(count + 1), np.empty(count + 1), np.empty(count + 1)
+    for row, time in enumerate(times):
+        plant.skip(float(time))
+        q, v = plant.state
+        # Bases turn sharply at the knots of an envelope: the last moment is still before one.
+        y, dy = np.array([base.motion(min(time, until - 1e-12)) for base in BASES]).T
+        stretch, speed = y - at_eras @ q, dy - at_eras @ v
+        power[row] = (k * stretch + c * speed) @ dy
+        loss[row] = c @ speed**2 + v @ structural @ v + finger[:, 1] @ (at_fingers @ v) ** 2
+        stored[row] = (
+            v @ v
+            + (plant.reduced.omega * q) @ (plant.reduced.omega * q)
+            + k @ stretch**2
+            + bolts @ (at_eras @ v) ** 2
+            + finger[:, 0] @ (at_fingers @ q) ** 2
+            + finger[:, 2] @ (at_fingers @ v) ** 2
+        ) / 2
+    put_in, lost = simpson([power, loss], times)
+    return Books(float(put_in), float(lost), float(stored[0]), float(stored[-1]))
+
+
+def test_work_is_stored_or_lost(rig: Rig) -> None:
+    """From knot to knot the books balance to 1e-5 of what went through them, for ramps as well.
+
+    When a finger comes or goes, what is stored changes by what its spring and its mass hold, and by
+    nothing else.
+    """
+    reduced = reduce_plate(rig.plate, rig.mesh, era_positions(rig.eras))
+    plant = Plant(reduced, rig.eras)
+    for number, base in enumerate(BASES):
+        plant.set_input(number, base.terms)
+    expected = 0.0  # what is stored when a period begins
+    for until, contacts in PERIODS:
+        gone = held_by_fingers(plant)
+        plant.set_contacts(contacts)
+        expected += held_by_fingers(plant) - gone
+        for knot in range(round(plant.time / KNOTS_APART) + 1, round(until / KNOTS_APART) + 1):
+            books = kept_for(plant, rig, knot * KNOTS_APART)
+            assert books.begin == pytest.approx(expected, rel=1e-9, abs=1e-15)
+            moved = books.lost + abs(books.put_in) + books.begin
+            assert moved > 1e-8
+            left = books.begin + books.put_in - books.lost
+            assert books.end == pytest.approx(left, abs=1e-5 * moved)
+            expected = books.end

@@ -1,0 +1,154 @@
+"""A far end as a process whose time passes only as its control socket says."""
+
+import signal
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from drivers.amplifier import Amplifier
+from drivers.command import CommandSet, DriveCommand
+from drivers.guard import Guard, GuardLimits
+from drivers.registry import open_backend
+from far_end_process import far_end_process
+from rig_files import write_rig
+from sim.sensors.recording_file import read_recording
+
+
+async def test_stepped_recorded_touched_and_broken(tmp_path: Path) -> None:
+    """Hours of real time may pass between two steps: time, watchdog and faults know steps only.
+
+    A recording holds exactly what was stepped through; its file appears when it is finished.
+    """
+    rig, file = write_rig(tmp_path / "rig.yaml"), tmp_path / "run.csv"
+    async with far_end_process(
+        rig, "--serial", "--virtual-time", "--rate", "2000", "--finger", "0.1,0.1"
+    ) as far_end:
+        hello = await far_end.ask("hello")
+        assert (hello["protocol"], hello["version"], hello["clock"]) == (
+            "era-sim-control",
+            2,
+            "virtual",
+        )
+        assert hello["urls"] == far_end.urls
+        assert (await far_end.ask("state"))["time_s"] == 0
+        noisy = {"at_m": [0.2, 0.1], "noise_m_s2_rthz": 0.01, "resolution_m_s2": 0.5}
+        assert (await far_end.ask("sensors", sensors={"P1": noisy}))["ok"]
+        assert (await far_end.ask("record", file=str(file)))["ok"]
+        amplifier = Amplifier(open_backend(far_end.urls["main"]), reply_timeout=5.0)
+        await amplifier.open()
+        try:
+            await amplifier.arm(0.5)
+            guard = Guard(GuardLimits(40, 500, 1), amplifier.capabilities)
+            wanted = CommandSet(1, (DriveCommand(0, 110.0, 0.5),), ramp=0.0, valid_for=0.0)
+            await amplifier.apply(guard.check(wanted))
+            assert await far_end.ask("step", seconds=0.4) == {"ok": True, "time_s": 0.4}
+            assert (await far_end.ask("state"))["amplifiers"]["main"]["levels"][0] == 0.5
+            assert (await far_end.ask("move", finger="1", at_m=[0.05, 0.05]))["ok"]
+            assert (await far_end.ask("come", finger="2", at_m=[0.2, 0.2]))["ok"]
+            assert "already" in (await far_end.ask("come", finger="2", at_m=[0.2, 0.2]))["error"]
+            assert (await far_end.ask("go", finger="1"))["ok"]
+            assert "not on the plate" in (await far_end.ask("move", finger="1"))["error"]
+            assert (await far_end.ask("state"))["fingers"] == {"2": [0.2, 0.2]}
+            tones = await far_end.ask("tones", since_s=0.2, until_s=0.4, frequencies_hz=[110.0])
+            assert abs(complex(tones["sensors"]["P1"]["real_m_s2"][0])) > 0
+            signals = await far_end.ask("signals", since_s=0.2, until_s=0.4)
+            readings = np.array(signals["sensors"]["P1"]["m_s2"])
+            assert (signals["sample_rate_hz"], len(readings)) == (2000, 400)
+            np.testing.assert_array_equal(readings, 0.5 * np.round(readings / 0.5))
+            # 0.1 s more and nobody feeds the watchdog.
+            assert (await far_end.ask("step", seconds=0.09)) == {"ok": True, "time_s": 0.49}
+            assert (await far_end.ask("state"))["amplifiers"]["main"]["fault"] == "NONE"
+            await far_end.ask("step", seconds=0.51)
+            assert (await far_end.ask("state"))["amplifiers"]["main"]["fault"] == "WATCHDOG"
+            await amplifier.clear()
+            await amplifier.arm(0.5)
+            assert (await far_end.ask("befall", fault="arc", amplifier="main"))["ok"]
+            assert (await far_end.ask("state"))["amplifiers"]["main"]["fault"] == "ARC"
+            befallen = (await far_end.ask("state"))["time_s"]
+            assert (await far_end.ask("faults"))["faults"]["main"] == [
+                {"fault": "arc", "begin_s": befallen, "end_s": None, "is_on": True}
+            ]
+            assert (await far_end.ask("recover"))["ok"]
+            assert (await far_end.ask("faults")) == {"faults": {"main": []}}
+            assert (
+                "none of the far end's"
+                in (await far_end.ask("befall", fault="arc", amplifier="x"))["error"]
+            )
+            assert "share" in (await far_end.ask("befall", fault="drop", share=2))["error"]
+            assert "seconds" in (await far_end.ask("step", seconds=-1))["error"]
+        finally:
+            await amplifier.close()
+        assert not file.exists()
+        finished = await far_end.ask("finish")
+        assert finished == {"file": str(file), "seconds": 1.0, "is_full": False}
+        assert "nothing is being recorded" in (await far_end.ask("finish"))["error"]
+        assert (await far_end.end())[0] == 0
+    recording = read_recording(file)
+    assert recording.names == ("P1", "finger_1")
+    assert (recording.start, recording.samples.shape) == (0.0005, (2000, 2))
+
+
+async def test_what_is_due_within_a_step_happens_at_its_time(tmp_path: Path) -> None:
+    """A fault half a second on, in one step of 0.8 s: silent 15 ms after it, and not before."""
+    async with far_end_process(
+        write_rig(tmp_path / "rig.yaml"), "--serial", "--virtual-time", "--sensor", "P1=0.0,0.0"
+    ) as far_end:
+        amplifier = Amplifier(open_backend(far_end.urls["main"]), reply_timeout=5.0)
+        await amplifier.open()
+        try:
+            await amplifier.arm(2.0)
+            guard = Guard(GuardLimits(40, 500, 1), amplifier.capabilities)
+            wanted = CommandSet(1, (DriveCommand(0, 110.0, 0.5),), ramp=0.0, valid_for=0.0)
+            await amplifier.apply(guard.check(wanted))
+            await far_end.ask("befall", fault="over_temperature", lasts=1.0)
+            await far_end.ask("step", seconds=0.8)
+            assert (await far_end.ask("state"))["amplifiers"]["main"]["fault"] == "OVER_TEMPERATURE"
+            signals = await far_end.ask("signals", since_s=0.3, until_s=0.8)
+        finally:
+            await amplifier.close()
+    strength = np.abs(np.reshape(signals["sensors"]["P1"]["m_s2"], (5, 1000))).max(axis=1)
+    assert strength[1] == pytest.approx(strength[0], rel=0.1)  # 0.3 to 0.5 s
+    assert strength[3] < 0.5 * strength[1]  # from 0.6 s on it only rings down
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+async def test_a_recording_of_the_whole_run_is_written_at_its_end(
+    tmp_path: Path, number: signal.Signals
+) -> None:
+    """Told to end, or its terminal closed, it writes the file and says so."""
+    file = tmp_path / "run.wav"
+    async with far_end_process(
+        write_rig(tmp_path / "rig.yaml"),
+        *("--modbus-tcp", "0", "--sensor", "P1=0.1,0.1", "--record", str(file)),
+    ) as far_end:
+        assert "--virtual-time" in (await far_end.ask("step", seconds=1))["error"]
+        assert await far_end.ask("tones", since_s=0, until_s=1) == {
+            "error": "frequencies_hz must be 1 to 64 different frequencies below 5000 Hz"
+        }
+        status, said = await far_end.end(number)
+    assert status == 0
+    assert said.startswith(f"wrote {file}: ")
+    assert read_recording(file).names == ("P1",)
+    assert not far_end.control.exists()
+
+
+@pytest.mark.parametrize("after", [0.06, 0.15, 0.3, 0.45])
+async def test_a_signal_while_it_starts_is_heard_and_makes_no_noise(
+    tmp_path: Path, after: float
+) -> None:
+    """At whatever moment of its start it is told to end, it ends, without a traceback."""
+    import asyncio
+    import sys
+
+    for command in (["-m", "sim"], ["-c", "from controller.main import main; main()", "sim"]):
+        process = await asyncio.create_subprocess_exec(
+            *(sys.executable, "-P", *command, str(write_rig(tmp_path / "rig.yaml")), "--serial"),
+            stdout=asyncio.subprocess.PIPE,
+            stderr=asyncio.subprocess.PIPE,
+        )
+        await asyncio.sleep(after)
+        process.terminate()
+        _, err = await asyncio.wait_for(process.communicate(), 30)
+        assert process.returncode in (0, 130, -15)
+        assert err == b""

@@ -1,0 +1,53 @@
+"""The live view of a far end: what a person reads off it."""
+
+import numpy as np
+from rich.console import Console
+
+from drivers.command import CommandSet, DriveCommand
+from drivers.protocol.messages import Apply, Arm
+from model.rig import Rig
+from sim.bench.bench import Bench
+from sim.control.site import Site
+from sim.process.view import PlateMap, draw
+
+
+def shown(site: Site, plate: PlateMap) -> str:
+    """The view as text, as wide as it likes."""
+    console = Console(width=120, force_terminal=False)
+    with console.capture() as capture:
+        console.print(draw(site, plate))
+    return capture.get()
+
+
+def rows_of(text: str) -> list[str]:
+    """The plate's rows, the top one first."""
+    return [line[1:-1] for line in text.splitlines() if line.startswith("|")]
+
+
+def test_the_plate_is_drawn_the_right_way_up_and_as_it_shakes(coarse_rig: Rig) -> None:
+    """ERAs in the corners, the finger where it is, nothing at rest, and the most where most is."""
+    bench = Bench(coarse_rig, now=0.0)
+    site = Site(bench, urls={"main": "serial:///dev/pts/7?baud=921600"})
+    plate = PlateMap(bench)
+    bench.taps.append(plate)
+    bench.place_fingers({"1": (0.25, 0.05)}, now=0.0)
+    still = shown(site, plate)
+    rows = rows_of(still)
+    assert [row[0] + row[-1] for row in (rows[0], rows[-1])] == ["EE", "EE"]
+    # 0.25 of 0.3048 m from the left, 0.05 of 0.2286 m from below.
+    assert rows[-1 - int(0.05 / 0.2286 * len(rows))].index("O") == int(0.25 / 0.3048 * 28)
+    assert set("".join(rows)) == {"E", "O", " "}
+    assert "serial:///dev/pts/7?baud=921600" in still
+    bench.exchange("main", Arm(2.0), now=0.1)
+    wanted = CommandSet(9, (DriveCommand(0, 40.0, 0.5),), ramp=0.0, valid_for=0.0)
+    bench.exchange("main", Apply(wanted), now=0.1)
+    bench.advance(1.0)
+    bench.advance(1.3)
+    moving = shown(site, plate)
+    assert "OPERATION_ENABLED" in moving
+    assert " 50%    0%    0%    0%" in moving
+    assert "1.3 s" in moving
+    shades = " ·-+*#@"
+    depth = np.array([[max(shades.find(c), 0) for c in row] for row in rows_of(moving)])
+    # SW, where the drive is, is below on the left.
+    assert depth[-3:, :8].mean() > depth[:3, -8:].mean()

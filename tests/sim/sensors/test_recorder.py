@@ -1,0 +1,120 @@
+"""Recording a bench from one moment to another: what is in it, how long it may become."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from drivers.command import CommandSet, DriveCommand
+from drivers.protocol.messages import Apply, Arm
+from model.errors import InputError
+from model.rig import Rig
+from sim.bench.bench import Bench
+from sim.sensors.accelerometer import Accelerometer
+from sim.sensors.recorder import Recorder
+from sim.sensors.recording_file import read_recording
+
+
+def play(bench: Bench, *, now: float) -> None:
+    """SW at 110 Hz, half its stroke."""
+    bench.exchange("main", Arm(2.0), now=now)
+    wanted = CommandSet(9, (DriveCommand(0, 110.0, 0.5),), ramp=0.0, valid_for=0.0)
+    bench.exchange("main", Apply(wanted), now=now)
+
+
+@pytest.mark.parametrize("ending", ["csv", "wav", "uff"])
+def test_sensors_and_fingers_are_recorded_without_a_gap(
+    coarse_rig: Rig, tmp_path: Path, ending: str
+) -> None:
+    """However the bench is advanced: a sensor at a finger's middle reads what the finger feels."""
+    bench = Bench(coarse_rig, now=3.0, sample_rate=4000.0)
+    bench.place_fingers({"7": (0.1, 0.08)}, now=3.0)
+    path = tmp_path / f"run.{ending}"
+    recorder = Recorder(bench, path, sensors=[Accelerometer("P1", 0.1, 0.08)], fingers=["7"])
+    play(bench, now=3.01)
+    for now in (3.0101, 3.11, 3.5):
+        bench.advance(now)
+    recorder.stop()
+    bench.advance(4.0)
+    recorder.finish()
+    found = read_recording(path)
+    assert found.names == ("P1", "finger_7")
+    assert found.sample_rate == 4000.0
+    assert found.samples.shape == (2000, 2)
+    assert found.start == pytest.approx(3.00025, abs=1e-5)
+    np.testing.assert_allclose(found.points, [[0.1, 0.08]] * 2)
+    np.testing.assert_allclose(found.samples[:, 0], found.samples[:, 1], atol=1e-4)
+    assert not found.samples[:39].any()
+    assert np.abs(found.samples[200:]).max() > 1
+    assert [file.name for file in tmp_path.iterdir() if not file.name.endswith("json")] == [
+        path.name
+    ]
+
+
+def test_a_finger_that_goes_reads_zero_and_one_that_moves_reads_on(
+    coarse_rig: Rig, tmp_path: Path
+) -> None:
+    """The recording's columns are those of its first moment."""
+    bench = Bench(coarse_rig, now=0.0)
+    bench.place_fingers({"a": (0.1, 0.08), "b": (0.2, 0.1)}, now=0.0)
+    path = tmp_path / "run.csv"
+    recorder = Recorder(bench, path, sensors=[], fingers=["a", "b"])
+    play(bench, now=0.0)
+    bench.advance(0.1)
+    bench.place_fingers({"b": (0.02, 0.02)}, now=0.1)
+    bench.advance(0.2)
+    recorder.stop()
+    recorder.finish()
+    late = read_recording(path).during(0.101, 0.2)
+    assert not late.samples[:, 0].any()
+    assert np.abs(late.samples[:, 1]).max() > 1
+
+
+def test_it_ends_where_it_has_become_too_long(
+    coarse_rig: Rig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """No more samples than there is room for, and it says so."""
+    monkeypatch.setattr("sim.sensors.recorder.values_max", lambda path: 1000)
+    bench = Bench(coarse_rig, now=0.0)
+    sensors = [Accelerometer("P1", 0.1, 0.08), Accelerometer("P2", 0.1, 0.1)]
+    recorder = Recorder(bench, tmp_path / "run.csv", sensors=sensors, fingers=[])
+    bench.advance(0.049)
+    assert not recorder.is_full
+    bench.advance(0.3)
+    assert recorder.is_full
+    recorder.stop()
+    recorder.finish()
+    assert len(read_recording(tmp_path / "run.csv").samples) == 500
+
+
+def test_what_cannot_be_recorded_is_said_at_the_start(coarse_rig: Rig, tmp_path: Path) -> None:
+    """Nothing there, another file there, no such folder, a format that cannot hold it."""
+    bench = Bench(coarse_rig, now=0.0, sample_rate=2500.5)
+    sensor = Accelerometer("a very long name", 0.1, 0.1)
+    letter = tmp_path / "letter.csv"
+    letter.write_text("Dear Sir")
+    for path, sensors, words in (
+        (tmp_path / "run.csv", [], "nothing to record"),
+        (letter, [sensor], "a file is there that is no recording"),
+        (tmp_path / "none" / "run.csv", [sensor], "another folder"),
+        (tmp_path / "run.txt", [sensor], "ends in .csv"),
+        (tmp_path / "run.wav", [sensor], "whole sampling rates"),
+        (tmp_path / "run.uff", [sensor], "10 characters"),
+    ):
+        with pytest.raises(InputError, match=words):
+            Recorder(bench, path, sensors=sensors, fingers=[])
+    assert letter.read_text() == "Dear Sir"
+    assert bench.taps == []
+
+
+def test_a_recording_without_samples_leaves_the_old_one(coarse_rig: Rig, tmp_path: Path) -> None:
+    """A file appears whole or not at all: what stood there stays until another one is complete."""
+    path = tmp_path / "run.csv"
+    path.write_text("time_s,old")
+    bench = Bench(coarse_rig, now=0.0)
+    recorder = Recorder(bench, path, sensors=[Accelerometer("P1", 0.1, 0.1)], fingers=[])
+    recorder.stop()
+    with pytest.raises(InputError, match="fewer than two samples"):
+        recorder.finish()
+    assert path.read_text() == "time_s,old"
+    assert list(tmp_path.iterdir()) == [path]

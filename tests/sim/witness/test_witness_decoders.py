@@ -1,0 +1,211 @@
+"""The witness's decoders against the examples of the three pages from which they were written."""
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from sim.witness.can_decoder import CanDecoder
+from sim.witness.can_text import CanFrame, SlcanText, SocketcandText
+from sim.witness.modbus_decoder import ModbusDecoder
+from sim.witness.seen import (
+    Answered,
+    Asked,
+    Damaged,
+    Drive,
+    Kind,
+    Meaning,
+    Restarted,
+    Told,
+    Toward,
+)
+from sim.witness.serial_decoder import SerialDecoder
+from sim.witness.witness import Witness
+
+DOCS = Path(__file__).parents[3] / "docs"
+# As the pages put it in words: 110 Hz, 0.2, 0 degrees; 250.5 Hz, 1, -90 degrees, keeping phase.
+SET = {0: Drive(110.0, 0.2, 0.0), 3: Drive(250.5, 1.0, -90.0, keep_phase=True)}
+
+
+def _serial() -> Iterator[tuple[str, Toward, bytes]]:
+    for line in (DOCS / "wire-protocol.md").read_text(encoding="utf-8").splitlines():
+        found = re.fullmatch(r"([\w ]+): `((?:[0-9A-F]{2} ?)+)`", line)
+        if found:
+            is_answer = found[1].endswith("reply") or found[1] == "Event"
+            yield found[1], "host" if is_answer else "amplifier", bytes.fromhex(found[2])
+
+
+def _modbus(transport: str) -> Iterator[tuple[str, Toward, bytes]]:
+    for line in (DOCS / "wire-modbus.md").read_text(encoding="utf-8").splitlines():
+        found = re.fullmatch(rf"([\w ]+), {transport}: `((?:[0-9A-F]{{2}} ?)+)`", line)
+        if found:
+            is_answer = found[1].endswith("reply")
+            yield found[1], "host" if is_answer else "amplifier", bytes.fromhex(found[2])
+
+
+def _can() -> Iterator[tuple[Toward, CanFrame]]:
+    for line in (DOCS / "wire-can.md").read_text(encoding="utf-8").splitlines():
+        found = re.fullmatch(r"    ([<>]) ([0-9A-F]{3})( FD)?((?: [0-9A-F]{2})*)", line)
+        if found:
+            toward: Toward = "amplifier" if found[1] == ">" else "host"
+            data = bytes.fromhex(found[4])
+            yield toward, CanFrame(int(found[2], 16), data, bool(found[3]))
+
+
+def _check(name: str, meaning: Meaning | None) -> None:
+    """An example means what its name says."""
+    assert meaning is not None
+    assert not isinstance(meaning, Damaged)
+    if not isinstance(meaning, Asked):
+        return
+    assert meaning.problem == ""
+    words = {*name.split(), *name.removeprefix("Refused ").split()}
+    named = [kind for kind in Kind if kind.value in words]
+    if named and "FC4" not in words:
+        assert meaning.kind is named[0]
+
+
+def test_serial_examples() -> None:
+    """Every frame of the page means what stands beside it."""
+    decoder = SerialDecoder()
+    seen = {}
+    for name, toward, data in _serial():
+        ((raw, meaning),) = decoder.feed(toward, 0.0, data)
+        assert raw == data
+        _check(name, meaning)
+        seen[name] = meaning
+    assert len(seen) >= 30
+    apply = seen["Apply request"]
+    assert isinstance(apply, Asked)
+    assert (apply.token, apply.ramp, apply.valid_for) == (513, 0.02, 0.5)
+    assert apply.drives == pytest.approx(SET) or apply.drives == SET
+    arm = seen["Arm reply"]
+    assert isinstance(arm, Answered)
+    assert arm.condition is not None
+    assert (arm.condition.state, arm.condition.watchdog_left, arm.condition.temperature) == (
+        4,
+        0.25,
+        25.0,
+    )
+    assert seen["Event"] == Told(address=1, state=6, fault=4)
+
+
+@pytest.mark.parametrize("transport", ["RTU", "TCP"])
+def test_modbus_examples(transport: str) -> None:
+    """Every telegram of the page means what stands beside it, over both transports."""
+    decoder = ModbusDecoder(over_tcp=transport == "TCP")
+    seen = {}
+    for name, toward, data in _modbus(transport):
+        ((raw, meaning),) = decoder.feed(toward, 0.0, data)
+        assert raw == data
+        _check(name, meaning)
+        if isinstance(meaning, Answered):
+            assert meaning.key is not None, name
+        seen[name] = meaning
+    assert len(seen) >= 35
+    apply, status = seen["Apply request"], seen["GetStatus reply"]
+    assert isinstance(apply, Asked)
+    assert (apply.token, apply.drives) == (513, SET)
+    assert isinstance(status, Answered)
+    assert status.condition is not None
+    assert status.condition.temperature == pytest.approx(-5.3)
+    assert (status.condition.state, status.condition.fault) == (7, 1)
+
+
+def test_can_examples() -> None:
+    """The session of the page: sets whole and torn, classic and FD, the watchdog, the end."""
+    decoder = CanDecoder("slcan", {1: 4})
+    seen = [meaning for toward, frame in _can() for meaning in decoder.take(toward, frame)]
+    assert not any(isinstance(meaning, Damaged) for meaning in seen)
+    sets = [one for one in seen if isinstance(one, Asked) and one.kind is Kind.APPLY]
+    assert [one.token for one in sets] == [513, 513, 516, 517, 518]
+    assert [bool(one.problem) for one in sets] == [False, False, True, False, False]
+    assert sets[0].drives == sets[4].drives == SET  # classic frames, and one CAN FD frame
+    refusals = [one.refusal for one in seen if isinstance(one, Answered) and one.refusal]
+    assert refusals == [15, 5]  # torn, WRONG_STATE
+    assert Told(address=1, state=7, fault=1) in seen
+    assert seen[-1] == Restarted(1)
+
+
+@pytest.mark.parametrize("place", range(1, 12))
+def test_a_flipped_bit_on_a_serial_line_is_seen(place: int) -> None:
+    """No single flipped bit of a stop leaves a frame that means something else."""
+    frame = bytes.fromhex("00042801070205 05B4C3FD8700")
+    for bit in range(8):
+        data = bytearray(frame)
+        data[place] ^= 1 << bit
+        for _, meaning in SerialDecoder().feed("amplifier", 0.0, bytes(data)):
+            assert isinstance(meaning, Damaged)
+
+
+def test_frames_come_in_pieces() -> None:
+    """However the bytes are cut, the frames are the same, on lines and in the text of adapters."""
+    serial = b"".join(data for _, toward, data in _serial() if toward == "amplifier")
+    whole = SerialDecoder().feed("amplifier", 0.0, serial)
+    decoder = SerialDecoder()
+    cut = [one for byte in serial for one in decoder.feed("amplifier", 0.0, bytes([byte]))]
+    assert cut == whole
+    text = b"< hi >< frame 181 1.5 0104 ><fdframe"
+    reader = SocketcandText("host")
+    pieces = [one for byte in text for one in reader.feed(bytes([byte]))]
+    assert [one.frame for one in pieces] == [None, CanFrame(0x181, b"\x01\x04", False)]
+    assert SlcanText("host").feed(b"t18120104\rz\r\a")[0].frame == pieces[1].frame
+
+
+def _over_tcp(number: int, pdu: str) -> bytes:
+    """A telegram of unit 1, with its header."""
+    body = bytes.fromhex("01" + pdu)
+    return number.to_bytes(2, "big") + b"\0\0" + len(body).to_bytes(2, "big") + body
+
+
+# docs/wire-modbus.md: a Ping with tag 22, refused with exception 2, and the block refusal that is
+# read then: tag, no check, BUSY, no channel, refused_tag.
+PING = _over_tcp(1, "17 03E8 000E 0008 0001 02 0016")
+REFUSED = _over_tcp(1, "97 02")
+WHY = _over_tcp(2, "04 0408 0005")
+EARLIER = _over_tcp(2, "04 0A 0015 0000 0007 00FF 0003")
+
+
+def test_a_refusal_of_an_earlier_write_answers_who_reads_it() -> None:
+    """A write damaged on its way leaves no tag; one refused now is not told under an older tag."""
+    for told, is_answer in ((EARLIER, True), (EARLIER[:-2] + b"\0\x16", False)):
+        decoder = ModbusDecoder(over_tcp=True)
+        decoder.feed("amplifier", 0.0, PING)
+        decoder.feed("host", 0.001, REFUSED)
+        ((_, asked),) = decoder.feed("amplifier", 0.002, WHY)
+        ((_, answer),) = decoder.feed("host", 0.003, told)
+        assert isinstance(asked, Asked)
+        assert isinstance(answer, Answered)
+        assert answer.problem == "it carries tag 21 instead of 22"
+        assert (answer.key == asked.key) is is_answer
+
+
+@pytest.mark.parametrize("are_on", [False, True])
+def test_a_refusal_of_an_earlier_write_is_wrong_where_nothing_damages(are_on: bool) -> None:
+    """Faults excuse it, and who goes on then asks nothing amid it; without faults it is told of."""
+    plan = {
+        "wires": {"line": "modbus-tcp"},
+        "amplifiers": {
+            "main": {
+                "wire": "line",
+                "address": 1,
+                "channels": {0: {"frequency_hz": [40, 500], "level": 1.0}},
+            }
+        },
+    }
+    witness = Witness(plan)
+    if are_on:
+        witness.faults(0.0, "line", are_on=True)
+    again = PING[:1] + b"\3" + PING[2:-1] + b"\x17"
+    pieces: tuple[tuple[float, Toward, bytes], ...] = (
+        (0.001, "amplifier", PING),
+        (0.002, "host", REFUSED),
+        (0.003, "amplifier", WHY),
+        (0.004, "host", EARLIER),
+        (0.005, "amplifier", again),
+    )
+    for time, toward, data in pieces:
+        witness.bytes("line", toward, time, data)
+    found = [violation.invariant for violation in witness.finish(0.010)]
+    assert found == ([] if are_on else ["answer"])

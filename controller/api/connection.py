@@ -10,6 +10,7 @@ from collections.abc import Callable
 from typing import cast
 
 from controller.api.jsonrpc import LONGEST_LINE, ErrorCode, RpcError, error_line
+from controller.api.moot import is_moot
 from controller.rate import Rate
 
 OUTGOING_LIMIT = 1 << 18  # bytes that a client has not read
@@ -91,6 +92,11 @@ class Connection(asyncio.Protocol):
         self._transport = None
         self._lines.clear()
         self._on_end(self)
+
+    @property
+    def next_is_moot(self) -> bool:
+        """Whether the next line, of those there are, needs no serving, for the one after it."""
+        return len(self._lines) > 1 and is_moot(self._lines[0], self._lines[1])
 
     def next_line(self) -> bytes:
         """The next line to serve, of those there are."""

@@ -8,7 +8,7 @@ Nothing here knows what a method means.
 import json
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Annotated, Any, TypeAlias
+from typing import Annotated, Any, Literal, TypeAlias
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic_core import from_json
@@ -78,7 +78,7 @@ class _Envelope(BaseModel):
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
 
-    jsonrpc: str = Field(pattern=r"^2\.0$")
+    jsonrpc: Literal["2.0"]
     method: str = Field(max_length=40)
     params: dict[str, Any] = Field(default_factory=dict)
     id: (

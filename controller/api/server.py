@@ -128,7 +128,10 @@ class ApiServer:
         while self._waiting:
             connection = self._waiting.popleft()
             if connection.has_lines:
-                self._serve(connection, connection.next_line())
+                if connection.next_is_moot:
+                    connection.next_line()
+                else:
+                    self._serve(connection, connection.next_line())
                 if connection.has_lines:
                     self._waiting.append(connection)
             connection.settle()

@@ -15,7 +15,7 @@ import pytest
 from controller.api.connection import OUTGOING_LIMIT, Connection
 from controller.api.events import LogEvent
 from controller.api.hub import Hub
-from controller.api.messages import METHODS, EffectsResult
+from controller.api.messages import METHODS, EffectsResult, TouchParams
 from controller.api.parts import Message, Nothing
 from controller.api.server import MOST_CONNECTIONS, ApiServer
 from daemon_bench import until
@@ -28,6 +28,7 @@ class Served:
     path: Path
     hub: Hub
     asked: list[str] = field(default_factory=list)
+    touched: list[tuple[str, float]] = field(default_factory=list)  # source, and first finger's x
     gate: asyncio.Event = field(default_factory=asyncio.Event)
     left: list[Connection] = field(default_factory=list)
     clients: set[Connection] = field(default_factory=set)
@@ -88,6 +89,8 @@ async def serving(folder: Path) -> AsyncIterator[Served]:
         def handle(client: Connection, params: Message) -> Message | Awaitable[Message]:
             made.asked.append(name)
             made.clients.add(client)
+            if isinstance(params, TouchParams) and params.touches:
+                made.touched.append((params.source, params.touches[0].x_m))
             if name == "subscribe":
                 hub.subscribe(client, ["log"])
             if name == "play":
@@ -241,6 +244,28 @@ async def test_a_flood_leaves_the_loop_to_others(served: Served) -> None:
         await asyncio.sleep(0)
         turns += 1
     assert turns > 50
+
+
+async def test_of_touches_that_wait_the_newest_counts(served: Served) -> None:
+    """One that wants no answer gives way to the next of its source, and only to that.
+
+    Not to another source's, nor where something else is asked in between, nor where an answer is
+    wanted, nor to what is no touch after all.
+    """
+
+    def touch(source: str, *, x: float, id: str = "") -> bytes:
+        params = f'{{"source":"{source}","touches":[{{"id":1,"x_m":{x},"y_m":0.1}}]}}'
+        return f'{{"jsonrpc":"2.0",{id}"method":"touch","params":{params}}}\n'.encode()
+
+    wire = await served.connect()
+    lines = [touch("a", x=0.01 * number) for number in range(4)]  # the last one counts
+    lines += [touch("b", x=0.04), touch("a", x=0.05)]
+    lines += [b'{"jsonrpc":"2.0","method":"disarm"}\n', touch("a", x=0.06, id='"id":7,')]
+    lines += [touch("a", x=0.07), b'{"jsonrpc":"2.0","method":"touch","params":{"source":"a"}}\n']
+    wire.send(b"".join(lines))
+    wire.ask("stop", id=8)
+    assert [(await wire.line())["id"] for _ in range(2)] == [7, 8]
+    assert served.touched == [("a", 0.03), ("b", 0.04), ("a", 0.05), ("a", 0.06), ("a", 0.07)]
 
 
 async def test_what_a_touch_sets_off_goes_before_the_next_turn(

@@ -8,44 +8,42 @@ async with await AsyncClient.connect() as era:
 
 import asyncio
 import contextlib
-import json
-from collections.abc import AsyncIterator, Sequence
+from collections.abc import AsyncIterator, Callable, Coroutine
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self, TypeVar
+from typing import Any, Concatenate, ParamSpec, Self, TypeVar
 
-from controller.api.client import ANSWER_TIMEOUT, MOST_EVENTS, USUAL_LEASE
-from controller.api.jsonrpc import LONGEST_LINE, RpcError, request_line
-from controller.api.messages import (
-    ArmParams,
-    ArmResult,
-    EffectsResult,
-    HelloParams,
-    HelloResult,
-    PlayParams,
-    RenewParams,
-    RenewResult,
-    StatusResult,
-    SubscribeParams,
-    TouchParams,
-    UnsubscribeParams,
-)
-from controller.api.parts import API_VERSION, Message, Nothing, Topic
-from controller.api.replies import (
-    Notification,
-    Unreachable,
-    error_of,
-    notification_of,
-    result_of,
-    touch_points,
-)
+from controller.api import calls
+from controller.api.calls import Call, as_message
+from controller.api.conversation import ANSWER_TIMEOUT, CHUNK, MOST_EVENTS, Conversation
+from controller.api.jsonrpc import RpcError
+from controller.api.messages import ArmResult, HelloParams
+from controller.api.parts import Message
+from controller.api.replies import Answer, Greeting, Notification, Unreachable, check_version
 from controller.api.socket_path import find_socket
 
-_ResultT = TypeVar("_ResultT", bound=Message)
+_P = ParamSpec("_P")
+_ResultT = TypeVar("_ResultT")
+_MessageT = TypeVar("_MessageT", bound=Message)
+
+
+def _method(
+    make: Callable[_P, Call[_ResultT]],
+) -> Callable[Concatenate["AsyncClient", _P], Coroutine[Any, Any, _ResultT]]:
+    """The method that makes a call and gives its answer."""
+
+    async def ask(client: "AsyncClient", /, *args: _P.args, **kwargs: _P.kwargs) -> _ResultT:
+        return await client._ask(make(*args, **kwargs))
+
+    calls.name_after(make, ask)
+    return ask
 
 
 class AsyncClient:
-    """A connection to a daemon, made by `connect`; any number of calls may be under way."""
+    """A connection to a daemon, made by `connect`; any number of calls may be under way.
+
+    Errors of the daemon raise RpcError, and Unreachable, a LinkError, where no answer comes.
+    """
 
     def __init__(
         self,
@@ -59,11 +57,11 @@ class AsyncClient:
         self._reader = reader
         self._writer = writer
         self._timeout = timeout
-        self._number = 0
-        self._calls: dict[int, asyncio.Future[dict[str, Any]]] = {}
+        self._conversation = Conversation()
+        self._waiting: dict[int, asyncio.Future[Answer]] = {}
         self._events: asyncio.Queue[Notification | None] = asyncio.Queue()
+        self._gone: Unreachable | None = None
         self._reading = asyncio.create_task(self._read_all(), name="daemon's answers")
-        self._is_closed = False
 
     @classmethod
     async def connect(
@@ -72,17 +70,13 @@ class AsyncClient:
         """A connection that has said hello; as `Client.connect`."""
         at = find_socket(path)
         try:
-            reader, writer = await asyncio.open_unix_connection(str(at), limit=16 * LONGEST_LINE)
+            reader, writer = await asyncio.open_unix_connection(str(at))
         except OSError as error:
             raise Unreachable.at(at, error) from error
         client = cls(at, reader, writer, timeout=timeout)
         try:
-            said = await client.hello(name)
-            if said.api_version.partition(".")[0] != API_VERSION.partition(".")[0]:
-                raise Unreachable(
-                    f"the daemon at {at} speaks version {said.api_version} of the API, this "
-                    f"program {API_VERSION}; update the older of the two"
-                )
+            said = await client.call("hello", HelloParams(client=name), Greeting)
+            check_version(said, at)
         except BaseException:
             await client.close()
             raise
@@ -101,31 +95,27 @@ class AsyncClient:
 
     async def close(self) -> None:
         """Hang up: fingers that were put down are lifted."""
-        self._is_closed = True
         self._writer.close()
         self._reading.cancel()
         await asyncio.gather(self._reading, return_exceptions=True)
         with contextlib.suppress(OSError):
             await self._writer.wait_closed()
 
-    async def hello(self, client: str) -> HelloResult:
-        """Say who one is; what the daemon drives."""
-        return await self.call("hello", HelloParams(client=client), HelloResult)
-
-    async def status(self) -> StatusResult:
-        """How everything is."""
-        return await self.call("status", Nothing(), StatusResult)
-
-    async def arm(self, owner: str, *, lease_s: float = USUAL_LEASE) -> ArmResult:
-        """High voltage on until the lease is over; `armed` renews it by itself."""
-        return await self.call("arm", ArmParams(owner=owner, lease_s=lease_s), ArmResult)
-
-    async def renew(self, lease: str) -> RenewResult:
-        """Keep the lease for as long again."""
-        return await self.call("renew", RenewParams(lease=lease), RenewResult)
+    hello = _method(calls.hello)
+    status = _method(calls.status)
+    arm = _method(calls.arm)
+    renew = _method(calls.renew)
+    disarm = _method(calls.disarm)
+    stop = _method(calls.stop)
+    clear = _method(calls.clear)
+    touch = _method(calls.touch)
+    effects = _method(calls.effects)
+    play = _method(calls.play)
+    subscribe = _method(calls.subscribe)
+    unsubscribe = _method(calls.unsubscribe)
 
     @contextlib.asynccontextmanager
-    async def armed(self, owner: str, *, lease_s: float = USUAL_LEASE) -> AsyncIterator[None]:
+    async def armed(self, owner: str, *, lease_s: float = calls.USUAL_LEASE) -> AsyncIterator[None]:
         """Armed within the block, disarmed after it; a task renews the lease meanwhile."""
         lease = await self.arm(owner, lease_s=lease_s)
         renewing = asyncio.create_task(self._keep_renewing(lease))
@@ -136,88 +126,65 @@ class AsyncClient:
             await asyncio.gather(renewing, return_exceptions=True)
             await self.disarm()
 
-    async def disarm(self) -> None:
-        """Silent along a short ramp, high voltage off."""
-        await self.call("disarm", Nothing(), Nothing)
-
-    async def stop(self) -> None:
-        """Quick stop, latched until `clear`."""
-        await self.call("stop", Nothing(), Nothing)
-
-    async def clear(self) -> None:
-        """Acknowledge a stop, or a fault whose cause is gone."""
-        await self.call("clear", Nothing(), Nothing)
-
-    async def touch(self, places: Sequence[tuple[float, float]], *, source: str = "python") -> None:
-        """All fingers of a source, at x, y [m]: for 150 ms, so repeat it while they are down."""
-        params = TouchParams(source=source, touches=touch_points(places))
-        await self.call("touch", params, Nothing)
-
-    async def effects(self) -> EffectsResult:
-        """The effects that can be played."""
-        return await self.call("effects", Nothing(), EffectsResult)
-
-    async def play(
-        self, effect: str, place: tuple[float, float], *, level_db_sl: float | None = None
-    ) -> None:
-        """Play an effect at x, y [m]."""
-        params = PlayParams(effect=effect, x_m=place[0], y_m=place[1], level_db_sl=level_db_sl)
-        await self.call("play", params, Nothing)
-
-    async def subscribe(self, *topics: Topic, rate_hz: float | None = None) -> None:
-        """Be told of topics; see `events`."""
-        params = SubscribeParams(topics=list(topics), rate_hz=rate_hz)
-        await self.call("subscribe", params, Nothing)
-
-    async def unsubscribe(self, *topics: Topic) -> None:
-        """Be told of them no more."""
-        await self.call("unsubscribe", UnsubscribeParams(topics=list(topics)), Nothing)
-
     async def events(self) -> AsyncIterator[Notification]:
         """What the daemon tells, as it comes; ends with the connection."""
         while (told := await self._events.get()) is not None:
             yield told
 
-    async def call(self, method: str, params: Message, result: type[_ResultT]) -> _ResultT:
-        """Ask and wait for the answer; raises RpcError, or Unreachable where none comes."""
-        if self._reading.done():
-            raise Unreachable.at(self.path, ConnectionResetError("the daemon has hung up"))
-        self._number += 1
-        number, answer = self._number, asyncio.get_running_loop().create_future()
-        self._calls[number] = answer
+    async def call(self, method: str, params: Message, result: type[_MessageT]) -> _MessageT:
+        """Ask by any method of the API, and wait for the answer."""
+        return await self._ask(Call(method, params, as_message(result)))
+
+    async def _ask(self, call: Call[_ResultT]) -> _ResultT:
+        if self._gone is not None:
+            raise self._gone
+        number, line = self._conversation.ask(call)
+        answer = self._waiting[number] = asyncio.get_running_loop().create_future()
         try:
-            self._writer.write(request_line(number, method, params))
+            self._writer.write(line)
             async with asyncio.timeout(self._timeout):
                 await self._writer.drain()
-                said = await answer
+                said = (await answer).said
+        except Unreachable:
+            raise
         except OSError as error:
             raise Unreachable.at(self.path, error) from error
         finally:
-            self._calls.pop(number, None)
-        if "error" in said:
-            raise error_of(said)
-        return result_of(said, result)
+            del self._waiting[number]
+        return call.read(said)
 
     async def _read_all(self) -> None:
-        """Give every line to whoever waits for it, until the connection ends."""
-        reason: OSError = ConnectionResetError("the daemon has hung up")
+        """Give every reply to whoever waits for it, until the connection ends."""
+        gone = Unreachable.at(self.path, ConnectionResetError("the daemon has hung up"))
         try:
-            while line := await self._reader.readline():
-                said = json.loads(line)
-                told = notification_of(said)
-                if told is not None:
-                    if self._events.qsize() >= MOST_EVENTS:
-                        self._events.get_nowait()
-                    self._events.put_nowait(told)
-                elif (answer := self._calls.get(said.get("id"))) and not answer.done():
-                    answer.set_result(said)
+            while data := await self._reader.read(CHUNK):
+                for reply in self._conversation.hear(data):
+                    if isinstance(reply, Notification):
+                        self._keep(reply)
+                    else:
+                        self._settle(reply)
+        except Unreachable as error:
+            gone = error
         except OSError as error:
-            reason = error
+            gone = Unreachable.at(self.path, error)
         finally:
-            for answer in self._calls.values():
+            self._gone = gone
+            for answer in self._waiting.values():
                 if not answer.done():
-                    answer.set_exception(reason)
+                    answer.set_exception(gone)
             self._events.put_nowait(None)
+
+    def _keep(self, told: Notification) -> None:
+        """Keep a notification for `events`; the oldest gives way."""
+        if self._events.qsize() >= MOST_EVENTS:
+            self._events.get_nowait()
+        self._events.put_nowait(told)
+
+    def _settle(self, answer: Answer) -> None:
+        """Hand an answer to whoever waits for it; one to no request in particular to everybody."""
+        for number, waiting in self._waiting.items():
+            if answer.number in (number, None) and not waiting.done():
+                waiting.set_result(answer)
 
     async def _keep_renewing(self, lease: ArmResult) -> None:
         with contextlib.suppress(RpcError, Unreachable):

@@ -6,58 +6,49 @@ with Client.connect() as era:
         era.touch([(0.10, 0.05)])
 """
 
-import json
 import socket
 import threading
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self, TypeVar
+from typing import Concatenate, ParamSpec, Self, TypeVar
 
-from controller.api.jsonrpc import LONGEST_LINE, request_line
-from controller.api.messages import (
-    ArmParams,
-    ArmResult,
-    EffectsResult,
-    HelloParams,
-    HelloResult,
-    PlayParams,
-    RenewParams,
-    RenewResult,
-    StatusResult,
-    SubscribeParams,
-    TouchParams,
-    UnsubscribeParams,
-)
-from controller.api.parts import API_VERSION, Message, Nothing, Topic
-from controller.api.replies import (
-    Notification,
-    Unreachable,
-    error_of,
-    notification_of,
-    result_of,
-    touch_points,
-)
+from controller.api import calls
+from controller.api.calls import Call, as_message
+from controller.api.conversation import ANSWER_TIMEOUT, CHUNK, MOST_EVENTS, Conversation
+from controller.api.messages import ArmResult, HelloParams
+from controller.api.parts import Message
+from controller.api.replies import Answer, Greeting, Notification, Unreachable, check_version
 from controller.api.socket_path import find_socket
 
-ANSWER_TIMEOUT = 5.0  # s; arming takes the longest, some tenths of a second
-MOST_EVENTS = 1000  # that wait to be looked at; older ones are dropped
-USUAL_LEASE = 10.0  # s
+_P = ParamSpec("_P")
+_ResultT = TypeVar("_ResultT")
+_MessageT = TypeVar("_MessageT", bound=Message)
 
-_ResultT = TypeVar("_ResultT", bound=Message)
+
+def _method(make: Callable[_P, Call[_ResultT]]) -> Callable[Concatenate["Client", _P], _ResultT]:
+    """The method that makes a call and waits for its answer."""
+
+    def ask(client: "Client", /, *args: _P.args, **kwargs: _P.kwargs) -> _ResultT:
+        return client._ask(make(*args, **kwargs))
+
+    calls.name_after(make, ask)
+    return ask
 
 
 class Client:
-    """A connection to a daemon; one thread at a time. Errors of the daemon raise RpcError."""
+    """A connection to a daemon; one thread at a time. Errors of the daemon raise RpcError.
+
+    Every method raises Unreachable, a LinkError, where no answer comes.
+    """
 
     def __init__(self, path: Path, *, timeout: float = ANSWER_TIMEOUT) -> None:
         self.path = path
         self._timeout = timeout
-        self._number = 0
+        self._conversation = Conversation()
         self._events: deque[Notification] = deque(maxlen=MOST_EVENTS)
-        self._rest = b""
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_CLOEXEC)
         self._socket.settimeout(timeout)
         try:
@@ -72,16 +63,12 @@ class Client:
     ) -> Self:
         """A connection that has said hello; path: of the socket, the usual one if None.
 
-        Raises Unreachable (a LinkError) where nobody answers, or somebody of another major version.
+        Raises Unreachable where nobody answers, or somebody of another major version.
         """
         client = cls(find_socket(path), timeout=timeout)
         try:
-            said = client.hello(name)
-            if said.api_version.partition(".")[0] != API_VERSION.partition(".")[0]:
-                raise Unreachable(
-                    f"the daemon at {client.path} speaks version {said.api_version} of the API, "
-                    f"this program {API_VERSION}; update the older of the two"
-                )
+            said = client.call("hello", HelloParams(client=name), Greeting)
+            check_version(said, client.path)
         except BaseException:
             client.close()
             raise
@@ -102,24 +89,21 @@ class Client:
         """Hang up: fingers that were put down are lifted."""
         self._socket.close()
 
-    def hello(self, client: str) -> HelloResult:
-        """Say who one is; what the daemon drives."""
-        return self.call("hello", HelloParams(client=client), HelloResult)
-
-    def status(self) -> StatusResult:
-        """How everything is."""
-        return self.call("status", Nothing(), StatusResult)
-
-    def arm(self, owner: str, *, lease_s: float = USUAL_LEASE) -> ArmResult:
-        """High voltage on until the lease is over; `armed` renews it by itself."""
-        return self.call("arm", ArmParams(owner=owner, lease_s=lease_s), ArmResult)
-
-    def renew(self, lease: str) -> RenewResult:
-        """Keep the lease for as long again."""
-        return self.call("renew", RenewParams(lease=lease), RenewResult)
+    hello = _method(calls.hello)
+    status = _method(calls.status)
+    arm = _method(calls.arm)
+    renew = _method(calls.renew)
+    disarm = _method(calls.disarm)
+    stop = _method(calls.stop)
+    clear = _method(calls.clear)
+    touch = _method(calls.touch)
+    effects = _method(calls.effects)
+    play = _method(calls.play)
+    subscribe = _method(calls.subscribe)
+    unsubscribe = _method(calls.unsubscribe)
 
     @contextmanager
-    def armed(self, owner: str, *, lease_s: float = USUAL_LEASE) -> Iterator[None]:
+    def armed(self, owner: str, *, lease_s: float = calls.USUAL_LEASE) -> Iterator[None]:
         """Armed within the block, disarmed after it; a thread renews the lease meanwhile."""
         lease = self.arm(owner, lease_s=lease_s)
         over = threading.Event()
@@ -134,42 +118,6 @@ class Client:
             self.disarm()
             thread.join()
 
-    def disarm(self) -> None:
-        """Silent along a short ramp, high voltage off."""
-        self.call("disarm", Nothing(), Nothing)
-
-    def stop(self) -> None:
-        """Quick stop, latched until `clear`."""
-        self.call("stop", Nothing(), Nothing)
-
-    def clear(self) -> None:
-        """Acknowledge a stop, or a fault whose cause is gone."""
-        self.call("clear", Nothing(), Nothing)
-
-    def touch(self, places: Sequence[tuple[float, float]], *, source: str = "python") -> None:
-        """All fingers of a source, at x, y [m]: for 150 ms, so repeat it while they are down."""
-        params = TouchParams(source=source, touches=touch_points(places))
-        self.call("touch", params, Nothing)
-
-    def effects(self) -> EffectsResult:
-        """The effects that can be played."""
-        return self.call("effects", Nothing(), EffectsResult)
-
-    def play(
-        self, effect: str, place: tuple[float, float], *, level_db_sl: float | None = None
-    ) -> None:
-        """Play an effect at x, y [m]."""
-        params = PlayParams(effect=effect, x_m=place[0], y_m=place[1], level_db_sl=level_db_sl)
-        self.call("play", params, Nothing)
-
-    def subscribe(self, *topics: Topic, rate_hz: float | None = None) -> None:
-        """Be told of topics; see `events`."""
-        self.call("subscribe", SubscribeParams(topics=list(topics), rate_hz=rate_hz), Nothing)
-
-    def unsubscribe(self, *topics: Topic) -> None:
-        """Be told of them no more."""
-        self.call("unsubscribe", UnsubscribeParams(topics=list(topics)), Nothing)
-
     def events(self, *, timeout: float | None = None) -> Iterator[Notification]:
         """What the daemon tells, as it comes; ends when nothing came for a timeout [s]."""
         self._socket.settimeout(timeout)
@@ -178,46 +126,44 @@ class Client:
                 while self._events:
                     yield self._events.popleft()
                 try:
-                    said = self._read()
+                    self._read()
                 except TimeoutError:
                     return
                 except OSError as error:
                     raise Unreachable.at(self.path, error) from error
-                if (told := notification_of(said)) is not None:
-                    self._events.append(told)
         finally:
             with suppress(OSError):
                 self._socket.settimeout(self._timeout)
 
-    def call(self, method: str, params: Message, result: type[_ResultT]) -> _ResultT:
-        """Ask and wait for the answer; raises RpcError, or Unreachable where none comes."""
-        self._number += 1
+    def call(self, method: str, params: Message, result: type[_MessageT]) -> _MessageT:
+        """Ask by any method of the API, and wait for the answer."""
+        return self._ask(Call(method, params, as_message(result)))
+
+    def _ask(self, call: Call[_ResultT]) -> _ResultT:
+        number, line = self._conversation.ask(call)
         try:
-            self._socket.sendall(request_line(self._number, method, params))
+            self._socket.sendall(line)
             while True:
-                said = self._read()
-                if (told := notification_of(said)) is not None:
-                    self._events.append(told)
-                elif said.get("id") == self._number:
-                    break
-                elif said.get("id") is None and "error" in said:
-                    raise error_of(said)
+                for answer in self._read():
+                    if answer.number in (number, None):
+                        return call.read(answer.said)
+        except Unreachable:
+            raise
         except OSError as error:
             raise Unreachable.at(self.path, error) from error
-        if "error" in said:
-            raise error_of(said)
-        return result_of(said, result)
 
-    def _read(self) -> dict[str, Any]:
-        """The next line; raises OSError."""
-        while b"\n" not in self._rest:
-            data = self._socket.recv(LONGEST_LINE)
-            if not data:
-                raise ConnectionResetError("the daemon has hung up")
-            self._rest += data
-        line, _, self._rest = self._rest.partition(b"\n")
-        said: dict[str, Any] = json.loads(line)
-        return said
+    def _read(self) -> list[Answer]:
+        """The answers that came next; notifications are kept for `events`. Raises OSError."""
+        data = self._socket.recv(CHUNK)
+        if not data:
+            raise ConnectionResetError("the daemon has hung up")
+        answers = []
+        for reply in self._conversation.hear(data):
+            if isinstance(reply, Notification):
+                self._events.append(reply)
+            else:
+                answers.append(reply)
+        return answers
 
 
 def _keep_renewing(path: Path, lease: ArmResult, over: threading.Event) -> None:

@@ -1,22 +1,26 @@
-"""What both clients make of the daemon's lines."""
+"""What clients make of the daemon's lines.
+
+A daemon of a later minor version says more than this program knows of: that is ignored here, while
+the server itself is strict about everything that it is asked.
+"""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeAlias, TypeVar
 
 from pydantic import ValidationError
 
 from controller.api.jsonrpc import ErrorCode, RpcError
-from controller.api.parts import Message, TouchPoint
+from controller.api.parts import API_VERSION, Message
 from drivers.errors import LinkError
 
-_ResultT = TypeVar("_ResultT", bound=Message)
+_MessageT = TypeVar("_MessageT", bound=Message)
 
 
 class Unreachable(LinkError):
-    """Nobody answers at the daemon's socket, or not any more."""
+    """Nobody answers at the daemon's socket, or not any more, or nobody who can be understood."""
 
     @classmethod
     def at(cls, path: Path, error: OSError) -> "Unreachable":
@@ -40,17 +44,56 @@ class Notification:
     data: Mapping[str, Any]
 
 
-def notification_of(said: Mapping[str, Any]) -> Notification | None:
-    """The notification that a line is; None for an answer."""
-    if said.get("method") != "event":
-        return None
-    params = said["params"]
-    return Notification(params["topic"], params["time_s"], params["lost"], params["data"])
+@dataclass(frozen=True)
+class Answer:
+    """What the daemon says to the request of a number; of None: to whatever it was."""
+
+    number: int | None
+    said: Mapping[str, Any]
 
 
-def error_of(said: Mapping[str, Any]) -> RpcError:
-    """The error that a line tells."""
-    error = said["error"]
+Reply: TypeAlias = Answer | Notification
+
+
+class Greeting(Message):
+    """Of what `hello` answers the one thing that every version has."""
+
+    api_version: str
+
+
+def reply_of(line: bytes) -> Reply:
+    """What a line is; raises Unreachable for one that a daemon would not say."""
+    try:
+        said = json.loads(line)
+        if said.get("method") != "event":
+            return Answer(said["id"], said)
+        params = said["params"]
+        return Notification(params["topic"], params["time_s"], params["lost"], params["data"])
+    except (ValueError, AttributeError, KeyError, TypeError) as error:
+        raise _foreign() from error
+
+
+def result_of(said: Mapping[str, Any], model: type[_MessageT]) -> _MessageT:
+    """The result that an answer tells; raises the RpcError that it tells instead."""
+    try:
+        if "error" in said:
+            raise _error_of(said["error"])
+        return model.model_validate_json(json.dumps(said["result"]), extra="ignore")
+    except (KeyError, TypeError, ValueError, ValidationError) as error:
+        raise _foreign() from error
+
+
+def check_version(greeting: Greeting, at: Path) -> None:
+    """Raise Unreachable for a daemon at a socket that speaks another major version."""
+    theirs = greeting.api_version
+    if theirs.partition(".")[0] != API_VERSION.partition(".")[0]:
+        raise Unreachable(
+            f"the daemon at {at} speaks version {theirs:.20} of the API, this program "
+            f"{API_VERSION}; update the older of the two"
+        )
+
+
+def _error_of(error: Mapping[str, Any]) -> RpcError:
     data = error.get("data") or {}
     return RpcError(
         ErrorCode(error["code"]),
@@ -60,17 +103,8 @@ def error_of(said: Mapping[str, Any]) -> RpcError:
     )
 
 
-def result_of(said: Mapping[str, Any], model: type[_ResultT]) -> _ResultT:
-    """The result that a line tells; keys of a later minor version are ignored."""
-    try:
-        return model.model_validate_json(json.dumps(said["result"]), extra="ignore")
-    except (KeyError, ValidationError) as error:
-        raise Unreachable(
-            "the daemon answered something that this program does not understand; update the older "
-            "of the two"
-        ) from error
-
-
-def touch_points(places: Sequence[tuple[float, float]]) -> list[TouchPoint]:
-    """Fingers 1, 2, ... at x, y [m]."""
-    return [TouchPoint(id=id, x_m=x, y_m=y) for id, (x, y) in enumerate(places, start=1)]
+def _foreign() -> Unreachable:
+    return Unreachable(
+        "the daemon answered something that this program does not understand; update the older of "
+        "the two"
+    )

@@ -19,7 +19,6 @@ from drivers.supervision import pauses
 _FIRST_PAUSE, _LONGEST_PAUSE = 0.1, 2.0  # s; between attempts to reach the daemon
 _RATE = 10.0  # Hz; of amplifiers and latency
 _NAME = "gateway"
-_FOREIGN = "the daemon's answer cannot be understood"
 _UPDATE = "update the older of daemon and gateway, then start both anew"
 
 _logger = logging.getLogger(__name__)
@@ -43,37 +42,30 @@ class DaemonLink:
         self._on_hello = on_hello
         self._on_event = on_event
         self._client: AsyncClient | None = None
+        self._away = ""  # why there is no daemon
         self.hello: HelloResult | None = None
 
     async def run(self) -> None:
         """Connect, listen, and connect again after a loss, until cancelled."""
         while True:
-            client = await self._connect()
-            try:
-                self.hello = await client.hello(_NAME)
-                self._on_hello(self.hello)
-                self._client = client
-                await client.subscribe(*TOPICS, rate_hz=_RATE)
-                async for told in client.events():
-                    self._on_event(told)
-                _logger.warning("the daemon has hung up")
-            except (RpcError, Unreachable) as error:
-                _logger.warning("the daemon was lost: %s", error)
-            except ValidationError:
-                _logger.warning("%s; %s", _FOREIGN, _UPDATE)
-                await asyncio.sleep(_LONGEST_PAUSE)
-            finally:
-                self._client = self.hello = None
-                self._on_hello(None)
-                await client.close()
+            for pause in pauses(first=_FIRST_PAUSE, longest=_LONGEST_PAUSE):
+                try:
+                    await self._follow()
+                except (RpcError, Unreachable) as error:
+                    self._is_away_because(str(error))
+                else:
+                    break
+                await asyncio.sleep(pause)
+            self._is_away_because("the daemon has hung up")
+            await asyncio.sleep(_FIRST_PAUSE)
 
     async def call(self, method: str, params: Message) -> dict[str, Any]:
         """Ask the daemon; its result as JSON. Raises RpcError, its own or that it is not there."""
         if self._client is None or self.hello is None:
             raise RpcError(
                 ErrorCode.LINK,
-                "the daemon does not answer",
-                remedy="see whether `era daemon` runs; the gateway connects by itself then",
+                self._away or "not connected to the daemon yet",
+                remedy="the gateway tries again by itself",
             )
         if method == "hello":  # or anybody could give the gateway another name in the daemon's log
             return self.hello.model_dump(mode="json")
@@ -81,15 +73,28 @@ class DaemonLink:
             result = await self._client.call(method, params, METHODS[method].result)
         except Unreachable as error:
             raise RpcError(ErrorCode.LINK, str(error)) from error
-        except ValidationError as error:
-            raise RpcError(ErrorCode.INTERNAL, _FOREIGN, remedy=_UPDATE) from error
         return result.model_dump(mode="json")
 
-    async def _connect(self) -> AsyncClient:
-        """A connection, as soon as there is a daemon."""
-        for pause in pauses(first=_FIRST_PAUSE, longest=_LONGEST_PAUSE):
-            try:
-                return await AsyncClient.connect(self._socket, name=_NAME)
-            except (RpcError, Unreachable, ValidationError):
-                await asyncio.sleep(pause)
-        raise AssertionError("pauses have no end")
+    async def _follow(self) -> None:
+        """Tell what a daemon tells until it hangs up; raises RpcError, or Unreachable for none."""
+        client = await AsyncClient.connect(self._socket, name=_NAME)
+        try:
+            self.hello = await client.hello(_NAME)
+            self._on_hello(self.hello)
+            await client.subscribe(*TOPICS, rate_hz=_RATE)
+            self._client, self._away = client, ""
+            async for told in client.events():
+                self._on_event(told)
+        except (ValidationError, KeyError) as error:
+            raise Unreachable(f"what the daemon tells cannot be understood; {_UPDATE}") from error
+        finally:
+            if self.hello is not None:
+                self._client = self.hello = None
+                self._on_hello(None)
+            await client.close()
+
+    def _is_away_because(self, reason: str) -> None:
+        """Log why there is no daemon, once, and tell whoever asks for it."""
+        if reason != self._away:
+            self._away = reason
+            _logger.warning("not connected to a daemon: %s", reason)

@@ -67,7 +67,9 @@ class Picture:
         if topic in ("pattern", "silence"):
             self._frames.pop("silence" if topic == "pattern" else "pattern", None)
             drive = told.data.get("drive", {})
-            self._drive = {name: Tone.model_validate(tone) for name, tone in drive.items()}
+            self._drive = {
+                name: Tone.model_validate(tone, extra="ignore") for name, tone in drive.items()
+            }
             self._wanted.set()
         if topic == "layout":
             self._exchange(told.data["layout"])

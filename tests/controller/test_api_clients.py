@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import inspect
 import os
 import re
 import socket
@@ -16,6 +17,7 @@ import controller
 from controller.api.async_client import AsyncClient
 from controller.api.client import Client
 from controller.api.jsonrpc import ErrorCode, RpcError
+from controller.api.messages import METHODS, ArmResult
 from controller.api.replies import Unreachable
 from controller.api.socket_path import SYSTEM_SOCKET, find_socket
 from daemon_bench import PLACE, running_daemon, until_state
@@ -29,7 +31,7 @@ async def test_the_waiting_client_does_all_there_is(tmp_path: Path) -> None:
     async with running_daemon(tmp_path) as bench:
 
         def study() -> list[str]:
-            seen = []
+            seen: list[str] = []
             with Client.connect(bench.socket, name="study") as era:
                 era.subscribe("pattern", "state")
                 with era.armed("study", lease_s=1):
@@ -134,7 +136,13 @@ HELLO = (
     ("lines", "message"),
     [
         ((HELLO,), r"speaks version 2\.0 of the API"),
-        ((b'{"jsonrpc":"2.0","id":1,"result":{"api_version":"2.0"}}\n',), "does not understand"),
+        (
+            (b'{"jsonrpc":"2.0","id":1,"result":{"api_version":"2.0"}}\n',),
+            r"version 2\.0 of the API",
+        ),
+        ((b'{"jsonrpc":"2.0","id":1,"result":{"mood":"good"}}\n',), "does not understand"),
+        ((b'{"jsonrpc":"2.0","id":1,"error":{"code":1,"message":"?"}}\n',), "does not understand"),
+        ((b"SSH-2.0-OpenSSH_9.2\n",), "does not understand"),
         ((), "is gone"),
         ((b'{"jso',), "is gone"),
     ],
@@ -149,13 +157,25 @@ async def test_whoever_answers_otherwise_is_no_daemon_of_ours(
         await AsyncClient.connect(tmp_path / "b")
 
 
-def test_keys_of_a_later_minor_version_are_ignored(tmp_path: Path) -> None:
-    """What this program does not know of yet does not disturb it."""
-    later = HELLO.replace(b'"2.0","software', b'"1.7","news":[1],"software').replace(
-        b'"length_m"', b'"mood":"good","length_m"'
-    )
-    with answering(tmp_path / "s", later), Client.connect(tmp_path / "s") as era:
-        assert era.path == tmp_path / "s"
+async def test_a_refusal_of_the_whole_connection_is_told(tmp_path: Path) -> None:
+    """It is the answer to no request in particular, and so to the one that was asked."""
+    busy = b'{"jsonrpc":"2.0","id":null,"error":{"code":1005,"message":"too many connections"}}\n'
+    with answering(tmp_path / "a", busy), pytest.raises(RpcError, match="too many") as caught:
+        await asyncio.to_thread(Client.connect, tmp_path / "a")
+    assert caught.value.code is ErrorCode.BUSY
+    with answering(tmp_path / "b", busy), pytest.raises(RpcError, match="too many"):
+        await AsyncClient.connect(tmp_path / "b")
+
+
+@pytest.mark.parametrize("client", [Client, AsyncClient])
+def test_both_clients_have_every_method_with_its_parameters(
+    client: type[Client] | type[AsyncClient],
+) -> None:
+    """As a notebook shows them: the signature, what comes back, and a sentence on each."""
+    for name in METHODS:
+        assert getattr(client, name).__doc__
+    assert list(inspect.signature(client.arm).parameters) == ["self", "owner", "lease_s"]
+    assert inspect.signature(client.arm).return_annotation is ArmResult
 
 
 def test_a_daemon_that_does_not_answer_is_given_up(tmp_path: Path) -> None:

@@ -1,0 +1,122 @@
+"""What clients ask of a daemon, method by method: the one list that both clients have."""
+
+import inspect
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Generic, TypeVar, get_args
+
+from controller.api.messages import (
+    ArmParams,
+    ArmResult,
+    EffectsResult,
+    HelloParams,
+    HelloResult,
+    PlayParams,
+    RenewParams,
+    RenewResult,
+    StatusResult,
+    SubscribeParams,
+    TouchParams,
+    UnsubscribeParams,
+)
+from controller.api.parts import Message, Nothing, Topic, TouchPoint
+from controller.api.replies import result_of
+
+USUAL_LEASE = 10.0  # s
+
+_MessageT = TypeVar("_MessageT", bound=Message)
+_ResultT = TypeVar("_ResultT")
+
+
+@dataclass(frozen=True)
+class Call(Generic[_ResultT]):
+    """A request, and how its answer is read; that raises RpcError or Unreachable."""
+
+    method: str
+    params: Message
+    read: Callable[[Mapping[str, Any]], _ResultT]
+
+
+def as_message(model: type[_MessageT]) -> Callable[[Mapping[str, Any]], _MessageT]:
+    """Reads an answer as a message."""
+    return lambda said: result_of(said, model)
+
+
+def hello(client: str) -> Call[HelloResult]:
+    """Say who one is; what the daemon drives."""
+    return Call("hello", HelloParams(client=client), as_message(HelloResult))
+
+
+def status() -> Call[StatusResult]:
+    """How everything is."""
+    return Call("status", Nothing(), as_message(StatusResult))
+
+
+def arm(owner: str, *, lease_s: float = USUAL_LEASE) -> Call[ArmResult]:
+    """High voltage on until the lease is over; `armed` renews it by itself."""
+    return Call("arm", ArmParams(owner=owner, lease_s=lease_s), as_message(ArmResult))
+
+
+def renew(lease: str) -> Call[RenewResult]:
+    """Keep the lease for as long again."""
+    return Call("renew", RenewParams(lease=lease), as_message(RenewResult))
+
+
+def disarm() -> Call[None]:
+    """Silent along a short ramp, high voltage off."""
+    return Call("disarm", Nothing(), _done)
+
+
+def stop() -> Call[None]:
+    """Quick stop, latched until `clear`."""
+    return Call("stop", Nothing(), _done)
+
+
+def clear() -> Call[None]:
+    """Acknowledge a stop, or a fault whose cause is gone."""
+    return Call("clear", Nothing(), _done)
+
+
+def touch(places: Sequence[tuple[float, float]], *, source: str = "python") -> Call[None]:
+    """All fingers of a source, at x, y [m]: for 150 ms, so repeat it while they are down."""
+    touches = [TouchPoint(id=id, x_m=x, y_m=y) for id, (x, y) in enumerate(places, start=1)]
+    return Call("touch", TouchParams(source=source, touches=touches), _done)
+
+
+def effects() -> Call[EffectsResult]:
+    """The effects that can be played."""
+    return Call("effects", Nothing(), as_message(EffectsResult))
+
+
+def play(
+    effect: str, place: tuple[float, float], *, level_db_sl: float | None = None
+) -> Call[None]:
+    """Play an effect at x, y [m]."""
+    x, y = place
+    params = PlayParams(effect=effect, x_m=x, y_m=y, level_db_sl=level_db_sl)
+    return Call("play", params, _done)
+
+
+def subscribe(*topics: Topic, rate_hz: float | None = None) -> Call[None]:
+    """Be told of topics; see `events`."""
+    return Call("subscribe", SubscribeParams(topics=list(topics), rate_hz=rate_hz), _done)
+
+
+def unsubscribe(*topics: Topic) -> Call[None]:
+    """Be told of them no more."""
+    return Call("unsubscribe", UnsubscribeParams(topics=list(topics)), _done)
+
+
+def name_after(make: Callable[..., Call[Any]], method: Callable[..., Any]) -> None:
+    """Let a client's method have the name, the description and the signature of its call."""
+    own = inspect.Parameter("self", inspect.Parameter.POSITIONAL_ONLY)
+    asked = inspect.signature(make)
+    (answer,) = get_args(asked.return_annotation)
+    method.__name__, method.__doc__ = make.__name__, make.__doc__
+    method.__signature__ = asked.replace(  # type: ignore[attr-defined]
+        parameters=[own, *asked.parameters.values()], return_annotation=answer
+    )
+
+
+def _done(said: Mapping[str, Any]) -> None:
+    result_of(said, Nothing)

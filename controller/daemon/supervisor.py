@@ -200,18 +200,25 @@ class Supervisor:
             await self.handle(Event(Kind.FAULT, problem, _CLEAR))
 
     async def _clear(self) -> None:
-        await self._the_controller.clear()
-        problem = await self._unsound()
+        # An amplifier that still falls silent overhears it, so it is said again at each look.
+        problem = await self._unsound(before_each=self._the_controller.clear)
         if problem is None:
             await self.handle(Event(Kind.SOUND, "acknowledged, and the cause is gone"))
             return
         await self.handle(Event(Kind.FAULT, problem, _CLEAR))
         raise CommandRefused(f"{problem}; the cause is not gone, so nothing was cleared")
 
-    async def _unsound(self) -> str | None:
-        """What is wrong with an amplifier that should be disarmed, once ramps had their time."""
+    async def _unsound(
+        self, *, before_each: Callable[[], Awaitable[None]] | None = None
+    ) -> str | None:
+        """What is wrong with an amplifier that should be disarmed, once ramps had their time.
+
+        before_each: to be done before each look.
+        """
         problem = None
         for _ in range(_READ_BACKS):
+            if before_each is not None:
+                await before_each()
             problem = _problem(await self._statuses())
             if problem is None:
                 break

@@ -287,6 +287,25 @@ def test_clear_waits_for_level_zero(run_virtual: Run, make_bench: Callable[..., 
     run_virtual(scenario())
 
 
+def test_clear_right_after_a_stop_waits_for_the_ramp(
+    run_virtual: Run, make_bench: Callable[..., Any]
+) -> None:
+    """An amplifier takes no Clear before it is silent: it is told again once it is."""
+
+    async def scenario() -> None:
+        loop = asyncio.get_running_loop()
+        async with watched(make_bench) as daemon:
+            await daemon.supervisor.handle(ARM)
+            await daemon.supervisor.handle(Event(Kind.STOP, "stop"))
+            silent = loop.time() + 0.05
+            stopping = daemon.status(State.QUICK_STOP_ACTIVE)
+            daemon.far_end.answer = lambda request: stopping if loop.time() < silent else None
+            await daemon.supervisor.handle(Event(Kind.CLEAR))
+            assert daemon.state is DaemonState.READY_TO_SWITCH_ON
+
+    run_virtual(scenario())
+
+
 def test_an_amplifier_that_will_not_be_armed_is_a_fault(
     run_virtual: Run, make_bench: Callable[..., Any]
 ) -> None:

@@ -8,6 +8,7 @@ import asyncio
 import contextlib
 import errno
 import os
+import socket
 import threading
 from collections.abc import Callable
 from typing import final
@@ -159,17 +160,28 @@ def _open_port(name: str, baud: int) -> serial.Serial:
     # USB adapters hold bytes back for 16 ms unless they are told not to; most can be.
     with contextlib.suppress(OSError, ValueError, AttributeError, NotImplementedError):
         port.set_low_latency_mode(True)
+    connection = _connection_of(port)
+    if connection is not None:
+        # Else the system holds a frame back until the one before is acknowledged, 40 ms perhaps:
+        # a stop must not wait for the answer to what it overtakes.
+        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     port.reset_input_buffer()
     return port
 
 
 def _close_port(port: serial.Serial) -> None:
     # pyserial does not close the socket of a server that hung up first, so that is done here.
-    connection = getattr(port, "_socket", None)
-    if connection is not None and str(port.port).startswith("socket://"):
+    connection = _connection_of(port)
+    if connection is not None:
         connection.close()
     with contextlib.suppress(OSError):
         port.close()
+
+
+def _connection_of(port: serial.Serial) -> socket.socket | None:
+    """The connection to a serial server that passes bytes on as they are; None for other ports."""
+    is_server = str(port.port).startswith("socket://")
+    return getattr(port, "_socket", None) if is_server else None
 
 
 def _why_not_open(port: str, problem: Exception) -> str:

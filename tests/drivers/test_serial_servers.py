@@ -5,6 +5,7 @@ import contextlib
 import socket
 import threading
 from collections.abc import Iterator
+from typing import Any
 
 import pytest
 import serial
@@ -83,6 +84,23 @@ def redirector(far_end: FarEnd) -> Iterator[Redirector]:
     redirector = Redirector(far_end.path)
     yield redirector
     redirector.close()
+
+
+async def test_frames_to_a_server_go_out_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also those that follow one which is not acknowledged yet: Nagle's algorithm is off."""
+    made: list[socket.socket] = []
+    connect = socket.create_connection
+
+    def noted(*args: Any, **kwargs: Any) -> socket.socket:
+        made.append(connect(*args, **kwargs))
+        return made[-1]
+
+    monkeypatch.setattr(socket, "create_connection", noted)
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        backend = SerialBackend(f"socket://127.0.0.1:{server.getsockname()[1]}")
+        await backend.open()
+        assert made[0].getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY)
+        await backend.close()
 
 
 async def test_an_amplifier_behind_rfc2217(far_end: FarEnd, redirector: Redirector) -> None:

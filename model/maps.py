@@ -1,6 +1,7 @@
 """A map of the plate: peak acceleration on a regular raster, for any drive."""
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -8,6 +9,7 @@ from model.arrays import FloatArray, lattice
 from model.assembly import assemble
 from model.errors import InputError
 from model.excitation import Excitation
+from model.free_plate import FreePlate
 from model.harmonic import direct_acceleration
 from model.rig import Rig
 from model.vibration import find_nulls, peak_acceleration, tone_amplitudes
@@ -30,12 +32,17 @@ class PlateMap:
 
 
 def plate_map(
-    rig: Rig, excitation: Excitation, *, raster: tuple[int, int] | None = None
+    rig: Rig,
+    excitation: Excitation,
+    *,
+    raster: tuple[int, int] | None = None,
+    free: FreePlate | None = None,
 ) -> PlateMap:
     """Solve the rig's plate for an excitation; the raster defaults to that of the mesh.
 
-    Raises InputError for a raster below 2x2 or of millions of points, or a frequency that the mesh
-    cannot carry.
+    free: the same plate where it has been solved before, in place of a direct solve. Raises
+    InputError for a raster below 2x2 or of millions of points, or a frequency that the mesh cannot
+    carry.
     """
     mesh = rig.mesh
     columns, rows = raster or mesh.raster
@@ -48,11 +55,9 @@ def plate_map(
     x = np.linspace(0, rig.plate.length, columns)
     y = np.linspace(0, rig.plate.width, rows)
     points = lattice(x, y)
-    matrices = assemble(rig.plate, mesh)
+    respond = free.acceleration if free else partial(direct_acceleration, assemble(rig.plate, mesh))
     _, amplitudes = tone_amplitudes(
-        excitation,
-        rig.eras,
-        lambda f: direct_acceleration(matrices, rig.eras, f, points, loads=rig.loads),
+        excitation, rig.eras, lambda f: respond(rig.eras, f, points, loads=rig.loads)
     )
     peak = peak_acceleration(amplitudes).reshape(rows, columns)
     return PlateMap(x, y, peak, find_nulls(x, y, peak))

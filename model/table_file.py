@@ -95,7 +95,7 @@ class _Header(BaseModel):
     grid: dict[str, int]
 
 
-def save_table(table: LocalizationTable, path: Path) -> None:
+def save_table(table: LocalizationTable, path: Path | str) -> None:
     """Write a table so that the file is either the old one or the whole new one, never between.
 
     Raises OSError where the folder cannot be written.
@@ -119,15 +119,16 @@ def save_table(table: LocalizationTable, path: Path) -> None:
     }
     header["sha256"] = _digest(header, arrays)
     encoded = np.frombuffer(json.dumps(header).encode(), dtype=np.uint8)
-    write_arrays(path, {"header": encoded, **arrays})
+    write_arrays(Path(path), {"header": encoded, **arrays})
 
 
-def load_table(path: Path, *, fingerprint: str | None = None) -> LocalizationTable:
+def load_table(path: Path | str, *, fingerprint: str | None = None) -> LocalizationTable:
     """Read a table, whole or not at all.
 
     fingerprint: of the rig that the table shall serve; a table of another plate is refused. Raises
     InputError for a missing, damaged or foreign file.
     """
+    path = Path(path)
     rebuild = f"build it again: era table build RIG -o {path}"
     try:
         content = read_arrays(path, _DTYPES, max_bytes=MAX_BYTES)

@@ -1,0 +1,127 @@
+"""Localized vibration from a notebook: `import era_haptics as era`.
+
+A rig, its plate solved, maps of it, its localization table, patterns for fingers, what these feel
+in time, pictures of all that; amplifiers and the daemon of a running panel. Places are metres from
+the corner SW, x along the plate's length, y along its width; everything else is SI, or says its
+unit in its name. What cannot be used raises InputError, a ValueError, in words for its reader.
+
+These names are the stable ones; the packages behind them (`model`, `sim`, `drivers`, `controller`)
+change without notice. A name is loaded when it is first used, so that a client of the daemon does
+not wait for the plate's linear algebra.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from controller.api.async_client import AsyncClient
+    from controller.api.client import Client
+    from controller.api.jsonrpc import RpcError
+    from controller.api.replies import Notification, Unreachable
+    from drivers.blocking import BlockingAmplifier
+    from drivers.command import DriveCommand
+    from drivers.errors import CommandRefused, DriverError, LinkError
+    from drivers.guard import GuardLimits
+    from era_haptics.amplifiers import commands_for, open_amplifier
+    from era_haptics.drive import Drive
+    from era_haptics.pictures import draw_map, draw_pattern, draw_playback
+    from era_haptics.solved_plate import SolvedPlate
+    from era_haptics.tables import query, table
+    from model.errors import InputError
+    from model.excitation import Tone
+    from model.finger_load import FingerLoad
+    from model.localization import Grid
+    from model.maps import PlateMap
+    from model.pattern import Pattern
+    from model.rig import Rig
+    from model.rig_file import load_rig
+    from model.supported_modes import SupportedModes
+    from model.table import LocalizationTable
+    from model.table_file import load_table, save_table
+    from sim.plant.playback import Playback
+
+_HOMES = {
+    "AsyncClient": "controller.api.async_client",
+    "BlockingAmplifier": "drivers.blocking",
+    "Client": "controller.api.client",
+    "CommandRefused": "drivers.errors",
+    "Drive": "era_haptics.drive",
+    "DriveCommand": "drivers.command",
+    "DriverError": "drivers.errors",
+    "FingerLoad": "model.finger_load",
+    "Grid": "model.localization",
+    "GuardLimits": "drivers.guard",
+    "InputError": "model.errors",
+    "LinkError": "drivers.errors",
+    "LocalizationTable": "model.table",
+    "Notification": "controller.api.replies",
+    "Pattern": "model.pattern",
+    "PlateMap": "model.maps",
+    "Playback": "sim.plant.playback",
+    "Rig": "model.rig",
+    "RpcError": "controller.api.jsonrpc",
+    "SolvedPlate": "era_haptics.solved_plate",
+    "SupportedModes": "model.supported_modes",
+    "Tone": "model.excitation",
+    "Unreachable": "controller.api.replies",
+    "commands_for": "era_haptics.amplifiers",
+    "draw_map": "era_haptics.pictures",
+    "draw_pattern": "era_haptics.pictures",
+    "draw_playback": "era_haptics.pictures",
+    "load_rig": "model.rig_file",
+    "load_table": "model.table_file",
+    "open_amplifier": "era_haptics.amplifiers",
+    "query": "era_haptics.tables",
+    "save_table": "model.table_file",
+    "table": "era_haptics.tables",
+}
+
+__all__ = [
+    "AsyncClient",
+    "BlockingAmplifier",
+    "Client",
+    "CommandRefused",
+    "Drive",
+    "DriveCommand",
+    "DriverError",
+    "FingerLoad",
+    "Grid",
+    "GuardLimits",
+    "InputError",
+    "LinkError",
+    "LocalizationTable",
+    "Notification",
+    "Pattern",
+    "PlateMap",
+    "Playback",
+    "Rig",
+    "RpcError",
+    "SolvedPlate",
+    "SupportedModes",
+    "Tone",
+    "Unreachable",
+    "commands_for",
+    "draw_map",
+    "draw_pattern",
+    "draw_playback",
+    "load_rig",
+    "load_table",
+    "open_amplifier",
+    "query",
+    "save_table",
+    "table",
+]
+
+
+def __getattr__(name: str) -> Any:
+    """The thing behind a name, loaded when it is first used."""
+    if name not in _HOMES:
+        raise AttributeError(f"era_haptics has no {name!r}; it has {', '.join(__all__)}")
+    found = getattr(import_module(_HOMES[name]), name)
+    globals()[name] = found
+    return found
+
+
+def __dir__() -> list[str]:
+    """All names, loaded or not, for completion."""
+    return list(__all__)

@@ -1,0 +1,94 @@
+"""Pictures, each a matplotlib Figure of its own, without pyplot: shown by a notebook, or saved."""
+
+import numpy as np
+from matplotlib.cm import ScalarMappable
+from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullLocator
+from numpy.lib.stride_tricks import sliding_window_view
+
+from era_haptics.drive import Drives, excitation_of
+from era_haptics.places import Places, as_points
+from era_haptics.solved_plate import SolvedPlate
+from model.arrays import FloatArray
+from model.figures.drawing import map_figure
+from model.figures.fingertips import LEVEL_COLORS, LEVEL_SCALE, draw_fingertip, draw_levels
+from model.pattern import Pattern
+from model.table import LocalizationTable
+from sim.plant.finger import Record
+from sim.plant.playback import Playback
+
+
+def draw_map(plate: SolvedPlate, drive: Pattern | Drives, *, title: str = "") -> Figure:
+    """Peak acceleration over the plate in g (1 g = 9.8 m/s²), ERAs, and nulls as red crosses.
+
+    As `era plate map` draws it. Raises InputError for a drive that the rig cannot play.
+    """
+    active = excitation_of(drive, plate.rig).keys()
+    return map_figure(plate.rig, plate.map(drive), active=active, title=title)
+
+
+def draw_pattern(
+    table: LocalizationTable, pattern: Pattern, target: Places, *, quiet: Places = ()
+) -> Figure:
+    """How strongly a table's pattern is felt all over the plate [dB SL], and the fingers on it.
+
+    target, quiet: places [m], as they were asked for. Raises InputError for what are no places.
+    """
+    figure = Figure(figsize=(6.4, 4.6), layout="constrained")
+    axes = figure.subplots()
+    axes.set_axis_off()
+    draw_levels(axes, table, pattern.excitation)
+    for place in as_points(target, what="target"):
+        draw_fingertip(axes, place, felt=True, level_db_sl=pattern.level_db_sl)
+    for place in as_points(quiet, what="quiet"):
+        draw_fingertip(axes, place, felt=False)
+    if pattern.contrast_db is not None:
+        axes.set_title(f"contrast {pattern.contrast_db:.1f} dB predicted", fontsize=11, pad=20)
+    figure.colorbar(
+        ScalarMappable(LEVEL_SCALE, LEVEL_COLORS),
+        ax=axes,
+        label="level above detection threshold / dB SL",
+        extend="both",
+        shrink=0.8,
+    )
+    return figure
+
+
+def draw_playback(playback: Playback) -> Figure:
+    """How strongly each finger was shaken over time [m/s²], on a logarithmic scale.
+
+    The largest acceleration within a period of the lowest frequency: of a target the mean over its
+    fingertip, of a quiet finger its loudest point, as contrast is counted.
+    """
+    figure = Figure(figsize=(6.4, 3.8), layout="constrained")
+    axes = figure.subplots()
+    period = 1 / min(playback.frequencies)
+    for number, record in enumerate(playback.targets, start=1):
+        times, peaks = _peaks(record, period)
+        axes.plot(1000 * times, peaks.mean(axis=1), label=f"target {number}", lw=2)
+    for number, record in enumerate(playback.quiet, start=1):
+        times, peaks = _peaks(record, period)
+        axes.plot(1000 * times, peaks.max(axis=1), label=f"quiet {number}", lw=1.2)
+    axes.set_yscale("log")
+    axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    axes.yaxis.set_major_formatter("{x:g}")
+    axes.yaxis.set_minor_locator(NullLocator())
+    axes.set_xlabel("time / ms")
+    axes.set_ylabel("peak acceleration / m/s²")
+    axes.grid(True, which="both", alpha=0.2)
+    axes.legend(loc="lower right")
+    if playback.contrast_db is not None:
+        axes.set_title(
+            f"contrast {playback.contrast_db:.1f} dB steady, "
+            f"{playback.transient_contrast_db:.1f} dB over the first 100 ms",
+            fontsize=11,
+        )
+    return figure
+
+
+def _peaks(record: Record, period: float) -> tuple[FloatArray, FloatArray]:
+    """Times (n,) [s] and the largest acceleration (n, p) [m/s²] within the period before each."""
+    step = record.times[1] - record.times[0]
+    width = max(1, round(period / step))
+    windows = sliding_window_view(np.abs(record.accelerations), width, axis=0)
+    return record.times[width - 1 :], windows.max(axis=-1)

@@ -1,0 +1,102 @@
+"""The plate of a rig, solved once and asked many times: modes, maps, and in time."""
+
+from functools import cached_property
+
+import numpy as np
+
+from era_haptics.drive import Drives, excitation_of
+from era_haptics.places import Places, as_points
+from model.assembly import era_positions
+from model.errors import InputError
+from model.excitation import Excitation
+from model.finger_load import FingerLoad
+from model.free_plate import FreePlate, solve_free_plate
+from model.maps import PlateMap, plate_map
+from model.pattern import ONSET_RAMP, Pattern
+from model.point_load import load_positions
+from model.question import Question
+from model.reduction import ReducedPlate, reduce_free_plate
+from model.rig import Rig
+from model.supported_modes import SupportedModes, supported_modes
+from sim.plant.playback import Playback, play
+
+
+class SolvedPlate:
+    """A rig's plate on its ERAs, up to the highest frequency of the rig's limits.
+
+    It is solved when it is first asked something, in some tenths of a second, and never again.
+    """
+
+    def __init__(self, rig: Rig) -> None:
+        self.rig = rig
+
+    @cached_property
+    def modes(self) -> SupportedModes:
+        """Natural frequencies (n,) [Hz], damping ratios (n,), and shapes anywhere by `at`.
+
+        All up to the highest frequency of the rig's limits; those of `era plate modes`.
+        """
+        rig = self.rig
+        return supported_modes(
+            self._reduced, rig.eras, loads=rig.loads, frequency_max=rig.limits.frequency_max
+        )
+
+    def map(self, drive: Pattern | Drives, *, raster: tuple[int, int] | None = None) -> PlateMap:
+        """Peak acceleration [m/s²] all over the plate, steadily driven, and where its nulls are.
+
+        raster: how many points along x and y, by default what shows all that the mesh can carry.
+        ERAs at one frequency add as complex amplitudes, magnitudes of several frequencies add
+        (paper Eq. 28). Raises InputError for a drive that the rig cannot play. The map of
+        `era plate map`, which is solved directly, within some 1e-5 of it.
+        """
+        return plate_map(self.rig, self._excitation(drive), raster=raster, free=self._free)
+
+    def play(
+        self,
+        drive: Pattern | Drives,
+        target: Places,
+        *,
+        quiet: Places = (),
+        duration: float = 1.0,
+        finger_load: FingerLoad | None = None,
+    ) -> Playback:
+        """What fingers at these places [m] feel while it plays for a duration [s], from rest on.
+
+        A pattern starts along its envelopes or its ramp, anything else along a ramp of 40 ms.
+        finger_load: what each finger does to the plate, None for fingers that only feel. The plate
+        in time is solved exactly, without steps (`docs/plant.md`). Raises InputError for fingers
+        off the plate, and a duration in which nothing becomes steady.
+        """
+        fingers = Question(as_points(target, what="target"), as_points(quiet, what="quiet"))
+        return play(
+            self.rig,
+            self._reduced,
+            self._excitation(drive),
+            fingers,
+            duration=duration,
+            ramp=drive.ramp if isinstance(drive, Pattern) else ONSET_RAMP,
+            onset=drive.onset if isinstance(drive, Pattern) else None,
+            finger_load=finger_load,
+        )
+
+    def _excitation(self, drive: Pattern | Drives) -> Excitation:
+        """The drive as physics; refuses what is beyond that for which the plate is solved."""
+        excitation, highest = excitation_of(drive, self.rig), self.rig.limits.frequency_max
+        for name, tone in excitation.items():
+            if tone.frequency > highest:
+                raise InputError(
+                    f"{name} is driven at {tone.frequency:g} Hz, but the rig's limits end at "
+                    f"{highest:g} Hz, and the plate is solved no further; raise limits.frequency "
+                    "in the rig"
+                )
+        return excitation
+
+    @cached_property
+    def _free(self) -> FreePlate:
+        rig = self.rig
+        return solve_free_plate(rig.plate, rig.mesh, frequency_max=rig.limits.frequency_max)
+
+    @cached_property
+    def _reduced(self) -> ReducedPlate:
+        attached = np.vstack([era_positions(self.rig.eras), load_positions(self.rig.loads)])
+        return reduce_free_plate(self._free, attached)

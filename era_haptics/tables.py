@@ -1,0 +1,72 @@
+"""The localization table, and what it answers."""
+
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from era_haptics.places import Places, as_points
+from model.localization import Grid
+from model.pattern import Pattern
+from model.perception import STRONG_DB_SL
+from model.question import Question
+from model.rig import Rig
+from model.robust import with_robust_contrast
+from model.table import PAPER_FREQUENCIES, PAPER_GRID, LocalizationTable
+from model.table_cache import cached_table
+from model.timing import Timing
+
+
+def table(
+    rig: Rig,
+    *,
+    mode: str = "switched",
+    frequencies: ArrayLike = PAPER_FREQUENCIES,
+    grid: Grid = PAPER_GRID,
+) -> LocalizationTable:
+    """The rig's localization table, from the user's cache, or built in a second or two and kept.
+
+    mode: what it answers in unless asked otherwise, `switched`, `graded`, `signed` or `phased`;
+    frequencies (f,) [Hz], ascending, within the rig's limits; grid: target cells. It is what
+    `era table build` writes; `load_table` and `save_table` are for such files. Raises InputError.
+    """
+    wanted = np.asarray(frequencies, dtype=float)
+    found, _ = cached_table(rig, frequencies=wanted, grid=grid, mode=mode)
+    return found
+
+
+def query(
+    table: LocalizationTable,
+    target: Places,
+    *,
+    quiet: Places = (),
+    level_db_sl: float = STRONG_DB_SL,
+    mode: str | None = None,
+    envelopes: bool = False,
+) -> Pattern:
+    """The best pattern for fingers at these places [m], with all that is predicted of it.
+
+    target: who shall feel it, quiet: who must not, each one place or several; level_db_sl: how
+    strongly, 20 dB above the detection threshold is strong; mode: the table's own if None;
+    envelopes: for amplifiers that play shaped onsets and endings. Raises InputError for places off
+    the plate or on top of each other, and a level that cannot be reached. The same as
+    `era table query`; `table.answer` is the quicker one, which predicts less.
+    """
+    question = Question(
+        as_points(target, what="target"),
+        as_points(quiet, what="quiet"),
+        level_db_sl=level_db_sl,
+        mode=mode,
+        envelopes=envelopes,
+    )
+    timing = _timing(table)
+    pattern = table.ask(question)
+    if envelopes:
+        pattern = timing.with_envelopes(question, pattern)
+    pattern = timing.with_transient_measures(question, pattern)
+    return with_robust_contrast(table, question, pattern)
+
+
+@lru_cache(maxsize=2)  # a notebook asks one table after the other, many times each
+def _timing(table: LocalizationTable) -> Timing:
+    return Timing(table)

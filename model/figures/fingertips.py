@@ -1,0 +1,76 @@
+"""How strongly a plate would be felt all over, and the fingertips on it."""
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import Normalize
+from matplotlib.patches import Circle
+from matplotlib.patheffects import withStroke
+
+from model.arrays import lattice
+from model.excitation import Excitation
+from model.figures.drawing import draw_eras
+from model.fingertip import FINGERTIP_RADIUS
+from model.perception import sensation_level
+from model.question import Point
+from model.table import LocalizationTable
+
+LEVEL_COLORS = "magma"
+LEVEL_SCALE = Normalize(-10.0, 30.0)
+"""From what hardly anybody feels to more than strong [dB SL]."""
+
+FELT_COLOR, QUIET_COLOR = "#6dff9c", "#9fdcff"
+
+_SIDE = 121  # points along a side; nulls are narrow
+
+
+def draw_levels(axes: Axes, table: LocalizationTable, excitation: Excitation) -> None:
+    """Draw the level above threshold [dB SL] over the plate, and the ERAs; axes in centimetres."""
+    x, y = (np.linspace(0, side, _SIDE) for side in (table.plate.length, table.plate.width))
+    level = sensation_level(*table.amplitudes(excitation, lattice(x, y))).reshape(_SIDE, _SIDE)
+    axes.pcolormesh(100 * x, 100 * y, level, cmap=LEVEL_COLORS, shading="gouraud", norm=LEVEL_SCALE)
+    axes.set_aspect("equal")
+    draw_eras(axes, table.eras, active=excitation.keys())
+    for era in table.eras:
+        if tone := excitation.get(era.name):
+            axes.annotate(
+                f"{era.name} {tone.frequency:g} Hz",
+                (100 * era.x, 100 * era.y),
+                xytext=(0, 9 if era.y > table.plate.width / 2 else -16),
+                textcoords="offset points",
+                ha="left" if era.x < table.plate.length / 2 else "right",
+                fontsize=9,
+            )
+
+
+def draw_fingertip(
+    axes: Axes, place: Point, *, felt: bool, level_db_sl: float | None = None
+) -> None:
+    """Draw a fingertip at x, y [m], whether it shall feel it, and what it feels [dB SL]."""
+    x, y = 100 * place[0], 100 * place[1]
+    outline = [withStroke(linewidth=2.5, foreground="black", alpha=0.75)]
+    color = FELT_COLOR if felt else QUIET_COLOR
+    axes.add_patch(
+        Circle(
+            (x, y),
+            100 * FINGERTIP_RADIUS,
+            fill=False,
+            color=color,
+            lw=2.4 if felt else 1.6,
+            path_effects=outline,
+        )
+    )
+    text = "felt" if felt else "quiet"
+    if level_db_sl is not None:
+        text += f"\n{round(level_db_sl)} dB SL"
+    axes.annotate(
+        text,
+        (x, y),
+        xytext=(0, -25 if y > 5 else 25),
+        textcoords="offset points",
+        ha="center",
+        va="center",
+        fontsize=8.5,
+        color=color,
+        fontweight="bold" if felt else "normal",
+        path_effects=outline,
+    )

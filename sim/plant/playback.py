@@ -1,0 +1,151 @@
+"""An excitation played straight on the plate in time, and what each fingertip felt of it.
+
+No wire and no amplifier stand between, as they do on the bench: from rest on the bases move exactly
+as they are told, along shaped onsets or a ramp.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from model.arrays import FloatArray
+from model.envelope import Envelopes, ramped_onset, shaped
+from model.errors import InputError
+from model.excitation import Excitation
+from model.finger_load import FingerLoad
+from model.fingertip import fingertip_points
+from model.localization import contrast_db, mean_level_db_sl
+from model.pattern import ONSET_RAMP
+from model.perception import sensation_level
+from model.question import Question
+from model.reduction import ReducedPlate
+from model.rig import Rig
+from model.transient import FIRST
+from model.vibration import base_amplitudes, peak_acceleration
+from sim.plant.felt import Felt, feel
+from sim.plant.finger import Record
+from sim.plant.plant import Plant
+
+SAMPLE_RATE = 10_000.0  # Hz; the peak of 500 Hz is then seen to 1.3 %
+
+STEADY = 0.25
+"""The last part [s] of what was played, in which steady amplitudes are read.
+
+A quarter of a second tells frequencies 10 Hz apart from each other.
+"""
+
+LONGEST = 10.0
+"""More [s] than any mode of a plate rings; ten fingers fill 150 megabytes by then."""
+
+
+@dataclass(frozen=True, eq=False)
+class Playback:
+    """What fingertips went through while an excitation played, from rest at time 0 on.
+
+    frequencies (f,) [Hz]: what was driven; targets, quiet: the record of each finger; settled [s]:
+    from when on the bases moved steadily. Measures are defined and named as those of a `Pattern`;
+    those of the steady vibration are read in the last STEADY seconds, and are true where the plate
+    does not ring any more by then, which takes it from 50 ms to a second.
+    """
+
+    frequencies: tuple[float, ...]
+    targets: tuple[Record, ...]
+    quiet: tuple[Record, ...]
+    settled: float
+
+    @property
+    def level_db_sl(self) -> float:
+        """Steady level at the target [dB SL], mean over its fingertip; of several the least."""
+        return min(mean_level_db_sl(*_tones(felt)) for felt in self._felt[: len(self.targets)])
+
+    @property
+    def quiet_level_db_sl(self) -> float | None:
+        """Steady level at the loudest quiet point [dB SL]; None where a finger is alone."""
+        loudest = [sensation_level(*_tones(felt)).max() for felt in self._felt[len(self.targets) :]]
+        return float(max(loudest)) if loudest else None
+
+    @property
+    def contrast_db(self) -> float | None:
+        """Steady contrast [dB], the target's mean to the loudest quiet point; None if alone."""
+        peaks = [peak_acceleration(felt.amplitude) for felt in self._felt]
+        return self._contrast(peaks)
+
+    @property
+    def transient_contrast_db(self) -> float | None:
+        """Contrast [dB] of the peaks over the first 100 ms; None where a finger is alone."""
+        first = [
+            np.abs(record.accelerations[record.times <= FIRST]).max(axis=0)
+            for record in (*self.targets, *self.quiet)
+        ]
+        return self._contrast(first)
+
+    def _contrast(self, peaks: list[FloatArray]) -> float | None:
+        count = len(self.targets)
+        if len(peaks) == count:
+            return None
+        loudest = np.concatenate(peaks[count:])
+        return min(float(contrast_db(peak, loudest)) for peak in peaks[:count])
+
+    @cached_property
+    def _felt(self) -> tuple[Felt, ...]:
+        """What each finger felt steadily, targets first."""
+        return tuple(
+            feel(self._last(record), self.frequencies) for record in (*self.targets, *self.quiet)
+        )
+
+    def _last(self, record: Record) -> Record:
+        since = max(self.settled, record.times[-1] - STEADY)
+        inside = record.times >= since
+        return Record(record.points, record.times[inside], record.accelerations[inside])
+
+
+def play(
+    rig: Rig,
+    reduced: ReducedPlate,
+    excitation: Excitation,
+    fingers: Question,
+    *,
+    duration: float,
+    ramp: float = ONSET_RAMP,
+    onset: Envelopes | None = None,
+    finger_load: FingerLoad | None = None,
+) -> Playback:
+    """Let an excitation play for a while [s] on a plate that is at rest, under these fingers.
+
+    reduced: the rig's plate for forces at its ERAs and loads; fingers: targets and quiet ones;
+    ramp [s], or onset in its place: how it starts; finger_load: what each finger does to the plate,
+    None for fingers that only feel. Raises InputError for fingers off the plate, for an excitation
+    that the rig cannot play, and for a time in which nothing becomes steady or that is too long.
+    """
+    fingers.check_on(rig.plate)
+    frequencies, _ = base_amplitudes(excitation, rig.eras)
+    settled = max(envelope.duration for envelope in onset.values()) if onset else ramp
+    if not settled < duration <= LONGEST:  # not true of NaN either
+        raise InputError(
+            f"nothing can be played for {duration:g} s: the onset takes {settled:g} s, and "
+            f"{LONGEST:g} s are the longest; one second shows most plates settled"
+        )
+    plant = Plant(reduced, rig.eras, loads=rig.loads)
+    contacts = (*fingers.targets, *fingers.quiet)
+    if finger_load is not None:
+        plant.set_contacts([finger_load.at(*at) for at in contacts])
+    bases = shaped(onset, rig.eras) if onset else ramped_onset(excitation, rig.eras, ramp=ramp)
+    for number, terms in enumerate(bases):
+        plant.set_input(number, terms)
+    discs = [fingertip_points(*at, rig.plate) for at in contacts]
+    times, felt = plant.advance(
+        duration, sample_rate=SAMPLE_RATE, shapes=plant.reduced.at(np.concatenate(discs))
+    )
+    ends = np.cumsum([len(disc) for disc in discs])[:-1]
+    records = tuple(
+        Record(disc, times, part)
+        for disc, part in zip(discs, np.split(felt, ends, axis=1), strict=True)
+    )
+    count = len(fingers.targets)
+    return Playback(tuple(frequencies.tolist()), records[:count], records[count:], settled)
+
+
+def _tones(felt: Felt) -> tuple[FloatArray, FloatArray]:
+    """Frequencies (f,) [Hz] and steady amplitudes (f, p) [m/s²]."""
+    return np.array(felt.frequencies), felt.amplitude

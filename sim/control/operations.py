@@ -52,8 +52,9 @@ from sim.control.values import finger_of, is_number, number_of, place_of, window
 from sim.faults.file import episode_of
 from sim.plant.felt import feel
 from sim.plant.finger import Position, Record
-from sim.sensors.accelerometer import Accelerometer, Recording
+from sim.sensors.accelerometer import Accelerometer
 from sim.sensors.recorder import Recorder
+from sim.sensors.recording import Recording
 from sim.sensors.signal_measures import tone_phasors
 
 VERSION = 2

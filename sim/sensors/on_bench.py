@@ -9,7 +9,8 @@ from model.arrays import FloatArray
 from model.errors import InputError
 from sim.bench.bench import Bench
 from sim.plant.finger import KEPT
-from sim.sensors.accelerometer import Accelerometer, Recording, positions, read_sensors
+from sim.sensors.accelerometer import Accelerometer, positions, read_sensors
+from sim.sensors.recording import Recording
 
 SENSORS_MAX = 64  # ten seconds of them take 50 MB
 

@@ -14,7 +14,8 @@ import numpy as np
 from model.arrays import FloatArray
 from model.errors import InputError
 from sim.bench.bench import Bench
-from sim.sensors.accelerometer import Accelerometer, Recording, positions, read_sensors
+from sim.sensors.accelerometer import Accelerometer, positions, read_sensors
+from sim.sensors.recording import Recording
 from sim.sensors.recording_file import check_recordable, values_max, write_recording
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
-from sim.sensors.accelerometer import Recording
+from sim.sensors.recording import Recording
 
 TRANSIENT = 0.1  # s from the onset; what decides what is felt of a short effect
 

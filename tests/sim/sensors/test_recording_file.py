@@ -7,8 +7,9 @@ import pytest
 from scipy.io import wavfile
 
 from model.errors import InputError
-from sim.sensors.accelerometer import Recording
-from sim.sensors.recording_file import read_recording, sidecar, write_recording
+from sim.sensors.formats.wav_file import sidecar
+from sim.sensors.recording import Recording
+from sim.sensors.recording_file import read_recording, write_recording
 
 
 @pytest.fixture

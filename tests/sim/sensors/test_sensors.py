@@ -7,7 +7,8 @@ import pytest
 
 from model.errors import InputError
 from model.rig import Rig
-from sim.sensors.accelerometer import Accelerometer, Recording, read_sensors, scanning_grid
+from sim.sensors.accelerometer import Accelerometer, read_sensors, scanning_grid
+from sim.sensors.recording import Recording
 from sim.sensors.signal_measures import (
     reverberation_time,
     spectrum,

@@ -12,7 +12,8 @@ from model.reduction import ReducedPlate, reduce_plate
 from model.rig import Rig
 from model.time_response import plate_in_time
 from sim.plant.plant import Plant
-from sim.sensors.accelerometer import Accelerometer, Recording, positions, read_sensors
+from sim.sensors.accelerometer import Accelerometer, positions, read_sensors
+from sim.sensors.recording import Recording
 from sim.sensors.signal_measures import (
     reverberation_time,
     steady_contrast_db,

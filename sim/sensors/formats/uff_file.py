@@ -1,0 +1,89 @@
+"""Recordings as universal files (UFF 58), for modal software.
+
+One record a sensor, 12 digits; start and sampling interval have six.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from model.errors import InputError
+from model.uff import (
+    ACCELERATION,
+    TIME,
+    TIME_RESPONSE,
+    Function,
+    Universal,
+    read_universal,
+    write_universal,
+)
+from sim.sensors.formats.format import Format, rounded
+from sim.sensors.recording import Recording
+
+_UP = 3
+_LONGEST_NAME = 10
+
+
+def _write(path: Path, recording: Recording) -> None:
+    nodes = {n: (x, y, 0.0) for n, (x, y) in enumerate(recording.points.tolist(), start=1)}
+    functions = [
+        Function(
+            str(path),
+            TIME_RESPONSE,
+            number,
+            0,
+            (name, ""),
+            (_UP, 0),
+            recording.times,
+            recording.samples[:, number - 1],
+            (TIME, ACCELERATION, 0),
+            ("m/s^2", ""),
+        )
+        for number, name in enumerate(recording.names, start=1)
+    ]
+    write_universal(path, Universal(nodes, functions))
+
+
+def _read(path: Path) -> Recording:
+    content = read_universal(path)
+    records = [f for f in content.functions if f.function_type == TIME_RESPONSE]
+    if not records:
+        raise InputError(f"{path}: holds no signals (dataset 58, function type 1)")
+    first = records[0]
+    for record in records:
+        if record.kinds[0] != TIME or record.kinds[1] != ACCELERATION:
+            raise InputError(f"{record.place}: the record is no acceleration over time")
+        if record.units[0].replace(" ", "") not in ("m/s^2", "m/s2", "m/s²"):
+            raise InputError(
+                f"{record.place}: the record is in {record.units[0] or 'no unit'!r}, not in m/s²"
+            )
+        if len(record.x) < 2 or not np.array_equal(record.x, first.x):
+            raise InputError(
+                f"{record.place}: the record's times are not those of the first; only sensors that "
+                "were recorded together can be read"
+            )
+        if record.response not in content.nodes:
+            raise InputError(f"{record.place}: node {record.response} has no place (dataset 2411)")
+    rate = (len(first.x) - 1) / (first.x[-1] - first.x[0])
+    return Recording(
+        tuple(record.names[0] or f"node {record.response}" for record in records),
+        np.array([content.nodes[record.response][:2] for record in records]),
+        rounded(float(rate), 6),
+        float(first.x[0]),
+        np.column_stack([record.data for record in records]),
+    )
+
+
+def _cannot_hold(names: Sequence[str], sample_rate: float) -> str | None:
+    long = [name for name in names if len(name) > _LONGEST_NAME]
+    return f"a UFF keeps {_LONGEST_NAME} characters of a name; {long[0]!r}" if long else None
+
+
+UFF = Format(
+    _write,
+    _read,
+    start=b"    -1",
+    values_max=1 << 22,  # as text in memory, 20 bytes a value
+    cannot_hold=_cannot_hold,
+)

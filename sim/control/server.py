@@ -8,14 +8,15 @@ import contextlib
 import json
 import os
 import socket
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
 
 from drivers import clock
 from drivers.errors import LinkError
-from sim.control.operations import Wait, carry_out
+from sim.control.answers import Answer, Wait
+from sim.control.operations import carry_out
 from sim.control.site import Site
 
 LINE_MAX = 64 * 1024  # bytes; thirty fingers take a tenth of it
@@ -74,7 +75,7 @@ async def _converse(site: Site, connection: socket.socket) -> None:
                 return
 
 
-def _encode_made(make_answer: Callable[[], dict[str, Any]]) -> bytes:
+def _encode_made(make_answer: Answer) -> bytes:
     return _encode(make_answer())
 
 

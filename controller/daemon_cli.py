@@ -251,6 +251,8 @@ def _shown(told: "StatusResult") -> str:
         )
     if told.silent_because is not None and told.contacts:
         lines.append(f"  silent: {told.silent_because}")
+    if told.plain_because is not None:
+        lines.append(f"  plain ramps: {told.plain_because}")
     for era, tone in told.drive.items():
         lines.append(
             f"  ERA {era}: {tone.frequency_hz:g} Hz, level {tone.level:.3f}, {tone.phase_deg:g} deg"

@@ -9,7 +9,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 from controller.contacts import Change, Contact, ContactTracker
-from controller.envelopes import ENVELOPE_TIME, PLAIN
+from controller.envelopes import ENVELOPE_TIME, PLAIN, Shaping
+from controller.loadings import LoadingTimes
 from controller.means import Means
 from controller.orders import FADE_RAMP, Order, OrderMaker, PatternTiming
 from controller.selection import PatternTable, Selection, Selector
@@ -23,9 +24,6 @@ from model.rig import Rig
 # With nobody on the plate the end may be short, so that zero is reached within 20 ms of the lift.
 RELEASE_RAMP = 0.010
 
-# One slow answer is a hiccup; three in a row are how this wire is.
-_SLOW_LOADINGS = 3
-
 _logger = logging.getLogger(__name__)
 
 
@@ -34,9 +32,8 @@ class Decision:
     """What is to be done now.
 
     changes: of the contacts, since the last decision; is_new: whether the selection is another;
-    order: what the amplifiers shall do, None if what plays stays; problem: why the selected pattern
-    was not let through; from_rest: whether nothing played before; since: when [s] the news came
-    that led to this.
+    order: what the amplifiers shall do, None if what plays stays; from_rest: whether nothing played
+    before; since: when [s] the news came that led to this.
     """
 
     contacts: tuple[Contact, ...]
@@ -44,7 +41,6 @@ class Decision:
     selection: Selection
     is_new: bool
     order: Order | None
-    problem: str | None
     from_rest: bool
     since: float
 
@@ -72,8 +68,7 @@ class Decider:
         self._table = table
         self._timing = timing
         self._means = means
-        self._envelope_time = envelope_time
-        self._slow_loadings = 0
+        self._loadings = LoadingTimes(envelope_time)
         self._tracker = ContactTracker(rig.plate)
         self._selector = Selector(table, wishes, means)
         self._orders = OrderMaker(rig, guards, timing=timing)
@@ -83,6 +78,7 @@ class Decider:
         self._ordered: Order | None = None
         self._brake_due: float | None = None  # when endings fit what plays
         self._has_brakes = False
+        self._again_at: float | None = None  # when a guard lets through what it refused
         self._changes: list[Change] = []
         self._since: float | None = None
 
@@ -119,9 +115,13 @@ class Decider:
     def due(self) -> float | None:
         """When [s] a decision is due, news or not.
 
-        A source is overdue then, a wish runs out, or what plays has settled and gets its brakes.
+        A source is overdue then, a wish runs out, what plays has settled and gets its brakes, or a
+        guard lets through what it refused.
         """
-        moments = (self._tracker.next_expiry, self._selector.until, self._brake_due)
+        moments = (
+            *(self._tracker.next_expiry, self._selector.until),
+            *(self._brake_due, self._again_at),
+        )
         return min((moment for moment in moments if moment is not None), default=None)
 
     @property
@@ -153,6 +153,7 @@ class Decider:
         self._playing = {}
         self._brake_due = None
         self._has_brakes = False
+        self._again_at = None
 
     def confirm(self, drive: Mapping[str, DriveCommand], *, now: float) -> None:
         """This is what the amplifiers made of the last order, by ERA, silent ones left out."""
@@ -162,37 +163,34 @@ class Decider:
             return
         if ordered.is_brake:
             self._has_brakes = True
-        elif self._means.shaping.endings and self._timing is not None:
+        elif self._shaping(now).endings and self._timing is not None:
             self._brake_due = now + ordered.settled_after
 
-    def loaded_in(self, duration: float) -> None:
-        """Loading the envelopes took so long [s]; where that is too long, there are no more."""
-        self._slow_loadings = self._slow_loadings + 1 if duration > self._envelope_time else 0
-        if self._slow_loadings == _SLOW_LOADINGS and self._means.shaping:
-            _logger.warning(
-                "loading envelopes takes %.0f ms, and touches may wait for %.0f ms: from now on "
-                "there are plain ramps; use a faster wire",
-                1000 * duration,
-                1000 * self._envelope_time,
-            )
-            self._means = replace(self._means, shaping=PLAIN)
-            self._selector.means = self._means
+    def loaded_in(self, duration: float, *, now: float) -> None:
+        """Loading the envelopes took so long [s]; where that is too long, ramps serve for now."""
+        self._loadings.took(duration, now=now)
+
+    def plain_because(self, now: float) -> str | None:
+        """Why touches begin along plain ramps though the amplifiers play envelopes."""
+        return self._loadings.problem(now) if self._means.shaping else None
 
     def decide(self, now: float) -> Decision:
         """Decide at a time [s]."""
         self.expire(now)
         contacts = self._tracker.contacts
         order: Order | None = None
-        problem = None
+        shaping = self._shaping(now)
+        if shaping != self._selector.means.shaping:
+            self._selector.means = replace(self._means, shaping=shaping)
         is_calm = True
         try:
             selection = self._selector.select(contacts, now)
-            is_new = selection != self._decided
+            is_new = selection != self._decided or self._is_due_again(now)
             if is_new and selection.pattern is not None and selection.question is not None:
-                order, problem = self._orders.play(
+                order = self._orders.play(
                     selection.pattern,
                     selection.question,
-                    is_shaped=self._means.shaping.onsets,
+                    is_shaped=shaping.onsets,
                     playing=self._playing,
                 )
             elif not is_new and self._brake_due is not None and now >= self._brake_due:
@@ -212,6 +210,8 @@ class Decider:
             self._playing = {}  # until the amplifiers have confirmed
             self._brake_due = None
             self._has_brakes = False
+        if is_new:
+            self._again_at = order.again_at if order is not None else None
         self._decided = selection
         decision = Decision(
             contacts=contacts,
@@ -219,7 +219,6 @@ class Decider:
             selection=selection,
             is_new=is_new,
             order=order,
-            problem=problem,
             from_rest=from_rest,
             since=now if self._since is None else min(self._since, now),
         )
@@ -229,6 +228,14 @@ class Decider:
     def silence(self, *, ramp: float) -> Order:
         """The order that brings every wired channel to zero along a ramp [s]; never fails."""
         return self._orders.silence(ramp=ramp)
+
+    def _shaping(self, now: float) -> Shaping:
+        """Which envelopes are played at a time [s]."""
+        return PLAIN if self._loadings.problem(now) else self._means.shaping
+
+    def _is_due_again(self, now: float) -> bool:
+        """Whether a guard lets through by now [s] what it refused."""
+        return self._again_at is not None and now >= self._again_at
 
     def _brake(self, selection: Selection) -> Order | None:
         """The order that gives what plays its brakes, now that it has settled."""

@@ -98,6 +98,11 @@ class Controller:
         return self._decider.means
 
     @property
+    def plain_because(self) -> str | None:
+        """Why touches begin along plain ramps just now though the amplifiers play envelopes."""
+        return self._decider.plain_because(self._clock()) if self._opened_decider else None
+
+    @property
     def rejected_touches(self) -> Mapping[str, int]:
         """How many touches could not be contacts, by the reason."""
         return self._tally.counts
@@ -260,10 +265,11 @@ class Controller:
             drive = drive_of_eras(commands, self._rig)
             self._decider.confirm(drive, now=self._clock())
             if any(order.envelopes.values()):
-                self._decider.loaded_in(self._group.loading_time)
+                self._decider.loaded_in(self._group.loading_time, now=self._clock())
             latency = self._group.last_sent - decision.since
-        if decision.problem is not None:
-            self._tell(self._observer.refused, decision.problem)
+        problem = order.problem if order is not None else None
+        if problem is not None:
+            self._tell(self._observer.refused, problem)
         if order is not None and order.is_brake:
             return
         selection = decision.selection
@@ -271,7 +277,7 @@ class Controller:
             silenced = Silenced(
                 contacts=decision.contacts,
                 selection=selection,
-                reason=decision.problem or selection.reason or "",
+                reason=problem or selection.reason or "",
                 latency=latency,
                 time=self._clock(),
             )

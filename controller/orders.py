@@ -40,13 +40,17 @@ class Order:
     """A command set for every amplifier, by its name, and the envelopes to be loaded before it.
 
     pattern: what is played by it, with the ramp and the onset that really are, or None; is_brake:
-    whether it only gives endings to what plays already.
+    whether it only gives endings to what plays already. problem: why a guard refused a pattern, so
+    that it is silence instead; again_at: when [s] that pattern may be asked for again, None for
+    never.
     """
 
     commands: Mapping[str, SafeCommand]
     envelopes: Mapping[str, tuple[SafeEnvelope, ...]] = field(default_factory=dict)
     pattern: Pattern | None = None
     is_brake: bool = False
+    problem: str | None = None
+    again_at: float | None = None
 
     @property
     def is_silence(self) -> bool:
@@ -84,8 +88,8 @@ class OrderMaker:
         *,
         is_shaped: bool,
         playing: Mapping[str, DriveCommand],
-    ) -> tuple[Order, str | None]:
-        """The order of a pattern, or silence everywhere and why, if a guard refuses any of it.
+    ) -> Order:
+        """The order of a pattern, or silence everywhere if a guard refuses any of it.
 
         is_shaped: whether to find onsets for it; where a guard refuses these, ramps take their
         place. playing: what ERAs play now; what runs on needs no onset.
@@ -93,7 +97,7 @@ class OrderMaker:
         if is_shaped and self._timing is not None and not goes_on(pattern.excitation, playing):
             shaped = self._timing.with_envelopes(question, pattern, onset=True, ending=False)
             try:
-                return self._shaped(shaped, playing), None
+                return self._shaped(shaped, playing)
             except CommandRefused as problem:
                 _logger.info("a plain ramp takes the place of envelopes: %s", problem)
         sets = route(
@@ -107,11 +111,11 @@ class OrderMaker:
             name: guard.check_or_silence(sets[name], ramp=FADE_RAMP)
             for name, guard in self._guards.items()
         }
-        reasons = [f"{name}: {reason}" for name, (_, reason) in checked.items() if reason]
-        if reasons:
-            return self.silence(ramp=FADE_RAMP), "; ".join(reasons)
+        refusals = {name: refusal for name, (_, refusal) in checked.items() if refusal}
+        if refusals:
+            return self._refused(refusals)
         commands = {name: safe for name, (safe, _) in checked.items()}
-        return Order(commands, pattern=_as_played(pattern, commands)), None
+        return Order(commands, pattern=_as_played(pattern, commands))
 
     def brake(
         self, pattern: Pattern, question: Question, *, playing: Mapping[str, DriveCommand]
@@ -160,6 +164,16 @@ class OrderMaker:
                 )
                 for name, guard in self._guards.items()
             }
+        )
+
+    def _refused(self, refusals: Mapping[str, CommandRefused]) -> Order:
+        """Silence, and why, by amplifier; where all that is wrong passes by itself, until when."""
+        moments = [refusal.until for refusal in refusals.values()]
+        known = [moment for moment in moments if moment is not None]
+        return replace(
+            self.silence(ramp=FADE_RAMP),
+            problem="; ".join(f"{name}: {refusal}" for name, refusal in refusals.items()),
+            again_at=max(known) if len(known) == len(moments) else None,
         )
 
     def _shaped(self, pattern: Pattern, playing: Mapping[str, DriveCommand]) -> Order:

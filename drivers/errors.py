@@ -30,12 +30,16 @@ class FrameError(DriverError):
 class CommandRefused(DriverError):
     """The guard or the amplifier refused a request; nothing of it was applied.
 
-    channel: the one to blame, where one is.
+    channel: the one to blame, where one is; until: when [s] the same may be asked for again, where
+    that is all that is wrong with it.
     """
 
-    def __init__(self, reason: str, *, channel: int | None = None) -> None:
+    def __init__(
+        self, reason: str, *, channel: int | None = None, until: float | None = None
+    ) -> None:
         super().__init__(reason)
         self.channel = channel
+        self.until = until
 
 
 class CommandError(DriverError, ValueError):

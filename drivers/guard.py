@@ -9,6 +9,7 @@ from typing import final
 
 from drivers.clock import now
 from drivers.command import CommandSet, DriveCommand, Envelope, Knot, token_after
+from drivers.errors import CommandRefused
 from drivers.guard_budget import Budget
 from drivers.guard_limits import (
     FREQUENCY_CEILING,
@@ -183,8 +184,8 @@ class Guard:
 
     def check_or_silence(
         self, command_set: CommandSet, *, ramp: float
-    ) -> tuple[SafeCommand, str | None]:
-        """The checked set and None, or silence along a ramp [s] and the reason.
+    ) -> tuple[SafeCommand, CommandRefused | None]:
+        """The checked set and None, or silence along a ramp [s] and why.
 
         For the control loop: whatever goes wrong in checking, and of whatever kind, the result can
         be sent and is silent.
@@ -192,7 +193,11 @@ class Guard:
         try:
             return self.check(command_set), None
         except Exception as problem:  # silence is right for every kind of failure
-            reason = f"{type(problem).__name__}: {problem}"
+            reason = (
+                problem
+                if isinstance(problem, CommandRefused)
+                else CommandRefused(f"{type(problem).__name__}: {problem}")
+            )
             token = getattr(command_set, "token", 0)
             return self.silence(token, range(self._bounds.channels), ramp=ramp), reason
 

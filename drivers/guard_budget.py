@@ -9,6 +9,7 @@ DUTY_WINDOW = 10.0
 """Over which the duty is counted [s]; short against the time in which an amplifier warms up."""
 
 _BURST = 1.0  # s; what was not used of the rate may be made up for within it
+_ROUNDING = 1e-6  # of a set; whoever waits for one must not be sent away at its moment
 
 
 class Budget:
@@ -30,10 +31,11 @@ class Budget:
         Raises CommandRefused where there is nothing left, or sets come too fast.
         """
         self._settle(now)
-        if self._sets < 1:
+        if self._sets < 1 - _ROUNDING:
             raise CommandRefused(
                 f"more than {self._rate:g} command sets a second; send fewer, for the limit is "
-                "there to stop a loop that runs wild"
+                "there to stop a loop that runs wild",
+                until=now + (1 - self._sets) / self._rate,
             )
         left = [self._on_time - (0.0 if self._since is None else now - self._since)]
         if self._duty_time is not None:

@@ -66,6 +66,9 @@ class StatusResult(Message):
     contacts: list[ContactStatus] = Field(description="in order of arrival, the newest last")
     drive: dict[str, Tone] = Field(description="by ERA, silent ones left out")
     silent_because: str | None = Field(None, description="why nothing is played though armed")
+    plain_because: str | None = Field(
+        None, description="why touches begin along plain ramps though shaped onsets are possible"
+    )
     predicted_contrast_db: float | None
     robust_contrast_db: float | None
     predicted_level_db_sl: float | None

@@ -168,6 +168,7 @@ class Service:
             contacts=scene.contact_statuses(),
             drive=scene.drive(),
             silent_because=scene.silent_because if held else None,
+            plain_because=self._controller.plain_because,
             predicted_contrast_db=pattern.predicted_contrast_db if pattern else None,
             robust_contrast_db=pattern.robust_contrast_db if pattern else None,
             predicted_level_db_sl=pattern.predicted_level_db_sl if pattern else None,

@@ -5,7 +5,7 @@ import math
 import selectors
 from collections.abc import AsyncIterator, Callable, Coroutine, Sequence
 from contextlib import AbstractAsyncContextManager, asynccontextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, TypeVar
 
 import numpy as np
@@ -308,13 +308,15 @@ def _make_bench(
     observer: Observer | None = None,
     channels: int = 2,
     far_ends: list[Any] | None = None,
+    rate: float = math.inf,
     **options: Any,
 ) -> Bench:
-    """A bench within a running loop; one amplifier unless more are named."""
+    """A bench within a running loop; one amplifier unless more are named; rate [1/s]: of sets."""
     names = amplifiers or ("main",)
     far_ends = far_ends or [FarEnd(channels) for _ in names]
     told = Told()
     rig = _rig(*names)
+    rig = replace(rig, limits=replace(rig.limits, rate=rate))
     table = Table({"SW": Tone(110.0, 20e-6, math.pi / 2)}, rig.plate)
     controller = Controller(
         rig,
@@ -345,7 +347,7 @@ async def _running(*amplifiers: str, **options: Any) -> AsyncIterator[Bench]:
 
 @pytest.fixture
 def make_bench() -> Callable[..., Bench]:
-    """Make a bench: names of amplifiers; observer, channels, far_ends, what a Controller takes."""
+    """Make a bench: names of amplifiers, what `_make_bench` and a Controller take."""
     return _make_bench
 
 

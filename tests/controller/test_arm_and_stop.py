@@ -162,7 +162,7 @@ def test_one_guard_refuses(running: Running, run_virtual: Run) -> None:
             for far_end in bench.far_ends:
                 assert len(far_end.requests(Stage)) == 1
                 assert [each.is_silent for each in far_end.sets()] == [True, True]
-            assert bench.told.refused[0].startswith("b: CommandRefused: level of channel 1")
+            assert bench.told.refused[0].startswith("b: level of channel 1")
             assert bench.controller.phase is Phase.ARMED
 
     run_virtual(scenario())

@@ -337,9 +337,9 @@ def test_a_table_that_fails(
 @pytest.mark.parametrize(
     ("excitation", "complaint"),
     [
-        ({"SW": Tone(110.0, 101e-6)}, r"main: CommandRefused: level of channel 0 is 1\.01"),
-        ({"SW": Tone(39.0, 10e-6)}, "main: CommandRefused: frequency of channel 0 is 39 Hz"),
-        ({"SW": Tone(110.0, math.nan)}, "main: CommandRefused: level of channel 0 is nan"),
+        ({"SW": Tone(110.0, 101e-6)}, r"main: level of channel 0 is 1\.01"),
+        ({"SW": Tone(39.0, 10e-6)}, "main: frequency of channel 0 is 39 Hz"),
+        ({"SW": Tone(110.0, math.nan)}, "main: level of channel 0 is nan"),
     ],
 )
 def test_guard_refuses(
@@ -357,6 +357,49 @@ def test_guard_refuses(
             assert re.match(complaint, refusal)
             assert bench.told.silenced[-1].reason == refusal
             assert bench.controller.phase is Phase.ARMED
+
+    run_virtual(scenario())
+
+
+@pytest.mark.parametrize("amplifiers", [["main"], ["left", "right"]])
+def test_what_came_too_fast_is_felt_as_soon_as_it_may(
+    run_virtual: Run, running: Running, amplifiers: list[str]
+) -> None:
+    """Two sets a second: the third touch is refused, and half a second after it is felt, resting.
+
+    Nothing is asked in vain before; and a finger that has left meanwhile is not felt any more.
+    """
+
+    async def scenario() -> None:
+        loop = asyncio.get_running_loop()
+        async with running(*amplifiers, rate=2.0) as bench:
+            bench.table.excitation = {"SW": Tone(110.0, 2e-5), "NE": Tone(110.0, 2e-5)}
+            begin = loop.time()
+            for _ in range(2):
+                bench.touch(FINGER)
+                await asyncio.sleep(0.010)
+                bench.touch()
+                await asyncio.sleep(0.010)
+            asked = len(bench.table.asked)
+            await bench.hold(FINGER, seconds=0.4)
+            (refusal,) = bench.told.refused
+            assert "more than 2 command sets a second" in refusal
+            assert bench.told.silenced[-1].reason == refusal
+            assert not any(bench.far_end.levels)
+            await bench.hold(FINGER, seconds=0.2)
+            assert any(bench.far_end.levels)
+            assert len(bench.told.refused) == 1
+            assert len(bench.table.asked) == asked + 1
+            assert bench.told.applied[-1].time == pytest.approx(begin + 0.5, abs=1e-3)
+            bench.touch()
+            await asyncio.sleep(0.010)
+            bench.touch(FINGER)
+            await asyncio.sleep(0.010)
+            assert len(bench.told.refused) == 2
+            bench.touch()
+            await asyncio.sleep(2)
+            assert not any(bench.far_end.levels)
+            assert len(bench.told.applied) == 3
 
     run_virtual(scenario())
 

@@ -344,24 +344,35 @@ def test_a_wire_that_turns_out_slow_gets_ramps(
     shapes: Shapes,
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    """Three slow loadings in a row; a single one is a hiccup."""
+    """Three slow loadings in a row; a single one is a hiccup. After 30 s it is tried again."""
     slow = 0.0
     link.delay = lambda request: slow if isinstance(request, LoadEnvelope) else 0.0
 
     async def scenario() -> None:
-        nonlocal slow
         async with running(far_ends=[link], timing=shapes, envelope_time=0.020) as bench:
-            shaped = []
-            for duration in (0.021, 0.021, 0.001, 0.021, 0.021, 0.021, 0.021):
+
+            async def is_shaped(duration: float) -> bool:
+                nonlocal slow
                 slow = duration
                 await bench.hold(FINGER, seconds=0.1)
                 await bench.hold(seconds=0.05)
-                shaped.append(bench.told.applied[-1].pattern.onset is not None)
+                return bench.told.applied[-1].pattern.onset is not None
+
+            shaped = []
+            for duration in (0.021, 0.021, 0.001, 0.021, 0.021):
+                shaped.append(await is_shaped(duration))
+                assert bench.controller.plain_because is None
+            for duration in (0.021, 0.001):
+                shaped.append(await is_shaped(duration))
             assert shaped == [True] * 6 + [False]
+            assert "again in 30 s" in bench.controller.plain_because
+            await asyncio.sleep(30)
+            assert bench.controller.plain_because is None
+            assert await is_shaped(0.001)
 
     with caplog.at_level(logging.WARNING):
         run_virtual(scenario())
-    assert "loading envelopes takes 21 ms" in caplog.text
+    assert "loading envelopes took 21 ms" in caplog.text
 
 
 def test_an_onset_that_the_guard_refuses_is_a_ramp(

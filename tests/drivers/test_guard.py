@@ -61,7 +61,7 @@ def test_bad_sets_are_refused(bad: CommandSet, reason: str) -> None:
         GUARD.check(bad)
     safe, why = GUARD.check_or_silence(bad, ramp=0.01)
     assert why is not None
-    assert reason in why
+    assert reason in str(why)
     assert safe.is_silent
     assert [command.channel for command in safe.commands] == [0, 1, 2, 3]
 
@@ -115,7 +115,7 @@ def test_a_broken_set_is_silence_whatever_it_raises() -> None:
         object.__setattr__(broken, name, getattr(GOOD, name))
     safe, reason = GUARD.check_or_silence(broken, ramp=0.01)
     assert safe.is_silent
-    assert reason == "ZeroDivisionError: broken"
+    assert str(reason) == "ZeroDivisionError: broken"
 
 
 def test_silence_without_a_token_takes_another_than_the_last() -> None:

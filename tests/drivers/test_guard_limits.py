@@ -125,13 +125,17 @@ def test_sets_come_no_faster_than_allowed() -> None:
     strict = guard(clock, rate=10.0)
     for token in range(1, 11):
         strict.check(playing(token, 0.5))
-    with pytest.raises(CommandRefused, match="10 command sets a second"):
+    with pytest.raises(CommandRefused, match="10 command sets a second") as caught:
         strict.check(playing(11, 0.5))
+    assert caught.value.until == pytest.approx(clock.now + 0.1)
     assert strict.check(playing(12, 0.0)).is_silent
     clock.now += 0.1001
     strict.check(playing(13, 0.5))
-    with pytest.raises(CommandRefused, match="a second"):
+    with pytest.raises(CommandRefused, match="a second") as caught:
         strict.check(playing(14, 0.5))
+    assert caught.value.until is not None
+    clock.now = caught.value.until
+    strict.check(playing(14, 0.5))
 
 
 def test_without_limits_nothing_is_shortened() -> None:

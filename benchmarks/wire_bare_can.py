@@ -11,7 +11,7 @@ from drivers.guard import SafeCommand
 from drivers.protocol.can_frame import CanFrame, cob_id
 from drivers.protocol.canopen_map import encode_order
 from drivers.protocol.messages import Apply, Arm
-from sim.far_ends.can_bus.sets import Order, SetBuffer
+from sim.far_ends.can_bus.sets import Action, Order, SetBuffer
 
 CALM = 2.0  # s; the longest watchdog
 
@@ -43,7 +43,8 @@ def can_codec(safe: SafeCommand) -> None:
     for frame in encode_order(Apply(safe), node=1, sequence=7):
         if frame.id == cob_id("order", 1):
             token, ramp, duration, what, sequence = struct.unpack("<HHHBB", frame.data)
-            order = Order(token, ramp, duration, what & 7, what >> 3, sequence, True, False)
+            action, count = Action(what & 7), what >> 3
+            order = Order(token, ramp, duration, action, count, sequence, True, False)
         elif frame.data:
             buffer.take(frame.data[6] >> 4, frame.data)
     buffer.command_set(order)

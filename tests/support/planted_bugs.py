@@ -505,9 +505,9 @@ FAR_ENDS: dict[str, Bug] = {
     "an answer comes without its levels": _bug(
         "answer",
         Edit(
-            "sim.far_ends.can_bus.node:CanNode._answer",
-            "for group, block in enumerate(blocks[1:]):\n        self._send(",
-            "for group, block in enumerate(blocks[2:]):\n        self._send(",
+            "sim.far_ends.can_bus.orders:Orders._answer",
+            "reversed(sent.items())",
+            "reversed(list(sent.items())[:2])",
         ),
         wire="socketcand",
     ),

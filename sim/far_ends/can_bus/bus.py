@@ -13,6 +13,9 @@ from drivers.protocol.can_frame import CanFrame
 from sim.faults.episodes import Faults
 from sim.transport.line import Line
 
+LENGTHS = (0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64)
+"""How many bytes a frame may have, by its length code; those up to eight without CAN FD."""
+
 Listener = Callable[[CanFrame], None]
 
 _HEAD = struct.Struct("<L")

@@ -10,10 +10,10 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
-from drivers.command import Envelope, Knot
 from drivers.protocol.definition import PROTOCOL, Quantity
-from drivers.protocol.messages import Achieved, FaultList, GetFaults, LoadEnvelope, Nak, NakCode
+from drivers.protocol.messages import FaultList, GetFaults, LoadEnvelope, Nak
 from sim.bench.station import Station
+from sim.far_ends.can_bus.domains import ABORTS, envelope_of, faults_domain
 from sim.far_ends.can_bus.sdo import (
     BAD_LENGTH,
     NO_OBJECT,
@@ -28,7 +28,6 @@ IDS: Mapping[str, int] = CANOPEN["cob_ids"]
 _Q = PROTOCOL.quantities
 _INDEX = {name: declared["index"] for name, declared in CANOPEN["objects"].items()}
 _WIDTH = {"u8": "<B", "u16": "<H", "u32": "<L", "i16": "<h"}
-_ABORTS = {NakCode[name]: code for name, code in CANOPEN["aborts"].items()}
 _PDO_SYNCHRONOUS, _PDO_ASYNCHRONOUS = 0, 255
 _RPDO, _RPDO_MAP, _TPDO, _TPDO_MAP = 0x1400, 0x1600, 0x1800, 0x1A00
 _ORDER_PDO, _SLOTS_PDO = 16, 17  # RPDO 17 and 18 and so on, whatever the number of channels
@@ -45,6 +44,12 @@ def channel_ids(node: int, channels: int) -> dict[int, int]:
     }
 
 
+def sent_ids(node: int, channels: int) -> tuple[int, ...]:
+    """The TPDO identifiers of a node: answer, condition, then the levels of four channels each."""
+    levels = (IDS["levels"] + node + group for group in range(-(-channels // 4)))
+    return (IDS["answer"] + node, IDS["condition"] + node, *levels)
+
+
 class ObjectDictionary:
     """What one amplifier keeps under its indices; pdo_written: an RPDO's object was written.
 
@@ -59,7 +64,7 @@ class ObjectDictionary:
         self._pdo_written = pdo_written
         self._channels = station.capabilities.channels
         self.achieved = b""
-        self.blocks: dict[str, bytes] = {}  # the last that was sent of each TPDO
+        self.blocks: dict[int, bytes] = {}  # the last of each PDO, by its identifier
         self.reset()
         self._reads: dict[tuple[int, int], Read] = {}
         self._writes: dict[tuple[int, int], Write] = {}
@@ -164,16 +169,15 @@ class ObjectDictionary:
         self._received_pdo(_ORDER_PDO, IDS["order"] + self._node, order, 0)
         for group in range(groups):
             self._received_pdo(_SLOTS_PDO + group, IDS["slots"] + self._node, slots, group + 1)
-        sent = [("answer", 0, 0), ("condition", 0, 0)]
-        sent += [("levels", group, group + 1) for group in range(groups)]
+        sent = [("answer", 0), ("condition", 0), *(("levels", 1 + n) for n in range(groups))]
         self._count(_INDEX["levels"], groups)
-        for number, (name, group, subindex) in enumerate(sent):
-            key = name if name != "levels" else f"levels {group}"
-            self._reads[_INDEX[name], subindex] = partial(self._block, key)
+        sent_by = sent_ids(self._node, self._channels)
+        for number, (cob_id, (name, subindex)) in enumerate(zip(sent_by, sent, strict=True)):
+            self._reads[_INDEX[name], subindex] = partial(self._block, cob_id)
             self._pdo(
                 _TPDO + number,
                 _TPDO_MAP + number,
-                IDS[name] + self._node + group,
+                cob_id,
                 _PDO_ASYNCHRONOUS,
                 _INDEX[name],
                 subindex,
@@ -184,7 +188,7 @@ class ObjectDictionary:
         kind = _PDO_SYNCHRONOUS if is_command else _PDO_ASYNCHRONOUS
         self._pdo(_RPDO + number, _RPDO_MAP + number, cob_id, kind, index, subindex)
         self._writes[index, subindex] = lambda data: self._write_pdo(cob_id, data)
-        self._reads[index, subindex] = partial(self._block, f"{cob_id}")
+        self._reads[index, subindex] = partial(self._block, cob_id)
 
     def _pdo(
         self, parameter: int, mapping: int, cob_id: int, kind: int, index: int, subindex: int
@@ -198,7 +202,7 @@ class ObjectDictionary:
     def _write_pdo(self, cob_id: int, data: bytes) -> None:
         if len(data) != 8:
             raise SdoAbort(BAD_LENGTH)
-        self.blocks[f"{cob_id}"] = data
+        self.blocks[cob_id] = data
         self._pdo_written(cob_id, data)
 
     def _serial_number(self) -> bytes:
@@ -209,8 +213,8 @@ class ObjectDictionary:
         text: str = getattr(self._station.identity, name)
         return text.encode()
 
-    def _block(self, key: str) -> bytes:
-        return self.blocks.get(key, bytes(8))
+    def _block(self, cob_id: int) -> bytes:
+        return self.blocks.get(cob_id, bytes(8))
 
     def _level(self, channel: int) -> bytes:
         return _scaled(_Q.level, self._station.status().levels[channel])
@@ -228,31 +232,12 @@ class ObjectDictionary:
 
     def _faults(self) -> bytes:
         reply = self._station.exchange(GetFaults())
-        records = reply.faults if isinstance(reply, FaultList) else ()
-        longest = _Q.age.maximum
-        return b"".join(
-            struct.pack(
-                "<BBL",
-                record.fault,
-                255 if record.channel is None else record.channel,
-                min(round(record.age * 1000), longest),
-            )
-            for record in records
-        )
+        return faults_domain(reply.faults if isinstance(reply, FaultList) else ())
 
     def _load(self, slot: int, data: bytes) -> None:
-        if len(data) < 3 or len(data) != 3 + 4 * data[2]:
-            raise SdoAbort(BAD_LENGTH)
-        step, _ = struct.unpack_from("<HB", data)
-        pairs = list(struct.iter_unpack("<Hh", data[3:]))
-        if not _Q.envelope_step.holds(step) or not all(
-            _Q.level.holds(level) and _Q.phase.holds(phase) for level, phase in pairs
-        ):
-            raise SdoAbort(_ABORTS[NakCode.BAD_VALUE])
-        knots = tuple(Knot(level / 10_000, phase / 100) for level, phase in pairs)
-        reply = self._station.exchange(LoadEnvelope(Envelope(slot, step / 10_000, knots)))
+        reply = self._station.exchange(LoadEnvelope(envelope_of(slot, data)))
         if isinstance(reply, Nak):
-            raise SdoAbort(_ABORTS[reply.code])
+            raise SdoAbort(ABORTS[reply.code])
 
     def _constant(self, name: str, subindex: int, value: bytes) -> None:
         self._reads[_INDEX[name], subindex] = lambda: value
@@ -264,24 +249,6 @@ class ObjectDictionary:
 
     def _count(self, index: int, count: int) -> None:
         self._reads[index, 0] = lambda: bytes([count])
-
-
-def achieved_domain(achieved: Achieved) -> bytes:
-    """What a set plays, as the object of that name holds it."""
-    data = struct.pack("<HB", achieved.token, len(achieved.commands))
-    for command in achieved.commands:
-        flags = command.keep_phase | command.skip_ending << 1 | command.channel << 4
-        flags |= bool(command.onset or command.ending) << 2
-        data += struct.pack(
-            "<HHhBxBB",
-            _Q.frequency.to_wire(command.frequency),
-            _Q.level.to_wire(command.level),
-            _Q.phase.to_wire(command.phase),
-            flags,
-            command.onset,
-            command.ending,
-        )
-    return data
 
 
 def _fields(values: Any) -> dict[str, float]:

@@ -6,16 +6,33 @@ slots with those that refer to some; anything less is torn.
 
 import struct
 from dataclasses import dataclass
+from enum import IntEnum
 from typing import NamedTuple
 
 from drivers.command import CommandSet, DriveCommand
 from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.messages import NakCode
 
-STATUS, APPLY, STAGE, COMMIT, ARM, DISARM, STOP, CLEAR = range(8)
-SETS = (APPLY, STAGE, COMMIT)
-TORN = 15
+TORN = 15  # the result of a set with a frame missing; others are those of refusals
+NO_CHANNEL = 255
 _Q = PROTOCOL.quantities
+
+
+class Action(IntEnum):
+    """What an order is for."""
+
+    STATUS = 0
+    APPLY = 1
+    STAGE = 2
+    COMMIT = 3
+    ARM = 4
+    DISARM = 5
+    STOP = 6
+    CLEAR = 7
+
+
+SETS = (Action.APPLY, Action.STAGE, Action.COMMIT)
+"""Those that wait for a SYNC."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,7 +42,7 @@ class Order:
     token: int
     ramp: int
     time: int
-    action: int
+    action: Action
     count: int
     sequence: int
     own: bool
@@ -45,7 +62,7 @@ class _Command(NamedTuple):
 class Refused(Exception):
     """An order that says nonsense, or a set with a frame missing."""
 
-    def __init__(self, code: int, channel: int = 255) -> None:
+    def __init__(self, code: int, channel: int = NO_CHANNEL) -> None:
         super().__init__(code, channel)
         self.code = code
         self.channel = channel

@@ -9,12 +9,11 @@ import re
 from collections.abc import Callable
 
 from drivers.protocol.can_frame import CanFrame
-from sim.far_ends.can_bus.bus import CanBus
+from sim.far_ends.can_bus.bus import LENGTHS, CanBus
 from sim.transport.pseudo_terminal import make_terminal
 
 _CR, _BELL = b"\r", b"\x07"
 _LONGEST = 160  # characters; a CAN FD frame has 133
-_FD_LENGTHS = (0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64)
 _FRAME = re.compile(rb"([tdb])([0-7][0-9A-Fa-f]{2})([0-9A-Fa-f])((?:[0-9A-Fa-f]{2})*)")
 _REMOTE = re.compile(rb"r[0-7][0-9A-Fa-f]{2}[0-8]|R[01][0-9A-Fa-f]{7}[0-8]")
 _EXTENDED = re.compile(rb"[TDB][01][0-9A-Fa-f]{7}[0-9A-Fa-f](?:[0-9A-Fa-f]{2})*")
@@ -110,7 +109,7 @@ class SlcanAdapter:
         if not self._is_open:
             return
         kind = "d" if frame.fd else "t"
-        length = _FD_LENGTHS.index(len(frame.data))
+        length = LENGTHS.index(len(frame.data))
         self._write(f"{kind}{frame.id:03X}{length:X}{frame.data.hex().upper()}\r".encode())
 
 
@@ -121,7 +120,7 @@ def _parse(line: bytes) -> CanFrame | None:
         return None
     kind, identifier, length, data = found.groups()
     is_fd = kind != b"t"
-    expected = _FD_LENGTHS[int(length, 16)]
+    expected = LENGTHS[int(length, 16)]
     if len(data) != 2 * expected or (not is_fd and expected > 8):
         return None
     return CanFrame(int(identifier, 16), bytes.fromhex(data.decode()), fd=is_fd)

@@ -12,12 +12,11 @@ from dataclasses import dataclass
 from drivers import clock
 from drivers.errors import LinkError
 from drivers.protocol.can_frame import CanFrame
-from sim.far_ends.can_bus.bus import CanBus
+from sim.far_ends.can_bus.bus import LENGTHS, CanBus
 
 BUS_NAME = "can0"
 _LONGEST = 512  # characters of an element; a CAN FD frame has 220
 _UNREAD_MAX = 1 << 18  # bytes; a client that does not take them is hung up on
-_FD_LENGTHS = (0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64)
 _SEND = re.compile(r"send ([0-9A-Fa-f]{1,8}) ([0-9A-Fa-f]{1,2})((?: [0-9A-Fa-f]{1,2})*)")
 _FD_SEND = re.compile(
     r"fdsend ([0-9A-Fa-f]{1,8}) ([0-9A-Fa-f]{1,2}) (\d{1,2})((?: [0-9A-Fa-f]{1,2})*)"
@@ -186,7 +185,7 @@ def _parse(element: str) -> CanFrame | None:
     else:
         return None
     content = bytes(int(byte, 16) for byte in data.split())
-    allowed = _FD_LENGTHS if is_fd else _FD_LENGTHS[:9]
+    allowed = LENGTHS if is_fd else LENGTHS[:9]
     if len(identifier) > 3 or int(identifier, 16) > 0x7FF:
         return None
     if count != len(content) or count not in allowed:

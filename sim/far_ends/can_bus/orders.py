@@ -1,0 +1,219 @@
+"""Orders and sets that come to a node in operation, and how it answers them.
+
+An order is carried out as it comes, a set when the SYNC after it has come. Written, as all of the
+node, from protocol.yaml's description, with nothing of the host's code in it.
+"""
+
+import struct
+from collections.abc import Callable, Sequence
+
+from drivers.protocol.can_frame import CanFrame
+from drivers.protocol.definition import PROTOCOL
+from drivers.protocol.messages import (
+    Achieved,
+    Apply,
+    Arm,
+    Clear,
+    Commit,
+    Disarm,
+    GetStatus,
+    Nak,
+    NakCode,
+    Reply,
+    Request,
+    Stage,
+    Status,
+    Stop,
+)
+from sim.bench.station import Station
+from sim.far_ends.can_bus.bus import LENGTHS
+from sim.far_ends.can_bus.domains import achieved_domain
+from sim.far_ends.can_bus.objects import IDS, ObjectDictionary, channel_ids, sent_ids
+from sim.far_ends.can_bus.sets import (
+    NO_CHANNEL,
+    SETS,
+    TORN,
+    Action,
+    Order,
+    Refused,
+    SetBuffer,
+    integers_of,
+)
+
+_Q = PROTOCOL.quantities
+
+
+class Orders:
+    """What a node is told to do; send puts an answer on the bus."""
+
+    def __init__(
+        self,
+        station: Station,
+        node: int,
+        *,
+        objects: ObjectDictionary,
+        send: Callable[[CanFrame], None],
+    ) -> None:
+        self._station = station
+        self._node = node
+        self._objects = objects
+        self._send = send
+        channels = station.capabilities.channels
+        self._channel_of = channel_ids(node, channels)
+        self._sent_ids = sent_ids(node, channels)
+        self._buffer = SetBuffer(channels)
+        self._waiting: Order | None = None  # for its SYNC
+        self._asked: tuple[int, list[tuple[object, ...]]] = (0, [])  # token, what was asked
+
+    def take(self, cob_id: int, data: bytes, *, fd: bool = False) -> None:
+        """A process data object of a host's; nothing where it is none for this node."""
+        if len(data) < 8:
+            return
+        if cob_id == IDS["order"] + self._node:
+            self._order(data, own=True, fd=fd)
+        elif cob_id == IDS["order"]:
+            self._order(data, own=False, fd=False)
+        elif cob_id == IDS["slots"] + self._node and len(data) == 8:
+            self._buffer.take_slots(data)
+        elif fd and cob_id == IDS["command"] + self._node:
+            self._buffer.take_blocks(data)
+        elif cob_id in self._channel_of and len(data) == 8:
+            self._buffer.take(self._channel_of[cob_id], data)
+
+    def sync(self) -> None:
+        """Carry out the set that has come, if one has."""
+        order, self._waiting = self._waiting, None
+        if order is not None and order.own:
+            self._carry_out(order, lambda: self._set_request(order))
+        elif order is not None and order.action is Action.COMMIT and _Q.token.holds(order.token):
+            self._station.broadcast(Commit(order.token))
+        elif order is None and self._buffer.sequence is not None:
+            # Commands without their order: it was lost, and whoever sent it waits.
+            lost = Order(0, 0, 0, Action.APPLY, 0, self._buffer.sequence, own=True, fd=False)
+            self._answer(lost, result=TORN)
+        self.forget()
+
+    def forget(self) -> None:
+        """What has come since the last SYNC has not come."""
+        self._buffer.clear()
+        self._waiting = None
+
+    def _order(self, data: bytes, *, own: bool, fd: bool) -> None:
+        token, ramp, duration, what, sequence = struct.unpack_from("<HHHBB", data)
+        order = Order(token, ramp, duration, Action(what & 7), what >> 3, sequence, own, fd)
+        if own and sequence == 0:
+            return
+        if fd:
+            self._buffer.take_blocks(data[8:])
+        if order.action in SETS:
+            self._waiting = order
+        elif own:
+            self._carry_out(order, lambda: self._plain_request(order))
+        elif order.action is Action.STOP:
+            self._station.broadcast(Stop(_nearest_ramp(ramp)))
+
+    def _carry_out(self, order: Order, make: Callable[[], Request]) -> None:
+        try:
+            reply = self._station.exchange(make())
+        except Refused as refused:
+            self._answer(order, result=refused.code, channel=refused.channel)
+            return
+        if reply is None:
+            return
+        if isinstance(reply, Nak):
+            channel = NO_CHANNEL if reply.channel is None else reply.channel
+            self._answer(order, result=reply.code, channel=channel)
+        elif isinstance(reply, Achieved):
+            self._answer(order, exact=self._is_exact(reply))
+        else:
+            if order.action is Action.ARM:
+                self._objects.host, self._objects.watchdog = order.token, order.time
+            self._answer(order, condition=self._condition(order, reply))
+
+    def _plain_request(self, order: Order) -> Request:
+        ramp = _nearest_ramp(order.ramp)
+        match order.action:
+            case Action.ARM:  # arm; its token is the number of the host
+                if not _Q.watchdog.holds(order.time) or not 1 <= order.token <= 127:
+                    raise Refused(NakCode.BAD_VALUE)
+                return Arm(order.time / 1000)
+            case Action.DISARM:
+                return Disarm(ramp)
+            case Action.STOP:
+                return Stop(ramp)
+            case Action.CLEAR:
+                return Clear()
+            case _:
+                return GetStatus()
+
+    def _set_request(self, order: Order) -> Request:
+        if not _Q.token.holds(order.token):
+            raise Refused(NakCode.BAD_TOKEN)
+        if order.action is Action.COMMIT:
+            return Commit(order.token)
+        wanted = self._buffer.command_set(order)
+        self._asked = order.token, [integers_of(command) for command in wanted.commands]
+        return Apply(wanted) if order.action is Action.APPLY else Stage(wanted)
+
+    def _is_exact(self, achieved: Achieved) -> bool:
+        """Whether a set plays as it was asked for; if not, the host reads what it does."""
+        self._objects.achieved = achieved_domain(achieved)
+        token, asked = self._asked
+        played = sorted(integers_of(command) for command in achieved.commands)
+        return token == achieved.token and played == asked
+
+    def _condition(self, order: Order, reply: Reply) -> list[bytes]:
+        """How it is: the condition, and the levels of four channels at a time."""
+        status = reply if isinstance(reply, Status) else self._station.status()
+        levels = [_Q.level.to_wire(min(level, 1.0)) for level in status.levels]
+        blocks = [
+            struct.pack(
+                "<BBhHBx",
+                order.sequence,
+                status.high_voltage,
+                _Q.temperature.to_wire(min(max(status.temperature, -100), 200)),
+                _Q.voltage.to_wire(status.voltage),
+                len(levels),
+            )
+        ]
+        for begin in range(0, len(levels), 4):
+            word = sum(level << 14 * place for place, level in enumerate(levels[begin : begin + 4]))
+            blocks.append(word.to_bytes(7, "little") + bytes([order.sequence]))
+        return blocks
+
+    def _answer(
+        self,
+        order: Order,
+        *,
+        result: int = 0,
+        channel: int = NO_CHANNEL,
+        exact: bool = False,
+        condition: Sequence[bytes] = (),
+    ) -> None:
+        """Answer in the kind of frame in which it was asked; the answer itself comes last."""
+        status = self._station.status()
+        answer = struct.pack(
+            "<BBBBHH",
+            order.sequence,
+            order.action | exact << 3 | result << 4,
+            status.state | status.fault << 4,
+            channel,
+            status.token,
+            min(max(round(status.watchdog_left * 1000), 0), _Q.watchdog_left.maximum),
+        )
+        blocks = [answer, *condition]
+        sent = dict(zip(self._sent_ids, blocks, strict=False))  # the condition may be left out
+        self._objects.blocks.update(sent)
+        if order.fd:
+            data = b"".join(blocks)
+            length = next(length for length in LENGTHS if length >= len(data))
+            frame = CanFrame(IDS["answer"] + self._node, data.ljust(length, b"\xff"), fd=True)
+            self._send(frame)
+            return
+        for cob_id, block in reversed(sent.items()):
+            self._send(CanFrame(cob_id, block))
+
+
+def _nearest_ramp(ramp: int) -> float:
+    """The nearest ramp [s] in range: silence is never refused for its ramp."""
+    return min(ramp, _Q.ramp.maximum) / _Q.ramp.per_unit

@@ -7,6 +7,7 @@ others have answers that suit a wire with one amplifier that only speaks when it
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 
 from drivers.errors import CommandError
 from drivers.protocol.messages import Broadcast, Event, Reply, Request
@@ -63,6 +64,21 @@ class Backend(ABC):
     def bus(self) -> str | None:
         """Names what it shares with others that one broadcast reaches; None without broadcasts."""
         return None
+
+    @property
+    def is_unsent(self) -> bool:
+        """Whether nothing of the request that is being exchanged has gone out yet.
+
+        As where it waits for others on the wire: if it is cancelled then, nothing is sent.
+        """
+        return False
+
+    def silencing(self, request: Request) -> AbstractContextManager[None]:
+        """A context in which a request that silences waits for its turn: keep the wire free for it.
+
+        What others would send meanwhile waits, on a wire that they share.
+        """
+        return nullcontext()
 
     async def broadcast(self, request: Broadcast) -> None:
         """Send a commit or a stop to every amplifier of the bus at once; nobody answers.

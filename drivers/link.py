@@ -5,6 +5,7 @@ What is lost stays lost until it is opened anew, and says so at once to whoever 
 
 import asyncio
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from typing import TypeVar, final
 
 from drivers import clock
@@ -26,7 +27,7 @@ from drivers.protocol.messages import (
 )
 from drivers.refusals import is_busy, refusal
 from drivers.statistics import LinkStatistics
-from drivers.turns import Kind, Turns
+from drivers.turns import GaveWay, Kind, Turns
 
 REPLY_TIMEOUT = 0.030  # s; a heartbeat and three of these are less than three heartbeats of 50 ms
 RETRIES = 2
@@ -50,7 +51,7 @@ class Link:
         self.backend = backend
         self._reply_timeout = reply_timeout
         self._retries_allowed = RETRIES
-        self._turns = Turns()
+        self._turns = Turns(lambda: backend.is_unsent)
         self._loss: str | None = "the amplifier is not open yet; call open() first"
         self._unanswered = 0
         self._is_stuck = False  # it was busy to the last: until it is not, nothing is repeated
@@ -116,9 +117,8 @@ class Link:
         FrameError for a reply to another kind of request.
         """
         self._raise_if_lost()
-        async with self._turns.take(kind):
-            self._raise_if_lost()
-            reply = await self._exchange(request, kind, timeout or self._reply_timeout)
+        with self._ahead(request, kind):
+            reply = await self._in_turn(request, kind, timeout or self._reply_timeout)
         name = type(request).__name__
         if isinstance(reply, Nak):
             self._refusals += 1
@@ -132,6 +132,20 @@ class Link:
         self._raise_if_lost()
         async with self._turns.take(kind):
             await self.backend.broadcast(request)
+
+    def _ahead(self, request: Request, kind: Kind) -> AbstractContextManager[None]:
+        """In which it goes before what others say on the wire, if it may."""
+        return self.backend.silencing(request) if kind.silences else nullcontext()
+
+    async def _in_turn(self, request: Request, kind: Kind, timeout: float) -> Reply:
+        while True:
+            try:
+                async with self._turns.take(kind):
+                    self._raise_if_lost()
+                    return await self._exchange(request, kind, timeout)
+            except GaveWay:
+                if not kind.silences:  # what silences is still wanted after the stop before it
+                    raise
 
     async def _exchange(self, request: Request, kind: Kind, timeout: float) -> Reply:
         busy = 0

@@ -1,15 +1,16 @@
 """Whose turn it is on a link that carries one request at a time.
 
-Requests that silence come first, then the others in order. One apply waits at most: a newer one
-takes its place, and a request that silences drops it. What is on the wire when a request that
-silences comes is waited for a moment only.
+Stops come first, then what else silences, then the others in order. One apply waits at most: a
+newer one takes its place, and a request that silences drops it. What has its turn gives way to what
+comes before it: at once while none of it is on the wire, else, unless it silences, after a moment.
 """
 
 import asyncio
 from collections import deque
-from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
+from collections.abc import Callable, Hashable
 from enum import Enum, auto
+from types import TracebackType
+from typing import final
 
 from drivers.errors import CommandRefused
 
@@ -17,7 +18,7 @@ from drivers.errors import CommandRefused
 # with a ramp of 10 ms all is silent within 20 ms.
 PATIENCE = 0.008
 
-_SUPERSEDED = "superseded by a newer set, or by a stop or disarm"
+SUPERSEDED = "superseded by a newer set, or by a stop or disarm"
 
 
 class Kind(Enum):
@@ -26,17 +27,35 @@ class Kind(Enum):
     ORDINARY = auto()
     APPLY = auto()
     SILENCE = auto()
+    STOP = auto()
+
+    @property
+    def silences(self) -> bool:
+        """Whether it goes before what does not."""
+        return self is Kind.SILENCE or self is Kind.STOP
 
 
+class GaveWay(CommandRefused):
+    """What had its turn has lost it to something that goes before it."""
+
+
+@final
 class Turns:
-    """Hands the link from one request to the next."""
+    """Hands the link from one request to the next.
 
-    def __init__(self) -> None:
+    is_unsent: whether nothing of what has the turn has gone out yet, and stays here if its task is
+    cancelled now; by default all has gone out at once.
+    """
+
+    def __init__(self, is_unsent: Callable[[], bool] = lambda: False) -> None:
+        self._is_unsent = is_unsent
         self._taken = False
+        self._stops: deque[asyncio.Future[None]] = deque()
         self._silences: deque[asyncio.Future[None]] = deque()
         self._others: deque[asyncio.Future[None]] = deque()
         self._apply: asyncio.Future[None] | None = None
-        self._limit: asyncio.Timeout | None = None  # of the turn, unless it silences
+        self._present: _Turn | None = None
+        self._awaited: dict[Hashable, Kind] = {}
 
     def raise_if_overtaken(self, kind: Kind) -> None:
         """Raise CommandRefused where a request that has the turn must not be repeated.
@@ -44,58 +63,85 @@ class Turns:
         Something that silences waits, or for an apply a newer one.
         """
         newer = kind is Kind.APPLY and self._apply is not None
-        if newer or (self._silences and kind is not Kind.SILENCE):
-            raise CommandRefused(_SUPERSEDED)
+        if newer or (not kind.silences and (self._stops or self._silences)):
+            raise CommandRefused(SUPERSEDED)
 
-    @asynccontextmanager
-    async def take(self, kind: Kind) -> AsyncIterator[None]:
-        """Wait for the turn and hold it; raises CommandRefused for what gave way to another."""
-        if kind is not Kind.ORDINARY:
-            self._drop_apply()
-        if self._taken:
-            await self._wait(kind)
-        self._taken = True
-        try:
-            if kind is Kind.SILENCE:
-                yield
-            else:
-                async with self._limited():
-                    yield
-        finally:
+    def take(self, kind: Kind) -> "_Turn":
+        """A context: waits for the turn and holds it; GaveWay, CommandRefused for what gave way."""
+        return _Turn(self, kind)
+
+    def is_awaited(self, who: Hashable) -> bool:
+        """Whether this one's request that silences is awaited; see `keep_free`."""
+        return who in self._awaited
+
+    def keep_free(self, who: Hashable, kind: Kind) -> None:
+        """Give no turn to what a request of this one's that is to come, and silences, goes before.
+
+        kind: of that request.
+        """
+        if self._awaited.get(who) is not Kind.STOP:
+            self._awaited[who] = kind
+        self._limit_turn()
+
+    def release(self, who: Hashable) -> None:
+        """It has come, or will not; safe to call twice."""
+        self._awaited.pop(who, None)
+        if not self._taken:
             self._pass_on()
 
-    @asynccontextmanager
-    async def _limited(self) -> AsyncIterator[None]:
-        """Hold the turn until a request that silences has waited for long enough."""
-        limit = asyncio.timeout(PATIENCE if self._silences else None)
-        try:
-            async with limit as self._limit:
-                yield
-        except TimeoutError as problem:
-            if limit.expired():
-                raise CommandRefused(_SUPERSEDED) from problem
-            raise
-        finally:
-            self._limit = None
+    async def come(self, kind: Kind) -> None:
+        """Wait for the turn; for `_Turn`."""
+        if kind is not Kind.ORDINARY:
+            self._drop_apply()
+        if self._taken or self._is_kept_from(kind):
+            await self._wait(kind)
+        self._taken = True
+
+    def begin(self, turn: "_Turn") -> None:
+        """The turn has begun."""
+        self._present = turn
+
+    def end(self) -> None:
+        """The turn is over."""
+        self._present = None
+        self._pass_on()
+
+    def _is_kept_from(self, kind: Kind) -> bool:
+        if kind is Kind.STOP:
+            return False
+        if self._stops or Kind.STOP in self._awaited.values():
+            return True
+        return not kind.silences and bool(self._silences or self._awaited)
 
     def _limit_turn(self) -> None:
-        """Let the present turn end soon if a request that silences waits, else when it likes."""
-        if self._limit is None or self._limit.expired():
+        """Let the present turn end now or soon if something before it waits, else when it likes."""
+        turn = self._present
+        if turn is None:
             return
-        if not self._silences:
-            self._limit.reschedule(None)
-        elif self._limit.when() is None:
-            self._limit.reschedule(asyncio.get_running_loop().time() + PATIENCE)
+        if self._is_kept_from(turn.kind) and self._is_unsent():
+            turn.give_way()
+        elif not turn.kind.silences and (self._stops or self._silences):
+            turn.limit(PATIENCE)
+        else:
+            turn.let_be()
 
     async def _wait(self, kind: Kind) -> None:
+        queue = {Kind.STOP: self._stops, Kind.SILENCE: self._silences}.get(kind, self._others)
         turn = asyncio.get_running_loop().create_future()
-        queue = self._silences if kind is Kind.SILENCE else self._others
         queue.append(turn)
         if kind is Kind.APPLY:
             self._apply = turn
         self._limit_turn()
         try:
             await turn
+            while self._is_kept_from(kind):  # by what came while the turn was being handed over
+                if kind is Kind.APPLY:
+                    self._pass_on()
+                    raise CommandRefused(SUPERSEDED)
+                turn = asyncio.get_running_loop().create_future()
+                queue.appendleft(turn)
+                self._pass_on()
+                await turn
         except asyncio.CancelledError:
             if not turn.cancelled() and turn.exception() is None:
                 # The turn was handed over in the very moment of the cancellation.
@@ -113,14 +159,75 @@ class Turns:
         if waiting is not None:
             self._others.remove(waiting)
             if not waiting.done():  # it may have been cancelled and not run since
-                waiting.set_exception(CommandRefused(_SUPERSEDED))
+                waiting.set_exception(CommandRefused(SUPERSEDED))
+
+    def _next(self) -> "deque[asyncio.Future[None]]":
+        """Those of whom the first may come now."""
+        if self._stops or Kind.STOP in self._awaited.values():
+            return self._stops
+        return self._silences if self._silences or self._awaited else self._others
 
     def _pass_on(self) -> None:
-        while queue := self._silences or self._others:
+        """Hand the turn, which nobody has, to the next."""
+        while queue := self._next():
             turn = queue.popleft()
             if self._apply is turn:
                 self._apply = None
             if not turn.done():
+                self._taken = True
                 turn.set_result(None)
                 return
         self._taken = False
+
+
+@final
+class _Turn:
+    """A turn, from when it comes until the context ends."""
+
+    __slots__ = ("_cancelling", "_gave_way", "_task", "_timer", "_turns", "kind")
+
+    def __init__(self, turns: Turns, kind: Kind) -> None:
+        self._turns = turns
+        self.kind = kind
+        self._timer: asyncio.TimerHandle | None = None
+        self._gave_way = False
+
+    async def __aenter__(self) -> None:
+        await self._turns.come(self.kind)
+        task = asyncio.current_task()
+        assert task is not None  # noqa: S101  a coroutine that waits is in one
+        self._task = task
+        self._cancelling = task.cancelling()
+        self._turns.begin(self)
+
+    async def __aexit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.let_be()
+        self._turns.end()
+        if not self._gave_way:
+            return
+        is_ours = self._task.uncancel() <= self._cancelling  # nobody else has cancelled it as well
+        if is_ours and kind is asyncio.CancelledError:
+            raise GaveWay(SUPERSEDED) from error
+
+    def give_way(self) -> None:
+        """End now."""
+        self.let_be()
+        if not self._gave_way:
+            self._gave_way = True
+            self._task.cancel()
+
+    def limit(self, seconds: float) -> None:
+        """End when so long [s] has passed, unless it is limited already."""
+        if self._timer is None and not self._gave_way:
+            self._timer = asyncio.get_running_loop().call_later(seconds, self.give_way)
+
+    def let_be(self) -> None:
+        """End whenever it likes."""
+        timer, self._timer = self._timer, None
+        if timer is not None:
+            timer.cancel()

@@ -73,6 +73,12 @@ class CanBackend(WireBackend):
         self._staged: Achieved | None = None  # as it was asked for
         self._channels = PROTOCOL.quantities.channel_count.maximum
         self._loss: str | None = None
+        self._is_listening = False
+
+    @property
+    def is_unsent(self) -> bool:
+        """Whether it is still being listened for another host, before anything is sent."""
+        return self._is_listening
 
     @property
     def bus(self) -> str:
@@ -183,7 +189,11 @@ class CanBackend(WireBackend):
 
     async def _order(self, order: Order, timeout: float) -> Reply:
         if isinstance(order, Arm):
-            await self._node.check_no_other_host()
+            self._is_listening = True
+            try:
+                await self._node.check_no_other_host()
+            finally:
+                self._is_listening = False
         sequence = self._orders.next_sequence()
         frames = encode_order(
             order, node=self._url.node, sequence=sequence, fd=bool(self._url.bus.fd)

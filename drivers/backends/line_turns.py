@@ -4,30 +4,74 @@ Each amplifier has turns of its own (`drivers.link`); these are between amplifie
 one of them goes before all that others wait for, and what was on the line meanwhile is sent again.
 """
 
-from collections.abc import Awaitable, Callable
-from typing import TypeVar
+from collections.abc import Awaitable, Callable, Iterator
+from contextlib import contextmanager
+from typing import TypeVar, final
 
 from drivers.errors import CommandRefused
 from drivers.protocol.messages import Apply, Disarm, Request, Stop
-from drivers.turns import Kind, Turns
+from drivers.turns import SUPERSEDED, GaveWay, Kind, Turns
 
 _T = TypeVar("_T")
 
 
 def kind_on_line(request: Request) -> Kind:
     """How a request stands to those for others; no set takes the place of another's."""
+    if isinstance(request, Stop):
+        return Kind.STOP
     is_silent_set = isinstance(request, Apply) and request.command_set.is_silent
-    return Kind.SILENCE if is_silent_set or isinstance(request, Stop | Disarm) else Kind.ORDINARY
+    return Kind.SILENCE if is_silent_set or isinstance(request, Disarm) else Kind.ORDINARY
 
 
-async def in_turn(turns: Turns, kind: Kind, exchange: Callable[[], Awaitable[_T]]) -> _T:
-    """Do an exchange when it has its turn, and again where it had to give way.
+@final
+class LineTurns:
+    """The turns of a line; amplifiers are known by their addresses."""
 
-    Repeating is safe: a token is played once, and the other requests may be repeated anyway.
-    """
-    while True:
+    def __init__(self) -> None:
+        self._turns = Turns(lambda: self._present in self._unsent)
+        self._present: int | None = None
+        self._unsent: set[int] = set()
+
+    def is_unsent(self, address: int) -> bool:
+        """Whether an amplifier's exchange is here and nothing of it has gone out yet."""
+        return address in self._unsent
+
+    def sent(self) -> None:
+        """What has the turn has gone out; to be called then."""
+        if self._present is not None:
+            self._unsent.discard(self._present)
+
+    @contextmanager
+    def silencing(self, request: Request, address: int) -> Iterator[None]:
+        """See `Backend.silencing`; until what silences this amplifier has its turn."""
+        self._turns.keep_free(address, kind_on_line(request))
         try:
-            async with turns.take(kind):
-                return await exchange()
-        except CommandRefused:  # no backend raises it by itself: an amplifier's refusal is a reply
-            continue
+            yield
+        finally:
+            self._turns.release(address)
+
+    async def carry_out(
+        self, kind: Kind, exchange: Callable[[], Awaitable[_T]], *, address: int | None
+    ) -> _T:
+        """Do an exchange when it has its turn, and again where it had to give way.
+
+        Repeating is safe: a token is played once, and the other requests may be repeated anyway.
+        address: whose it is; None for one to all. Raises CommandRefused instead of beginning where
+        this amplifier itself is being silenced.
+        """
+        while True:
+            if not kind.silences and self._turns.is_awaited(address):
+                raise CommandRefused(SUPERSEDED)
+            if address is not None:
+                self._unsent.add(address)
+            try:
+                async with self._turns.take(kind):
+                    self._present = address
+                    if kind.silences:
+                        self._turns.release(address)
+                    return await exchange()
+            except GaveWay:
+                continue
+            finally:
+                if address is not None:
+                    self._unsent.discard(address)

@@ -9,6 +9,7 @@ An amplifier cannot speak unasked here: events are what its answers show to have
 """
 
 import asyncio
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 
 from drivers.backends.line_turns import kind_on_line
@@ -90,6 +91,17 @@ class ModbusBackend(WireBackend):
         bits = self._url.bits_per_byte
         return loading_time(knots, baud=self._url.baud, bits_per_byte=bits)
 
+    @property
+    def is_unsent(self) -> bool:
+        """Whether what is asked waits for others, or for the line to be silent."""
+        return self._link is not None and self._link.is_unsent(self._url.unit)
+
+    def silencing(self, request: Request) -> AbstractContextManager[None]:
+        """See `Backend.silencing`."""
+        if self._link is None:
+            return nullcontext()
+        return self._link.silencing(request, self._url.unit)
+
     async def open(self) -> None:
         """Open the line, or join those who have it open in this process; raises LinkError."""
         if self._link is not None:
@@ -136,7 +148,9 @@ class ModbusBackend(WireBackend):
     async def broadcast(self, request: Broadcast) -> None:
         """Write a commit or a stop to all units of the line; a stop goes before all that wait."""
         link = self._opened()
-        await link.broadcast(modbus_map.to_broadcast(request), kind_on_line(request))
+        kind = kind_on_line(request)
+        unit = None if kind.silences else self._url.unit
+        await link.broadcast(modbus_map.to_broadcast(request), kind, unit=unit)
         self._last_sent = link.last_sent
 
     async def _check_alone(self) -> None:

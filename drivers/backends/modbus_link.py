@@ -7,20 +7,22 @@ answer it is given the time to come all the same, or it would run into the next 
 import asyncio
 import contextlib
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from weakref import WeakKeyDictionary
 
 from drivers import clock
-from drivers.backends.line_turns import in_turn
+from drivers.backends.line_turns import LineTurns
 from drivers.backends.modbus_frames import Answer, AnswerReader, Telegram, make_telegram
 from drivers.backends.modbus_stream import Stream, open_stream
 from drivers.backends.modbus_url import ModbusUrl
 from drivers.backends.waiting import reply_within
 from drivers.errors import LinkError, LinkTimeout
 from drivers.protocol.definition import PROTOCOL
+from drivers.protocol.messages import Request
 from drivers.protocol.modbus_map import Read, Write
 from drivers.protocol.modbus_timing import silence
 from drivers.statistics import WireCounters
-from drivers.turns import Kind, Turns
+from drivers.turns import Kind
 
 _REACTION = PROTOCOL.reaction
 _BROADCAST: int = PROTOCOL.modbus["broadcast"]
@@ -41,7 +43,7 @@ class ModbusLink:
         self.last_sent = 0.0
         self._stream: Stream | None = None
         self._opening = asyncio.Lock()
-        self._turns = Turns()
+        self._turns = LineTurns()
         self._reader = AnswerReader(is_rtu=line.is_rtu, counters=self.counters)
         self._users: dict[int, Callable[[str], None]] = {}  # by their units
         self.is_contradicted = False  # whether the last answer was followed by another
@@ -137,16 +139,30 @@ class ModbusLink:
             finally:
                 self._answer = None
 
-        return await in_turn(self._turns, kind, exchange)
+        return await self._turns.carry_out(kind, exchange, address=unit)
 
-    async def broadcast(self, write: Write, kind: Kind) -> None:
-        """Write to all units, in the turn of this kind; nobody answers."""
-        async with self._turns.take(kind):
+    async def broadcast(self, write: Write, kind: Kind, *, unit: int | None) -> None:
+        """Write to all units, in the turn of this kind and unit; nobody answers.
+
+        unit: whose stop this gives way to, and which may be one that others ask meanwhile; or None.
+        """
+
+        async def send() -> None:
             await self._await_silence()
             self._telegram = None
             telegram = self._make(None, write, unit=_BROADCAST)
             self._send(telegram.frame)
             self._free_from = self.last_sent + self._time_of(len(telegram.frame)) + self._gap
+
+        await self._turns.carry_out(kind, send, address=unit)
+
+    def is_unsent(self, unit: int) -> bool:
+        """Whether what is asked of a unit waits for others, or for the line to be silent."""
+        return self._turns.is_unsent(unit)
+
+    def silencing(self, request: Request, unit: int) -> AbstractContextManager[None]:
+        """See `Backend.silencing`."""
+        return self._turns.silencing(request, unit)
 
     def _make(self, read: Read | None, write: Write | None, *, unit: int) -> Telegram:
         self._transaction = (self._transaction + 1) % _TRANSACTIONS
@@ -162,6 +178,7 @@ class ModbusLink:
         self._given, self.is_contradicted = None, False
         self._came.clear()
         self._stream.write(frame)
+        self._turns.sent()
         self.last_sent = clock.now()
         self.counters.frames_out += 1
 

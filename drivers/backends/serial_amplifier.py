@@ -5,9 +5,10 @@ line, each at its own address.
 """
 
 import asyncio
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 
-from drivers.backends.line_turns import in_turn, kind_on_line
+from drivers.backends.line_turns import kind_on_line
 from drivers.backends.serial_line import SerialLine, shared_line
 from drivers.backends.serial_url import SerialUrl
 from drivers.backends.stand_in import number_below
@@ -76,6 +77,17 @@ class SerialBackend(WireBackend):
         """Time [s] on the line of loading an envelope; 0 where the line's end is a server."""
         return loading_time(knots, baud=self._url.baud) if self._url.is_local else 0.0
 
+    @property
+    def is_unsent(self) -> bool:
+        """Whether what is asked waits for others on the line."""
+        return self._line is not None and self._line.turns.is_unsent(self._url.address)
+
+    def silencing(self, request: Request) -> AbstractContextManager[None]:
+        """See `Backend.silencing`."""
+        if self._line is None:
+            return nullcontext()
+        return self._line.turns.silencing(request, self._url.address)
+
     async def open(self) -> None:
         """Open the port, for this process alone where the system can; raises LinkError."""
         if self._line is not None:
@@ -112,7 +124,9 @@ class SerialBackend(WireBackend):
 
         if len(line.addresses) == 1:
             return await exchange()
-        return await in_turn(line.turns, kind_on_line(request), exchange)
+        return await line.turns.carry_out(
+            kind_on_line(request), exchange, address=self._url.address
+        )
 
     async def broadcast(self, request: Broadcast) -> None:
         """Send a commit to every amplifier of the line in its turn, or a stop at once."""
@@ -121,8 +135,11 @@ class SerialBackend(WireBackend):
         if isinstance(request, Stop):
             line.send(data)
             return
-        async with line.turns.take(Kind.ORDINARY):
+
+        async def send() -> None:
             line.send(data)
+
+        await line.turns.carry_out(Kind.ORDINARY, send, address=self._url.address)
 
     async def _check_alone(self) -> None:
         """Leave a second amplifier of this address the time to answer; LinkError where one does."""
@@ -141,6 +158,7 @@ class SerialBackend(WireBackend):
         self._answered, self._is_contradicted = None, False
         try:
             line.send(data)
+            line.turns.sent()
             self._last_sent = line.last_sent
             self._counters.frames_out += 1
             on_line = exchange_time(len(data), baud=self._url.baud)

@@ -4,11 +4,11 @@ import asyncio
 from collections.abc import Callable
 
 from drivers import clock
+from drivers.backends.line_turns import LineTurns
 from drivers.backends.serial_port import open_port
 from drivers.backends.stand_in import Port
 from drivers.errors import LinkError
 from drivers.protocol.serial_frame import Frame, FrameReader
-from drivers.turns import Turns
 
 
 class SerialLine:
@@ -19,7 +19,7 @@ class SerialLine:
 
     def __init__(self, port: str, *, baud: int) -> None:
         self.port = port
-        self.turns = Turns()
+        self.turns = LineTurns()
         self.last_sent = 0.0
         self.frames_out = 0
         self._baud = baud

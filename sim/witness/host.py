@@ -169,9 +169,8 @@ class Host:
     def _check_stop(self, side: Side, time: float, asked: Asked) -> None:
         is_other = asked.kind is not Kind.STOP and asked.kind not in _UNCOUNTED
         # What was asked before it, at the same moment, may go before it.
-        wished = side.stop_wished
-        if wished is not None and time > wished + self._times.begun and is_other:
-            if asked.kind is Kind.DISARM and wished < self._disarm_wished + _BEGUN:
+        if side.stop_wished is not None and time > side.stop_wished and is_other:
+            if asked.kind is Kind.DISARM and side.stop_wished < self._disarm_wished + _BEGUN:
                 return  # which silences as well
             side.complain(
                 "stop",

@@ -35,9 +35,8 @@ class Times:
 
     lift: from the last finger's lift to a command of zero; release: to zero itself;
     touch: from a touch to a pattern; stop: from the wish to the frame; heartbeat: between two signs
-    of life; begun: between two frames of a line, so that what had its turn before a stop was wished
-    may go out yet; reply: to an answer; together: until all amplifiers have what one has; slack:
-    what the witness's own clock may be wrong by.
+    of life; reply: to an answer; together: until all amplifiers have what one has; slack: what the
+    witness's own clock may be wrong by.
     """
 
     lift: float = 0.020
@@ -45,7 +44,6 @@ class Times:
     touch: float = 0.100
     stop: float = 0.020
     heartbeat: float = 0.075
-    begun: float = 0.0
     reply: float = 0.030
     together: float = 0.020
     slack: float = 0.001

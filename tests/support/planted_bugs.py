@@ -258,7 +258,7 @@ DRIVERS: dict[str, Bug] = {
     ),
     "two requests are on the line at once": _bug(
         "credit",
-        Edit("drivers.turns:Turns.take", "if self._taken:", "if False:"),
+        Edit("drivers.turns:Turns.come", "if self._taken or", "if False and"),
         scenario=scenarios.slow_touch,
     ),
     "a stop is queued behind": _bug(

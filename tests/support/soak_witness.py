@@ -21,7 +21,6 @@ _CHANNEL = {"frequency_hz": [40, 500], "level": 1.0}
 _TOUCH = 0.19  # s; from a touch to its pattern
 _HEARTBEAT = 0.055  # s; between two signs of life, and as long as what is on the wire takes
 _RAMP = 0.040  # s; along which what plays may fall silent after the last lift
-_RTU_GAP = 0.002  # s; of silence before each frame
 _ENDED = 1e-6  # s; after a lease has ended
 
 
@@ -35,7 +34,6 @@ class SoakWitness:
         self, loop: VirtualLoop, urls: Mapping[str, str], *, channels: int, release: float
     ) -> None:
         places = {name: place_of(url) for name, url in urls.items()}
-        kinds = {place.kind for place in places.values()}
         plan: dict[str, Any] = {
             "wires": {place.place: place.kind for place in places.values()},
             "amplifiers": {
@@ -52,7 +50,6 @@ class SoakWitness:
                 "touch": _TOUCH,
                 "stop": release,
                 "heartbeat": _HEARTBEAT + release,
-                "begun": _RTU_GAP if "modbus-rtu" in kinds else 0.0,
             },
         }
         self._loop = loop

@@ -1,0 +1,344 @@
+"""A stop goes before whatever is not on the wire yet, on lines that amplifiers share, too.
+
+In virtual time, so that it can come at any moment between two frames; what is told is what the
+amplifiers were asked, in its order.
+"""
+
+import asyncio
+from collections.abc import Callable, Coroutine
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import pytest
+
+from drivers.amplifier import Amplifier
+from drivers.backends.stand_in import STAND_IN
+from drivers.command import CommandSet, DriveCommand
+from drivers.errors import CommandRefused
+from drivers.guard import Guard, GuardLimits, SafeCommand
+from drivers.protocol.messages import (
+    Apply,
+    Disarm,
+    GetStatus,
+    Reply,
+    Request,
+    Stage,
+    State,
+    Stop,
+)
+from drivers.registry import open_backend
+from memory_machine import MemoryMachine
+from model.rig import Channel, Rig
+from sim.far_ends.wires import Wire
+from sim.transport.pseudo_terminal import TERMINAL_MAKER
+from virtual_loop import VirtualLoop, run_virtual
+from wires import far_side
+
+LINES = {
+    "serial": Wire("serial", speed=115_200, shared=True),
+    "modbus+rtu": Wire("modbus-rtu", speed=115_200, shared=True),
+}
+BUSES = {"can+slcan": Wire("slcan", shared=True)}
+RTU_GAP = 0.00175  # s of silence before a frame above 19 200 Bd (Modbus over serial line, 2.5.1.1)
+MOMENTS = [number * 0.0005 for number in range(1, 30)]  # s; one of them is in every gap
+
+
+class Chain:
+    """Two armed amplifiers, east and west, and all that they were told since.
+
+    frames: how many the host has put on the line since.
+    """
+
+    def __init__(self) -> None:
+        self.asked: list[tuple[str, Request]] = []
+        self.frames = 0
+
+    def begin(self, amplifiers: dict[str, Amplifier]) -> None:
+        """They are ready."""
+        self.east, self.west = amplifiers["east"], amplifiers["west"]
+        self.forget()
+
+    def forget(self) -> None:
+        """Count anew."""
+        self.asked.clear()
+        self.frames = 0
+
+    def seen(self, link: str, toward: str, data: bytes) -> None:
+        """Bytes go out."""
+        self.frames += toward == "amplifier"
+
+    def kinds(self) -> list[tuple[str, str]]:
+        """Whom, and what, by its name."""
+        return [(name, type(request).__name__) for name, request in self.asked]
+
+    def tone(self, amplifier: Amplifier, token: int, level: float = 0.3) -> SafeCommand:
+        """A set on channel 0."""
+        guard = Guard(GuardLimits(40.0, 500.0, 1.0), amplifier.capabilities)
+        commands = (DriveCommand(0, 110.0, level),)
+        return guard.check(CommandSet(token, commands, ramp=0.0, valid_for=0.0))
+
+
+def on_a_line(line: str, rig: Rig, use: Callable[[Chain], Coroutine[Any, Any, None]]) -> None:
+    """Use both in virtual time, from a moment at which their line has long been silent."""
+    wiring = {
+        era: Channel("west" if number % 2 else "east", number // 2)
+        for number, era in enumerate(rig.wiring)
+    }
+    two = replace(rig, wiring=wiring, amplifiers={"east": "sim://", "west": "sim://"})
+
+    chain = Chain()
+
+    async def run() -> None:
+        loop = asyncio.get_running_loop()
+        assert isinstance(loop, VirtualLoop)
+        machine = MemoryMachine(loop)
+        STAND_IN.set(machine)
+        TERMINAL_MAKER.set(machine.make_terminal)
+        async with far_side({**LINES, **BUSES}[line], two) as far:
+            for name, station in far.stations.items():
+                station.exchange = partial(  # type: ignore[method-assign]
+                    note, chain.asked, name, station.exchange
+                )
+            both = {name: Amplifier(open_backend(url)) for name, url in far.urls.items()}
+            for amplifier in both.values():
+                await amplifier.open()
+                await amplifier.arm(2.0)
+            await asyncio.sleep(0.1)
+            chain.begin(both)
+            await use(chain)
+            for amplifier in both.values():
+                await amplifier.close()
+
+    run_virtual(run(), seen=chain.seen)
+
+
+def note(
+    asked: list[tuple[str, Request]],
+    name: str,
+    exchange: Callable[[Request], Reply | None],
+    request: Request,
+) -> Reply | None:
+    """Keep what an amplifier is told, and let it answer; on Modbus all answers hold its status."""
+    if not isinstance(request, GetStatus):
+        asked.append((name, request))
+    return exchange(request)
+
+
+async def refused(task: "asyncio.Task[Any]") -> None:
+    """It gave way, and says so."""
+    with pytest.raises(CommandRefused, match="superseded"):
+        await task
+
+
+SENDING: dict[str, Callable[[Chain], Coroutine[Any, Any, object]]] = {
+    "clear": lambda chain: chain.east.clear(),
+    "stage": lambda chain: chain.east.stage(chain.tone(chain.east, 7)),
+    "apply": lambda chain: chain.east.apply(chain.tone(chain.east, 7)),
+    "heartbeat": lambda chain: chain.east.heartbeat(),
+    "commit for all": lambda chain: chain.east.commit_on_bus(7),
+}
+
+
+@pytest.mark.parametrize("line", LINES)
+@pytest.mark.parametrize("what", SENDING)
+def test_what_waits_for_the_line_is_not_sent_before_a_stop(
+    line: str, what: str, coarse_rig: Rig
+) -> None:
+    """West is on the line and east's request waits for it: then east's stop is what comes next,
+    and what waited is refused without ever having been sent."""
+
+    async def use(chain: Chain) -> None:
+        beat = asyncio.create_task(chain.west.heartbeat())
+        await asyncio.sleep(0.0005)
+        waiting = asyncio.create_task(SENDING[what](chain))
+        await asyncio.sleep(0.0005)
+        status = await chain.east.stop()
+        await refused(waiting)
+        await beat
+        assert chain.kinds() == [("west", "Ping"), ("east", "Stop")]
+        assert status.state is State.QUICK_STOP_ACTIVE
+        assert chain.east.statistics.retries == chain.east.statistics.timeouts == 0
+        assert (await chain.east.heartbeat()).state is State.QUICK_STOP_ACTIVE
+
+    on_a_line(line, coarse_rig, use)
+
+
+@pytest.mark.parametrize("line", LINES)
+def test_a_stop_whose_turn_is_to_come_keeps_the_line_free(line: str, coarse_rig: Rig) -> None:
+    """West waits for its own answer and east for the line when west's stop is wished: the stop is
+    next, and east's request comes after it, once, and is answered."""
+
+    async def use(chain: Chain) -> None:
+        beat = asyncio.create_task(chain.west.heartbeat())
+        await asyncio.sleep(0.0005)
+        waiting = asyncio.create_task(chain.east.apply(chain.tone(chain.east, 7)))
+        await asyncio.sleep(0.0005)
+        await chain.west.stop()
+        await beat
+        assert (await waiting).token == 7
+        assert chain.kinds() == [("west", "Ping"), ("west", "Stop"), ("east", "Apply")]
+
+    on_a_line(line, coarse_rig, use)
+
+
+@pytest.mark.parametrize("line", LINES)
+@pytest.mark.parametrize("whose", ["east", "west"])
+@pytest.mark.parametrize("silencing", [Stop, Disarm, Apply])
+def test_at_whatever_moment_it_is_wished_it_comes_next(
+    line: str, whose: str, silencing: type[Request], coarse_rig: Rig
+) -> None:
+    """While sets and heartbeats follow each other on the line, what silences one amplifier is the
+    next frame that the host sends, and no token is played twice."""
+
+    async def use(chain: Chain) -> None:
+        amplifier = {"east": chain.east, "west": chain.west}[whose]
+        for number, moment in enumerate(MOMENTS):
+            chain.forget()
+            tokens = {"east": 2 * number + 1, "west": 2 * number + 2}
+            others = [
+                asyncio.create_task(one())
+                for one in (
+                    chain.west.heartbeat,
+                    partial(chain.east.apply, chain.tone(chain.east, tokens["east"])),
+                    chain.east.heartbeat,
+                    partial(chain.west.apply, chain.tone(chain.west, tokens["west"])),
+                )
+            ]
+            await asyncio.sleep(moment)
+            sent = chain.frames
+            if silencing is Apply:
+                await amplifier.apply(chain.tone(amplifier, 1000 + number, level=0.0))
+            else:
+                await (amplifier.stop(0.0) if silencing is Stop else amplifier.disarm(0.0))
+            await asyncio.gather(*others, return_exceptions=True)
+            name, request = chain.asked[sent]
+            assert (name, type(request)) == (whose, silencing), f"wished after {moment} s"
+            assert not isinstance(request, Apply) or request.command_set.token == 1000 + number
+            tokens_of_applies = [
+                request.command_set.token
+                for _, request in chain.asked
+                if isinstance(request, Apply | Stage)
+            ]
+            assert len(set(tokens_of_applies)) == len(tokens_of_applies)
+            if silencing is not Apply:
+                for one in (chain.east, chain.west):
+                    await one.disarm(0.0)
+                    await asyncio.sleep(0.1)
+                    await one.clear()
+                    await one.arm(2.0)
+            await asyncio.sleep(0.1)
+
+    on_a_line(line, coarse_rig, use)
+
+
+@pytest.mark.parametrize("whose", ["east", "west"])
+def test_between_two_frames_of_rtu_it_is_not_too_late(whose: str, coarse_rig: Rig) -> None:
+    """What has its turn but waits for the line to be silent for 3.5 characters gives way to a stop
+    of its own amplifier for good, and to that of another until it is out."""
+
+    async def use(chain: Chain) -> None:
+        await chain.west.heartbeat()
+        staged = asyncio.create_task(chain.east.stage(chain.tone(chain.east, 7)))
+        await asyncio.sleep(RTU_GAP / 2)
+        begin = asyncio.get_running_loop().time()
+        amplifier = {"east": chain.east, "west": chain.west}[whose]
+        await amplifier.stop()
+        assert amplifier.last_sent - begin < RTU_GAP
+        if whose == "east":
+            await refused(staged)
+        else:
+            assert (await staged).token == 7
+        after = [] if whose == "east" else [("east", "Stage")]
+        assert chain.kinds() == [("west", "Ping"), (whose, "Stop"), *after]
+
+    on_a_line("modbus+rtu", coarse_rig, use)
+
+
+@pytest.mark.parametrize("line", LINES)
+@pytest.mark.parametrize("what", ["disarm", "silent set"])
+def test_a_stop_goes_before_what_else_silences(line: str, what: str, coarse_rig: Rig) -> None:
+    """A disarm or a silent set that waits for the line lets a stop of its own amplifier, or of the
+    other, go first, and follows it."""
+
+    async def use(chain: Chain) -> None:
+        for amplifier, name in ((chain.east, "east"), (chain.west, "west")):
+            await asyncio.sleep(0.1)
+            chain.forget()
+            beat = asyncio.create_task(chain.west.heartbeat())
+            await asyncio.sleep(0.0005)
+            silent = chain.east.apply(chain.tone(chain.east, 7, 0.0))
+            waiting = asyncio.create_task(chain.east.disarm() if what == "disarm" else silent)
+            if what == "disarm":
+                silent.close()
+            await asyncio.sleep(0.0005)
+            await amplifier.stop()
+            await asyncio.gather(beat, waiting, return_exceptions=True)
+            kind = "Disarm" if what == "disarm" else "Apply"
+            assert chain.kinds() == [("west", "Ping"), (name, "Stop"), ("east", kind)]
+            for one in (chain.east, chain.west):
+                await one.disarm(0.0)
+                await asyncio.sleep(0.1)
+                await one.clear()
+                await one.arm(2.0)
+
+    on_a_line(line, coarse_rig, use)
+
+
+def test_on_can_a_stop_does_not_wait_for_who_listens_before_arming(coarse_rig: Rig) -> None:
+    """An arm that listens for another host's heartbeats, up to 60 ms, gives way and is refused."""
+
+    async def use(chain: Chain) -> None:
+        await chain.east.close()
+        await chain.east.open()
+        arming = asyncio.create_task(chain.east.arm(2.0))
+        await asyncio.sleep(0.005)
+        chain.forget()
+        begin = asyncio.get_running_loop().time()
+        await chain.east.stop()
+        assert chain.east.last_sent == begin
+        await refused(arming)
+        assert chain.kinds() == [("east", "Stop")]
+
+    on_a_line("can+slcan", coarse_rig, use)
+
+
+@pytest.mark.parametrize("line", LINES)
+def test_a_stop_that_is_given_up_lets_the_others_go_on(line: str, coarse_rig: Rig) -> None:
+    """Who wished it is cancelled before its turn has come: what waits on the line is sent all the
+    same, and the next requests find it free."""
+
+    async def use(chain: Chain) -> None:
+        beat = asyncio.create_task(chain.west.heartbeat())
+        await asyncio.sleep(0.0005)
+        waiting = asyncio.create_task(chain.east.clear())
+        stop = asyncio.create_task(chain.west.stop())
+        await asyncio.sleep(0.0005)
+        stop.cancel()
+        await asyncio.gather(beat, waiting)
+        assert stop.cancelled()
+        await chain.west.heartbeat()
+        assert chain.kinds() == [("west", "Ping"), ("east", "Clear"), ("west", "Ping")]
+
+    on_a_line(line, coarse_rig, use)
+
+
+@pytest.mark.parametrize("line", LINES)
+def test_who_is_cancelled_as_it_gives_way_is_cancelled(line: str, coarse_rig: Rig) -> None:
+    """A request that its caller gives up in the very moment in which it gives way ends as
+    cancelled, not as refused: time-outs of callers keep their meaning."""
+
+    async def use(chain: Chain) -> None:
+        beat = asyncio.create_task(chain.west.heartbeat())
+        await asyncio.sleep(0.0005)
+        waiting = asyncio.create_task(chain.east.clear())
+        await asyncio.sleep(0.0005)
+        stop = asyncio.create_task(chain.east.stop())
+        await asyncio.sleep(0)
+        waiting.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await waiting
+        await asyncio.gather(beat, stop)
+        assert chain.kinds() == [("west", "Ping"), ("east", "Stop")]
+
+    on_a_line(line, coarse_rig, use)

@@ -40,6 +40,7 @@ Thin: TypeAlias = Callable[[Sequence[Datagram]], Iterable[Datagram]]
 
 _TIMESTAMPS = 35  # SO_TIMESTAMPNS and SCM_TIMESTAMPNS of Linux, which Python does not name
 _TIMESPEC = struct.Struct("@ll")
+_LOOKS, _AT_ONCE = 3, 0.00005  # s; two clocks that are read further apart are read again
 _LONGEST_WAIT = 1.0  # s; a system's clock that was set meanwhile must not make touches old
 
 
@@ -86,13 +87,14 @@ class Datagrams:
 
     def _readable(self) -> None:
         """Take what has arrived; reading costs a tenth of what understanding does."""
+        ahead = _ahead(self._loop.time)
         for _ in range(_MOST):
             try:
                 data, ancillary, _, peer = self._line.recvmsg(self._most, _ANCILLARY)
             except OSError:  # there is nothing more, or what was sent from here was refused
                 break
             at = (str(peer[0]), int(peer[1]))
-            self._waiting.append(Datagram(data, at, self._arrival(ancillary)))
+            self._waiting.append(Datagram(data, at, self._arrival(ancillary, ahead)))
         if len(self._waiting) > MANY:
             self._waiting = deque(self._thin(self._waiting), maxlen=_MOST)
         if not self._is_due:
@@ -110,17 +112,31 @@ class Datagrams:
             self._is_due = True
             self._loop.call_soon(self._hand_on)
 
-    def _arrival(self, ancillary: list[tuple[int, int, bytes]]) -> float:
-        """When a datagram arrived, never before the one that was read before it."""
-        waited = 0.0
+    def _arrival(self, ancillary: list[tuple[int, int, bytes]], ahead: float) -> float:
+        """When a datagram arrived, never before the one that was read before it.
+
+        ahead [s]: how far the loop's clock is before the system's.
+        """
+        now = arrived = self._loop.time()
         for level, kind, content in ancillary:
             if (level, kind) == (socket.SOL_SOCKET, _TIMESTAMPS) and len(content) == _TIMESPEC.size:
                 seconds, nanoseconds = _TIMESPEC.unpack(content)
-                waited = time.time() - seconds - nanoseconds * 1e-9
-        if not 0 <= waited <= _LONGEST_WAIT:
-            waited = 0.0
-        self._latest = max(self._latest, self._loop.time() - waited)
+                arrived = seconds + nanoseconds * 1e-9 + ahead
+        if not now - _LONGEST_WAIT <= arrived <= now:
+            arrived = now
+        self._latest = max(self._latest, arrived)
         return self._latest
+
+
+def _ahead(clock: Callable[[], float]) -> float:
+    """How far a clock is before the system's [s]; looked again where something came in between."""
+    ahead = 0.0
+    for _ in range(_LOOKS):
+        before = clock()
+        ahead = before - time.time()
+        if clock() - before < _AT_ONCE:
+            break
+    return ahead
 
 
 _ANCILLARY = 64  # bytes; room for a timestamp and its header

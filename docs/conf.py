@@ -1,16 +1,23 @@
 """How Sphinx builds these pages; `make docs` does it, with warnings as errors."""
 
+import re
 from importlib.metadata import version as version_of
+
+from sphinx.application import Sphinx
 
 project = "era-haptics"
 project_copyright = "the era-haptics developers"
 release = version = version_of("era-haptics")
 
-extensions = ["myst_parser", "sphinx-mathjax-offline"]
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx-mathjax-offline"]
 myst_enable_extensions = ["dollarmath", "deflist", "colon_fence"]
 myst_heading_anchors = 4
 exclude_patterns = ["_build"]
 root_doc = "index"
+
+autodoc_typehints_format = "short"
+autodoc_member_order = "bysource"
+python_use_unqualified_type_names = True
 
 html_theme = "furo"
 html_title = "era-haptics"
@@ -23,3 +30,28 @@ html_theme_options = {
 
 # Everything a page loads lies beside it: docs are read where there is no network, too.
 intersphinx_mapping: dict[str, tuple[str, str | None]] = {}
+
+
+_ARRAY_TYPE = re.compile(r"~numpy\.ndarray\[.*?~numpy\.dtype\[[^]]*\]\]")
+_LONG_ARRAY = re.compile(r"array\(\[([^,]+),.+?, *([^,]+)\]\)")
+
+
+def _shorten(
+    app: Sphinx,
+    what: str,
+    name: str,
+    obj: object,
+    options: object,
+    signature: str | None,
+    gives: str | None,
+) -> tuple[str, str | None] | None:
+    """Say of an array that it is one, for its shape stands in the words below."""
+    if signature is None:
+        return None
+    short = _LONG_ARRAY.sub(r"[\1, ..., \2]", _ARRAY_TYPE.sub("ndarray", signature))
+    return short, None if gives is None else _ARRAY_TYPE.sub("ndarray", gives)
+
+
+def setup(app: Sphinx) -> None:
+    """Called by Sphinx."""
+    app.connect("autodoc-process-signature", _shorten)

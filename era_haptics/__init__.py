@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from model.maps import PlateMap
     from model.pattern import Pattern
     from model.rig import Rig
-    from model.rig_file import load_rig
+    from model.rig_file import example_rig_path, load_rig
     from model.supported_modes import SupportedModes
     from model.table import LocalizationTable
     from model.table_file import load_table, save_table
@@ -68,6 +68,7 @@ _HOMES = {
     "draw_map": "era_haptics.pictures",
     "draw_pattern": "era_haptics.pictures",
     "draw_playback": "era_haptics.pictures",
+    "example_rig_path": "model.rig_file",
     "load_rig": "model.rig_file",
     "load_table": "model.table_file",
     "open_amplifier": "era_haptics.amplifiers",
@@ -104,6 +105,7 @@ __all__ = [
     "draw_map",
     "draw_pattern",
     "draw_playback",
+    "example_rig_path",
     "load_rig",
     "load_table",
     "open_amplifier",

@@ -1,11 +1,12 @@
 """The localization table, and what it answers."""
 
+from collections.abc import Sequence
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from era_haptics.places import Places, as_points
+from model.arrays import FloatArray
 from model.localization import Grid
 from model.pattern import Pattern
 from model.perception import STRONG_DB_SL
@@ -21,7 +22,7 @@ def table(
     rig: Rig,
     *,
     mode: str = "switched",
-    frequencies: ArrayLike = PAPER_FREQUENCIES,
+    frequencies: Sequence[float] | FloatArray = PAPER_FREQUENCIES,
     grid: Grid = PAPER_GRID,
 ) -> LocalizationTable:
     """The rig's localization table, from the user's cache, or built in a second or two and kept.

@@ -1,0 +1,157 @@
+# %% [markdown]
+"""
+# A panel from Python: simulated amplifier, daemon, touches
+
+For who builds a panel. Run it: `python examples/hmi_engineer.py`, or open it as a notebook in VS
+Code or, with jupytext, in Jupyter. It starts what a running panel has, each a process of its own:
+
+    simulated amplifier, plate (era sim)  <- serial ->  daemon (era daemon)  <- socket ->  here
+
+With a real amplifier and a real panel the first goes, its URL in the rig becomes that of the
+hardware, and the daemon gets a `touch:` in its file. Nothing else changes.
+"""
+
+# %%
+import atexit
+import json
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from contextlib import ExitStack
+from pathlib import Path
+
+import numpy as np
+
+import era_haptics as era
+
+target, quiet = (0.08, 0.06), (0.22, 0.16)
+ERA = Path(sys.executable).with_name("era")
+panel = ExitStack()  # what is closed at the end: daemon, then amplifier
+atexit.register(panel.close)  # also where a cell fails
+folder = Path(panel.enter_context(tempfile.TemporaryDirectory(prefix="era-")))
+
+
+def start(*arguments):
+    """An `era` command that ends with the panel."""
+    process = subprocess.Popen([ERA, *map(str, arguments)], stdout=subprocess.PIPE, text=True)
+
+    def end():
+        process.terminate()
+        process.communicate(timeout=10)
+
+    panel.callback(end)
+    return process
+
+
+# %% [markdown]
+"""
+## The simulated amplifier
+It prints where it is, and serves a control socket on which fingers are put on the plate and asked
+what they felt: one JSON object a line each way.
+"""
+
+# %%
+far_end = start("sim", era.example_rig_path(), "--serial", "--control", folder / "control")
+url = far_end.stdout.readline().strip().removeprefix("main: ")
+print("the amplifier is at", url)
+control_socket = panel.enter_context(socket.socket(socket.AF_UNIX))
+control_socket.connect(str(folder / "control"))
+lines = panel.enter_context(control_socket.makefile("rw", encoding="utf-8"))
+
+
+def ask_plate(**question):
+    """One question to the simulated plate, and its answer."""
+    print(json.dumps(question), file=lines, flush=True)
+    return json.loads(lines.readline())
+
+
+ask_plate(op="fingers", fingers={"target": target, "quiet": quiet})
+
+# %% [markdown]
+"""
+## One amplifier by hand
+Before a daemon takes it over: who it is, and a buzz of a tenth of a second on one ERA. Nothing
+beyond the rig's limits is sent, and it is disarmed when the block ends.
+"""
+
+# %%
+rig = era.load_rig(era.example_rig_path())
+with era.open_amplifier(rig, url=url) as amplifier:
+    print(amplifier.identity.product, "with", amplifier.capabilities.channels, "channels")
+    amplifier.arm()
+    amplifier.play(era.commands_for(rig, {"SW": era.Drive(110, level=0.1)})["main"], duration=0.1)
+
+# %% [markdown]
+"""
+## The daemon
+Its file needs the rig; its table is built once and kept. It starts disarmed.
+"""
+
+# %%
+text = era.example_rig_path().read_text("utf-8").replace('"sim://"', json.dumps(url))
+(folder / "rig.yaml").write_text(text, "utf-8")
+(folder / "daemon.yaml").write_text(
+    "rig: rig.yaml\nmode: phased\nsocket: era.sock\nlog: {level: warning}\n", "utf-8"
+)
+daemon = start("daemon", folder / "daemon.yaml")
+
+
+def connect():
+    """A client, as soon as the daemon serves and is in order; the first start builds its table."""
+    for _ in range(600):
+        try:
+            client = era.Client.connect(folder / "era.sock", name="example")
+        except era.Unreachable:
+            if daemon.poll() is not None:
+                raise
+        else:
+            if client.status().state == "READY_TO_SWITCH_ON":
+                return client
+            client.close()
+        time.sleep(0.1)
+    raise TimeoutError("the daemon does not get ready")
+
+
+# %% [markdown]
+"""
+## Touches
+A finger rests in one place, then another comes down: the newest one feels it, the other must not.
+The daemon forgets fingers that it does not hear of for 150 ms, so frames are repeated.
+"""
+
+
+# %%
+def hold(client, places, seconds):
+    """Fingers at these places for a while."""
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        client.touch(places)
+        time.sleep(0.05)
+
+
+client = panel.enter_context(connect())
+with client.armed("example"):
+    hold(client, [quiet], 0.2)
+    hold(client, [quiet, target], 1.0)
+    status = client.status()
+    now = time.monotonic()  # one clock for all processes of a machine
+    felt = ask_plate(op="felt", since_s=now - 0.3, until_s=now - 0.05)["fingers"]
+    client.touch([])
+
+# %%
+# Amplitudes of different frequencies add; a target counts by its mean, a quiet finger by its
+# loudest point, as in the predictions.
+peak = {name: np.sum(each["amplitude_m_s2"], axis=0) for name, each in felt.items()}
+felt_contrast_db = 20 * np.log10(peak["target"].mean() / peak["quiet"].max())
+predicted_contrast_db = status.predicted_contrast_db
+print("played:", {name: f"{tone.frequency_hz:g} Hz" for name, tone in status.drive.items()})
+print(
+    f"target {peak['target'].mean():.2f} m/s², quiet finger {peak['quiet'].max():.3f} m/s² at most"
+)
+print(f"contrast {felt_contrast_db:.1f} dB felt, {predicted_contrast_db:.1f} dB predicted")
+
+# %%
+panel.close()
+print("daemon ended with status", daemon.returncode)

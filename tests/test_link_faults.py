@@ -245,9 +245,9 @@ async def test_each_token_is_applied_once_under_loss(far: FarSide) -> None:
     commit = far.amplifier._commit
 
     def noted(token: int, now: float) -> object:
-        active = far.amplifier._active
+        active = far.amplifier._sets.active
         reply = commit(token, now)
-        if far.amplifier._active is not active:
+        if far.amplifier._sets.active is not active:
             played.append(token)
         return reply
 

@@ -2,7 +2,8 @@
 
 Everything happens at its own time: a watchdog that ran out between two calls ran out when it did,
 and what a channel plays is a description in time (`sim.waveform`), not samples. Nothing here reads
-a clock or knows a wire.
+a clock or knows a wire. State, watchdog, warmth and silence stand in one file, for each of them ends
+the others; what can be played, what is staged and what sounds are other files.
 
 Not modelled: the time high voltage takes to rise, and the voltage waveform behind a tone.
 """
@@ -11,7 +12,6 @@ import math
 from collections import deque
 from collections.abc import Callable, Sequence
 
-from drivers.command import CommandSet, Envelope
 from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.messages import (
     Achieved,
@@ -30,7 +30,6 @@ from drivers.protocol.messages import (
     GetStatus,
     Hello,
     Identity,
-    Loaded,
     LoadEnvelope,
     Nak,
     NakCode,
@@ -41,16 +40,16 @@ from drivers.protocol.messages import (
     Status,
     Stop,
 )
-from sim.amplifier.channels import Channels, PlayableSet
+from sim.amplifier.channels import Channels
 from sim.amplifier.heat import DERATE_ABOVE, DERATED, FAULT_ABOVE, GOOD_BELOW, Heat
-from sim.amplifier.quantiser import RefusedSet, quantise_envelope, quantise_set
+from sim.amplifier.quantiser import RefusedSet
+from sim.amplifier.sets import Sets
 from sim.amplifier.states import ENABLED, next_state
 from sim.waveform.output import Output
 
 SILENCING_RAMP = 0.005  # s; a fault must be silent within 5 ms of the watchdog's expiry
 _Q = PROTOCOL.quantities
 _FAULTS_KEPT = 16
-_TOKENS_REMEMBERED = 16  # duplicates of old sets are older than a few exchanges at most
 _HIGH_VOLTAGE = 1800.0  # V
 _DISCHARGE = 0.02  # s; time constant of the supply once it is off
 _SLOTS = 63
@@ -103,10 +102,7 @@ class SimulatedAmplifier:
     def _start(self) -> None:
         """As when its supply comes back: nothing is remembered but the temperature and faults."""
         self._channels = Channels(self.capabilities.channels)
-        self._slots: dict[int, Envelope] = {}
-        self._staged: PlayableSet | None = None
-        self._active: PlayableSet | None = None
-        self._tokens: deque[int] = deque(maxlen=_TOKENS_REMEMBERED)
+        self._sets = Sets(self.capabilities)
         self._watchdog = 0.0
         self._fed = 0.0
         self._vibration_end = math.inf
@@ -148,7 +144,10 @@ class SimulatedAmplifier:
         following = next_state(self.state, type(request))
         if following is None:
             return Nak(NakCode.WRONG_STATE)
-        reply = self._carry_out(request, following, now)
+        try:
+            reply = self._carry_out(request, following, now)
+        except RefusedSet as refusal:
+            reply = refusal.nak
         if not isinstance(request, _NOT_FEEDING) and not isinstance(reply, Nak):
             self._fed = now
         # A watchdog that is fed by this very request is full when its status is told.
@@ -163,7 +162,7 @@ class SimulatedAmplifier:
         return Status(
             state=self.state,
             fault=self.fault,
-            token=self._active.token if self._active else 0,
+            token=self._sets.token,
             high_voltage=is_on,
             temperature=self._heat.at(now),
             watchdog_left=left,
@@ -221,16 +220,15 @@ class SimulatedAmplifier:
                     self.fault = Fault.NONE
                     self._enter(following, now)
             case LoadEnvelope(envelope=envelope):
-                return self._load(envelope)
+                return self._sets.load(envelope)
             case Stage(command_set=wanted):
-                return self._stage(wanted)
+                return self._sets.stage(wanted, share=self._share)
             case Commit(token=token):
                 return self._commit(token, now)
             case Apply(command_set=wanted):
-                if self._active is not None and self._active.token == wanted.token:
-                    return Achieved(self._active.token, self._active.commands)
-                reply = self._stage(wanted)
-                return reply if isinstance(reply, Nak) else self._commit(wanted.token, now)
+                if self._sets.playing(wanted.token) is None:
+                    self._sets.stage(wanted, share=self._share)
+                return self._commit(wanted.token, now)
             case _:  # GetStatus and Ping ask for nothing more
                 pass
         return None
@@ -243,59 +241,25 @@ class SimulatedAmplifier:
         self._silence(now, ramp=SILENCING_RAMP)
         self._watchdog = watchdog
         self._fed = now
-        self._active = None
-        self._tokens.clear()
+        self._sets.forget()
         self._enter(State.OPERATION_ENABLED, now)
         return None
 
-    def _load(self, envelope: Envelope) -> Reply:
-        try:
-            kept = quantise_envelope(envelope, self.capabilities)
-        except RefusedSet as refusal:
-            return refusal.nak
-        if kept.knots:
-            self._slots[kept.slot] = kept
-        else:
-            self._slots.pop(kept.slot, None)
-        return Loaded(slot=kept.slot, knots=len(kept.knots))
+    def _commit(self, token: int, now: float) -> Achieved:
+        active = self._sets.playing(token)
+        if active is None:
+            active = self._sets.commit(token)
+            wanted = active.command_set
+            self._channels.play(active, now)
+            self._warm(now)
+            ends = wanted.valid_for > 0 and not wanted.is_silent
+            self._vibration_end = now + wanted.valid_for if ends else math.inf
+        return active.achieved
 
-    def _stage(self, wanted: CommandSet) -> Reply:
-        if wanted.token in self._tokens:  # a late copy, which must not oust what is staged now
-            return Nak(NakCode.BAD_TOKEN)
-        try:
-            staged = self._with_envelopes(quantise_set(wanted, self.capabilities))
-        except RefusedSet as refusal:
-            return refusal.nak
-        if self._is_derated:
-            staged = staged.derated(DERATED)
-        self._staged = staged
-        return Achieved(staged.token, staged.commands)
-
-    def _with_envelopes(self, wanted: CommandSet) -> PlayableSet:
-        """The set with the envelopes that it refers to, as they are loaded now."""
-        onsets: dict[int, Envelope] = {}
-        endings: dict[int, Envelope] = {}
-        for command in wanted.commands:
-            for slot, shapes in ((command.onset, onsets), (command.ending, endings)):
-                if slot and slot not in self._slots:
-                    raise RefusedSet(NakCode.NO_ENVELOPE, command.channel)
-                if slot:
-                    shapes[command.channel] = self._slots[slot]
-        return PlayableSet(wanted, onsets, endings)
-
-    def _commit(self, token: int, now: float) -> Reply:
-        if self._active is not None and self._active.token == token:
-            return Achieved(token, self._active.commands)
-        if self._staged is None or self._staged.token != token:
-            return Nak(NakCode.BAD_TOKEN)
-        self._active, self._staged = self._staged, None
-        wanted = self._active.command_set
-        self._channels.play(self._active, now)
-        self._warm(now)
-        self._tokens.append(token)
-        ends = wanted.valid_for > 0 and not wanted.is_silent
-        self._vibration_end = now + wanted.valid_for if ends else math.inf
-        return Achieved(token, wanted.commands)
+    @property
+    def _share(self) -> float:
+        """Of its level, which it plays now."""
+        return DERATED if self._is_derated else 1.0
 
     def _stopping_ramp(self, ramp: float) -> float:
         """A ramp that can be played: a stop is never refused for its ramp."""
@@ -308,7 +272,7 @@ class SimulatedAmplifier:
         self._channels.silence(moment, ramp=ramp)
         self._silent_from = self._channels.silent_from(moment)
         self._vibration_end = math.inf
-        self._staged = None
+        self._sets.staged = None
         self._warm(moment)
 
     def _enter(self, state: State, moment: float, *, channel: int | None = None) -> None:

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from drivers.command import CommandSet, DriveCommand, Envelope
+from drivers.protocol.messages import Achieved
 from sim.waveform.output import Output, end_along, fade_to, level_of, shape_to
 
 _DERATING_RAMP = 0.02  # s; no click
@@ -28,6 +29,11 @@ class PlayableSet:
     def commands(self) -> tuple[DriveCommand, ...]:
         """The set's commands."""
         return self.command_set.commands
+
+    @property
+    def achieved(self) -> Achieved:
+        """What the host is told of it."""
+        return Achieved(self.token, self.commands)
 
     def derated(self, factor: float) -> "PlayableSet":
         """The same with every level, those of the knots included, at this share."""

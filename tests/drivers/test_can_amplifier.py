@@ -280,7 +280,7 @@ async def test_envelopes_are_loaded_in_blocks_or_segments(
     async with opened(virtual.url()) as amplifier:
         guard = Guard(LIMITS, amplifier.capabilities)
         await amplifier.load_envelope(guard.check_envelope(SHAPE))
-        kept = virtual.far.amplifier._slots[7]
+        kept = virtual.far.amplifier._sets.slots[7]
         assert (kept.step, len(kept.knots)) == (0.005, 32)
         assert kept.knots[31] == Knot(0.31, -50.0)
         await amplifier.arm(2.0)

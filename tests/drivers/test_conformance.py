@@ -63,8 +63,8 @@ class Flawed(Backend):
 def forgets_tokens(amplifier: SimulatedAmplifier, request: Request, now: float) -> Reply:
     """Plays a repeated token once more."""
     if isinstance(request, Apply):
-        amplifier._tokens.clear()
-        amplifier._active = None
+        amplifier._sets.tokens.clear()
+        amplifier._sets.active = None
     return amplifier.handle(request, now)
 
 
@@ -143,10 +143,10 @@ def ignores_endings(amplifier: SimulatedAmplifier, request: Request, now: float)
 
 def keeps_empty_slots(amplifier: SimulatedAmplifier, request: Request, now: float) -> Reply:
     """Never forgets an envelope."""
-    kept = dict(amplifier._slots)
+    kept = dict(amplifier._sets.slots)
     reply = amplifier.handle(request, now)
     if isinstance(request, LoadEnvelope):
-        amplifier._slots = kept | amplifier._slots
+        amplifier._sets.slots = kept | amplifier._sets.slots
     return reply
 
 
@@ -164,8 +164,8 @@ def has_no_range(amplifier: SimulatedAmplifier, request: Request, now: float) ->
 
 def commits_anything(amplifier: SimulatedAmplifier, request: Request, now: float) -> Reply:
     """Plays what is staged whatever token is named."""
-    if isinstance(request, Commit) and amplifier._staged is not None:
-        reply = amplifier.handle(Commit(amplifier._staged.token), now)
+    if isinstance(request, Commit) and amplifier._sets.staged is not None:
+        reply = amplifier.handle(Commit(amplifier._sets.staged.token), now)
         return Achieved(request.token, ()) if isinstance(reply, Achieved) else reply
     return amplifier.handle(request, now)
 

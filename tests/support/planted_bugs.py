@@ -430,7 +430,7 @@ FAR_ENDS: dict[str, Bug] = {
     ),
     "a stale set is played": _bug(
         "token",
-        Edit(f"{_FAR}._stage", "if wanted.token in self._tokens:", "if False:"),
+        Edit("sim.amplifier.sets:Sets.stage", "if wanted.token in self.tokens:", "if False:"),
         scenario=scenarios.late_copy,
     ),
     "a damaged frame is carried out": _bug(
@@ -513,7 +513,7 @@ FAR_ENDS: dict[str, Bug] = {
     ),
     "it forgets which set plays": _bug(
         "token",
-        Edit(f"{_FAR}.status", "self._active.token if self._active else 0", "0"),
+        Edit(f"{_FAR}.status", "self._sets.token", "0"),
     ),
 }
 

@@ -2,7 +2,6 @@
 
 import asyncio
 import random
-from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -10,6 +9,7 @@ import pytest
 from controller.amplifiers import Phase
 from controller.loop import Controller
 from controller.touch import Touch, TouchFrame
+from controller_bench import make_bench
 from drivers.amplifier import Amplifier
 from drivers.backend import Backend
 from drivers.errors import DriverError, LinkTimeout
@@ -17,6 +17,7 @@ from drivers.protocol.messages import Reply, Request, State
 from model.excitation import Tone
 from shaped_link import Shapes
 from sim.amplifier.amplifier import SimulatedAmplifier
+from virtual_loop import in_virtual_time
 
 PAUSES = (0.0, 0.001, 0.004, 0.02, 0.06)
 WATCHDOG = 0.25 + 0.005  # s; what an amplifier needs to fall silent by itself
@@ -90,48 +91,43 @@ async def step_at_random(
 
 @pytest.mark.parametrize("loss", [0.0, 0.1])
 @pytest.mark.parametrize("seed", range(40))
-def test_nothing_stays_vibrating(
-    run_virtual: Callable[..., Any], make_bench: Callable[..., Any], seed: int, loss: float
-) -> None:
+@in_virtual_time
+async def test_nothing_stays_vibrating(seed: int, loss: float) -> None:
     """While answers come, zero is reached 20 ms after the last finger; in the end in any case.
 
     The end is a close, or a loop that is no more: then the watchdogs do it. No task is left.
     """
-
-    async def scenario() -> None:
-        dice = random.Random(seed)
-        loop = asyncio.get_running_loop()
-        bench = make_bench(*("a", "b")[: dice.choice((1, 2))])
-        links = {name: Link(dice, loss=loss) for name in bench.rig.amplifiers}
-        controller = Controller(
-            bench.rig,
-            bench.table,
-            amplifiers={name: Amplifier(link) for name, link in links.items()},
-            timing=dice.choice((None, Shapes())),
-            clock=loop.time,
-        )
-        await controller.open()
-        tasks = [asyncio.create_task(controller.run())]
-        down, lifted = False, loop.time()
-        for _ in range(40):
-            was, change = down, await step_at_random(controller, bench.table, dice, tasks)
-            down = was if change is None else change
-            if was and not down:
-                lifted = loop.time()
-            await asyncio.sleep(dice.choice(PAUSES))
-            if down or loop.time() - lifted < 0.0205 or controller.phase is not Phase.ARMED:
-                continue
-            assert loss or max(link.level() for link in links.values()) < 1e-3
-        if dice.random() < 0.5:
-            await controller.close()
-            states = {link.amplifier.state for link in links.values()}
-            assert loss or State.OPERATION_ENABLED not in states
-        tasks[0].cancel()
-        await asyncio.sleep(WATCHDOG + 0.15)
-        assert max(link.level() for link in links.values()) == 0
+    dice = random.Random(seed)
+    loop = asyncio.get_running_loop()
+    bench = make_bench(*("a", "b")[: dice.choice((1, 2))])
+    links = {name: Link(dice, loss=loss) for name in bench.rig.amplifiers}
+    controller = Controller(
+        bench.rig,
+        bench.table,
+        amplifiers={name: Amplifier(link) for name, link in links.items()},
+        timing=dice.choice((None, Shapes())),
+        clock=loop.time,
+    )
+    await controller.open()
+    tasks = [asyncio.create_task(controller.run())]
+    down, lifted = False, loop.time()
+    for _ in range(40):
+        was, change = down, await step_at_random(controller, bench.table, dice, tasks)
+        down = was if change is None else change
+        if was and not down:
+            lifted = loop.time()
+        await asyncio.sleep(dice.choice(PAUSES))
+        if down or loop.time() - lifted < 0.0205 or controller.phase is not Phase.ARMED:
+            continue
+        assert loss or max(link.level() for link in links.values()) < 1e-3
+    if dice.random() < 0.5:
         await controller.close()
-        for ended in await asyncio.gather(*tasks, return_exceptions=True):
-            assert ended is None or isinstance(ended, DriverError | asyncio.CancelledError)
-        assert asyncio.all_tasks() == {asyncio.current_task()}
-
-    run_virtual(scenario())
+        states = {link.amplifier.state for link in links.values()}
+        assert loss or State.OPERATION_ENABLED not in states
+    tasks[0].cancel()
+    await asyncio.sleep(WATCHDOG + 0.15)
+    assert max(link.level() for link in links.values()) == 0
+    await controller.close()
+    for ended in await asyncio.gather(*tasks, return_exceptions=True):
+        assert ended is None or isinstance(ended, DriverError | asyncio.CancelledError)
+    assert asyncio.all_tasks() == {asyncio.current_task()}

@@ -2,7 +2,6 @@
 
 import asyncio
 import socket
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -18,6 +17,7 @@ from controller.sources.capture import (
 )
 from drivers.errors import LinkError
 from model.errors import InputError
+from virtual_sockets import in_virtual_time_on_sockets
 
 
 @given(
@@ -93,35 +93,27 @@ def test_only_readable_captures_are_written(tmp_path: Path, datagrams: list[Data
     assert not path.exists()
 
 
-def test_replay_over_udp(run_virtual_on_sockets: Callable[..., None]) -> None:
+@in_virtual_time_on_sockets
+async def test_replay_over_udp() -> None:
     """Datagrams arrive unchanged, each at its own time."""
-
-    async def scenario() -> None:
-        loop = asyncio.get_running_loop()
-        start = loop.time()
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
-            receiver.bind(("127.0.0.1", 0))
-            receiver.setblocking(False)
-            datagrams = [Datagram(0.0, b"one"), Datagram(0.25, b"two"), Datagram(1.0, b"three")]
-            port = receiver.getsockname()[1]
-            replay = asyncio.create_task(replay_capture(datagrams, "127.0.0.1", port))
-            received = [
-                (await loop.sock_recv(receiver, 100), loop.time() - start) for _ in datagrams
-            ]
-            await replay
-        assert received == [(b"one", 0.0), (b"two", 0.25), (b"three", 1.0)]
-
-    run_virtual_on_sockets(scenario())
+    loop = asyncio.get_running_loop()
+    start = loop.time()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
+        receiver.bind(("127.0.0.1", 0))
+        receiver.setblocking(False)
+        datagrams = [Datagram(0.0, b"one"), Datagram(0.25, b"two"), Datagram(1.0, b"three")]
+        port = receiver.getsockname()[1]
+        replay = asyncio.create_task(replay_capture(datagrams, "127.0.0.1", port))
+        received = [(await loop.sock_recv(receiver, 100), loop.time() - start) for _ in datagrams]
+        await replay
+    assert received == [(b"one", 0.0), (b"two", 0.25), (b"three", 1.0)]
 
 
-def test_replay_to_nobody(run_virtual_on_sockets: Callable[..., None]) -> None:
+@in_virtual_time_on_sockets
+async def test_replay_to_nobody() -> None:
     """A port where nobody listens is told at the next datagram."""
-
-    async def scenario() -> None:
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as closed:
-            closed.bind(("127.0.0.1", 0))
-            port = closed.getsockname()[1]
-        with pytest.raises(LinkError, match=f"nobody listens on UDP 127.0.0.1:{port}"):
-            await replay_capture([Datagram(t, b"x") for t in (0.0, 0.1, 0.2)], "127.0.0.1", port)
-
-    run_virtual_on_sockets(scenario())
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as closed:
+        closed.bind(("127.0.0.1", 0))
+        port = closed.getsockname()[1]
+    with pytest.raises(LinkError, match=f"nobody listens on UDP 127.0.0.1:{port}"):
+        await replay_capture([Datagram(t, b"x") for t in (0.0, 0.1, 0.2)], "127.0.0.1", port)

@@ -2,7 +2,7 @@
 
 import asyncio
 import itertools
-from collections.abc import AsyncIterator, Callable, Coroutine
+from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
 from typing import Any
@@ -15,6 +15,7 @@ from controller.daemon.supervisor import Supervisor
 from controller.loop import Controller
 from controller.observer import Observer
 from controller.touch import Touch, TouchFrame
+from controller_bench import make_bench
 from drivers.amplifier import Amplifier
 from drivers.errors import CommandRefused, LinkError
 from drivers.protocol.messages import (
@@ -34,8 +35,8 @@ from drivers.protocol.messages import (
     Stop,
 )
 from drivers.watchdog import HEARTBEAT
+from virtual_loop import in_virtual_time
 
-Run = Callable[[Coroutine[Any, Any, None]], None]
 ARM = Event(Kind.ARM, "somebody armed")
 
 
@@ -66,7 +67,7 @@ class Watched:
 
 
 @asynccontextmanager
-async def watched(make_bench: Callable[..., Any]) -> AsyncIterator[Watched]:
+async def watched() -> AsyncIterator[Watched]:
     """A supervisor whose control loop runs; closed in the end, when its loop must have ended."""
     bench = make_bench()
     amplifiers = {"main": Amplifier(bench.far_end)}
@@ -100,71 +101,58 @@ async def watched(make_bench: Callable[..., Any]) -> AsyncIterator[Watched]:
         assert not bench.far_end.is_open
 
 
-def test_it_starts_disarmed_and_ready(run_virtual: Run, make_bench: Callable[..., Any]) -> None:
+@in_virtual_time
+async def test_it_starts_disarmed_and_ready() -> None:
     """Opened, read back, ready; nothing was armed, and nothing played for a finger."""
-
-    async def scenario() -> None:
-        async with watched(make_bench) as daemon:
-            assert daemon.states == [DaemonState.SWITCH_ON_DISABLED, DaemonState.READY_TO_SWITCH_ON]
-            daemon.touch()
-            await asyncio.sleep(1)
-            assert not daemon.far_end.requests(Arm, Apply, Ping)
-
-    run_virtual(scenario())
+    async with watched() as daemon:
+        assert daemon.states == [DaemonState.SWITCH_ON_DISABLED, DaemonState.READY_TO_SWITCH_ON]
+        daemon.touch()
+        await asyncio.sleep(1)
+        assert not daemon.far_end.requests(Arm, Apply, Ping)
 
 
-def test_heartbeats_come_from_the_control_loop_alone(
-    run_virtual: Run, make_bench: Callable[..., Any]
-) -> None:
+@in_virtual_time
+async def test_heartbeats_come_from_the_control_loop_alone() -> None:
     """While a turn of the loop takes its time, no heartbeat is sent, whatever else runs."""
+    async with watched() as daemon:
+        await daemon.supervisor.handle(ARM)
+        await asyncio.sleep(1)
+        times = daemon.far_end.times(Ping)
+        assert len(times) >= 18
+        gaps = [late - early for early, late in itertools.pairwise(times)]
+        assert max(gaps) == pytest.approx(HEARTBEAT, abs=1e-6)
+        before = len(times)
+        step = daemon.controller.step
 
-    async def scenario() -> None:
-        async with watched(make_bench) as daemon:
-            await daemon.supervisor.handle(ARM)
-            await asyncio.sleep(1)
-            times = daemon.far_end.times(Ping)
-            assert len(times) >= 18
-            gaps = [late - early for early, late in itertools.pairwise(times)]
-            assert max(gaps) == pytest.approx(HEARTBEAT, abs=1e-6)
-            before = len(times)
-            step = daemon.controller.step
+        async def hung() -> None:
+            await asyncio.sleep(3)
+            await step()
 
-            async def hung() -> None:
-                await asyncio.sleep(3)
-                await step()
-
-            daemon.controller.step = hung  # type: ignore[method-assign]
-            await asyncio.sleep(0.06)
-            alive = len(daemon.alive)
-            await asyncio.sleep(2)
-            assert len(daemon.far_end.times(Ping)) <= before + 1
-            assert len(daemon.alive) == alive
-            daemon.controller.step = step  # type: ignore[method-assign]
-            await asyncio.sleep(1.5)
-
-    run_virtual(scenario())
+        daemon.controller.step = hung  # type: ignore[method-assign]
+        await asyncio.sleep(0.06)
+        alive = len(daemon.alive)
+        await asyncio.sleep(2)
+        assert len(daemon.far_end.times(Ping)) <= before + 1
+        assert len(daemon.alive) == alive
+        daemon.controller.step = step  # type: ignore[method-assign]
+        await asyncio.sleep(1.5)
 
 
-def test_the_control_loop_says_that_it_is_alive(
-    run_virtual: Run, make_bench: Callable[..., Any]
-) -> None:
+@in_virtual_time
+async def test_the_control_loop_says_that_it_is_alive() -> None:
     """Disarmed as armed, and while there is no link: no gap is longer than half a second."""
-
-    async def scenario() -> None:
-        async with watched(make_bench) as daemon:
-            await asyncio.sleep(5)
-            await daemon.supervisor.handle(ARM)
-            await asyncio.sleep(5)
-            daemon.far_end.answer = unreachable
-            await asyncio.sleep(60)
-            assert daemon.state is DaemonState.COMM_LOST
-            moments = [*daemon.alive, asyncio.get_running_loop().time()]
-            assert max(b - a for a, b in itertools.pairwise(moments)) <= 0.6
-            daemon.far_end.answer = lambda request: None
-            await asyncio.sleep(6)
-            assert daemon.state is DaemonState.FAULT
-
-    run_virtual(scenario())
+    async with watched() as daemon:
+        await asyncio.sleep(5)
+        await daemon.supervisor.handle(ARM)
+        await asyncio.sleep(5)
+        daemon.far_end.answer = unreachable
+        await asyncio.sleep(60)
+        assert daemon.state is DaemonState.COMM_LOST
+        moments = [*daemon.alive, asyncio.get_running_loop().time()]
+        assert max(b - a for a, b in itertools.pairwise(moments)) <= 0.6
+        daemon.far_end.answer = lambda request: None
+        await asyncio.sleep(6)
+        assert daemon.state is DaemonState.FAULT
 
 
 def unreachable(request: Request) -> Reply | None:
@@ -172,213 +160,165 @@ def unreachable(request: Request) -> Reply | None:
     raise LinkError("the wire is cut")
 
 
-def test_a_lost_link_is_tried_again_with_growing_pauses(
-    run_virtual: Run, make_bench: Callable[..., Any]
-) -> None:
+@in_virtual_time
+async def test_a_lost_link_is_tried_again_with_growing_pauses() -> None:
     """0.1 s at first, each pause twice the one before up to 5 s; back again, nothing is armed."""
-
-    async def scenario() -> None:
-        async with watched(make_bench) as daemon:
-            await daemon.supervisor.handle(ARM)
-            daemon.far_end.answer = unreachable
-            daemon.far_end.asked.clear()
-            await asyncio.sleep(30)
-            assert daemon.state is DaemonState.COMM_LOST
-            tries = [time for time, _ in daemon.far_end.asked][-9:]
-            pauses = [round(b - a, 3) for a, b in itertools.pairwise(tries)]
-            assert pauses[-2:] == [5.0, 5.0]
-            assert pauses[0] < 1
-            assert daemon.links[0] == "lost"
-            assert set(daemon.links[1:]) == {"retry"}
-            daemon.far_end.answer = lambda request: None
-            daemon.far_end.asked.clear()
-            await asyncio.sleep(6)
-            assert daemon.state is DaemonState.FAULT
-            assert not daemon.far_end.requests(Arm, Apply)
-            await daemon.supervisor.handle(Event(Kind.CLEAR))
-            assert daemon.state is DaemonState.READY_TO_SWITCH_ON
-
-    run_virtual(scenario())
+    async with watched() as daemon:
+        await daemon.supervisor.handle(ARM)
+        daemon.far_end.answer = unreachable
+        daemon.far_end.asked.clear()
+        await asyncio.sleep(30)
+        assert daemon.state is DaemonState.COMM_LOST
+        tries = [time for time, _ in daemon.far_end.asked][-9:]
+        pauses = [round(b - a, 3) for a, b in itertools.pairwise(tries)]
+        assert pauses[-2:] == [5.0, 5.0]
+        assert pauses[0] < 1
+        assert daemon.links[0] == "lost"
+        assert set(daemon.links[1:]) == {"retry"}
+        daemon.far_end.answer = lambda request: None
+        daemon.far_end.asked.clear()
+        await asyncio.sleep(6)
+        assert daemon.state is DaemonState.FAULT
+        assert not daemon.far_end.requests(Arm, Apply)
+        await daemon.supervisor.handle(Event(Kind.CLEAR))
+        assert daemon.state is DaemonState.READY_TO_SWITCH_ON
 
 
-def test_comm_lost_lasts_as_long_as_a_lost_amplifier_may_play(
-    run_virtual: Run, make_bench: Callable[..., Any]
-) -> None:
+@in_virtual_time
+async def test_comm_lost_lasts_as_long_as_a_lost_amplifier_may_play() -> None:
     """Reopened after 0.1 s already, it is still `assume energised` until 0.35 s have passed."""
-
-    async def scenario() -> None:
-        async with watched(make_bench) as daemon:
-            await daemon.supervisor.handle(ARM)
-            lost = asyncio.get_running_loop().time()
-            await daemon.supervisor.handle(Event(Kind.LINK_LOST, "cut"))
-            await asyncio.sleep(0.2)
-            assert daemon.links == ["reopened"]
-            assert daemon.state is DaemonState.COMM_LOST
-            assert daemon.supervisor.machine.assume_energised(lost + 0.2)
-            await asyncio.sleep(0.25)
-            assert daemon.state is DaemonState.FAULT
-
-    run_virtual(scenario())
+    async with watched() as daemon:
+        await daemon.supervisor.handle(ARM)
+        lost = asyncio.get_running_loop().time()
+        await daemon.supervisor.handle(Event(Kind.LINK_LOST, "cut"))
+        await asyncio.sleep(0.2)
+        assert daemon.links == ["reopened"]
+        assert daemon.state is DaemonState.COMM_LOST
+        assert daemon.supervisor.machine.assume_energised(lost + 0.2)
+        await asyncio.sleep(0.25)
+        assert daemon.state is DaemonState.FAULT
 
 
-def test_an_amplifier_that_comes_back_armed_is_disarmed(
-    run_virtual: Run, make_bench: Callable[..., Any]
-) -> None:
+@in_virtual_time
+async def test_an_amplifier_that_comes_back_armed_is_disarmed() -> None:
     """Lost for less than its watchdog, it may be as it was: it is told before anything else."""
-
-    async def scenario() -> None:
-        async with watched(make_bench) as daemon:
-            await daemon.supervisor.handle(ARM)
-            daemon.far_end.answer = unreachable
-            await asyncio.sleep(0.2)
-            assert daemon.state is DaemonState.COMM_LOST
-            daemon.far_end.state = State.OPERATION_ENABLED
-            daemon.far_end.asked.clear()
-            daemon.far_end.answer = lambda request: None
-            await asyncio.sleep(1)
-            assert daemon.state is DaemonState.FAULT
-            assert daemon.far_end.requests(Disarm)
-            assert daemon.far_end.state is State.SWITCH_ON_DISABLED
-
-    run_virtual(scenario())
+    async with watched() as daemon:
+        await daemon.supervisor.handle(ARM)
+        daemon.far_end.answer = unreachable
+        await asyncio.sleep(0.2)
+        assert daemon.state is DaemonState.COMM_LOST
+        daemon.far_end.state = State.OPERATION_ENABLED
+        daemon.far_end.asked.clear()
+        daemon.far_end.answer = lambda request: None
+        await asyncio.sleep(1)
+        assert daemon.state is DaemonState.FAULT
+        assert daemon.far_end.requests(Disarm)
+        assert daemon.far_end.state is State.SWITCH_ON_DISABLED
 
 
-def test_clear_is_refused_while_the_cause_is_there(
-    run_virtual: Run, make_bench: Callable[..., Any]
-) -> None:
+@in_virtual_time
+async def test_clear_is_refused_while_the_cause_is_there() -> None:
     """An amplifier that stays in its fault keeps the daemon in it; then clear works."""
-
-    async def scenario() -> None:
-        async with watched(make_bench) as daemon:
-            await daemon.supervisor.handle(ARM)
-            hot = daemon.status(State.FAULT, Fault.OVER_TEMPERATURE)
-            daemon.far_end.answer = lambda request: hot if isinstance(request, Ping) else None
-            await asyncio.sleep(0.2)
-            assert daemon.state is DaemonState.FAULT
-            assert "OVER_TEMPERATURE" in daemon.supervisor.machine.cause
-            assert daemon.far_end.requests(Stop)
-            daemon.far_end.answer = lambda request: (
-                hot if isinstance(request, Clear | GetStatus) else None
-            )
-            with pytest.raises(CommandRefused, match="not gone"):
-                await daemon.supervisor.handle(Event(Kind.CLEAR))
-            assert daemon.state is DaemonState.FAULT
-            daemon.far_end.answer = lambda request: None
-            await asyncio.sleep(10)
-            assert daemon.state is DaemonState.FAULT
+    async with watched() as daemon:
+        await daemon.supervisor.handle(ARM)
+        hot = daemon.status(State.FAULT, Fault.OVER_TEMPERATURE)
+        daemon.far_end.answer = lambda request: hot if isinstance(request, Ping) else None
+        await asyncio.sleep(0.2)
+        assert daemon.state is DaemonState.FAULT
+        assert "OVER_TEMPERATURE" in daemon.supervisor.machine.cause
+        assert daemon.far_end.requests(Stop)
+        daemon.far_end.answer = lambda request: (
+            hot if isinstance(request, Clear | GetStatus) else None
+        )
+        with pytest.raises(CommandRefused, match="not gone"):
             await daemon.supervisor.handle(Event(Kind.CLEAR))
-            assert daemon.state is DaemonState.READY_TO_SWITCH_ON
+        assert daemon.state is DaemonState.FAULT
+        daemon.far_end.answer = lambda request: None
+        await asyncio.sleep(10)
+        assert daemon.state is DaemonState.FAULT
+        await daemon.supervisor.handle(Event(Kind.CLEAR))
+        assert daemon.state is DaemonState.READY_TO_SWITCH_ON
 
-    run_virtual(scenario())
 
-
-def test_clear_waits_for_level_zero(run_virtual: Run, make_bench: Callable[..., Any]) -> None:
+@in_virtual_time
+async def test_clear_waits_for_level_zero() -> None:
     """A level that is still reported is no silence, whatever state the amplifier is in."""
-
-    async def scenario() -> None:
-        async with watched(make_bench) as daemon:
-            await daemon.supervisor.handle(Event(Kind.STOP, "stop"))
-            loud = daemon.status(State.SWITCH_ON_DISABLED, level=0.01)
-            daemon.far_end.answer = lambda request: loud if isinstance(request, GetStatus) else None
-            with pytest.raises(CommandRefused, match="level"):
-                await daemon.supervisor.handle(Event(Kind.CLEAR))
-            assert daemon.state is DaemonState.FAULT
-
-    run_virtual(scenario())
-
-
-def test_clear_right_after_a_stop_waits_for_the_ramp(
-    run_virtual: Run, make_bench: Callable[..., Any]
-) -> None:
-    """An amplifier takes no Clear before it is silent: it is told again once it is."""
-
-    async def scenario() -> None:
-        loop = asyncio.get_running_loop()
-        async with watched(make_bench) as daemon:
-            await daemon.supervisor.handle(ARM)
-            await daemon.supervisor.handle(Event(Kind.STOP, "stop"))
-            silent = loop.time() + 0.05
-            stopping = daemon.status(State.QUICK_STOP_ACTIVE)
-            daemon.far_end.answer = lambda request: stopping if loop.time() < silent else None
+    async with watched() as daemon:
+        await daemon.supervisor.handle(Event(Kind.STOP, "stop"))
+        loud = daemon.status(State.SWITCH_ON_DISABLED, level=0.01)
+        daemon.far_end.answer = lambda request: loud if isinstance(request, GetStatus) else None
+        with pytest.raises(CommandRefused, match="level"):
             await daemon.supervisor.handle(Event(Kind.CLEAR))
-            assert daemon.state is DaemonState.READY_TO_SWITCH_ON
-
-    run_virtual(scenario())
+        assert daemon.state is DaemonState.FAULT
 
 
-def test_an_amplifier_that_will_not_be_armed_is_a_fault(
-    run_virtual: Run, make_bench: Callable[..., Any]
-) -> None:
+@in_virtual_time
+async def test_clear_right_after_a_stop_waits_for_the_ramp() -> None:
+    """An amplifier takes no Clear before it is silent: it is told again once it is."""
+    loop = asyncio.get_running_loop()
+    async with watched() as daemon:
+        await daemon.supervisor.handle(ARM)
+        await daemon.supervisor.handle(Event(Kind.STOP, "stop"))
+        silent = loop.time() + 0.05
+        stopping = daemon.status(State.QUICK_STOP_ACTIVE)
+        daemon.far_end.answer = lambda request: stopping if loop.time() < silent else None
+        await daemon.supervisor.handle(Event(Kind.CLEAR))
+        assert daemon.state is DaemonState.READY_TO_SWITCH_ON
+
+
+@in_virtual_time
+async def test_an_amplifier_that_will_not_be_armed_is_a_fault() -> None:
     """Whoever asked is told, nothing stays armed, and somebody must acknowledge."""
-
-    async def scenario() -> None:
-        async with watched(make_bench) as daemon:
-            daemon.far_end.answer = lambda request: (
-                Nak(NakCode.WRONG_STATE) if isinstance(request, Arm) else None
-            )
-            with pytest.raises(CommandRefused):
-                await daemon.supervisor.handle(ARM)
-            assert daemon.state is DaemonState.FAULT
-            assert daemon.far_end.requests(Disarm)
-
-    run_virtual(scenario())
-
-
-def test_a_stop_while_arming_is_a_stop_and_no_fault(
-    run_virtual: Run, make_bench: Callable[..., Any]
-) -> None:
-    """The arming is refused, the state is that of the stop, and the amplifier is not armed."""
-
-    async def scenario() -> None:
-        async with watched(make_bench) as daemon:
-            daemon.far_end.delay = 0.005
-            arming = asyncio.create_task(daemon.supervisor.handle(ARM))
-            await asyncio.sleep(0.002)
-            await daemon.supervisor.handle(Event(Kind.STOP, "stop"))
-            with pytest.raises(CommandRefused):
-                await arming
-            assert daemon.state is DaemonState.QUICK_STOP_ACTIVE
-            assert DaemonState.OPERATION_ENABLED not in daemon.states
-            assert daemon.far_end.state is not State.OPERATION_ENABLED
-
-    run_virtual(scenario())
-
-
-def test_a_fault_of_a_disarmed_amplifier_is_seen(
-    run_virtual: Run, make_bench: Callable[..., Any]
-) -> None:
-    """Within a second, though nobody asks for anything."""
-
-    async def scenario() -> None:
-        async with watched(make_bench) as daemon:
-            sick = daemon.status(State.FAULT, Fault.INTERNAL)
-            daemon.far_end.answer = lambda request: sick if isinstance(request, GetStatus) else None
-            await asyncio.sleep(1)
-            assert daemon.state is DaemonState.FAULT
-
-    run_virtual(scenario())
-
-
-def test_closing_while_playing_ends_in_silence_read_back(
-    run_virtual: Run, make_bench: Callable[..., Any]
-) -> None:
-    """Ramp to zero in 50 ms, the level read back, disarmed, closed: in less than a second."""
-
-    async def scenario() -> None:
-        loop = asyncio.get_running_loop()
-        async with watched(make_bench) as daemon:
+    async with watched() as daemon:
+        daemon.far_end.answer = lambda request: (
+            Nak(NakCode.WRONG_STATE) if isinstance(request, Arm) else None
+        )
+        with pytest.raises(CommandRefused):
             await daemon.supervisor.handle(ARM)
-            daemon.touch()
-            await asyncio.sleep(0.02)
-            assert daemon.far_end.levels[0] > 0
-            begin = loop.time()
-            await daemon.supervisor.close("told to end")
-            assert loop.time() - begin < 0.5
-            asked = [request for time, request in daemon.far_end.asked if time >= begin]
-            silence = next(request for request in asked if isinstance(request, Apply))
-            assert silence.command_set.is_silent
-            assert silence.command_set.ramp == pytest.approx(0.05)
-            kinds = [type(request) for request in asked]
-            assert kinds.index(Apply) < kinds.index(GetStatus) < kinds.index(Disarm)
+        assert daemon.state is DaemonState.FAULT
+        assert daemon.far_end.requests(Disarm)
 
-    run_virtual(scenario())
+
+@in_virtual_time
+async def test_a_stop_while_arming_is_a_stop_and_no_fault() -> None:
+    """The arming is refused, the state is that of the stop, and the amplifier is not armed."""
+    async with watched() as daemon:
+        daemon.far_end.delay = 0.005
+        arming = asyncio.create_task(daemon.supervisor.handle(ARM))
+        await asyncio.sleep(0.002)
+        await daemon.supervisor.handle(Event(Kind.STOP, "stop"))
+        with pytest.raises(CommandRefused):
+            await arming
+        assert daemon.state is DaemonState.QUICK_STOP_ACTIVE
+        assert DaemonState.OPERATION_ENABLED not in daemon.states
+        assert daemon.far_end.state is not State.OPERATION_ENABLED
+
+
+@in_virtual_time
+async def test_a_fault_of_a_disarmed_amplifier_is_seen() -> None:
+    """Within a second, though nobody asks for anything."""
+    async with watched() as daemon:
+        sick = daemon.status(State.FAULT, Fault.INTERNAL)
+        daemon.far_end.answer = lambda request: sick if isinstance(request, GetStatus) else None
+        await asyncio.sleep(1)
+        assert daemon.state is DaemonState.FAULT
+
+
+@in_virtual_time
+async def test_closing_while_playing_ends_in_silence_read_back() -> None:
+    """Ramp to zero in 50 ms, the level read back, disarmed, closed: in less than a second."""
+    loop = asyncio.get_running_loop()
+    async with watched() as daemon:
+        await daemon.supervisor.handle(ARM)
+        daemon.touch()
+        await asyncio.sleep(0.02)
+        assert daemon.far_end.levels[0] > 0
+        begin = loop.time()
+        await daemon.supervisor.close("told to end")
+        assert loop.time() - begin < 0.5
+        asked = [request for time, request in daemon.far_end.asked if time >= begin]
+        silence = next(request for request in asked if isinstance(request, Apply))
+        assert silence.command_set.is_silent
+        assert silence.command_set.ramp == pytest.approx(0.05)
+        kinds = [type(request) for request in asked]
+        assert kinds.index(Apply) < kinds.index(GetStatus) < kinds.index(Disarm)

@@ -1,9 +1,6 @@
 """Effects through the control loop, on a virtual clock: what the amplifier is told, and when."""
 
 import asyncio
-from collections.abc import Callable
-from contextlib import AbstractAsyncContextManager
-from typing import Any
 
 import pytest
 
@@ -12,36 +9,30 @@ from controller.effects.effect import Course, Effect, Feeling, Nothing
 from controller.effects.layout import Layout
 from controller.effects.player import EffectPlayer
 from controller.effects.timed import Buzz, Click
-
-Run = Callable[..., Any]
-Running = Callable[..., AbstractAsyncContextManager[Any]]
-FINGER = (1, 0.5, 0.5)
+from controller_bench import FINGER, running
+from virtual_loop import in_virtual_time
 
 
 @pytest.mark.parametrize("duration", [0.020, 0.040, 0.065])
-def test_a_click_ends_on_time_while_nothing_moves(
-    run_virtual: Run, running: Running, duration: float
-) -> None:
+@in_virtual_time
+async def test_a_click_ends_on_time_while_nothing_moves(duration: float) -> None:
     """Told to fall silent within a millisecond of its end, not with the next heartbeat."""
-
-    async def scenario() -> None:
-        layout = Layout(effects={"click": Click(duration=duration)}, elsewhere="click")
-        async with running(wishes=EffectPlayer(layout)) as bench:
-            loop = asyncio.get_running_loop()
-            bench.touch(FINGER)
-            begin = loop.time()
-            await asyncio.sleep(duration - 0.001)
-            _, played = bench.far_end.sets()  # the first is the silence with which it is armed
-            assert any(command.level for command in played.commands)
-            await asyncio.sleep(0.002)
-            assert loop.time() - begin == pytest.approx(duration + 0.001)
-            *_, silent = bench.far_end.sets()
-            assert not any(command.level for command in silent.commands)
-
-    run_virtual(scenario())
+    layout = Layout(effects={"click": Click(duration=duration)}, elsewhere="click")
+    async with running(wishes=EffectPlayer(layout)) as bench:
+        loop = asyncio.get_running_loop()
+        bench.touch(FINGER)
+        begin = loop.time()
+        await asyncio.sleep(duration - 0.001)
+        _, played = bench.far_end.sets()  # the first is the silence with which it is armed
+        assert any(command.level for command in played.commands)
+        await asyncio.sleep(0.002)
+        assert loop.time() - begin == pytest.approx(duration + 0.001)
+        *_, silent = bench.far_end.sets()
+        assert not any(command.level for command in silent.commands)
 
 
-def test_an_effect_that_fails_is_silence_and_no_more(run_virtual: Run, running: Running) -> None:
+@in_virtual_time
+async def test_an_effect_that_fails_is_silence_and_no_more() -> None:
     """Of a plug-in that raises: all fall silent for as long as it does, then touches are felt."""
 
     class Broken(Effect):
@@ -62,19 +53,16 @@ def test_an_effect_that_fails_is_silence_and_no_more(run_virtual: Run, running: 
                 raise ZeroDivisionError("in a plug-in")
             return Feeling(20.0, until=now + 0.03)
 
-    async def scenario() -> None:
-        layout = Layout(effects={"broken": Broken(), "buzz": Buzz()}, elsewhere="broken")
-        player = EffectPlayer(layout)
-        async with running(wishes=player) as bench:
-            await bench.hold(FINGER, seconds=0.2)
-            _, played, silent = bench.far_end.sets()
-            assert any(command.level for command in played.commands)
-            assert not any(command.level for command in silent.commands)
-            assert "ZeroDivisionError" in bench.told.silenced[-1].reason
-            bench.touch()
-            await asyncio.sleep(0.01)
-            player.layout = Layout(effects=layout.effects, elsewhere="buzz")
-            await bench.hold(FINGER, seconds=0.2)
-            assert any(command.level for command in bench.far_end.sets()[-1].commands)
-
-    run_virtual(scenario())
+    layout = Layout(effects={"broken": Broken(), "buzz": Buzz()}, elsewhere="broken")
+    player = EffectPlayer(layout)
+    async with running(wishes=player) as bench:
+        await bench.hold(FINGER, seconds=0.2)
+        _, played, silent = bench.far_end.sets()
+        assert any(command.level for command in played.commands)
+        assert not any(command.level for command in silent.commands)
+        assert "ZeroDivisionError" in bench.told.silenced[-1].reason
+        bench.touch()
+        await asyncio.sleep(0.01)
+        player.layout = Layout(effects=layout.effects, elsewhere="buzz")
+        await bench.hold(FINGER, seconds=0.2)
+        assert any(command.level for command in bench.far_end.sets()[-1].commands)

@@ -24,8 +24,7 @@ from controller.sources.slots import SlotState
 from controller.touch import TouchFrame
 from controller.touch_registry import open_source
 from model.errors import InputError
-
-RunVirtual = Callable[[Coroutine[Any, Any, Any]], Any]
+from virtual_sockets import run_virtual_on_sockets
 
 EMPTY = SlotState(-1, 0, 0)
 KINDS = {"slot": (3, 0x2F), "id": (3, 0x39), "x": (3, 0x35), "y": (3, 0x36)}
@@ -112,7 +111,7 @@ async def follow(
     return seen
 
 
-def test_fingers_come_move_and_go(run_virtual_on_sockets: RunVirtual) -> None:
+def test_fingers_come_move_and_go() -> None:
     """Each report is a frame, in shares of the panel's axes, y downwards as the kernel counts."""
     panel = PipePanel()
 
@@ -131,7 +130,7 @@ def test_fingers_come_move_and_go(run_virtual_on_sockets: RunVirtual) -> None:
     ]
 
 
-def test_fingers_that_were_there_before(run_virtual_on_sockets: RunVirtual) -> None:
+def test_fingers_that_were_there_before() -> None:
     """What rests on the panel when it is opened is there at once, by the kernel's own state."""
     panel = PipePanel()
     panel.state = {0: EMPTY, 1: SlotState(5, 500, 250)}
@@ -145,7 +144,7 @@ def test_fingers_that_were_there_before(run_virtual_on_sockets: RunVirtual) -> N
     assert [touches for _, touches in seen] == [{5: (0.5, 0.5)}, {5: (0.6, 0.5)}]
 
 
-def test_a_resting_finger_is_told_again(run_virtual_on_sockets: RunVirtual) -> None:
+def test_a_resting_finger_is_told_again() -> None:
     """Every 50 ms the kernel is asked, well within the 150 ms after which a contact counts as gone.
 
     If it knows of a lift that no event told, the finger is lifted then.
@@ -169,7 +168,7 @@ def test_a_resting_finger_is_told_again(run_virtual_on_sockets: RunVirtual) -> N
     ]
 
 
-def test_lost_events(run_virtual_on_sockets: RunVirtual) -> None:
+def test_lost_events() -> None:
     """After SYN_DROPPED the kernel's state counts, as its documentation asks for."""
     panel = PipePanel()
 
@@ -185,7 +184,7 @@ def test_lost_events(run_virtual_on_sockets: RunVirtual) -> None:
 
 
 @pytest.mark.parametrize("notices", ["by reading", "by asking"])
-def test_a_panel_that_is_pulled_out(run_virtual_on_sockets: RunVirtual, notices: str) -> None:
+def test_a_panel_that_is_pulled_out(notices: str) -> None:
     """Its fingers are lifted when it goes; it is waited for, and followed when it is back."""
     first, second = PipePanel(), PipePanel()
     first.state = {0: SlotState(7, 0, 0), 1: EMPTY}

@@ -1,7 +1,6 @@
 """Recordings of touch panels in evemu's text format."""
 
 import asyncio
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -11,6 +10,7 @@ from hypothesis import strategies as st
 from controller.sources.evemu import EvemuSource, read_evemu
 from controller.touch import TouchFrame
 from model.errors import InputError
+from virtual_loop import in_virtual_time
 
 RANGES = """\
 # EVEMU 1.3
@@ -261,29 +261,25 @@ def test_files_that_cannot_be_read(tmp_path: Path) -> None:
         read_evemu(binary)
 
 
-def test_replay_at_its_own_pace(tmp_path: Path, run_virtual: Callable[..., None]) -> None:
+@in_virtual_time
+async def test_replay_at_its_own_pace(tmp_path: Path) -> None:
     """Frames come at their times; a touched panel at rest repeats itself at most 50 ms apart."""
     path = write(tmp_path, (0, "id 1 x 100 y 0"), (0.12, "x 200"), (0.14, "id -1"), (0.5, "id 2"))
-
-    async def scenario() -> None:
-        start = asyncio.get_running_loop().time()
-        delivered: list[TouchFrame] = []
-        await EvemuSource(f"evemu:{path}").run(delivered.append)
-        assert [
-            (round(frame.time - start, 6), [touch.id for touch in frame.touches])
-            for frame in delivered
-        ] == [
-            (0.0, [1]),
-            (0.05, [1]),
-            (0.1, [1]),
-            (0.12, [1]),
-            (0.14, []),
-            (0.5, [2]),
-            (0.55, []),  # never lifted in the recording
-        ]
-        assert {frame.source for frame in delivered} == {"evemu:panel.taps.events"}
-
-    run_virtual(scenario())
+    start = asyncio.get_running_loop().time()
+    delivered: list[TouchFrame] = []
+    await EvemuSource(f"evemu:{path}").run(delivered.append)
+    assert [
+        (round(frame.time - start, 6), [touch.id for touch in frame.touches]) for frame in delivered
+    ] == [
+        (0.0, [1]),
+        (0.05, [1]),
+        (0.1, [1]),
+        (0.12, [1]),
+        (0.14, []),
+        (0.5, [2]),
+        (0.55, []),  # never lifted in the recording
+    ]
+    assert {frame.source for frame in delivered} == {"evemu:panel.taps.events"}
 
 
 def test_url(tmp_path: Path) -> None:

@@ -1,9 +1,7 @@
 """Recorded TUIO streams as a touch source."""
 
 import asyncio
-from collections.abc import Callable, Coroutine
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -12,8 +10,7 @@ from controller.sources.tuio import tuio_datagram
 from controller.touch import Touch, TouchFrame
 from controller.touch_registry import open_source
 from model.errors import InputError
-
-RunVirtual = Callable[[Coroutine[Any, Any, Any]], Any]
+from virtual_loop import run_virtual
 
 
 def write(path: Path, *moments: tuple[float, tuple[Touch, ...]], source: str = "table") -> None:
@@ -40,7 +37,7 @@ async def delivered(url: str) -> list[tuple[float, str, dict[int, tuple[float, f
     return seen
 
 
-def test_own_pace(tmp_path: Path, run_virtual: RunVirtual) -> None:
+def test_own_pace(tmp_path: Path) -> None:
     """Frames come at their times, again every 50 ms while a finger is down, lifted in the end."""
     path = tmp_path / "taps.tuio"
     write(path, (0.0, ()), (0.2, (Touch(3, 0.5, 0.25),)), (0.32, (Touch(3, 0.75, 0.25),)))
@@ -56,7 +53,7 @@ def test_own_pace(tmp_path: Path, run_virtual: RunVirtual) -> None:
     assert {source for _, source, _ in seen} == {"tuio:taps.tuio/table"}
 
 
-def test_another_pace(tmp_path: Path, run_virtual: RunVirtual) -> None:
+def test_another_pace(tmp_path: Path) -> None:
     """At twice the speed a finger is down for half the time."""
     path = tmp_path / "taps.tuio"
     write(path, (0.0, (Touch(3, 0.5, 0.25),)), (0.08, ()))

@@ -5,7 +5,6 @@ import logging
 import math
 import socket
 import struct
-from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -18,6 +17,7 @@ from controller.sources.tuio import TuioReader, TuioSource, tuio_datagram
 from controller.tally import Tally
 from controller.touch import Touch, TouchFrame
 from model.errors import InputError
+from virtual_sockets import in_virtual_time_on_sockets
 
 PEER = ("192.0.2.7", 50000)
 
@@ -269,40 +269,34 @@ def test_tuio_datagram_is_the_inverse(places: dict[int, tuple[float, float]]) ->
     assert result == TouchFrame("tuio:192.0.2.7/table@a", 2.0, wanted)
 
 
-def test_over_udp(run_virtual_on_sockets: Callable[..., list[TouchFrame]]) -> None:
+@in_virtual_time_on_sockets
+async def test_over_udp() -> None:
     """A datagram to the bound port becomes a frame at the loop's time; port 0 takes a free one."""
-
-    async def scenario() -> list[TouchFrame]:
-        source = TuioSource("tuio:127.0.0.1:0")
-        await source.open()
-        assert source.port > 0
-        delivered: asyncio.Queue[TouchFrame] = asyncio.Queue()
-        running = asyncio.create_task(source.run(delivered.put_nowait))
-        await asyncio.sleep(0)
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
-            sender.sendto(b"noise", ("127.0.0.1", source.port))
-            sender.sendto(frame((1, 0.25, 0.5)), ("127.0.0.1", source.port))
-            received = [await delivered.get()]
-        running.cancel()
-        await asyncio.gather(running, return_exceptions=True)
-        assert source.tally.counts == {"malformed": 1}
-        assert received[0].time == asyncio.get_running_loop().time()
-        return received
-
-    assert touches(run_virtual_on_sockets(scenario())[0]) == [(1, 0.25, 0.5)]
+    source = TuioSource("tuio:127.0.0.1:0")
+    await source.open()
+    assert source.port > 0
+    delivered: asyncio.Queue[TouchFrame] = asyncio.Queue()
+    running = asyncio.create_task(source.run(delivered.put_nowait))
+    await asyncio.sleep(0)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        sender.sendto(b"noise", ("127.0.0.1", source.port))
+        sender.sendto(frame((1, 0.25, 0.5)), ("127.0.0.1", source.port))
+        received = await delivered.get()
+    running.cancel()
+    await asyncio.gather(running, return_exceptions=True)
+    assert source.tally.counts == {"malformed": 1}
+    assert received.time == asyncio.get_running_loop().time()
+    assert touches(received) == [(1, 0.25, 0.5)]
 
 
-def test_a_port_that_is_taken(run_virtual_on_sockets: Callable[..., None]) -> None:
+@in_virtual_time_on_sockets
+async def test_a_port_that_is_taken() -> None:
     """The error names the port and what to do."""
-
-    async def scenario() -> None:
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
-            other.bind(("127.0.0.1", 0))
-            port = other.getsockname()[1]
-            with pytest.raises(InputError, match=f"127.0.0.1:{port}.*another port"):
-                await TuioSource(f"tuio:127.0.0.1:{port}").open()
-
-    run_virtual_on_sockets(scenario())
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        other.bind(("127.0.0.1", 0))
+        port = other.getsockname()[1]
+        with pytest.raises(InputError, match=f"127.0.0.1:{port}.*another port"):
+            await TuioSource(f"tuio:127.0.0.1:{port}").open()
 
 
 @pytest.mark.parametrize(

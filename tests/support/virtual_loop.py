@@ -5,12 +5,14 @@ twice in it with the same chance runs twice the same, byte for byte.
 """
 
 import asyncio
+import functools
 import math
 import random
 from asyncio.base_events import BaseEventLoop
 from collections.abc import Callable, Coroutine
-from typing import Any, TypeVar
+from typing import Any, ParamSpec, TypeVar
 
+P = ParamSpec("P")
 T = TypeVar("T")
 
 START = 1000.0  # s; a clock that begins at zero hides who takes zero for "never"
@@ -218,3 +220,13 @@ def run_virtual(
     """Run a coroutine to its end in virtual time; raises Stuck where it never ends."""
     with asyncio.Runner(loop_factory=lambda: VirtualLoop(dice, seen)) as runner:
         return runner.run(main)
+
+
+def in_virtual_time(test: Callable[P, Coroutine[Any, Any, T]]) -> Callable[P, T]:
+    """Let a test run to its end in virtual time."""
+
+    @functools.wraps(test)
+    def run(*args: P.args, **kwargs: P.kwargs) -> T:
+        return run_virtual(test(*args, **kwargs))
+
+    return run

@@ -1,17 +1,14 @@
-"""An event loop on a virtual clock, and a controller between a table and amplifiers of our own."""
+"""A controller between a table and amplifiers of our own, which obey and remember."""
 
 import asyncio
 import math
-import selectors
-from collections.abc import AsyncIterator, Callable, Coroutine, Sequence
-from contextlib import AbstractAsyncContextManager, asynccontextmanager
+from collections.abc import AsyncIterator, Callable, Sequence
+from contextlib import asynccontextmanager
 from dataclasses import dataclass, field, replace
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
-import pytest
 
-import virtual_loop
 from controller.loop import Controller
 from controller.observer import Applied, Observer, Silenced
 from controller.touch import Touch, TouchFrame, TouchSource
@@ -49,53 +46,8 @@ from model.plate import Material, Plate
 from model.question import Question
 from model.rig import Channel, Limits, Rig
 
-T = TypeVar("T")
-
-
-class _Selector(selectors.DefaultSelector):
-    """Waiting for a timer costs no time, waiting for the machine does: the clock jumps."""
-
-    now = virtual_loop.START
-
-    def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
-        ready = super().select(0)
-        if ready or timeout is None:
-            return ready or super().select(timeout)
-        self.now += timeout
-        return ready
-
-
-class _LoopOfTheMachine(asyncio.SelectorEventLoop):
-    """asyncio's own loop with the machine's sockets and pipes, on a virtual clock."""
-
-    def __init__(self) -> None:
-        self._virtual = _Selector()
-        super().__init__(self._virtual)
-
-    def time(self) -> float:
-        """Virtual seconds."""
-        return self._virtual.now
-
-
-@pytest.fixture
-def run_virtual_on_sockets() -> Callable[[Coroutine[Any, Any, T]], T]:
-    """As run_virtual, for what must have real sockets and pipes."""
-
-    def run(coroutine: Coroutine[Any, Any, T]) -> T:
-        with asyncio.Runner(loop_factory=_LoopOfTheMachine) as runner:
-            return runner.run(coroutine)
-
-    return run
-
-
-@pytest.fixture
-def run_virtual() -> Callable[[Coroutine[Any, Any, T]], T]:
-    """Run a coroutine to its end in virtual time."""
-
-    def run(coroutine: Coroutine[Any, Any, T]) -> T:
-        return virtual_loop.run_virtual(coroutine)
-
-    return run
+FINGER = (1, 0.5, 0.5)
+OTHER = (2, 0.9, 0.9)
 
 
 class FarEnd(Backend):
@@ -302,7 +254,7 @@ class Bench:
             await asyncio.sleep(0.05)
 
 
-def _make_bench(
+def make_bench(
     *amplifiers: str,
     sources: Sequence[TouchSource] = (),
     observer: Observer | None = None,
@@ -311,7 +263,10 @@ def _make_bench(
     rate: float = math.inf,
     **options: Any,
 ) -> Bench:
-    """A bench within a running loop; one amplifier unless more are named; rate [1/s]: of sets."""
+    """A bench within a running loop; one amplifier unless more are named.
+
+    rate [1/s]: the rig's limit of sets; options: as a `Controller` takes them.
+    """
     names = amplifiers or ("main",)
     far_ends = far_ends or [FarEnd(channels) for _ in names]
     told = Told()
@@ -331,9 +286,12 @@ def _make_bench(
 
 
 @asynccontextmanager
-async def _running(*amplifiers: str, **options: Any) -> AsyncIterator[Bench]:
-    """A bench that is open, armed and runs; closed at the end, and its loop must have survived."""
-    bench = _make_bench(*amplifiers, **options)
+async def running(*amplifiers: str, **options: Any) -> AsyncIterator[Bench]:
+    """A bench that is open, armed and runs; closed at the end, and its loop must have survived.
+
+    Amplifiers and options as for `make_bench`.
+    """
+    bench = make_bench(*amplifiers, **options)
     await bench.controller.open()
     await bench.controller.arm()
     task = asyncio.create_task(bench.controller.run())
@@ -343,15 +301,3 @@ async def _running(*amplifiers: str, **options: Any) -> AsyncIterator[Bench]:
     finally:
         await bench.controller.close()
         await task
-
-
-@pytest.fixture
-def make_bench() -> Callable[..., Bench]:
-    """Make a bench: names of amplifiers, what `_make_bench` and a Controller take."""
-    return _make_bench
-
-
-@pytest.fixture
-def running() -> Callable[..., AbstractAsyncContextManager[Bench]]:
-    """A bench that is open, armed and runs, as a context; arguments as for make_bench."""
-    return _running

@@ -35,6 +35,8 @@ def panel(rig: str, port: str, kind: str, count: str, rate: str, seed: str, file
         _wait_until(begin + int(number * 1e9 / work.rate))
         sent[number] = time.monotonic_ns()
         line.send(datagram)
+    print("sent", flush=True)
+    sys.stdin.readline()  # others are measured until then
     np.save(file, sent)
 
 

@@ -64,15 +64,14 @@ class Matched:
 def match(
     commands: Sequence[Command],
     sent: np.ndarray,
-    error: Callable[[int, Command], float],
-    *,
+    *errors: Callable[[int, Command], float],
     first: Callable[[int, int], int],
 ) -> Matched:
     """Match commands to touches that were sent at times (n,) [s], each to a newer one.
 
-    error: how far a command is from what answers a touch, 1 at the most where it does; the nearest
-    counts. first: after which touch answered last, up to the one that is answered now, a command
-    was first due.
+    errors: how far a command is from what answers a touch, 1 at the most where it does; the nearest
+    counts, and a later error only where no touch does by those before it. first: after which touch
+    answered last, up to the one that is answered now, a command was first due.
     """
     found: list[tuple[int, float, float]] = []
     before, unmatched = -1, 0
@@ -81,12 +80,10 @@ def match(
         oldest = int(np.searchsorted(sent, command.time - LONGEST))
         # Of equal ones the newest, which no daemon can be blamed for.
         touches = range(newest, max(before, oldest - 1), -1)
-        errors = [error(touch, command) for touch in touches]
-        nearest = int(np.argmin(errors)) if errors else 0
-        if not errors or errors[nearest] > 1:
+        touch = _nearest(touches, command, errors)
+        if touch is None:
             unmatched += 1
             continue
-        touch = touches[nearest]
         since = sent[first(before, touch)]
         found.append((touch, command.time - sent[touch], command.time - since))
         before = touch
@@ -94,19 +91,42 @@ def match(
     return Matched(numbers.astype(int), newest_, oldest_, unmatched)
 
 
+def _nearest(
+    touches: Sequence[int],
+    command: Command,
+    errors: Sequence[Callable[[int, Command], float]],
+) -> int | None:
+    """The touch that a command answers, by the first of the errors by which it answers any."""
+    for error in errors if touches else ():
+        found = [error(touch, command) for touch in touches]
+        nearest = int(np.argmin(found))
+        if found[nearest] <= 1:
+            return touches[nearest]
+    return None
+
+
 class Expected:
-    """What the daemon's table answers for each touch of some work."""
+    """What the daemon's table answers for each touch of some work.
+
+    flooded: how far the flood has moved its finger [m]; None where it has none.
+    """
 
     def __init__(
-        self, work: Work, rig: Rig, table: LocalizationTable, means: Means, *, is_flooded: bool
+        self,
+        work: Work,
+        rig: Rig,
+        table: LocalizationTable,
+        means: Means,
+        *,
+        flooded: float | None,
     ) -> None:
         self._rig, self._table, self._means = rig, table, means
         self._places = [self._on_plate(x, y) for _, x, y in places(work, rig.plate)]
         self._work = work
         self._others = [self._on_plate(*HELD)]
-        if is_flooded:
+        if flooded is not None:
             length, width = rig.plate.length, rig.plate.width
-            self._others.append((FLOODING[0] * length, FLOODING[1] * width))
+            self._others.append((FLOODING[0] * length + flooded, FLOODING[1] * width))
         self._known: dict[int, Mapping[int, tuple[float, complex]]] = {}
 
     def error(self, touch: int, command: Command) -> float:

@@ -9,13 +9,13 @@ from matplotlib.figure import Figure
 
 from benchmarks.latency_run import Found
 
-OURS, PLAIN = "#d62728", "#1f77b4"
+OURS, PLAIN, TERMINAL = "#d62728", "#1f77b4", "#2ca02c"
 SHORTEST, LONGEST = 0.03, 100.0  # ms
 SHARES = (0.5, 0.01, 0.001)  # of the targets: half is longer, one in a hundred, one in a thousand
 
 
 def draw(found: Sequence[Found], file: Path, *, targets: Sequence[float]) -> None:
-    """Left a histogram of the daemon and the plain exchange, loaded; right how many are longer.
+    """Left histograms of what is loaded and goes over TCP; right how many are longer, of all.
 
     targets [ms]: median, 99th percentile, 99.9th.
     """
@@ -24,16 +24,16 @@ def draw(found: Sequence[Found], file: Path, *, targets: Sequence[float]) -> Non
     left, right = figure.subplots(1, 2)
     edges = np.geomspace(SHORTEST, LONGEST, 100)
     for one in found:
-        color = PLAIN if one.own is None else OURS
+        color = PLAIN if one.own is None else OURS if one.case.wire == "tcp" else TERMINAL
         times = np.sort(1e3 * one.matched.newest)
-        style = "-" if one.case.is_loaded else ":"
-        if one in found[:2]:
-            weights = np.full(len(times), 100 / max(1, len(times)))
+        share = 1 / max(1, len(times))
+        if one.case.is_loaded and one.case.wire == "tcp":
+            weights = np.full(len(times), 100 * share)
             kept = np.clip(times, SHORTEST, LONGEST)
             left.hist(kept, edges, weights=weights, color=color, alpha=0.6, label=one.case.name)
-        if one in found[:4]:
-            longer = 1 - np.arange(len(times)) / max(1, len(times))
-            right.plot(times, longer, style, color=color, lw=1.5, label=one.case.name)
+        style = "-" if one.case.is_loaded else ":"
+        longer = 1 - share * np.arange(len(times))
+        right.plot(times, longer, style, color=color, lw=1.5, label=one.case.name)
     right.plot(targets, SHARES, "kv", ms=6, label="targets")
     left.set(xscale="log", xlim=(SHORTEST, LONGEST), ylabel="share of commands / %")
     right.set(xscale="log", yscale="log", xlim=(SHORTEST, LONGEST), ylabel="share that is longer")

@@ -13,9 +13,11 @@ import contextlib
 import gc
 import json
 import os
+import socket
 import sys
 from dataclasses import replace
 from pathlib import Path
+from urllib.parse import urlsplit
 
 import serial
 from pythonosc.osc_packet import OscPacket
@@ -67,11 +69,21 @@ class Flooded(asyncio.Protocol):
             json.loads(line)
 
 
+def _opened(url: SerialUrl) -> serial.Serial | socket.socket:
+    """The wire: a port, or a connection to a serial server."""
+    if url.is_local:
+        return serial.Serial(url.port, url.baud, timeout=0, exclusive=True)
+    place = urlsplit(url.port)
+    line = socket.create_connection((place.hostname or "", place.port or 0))
+    line.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    line.setblocking(False)
+    return line
+
+
 async def main() -> None:
-    parsed = SerialUrl.parse(sys.argv[2])
     loop = asyncio.get_running_loop()
-    with serial.Serial(parsed.port, parsed.baud, timeout=0, exclusive=True) as port:
-        port.write(encode_frame(encode_request(Arm(2.0), address=1, sequence=0)))
+    with _opened(SerialUrl.parse(sys.argv[2])) as port:
+        os.write(port.fileno(), encode_frame(encode_request(Arm(2.0), address=1, sequence=0)))
         loop.add_reader(port.fileno(), os.read, port.fileno(), 4096)
         transport, _ = await loop.create_datagram_endpoint(
             lambda: Panel(port.fileno()), local_addr=("127.0.0.1", 0)

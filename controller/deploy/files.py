@@ -12,6 +12,9 @@ from model.errors import InputError
 NAME = "era-haptics"
 """Of the service, its user and its group."""
 
+NICE = -10
+"""How urgent the service is; the lower, the more, from -20."""
+
 _HEAD = (
     "# Written by `era systemd install`; systemctl edit changes it without touching this file.\n"
 )
@@ -86,7 +89,7 @@ Environment=XDG_RUNTIME_DIR=/run XDG_CACHE_HOME=/var/cache/{NAME}
 Environment=OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 PYTHONNOUSERSITE=1
 
 # Touches go before everything that is not urgent; nice alone counts within a session only.
-Nice=-10
+Nice={NICE}
 CPUWeight=1000
 OOMScoreAdjust=-500
 LimitNOFILE=4096

@@ -1,0 +1,109 @@
+"""The latency benchmark on a machine that is not left alone: what it does again, what it says."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from benchmarks.latency_machine import busy_ticks
+from benchmarks.latency_match import Command, Matched, match
+from benchmarks.latency_programs import Ended
+from benchmarks.latency_report import HEAD_CELLS, cases, report, write_report
+from benchmarks.latency_run import Case, Disturbed, Failed, Found, attempt
+from controller.api.parts import LatencySummary
+
+CASES = cases(0.01, 1)
+
+
+def found(case: Case, *, milliseconds: float, others: float = 0.0) -> Found:
+    """Ten touches, each answered after as long."""
+    times = np.full(10, 1e-3 * milliseconds)
+    own = None
+    if case.touch_wait is not None:
+        own = LatencySummary(count=10, median=1.0, p99=1.0, p999=1.0, histogram=[])
+    return Found(case, Matched(np.arange(10), times, times, 0), own, 10, 0.01, others, True)
+
+
+def measuring(*outcomes: Found | Exception) -> Callable[[], Found]:
+    """What measures a case, attempt by attempt."""
+    left = list(outcomes)
+
+    def measured() -> Found:
+        outcome = left.pop(0)
+        if isinstance(outcome, Exception):
+            raise outcome
+        return outcome
+
+    return measured
+
+
+def test_a_disturbed_case_is_tried_once_more() -> None:
+    """Where the second attempt works it counts; where that fails as well it is told why, twice."""
+    case = CASES[0]
+    good = found(case, milliseconds=1.0)
+    assert attempt(case, measuring(Disturbed("FAULT"), good)) is good
+    failed = attempt(case, measuring(Disturbed("FAULT"), Ended("the panel")))
+    assert isinstance(failed, Failed)
+    assert [why.partition(" (load average")[0] for why in failed.why] == ["FAULT", "the panel"]
+
+
+def test_a_bug_is_no_disturbance() -> None:
+    """What is not known to come from a busy machine is raised."""
+    with pytest.raises(ZeroDivisionError):
+        attempt(CASES[0], measuring(ZeroDivisionError()))
+
+
+def test_a_case_that_failed_leaves_the_rest_of_the_report(tmp_path: Path) -> None:
+    """The page tells what disturbed it, and has a full row for it and each other, and a picture."""
+    (tmp_path / "pictures").mkdir()
+    outcomes: list[Found | Failed] = [found(case, milliseconds=1.0) for case in CASES]
+    outcomes[0] = Failed(CASES[0], ("COMM_LOST in a hurry", "FAULT again"))
+    write_report(outcomes, seconds=4, seed=2, minutes=1.4, docs=tmp_path)
+    page = (tmp_path / "latency.md").read_text("utf-8")
+    rows = [line for line in page.splitlines() if line.startswith("|")]
+    assert {row.count("|") for row in rows} == {HEAD_CELLS + 1}
+    assert [row.split("|")[1].strip() for row in rows[2:]] == [case.name for case in CASES]
+    assert "each time: COMM_LOST in a hurry; then: FAULT again." in page
+    assert "--seconds 4 --seed 2" in page
+    assert (tmp_path / "pictures" / "latency.png").stat().st_size > 10_000
+
+
+def test_the_verdict_holds_each_quantile_to_its_target() -> None:
+    """2 ms for the median, 5 for the 99th percentile and 10 for the 99.9th, of the first case."""
+    slow = [found(CASES[0], milliseconds=6.0), found(CASES[1], milliseconds=3.0)]
+    page = report(slow, seconds=100, seed=1, minutes=9)
+    assert "median 6.00 of 2 ms (**missed**), 99th percentile 6.00 of 5 ms (**missed**)" in page
+    assert "99.9th 6.00 of 10 ms (met)" in page
+    assert "median 2.0, 99th percentile 2.0" in page  # times the plain exchange
+
+
+def test_what_others_did_meanwhile_is_said() -> None:
+    """Half a processor is too much for figures that shall be those of an idle machine."""
+    quiet = [found(case, milliseconds=1.0, others=0.1) for case in CASES[:2]]
+    assert "was disturbed**" not in report(quiet, seconds=100, seed=1, minutes=9)
+    busy = [found(CASES[0], milliseconds=1.0, others=0.5), quiet[1]]
+    page = report(busy, seconds=100, seed=1, minutes=9)
+    assert "***taps, loaded* was disturbed**: others kept 0.5 processors busy" in page
+
+
+def test_busy_is_neither_idle_nor_waiting() -> None:
+    """As proc(5) has it: user nice system idle iowait irq softirq steal guest guest_nice."""
+    assert busy_ticks("cpu  100 20 30 4000 500 6 7 8 90 9") == 100 + 20 + 30 + 6 + 7 + 8
+
+
+def test_a_set_of_a_flood_that_fell_silent_is_matched() -> None:
+    """What answers no touch beside the flood's finger may answer one without it, and only then."""
+    sent = np.array([0.0, 0.001, 0.002])
+    commands = [Command(0.0015, 1, 1, ()), Command(0.003, 2, 2, ()), Command(0.0035, 3, 3, ())]
+
+    def flooded(touch: int, command: Command) -> float:
+        return 0.0 if (touch, command.token) == (1, 1) else 9.0
+
+    def alone(touch: int, command: Command) -> float:
+        return 0.0 if (touch, command.token) in ((0, 1), (2, 2)) else 9.0
+
+    matched = match(commands, sent, flooded, alone, first=lambda before, touch: before + 1)
+    assert matched.touch.tolist() == [1, 2]
+    assert matched.newest == pytest.approx([0.0005, 0.001])
+    assert matched.unmatched == 1

@@ -19,7 +19,7 @@ from drivers.statistics import WireCounters
 from model.errors import InputError
 from model.rig_file import load_rig
 from sim.bench.bench import Bench
-from sim.bench.real_time import Exchange, exchange_with, keep_time
+from sim.bench.real_time import keep_time
 from sim.control.server import control_socket
 from sim.control.site import Site
 
@@ -44,7 +44,8 @@ class SimulatedBackend(Backend):
         self._control = Path(options["control"]) if options.get("control") else None
         self._amplifier = options.get("amplifier")
         self._open: contextlib.AsyncExitStack | None = None
-        self._exchange: Exchange | None = None
+        self._bench: Bench | None = None
+        self._name = ""
         self._last_sent = 0.0
         self._counters = WireCounters()
         self._on_event: Callable[[Event], None] = lambda event: None
@@ -69,7 +70,7 @@ class SimulatedBackend(Backend):
             return
         try:
             rig = load_rig(self._rig)
-            name = self._name(tuple(rig.amplifiers))
+            name = self._chosen_from(tuple(rig.amplifiers))
             bench = await asyncio.to_thread(Bench, rig, now=clock.now())
         except (InputError, OSError) as error:
             raise CommandError(f"{self._url}: {error}") from error
@@ -78,32 +79,32 @@ class SimulatedBackend(Backend):
                 await stack.enter_async_context(control_socket(Site(bench), self._control))
             task = asyncio.create_task(keep_time(bench), name=f"simulated plate of {self._url}")
             stack.push_async_callback(_cancel, task)
-            self._exchange = exchange_with(bench, name)
             bench.amplifiers[name].listeners.append(self._tell)
+            self._bench, self._name = bench, name
             self._open = stack.pop_all()
 
     async def close(self) -> None:
         """Stop simulating; the plate and its amplifiers are gone."""
         stack, self._open = self._open, None
-        self._exchange = None
+        self._bench = None
         if stack is not None:
             await stack.aclose()
 
     async def exchange(self, request: Request, *, timeout: float) -> Reply:
         """Hand a request over; the answer is there at once. LinkError if it is not open."""
         _require_safe(request)
-        if self._exchange is None:
+        if self._bench is None:
             raise LinkError(f"{self._url} is not open")
         self._last_sent = clock.now()
         self._counters.frames_out += 1
         self._counters.frames_in += 1
-        return self._exchange(request)
+        return self._bench.exchange(self._name, request, now=self._last_sent)
 
     def _tell(self, event: Event, moment: float) -> None:
         self._counters.events += 1
         self._on_event(event)
 
-    def _name(self, names: tuple[str, ...]) -> str:
+    def _chosen_from(self, names: tuple[str, ...]) -> str:
         if self._amplifier is None and len(names) == 1:
             return names[0]
         if self._amplifier in names:

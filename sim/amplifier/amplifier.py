@@ -2,8 +2,8 @@
 
 Everything happens at its own time: a watchdog that ran out between two calls ran out when it did,
 and what a channel plays is a description in time (`sim.waveform`), not samples. Nothing here reads
-a clock or knows a wire. State, watchdog, warmth and silence stand in one file, for each of them ends
-the others; what can be played, what is staged and what sounds are other files.
+a clock or knows a wire. State, watchdog, warmth and silence stand together here, for each ends the
+others; what can be played, what is staged and what sounds are files of their own.
 
 Not modelled: the time high voltage takes to rise, and the voltage waveform behind a tone.
 """

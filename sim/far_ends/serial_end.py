@@ -15,7 +15,7 @@ from drivers.protocol.payload import Malformed
 from drivers.protocol.serial_codec import decode_request, encode_event, encode_reply
 from drivers.protocol.serial_frame import Frame, FrameCounters, FrameReader, encode_frame
 from sim.bench.station import Station
-from sim.transport.line import Line
+from sim.transport.line import TwoWayLine
 from sim.transport.pseudo_terminal import make_terminal
 
 
@@ -35,12 +35,15 @@ class SerialEnd:
         }
         self._first = stations[0]
         self._baud = baud or PROTOCOL.serial.baud
-        faults = self._first.faults
-        self._inward = Line(self._arrived, toward="amplifier", faults=faults, bits_per_second=baud)
-        self._outward = Line(self._to_host, toward="host", faults=faults, bits_per_second=baud)
+        self._line = TwoWayLine(
+            to_amplifier=self._arrived,
+            to_host=self._to_host,
+            faults=self._first.faults,
+            bits_per_second=baud,
+        )
         self._events = 0
         self._reader = FrameReader()
-        self._terminal = make_terminal(self._inward.send, unpluggable=unpluggable)
+        self._terminal = make_terminal(self._line.inward.send, unpluggable=unpluggable)
         self._is_unpluggable = unpluggable
 
     @property
@@ -78,22 +81,13 @@ class SerialEnd:
 
     def close(self) -> None:
         """Hang up; to be called in the event loop that it was started in."""
-        self._still()
+        self._line.close()
         self._terminal.close()
-
-    def _still(self) -> None:
-        """Forget what is under way on the line."""
-        self._inward.close()
-        self._outward.close()
 
     def _plug(self, is_plugged: bool) -> None:
         """The line has come, or gone."""
-        if is_plugged:
-            self._terminal.plug_in()
-            self._terminal.listen()
-        else:
-            self._still()
-            self._terminal.unplug()
+        self._line.close()
+        self._terminal.plug(is_plugged)
 
     def _arrived(self, data: bytes) -> None:
         for frame in self._reader.feed(data):
@@ -104,7 +98,7 @@ class SerialEnd:
             elif frame.address in self._stations:
                 reply = self._answer(frame, self._stations[frame.address])
                 if reply is not None:
-                    self._outward.send(encode_frame(encode_reply(reply, frame)))
+                    self._line.outward.send(encode_frame(encode_reply(reply, frame)))
 
     def _answer(self, frame: Frame, station: Station) -> Reply | None:
         try:
@@ -124,7 +118,7 @@ class SerialEnd:
         if self._first.is_answering:
             self._events = (self._events + 1) & 0xFFFF
             frame = encode_event(event, address=PROTOCOL.serial.address, sequence=self._events)
-            self._outward.send(encode_frame(frame))
+            self._line.outward.send(encode_frame(frame))
 
     def _to_host(self, data: bytes) -> None:
         self._terminal.write(data)

@@ -1,17 +1,18 @@
-"""One direction of a simulated wire: how long telegrams take on it, and what befalls them.
+"""A simulated wire: how long telegrams take on it each way, and what befalls them.
 
 Not modelled: the gaps between the bytes of one telegram; it arrives whole, when its last bit would.
 """
 
 import asyncio
 from collections.abc import Callable
+from functools import partial
 
 from drivers import clock
 from sim.faults.episodes import Faults, Toward
 
 
 class Line:
-    """Carries telegrams one way, in the running event loop.
+    """One direction. Carries telegrams one way, in the running event loop.
 
     deliver is called with each that arrives; bits_per_second: of the wire, None for one that takes
     no time; bits_per_byte: on it, framing included.
@@ -58,3 +59,27 @@ class Line:
 
         timer = asyncio.get_running_loop().call_later(delay, arrive)
         self._on_the_way.add(timer)
+
+
+class TwoWayLine:
+    """A wire: `inward` carries to the amplifier, `outward` to the host; the rest as for `Line`."""
+
+    def __init__(
+        self,
+        *,
+        to_amplifier: Callable[[bytes], None],
+        to_host: Callable[[bytes], None],
+        faults: Faults,
+        bits_per_second: float | None = None,
+        bits_per_byte: float = 10.0,
+    ) -> None:
+        make = partial(
+            Line, faults=faults, bits_per_second=bits_per_second, bits_per_byte=bits_per_byte
+        )
+        self.inward = make(to_amplifier, toward="amplifier")
+        self.outward = make(to_host, toward="host")
+
+    def close(self) -> None:
+        """What is on the way is lost."""
+        self.inward.close()
+        self.outward.close()

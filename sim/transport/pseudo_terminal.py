@@ -40,6 +40,14 @@ class Terminal(ABC):
     def unplug(self) -> None:
         """Take the line away: for the host it is gone."""
 
+    def plug(self, is_plugged: bool) -> None:
+        """Pull the line out, or put it in again and read from then on."""
+        if is_plugged:
+            self.plug_in()
+            self.listen()
+        else:
+            self.unplug()
+
     @abstractmethod
     def close(self) -> None:
         """Give everything back."""

@@ -11,7 +11,7 @@ from collections.abc import Callable
 
 from drivers.protocol.can_frame import CanFrame
 from sim.faults.episodes import Faults
-from sim.transport.line import Line
+from sim.transport.line import TwoWayLine
 
 LENGTHS = (0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64)
 """How many bytes a frame may have, by its length code; those up to eight without CAN FD."""
@@ -57,31 +57,27 @@ class Stub:
         self._hears = hears
         self.damaged = 0
         # A telegram has eight bytes beside the data: about what frame, stuffing and gap cost.
-        self._inward = Line(
-            self._arrive,
-            toward="amplifier",
+        self._line = TwoWayLine(
+            to_amplifier=self._arrive,
+            to_host=self._leave,
             faults=faults,
             bits_per_second=bitrate,
             bits_per_byte=8,
-        )
-        self._outward = Line(
-            self._leave, toward="host", faults=faults, bits_per_second=bitrate, bits_per_byte=8
         )
         self._listener = self._hear  # one object, by which the bus knows it
         bus.join(self._listener)
 
     def send(self, frame: CanFrame) -> None:
         """Send a frame of the amplifier's."""
-        self._outward.send(_telegram(frame))
+        self._line.outward.send(_telegram(frame))
 
     def close(self) -> None:
         """Leave the bus; what is on the way is lost."""
         self._bus.leave(self._listener)
-        self._inward.close()
-        self._outward.close()
+        self._line.close()
 
     def _hear(self, frame: CanFrame) -> None:
-        self._inward.send(_telegram(frame))
+        self._line.inward.send(_telegram(frame))
 
     def _arrive(self, telegram: bytes) -> None:
         frame = self._checked(telegram)

@@ -36,11 +36,7 @@ class SlcanEnd:
     def plug(self, is_plugged: bool) -> None:
         """Have the adapter plugged in, or pulled out."""
         self._adapter.reset()
-        if is_plugged:
-            self._port.plug_in()
-            self._port.listen()
-        else:
-            self._port.unplug()
+        self._port.plug(is_plugged)
 
     def close(self) -> None:
         """Leave bus and port."""

@@ -27,7 +27,7 @@ from sim.far_ends.modbus.frames import (
     tcp_frame,
 )
 from sim.far_ends.modbus.unit import ModbusUnit
-from sim.transport.line import Line
+from sim.transport.line import TwoWayLine
 from sim.transport.pseudo_terminal import make_terminal
 
 _MAP = PROTOCOL.modbus
@@ -65,26 +65,17 @@ class _Wire(ABC):
         self.units = units
         self.reader = reader
         self._timer: asyncio.TimerHandle | None = None
-        faults = units.stations[0].faults
-        self.inward = Line(
-            self._arrived,
-            toward="amplifier",
-            faults=faults,
-            bits_per_second=speed,
-            bits_per_byte=_BITS_PER_BYTE,
-        )
-        self.outward = Line(
-            self.send,
-            toward="host",
-            faults=faults,
+        self.line = TwoWayLine(
+            to_amplifier=self._arrived,
+            to_host=self.send,
+            faults=units.stations[0].faults,
             bits_per_second=speed,
             bits_per_byte=_BITS_PER_BYTE,
         )
 
     def hang_up(self) -> None:
         """What is on the way is lost."""
-        self.inward.close()
-        self.outward.close()
+        self.line.close()
         if self._timer is not None:
             self._timer.cancel()
 
@@ -107,7 +98,7 @@ class _Wire(ABC):
         for request in requests:
             frame = self.reply_to(request)
             if frame is not None:
-                self.outward.send(frame)
+                self.line.outward.send(frame)
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
@@ -129,7 +120,7 @@ class ModbusRtuEnd(_Wire):
         super().__init__(_Units(stations), RtuReader(), speed=speed)
         self._baud = speed or _MAP["baud"]
         self._is_unpluggable = unpluggable
-        self._terminal = make_terminal(self.inward.send, unpluggable=unpluggable)
+        self._terminal = make_terminal(self.line.inward.send, unpluggable=unpluggable)
 
     @property
     def urls(self) -> dict[str, str]:
@@ -158,12 +149,8 @@ class ModbusRtuEnd(_Wire):
         return None if pdu is None else rtu_frame(request.unit, pdu)
 
     def _plug(self, is_plugged: bool) -> None:
-        if is_plugged:
-            self._terminal.plug_in()
-            self._terminal.listen()
-        else:
-            self.hang_up()
-            self._terminal.unplug()
+        self.hang_up()
+        self._terminal.plug(is_plugged)
 
 
 class _Connection(_Wire, asyncio.Protocol):
@@ -181,7 +168,7 @@ class _Connection(_Wire, asyncio.Protocol):
         self._end.connected(self)
 
     def data_received(self, data: bytes) -> None:
-        self.inward.send(data)
+        self.line.inward.send(data)
 
     def connection_lost(self, exc: Exception | None) -> None:
         self._end.connections.discard(self)

@@ -17,8 +17,8 @@ def as_points(places: Places, *, what: str) -> tuple[Point, ...]:
     try:
         found = np.asarray(places, dtype=float)
     except (TypeError, ValueError):
-        found = np.empty(0)
-    if found.size == 0 and np.ndim(places) <= 1 and len(places) == 0:
+        found = np.empty(1)
+    if found.size == 0:
         return ()
     if found.ndim > 2 or found.shape[-1:] != (2,):
         raise InputError(

@@ -1,0 +1,52 @@
+"""A rig's amplifiers from a script."""
+
+from dataclasses import replace
+
+import pytest
+
+import era_haptics as era
+from model.rig import Channel
+from paper_plate import make_paper_rig
+
+RIG = make_paper_rig(12, 9)
+URL = f"sim://{era.example_rig_path()}"
+
+
+def test_commands_go_by_the_rigs_wiring() -> None:
+    """Levels of the stroke, degrees, every wired channel by its own amplifier, others silent."""
+    wiring = {
+        "SW": Channel("a", 1), "SE": Channel("a", 0), "NE": Channel("b", 5), "NW": Channel("b", 2),
+    }  # fmt: skip
+    rig = replace(RIG, wiring=wiring, amplifiers={"a": "sim://", "b": "sim://"})
+    asked = era.commands_for(rig, {"SW": era.Drive(110, level=0.25), "NE": era.Tone(90, 5e-5, -1)})
+    told = {
+        name: [(c.channel, c.frequency, round(c.level, 9), round(c.phase, 3)) for c in commands]
+        for name, commands in asked.items()
+    }
+    assert told == {
+        "a": [(0, 40.0, 0.0, 0.0), (1, 110, 0.25, 0.0)],
+        "b": [(2, 40.0, 0.0, 0.0), (5, 90, 0.5, -57.296)],
+    }
+
+
+def test_it_is_opened_within_the_rigs_limits() -> None:
+    """It plays what the rig allows and refuses the rest."""
+    rig = replace(RIG, limits=replace(RIG.limits, level=0.2))
+    with era.open_amplifier(rig, url=URL) as amplifier:
+        amplifier.arm()
+        (commands,) = era.commands_for(rig, {"SW": era.Drive(110, level=0.2)}).values()
+        achieved = amplifier.play(commands, duration=0.02)
+        assert {command.channel: command.level for command in achieved.commands} == pytest.approx(
+            {0: 0.2, 1: 0.0, 2: 0.0, 3: 0.0}
+        )
+        (commands,) = era.commands_for(rig, {"SW": era.Drive(110, level=0.21)}).values()
+        with pytest.raises(era.CommandRefused, match="level"):
+            amplifier.apply(commands)
+
+
+def test_one_of_several_must_be_named() -> None:
+    """By a name of the rig."""
+    rig = replace(RIG, amplifiers={"a": "sim://", "b": "sim://"})
+    for name in (None, "c"):
+        with pytest.raises(era.InputError, match="the rig has the amplifiers a, b; name one"):
+            era.open_amplifier(rig, name)

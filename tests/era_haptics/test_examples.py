@@ -1,0 +1,118 @@
+"""The notebooks of the examples and the lines of the API's page, run as users run them."""
+
+import os
+import re
+import runpy
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+ROOT = Path(__file__).parents[2]
+EXAMPLES = ROOT / "examples"
+PAGE = (ROOT / "docs" / "python-api.md").read_text("utf-8")
+WIRE_PAGE = (ROOT / "docs" / "wire-protocol.md").read_text("utf-8")
+
+# Founding paper, in-house column of Table 2 [Hz].
+TABLE_2 = ["31.98", "68.50", "76.62", "107.84", "160.77"]
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """A cache of tables that all of them share, and nobody else."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
+        yield
+
+
+def run(name: str) -> str:
+    """What an example prints, run as a script."""
+    said = subprocess.run(
+        [sys.executable, EXAMPLES / name],
+        capture_output=True,
+        text=True,
+        check=False,
+        env={**os.environ, "MPLBACKEND": "Agg"},
+    )
+    assert (said.returncode, said.stderr) == (0, "")
+    return said.stdout
+
+
+def number_in(text: str, pattern: str) -> float:
+    """The one number that a pattern finds."""
+    (found,) = re.findall(pattern, text)
+    return float(found)
+
+
+@pytest.mark.usefixtures("cache")
+def test_the_researchers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The paper's table and claim come out, felt is what was predicted, pictures are written."""
+    monkeypatch.setenv("ERA_PICTURES", str(tmp_path))
+    ran: dict[str, Any] = runpy.run_path(str(EXAMPLES / "researcher.py"))
+    assert [f"{frequency:.2f}" for frequency in ran["paper_frequencies"]] == TABLE_2
+    assert 1.5 < ran["rise"] < 1.8  # of the paper's claim, by solvers of their own
+    assert ran["alike"] > 0.98
+    for asked, felt in ran["played"].values():
+        assert felt.contrast_db == pytest.approx(asked.contrast_db, abs=0.2)
+        assert felt.transient_contrast_db == pytest.approx(asked.transient_contrast_db, abs=0.4)
+        assert felt.level_db_sl == pytest.approx(20.0, abs=0.05)
+    ramp, shaped = (felt.transient_contrast_db for _, felt in ran["played"].values())
+    assert shaped > ramp + 3
+    assert (ran["study"]["phased"] >= ran["study"]["switched"] - 0.5).all()
+    assert np.diff(ran["study"]["phased"]).min() > 0  # the farther, the easier
+    pictures = sorted(path.name for path in tmp_path.iterdir())
+    assert pictures == ["map.png", "pattern.png", "ramp.png", "shaped.png"]
+
+
+@pytest.mark.alone
+@pytest.mark.usefixtures("cache")
+def test_the_hmi_engineers() -> None:
+    """What the finger felt on the plate in time is what the daemon predicted; all ends in order."""
+    said = run("hmi_engineer.py")
+    felt = number_in(said, r"contrast (\S+) dB felt")
+    predicted = number_in(said, r"(\S+) dB predicted")
+    assert predicted > 20
+    assert felt == pytest.approx(predicted, abs=1.5)  # it has vibrated for a second
+    assert "daemon ended with status 0" in said
+
+
+@pytest.mark.alone
+def test_the_vendors() -> None:
+    """The frame by hand is that of the wire's page, it is answered, and the contract is kept."""
+    said = run("amplifier_vendor.py")
+    (ping,) = re.findall(r"^Ping request: `([0-9A-F ]+)`$", WIRE_PAGE, re.MULTILINE)
+    assert f"by hand  {ping}" in said
+    assert f"by codec {ping}" in said
+    assert re.search(r"^reply    00 .* 00 -> Status SWITCH_ON_DISABLED$", said, re.MULTILINE)
+    kept, of = re.findall(r"^(\d+) of (\d+) kept$", said, re.MULTILINE)[0]
+    assert kept == of
+    assert int(of) == said.count("\nkept ") > 15
+
+
+@pytest.mark.usefixtures("cache")
+def test_the_ten_lines_of_the_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """They run as they stand there, and predicted is felt."""
+    (tmp_path / "examples").mkdir()
+    shutil.copy(EXAMPLES / "paper_plate.yaml", tmp_path / "examples")
+    monkeypatch.chdir(tmp_path)
+    (lines,) = re.findall(r"^```python\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL)
+    assert len(lines.split("\n\n")[1].splitlines()) == 10
+    (tmp_path / "page.py").write_text(lines, "utf-8")
+    ran = runpy.run_path("page.py")
+    assert ran["felt"].contrast_db == pytest.approx(ran["pattern"].contrast_db, abs=0.2)
+    assert (tmp_path / "pattern.png").stat().st_size > 10_000
+
+
+def test_the_page_has_every_name() -> None:
+    """What is exported is documented, and nothing else."""
+    import era_haptics as era
+
+    documented = set(re.findall(r"^\.\. auto\w+:: era_haptics\.(\w+)", PAGE, re.MULTILINE))
+    errors = set(re.findall(r"`(\w+)`", PAGE.partition("| exception")[2].partition("## Speed")[0]))
+    assert documented | (errors & set(era.__all__)) == set(era.__all__)
+    assert documented & errors == set()

@@ -1,0 +1,85 @@
+"""What the pictures of the API show, read back from the figures."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from matplotlib.colors import to_hex
+from matplotlib.figure import Figure
+from matplotlib.patches import Circle
+
+import era_haptics as era
+from model.table_build import build_table
+from paper_plate import make_paper_rig
+
+TARGET, QUIET = (0.08, 0.06), [(0.22, 0.16), (0.25, 0.04)]
+PLATE = era.SolvedPlate(make_paper_rig(12, 9))
+
+
+def markers(figure: Figure) -> dict[str, str]:
+    """Colours of the ERAs' marks, by place in centimetres."""
+    (axes, *_) = figure.axes
+    return {
+        f"{float(line.get_xdata()[0]):.0f},{float(line.get_ydata()[0]):.0f}": to_hex(
+            line.get_color()
+        )
+        for line in axes.lines
+        if line.get_marker() == "o"
+    }
+
+
+def test_a_map_marks_who_is_driven() -> None:
+    """Red where driven, green where only holding; the largest value is at the top of the scale."""
+    figure = era.draw_map(PLATE, {"SW": 110, "NE": era.Drive(110, level=0.5)}, title="a diagonal")
+    red, green = "#d62728", "#2ca02c"
+    assert markers(figure) == {"0,0": red, "30,0": green, "30,23": red, "0,23": green}
+    assert figure.axes[0].get_title() == "a diagonal"
+    peak = PLATE.map({"SW": 110, "NE": era.Drive(110, level=0.5)}).peak.max() / 9.8
+    assert figure.axes[1].get_ylim()[1] == pytest.approx(peak)
+
+
+def test_a_pattern_is_drawn_with_its_fingers() -> None:
+    """Circles of 13 mm where fingers are, the contrast in the title, the plate in decibels."""
+    table = build_table(
+        PLATE.rig, frequencies=np.array([60.0, 110.0, 250.0]), grid=era.Grid(4, 3), mode="phased"
+    )
+    pattern = era.query(table, TARGET, quiet=QUIET)
+    figure = era.draw_pattern(table, pattern, TARGET, quiet=QUIET)
+    axes = figure.axes[0]
+    circles = [patch for patch in axes.patches if isinstance(patch, Circle)]
+    assert [np.round(circle.center, 6).tolist() for circle in circles] == [
+        [8.0, 6.0], [22.0, 16.0], [25.0, 4.0],
+    ]  # fmt: skip
+    assert {circle.radius for circle in circles} == {1.3}
+    assert f"{pattern.contrast_db:.1f} dB predicted" in axes.get_title()
+    texts = [text.get_text() for text in axes.texts]
+    assert texts.count("quiet") == 2
+    assert "felt\n20 dB SL" in texts
+    drawn = np.asarray(axes.collections[0].get_array()).reshape(121, 121)
+    row, column = round(0.06 / 0.2286 * 120), round(0.08 / 0.3048 * 120)
+    assert drawn[row, column] == pytest.approx(20.0, abs=1.0)
+
+
+def test_a_playback_is_drawn_over_time() -> None:
+    """A line a finger; the last of the target's is its steady amplitude, peak by peak."""
+    played = PLATE.play({"SW": era.Drive(110, level=0.1)}, TARGET, quiet=QUIET, duration=1.2)
+    figure = era.draw_playback(played)
+    axes = figure.axes[0]
+    names = [text.get_text() for text in axes.get_legend().get_texts()]
+    assert names == ["target 1", "quiet 1", "quiet 2"]
+    lines = dict(zip(names, axes.lines, strict=True))
+    assert float(lines["target 1"].get_xdata()[-1]) == pytest.approx(1200.0)
+    at_target = float(lines["target 1"].get_ydata()[-1])
+    loudest = max(float(lines[name].get_ydata()[-1]) for name in names[1:])
+    assert 20 * np.log10(at_target / loudest) == pytest.approx(played.contrast_db, abs=0.1)
+    assert f"{played.contrast_db:.1f} dB steady" in axes.get_title()
+
+
+def test_pictures_leave_pyplot_alone() -> None:
+    """Nothing global is touched, so that a notebook keeps its own settings and windows."""
+    program = "import sys, era_haptics as e; e.draw_map; print('matplotlib.pyplot' in sys.modules)"
+    said = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True
+    )
+    assert said.stdout == "False\n"

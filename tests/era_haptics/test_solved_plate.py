@@ -1,0 +1,89 @@
+"""A plate solved once, against direct solves and other ways through the code."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import era_haptics as era
+from model.maps import plate_map
+from paper_plate import make_paper_rig
+
+TARGET, QUIET = (0.08, 0.06), [(0.22, 0.16)]
+
+# Converged Reissner-Mindlin frequencies [Hz] on the ERAs: NGSolve 6.2, order 5.
+CONVERGED = [
+    31.6186, 67.9034, 75.4567, 106.449, 156.821, 211.972,
+    214.733, 248.396, 330.943, 357.949, 388.062, 444.871,
+]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def plate() -> era.SolvedPlate:
+    """The paper's plate on the mesh of the example."""
+    return era.SolvedPlate(era.load_rig(era.example_rig_path()))
+
+
+@pytest.fixture(scope="module")
+def table(plate: era.SolvedPlate) -> era.LocalizationTable:
+    """Of the same plate, at a few frequencies."""
+    from model.table_build import build_table
+
+    frequencies = np.array([60.0, 110.0, 180.0, 250.0])
+    return build_table(plate.rig, frequencies=frequencies, grid=era.Grid(4, 3), mode="phased")
+
+
+def test_modes_are_converged(plate: era.SolvedPlate) -> None:
+    """All twelve up to the rig's 500 Hz, by another program within 0.02 %."""
+    np.testing.assert_allclose(plate.modes.natural_frequencies, CONVERGED, rtol=2e-4)
+    assert len(plate.modes.damping_ratios) == 12
+
+
+def test_a_map_is_that_of_a_direct_solve() -> None:
+    """Two ERAs at one frequency and one at another, on a raster, within 1e-4 of the largest."""
+    rig = make_paper_rig(24, 18)
+    drive = {"SW": 110, "NE": era.Drive(110, level=0.5, phase_deg=90), "SE": era.Tone(250, 2e-5)}
+    excitation = {
+        "SW": era.Tone(110, 1e-4),
+        "NE": era.Tone(110, 0.5e-4, np.pi / 2),
+        "SE": era.Tone(250, 2e-5),
+    }
+    found = era.SolvedPlate(rig).map(drive, raster=(13, 9))
+    direct = plate_map(rig, excitation, raster=(13, 9))
+    np.testing.assert_array_equal(found.x, np.linspace(0, 0.3048, 13))
+    np.testing.assert_allclose(found.peak, direct.peak, atol=1e-4 * direct.peak.max())
+
+
+def test_point_masses_are_on_it() -> None:
+    """A map of a plate that carries one is that of the direct solve, which differs from without."""
+    from model.point_mass import PointMass
+
+    rig = make_paper_rig(24, 18)
+    carrying = replace(rig, masses=(PointMass(0.1, 0.1, 0.02),))
+    found, bare = (era.SolvedPlate(each).map({"SW": 110}).peak for each in (carrying, rig))
+    direct = plate_map(carrying, {"SW": era.Tone(110, 1e-4)}).peak
+    np.testing.assert_allclose(found, direct, atol=1e-4 * direct.max())
+    assert np.abs(found - bare).max() > 0.05 * bare.max()
+
+
+@pytest.mark.parametrize("envelopes", [False, True])
+def test_what_is_felt_is_what_was_predicted(
+    plate: era.SolvedPlate, table: era.LocalizationTable, envelopes: bool
+) -> None:
+    """Steady in the frequency domain, at first in another solution in time, against the plant."""
+    pattern = era.query(table, TARGET, quiet=QUIET, envelopes=envelopes)
+    felt = plate.play(pattern, TARGET, quiet=QUIET, duration=1.5)
+    assert pattern.contrast_db is not None
+    assert pattern.contrast_db > 10
+    assert felt.contrast_db == pytest.approx(pattern.contrast_db, abs=0.3)
+    assert felt.level_db_sl == pytest.approx(20.0, abs=0.1)
+    assert felt.quiet_level_db_sl == pytest.approx(pattern.quiet_level_db_sl, abs=0.3)
+    assert felt.transient_contrast_db == pytest.approx(pattern.transient_contrast_db, abs=0.5)
+    assert felt.settled == (0.04 if not envelopes else pytest.approx(0.105))
+
+
+def test_what_it_is_not_solved_for_is_refused(plate: era.SolvedPlate) -> None:
+    """Above the rig's limits its answers would be wrong, so there are none."""
+    for ask in (plate.map, lambda drive: plate.play(drive, TARGET)):
+        with pytest.raises(era.InputError, match=r"limits end at 500 Hz.*raise limits\.freq"):
+            ask({"SW": 501})

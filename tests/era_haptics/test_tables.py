@@ -1,0 +1,67 @@
+"""Tables and their answers from Python, against the commands."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import era_haptics as era
+from model.cli import app
+from model.fingertip import fingertip_points
+from model.localization import mean_level_db_sl
+
+TARGET, QUIET = (0.08, 0.06), [(0.22, 0.16), (0.25, 0.04)]
+
+
+@pytest.fixture(scope="module")
+def table(tmp_path_factory: pytest.TempPathFactory) -> era.LocalizationTable:
+    """A small one, from a cache of its own."""
+    rig = era.load_rig(str(era.example_rig_path()), mesh="12x9")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
+        return era.table(rig, mode="signed", frequencies=[60, 110, 250], grid=era.Grid(4, 3))
+
+
+@pytest.mark.parametrize("envelopes", [False, True])
+def test_a_query_is_the_commands(
+    table: era.LocalizationTable, tmp_path: Path, envelopes: bool
+) -> None:
+    """Every measure of `era table query --json`, from the table's file."""
+    path = str(tmp_path / "t.npz")
+    era.save_table(table, path)
+    pattern = era.query(
+        era.load_table(path), TARGET, quiet=QUIET, level_db_sl=15, envelopes=envelopes
+    )
+    options = ["--target", "0.08,0.06", "--quiet", "0.22,0.16", "--quiet", "0.25,0.04"]
+    options += ["--level", "15", *(["--envelopes"] if envelopes else [])]
+    answer = json.loads(
+        CliRunner().invoke(app, ["table", "query", path, *options, "--json"]).stdout
+    )
+    for measure in (
+        *("level_db_sl", "contrast_db", "contrast_db_sl", "robust_contrast_db"),
+        *("transient_contrast_db", "left_after_db", "quiet_level_db_sl", "usable_level_db_sl"),
+    ):
+        assert getattr(pattern, measure) == pytest.approx(answer[measure], abs=1e-6), measure
+    assert table.drive_of(pattern.excitation) == answer["drive"]
+    assert bool(pattern.onset) is envelopes
+
+
+def test_a_table_is_what_was_asked_for(table: era.LocalizationTable) -> None:
+    """Mode, frequencies and cells."""
+    assert table.mode == "signed"
+    np.testing.assert_array_equal(table.frequencies, [60.0, 110.0, 250.0])
+    assert table.grid == era.Grid(4, 3)
+
+
+def test_several_targets_and_no_quiet_finger(table: era.LocalizationTable) -> None:
+    """Both targets feel at least what was asked for; alone there is nobody to be told from."""
+    targets = [TARGET, (0.25, 0.2)]
+    both = era.query(table, targets, quiet=(0.15, 0.11))
+    levels = [
+        mean_level_db_sl(*table.amplitudes(both.excitation, fingertip_points(*target, table.plate)))
+        for target in targets
+    ]
+    assert min(levels) == pytest.approx(20.0, abs=0.1)
+    assert era.query(table, TARGET).contrast_db is None

@@ -1,0 +1,115 @@
+"""An excitation played on the plate in time, against the frequency domain and by hand."""
+
+import math
+
+import numpy as np
+import pytest
+
+from model.assembly import assemble, era_positions
+from model.envelope import Envelope, shaped
+from model.errors import InputError
+from model.excitation import Tone
+from model.finger_load import FingerLoad
+from model.fingertip import fingertip_points
+from model.harmonic import direct_acceleration
+from model.localization import mean_level_db_sl
+from model.point_load import PointLoad
+from model.question import Question
+from model.reduction import ReducedPlate, reduce_plate
+from model.rig import Rig
+from model.time_response import plate_in_time
+from model.transient import Transients
+from sim.plant.finger import Record
+from sim.plant.playback import Playback, play
+
+TARGET, QUIET = (0.10, 0.03), (0.22, 0.16)
+FINGERS = Question((TARGET,), (QUIET,))
+HEAVY = FingerLoad(stiffness=5000.0, damping=20.0, mass=0.005)
+EXCITATION = {"SW": Tone(110.0, 1e-5), "NE": Tone(250.0, 5e-6, math.pi / 2)}
+
+
+@pytest.fixture(scope="module")
+def reduced(coarse_rig: Rig) -> ReducedPlate:
+    """The paper's plate, for forces at its ERAs."""
+    return reduce_plate(coarse_rig.plate, coarse_rig.mesh, era_positions(coarse_rig.eras))
+
+
+def steady(rig: Rig, place: tuple[float, float], *loads: PointLoad) -> np.ndarray:
+    """Amplitudes (2, p) [m/s²] under a fingertip at 110 and 250 Hz, by a direct solve."""
+    points = fingertip_points(*place, rig.plate)
+    frequencies = np.array([110.0, 250.0])
+    unit = direct_acceleration(
+        assemble(rig.plate, rig.mesh), rig.eras, frequencies, points, loads=loads
+    )
+    return np.abs([0.1 * unit[0, 0], 0.05 * unit[1, 2]])  # SW and NE, of 100 µm
+
+
+@pytest.mark.parametrize("finger_load", [None, HEAVY])
+def test_steady_measures_are_those_of_the_frequency_domain(
+    coarse_rig: Rig, reduced: ReducedPlate, finger_load: FingerLoad | None
+) -> None:
+    """Level and contrast by a direct solve, within 0.1 dB, fingers that load the plate or not."""
+    played = play(coarse_rig, reduced, EXCITATION, FINGERS, duration=1.2, finger_load=finger_load)
+    loads = [finger_load.at(*at) for at in (TARGET, QUIET)] if finger_load else []
+    at_target, at_quiet = (steady(coarse_rig, at, *loads) for at in (TARGET, QUIET))
+    level = mean_level_db_sl(np.array([110.0, 250.0]), at_target)
+    contrast = 20 * math.log10(at_target.sum(axis=0).mean() / at_quiet.sum(axis=0).max())
+    assert played.level_db_sl == pytest.approx(level, abs=0.1)
+    assert played.contrast_db == pytest.approx(contrast, abs=0.1)
+    free = mean_level_db_sl(np.array([110.0, 250.0]), steady(coarse_rig, TARGET))
+    assert (abs(level - free) > 1) is (finger_load is not None)
+
+
+def test_measures_count_as_those_of_patterns_do() -> None:
+    """Of made-up records: means over targets, the loudest quiet point, the lesser target."""
+    times = np.arange(1, 10_001) / 10_000
+    points = np.zeros((2, 2))
+
+    def record(*amplitudes: float) -> Record:
+        wave = np.sin(2 * np.pi * 100 * times)
+        early = np.where(times <= 0.1, 0.5, 1.0)  # half as strong while it starts
+        return Record(points, times, (wave * early)[:, None] * np.array(amplitudes))
+
+    quiet = record(0.1, 0.2)
+    quiet.accelerations[500] = 1.0  # a peak at 50 ms
+    played = Playback((100.0,), (record(3.0, 5.0), record(2.0, 2.0)), (quiet,), settled=0.1)
+    assert played.contrast_db == pytest.approx(20 * math.log10(2 / 0.2), abs=1e-6)
+    assert played.transient_contrast_db == pytest.approx(20 * math.log10(1.0 / 1.0), abs=1e-6)
+    assert played.quiet_level_db_sl is not None
+    assert played.level_db_sl - played.quiet_level_db_sl == pytest.approx(20.0, abs=1e-6)
+    alone = Playback((100.0,), (record(3.0, 5.0),), (), settled=0.1)
+    assert (alone.contrast_db, alone.transient_contrast_db, alone.quiet_level_db_sl) == (None,) * 3
+
+
+def test_an_envelope_stands_in_the_place_of_the_ramp(
+    coarse_rig: Rig, reduced: ReducedPlate
+) -> None:
+    """What fingertips go through is what another solution in time says, the model's own."""
+    excitation = {"SW": Tone(110.0, 1e-5)}
+    onset = {"SW": Envelope(110.0, 2e-6, (4e-6j, -1e-5, 1e-5)), "NE": Envelope(110.0, 0, (5e-6, 0))}
+    played = play(coarse_rig, reduced, excitation, FINGERS, duration=0.2, onset=onset)
+    assert played.settled == pytest.approx(0.015)
+    transients = Transients(plate_in_time(reduced, coarse_rig.eras))
+    for record in (*played.targets, *played.quiet):
+        other = transients.acceleration(shaped(onset, coarse_rig.eras), record.points, duration=0.2)
+        every = 2000  # Hz, of which both sampling rates are multiples
+        here = record.accelerations[4::5][:-1]
+        np.testing.assert_allclose(record.times[4::5][:-1] * every, np.arange(1, 400))
+        np.testing.assert_allclose(here, other[4::4], atol=1e-6 * np.abs(other).max())
+
+
+@pytest.mark.parametrize(
+    ("fingers", "duration", "says"),
+    [
+        (FINGERS, 0.04, "the onset takes 0.04 s"),
+        (FINGERS, math.nan, "nothing can be played for nan s"),
+        (FINGERS, 11.0, "10 s are the longest"),
+        (Question(((8.0, 6.0),)), 1.0, "is not on the plate"),
+    ],
+)
+def test_what_cannot_be_played_is_refused(
+    coarse_rig: Rig, reduced: ReducedPlate, fingers: Question, duration: float, says: str
+) -> None:
+    """Times in which nothing settles or that fill the memory, and fingers beside the plate."""
+    with pytest.raises(InputError, match=says):
+        play(coarse_rig, reduced, EXCITATION, fingers, duration=duration)

@@ -14,11 +14,11 @@ import numpy as np
 from examples.make_measured import FREQUENCIES, SENSOR, true_rig
 from model.calibration.calibrate import calibrate
 from model.calibration.outcome import Calibration
-from model.fingertip import fingertip_points
-from model.rig import Rig
-from model.rig_file import load_rig
-from model.table import LocalizationTable
-from model.table_build import build_table
+from model.finger.fingertip import fingertip_points
+from model.rig.file import load_rig
+from model.rig.rig import Rig
+from model.table.build import build_table
+from model.table.table import LocalizationTable
 from sim.sensors.accelerometer import scanning_grid
 from sim.sensors.stepped_sine import record_responses
 

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.latency_touches import FLOODING, WANDERS, Work, datagrams
-from model.rig_file import load_rig
+from model.rig.file import load_rig
 
 BATCH = 10  # messages of the flood at a time
 

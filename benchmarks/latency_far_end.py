@@ -20,7 +20,7 @@ from typing import cast
 from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.serial_codec import decode_request, encode_reply
 from drivers.protocol.serial_frame import Frame, FrameReader, encode_frame
-from model.rig_file import load_rig
+from model.rig.file import load_rig
 from sim.amplifier.amplifier import SimulatedAmplifier
 from sim.transport.pseudo_terminal import make_terminal
 

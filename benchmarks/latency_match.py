@@ -21,8 +21,8 @@ from drivers.command import DriveCommand
 from drivers.protocol.messages import Apply
 from drivers.protocol.serial_codec import decode_request
 from drivers.protocol.serial_frame import Frame
-from model.rig import Rig
-from model.table import LocalizationTable
+from model.rig.rig import Rig
+from model.table.table import LocalizationTable
 
 LONGEST = 0.5  # s; a command answers no touch that is older
 _CLOSE = (1e-4, 2e-3)  # of full stroke, and of the level: steps on the wire, and the flood's finger

@@ -23,9 +23,9 @@ from controller.api.parts import LatencySummary
 from controller.means import Means, means_of
 from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.messages import Capabilities
-from model.rig import Rig
-from model.rig_file import example_rig_path, load_rig
-from model.table import LocalizationTable
+from model.rig.file import example_rig_path, load_rig
+from model.rig.rig import Rig
+from model.table.table import LocalizationTable
 from sim.amplifier.amplifier import capabilities
 
 FLOOD_RATE = 10_000  # Hz

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from controller.sources.tuio import tuio_datagram
 from controller.touch import Touch, TouchFrame
-from model.plate import Plate
+from model.structure.plate import Plate
 
 APART = 0.050  # m; between a finger that is to feel it and those that are not
 HELD = (0.25, 0.3)  # of the sensor; a finger of the panel that stays

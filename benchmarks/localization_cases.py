@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 
 from model.drive_modes.fields import Fields
-from model.fingertip import fingertip_points
-from model.question import Question
-from model.rig_file import load_rig
-from model.table_build import build_table
+from model.finger.fingertip import fingertip_points
+from model.rig.file import load_rig
+from model.table.build import build_table
+from model.table.question import Question
 
 RIG = Path(__file__).parent.parent / "examples" / "paper_plate.yaml"
 FREQUENCIES = np.linspace(40.0, 500.0, 27)

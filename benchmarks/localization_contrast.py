@@ -21,9 +21,9 @@ from benchmarks.localization_methods import (
     time_reversal,
 )
 from model.drive_modes import MODES, best_drive
+from model.drive_modes.exact_search import search_exactly
 from model.drive_modes.fields import ERROR_SHARE
-from model.exact_search import search_exactly
-from model.robust import with_robust_contrast
+from model.table.robust import with_robust_contrast
 
 QUIET = (1, 2, 3)
 GOALS = {

@@ -11,9 +11,9 @@ from benchmarks.localization_cases import paper_table, question_of
 from model.arrays import lattice
 from model.drive_modes import MODES
 from model.figures.drawing import draw_eras
-from model.fingertip import FINGERTIP_RADIUS
-from model.perception import sensation_level
-from model.robust import with_robust_contrast
+from model.finger.fingertip import FINGERTIP_RADIUS
+from model.finger.perception import sensation_level
+from model.table.robust import with_robust_contrast
 
 PLACES = np.array([[0.09, 0.15], [0.20, 0.07]])  # target, quiet [m]
 SIDE = 161

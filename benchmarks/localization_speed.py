@@ -17,12 +17,12 @@ from benchmarks.localization_cases import (
     question_of,
 )
 from benchmarks.localization_contrast import Section
+from model.drive_modes.exact_search import search_exactly
 from model.drive_modes.fields import Fields
-from model.exact_search import search_exactly
-from model.localization import Grid
-from model.question import Question
-from model.rig_file import load_rig
-from model.table_build import build_table
+from model.finger.grid import Grid
+from model.rig.file import load_rig
+from model.table.build import build_table
+from model.table.question import Question
 
 QUESTIONS = 400
 MODES = ("switched", "phased")

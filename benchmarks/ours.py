@@ -13,11 +13,11 @@ from benchmarks.problem import (
     WIDTH,
     E,
 )  # fmt: skip
-from model.actuator import Era
-from model.free_plate import solve_free_plate
-from model.mesh import Mesh
-from model.plate import Material
-from model.plate import Plate as PlateOf
+from model.fem.mesh import Mesh
+from model.reduction.free_plate import solve_free_plate
+from model.structure.actuator import Era
+from model.structure.plate import Material
+from model.structure.plate import Plate as PlateOf
 from model.studies.receptances import Receptances
 
 NAME = "era-haptics"

@@ -10,14 +10,14 @@ import numpy as np
 from benchmarks.plant_time import FINGERS, RIG, Case
 from drivers.command import CommandSet, DriveCommand
 from drivers.protocol.messages import Achieved, Apply, Arm
-from model.actuator import Era
-from model.assembly import era_positions
-from model.base_motion import fade
-from model.finger_load import FingerLoad, finger_loads
-from model.fingertip import fingertip_points
-from model.reduction import ReducedPlate, reduce_plate
-from model.rig import Channel, Rig
-from model.rig_file import load_rig
+from model.fem.assembly import era_positions
+from model.finger.fingertip import fingertip_points
+from model.finger.load import FingerLoad, finger_loads
+from model.reduction.reduced_plate import ReducedPlate, reduce_plate
+from model.rig.file import load_rig
+from model.rig.rig import Channel, Rig
+from model.structure.actuator import Era
+from model.transients.base_motion import fade
 from sim.bench.bench import SAMPLE_RATE, Bench
 from sim.plant.plant import Plant
 

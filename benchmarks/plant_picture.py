@@ -2,7 +2,7 @@
 
     python -m benchmarks.plant_picture FILE.png
 
-The plate of the founding paper, one ERA at 110 Hz. The finger loads it (`model.finger_load`); grey
+The plate of the founding paper, one ERA at 110 Hz. The finger loads it (`model.finger.load`); grey
 is what would be there if it only felt.
 """
 
@@ -13,11 +13,11 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from model.assembly import era_positions
-from model.base_motion import fade
-from model.finger_load import finger_loads
-from model.reduction import reduce_plate
-from model.rig_file import load_rig
+from model.fem.assembly import era_positions
+from model.finger.load import finger_loads
+from model.reduction.reduced_plate import reduce_plate
+from model.rig.file import load_rig
+from model.transients.base_motion import fade
 from sim.plant.plant import Plant
 
 RIG = Path(__file__).parent.parent / "examples" / "paper_plate.yaml"

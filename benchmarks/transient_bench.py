@@ -16,17 +16,17 @@ from benchmarks.transient_cases import (
     with_errors,
     wrong,
 )
-from model.assembly import era_positions
-from model.envelope import Bases, ramped_ending, ramped_onset, shaped
-from model.excitation import Excitation
-from model.point_load import load_positions
-from model.question import Question
-from model.reduction import reduce_plate
-from model.rig import Rig
-from model.shaping import Shaper
-from model.table_build import build_table
-from model.time_response import PlateInTime, plate_in_time
-from model.transient import Transients
+from model.fem.assembly import era_positions
+from model.reduction.reduced_plate import reduce_plate
+from model.rig.rig import Rig
+from model.structure.point_load import load_positions
+from model.table.build import build_table
+from model.table.question import Question
+from model.transients.envelope import Bases, ramped_ending, ramped_onset, shaped
+from model.transients.measures import Transients
+from model.transients.shaping import Shaper
+from model.transients.time_response import PlateInTime, plate_in_time
+from model.vibration.excitation import Excitation
 
 T = TypeVar("T")
 Columns = dict[str, list[float]]

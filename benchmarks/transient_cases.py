@@ -6,13 +6,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from model.arrays import ComplexArray
-from model.envelope import Envelopes
-from model.excitation import Excitation, Tone
-from model.fingertip import FINGERTIP_RADIUS, fingertip_points
-from model.free_plate import solve_free_plate
-from model.knots import GAIN_ERROR, PHASE_ERROR
-from model.perception import STRONG_DB_SL, detection_threshold
-from model.rig import Rig
+from model.finger.fingertip import FINGERTIP_RADIUS, fingertip_points
+from model.finger.perception import STRONG_DB_SL, detection_threshold
+from model.reduction.free_plate import solve_free_plate
+from model.rig.rig import Rig
+from model.transients.envelope import Envelopes
+from model.transients.knots import GAIN_ERROR, PHASE_ERROR
+from model.vibration.excitation import Excitation, Tone
 
 FREQUENCIES = np.linspace(40, 500, 27)
 APART = 0.05

@@ -7,13 +7,13 @@ from matplotlib.figure import Figure
 
 from benchmarks.transient_cases import Case
 from model.arrays import FloatArray
-from model.envelope import Bases, ramped_ending, ramped_onset, shaped
-from model.fingertip import fingertip_points
-from model.pattern import ONSET_RAMP
-from model.rig import Rig
-from model.shaping import Shaper
-from model.time_response import PlateInTime
-from model.transient import SAMPLE_RATE, Transients
+from model.finger.fingertip import fingertip_points
+from model.rig.rig import Rig
+from model.table.pattern import ONSET_RAMP
+from model.transients.envelope import Bases, ramped_ending, ramped_onset, shaped
+from model.transients.measures import SAMPLE_RATE, Transients
+from model.transients.shaping import Shaper
+from model.transients.time_response import PlateInTime
 
 LASTS = 0.160  # s
 RAMPED = f"{1e3 * ONSET_RAMP:.0f} ms ramp"

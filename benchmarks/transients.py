@@ -31,7 +31,7 @@ def main() -> None:
     from benchmarks.transient_bench import Bench, print_columns
     from benchmarks.transient_cases import find_cases
     from benchmarks.transient_picture import draw
-    from model.rig_file import load_rig
+    from model.rig.file import load_rig
 
     rng = np.random.default_rng(options.seed)
     rig = load_rig(RIG)

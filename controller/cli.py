@@ -60,8 +60,8 @@ def demo(
         run_demo,
         write_picture,
     )
-    from model.rig_file import example_rig_path, load_rig
-    from model.table_cache import cached_table
+    from model.rig.file import example_rig_path, load_rig
+    from model.table.cache import cached_table
 
     if wire not in WIRES:
         raise InputError(f"--wire {wire}: there is no such wire yet; choose {' or '.join(WIRES)}")

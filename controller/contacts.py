@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from controller.touch import Touch, TouchFrame
-from model.plate import Plate
+from model.structure.plate import Plate
 
 # A source repeats its frame every 100 ms at least; one that missed that by half is gone, and a
 # finger nobody sees must not be driven.

@@ -150,7 +150,7 @@ def touch(
     as_json: Json = False,
 ) -> None:
     """Put fingers on the plate for a while; the last one is felt, the others are kept quiet."""
-    from model.points import parse_point
+    from model.config.points import parse_point
 
     places = [parse_point(text, what="X,Y") for text in at]
     with _client(socket) as era:

@@ -18,8 +18,8 @@ from controller.touch import TouchFrame
 from controller.wishes import Wishes
 from drivers.command import DriveCommand
 from drivers.guard import Guard
-from model.question import Question
-from model.rig import Rig
+from model.rig.rig import Rig
+from model.table.question import Question
 
 # With nobody on the plate the end may be short, so that zero is reached within 20 ms of the lift.
 RELEASE_RAMP = 0.010

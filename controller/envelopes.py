@@ -17,10 +17,10 @@ from typing import Protocol
 
 from drivers.command import Envelope, Knot
 from drivers.protocol.messages import Capabilities
-from model.envelope import KNOT_STEP
-from model.knots import ENDING_KNOTS, ONSET_KNOTS
-from model.pattern import Pattern
-from model.rig import Rig
+from model.rig.rig import Rig
+from model.table.pattern import Pattern
+from model.transients.envelope import KNOT_STEP
+from model.transients.knots import ENDING_KNOTS, ONSET_KNOTS
 
 ENVELOPE_TIME = 0.030
 """How long [s] the loading of envelopes may hold up a touch: one that is felt within 50 ms is felt

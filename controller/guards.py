@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping
 from drivers.amplifier import Amplifier
 from drivers.guard import Guard, GuardLimits
 from model.errors import InputError
-from model.rig import Limits, Rig
+from model.rig.rig import Limits, Rig
 
 
 def make_guards(

@@ -24,8 +24,8 @@ from drivers.amplifier import Amplifier
 from drivers.errors import CommandError, DriverError, LinkError
 from drivers.watchdog import HEARTBEAT
 from model.errors import InputError
-from model.perception import STRONG_DB_SL
-from model.rig import Rig
+from model.finger.perception import STRONG_DB_SL
+from model.rig.rig import Rig
 
 # On an orderly end nobody waits, so the end is soft.
 CLOSING_RAMP = 0.050

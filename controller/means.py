@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from controller.envelopes import ENVELOPE_TIME, Loading, Shaping, shaping_of
 from model.drive_modes import MODES, playable_modes
 from model.errors import InputError
-from model.rig import Rig
+from model.rig.rig import Rig
 
 
 @dataclass(frozen=True)

@@ -8,8 +8,8 @@ from controller.contacts import Change, Contact
 from controller.orders import PatternTiming
 from controller.selection import Felt, Selection
 from drivers.command import DriveCommand
-from model.pattern import Pattern
-from model.question import Question
+from model.table.pattern import Pattern
+from model.table.question import Question
 
 
 @dataclass(frozen=True)

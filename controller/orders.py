@@ -10,9 +10,9 @@ from controller.routing import goes_on, route, route_again, route_end
 from drivers.command import DriveCommand, token_after
 from drivers.errors import CommandRefused
 from drivers.guard import Guard, SafeCommand, SafeEnvelope
-from model.pattern import Pattern
-from model.question import Question
-from model.rig import Rig
+from model.rig.rig import Rig
+from model.table.pattern import Pattern
+from model.table.question import Question
 
 FADE_RAMP = 0.020
 """How fingers that stay on the plate are left [s]; a shorter end they would feel as a tap."""
@@ -21,7 +21,7 @@ _logger = logging.getLogger(__name__)
 
 
 class PatternTiming(Protocol):
-    """What is needed of `model.timing.Timing`."""
+    """What is needed of `model.table.timing.Timing`."""
 
     def prepare(self, frequencies: Iterable[float]) -> None:
         """Work out ahead what shaping needs to know about frequencies [Hz]."""

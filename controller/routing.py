@@ -9,10 +9,10 @@ from dataclasses import replace
 
 from controller.envelopes import ending_slots, onset_slots
 from drivers.command import CommandSet, DriveCommand
-from model.envelope import Envelopes
 from model.errors import InputError
-from model.excitation import Excitation
-from model.rig import Rig
+from model.rig.rig import Rig
+from model.transients.envelope import Envelopes
+from model.vibration.excitation import Excitation
 
 
 def route(

@@ -13,14 +13,14 @@ from controller.means import Means
 from controller.wishes import Target, Wish, Wishes
 from model.arrays import FloatArray
 from model.errors import InputError
-from model.excitation import Excitation
-from model.fingertip import fingertip_points
-from model.localization import contrast_db, mean_level_db_sl
-from model.pattern import UNAWARE_DB_SL, Pattern
-from model.perception import FELT_DB_SL
-from model.plate import Plate
-from model.question import Question
-from model.vibration import peak_acceleration
+from model.finger.contrast import contrast_db, mean_level_db_sl
+from model.finger.fingertip import fingertip_points
+from model.finger.perception import FELT_DB_SL
+from model.structure.plate import Plate
+from model.table.pattern import UNAWARE_DB_SL, Pattern
+from model.table.question import Question
+from model.vibration.excitation import Excitation
+from model.vibration.peak import peak_acceleration
 
 # Fields vary over a good part of a bending wavelength, 17 cm and more below 500 Hz; a fingertip
 # that moved by less than its own radius is still within the disc it was chosen for.

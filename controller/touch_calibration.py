@@ -13,7 +13,7 @@ import numpy as np
 
 from controller.touch import Touch, TouchFrame, TouchSource
 from model.errors import InputError
-from model.plate import Plate
+from model.structure.plate import Plate
 
 Row: TypeAlias = tuple[float, float, float]
 Point: TypeAlias = tuple[float, float]

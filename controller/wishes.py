@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from controller.contacts import Contact, ContactKey
-from model.perception import STRONG_DB_SL
+from model.finger.perception import STRONG_DB_SL
 
 NOBODY_TOUCHES = "nobody touches the plate"
 

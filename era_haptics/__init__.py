@@ -28,16 +28,16 @@ if TYPE_CHECKING:
     from era_haptics.solved_plate import SolvedPlate
     from era_haptics.tables import query, table
     from model.errors import InputError
-    from model.excitation import Tone
-    from model.finger_load import FingerLoad
-    from model.localization import Grid
-    from model.maps import PlateMap
-    from model.pattern import Pattern
-    from model.rig import Rig
-    from model.rig_file import example_rig_path, load_rig
-    from model.supported_modes import SupportedModes
-    from model.table import LocalizationTable
-    from model.table_file import load_table, save_table
+    from model.finger.grid import Grid
+    from model.finger.load import FingerLoad
+    from model.rig.file import example_rig_path, load_rig
+    from model.rig.rig import Rig
+    from model.table.file import load_table, save_table
+    from model.table.pattern import Pattern
+    from model.table.table import LocalizationTable
+    from model.transients.supported_modes import SupportedModes
+    from model.vibration.excitation import Tone
+    from model.vibration.maps import PlateMap
     from sim.plant.playback import Playback
 
 _HOMES = {
@@ -48,32 +48,32 @@ _HOMES = {
     "Drive": "era_haptics.drive",
     "DriveCommand": "drivers.command",
     "DriverError": "drivers.errors",
-    "FingerLoad": "model.finger_load",
-    "Grid": "model.localization",
+    "FingerLoad": "model.finger.load",
+    "Grid": "model.finger.grid",
     "GuardLimits": "drivers.guard",
     "InputError": "model.errors",
     "LinkError": "drivers.errors",
-    "LocalizationTable": "model.table",
+    "LocalizationTable": "model.table.table",
     "Notification": "controller.api.replies",
-    "Pattern": "model.pattern",
-    "PlateMap": "model.maps",
+    "Pattern": "model.table.pattern",
+    "PlateMap": "model.vibration.maps",
     "Playback": "sim.plant.playback",
-    "Rig": "model.rig",
+    "Rig": "model.rig.rig",
     "RpcError": "controller.api.jsonrpc",
     "SolvedPlate": "era_haptics.solved_plate",
-    "SupportedModes": "model.supported_modes",
-    "Tone": "model.excitation",
+    "SupportedModes": "model.transients.supported_modes",
+    "Tone": "model.vibration.excitation",
     "Unreachable": "controller.api.replies",
     "commands_for": "era_haptics.amplifiers",
     "draw_map": "era_haptics.pictures",
     "draw_pattern": "era_haptics.pictures",
     "draw_playback": "era_haptics.pictures",
-    "example_rig_path": "model.rig_file",
-    "load_rig": "model.rig_file",
-    "load_table": "model.table_file",
+    "example_rig_path": "model.rig.file",
+    "load_rig": "model.rig.file",
+    "load_table": "model.table.file",
     "open_amplifier": "era_haptics.amplifiers",
     "query": "era_haptics.tables",
-    "save_table": "model.table_file",
+    "save_table": "model.table.file",
     "table": "era_haptics.tables",
 }
 

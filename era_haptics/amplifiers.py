@@ -6,8 +6,8 @@ from drivers.blocking import BlockingAmplifier
 from drivers.command import DriveCommand
 from era_haptics.drive import Drives, excitation_of
 from model.errors import InputError
-from model.pattern import Pattern
-from model.rig import Rig
+from model.rig.rig import Rig
+from model.table.pattern import Pattern
 
 
 def open_amplifier(

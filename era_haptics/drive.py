@@ -7,9 +7,9 @@ from numbers import Real
 from typing import TypeAlias
 
 from model.errors import InputError
-from model.excitation import Excitation, Tone
-from model.pattern import Pattern
-from model.rig import Rig
+from model.rig.rig import Rig
+from model.table.pattern import Pattern
+from model.vibration.excitation import Excitation, Tone
 
 
 @dataclass(frozen=True)

@@ -12,8 +12,8 @@ from era_haptics.solved_plate import SolvedPlate
 from model.arrays import FloatArray
 from model.figures.drawing import map_figure
 from model.figures.fingertips import LEVEL_COLORS, LEVEL_SCALE, draw_fingertip, draw_levels
-from model.pattern import Pattern
-from model.table import LocalizationTable
+from model.table.pattern import Pattern
+from model.table.table import LocalizationTable
 from sim.plant.finger import Record
 from sim.plant.playback import Playback
 

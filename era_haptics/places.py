@@ -6,7 +6,7 @@ from typing import TypeAlias
 import numpy as np
 
 from model.errors import InputError
-from model.question import Point
+from model.table.question import Point
 
 Places: TypeAlias = Sequence[float] | Sequence[Sequence[float]]
 """One place x, y [m], or several; also as an array of shape (2,) or (n, 2)."""

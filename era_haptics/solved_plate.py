@@ -6,18 +6,18 @@ import numpy as np
 
 from era_haptics.drive import Drives, excitation_of
 from era_haptics.places import Places, as_points
-from model.assembly import era_positions
 from model.errors import InputError
-from model.excitation import Excitation
-from model.finger_load import FingerLoad
-from model.free_plate import FreePlate, solve_free_plate
-from model.maps import PlateMap, plate_map
-from model.pattern import ONSET_RAMP, Pattern
-from model.point_load import load_positions
-from model.question import Question
-from model.reduction import ReducedPlate, reduce_free_plate
-from model.rig import Rig
-from model.supported_modes import SupportedModes, supported_modes
+from model.fem.assembly import era_positions
+from model.finger.load import FingerLoad
+from model.reduction.free_plate import FreePlate, solve_free_plate
+from model.reduction.reduced_plate import ReducedPlate, reduce_free_plate
+from model.rig.rig import Rig
+from model.structure.point_load import load_positions
+from model.table.pattern import ONSET_RAMP, Pattern
+from model.table.question import Question
+from model.transients.supported_modes import SupportedModes, supported_modes
+from model.vibration.excitation import Excitation
+from model.vibration.maps import PlateMap, plate_map
 from sim.plant.playback import Playback, play
 
 

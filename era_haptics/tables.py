@@ -7,15 +7,15 @@ import numpy as np
 
 from era_haptics.places import Places, as_points
 from model.arrays import FloatArray
-from model.localization import Grid
-from model.pattern import Pattern
-from model.perception import STRONG_DB_SL
-from model.question import Question
-from model.rig import Rig
-from model.robust import with_robust_contrast
-from model.table import PAPER_FREQUENCIES, PAPER_GRID, LocalizationTable
-from model.table_cache import cached_table
-from model.timing import Timing
+from model.finger.grid import Grid
+from model.finger.perception import STRONG_DB_SL
+from model.rig.rig import Rig
+from model.table.cache import cached_table
+from model.table.pattern import Pattern
+from model.table.question import Question
+from model.table.robust import with_robust_contrast
+from model.table.table import PAPER_FREQUENCIES, PAPER_GRID, LocalizationTable
+from model.table.timing import Timing
 
 
 def table(

@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 
 from model.calibration.responses_file import write_responses_csv, write_responses_uff
-from model.rig import Rig
-from model.rig_file import load_rig
+from model.rig.file import load_rig
+from model.rig.rig import Rig
 from sim.sensors.accelerometer import Accelerometer, scanning_grid
 from sim.sensors.stepped_sine import record_responses
 

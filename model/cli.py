@@ -2,18 +2,18 @@
 
 import typer
 
-from model.calibrate_cli import calibrate
-from model.config_cli import config_app
+from model.commands.calibrate_cli import calibrate
+from model.commands.config_cli import config_app
+from model.commands.figure_cli import figure_app
+from model.commands.plate_cli import plate_app
+from model.commands.plate_show_cli import materials, show
+from model.commands.study_cli import study_app
+from model.commands.table_build_cli import build
+from model.commands.table_cli import query, table_app
+from model.commands.table_export_cli import export, plot
+from model.commands.table_show_cli import show as show_table
+from model.commands.table_show_cli import verify
 from model.errors import InputError
-from model.figure_cli import figure_app
-from model.plate_cli import plate_app
-from model.plate_show_cli import materials, show
-from model.study_cli import study_app
-from model.table_build_cli import build
-from model.table_cli import query, table_app
-from model.table_export_cli import export, plot
-from model.table_show_cli import show as show_table
-from model.table_show_cli import verify
 
 plate_app.command()(materials)
 plate_app.command()(show)

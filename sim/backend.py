@@ -17,7 +17,7 @@ from drivers.guard import SafeCommand, SafeEnvelope
 from drivers.protocol.messages import Apply, Event, LoadEnvelope, Reply, Request, Stage
 from drivers.statistics import WireCounters
 from model.errors import InputError
-from model.rig_file import load_rig
+from model.rig.file import load_rig
 from sim.bench.bench import Bench
 from sim.bench.real_time import keep_time
 from sim.control.server import control_socket

@@ -153,9 +153,9 @@ def _simulate(
     until_eof: bool,
 ) -> None:
     """As told on the command line; common: by kind of wire, its option and port, if it stands."""
-    from model.finger_load import parse_finger_load
-    from model.points import parse_point
-    from model.rig_file import load_rig
+    from model.config.points import parse_point
+    from model.finger.load import parse_finger_load
+    from model.rig.file import load_rig
     from sim.far_ends.wire_choice import choose_wires
     from sim.far_ends.wires import Wire
     from sim.faults.file import FaultFile, load_faults
@@ -209,7 +209,7 @@ def _of_kind(plain: "Wire", kind: str, port: int) -> "Wire":
 
 
 def _sensor(text: str) -> "Accelerometer":
-    from model.points import parse_point
+    from model.config.points import parse_point
     from sim.sensors.accelerometer import Accelerometer
 
     name, equals, place = text.partition("=")

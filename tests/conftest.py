@@ -7,7 +7,7 @@ for _variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
 
 import pytest  # noqa: E402
 
-from model.rig import Rig  # noqa: E402
+from model.rig.rig import Rig  # noqa: E402
 from paper_plate import make_paper_rig  # noqa: E402
 
 

@@ -28,7 +28,7 @@ from drivers.registry import open_backend
 from drivers.supervision import reopen
 from drivers.watchdog import HEARTBEAT, HEARTBEATS_BORNE
 from memory_machine import MemoryMachine
-from model.rig import Rig
+from model.rig.rig import Rig
 from sim.far_ends.wires import Wire
 from sim.faults.episodes import Episode, FaultKind
 from sim.transport.pseudo_terminal import TERMINAL_MAKER

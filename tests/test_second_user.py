@@ -12,7 +12,7 @@ from drivers.backends.sole_host import SoleHost
 from drivers.errors import LinkError
 from drivers.protocol.messages import State
 from drivers.registry import open_backend
-from model.rig import Rig
+from model.rig.rig import Rig
 from wires import WIRES, FarSide, far_side
 
 PATIENT = 2.0  # s

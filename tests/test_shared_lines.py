@@ -16,7 +16,7 @@ from drivers.guard import Guard, GuardLimits, SafeCommand
 from drivers.protocol.messages import State, Status
 from drivers.registry import open_backend
 from drivers.supervision import reopen
-from model.rig import Channel, Rig
+from model.rig.rig import Channel, Rig
 from sim.far_ends.wires import Wire
 from sim.faults.episodes import Episode
 from wires import SHARED_WIRES, FarSide, far_side, patient

@@ -14,12 +14,12 @@ from controller.touch_calibration import CalibratedSource, TouchCalibration, fit
 from controller.touch_registry import open_source
 from drivers.errors import CommandError
 from drivers.registry import open_backend
-from model.config import Validation
-from model.document import ConfigError, Document, read_document
+from model.config.document import ConfigError, Document, read_document
+from model.config.sections import Validation
 from model.errors import InputError
-from model.perception import STRONG_DB_SL
-from model.rig import Rig
-from model.rig_file import load_rig
+from model.finger.perception import STRONG_DB_SL
+from model.rig.file import load_rig
+from model.rig.rig import Rig
 
 API_SOURCES = "api"
 """What the sources of clients of the API are called, before the colon; nothing else is."""

@@ -7,8 +7,8 @@ from typing import Any
 from controller.daemon.config import is_daemon_document, load_daemon_config
 from controller.daemon.sections import DaemonSection
 from drivers.rig_check import check_links
-from model.config_kinds import Good
-from model.document import Document
+from model.config.document import Document
+from model.config.kinds import Good
 
 
 class DaemonKind:

@@ -34,8 +34,8 @@ from drivers.errors import DriverError
 from drivers.registry import open_backend
 from drivers.steady import no_long_collections
 from model.errors import InputError
-from model.table import LocalizationTable
-from model.timing import Timing
+from model.table.table import LocalizationTable
+from model.table.timing import Timing
 
 _END_PATIENCE = 0.2  # s; by then whoever can be silenced has been
 _DUMP_PAUSE = 1.0  # s; between two dumps, for faults come in company

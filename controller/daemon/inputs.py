@@ -10,7 +10,7 @@ from controller.daemon.config import API_SOURCES, TouchInput
 from controller.touch import Touch, TouchFrame
 from drivers.supervision import pauses
 from model.errors import InputError
-from model.plate import Plate
+from model.structure.plate import Plate
 
 _FIRST_PAUSE, _LONGEST_PAUSE = 1.0, 30.0  # s; before a source that failed is begun again
 MOST_SOURCES = 64  # of one client, with fingers down: a gateway has many guests

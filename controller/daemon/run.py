@@ -12,9 +12,9 @@ from controller.daemon.notify import ServiceManager
 from controller.daemon.place import Place
 from controller.daemon.sections import loopback_address
 from model.errors import InputError
-from model.table import LocalizationTable
-from model.table_cache import cached_table
-from model.table_file import load_table
+from model.table.cache import cached_table
+from model.table.file import load_table
+from model.table.table import LocalizationTable
 
 _SWITCH_INTERVAL = 0.001  # s; another thread keeps the control loop waiting no longer
 

@@ -7,11 +7,11 @@ from pydantic import AfterValidator, Field, Strict
 
 from controller.api.parts import LONGEST_LEASE, SHORTEST_LEASE
 from controller.envelopes import ENVELOPE_TIME
-from model.config import Quantity, Section
+from model.config.sections import Quantity, Section
+from model.config.units import LENGTH, RATIO, TIME
 from model.drive_modes import MODES
-from model.perception import STRONG_DB_SL
-from model.rig_sections import Identifier
-from model.units import LENGTH, RATIO, TIME
+from model.finger.perception import STRONG_DB_SL
+from model.rig.sections import Identifier
 
 _NUMBER = Annotated[float, Quantity(RATIO, least=-10, most=10)]
 _ROW = Annotated[tuple[_NUMBER, _NUMBER, _NUMBER], Strict(strict=False)]  # a list in the file

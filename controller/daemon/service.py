@@ -46,7 +46,7 @@ from controller.loop import Controller
 from drivers import clock
 from drivers.amplifier import Amplifier
 from drivers.errors import CommandError
-from model.table import LocalizationTable
+from model.table.table import LocalizationTable
 
 _ARMABLE = (State.SWITCHED_ON, State.OPERATION_ENABLED)
 _LOST = RpcError(

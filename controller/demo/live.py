@@ -12,8 +12,8 @@ from controller.daemon.notify import ServiceManager
 from controller.daemon.place import Place
 from controller.demo.far_end import open_far_end
 from model.errors import InputError
-from model.rig_file import load_rig
-from model.table import LocalizationTable
+from model.rig.file import load_rig
+from model.table.table import LocalizationTable
 
 
 async def run_live(rig_file: Path, table: LocalizationTable, *, wire: str, dashboard: str) -> None:

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from controller.demo.far_end import FingerFelt
-from model.localization import contrast_db, mean_level_db_sl
-from model.vibration import peak_acceleration
+from model.finger.contrast import contrast_db, mean_level_db_sl
+from model.vibration.peak import peak_acceleration
 
 
 @dataclass(frozen=True)
@@ -38,5 +38,5 @@ def measure(target: FingerFelt, quiet: Sequence[FingerFelt]) -> Measured | None:
 
 
 def peak_contrast_db(target: FingerFelt, quiet: Sequence[FingerFelt]) -> float:
-    """Contrast [dB] of the peaks of a window, as `model.transient` predicts that of an onset."""
+    """Contrast [dB] of a window's peaks, as `model.transients.measures` predicts an onset's."""
     return float(contrast_db(target.peaks, np.concatenate([finger.peaks for finger in quiet])))

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from controller.demo.rows import PlayedPattern, TouchRow
 from model.figures.fingertips import LEVEL_COLORS, LEVEL_SCALE, draw_fingertip, draw_levels
-from model.table import LocalizationTable
+from model.table.table import LocalizationTable
 
 PANELS = 6
 

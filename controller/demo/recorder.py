@@ -13,7 +13,7 @@ from controller.demo.rows import Onset, Place, PlayedPattern, TouchRow
 from controller.observer import Applied, Observer, Silenced
 from controller.selection import Felt
 from drivers import clock
-from model.transient import FIRST
+from model.transients.measures import FIRST
 
 # The last part of a pattern is judged: by then the plate has settled, if the pattern was held long
 # enough, and a quarter of a second tells frequencies 10 Hz apart from each other.

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 from controller.demo.measure import Measured
-from model.pattern import Pattern
+from model.table.pattern import Pattern
 
 Place: TypeAlias = tuple[float, float]
 

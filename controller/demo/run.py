@@ -20,9 +20,9 @@ from drivers.errors import LinkError
 from drivers.registry import open_backend
 from drivers.steady import no_long_collections
 from model.figures import save_figure
-from model.rig_file import load_rig
-from model.table import LocalizationTable
-from model.timing import Timing
+from model.rig.file import load_rig
+from model.table.table import LocalizationTable
+from model.table.timing import Timing
 
 Play: TypeAlias = Callable[[], Awaitable[None]]
 RecordedTouches: TypeAlias = Callable[[], Awaitable[tuple[TouchSource, Play]]]

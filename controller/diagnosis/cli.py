@@ -11,7 +11,7 @@ from model.errors import InputError
 
 if TYPE_CHECKING:
     from model.diagnosis.observation import Observation
-    from model.rig import Rig
+    from model.rig.rig import Rig
 
 rig_app = typer.Typer(no_args_is_help=True, help="A rig and what it really is.")
 
@@ -66,7 +66,7 @@ def check(
 
     from model.diagnosis import wording
     from model.diagnosis.verdict import diagnose
-    from model.rig_file import load_rig
+    from model.rig.file import load_rig
 
     if (sensors is None) == (measured is None):
         raise InputError(
@@ -118,7 +118,7 @@ def _from_file(rig: "Rig", path: Path, *, has_phases: bool) -> "Observation":
 def _frequencies(rig: "Rig", text: str | None) -> list[float]:
     import numpy as np
 
-    from model.points import parse_frequencies
+    from model.config.points import parse_frequencies
 
     low, high = rig.limits.frequency_min, rig.limits.frequency_max
     if text is None:
@@ -151,7 +151,7 @@ def _live(
     from controller.diagnosis.sensors import simulated_sensors
     from drivers.amplifier import Amplifier
     from drivers.registry import open_backend
-    from model.points import parse_pair
+    from model.config.points import parse_pair
 
     if not 0 < level <= _LEVEL_MAX:
         raise InputError(f"--level {level:g}: take one above 0 and at most {_LEVEL_MAX:g}")

@@ -20,8 +20,8 @@ from drivers.errors import CommandRefused
 from drivers.guard import Guard, SafeCommand
 from model.arrays import ComplexArray, FloatArray
 from model.diagnosis.observation import Observation, Pair
-from model.excitation import Excitation, Tone
-from model.rig import Rig
+from model.rig.rig import Rig
+from model.vibration.excitation import Excitation, Tone
 
 RAMP = 0.05  # s; neither begin nor end of a tone strikes the plate
 _PAIRED = 3  # frequencies at which channels are driven in pairs

@@ -8,9 +8,9 @@ from typing import Annotated, ClassVar, Literal, TypeAlias
 from pydantic import BeforeValidator
 
 from controller.contacts import Contact
-from model.config import Quantity, Section
-from model.perception import STRONG_DB_SL
-from model.units import RATIO
+from model.config.sections import Quantity, Section
+from model.config.units import RATIO
+from model.finger.perception import STRONG_DB_SL
 
 NEIGHBOURS: Literal["neighbours"] = "neighbours"
 """A level: as strong as the neighbours allow."""

@@ -8,7 +8,7 @@ from typing import Any
 from controller.effects.effect import Effect
 from controller.effects.shapes import Shape
 from controller.effects.timed import Buzz, Click
-from model.perception import STRONG_DB_SL
+from model.finger.perception import STRONG_DB_SL
 
 
 @dataclass(frozen=True)

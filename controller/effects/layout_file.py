@@ -9,13 +9,13 @@ from controller.effects.effect import Effect, Level
 from controller.effects.kinds import effect_kind
 from controller.effects.layout import BUZZ, Layout, Region, usual_effects
 from controller.effects.shapes import Circle, Polygon, Rectangle, Shape
-from model.config import Quantity, Section, Validation
-from model.document import Document, KeyPath, read_document
+from model.config.document import Document, KeyPath, read_document
+from model.config.sections import Quantity, Section, Validation
+from model.config.units import LENGTH
 from model.errors import InputError
-from model.perception import STRONG_DB_SL
-from model.plate import Plate
-from model.rig_sections import Identifier
-from model.units import LENGTH
+from model.finger.perception import STRONG_DB_SL
+from model.rig.sections import Identifier
+from model.structure.plate import Plate
 
 _MOST_REGIONS = 256
 _LENGTH = Annotated[float, Quantity(LENGTH, least=-10, most=10)]

@@ -5,8 +5,8 @@ from typing import Any
 
 from controller.effects.kinds import effect_kind, effect_kinds
 from controller.effects.layout_file import LayoutSection, is_layout_document, load_layout
-from model.config_kinds import Good
-from model.document import Document
+from model.config.document import Document
+from model.config.kinds import Good
 
 
 class LayoutKind:

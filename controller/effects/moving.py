@@ -10,8 +10,8 @@ from pydantic import model_validator
 from controller.contacts import Contact
 from controller.effects.effect import Course, Effect, Feeling, Nothing
 from controller.effects.timed import SHORTEST
-from model.config import Quantity
-from model.units import LENGTH, RATIO, SPEED, TIME
+from model.config.sections import Quantity
+from model.config.units import LENGTH, RATIO, SPEED, TIME
 
 # Panels report 60 to 200 times a second; over this time [s] speed is told from noise.
 _MEMORY = 0.060

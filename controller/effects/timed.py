@@ -12,9 +12,9 @@ from controller.effects.effect import (
     Feeling,
     Nothing,
 )
-from model.config import Quantity
-from model.perception import STRONG_DB_SL
-from model.units import RATIO, TIME
+from model.config.sections import Quantity
+from model.config.units import RATIO, TIME
+from model.finger.perception import STRONG_DB_SL
 
 # The plate needs some 20 ms to follow, see docs/transients.md; a shorter click would be none.
 SHORTEST = 0.020

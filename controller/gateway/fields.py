@@ -9,8 +9,8 @@ import numpy as np
 
 from controller.api.parts import Tone
 from model.arrays import ComplexArray, lattice
-from model.free_plate import solve_free_plate
-from model.rig import Rig
+from model.reduction.free_plate import solve_free_plate
+from model.rig.rig import Rig
 
 _COLUMNS = 64  # points along the plate's longer side; bending waves are several of them long
 _MOST_FREQUENCIES = 64  # that are kept

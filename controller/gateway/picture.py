@@ -17,7 +17,7 @@ from controller.gateway.daemon_link import DaemonLink
 from controller.gateway.fields import FieldMaker
 from controller.gateway.topics import FIELD, HELLO
 from model.errors import InputError
-from model.rig_file import parse_rig
+from model.rig.file import parse_rig
 
 _KEPT = frozenset({"state", "contacts", "pattern", "silence", "amplifiers", "latency", "layout"})
 _NO_FIELD = bytes(8 + 4)  # no columns, no rows, no frequencies, scale 0

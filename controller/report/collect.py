@@ -17,7 +17,7 @@ from controller.daemon.config import is_daemon_document
 from controller.daemon.records import DUMPS
 from controller.report.redaction import redacted
 from drivers.errors import LinkError
-from model.document import read_document
+from model.config.document import read_document
 from model.errors import InputError
 
 LARGEST_FILE = 1 << 20  # bytes of one file that is put in

@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from model.actuator import Gain
 from model.arrays import ComplexArray, FloatArray
 from model.calibration.fast_plate import FastPlate, fast_plate
 from model.calibration.fit import Fit, Problem, misfit, row_size, solve, with_free
@@ -16,7 +15,8 @@ from model.calibration.parameters import Parameter, parameters_of, rig_with, sta
 from model.calibration.responses import Responses
 from model.calibration.screening import silent_eras, silent_sensors, unlike_the_plate
 from model.errors import InputError
-from model.rig import Rig
+from model.rig.rig import Rig
+from model.structure.actuator import Gain
 
 _STARTS = 2  # of many, those that explain the shapes best
 _WRONG_SCALE = 0.02  # what sensors are commonly calibrated to

@@ -9,11 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from model.arrays import ComplexArray, FloatArray
-from model.assembly import era_positions
-from model.harmonic import check_frequencies, hold_and_drive
-from model.point_load import load_positions
-from model.reduction import reduce_plate
-from model.rig import Rig
+from model.fem.assembly import era_positions
+from model.fem.harmonic import check_frequencies, hold_and_drive
+from model.reduction.reduced_plate import reduce_plate
+from model.rig.rig import Rig
+from model.structure.point_load import load_positions
 
 
 @dataclass(frozen=True, eq=False)

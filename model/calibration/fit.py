@@ -23,7 +23,7 @@ from scipy.optimize import least_squares, nnls
 from model.arrays import ComplexArray, FloatArray, IntArray
 from model.calibration.fast_plate import FastPlate
 from model.calibration.parameters import Parameter, rig_with
-from model.rig import Rig
+from model.rig.rig import Rig
 
 _Loss: TypeAlias = Literal["linear", "soft_l1"]
 

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from model.arrays import ComplexArray, FloatArray
 from model.calibration.parameters import Parameter
-from model.rig import Rig
+from model.rig.rig import Rig
 
 FITS = 0.25
 """Largest error of what was held out, relative to the response, of a fit to believe."""

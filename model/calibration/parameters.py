@@ -6,9 +6,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from model.actuator import Era, damping_from_ratio
 from model.arrays import FloatArray
-from model.rig import Rig
+from model.rig.rig import Rig
+from model.structure.actuator import Era, damping_from_ratio
 
 # The order of what the rig's author cannot know: a fit that leaves more than this open has not
 # found the parameter, and its value stays what it was.

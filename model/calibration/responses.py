@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from model.actuator import Era
 from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
-from model.rig import Rig
+from model.rig.rig import Rig
+from model.structure.actuator import Era
 
 # How far [m] a bolt may be from where the rig has it, and a sensor beyond the plate's edge: what a
 # ruler gives.

@@ -14,10 +14,9 @@ from pathlib import Path
 import numpy as np
 
 from model.calibration.responses import MeasuredFunction, Responses
-from model.csv_file import write_columns
 from model.errors import InputError
-from model.rig import Rig
-from model.uff import (
+from model.files.csv_file import write_columns
+from model.files.uff import (
     ACCELERATION,
     DISPLACEMENT,
     FREQUENCY,
@@ -28,6 +27,7 @@ from model.uff import (
     read_universal,
     write_universal,
 )
+from model.rig.rig import Rig
 
 COLUMNS = ("era", "sensor", "x_m", "y_m", "frequency_hz", "real_1_s2", "imag_1_s2")
 ERA_COLUMNS = ("era_x_m", "era_y_m")  # may be left out

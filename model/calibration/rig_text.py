@@ -8,13 +8,13 @@ import numpy as np
 import yaml
 from scipy.optimize import brentq
 
-from model.actuator import Era, Gain
 from model.calibration.outcome import Calibration
-from model.document import KeyPath
+from model.config.document import KeyPath
 from model.errors import InputError
-from model.laminate import Laminate, equivalent_plate
-from model.plate import Material
-from model.rig import Rig
+from model.rig.rig import Rig
+from model.structure.actuator import Era, Gain
+from model.structure.laminate import Laminate, equivalent_plate
+from model.structure.plate import Material
 
 _PER_LINE = 4  # gains
 

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from model.calibration.outcome import Calibration, FittedParameter
-from model.rig import Rig
+from model.rig.rig import Rig
 
 
 def change_rows(calibration: Calibration) -> list[str]:

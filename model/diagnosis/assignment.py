@@ -12,7 +12,7 @@ from scipy.stats import ttest_1samp
 from model.arrays import ComplexArray, FloatArray
 from model.calibration.fast_plate import FastPlate
 from model.calibration.parameters import parameters_of, rig_with, starts
-from model.rig import Rig
+from model.rig.rig import Rig
 
 _LEAST_MISFIT = 0.02  # below it sensors' errors decide and not shapes
 

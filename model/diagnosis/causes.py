@@ -20,7 +20,7 @@ from model.calibration.fast_plate import FastPlate, fast_plate
 from model.diagnosis.assignment import mac_of
 from model.diagnosis.plate_match import Match, match_plate
 from model.errors import InputError
-from model.rig import Rig
+from model.rig.rig import Rig
 
 _SIZES = (0.6, 0.67, 0.75, 0.82, 0.88, 0.94, 1.06, 1.13, 1.21, 1.33, 1.5, 1.67)
 _STIFFNESSES = (0.01, 0.03, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 1.25, 1.5, 2.0, 3.0, 5.0, 10.0, 30.0)

@@ -21,7 +21,7 @@ from scipy.optimize import least_squares
 from model.arrays import ComplexArray, FloatArray
 from model.calibration.fast_plate import FastPlate
 from model.calibration.parameters import Parameter, parameters_of, rig_with
-from model.rig import Rig
+from model.rig.rig import Rig
 
 # One standard deviation of what a rig's author knows: an alloy's modulus and a sheet's thickness, a
 # maker's spring, and hardly anything about losses.

@@ -13,7 +13,7 @@ from model.diagnosis.assignment import likeness
 from model.diagnosis.observation import Observation
 from model.diagnosis.plate_match import FITS, Match
 from model.errors import InputError
-from model.rig import Rig
+from model.rig.rig import Rig
 
 _DEAD = 0.03  # of the response that the rig predicts
 _FAINT = 0.3  # of it: dead if its shape is that of no ERA either

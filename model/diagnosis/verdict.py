@@ -23,7 +23,7 @@ from model.diagnosis.screening import (
     usable_sensors,
 )
 from model.errors import InputError
-from model.rig import Channel, Rig
+from model.rig.rig import Channel, Rig
 
 WEAK, STRONG = 0.7, 1.4  # gain of a channel: 3 dB either way
 UNLIKELY = 3.0  # standard deviations from what a rig's author can know

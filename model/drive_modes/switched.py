@@ -3,7 +3,7 @@
 The paper's idea: switching frequencies and activation sets moves the nulls about. Four ERAs and 27
 frequencies make 4 * 27 + 6 * 27² = 4482 patterns, six and 361 two millions. Every pattern is one
 source or the sum of two: an ERA at a frequency, or a pair of ERAs at the same one
-(`model.exact_search` drives more of them).
+(`model.drive_modes.exact_search` drives more of them).
 
 Patterns are not gone through: the loudest quiet point is at least any mean of them, and of a sum of
 two sources a mean is the sum of theirs. So a pattern of contrast above c needs

@@ -9,13 +9,13 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
 from matplotlib.figure import Figure
 
-from model.actuator import Era
 from model.arrays import FloatArray
 from model.errors import InputError
-from model.maps import PlateMap
-from model.plate import Plate
-from model.rig import Rig
-from model.vibration import G
+from model.rig.rig import Rig
+from model.structure.actuator import Era
+from model.structure.plate import Plate
+from model.vibration.maps import PlateMap
+from model.vibration.peak import G
 
 COLORS = "viridis"
 ACTIVE_COLOR = "#d62728"

@@ -7,12 +7,12 @@ from matplotlib.patches import Circle
 from matplotlib.patheffects import withStroke
 
 from model.arrays import lattice
-from model.excitation import Excitation
 from model.figures.drawing import draw_eras
-from model.fingertip import FINGERTIP_RADIUS
-from model.perception import sensation_level
-from model.question import Point
-from model.table import LocalizationTable
+from model.finger.fingertip import FINGERTIP_RADIUS
+from model.finger.perception import sensation_level
+from model.table.question import Point
+from model.table.table import LocalizationTable
+from model.vibration.excitation import Excitation
 
 LEVEL_COLORS = "magma"
 LEVEL_SCALE = Normalize(-10.0, 30.0)

@@ -9,8 +9,8 @@ from matplotlib.patches import Rectangle
 
 from model.arrays import FloatArray
 from model.figures.drawing import ACTIVE_COLOR, RESTING_COLOR
-from model.plate import Plate
-from model.vibration import G
+from model.structure.plate import Plate
+from model.vibration.peak import G
 
 BOX_COLOR = "#9ecae1"
 

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
-from model.activation import STATISTICS
 from model.studies.cases import Cases
 from model.studies.solve import DRIVES, CaseResults
+from model.vibration.activation import STATISTICS
 
 _logger = logging.getLogger(__name__)
 

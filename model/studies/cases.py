@@ -8,9 +8,9 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from model.actuator import Era
 from model.arrays import FloatArray, IntArray
-from model.layouts import alike, place_eras
+from model.rig.layouts import alike, place_eras
+from model.structure.actuator import Era
 
 VACANT = -1
 """Stands after the last ERA of a layout in an array that holds larger ones too."""

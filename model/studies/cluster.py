@@ -3,12 +3,13 @@
 import re
 from collections.abc import Mapping
 
-from model.actuator import Era
 from model.errors import InputError
+from model.structure.actuator import Era
 from model.studies.cases import Cases
 from model.studies.receptances import Receptances
-from model.studies.solve import CaseResults, StudyProblem, code_version, solve_cases
+from model.studies.solve import CaseResults, StudyProblem, solve_cases
 from model.studies.workers import Solved, Workers
+from model.version import code_version
 
 _CONNECT_TIMEOUT = 10.0  # s
 

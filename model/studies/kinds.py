@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 
 from model.errors import InputError
-from model.rig import Rig
+from model.rig.rig import Rig
 from model.studies.cases import Cases, all_alike
 from model.studies.pool import LayoutPool
 

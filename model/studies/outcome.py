@@ -6,16 +6,16 @@ from typing import Any
 
 import numpy as np
 
-from model.activation import STATISTICS
-from model.csv_file import Column, Columns, write_columns
-from model.document import Value
+from model.config.document import Value
 from model.figures import save_figure
-from model.rig import Rig
+from model.files.csv_file import Column, Columns, write_columns
+from model.rig.rig import Rig
 from model.studies.cases import Cases
 from model.studies.pictures import PICTURES
 from model.studies.ranking import Ranking, era_counts
 from model.studies.solve import DRIVE_NAMES, DRIVES, CaseResults
 from model.studies.wording import in_words, rig_yaml
+from model.vibration.activation import STATISTICS
 
 SHOWN = 10
 """So many cases of the ranking are in a summary; all are in the CSV file."""

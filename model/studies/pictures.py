@@ -6,7 +6,7 @@ from matplotlib.figure import Figure
 
 from model.arrays import FloatArray
 from model.figures.layout_boxes import LayoutBox, layout_boxes_figure
-from model.rig import Rig
+from model.rig.rig import Rig
 from model.studies.ranking import Ranking, era_counts
 from model.studies.solve import DRIVE_NAMES, DRIVES
 

@@ -6,8 +6,8 @@ from itertools import combinations, permutations
 import numpy as np
 
 from model.arrays import FloatArray
-from model.layouts import candidate_places, named_layouts
-from model.rig import Rig
+from model.rig.layouts import candidate_places, named_layouts
+from model.rig.rig import Rig
 from model.studies.cases import OWN, VACANT, Cases, Numbers, all_alike
 
 # So few possible layouts are all listed and shuffled; of more, some are drawn. Not by how many are

@@ -4,10 +4,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from model.activation import MEDIAN
 from model.arrays import FloatArray, IntArray
 from model.studies.cases import OWN, VACANT, Cases
 from model.studies.solve import CaseResults
+from model.vibration.activation import MEDIAN
 
 GOOD_ENOUGH = 0.9
 """Fewer or softer ERAs are recommended where they reach this share of the best median."""

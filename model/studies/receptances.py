@@ -8,12 +8,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from model.actuator import Era
 from model.arrays import ComplexArray, FloatArray, IntArray
 from model.errors import InputError
-from model.free_plate import solve_free_plate
-from model.harmonic import hold_and_drive
-from model.rig import Rig
+from model.fem.harmonic import hold_and_drive
+from model.reduction.free_plate import solve_free_plate
+from model.rig.rig import Rig
+from model.structure.actuator import Era
 
 # More than this [bytes] and the machine is likely to run out of memory.
 _MOST_BYTES = 2 << 30

@@ -3,13 +3,19 @@
 import hashlib
 import json
 from dataclasses import asdict, dataclass
-from functools import cache
-from importlib import metadata, resources
 
 import numpy as np
 from numpy.typing import NDArray
 
-from model.activation import (
+from model.arrays import ComplexArray, FloatArray
+from model.errors import InputError
+from model.fem.harmonic import check_frequencies
+from model.rig.rig import Rig
+from model.structure.actuator import Era
+from model.studies.cases import Cases
+from model.studies.receptances import Receptances, solve_receptances
+from model.version import code_version
+from model.vibration.activation import (
     MEDIAN,
     STATISTICS,
     activation_sets,
@@ -17,13 +23,6 @@ from model.activation import (
     equal_area_points,
     felt_acceleration,
 )
-from model.actuator import Era
-from model.arrays import ComplexArray, FloatArray
-from model.errors import InputError
-from model.harmonic import check_frequencies
-from model.rig import Rig
-from model.studies.cases import Cases
-from model.studies.receptances import Receptances, solve_receptances
 
 DRIVES = ("1", "2", "all")
 """How many ERAs are active: of each case the best single one and the best pair, and all of them."""
@@ -114,17 +113,3 @@ def solve_cases(receptances: Receptances, eras: tuple[Era, ...], cases: Cases) -
             statistics[case, drive] = every[best]
             active[case, drive] = sum(1 << era for era in sets[best])
     return CaseResults(statistics, active)
-
-
-@cache
-def code_version() -> str:
-    """Version of the distribution, and the beginning of a SHA-256 over the source of the model."""
-    digest = hashlib.sha256()
-    pending = [resources.files("model")]
-    while pending:
-        for entry in sorted(pending.pop().iterdir(), key=lambda entry: entry.name):
-            if entry.is_dir():
-                pending.append(entry)
-            elif entry.name.endswith(".py"):
-                digest.update(entry.read_bytes())
-    return f"{metadata.version('era-haptics')}+{digest.hexdigest()[:12]}"

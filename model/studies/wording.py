@@ -5,9 +5,9 @@ from copy import deepcopy
 
 import yaml
 
-from model.document import Value
-from model.plate import Plate
-from model.rig import Rig
+from model.config.document import Value
+from model.rig.rig import Rig
+from model.structure.plate import Plate
 from model.studies.ranking import Ranking
 
 

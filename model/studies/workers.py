@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import TypeAlias
 
 from model import processes
-from model.actuator import Era
+from model.structure.actuator import Era
 from model.studies.cases import Cases
 from model.studies.receptances import Receptances
 from model.studies.solve import CaseResults, StudyProblem, solve_cases

@@ -12,16 +12,16 @@ from typing import Protocol
 import numpy as np
 
 from drivers.protocol.messages import Reply, Request
-from model.actuator import Era
 from model.arrays import FloatArray
-from model.assembly import era_positions
-from model.base_motion import Term
-from model.finger_load import FingerLoad
-from model.mesh import Mesh
-from model.plate import Plate
-from model.point_load import PointLoad, load_positions
-from model.reduction import ReducedPlate, reduce_plate
-from model.rig import Rig
+from model.fem.assembly import era_positions
+from model.fem.mesh import Mesh
+from model.finger.load import FingerLoad
+from model.reduction.reduced_plate import ReducedPlate, reduce_plate
+from model.rig.rig import Rig
+from model.structure.actuator import Era
+from model.structure.plate import Plate
+from model.structure.point_load import PointLoad, load_positions
+from model.transients.base_motion import Term
 from sim.amplifier.amplifier import SimulatedAmplifier
 from sim.plant.base_motion import terms_of
 from sim.plant.felt import Felt, feel

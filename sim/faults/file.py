@@ -14,10 +14,10 @@ from typing import Annotated, Any
 
 from pydantic import ValidationError
 
-from model.config import Quantity, Section, Validation
-from model.document import read_document
+from model.config.document import read_document
+from model.config.sections import Quantity, Section, Validation
+from model.config.units import RATIO, TIME
 from model.errors import InputError
-from model.units import RATIO, TIME
 from sim.faults.episodes import Episode, FaultKind, Faults, Toward
 
 

@@ -4,7 +4,7 @@ import cmath
 import math
 from itertools import pairwise
 
-from model.base_motion import Term, fade
+from model.transients.base_motion import Term, fade
 from sim.waveform.fading_tone import FadingTone
 from sim.waveform.shaped_tone import ShapedTone
 

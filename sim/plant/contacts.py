@@ -14,11 +14,11 @@ from typing import TypeAlias, TypeVar
 
 import numpy as np
 
-from model.actuator import Era
 from model.arrays import FloatArray
-from model.point_load import PointLoad
-from model.reduction import ReducedPlate
-from model.time_response import PlateInTime, plate_in_time
+from model.reduction.reduced_plate import ReducedPlate
+from model.structure.actuator import Era
+from model.structure.point_load import PointLoad
+from model.transients.time_response import PlateInTime, plate_in_time
 
 BLOCK = 256  # samples that one table of exponentials serves
 

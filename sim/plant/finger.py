@@ -13,9 +13,9 @@ import numpy as np
 
 from model.arrays import FloatArray
 from model.errors import InputError
-from model.fingertip import fingertip_points
-from model.plate import Plate
-from model.reduction import ReducedPlate
+from model.finger.fingertip import fingertip_points
+from model.reduction.reduced_plate import ReducedPlate
+from model.structure.plate import Plate
 
 KEPT = 10.0  # s; what is older is forgotten
 FINGERS_MAX = 32  # four people with eight fingers each; what they feel still fits into memory

@@ -13,9 +13,9 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from model.base_motion import Term
 from model.errors import InputError
-from model.rig import Channel, Rig
+from model.rig.rig import Channel, Rig
+from model.transients.base_motion import Term
 from sim.waveform.output import Output
 
 NOISE_LINES = 32

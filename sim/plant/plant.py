@@ -1,8 +1,8 @@
 """The plate in time, from one change of the drive or of the contacts to the next.
 
-The equations of motion and their exact solutions are the model's (`model.time_response`, which says
-what is not modelled); here is what a running plant adds: its clock, what the bases do now, and the
-free vibration that every change leaves behind.
+The equations of motion and their exact solutions are the model's (`model.transients.time_response`,
+which says what is not modelled); here is what a running plant adds: its clock, what the bases do
+now, and the free vibration that every change leaves behind.
 """
 
 from collections.abc import Sequence
@@ -10,12 +10,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from model.actuator import Era
 from model.arrays import FloatArray
-from model.base_motion import Term
-from model.point_load import PointLoad
-from model.reduction import ReducedPlate
-from model.time_response import Answer
+from model.reduction.reduced_plate import ReducedPlate
+from model.structure.actuator import Era
+from model.structure.point_load import PointLoad
+from model.transients.base_motion import Term
+from model.transients.time_response import Answer
 from sim.plant.contacts import BLOCK, Carried, ContactPlates
 
 _NEGLIGIBLE = 1e-60  # modal amplitude far below anything measurable, above slow subnormal numbers

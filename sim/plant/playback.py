@@ -10,19 +10,19 @@ from functools import cached_property
 import numpy as np
 
 from model.arrays import FloatArray
-from model.envelope import Envelopes, ramped_onset, shaped
 from model.errors import InputError
-from model.excitation import Excitation
-from model.finger_load import FingerLoad
-from model.fingertip import fingertip_points
-from model.localization import contrast_db, mean_level_db_sl
-from model.pattern import ONSET_RAMP
-from model.perception import sensation_level
-from model.question import Question
-from model.reduction import ReducedPlate
-from model.rig import Rig
-from model.transient import FIRST
-from model.vibration import base_amplitudes, peak_acceleration
+from model.finger.contrast import contrast_db, mean_level_db_sl
+from model.finger.fingertip import fingertip_points
+from model.finger.load import FingerLoad
+from model.finger.perception import sensation_level
+from model.reduction.reduced_plate import ReducedPlate
+from model.rig.rig import Rig
+from model.table.pattern import ONSET_RAMP
+from model.table.question import Question
+from model.transients.envelope import Envelopes, ramped_onset, shaped
+from model.transients.measures import FIRST
+from model.vibration.excitation import Excitation
+from model.vibration.peak import base_amplitudes, peak_acceleration
 from sim.plant.felt import Felt, feel
 from sim.plant.finger import Record
 from sim.plant.plant import Plant

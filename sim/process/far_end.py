@@ -12,8 +12,8 @@ from pathlib import Path
 
 from drivers import clock
 from drivers.steady import no_long_collections
-from model.finger_load import FingerLoad
-from model.rig import Rig
+from model.finger.load import FingerLoad
+from model.rig.rig import Rig
 from sim.bench.bench import SAMPLE_RATE, Bench
 from sim.bench.real_time import keep_time
 from sim.bench.station import Station

@@ -13,7 +13,7 @@ import numpy as np
 
 from model.arrays import FloatArray
 from model.errors import InputError
-from model.plate import Plate
+from model.structure.plate import Plate
 from sim.sensors.recording import Recording
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from model.errors import InputError
-from model.replacing import begins_with
+from model.files.replacing import begins_with
 from sim.sensors.formats.csv_file import CSV
 from sim.sensors.formats.format import Format
 from sim.sensors.formats.uff_file import UFF

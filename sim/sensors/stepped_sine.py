@@ -10,13 +10,13 @@ from collections.abc import Sequence
 import numpy as np
 
 from model.arrays import FloatArray
-from model.assembly import era_positions
-from model.base_motion import Term
 from model.calibration.responses import Responses
 from model.errors import InputError
-from model.point_load import load_positions
-from model.reduction import reduce_plate
-from model.rig import Rig
+from model.fem.assembly import era_positions
+from model.reduction.reduced_plate import reduce_plate
+from model.rig.rig import Rig
+from model.structure.point_load import load_positions
+from model.transients.base_motion import Term
 from sim.plant.plant import Plant
 from sim.sensors.accelerometer import Accelerometer, positions, read_sensors
 from sim.sensors.signal_measures import tone_phasors
@@ -37,8 +37,8 @@ def record_responses(
     """Measure the frequency responses of a rig's plate in time, at a level 0..1 of full stroke.
 
     The plate vibrates with all that the rig says, gains of its ERAs among them; its structural
-    damping is the viscous equivalent of `model.time_response`. Raises InputError for frequencies
-    [Hz] that the sampling rate [Hz] cannot tell.
+    damping is the viscous equivalent of `model.transients.time_response`. Raises InputError for
+    frequencies [Hz] that the sampling rate [Hz] cannot tell.
     """
     if frequencies.max() >= 0.4 * sample_rate:
         raise InputError(

@@ -14,7 +14,7 @@ from drivers.amplifier import Amplifier
 from drivers.backend import Backend
 from drivers.errors import DriverError, LinkTimeout
 from drivers.protocol.messages import Reply, Request, State
-from model.excitation import Tone
+from model.vibration.excitation import Tone
 from shaped_link import Shapes
 from sim.amplifier.amplifier import SimulatedAmplifier
 from virtual_loop import in_virtual_time

@@ -27,7 +27,7 @@ from drivers.protocol.messages import (
     Stop,
 )
 from model.errors import InputError
-from model.excitation import Tone
+from model.vibration.excitation import Tone
 from virtual_loop import in_virtual_time
 
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from controller.contacts import LEASE, MOST_CONTACTS, ContactKey, ContactTracker
 from controller.touch import Touch, TouchFrame
-from model.plate import Material, Plate
+from model.structure.plate import Material, Plate
 
 PLATE = Plate(0.3, 0.2, 0.0015, Material("aluminium", 70e9, 2700.0, 0.33))
 

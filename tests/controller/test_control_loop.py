@@ -23,7 +23,7 @@ from drivers.protocol.messages import (
 )
 from drivers.watchdog import HEARTBEAT
 from model.errors import InputError
-from model.excitation import Excitation, Tone
+from model.vibration.excitation import Excitation, Tone
 from virtual_loop import in_virtual_time
 
 

@@ -7,10 +7,10 @@ from typer.testing import CliRunner
 from controller.api.socket_path import default_socket
 from controller.daemon.config import load_daemon_config
 from controller.touch import Touch
-from model.config_cli import config_app
-from model.document import ConfigError
+from model.commands.config_cli import config_app
+from model.config.document import ConfigError
 from model.errors import InputError
-from model.rig_file import example_rig_path
+from model.rig.file import example_rig_path
 
 RUNNER = CliRunner()
 

@@ -13,7 +13,7 @@ from controller.daemon.inputs import MOST_SOURCES, ApiTouches, TouchInputs
 from controller.touch import Touch, TouchFrame, TouchSource
 from controller.touch_calibration import TouchCalibration
 from model.errors import InputError
-from model.plate import Material, Plate
+from model.structure.plate import Material, Plate
 
 PLATE = Plate(0.4, 0.2, 0.0015, Material("aluminium", 70e9, 2700.0, 0.33))
 

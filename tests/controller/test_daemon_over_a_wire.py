@@ -30,7 +30,7 @@ from drivers.amplifier import Amplifier
 from drivers.protocol.messages import Apply, LoadEnvelope, State
 from drivers.registry import open_backend
 from model.errors import InputError
-from model.rig_file import load_rig
+from model.rig.file import load_rig
 from sim.faults.episodes import Episode
 
 READY = "READY_TO_SWITCH_ON"

@@ -4,7 +4,7 @@ import pytest
 
 from controller.daemon.config import DaemonConfig, load_daemon_config
 from controller.daemon.reload import ReloadPlan, plan_reload
-from model.rig_file import example_rig_path
+from model.rig.file import example_rig_path
 
 USUAL = {
     "rig": "rig.yaml",

@@ -9,8 +9,8 @@ from controller.demo.far_end import FingerFelt
 from controller.demo.measure import finger_level, measure, peak_contrast_db
 from controller.demo.picture import choose_rows
 from controller.demo.rows import Onset, PlayedPattern, TouchRow
-from model.pattern import Pattern
-from model.perception import detection_threshold
+from model.finger.perception import detection_threshold
+from model.table.pattern import Pattern
 
 
 def felt(amplitudes, frequencies=(100.0, 250.0)):

@@ -8,8 +8,8 @@ from controller.effects.layout_file import load_layout
 from controller.effects.moving import Detents
 from controller.effects.shapes import Rectangle
 from controller.effects.timed import Click
-from model.document import ConfigError
-from model.rig_file import example_rig_path, load_rig
+from model.config.document import ConfigError
+from model.rig.file import example_rig_path, load_rig
 
 EXAMPLE = Path(__file__).parents[2] / "controller" / "effects" / "example.yaml"
 

@@ -12,14 +12,14 @@ from controller.means import means_of
 from drivers.command import Envelope as WireEnvelope
 from drivers.command import Knot
 from drivers.protocol.messages import Capabilities
-from model.actuator import Era
-from model.envelope import Envelope
 from model.errors import InputError
-from model.excitation import Tone
-from model.mesh import Mesh
-from model.pattern import Pattern
-from model.plate import Material, Plate
-from model.rig import Channel, Limits, Rig
+from model.fem.mesh import Mesh
+from model.rig.rig import Channel, Limits, Rig
+from model.structure.actuator import Era
+from model.structure.plate import Material, Plate
+from model.table.pattern import Pattern
+from model.transients.envelope import Envelope
+from model.vibration.excitation import Tone
 from sim.amplifier.amplifier import capabilities
 
 FINE = capabilities(4)

@@ -8,7 +8,7 @@ from controller.amplifiers import Phase
 from controller.loop import Controller
 from drivers.amplifier import Amplifier
 from model.errors import InputError
-from model.timing import Timing
+from model.table.timing import Timing
 from shaped_link import Link
 from small_table import small_problem, small_table
 from virtual_loop import in_virtual_time

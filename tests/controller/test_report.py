@@ -11,7 +11,7 @@ import pytest
 
 from controller.report.collect import MOST_DUMPS, collect
 from controller.report.redaction import redacted
-from model.rig_file import example_rig_path
+from model.rig.file import example_rig_path
 
 HOME = Path("/home/somebody")
 

@@ -6,12 +6,12 @@ import pytest
 
 from controller.routing import drive_of_eras, route
 from drivers.command import CommandSet, DriveCommand
-from model.actuator import Era
 from model.errors import InputError
-from model.excitation import Excitation, Tone
-from model.mesh import Mesh
-from model.plate import Material, Plate
-from model.rig import Channel, Limits, Rig
+from model.fem.mesh import Mesh
+from model.rig.rig import Channel, Limits, Rig
+from model.structure.actuator import Era
+from model.structure.plate import Material, Plate
+from model.vibration.excitation import Excitation, Tone
 
 PLATE = Plate(0.3, 0.2, 0.0015, Material("aluminium", 70e9, 2700.0, 0.33))
 RIG = Rig(

@@ -14,11 +14,11 @@ from controller.selection import Selector, strongest
 from controller.wishes import Target, Wish
 from model.arrays import FloatArray
 from model.errors import InputError
-from model.excitation import Excitation, Tone
-from model.pattern import Pattern
-from model.perception import detection_threshold
-from model.plate import Material, Plate
-from model.question import Question
+from model.finger.perception import detection_threshold
+from model.structure.plate import Material, Plate
+from model.table.pattern import Pattern
+from model.table.question import Question
+from model.vibration.excitation import Excitation, Tone
 from small_table import small_table
 
 MEANS = Means("phased", ("switched", "phased"), (45.0, 300.0), {"SW": 1e-4}, PLAIN)

@@ -12,7 +12,7 @@ from controller.contacts import Contact
 from controller.wishes import Target, Wish
 from controller_bench import FINGER, OTHER, make_bench, running
 from drivers.protocol.messages import Apply, LoadEnvelope, State
-from model.excitation import Tone
+from model.vibration.excitation import Tone
 from shaped_link import Link, Shapes
 from virtual_loop import in_virtual_time
 

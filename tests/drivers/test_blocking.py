@@ -9,7 +9,7 @@ from drivers.command import DriveCommand, Envelope, Knot
 from drivers.errors import CommandError, CommandRefused
 from drivers.guard import GuardLimits
 from drivers.protocol.messages import State
-from model.rig_file import example_rig_path
+from model.rig.file import example_rig_path
 
 LIMITS = GuardLimits(40.0, 500.0, 0.5)
 URL = f"sim://{example_rig_path()}"

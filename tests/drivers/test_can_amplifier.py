@@ -25,7 +25,7 @@ from drivers.guard import Guard, GuardLimits, SafeCommand
 from drivers.protocol.can_frame import CanFrame
 from drivers.protocol.canopen_objects import index_of
 from drivers.protocol.messages import Apply, Event, Fault, Ping, State
-from model.rig import Rig
+from model.rig.rig import Rig
 from sim.bench.bench import Bench
 from sim.bench.station import Station
 from sim.far_ends.can_bus.bus import CanBus

@@ -29,7 +29,7 @@ from drivers.protocol.messages import (
 )
 from drivers.registry import open_backend
 from memory_machine import MemoryMachine
-from model.rig import Channel, Rig
+from model.rig.rig import Channel, Rig
 from sim.far_ends.wires import Wire
 from sim.transport.pseudo_terminal import TERMINAL_MAKER
 from virtual_loop import VirtualLoop, run_virtual

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 import era_haptics as era
-from model.rig import Channel
+from model.rig.rig import Channel
 from paper_plate import make_paper_rig
 
 RIG = make_paper_rig(12, 9)

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
 import era_haptics as era
-from model.table_build import build_table
+from model.table.build import build_table
 from paper_plate import make_paper_rig
 
 TARGET, QUIET = (0.08, 0.06), [(0.22, 0.16), (0.25, 0.04)]

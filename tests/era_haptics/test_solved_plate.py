@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import era_haptics as era
-from model.maps import plate_map
+from model.vibration.maps import plate_map
 from paper_plate import make_paper_rig
 
 TARGET, QUIET = (0.08, 0.06), [(0.22, 0.16)]
@@ -27,7 +27,7 @@ def plate() -> era.SolvedPlate:
 @pytest.fixture(scope="module")
 def table(plate: era.SolvedPlate) -> era.LocalizationTable:
     """Of the same plate, at a few frequencies."""
-    from model.table_build import build_table
+    from model.table.build import build_table
 
     frequencies = np.array([60.0, 110.0, 180.0, 250.0])
     return build_table(plate.rig, frequencies=frequencies, grid=era.Grid(4, 3), mode="phased")
@@ -56,7 +56,7 @@ def test_a_map_is_that_of_a_direct_solve() -> None:
 
 def test_point_masses_are_on_it() -> None:
     """A map of a plate that carries one is that of the direct solve, which differs from without."""
-    from model.point_mass import PointMass
+    from model.structure.point_mass import PointMass
 
     rig = make_paper_rig(24, 18)
     carrying = replace(rig, masses=(PointMass(0.1, 0.1, 0.02),))

@@ -12,8 +12,8 @@ from model.calibration.fast_plate import fast_plate
 from model.calibration.responses_file import write_responses_csv, write_responses_uff
 from model.cli import app
 from model.errors import InputError
-from model.rig import Rig
-from model.rig_file import example_rig_path, load_rig
+from model.rig.file import example_rig_path, load_rig
+from model.rig.rig import Rig
 from perturbed_plate import FREQUENCIES, perturbed
 from sim.sensors.accelerometer import Accelerometer, scanning_grid
 from sim.sensors.stepped_sine import record_responses

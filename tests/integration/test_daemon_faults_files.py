@@ -23,7 +23,7 @@ from daemon_bench import daemon_table, far_end, until, write_daemon
 from daemon_process import ENABLED, WATCHDOG, daemon_process, disarmed, holding, play, run_era
 from journal import Journal, loudness
 from model.errors import InputError
-from model.table_file import save_table
+from model.table.file import save_table
 
 SOON = 5.0  # s; a bomb would take minutes, and gigabytes
 

@@ -39,7 +39,7 @@ from daemon_process import (
 )
 from drivers.protocol.messages import Apply, Disarm, Fault, GetStatus, State
 from journal import Journal, energised, loudness, silent_from
-from model.rig_file import load_rig
+from model.rig.file import load_rig
 from rig_files import TWO_AMPLIFIERS, write_rig
 from sim.far_ends.wires import Wire
 from sim.faults.episodes import Episode

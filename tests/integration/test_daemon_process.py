@@ -22,7 +22,7 @@ from daemon_process import (
     run_era,
 )
 from drivers.protocol.messages import State
-from model.table_file import save_table
+from model.table.file import save_table
 
 
 async def test_a_second_daemon_is_refused_and_disturbs_nothing(tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ from model.errors import InputError
 LIVE = """\
 import asyncio
 from controller.demo.live import run_live
-from model.rig_file import example_rig_path
+from model.rig.file import example_rig_path
 from small_table import small_table
 asyncio.run(run_live(example_rig_path(), small_table(), wire="serial", dashboard="127.0.0.1:0"))
 """

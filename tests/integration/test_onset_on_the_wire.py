@@ -9,10 +9,10 @@ from controller.demo.run import read_touches, run_demo
 from controller.sources.capture import Datagram, write_capture
 from controller.sources.tuio import tuio_datagram
 from controller.touch import Touch, TouchFrame
-from model.question import Question
-from model.rig_file import example_rig_path, load_rig
-from model.table_build import build_table
-from model.timing import Timing
+from model.rig.file import example_rig_path, load_rig
+from model.table.build import build_table
+from model.table.question import Question
+from model.table.timing import Timing
 
 FRAME = 1 / 50
 FINGERS = ((1, 0.30, 0.35), (2, 0.80, 0.70))  # id, x, y in TUIO's coordinates

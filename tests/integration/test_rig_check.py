@@ -19,7 +19,7 @@ from drivers.errors import LinkError
 from far_end_process import far_end_process
 from model.calibration.responses_file import write_responses_csv, write_responses_uff
 from model.errors import InputError
-from model.rig_file import load_rig
+from model.rig.file import load_rig
 from rig_files import TWO_AMPLIFIERS, write_rig
 from sim.sensors.accelerometer import Accelerometer, scanning_grid
 from sim.sensors.stepped_sine import record_responses

@@ -17,10 +17,10 @@ import numpy as np
 import pytest
 
 from felt_as_asked import CHECKS, Truth, responses_apart, rounding
-from model.localization import Grid
-from model.rig_file import load_rig
-from model.table_build import build_table
-from model.table_file import save_table
+from model.finger.grid import Grid
+from model.rig.file import load_rig
+from model.table.build import build_table
+from model.table.file import save_table
 from rig_files import write_rig
 from touch_stream import Stream
 from whole_chain import Chain, Played, running_chain

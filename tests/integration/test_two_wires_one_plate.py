@@ -12,7 +12,7 @@ from drivers.guard import Guard, GuardLimits
 from drivers.registry import open_backend
 from far_end_process import FarEndProcess, far_end_process
 from model.calibration.fast_plate import fast_plate
-from model.rig_file import load_rig
+from model.rig.file import load_rig
 from rig_files import TWO_AMPLIFIERS, write_rig
 
 FREQUENCY = 170.0

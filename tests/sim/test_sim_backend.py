@@ -11,7 +11,7 @@ from drivers.command import CommandSet, DriveCommand
 from drivers.errors import CommandError, LinkError
 from drivers.guard import Guard, GuardLimits
 from drivers.protocol.messages import Achieved, Apply, Arm, Capabilities, GetCaps, Stage, Status
-from model.rig_file import example_rig_path
+from model.rig.file import example_rig_path
 from sim.backend import SimulatedBackend
 
 URL = f"sim://{example_rig_path()}"

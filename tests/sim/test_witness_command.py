@@ -12,8 +12,8 @@ from typer.testing import CliRunner
 from drivers.amplifier import Amplifier
 from drivers.registry import open_backend
 from model.errors import InputError
-from model.rig import Rig
-from model.rig_file import example_rig_path
+from model.rig.file import example_rig_path
+from model.rig.rig import Rig
 from sim.cli import app
 from sim.witness.capture import read_capture
 from sim.witness.plan import plan_of

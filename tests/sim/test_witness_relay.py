@@ -11,7 +11,7 @@ from drivers.guard import Guard, GuardLimits
 from drivers.protocol.messages import State
 from drivers.registry import open_backend
 from model.errors import InputError
-from model.rig import Rig
+from model.rig.rig import Rig
 from sim.witness.place import place_of
 from sim.witness.witness import Witness
 from sim.witness_relay import relays

@@ -37,14 +37,14 @@ from drivers.protocol.messages import (
     Status,
     Stop,
 )
-from model.actuator import Era
 from model.arrays import FloatArray
-from model.excitation import Excitation, Tone
-from model.mesh import Mesh
-from model.pattern import Pattern
-from model.plate import Material, Plate
-from model.question import Question
-from model.rig import Channel, Limits, Rig
+from model.fem.mesh import Mesh
+from model.rig.rig import Channel, Limits, Rig
+from model.structure.actuator import Era
+from model.structure.plate import Material, Plate
+from model.table.pattern import Pattern
+from model.table.question import Question
+from model.vibration.excitation import Excitation, Tone
 
 FINGER = (1, 0.5, 0.5)
 OTHER = (2, 0.9, 0.9)

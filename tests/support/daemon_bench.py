@@ -14,8 +14,8 @@ from controller.daemon.daemon import Daemon
 from controller.daemon.log import LogThread
 from controller.daemon.notify import ServiceManager
 from controller.daemon.place import Place
-from model.rig_file import load_rig
-from model.table import LocalizationTable
+from model.rig.file import load_rig
+from model.table.table import LocalizationTable
 from rig_files import write_rig
 from small_table import small_table
 from wires import WIRES, FarSide, far_side

@@ -21,7 +21,7 @@ from controller.api.async_client import AsyncClient
 from controller.api.jsonrpc import RpcError
 from daemon_bench import PATIENCE, PLACE, daemon_table, until, until_state, write_daemon
 from journal import Journal, loudness
-from model.table_file import save_table
+from model.table.file import save_table
 from wires import FarSide
 
 ERA = Path(sys.executable).with_name("era")

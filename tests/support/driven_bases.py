@@ -5,7 +5,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-from model.base_motion import Term, fade
+from model.transients.base_motion import Term, fade
 from sim.plant.base_motion import terms_of
 from sim.waveform.shaped_tone import ShapedTone
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from model.rig_file import example_rig_path
+from model.rig.file import example_rig_path
 
 PATIENCE = 30  # s; for a loaded machine, not an expectation
 

@@ -13,14 +13,14 @@ import numpy as np
 
 from heard import SENSORS, Heard
 from model.arrays import ComplexArray, FloatArray
-from model.assembly import assemble
-from model.fingertip import fingertip_points
-from model.harmonic import direct_acceleration
-from model.localization import contrast_db, mean_level_db_sl
-from model.question import Question
-from model.rig import Rig
-from model.table import LocalizationTable
-from model.timing import Timing
+from model.fem.assembly import assemble
+from model.fem.harmonic import direct_acceleration
+from model.finger.contrast import contrast_db, mean_level_db_sl
+from model.finger.fingertip import fingertip_points
+from model.rig.rig import Rig
+from model.table.question import Question
+from model.table.table import LocalizationTable
+from model.table.timing import Timing
 from stream_daemon import LEVEL_DB_SL
 from touch_stream import Situation, Stream
 from whole_chain import LEVEL_LIMIT, Played

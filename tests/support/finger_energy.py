@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from model.point_load import load_positions
+from model.structure.point_load import load_positions
 from sim.plant.plant import Plant
 
 

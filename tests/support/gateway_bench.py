@@ -45,8 +45,8 @@ from controller.api.parts import (
 )
 from controller.api.server import ApiServer
 from daemon_bench import PATIENCE, daemon_table, write_daemon
-from model.rig_file import parse_rig
-from model.table_file import save_table
+from model.rig.file import parse_rig
+from model.table.file import save_table
 from rig_files import write_rig
 
 ERA = Path(sys.executable).with_name("era")

@@ -34,7 +34,7 @@ from daemon_process import (
 )
 from drivers.protocol.messages import State
 from journal import Journal, energised, loudness
-from model.rig_file import load_rig
+from model.rig.file import load_rig
 from rig_files import TWO_AMPLIFIERS, write_rig
 from sim.far_ends.wires import Wire
 from wires import WIRES, far_side

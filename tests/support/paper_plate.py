@@ -1,9 +1,9 @@
 """The founding paper's plate, for tests that need a rig without a file."""
 
-from model.actuator import Era, damping_from_ratio
-from model.mesh import Mesh
-from model.plate import Material, Plate
-from model.rig import Channel, Limits, Rig
+from model.fem.mesh import Mesh
+from model.rig.rig import Channel, Limits, Rig
+from model.structure.actuator import Era, damping_from_ratio
+from model.structure.plate import Material, Plate
 
 # Section 3 of the founding paper; stiffness recovered from its Table 2, damping and stroke assumed.
 ALUMINIUM = Material("aluminium", E=70e9, rho=2700.0, nu=0.33)

@@ -5,10 +5,10 @@ from functools import cache
 
 import numpy as np
 
-from model.mesh import Mesh
-from model.rig import Rig
-from model.table import LocalizationTable
-from model.table_build import build_table
+from model.fem.mesh import Mesh
+from model.rig.rig import Rig
+from model.table.build import build_table
+from model.table.table import LocalizationTable
 from paper_plate import make_paper_rig
 
 FREQUENCIES = np.linspace(40.0, 500.0, 27)

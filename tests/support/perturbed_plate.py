@@ -5,10 +5,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from model.assembly import assemble
 from model.calibration.responses import Responses
-from model.harmonic import direct_acceleration
-from model.rig import Rig
+from model.fem.assembly import assemble
+from model.fem.harmonic import direct_acceleration
+from model.rig.rig import Rig
 
 # Relative to the rig, bolt masses in kg: what assembly and ageing do.
 STIFFNESS = (1.15, 0.9, 1.05, 0.82)

@@ -7,10 +7,10 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 from model.arrays import FloatArray
-from model.assembly import era_positions
-from model.reduction import reduce_plate
-from model.rig import Rig
-from model.time_response import PlateInTime, modal_matrices, plate_in_time
+from model.fem.assembly import era_positions
+from model.reduction.reduced_plate import reduce_plate
+from model.rig.rig import Rig
+from model.transients.time_response import PlateInTime, modal_matrices, plate_in_time
 from paper_plate import make_paper_rig
 
 Motion = Callable[[float], tuple[float, float]]

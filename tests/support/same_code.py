@@ -4,13 +4,13 @@ What is kept is kept under a digest of the source, and the source may be edited 
 process that starts later would find nothing of what another has kept, and be right.
 """
 
-from model.studies.solve import code_version
+from model.version import code_version
 
 
 def era_program() -> str:
     """A program text for `python -c`."""
     return (
-        "import sys; import model.studies.solve as solve; "
-        f"solve.code_version = lambda: {code_version()!r}; "
+        "import sys; from model import version; "
+        f"version.code_version = lambda: {code_version()!r}; "
         "from controller.main import main; sys.exit(main())"
     )

@@ -3,7 +3,7 @@
 from distributed import Client, Worker, WorkerPlugin
 
 from model.studies import cluster
-from model.studies.solve import code_version
+from model.version import code_version
 
 
 class SameCode(WorkerPlugin):

@@ -8,9 +8,9 @@ from typing import Any
 
 from drivers.backend import Backend
 from drivers.protocol.messages import Reply, Request
-from model.envelope import Envelope
-from model.pattern import Pattern
-from model.question import Question
+from model.table.pattern import Pattern
+from model.table.question import Question
+from model.transients.envelope import Envelope
 from sim.amplifier.amplifier import SimulatedAmplifier
 
 

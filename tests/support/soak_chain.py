@@ -26,8 +26,8 @@ from drivers.errors import DriverError
 from drivers.protocol.messages import Reply, Request
 from drivers.registry import open_backend
 from memory_machine import MemoryMachine
-from model.rig import Channel, Rig
-from model.table import LocalizationTable
+from model.rig.rig import Channel, Rig
+from model.table.table import LocalizationTable
 from paper_plate import make_paper_rig
 from sim.bench.bench import Bench
 from sim.bench.station import Station

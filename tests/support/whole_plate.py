@@ -11,12 +11,12 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import linalg, sparse
 
-from model.actuator import Era
 from model.arrays import ComplexArray, FloatArray
-from model.assembly import PlateMatrices, assemble
-from model.mesh import Mesh
-from model.plate import Plate
-from model.point_load import PointLoad
+from model.fem.assembly import PlateMatrices, assemble
+from model.fem.mesh import Mesh
+from model.structure.actuator import Era
+from model.structure.plate import Plate
+from model.structure.point_load import PointLoad
 
 Motion = Callable[[float], tuple[float, float]]
 """Displacement [m] and velocity [m/s] of a base at a time [s]."""

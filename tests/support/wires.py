@@ -8,7 +8,7 @@ from contextlib import asynccontextmanager
 from dataclasses import dataclass
 
 from drivers import clock
-from model.rig import Rig
+from model.rig.rig import Rig
 from sim.amplifier.amplifier import SimulatedAmplifier
 from sim.bench.bench import Bench
 from sim.bench.station import Station

@@ -23,14 +23,14 @@ from drivers.backends.stand_in import STAND_IN
 from drivers.protocol.messages import Fault
 from drivers.registry import open_backend
 from memory_machine import MemoryMachine
-from model.actuator import Era
 from model.arrays import FloatArray
-from model.excitation import Excitation, Tone
-from model.mesh import Mesh
-from model.pattern import Pattern
-from model.plate import Material, Plate
-from model.question import Question
-from model.rig import Channel, Limits, Rig
+from model.fem.mesh import Mesh
+from model.rig.rig import Channel, Limits, Rig
+from model.structure.actuator import Era
+from model.structure.plate import Material, Plate
+from model.table.pattern import Pattern
+from model.table.question import Question
+from model.vibration.excitation import Excitation, Tone
 from sim.bench.bench import Bench
 from sim.bench.station import Station
 from sim.far_ends.wires import Wire, open_wire

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from model.errors import InputError
-from model.uff import read_bytes
+from model.files.uff import read_bytes
 from sim.sensors.formats.format import Format, rounded
 from sim.sensors.recording import Recording
 

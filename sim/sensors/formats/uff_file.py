@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from model.errors import InputError
-from model.uff import (
+from model.files.uff import (
     ACCELERATION,
     TIME,
     TIME_RESPONSE,

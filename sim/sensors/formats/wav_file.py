@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from model.errors import InputError
-from model.uff import read_bytes
+from model.files.uff import read_bytes
 from sim.sensors.formats.format import Format
 from sim.sensors.recording import Recording
 

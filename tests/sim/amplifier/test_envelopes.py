@@ -20,8 +20,8 @@ from drivers.protocol.messages import (
     Stage,
     Stop,
 )
-from model.base_motion import Term
-from model.envelope import Envelope as BaseEnvelope
+from model.transients.base_motion import Term
+from model.transients.envelope import Envelope as BaseEnvelope
 from sim.amplifier.amplifier import SimulatedAmplifier
 from sim.plant.base_motion import terms_of
 

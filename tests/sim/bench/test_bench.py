@@ -7,12 +7,12 @@ import pytest
 
 from drivers.command import CommandSet, DriveCommand
 from drivers.protocol.messages import Achieved, Apply, Arm, Fault, Ping
-from model.assembly import assemble
-from model.fingertip import fingertip_points
-from model.harmonic import direct_acceleration
-from model.point_load import PointLoad
-from model.point_mass import PointMass
-from model.rig import Rig
+from model.fem.assembly import assemble
+from model.fem.harmonic import direct_acceleration
+from model.finger.fingertip import fingertip_points
+from model.rig.rig import Rig
+from model.structure.point_load import PointLoad
+from model.structure.point_mass import PointMass
 from sim.bench.bench import Bench
 
 START = 98765.4321  # as large as a clock may be

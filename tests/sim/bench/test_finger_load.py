@@ -8,13 +8,13 @@ import pytest
 from drivers.command import CommandSet, DriveCommand
 from drivers.protocol.messages import Apply, Arm, Ping
 from model.arrays import FloatArray
-from model.assembly import assemble
 from model.errors import InputError
-from model.finger_load import FingerLoad, finger_loads, parse_finger_load
-from model.fingertip import fingertip_points
-from model.harmonic import direct_acceleration
-from model.point_load import PointLoad
-from model.rig import Rig
+from model.fem.assembly import assemble
+from model.fem.harmonic import direct_acceleration
+from model.finger.fingertip import fingertip_points
+from model.finger.load import FingerLoad, finger_loads, parse_finger_load
+from model.rig.rig import Rig
+from model.structure.point_load import PointLoad
 from sim.bench.bench import Bench
 from sim.sensors.accelerometer import Accelerometer
 from sim.sensors.on_bench import Accelerometers

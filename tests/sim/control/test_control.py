@@ -15,7 +15,7 @@ import pytest
 from drivers.command import CommandSet, DriveCommand
 from drivers.errors import LinkError
 from drivers.protocol.messages import Apply, Arm
-from model.rig import Rig
+from model.rig.rig import Rig
 from sim.bench.bench import Bench
 from sim.control.operations import carry_out
 from sim.control.server import LINE_MAX, control_socket

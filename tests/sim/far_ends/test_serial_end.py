@@ -24,7 +24,7 @@ from drivers.protocol.messages import (
 )
 from drivers.protocol.serial_codec import decode_reply, encode_request
 from drivers.protocol.serial_frame import Frame, FrameReader, encode_frame
-from model.rig import Rig
+from model.rig.rig import Rig
 from sim.bench.bench import Bench
 from sim.bench.station import Station
 from sim.far_ends.serial_end import SerialEnd

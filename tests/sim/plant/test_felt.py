@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from model.errors import InputError
-from model.fingertip import fingertip_points
-from model.mesh import Mesh
-from model.reduction import ReducedPlate
-from model.rig import Rig
+from model.fem.mesh import Mesh
+from model.finger.fingertip import fingertip_points
+from model.reduction.reduced_plate import ReducedPlate
+from model.rig.rig import Rig
 from sim.plant.felt import feel
 from sim.plant.finger import Fingers, Record
 

@@ -12,7 +12,7 @@ from drivers.command import CommandSet, DriveCommand
 from drivers.protocol.messages import Apply, Arm, Nak, Ping, Request, Stop
 from model.arrays import FloatArray
 from model.errors import InputError
-from model.rig import Channel, Rig
+from model.rig.rig import Channel, Rig
 from sim.bench.bench import Bench
 from sim.plant.imperfections import ChannelErrors, Imperfections, draw_imperfections, draw_noise
 

@@ -8,15 +8,15 @@ import pytest
 from scipy.signal import butter, sosfiltfilt
 
 from driven_bases import STILL, Base, faded_base, shaped_base
-from model.actuator import Era
 from model.arrays import ComplexArray, FloatArray
-from model.assembly import assemble, era_positions
-from model.base_motion import Term
-from model.finger_load import FingerLoad
-from model.harmonic import direct_acceleration
-from model.point_load import PointLoad
-from model.reduction import ReducedPlate, reduce_plate
-from model.rig import Rig
+from model.fem.assembly import assemble, era_positions
+from model.fem.harmonic import direct_acceleration
+from model.finger.load import FingerLoad
+from model.reduction.reduced_plate import ReducedPlate, reduce_plate
+from model.rig.rig import Rig
+from model.structure.actuator import Era
+from model.structure.point_load import PointLoad
+from model.transients.base_motion import Term
 from paper_plate import make_paper_rig
 from sim.plant.plant import Plant
 from whole_plate import WholePlate, whole_plate

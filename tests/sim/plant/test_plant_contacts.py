@@ -9,14 +9,14 @@ from numpy.testing import assert_allclose
 from driven_bases import Base, faded_base, shaped_base
 from finger_energy import held_by_fingers
 from model.arrays import FloatArray
-from model.assembly import era_positions
-from model.base_motion import Term
-from model.finger_load import FingerLoad, finger_loads
-from model.mesh import Mesh
-from model.point_load import PointLoad, load_positions
-from model.reduction import ReducedPlate, reduce_plate
-from model.rig import Rig
-from model.time_response import modal_matrices
+from model.fem.assembly import era_positions
+from model.fem.mesh import Mesh
+from model.finger.load import FingerLoad, finger_loads
+from model.reduction.reduced_plate import ReducedPlate, reduce_plate
+from model.rig.rig import Rig
+from model.structure.point_load import PointLoad, load_positions
+from model.transients.base_motion import Term
+from model.transients.time_response import modal_matrices
 from sim.plant.plant import Plant
 
 STROKE = 1e-4

@@ -5,20 +5,20 @@ import math
 import numpy as np
 import pytest
 
-from model.assembly import assemble, era_positions
-from model.envelope import Envelope, shaped
 from model.errors import InputError
-from model.excitation import Tone
-from model.finger_load import FingerLoad
-from model.fingertip import fingertip_points
-from model.harmonic import direct_acceleration
-from model.localization import mean_level_db_sl
-from model.point_load import PointLoad
-from model.question import Question
-from model.reduction import ReducedPlate, reduce_plate
-from model.rig import Rig
-from model.time_response import plate_in_time
-from model.transient import Transients
+from model.fem.assembly import assemble, era_positions
+from model.fem.harmonic import direct_acceleration
+from model.finger.contrast import mean_level_db_sl
+from model.finger.fingertip import fingertip_points
+from model.finger.load import FingerLoad
+from model.reduction.reduced_plate import ReducedPlate, reduce_plate
+from model.rig.rig import Rig
+from model.structure.point_load import PointLoad
+from model.table.question import Question
+from model.transients.envelope import Envelope, shaped
+from model.transients.measures import Transients
+from model.transients.time_response import plate_in_time
+from model.vibration.excitation import Tone
 from sim.plant.finger import Record
 from sim.plant.playback import Playback, play
 

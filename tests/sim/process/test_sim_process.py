@@ -14,7 +14,7 @@ from drivers.backends.serial_amplifier import SerialBackend
 from drivers.command import CommandSet, DriveCommand
 from drivers.guard import Guard, GuardLimits
 from drivers.protocol.messages import State
-from model.rig_file import example_rig_path
+from model.rig.file import example_rig_path
 
 ROOT = example_rig_path().parent.parent
 PATIENCE = 30  # s; for a loaded machine, not an expectation

@@ -5,7 +5,7 @@ from rich.console import Console
 
 from drivers.command import CommandSet, DriveCommand
 from drivers.protocol.messages import Apply, Arm
-from model.rig import Rig
+from model.rig.rig import Rig
 from sim.bench.bench import Bench
 from sim.control.site import Site
 from sim.process.view import PlateMap, draw

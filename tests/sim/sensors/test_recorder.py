@@ -8,7 +8,7 @@ import pytest
 from drivers.command import CommandSet, DriveCommand
 from drivers.protocol.messages import Apply, Arm
 from model.errors import InputError
-from model.rig import Rig
+from model.rig.rig import Rig
 from sim.bench.bench import Bench
 from sim.sensors.accelerometer import Accelerometer
 from sim.sensors.recorder import Recorder

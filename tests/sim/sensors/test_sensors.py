@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from model.errors import InputError
-from model.rig import Rig
+from model.rig.rig import Rig
 from sim.sensors.accelerometer import Accelerometer, read_sensors, scanning_grid
 from sim.sensors.recording import Recording
 from sim.sensors.signal_measures import (

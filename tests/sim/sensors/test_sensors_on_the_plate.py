@@ -5,12 +5,12 @@ import math
 import numpy as np
 import pytest
 
-from model.assembly import era_positions
-from model.base_motion import Term
-from model.free_plate import solve_free_plate
-from model.reduction import ReducedPlate, reduce_plate
-from model.rig import Rig
-from model.time_response import plate_in_time
+from model.fem.assembly import era_positions
+from model.reduction.free_plate import solve_free_plate
+from model.reduction.reduced_plate import ReducedPlate, reduce_plate
+from model.rig.rig import Rig
+from model.transients.base_motion import Term
+from model.transients.time_response import plate_in_time
 from sim.plant.plant import Plant
 from sim.sensors.accelerometer import Accelerometer, positions, read_sensors
 from sim.sensors.recording import Recording

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from model.base_motion import Term
+from model.transients.base_motion import Term
 from sim.plant.base_motion import terms_of
 from sim.waveform.fading_tone import FadingTone
 from sim.waveform.output import Output, fade_to, level_of

@@ -11,7 +11,7 @@ import pytest
 import drivers
 from drivers.backends.can_url import CanUrl
 from drivers.protocol.messages import Fault, State
-from model.rig import Rig
+from model.rig.rig import Rig
 from sim.far_ends.wires import Wire
 from wires import far_side
 

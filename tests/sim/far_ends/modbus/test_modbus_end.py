@@ -18,8 +18,8 @@ from drivers.errors import LinkError
 from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.messages import Commit, Fault, NakCode, Ping, State, Stop
 from modbus_session import EXAMPLES, ScriptedStation
-from model.rig import Rig
-from model.rig_file import example_rig_path
+from model.rig.file import example_rig_path
+from model.rig.rig import Rig
 from sim.far_ends.modbus.end import ModbusRtuEnd, ModbusTcpEnd
 from sim.far_ends.modbus.frames import PAUSE, crc
 from sim.far_ends.wires import Wire

@@ -1,0 +1,1 @@
+"""The model's commands of `era`: arguments parsed, answers printed."""

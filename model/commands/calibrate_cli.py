@@ -1,0 +1,103 @@
+"""`era calibrate`: a rig's values from responses measured on it."""
+
+import json
+import time
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from model.errors import InputError
+
+NOT_THIS_PLATE = 1  # exit status: the answer is no
+
+
+def calibrate(
+    rig_file: Annotated[Path, typer.Argument(metavar="RIG", help="The rig as it is believed.")],
+    measured_file: Annotated[
+        Path, typer.Argument(metavar="MEASURED", help="Responses, .uff, .unv or .csv.")
+    ],
+    output: Annotated[
+        Path, typer.Option("--output", "-o", metavar="RIG2.yaml", help="The new rig.")
+    ],
+    mesh: Annotated[
+        str | None, typer.Option(metavar="NXxNY", help="Elements, in place of the rig's.")
+    ] = None,
+    all_scales: Annotated[
+        bool, typer.Option("--scales", help="Estimate every sensor's scale, not only wrong ones.")
+    ] = False,
+    picture: Annotated[
+        Path | None, typer.Option(metavar="FIT.png", help="Draw measured, before and after.")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="One JSON object, nothing else.")] = False,
+) -> None:
+    """Fit a rig to measured frequency responses: values with their uncertainty, and a new rig."""
+    from model.calibration import wording
+    from model.calibration.calibrate import calibrate as fit
+    from model.calibration.responses import responses_of
+    from model.calibration.responses_file import read_functions
+    from model.rig.file import load_rig
+
+    if output.suffix not in (".yaml", ".yml"):
+        raise InputError(f"{output}: a rig file ends in .yaml; try {output.with_suffix('.yaml')}")
+    for taken in (rig_file, measured_file):
+        if output.resolve() == taken.resolve():
+            raise InputError(f"{output}: the new rig would overwrite {taken}; choose another name")
+    rig = load_rig(rig_file, mesh=mesh)
+    responses = responses_of(read_functions(measured_file), rig)
+    started = time.perf_counter()
+    calibration = fit(rig, responses, all_scales=all_scales)
+    elapsed = time.perf_counter() - started
+    rows = wording.change_rows(calibration)
+    notes = [*wording.finding_rows(calibration), wording.check_row(calibration)]
+    files = []
+    if calibration.is_good:
+        from model.calibration.rig_text import calibrated_text, check_reads_back
+
+        comment = "\n".join(
+            [f"{rig_file.name} calibrated with {measured_file.name} by `era calibrate`:"]
+            + [f"  {row}" for row in [*rows, *notes]]
+        )
+        text = calibrated_text(
+            rig_file.read_text(encoding="utf-8"), rig, calibration, comment=comment
+        )
+        _write(output, text)
+        check_reads_back(load_rig(output, mesh=mesh), calibration, output)
+        files.append(str(output))
+    if picture is not None:
+        from model.figures import save_figure
+        from model.figures.calibration import calibration_figure
+
+        save_figure(calibration_figure(calibration), picture)
+        files.append(str(picture))
+    if as_json:
+        told = wording.as_json(calibration, rig, files)
+        print(json.dumps({**told, "solve_time_s": elapsed}))
+    else:
+        print(
+            f"{measured_file}: {len(responses.sensors)} sensors, {len(responses.frequencies)} "
+            f"frequencies from {responses.frequencies[0]:g} to {responses.frequencies[-1]:g} Hz, "
+            f"{responses.count} values; fitted in {elapsed:.1f} s"
+        )
+        print()
+        print("\n".join([*rows, *wording.gain_rows(calibration)]))
+        print()
+        print("\n".join(notes))
+    if not calibration.is_good:
+        typer.echo(
+            "The rig does not fit what was measured, and no new rig is written. Is it another "
+            "plate, are places or ERAs swapped, are phases not those of exp(+i omega t), or is "
+            "noise more than a quarter of the response?",
+            err=True,
+        )
+        raise typer.Exit(NOT_THIS_PLATE)
+    if not as_json:
+        print(f"wrote {', '.join(files)}")
+        print(f"Next: era table build {output} -o table.npz")
+
+
+def _write(path: Path, text: str) -> None:
+    try:
+        path.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written: {error.strerror}") from error

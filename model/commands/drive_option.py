@@ -1,0 +1,54 @@
+"""What `--drive` says: ERA=HZ[@LEVEL[:PHASE_DEG]]."""
+
+import math
+import re
+from collections.abc import Sequence
+
+from model.errors import InputError
+from model.rig.rig import Rig
+from model.vibration.excitation import Excitation, Tone
+
+_FORM = re.compile(r"(?P<era>[^=]+)=(?P<frequency>[^@:]+)(?:@(?P<level>[^:]+)(?::(?P<phase>.+))?)?")
+
+
+def parse_drives(texts: Sequence[str], rig: Rig) -> Excitation:
+    """Excitation from drives such as `SW=110`, `NE=250@0.5` or `NE=250@0.5:90`.
+
+    Level 1, full stroke, and phase 0 where they are not given. Raises InputError.
+    """
+    excitation: dict[str, Tone] = {}
+    names = [era.name for era in rig.eras]
+    for text in texts:
+        match = _FORM.fullmatch(text.strip())
+        if match is None:
+            raise InputError(
+                f"--drive {text!r} is not ERA=HZ[@LEVEL[:PHASE_DEG]], for instance "
+                f"{names[0]}=110 or {names[0]}=110@0.5:90"
+            )
+        name = match["era"]
+        if name not in names:
+            raise InputError(
+                f"--drive {text!r}: the rig has no ERA {name!r}, only {', '.join(names)}"
+            )
+        if name in excitation:
+            raise InputError(f"--drive {text!r}: {name} is driven twice; one tone per ERA")
+        frequency = _number(match["frequency"], text, what="frequency")
+        level = _number(match["level"] or "1", text, what="level")
+        phase = _number(match["phase"] or "0", text, what="phase")
+        if not 0 <= level <= 1:
+            raise InputError(f"--drive {text!r}: level is {level:g}, must lie between 0 and 1")
+        if frequency <= 0:
+            raise InputError(f"--drive {text!r}: frequency is {frequency:g} Hz, must be above zero")
+        stroke = rig.era(name).stroke
+        excitation[name] = Tone(frequency, level * stroke, math.radians(phase))
+    return excitation
+
+
+def _number(text: str, drive: str, *, what: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        raise InputError(f"--drive {drive!r}: {what} {text!r} is not a number") from None
+    if not math.isfinite(value):
+        raise InputError(f"--drive {drive!r}: {what} {text!r} is not a finite number")
+    return value

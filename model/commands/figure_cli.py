@@ -1,0 +1,71 @@
+"""`era figure`: the founding paper's figures, each with the numbers that are drawn in it."""
+
+import json
+import time
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from model.commands.plate_cli import JsonOption, MeshOption, RigArgument
+
+figure_app = typer.Typer()
+
+
+@figure_app.command()
+def figure(
+    number: Annotated[
+        str, typer.Argument(metavar="6|7|10|11|12|13|all", help="Number of the figure.")
+    ],
+    rig_file: RigArgument,
+    output: Annotated[
+        Path, typer.Option("--output", "-o", metavar="DIR", help="Folder to write into.")
+    ],
+    mesh: MeshOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Draw a figure of the founding paper for a rig, with a CSV file of its numbers beside it."""
+    from model.figures import save_figure
+    from model.files.csv_file import write_columns
+    from model.paper.catalogue import paper_figures
+    from model.rig.file import load_rig
+
+    rig = load_rig(rig_file, mesh=mesh)
+    output.mkdir(parents=True, exist_ok=True)
+    started = time.perf_counter()
+    files: list[str] = []
+    findings = {}
+    for made in paper_figures(rig, number):
+        picture = output / f"{made.name}.png"
+        save_figure(made.figure, picture)
+        files.append(str(picture))
+        for suffix, columns in made.tables.items():
+            table = output / f"{made.name}{suffix}.csv"
+            write_columns(table, columns)
+            files.append(str(table))
+        findings[made.name] = dict(made.findings)
+        if not as_json:
+            print(made.name)
+            for key, value in made.findings.items():
+                print(f"  {key:40s} {_shown(value)}")
+    elapsed = time.perf_counter() - started
+    if as_json:
+        answer = {"figures": findings, "mesh": [rig.mesh.nx, rig.mesh.ny]}
+        print(json.dumps(answer | {"time_s": elapsed, "files": files}))
+        return
+    print(f"{elapsed:.1f} s, mesh {rig.mesh}; wrote")
+    for name in files:
+        print(f"  {name}")
+    print(f"Next: era study placement {rig_file} -o study")
+
+
+def _shown(value: object) -> str:
+    match value:
+        case float():
+            return f"{value:.5g}"
+        case list():
+            return ", ".join(_shown(one) for one in value)
+        case dict():
+            return ", ".join(f"{key} {_shown(one)}" for key, one in value.items())
+        case _:
+            return str(value)

@@ -1,0 +1,197 @@
+"""`era plate`: natural frequencies and maps."""
+
+import json
+import time
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+plate_app = typer.Typer(help="The plate: natural frequencies and vibration maps.")
+
+RigArgument = Annotated[Path, typer.Argument(metavar="RIG", help="Rig file, e.g. RIG.yaml.")]
+MeshOption = Annotated[
+    str | None, typer.Option(metavar="NXxNY", help="Elements along x and y, in place of the rig's.")
+]
+JsonOption = Annotated[bool, typer.Option("--json", help="One JSON object, nothing else.")]
+
+
+class Support(StrEnum):
+    """What holds the plate."""
+
+    ERAS = "eras"
+    SIMPLY_SUPPORTED = "simply-supported"
+    FREE = "free"
+
+
+@plate_app.command()
+def modes(
+    rig_file: RigArgument,
+    mesh: MeshOption = None,
+    support: Annotated[Support, typer.Option(help="What holds the plate.")] = Support.ERAS,
+    count: Annotated[int, typer.Option("-n", min=1, help="How many modes.")] = 12,
+    as_json: JsonOption = False,
+) -> None:
+    """Natural frequencies of the undamped plate; elastic modes only where it is free."""
+    from model.fem import modal
+    from model.fem.assembly import assemble
+    from model.rig.file import load_rig
+
+    rig = load_rig(rig_file, mesh=mesh)
+    started = time.perf_counter()
+    matrices = assemble(rig.plate, rig.mesh)
+    solved = modal.modes(matrices, count, support=support.value, eras=rig.eras, loads=rig.loads)
+    elapsed = time.perf_counter() - started
+    carried = rig.mesh.highest_frequency(rig.plate)
+    if as_json:
+        print(
+            json.dumps(
+                {
+                    "frequencies_hz": solved.natural_frequencies.tolist(),
+                    "mesh_carries_up_to_hz": carried,
+                    "support": support.value,
+                    "mesh": [rig.mesh.nx, rig.mesh.ny],
+                    "dof": matrices.dof,
+                    "element": rig.mesh.element,
+                    "solve_time_s": elapsed,
+                }
+            )
+        )
+        return
+    mesh_text = f"{rig.mesh} ({rig.mesh.element}), {matrices.dof} dof"
+    print(f"{rig_file}: {mesh_text}, support: {support.value}")
+    for number, frequency in enumerate(solved.natural_frequencies, start=1):
+        beyond = "  beyond what the mesh carries" if frequency > carried else ""
+        print(f"mode {number:3d}  {frequency:9.2f} Hz{beyond}")
+    if solved.natural_frequencies[-1] > carried:
+        print(
+            f"above {carried:.0f} Hz a bending wavelength has fewer than six nodes of this mesh: "
+            "those frequencies are far off; use a finer --mesh"
+        )
+    print(f"solved in {elapsed:.2f} s")
+
+
+@plate_app.command("map")
+def plate_map(
+    rig_file: RigArgument,
+    drive: Annotated[
+        list[str],
+        typer.Option(metavar="ERA=HZ[@LEVEL[:PHASE_DEG]]", help="A tone of one ERA; repeatable."),
+    ],
+    mesh: MeshOption = None,
+    points: Annotated[
+        str | None, typer.Option(metavar="XxY", help="Raster of the answer; default: the mesh's.")
+    ] = None,
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", metavar="MAP.png", help="Draw it.")
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Peak acceleration all over the plate for any drive."""
+    import numpy as np
+
+    from model.commands.drive_option import parse_drives
+    from model.config.points import parse_pair
+    from model.rig.file import load_rig
+    from model.vibration.maps import plate_map as solve
+    from model.vibration.peak import G
+
+    rig = load_rig(rig_file, mesh=mesh)
+    excitation = parse_drives(drive, rig)
+    started = time.perf_counter()
+    solved = solve(rig, excitation, raster=parse_pair(points, what="--points") if points else None)
+    elapsed = time.perf_counter() - started
+    if output is not None:
+        from model.figures import map_figure, save_figure
+
+        figure = map_figure(rig, solved, active=excitation.keys(), title=", ".join(drive))
+        save_figure(figure, output)
+    row, column = divmod(int(solved.peak.argmax()), len(solved.x))
+    if as_json:
+        print(
+            json.dumps(
+                {
+                    "x_m": solved.x.tolist(),
+                    "y_m": solved.y.tolist(),
+                    "peak_acceleration_m_s2": solved.peak.tolist(),
+                    "max_m_s2": float(solved.peak.max()),
+                    "max_at_m": [float(solved.x[column]), float(solved.y[row])],
+                    "nulls_m": solved.nulls.tolist(),
+                    "mesh": [rig.mesh.nx, rig.mesh.ny],
+                    "solve_time_s": elapsed,
+                    "files": [str(output)] if output else [],
+                }
+            )
+        )
+        return
+    print(f"{rig_file}: {', '.join(drive)} on a {rig.mesh} mesh, solved in {elapsed:.2f} s")
+    print(
+        f"largest  {solved.peak.max() / G:8.2f} g  ({solved.peak.max():.1f} m/s²) "
+        f"at ({solved.x[column]:.4f}, {solved.y[row]:.4f}) m"
+    )
+    print(f"median   {float(np.median(solved.peak)) / G:8.2f} g")
+    print(f"nulls    {len(solved.nulls):5d}")
+    if output is not None:
+        print(f"wrote {output}")
+        print(f"Next: era table build {rig_file} -o table.npz")
+
+
+@plate_app.command()
+def convergence(
+    rig_file: RigArgument,
+    mesh: MeshOption = None,
+    frequencies: Annotated[
+        str | None,
+        typer.Option(metavar="LO:HI:STEP|LIST", help="Where to compare, in Hz; default 110,250."),
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """How wrong meshes are: natural frequencies and response, against a finer mesh."""
+    from model.config.points import parse_frequencies
+    from model.rig.file import load_rig
+    from model.vibration.convergence import (
+        default_frequencies,
+        meshes_to_compare,
+        study_convergence,
+    )
+
+    rig = load_rig(rig_file, mesh=mesh)
+    asked = parse_frequencies(frequencies) if frequencies else default_frequencies(rig)
+    study = study_convergence(rig, meshes_to_compare(rig), frequencies=asked)
+    if as_json:
+        rows = [
+            {
+                "mesh": [error.mesh.nx, error.mesh.ny],
+                "element": error.mesh.element,
+                "strip_m": error.mesh.strip,
+                "dof": error.dof,
+                "is_the_rigs": error.mesh == rig.mesh,
+                "natural_frequency_error_percent": (100 * error.frequency).tolist(),
+                "response_error_percent": (100 * error.response).tolist(),
+            }
+            for error in study.errors
+        ]
+        reference = {
+            "mesh": [study.reference.nx, study.reference.ny],
+            "element": study.reference.element,
+            "strip_m": study.reference.strip,
+            "natural_frequencies_hz": study.natural_frequencies.tolist(),
+        }
+        print(
+            json.dumps({"reference": reference, "frequencies_hz": asked.tolist(), "meshes": rows})
+        )
+        return
+    print(f"{rig_file}: errors against {study.reference}")
+    print("natural frequencies: the worst of the lowest twelve, on the ERAs; response: relative L2")
+    print("of the acceleration over the plate, the worst of the ERAs driven alone")
+    print()
+    heads = "".join(f"{f'at {frequency:g} Hz':>12}" for frequency in asked)
+    print(f"{'mesh':>9}{'element':>9}{'strips':>8}{'dof':>8}{'nat. freq.':>12}{heads}")
+    for error in study.errors:
+        mesh_text = f"{error.mesh.nx}x{error.mesh.ny}"
+        strip = f"{1000 * error.mesh.strip:.3g} mm" if error.mesh.strip else "-"
+        errors = [100 * abs(error.frequency).max(), *(100 * error.response)]
+        columns = "".join(f"{value:10.3f} %" for value in errors)
+        mine = "  <- the rig's" if error.mesh == rig.mesh else ""
+        print(f"{mesh_text:>9}{error.mesh.element:>9}{strip:>8}{error.dof:>8}{columns}{mine}")

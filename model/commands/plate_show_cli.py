@@ -1,0 +1,91 @@
+"""`era plate materials` and `era plate show`: what plates are made of, a rig's plate above all."""
+
+import json
+import math
+from typing import Any
+
+from model.commands.plate_cli import JsonOption, RigArgument
+
+
+def materials(as_json: JsonOption = False) -> None:
+    """The materials known by name, their numbers, and where these come from."""
+    from model.structure.materials import KNOWN_MATERIALS
+
+    if as_json:
+        entries = [
+            {
+                "name": name,
+                "E_pa": known.material.E,
+                "rho_kg_m3": known.material.rho,
+                "nu": known.material.nu,
+                "source": known.source,
+                "spread": known.spread,
+                "loss_factor": known.loss_factor,
+            }
+            for name, known in KNOWN_MATERIALS.items()
+        ]
+        print(json.dumps({"materials": entries}))
+        return
+    for name, known in KNOWN_MATERIALS.items():
+        numbers = known.material
+        print(f"{name}: E {numbers.E / 1e9:g} GPa, rho {numbers.rho:g} kg/m³, nu {numbers.nu:g}")
+        print(f"    source  {known.source}")
+        print(f"    spread  {known.spread}")
+        print(f"    loss factor of the bare material, about  {known.loss_factor}")
+    print("Any other goes by its numbers: material: {E: 70 GPa, rho: 2700, nu: 0.33}")
+
+
+def show(rig_file: RigArgument, as_json: JsonOption = False) -> None:
+    """What the plate is made of and how it bends; of a laminate, between which bounds."""
+    from model.rig.file import load_rig
+    from model.rig.plate_summary import plate_summary
+
+    summary = plate_summary(load_rig(rig_file))
+    if as_json:
+        print(json.dumps(summary))
+        return
+    print(f"{rig_file}: {1e3 * summary['length_m']:g} x {1e3 * summary['width_m']:g} mm")
+    laminate = summary["laminate"]
+    if laminate is not None:
+        _print_laminate(laminate)
+    print("solved as one plate" if laminate is not None else "plate")
+    print(
+        f"    {1e3 * summary['thickness_m']:.4g} mm of {summary['material']}: "
+        f"E {summary['E_pa'] / 1e9:.4g} GPa, rho {summary['rho_kg_m3']:.5g} kg/m³, "
+        f"nu {summary['nu']:.3g}, loss factor {summary['loss_factor']:g}"
+    )
+    print(f"    flexural rigidity  {summary['flexural_rigidity_n_m']:.4g} N m")
+    print(
+        f"    mass  {1e3 * summary['mass_kg']:.4g} g ({summary['surface_density_kg_m2']:.4g} kg/m²)"
+    )
+    for key, wavelength in summary["bending_wavelength_m"].items():
+        print(f"    bending wavelength at {_frequency(key)}  {100 * wavelength:.3g} cm")
+    for mass in summary["point_masses"]:
+        x, y = mass["at_m"]
+        print(f"    carries {1e3 * mass['mass_kg']:g} g at ({x:g}, {y:g}) m")
+
+
+def _print_laminate(laminate: dict[str, Any]) -> None:
+    print(f"laminate of {1e3 * laminate['thickness_m']:g} mm, bond {laminate['bond']}")
+    for layer in laminate["layers"]:
+        print(
+            f"    {1e3 * layer['thickness_m']:g} mm of {layer['material']}: "
+            f"E {layer['E_pa'] / 1e9:g} GPa, rho {layer['rho_kg_m3']:g} kg/m³, nu {layer['nu']:g}"
+        )
+    used = laminate["rigidity_n_m"]
+    rows = {
+        "perfectly bonded": laminate["rigidity_perfectly_bonded_n_m"],
+        "freely sliding": laminate["rigidity_freely_sliding_n_m"],
+    }
+    for key, rigidity in laminate.get("rigidity_by_frequency_n_m", {}).items():
+        rows[f"adhesive in shear at {_frequency(key)}"] = rigidity
+    print(f"    rigidity taken  {used:.4g} N m", end="")
+    at = laminate["bond_frequency_hz"]
+    print("" if at is None else f", adhesive in shear at {at:g} Hz")
+    for name, rigidity in rows.items():
+        ratio = math.sqrt(rigidity / used)
+        print(f"    {name}  {rigidity:.4g} N m: natural frequencies of bending x {ratio:.3f}")
+
+
+def _frequency(key: str) -> str:
+    return key.replace("_hz", " Hz")

@@ -1,0 +1,168 @@
+"""`era study`: which layout of ERAs, how many, how stiff."""
+
+import json
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from model.commands.plate_cli import JsonOption, MeshOption, RigArgument
+
+if TYPE_CHECKING:
+    from model.studies.workers import Workers
+
+study_app = typer.Typer()
+
+
+class Study(StrEnum):
+    """What is varied."""
+
+    PLACEMENT = "placement"
+    COUNT = "count"
+    STIFFNESS = "stiffness"
+
+
+class Driven(StrEnum):
+    """How many ERAs are active."""
+
+    ONE = "1"
+    TWO = "2"
+    ALL = "all"
+
+
+@study_app.command()
+def study(
+    what: Annotated[Study, typer.Argument(help="What is varied.", metavar="|".join(Study))],
+    rig_file: RigArgument,
+    output: Annotated[
+        Path, typer.Option("--output", "-o", metavar="DIR", help="Folder to write into.")
+    ],
+    layouts: Annotated[int, typer.Option(min=1, help="How many layouts.")] = 200,
+    active: Annotated[
+        Driven, typer.Option(help="Rank by the best single ERA, the best pair, or all ERAs.")
+    ] = Driven.TWO,
+    frequencies: Annotated[
+        str, typer.Option(metavar="LO:HI:STEP", help="Frequencies in Hz, both ends included.")
+    ] = "60:320:10",
+    candidates: Annotated[
+        str, typer.Option(metavar="NXxNY", help="Raster of places, edges included.")
+    ] = "13x13",
+    seed: Annotated[int, typer.Option(min=0, help="Of the random layouts.")] = 0,
+    workers: Annotated[int, typer.Option(min=1, max=256, help="Processes on this machine.")] = 1,
+    cluster: Annotated[
+        str | None, typer.Option(metavar="tcp://HOST:PORT", help="A Dask scheduler, instead.")
+    ] = None,
+    mesh: MeshOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Compare layouts of ERAs by how strongly the whole plate vibrates; go on where one stopped."""
+    from model.config.document import read_document
+    from model.config.points import parse_frequencies, parse_pair
+    from model.errors import InputError
+    from model.rig.file import load_rig
+    from model.studies.cache import ResultCache
+    from model.studies.kinds import STUDIES
+    from model.studies.outcome import ranking_summary, write_outcome
+    from model.studies.ranking import rank
+    from model.studies.run import run_study
+    from model.studies.solve import DRIVES, study_problem
+
+    rig = load_rig(rig_file, mesh=mesh)
+    if what is not Study.COUNT and active is Driven.TWO and len(rig.eras) < 2:
+        raise InputError(
+            f"{rig_file} has one ERA, so there is no pair to drive; rank by it with --active 1"
+        )
+    if cluster is not None and workers != 1:
+        raise InputError("--workers is for this machine, --cluster for others; give one of them")
+    started = time.perf_counter()
+    cases = STUDIES[what](
+        rig, layouts=layouts, seed=seed, raster=parse_pair(candidates, what="--candidates")
+    )
+    problem = study_problem(rig, cases, parse_frequencies(frequencies))
+    cache = ResultCache(output / "chunks", problem.digest)
+    output.mkdir(parents=True, exist_ok=True)
+    with _progress(len(cases)) as advance:
+        try:
+            run = run_study(
+                problem, cases, workers=_who(workers, cluster), cache=cache, progress=advance
+            )
+        except KeyboardInterrupt:
+            typer.echo(
+                f"era: interrupted; what is done is kept in {cache.folder}, and the same command "
+                "goes on from there",
+                err=True,
+            )
+            raise
+    ranking = rank(cases, run.results, drive=DRIVES.index(active))
+    data = read_document(rig_file).data
+    files = [str(path) for path in write_outcome(output, what, rig, data=data, ranking=ranking)]
+    elapsed = time.perf_counter() - started
+    summary = {
+        "study": what.value,
+        "cases": len(cases),
+        "solved": run.solved_count,
+        "from_cache": run.cached_count,
+        "frequencies_hz": problem.frequencies.tolist(),
+        "points": len(problem.points),
+        "mesh": str(rig.mesh),
+        **ranking_summary(rig, ranking),
+        "time_s": elapsed,
+        "files": files,
+    }
+    if as_json:
+        print(json.dumps(summary))
+        return
+    _show(summary)
+    print("wrote")
+    for name in files:
+        print(f"  {name}")
+    print(f"Next: era table build {files[0]} -o table.npz")
+
+
+def _show(summary: dict[str, Any]) -> None:
+    """The head of the ranking, the rig as it is, and what is recommended."""
+    from model.vibration.peak import G
+
+    print(
+        f"{summary['cases']} cases in {summary['time_s']:.1f} s ({summary['from_cache']} of them "
+        f"kept from before), mesh {summary['mesh']}, {len(summary['frequencies_hz'])} frequencies"
+    )
+    print(f"ranked by the median over the plate, {summary['driven']} driven")
+    print("rank  layout                        stiffness   lowest   median  highest    unfelt")
+    for case in summary["ranking"]:
+        lowest, median, highest = (
+            case[f"{name}_m_s2"] / G for name in ("minimum", "median", "maximum")
+        )
+        stiffness = max(case["stiffness_n_m"].values()) / 1000
+        print(
+            f"{case['rank']:4d}  {case['layout']:28s} {stiffness:6.4g} kN/m {lowest:6.1f} g "
+            f"{median:6.1f} g {highest:6.1f} g {100 * case['unfelt_share']:7.2f} %"
+        )
+    print(f"Recommended: {summary['recommended']['words']}")
+
+
+def _who(workers: int, cluster: str | None) -> "Workers":
+    """Who solves: this process, more of them, or a cluster."""
+    from model.studies.cluster import on_cluster
+    from model.studies.workers import in_process, on_processes
+
+    if cluster is not None:
+        return on_cluster(cluster)
+    return on_processes(workers) if workers > 1 else in_process
+
+
+@contextmanager
+def _progress(total: int) -> Iterator[Callable[[int], None]]:
+    """A progress bar on standard error where that is a terminal; yields what moves it on."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemainingColumn
+
+    console = Console(stderr=True)
+    columns = (BarColumn(), MofNCompleteColumn(), "layouts", TimeRemainingColumn())
+    with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
+        task = bar.add_task("", total=total)
+        yield lambda count: bar.advance(task, count)

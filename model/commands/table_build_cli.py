@@ -1,0 +1,108 @@
+"""`era table build`: from a rig to its table."""
+
+import json
+import time
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from model.commands.plate_cli import JsonOption, MeshOption, RigArgument
+
+
+def build(
+    rig_file: RigArgument,
+    output: Annotated[Path, typer.Option("--output", "-o", metavar="TABLE", help="File to write.")],
+    frequencies: Annotated[
+        str, typer.Option(metavar="LO:HI:STEP", help="Frequencies in Hz, both ends included.")
+    ] = "60:320:10",
+    mode: Annotated[
+        str, typer.Option(help="Drive mode to answer in: switched, graded, signed or phased.")
+    ] = "switched",
+    grid: Annotated[
+        str, typer.Option(metavar="NXxNY", help="Target cells along x and y.")
+    ] = "12x9",
+    mesh: MeshOption = None,
+    workers: Annotated[
+        int, typer.Option(min=1, max=256, help="Processes; for tables that take long.")
+    ] = 1,
+    as_json: JsonOption = False,
+) -> None:
+    """Solve the plate and write its table; go on where an interrupted build stopped."""
+    from model.commands.progress import progress_bar
+    from model.config.points import parse_frequencies, parse_pair
+    from model.drive_modes import MODES
+    from model.errors import InputError
+    from model.files.replacing import begins_with, check_replaceable
+    from model.finger.grid import Grid
+    from model.rig.file import load_rig
+    from model.table.build import build_in_parts
+    from model.table.file import ZIP, save_table
+    from model.table.kept_parts import KeptParts
+    from model.table.parts import TableProblem
+    from model.table.summary import pattern_count
+
+    if mode not in MODES:
+        raise InputError(f"unknown drive mode --mode {mode!r}; known: {', '.join(MODES)}")
+    if output.is_dir() or not output.absolute().parent.is_dir():
+        raise InputError(
+            f"--output {output}: give the name of a file in a folder that exists, e.g. table.npz"
+        )
+    check_replaceable(output, is_own=begins_with(output, ZIP), what="localization table")
+    rig = load_rig(rig_file, mesh=mesh)
+    started = time.perf_counter()
+    cells = Grid(*parse_pair(grid, what="--grid"))
+    problem = TableProblem(rig, parse_frequencies(frequencies), cells)
+    kept = KeptParts.beside(output, problem.digest)
+    with progress_bar("parts") as progress:
+        try:
+            built = build_in_parts(
+                problem, mode=mode, workers=workers, kept=kept, progress=progress
+            )
+        except KeyboardInterrupt:
+            done = (
+                f"what is done is kept in {kept.folder}, and the same command goes on from there"
+                if kept.folder.is_dir()
+                else "nothing was done yet"
+            )
+            typer.echo(f"era: interrupted; {done}", err=True)
+            raise
+    table = built.table
+    save_table(table, output)
+    kept.clear()
+    elapsed = time.perf_counter() - started
+    patterns = pattern_count(len(table.eras), len(table.frequencies))
+    error = 100 * float(table.discretisation_error.max())
+    if as_json:
+        print(
+            json.dumps(
+                {
+                    "patterns": patterns,
+                    "cells": table.grid.cell_count,
+                    "frequencies_hz": table.frequencies.tolist(),
+                    "mesh": [table.mesh.nx, table.mesh.ny],
+                    "element": table.mesh.element,
+                    "discretisation_error_percent": error,
+                    "mode": table.mode,
+                    "fingerprint": table.fingerprint,
+                    "code_version": table.code_version,
+                    "parts": built.part_count,
+                    "parts_reused": built.reused_count,
+                    "build_time_s": elapsed,
+                    "files": [str(output)],
+                }
+            )
+        )
+        return
+    if built.reused_count:
+        print(
+            f"reused {built.reused_count} of {built.part_count} parts that an interrupted build "
+            "had done"
+        )
+    print(
+        f"{patterns} patterns of {len(table.frequencies)} frequencies for {table.grid.cell_count} "
+        f"cells, built in {elapsed:.2f} s"
+    )
+    print(f"mesh {table.mesh}: fields within {error:.3g} % of a finer one ({table.reference_mesh})")
+    print(f"wrote {output} ({output.stat().st_size / 1e6:.1f} MB)")
+    print(f"Next: era table show {output}")

@@ -1,0 +1,94 @@
+"""`era table plot` and `era table export`: a table as pictures, and for other programs."""
+
+import json
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from model.commands.plate_cli import JsonOption
+from model.commands.table_cli import TableArgument
+
+
+class Format(StrEnum):
+    """What other programs read."""
+
+    MAT = "mat"
+    CSV = "csv"
+
+
+class Content(StrEnum):
+    """What the rows of a CSV file are."""
+
+    PATTERNS = "patterns"
+    FIELDS = "fields"
+
+
+def plot(
+    table_file: TableArgument,
+    output: Annotated[
+        Path, typer.Option("--output", "-o", metavar="DIR", help="Folder to write into.")
+    ],
+    as_json: JsonOption = False,
+) -> None:
+    """Draw weak cells, levels, distributions of contrast and an example answer."""
+    from model.commands.progress import progress_bar
+    from model.figures import save_figure
+    from model.figures.table_pictures import table_figures
+    from model.table.file import load_table
+
+    table = load_table(table_file)
+    output.mkdir(parents=True, exist_ok=True)
+    files = []
+    with progress_bar("cells and contact sets") as progress:
+        for name, figure in table_figures(table, progress=progress):
+            path = output / f"{name}.png"
+            save_figure(figure, path)
+            files.append(str(path))
+    if as_json:
+        print(json.dumps({"files": files}))
+        return
+    print("wrote")
+    for file in files:
+        print(f"  {file}")
+    print(f"Next: era table show {table_file} --weak")
+
+
+def export(
+    table_file: TableArgument,
+    to: Annotated[Format, typer.Option("--format", help="For MATLAB and Octave, or as text.")],
+    output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="File to write.")],
+    content: Annotated[
+        Content | None,
+        typer.Option(help="Rows of a CSV file: patterns at the cells, or fields on the raster."),
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Write a table for other programs; docs/table-file.md says what is in it."""
+    from model.errors import InputError
+    from model.files.replacing import check_replaceable
+    from model.table.export import export_csv, export_mat
+    from model.table.file import load_table
+
+    if content is not None and to is Format.MAT:
+        raise InputError("--content is for CSV files; a .mat file holds everything")
+    suffix = f".{to.value}"
+    check_replaceable(output, is_own=output.suffix == suffix, what=f"{suffix} file")
+    table = load_table(table_file)
+    if to is Format.MAT:
+        export_mat(table, output)
+    else:
+        export_csv(table, output, content=(content or Content.PATTERNS).value)
+    if as_json:
+        print(json.dumps({"files": [str(output)]}))
+        return
+    print(f"wrote {output} ({output.stat().st_size / 1e6:.1f} MB)")
+    print(f"Next: {_reader(to, output)}")
+
+
+def _reader(to: Format, output: Path) -> str:
+    """A line that opens the file."""
+    if to is Format.MAT:
+        return f"load('{output}') in MATLAB or Octave, scipy.io.loadmat in Python"
+    return f"open {output} in a spreadsheet, or pandas.read_csv('{output}')"

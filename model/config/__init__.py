@@ -1,0 +1,1 @@
+"""What people write: configuration files, values with units, positions and ranges."""

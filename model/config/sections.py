@@ -1,0 +1,188 @@
+"""The shape of a configuration file: sections as pydantic models, every error found at once."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from difflib import get_close_matches
+from functools import cache
+from types import UnionType
+from typing import Annotated, Any, TypeVar, Union, get_args, get_origin
+
+from pydantic import BaseModel, ConfigDict, GetCoreSchemaHandler, TypeAdapter, ValidationError
+from pydantic_core import CoreSchema, ErrorDetails, core_schema
+
+from model.config.document import ConfigError, Document, KeyPath, Problem, Value
+from model.config.units import Dimension, quantity
+
+
+class Section(BaseModel):
+    """A mapping in a configuration file: no unknown keys, nothing converted behind one's back."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
+
+
+SectionT = TypeVar("SectionT", bound=Section)
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """Annotates a float field that is written with a unit or in SI; bounds in SI.
+
+    above and below exclude the bound itself, least and most include it.
+    """
+
+    dimension: Dimension
+    above: float = -float("inf")
+    least: float = -float("inf")
+    most: float = float("inf")
+    below: float = float("inf")
+
+    def read(self, value: object) -> float:
+        """The value in SI units; raises InputError if it is none, or out of bounds."""
+        result = quantity(value, self.dimension)
+        if self.above < result < self.below and self.least <= result <= self.most:
+            return result
+        limits = [
+            f"{words} {limit:g} {self.dimension.unit}".strip()
+            for words, limit in (
+                ("above", self.above),
+                ("at least", self.least),
+                ("at most", self.most),
+                ("below", self.below),
+            )
+            if abs(limit) != float("inf")
+        ]
+        bare = f"; a bare number is in {self.dimension.unit}" if self.dimension.unit else ""
+        raise ValueError(f"{value} is out of range, must be {' and '.join(limits)}{bare}")
+
+    def __get_pydantic_core_schema__(
+        self, source: object, handler: GetCoreSchemaHandler
+    ) -> CoreSchema:
+        return core_schema.no_info_plain_validator_function(self.read)
+
+    def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: object) -> dict[str, Any]:
+        unit = self.dimension.unit or "no unit"
+        description = f"{self.dimension.name} [{unit}], for example {self.dimension.example}"
+        return {"type": ["number", "string"], "description": description}
+
+
+class Validation:
+    """Checks a document against its sections, and gathers what is wrong with it."""
+
+    def __init__(self, document: Document, root: type[Section]) -> None:
+        """Find every key that is unknown, missing, or has a value that its section refuses."""
+        self._document = document
+        self._problems: list[Problem] = []
+        try:
+            root.model_validate(document.data)
+        except ValidationError as error:
+            for details in error.errors(include_url=False):
+                self._problems.append(_problem(document, root, details))
+
+    def part(self, path: KeyPath, section: type[SectionT]) -> SectionT | None:
+        """A section if it is in order by itself, so that checks across sections need not wait."""
+        try:
+            return section.model_validate(self._document.value(path))
+        except (KeyError, ValidationError):
+            return None
+
+    def nested(
+        self, path: KeyPath, section: type[SectionT], *, without: str | None = None
+    ) -> SectionT | None:
+        """A section that its parent leaves open, but for one of its keys; problems are noted."""
+        value = self.mapping(path)
+        try:
+            return section.model_validate({k: v for k, v in value.items() if k != without})
+        except ValidationError as error:
+            for details in error.errors(include_url=False):
+                self._problems.append(_problem(self._document, section, details, below=path))
+            return None
+
+    def field(self, path: tuple[str, ...], section: type[Section]) -> Any:
+        """One field of a section if that is in order, whatever its neighbours are; else None."""
+        try:
+            return _field_reader(section, path[-1]).validate_python(self._document.value(path))
+        except (KeyError, ValidationError):
+            return None
+
+    def mapping(self, path: KeyPath) -> Mapping[str, Value]:
+        """A mapping as it stands in the file, unchecked; empty if there is none."""
+        try:
+            value = self._document.value(path)
+        except KeyError:
+            return {}
+        return value if isinstance(value, dict) else {}
+
+    def add(self, path: KeyPath, message: str) -> None:
+        """Note a problem at a key."""
+        self._problems.append(self._document.problem(path, message))
+
+    def finish(self) -> None:
+        """Raise ConfigError if anything is wrong."""
+        if self._problems:
+            raise ConfigError(self._document.source, self._problems)
+
+
+@cache
+def _field_reader(section: type[Section], name: str) -> TypeAdapter[Any]:
+    return TypeAdapter(
+        section.model_fields[name].rebuild_annotation(), config=ConfigDict(strict=True)
+    )
+
+
+def _problem(
+    document: Document, root: type[Section], details: ErrorDetails, *, below: KeyPath = ()
+) -> Problem:
+    """A pydantic error in our words, of a section that lies below a path."""
+    # pydantic marks an error in a mapping's key, not its value, by a last entry "[key]".
+    path = tuple(part for part in details["loc"] if part != "[key]")
+    context = details.get("ctx", {})
+    match details["type"]:
+        case "missing":
+            message = "is missing; add it"
+        case "extra_forbidden":
+            message = _unknown_key(str(path[-1]), _section_at(root, path[:-1]))
+        case "value_error":
+            message = str(context["error"])
+        case "model_type" | "dict_type":
+            message = f"must be a mapping, `key: value` each on a line, not {_shown(details)}"
+        case "list_type" | "tuple_type":
+            message = f"must be a list in brackets, not {_shown(details)}"
+        case "int_type" | "int_from_float":
+            message = f"must be a whole number, not {_shown(details)}"
+        case "string_type":
+            message = f"must be a text, not {_shown(details)}"
+        case "too_short" | "too_long":
+            bound = f"at least {context['min_length']}" if "min_length" in context else ""
+            bound = bound or f"at most {context['max_length']}"
+            message = f"has {context['actual_length']} entries, must have {bound}"
+        case _:
+            message = f"{_shown(details)} cannot be used: {details['msg']}"
+    return document.problem((*below, *path), message)
+
+
+def _shown(details: ErrorDetails) -> str:
+    text = "nothing" if details["input"] is None else repr(details["input"])
+    return text if len(text) <= 40 else f"{text[:40]}..."
+
+
+def _unknown_key(key: str, section: type[Section]) -> str:
+    known = list(section.model_fields)
+    close = get_close_matches(key.lower(), known, n=1, cutoff=0.6)
+    meant = f"did you mean {close[0]}? " if close else ""
+    return f"unknown key; {meant}known here are: {', '.join(known)}"
+
+
+def _section_at(root: type[Section], path: KeyPath) -> type[Section]:
+    """The section whose keys stand below a path."""
+    kind: Any = root
+    for part in path:
+        if get_origin(kind) in (dict, list):
+            kind = get_args(kind)[-1]
+        else:
+            kind = kind.model_fields[part].annotation
+        if get_origin(kind) in (Union, UnionType):  # of a field that may be left out
+            kind = get_args(kind)[0]
+        if get_origin(kind) is Annotated:
+            kind = get_args(kind)[0]
+    section: type[Section] = kind
+    return section

@@ -1,9 +1,0 @@
-"""Plate elements, a file each; a mesh names the one that it is made of."""
-
-from model.elements.element import DOF_PER_NODE, Element
-from model.elements.lagrange import Q3, Q4, Q5
-from model.elements.mitc4 import MITC4
-
-__all__ = ["DOF_PER_NODE", "ELEMENTS", "Element"]
-
-ELEMENTS = {element.name: element for element in (MITC4, Q3, Q4, Q5)}

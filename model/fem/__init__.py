@@ -1,0 +1,1 @@
+"""Finite elements: the plate on a mesh, its matrices, and direct answers from them."""

@@ -1,0 +1,97 @@
+"""From one element to the whole plate: sparse stiffness and mass, and what holds them."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import sparse
+
+from model.arrays import FloatArray, IntArray
+from model.errors import InputError
+from model.fem.elements import DOF_PER_NODE
+from model.fem.mesh import Mesh
+from model.structure.actuator import Era
+from model.structure.plate import Plate
+
+
+@dataclass(frozen=True)
+class PlateMatrices:
+    """Stiffness and mass of the free plate, CSC, (dof, dof), with the mesh that they belong to.
+
+    Degree of freedom 3 * node is the deflection, the next two are the rotations.
+    """
+
+    plate: Plate
+    mesh: Mesh
+    stiffness: sparse.csc_array
+    mass: sparse.csc_array
+
+    @property
+    def dof(self) -> int:
+        """Number of degrees of freedom."""
+        return DOF_PER_NODE * self.mesh.node_count
+
+    def deflection_at(self, points: FloatArray) -> sparse.csr_array:
+        """Maps the degrees of freedom to deflections at points [m] (n, 2): sparse (n, dof)."""
+        pick = sparse.csr_array(np.array([[1.0, 0.0, 0.0]]))
+        return sparse.csr_array(sparse.kron(self.mesh.interpolation(points), pick, format="csr"))
+
+
+@dataclass(frozen=True)
+class ElementMatrices:
+    """Stiffness and mass of every element of a mesh, as few as there are sizes of elements.
+
+    stiffness, mass: (sizes, n, n); size: which of them an element has, (elements,).
+    """
+
+    stiffness: FloatArray
+    mass: FloatArray
+    size: IntArray
+
+
+def element_matrices(plate: Plate, mesh: Mesh) -> ElementMatrices:
+    """One matrix for the elements of a plain mesh, four where it has strips along its edges.
+
+    Raises InputError for a mesh of another plate.
+    """
+    sides = ((plate.length, mesh.length), (plate.width, mesh.width))
+    if not all(math.isclose(*side) for side in sides):
+        raise InputError(
+            f"the mesh lies over {mesh.length:g} x {mesh.width:g} m, the plate is "
+            f"{plate.length:g} x {plate.width:g} m; make the mesh for this plate"
+        )
+    widths = [(size, mesh.strip) if mesh.strip else (size,) for size in mesh.element_size]
+    sizes = [(dx, dy) for dy in widths[1] for dx in widths[0]]
+    side_x, side_y = mesh.element_sides
+    return ElementMatrices(
+        stiffness=np.array([mesh.kind.stiffness(plate, dx, dy) for dx, dy in sizes]),
+        mass=np.array([mesh.kind.mass(plate, dx, dy) for dx, dy in sizes]),
+        size=(len(widths[0]) * side_y[:, None] + side_x).ravel(),
+    )
+
+
+def element_dofs(mesh: Mesh) -> IntArray:
+    """Degrees of freedom of each element, node by node, (elements, 3 (order + 1)²)."""
+    dofs = DOF_PER_NODE * mesh.connectivity[:, :, None] + np.arange(DOF_PER_NODE)
+    return np.asarray(dofs.reshape(len(mesh.connectivity), -1))
+
+
+def assemble(plate: Plate, mesh: Mesh) -> PlateMatrices:
+    """Assemble the free plate."""
+    elements = element_matrices(plate, mesh)
+    dofs = element_dofs(mesh)
+    size = DOF_PER_NODE * mesh.node_count
+
+    def whole(matrices: FloatArray) -> sparse.csc_array:
+        row, column = np.nonzero(matrices.any(axis=0))
+        values = matrices[:, row, column][elements.size]
+        places = (dofs[:, row].ravel(), dofs[:, column].ravel())
+        return sparse.csc_array(sparse.coo_array((values.ravel(), places), shape=(size, size)))
+
+    return PlateMatrices(plate, mesh, whole(elements.stiffness), whole(elements.mass))
+
+
+def era_positions(eras: Sequence[Era]) -> FloatArray:
+    """Positions of ERAs [m], (n, 2)."""
+    return np.array([[era.x, era.y] for era in eras], dtype=float).reshape(-1, 2)

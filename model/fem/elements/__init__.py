@@ -1,0 +1,9 @@
+"""Plate elements, a file each; a mesh names the one that it is made of."""
+
+from model.fem.elements.element import DOF_PER_NODE, Element
+from model.fem.elements.lagrange import Q3, Q4, Q5
+from model.fem.elements.mitc4 import MITC4
+
+__all__ = ["DOF_PER_NODE", "ELEMENTS", "Element"]
+
+ELEMENTS = {element.name: element for element in (MITC4, Q3, Q4, Q5)}

@@ -1,0 +1,215 @@
+"""A structured mesh of rectangles over the plate."""
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy import sparse
+
+from model.arrays import FloatArray, IntArray, lattice
+from model.errors import InputError
+from model.fem.elements import ELEMENTS, Element
+from model.structure.plate import Plate
+
+# What the automatic mesh is made of. The lowest twelve natural frequencies of the paper's plate are
+# then within 0.01 % of converged, and its accelerations (relative L2) within 0.1 % on ERAs at the
+# corners, 0.2 % on ERAs elsewhere and 0.6 % there at a resonance: a force at a point bends the
+# plate more sharply than an element does.
+AUTO_ELEMENT = "Q5"
+AUTO_ELEMENTS_PER_WAVELENGTH = 5.5
+AUTO_LEAST_ELEMENTS = 3
+AUTO_STRIP_THICKNESSES = 2.0  # the layer along a free edge is about as wide as the plate is thick
+
+# Fewer nodes to a wavelength than this and an answer is not worth having.
+LEAST_NODES_PER_WAVELENGTH = 6
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """nx by ny equal rectangles over length by width [m], and if wanted a strip along every edge.
+
+    element: a name in ELEMENTS. strip [m]: the width of one more row of elements along every edge,
+    for the layer at a free edge; the nx by ny elements then share what is left. The nodes form a
+    lattice: node j * columns + i lies at (node_x[i], node_y[j]).
+    """
+
+    nx: int
+    ny: int
+    length: float
+    width: float
+    element: str = "MITC4"
+    strip: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Refuse a mesh without elements, of unknown ones, or with strips that fill the plate."""
+        if self.nx < 1 or self.ny < 1:
+            raise InputError(f"mesh: {self.nx}x{self.ny} has no elements; at least 1x1 is needed")
+        if self.element not in ELEMENTS:
+            raise InputError(
+                f"mesh: unknown element {self.element!r}; known are: {', '.join(ELEMENTS)}"
+            )
+        if not 0 <= 2 * self.strip < min(self.length, self.width):
+            raise InputError(
+                f"mesh: strips of {self.strip:g} m along the edges leave nothing of a plate of "
+                f"{self.length:g} x {self.width:g} m; make them narrower, or 0 for none"
+            )
+
+    @classmethod
+    def auto(cls, plate: Plate, *, frequency_max: float) -> "Mesh":
+        """The cheapest mesh that is accurate for bending waves up to a frequency [Hz]."""
+        size = plate.bending_wavelength(frequency_max) / AUTO_ELEMENTS_PER_WAVELENGTH
+        nx, ny = (
+            max(AUTO_LEAST_ELEMENTS, math.ceil(side / size)) for side in (plate.length, plate.width)
+        )
+        # A plate so thick that the layer is no smaller than an element needs no strip for it.
+        strip = AUTO_STRIP_THICKNESSES * plate.thickness
+        if strip > min(plate.length / nx, plate.width / ny) / 2:
+            strip = 0.0
+        return cls(nx, ny, plate.length, plate.width, AUTO_ELEMENT, strip)
+
+    @classmethod
+    def coarsest(cls, plate: Plate, *, frequency: float) -> "Mesh":
+        """The coarsest mesh of the paper's element that carries a frequency [Hz]."""
+        size = plate.bending_wavelength(frequency) / LEAST_NODES_PER_WAVELENGTH
+        # Rounding shall not put a mesh that fits exactly just beyond what it carries.
+        size *= 1 - 1e-9
+        nx, ny = (math.ceil(side / size) for side in (plate.length, plate.width))
+        return cls(nx, ny, plate.length, plate.width)
+
+    def __str__(self) -> str:
+        text = f"{self.nx}x{self.ny}"
+        if self.kind.order > 1:
+            text += f" {self.element}"
+        if self.strip:
+            text += f" with strips of {1000 * self.strip:.3g} mm"
+        return text
+
+    @property
+    def kind(self) -> Element:
+        """The element that the mesh is made of."""
+        return ELEMENTS[self.element]
+
+    @property
+    def element_size(self) -> tuple[float, float]:
+        """Side lengths (dx, dy) of the nx by ny elements, the largest ones [m]."""
+        return (self.length - 2 * self.strip) / self.nx, (self.width - 2 * self.strip) / self.ny
+
+    @property
+    def element_counts(self) -> tuple[int, int]:
+        """How many elements lie along x and y, strips included."""
+        strips = 2 if self.strip else 0
+        return self.nx + strips, self.ny + strips
+
+    @cached_property
+    def element_sides(self) -> tuple[IntArray, IntArray]:
+        """Which elements along x and y are as wide as a strip (1) and which are not (0)."""
+        sides = tuple(np.zeros(count, dtype=int) for count in self.element_counts)
+        if self.strip:
+            for side in sides:
+                side[[0, -1]] = 1
+        return sides[0], sides[1]
+
+    @property
+    def columns(self) -> int:
+        """Number of nodes along x."""
+        return self.kind.order * self.element_counts[0] + 1
+
+    @property
+    def rows(self) -> int:
+        """Number of nodes along y."""
+        return self.kind.order * self.element_counts[1] + 1
+
+    @property
+    def node_count(self) -> int:
+        """Number of nodes."""
+        return self.columns * self.rows
+
+    @cached_property
+    def lines(self) -> tuple[FloatArray, FloatArray]:
+        """Where elements meet along x and along y [m], the plate's edges included."""
+        lines = []
+        for length, count in ((self.length, self.nx), (self.width, self.ny)):
+            inner = np.linspace(self.strip, length - self.strip, count + 1)
+            lines.append(np.concatenate([[0.0], inner, [length]]) if self.strip else inner)
+        return lines[0], lines[1]
+
+    @cached_property
+    def node_x(self) -> FloatArray:
+        """Positions of the columns of nodes [m]."""
+        return self._along(self.lines[0])
+
+    @cached_property
+    def node_y(self) -> FloatArray:
+        """Positions of the rows of nodes [m]."""
+        return self._along(self.lines[1])
+
+    def _along(self, lines: FloatArray) -> FloatArray:
+        share = (1 + np.array(self.kind.side[:-1])) / 2
+        inner = lines[:-1, None] + share * np.diff(lines)[:, None]
+        return np.append(inner.ravel(), lines[-1])
+
+    @cached_property
+    def nodes(self) -> FloatArray:
+        """Positions of the nodes [m], (node_count, 2)."""
+        return lattice(self.node_x, self.node_y)
+
+    @cached_property
+    def connectivity(self) -> IntArray:
+        """Nodes of each element, row by row from its lower left, (elements, (order + 1)²).
+
+        Elements are numbered row by row as well, x running first.
+        """
+        order = self.kind.order
+        along_x, along_y = (order * np.arange(count) for count in self.element_counts)
+        corner = (along_y[:, None] * self.columns + along_x).ravel()
+        step = np.arange(order + 1)
+        return np.asarray(corner[:, None] + (step[:, None] * self.columns + step).ravel())
+
+    @property
+    def raster(self) -> tuple[int, int]:
+        """How many evenly spaced points along x and y show what the mesh can carry.
+
+        The nodes themselves where elements are of the first order and without strips.
+        """
+        per_element = 1 if self.kind.order == 1 else 2 * self.kind.order
+        return per_element * self.nx + 1, per_element * self.ny + 1
+
+    @property
+    def shortest_wavelength(self) -> float:
+        """The shortest bending wave [m] that it can carry: six elements of the first order."""
+        return LEAST_NODES_PER_WAVELENGTH * max(self.element_size) / self.kind.order
+
+    def highest_frequency(self, plate: Plate) -> float:
+        """The highest frequency [Hz] whose bending waves in a plate it can carry."""
+        return plate.bending_frequency(self.shortest_wavelength)
+
+    def interpolation(self, points: FloatArray) -> sparse.csr_array:
+        """Shape functions at points [m] (n, 2): sparse (n, node_count), rows sum to 1.
+
+        These are the element's own shape functions for the deflection, so nothing is lost.
+        Points must lie on the plate; raises InputError for one that does not.
+        """
+        points = np.atleast_2d(np.asarray(points, dtype=float))
+        tolerance = 1e-9 * max(self.length, self.width)
+        upper = np.array([self.length, self.width])
+        off = ~((points >= -tolerance) & (points <= upper + tolerance)).all(axis=1)
+        if off.any():
+            x, y = points[np.argmax(off)]
+            raise InputError(
+                f"point ({x:g}, {y:g}) m is not on the plate, which reaches from (0, 0) to "
+                f"({self.length:g}, {self.width:g}) m"
+            )
+        cell_x, weight_x = self._locate(points[:, 0], self.lines[0])
+        cell_y, weight_y = self._locate(points[:, 1], self.lines[1])
+        weights = weight_y[:, :, None] * weight_x[:, None, :]
+        columns = self.connectivity[cell_y * self.element_counts[0] + cell_x]
+        rows = np.repeat(np.arange(len(points)), columns.shape[1])
+        shape = (len(points), self.node_count)
+        return sparse.csr_array((weights.ravel(), (rows, columns.ravel())), shape=shape)
+
+    def _locate(self, position: FloatArray, lines: FloatArray) -> tuple[IntArray, FloatArray]:
+        """In which element along one direction each position [m] lies, and its shape functions."""
+        cell = np.clip(np.searchsorted(lines, position, side="right") - 1, 0, len(lines) - 2)
+        start, end = lines[cell], lines[cell + 1]
+        return cell, self.kind.shape((2 * position - start - end) / (end - start))

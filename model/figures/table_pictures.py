@@ -1,0 +1,200 @@
+"""A table in pictures: where on the plate it is weak, what level it has, how much contrast."""
+
+from collections.abc import Callable, Iterator, Sequence
+from itertools import zip_longest
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.figure import Figure
+from matplotlib.patches import Circle, Rectangle
+from numpy.typing import NDArray
+
+from model.arrays import FloatArray, lattice
+from model.errors import InputError
+from model.figures.drawing import COLORS, draw_eras, raster
+from model.finger.fingertip import FINGERTIP_RADIUS
+from model.finger.grid import Grid
+from model.finger.perception import FELT_DB_SL, sensation_level
+from model.table.pattern import Pattern
+from model.table.question import Point, Question
+from model.table.summary import CONTACT_SETS, contrast_distribution
+from model.table.table import LocalizationTable
+from model.table.weak_cells import WANTED_CONTRAST_DB, WeakCells, find_weak_cells, map_grid
+
+TARGET_COLOR, QUIET_COLOR = "#2ca02c", "#1f77b4"
+
+# Where the fingers of the example are, in shares of the plate.
+_EXAMPLE = ((0.3, 0.35), (0.8, 0.6), (0.45, 0.85))
+
+
+def table_figures(
+    table: LocalizationTable, *, progress: Callable[[int, int], None] = lambda done, of: None
+) -> Iterator[tuple[str, Figure]]:
+    """Every picture with its name; progress: called with how many questions are done, of how many.
+
+    Cells count as one each, though each takes up to 48 questions.
+    """
+    cells = map_grid(table).cell_count
+    total = cells + 3 * CONTACT_SETS
+    weak = find_weak_cells(table, progress=lambda done, _: progress(done, total))
+    yield "weak_cells", weak_cells_figure(table, weak)
+    yield "levels", levels_figure(table)
+    yield (
+        "contrast",
+        contrast_figure(table, progress=lambda done, _: progress(cells + done, total)),
+    )
+    yield "answer", answer_figure(table)
+
+
+def weak_cells_figure(table: LocalizationTable, weak: WeakCells) -> Figure:
+    """Contrast from each cell to the median other finger and to one in ten, on one scale."""
+    figure = Figure(figsize=(11, 4.6), layout="compressed")
+    panels = (
+        ("median other finger", weak.median_db, ~weak.feasible),
+        ("one other finger in ten (tenth percentile)", weak.tenth_db, weak.weak),
+    )
+    known = np.concatenate([values[np.isfinite(values)] for _, values, _ in panels])
+    limits = (float(known.min()), float(known.max())) if len(known) else (0.0, 1.0)
+    grid = figure.subplots(1, 2, sharey=True)
+    for axes, (title, values, below) in zip(grid, panels, strict=True):
+        image = _draw_cells(axes, table, weak.grid, values, limits=limits)
+        _cross_out(axes, table, weak.grid, below)
+        axes.set_title(title)
+        axes.label_outer()
+    figure.colorbar(image, ax=grid, label="contrast / dB")
+    figure.suptitle(
+        f"Mode {table.mode}: contrast from each cell to one other finger\n"
+        f"(crosses: below {WANTED_CONTRAST_DB:g} dB; dots: ERAs)"
+    )
+    return figure
+
+
+def levels_figure(table: LocalizationTable) -> Figure:
+    """The highest level that any pattern of one or two ERAs reaches at each cell."""
+    figure = Figure(figsize=(7, 5), layout="compressed")
+    axes = figure.subplots()
+    levels = table.available_level_db_sl
+    limits = (float(levels.min()), float(levels.max()))
+    image = _draw_cells(axes, table, table.grid, levels, limits=limits)
+    _cross_out(axes, table, table.grid, levels < FELT_DB_SL)
+    figure.colorbar(image, ax=axes, label="level / dB SL")
+    axes.set_title(
+        f"Highest level of one or two ERAs at full stroke\n(crosses: dead, below {FELT_DB_SL:g} "
+        "dB SL)"
+    )
+    return figure
+
+
+def contrast_figure(
+    table: LocalizationTable, *, progress: Callable[[int, int], None] = lambda done, of: None
+) -> Figure:
+    """Which share of random contact sets has at least a contrast, for 1, 2 and 3 other fingers."""
+    figure = Figure(figsize=(7, 4.5), layout="constrained")
+    axes = figure.subplots()
+    rng = np.random.default_rng(0)
+    for others in (1, 2, 3):
+        found = contrast_distribution(table, others=others, rng=rng, progress=progress)
+        contrasts = np.sort(found)
+        share = 1 - np.arange(len(contrasts)) / max(1, len(contrasts))
+        label = f"{others} other{'s' if others > 1 else ''}"
+        if len(contrasts):
+            label += f": median {np.median(contrasts):.1f} dB"
+        axes.step(contrasts, 100 * share, where="pre", label=label)
+    axes.axvline(WANTED_CONTRAST_DB, color="0.5", ls=":", lw=1)
+    axes.set_xlim(left=0)
+    axes.set_ylim(0, 100)
+    axes.set_xlabel("contrast / dB")
+    axes.set_ylabel("contact sets with at least this contrast / %")
+    axes.grid(color="0.9")
+    figure.legend(loc="outside lower center", ncols=3, fontsize=9, frameon=False)
+    axes.set_title(f"Mode {table.mode}: random contact sets at least 5 cm apart")
+    return figure
+
+
+def answer_figure(table: LocalizationTable) -> Figure:
+    """An answer of the table: how strongly each place would be felt, with the fingers on it."""
+    plate = table.plate
+    target, *quiet = ((u * plate.length, v * plate.width) for u, v in _EXAMPLE)
+    question = Question((target,), tuple(quiet))
+    figure = Figure(figsize=(8, 6), layout="compressed")
+    axes = figure.subplots()
+    try:
+        pattern = table.ask(question)
+    except InputError:  # too weak a rig, or too small a plate for three fingers
+        axes.set_title("The table has no answer to the three fingers of this picture")
+        axes.axis("off")
+        return figure
+    columns, rows = raster(plate)
+    x, y = np.linspace(0, plate.length, columns), np.linspace(0, plate.width, rows)
+    points = lattice(x, y)
+    levels = sensation_level(*table.amplitudes(pattern.excitation, points))
+    image = axes.pcolormesh(
+        100 * x,
+        100 * y,
+        levels.reshape(rows, columns),
+        cmap=COLORS,
+        shading="gouraud",
+        vmin=-10,
+        vmax=max(20.0, float(levels.max())),
+    )
+    _label(axes)
+    draw_eras(axes, table.eras, active=pattern.excitation.keys())
+    _draw_fingers(axes, [target], TARGET_COLOR)
+    _draw_fingers(axes, quiet, QUIET_COLOR)
+    figure.colorbar(image, ax=axes, label="level / dB SL")
+    axes.set_title(
+        f"Green: the finger to feel it, {pattern.level_db_sl:.0f} dB SL; blue: the others, "
+        f"{pattern.quiet_level_db_sl:.0f} dB SL at most; contrast {pattern.contrast_db:.1f} dB\n"
+        f"{_in_words(table, pattern)}",
+        fontsize=10,
+    )
+    return figure
+
+
+def _in_words(table: LocalizationTable, pattern: Pattern) -> str:
+    """Two tones to a line, at most twelve."""
+    tones = [
+        f"{name} {tone['frequency_hz']:g} Hz, level {tone['level']:.3f} at {tone['phase_deg']:.0f}°"
+        for name, tone in table.drive_of(pattern.excitation).items()
+    ]
+    lines = ["; ".join(pair) for pair in zip_longest(tones[0:12:2], tones[1:12:2], fillvalue="")]
+    return "\n".join(line.removesuffix("; ") for line in lines)
+
+
+def _draw_cells(
+    axes: Axes,
+    table: LocalizationTable,
+    grid: Grid,
+    values: FloatArray,
+    *,
+    limits: tuple[float, float],
+) -> ScalarMappable:
+    """Cells in their colours with ERAs over them; what has no value stays white."""
+    x = np.linspace(0, 100 * table.plate.length, grid.nx + 1)
+    y = np.linspace(0, 100 * table.plate.width, grid.ny + 1)
+    shown = np.ma.masked_invalid(values.reshape(grid.ny, grid.nx))
+    image = axes.pcolormesh(x, y, shown, cmap=COLORS, vmin=limits[0], vmax=limits[1])
+    axes.add_patch(Rectangle((0, 0), x[-1], y[-1], fill=False, ec="0.4", clip_on=False))
+    draw_eras(axes, table.eras, active=[era.name for era in table.eras])
+    _label(axes)
+    return image
+
+
+def _cross_out(axes: Axes, table: LocalizationTable, grid: Grid, cells: NDArray[np.bool_]) -> None:
+    """A cross on each of some cells."""
+    marked = 100 * grid.centres(table.plate)[cells]
+    axes.plot(*marked.T, "x", color="white", ms=6, mew=1.5)
+
+
+def _draw_fingers(axes: Axes, places: Sequence[Point], color: str) -> None:
+    for x, y in places:
+        radius = 100 * FINGERTIP_RADIUS
+        axes.add_patch(Circle((100 * x, 100 * y), radius, fill=False, ec="white", lw=4))
+        axes.add_patch(Circle((100 * x, 100 * y), radius, fill=False, ec=color, lw=2.5))
+
+
+def _label(axes: Axes) -> None:
+    axes.set_aspect("equal")
+    axes.set_xlabel("x / cm")
+    axes.set_ylabel("y / cm")

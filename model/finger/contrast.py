@@ -1,0 +1,32 @@
+"""How localized a pattern is: contrast between regions of the plate, and level at the target."""
+
+import numpy as np
+
+from model.arrays import FloatArray
+from model.finger.perception import sensation_level
+
+# A lone finger is told from the rest of the plate beyond this distance [m] (about two fingertips).
+SURROUNDINGS_RADIUS = 0.05
+
+
+def contrast_db(target: FloatArray, quiet: FloatArray) -> FloatArray:
+    """Contrast [dB] of peak accelerations: mean over the target's points to the quiet maximum.
+
+    target (..., p), quiet (..., q) -> (...).
+    """
+    return decibels(target.mean(axis=-1) / quiet.max(axis=-1))
+
+
+def decibels(ratio: FloatArray) -> FloatArray:
+    """20 log10 of an amplitude ratio; -inf for zero."""
+    with np.errstate(divide="ignore"):
+        return np.asarray(20 * np.log10(ratio))
+
+
+def mean_level_db_sl(frequencies: FloatArray, amplitudes: FloatArray) -> float:
+    """Level [dB SL] over a region: mean over its points of how far above threshold each is felt.
+
+    frequencies (f,) [Hz], amplitudes (f, p) [m/s²].
+    """
+    above = 10 ** (sensation_level(frequencies, amplitudes) / 20)
+    return float(decibels(above.mean()))

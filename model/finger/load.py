@@ -1,0 +1,59 @@
+"""What a resting fingertip does to the plate: a mass, a spring and a damper at its centre.
+
+1 kN/m, 2 N s/m and 0.2 g for a finger that presses lightly. What is measured has this order and
+spreads widely from finger to finger: for sideways motion 1 kN/m, 1 N s/m and 0.1 g are in use (DOI
+10.1186/s40648-017-0080-8, table 1), and from 50 to 500 Hz one mass, spring and damper is a coarse
+picture of a finger that presses with less than half a newton (World Haptics 2005, page 657).
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from model.config.units import DAMPING, MASS, STIFFNESS, quantity
+from model.errors import InputError
+from model.structure.point_load import PointLoad
+
+
+@dataclass(frozen=True)
+class FingerLoad:
+    """A finger's stiffness [N/m], damping [N s/m] and mass [kg]; by default it presses lightly."""
+
+    stiffness: float = 1000.0
+    damping: float = 2.0
+    mass: float = 0.0002
+
+    def __post_init__(self) -> None:
+        """Refuse what no finger has."""
+        self.at(0.0, 0.0)
+
+    def at(self, x: float, y: float) -> PointLoad:
+        """The finger at x, y [m]."""
+        return PointLoad(x, y, self.stiffness, self.damping, self.mass)
+
+
+def finger_loads(contacts: Iterable[tuple[float, float]]) -> tuple[PointLoad, ...]:
+    """What fingers at contacts [m] do to the plate."""
+    return tuple(FingerLoad().at(x, y) for x, y in contacts)
+
+
+def parse_finger_load(text: str, *, what: str) -> FingerLoad:
+    """What a finger does from `light` or its stiffness, damping and mass, `1 kN/m,2 N s/m,0.2 g`.
+
+    Bare numbers are N/m, N s/m and kg; what names the option in the error.
+    """
+    if text.strip() == "light":
+        return FingerLoad()
+    parts = text.split(",")
+    if len(parts) != 3:
+        raise InputError(
+            f"{what} {text!r}: write light, or stiffness, damping and mass of a finger, as in "
+            f"{what} '1 kN/m,2 N s/m,0.2 g'"
+        )
+    try:
+        numbers = [
+            quantity(part, dimension)
+            for part, dimension in zip(parts, (STIFFNESS, DAMPING, MASS), strict=True)
+        ]
+        return FingerLoad(*numbers)
+    except InputError as error:
+        raise InputError(f"{what} {text!r}: {error}") from None

@@ -1,0 +1,154 @@
+"""What the modes that were left out add where forces act on the free plate.
+
+Solved with each symmetry class's factors when a point is first asked for, and kept.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import sparse
+
+from model.arrays import FloatArray
+from model.fem.mesh import Mesh
+from model.reduction.class_modes import ClassModes
+
+# Solves for each point. A field then converges with their number, a receptance between attachments
+# with twice that, since it can be had from inner products of what was solved.
+TERMS = 4
+
+# Memory for solved points [bytes]; beyond it the oldest are forgotten.
+KEPT_BYTES = 512 << 20
+KEPT_RASTERS = 4  # and sets of points that answers were asked for
+
+
+@dataclass(frozen=True, eq=False)
+class Attachments:
+    """Points where forces act on a free plate, with what has been solved for them.
+
+    shapes: (n, r) of the modes; residuals: by symmetry class, (n, TERMS, size); moments: (2 TERMS,
+    n, n) receptances of all truncated modes together with their u / u_c to the power 1, 2, ...
+    """
+
+    shapes: FloatArray
+    residuals: tuple[FloatArray, ...]
+    moments: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Solved:
+    """One point in one class: its force (size,), and sums of phi (u / u_c)^j, (TERMS, size).
+
+    momenta: the same sums times the mass.
+    """
+
+    force: FloatArray
+    residual: FloatArray
+    momenta: FloatArray
+
+
+class AttachmentSolver:
+    """Solves for points of one plate, and remembers.
+
+    scale: u_c, 1 / (lambda + shift) of the lowest mode left out [s²/rad²].
+    """
+
+    def __init__(self, mesh: Mesh, classes: Sequence[ClassModes], *, scale: float) -> None:
+        self._mesh = mesh
+        self._classes = tuple(classes)
+        self._scale = scale
+        self._solved: dict[tuple[float, float], tuple[_Solved, ...]] = {}
+        self._observed: dict[bytes, tuple[FloatArray, tuple[sparse.csr_array, ...]]] = {}
+
+    def solve(self, points: FloatArray) -> Attachments:
+        """Solve for forces at points [m] (n, 2), as far as they have not been solved for."""
+        known = self._known(points)
+        shapes = [
+            np.array([each[number].force for each in known]).reshape(len(known), -1) @ part.vectors
+            for number, part in enumerate(self._classes)
+        ]
+        residuals = tuple(
+            np.array([each[number].residual for each in known]).reshape(
+                len(known), TERMS, part.symmetry.size
+            )
+            for number, part in enumerate(self._classes)
+        )
+        moments = self._between(known, known)
+        self._forget()
+        return Attachments(np.hstack(shapes), residuals, moments)
+
+    def moments(self, points: FloatArray, others: FloatArray) -> FloatArray:
+        """As the moments of attachments at points (n, 2), with others (m, 2): (2 TERMS, n, m)."""
+        return self._between(self._known(points), self._known(others))
+
+    def _known(self, points: FloatArray) -> "list[tuple[_Solved, ...]]":
+        """What is solved for points [m] (n, 2), by point and class."""
+        keys = [(float(x), float(y)) for x, y in np.asarray(points, dtype=float).reshape(-1, 2)]
+        unknown = [key for key in dict.fromkeys(keys) if key not in self._solved]
+        if unknown:
+            self._solve_for(unknown)
+        return [self._solved[key] for key in keys]
+
+    def _between(
+        self, points: "list[tuple[_Solved, ...]]", others: "list[tuple[_Solved, ...]]"
+    ) -> FloatArray:
+        rows, columns = len(points), len(others)
+        moments = np.zeros((2 * TERMS, rows, columns))
+        for number, part in enumerate(self._classes):
+            size = part.symmetry.size
+            force = np.array([each[number].force for each in points]).reshape(rows, size)
+            residual = np.array([each[number].residual for each in points]).reshape(-1, size)
+            momenta = np.array([each[number].momenta for each in others]).reshape(-1, size)
+            first = np.array([each[number].residual[0] for each in others]).reshape(columns, size)
+            moments[0] += force @ first.T
+            inner = (residual @ momenta.T).reshape(rows, TERMS, columns, TERMS)
+            for power in range(2, 2 * TERMS + 1):
+                moments[power - 1] += inner[:, power // 2 - 1, :, (power + 1) // 2 - 1]
+        return moments
+
+    def basis(self, attached: Attachments, points: FloatArray) -> FloatArray:
+        """Deflection at points by modes and by residual vectors, (p, r + TERMS n).
+
+        Residual vectors come term by term, each for all attachments.
+        """
+        shapes, maps = self._observe(np.asarray(points, dtype=float))
+        extra = np.zeros((len(shapes), TERMS * len(attached.shapes)))
+        for each, residual in zip(maps, attached.residuals, strict=True):
+            extra += each @ residual.transpose(2, 1, 0).reshape(residual.shape[2], -1)
+        return np.hstack([shapes, extra])
+
+    def _observe(self, points: FloatArray) -> tuple[FloatArray, tuple[sparse.csr_array, ...]]:
+        """Mode shapes at points (p, r), and by class the map to deflections there; kept a while."""
+        key = points.tobytes()
+        if key not in self._observed:
+            interpolation = self._mesh.interpolation(points)
+            maps = tuple(
+                sparse.csr_array(interpolation @ part.symmetry.spread) for part in self._classes
+            )
+            pairs = zip(maps, self._classes, strict=True)
+            shapes = np.hstack([each @ part.vectors for each, part in pairs])
+            if len(self._observed) >= KEPT_RASTERS:
+                self._observed.clear()
+            self._observed[key] = shapes, maps
+        return self._observed[key]
+
+    def _solve_for(self, points: list[tuple[float, float]]) -> None:
+        interpolation = self._mesh.interpolation(np.array(points))
+        forces = [(interpolation @ part.symmetry.spread).toarray() for part in self._classes]
+        solved = [
+            part.residuals(force, terms=TERMS, scale=self._scale)
+            for part, force in zip(self._classes, forces, strict=True)
+        ]
+        for number, point in enumerate(points):
+            self._solved[point] = tuple(
+                _Solved(
+                    force[number].copy(), residual[0, number].copy(), residual[1, number].copy()
+                )
+                for force, residual in zip(forces, solved, strict=True)
+            )
+
+    def _forget(self) -> None:
+        """Drop the oldest solved points where they take too much memory."""
+        size = 8 * (2 * TERMS + 1) * sum(part.symmetry.size for part in self._classes)
+        while len(self._solved) * size > KEPT_BYTES:
+            del self._solved[next(iter(self._solved))]

@@ -1,0 +1,102 @@
+"""The modes of one symmetry class of the free plate, with the factors that they were found by."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy import linalg, sparse
+from scipy.sparse.linalg import LinearOperator, eigsh
+
+from model.arrays import FloatArray
+from model.fem.assembly import ElementMatrices
+from model.fem.factorisation import Factor, factorise_definite
+from model.fem.symmetry import SymmetryClass
+
+
+@dataclass(frozen=True, eq=False)
+class ClassModes:
+    """One symmetry class: its factors, and its modes up to the cut-off.
+
+    factor: of stiffness + shift * mass; mass (n, n); squared (r,) [rad²/s²], vectors (n, r) of unit
+    modal mass; next_squared: of the lowest mode left out.
+    """
+
+    symmetry: SymmetryClass
+    factor: Factor
+    mass: sparse.csr_array
+    squared: FloatArray
+    vectors: FloatArray
+    next_squared: float
+
+    @cached_property
+    def _momenta(self) -> FloatArray:
+        """Mass times the modes, (n, r)."""
+        return np.asarray(self.mass @ self.vectors)
+
+    def residuals(self, forces: FloatArray, *, terms: int, scale: float) -> FloatArray:
+        """What the truncated modes make of forces (m, n): (2, m, terms, n), second: times the mass.
+
+        The j-th term is their sum of phi (phi . force) (u / scale)^j, u = 1 / (lambda + shift), j
+        from 1 on.
+        """
+        result = np.empty((2, len(forces), terms, forces.shape[1]))
+        force = forces.T
+        for term in range(terms):
+            deflection = self.factor.solve(force) / scale
+            # The kept modes' share is taken out; once leaves rounding behind, twice is enough.
+            for _ in range(2):
+                deflection -= self.vectors @ (self._momenta.T @ deflection)
+            force = self.mass @ deflection
+            result[0, :, term], result[1, :, term] = deflection.T, force.T
+        return result
+
+
+def solve_class(
+    symmetry: SymmetryClass, elements: ElementMatrices, *, shift: float, cut: float, count: int
+) -> ClassModes:
+    """All modes of a class below the cut [rad²/s²].
+
+    count: how many to look for at first; more where they do not reach the cut.
+    """
+    shifted, unsummed = symmetry.assemble(elements, shift)
+    factor, mass = factorise_definite(shifted), sparse.csr_array(unsummed)
+    while True:
+        squared, vectors = _lowest(factor, mass, count, shift=shift)
+        if squared[-1] >= cut or len(squared) == symmetry.size:
+            break
+        count += count // 3 + 1
+    kept = int(np.searchsorted(squared, cut))
+    squared[np.abs(squared) < 1e-6 * shift] = 0.0
+    return ClassModes(
+        symmetry,
+        factor,
+        mass,
+        squared[:kept],
+        vectors[:, :kept],
+        float(squared[min(kept, len(squared) - 1)]),
+    )
+
+
+def _lowest(
+    factor: Factor, mass: sparse.csr_array, count: int, *, shift: float
+) -> tuple[FloatArray, FloatArray]:
+    """The lowest eigenpairs; all of them where that is no more work."""
+    size = mass.shape[0]
+    if count >= size / 2:
+        inverse = factor.solve(np.eye(size))
+        # u phi = (K + shift M)^-1 M phi, made symmetric with the mass's own root.
+        root = linalg.cholesky(mass.toarray(), lower=True)
+        u, vectors = linalg.eigh(root.T @ inverse @ root)
+        vectors = linalg.solve_triangular(root.T, vectors)
+    else:
+        squared, vectors = eigsh(
+            mass,  # only its shape is used
+            count,
+            M=mass,
+            sigma=-shift,
+            OPinv=LinearOperator(mass.shape, matvec=factor.solve, dtype=float),
+            v0=np.random.default_rng(0).standard_normal(size),  # ARPACK's own start is random
+        )
+        u = 1 / (squared + shift)
+    order = np.argsort(-u)
+    return 1 / u[order] - shift, vectors[:, order]

@@ -1,0 +1,58 @@
+"""What is wrong with how a rig reaches its amplifiers, as those say who know wires.
+
+Nothing here knows any: a check is an entry point of the group `era_haptics.rig_checks`, a callable
+as `RigCheck`.
+"""
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from importlib.metadata import entry_points
+from typing import Protocol
+from urllib.parse import quote
+
+from model.config.document import Document, Problem
+from model.rig.rig import Rig
+from model.rig.sections import LimitsSection
+
+GROUP = "era_haptics.rig_checks"
+
+
+class RigCheck(Protocol):
+    """Looks at URLs and opens nothing."""
+
+    def __call__(
+        self, urls: Mapping[str, str], *, channels: Mapping[str, int], frequency_max: float
+    ) -> tuple[Mapping[str, str], Sequence[str]]:
+        """What is wrong, by the amplifier's name, and what to be warned of.
+
+        channels: how many of each are wired; frequency_max [Hz]: up to which ERAs are driven.
+        """
+
+
+def check_amplifiers(document: Document, rig: Rig | None) -> tuple[list[Problem], list[str]]:
+    """Problems and warnings; rig: what the document became, if it did."""
+    urls = _urls(document)
+    wired = Counter(channel.amplifier for channel in rig.wiring.values()) if rig else Counter()
+    highest = rig.limits.frequency_max if rig else LimitsSection().frequency[1]
+    problems: list[Problem] = []
+    warnings: list[str] = []
+    for point in entry_points(group=GROUP):
+        check: RigCheck = point.load()
+        wrong, told = check(urls, channels=wired, frequency_max=highest)
+        problems += [
+            document.problem(("amplifiers", name, "url"), what) for name, what in wrong.items()
+        ]
+        warnings += told
+    return problems, warnings
+
+
+def _urls(document: Document) -> dict[str, str]:
+    """Every URL that is a text; `sim://` is an amplifier over this rig itself."""
+    amplifiers = document.data.get("amplifiers")
+    urls = {}
+    for name, amplifier in amplifiers.items() if isinstance(amplifiers, dict) else ():
+        url = amplifier.get("url") if isinstance(amplifier, dict) else None
+        if isinstance(url, str):
+            here = f"sim://{quote(document.source)}?amplifier={quote(str(name))}"
+            urls[name] = here if url == "sim://" else url
+    return urls

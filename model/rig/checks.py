@@ -1,0 +1,140 @@
+"""What is wrong with a rig between its sections, each of which may be in order by itself."""
+
+import math
+
+from model.config.document import key_name
+from model.config.sections import Validation
+from model.errors import InputError
+from model.fem.mesh import LEAST_NODES_PER_WAVELENGTH, Mesh
+from model.rig.parts import laminate_of, mesh_of, plate_of
+from model.rig.rig import SAME_POINT
+from model.rig.sections import EraSection, LimitsSection, MassSection, PlateSection
+from model.structure.plate import Plate
+
+
+def check_across(validation: Validation, *, mesh_given: bool) -> None:
+    """Note what is wrong between sections, as far as these are in order by themselves."""
+    plate = _check_plate(validation)
+    if plate is not None and not mesh_given:
+        limits = validation.field(("limits", "frequency"), LimitsSection)
+        _check_mesh(validation, plate, frequency_max=(limits or LimitsSection().frequency)[1])
+    names = tuple(validation.mapping(("eras",)))
+    _check_places(validation, names, plate)
+    for name in validation.mapping(("masses",)):
+        place = validation.field(("masses", name, "at"), MassSection)
+        if place is not None:
+            _check_on_plate(validation, ("masses", name, "at"), plate, place, what="mass")
+    _check_wiring(validation, names)
+    for name in names:
+        if {"damping", "damping_ratio"} <= validation.mapping(("eras", name)).keys():
+            validation.add(
+                ("eras", name, "damping"), "stands beside damping_ratio; keep one of the two"
+            )
+
+
+def _check_plate(validation: Validation) -> Plate | None:
+    """The plate if all about it is in order; thickness and material, or layers, make it one."""
+    given = {key for key, value in validation.mapping(("plate",)).items() if value is not None}
+    if not given:
+        return None
+    if "layers" in given:
+        for key in sorted({"thickness", "material"} & given):
+            validation.add(("plate", key), "stands beside layers; keep one of the two")
+    else:
+        for key in ("thickness", "material"):
+            if key not in given:
+                validation.add(("plate", key), "is missing; add it, or layers for a laminate")
+        for key in sorted({"bond", "bond_frequency"} & given):
+            validation.add(("plate", key), "goes with layers only; remove it")
+    section = validation.part(("plate",), PlateSection)
+    if section is None or (section.layers is None and not {"thickness", "material"} <= given):
+        return None
+    try:
+        laminate, plate = laminate_of(section), plate_of(section)
+    except InputError as error:
+        validation.add(("plate", "bond" if "bond" in given else "layers"), str(error))
+        return None
+    thickness = plate.thickness if laminate is None else laminate.thickness
+    if thickness > min(plate.length, plate.width):
+        validation.add(
+            ("plate", "thickness" if laminate is None else "layers"),
+            f"{thickness:g} m is more than the plate is wide; is it in mm? write {thickness:g} mm",
+        )
+    return plate
+
+
+def _check_mesh(validation: Validation, plate: Plate, *, frequency_max: float) -> None:
+    text = validation.mapping(()).get("mesh", "auto")
+    if not isinstance(text, str):
+        return
+    try:
+        mesh = mesh_of(text, plate, frequency_max=frequency_max)
+    except InputError as error:
+        validation.add(("mesh",), str(error))
+        return
+    if frequency_max > mesh.highest_frequency(plate):
+        coarsest = Mesh.coarsest(plate, frequency=frequency_max)
+        validation.add(
+            ("mesh",),
+            f"{mesh} is too coarse for bending waves at {frequency_max:g} Hz (limits.frequency): "
+            f"at least {coarsest} is needed, {LEAST_NODES_PER_WAVELENGTH} elements a "
+            "wavelength; auto takes a mesh that is accurate",
+        )
+
+
+def _check_places(validation: Validation, names: tuple[str, ...], plate: Plate | None) -> None:
+    placed: dict[str, tuple[float, float]] = {}
+    for name in names:
+        place = validation.field(("eras", name, "at"), EraSection)
+        if place is None:
+            continue
+        _check_on_plate(validation, ("eras", name, "at"), plate, place, what="ERA")
+        for other, taken in placed.items():
+            if math.dist(taken, place) < SAME_POINT:
+                validation.add(
+                    ("eras", name, "at"), f"is where ERA {other} is already; move one of them"
+                )
+        placed[name] = place
+
+
+def _check_on_plate(
+    validation: Validation,
+    key: tuple[str, ...],
+    plate: Plate | None,
+    place: tuple[float, float],
+    *,
+    what: str,
+) -> None:
+    x, y = place
+    if plate is not None and not (
+        -SAME_POINT <= x <= plate.length + SAME_POINT
+        and -SAME_POINT <= y <= plate.width + SAME_POINT
+    ):
+        validation.add(
+            key,
+            f"({x:g}, {y:g}) m is off the plate, which reaches from (0, 0) to "
+            f"({plate.length:g}, {plate.width:g}) m; move the {what} onto it",
+        )
+
+
+def _check_wiring(validation: Validation, names: tuple[str, ...]) -> None:
+    amplifiers = validation.mapping(("amplifiers",))
+    wired: dict[tuple[str, int], str] = {}
+    for name in names:
+        amplifier = validation.field(("eras", name, "amplifier"), EraSection)
+        channel = validation.field(("eras", name, "channel"), EraSection)
+        if amplifier is not None and amplifier not in amplifiers:
+            known = ", ".join(key_name((key,)) for key in amplifiers) or "none"
+            validation.add(
+                ("eras", name, "amplifier"),
+                f"unknown amplifier {amplifier}; known under amplifiers: {known}",
+            )
+        if amplifier is None or channel is None:
+            continue
+        other = wired.setdefault((amplifier, channel), name)
+        if other != name:
+            validation.add(
+                ("eras", name, "channel"),
+                f"{channel} of amplifier {amplifier} drives ERA {other} already; "
+                "give each ERA its own channel",
+            )

@@ -1,0 +1,65 @@
+"""Rigs, as `era config` deals with them."""
+
+from pathlib import Path
+from typing import Any
+
+from model.config.document import ConfigError, Document, Problem, read_document
+from model.config.kinds import Good
+from model.rig.amplifiers import check_amplifiers
+from model.rig.file import example_rig_path, load_rig, rig_schema
+from model.rig.rig import Rig
+
+
+class RigKind:
+    """A rig file."""
+
+    def recognises(self, document: Document) -> bool:
+        """A rig has a plate."""
+        return "plate" in document.data
+
+    def check(self, path: Path) -> Good:
+        """A good rig in one line, so that a value that is only unlikely catches the eye.
+
+        With what others that know amplifiers say of its URLs.
+        """
+        document = read_document(path)
+        problems: list[Problem] = []
+        rig = None
+        try:
+            rig = load_rig(path)
+        except ConfigError as error:
+            problems += error.problems
+        wrong, warnings = check_amplifiers(document, rig)
+        known = {problem.key for problem in problems}
+        problems += [problem for problem in wrong if problem.key not in known]
+        if rig is None or problems:
+            raise ConfigError(document.source, problems)
+        return Good(_summary(rig), warnings)
+
+    def example(self) -> str:
+        """The paper's plate."""
+        return example_rig_path().read_text(encoding="utf-8")
+
+    def schema(self) -> dict[str, Any]:
+        """For editors."""
+        return rig_schema()
+
+
+RIG = RigKind()
+
+
+def _summary(rig: Rig) -> str:
+    plate, laminate = rig.plate, rig.laminate
+    thickness = plate.thickness if laminate is None else laminate.thickness
+    sizes = " x ".join(f"{1e3 * size:g}" for size in (plate.length, plate.width, thickness))
+    made_of = plate.material.name
+    if laminate is not None:
+        made_of = f"laminate ({', '.join(layer.material.name for layer in laminate.layers)})"
+    parts = [
+        f"{sizes} mm of {made_of}",
+        f"mesh {rig.mesh}",
+        f"ERAs {', '.join(era.name for era in rig.eras)}",
+    ]
+    if rig.masses:
+        parts.append(f"carries {1e3 * sum(mass.mass for mass in rig.masses):g} g")
+    return f"good: {', '.join(parts)}"

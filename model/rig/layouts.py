@@ -1,0 +1,115 @@
+"""Where ERAs can stand under a plate: layouts by name, and the raster that studies choose from.
+
+The drawings of the paper's layouts (its Figures 8 and 9) are lost, so these are our own. Places are
+fractions of the plate's length and width: a layout fits every plate.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+
+from model.arrays import FloatArray
+from model.errors import InputError
+from model.structure.actuator import Era
+from model.structure.plate import Plate
+
+Place = tuple[float, float]
+"""Where an ERA stands, as fractions (of the length, of the width), 0 to 1."""
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Where the ERAs of a rig stand."""
+
+    name: str
+    places: tuple[Place, ...]
+
+    def positions(self, plate: Plate) -> FloatArray:
+        """Positions on a plate [m], (eras, 2)."""
+        return np.array(self.places) * [plate.length, plate.width]
+
+
+FOUR_ERA_LAYOUTS = (
+    Layout("corners", ((0, 0), (1, 0), (1, 1), (0, 1))),
+    Layout("mid-edges", ((1 / 2, 0), (1, 1 / 2), (1 / 2, 1), (0, 1 / 2))),
+    Layout("long edges", ((1 / 4, 0), (3 / 4, 0), (3 / 4, 1), (1 / 4, 1))),
+    Layout("short edges", ((0, 1 / 4), (1, 1 / 4), (1, 3 / 4), (0, 3 / 4))),
+    Layout("inset corners", ((1 / 6, 1 / 6), (5 / 6, 1 / 6), (5 / 6, 5 / 6), (1 / 6, 5 / 6))),
+    Layout("trapezoid", ((0, 0), (1, 0), (3 / 4, 1), (1 / 4, 1))),
+    Layout("diagonal", ((0, 0), (1 / 3, 1 / 3), (2 / 3, 2 / 3), (1, 1))),
+)
+"""Seven ways to stand four ERAs under a plate; the first is the paper's own, of its Table 2."""
+
+_OTHERS = (
+    Layout("centre", ((1 / 2, 1 / 2),)),
+    Layout("opposite corners", ((0, 0), (1, 1))),
+    Layout("mid-short-edges", ((0, 1 / 2), (1, 1 / 2))),
+    Layout("triangle", ((0, 0), (1, 0), (1 / 2, 1))),
+    Layout("corners and centre", ((0, 0), (1, 0), (1, 1), (0, 1), (1 / 2, 1 / 2))),
+    Layout("corners and mid-long-edges", ((0, 0), (1 / 2, 0), (1, 0), (1, 1), (1 / 2, 1), (0, 1))),
+)
+
+
+def named_layouts(era_count: int) -> tuple[Layout, ...]:
+    """The layouts that have a name, of this many ERAs; empty where there are none."""
+    layouts = (*FOUR_ERA_LAYOUTS, *_OTHERS)
+    return tuple(layout for layout in layouts if len(layout.places) == era_count)
+
+
+def alike(era: Era, positions: FloatArray) -> tuple[Era, ...]:
+    """ERAs like one of them at positions [m] (n, 2), by the names E1, E2, ..."""
+    return tuple(
+        replace(era, name=f"E{number}", x=float(x), y=float(y))
+        for number, (x, y) in enumerate(positions, start=1)
+    )
+
+
+def place_eras(eras: Sequence[Era], positions: FloatArray) -> tuple[Era, ...]:
+    """The same ERAs at other positions [m] (eras, 2)."""
+    return tuple(
+        replace(era, x=float(x), y=float(y)) for era, (x, y) in zip(eras, positions, strict=True)
+    )
+
+
+def candidate_places(nx: int, ny: int) -> FloatArray:
+    """Raster of places as fractions, edges included, x first: (nx * ny, 2).
+
+    13x13, every twelfth of a side, holds all named layouts.
+    """
+    if not (2 <= nx <= 100 and 2 <= ny <= 100):
+        raise InputError(f"candidates {nx}x{ny}: 2x2 to 100x100 places are possible")
+    x, y = np.meshgrid(np.linspace(0, 1, nx), np.linspace(0, 1, ny))
+    return np.column_stack([x.ravel(), y.ravel()])
+
+
+def edge_pair(eras: Sequence[Era]) -> tuple[int, int]:
+    """Two ERAs side by side along the plate's x axis: most alike in y, then furthest apart in x."""
+
+    def order(pair: tuple[int, int]) -> tuple[float, float]:
+        across, along = abs(_apart(eras, pair))[::-1]
+        return _rounded(across), -_rounded(along)
+
+    return min(_pairs(eras), key=order)
+
+
+def diagonal_pair(eras: Sequence[Era]) -> tuple[int, int]:
+    """The two ERAs that are furthest apart; the first of several such pairs."""
+    return max(_pairs(eras), key=lambda pair: _rounded(np.hypot(*_apart(eras, pair))))
+
+
+def _pairs(eras: Sequence[Era]) -> list[tuple[int, int]]:
+    if len(eras) < 2:
+        raise InputError(f"two ERAs are needed to drive a pair; this rig has {len(eras)}")
+    return list(combinations(range(len(eras)), 2))
+
+
+def _apart(eras: Sequence[Era], pair: tuple[int, int]) -> FloatArray:
+    first, second = (eras[index] for index in pair)
+    return np.array([second.x - first.x, second.y - first.y])
+
+
+def _rounded(distance: float) -> float:
+    """A distance [m] without the rounding errors that would decide between equal pairs."""
+    return round(float(distance), 9)

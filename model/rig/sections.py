@@ -1,0 +1,194 @@
+"""What may stand in a rig file: its sections, keys, defaults and bounds.
+
+Bounds are wide: they are there to catch a value in the wrong unit, not to teach engineering.
+"""
+
+import re
+from itertools import pairwise
+from typing import Annotated, Any
+
+from pydantic import (
+    AfterValidator,
+    ConfigDict,
+    Field,
+    GetCoreSchemaHandler,
+    GetJsonSchemaHandler,
+    Strict,
+)
+from pydantic_core import CoreSchema, core_schema
+
+from model.config.sections import Quantity, Section
+from model.config.units import (
+    DAMPING,
+    DENSITY,
+    FREQUENCY,
+    LENGTH,
+    MASS,
+    MODULUS,
+    RATE,
+    RATIO,
+    SLEW,
+    STIFFNESS,
+    TIME,
+)
+from model.structure.laminate import Bond
+from model.structure.materials import KNOWN_MATERIALS, material
+
+
+class _MaterialByName:
+    """Annotates a material that may be given by its name."""
+
+    def read(self, value: object) -> object:
+        """The numbers of a named material; anything else as it is."""
+        if not isinstance(value, str):
+            return value
+        known = material(value)
+        return MaterialSection(name=known.name, E=known.E, rho=known.rho, nu=known.nu)
+
+    def __get_pydantic_core_schema__(
+        self, source: Any, handler: GetCoreSchemaHandler
+    ) -> CoreSchema:
+        return core_schema.no_info_before_validator_function(self.read, handler(source))
+
+    def __get_pydantic_json_schema__(
+        self, schema: CoreSchema, handler: GetJsonSchemaHandler
+    ) -> dict[str, Any]:
+        return {"anyOf": [{"enum": list(KNOWN_MATERIALS)}, handler(schema)]}
+
+
+def _identifier(text: str) -> str:
+    if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_-]{0,31}", text):
+        raise ValueError("is no name; use a letter, then letters, digits, - and _, 32 at most")
+    return text
+
+
+def _url(text: str) -> str:
+    if not re.fullmatch(r"[a-z][a-z0-9+.-]*://[!-~]{0,250}", text):
+        raise ValueError(
+            f"{text[:40]!r} is no URL; write for example sim:// or serial:///dev/ttyUSB0?baud=921600"
+        )
+    return text
+
+
+def _ascending(bounds: tuple[float, float]) -> tuple[float, float]:
+    low, high = bounds
+    if low >= high:
+        raise ValueError(f"goes from {low:g} to {high:g} Hz; give the lower frequency first")
+    return bounds
+
+
+def _gains(rows: list[tuple[float, float, float]]) -> list[tuple[float, float, float]]:
+    for frequency, size, phase in rows:
+        if not (0 < frequency < 1e5 and 1e-3 <= size <= 1e3 and -360 <= phase <= 360):
+            raise ValueError(
+                f"[{frequency:g}, {size:g}, {phase:g}] is no gain; write [frequency in Hz, "
+                "magnitude from 0.001 to 1000, phase from -360 to 360 degrees]"
+            )
+    if any(low[0] >= high[0] for low, high in pairwise(rows)):
+        raise ValueError("has frequencies that do not ascend; sort its rows by the first number")
+    return rows
+
+
+GainRow = Annotated[tuple[float, float, float], Strict(strict=False)]  # a list in the file
+Identifier = Annotated[str, AfterValidator(_identifier)]
+Side = Annotated[float, Quantity(LENGTH, above=0, most=100)]
+Coordinate = Annotated[float, Quantity(LENGTH, least=-100, most=100)]
+Place = Annotated[tuple[Coordinate, Coordinate], Strict(strict=False)]  # a list in the file
+Thickness = Annotated[float, Quantity(LENGTH, least=1e-6, most=1)]
+Frequency = Annotated[float, Quantity(FREQUENCY, least=1, most=2000)]
+
+
+class MaterialSection(Section):
+    """A material by its numbers."""
+
+    name: Identifier = "custom"
+    E: Annotated[float, Quantity(MODULUS, least=1e3, most=1e13)]
+    rho: Annotated[float, Quantity(DENSITY, least=1, most=1e5)]
+    nu: Annotated[float, Quantity(RATIO, above=-1, below=0.5)]
+
+
+MaterialOrName = Annotated[MaterialSection, _MaterialByName()]
+
+
+class LayerSection(Section):
+    """One layer of a laminate."""
+
+    material: MaterialOrName
+    thickness: Thickness
+
+
+class PlateSection(Section):
+    """The plate: thickness and material, or in their place layers from one face to the other.
+
+    loss_factor: the paper prints none; 1 % is the usual order of a metal panel.
+    """
+
+    model_config = ConfigDict(
+        json_schema_extra={
+            "oneOf": [{"required": ["thickness", "material"]}, {"required": ["layers"]}]
+        }
+    )
+
+    length: Side
+    width: Side
+    thickness: Thickness | None = None
+    material: MaterialOrName | None = None
+    layers: Annotated[list[LayerSection], Field(min_length=1, max_length=20)] | None = None
+    bond: Annotated[Bond, Strict(strict=False)] = Bond.FULL
+    bond_frequency: Frequency | None = None
+    loss_factor: Annotated[float, Quantity(RATIO, least=0, below=1)] = 0.01
+
+
+class EraSection(Section):
+    """One ERA. The paper prints neither damping nor stroke; the defaults are our assumptions."""
+
+    at: Place
+    stiffness: Annotated[float, Quantity(STIFFNESS, above=0, most=1e12)]
+    damping_ratio: Annotated[float, Quantity(RATIO, least=0, most=2)] = 0.05
+    damping: Annotated[float, Quantity(DAMPING, least=0, most=1e6)] | None = None
+    bolt_mass: Annotated[float, Quantity(MASS, least=0, most=10)] = 0.0
+    stroke: Annotated[float, Quantity(LENGTH, above=0, most=0.01)] = 100e-6
+    gains: Annotated[list[GainRow], Field(max_length=2000), AfterValidator(_gains)] | None = None
+    amplifier: Identifier
+    channel: Annotated[int, Field(ge=0, le=255)]
+
+
+class MassSection(Section):
+    """Something small that the plate carries."""
+
+    at: Place
+    mass: Annotated[float, Quantity(MASS, least=0, most=10)]
+
+
+class AmplifierSection(Section):
+    """How an amplifier is reached."""
+
+    url: Annotated[str, AfterValidator(_url)]
+
+
+class LimitsSection(Section):
+    """What no command may exceed: frequencies between which skin feels vibration well, level.
+
+    The others are without limit unless given; see `Limits` for what they count.
+    """
+
+    frequency: Annotated[
+        tuple[Frequency, Frequency], Strict(strict=False), AfterValidator(_ascending)
+    ] = (40.0, 500.0)
+    level: Annotated[float, Quantity(RATIO, least=0, most=1)] = 1.0
+    slew: Annotated[float, Quantity(SLEW, above=0, most=1e6)] | None = None
+    power: Annotated[float, Quantity(RATIO, above=0, most=256)] | None = None
+    on_time: Annotated[float, Quantity(TIME, above=0, most=86_400)] | None = None
+    duty: Annotated[float, Quantity(RATIO, above=0, most=1)] | None = None
+    rate: Annotated[float, Quantity(RATE, least=1, most=2000)] | None = None
+
+
+class RigSection(Section):
+    """A rig file. mesh: auto or NXxNY."""
+
+    plate: PlateSection
+    mesh: str = "auto"
+    eras: Annotated[dict[Identifier, EraSection], Field(min_length=1, max_length=64)]
+    masses: Annotated[dict[Identifier, MassSection], Field(max_length=64, default_factory=dict)]
+    amplifiers: Annotated[dict[Identifier, AmplifierSection], Field(min_length=1)]
+    limits: LimitsSection = LimitsSection()

@@ -1,0 +1,120 @@
+"""Making a localization table: a plate solved on its mesh, in parts that do not depend on another.
+
+The parts are the same whoever solves them and how many at once, so the table is, to the bit; and
+what is done of them can be kept (`model.table.kept_parts`), so that an interrupted build goes on.
+"""
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model.arrays import FloatArray
+from model.drive_modes import MODES
+from model.errors import InputError
+from model.files.array_file import Arrays
+from model.finger.grid import Grid
+from model.processes import on_processes
+from model.rig.rig import Rig
+from model.table.kept_parts import KeptParts
+from model.table.parts import Part, TableProblem, solve_part
+from model.table.table import PAPER_FREQUENCIES, PAPER_GRID, LocalizationTable
+
+
+@dataclass(frozen=True, eq=False)
+class Build:
+    """A table, and how many of its parts had been kept from a build that was interrupted."""
+
+    table: LocalizationTable
+    part_count: int
+    reused_count: int
+
+
+def build_table(
+    rig: Rig,
+    *,
+    frequencies: FloatArray = PAPER_FREQUENCIES,
+    grid: Grid = PAPER_GRID,
+    mode: str = "switched",
+) -> LocalizationTable:
+    """Solve the rig's plate on its mesh and keep what localization needs.
+
+    frequencies [Hz], ascending, within the rig's limits; mode: one of MODES. Raises InputError.
+    """
+    return build_in_parts(TableProblem(rig, frequencies, grid), mode=mode).table
+
+
+def build_in_parts(
+    problem: TableProblem,
+    *,
+    mode: str,
+    workers: int = 1,
+    kept: KeptParts | None = None,
+    progress: Callable[[int, int], None] = lambda done, of: None,
+) -> Build:
+    """The same, by so many processes; parts that are kept are taken from there, others put there.
+
+    progress: called with how many parts are done, of how many. An exception, Ctrl-C among them,
+    leaves what is done where it is kept.
+    """
+    if mode not in MODES:
+        raise InputError(f"unknown drive mode {mode!r}; known: {', '.join(MODES)}")
+    parts = dict(enumerate(problem.parts()))
+    done: dict[int, Arrays] = {}
+    for number, part in parts.items():
+        found = kept.load(part) if kept else None
+        if found is not None:
+            done[number] = found
+    reused_count = len(done)
+    progress(len(done), len(parts))
+    missing = {number: part for number, part in parts.items() if number not in done}
+    for number, arrays in _solve(problem, missing, workers=workers):
+        if kept:
+            kept.store(parts[number], arrays)
+        done[number] = arrays
+        progress(len(done), len(parts))
+    table = _put_together(problem, mode, {parts[number]: done[number] for number in parts})
+    return Build(table, len(parts), reused_count)
+
+
+def _solve(
+    problem: TableProblem, missing: Mapping[int, Part], *, workers: int
+) -> Iterator[tuple[int, Arrays]]:
+    """Every part that is missing, in any order."""
+    if not missing:
+        return
+    if workers > 1 and len(missing) > 1:
+        # A copy, without what has been worked out here: not all of that can be sent.
+        yield from on_processes(workers, solve_part, replace(problem), missing)
+        return
+    for number, part in missing.items():
+        yield number, solve_part(problem, part)
+
+
+def _put_together(
+    problem: TableProblem, mode: str, solved: Mapping[Part, Arrays]
+) -> LocalizationTable:
+    def joined(name: str, *, axis: int) -> NDArray[Any]:
+        pieces = [arrays[name] for arrays in solved.values() if name in arrays]
+        return np.concatenate(pieces, axis=axis)
+
+    rig = problem.rig
+    (modes,) = (arrays for part, arrays in solved.items() if part.what == "modes")
+    return LocalizationTable(
+        plate=rig.plate,
+        eras=rig.eras,
+        masses=rig.masses,
+        mesh=rig.mesh,
+        raster=problem.raster,
+        grid=problem.grid,
+        mode=mode,
+        code_version=problem.code_version,
+        frequencies=problem.frequencies,
+        reference_mesh=problem.reference_mesh,
+        discretisation_error=joined("discretisation_error", axis=0),
+        acceleration=joined("acceleration", axis=1),
+        cell_sources=joined("cell_sources", axis=1),
+        **modes,
+    )

@@ -1,0 +1,151 @@
+"""A table for other programs: a .mat file that holds all of it, or .csv files for a part each.
+
+`docs/table-file.md` lists every name with its shape and unit.
+"""
+
+import csv
+import io
+from collections.abc import Iterator
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from model.drive_modes.fields import SILENT
+from model.drive_modes.sources import all_patterns
+from model.errors import InputError
+from model.files.array_file import whole_or_nothing
+from model.table.file import FORMAT_VERSION
+from model.table.summary import pattern_count
+from model.table.table import LocalizationTable
+
+MOST_BYTES = (1 << 31) - 1
+"""Of one variable in a .mat file of version 5, its header included."""
+
+
+def export_mat(table: LocalizationTable, path: Path) -> None:
+    """Write a struct `table` as a .mat file of version 5.
+
+    Raises InputError for a table that the format cannot hold, OSError where it cannot be written.
+    """
+    from scipy.io import savemat
+
+    patterns = pattern_count(len(table.eras), len(table.frequencies))
+    size = patterns * (4 * table.grid.cell_count + 8 * len(table.eras)) + table.acceleration.nbytes
+    if size > MOST_BYTES:
+        raise InputError(
+            f"the table has {size / 1e9:.1f} GB with all its patterns, more than a .mat file of "
+            "version 5 holds; the table itself is a .npz file, which numpy.load opens"
+        )
+    pattern_hz = _pattern_frequencies(table)
+    content = {
+        "format_version": float(FORMAT_VERSION),
+        "code_version": table.code_version,
+        "fingerprint": table.fingerprint,
+        "mode": table.mode,
+        "plate": _plate(table),
+        "eras": _structs([asdict(era) for era in table.eras]),
+        "masses": _structs([asdict(mass) for mass in table.masses]),
+        "mesh": str(table.mesh),
+        "reference_mesh": str(table.reference_mesh),
+        "discretisation_error": table.discretisation_error,
+        "frequency_hz": table.frequencies,
+        "raster_x_m": table.raster.x,
+        "raster_y_m": table.raster.y,
+        "acceleration_m_s2": table.acceleration,
+        "mode_omega_rad_s": table.omega,
+        "mode_shape": table.shapes,
+        "mode_shape_held": table.held,
+        "cell_centre_m": table.cell_centres,
+        "cells_along_x": float(table.grid.nx),
+        "cells_along_y": float(table.grid.ny),
+        "pattern_frequency_hz": pattern_hz,
+        "pattern_response_m_s2": table.cell_response,
+    }
+    with whole_or_nothing(path) as stream:
+        savemat(
+            stream,  # type: ignore[arg-type]  # it takes files too, its types do not say so
+            {"table": content},
+            long_field_names=True,
+            oned_as="column",
+        )
+
+
+def export_csv(table: LocalizationTable, path: Path, *, content: str) -> None:
+    """Write a .csv file whose columns have their units in their names.
+
+    content: "patterns": a row for each `switched` pattern, with the frequency of each ERA, empty
+    where it is silent, and the response of every cell; "fields": a row for each raster point and
+    frequency, with real and imaginary acceleration by each ERA alone at full stroke.
+    """
+    rows = {"patterns": _pattern_rows, "fields": _field_rows}[content](table)
+    with whole_or_nothing(path) as stream:
+        text = io.TextIOWrapper(stream, encoding="utf-8", newline="", write_through=True)
+        csv.writer(text, lineterminator="\r\n").writerows(rows)  # RFC 4180
+        text.detach()
+
+
+def _pattern_frequencies(table: LocalizationTable) -> np.ndarray[Any, np.dtype[np.float64]]:
+    """Frequency [Hz] of each ERA in each pattern, 0 where it is silent, (n, eras)."""
+    index = all_patterns(len(table.eras), len(table.frequencies)).index
+    return np.where(index == SILENT, 0.0, table.frequencies[index])
+
+
+def _pattern_rows(table: LocalizationTable) -> Iterator[list[object]]:
+    cells = [f"x{x:.4f}_y{y:.4f}_m_s2" for x, y in table.cell_centres]
+    yield [*(f"{era.name}_hz" for era in table.eras), *cells]
+    for frequencies, response in zip(_pattern_frequencies(table), table.cell_response, strict=True):
+        yield [*(f or "" for f in frequencies.tolist()), *_short(response)]
+
+
+def _field_rows(table: LocalizationTable) -> Iterator[list[object]]:
+    parts = [f"{era.name}_{part}_m_s2" for era in table.eras for part in ("real", "imag")]
+    yield ["x_m", "y_m", "frequency_hz", *parts]
+    for (x, y), at_point in zip(table.raster.points.tolist(), table.acceleration, strict=True):
+        for frequency, values in zip(table.frequencies.tolist(), at_point, strict=True):
+            yield [x, y, frequency, *_short(values.view(np.float32))]
+
+
+def _short(values: np.ndarray[Any, np.dtype[np.float32]]) -> list[str]:
+    """The fewest digits that tell single-precision numbers apart."""
+    return [str(value) for value in values]
+
+
+def _plate(table: LocalizationTable) -> dict[str, Any]:
+    plate, material = table.plate, table.plate.material
+    return {
+        "length_m": plate.length,
+        "width_m": plate.width,
+        "thickness_m": plate.thickness,
+        "loss_factor": plate.loss_factor,
+        "material": material.name,
+        "E_pa": material.E,
+        "rho_kg_m3": material.rho,
+        "nu": material.nu,
+    }
+
+
+_UNITS = {
+    "x": "x_m",
+    "y": "y_m",
+    "stiffness": "stiffness_n_m",
+    "damping": "damping_ns_m",
+    "bolt_mass": "bolt_mass_kg",
+    "mass": "mass_kg",
+    "stroke": "stroke_m",
+    "gains": "gain_hz_ratio_rad",
+}
+
+
+def _structs(rows: list[dict[str, Any]]) -> np.ndarray[Any, np.dtype[Any]]:
+    """A struct array (n, 1), names with units; without fields where there are no rows."""
+    if not rows:
+        return np.zeros((0, 0))
+    names = {key: _UNITS.get(key, key) for key in rows[0]}
+    structs = np.empty((len(rows), 1), dtype=[(name, object) for name in names.values()])
+    for number, row in enumerate(rows):
+        for key, name in names.items():
+            value = row[key]
+            structs[name][number, 0] = np.reshape(value, (-1, 3)) if key == "gains" else value
+    return structs

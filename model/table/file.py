@@ -1,0 +1,234 @@
+"""The table as a file: an uncompressed .npz that any researcher opens with numpy.
+
+Members: `header` (JSON as bytes) and the arrays of `LocalizationTable` under their own names. The
+header carries the format version, the plate's fingerprint, everything that made the table, and a
+SHA-256 over the content, so that a damaged or foreign file is refused before any of it is used.
+
+Version 1 held the fields at the nodes of the mesh; 2 holds them on a raster, with the plate's modes
+and point masses, and what `switched` patterns are made of at the cells in place of every one of
+them: of fine frequency steps there are millions. 3 says how wrong the mesh is.
+"""
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from model.drive_modes import MODES
+from model.errors import InputError
+from model.fem.mesh import Mesh
+from model.files.array_file import UNREADABLE, digest_of, read_arrays, write_arrays
+from model.finger.grid import Grid
+from model.structure.actuator import Era
+from model.structure.plate import Material, Plate
+from model.structure.point_mass import PointMass
+from model.table.raster import Raster
+from model.table.table import LocalizationTable
+
+FORMAT = "era-haptics localization table"
+ZIP = b"PK\x03\x04"
+"""How every table, as every .npz file, begins."""
+
+FORMAT_VERSION = 3
+
+# A table of the paper's plate has 1.4 MB, one of eight ERAs and a fine grid some hundred; what is
+# larger than this is not a table.
+MAX_BYTES = 2 << 30
+
+_DTYPES = {
+    "header": "|u1",
+    "frequencies": "<f8",
+    "acceleration": "<c8",
+    "omega": "<f8",
+    "held": "<f8",
+    "shapes": "<f4",
+    "cell_sources": "<f4",
+}
+
+
+# Of accelerations [m/s²], frequencies [rad/s] and shapes [1/sqrt(kg)]; what is larger is of no
+# plate, and cannot be squared in single precision.
+MOST = 1e9
+
+
+class _Raster(BaseModel):
+    """What it must hold about the raster."""
+
+    model_config = ConfigDict(extra="forbid", strict=True)
+
+    nx: int
+    ny: int
+    length: float
+    width: float
+
+
+class _Mesh(_Raster):
+    """And about a mesh."""
+
+    element: str
+    strip: float
+
+
+class _Header(BaseModel):
+    """What the JSON header must hold."""
+
+    model_config = ConfigDict(extra="forbid", strict=True)
+
+    format: str
+    format_version: int
+    code_version: str
+    fingerprint: str
+    sha256: str
+    mode: str
+    plate: dict[str, Any]
+    eras: list[dict[str, Any]]
+    masses: list[dict[str, Any]]
+    mesh: _Mesh
+    reference_mesh: _Mesh
+    discretisation_error: list[float]
+    frequencies_hz: list[float]
+    raster: _Raster
+    grid: dict[str, int]
+
+
+def save_table(table: LocalizationTable, path: Path | str) -> None:
+    """Write a table so that the file is either the old one or the whole new one, never between.
+
+    Raises OSError where the folder cannot be written.
+    """
+    arrays = _arrays(table)
+    header = {
+        "format": FORMAT,
+        "format_version": FORMAT_VERSION,
+        "code_version": table.code_version,
+        "fingerprint": table.fingerprint,
+        "mode": table.mode,
+        "plate": asdict(table.plate),
+        "eras": [asdict(era) for era in table.eras],
+        "masses": [asdict(mass) for mass in table.masses],
+        "mesh": asdict(table.mesh),
+        "reference_mesh": asdict(table.reference_mesh),
+        "discretisation_error": table.discretisation_error.tolist(),
+        "frequencies_hz": table.frequencies.tolist(),
+        "raster": asdict(table.raster),
+        "grid": asdict(table.grid),
+    }
+    header["sha256"] = _digest(header, arrays)
+    encoded = np.frombuffer(json.dumps(header).encode(), dtype=np.uint8)
+    write_arrays(Path(path), {"header": encoded, **arrays})
+
+
+def load_table(path: Path | str, *, fingerprint: str | None = None) -> LocalizationTable:
+    """Read a table, whole or not at all.
+
+    fingerprint: of the rig that the table shall serve; a table of another plate is refused. Raises
+    InputError for a missing, damaged or foreign file.
+    """
+    path = Path(path)
+    rebuild = f"build it again: era table build RIG -o {path}"
+    try:
+        content = read_arrays(path, _DTYPES, max_bytes=MAX_BYTES)
+    except FileNotFoundError:
+        raise InputError(
+            f"there is no table {path}; build one: era table build RIG -o {path}"
+        ) from None
+    except UNREADABLE as error:
+        raise InputError(
+            f"{path} is not a readable localization table ({error}); give a file that era table "
+            "build has written, or, if this was one, build it again"
+        ) from error
+    try:
+        header = _Header.model_validate_json(content.pop("header").tobytes())
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"]) or "header"
+        raise InputError(f"{path}: bad header ({where}: {first['msg']}); {rebuild}") from error
+    if header.format != FORMAT or header.format_version != FORMAT_VERSION:
+        raise InputError(
+            f"{path} has format {header.format!r} version {header.format_version}; this program "
+            f"reads version {FORMAT_VERSION}; {rebuild}"
+        )
+    if _digest(header.model_dump(exclude={"sha256"}), content) != header.sha256:
+        raise InputError(f"{path} is damaged: its content does not match its checksum; {rebuild}")
+    table = _assemble(header, content, path)
+    if table.fingerprint != header.fingerprint:
+        raise InputError(f"{path}: the fingerprint is not that of the plate in it; {rebuild}")
+    if fingerprint is not None and fingerprint != table.fingerprint:
+        raise InputError(
+            f"{path} was built for another plate (fingerprint {table.fingerprint[:12]}, the rig's "
+            f"is {fingerprint[:12]}); {rebuild}"
+        )
+    return table
+
+
+def _arrays(table: LocalizationTable) -> dict[str, NDArray[Any]]:
+    return {
+        name: np.ascontiguousarray(getattr(table, name), dtype=dtype)
+        for name, dtype in _DTYPES.items()
+        if name != "header"
+    }
+
+
+def _digest(header: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> str:
+    """SHA-256 over the header without its checksum, and over every array with its shape."""
+    return digest_of(json.dumps(header, sort_keys=True), arrays)
+
+
+def _assemble(header: _Header, arrays: dict[str, NDArray[Any]], path: Path) -> LocalizationTable:
+    """A table from checked parts; sizes must fit each other and every number must be one."""
+    try:
+        material = header.plate.pop("material")
+        table = LocalizationTable(
+            plate=Plate(**header.plate, material=Material(**material)),
+            eras=tuple(Era(**era) for era in header.eras),
+            masses=tuple(PointMass(**mass) for mass in header.masses),
+            mesh=Mesh(**header.mesh.model_dump()),
+            reference_mesh=Mesh(**header.reference_mesh.model_dump()),
+            discretisation_error=np.array(header.discretisation_error, dtype=float),
+            raster=Raster(**header.raster.model_dump()),
+            grid=Grid(**header.grid),
+            mode=header.mode,
+            code_version=header.code_version,
+            **arrays,
+        )
+    except (TypeError, KeyError, ValueError) as error:
+        raise InputError(f"{path}: the header does not describe a plate ({error})") from error
+    if table.mode not in MODES:
+        raise InputError(f"{path}: unknown drive mode {table.mode!r}")
+    count, era_count, coordinates = len(table.frequencies), len(table.eras), len(table.omega)
+    sources = era_count * (era_count + 1) // 2 * count + 1
+    expected = {
+        "frequencies": (count,),
+        "discretisation_error": (count,),
+        "acceleration": (table.raster.point_count, count, era_count),
+        "omega": (coordinates,),
+        "held": (era_count + len(table.masses), coordinates),
+        "shapes": (table.raster.point_count, coordinates),
+        "cell_sources": (sources, table.grid.cell_count),
+    }
+    for name, shape in expected.items():
+        values = getattr(table, name)
+        if values.shape != shape:
+            raise InputError(f"{path}: {name} has shape {values.shape}, expected {shape}")
+        if not np.isfinite(values).all():
+            raise InputError(f"{path}: {name} holds values that are not numbers")
+        if values.size and np.abs(values).max() > MOST:
+            raise InputError(
+                f"{path}: {name} holds values up to {np.abs(values).max():.3g}, which no plate has"
+            )
+    for name in ("acceleration", "shapes", "cell_sources"):
+        if count > 0 and not getattr(table, name).any():
+            raise InputError(f"{path}: {name} is zero everywhere, and no plate rests so")
+    # Rows are found by frequency: in another order it would be the wrong ones.
+    if not (count > 0 and table.frequencies[0] > 0 and (np.diff(table.frequencies) > 0).all()):
+        raise InputError(f"{path}: the frequencies are none, not above zero, or do not ascend")
+    if table.frequencies.tolist() != header.frequencies_hz:
+        raise InputError(f"{path}: the header's frequencies are not those of the table")
+    size = (table.raster.length, table.raster.width)
+    if size != (table.plate.length, table.plate.width):
+        raise InputError(f"{path}: the raster is not of the plate's size")
+    return table

@@ -1,0 +1,131 @@
+"""Questions to a table as JSON, and its answers."""
+
+import cmath
+import math
+import time
+from collections.abc import Iterable, Iterator
+from typing import Annotated, Any
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from model.errors import InputError
+from model.finger.perception import STRONG_DB_SL
+from model.table.question import Question
+from model.table.robust import with_robust_contrast
+from model.table.table import LocalizationTable
+from model.table.timing import Timing
+from model.transients.envelope import Envelopes
+
+_Place = Annotated[list[float], Field(min_length=2, max_length=2)]
+
+
+class _Line(BaseModel):
+    """What a line of a batch may hold."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    target: _Place | None = None
+    targets: list[_Place] = []
+    quiet: list[_Place] = []
+    mode: str | None = None
+    level_db_sl: float = STRONG_DB_SL
+    eras_at_most: int = 2
+    envelopes: bool = False
+
+
+def question_from_json(line: str) -> Question:
+    """The question of one line, `{"target": [x, y], "quiet": [[x, y], ...], "mode": ...}`.
+
+    Several targets: `"targets": [[x, y], ...]`; also `"level_db_sl"`, `"eras_at_most"` and
+    `"envelopes"`. Raises InputError.
+    """
+    try:
+        asked = _Line.model_validate_json(line)
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"])
+        raise InputError(f"{where or 'line'}: {first['msg']}") from None
+    targets = [*([] if asked.target is None else [asked.target]), *asked.targets]
+    return Question(
+        targets=tuple((x, y) for x, y in targets),
+        quiet=tuple((x, y) for x, y in asked.quiet),
+        level_db_sl=asked.level_db_sl,
+        mode=asked.mode,
+        eras_at_most=asked.eras_at_most,
+        envelopes=asked.envelopes,
+    )
+
+
+def answer_as_json(table: LocalizationTable, question: Question, timing: Timing) -> dict[str, Any]:
+    """The answer with all its measures; solve_time_s is that of the pattern, without measures.
+
+    A table that has been prepared answers as it does while fingers wait.
+    """
+    started = time.perf_counter()
+    pattern = table.ask(question)
+    if question.envelopes:
+        pattern = timing.with_envelopes(question, pattern)
+    elapsed = time.perf_counter() - started
+    pattern = timing.with_transient_measures(question, pattern)
+    pattern = with_robust_contrast(table, question, pattern)
+    return {
+        "drive": table.drive_of(pattern.excitation),
+        "mode": pattern.mode,
+        "level_db_sl": pattern.level_db_sl,
+        "contrast_db": pattern.contrast_db,
+        "contrast_db_sl": pattern.contrast_db_sl,
+        "contrast_bound_db": pattern.contrast_bound_db,
+        "robust_contrast_db": pattern.robust_contrast_db,
+        "transient_contrast_db": pattern.transient_contrast_db,
+        "left_after_db": pattern.left_after_db,
+        "surroundings_contrast_db": pattern.surroundings_contrast_db,
+        "quiet_level_db_sl": pattern.quiet_level_db_sl,
+        "quiet_is_unaware": pattern.quiet_is_unaware,
+        "usable_level_db_sl": pattern.usable_level_db_sl,
+        "ramp_s": pattern.ramp,
+        "onset": envelopes_as_json(pattern.onset, table),
+        "ending": envelopes_as_json(pattern.ending, table),
+        "solve_time_s": elapsed,
+    }
+
+
+def prepared_timing(table: LocalizationTable) -> Timing:
+    """What shapes the table's patterns, with all that does not depend on fingers worked out."""
+    timing = Timing(table)
+    timing.prepare(table.frequencies.tolist())
+    return timing
+
+
+def envelopes_as_json(
+    envelopes: Envelopes | None, table: LocalizationTable
+) -> dict[str, Any] | None:
+    """By ERA: level 0..1 of the stroke and phase at the start and at every knot, and their step."""
+    if envelopes is None:
+        return None
+    strokes = {era.name: era.stroke for era in table.eras}
+    return {
+        name: {
+            "frequency_hz": envelope.frequency,
+            "step_s": envelope.step,
+            "start": _as_level_and_phase(envelope.start, stroke=strokes[name]),
+            "knots": [_as_level_and_phase(knot, stroke=strokes[name]) for knot in envelope.knots],
+        }
+        for name, envelope in envelopes.items()
+    }
+
+
+def _as_level_and_phase(amplitude: complex, *, stroke: float) -> dict[str, float]:
+    return {"level": abs(amplitude) / stroke, "phase_deg": math.degrees(cmath.phase(amplitude))}
+
+
+def answer_lines(table: LocalizationTable, lines: Iterable[str]) -> Iterator[dict[str, Any]]:
+    """An answer for every line that is not empty; `{"error": ..., "line": n}` where it has none."""
+    table.prepare()
+    timing = prepared_timing(table)
+    for number, line in enumerate(lines, start=1):
+        if not line.strip():
+            continue
+        try:
+            yield answer_as_json(table, question_from_json(line), timing)
+        except InputError as error:
+            yield {"error": str(error), "line": number}

@@ -1,0 +1,125 @@
+"""What a table can do, in a handful of numbers."""
+
+import contextlib
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from model.arrays import FloatArray, IntArray
+from model.drive_modes.sources import all_patterns
+from model.errors import InputError
+from model.finger.perception import FELT_DB_SL
+from model.table.table import LocalizationTable
+from model.table.weak_cells import LEAST_DISTANCE, WeakCells
+
+CONTACT_SETS = 200
+
+PAIRS = 20_000
+ALIKE = 0.95
+"""Two patterns are alike where their responses at the cells are correlated more than this."""
+
+
+def summarize(
+    table: LocalizationTable,
+    weak: WeakCells,
+    *,
+    progress: Callable[[int, int], None] = lambda done, of: None,
+) -> dict[str, Any]:
+    """Provenance, levels that can be had, dead zones, weak cells, contrast, likeness of patterns.
+
+    Contrast: median and tenth percentile [dB] over random contact sets (seed 0). progress: called
+    with how many of these are done, of how many.
+    """
+    available = table.available_level_db_sl
+    known = np.isfinite(weak.tenth_db) | np.isneginf(weak.tenth_db)
+    summary: dict[str, Any] = {
+        "mode": table.mode,
+        "plate_m": [table.plate.length, table.plate.width, table.plate.thickness],
+        "eras": [era.name for era in table.eras],
+        "frequencies_hz": [float(table.frequencies[0]), float(table.frequencies[-1])],
+        "frequency_count": len(table.frequencies),
+        "grid": str(table.grid),
+        "cells": table.grid.cell_count,
+        "patterns": pattern_count(len(table.eras), len(table.frequencies)),
+        "least_level_at_full_stroke_db_sl": float(available.min()),
+        "dead_zone_share": float((available < FELT_DB_SL).mean()),
+        "feasible_share": float(weak.feasible[known].mean()) if known.any() else None,
+        "weak_share": float(weak.weak[known].mean()) if known.any() else None,
+    }
+    rng = np.random.default_rng(0)
+    for others in (1, 2, 3):
+        contrasts = contrast_distribution(table, others=others, rng=rng, progress=progress)
+        for name, percentile in (("median", 50), ("tenth_percentile", 10)):
+            value = float(np.percentile(contrasts, percentile)) if len(contrasts) else None
+            summary[f"contrast_{others}_quiet_{name}_db"] = value
+    summary["alike_pattern_pairs_share"] = alike_share(table)
+    summary["mesh"] = str(table.mesh)
+    summary["discretisation_error_percent"] = 100 * float(table.discretisation_error.max())
+    summary["reference_mesh"] = str(table.reference_mesh)
+    summary["raster"] = f"{table.raster.nx}x{table.raster.ny}"
+    summary["code_version"] = table.code_version
+    summary["fingerprint"] = table.fingerprint
+    return summary
+
+
+def pattern_count(era_count: int, frequency_count: int) -> int:
+    """How many `switched` patterns there are."""
+    pairs = era_count * (era_count - 1) // 2
+    return era_count * frequency_count + pairs * frequency_count**2
+
+
+def contrast_distribution(
+    table: LocalizationTable,
+    *,
+    others: int,
+    rng: np.random.Generator,
+    progress: Callable[[int, int], None] = lambda done, of: None,
+) -> FloatArray:
+    """Predicted contrast [dB] of random contact sets, up to (CONTACT_SETS,).
+
+    Sets whose target no pattern reaches are left out, and so are all on a plate too small for them.
+    progress: as for `summarize`, which asks for one, two and three others in turn.
+    """
+    size = np.array([table.plate.length, table.plate.width])
+    contrasts: list[float] = []
+    asked = 0
+    for _ in range(50 * CONTACT_SETS):
+        contacts = rng.uniform(0, size, (others + 1, 2))
+        gaps = np.linalg.norm(contacts[:, None] - contacts[None], axis=-1)
+        if gaps[np.triu_indices(others + 1, 1)].min() < LEAST_DISTANCE:
+            continue
+        asked += 1
+        target, *quiet = [(float(x), float(y)) for x, y in contacts]
+        with contextlib.suppress(InputError):
+            contrast = table.answer(target, quiet=quiet).contrast_db
+            contrasts.append(np.nan if contrast is None else contrast)
+        progress((others - 1) * CONTACT_SETS + len(contrasts), 3 * CONTACT_SETS)
+        # Where hardly a target is reached, the few that are must do.
+        if len(contrasts) == CONTACT_SETS or asked == 2 * CONTACT_SETS:
+            break
+    return np.array(contrasts)
+
+
+def alike_share(table: LocalizationTable, *, seed: int = 0) -> float | None:
+    """Share of pairs of `switched` patterns that are alike, of a random sample of PAIRS.
+
+    The more of them, the less there is to choose from. None where there is only one pattern or
+    cell.
+    """
+    patterns = all_patterns(len(table.eras), len(table.frequencies))
+    count = len(patterns.first)
+    if min(count, table.grid.cell_count) < 2:
+        return None
+    rng = np.random.default_rng(seed)
+    one = rng.integers(count, size=PAIRS)
+    other = (one + rng.integers(1, count, size=PAIRS)) % count  # never a pattern with itself
+
+    def scaled(chosen: IntArray) -> FloatArray:
+        sources = table.cell_sources.astype(float)
+        rows = sources[patterns.first[chosen]] + sources[patterns.second[chosen]]
+        rows -= rows.mean(axis=1, keepdims=True)
+        return np.asarray(rows / np.linalg.norm(rows, axis=1, keepdims=True))
+
+    correlation = (scaled(one) * scaled(other)).sum(axis=1)
+    return float((correlation > ALIKE).mean())

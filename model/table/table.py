@@ -1,0 +1,238 @@
+"""The localization table: which pattern makes one finger feel it and the others not.
+
+It holds the field of every ERA at every frequency on a raster over the plate, so that any set of
+fingertips can be asked for at run time in any drive mode; the modes of the plate there, from which
+follows what another stiffness, thickness or finger would change; and the response of every
+`switched` pattern at every cell of a grid.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model.arrays import FloatArray
+from model.drive_modes.fields import Fields, SingleComplex
+from model.drive_modes.sources import (
+    all_patterns,
+    magnitudes_of_sources,
+    per_source,
+    sums_of_sources,
+)
+from model.errors import InputError
+from model.fem.mesh import Mesh
+from model.finger.contrast import SURROUNDINGS_RADIUS, decibels
+from model.finger.grid import Grid
+from model.finger.perception import STRONG_DB_SL, detection_threshold
+from model.rig.rig import physics_fingerprint
+from model.structure.actuator import Era
+from model.structure.plate import Plate
+from model.structure.point_load import PointLoad
+from model.structure.point_mass import PointMass
+from model.table.answer import answer_to
+from model.table.pattern import ONSET_RAMP, Pattern
+from model.table.question import LEAST_LEVEL_DB_SL, Point, Question
+from model.table.raster import Fingertips, Raster
+from model.table.reduced_on_raster import ReducedOnRaster
+from model.transients.onset import RampedOnsets
+from model.transients.time_response import PlateInTime, plate_in_time
+from model.vibration.excitation import Excitation
+from model.vibration.peak import base_amplitudes
+
+PAPER_FREQUENCIES = np.arange(60.0, 321.0, 10.0)
+"""The 27 excitation frequencies [Hz]: 60 to 320 in steps of 10 holds every one the paper names."""
+
+PAPER_GRID = Grid(12, 9)
+
+
+@dataclass(frozen=True, eq=False)
+class LocalizationTable:
+    """Fields of one plate on its ERAs, with all that is needed to choose among patterns.
+
+    mode: what questions are answered in unless they say; frequencies (f,) [Hz]; acceleration
+    (points, f, eras) complex [m/s²] on the raster, each ERA alone at full stroke; omega (r,)
+    [rad/s], held (eras + masses, r) and shapes (points, r) [1/sqrt(kg)]: the reduced free plate, at
+    what holds it and on the raster (`model.reduction.reduced_plate`); cell_sources (sources, cells)
+    [m/s²]: mean peak acceleration over each cell of what `switched` patterns are made of
+    (`model.drive_modes.sources`); discretisation_error (f,): of the fields of any ERA alone,
+    relative L2 over the raster, against the same plate on the reference mesh.
+    """
+
+    plate: Plate
+    eras: tuple[Era, ...]
+    masses: tuple[PointMass, ...]
+    mesh: Mesh
+    raster: Raster
+    grid: Grid
+    mode: str
+    code_version: str
+    frequencies: FloatArray
+    acceleration: SingleComplex
+    omega: FloatArray
+    held: FloatArray
+    shapes: NDArray[np.float32]
+    cell_sources: NDArray[np.float32]
+    reference_mesh: Mesh
+    discretisation_error: FloatArray
+
+    @property
+    def fingerprint(self) -> str:
+        """Fingerprint of the plate on its ERAs that this table is for."""
+        return physics_fingerprint(self.plate, self.eras, masses=self.masses)
+
+    @property
+    def patterns(self) -> NDArray[np.int16]:
+        """Every `switched` pattern: index of each ERA's frequency, or SILENT, (n, eras)."""
+        return all_patterns(len(self.eras), len(self.frequencies)).index
+
+    @property
+    def cell_response(self) -> NDArray[np.float32]:
+        """Mean peak acceleration over each cell of every `switched` pattern, (n, cells) [m/s²]."""
+        return sums_of_sources(self.cell_sources.T, len(self.eras)).T
+
+    def answer(
+        self,
+        target: Point,
+        *,
+        quiet: Sequence[Point] = (),
+        level_db_sl: float = STRONG_DB_SL,
+        mode: str | None = None,
+    ) -> Pattern:
+        """The pattern for one target; see `ask`."""
+        return self.ask(Question((target,), tuple(quiet), level_db_sl=level_db_sl, mode=mode))
+
+    def ask(self, question: Question) -> Pattern:
+        """The best pattern in a mode among those that reach a level at the targets.
+
+        `switched` goes by contrast, the other modes by their robust score (`model.drive_modes`); a
+        lone finger is told from the plate beyond 50 mm, root mean square. The pattern is then
+        turned down to the level asked for; contrast does not depend on that. Raises InputError for
+        contacts off the plate or on top of each other and a level that cannot be reached.
+        """
+        return answer_to(self, question)
+
+    def prepare(self, mode: str | None = None) -> None:
+        """Work out what the first question in a mode would have to wait for."""
+        centre = (self.plate.length / 2, self.plate.width / 2)
+        for quiet in ((), ((0.0, 0.0),)):
+            self.ask(Question((centre,), quiet, level_db_sl=LEAST_LEVEL_DB_SL, mode=mode))
+        if (mode or self.mode) != "switched":
+            _ = self.onsets  # not every question has patterns to choose among
+
+    def fields(self, question: Question) -> Fields:
+        """What a drive mode needs to know about a question, at all frequencies of the table."""
+        return self.fields_at(question, self.fingertips(question))
+
+    def fields_at(self, question: Question, fingertips: Fingertips) -> Fields:
+        """The same, with the question's fingertips as `fingertips` has them."""
+        found, ends = self._by_frequency(fingertips.read(self._values)), fingertips.ends
+        count = len(question.targets)
+        if question.quiet:
+            quiet = found[:, :, ends[count - 1] :]
+        else:
+            quiet = self._cell_fields[:, :, self._far_from(question.targets)]
+        return Fields(
+            targets=tuple(
+                np.ascontiguousarray(found[:, :, start:end] * gain)
+                for start, end, gain in zip((0, *ends), ends[:count], question.gains, strict=False)
+            ),
+            quiet=np.ascontiguousarray(quiet),
+            is_alone=not question.quiet,
+            threshold=self._threshold,
+            wanted=10 ** (question.level_db_sl / 20),
+        )
+
+    def amplitudes(
+        self, excitation: Excitation, points: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Frequencies (f,) [Hz] and peak acceleration at points (p, 2) [m] of the plate, (f, p).
+
+        The excitation's frequencies must be the table's own.
+        """
+        frequencies, bases = base_amplitudes(excitation, self.eras)
+        weights = (bases / [era.stroke for era in self.eras]).astype(np.complex64)
+        rows = np.searchsorted(self.frequencies, frequencies)
+        coherent = np.einsum("fe,pfe->pf", weights, self.acceleration[:, rows])
+        found = self.raster.at(np.ascontiguousarray(coherent).view(np.float32), points)
+        return frequencies, np.abs(found.view(np.complex64)).T.astype(float)
+
+    def shapes_at(self, points: Sequence[Point]) -> FloatArray:
+        """Shapes of the reduced plate at points [m] of it, (p, r)."""
+        return self.raster.at(self.shapes, np.array(points)).astype(float)
+
+    def shapes_at_fingertips(self, contacts: Sequence[Point]) -> tuple[FloatArray, list[int]]:
+        """Shapes under fingertips (p, r), and where the points of each one end."""
+        fingertips = self.raster.fingertips(np.array(contacts))
+        return fingertips.read(self.shapes).astype(float), fingertips.ends
+
+    def drive_of(self, excitation: Excitation) -> dict[str, dict[str, float]]:
+        """An excitation as people read it: frequency, level 0..1 of the stroke, phase, by ERA."""
+        strokes = {era.name: era.stroke for era in self.eras}
+        return {
+            name: {
+                "frequency_hz": tone.frequency,
+                "level": tone.amplitude / strokes[name],
+                "phase_deg": math.degrees(tone.phase),
+            }
+            for name, tone in excitation.items()
+        }
+
+    @cached_property
+    def available_level_db_sl(self) -> FloatArray:
+        """Highest level [dB SL] of any `switched` pattern at the centre of each cell, (cells,)."""
+        sources = magnitudes_of_sources(self._cell_fields)
+        powers = (sources / per_source(self._threshold, len(self.eras))) ** 2
+        # One cell after the other: of fine frequency steps there are millions of patterns.
+        most = [sums_of_sources(cell[None], len(self.eras)).max() for cell in powers.T]
+        return decibels(np.sqrt(np.array(most, dtype=float)))
+
+    @cached_property
+    def cell_centres(self) -> FloatArray:
+        """Centres of the grid's cells [m], (cells, 2)."""
+        return self.grid.centres(self.plate)
+
+    @cached_property
+    def in_time(self) -> PlateInTime:
+        """The plate on its ERAs in time."""
+        reduced = ReducedOnRaster(self.plate, self.omega, self.raster, self.shapes)
+        loads = [PointLoad(mass.x, mass.y, mass=mass.mass) for mass in self.masses]
+        return plate_in_time(reduced, self.eras, loads=loads, held=self.held)
+
+    @cached_property
+    def onsets(self) -> RampedOnsets | None:
+        """What plain ramps do at the table's frequencies."""
+        try:
+            return RampedOnsets(self.in_time, self.frequencies, ramp=ONSET_RAMP)
+        except InputError:  # too few ERAs to rest on: it has answers, but no motion in time
+            return None
+
+    @cached_property
+    def _threshold(self) -> NDArray[np.float32]:
+        return detection_threshold(self.frequencies).astype(np.float32)
+
+    @cached_property
+    def _values(self) -> NDArray[np.float32]:
+        """The fields as real numbers, a row for each raster point."""
+        return self.acceleration.reshape(self.raster.point_count, -1).view(np.float32)
+
+    @cached_property
+    def _cell_fields(self) -> SingleComplex:
+        """Fields at the centres of the cells, (f, eras, cells)."""
+        return self._by_frequency(self.raster.at(self._values, self.cell_centres))
+
+    def fingertips(self, question: Question) -> Fingertips:
+        """Where the question's fingers are on the raster, targets first."""
+        return self.raster.fingertips(np.array([*question.targets, *question.quiet]))
+
+    def _by_frequency(self, values: NDArray[np.float32]) -> SingleComplex:
+        fields = values.view(np.complex64).reshape(len(values), len(self.frequencies), -1)
+        return np.ascontiguousarray(fields.transpose(1, 2, 0))
+
+    def _far_from(self, targets: Sequence[Point]) -> NDArray[np.bool_]:
+        """Which cells are not near any target; all of them where the plate is so small."""
+        apart = np.linalg.norm(self.cell_centres[:, None] - np.array(targets), axis=-1)
+        far: NDArray[np.bool_] = (apart > SURROUNDINGS_RADIUS).all(axis=1)
+        return far if far.any() else np.ones_like(far)

@@ -1,0 +1,67 @@
+"""Onset, ending and transient measures of the patterns that a table answers."""
+
+from collections.abc import Iterable
+from dataclasses import replace
+
+from model.table.pattern import Pattern
+from model.table.question import Question
+from model.table.table import LocalizationTable
+from model.transients.envelope import Bases, ramped_ending, ramped_onset, shaped
+from model.transients.measures import Transients
+from model.transients.shaping import Shaper
+
+
+class Timing:
+    """Knows the plate of a table in time; made once, it serves any number of patterns.
+
+    Some ten milliseconds to make, one more for each frequency when it is first needed.
+    """
+
+    def __init__(self, table: LocalizationTable) -> None:
+        self._eras = table.eras
+        self._shaper, self._transients = Shaper(table.in_time), Transients(table.in_time)
+
+    def prepare(self, frequencies: Iterable[float]) -> None:
+        """Work out ahead what shaping needs to know about frequencies [Hz]."""
+        for frequency in frequencies:
+            self._shaper.prepare(frequency)
+
+    def with_envelopes(
+        self, question: Question, pattern: Pattern, *, onset: bool = True, ending: bool = True
+    ) -> Pattern:
+        """The pattern with a shaped onset and ending, or one, for amplifiers with envelopes.
+
+        A few milliseconds for both. Where nobody is to be kept quiet the plate around the targets
+        is, at the onset. An ending belongs to what plays: silent ERAs help at the onset only.
+        """
+        targets, quiet, tones = question.targets, question.quiet, pattern.excitation
+        if onset:
+            envelopes = self._shaper.onset(tones, targets=targets, quiet=quiet)
+            pattern = replace(pattern, onset=envelopes)
+        if ending:
+            envelopes = self._shaper.ending(tones, targets=targets, quiet=quiet, helped=False)
+            pattern = replace(pattern, ending=envelopes)
+        return pattern
+
+    def with_transient_measures(self, question: Question, pattern: Pattern) -> Pattern:
+        """The pattern with its contrast over the first 100 ms and what it leaves when it ends.
+
+        With its own onset and ending: its envelopes, or its ramp where it has none.
+        """
+        contrast = None
+        if question.quiet:
+            contrast = self._transients.contrast_db(
+                self._onset(pattern), targets=question.targets, quiet=question.quiet
+            )
+        left = self._transients.left_db(pattern.excitation, self._ending(pattern))
+        return replace(pattern, transient_contrast_db=contrast, left_after_db=left)
+
+    def _onset(self, pattern: Pattern) -> Bases:
+        if pattern.onset is None:
+            return ramped_onset(pattern.excitation, self._eras, ramp=pattern.ramp)
+        return shaped(pattern.onset, self._eras)
+
+    def _ending(self, pattern: Pattern) -> Bases:
+        if pattern.ending is None:
+            return ramped_ending(pattern.excitation, self._eras, ramp=pattern.ramp)
+        return shaped(pattern.ending, self._eras)

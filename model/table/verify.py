@@ -1,0 +1,294 @@
+"""Whether a table tells the truth: a sample of it recomputed by other ways than made it.
+
+- Content: fields on the raster, responses of the cells and modes of the plate, against the sparse
+  direct solve on the table's own mesh, relative L2.
+- Answers: level and contrast predicted for random contacts, against the same solve.
+- Answers in time: the pattern is started from rest on the plate in time
+  (`model.transients.time_response`) and left on until nothing of its start remains; the amplitudes
+  that the fingertips then see. Contrast beyond 25 dB counts as 25: a quiet finger is then in a
+  null, where the two descriptions of damping, hysteretic and viscous, differ by more than is left
+  of the vibration.
+"""
+
+import contextlib
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model.arrays import ComplexArray, FloatArray
+from model.drive_modes.sources import magnitudes_of_sources
+from model.errors import InputError
+from model.fem.assembly import PlateMatrices, assemble, era_positions
+from model.fem.harmonic import direct_acceleration, hold_and_drive
+from model.finger.contrast import contrast_db, mean_level_db_sl
+from model.finger.fingertip import fingertip_points
+from model.finger.grid import CELL_SAMPLES, Grid
+from model.reduction.reduced_plate import reduce_plate
+from model.rig.rig import Rig
+from model.structure.point_load import load_positions
+from model.table.pattern import Pattern
+from model.table.question import Question
+from model.table.table import LocalizationTable
+from model.table.weak_cells import LEAST_DISTANCE
+from model.transients.envelope import ramped_onset
+from model.transients.measures import SAMPLE_RATE, Transients
+from model.transients.time_response import PlateInTime, plate_in_time
+from model.vibration.excitation import Excitation
+from model.vibration.peak import base_amplitudes, peak_acceleration, tone_amplitudes
+
+CONTENT_TOLERANCE = 1e-4
+"""Of content, relative L2; of the paper's plate it is some 1e-5, on its coarsest mesh 2e-5."""
+
+ROUNDING_DB = 0.01
+
+RASTER_ERROR = 2e-4
+"""Of a field between the points of the raster, relative to its root mean square over the plate."""
+
+TIME_TOLERANCE_DB = 1.0
+MOST_CONTRAST_IN_TIME_DB = 25.0
+
+SAMPLED_FREQUENCIES = 3
+SAMPLED_CELLS = 3
+
+_ALL_OVER = Grid(8, 6)  # where the root mean square is taken
+
+_WINDOW = 0.25  # s, in which steady amplitudes are read
+_LEFT = 1e-4  # of what the start excited, before they are
+_LONGEST = 20.0  # s
+
+
+@dataclass(frozen=True)
+class ContentCheck:
+    """What was recomputed of the table's content, and its error relative L2."""
+
+    what: str
+    error: float
+
+    @property
+    def holds(self) -> bool:
+        """Whether it is within CONTENT_TOLERANCE."""
+        return self.error <= CONTENT_TOLERANCE
+
+
+@dataclass(frozen=True)
+class AnswerCheck:
+    """An answer, its level [dB SL] and contrast [dB] predicted, solved directly, and in time.
+
+    The tolerances [dB] follow from `field_error`: more where less is left of the vibration.
+    """
+
+    question: Question
+    pattern: Pattern
+    predicted_contrast_db: float
+    direct_level_db_sl: float
+    direct_contrast_db: float
+    contrast_in_time_db: float
+    level_tolerance_db: float
+    contrast_tolerance_db: float
+
+    @property
+    def holds(self) -> bool:
+        """Whether all are within their tolerances; what is not a number is not."""
+        level = abs(self.direct_level_db_sl - self.pattern.level_db_sl)
+        contrast = abs(self.direct_contrast_db - self.predicted_contrast_db)
+        predicted, in_time = (
+            min(each, MOST_CONTRAST_IN_TIME_DB)
+            for each in (self.predicted_contrast_db, self.contrast_in_time_db)
+        )
+        return (
+            level <= self.level_tolerance_db
+            and contrast <= self.contrast_tolerance_db
+            and abs(in_time - predicted) <= self.time_tolerance_db
+        )
+
+    @property
+    def time_tolerance_db(self) -> float:
+        """Of the contrast in time."""
+        return TIME_TOLERANCE_DB + self.contrast_tolerance_db
+
+
+@dataclass(frozen=True)
+class Verification:
+    """All that was recomputed."""
+
+    content: tuple[ContentCheck, ...]
+    answers: tuple[AnswerCheck, ...]
+
+    @property
+    def misses(self) -> int:
+        """How many do not hold."""
+        held = [check.holds for check in self.content] + [check.holds for check in self.answers]
+        return held.count(False)
+
+
+def field_error(table: LocalizationTable, frequency: float) -> float:
+    """By how much the raster and the mesh's own shape functions may differ between their points.
+
+    Relative to the field's root mean square. A wave between nodes a step s apart is followed by a
+    polynomial of order p within (k s)^(p + 1) / 4 (p + 1): next to nothing of elements of high
+    order; those of the first order make straight lines of it, the raster does not.
+    """
+    order = table.mesh.kind.order
+    step = max(table.mesh.element_size) / order
+    phase = 2 * math.pi / table.plate.bending_wavelength(frequency) * step
+    return float(RASTER_ERROR + phase ** (order + 1) / (4 * (order + 1)))
+
+
+def verify_table(
+    table: LocalizationTable,
+    rig: Rig,
+    *,
+    samples: int = 12,
+    seed: int = 0,
+    progress: Callable[[int, int], None] = lambda done, of: None,
+) -> Verification:
+    """Recompute content and so many answers to random contacts, with 1, 2, 3 quiet ones in turn.
+
+    The rig must be the table's own: check the fingerprint when loading. progress: called with how
+    many answers are done, of how many. Raises InputError where no contacts have an answer.
+    """
+    rng = np.random.default_rng(seed)
+    matrices = assemble(rig.plate, table.mesh)
+    content = tuple(_check_content(table, rig, matrices, rng))
+    check = _AnswerChecker(table, rig, matrices)
+    answers = []
+    for number in range(samples):
+        answers.append(check(*_random_answer(table, rng, others=1 + number % 3)))
+        progress(number + 1, samples)
+    return Verification(content, tuple(answers))
+
+
+def _check_content(
+    table: LocalizationTable, rig: Rig, matrices: PlateMatrices, rng: np.random.Generator
+) -> Iterator[ContentCheck]:
+    count = min(SAMPLED_FREQUENCIES, len(table.frequencies))
+    chosen = np.sort(rng.choice(len(table.frequencies), count, replace=False))
+    cells = rng.choice(table.grid.cell_count, min(SAMPLED_CELLS, table.grid.cell_count), False)
+    each = CELL_SAMPLES**2
+    samples = table.grid.samples(rig.plate).reshape(-1, each, 2)[cells].reshape(-1, 2)
+    points = np.concatenate([table.raster.points, samples])
+    exact = direct_acceleration(
+        matrices, rig.eras, table.frequencies[chosen], points, loads=rig.loads
+    )
+    on_raster, in_cells = np.split(exact, [table.raster.point_count], axis=2)
+    kept = table.acceleration[:, chosen].transpose(1, 2, 0)
+    yield ContentCheck("fields on the raster", _relative(kept, on_raster))
+
+    found = np.array([_modal_response(table, rig, index) for index in chosen])
+    yield ContentCheck("modes of the plate", _relative(found, on_raster))
+
+    sources = magnitudes_of_sources(in_cells)[:-1].reshape(-1, count, len(cells), each)
+    f = len(table.frequencies)
+    kept_sources = table.cell_sources[:-1].reshape(-1, f, table.grid.cell_count)
+    at_cells = kept_sources[:, chosen][:, :, cells]
+    yield ContentCheck("responses of the cells", _relative(at_cells, sources.mean(axis=-1)))
+
+
+def _relative(found: NDArray[Any], exact: NDArray[Any]) -> float:
+    """The worst relative L2 error along the last axis; infinite where it is not a number."""
+    size = np.linalg.norm(exact, axis=-1)
+    worst = float((np.linalg.norm(found - exact, axis=-1) / size).max())
+    return worst if math.isfinite(worst) else math.inf
+
+
+def _modal_response(table: LocalizationTable, rig: Rig, index: int) -> ComplexArray:
+    """Fields (eras, points) at one frequency from the modes that the table holds."""
+    omega = 2 * np.pi * table.frequencies[index]
+    loss = 1 + 1j * rig.plate.loss_factor
+    answer = 1 / (loss * table.omega**2 - omega**2)
+    receptance = (table.held * answer) @ table.held.T
+    (hold,), (drive,) = hold_and_drive(rig.eras, rig.loads, np.array([omega]))
+    push = np.zeros((len(hold), len(drive)), dtype=complex)
+    np.fill_diagonal(push, drive)
+    force = np.linalg.solve(np.eye(len(hold)) + hold[:, None] * receptance, push)
+    return np.asarray(-(omega**2) * (table.shapes @ ((answer * table.held).T @ force)).T)
+
+
+class _AnswerChecker:
+    """Recomputes answers; what all of them need is worked out once."""
+
+    def __init__(self, table: LocalizationTable, rig: Rig, matrices: PlateMatrices) -> None:
+        self._table, self._rig, self._matrices = table, rig, matrices
+        attached = np.vstack([era_positions(rig.eras), load_positions(rig.loads)])
+        highest = float(table.frequencies[-1])
+        reduced = reduce_plate(rig.plate, table.mesh, attached, frequency_max=highest)
+        self._plate = plate_in_time(reduced, rig.eras, loads=rig.loads)
+        self._transients = Transients(self._plate)
+
+    def __call__(self, question: Question, pattern: Pattern) -> AnswerCheck:
+        """One answer recomputed."""
+        rig = self._rig
+        contacts = (*question.targets, *question.quiet)
+        discs = np.concatenate([fingertip_points(*each, rig.plate) for each in contacts])
+        count = len(fingertip_points(*contacts[0], rig.plate))
+        points = np.concatenate([discs, _ALL_OVER.centres(rig.plate)])
+        frequencies, everywhere = tone_amplitudes(
+            pattern.excitation,
+            rig.eras,
+            lambda f: direct_acceleration(self._matrices, rig.eras, f, points, loads=rig.loads),
+        )
+        direct, rest = np.split(everywhere, [len(discs)], axis=1)
+        in_time = steady_in_time(self._plate, self._transients, pattern.excitation, discs)
+        peak = peak_acceleration(direct)
+        wrong = field_error(self._table, float(frequencies[-1]))
+        wrong *= math.sqrt(float((peak_acceleration(rest) ** 2).mean()))
+        at_target = 20 * math.log10(1 + wrong / peak[:count].mean())
+        at_quiet = 20 * math.log10(1 + wrong / peak[count:].max())
+        contrast = pattern.contrast_db
+        return AnswerCheck(
+            question,
+            pattern,
+            predicted_contrast_db=math.nan if contrast is None else contrast,
+            direct_level_db_sl=mean_level_db_sl(frequencies, direct[:, :count]),
+            direct_contrast_db=_contrast(direct, count),
+            contrast_in_time_db=_contrast(in_time, count),
+            level_tolerance_db=ROUNDING_DB + at_target,
+            contrast_tolerance_db=ROUNDING_DB + at_target + at_quiet,
+        )
+
+
+def steady_in_time(
+    plate: PlateInTime, transients: Transients, excitation: Excitation, points: FloatArray
+) -> FloatArray:
+    """Amplitudes (f, p) [m/s²] at points [m] long after an excitation started from rest."""
+    slowest = -float(plate.eigenvalues.real.max())
+    settled = -math.log(_LEFT) / slowest if slowest > 0 else _LONGEST
+    duration = min(settled, _LONGEST) + _WINDOW
+    bases = ramped_onset(excitation, plate.eras, ramp=0.02)
+    felt = transients.acceleration(bases, points, duration=duration)
+    last = round(_WINDOW * SAMPLE_RATE)
+    times = np.arange(len(felt) - last, len(felt)) / SAMPLE_RATE
+    frequencies, _ = base_amplitudes(excitation, plate.eras)
+    turns = 2 * np.pi * np.outer(times, frequencies)
+    fitted, *_ = np.linalg.lstsq(np.hstack([np.cos(turns), np.sin(turns)]), felt[-last:])
+    return np.asarray(np.hypot(*np.split(fitted, 2)))
+
+
+def _contrast(amplitudes: FloatArray, at_target: int) -> float:
+    peak = peak_acceleration(amplitudes)
+    return float(contrast_db(peak[:at_target], peak[at_target:]))
+
+
+def _random_answer(
+    table: LocalizationTable, rng: np.random.Generator, *, others: int
+) -> tuple[Question, Pattern]:
+    """Contacts at least 5 cm apart, and the table's answer; where they do not fit, fewer."""
+    size = [table.plate.length, table.plate.width]
+    for tries in range(1000):
+        count = 1 + max(1, others - tries // 200)
+        contacts = rng.uniform(0, size, (count, 2))
+        apart = np.linalg.norm(contacts[:, None] - contacts, axis=-1)
+        if apart[np.triu_indices(count, 1)].min() < LEAST_DISTANCE:
+            continue
+        target, *quiet = ((float(x), float(y)) for x, y in contacts)
+        question = Question((target,), tuple(quiet))
+        with contextlib.suppress(InputError):
+            return question, table.ask(question)
+    raise InputError(
+        f"no random contacts on this plate of {size[0]:g} x {size[1]:g} m have an answer at 20 dB "
+        "SL to verify; is it smaller than two fingers, or its stroke too small?"
+    )

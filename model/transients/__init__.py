@@ -1,0 +1,1 @@
+"""The plate in time: onsets and endings, predicted exactly and shaped to stay quiet."""

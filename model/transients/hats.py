@@ -1,0 +1,89 @@
+"""The plate's answers to hats: what knots of an envelope do, in closed form.
+
+A hat is a drive that rises from nothing to an ERA's full stroke in one step and falls again in the
+next, at a carrier exp(s t). An envelope that is linear between knots is a sum of hats, one for each
+knot; the plate's answer to a hat that begins later is the same answer, later. So one answer for
+each ERA serves all knots. Answers are demodulated: without the factor exp(s t), as the envelopes
+themselves are.
+
+A ramp t / step from time 0 on is answered by z(t) = a0 + a1 t - a0 exp((lambda - s) t) in the
+coordinates of `PlateInTime`; a hat is the second difference of that.
+"""
+
+import numpy as np
+
+from model.arrays import ComplexArray, FloatArray
+from model.transients.time_response import PlateInTime
+
+
+def steady_states(plate: PlateInTime, omega: float) -> ComplexArray:
+    """State z of the plate vibrating steadily, each ERA alone at full stroke, (eras, 2 r)."""
+    count = len(plate.eras)
+    strokes = np.array([era.stroke for era in plate.eras], dtype=complex)
+    carrier = np.full(count, 1j * omega)
+    return plate.particular(range(count), carrier, strokes, 0 * strokes)[0]
+
+
+def hat_accelerations(
+    plate: PlateInTime, omega: float, *, step: float, steps: int, samples: int
+) -> ComplexArray:
+    """Acceleration of the reduced coordinates after a hat on each ERA began, (n, eras, r).
+
+    omega [rad/s]; step [s]: from a hat's begin to its top. n = steps * samples moments, those in
+    the middle of each share of a step, for at knots the force jumps.
+    """
+    s = 1j * omega
+    times = step * (np.arange(steps * samples) + 0.5) / samples
+    a0, a1 = _ramps(plate, s, step)
+    b0, b1 = a0 @ plate.displacement.T, a1 @ plate.displacement.T
+    forced = s**2 * (b0 + times[:, None, None] * b1) + 2 * s * b1
+    table = np.exp(np.outer(times, plate.eigenvalues - s))
+    free = np.stack([table @ (plate.acceleration * row).T for row in a0], axis=1)
+    ramps = forced - free
+    hats = ramps.copy()
+    hats[samples:] -= 2 * ramps[:-samples]
+    hats[2 * samples :] += ramps[: -2 * samples]
+    return np.asarray(hats)
+
+
+def ending_states(plate: PlateInTime, omega: float, *, step: float, steps: int) -> ComplexArray:
+    """State z when an ending of so many steps is over, from what leads to it, (2 r, steps, eras).
+
+    First, of each ERA at full stroke: the tone that had been steady until the ending began and
+    then fell to nothing within one step; after that a hat whose top is after step 1, 2, ...
+    """
+    s = 1j * omega
+    a0, a1 = _ramps(plate, s, step)
+    times = step * np.arange(steps + 1)
+    decay = np.exp(np.outer(times, plate.eigenvalues - s))
+    ramps = a0 + times[:, None, None] * a1 - decay[:, None] * a0
+    steady = steady_states(plate, omega)
+    columns = [steady - ramps[steps] + ramps[steps - 1]]
+    for knot in range(1, steps):
+        since = steps - knot
+        columns.append(ramps[since + 1] - 2 * ramps[since] + ramps[since - 1])
+    return np.stack(columns).transpose(2, 0, 1)
+
+
+def mean_square(plate: PlateInTime, duration: float) -> ComplexArray:
+    """Hermitian form (2 r, 2 r): z^H W z is a free vibration's mean square over duration [s].
+
+    Of the acceleration of all reduced coordinates together, which is that over the plate times its
+    mass, since the plate's own mass is the identity in them; z at the start, mean over its phase,
+    twice.
+    """
+    rates = plate.eigenvalues.conj()[:, None] + plate.eigenvalues
+    shapes = plate.acceleration.conj().T @ plate.acceleration
+    return np.asarray(shapes * np.expm1(rates * duration) / (rates * duration))
+
+
+def _ramps(plate: PlateInTime, s: complex, step: float) -> tuple[ComplexArray, ComplexArray]:
+    """Particular solutions (eras, 2 r) for the base of each ERA rising by its stroke in a step."""
+    count = len(plate.eras)
+    slopes: ComplexArray = np.array([era.stroke / step + 0j for era in plate.eras])
+    return plate.particular(range(count), np.full(count, s), 0 * slopes, slopes)
+
+
+def raised_cosine(times: FloatArray, ramp: float) -> FloatArray:
+    """0 at time 0, 1 from ramp [s] on, (n,)."""
+    return np.asarray((1 - np.cos(np.pi * np.clip(times / ramp, 0, 1))) / 2)

@@ -1,0 +1,215 @@
+"""What fingers feel while a vibration starts, and what is left of it after it ended.
+
+Two measures: contrast of the peaks over the first 100 ms, and the vibration of the whole plate in
+the 100 ms after the end.
+"""
+
+import math
+from collections import defaultdict
+from collections.abc import Sequence
+from itertools import pairwise
+
+import numpy as np
+
+from model.arrays import ComplexArray, FloatArray
+from model.finger.contrast import contrast_db
+from model.finger.fingertip import fingertip_points
+from model.transients.base_motion import Term
+from model.transients.envelope import Bases
+from model.transients.hats import mean_square, steady_states
+from model.transients.time_response import PlateInTime
+from model.vibration.excitation import Excitation
+
+FIRST = 0.100
+"""The time [s] from the first motion over which an onset is judged."""
+
+AFTER = 0.100
+"""The time [s] after the last motion of a base over which an ending is judged."""
+
+SAMPLE_RATE = 8000.0
+"""Sixteen samples [Hz] to a period of 500 Hz, so that a peak is found within 2 %."""
+
+
+class Transients:
+    """Predicts onsets and endings of a plate on its ERAs."""
+
+    def __init__(self, plate: PlateInTime) -> None:
+        self._plate = plate
+        self._mean_square = mean_square(plate, AFTER)
+        times = np.arange(round(FIRST * SAMPLE_RATE)) / SAMPLE_RATE
+        table = np.exp(np.outer(times, plate.eigenvalues))
+        self._table = np.hstack([table.real, table.imag])
+
+    def contrast_db(
+        self,
+        bases: Bases,
+        *,
+        targets: Sequence[tuple[float, float]],
+        quiet: Sequence[tuple[float, float]],
+    ) -> float:
+        """Contrast [dB] of the peaks over the first 100 ms of bases that start from rest.
+
+        Mean over a target's points, at the target where it is least, to the loudest quiet point;
+        positions in m.
+        """
+        plate = self._plate.reduced.plate
+        discs = [fingertip_points(*each, plate) for each in (*targets, *quiet)]
+        felt = self.acceleration(bases, np.concatenate(discs))
+        ends = np.cumsum([len(disc) for disc in discs])[:-1]
+        peaks = np.split(np.abs(felt).max(axis=0), ends)
+        loudest = np.concatenate(peaks[len(targets) :])
+        return min(float(contrast_db(peak, loudest)) for peak in peaks[: len(targets)])
+
+    def ending_contrast_db(
+        self,
+        excitation: Excitation,
+        ending: Bases,
+        *,
+        targets: Sequence[tuple[float, float]],
+        quiet: Sequence[tuple[float, float]],
+    ) -> float:
+        """Contrast [dB] of the targets while they still felt an excitation to the end of it.
+
+        Mean steady peak acceleration over a target's points, at the target where it is least, to
+        the loudest peak at a quiet point until 100 ms after the ending, whose bases move as told
+        from time 0 on; positions in m.
+        """
+        plate = self._plate.reduced.plate
+        discs = [fingertip_points(*each, plate) for each in targets]
+        at_targets = np.concatenate(discs)
+        at_quiet = np.concatenate([fingertip_points(*each, plate) for each in quiet])
+        shapes = self._plate.reduced.at(at_targets) @ self._plate.displacement
+        by_frequency: dict[float, ComplexArray] = {}
+        for name, state in self._steady(excitation).items():
+            frequency = excitation[name].frequency
+            by_frequency[frequency] = by_frequency.get(frequency, 0) + shapes @ state
+        steady = sum(
+            (2 * math.pi * frequency) ** 2 * np.abs(field)
+            for frequency, field in by_frequency.items()
+        )
+        over = max((term.end for base in ending for term in base), default=0.0)
+        felt = self.acceleration(ending, at_quiet, duration=over + AFTER, after=excitation)
+        loudest = np.abs(felt).max(axis=0)
+        ends = np.cumsum([len(disc) for disc in discs])[:-1]
+        each = np.split(np.asarray(steady), ends)
+        return min(float(contrast_db(peak, loudest)) for peak in each)
+
+    def acceleration(
+        self,
+        bases: Bases,
+        points: FloatArray,
+        *,
+        duration: float = FIRST,
+        after: Excitation | None = None,
+    ) -> FloatArray:
+        """Acceleration [m/s²] at points [m] (p, 2) from time 0 on, every 1 / SAMPLE_RATE, (n, p).
+
+        after: the excitation that had been steady before; None for rest.
+        """
+        shapes = self._plate.reduced.at(points)
+        drive = _Drive(self._plate, bases)
+        z = np.zeros(len(self._plate.eigenvalues), dtype=complex)
+        for state in self._steady(after or {}).values():
+            z += state
+        times = np.arange(round(duration * SAMPLE_RATE)) / SAMPLE_RATE
+        felt = np.empty((len(times), len(shapes)))
+        free_shapes = (shapes @ self._plate.acceleration).T
+        forced_shapes = (shapes @ self._plate.displacement).T
+        for since, until in drive.pieces(duration):
+            z = z + drive.change(since)
+            first, last = (int(index) for index in np.searchsorted(times, [since, until]))
+            felt[first:last] = drive.forced(times[first:last], since, forced_shapes)
+            for start in range(first, last, len(self._table)):
+                stop = min(last, start + len(self._table))
+                now = z * np.exp(self._plate.eigenvalues * (times[start] - since))
+                free = now[:, None] * free_shapes
+                felt[start:stop] += self._table[: stop - start] @ np.vstack([free.imag, free.real])
+            z = z * np.exp(self._plate.eigenvalues * (until - since))
+        return felt
+
+    def left_db(self, excitation: Excitation, ending: Bases) -> float:
+        """What is left [dB] in the 100 ms after an excitation ended as the bases say from time 0.
+
+        Root mean square acceleration over the whole plate relative to the steady one; mean over the
+        phases at which the end comes. The bases must come to rest, and each ERA must end at the
+        frequency it had.
+        """
+        over = max((term.end for base in ending for term in base), default=0.0)
+        frequencies = {tone.frequency for tone in excitation.values()}
+        steady = self._steady(excitation)
+        still = np.zeros(len(self._plate.eigenvalues), dtype=complex)
+        left: dict[float, ComplexArray] = defaultdict(lambda: still)
+        power = 0.0
+        for number, (era, base) in enumerate(zip(self._plate.eras, ending, strict=True)):
+            alone = tuple(base if other == number else () for other in range(len(ending)))
+            drive = _Drive(self._plate, alone)
+            tone = excitation.get(era.name)
+            frequency = tone.frequency if tone else min(frequencies)
+            z = steady.get(era.name, still)
+            for since, until in drive.pieces(over):
+                z = (z + drive.change(since)) * np.exp(self._plate.eigenvalues * (until - since))
+            left[frequency] = left[frequency] + z + drive.change(over)
+        for frequency in frequencies:
+            together = sum(
+                (steady[name] for name, tone in excitation.items() if tone.frequency == frequency),
+                start=still,
+            )
+            omega = 2 * math.pi * frequency
+            power += omega**4 * float(np.linalg.norm(self._plate.displacement @ together)) ** 2
+        remaining = sum(float((z.conj() @ self._mean_square @ z).real) for z in left.values())
+        return 10 * math.log10(remaining / power)
+
+    def _steady(self, excitation: Excitation) -> dict[str, ComplexArray]:
+        """State (2 r,) at time 0, from which phases count, that each tone alone keeps up."""
+        states = {}
+        for number, era in enumerate(self._plate.eras):
+            tone = excitation.get(era.name)
+            if tone is not None:
+                unit = steady_states(self._plate, 2 * math.pi * tone.frequency)[number]
+                states[era.name] = unit * (tone.amplitude / era.stroke * np.exp(1j * tone.phase))
+        return states
+
+
+class _Drive:
+    """The particular solutions of all terms of all bases, those of one time and omega together."""
+
+    def __init__(self, plate: PlateInTime, bases: Bases) -> None:
+        together: dict[tuple[float, float, float], list[tuple[int, Term]]] = defaultdict(list)
+        for era, base in enumerate(bases):
+            for term in base:
+                together[term.start, term.end, term.omega].append((era, term))
+        self._a0 = np.empty((len(together), len(plate.eigenvalues)), dtype=complex)
+        self._a1 = np.empty_like(self._a0)
+        keys = np.array(list(together)).reshape(-1, 3)
+        self._start, self._end, self._s = keys[:, 0], keys[:, 1], 1j * keys[:, 2]
+        for row, terms in enumerate(together.values()):
+            a0, a1 = plate.particular(
+                [era for era, _ in terms],
+                np.full(len(terms), self._s[row]),
+                [term.c0 for _, term in terms],
+                [term.c1 for _, term in terms],
+            )
+            self._a0[row], self._a1[row] = a0.sum(axis=0), a1.sum(axis=0)
+
+    def pieces(self, duration: float) -> list[tuple[float, float]]:
+        """From 0 to a duration [s], cut where terms start or end."""
+        moments = {0.0, duration, *self._start.tolist(), *self._end.tolist()}
+        inside = sorted(moment for moment in moments if 0 <= moment <= duration)
+        return list(pairwise(inside))
+
+    def change(self, time: float) -> ComplexArray:
+        """By how much the free vibration (2 r,) changes where terms start or end at a time [s]."""
+        sign = (self._end == time).astype(float) - (self._start == time)
+        rows = np.flatnonzero(sign)
+        tau = time - self._start[rows]
+        size = sign[rows] * np.exp(self._s[rows] * tau)
+        return np.asarray(size @ self._a0[rows] + (size * tau) @ self._a1[rows])
+
+    def forced(self, times: FloatArray, since: float, shapes: ComplexArray) -> FloatArray:
+        """Acceleration (n, p) of the terms that hold from a time [s] on; shapes (2 r, p)."""
+        rows = np.flatnonzero((self._start <= since) & (since < self._end))
+        s = self._s[rows, None]
+        b0, b1 = self._a0[rows] @ shapes, self._a1[rows] @ shapes
+        tau = times[:, None] - self._start[rows]
+        turn = np.exp(self._s[rows] * tau)
+        return np.asarray((turn @ (s**2 * b0 + 2 * s * b1) + (turn * tau) @ (s**2 * b1)).imag)

@@ -1,0 +1,155 @@
+"""Shaped onsets and brakes: envelopes that keep quiet fingers quiet, and that stop the plate.
+
+Onset. Least squares over the knots of every ERA: each target follows its steady vibration times a
+raised cosine, each quiet fingertip stays still, from the first millisecond until the plate has
+settled.
+
+Ending. The plate's mean square over the time after the last knot is a quadratic form of its state
+then, so of the knots; its least value is the brake. That does not depend on who touches the plate,
+nor on the carrier's phase at the moment of the end. Where quiet fingers are known, they are kept
+quiet while the brake lasts, too: stopping the plate takes other vibrations than the pattern's.
+
+Both are robust against errors of the ERAs (`model.transients.knots`), and no knot ever exceeds the
+stroke (`model.transients.bounded_solution`).
+"""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from model.arrays import ComplexArray, FloatArray, IntArray
+from model.finger.contrast import SURROUNDINGS_RADIUS
+from model.finger.fingertip import FINGERTIP_RADIUS, fingertip_points
+from model.finger.grid import Grid
+from model.transients.envelope import Envelope, Envelopes
+from model.transients.hats import mean_square
+from model.transients.knots import Carrier, ending_knots, onset_knots, solve_carrier
+from model.transients.measures import AFTER
+from model.transients.time_response import PlateInTime
+from model.vibration.excitation import Excitation
+
+RISE = 0.040
+"""How long [s] a target takes to full vibration along its raised cosine."""
+
+_SURROUNDINGS = Grid(12, 9)
+
+Position = tuple[float, float]
+
+
+class Shaper:
+    """Finds onsets and endings for a plate on its ERAs.
+
+    What does not depend on the contacts is worked out once for each frequency and kept.
+    """
+
+    def __init__(self, plate: PlateInTime) -> None:
+        self._plate = plate
+        self._after = mean_square(plate, AFTER)
+        self._carriers: dict[float, Carrier] = {}
+
+    def prepare(self, frequency: float) -> None:
+        """Work out ahead what belongs to a frequency [Hz]."""
+        self._carrier(frequency)
+
+    def onset(
+        self,
+        excitation: Excitation,
+        *,
+        targets: Sequence[Position],
+        quiet: Sequence[Position] = (),
+        rise: float = RISE,
+    ) -> Envelopes:
+        """Envelopes that lead from rest to an excitation and keep quiet fingers [m] quiet.
+
+        targets [m] follow their steady vibration along a raised cosine of rise [s]. Without quiet
+        fingers the plate beyond 50 mm of the targets takes their place. An ERA that the excitation
+        leaves silent helps where there is one frequency only.
+        """
+        felt = self._fingertips(targets)
+        still = self._fingertips(quiet) if quiet else self._surroundings(targets)
+        envelopes: dict[str, Envelope] = {}
+        for frequency, amplitudes, active in self._groups(excitation):
+            knots = onset_knots(
+                self._carrier(frequency), amplitudes, active, felt=felt, still=still, rise=rise
+            )
+            envelopes.update(self._envelopes(frequency, np.vstack([0 * knots[0], knots]), active))
+        return envelopes
+
+    def ending(
+        self,
+        excitation: Excitation,
+        *,
+        targets: Sequence[Position] = (),
+        quiet: Sequence[Position] = (),
+        helped: bool = True,
+    ) -> Envelopes:
+        """Envelopes that lead from an excitation to silence and bring the whole plate to rest.
+
+        With targets and quiet fingers [m] the quiet ones are kept quiet meanwhile. helped: whether
+        an ERA that the excitation leaves silent helps where there is one frequency only.
+        """
+        both = bool(targets and quiet)
+        felt = self._fingertips(targets) if both else None
+        still = self._fingertips(quiet) if both else None
+        envelopes: dict[str, Envelope] = {}
+        for frequency, amplitudes, active in self._groups(excitation, helped=helped):
+            knots = ending_knots(
+                self._carrier(frequency), amplitudes, active, felt=felt, still=still
+            )
+            envelopes.update(self._envelopes(frequency, knots, active))
+        return envelopes
+
+    def _carrier(self, frequency: float) -> Carrier:
+        if frequency not in self._carriers:
+            self._carriers[frequency] = solve_carrier(self._plate, frequency, after=self._after)
+        return self._carriers[frequency]
+
+    def _envelopes(self, frequency: float, knots: ComplexArray, active: IntArray) -> Envelopes:
+        """From start and knots (n, active) in strokes."""
+        envelopes = {}
+        for era, column in zip(active, knots.T, strict=True):
+            start, *rest = (column * self._plate.eras[era].stroke).tolist()
+            envelopes[self._plate.eras[era].name] = Envelope(frequency, start, tuple(rest))
+        return envelopes
+
+    def _groups(
+        self, excitation: Excitation, *, helped: bool = True
+    ) -> list[tuple[float, ComplexArray, IntArray]]:
+        """Per frequency [Hz]: amplitudes (eras,) in strokes, and which ERAs play it."""
+        eras = self._plate.eras
+        frequencies = sorted({tone.frequency for tone in excitation.values()})
+        groups = []
+        for frequency in frequencies:
+            amplitudes = np.zeros(len(eras), dtype=complex)
+            plays = np.full(len(eras), helped and len(frequencies) == 1)
+            for number, era in enumerate(eras):
+                tone = excitation.get(era.name)
+                if tone is not None and tone.frequency == frequency:
+                    amplitudes[number] = tone.amplitude / era.stroke * np.exp(1j * tone.phase)
+                    plays[number] = True
+            groups.append((frequency, amplitudes, np.flatnonzero(plays)))
+        return groups
+
+    def _fingertips(self, positions: Sequence[Position]) -> FloatArray:
+        """Few rows (d, r) that a vibration under fingertips comes down to.
+
+        The sum of their squares is the mean square over a fingertip's points, summed over the
+        fingertips: polynomials of second order, orthonormal there, hold all that a bending wave
+        much longer than the fingertip does.
+        """
+        rows = []
+        for x, y in positions:
+            points = fingertip_points(x, y, self._plate.reduced.plate)
+            u, v = ((points - [x, y]) / FINGERTIP_RADIUS).T
+            basis, _ = np.linalg.qr(np.column_stack([np.ones(len(u)), u, v, u * u, u * v, v * v]))
+            rows.append(basis.T @ self._plate.reduced.at(points) / math.sqrt(len(points)))
+        return np.concatenate(rows)
+
+    def _surroundings(self, targets: Sequence[Position]) -> FloatArray:
+        """The same for the plate beyond 50 mm of all targets, or all of it where that is none."""
+        centres = _SURROUNDINGS.centres(self._plate.reduced.plate)
+        distance = np.linalg.norm(centres[:, None] - np.array(targets), axis=-1).min(axis=1)
+        far = distance > SURROUNDINGS_RADIUS
+        shapes = self._plate.reduced.at(centres[far] if far.any() else centres)
+        return np.asarray(np.linalg.qr(shapes, mode="r")) / math.sqrt(len(shapes))

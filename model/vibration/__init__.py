@@ -1,0 +1,1 @@
+"""Steady vibration: what drives the plate, and how strongly it then moves where."""

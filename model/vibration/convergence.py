@@ -1,0 +1,131 @@
+"""How far a mesh is from converged: natural frequencies and response, beside a finer mesh."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from model.arrays import ComplexArray, FloatArray, lattice
+from model.errors import InputError
+from model.fem.assembly import assemble
+from model.fem.mesh import Mesh
+from model.fem.modal import modes
+from model.reduction.free_plate import solve_free_plate
+from model.rig.rig import Rig
+from model.structure.plate import Plate
+
+PAPER_FREQUENCIES = (110.0, 250.0)
+"""Where the founding paper shows maps [Hz]."""
+
+MODE_COUNT = 12
+
+# The coarsest MITC4 mesh that is looked at; on the paper's plate up to 500 Hz it is the paper's own
+# 12x9. Each next one has twice as many elements along both sides.
+_COARSEST_PER_WAVELENGTH = 6.5
+_DOUBLINGS = 3
+
+# Below this share of the plate's lowest bending frequency a natural frequency is rounding: on one
+# ERA or two the plate can tilt freely.
+_HELD = 1e-4
+
+# A raster for comparing responses, finer than half a wave of any frequency that has been asked for.
+_RASTER = (49, 37)
+
+
+@dataclass(frozen=True)
+class MeshError:
+    """How wrong a mesh is, relative to the reference.
+
+    frequency: of the natural frequencies that are compared, signed, (n,); response: of the
+    acceleration field at each frequency, relative L2 over the plate, the worst driven ERA, (f,).
+    """
+
+    mesh: Mesh
+    dof: int
+    frequency: FloatArray
+    response: FloatArray
+
+
+@dataclass(frozen=True)
+class Convergence:
+    """Errors of several meshes against a reference mesh, response at frequencies (f,) [Hz].
+
+    natural_frequencies: the lowest on the ERAs [Hz], but for motion that nothing holds, (n,).
+    """
+
+    reference: Mesh
+    frequencies: FloatArray
+    natural_frequencies: FloatArray
+    errors: tuple[MeshError, ...]
+
+
+def meshes_to_compare(rig: Rig) -> tuple[Mesh, ...]:
+    """Four MITC4 meshes, the automatic one, and the rig's own where it is none of these."""
+    plate, high = rig.plate, rig.limits.frequency_max
+    size = plate.bending_wavelength(high) / _COARSEST_PER_WAVELENGTH
+    nx, ny = (max(1, math.ceil(side / size)) for side in (plate.length, plate.width))
+    plain = [Mesh(nx << n, ny << n, plate.length, plate.width) for n in range(_DOUBLINGS + 1)]
+    chosen = [*plain, Mesh.auto(plate, frequency_max=high), rig.mesh]
+    return tuple(dict.fromkeys(chosen))
+
+
+def reference_mesh(plate: Plate, *, frequency_max: float) -> Mesh:
+    """Half as many elements again along both sides as the automatic one, in strips half as wide."""
+    auto = Mesh.auto(plate, frequency_max=frequency_max)
+    nx, ny = (math.ceil(1.5 * count) for count in (auto.nx, auto.ny))
+    return Mesh(nx, ny, auto.length, auto.width, auto.element, auto.strip / 2)
+
+
+def default_frequencies(rig: Rig) -> FloatArray:
+    """Those of the paper's maps [Hz] as far as they are within the rig's limit, else the limit."""
+    high = rig.limits.frequency_max
+    within = [frequency for frequency in PAPER_FREQUENCIES if frequency <= high]
+    return np.array(within or [high])
+
+
+def study_convergence(
+    rig: Rig, meshes: Sequence[Mesh], *, frequencies: Sequence[float] | FloatArray
+) -> Convergence:
+    """Solve a rig on each mesh and on the reference.
+
+    frequencies [Hz] up to the rig's limit. Raises InputError for those that a mesh cannot carry.
+    """
+    high = rig.limits.frequency_max
+    asked = np.asarray(frequencies, dtype=float)
+    if (asked > high).any():
+        raise InputError(
+            f"{asked.max():g} Hz is above the rig's limits.frequency of {high:g} Hz, for "
+            "which its meshes are made; ask for lower frequencies or raise the limit"
+        )
+    reference = reference_mesh(rig.plate, frequency_max=high)
+    exact = _natural_frequencies(rig, reference)
+    held = exact > _HELD * rig.plate.lowest_bending_frequency
+    exact_response = _response(rig, reference, asked)
+    size = np.linalg.norm(exact_response, axis=2)
+    errors = []
+    for mesh in meshes:
+        difference = np.linalg.norm(_response(rig, mesh, asked) - exact_response, axis=2)
+        errors.append(
+            MeshError(
+                mesh,
+                dof=3 * mesh.node_count,
+                frequency=_natural_frequencies(rig, mesh)[held] / exact[held] - 1,
+                response=(difference / size).max(axis=1),
+            )
+        )
+    return Convergence(reference, asked, exact[held], tuple(errors))
+
+
+def _natural_frequencies(rig: Rig, mesh: Mesh) -> FloatArray:
+    matrices = assemble(rig.plate, mesh)
+    solved = modes(matrices, MODE_COUNT, support="eras", eras=rig.eras, loads=rig.loads)
+    return solved.natural_frequencies
+
+
+def _response(rig: Rig, mesh: Mesh, frequencies: FloatArray) -> ComplexArray:
+    x = np.linspace(0, rig.plate.length, _RASTER[0])
+    y = np.linspace(0, rig.plate.width, _RASTER[1])
+    points = lattice(x, y)
+    free = solve_free_plate(rig.plate, mesh, frequency_max=rig.limits.frequency_max)
+    return free.acceleration(rig.eras, frequencies, points, loads=rig.loads)

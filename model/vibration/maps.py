@@ -1,0 +1,63 @@
+"""A map of the plate: peak acceleration on a regular raster, for any drive."""
+
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+
+from model.arrays import FloatArray, lattice
+from model.errors import InputError
+from model.fem.assembly import assemble
+from model.fem.harmonic import direct_acceleration
+from model.reduction.free_plate import FreePlate
+from model.rig.rig import Rig
+from model.vibration.excitation import Excitation
+from model.vibration.peak import find_nulls, peak_acceleration, tone_amplitudes
+
+MOST_POINTS = 1_000_000
+"""Of a map: finer than any screen, and some hundred bytes of memory each."""
+
+
+@dataclass(frozen=True)
+class PlateMap:
+    """Peak acceleration [m/s²] at raster points x (nx,), y (ny,) [m]: peak (ny, nx), and its nulls.
+
+    nulls: positions [m] (n, 2).
+    """
+
+    x: FloatArray
+    y: FloatArray
+    peak: FloatArray
+    nulls: FloatArray
+
+
+def plate_map(
+    rig: Rig,
+    excitation: Excitation,
+    *,
+    raster: tuple[int, int] | None = None,
+    free: FreePlate | None = None,
+) -> PlateMap:
+    """Solve the rig's plate for an excitation; the raster defaults to that of the mesh.
+
+    free: the same plate where it has been solved before, in place of a direct solve. Raises
+    InputError for a raster below 2x2 or of millions of points, or a frequency that the mesh cannot
+    carry.
+    """
+    mesh = rig.mesh
+    columns, rows = raster or mesh.raster
+    if columns < 2 or rows < 2:
+        raise InputError(f"a map of {columns}x{rows} points is none; 2x2 is the least")
+    if columns * rows > MOST_POINTS:
+        raise InputError(
+            f"a map of {columns}x{rows} points is too large; {MOST_POINTS} points are the most"
+        )
+    x = np.linspace(0, rig.plate.length, columns)
+    y = np.linspace(0, rig.plate.width, rows)
+    points = lattice(x, y)
+    respond = free.acceleration if free else partial(direct_acceleration, assemble(rig.plate, mesh))
+    _, amplitudes = tone_amplitudes(
+        excitation, rig.eras, lambda f: respond(rig.eras, f, points, loads=rig.loads)
+    )
+    peak = peak_acceleration(amplitudes).reshape(rows, columns)
+    return PlateMap(x, y, peak, find_nulls(x, y, peak))

@@ -1,0 +1,70 @@
+"""What an excitation makes the plate do: peak acceleration, and where nothing moves.
+
+ERAs at the same frequency add as complex numbers; only magnitudes of different frequencies add
+(paper Eq. 28). Magnitudes added within a frequency would wipe out the nodal lines.
+"""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from scipy.ndimage import minimum_filter
+
+from model.arrays import ComplexArray, FloatArray
+from model.errors import InputError
+from model.structure.actuator import Era
+from model.vibration.excitation import Excitation
+
+G = 9.8
+"""Standard gravity as the paper rounds it [m/s²]; used only where accelerations are shown in g."""
+
+NULL_SHARE = 0.1
+"""A null lies below this share of the map's maximum."""
+
+
+def base_amplitudes(excitation: Excitation, eras: Sequence[Era]) -> tuple[FloatArray, ComplexArray]:
+    """Distinct frequencies (f,) [Hz], and how each ERA's base moves at them, (f, eras) [m].
+
+    Raises InputError where nothing is driven, or an ERA that is not there.
+    """
+    if not excitation:
+        raise InputError("no ERA is driven; name at least one")
+    names = [era.name for era in eras]
+    unknown = [name for name in excitation if name not in names]
+    if unknown:
+        raise InputError(f"the rig has no ERA {unknown[0]!r}; it has {', '.join(names)}")
+    frequencies = np.array(sorted({tone.frequency for tone in excitation.values()}))
+    amplitudes = np.zeros((len(frequencies), len(eras)), dtype=complex)
+    for name, tone in excitation.items():
+        row = np.searchsorted(frequencies, tone.frequency)
+        amplitudes[row, names.index(name)] = tone.amplitude * np.exp(1j * tone.phase)
+    return frequencies, amplitudes
+
+
+def tone_amplitudes(
+    excitation: Excitation,
+    eras: Sequence[Era],
+    response: Callable[[FloatArray], ComplexArray],
+) -> tuple[FloatArray, FloatArray]:
+    """Peak acceleration [m/s²] per distinct frequency: frequencies (f,) [Hz], amplitudes (f, p).
+
+    response: frequencies (f,) -> acceleration of each ERA at full stroke (f, eras, p).
+    """
+    frequencies, amplitudes = base_amplitudes(excitation, eras)
+    weights = amplitudes / np.array([era.stroke for era in eras])
+    coherent = np.einsum("fe,fep->fp", weights, response(frequencies))
+    return frequencies, np.abs(coherent)
+
+
+def peak_acceleration(amplitudes: FloatArray) -> FloatArray:
+    """Peak acceleration over time (p,) [m/s²] from amplitudes per frequency (f, p): their sum."""
+    return np.asarray(amplitudes.sum(axis=0))
+
+
+def find_nulls(x: FloatArray, y: FloatArray, peak: FloatArray) -> FloatArray:
+    """Positions [m] (n, 2) of the nulls of a map (len(y), len(x)): low local minima.
+
+    A curve of nulls shows as the lowest points along it.
+    """
+    low = peak <= NULL_SHARE * peak.max()
+    rows, columns = np.nonzero(low & (peak == minimum_filter(peak, size=3, mode="nearest")))
+    return np.column_stack([x[columns], y[rows]])

@@ -1,0 +1,128 @@
+"""New values in a rig file that somebody wrote, in whatever way they wrote it."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from model.calibration.outcome import Calibration
+from model.calibration.rig_text import calibrated_text, check_reads_back
+from model.errors import InputError
+from model.rig.file import load_rig
+from model.rig.rig import Rig
+
+FLOW = """\
+# my panel
+plate: {length: 0.3, width: 0.2, thickness: 2 mm, material: steel}  # from stock
+mesh: 12x9
+limits: {frequency: [40, 200]}
+eras:
+  A: {at: [0, 0], stiffness: 9 kN/m, damping_ratio: 0.1, amplifier: m, channel: 0}
+  B: {at: [0.3, 0], stiffness: 9000, amplifier: m, channel: 1, }
+  C: {at: [0, 0.2], stiffness: 9000, damping: 2, bolt_mass: 3 g, amplifier: m, channel: 2}
+amplifiers: {m: {url: "sim://"}}
+"""
+
+BLOCK = """\
+plate:
+  length: 0.3
+  width: 0.2
+  layers:   # glass on glass
+    - material: soda-lime-glass
+      thickness: 2 mm
+    - material: {E: 60 GPa, rho: 2500, nu: 0.2}
+      thickness: 1 mm   # the touch side
+  bond: none
+  loss_factor: 2 %   # bonded
+mesh: 12x9
+limits: {frequency: [40, 200]}
+eras:
+  A:   # "ä" in a comment: µ
+    at:
+      - 0
+      - 0
+    stiffness: 9000   # maker's
+    amplifier: m
+    channel: 0
+    gains:
+      - [50, 1, 0]
+      - [60, 1, 0]
+  B:
+    at: [0.3, 0]
+    bolt_mass: 1 g
+    stiffness: 9000
+    amplifier: m
+    channel: 1
+  C: {at: [0, 0.2], stiffness: 9000, amplifier: m, channel: 2}
+amplifiers: {m: {url: "sim://"}}
+"""
+
+
+def calibration(rig: Rig) -> Calibration:
+    """One that found other values everywhere, gains for all but the last ERA."""
+    material = replace(rig.plate.material, E=1.2345678 * rig.plate.material.E)
+    eras = tuple(
+        replace(
+            era,
+            stiffness=era.stiffness * 1.1 + number,
+            damping=era.damping + 1.5,
+            bolt_mass=era.bolt_mass + 0.0123456,
+            gains=((50.0, 0.91234, -0.2), (60.5, 1.1, 3.0)) if number < 2 else (),
+        )
+        for number, era in enumerate(rig.eras)
+    )
+    new = replace(rig, plate=replace(rig.plate, material=material, loss_factor=0.0234), eras=eras)
+    none = np.zeros((0, 3, 0), dtype=complex)
+    return Calibration(
+        rig=new,
+        parameters=(),
+        gains_error=np.zeros((0, 3)),
+        dead_sensors=(),
+        dead_eras=(),
+        scales=(),
+        outlier_count=0,
+        value_count=0,
+        error=0.0,
+        held_out=None,
+        sensors=(),
+        frequencies=np.zeros(0),
+        measured=none,
+        before=none,
+        after=none,
+    )
+
+
+@pytest.mark.parametrize("text", [FLOW, BLOCK], ids=["flow", "block"])
+def test_new_values_in_old_text(tmp_path: Path, text: str) -> None:
+    """Every value is read back, and every comment and line of the author's stands."""
+    path = tmp_path / "rig.yaml"
+    path.write_text(text, encoding="utf-8")
+    rig = load_rig(path)
+    found = calibration(rig)
+    written = calibrated_text(text, rig, found, comment="new\nvalues")
+    assert written.startswith("# new\n# values\n\n")
+    for line in text.splitlines():
+        if "#" in line:
+            assert line[line.index("#") :] in written
+    path.write_text(written, encoding="utf-8")
+    back = load_rig(path)
+    check_reads_back(back, found, path)
+    assert pytest.approx(found.rig.plate.material.E, rel=1e-6) == back.plate.material.E
+    assert back.plate.loss_factor == 0.0234
+    for era, wanted in zip(back.eras, found.rig.eras, strict=True):
+        assert era.stiffness == pytest.approx(wanted.stiffness, rel=1e-5)
+        assert era.damping == pytest.approx(wanted.damping, rel=1e-5)
+        assert era.bolt_mass == pytest.approx(wanted.bolt_mass, rel=1e-5)
+        np.testing.assert_allclose(era.gains, wanted.gains, rtol=1e-5)
+    assert back.wiring == rig.wiring
+    assert back.plate.material.rho == rig.plate.material.rho
+
+
+def test_what_does_not_read_back_is_refused(tmp_path: Path) -> None:
+    """A file with other values than the fitted ones is not taken for the new rig."""
+    path = tmp_path / "rig.yaml"
+    path.write_text(FLOW)
+    rig = load_rig(path)
+    with pytest.raises(InputError, match="could not be put into the rig file"):
+        check_reads_back(rig, calibration(rig), path)

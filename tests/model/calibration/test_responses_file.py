@@ -1,0 +1,225 @@
+"""Files of measured frequency responses, and what is refused in them."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import pyuff
+
+from model.calibration.responses import Responses, responses_of
+from model.calibration.responses_file import (
+    read_functions,
+    write_responses_csv,
+    write_responses_uff,
+)
+from model.errors import InputError
+from model.rig.rig import Rig
+from model.structure.plate import Plate
+
+WRITERS = {"csv": write_responses_csv, "uff": write_responses_uff}
+
+
+@pytest.fixture
+def responses() -> Responses:
+    """Three sensors, three frequencies, two of four ERAs; one value was not measured."""
+    rng = np.random.default_rng(4)
+    values = np.full((3, 4, 3), np.nan, dtype=complex)
+    values[:, :2] = 1e5 * (rng.standard_normal((3, 2, 3)) + 1j * rng.standard_normal((3, 2, 3)))
+    values[1, 0, 2] = np.nan
+    points = np.array([[0.1, 0.05], [0.2, 0.15], [0.3048, 0.2286]])
+    return Responses(("P1", "P2", "rim"), points, np.array([50.0, 110.25, 320.0]), values)
+
+
+@pytest.mark.parametrize("ending", WRITERS)
+def test_what_was_written_is_read_back(
+    responses: Responses, coarse_rig: Rig, tmp_path: Path, ending: str
+) -> None:
+    """Sensors, places, frequencies and complex values, gaps among them."""
+    path = tmp_path / f"measured.{ending}"
+    WRITERS[ending](path, responses, coarse_rig)
+    back = responses_of(read_functions(path), coarse_rig)
+    order = [back.sensors.index(name) for name in responses.sensors]
+    np.testing.assert_allclose(back.points[order], responses.points, rtol=1e-12)
+    np.testing.assert_array_equal(back.frequencies, responses.frequencies)
+    np.testing.assert_allclose(back.values[:, :, order], responses.values, rtol=1e-11)
+    assert back.count == 17
+
+
+def test_a_uff_of_another_program(coarse_rig: Rig, tmp_path: Path) -> None:
+    """Written by pyuff alone: single precision, nodes as dataset 15, no names, sensor upside down.
+
+    ERAs are known by their nodes' places.
+    """
+    nodes = pyuff.prepare_15(
+        node_nums=[7, 40],
+        def_cs=[0, 0],
+        disp_cs=[0, 0],
+        color=[0, 0],
+        x=[0.1, 0.3048],
+        y=[0.05, 0.0],
+        z=[0.0, 0.0],
+    )
+    record = pyuff.prepare_58(
+        func_type=4,
+        rsp_node=7,
+        rsp_dir=-3,
+        ref_node=40,
+        ref_dir=3,
+        ord_data_type=5,
+        num_pts=3,
+        abscissa_spacing=1,
+        abscissa_min=50.0,
+        abscissa_inc=10.0,
+        abscissa_spec_data_type=18,
+        ordinate_spec_data_type=12,
+        ordinate_axis_units_lab="m/s**2",
+        orddenom_spec_data_type=8,
+        x=np.array([50.0, 60.0, 70.0]),
+        data=np.array([1 + 2j, 3 - 1j, -250 + 0.5j]),
+    )
+    path = tmp_path / "other.unv"
+    file = pyuff.UFF(str(path))
+    file.write_sets([nodes, record], "overwrite", force_double=False)
+    back = responses_of(read_functions(path), coarse_rig)
+    assert back.sensors == ("node:7",)
+    np.testing.assert_allclose(back.frequencies, [50, 60, 70])
+    np.testing.assert_allclose(back.values[:, 1, 0], [-1 - 2j, -3 + 1j, 250 - 0.5j], rtol=1e-5)
+    assert np.isnan(back.values[:, [0, 2, 3]]).all()
+
+
+# pyuff does not close a file that it has written bytes to.
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+@pytest.mark.filterwarnings("ignore::ResourceWarning")
+@pytest.mark.parametrize("is_whole", [True, False])
+def test_a_binary_uff(
+    responses: Responses, coarse_rig: Rig, tmp_path: Path, *, is_whole: bool
+) -> None:
+    """Records as bytes (58b) are read to the last bit; one that lost some of them is refused."""
+    write_responses_uff(tmp_path / "ascii.uff", responses, coarse_rig)
+    sets = pyuff.UFF(str(tmp_path / "ascii.uff")).read_sets()
+    for each in sets[2:]:
+        each.update(binary=1, n_bytes=0)
+    path = tmp_path / "binary.uff"
+    pyuff.UFF(str(path)).write_sets(sets, "overwrite")
+    if is_whole:
+        back = responses_of(read_functions(path), coarse_rig)
+        np.testing.assert_allclose(back.values, responses.values, rtol=1e-11)
+        return
+    content = path.read_bytes()
+    cut = content.rindex(b"    -1")
+    path.write_bytes(content[: cut - 24] + b"\n" + content[cut:])
+    with pytest.raises(InputError, match=r"binary\.uff:?\d*: "):
+        read_functions(path)
+
+
+def damage(path: Path, before: str, after: str) -> None:
+    """Replace the first occurrence of a text in a file."""
+    text = path.read_bytes().decode()
+    assert before in text
+    path.write_bytes(text.replace(before, after, 1).encode("latin-1"))
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "said"),
+    [
+        ("x_m,y_m,freq", "x_mm,y_mm,freq", r":1: the columns must be .* x_m, y_m missing; 'x_mm'"),
+        ("real_1_s2", "real_g_m", r":1: .*real_1_s2 missing; 'real_g_m' unknown"),
+        ("era_x_m", "sensor", r":1: .*twice"),
+        (",50.0,", ",fifty,", r":2: frequency_hz is 'fifty', not a finite number"),
+        (",50.0,", ",nan,", r":2: frequency_hz is 'nan', not a finite number"),
+        (",50.0,", ",-50.0,", r":2: frequency_hz is -50, not above zero"),
+        (",50.0,", ",50.0,1.0,", r":2: 10 values stand here, the first line names 9"),
+        ("\nSW,", "\n,", r":2: era or sensor has no name"),
+        (",0.1,0.05,", ",0.11,0.05,", r":\d+: sensor P1 or ERA SW is at another place"),
+        ("\nSW,", "\n\xff,", "UTF-8"),
+        ("\nSW,", '\n"SW,', "is no CSV"),
+    ],
+)
+def test_damaged_csv(
+    responses: Responses, coarse_rig: Rig, tmp_path: Path, before: str, after: str, said: str
+) -> None:
+    """Wrong units, foreign columns, broken values: file and line."""
+    path = tmp_path / "measured.csv"
+    write_responses_csv(path, responses, coarse_rig)
+    damage(path, before, after)
+    with pytest.raises(InputError, match=rf"measured\.csv.*{said}"):
+        read_functions(path)
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "said"),
+    [
+        ("m/s^2", "g    ", r":\d+: the record is in 'g', not in m/s²"),
+        ("         1                  SI", "         5                  SI", r":1: .* of code 5"),
+        ("        12    0", "        11    0", r":\d+: the record is of data type 11 over 8"),
+        ("         8    0", "        13    0", r":\d+: .* data type 12 over 13"),
+        ("         6         3", "         6         4", r":\d+: the record announces 4 values"),
+        ("  5.00000e+01", "  x.00000e+01", r":\d+: 'x.00000e\+01.*' is not the numbers"),
+        ("  5.00000e+01", "  0.00000e+00", r":\d+: the record begins at 0 Hz"),
+        ("         1   3 ", "         1   1 ", r":\d+: the record's directions are 1 and 3"),
+        ("    4         0", "    9         0", ""),
+        ("\n    -1\n", "\n    -3\n", r":\d+: the dataset that begins here has no end"),
+    ],
+)
+def test_damaged_uff(
+    responses: Responses, coarse_rig: Rig, tmp_path: Path, before: str, after: str, said: str
+) -> None:
+    """Wrong units and kinds, broken records: file and line; other functions are passed over."""
+    path = tmp_path / "measured.uff"
+    write_responses_uff(path, responses, coarse_rig)
+    damage(path, before, after)
+    if not said:
+        assert len(read_functions(path)) == 5
+        return
+    with pytest.raises(InputError, match=rf"measured\.uff{said}"):
+        read_functions(path)
+
+
+@pytest.mark.parametrize("ending", WRITERS)
+def test_files_without_measurements(
+    responses: Responses, coarse_rig: Rig, tmp_path: Path, ending: str
+) -> None:
+    """No file, an empty one, a letter, a file cut off, and an ending that is unknown."""
+    path = tmp_path / f"measured.{ending}"
+    with pytest.raises(InputError, match="cannot be read"):
+        read_functions(path)
+    path.write_bytes(b" \n")
+    with pytest.raises(InputError, match="is empty"):
+        read_functions(path)
+    path.write_text("Dear all, the measurement was a success.\n")
+    with pytest.raises(InputError, match=f"measured.{ending}"):
+        read_functions(path)
+    WRITERS[ending](path, responses, coarse_rig)
+    path.write_bytes(path.read_bytes()[:-30])
+    with pytest.raises(InputError, match=rf"measured\.{ending}:\d+: "):
+        read_functions(path)
+    with pytest.raises(InputError, match="are read from"):
+        read_functions(tmp_path / "measured.mat")
+
+
+@pytest.mark.parametrize("ending", WRITERS)
+def test_another_plate(responses: Responses, coarse_rig: Rig, tmp_path: Path, ending: str) -> None:
+    """Points beyond the rig's plate, ERAs elsewhere or of other names, frequencies it forbids."""
+    path = tmp_path / f"measured.{ending}"
+    WRITERS[ending](path, responses, coarse_rig)
+    functions = read_functions(path)
+    plate = coarse_rig.plate
+    small = Plate(0.25, 0.2, plate.thickness, plate.material)
+    inside = tuple(replace(era, x=min(era.x, 0.25), y=min(era.y, 0.2)) for era in coarse_rig.eras)
+    with pytest.raises(InputError, match=rf"measured\.{ending}:\d+: sensor rim .* is off"):
+        responses_of(functions, replace(coarse_rig, plate=small, eras=inside))
+    moved = tuple(replace(era, x=0.9 * era.x) for era in coarse_rig.eras)
+    with pytest.raises(InputError, match=rf"measured\.{ending}:\d+: ERA SE was measured at"):
+        responses_of(functions, replace(coarse_rig, eras=moved))
+    others = tuple(replace(era, name=f"X{era.name}", x=0.1 + era.x / 3) for era in coarse_rig.eras)
+    with pytest.raises(InputError, match=rf"measured\.{ending}:\d+: the rig has no ERA SW"):
+        responses_of(functions, replace(coarse_rig, eras=others))
+    limits = replace(coarse_rig.limits, frequency_max=300.0)
+    with pytest.raises(InputError, match=rf"measured\.{ending}:\d+: 320 Hz is beyond"):
+        responses_of(functions, replace(coarse_rig, limits=limits))
+    with pytest.raises(InputError, match="stands twice"):
+        responses_of([*functions, functions[0]], coarse_rig)
+    elsewhere = replace(functions[0], point=(0.2, 0.2), era="NE", era_point=None)
+    with pytest.raises(InputError, match="give each place its own name"):
+        responses_of([*functions, elsewhere], coarse_rig)

@@ -1,0 +1,63 @@
+"""`era figure`: pictures and CSV files in a folder."""
+
+import csv
+import json
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from model.commands.figure_cli import figure_app
+from model.errors import InputError
+from model.rig.file import example_rig_path
+
+RUNNER = CliRunner()
+RIG = str(example_rig_path())
+PNG = b"\x89PNG\r\n\x1a\n"
+
+
+def test_a_figure_is_written_with_its_numbers(tmp_path: Path) -> None:
+    """Figure 7 as PNG and CSV in a new folder; the files and one next step are told."""
+    folder = tmp_path / "new" / "figures"
+    result = RUNNER.invoke(figure_app, ["7", RIG, "-o", str(folder), "--mesh", "12x9"])
+    assert result.exit_code == 0
+    assert sorted(path.name for path in folder.iterdir()) == [
+        "figure_7.csv",
+        "figure_7.png",
+        "figure_7_shapes.csv",
+    ]
+    assert (folder / "figure_7.png").read_bytes().startswith(PNG)
+    with (folder / "figure_7.csv").open(encoding="utf-8") as stream:
+        rows = list(csv.DictReader(stream))
+    # Table 2 of the paper, as it prints it and as the model gives it on the same mesh.
+    assert [row["paper_hz"] for row in rows] == ["31.98", "68.5", "76.62", "107.84", "160.77"]
+    assert [f"{float(row['model_12x9_hz']):.2f}" for row in rows] == [
+        "31.98", "68.50", "76.62", "107.84", "160.77",
+    ]  # fmt: skip
+    assert str(folder / "figure_7.png") in result.stdout
+    assert result.stdout.splitlines()[-1].startswith("Next: ")
+
+
+def test_as_json_the_findings_are_one_object(tmp_path: Path) -> None:
+    """Figure 13: ratio and correlation by name, and the files, and nothing else."""
+    arguments = ["13", RIG, "-o", str(tmp_path), "--mesh", "12x9", "--json"]
+    answer = json.loads(RUNNER.invoke(figure_app, arguments).stdout)
+    assert 1.5 < answer["figures"]["figure_13_maps"]["maximum_stiff_to_soft_ratio"] < 1.8
+    assert all(Path(name).is_file() for name in answer["files"])
+    assert len(answer["files"]) == 4
+
+
+def test_a_folder_that_cannot_be_is_told(tmp_path: Path) -> None:
+    """A file stands where the folder should be: its name is in the error."""
+    (tmp_path / "taken").write_text("mine", encoding="utf-8")
+    result = RUNNER.invoke(figure_app, ["7", RIG, "-o", str(tmp_path / "taken")])
+    assert isinstance(result.exception, OSError)
+    assert result.exception.filename == str(tmp_path / "taken")
+
+
+def test_an_unknown_figure_is_bad_input(tmp_path: Path) -> None:
+    """The error says which there are."""
+    result = RUNNER.invoke(figure_app, ["5", RIG, "-o", str(tmp_path)])
+    assert isinstance(result.exception, InputError)
+    with pytest.raises(InputError, match="6, 7, 10, 11, 12, 13, and all"):
+        raise result.exception

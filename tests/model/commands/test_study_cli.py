@@ -1,0 +1,226 @@
+"""`era study`: from a rig file to a recommended one."""
+
+import csv
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from typer.testing import CliRunner
+
+from model.commands.study_cli import study_app
+from model.errors import InputError
+from model.rig.file import example_rig_path, load_rig
+from model.studies.run import CHUNK
+from same_code import era_program
+
+RUNNER = CliRunner()
+RIG = str(example_rig_path())
+QUICK = ["--mesh", "12x9", "--frequencies", "60,110,250", "--candidates", "7x5"]
+PNG = b"\x89PNG\r\n\x1a\n"
+
+
+def study(what: str, folder: Path, *more: str, rig: str = RIG) -> dict[str, Any]:
+    """Run a study as JSON, and read its answer."""
+    result = RUNNER.invoke(study_app, [what, rig, "-o", str(folder), "--json", *QUICK, *more])
+    if result.exception is not None:
+        raise result.exception
+    answer: dict[str, Any] = json.loads(result.stdout)
+    return answer
+
+
+@pytest.mark.parametrize("what", ["placement", "count", "stiffness"])
+def test_a_study_recommends_a_rig_that_loads(tmp_path: Path, what: str) -> None:
+    """The rig to paste holds exactly the ERAs of the recommendation, on the same plate."""
+    answer = study(what, tmp_path, "--layouts", "12")
+    recommended = answer["recommended"]
+    rig = load_rig(tmp_path / "recommended.yaml")
+    assert rig.plate == load_rig(RIG).plate
+    assert {era.name: [era.x, era.y] for era in rig.eras} == recommended["at_m"]
+    assert {era.name: era.stiffness for era in rig.eras} == recommended["stiffness_n_m"]
+    assert set(recommended["active"]) <= {era.name for era in rig.eras}
+    assert all(name in recommended["words"] for name in recommended["at_m"])
+    for name in answer["files"]:
+        assert Path(name).is_file()
+        assert not name.endswith(".png") or Path(name).read_bytes().startswith(PNG)
+
+
+def test_what_no_study_changes_is_kept(tmp_path: Path) -> None:
+    """Bolt mass, measured gains and what else a rig says of its ERAs is in the recommended one."""
+    data = yaml.safe_load(Path(RIG).read_text(encoding="utf-8"))
+    for era in data["eras"].values():
+        era |= {
+            "bolt_mass": "4 g",
+            "stroke": "80 um",
+            "gains": [[60, 0.9, -2], [320, 1, 3]],
+        }
+    path = tmp_path / "rig.yaml"
+    path.write_text(yaml.safe_dump(data, sort_keys=False), encoding="utf-8")
+    study("placement", tmp_path / "out", "--layouts", "12", rig=str(path))
+    rig = load_rig(tmp_path / "out" / "recommended.yaml")
+    before = load_rig(path).eras[0]
+    assert len(before.gains) == 2
+    for era in rig.eras:
+        assert (era.bolt_mass, era.stroke, era.gains) == (0.004, 80e-6, before.gains)
+        assert era.stiffness == before.stiffness
+        assert era.damping == before.damping
+
+
+def test_the_recommended_rig_does_what_was_promised(tmp_path: Path) -> None:
+    """A study of the recommended rig finds its own layout with the same statistics."""
+    first = study("placement", tmp_path / "a", "--layouts", "12")
+    again = study("placement", tmp_path / "b", "--layouts", "1", rig=first["files"][0])
+    (own,) = again["ranking"]
+    assert own["layout"] == "own"
+    for key in ("minimum_m_s2", "median_m_s2", "maximum_m_s2"):
+        assert own[key] == pytest.approx(first["recommended"][key], rel=1e-9)
+
+
+def test_the_csv_has_every_case_and_drive(tmp_path: Path) -> None:
+    """Three rows a layout; the best of them by median is the head of the ranking."""
+    answer = study("placement", tmp_path, "--layouts", "20")
+    with (tmp_path / "placement.csv").open(encoding="utf-8") as stream:
+        rows = list(csv.DictReader(stream))
+    assert len(rows) == 60
+    pairs = [row for row in rows if row["driven"] == "2"]
+    best = max(pairs, key=lambda row: float(row["median_m_s2"]))
+    assert best["layout"] == answer["ranking"][0]["layout"] == answer["recommended"]["layout"]
+    assert float(best["median_m_s2"]) == answer["ranking"][0]["median_m_s2"]
+    medians = [case["median_m_s2"] for case in answer["ranking"][:10]]
+    assert medians == sorted(medians, reverse=True)
+    assert "own" in {case["layout"] for case in answer["ranking"]}
+
+
+def test_a_second_run_takes_everything_from_the_first(tmp_path: Path) -> None:
+    """Nothing is solved, and the answer is the same but for its time; another seed is new."""
+    first = study("placement", tmp_path, "--layouts", "20")
+    second = study("placement", tmp_path, "--layouts", "20")
+    assert (first["solved"], first["from_cache"]) == (20, 0)
+    assert (second["solved"], second["from_cache"]) == (0, 20)
+    assert second["ranking"] == first["ranking"]
+    other = study("placement", tmp_path, "--layouts", "20", "--seed", "1")
+    assert other["from_cache"] == 0
+    assert other["ranking"] != first["ranking"]
+
+
+def test_more_eras_than_the_rig_has_get_channels_of_their_own(tmp_path: Path) -> None:
+    """Six ERAs recommended for a rig of four: loadable, so no two on one channel."""
+    answer = study("count", tmp_path, "--layouts", "6", "--active", "all")
+    counts = {len(case["at_m"]) for case in answer["ranking"]}
+    assert counts == {1, 2, 3, 4, 5, 6}
+    rig = load_rig(tmp_path / "recommended.yaml")
+    assert len(rig.eras) == len(answer["recommended"]["at_m"]) > 4
+    assert len(set(rig.wiring.values())) == len(rig.eras)
+
+
+def test_people_read_a_ranking_and_one_next_step(tmp_path: Path) -> None:
+    """How long it took, the ranking with units, the recommendation in words, files, Next."""
+    result = RUNNER.invoke(
+        study_app, ["placement", RIG, "-o", str(tmp_path), "--layouts", "5", *QUICK]
+    )
+    assert result.exit_code == 0
+    lines = result.stdout.splitlines()
+    assert lines[0].startswith("5 cases in ")
+    assert " s (0 of them kept" in lines[0]
+    assert " g " in lines[3]
+    assert any(line.startswith("Recommended: 4 ERAs of 17 kN/m: ") for line in lines)
+    assert lines[-1] == f"Next: era table build {tmp_path}/recommended.yaml -o table.npz"
+
+
+def one_era_rig(folder: Path) -> str:
+    """The example's rig with its first ERA alone."""
+    data = yaml.safe_load(Path(RIG).read_text(encoding="utf-8"))
+    data["eras"] = dict([next(iter(data["eras"].items()))])
+    path = folder / "one.yaml"
+    path.write_text(yaml.safe_dump(data, sort_keys=False), encoding="utf-8")
+    return str(path)
+
+
+def test_a_pair_of_one_era_is_refused_and_a_way_out_told(tmp_path: Path) -> None:
+    """A rig of one ERA has no pair to rank by; with --active 1 it can be studied."""
+    rig = one_era_rig(tmp_path)
+    with pytest.raises(InputError, match="rank by it with --active 1"):
+        study("placement", tmp_path / "out", rig=rig)
+    answer = study("placement", tmp_path / "out", "--active", "1", "--layouts", "9", rig=rig)
+    assert len(answer["recommended"]["at_m"]) == 1
+    (era,) = load_rig(tmp_path / "out" / "recommended.yaml").eras
+    assert answer["recommended"]["at_m"] == {era.name: [era.x, era.y]}
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["loudness", RIG],
+        ["placement", RIG, "--layouts", "0"],
+        ["placement", RIG, "--layouts", "-3"],
+        ["placement", RIG, "--layouts", "many"],
+        ["placement", RIG, "--workers", "0"],
+        ["placement", RIG, "--active", "3"],
+        ["placement", RIG, "--seed", "-1"],
+    ],
+    ids=lambda arguments: " ".join(arguments[::2]) if len(arguments) > 2 else arguments[0],
+)
+def test_bad_usage_is_refused(tmp_path: Path, arguments: list[str]) -> None:
+    """An unknown study and numbers that are none or out of range end with status 2."""
+    result = RUNNER.invoke(study_app, [*arguments, "-o", str(tmp_path)])
+    assert result.exit_code == 2
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        (["--frequencies", "0:100:10"], "LO:HI:STEP"),
+        (["--frequencies", "60,110,60"], "60 Hz more than once"),
+        (["--frequencies", "60,9000"], "Hz"),
+        (["--candidates", "1x1"], "2x2 to 100x100"),
+        (["--candidates", "many"], "two numbers"),
+        (["--workers", "2", "--cluster", "tcp://127.0.0.1:1"], "one of them"),
+        (["--cluster", "nowhere"], "no address"),
+    ],
+)
+def test_bad_input_is_told(tmp_path: Path, more: list[str], message: str) -> None:
+    """One clear error, before anything is solved."""
+    with pytest.raises(InputError, match=message):
+        study("placement", tmp_path, *more)
+
+
+def test_a_folder_that_cannot_be_is_told(tmp_path: Path) -> None:
+    """A file stands where the folder, or its chunks, should be: its name is in the error."""
+    (tmp_path / "taken").write_text("mine", encoding="utf-8")
+    with pytest.raises(OSError, match="taken"):
+        study("placement", tmp_path / "taken", "--layouts", "2")
+    (tmp_path / "chunks").write_text("mine", encoding="utf-8")
+    with pytest.raises(OSError, match="chunks"):
+        study("placement", tmp_path, "--layouts", "2")
+
+
+def test_ctrl_c_leaves_a_study_that_goes_on(tmp_path: Path) -> None:
+    """SIGINT in the middle, with two workers: status 130, chunks kept, and used by the next run."""
+    command = [sys.executable, "-c", era_program()]
+    arguments = ["study", "placement", RIG, "-o", str(tmp_path), "--layouts", "30000", *QUICK]
+    with subprocess.Popen(
+        [*command, *arguments, "--workers", "2"],
+        stderr=subprocess.PIPE,
+        stdout=subprocess.DEVNULL,
+        text=True,
+        start_new_session=True,
+    ) as running:
+        while not list(tmp_path.glob("chunks/[!.]*.npz")):
+            assert running.poll() is None
+            time.sleep(0.02)
+        os.killpg(running.pid, signal.SIGINT)  # as a terminal does: to the workers as well
+        _, said = running.communicate(timeout=60)
+    assert running.returncode == 130
+    assert "goes on from there" in said
+    assert "Traceback" not in said
+    kept = len(list(tmp_path.glob("chunks/*.npz")))
+    assert 0 < kept < 30000 / CHUNK
+    assert not list(tmp_path.glob("chunks/.*"))
+    answer = study("placement", tmp_path, "--layouts", str(2 * CHUNK), "--workers", "1")
+    assert answer["from_cache"] >= CHUNK

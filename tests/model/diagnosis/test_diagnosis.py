@@ -1,0 +1,285 @@
+"""What is wrong with a rig, told from responses that another solver computes for a known truth.
+
+Truth comes from one sparse solve a frequency (`model.fem.harmonic`), the comparison from the
+reduced plate. Gains of 5 % and 5 degrees at random and noise of 2 % of each row are in every
+measurement.
+"""
+
+import json
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from model.diagnosis.observation import Observation, Pair
+from model.diagnosis.verdict import Verdict, diagnose
+from model.diagnosis.wording import as_json, channel_table, verdict_rows
+from model.errors import InputError
+from model.fem.assembly import assemble
+from model.fem.harmonic import direct_acceleration
+from model.fem.mesh import Mesh
+from model.rig.rig import Rig
+
+FREQUENCIES = np.linspace(57.0, 487.0, 10)
+NX, NY = 4, 2
+
+
+def points(rig: Rig) -> np.ndarray:
+    """Eight places in the middle of as many cells."""
+    x, y = (np.arange(NX) + 0.5) / NX, (np.arange(NY) + 0.5) / NY
+    return np.array([[a * rig.plate.length, b * rig.plate.width] for b in y for a in x])
+
+
+def within_tolerance(rig: Rig, rng: np.random.Generator) -> Rig:
+    """A plate as builders build it by the rig's file: E ±5 %, h ±2 %, k ±10 %, damping x2."""
+    material = replace(rig.plate.material, E=rig.plate.material.E * rng.uniform(0.95, 1.05))
+    plate = replace(
+        rig.plate,
+        material=material,
+        thickness=rig.plate.thickness * rng.uniform(0.98, 1.02),
+        loss_factor=rig.plate.loss_factor * 2 ** rng.uniform(-1, 1),
+    )
+    eras = tuple(
+        replace(
+            era,
+            stiffness=era.stiffness * rng.uniform(0.9, 1.1),
+            damping=era.damping * 2 ** rng.uniform(-1, 1),
+            bolt_mass=rng.uniform(0, 0.004),
+        )
+        for era in rig.eras
+    )
+    return replace(rig, plate=plate, eras=eras)
+
+
+def respond(truth: Rig, places: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Measured responses (f, e, s) [1/s²]."""
+    strokes = np.array([era.stroke for era in truth.eras])[:, None]
+    matrices = assemble(truth.plate, truth.mesh)
+    values = direct_acceleration(matrices, truth.eras, FREQUENCIES, places) / strokes
+    shape = (*values.shape[:2], 1)
+    values = values * (1 + 0.05 * rng.standard_normal(shape))
+    values = values * np.exp(1j * np.radians(5) * rng.standard_normal(shape))
+    return values + noise_like(values, 0.02, rng)
+
+
+def noise_like(values: np.ndarray, share: float, rng: np.random.Generator) -> np.ndarray:
+    """Complex white noise, a share of each row's rms over the sensors."""
+    size = np.sqrt((np.abs(values) ** 2).mean(axis=2, keepdims=True))
+    white = rng.standard_normal(values.shape) + 1j * rng.standard_normal(values.shape)
+    return np.asarray(share * size * white / np.sqrt(2))
+
+
+def observe(
+    places: np.ndarray, values: np.ndarray, *, has_phases: bool = True, pairs: Sequence[Pair] = ()
+) -> Observation:
+    """Sensors P1, P2, ... at these places."""
+    names = tuple(f"P{number}" for number in range(1, len(places) + 1))
+    return Observation(names, places, FREQUENCIES, values, has_phases, pairs)
+
+
+def states(verdict: Verdict) -> dict[str, tuple[str, ...]]:
+    """What is wrong with channels, by the ERA in the rig."""
+    return {c.era: c.states for c in verdict.channels if c.states != ("well",)}
+
+
+@pytest.fixture(scope="module")
+def built(coarse_rig: Rig) -> tuple[np.ndarray, np.ndarray]:
+    """Places, and responses of one plate within tolerance."""
+    rng = np.random.default_rng(7)
+    places = points(coarse_rig)
+    return places, respond(within_tolerance(coarse_rig, rng), places, rng)
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_a_plate_within_tolerance_is_well_and_a_swap_on_it_is_seen(
+    coarse_rig: Rig, seed: int
+) -> None:
+    """No false alarm, and none overslept, whichever two channels are exchanged."""
+    rng = np.random.default_rng(1000 + seed)
+    places = points(coarse_rig)
+    values = respond(within_tolerance(coarse_rig, rng), places, rng)
+    well = diagnose(coarse_rig, observe(places, values))
+    assert well.is_well
+    assert verdict_rows(well) == ["ALL WELL: plate and channels are what the rig says"]
+    one, other = rng.choice(4, size=2, replace=False)
+    values[:, [one, other]] = values[:, [other, one]]
+    swapped = diagnose(coarse_rig, observe(places, values))
+    names = {coarse_rig.eras[one].name, coarse_rig.eras[other].name}
+    assert [set(cycle) for cycle in swapped.swapped] == [names]
+    assert states(swapped).keys() == names
+    assert swapped.plate_matches
+    assert min(c.confidence for c in swapped.channels) > 0.95
+
+
+def test_three_in_a_circle(coarse_rig: Rig, built: tuple[np.ndarray, np.ndarray]) -> None:
+    """SW's channel drives SE, SE's NE, NE's SW: which permutation it is, is found."""
+    places, values = built
+    verdict = diagnose(coarse_rig, observe(places, values[:, [1, 2, 0, 3]]))
+    assert verdict.swapped == (("SW", "SE", "NE"),)
+    assert [c.drives for c in verdict.channels] == ["SE", "NE", "SW", "NW"]
+
+
+def test_dead_weak_and_inverted_channels(
+    coarse_rig: Rig, built: tuple[np.ndarray, np.ndarray]
+) -> None:
+    """Each is named with its gain; a dead one whether sensors read nothing or noise."""
+    places, values = built
+    rng = np.random.default_rng(3)
+    broken = values.copy()
+    broken[:, 0] *= 1e-4
+    broken[:, 1] *= 0.4
+    broken[:, 3] *= -1
+    verdict = diagnose(coarse_rig, observe(places, broken))
+    assert states(verdict) == {"SW": ("dead",), "SE": ("weak",), "NW": ("inverted",)}
+    assert verdict.channels[1].gain == pytest.approx(0.4, rel=0.1)
+    assert abs(verdict.channels[3].phase or 0) == pytest.approx(180, abs=10)
+    assert verdict.plate_matches
+    broken = values.copy()
+    broken[:, 2] = noise_like(values, 0.1, rng)[:, 2]
+    assert states(diagnose(coarse_rig, observe(places, broken))) == {"NE": ("dead",)}
+
+
+def test_a_channel_on_anothers_era(coarse_rig: Rig, built: tuple[np.ndarray, np.ndarray]) -> None:
+    """SW's plug is in NW's socket, and NW's hangs free: another ERA, and a dead channel."""
+    places, values = built
+    broken = values.copy()
+    broken[:, 0], broken[:, 3] = values[:, 3], 1e-6
+    verdict = diagnose(coarse_rig, observe(places, broken))
+    assert states(verdict) == {"SW": ("other ERA",), "NW": ("dead",)}
+    assert verdict.channels[0].drives == "NW"
+    assert verdict.swapped == ()
+    assert any(row.startswith("WRONG ERA: channel 0") for row in verdict_rows(verdict))
+
+
+def test_bad_sensors_are_not_blamed_on_the_rig(
+    coarse_rig: Rig, built: tuple[np.ndarray, np.ndarray]
+) -> None:
+    """A dead one and one that is upside down and half are named and left out; the rig is well."""
+    places, values = built
+    broken = values.copy()
+    broken[:, :, 5] = 1e-9
+    broken[:, :, 2] *= -0.5
+    verdict = diagnose(coarse_rig, observe(places, broken))
+    assert verdict.is_well
+    assert [name for name, _ in verdict.bad_sensors] == ["P6", "P3"]
+
+
+def test_polarity_without_phases_of_the_drive(
+    coarse_rig: Rig, built: tuple[np.ndarray, np.ndarray]
+) -> None:
+    """Pairs tell it; the fewer are the wrong ones; of two, nobody knows."""
+    places, values = built
+    rng = np.random.default_rng(5)
+    sign = np.array([1, 1, 1, -1])[None, :, None]
+    turned = values * sign
+    pairs = [
+        Pair(float(FREQUENCIES[row]), (i, j), turned[row, i] + turned[row, j])
+        for i, j in ((0, 1), (1, 2), (2, 3), (0, 3))
+        for row in (1, 4, 8)
+    ]
+    loose = turned * np.exp(1j * rng.uniform(0, 6, (*turned.shape[:2], 1)))
+    seen = diagnose(coarse_rig, observe(places, loose, has_phases=False, pairs=pairs))
+    assert states(seen) == {"NW": ("inverted",)}
+    none = diagnose(coarse_rig, observe(places, loose, has_phases=False))
+    assert none.is_well
+    alone = [pair for pair in pairs if pair.eras == (2, 3)]
+    two = diagnose(coarse_rig, observe(places, loose, has_phases=False, pairs=alone))
+    assert states(two) == {"NW": ("inverted",)}
+    assert two.channels[3].confidence == 0.5
+    assert "half against half" in verdict_rows(two)[0]
+
+
+def changed(rig: Rig, what: str) -> Rig:
+    """A plate that is not the rig's."""
+    match what:
+        case "plate.thickness":
+            return replace(rig, plate=replace(rig.plate, thickness=0.002))
+        case "plate.length":
+            plate = replace(rig.plate, length=1.2 * rig.plate.length)
+            eras = tuple(replace(era, x=1.2 * era.x) for era in rig.eras)
+            mesh = Mesh(14, 9, plate.length, plate.width)
+            return replace(rig, plate=plate, eras=eras, mesh=mesh)
+        case "eras.stiffness":
+            return replace(
+                rig, eras=tuple(replace(era, stiffness=2.2 * era.stiffness) for era in rig.eras)
+            )
+        case _:  # a bolt of NE is loose
+            loose = replace(rig.eras[2], stiffness=200.0, damping=0.05)
+            return replace(rig, eras=(*rig.eras[:2], loose, rig.eras[3]))
+
+
+@pytest.mark.parametrize(
+    ("what", "value", "within"),
+    [
+        ("plate.thickness", 0.002, 0.04),
+        ("plate.length", 1.2 * 0.3048, 0.04),
+        ("eras.stiffness", 2.2 * 17000, 0.12),
+        ("eras.NE.stiffness", 200.0, 0.12),
+    ],
+)
+def test_what_would_explain_another_plate_is_named(
+    coarse_rig: Rig, what: str, value: float, within: float
+) -> None:
+    """The first of the explanations is the truth, its value within what is uncertain otherwise."""
+    rng = np.random.default_rng(11)
+    truth = changed(within_tolerance(coarse_rig, rng), what)
+    places = points(coarse_rig)
+    verdict = diagnose(coarse_rig, observe(places, respond(truth, places, rng)))
+    assert not verdict.plate_matches
+    first = verdict.explanations[0]
+    assert first.cause.key == what
+    assert first.value == pytest.approx(value, rel=within)
+    assert first.share > 0.5
+    said = "\n".join(verdict_rows(verdict))
+    assert "PLATE: the rig does not match the plate" in said
+    assert f"{what} " in said
+    told = json.loads(json.dumps(as_json(verdict)))
+    assert told["plate"]["explanations"][0]["key"] == what
+    assert told["all_well"] is False
+
+
+def test_a_swap_on_another_plate_is_both(coarse_rig: Rig) -> None:
+    """Neither hides the other."""
+    rng = np.random.default_rng(13)
+    places = points(coarse_rig)
+    values = respond(changed(coarse_rig, "eras.stiffness"), places, rng)[:, [0, 2, 1, 3]]
+    verdict = diagnose(coarse_rig, observe(places, values))
+    assert verdict.swapped == (("SE", "NE"),)
+    assert verdict.explanations[0].cause.key == "eras.stiffness"
+
+
+def test_nothing_at_all_moves(coarse_rig: Rig, built: tuple[np.ndarray, np.ndarray]) -> None:
+    """All dead is said of each, and nothing of a plate that nobody has seen."""
+    places, values = built
+    verdict = diagnose(coarse_rig, observe(places, 1e-5 * values))
+    assert set(states(verdict).values()) == {("dead",)}
+    assert len(verdict_rows(verdict)) == 4
+    assert len(channel_table(verdict)) == 5
+    assert as_json(verdict)["plate"]["unexplained"] is None
+
+
+def test_too_little_to_tell_is_refused(
+    coarse_rig: Rig, built: tuple[np.ndarray, np.ndarray]
+) -> None:
+    """Two sensors, three frequencies, no channel: what is needed is said."""
+    places, values = built
+    with pytest.raises(InputError, match="2 usable sensors"):
+        diagnose(coarse_rig, observe(places[:2], values[:, :, :2]))
+    few = replace(observe(places, values[:3]), frequencies=FREQUENCIES[:3])
+    with pytest.raises(InputError, match="at 3 frequencies"):
+        diagnose(coarse_rig, few)
+    with pytest.raises(InputError, match="no channel was driven"):
+        diagnose(coarse_rig, observe(places, np.full_like(values, np.nan)))
+
+
+def test_channels_that_were_not_driven_are_not_judged(
+    coarse_rig: Rig, built: tuple[np.ndarray, np.ndarray]
+) -> None:
+    """Half a measurement is judged as far as it goes."""
+    places, values = built
+    part = values.copy()
+    part[:, 1:3] = np.nan
+    verdict = diagnose(coarse_rig, observe(places, part))
+    assert states(verdict) == {"SE": ("not driven",), "NE": ("not driven",)}
+    assert verdict.is_well

@@ -1,0 +1,371 @@
+"""Drive modes: what each finds is the best there is, by other ways of looking for it."""
+
+from dataclasses import replace
+from itertools import product
+
+import numpy as np
+import pytest
+from scipy.optimize import minimize
+
+from model.drive_modes import (
+    MODES,
+    Choice,
+    best_drive,
+    coherent,
+    fields,
+    loudest,
+    playable_modes,
+)
+from model.drive_modes import switched as switched_mode
+from model.drive_modes.fields import ERROR_SHARE, SILENT, Drive, Fields, Outcome, judge
+from model.drive_modes.phased import PHASED
+from model.table.build import build_table
+from model.table.question import Question
+from paper_table import FREQUENCIES, contact_sets, smooth_rig, smooth_table
+
+F, E = 5, 3
+
+
+def random_fields(seed, *, targets=1, quiet=6, points=3, is_alone=False, wanted=1e-6, eras=E):
+    """Fields without any physics in them."""
+    rng = np.random.default_rng(seed)
+
+    def field(count):
+        parts = rng.standard_normal((2, F, eras, count))
+        return (parts[0] + 1j * parts[1]).astype(np.complex64)
+
+    threshold = rng.uniform(0.5, 2.0, F).astype(np.float32)
+    return Fields(
+        tuple(field(points) for _ in range(targets)), field(quiet), is_alone, threshold, wanted
+    )
+
+
+def fields_on_plate(places, *, targets=1, level=12.0):
+    """Fields of fingertips on the paper's plate."""
+    return smooth_table().fields(
+        Question(tuple(places[:targets]), tuple(places[targets:]), level_db_sl=level)
+    )
+
+
+def contrast_by_hand(given, drive_index, weights):
+    """Equation 28 written out for one drive: contrast, and how many times above threshold."""
+    frequencies = sorted(set(drive_index) - {SILENT})
+
+    def amplitudes(field):
+        rows = []
+        for f in frequencies:
+            total = 0
+            for era, index in enumerate(drive_index):
+                if index == f:
+                    total = total + weights[era] * field[f, era]
+            rows.append(np.abs(total))
+        return np.array(rows)
+
+    threshold = given.threshold[frequencies][:, None]
+    peaks, felt = [], []
+    for field in given.targets:
+        a = amplitudes(field)
+        peaks.append(a.sum(axis=0).mean())
+        felt.append(np.sqrt(((a / threshold) ** 2).sum(axis=0)).mean())
+    quiet = amplitudes(given.quiet).sum(axis=0)
+    loud = np.sqrt((quiet**2).mean()) if given.is_alone else quiet.max()
+    return min(peaks) / loud, min(felt)
+
+
+@pytest.mark.parametrize("is_alone", [False, True])
+@pytest.mark.parametrize("targets", [1, 2])
+@pytest.mark.parametrize("wanted", [1e-6, 1.4, 2.0])
+def test_switched_finds_the_best_of_all_patterns(is_alone, targets, wanted, monkeypatch):
+    """One or two ERAs of three at five frequencies, every pattern tried by hand."""
+    monkeypatch.setattr(switched_mode, "AT_ONCE", 3)
+    monkeypatch.setattr(switched_mode, "BOUND_POINTS", 1)  # so that bounds mislead
+    for seed in range(5):
+        given = random_fields(seed, targets=targets, is_alone=is_alone, wanted=wanted)
+        best = 0.0
+        for index in product([SILENT, *range(F)], repeat=E):
+            if 1 <= sum(i != SILENT for i in index) <= 2:
+                contrast, felt = contrast_by_hand(given, index, np.ones(E))
+                best = max(best, contrast if felt >= wanted else 0.0)
+        drive = MODES["switched"].find(given, 0.0)
+        assert drive is not None
+        found, felt = contrast_by_hand(given, drive.index.tolist(), drive.weight)
+        assert felt >= wanted * (1 - 1e-5)
+        assert found == pytest.approx(best, rel=1e-5)
+
+
+@pytest.mark.parametrize("few", [0, 10_000])
+@pytest.mark.parametrize("targets", [1, 2])
+def test_switched_says_whether_something_is_better(few, targets, monkeypatch):
+    """Just below its best contrast it finds that, just above nothing, of few sources and many."""
+    monkeypatch.setattr(switched_mode, "FEW_SOURCES", few)
+    for seed in range(8):
+        given = random_fields(seed, targets=targets)
+        best = judge(given, MODES["switched"].find(given, 0.0))
+        contrast = best.peak / best.quiet_peak
+        again = MODES["switched"].find(given, 0.999 * contrast)
+        assert again is not None
+        assert judge(given, again).peak == best.peak
+        assert MODES["switched"].find(given, 1.001 * contrast) is None
+
+
+def test_what_a_drive_does_is_equation_28():
+    """Peak, level and contrast of a drive at two frequencies, by hand."""
+    given = random_fields(1)
+    drive = Drive(np.array([2, 0, 2]), np.array([0.5j, 1.0, -0.25], dtype=np.complex64))
+    outcome = judge(given, drive)
+    contrast, felt = contrast_by_hand(given, [2, 0, 2], [0.5j, 1.0, -0.25])
+    assert outcome.peak / outcome.quiet_peak == pytest.approx(contrast, rel=1e-5)
+    assert outcome.sensation == pytest.approx(felt, rel=1e-5)
+
+
+def test_what_a_quiet_finger_feels_of_two_tones_is_their_power():
+    """Multiples of threshold add as squares: 3 at one frequency and 4 at another are felt as 5."""
+    quiet = np.zeros((2, 2, 1), dtype=np.complex64)
+    quiet[0, 0], quiet[1, 1] = 3.0, 40.0j
+    given = Fields(
+        (np.ones((2, 2, 1), dtype=np.complex64),), quiet, False, np.array([1.0, 10.0]), 1e-6
+    )
+    outcome = judge(given, Drive(np.array([0, 1]), np.ones(2, dtype=np.complex64)))
+    assert outcome.quiet_sensation == pytest.approx(5.0)
+    assert outcome.quiet_peak == pytest.approx(43.0)
+
+
+@pytest.mark.parametrize(
+    ("scores", "near"),
+    [
+        ([1.2, 2.0, 1.9, 1.41, 1.42], [1, 2, 4]),  # 3 dB below 2 is 1.416
+        ([1.9, 1.7, 2.0, 1.8, 1.6, 1.5], [2, 0, 3, 1]),
+        ([1.99, 1.9], []),  # the best is none of them: it has several frequencies
+    ],
+)
+def test_what_is_near_the_best_is_within_three_decibels(scores, near):
+    """The best first, four at the most; none where the best drive is not among them."""
+    frequencies = np.arange(10, 10 + len(scores))
+    choice = Choice(
+        Drive(np.array([0, 1]), np.ones(2, dtype=np.complex64)),
+        Outcome(peak=1.0, sensation=1.0, quiet_peak=0.4, quiet_sensation=0.4, score=2.0),
+        frequencies,
+        np.repeat(frequencies[:, None], 2, axis=1).astype(np.complex64),
+        np.array(scores, dtype=np.float32),
+    )
+    found = choice.near()
+    assert (found.frequencies - 10).tolist() == near
+    assert found.weights[:, 0].tolist() == found.frequencies.tolist()
+    assert found.score == pytest.approx([scores[place] for place in near])
+
+
+def test_phased_for_one_quiet_point_is_the_closed_form():
+    """With one point at the target and one quiet, the best score is sqrt(h^H R^-1 h)."""
+    for seed in range(5):
+        given = random_fields(seed, quiet=1, points=1)
+        best = 0.0
+        for f in range(F):
+            q, t = given.quiet[f, :, 0].astype(complex), given.targets[0][f, :, 0]
+            R = np.outer(q.conj(), q) + ERROR_SHARE**2 * np.diag(np.abs(q) ** 2)
+            best = max(best, np.sqrt((t @ np.linalg.solve(R, t.conj())).real))
+        drive = MODES["phased"].find(given, 0.0)
+        assert judge(given, drive).score == pytest.approx(best, rel=1e-3)
+
+
+def test_phased_for_a_lone_finger_is_the_closed_form():
+    """What is around it counts by its mean power, so at every frequency it is h^H R^-1 h."""
+    for seed in range(5):
+        given = random_fields(seed, points=1, is_alone=True)
+        best = 0.0
+        for f in range(F):
+            q, t = given.quiet[f].astype(complex), given.targets[0][f, :, 0]
+            power = (np.abs(q) ** 2).mean(axis=1)
+            R = q.conj() @ q.T / q.shape[1] + ERROR_SHARE**2 * np.diag(power)
+            best = max(best, np.sqrt((t @ np.linalg.solve(R, t.conj())).real))
+        drive = MODES["phased"].find(given, 0.0)
+        assert judge(given, drive).score == pytest.approx(best, rel=1e-3)
+
+
+@pytest.mark.parametrize(("mode", "lowest"), [("signed", -1.0), ("graded", 0.0)])
+def test_real_weights_are_the_best_of_a_fine_grid(mode, lowest):
+    """One quiet point and one target whose phases fit nothing: every direction of weights tried."""
+    side = np.linspace(lowest, 1.0, 61)
+    grid = np.array([[1.0, a, b] for a in side for b in side])
+    grid = np.concatenate([np.roll(grid, shift, axis=1) for shift in range(3)])
+    for seed in range(8):
+        given = random_fields(seed, quiet=1, points=1)
+        best = 0.0
+        for f in range(F):
+            q, t = given.quiet[f, :, 0], given.targets[0][f, :, 0]
+            power = np.abs(grid @ q) ** 2 + ERROR_SHARE**2 * (grid**2 @ np.abs(q) ** 2)
+            best = max(best, (np.abs(grid @ t) / np.sqrt(power)).max())
+        assert judge(given, MODES[mode].find(given, 0.0)).score >= 0.995 * best
+
+
+def refined(given, frequency, start, free):
+    """The best score at a frequency by a general optimiser; free: parameters to weights."""
+
+    def loss(x):
+        weight = free(x).astype(complex)
+        t = np.abs(weight @ given.targets[0][frequency]).mean()
+        q = np.abs(weight @ given.quiet[frequency]) ** 2
+        wrong = (np.abs(weight) ** 2) @ np.abs(given.quiet[frequency]) ** 2
+        return -t / np.sqrt((q + ERROR_SHARE**2 * wrong).max())
+
+    options = {"maxiter": 1500, "xatol": 1e-4, "fatol": 1e-4}
+    return -minimize(loss, start, method="Nelder-Mead", options=options).fun
+
+
+@pytest.mark.parametrize(
+    ("mode", "count", "free"),
+    [
+        ("phased", 8, lambda x: x[:4] + 1j * x[4:]),
+        ("signed", 4, lambda x: x),
+        ("graded", 4, np.abs),
+    ],
+)
+def test_a_general_optimiser_finds_nothing_better(mode, count, free):
+    """On the plate, from several starts, Nelder-Mead gains no more than 2 % (0.17 dB)."""
+    for number, places in enumerate(contact_sets(3, fingers=3, seed=4)):
+        given = fields_on_plate(places, level=-60.0).at(np.array([2, 9, 16]))
+        score = judge(given, MODES[mode].find(given, 0.0)).score
+        rng = np.random.default_rng(number)
+        best = max(
+            refined(given, f, rng.standard_normal(count), free) for f in range(3) for _ in range(4)
+        )
+        assert score >= 0.98 * best
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_modes_keep_to_what_they_may(seed):
+    """Switched: full stroke; graded: real and not below zero; signed: real; none above 1."""
+    given = random_fields(seed)
+    switched, graded, signed, phased = (MODES[mode].find(given, 0.0) for mode in MODES)
+    assert set(np.abs(switched.weight).tolist()) <= {0.0, 1.0}
+    assert (graded.weight.imag == 0).all()
+    assert (graded.weight.real >= 0).all()
+    assert (signed.weight.imag == 0).all()
+    for drive in (graded, signed, phased):
+        assert np.abs(drive.weight).max() == pytest.approx(1.0, rel=1e-5)
+
+
+@pytest.mark.parametrize("level", [12.0, 60.0])
+def test_more_freedom_is_never_worse(level):
+    """On the paper's plate each mode's robust score is at least that of the mode before it.
+
+    At 60 dB SL the level holds the best weights back, and poorer modes find better ones by chance;
+    of one target `phased` leaves them out elsewhere and may miss half a decibel.
+    """
+    held_back = 0
+    for quiet, targets in ((1, 1), (3, 1), (7, 1), (2, 2), (3, 2)):
+        for places in contact_sets(10, fingers=quiet + targets, seed=quiet):
+            given = fields_on_plate(places, targets=targets, level=level)
+            found = [best_drive(given, mode) for mode in MODES]
+            scores = [one[1].score if one else 1e-3 for one in found]
+            switched, graded, signed, phased = 20 * np.log10(scores)
+            assert graded >= switched
+            assert signed >= graded - 1e-4
+            assert phased >= switched
+            is_held_back = PHASED.search(given, 0.0).is_held_back
+            held_back += is_held_back
+            strict = is_held_back or targets > 1
+            assert phased >= signed - (1e-4 if strict else 0.5)
+    assert (held_back > 10) == (level > 50.0)
+
+
+def test_more_frequencies_and_eras_are_never_worse():
+    """Every second frequency, or one ERA less, has no better best; phased to half a decibel."""
+    for places in contact_sets(10, fingers=3, seed=3):
+        given = fields_on_plate(places)
+        fewer = given.at(np.arange(0, len(FREQUENCIES), 2))
+        without = Fields(
+            tuple(field[:, :3] for field in given.targets),
+            given.quiet[:, :3],
+            False,
+            given.threshold,
+            given.wanted,
+        )
+        for mode, slack in (("switched", 1e-9), ("phased", 0.5)):
+            most = 20 * np.log10(best_drive(given, mode)[1].score)
+            for less in (fewer, without):
+                outcome = best_drive(less, mode)[1]
+                if mode == "switched":  # goes by contrast, not by the score
+                    whole = best_drive(given, mode)[1]
+                    assert outcome.peak / outcome.quiet_peak <= whole.peak / whole.quiet_peak
+                else:
+                    assert 20 * np.log10(outcome.score) <= most + slack
+
+
+def test_the_phased_optimum_does_not_depend_on_what_holds_the_plate(monkeypatch):
+    """Without errors: half the stiffness and four times the damping, the same best contrast."""
+    monkeypatch.setattr(coherent, "ERROR_SHARE", 1e-3)
+    monkeypatch.setattr(fields, "ERROR_SHARE", 1e-3)
+    rig = smooth_rig()
+    other = replace(
+        rig,
+        eras=tuple(
+            replace(era, stiffness=era.stiffness / 2, damping=era.damping * 4) for era in rig.eras
+        ),
+    )
+    tables = [build_table(each, frequencies=FREQUENCIES[::4]) for each in (rig, other)]
+    for places in contact_sets(8, fingers=2, seed=8):
+        question = Question((places[0],), (places[1],), level_db_sl=-60.0)
+        scores = [
+            20 * np.log10(judge(given, MODES["phased"].find(given, 0.0)).score)
+            for given in (table.fields(question) for table in tables)
+        ]
+        assert scores[0] == pytest.approx(scores[1], abs=0.1)
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_what_is_said_to_be_the_loudest_is_had(mode):
+    """A hair below the loudest level there is a drive; a tenth above there is none."""
+    for places in contact_sets(5, fingers=2, seed=5):
+        given = fields_on_plate(places)
+        most = loudest(given, mode)
+        found = best_drive(replace(given, wanted=0.999 * most), mode)
+        assert found is not None
+        assert found[1].sensation >= 0.999 * most * (1 - 1e-5)
+        assert best_drive(replace(given, wanted=1.1 * most), mode) is None
+
+
+def test_phased_is_loudest_with_all_eras_in_step():
+    """At one point no weights of up to full stroke give more than the sum of the magnitudes."""
+    given = random_fields(2, points=1)
+    sums = np.abs(given.targets[0][:, :, 0]).sum(axis=1) / given.threshold
+    assert MODES["phased"].loudest(given) == pytest.approx(sums.max(), rel=1e-4)
+
+
+def test_two_targets_and_a_quiet_point_are_all_served():
+    """Four ERAs, two targets, one quiet point, next to no errors to fear: both targets feel it."""
+    for seed in range(5):
+        given = random_fields(seed, targets=2, quiet=1, points=1, eras=4)
+        drive, outcome = best_drive(given, "phased")
+        (frequency, weight), *more = drive.tones()
+        assert not more
+        reached = [np.abs(weight @ field[frequency])[0] for field in given.targets]
+        assert outcome.peak == pytest.approx(min(reached), rel=1e-5)
+
+        # No mixture of the two single solutions, at any phase and ratio, has a better lesser one.
+        best = 0.0
+        for f in range(F):
+            h = np.stack([field[f, :, 0] for field in given.targets]).astype(complex)
+            q = given.quiet[f, :, 0].astype(complex)
+            R = np.outer(q.conj(), q) + ERROR_SHARE**2 * np.diag(np.abs(q) ** 2)
+            single = np.linalg.solve(R, h.conj().T)
+            for phase, ratio in product(np.linspace(0, 2 * np.pi, 73), np.geomspace(0.1, 10, 41)):
+                w = single[:, 0] + ratio * np.exp(1j * phase) * single[:, 1]
+                cost = np.sqrt((w.conj() @ R @ w).real)
+                best = max(best, np.abs(h @ w).min() / cost)
+        assert outcome.score >= 0.98 * best
+
+
+@pytest.mark.parametrize(
+    ("level_step", "phase_step", "richest"),
+    [
+        (1.0, 1.0, "switched"),
+        (0.01, 360.0, "graded"),
+        (0.01, 180.0, "signed"),
+        (1 / 4096, 0.1, "phased"),
+        (0.01, 45.0, "signed"),
+    ],
+)
+def test_what_an_amplifier_can_play_follows_from_its_steps(level_step, phase_step, richest):
+    """On and off only; levels; signs; phases; phases too coarse to cancel with."""
+    modes = playable_modes(level_step=level_step, phase_step=phase_step)
+    assert modes == tuple(MODES)[: list(MODES).index(richest) + 1]

@@ -1,0 +1,47 @@
+"""The bound for mixtures: no looser than the best mixture, found by another program."""
+
+import numpy as np
+import pytest
+from scipy.optimize import linprog, minimize
+
+from model.drive_modes.mixture_bound import mixture_bound
+
+
+def sources(seed):
+    """Magnitudes of 40 sources at 80 quiet points, more than the program begins with."""
+    return np.random.default_rng(seed).exponential(size=(40, 80))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_loudest_points_bound_is_reached_by_a_mixture(seed):
+    """The primal program over all points at once has the same value, to a thousandth."""
+    relative = sources(seed)
+    n, points = relative.shape
+    primal = linprog(
+        np.append(np.zeros(n), 1.0),
+        A_ub=np.column_stack([relative.T, -np.ones(points)]),
+        b_ub=np.zeros(points),
+        A_eq=[np.append(np.ones(n), 0.0)],
+        b_eq=[1.0],
+        method="highs-ipm",
+    )
+    share, bound = mixture_bound(relative, is_rms=False)
+    assert share.sum() == pytest.approx(1.0)
+    assert (share >= 0).all()
+    assert 1 / primal.fun <= bound * (1 + 1e-9)
+    assert bound == pytest.approx(1 / primal.fun, rel=2e-3)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_rms_bound_is_reached_by_a_mixture(seed):
+    """A general optimiser over mixtures comes within a percent of it, and not beyond."""
+    relative = sources(seed)
+
+    def loud(x):
+        mixture = np.abs(x) / np.abs(x).sum()
+        return np.sqrt(((mixture @ relative) ** 2).mean())
+
+    best = minimize(loud, np.ones(len(relative)), method="L-BFGS-B").fun
+    share, bound = mixture_bound(relative, is_rms=True)
+    assert np.linalg.norm(share) * np.sqrt(len(share)) == pytest.approx(1.0)
+    assert 0.99 * bound <= 1 / best <= bound * (1 + 1e-9)

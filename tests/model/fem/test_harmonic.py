@@ -1,0 +1,61 @@
+"""The complex response to ERAs, against hand calculation and physics."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from model.fem.assembly import assemble, era_positions
+from model.fem.harmonic import direct_acceleration
+from model.reduction.free_plate import solve_free_plate
+from model.structure.actuator import Era
+from paper_plate import make_paper_rig
+
+
+def test_far_below_resonance_the_plate_rides_on_its_base(coarse_rig):
+    """All ERAs together at 1 Hz move the plate with the stroke: acceleration omega² alpha."""
+    points = coarse_rig.mesh.nodes
+    matrices = assemble(coarse_rig.plate, coarse_rig.mesh)
+    response = direct_acceleration(matrices, coarse_rig.eras, np.array([1.0]), points)
+    together = response[0].sum(axis=0)
+    np.testing.assert_allclose(-together / ((2 * np.pi) ** 2 * 100e-6), 1.0, rtol=5e-3)
+
+
+def test_a_thick_plate_on_soft_eras_answers_like_one_mass_on_springs(coarse_rig):
+    """Driven evenly, a plate 20 mm thick follows the one-mass transmissibility by hand."""
+    plate = replace(coarse_rig.plate, thickness=0.020)
+    soft = tuple(Era(e.name, e.x, e.y, 500.0, 2.0, 0.003, 1e-4) for e in coarse_rig.eras)
+    omega = 2 * np.pi * 8.0
+    matrices = assemble(plate, coarse_rig.mesh)
+    response = direct_acceleration(matrices, soft, np.array([8.0]), coarse_rig.mesh.nodes)
+    mass = plate.mass + 4 * 0.003
+    spring = 4 * (500.0 + 1j * omega * 2.0)
+    by_hand = -(omega**2) * 1e-4 * spring / (spring - omega**2 * mass)
+    np.testing.assert_allclose(response[0].sum(axis=0), by_hand, rtol=2e-3)
+
+
+def test_the_response_is_reciprocal(fine_rig):
+    """What SW's force does at NE, NE's does at SW; with equal ERAs the matrix is symmetric."""
+    points = era_positions(fine_rig.eras)
+    free = solve_free_plate(fine_rig.plate, fine_rig.mesh)
+    at_eras = free.acceleration(fine_rig.eras, np.array([110.0, 250.0]), points)
+    np.testing.assert_allclose(at_eras, at_eras.transpose(0, 2, 1), rtol=1e-9)
+
+
+def test_the_corner_layout_mirrors(fine_rig):
+    """SW's response on the plate is SE's mirrored, since the plate is symmetric."""
+    mesh = fine_rig.mesh
+    matrices = assemble(fine_rig.plate, mesh)
+    response = direct_acceleration(matrices, fine_rig.eras, np.array([170.0]), mesh.nodes)[0]
+    west, east = response[:2].reshape(2, mesh.ny + 1, mesh.nx + 1)
+    np.testing.assert_allclose(west, east[:, ::-1], rtol=1e-6, atol=1e-6 * np.abs(west).max())
+
+
+def test_damping_limits_the_resonance(coarse_rig):
+    """At a resonance the response falls as damping grows, and stays finite."""
+    peaks = []
+    for ratio in (0.02, 0.05, 0.1):
+        rig = make_paper_rig(12, 9, damping_ratio=ratio)
+        matrices = assemble(rig.plate, rig.mesh)
+        response = direct_acceleration(matrices, rig.eras, np.array([107.84]), rig.mesh.nodes)
+        peaks.append(np.abs(response).max())
+    assert peaks[0] > peaks[1] > peaks[2] > 0

@@ -1,0 +1,119 @@
+"""Meshes: where nodes lie, what is interpolated between them, and what is none."""
+
+import json
+from dataclasses import asdict
+
+import numpy as np
+import pytest
+
+from model.errors import InputError
+from model.fem.elements import ELEMENTS
+from model.fem.mesh import Mesh
+from model.structure.plate import Plate
+from paper_plate import ALUMINIUM, LENGTH, WIDTH
+
+MESHES = [Mesh(12, 9, LENGTH, WIDTH), Mesh(4, 3, LENGTH, WIDTH, "MITC4", 0.002)] + [
+    Mesh(3, 2, LENGTH, WIDTH, name, 0.003) for name in ELEMENTS
+]
+
+
+@pytest.mark.parametrize("mesh", MESHES, ids=str)
+def test_interpolation_gives_back_what_the_element_can_carry(mesh):
+    """Every polynomial up to the element's order, along both sides, comes out at any point."""
+    points = np.random.default_rng(0).uniform(0, [LENGTH, WIDTH], (60, 2))
+    points[0] = [LENGTH, WIDTH]
+    order = mesh.kind.order
+
+    def carried(at):
+        return (1 + at[:, 0] / LENGTH) ** order * (2 - at[:, 1] / WIDTH) ** order
+
+    np.testing.assert_allclose(
+        mesh.interpolation(points) @ carried(mesh.nodes), carried(points), rtol=1e-12
+    )
+
+
+@pytest.mark.parametrize("mesh", MESHES, ids=str)
+def test_every_element_lists_its_nodes_row_by_row(mesh):
+    """The first and last node of an element are its lower left and upper right corner."""
+    x, y = mesh.lines
+    lower_left = mesh.nodes[mesh.connectivity[:, 0]]
+    upper_right = mesh.nodes[mesh.connectivity[:, -1]]
+    expected = [(a, b) for b in y[:-1] for a in x[:-1]]
+    np.testing.assert_allclose(lower_left, expected, atol=1e-15)
+    np.testing.assert_allclose(upper_right, [(a, b) for b in y[1:] for a in x[1:]], atol=1e-15)
+
+
+def test_strips_lie_along_every_edge():
+    """Strips of 3 mm are the first and last elements; those between share the rest evenly."""
+    mesh = Mesh(4, 3, 0.3, 0.2, "Q5", 0.003)
+    x, y = mesh.lines
+    np.testing.assert_allclose(x, [0, 0.003, 0.0765, 0.15, 0.2235, 0.297, 0.3])
+    np.testing.assert_allclose(y, [0, 0.003, 0.003 + 0.194 / 3, 0.003 + 2 * 0.194 / 3, 0.197, 0.2])
+
+
+@pytest.mark.parametrize("mesh", MESHES, ids=str)
+def test_a_mesh_survives_being_written_down(mesh):
+    """Its fields, through JSON, make the same mesh."""
+    assert Mesh(**json.loads(json.dumps(asdict(mesh)))) == mesh
+
+
+def test_the_automatic_mesh_follows_the_wave():
+    """At twice the frequency the wave is 1.41 times shorter, at four times half as long."""
+    plate = Plate(LENGTH, WIDTH, 0.0015, ALUMINIUM)
+    low, high = (Mesh.auto(plate, frequency_max=f) for f in (500.0, 2000.0))
+    # 0.3048 m and 0.2286 m of waves 0.1704 m and 0.0852 m long, 5.5 elements each
+    assert [(mesh.nx, mesh.ny) for mesh in (low, high)] == [(10, 8), (20, 15)]
+    assert low.strip == high.strip == 0.003
+
+
+def test_a_thick_plate_needs_no_strips():
+    """Where the edge's layer is as wide as an element, the element follows it already."""
+    assert Mesh.auto(Plate(0.2, 0.1, 0.02, ALUMINIUM), frequency_max=500.0).strip == 0
+
+
+@pytest.mark.parametrize("kind", [("MITC4", 12, 9), ("Q3", 4, 3)])
+def test_a_mesh_carries_six_nodes_to_a_wavelength(kind):
+    """Nodes an inch apart carry waves of 152.4 mm, which are those of 631.85 Hz."""
+    element, nx, ny = kind
+    mesh = Mesh(nx, ny, LENGTH, WIDTH, element)
+    # 2 pi / wavelength² * sqrt(D / rho h), with D = 22.0935 N m and rho h = 4.05 kg/m²
+    highest = mesh.highest_frequency(Plate(LENGTH, WIDTH, 0.0015, ALUMINIUM))
+    assert highest == pytest.approx(631.85, abs=0.01)
+
+
+@pytest.mark.parametrize("sides", [(0.3048, 0.2286), (0.7, 0.1), (0.05, 0.06)])
+def test_the_coarsest_mesh_carries_its_frequency_and_no_coarser_one_does(sides):
+    """Its elements are short enough along both sides; one fewer along either is too long."""
+    plate = Plate(*sides, 0.0015, ALUMINIUM)
+    for frequency in (40.0, 500.0, 1637.0):
+        mesh = Mesh.coarsest(plate, frequency=frequency)
+        assert mesh.highest_frequency(plate) >= frequency
+        for fewer in ((mesh.nx - 1, mesh.ny), (mesh.nx, mesh.ny - 1)):
+            if min(fewer):
+                assert Mesh(*fewer, *sides).highest_frequency(plate) < frequency
+    exact = Mesh(12, 9, LENGTH, WIDTH)
+    paper = Plate(LENGTH, WIDTH, 0.0015, ALUMINIUM)
+    again = Mesh.coarsest(paper, frequency=exact.highest_frequency(paper) * (1 - 1e-8))
+    assert (again.nx, again.ny) == (12, 9)
+
+
+def test_a_mesh_says_its_strips_in_three_digits():
+    """Twice the thickness of a laminate's equivalent plate is a long number."""
+    mesh = Mesh(4, 3, LENGTH, WIDTH, "Q5", 0.003127438)
+    assert str(mesh) == "4x3 Q5 with strips of 3.13 mm"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        ((0, 9, 0.3, 0.2), "no elements"),
+        ((4, 4, 0.3, 0.2, "MITC9"), "unknown element 'MITC9'"),
+        ((4, 4, 0.3, 0.2, "Q5", 0.1), "leave nothing"),
+        ((4, 4, 0.3, 0.2, "Q5", -0.001), "leave nothing"),
+        ((4, 4, 0.3, 0.2, "Q5", float("nan")), "leave nothing"),
+    ],
+)
+def test_what_is_no_mesh_is_refused(arguments, says):
+    """No elements, unknown ones, or strips wider than the plate."""
+    with pytest.raises(InputError, match=says):
+        Mesh(*arguments)

@@ -1,0 +1,245 @@
+"""The paper's figures: the numbers beside them, against what the paper prints and claims.
+
+Checks and their bounds: the paper's Tables 1 and 2 and its sections 3.2 and 3.3, with the ERA
+parameters recovered from Table 2.
+"""
+
+import io
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+from model.errors import InputError
+from model.fem.mesh import Mesh
+from model.paper.catalogue import FIGURE_NUMBERS, paper_figures
+from model.paper.figure import PaperFigure
+from model.paper.mode_shapes import paper_mesh, thin_plate_frequencies
+from paper_plate import make_paper_rig
+
+
+@pytest.fixture(scope="module")
+def figures() -> dict[str, PaperFigure]:
+    """All figures of the paper's rig, on a mesh that is near converged."""
+    return {made.name: made for made in paper_figures(make_paper_rig(48, 36), "all")}
+
+
+def peaks(figure: PaperFigure) -> dict[str, np.ndarray]:
+    """The maps of a figure as its CSV file has them, by column."""
+    return {
+        name: np.asarray(column)
+        for name, column in figure.tables[""].items()
+        if name.startswith("peak_")
+    }
+
+
+def test_every_figure_with_results_is_there(figures):
+    """Figures 6, 7, 10, 11 (twice, as in the paper), 12 and 13 (maps and study)."""
+    assert set(figures) == {
+        "figure_6",
+        "figure_7",
+        "figure_10",
+        "figure_11_boxplots",
+        "figure_11_maps",
+        "figure_12",
+        "figure_13_maps",
+        "figure_13_stiffness",
+    }
+    assert FIGURE_NUMBERS == ("6", "7", "10", "11", "12", "13")
+
+
+def test_figure_6_has_the_papers_table_1(figures):
+    """On the paper's mesh its five frequencies to the last digit; Eq. 29 beside them."""
+    table = figures["figure_6"].tables[""]
+    # Half up, as the paper rounds: 110.945 is 110.95.
+    ours = [np.floor(100 * value + 0.5) / 100 for value in table["model_12x9_hz"]]
+    assert ours == [110.95, 234.16, 337.90, 454.29, 459.69]
+    np.testing.assert_allclose(
+        table["analytical_hz"], [109.70, 228.17, 320.31, 425.62, 438.79], atol=0.006
+    )
+    np.testing.assert_allclose(table["model_fine_hz"], table["comsol_hz"], rtol=0.005)
+
+
+def test_figure_7_has_the_papers_table_2(figures):
+    """On its ERAs too; the fine mesh comes to the COMSOL column within 0.5 %."""
+    table = figures["figure_7"].tables[""]
+    assert [f"{value:.2f}" for value in table["model_12x9_hz"]] == [
+        "31.98", "68.50", "76.62", "107.84", "160.77",
+    ]  # fmt: skip
+    np.testing.assert_allclose(table["model_fine_hz"], table["comsol_hz"], rtol=0.005)
+
+
+def test_mode_1_simply_supported_is_a_half_wave_each_way(figures):
+    """sin(pi x / L) sin(pi y / b); mode 5 has two half waves along both sides."""
+    shapes = figures["figure_6"].tables["_shapes"]
+    x, y = np.asarray(shapes["x_m"]) / 0.3048, np.asarray(shapes["y_m"]) / 0.2286
+    for mode, waves in (("mode_1", 1), ("mode_5", 2)):
+        by_hand = np.sin(waves * np.pi * x) * np.sin(waves * np.pi * y)
+        shape = np.asarray(shapes[mode])
+        np.testing.assert_allclose(shape * np.sign(shape @ by_hand), by_hand, atol=0.02)
+
+
+def test_two_active_eras_beat_one_in_every_layout(figures):
+    """Section 3.2: the best pair has a higher median than the best single ERA, in each layout."""
+    gain = figures["figure_11_boxplots"].findings["median_two_to_one_era_ratio"]
+    assert len(gain) >= 5
+    assert all(ratio > 1 for ratio in gain.values())
+
+
+@pytest.mark.parametrize(("name", "sets"), [("figure_10", 4), ("figure_11_boxplots", 6)])
+def test_box_plots_have_every_activation_set_beside_them(figures, name, sets):
+    """Seven layouts, each with its four ERAs or six pairs; quartiles in order, above zero."""
+    table = figures[name].tables[""]
+    assert len(table["layout"]) == 7 * sets
+    five = np.array(
+        [
+            table[f"{key}_m_s2"]
+            for key in ("minimum", "lower_quartile", "median", "upper_quartile", "maximum")
+        ]
+    )
+    assert (np.diff(five, axis=0) > 0).all()
+    assert five.min() > 0
+
+
+def test_the_symmetry_of_the_corners_is_in_the_numbers(figures):
+    """Each corner ERA alone gives the same statistics, for the plate mirrors."""
+    table = figures["figure_10"].tables[""]
+    medians = [
+        median
+        for layout, median in zip(table["layout"], table["median_m_s2"], strict=True)
+        if layout == "corners"
+    ]
+    np.testing.assert_allclose(medians, medians[0], rtol=1e-6)
+
+
+def test_edge_and_diagonal_pairs_have_nearly_the_same_maximum(figures):
+    """Section 3.2, 110 Hz: a negligible change in maximum, about 1 %, but other nulls."""
+    edge, diagonal = peaks(figures["figure_11_maps"]).values()
+    assert edge.max() / diagonal.max() == pytest.approx(1.0, abs=0.015)
+    assert figures["figure_11_maps"].findings["edge_nulls_kept_on_diagonal_share"] < 0.6
+    assert np.corrcoef(edge, diagonal)[0, 1] < 0.99
+
+
+def test_the_switched_patterns_leave_hardly_a_spot_still(figures):
+    """Section 3.3: together the six leave under 5 % of the plate below 30 % of their maxima."""
+    maps = peaks(figures["figure_12"])
+    assert len(maps) == 6
+    still = np.all([peak < 0.3 * peak.max() for peak in maps.values()], axis=0)
+    assert 0 < still.mean() < 0.05
+    # Alone each leaves several times as much.
+    assert all((peak < 0.3 * peak.max()).mean() > 0.2 for peak in maps.values())
+
+
+def test_swapped_frequencies_turn_the_pattern_by_half_a_turn(figures):
+    """300 and 100 Hz exchanged between opposite corners: the same map, rotated."""
+    maps = peaks(figures["figure_12"])
+    there, back = maps["peak_300_100_hz_m_s2"], maps["peak_100_300_hz_m_s2"]
+    np.testing.assert_allclose(there, back[::-1], rtol=1e-5, atol=1e-5 * there.max())
+
+
+def test_twice_the_stiffness_raises_the_map_and_keeps_it(figures):
+    """Section 3.3, 250 Hz, 8 to 16 kN/m: 1.5 to 1.8 times the maximum, correlation above 0.98."""
+    soft, stiff = peaks(figures["figure_13_maps"]).values()
+    assert 1.5 < stiff.max() / soft.max() < 1.8
+    assert np.corrcoef(soft, stiff)[0, 1] > 0.98
+
+
+def test_the_stiffness_study_holds_the_stiffness_pair(figures):
+    """At 8 and 16 kN/m the study's maxima are those of the two maps, at 17 kN/m it is the map."""
+    study = figures["figure_13_stiffness"].tables[""]
+    stiffness = np.asarray(study["stiffness_n_m"])
+    for value, peak in zip(
+        (8000.0, 16000.0), peaks(figures["figure_13_maps"]).values(), strict=True
+    ):
+        row = int(np.abs(stiffness - value).argmin())
+        assert stiffness[row] == pytest.approx(value)
+        assert study["maximum_m_s2"][row] == pytest.approx(peak.max())
+    correlation = np.asarray(study["correlation"])
+    assert stiffness[correlation.argmax()] == pytest.approx(17_000, rel=0.1)
+    assert correlation.max() <= 1 + 1e-12
+
+
+@pytest.mark.parametrize("name", ["figure_11_maps", "figure_12", "figure_13_maps"])
+def test_all_maps_of_a_figure_share_one_colour_scale(figures, name):
+    """From 0 to the largest value of all of them, and the colour bar says its unit."""
+    *maps, bar = figures[name].figure.axes
+    (limits,) = {axes.collections[0].get_clim() for axes in maps}
+    largest = max(peak.max() for peak in peaks(figures[name]).values()) / 9.8
+    assert limits == pytest.approx((0.0, largest))
+    assert bar.get_ylabel().endswith("/ g")
+
+
+def test_switched_pairs_are_in_the_titles(figures):
+    """Each map of Figure 12 says which ERA has which frequency, in the paper's order."""
+    titles = [axes.get_title() for axes in figures["figure_12"].figure.axes[:6]]
+    assert titles[0] == "(a) SW 320 Hz, NE 320 Hz"
+    assert titles[1] == "(b) SW 300 Hz, NE 100 Hz"
+    assert titles[5] == "(f) SW 150 Hz, NE 150 Hz"
+
+
+def test_active_eras_are_red_and_the_others_green(figures):
+    """Figure 11 (a): SW and SE are driven, NE and NW only hold."""
+    axes = figures["figure_11_maps"].figure.axes[0]
+    marks = {
+        (round(float(line.get_xdata()[0]), 2), round(float(line.get_ydata()[0]), 2)): (
+            line.get_color()
+        )
+        for line in axes.lines
+        if line.get_marker() == "o"
+    }
+    assert marks == {
+        (0.0, 0.0): "#d62728",
+        (30.48, 0.0): "#d62728",
+        (30.48, 22.86): "#2ca02c",
+        (0.0, 22.86): "#2ca02c",
+    }
+
+
+def test_every_figure_can_be_drawn(figures):
+    """As PNG without a display, at least 1000 pixels wide at 150 dots an inch."""
+    for made in figures.values():
+        FigureCanvasAgg(made.figure)
+        made.figure.savefig(io.BytesIO(), dpi=20)
+        assert made.figure.get_figwidth() * 150 >= 1000
+
+
+def test_another_plate_has_no_printed_columns():
+    """Only the paper's plate can be compared with what the paper prints."""
+    rig = make_paper_rig(12, 9)
+    thick = replace(rig, plate=replace(rig.plate, thickness=0.002))
+    (made,) = paper_figures(thick, "6")
+    assert list(made.tables[""]) == ["mode", "analytical_hz", "model_12x9_hz", "model_fine_hz"]
+    (made,) = paper_figures(replace(rig, eras=rig.eras[:3]), "7")
+    assert list(made.tables[""]) == ["mode", "model_12x9_hz", "model_fine_hz"]
+
+
+def test_the_papers_mesh_and_eq_29_for_the_papers_plate():
+    """12 x 9 elements of an inch; Eq. 29 gives the analytical column of Table 1."""
+    plate = make_paper_rig(12, 9).plate
+    assert str(paper_mesh(plate)) == "12x9"
+    np.testing.assert_allclose(
+        thin_plate_frequencies(plate, 5), [109.70, 228.17, 320.31, 425.62, 438.79], atol=0.006
+    )
+
+
+@pytest.mark.parametrize("number", ["1", "8", "14", "", "figure_6"])
+def test_a_figure_without_results_is_refused(number):
+    """Figures 1 to 5, 8 and 9 are sketches; others are not there."""
+    with pytest.raises(InputError, match="those with results are 6, 7, 10"):
+        list(paper_figures(make_paper_rig(12, 9), number))
+
+
+def test_a_pair_of_one_era_is_refused():
+    """Figure 12 drives a diagonal pair; a rig of one ERA has none."""
+    rig = make_paper_rig(12, 9)
+    with pytest.raises(InputError, match="two ERAs are needed"):
+        list(paper_figures(replace(rig, eras=rig.eras[:1]), "12"))
+
+
+def test_a_mesh_too_coarse_for_320_hz_is_refused():
+    """Three by two elements carry no wave of 320 Hz."""
+    rig = make_paper_rig(12, 9)
+    coarse = replace(rig, mesh=Mesh(3, 2, rig.plate.length, rig.plate.width))
+    with pytest.raises(InputError, match="Hz"):
+        list(paper_figures(coarse, "12"))

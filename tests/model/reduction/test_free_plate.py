@@ -1,0 +1,235 @@
+"""The free plate with anything attached to it, against the direct solve of the same mesh."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import sparse
+from scipy.sparse.linalg import splu
+
+from model.errors import InputError
+from model.fem.assembly import assemble
+from model.fem.harmonic import direct_acceleration
+from model.fem.mesh import Mesh
+from model.fem.modal import modes
+from model.reduction.free_plate import FreePlate, solve_free_plate
+from model.structure.actuator import Era
+from model.structure.plate import Plate
+from model.structure.point_load import PointLoad
+from paper_plate import ALUMINIUM, LENGTH, WIDTH
+
+# Even and odd counts of elements, low and high order, with strips along the edges and without.
+MESHES = {
+    "24x18": Mesh(24, 18, LENGTH, WIDTH),
+    "19x15": Mesh(19, 15, LENGTH, WIDTH),
+    "5x4 Q4": Mesh(5, 4, LENGTH, WIDTH, "Q4", 0.003),
+}
+
+
+@pytest.fixture(scope="module", params=MESHES)
+def free(request: pytest.FixtureRequest) -> FreePlate:
+    """The paper's plate, solved once for every layout that follows."""
+    return solve_free_plate(Plate(LENGTH, WIDTH, 0.0015, ALUMINIUM), MESHES[request.param])
+
+
+def random_eras(rng: np.random.Generator, count: int) -> tuple[Era, ...]:
+    """ERAs anywhere, from hardly there (10 N/m) to as good as clamped (1e8 N/m)."""
+    return tuple(
+        Era(
+            f"E{number}",
+            x=rng.uniform(0, LENGTH),
+            y=rng.choice([0, WIDTH, rng.uniform(0, WIDTH)]),
+            stiffness=10 ** rng.uniform(1, 8),
+            damping=10 ** rng.uniform(-2, 2),
+            bolt_mass=rng.choice([0.0, 0.003, 0.05]),
+            stroke=1e-4,
+        )
+        for number in range(count)
+    )
+
+
+def random_loads(rng: np.random.Generator) -> tuple[PointLoad, ...]:
+    """Up to three fingers and a mass, anywhere."""
+    fingers = tuple(
+        PointLoad(rng.uniform(0, LENGTH), rng.uniform(0, WIDTH), 10 ** rng.uniform(2, 4), 2.0, 2e-4)
+        for _ in range(rng.integers(0, 4))
+    )
+    return (*fingers, PointLoad(rng.uniform(0, LENGTH), rng.uniform(0, WIDTH), mass=0.02))
+
+
+def test_any_layout_at_any_frequency_agrees_with_the_direct_solve(free):
+    """One solved plate is within 1e-4 (relative L2) of a direct solve; its error covers the miss.
+
+    One to six ERAs of any stiffness, bolts, fingers, a mass; frequencies anywhere up to 500 Hz and
+    at a resonance of each layout. What rounding leaves in the direct solve grows as the inertia of
+    the plate gets lost beside the stiffness, with 1 / frequency².
+    """
+    rng = np.random.default_rng(7)
+    matrices = assemble(free.plate, free.mesh)
+    points = free.mesh.nodes[::3]
+    for _ in range(8):
+        eras, loads = random_eras(rng, rng.integers(1, 7)), random_loads(rng)
+        natural = modes(matrices, 12, support="eras", eras=eras).natural_frequencies
+        resonance = rng.choice(natural[(natural > 5) & (natural < 500)])
+        frequencies = np.array([*rng.uniform(5, 500, 3), resonance, 500.0])
+        direct = direct_acceleration(matrices, eras, frequencies, points, loads=loads)
+        quick = free.respond(eras, frequencies, points, loads=loads)
+        error = np.linalg.norm(quick.acceleration - direct, axis=2)
+        error /= np.linalg.norm(direct, axis=2)
+        assert error.max() < 1e-4
+        rounding = 1e-8 * (100 / frequencies[:, None]) ** 2
+        assert (error < np.maximum(1.5 * quick.error, rounding)).all()
+        assert quick.error.max() < 1e-4
+
+
+def test_the_estimate_covers_poor_answers_at_resonances_too(monkeypatch):
+    """One solve a point: what couples stiff ERAs is then poor, and resonances amplify that."""
+    monkeypatch.setattr("model.reduction.free_plate.TERMS", 1)
+    monkeypatch.setattr("model.reduction.attachments.TERMS", 1)
+    plate = Plate(LENGTH, WIDTH, 0.0015, ALUMINIUM, loss_factor=1e-3)
+    mesh = MESHES["24x18"]
+    free = solve_free_plate(plate, mesh)
+    matrices = assemble(plate, mesh)
+    places = [(0.051, 0.017), (0.29, 0.08), (0.12, 0.1), (0.2, 0.15)]
+    eras = [Era(f"E{n}", x, y, 1e6, 1.0, 0.0, 1e-4) for n, (x, y) in enumerate(places)]
+    natural = modes(matrices, 12, support="eras", eras=eras).natural_frequencies
+    frequencies = natural[natural < 500]
+    direct = direct_acceleration(matrices, eras, frequencies, mesh.nodes)
+    quick = free.respond(eras, frequencies, mesh.nodes)
+    error = np.linalg.norm(quick.acceleration - direct, axis=2) / np.linalg.norm(direct, axis=2)
+    assert error.max() > 0.01
+    assert (error < 1.5 * quick.error).all()
+
+
+def test_the_error_estimate_is_not_the_same_for_all(free):
+    """It falls by decades from 500 Hz to 50 Hz: it says where an answer is good, not only that."""
+    eras = random_eras(np.random.default_rng(1), 4)
+    error = free.respond(eras, np.array([50.0, 500.0]), free.mesh.nodes[:5]).error
+    assert (error[0] < 0.01 * error[1]).all()
+
+
+def test_below_all_bending_modes_it_agrees_too():
+    """A block 20 mm thick only rocks on its ERAs up to 500 Hz: rigid modes alone are kept."""
+    plate = Plate(0.3, 0.2, 0.02, ALUMINIUM)
+    mesh = Mesh(3, 3, 0.3, 0.2, "Q4")
+    eras = random_eras(np.random.default_rng(3), 4)
+    eras = tuple(replace(era, x=era.x * 0.9, y=era.y * 0.8) for era in eras)
+    frequencies = np.array([40.0, 210.0, 500.0])
+    direct = direct_acceleration(assemble(plate, mesh), eras, frequencies, mesh.nodes)
+    quick = solve_free_plate(plate, mesh).acceleration(eras, frequencies, mesh.nodes)
+    error = np.linalg.norm(quick - direct, axis=2) / np.linalg.norm(direct, axis=2)
+    assert error.max() < 1e-4
+
+
+def test_without_damping_between_resonances_it_still_agrees():
+    """A plate and ERAs that lose nothing leave no damping to hide behind."""
+    plate = Plate(LENGTH, WIDTH, 0.0015, ALUMINIUM, loss_factor=0.0)
+    mesh = MESHES["24x18"]
+    eras = (
+        Era("A", 0.05, 0.02, 3e4, 0.0, 0.01, 1e-4),
+        Era("B", 0.29, 0.08, 1e5, 0.0, 0.0, 1e-4),
+        Era("C", 0.12, 0.2286, 8e3, 0.0, 0.0, 1e-4),
+    )
+    frequencies = np.array([61.0, 187.0, 333.0, 471.0])
+    direct = direct_acceleration(assemble(plate, mesh), eras, frequencies, mesh.nodes)
+    quick = solve_free_plate(plate, mesh).acceleration(eras, frequencies, mesh.nodes)
+    error = np.linalg.norm(quick - direct, axis=2) / np.linalg.norm(direct, axis=2)
+    assert error.max() < 1e-4
+
+
+@pytest.mark.parametrize(
+    ("length", "width", "mesh"),
+    [(1.0, 0.02, (60, 3)), (0.05, 0.4, (4, 40)), (0.03, 0.03, (1, 1)), (0.03, 0.03, (2, 1))],
+    ids=["bar", "standing bar", "one element", "two elements"],
+)
+def test_bars_and_the_smallest_meshes_agree_too(length, width, mesh):
+    """Many modes in a row, as of a bar, or hardly any degrees of freedom: neither breaks it."""
+    plate = Plate(length, width, 0.002, ALUMINIUM)
+    mesh = Mesh(*mesh, length, width)
+    eras = (Era("A", 0.3 * length, width, 1e4, 1.0, 0.0, 1e-4), Era("B", 0, 0, 1e4, 1, 0, 1e-4))
+    frequencies = np.array([40.0, 200.0, 400.0])
+    direct = direct_acceleration(assemble(plate, mesh), eras, frequencies, mesh.nodes)
+    quick = solve_free_plate(plate, mesh).acceleration(eras, frequencies, mesh.nodes)
+    error = np.linalg.norm(quick - direct, axis=2) / np.linalg.norm(direct, axis=2)
+    assert error.max() < 1e-4
+
+
+def test_the_classes_hold_every_mode_of_the_plate(free):
+    """The four quarters' modes are those of the whole plate, found without its symmetry."""
+    whole = modes(assemble(free.plate, free.mesh), 15, support="free").natural_frequencies
+    quarters = np.sort(np.sqrt(free.squared)) / (2 * np.pi)
+    assert (quarters[:3] == 0).all()
+    np.testing.assert_allclose(quarters[3:18], whole, rtol=1e-8)
+
+
+@pytest.mark.parametrize("frequency", [0.0, -10.0, float("nan"), 501.0])
+def test_a_frequency_that_it_was_not_solved_for_is_refused(free, frequency):
+    """Nothing, or less than nothing, or more than was solved for, has no answer."""
+    eras = random_eras(np.random.default_rng(0), 3)
+    with pytest.raises(InputError, match=r"above zero|solved up to 500 Hz"):
+        free.acceleration(eras, np.array([100.0, frequency]), free.mesh.nodes)
+
+
+def test_a_frequency_beyond_the_mesh_is_refused():
+    """Six nodes to a wavelength are the least: the wave at 450 Hz is 180 mm, an element 51 mm."""
+    plate = Plate(LENGTH, WIDTH, 0.0015, ALUMINIUM)
+    free = solve_free_plate(plate, Mesh(6, 5, LENGTH, WIDTH))
+    eras = random_eras(np.random.default_rng(0), 3)
+    with pytest.raises(InputError, match=r"3\.6 elements in a bending wavelength at 450 Hz"):
+        free.acceleration(eras, np.array([450.0]), free.mesh.nodes)
+
+
+def test_the_mesh_of_another_plate_is_refused():
+    """A plate 1 cm longer than its mesh is an error, not the answer of the shorter one."""
+    mesh = Mesh(12, 9, LENGTH, WIDTH)
+    longer = Plate(LENGTH + 0.01, WIDTH, 0.0015, ALUMINIUM)
+    with pytest.raises(InputError, match=r"over 0\.3048 x 0\.2286 m, the plate is 0\.3148 x"):
+        solve_free_plate(longer, mesh)
+    with pytest.raises(InputError, match="make the mesh for this plate"):
+        assemble(longer, mesh)
+
+
+def test_points_off_the_plate_are_refused(free):
+    """An ERA or an observed point beyond the edge is an error, not an extrapolation."""
+    eras = random_eras(np.random.default_rng(0), 3)
+    beyond = np.array([[LENGTH + 0.01, 0.1]])
+    with pytest.raises(InputError, match="is not on the plate"):
+        free.acceleration(eras, np.array([100.0]), beyond)
+    with pytest.raises(InputError, match="is not on the plate"):
+        free.acceleration((replace(eras[0], x=-0.01),), np.array([100.0]), free.mesh.nodes)
+
+
+def test_receptances_are_what_a_direct_solve_gives(free):
+    """Deflection per unit force between places and to points, a mass and a finger on the plate."""
+    places = np.array([[0.0, 0.0], [0.21, 0.07], [0.11, WIDTH]])
+    points = free.mesh.nodes[::5]
+    loads = (PointLoad(0.2, 0.1, mass=0.02), PointLoad(0.05, 0.2, 1000.0, 2.0, 2e-4))
+    frequencies = np.array([60.0, 155.0, 470.0])
+    between, to_points = free.receptances(places, points, frequencies, loads=loads)
+    matrices = assemble(free.plate, free.mesh)
+    touch = matrices.deflection_at(places)
+    carry = matrices.deflection_at(np.array([[load.x, load.y] for load in loads]))
+    for row, omega in enumerate(2 * np.pi * frequencies):
+        hold = [-(omega**2) * 0.02, 1000.0 + 2j * omega - omega**2 * 2e-4]
+        dynamic = (1 + 0.01j) * matrices.stiffness - omega**2 * matrices.mass
+        dynamic = dynamic + carry.T @ sparse.diags_array(hold) @ carry
+        field = splu(dynamic.tocsc()).solve(touch.T.toarray().astype(complex))
+        for quick, exact in (
+            (between[row], touch @ field),
+            (to_points[row], (matrices.deflection_at(points) @ field).T),
+        ):
+            assert np.linalg.norm(quick - exact) < 2e-6 * np.linalg.norm(exact)
+
+
+def test_what_is_forgotten_is_solved_again(monkeypatch):
+    """A plate that may keep no solved point answers as one that keeps them all."""
+    plate = Plate(LENGTH, WIDTH, 0.0015, ALUMINIUM)
+    frequencies = np.array([60.0, 470.0])
+    layouts = [random_eras(np.random.default_rng(seed), 4) for seed in (0, 1, 0)]
+    plates = [solve_free_plate(plate, MESHES["19x15"]) for _ in range(2)]
+    keeping = [plates[0].acceleration(eras, frequencies, plates[0].mesh.nodes) for eras in layouts]
+    monkeypatch.setattr("model.reduction.attachments.KEPT_BYTES", 0)
+    monkeypatch.setattr("model.reduction.attachments.KEPT_RASTERS", 1)
+    for eras, kept in zip(layouts, keeping, strict=True):
+        again = plates[1].acceleration(eras, frequencies, plates[1].mesh.nodes)
+        np.testing.assert_allclose(again, kept, rtol=1e-9)

@@ -1,0 +1,108 @@
+"""ERAs that move otherwise than they are asked to."""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from model.errors import InputError
+from model.fem.assembly import assemble, era_positions
+from model.fem.harmonic import direct_acceleration
+from model.reduction.free_plate import solve_free_plate
+from model.reduction.reduced_plate import reduce_plate
+from model.rig.file import load_rig
+from model.rig.rig import Rig
+from model.table.build import build_table
+from model.table.file import load_table, save_table
+from model.transients.time_response import plate_in_time
+
+GAINS = ((100.0, 0.9, 0.2), (200.0, 1.3, -0.4))
+
+
+@pytest.fixture
+def uneven(coarse_rig: Rig) -> Rig:
+    """The paper's plate, its second ERA with gains."""
+    eras = list(coarse_rig.eras)
+    eras[1] = replace(eras[1], gains=GAINS)
+    return replace(coarse_rig, eras=tuple(eras))
+
+
+def test_gains_between_and_beyond_their_frequencies(uneven: Rig) -> None:
+    """On the line between two complex gains, and the last one beyond."""
+    low, high = 0.9 * np.exp(0.2j), 1.3 * np.exp(-0.4j)
+    found = uneven.eras[1].gain(np.array([50.0, 100.0, 125.0, 300.0]))
+    np.testing.assert_allclose(found, [low, low, 0.75 * low + 0.25 * high, high])
+
+
+def test_the_response_has_the_gain_and_nothing_else_changes(coarse_rig: Rig, uneven: Rig) -> None:
+    """Direct solve and free plate: the ERA's own response times its gain, its neighbours' not."""
+    points = np.array([[0.1, 0.05], [0.2, 0.2]])
+    frequencies = np.array([100.0, 150.0, 200.0])
+    factor = np.ones((3, 4, 1), dtype=complex)
+    factor[:, 1, 0] = uneven.eras[1].gain(frequencies)
+    matrices = assemble(coarse_rig.plate, coarse_rig.mesh)
+    before = direct_acceleration(matrices, coarse_rig.eras, frequencies, points)
+    after = direct_acceleration(matrices, uneven.eras, frequencies, points)
+    np.testing.assert_allclose(after, factor * before, rtol=1e-12)
+    free = solve_free_plate(coarse_rig.plate, coarse_rig.mesh)
+    np.testing.assert_allclose(
+        free.acceleration(uneven.eras, frequencies, points),
+        factor * free.acceleration(coarse_rig.eras, frequencies, points),
+        rtol=1e-10,
+    )
+
+
+def test_the_plate_in_time_has_it_too(coarse_rig: Rig, uneven: Rig) -> None:
+    """A steady tone's particular solution is the ungained one times the gain at its frequency."""
+    reduced = reduce_plate(coarse_rig.plate, coarse_rig.mesh, era_positions(coarse_rig.eras))
+    s = np.array([2j * math.pi * 125.0])
+    plain, _ = plate_in_time(reduced, coarse_rig.eras).particular([1], s, [1e-4], [0j])
+    gained, _ = plate_in_time(reduced, uneven.eras).particular([1], s, [1e-4], [0j])
+    gain = uneven.eras[1].gain(np.array(125.0))
+    np.testing.assert_allclose(gained, gain * plain, rtol=1e-9, atol=1e-12 * abs(plain).max())
+
+
+def test_a_table_is_of_these_gains(coarse_rig: Rig, uneven: Rig, tmp_path: Path) -> None:
+    """Gains change the fingerprint, and come back from a table's file."""
+    assert uneven.fingerprint != coarse_rig.fingerprint
+    table = build_table(uneven, frequencies=np.array([100.0, 110.0]))
+    save_table(table, tmp_path / "table.npz")
+    back = load_table(tmp_path / "table.npz")
+    assert back.eras[1].gains == GAINS
+    assert back.fingerprint == uneven.fingerprint
+
+
+def test_gains_in_a_rig_file(tmp_path: Path) -> None:
+    """Rows of frequency, magnitude and degrees; a row that is none is refused with its line."""
+    text = """\
+plate: {length: 0.3, width: 0.2, thickness: 1.5 mm, material: steel}
+mesh: 12x9
+limits: {frequency: [40, 200]}
+eras:
+  A: {at: [0, 0], stiffness: 9000, amplifier: m, channel: 0, gains: [[50, 0.9, 90], [60, 1, 0]]}
+  B: {at: [0.3, 0], stiffness: 9000, amplifier: m, channel: 1}
+  C: {at: [0, 0.2], stiffness: 9000, amplifier: m, channel: 2}
+amplifiers: {m: {url: "sim://"}}
+"""
+    path = tmp_path / "rig.yaml"
+    path.write_text(text)
+    rig = load_rig(path)
+    assert rig.eras[0].gains == ((50.0, 0.9, math.pi / 2), (60.0, 1.0, 0.0))
+    assert rig.eras[1].gains == ()
+    for row, said in (("[60, 0, 0]", "is no gain"), ("[40, 1, 0]", "ascend")):
+        path.write_text(text.replace("[60, 1, 0]", row))
+        with pytest.raises(InputError, match=rf"rig\.yaml:5: eras\.A\.gains: .*{said}"):
+            load_rig(path)
+
+
+def test_gains_that_are_none_are_refused(coarse_rig: Rig) -> None:
+    """No magnitude, no number, or frequencies that do not ascend."""
+    for gains in (
+        ((50.0, 0.0, 0.0),),
+        ((50.0, 1.0, math.nan),),
+        ((9.0, 1.0, 0.0), (9.0, 1.0, 0.0)),
+    ):
+        with pytest.raises(InputError, match="ERA SW"):
+            replace(coarse_rig.eras[0], gains=gains)

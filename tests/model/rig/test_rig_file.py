@@ -1,0 +1,478 @@
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from model.config.document import ConfigError
+from model.errors import InputError
+from model.rig.file import example_rig_path, load_rig, parse_rig, rig_schema
+from model.rig.parts import parse_mesh
+from model.rig.rig import Channel
+from model.structure.materials import material
+from model.structure.plate import Plate
+from model.structure.point_mass import PointMass
+
+# A line per value, so that every problem has a line of its own.
+GOOD = """\
+plate:
+  length: 12 in
+  width: 9 in
+  thickness: 1.5 mm
+  material: aluminium
+mesh: 48x36
+eras:
+  SW:
+    at: [0, 0]
+    stiffness: 17 kN/m
+    damping: 2.0
+    amplifier: main
+    channel: 0
+  NE:
+    at: [0.3048, 228.6 mm]
+    stiffness: 17000
+    amplifier: main
+    channel: 1
+amplifiers:
+  main: {url: "sim://"}
+limits:
+  frequency: [40, 500]
+  level: 0.5
+"""
+
+
+def write(folder: Path, text: str) -> Path:
+    """A rig file of this text."""
+    path = folder / "rig.yaml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def changed(line: int, text: str) -> str:
+    """The good rig with one line in place of another; an empty text takes the line out."""
+    lines = GOOD.splitlines()
+    lines[line - 1 : line] = text.splitlines()
+    return "\n".join(lines) + "\n"
+
+
+def refused(folder: Path, text: str) -> list[tuple[int | None, str, str]]:
+    """The problems for which this text is refused: line, key, message."""
+    with pytest.raises(ConfigError) as caught:
+        load_rig(write(folder, text))
+    return [(problem.line, problem.key, problem.message) for problem in caught.value.problems]
+
+
+def test_a_good_rig_is_what_its_file_says(tmp_path: Path) -> None:
+    """Units are converted, defaults filled in, wiring and limits taken over."""
+    rig = load_rig(write(tmp_path, GOOD))
+    assert (rig.plate.length, rig.plate.width, rig.plate.thickness) == (0.3048, 0.2286, 0.0015)
+    assert rig.plate.loss_factor == 0.01
+    assert (rig.mesh.nx, rig.mesh.ny) == (48, 36)
+    assert (rig.mesh.length, rig.mesh.width) == (0.3048, 0.2286)
+    assert [era.name for era in rig.eras] == ["SW", "NE"]
+    north_east = rig.era("NE")
+    assert (north_east.x, north_east.y) == (0.3048, 0.2286)
+    assert (north_east.stiffness, north_east.bolt_mass, north_east.stroke) == (17000, 0, 1e-4)
+    assert rig.era("SW").damping == 2.0
+    assert rig.wiring == {"SW": Channel("main", 0), "NE": Channel("main", 1)}
+    assert rig.amplifiers == {"main": "sim://"}
+    assert (rig.limits.frequency_min, rig.limits.frequency_max, rig.limits.level) == (40, 500, 0.5)
+
+
+def test_damping_follows_from_its_ratio(tmp_path: Path) -> None:
+    """c = 2 zeta sqrt(k m / n), by hand: m = 2700 * 0.3048 * 0.2286 * 0.0015 kg, two ERAs."""
+    rig = load_rig(write(tmp_path, changed(11, "    damping_ratio: 10 %")))
+    mass = 2700 * 0.3048 * 0.2286 * 0.0015
+    assert rig.era("SW").damping == pytest.approx(0.2 * math.sqrt(17000 * mass / 2), rel=1e-12)
+    assert rig.era("NE").damping == pytest.approx(0.1 * math.sqrt(17000 * mass / 2), rel=1e-12)
+
+
+def test_the_example_is_the_papers_plate() -> None:
+    """Section 3 of the paper prints plate and material; Table 2's digits need k_b = 17 000 N/m."""
+    rig = load_rig(example_rig_path())
+    plate = rig.plate
+    assert (plate.length, plate.width, plate.thickness) == (0.3048, 0.2286, 0.0015)
+    assert (plate.material.E, plate.material.rho, plate.material.nu) == (70e9, 2700.0, 0.33)
+    assert plate.loss_factor == 0.01
+    places = {era.name: (era.x, era.y) for era in rig.eras}
+    assert places == {
+        "SW": (0.0, 0.0),
+        "SE": (0.3048, 0.0),
+        "NE": (0.3048, 0.2286),
+        "NW": (0.0, 0.2286),
+    }
+    assert {(era.stiffness, era.bolt_mass, era.stroke) for era in rig.eras} == {(17000, 0, 1e-4)}
+    # 2 * 0.05 * sqrt(17000 * 0.282193 kg / 4)
+    assert {round(era.damping, 4) for era in rig.eras} == {3.4631}
+    assert [rig.wiring[name] for name in places] == [Channel("main", n) for n in range(4)]
+    assert rig.amplifiers == {"main": "sim://"}
+    assert (rig.limits.frequency_min, rig.limits.frequency_max, rig.limits.level) == (40, 500, 1)
+
+
+def test_limits_over_time_are_read_with_their_units(tmp_path: Path) -> None:
+    """2 % a millisecond is 20 a second, half a minute 30 s; what is not given is no limit."""
+    text = GOOD + "  slew: 2 %/ms\n  power: 150 %\n  on_time: 0.5 min\n  duty: 25 %\n"
+    limits = load_rig(write(tmp_path, text)).limits
+    assert (limits.slew, limits.power, limits.on_time, limits.duty) == (20.0, 1.5, 30.0, 0.25)
+    assert limits.rate == math.inf
+    rate = load_rig(write(tmp_path, GOOD + "  rate: 0.1 kHz\n")).limits
+    assert (rate.rate, rate.slew, rate.power, rate.on_time, rate.duty) == (100, *[math.inf] * 3, 1)
+
+
+def test_mesh_and_limits_may_be_left_out(tmp_path: Path) -> None:
+    """Without them the mesh is chosen for 500 Hz, which is the default limit."""
+    without = "\n".join(line for line in GOOD.splitlines()[:20] if not line.startswith("mesh"))
+    rig = load_rig(write(tmp_path, without))
+    assert (rig.limits.frequency_min, rig.limits.frequency_max, rig.limits.level) == (40, 500, 1)
+    with_them = GOOD.replace("mesh: 48x36", "mesh: auto")
+    assert rig.mesh == load_rig(write(tmp_path, with_them)).mesh
+    # D = E h^3 / 12 (1 - nu^2) = 22.0935 N m; wavelength = 2 pi (D / rho h w^2)^(1/4) = 0.1713 m
+    assert np.diff(np.unique(rig.mesh.nodes[:, 0])).max() < 0.1713 / 6
+
+
+def test_a_mesh_asked_for_stands_in_place_of_the_files(tmp_path: Path) -> None:
+    """It may be as coarse as is wanted, and the file's own is then not judged."""
+    assert str(load_rig(write(tmp_path, GOOD), mesh="2x3").mesh) == "2x3"
+    assert str(load_rig(write(tmp_path, changed(6, "mesh: 3x3")), mesh="12x9").mesh) == "12x9"
+    auto = load_rig(write(tmp_path, GOOD), mesh="auto").mesh
+    assert auto == load_rig(write(tmp_path, changed(6, "mesh: auto"))).mesh
+
+
+@pytest.mark.parametrize(
+    ("line", "text", "where", "message"),
+    [
+        (2, "  length: 12 kg", (2, "plate.length"), "is not a length"),
+        (2, "  length: -12 in", (2, "plate.length"), "must be above 0 m"),
+        (2, "  length: 0", (2, "plate.length"), "must be above 0 m"),
+        (2, "  length: .nan", (2, "plate.length"), "is not a finite number"),
+        (2, "  length: true", (2, "plate.length"), "True is not a length"),
+        (2, "  length:", (2, "plate.length"), "None is not a length"),
+        (2, "  length: 304.8", (2, "plate.length"), "a bare number is in m"),
+        (2, "", (1, "plate.length"), "is missing"),
+        (2, "  length: 12 in\n  colour: red", (3, "plate.colour"), "unknown key; known here are"),
+        (3, "  width: .inf", (3, "plate.width"), "is not a finite number"),
+        (3, "  width: 0 mm", (3, "plate.width"), "must be above 0 m"),
+        (4, "  thickness: 0", (4, "plate.thickness"), "must be at least"),
+        (4, "  thickness: .nan", (4, "plate.thickness"), "is not a finite number"),
+        (4, "  thickness:", (4, "plate.thickness"), "is missing; add it, or layers"),
+        (4, "", (1, "plate.thickness"), "is missing; add it, or layers"),
+        (5, "", (1, "plate.material"), "is missing; add it, or layers"),
+        (4, "  thickness: -1.5 mm", (4, "plate.thickness"), "must be at least"),
+        (4, "  thickness: 0.4", (4, "plate.thickness"), "is it in mm"),
+        (4, "  thicknes: 1.5 mm\n  thickness: 1.5 mm", (4, "plate.thicknes"), "mean thickness"),
+        (5, "  material: aluminum", (5, "plate.material"), "did you mean aluminium"),
+        (5, "  material: 7", (5, "plate.material"), "must be a mapping"),
+        (5, "  material: glas", (5, "plate.material"), "known are: aluminium, steel, soda-lime"),
+        (5, "  material: soda glass", (5, "plate.material"), "did you mean soda-lime-glass"),
+        (5, "  material: {E: .nan, rho: 2700, nu: 0.3}", (5, "plate.material.E"), "not a finite"),
+        (5, "  material: {E: 70 GPa, rho: 0, nu: 0.3}", (5, "plate.material.rho"), "at least 1"),
+        (5, "  material: aluminium\n  bond: none", (6, "plate.bond"), "goes with layers only"),
+        (5, "  material: {E: 70 GPa, rho: 2700, nu: 0.5}", (5, "plate.material.nu"), "below 0.5"),
+        (5, "  material: {E: 70 GPa, rho: 2700, nu: -1}", (5, "plate.material.nu"), "above -1"),
+        (5, "  material: {E: 70, rho: 2700, nu: 0.3}", (5, "plate.material.E"), "out of range"),
+        (5, "  material: {E: 70 GPa, nu: 0.3}", (5, "plate.material.rho"), "is missing"),
+        (5, "  material: {E: 1, rho: 0, nu: 0, F: 1}", (5, "plate.material.F"), "unknown key"),
+        (5, "  material: aluminium\n  loss_factor: 1", (6, "plate.loss_factor"), "below 1"),
+        (6, "mesh: 48", (6, "mesh"), "must be a text, not 48"),
+        (6, "mesh: fine", (6, "mesh"), "for example 48x36"),
+        (6, "mesh: 0x36", (6, "mesh"), "1 to 1000 elements"),
+        (6, "mesh: 1001x36", (6, "mesh"), "1 to 1000 elements"),
+        # 0.3048 m / (0.17132 m / 6) = 10.67 and 0.2286 m / (0.17132 m / 6) = 8.01
+        (6, "mesh: 10x9", (6, "mesh"), "at least 11x9 is needed"),
+        (6, "mesh: 11x8", (6, "mesh"), "at least 11x9 is needed"),
+        (6, "mehs: 48x36", (6, "mehs"), "did you mean mesh"),
+        (9, "    at: [0, 0, 0]", (9, "eras.SW.at"), "has 3 entries"),
+        (9, "    at: [0]", (9, "eras.SW.at[1]"), "is missing"),
+        (9, "    at: 0", (9, "eras.SW.at"), "must be a list"),
+        (9, "    at: [0, 1 kg]", (9, "eras.SW.at[1]"), "is not a length"),
+        (9, "    at: [.nan, 0]", (9, "eras.SW.at[0]"), "is not a finite number"),
+        (9, "    at: [0, 9.1 in]", (9, "eras.SW.at"), "off the plate, which reaches"),
+        (9, "    at: [-1 mm, 0]", (9, "eras.SW.at"), "off the plate, which reaches"),
+        (9, "    at: [12 in, 9 in]", (15, "eras.NE.at"), "where ERA SW is already"),
+        (10, "    stiffness: 17 N", (10, "eras.SW.stiffness"), "for example 17 kN/m"),
+        (10, "    stiffness: .inf", (10, "eras.SW.stiffness"), "is not a finite number"),
+        (10, "    stiffness: 0", (10, "eras.SW.stiffness"), "must be above 0 N/m"),
+        (10, "", (8, "eras.SW.stiffness"), "is missing"),
+        (11, "    damping: -1", (11, "eras.SW.damping"), "must be at least 0"),
+        (11, "    damping_ratio: 5", (11, "eras.SW.damping_ratio"), "at most 2"),
+        (
+            11,
+            "    damping: 2\n    damping_ratio: 0.05",
+            (11, "eras.SW.damping"),
+            "keep one of the two",
+        ),
+        (11, "    bolt_mass: -1 g", (11, "eras.SW.bolt_mass"), "must be at least 0 kg"),
+        (11, "    stroke: 100", (11, "eras.SW.stroke"), "a bare number is in m"),
+        (11, "    stroke: 0 um", (11, "eras.SW.stroke"), "must be above 0 m"),
+        (12, "    amplifier: mian", (12, "eras.SW.amplifier"), "known under amplifiers: main"),
+        (12, "", (8, "eras.SW.amplifier"), "is missing"),
+        (13, "    channel: -1", (13, "eras.SW.channel"), "greater than or equal to 0"),
+        (13, "    channel: 0.5", (13, "eras.SW.channel"), "must be a whole number"),
+        (13, "    channel: '0'", (13, "eras.SW.channel"), "must be a whole number"),
+        (13, "    channel: true", (13, "eras.SW.channel"), "must be a whole number"),
+        (13, "    channel: 1", (18, "eras.NE.channel"), "drives ERA SW already"),
+        (14, "  2E:", (14, "eras.2E"), "is no name"),
+        (14, "  'N E':", (14, "eras.'N E'"), "is no name"),
+        (20, "  main: sim://", (20, "amplifiers.main"), "must be a mapping"),
+        (20, "  main: {url: sim}", (20, "amplifiers.main.url"), "is no URL"),
+        (22, "  frequency: [500, 40]", (22, "limits.frequency"), "the lower frequency first"),
+        (22, "  frequency: [0, 500]", (22, "limits.frequency[0]"), "must be at least 1 Hz"),
+        (22, "  frequency: [40, 1 MHz]", (22, "limits.frequency[1]"), "at most 2000 Hz"),
+        (22, "  frequency: [40, 500 rpm]", (22, "limits.frequency[1]"), "is not a frequency"),
+        (23, "  level: 1.1", (23, "limits.level"), "at most 1"),
+        (23, "  level: -0.1", (23, "limits.level"), "at least 0"),
+        (23, "  slew: 0", (23, "limits.slew"), "above 0 1/s"),
+        (23, "  slew: 5 s", (23, "limits.slew"), "is not a rise of the level"),
+        (23, "  power: 0", (23, "limits.power"), "above 0"),
+        (23, "  on_time: 5 Hz", (23, "limits.on_time"), "is not a time"),
+        (23, "  duty: 101 %", (23, "limits.duty"), "at most 1"),
+        (23, "  rate: 3 kHz", (23, "limits.rate"), "at most 2000 1/s"),
+        (23, "  rate: .inf", (23, "limits.rate"), "is not a finite number"),
+        (23, "  level: .nan", (23, "limits.level"), "is not a finite number"),
+        (23, "  level: 0.5\nmasses: 2", (24, "masses"), "must be a mapping"),
+        (
+            23,
+            "  level: 0.5\nmasses:\n  cam:\n    at: [1, 0]\n    mass: 5 g",
+            (26, "masses.cam.at"),
+            "move the mass onto it",
+        ),
+        (
+            23,
+            "  level: 0.5\nmasses:\n  cam:\n    at: [0, 0]\n    mass: -5 g",
+            (27, "masses.cam.mass"),
+            "must be at least 0 kg",
+        ),
+        (
+            23,
+            "  level: 0.5\nmasses:\n  cam:\n    at: [0, 0]\n    mass: .nan",
+            (27, "masses.cam.mass"),
+            "is not a finite number",
+        ),
+        (
+            23,
+            "  level: 0.5\nmasses:\n  cam:\n    at: [0, 0]",
+            (25, "masses.cam.mass"),
+            "is missing",
+        ),
+        (
+            23,
+            "  level: 0.5\nmasses:\n  2nd: {at: [0, 0], mass: 5 g}",
+            (25, "masses.2nd"),
+            "is no name",
+        ),
+        (23, "  level: 0.5\nplates: 2", (24, "plates"), "did you mean plate"),
+    ],
+)
+def test_a_bad_value_is_refused_with_its_line_and_key(
+    tmp_path: Path, line: int, text: str, where: tuple[int, str], message: str
+) -> None:
+    """Whatever cannot work is refused; the problem names its line and key and what to do."""
+    problems = refused(tmp_path, changed(line, text))
+    assert any(where == (line, key) and message in said for line, key, said in problems)
+
+
+LAMINATE = GOOD.replace(
+    """\
+  thickness: 1.5 mm
+  material: aluminium
+""",
+    """\
+  layers:
+    - material: aluminium
+      thickness: 1 mm
+    - material: {E: 1 MPa, rho: 1000, nu: 0.49}
+      thickness: 0.2 mm
+    - {material: acrylic, thickness: 2 mm}
+  bond: shear
+  bond_frequency: 150
+""",
+)
+
+
+@pytest.mark.parametrize(
+    ("first", "last", "text", "where", "message"),
+    [
+        (4, 9, "  layers: []", (4, "plate.layers"), "has 0 entries"),
+        (4, 9, "  layers:\n    - 7", (5, "plate.layers[0]"), "must be a mapping"),
+        (4, 9, "  layers: {a: 1}", (4, "plate.layers"), "must be a list"),
+        (4, 4, "  thickness: 1 mm\n  layers:", (4, "plate.thickness"), "stands beside layers"),
+        (4, 4, "  material: steel\n  layers:", (4, "plate.material"), "stands beside layers"),
+        (5, 5, "    - material: aluminum", (5, "plate.layers[0].material"), "mean aluminium"),
+        (6, 6, "      thicknes: 1 mm", (6, "plate.layers[0].thicknes"), "did you mean thickness"),
+        (6, 6, "      thickness: 0", (6, "plate.layers[0].thickness"), "must be at least"),
+        (6, 6, "      thickness: .nan", (6, "plate.layers[0].thickness"), "not a finite number"),
+        (6, 6, "      thickness: 300 mm", (4, "plate.layers"), "more than the plate is wide"),
+        (
+            7,
+            7,
+            "    - material: {E: 1 MPa, rho: 1000, nu: 0.49, tan: 1}",
+            (7, "plate.layers[1].material.tan"),
+            "unknown key; known here are: name, E, rho, nu",
+        ),
+        (8, 8, "", (7, "plate.layers[1].thickness"), "is missing"),
+        (9, 9, "", (9, "plate.bond"), "needs 3, 5, 7, ... layers"),
+        (10, 10, "  bond: glue", (10, "plate.bond"), "'full', 'none' or 'shear'"),
+        (10, 10, "  bond: full", (10, "plate.bond"), "bond_frequency goes with bond shear only"),
+        (11, 11, "", (10, "plate.bond"), "needs a bond_frequency"),
+        (11, 11, "  bond_frequency: 0", (11, "plate.bond_frequency"), "must be at least 1 Hz"),
+        (11, 11, "  bond_frequency: .nan", (11, "plate.bond_frequency"), "not a finite number"),
+    ],
+)
+def test_a_bad_laminate_is_refused_with_its_line_and_key(
+    tmp_path: Path, first: int, last: int, text: str, where: tuple[int, str], message: str
+) -> None:
+    """Whatever cannot be a laminate is refused, down to the layer that is wrong."""
+    lines = LAMINATE.splitlines()
+    lines[first - 1 : last] = text.splitlines()
+    problems = refused(tmp_path, "\n".join(lines))
+    assert any(where == (number, key) and message in said for number, key, said in problems)
+
+
+def test_a_laminate_is_its_equivalent_plate(tmp_path: Path) -> None:
+    """The plate has the stack's mass, by hand 2.7 + 0.2 + 2.38 kg/m², and the bond is read."""
+    rig = load_rig(write(tmp_path, LAMINATE))
+    assert rig.plate.mass == pytest.approx(5.28 * 0.3048 * 0.2286, rel=1e-9)
+    assert rig.laminate is not None
+    assert [layer.thickness for layer in rig.laminate.layers] == [1e-3, 0.2e-3, 2e-3]
+    assert (rig.laminate.bond, rig.laminate.bond_frequency) == ("shear", 150.0)
+    firmer = load_rig(write(tmp_path, LAMINATE.replace("1 MPa", "10 MPa")))
+    assert firmer.plate.flexural_rigidity > rig.plate.flexural_rigidity
+    assert firmer.fingerprint != rig.fingerprint
+
+
+def test_one_layer_is_the_same_plate_as_no_layers(tmp_path: Path) -> None:
+    """A laminate of one layer has the numbers of that plate, and so its fingerprint."""
+    one = GOOD.replace(
+        "  thickness: 1.5 mm\n  material: aluminium",
+        "  layers: [{material: aluminium, thickness: 1.5 mm}]",
+    )
+    assert load_rig(write(tmp_path, one)).fingerprint == load_rig(write(tmp_path, GOOD)).fingerprint
+
+
+def test_masses_are_on_the_rig_and_in_its_fingerprint(tmp_path: Path) -> None:
+    """A mass is read with its unit; its name and order are no physics, its weight and place are."""
+    bare = load_rig(write(tmp_path, GOOD))
+    assert bare.masses == ()
+    camera = "  camera: {at: [50 mm, 9 in], mass: 20 g}\n"
+    plug = "  plug: {at: [0, 0], mass: 5 g}\n"
+    rig = load_rig(write(tmp_path, GOOD + "masses:\n" + camera + plug))
+    assert rig.masses == (PointMass(0.05, 0.2286, 0.02), PointMass(0.0, 0.0, 0.005))
+    turned = (GOOD + "masses:\n" + plug + camera).replace("camera", "eye")
+    assert load_rig(write(tmp_path, turned)).fingerprint == rig.fingerprint
+    heavier = load_rig(
+        write(tmp_path, (GOOD + "masses:\n" + camera + plug).replace("20 g", "21 g"))
+    )
+    assert len({bare.fingerprint, rig.fingerprint, heavier.fingerprint}) == 3
+
+
+@pytest.mark.parametrize(
+    ("first", "last", "text", "where", "message"),
+    [
+        (7, 18, "eras: {}", (7, "eras"), "has 0 entries, must have at least 1"),
+        (7, 18, "eras:", (7, "eras"), "must be a mapping"),
+        (7, 18, "", (1, "eras"), "is missing"),
+        (1, 5, "plate: 5", (1, "plate"), "must be a mapping"),
+        (19, 20, "amplifiers:", (19, "amplifiers"), "must be a mapping"),
+        (14, 18, "  NE: 5", (14, "eras.NE"), "must be a mapping"),
+    ],
+)
+def test_a_bad_section_is_refused(
+    tmp_path: Path, first: int, last: int, text: str, where: tuple[int, str], message: str
+) -> None:
+    """A section that is empty, missing or no mapping is refused as a whole."""
+    lines = GOOD.splitlines()
+    lines[first - 1 : last] = [text] if text else []
+    problems = refused(tmp_path, "\n".join(lines))
+    assert any(where == (line, key) and message in said for line, key, said in problems)
+
+
+def test_a_mesh_of_a_plate_that_is_far_too_thin_is_refused(tmp_path: Path) -> None:
+    """A plate whose waves would need millions of elements is refused before it is meshed."""
+    text = GOOD.replace("1.5 mm", "1 um").replace("48x36", "auto")
+    ((line, key, message),) = refused(tmp_path, text)
+    assert (line, key) == (6, "mesh")
+    assert "lower limits.frequency" in message
+
+
+def test_everything_wrong_is_said_at_once(tmp_path: Path) -> None:
+    """One reading finds errors of every kind: shape, units, and between sections."""
+    text = changed(10, "    stiffness: 17 N").replace("[0.3048, 228.6 mm]", "[1, 0]")
+    text = (
+        text.replace("channel: 1", "channel: 0")
+        .replace("9 in", "9 inch es")
+        .replace("level", "levle")
+        .replace("NE:\n", "NE:\n    colour: red\n")
+    )
+    keys = [(line, key) for line, key, _ in refused(tmp_path, text)]
+    assert keys == [
+        (3, "plate.width"),
+        (10, "eras.SW.stiffness"),
+        (15, "eras.NE.colour"),
+        (19, "eras.NE.channel"),
+        (24, "limits.levle"),
+    ]
+
+
+def test_an_era_on_the_edge_within_rounding_is_on_it(tmp_path: Path) -> None:
+    """What arithmetic adds to a corner's coordinate is taken off again."""
+    rig = load_rig(write(tmp_path, GOOD.replace("[0.3048,", "[0.30480000000000007,")))
+    assert rig.era("NE").x == 0.3048
+
+
+@pytest.mark.parametrize("text", ["48x36", "48X36", " 48 x 36 ", "48×36"])
+def test_a_mesh_is_read(text: str) -> None:
+    """The ways in which people write a mesh are one mesh over the plate."""
+    plate = Plate(0.4, 0.3, 0.002, material("aluminium"))
+    mesh = parse_mesh(text, plate)
+    assert (mesh.nx, mesh.ny, mesh.length, mesh.width) == (48, 36, 0.4, 0.3)
+
+
+@pytest.mark.parametrize(
+    "text", ["", "48", "48x", "x36", "4.8x36", "-4x3", "0x3", "3x1001", "9" * 50]
+)
+def test_what_is_no_mesh_is_refused(text: str) -> None:
+    """Other texts are refused, with a short message."""
+    with pytest.raises(InputError, match=r"mesh .*elements") as caught:
+        parse_mesh(text, Plate(0.4, 0.3, 0.002, material("aluminium")))
+    assert len(str(caught.value)) < 200
+
+
+def test_the_same_plate_has_the_same_fingerprint_however_it_is_written(tmp_path: Path) -> None:
+    """Units, a material's name and the wiring do not make another plate; a value does."""
+    fingerprint = load_rig(write(tmp_path, GOOD)).fingerprint
+    same = GOOD.replace("12 in", "304.8 mm").replace(
+        "aluminium", "{name: alloy, E: 70e9, rho: 2.7 g/cm^3, nu: 33 %}"
+    )
+    same = same.replace("channel: 1", "channel: 3").replace("sim://", "serial:///dev/ttyUSB0")
+    assert load_rig(write(tmp_path, same)).fingerprint == fingerprint
+    other = GOOD.replace("1.5 mm", "1.5001 mm")
+    assert load_rig(write(tmp_path, other)).fingerprint != fingerprint
+
+
+def test_the_schema_for_editors_knows_what_the_example_says() -> None:
+    """Every key of the example stands in the schema's section for it, and all required ones do."""
+    schema = rig_schema()
+    example = yaml.safe_load(example_rig_path().read_text(encoding="utf-8"))
+    sections = schema["$defs"]
+    assert example.keys() <= schema["properties"].keys()
+    assert set(schema["required"]) <= example.keys()
+    for section, content in (
+        ("PlateSection", example["plate"]),
+        ("EraSection", example["eras"]["NE"]),
+        ("AmplifierSection", example["amplifiers"]["main"]),
+        ("LimitsSection", example["limits"]),
+    ):
+        assert content.keys() <= sections[section]["properties"].keys()
+        assert set(sections[section].get("required", [])) <= content.keys()
+        assert sections[section]["additionalProperties"] is False
+    assert json.loads(json.dumps(schema)) == schema
+
+
+def test_text_of_a_rig() -> None:
+    """The text of a file gives the rig of the file, and its problems name where it came from."""
+    text = example_rig_path().read_text(encoding="utf-8")
+    assert parse_rig("the daemon", text) == load_rig(example_rig_path())
+    with pytest.raises(ConfigError, match="the daemon"):
+        parse_rig("the daemon", text.replace("thickness", "thikness"))

@@ -1,0 +1,126 @@
+"""The reference of the rig file against what rig files may say."""
+
+import re
+from pathlib import Path
+from typing import get_args
+
+import pytest
+from typer.testing import CliRunner
+
+import model
+from model.cli import app
+from model.config.sections import Quantity
+from model.config.units import quantity
+from model.rig.file import load_rig
+from model.rig.sections import (
+    AmplifierSection,
+    EraSection,
+    LayerSection,
+    LimitsSection,
+    MassSection,
+    MaterialSection,
+    PlateSection,
+    RigSection,
+)
+from model.structure.materials import KNOWN_MATERIALS
+
+ROOT = Path(model.__file__).parent.parent
+PAGE = (ROOT / "docs" / "rig.md").read_text("utf-8")
+SECTIONS = {
+    "The file": RigSection,
+    "plate": PlateSection,
+    "layers": LayerSection,
+    "material": MaterialSection,
+    "eras": EraSection,
+    "masses": MassSection,
+    "amplifiers": AmplifierSection,
+    "limits": LimitsSection,
+}
+
+
+def rows(heading):
+    """The table of keys under a heading: (unit, default, limits, meaning) by key."""
+    part = re.split(r"^## ", PAGE, flags=re.MULTILINE)
+    (text,) = [section for section in part if section.startswith(f"{heading}\n")]
+    table = text[text.index("| key |") :].split("\n\n")[0].splitlines()[2:]
+    cells = [[cell.strip() for cell in re.split(r"(?<!\\)\|", line)[1:-1]] for line in table]
+    return {key.strip("`"): rest for key, *rest in cells}
+
+
+def quantities(annotation, metadata=()):
+    """Every Quantity that a field's type carries, however deep."""
+    found = [part for part in metadata if isinstance(part, Quantity)]
+    for part in (*get_args(annotation), *getattr(annotation, "__metadata__", ())):
+        found += [part] if isinstance(part, Quantity) else quantities(part)
+    return found
+
+
+@pytest.mark.parametrize("heading", SECTIONS)
+def test_every_key_is_documented_and_no_other(heading):
+    """A section's table names exactly the keys that the section has, in their order."""
+    assert list(rows(heading)) == list(SECTIONS[heading].model_fields)
+
+
+@pytest.mark.parametrize("heading", SECTIONS)
+def test_units_and_limits_are_those_that_are_checked(heading):
+    """A quantity's row has its SI unit and every finite bound, in the words of the error."""
+    for key, field in SECTIONS[heading].model_fields.items():
+        unit, _, limits, _ = rows(heading)[key]
+        found = quantities(field.annotation, field.metadata)
+        assert unit == (found[0].dimension.unit if found else "")
+        for asked in found:
+            bounds = {
+                "above": asked.above,
+                "at least": asked.least,
+                "at most": asked.most,
+                "below": asked.below,
+            }
+            words = [f"{word} {b:g}" for word, b in bounds.items() if abs(b) != float("inf")]
+            assert limits == ", ".join(words)
+
+
+@pytest.mark.parametrize("heading", SECTIONS)
+def test_defaults_are_those_that_are_taken(heading):
+    """Required keys say so; the others show the value that stands in when they are left out."""
+    for key, field in SECTIONS[heading].model_fields.items():
+        default = rows(heading)[key][1]
+        if field.is_required():
+            assert default == "required"
+        elif isinstance(field.default, float):
+            (asked,) = quantities(field.annotation, field.metadata)
+            assert quantity(default, asked.dimension) == field.default
+        elif isinstance(field.default, tuple):
+            assert default == f"`[{', '.join(f'{bound:g}' for bound in field.default)}]`"
+        elif isinstance(field.default, str):
+            assert default == f"`{field.default}`"
+        else:
+            assert "none" in default or "`layers`" in default or default == "see there"
+
+
+def test_the_least_rig_of_the_page_is_good(tmp_path):
+    """The rig that the page prints loads, with three ERAs."""
+    path = tmp_path / "rig.yaml"
+    path.write_text(re.search(r"```yaml\n(.*?)```", PAGE, re.DOTALL)[1], encoding="utf-8")
+    assert [era.name for era in load_rig(path).eras] == ["SW", "SE", "N"]
+
+
+def test_the_materials_of_the_page_are_those_that_are_known():
+    """Names and numbers of the page's table are the list's."""
+    printed = re.findall(
+        r"^\| `([\w-]+)` \| ([\d.]+) GPa \| (\d+) kg/m³ \| ([\d.]+) \|", PAGE, re.M
+    )
+    known = [known.material for known in KNOWN_MATERIALS.values()]
+    assert [(name, float(E) * 1e9, float(rho), float(nu)) for name, E, rho, nu in printed] == [
+        (material.name, material.E, material.rho, material.nu) for material in known
+    ]
+
+
+def test_what_the_page_says_of_the_glass_panel_is_what_is_printed():
+    """Every line of the quoted output is in the output of the command that it names."""
+    result = CliRunner().invoke(app, ["plate", "show", str(ROOT / "examples" / "glass_panel.yaml")])
+    quoted = PAGE[PAGE.index("    laminate of 2.7 mm") :].split("\n\n")[0].splitlines()
+    assert len(quoted) == 6
+    for line in quoted:
+        assert f"{line.removeprefix('    ')}\n" in result.stdout
+    assert "by 56 % in frequency" in PAGE.replace("\n", " ")
+    assert "x 1.564" in result.stdout

@@ -1,0 +1,309 @@
+"""Solving, keeping and ranking the cases of a study."""
+
+import io
+import logging
+import multiprocessing
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from model.errors import InputError
+from model.fem.assembly import assemble
+from model.fem.harmonic import direct_acceleration
+from model.structure.actuator import Era
+from model.structure.point_load import PointLoad
+from model.structure.point_mass import PointMass
+from model.studies.cache import ResultCache
+from model.studies.kinds import count_cases, placement_cases, stiffness_cases
+from model.studies.outcome import ranking_summary
+from model.studies.ranking import era_counts, rank
+from model.studies.run import CHUNK, run_study
+from model.studies.solve import DRIVES, CaseResults, solve_cases, study_problem
+from model.studies.workers import in_process, on_processes
+from model.vibration.activation import MEDIAN, cumulative_peak, cumulative_statistics
+from paper_plate import make_paper_rig
+from studies import FREQUENCIES, chunks_of, same_to_the_bit, small_study
+
+
+@pytest.fixture(scope="module")
+def study():
+    """A problem and cases for more than two chunks."""
+    return small_study(layouts=2 * CHUNK + 10)
+
+
+@pytest.fixture(scope="module")
+def results(study):
+    """All cases solved in this process, without a cache."""
+    problem, cases = study
+    return solve_cases(problem.solve(), problem.rig.eras, cases)
+
+
+def npy_bytes(array):
+    """An array as numpy saves it alone."""
+    stream = io.BytesIO()
+    np.save(stream, array)
+    return stream.getvalue()
+
+
+def counting(solved):
+    """Workers that note which chunks they were asked for."""
+
+    def solve_and_note(problem, chunks):
+        solved.extend(chunks)
+        yield from in_process(problem, chunks)
+
+    return solve_and_note
+
+
+def test_statistics_are_those_of_the_direct_solve(study, results):
+    """For the rig itself and random layouts, against one sparse factorisation per frequency."""
+    problem, cases = study
+    matrices = assemble(problem.rig.plate, problem.rig.mesh)
+    for case in (0, 3, 20, 120):
+        eras = cases.eras_of(case, problem.rig.eras)
+        direct = direct_acceleration(matrices, eras, FREQUENCIES, problem.points)
+        for drive, size in enumerate((1, 2, 4)):
+            active = results.active_eras(case, drive)
+            assert len(active) == size
+            median = results.statistics[case, drive, MEDIAN]
+            assert median == pytest.approx(np.median(cumulative_peak(direct, active)), rel=1e-4)
+        best = cumulative_statistics(direct)[:4, MEDIAN].max()
+        assert results.statistics[case, 0, MEDIAN] == pytest.approx(best, rel=1e-4)
+
+
+def test_eras_that_differ_are_solved_as_they_are():
+    """Stiffness, damping, bolt mass and stroke of each ERA are its own, as in the direct solve."""
+    paper = make_paper_rig(12, 9)
+    parameters = [(8e3, 1.0, 0.0, 1e-4), (3e4, 5.0, 0.01, 5e-5), (17e3, 3.0, 0.02, 2e-4)]
+    eras = tuple(
+        Era(era.name, era.x, era.y, *numbers)
+        for era, numbers in zip(paper.eras[:3], parameters, strict=True)
+    )
+    rig = replace(paper, eras=eras)
+    cases = placement_cases(rig, layouts=12, seed=0, raster=(7, 5))
+    problem = study_problem(rig, cases, FREQUENCIES)
+    placed = cases.eras_of(9, eras)
+    direct = direct_acceleration(assemble(rig.plate, rig.mesh), placed, FREQUENCIES, problem.points)
+    fast = problem.solve().acceleration(cases.places_of(9), placed)
+    np.testing.assert_allclose(fast, direct, rtol=1e-4, atol=1e-4 * np.abs(direct).max())
+
+
+def test_what_the_plate_carries_is_in_the_answer(study):
+    """A point mass of the rig is there in every layout, as in the direct solve."""
+    problem, cases = study
+    mass = PointMass(0.1, 0.08, 0.05)
+    loaded = replace(problem.rig, masses=(mass,))
+    carried = study_problem(loaded, cases, FREQUENCIES)
+    assert carried.digest != problem.digest
+    solved = solve_cases(carried.solve(), loaded.eras, cases.part(8, 9))
+    direct = direct_acceleration(
+        assemble(loaded.plate, loaded.mesh),
+        cases.eras_of(8, loaded.eras),
+        FREQUENCIES,
+        carried.points,
+        loads=[PointLoad(mass.x, mass.y, mass=mass.mass)],
+    )
+    expected = np.median(cumulative_peak(direct, solved.active_eras(0, 1)))
+    assert solved.statistics[0, 1, MEDIAN] == pytest.approx(expected, rel=1e-4)
+
+
+def test_one_era_has_no_pair_and_two_have_no_more():
+    """A count study leaves the pair of a lone ERA out; of two, the pair is all."""
+    rig = make_paper_rig(12, 9)
+    cases = count_cases(rig, layouts=6, seed=0, raster=(7, 5))
+    problem = study_problem(rig, cases, FREQUENCIES)
+    results = solve_cases(problem.solve(), rig.eras, cases)
+    by_drive = dict(zip(DRIVES, results.statistics.transpose(1, 0, 2), strict=True))
+    assert np.isnan(by_drive["2"][0]).all()
+    np.testing.assert_array_equal(by_drive["all"][0], by_drive["1"][0])
+    np.testing.assert_array_equal(by_drive["all"][1], by_drive["2"][1])
+    pairs = rank(cases, results, drive=DRIVES.index("2"))
+    assert sorted(era_counts(cases)[pairs.order]) == [2, 3, 4, 5, 6]
+
+
+def test_more_workers_give_the_same_to_the_bit(study):
+    """Two processes and this one agree in every bit of every chunk."""
+    problem, cases = study
+    chunks = chunks_of(cases, 30)
+    two = dict(on_processes(2)(problem, chunks))
+    assert same_to_the_bit(two, dict(in_process(problem, chunks)))
+
+
+def test_a_run_puts_chunks_together_in_order(study, results, tmp_path):
+    """Whatever order workers finish in; each case is told to the progress bar once."""
+    problem, cases = study
+
+    def backwards(problem, chunks):
+        yield from reversed(list(in_process(problem, chunks)))
+
+    told = []
+    run = run_study(
+        problem,
+        cases,
+        workers=backwards,
+        cache=ResultCache(tmp_path, problem.digest),
+        progress=told.append,
+    )
+    assert same_to_the_bit({0: run.results}, {0: results})
+    assert (sum(told), run.solved_count, run.cached_count) == (len(cases), len(cases), 0)
+
+
+def test_an_interrupted_run_resumes_without_solving_anything_twice(study, results, tmp_path):
+    """Ctrl-C after the first chunk; the second run solves the other two, the third none at all."""
+    problem, cases = study
+    cache = ResultCache(tmp_path / "chunks", problem.digest)
+
+    def interrupted(problem, chunks):
+        yield next(in_process(problem, chunks))
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run_study(problem, cases, workers=interrupted, cache=cache)
+    asked = []
+    run = run_study(problem, cases, workers=counting(asked), cache=cache)
+    assert asked == [1, 2]
+    assert (run.solved_count, run.cached_count) == (len(cases) - CHUNK, CHUNK)
+    assert same_to_the_bit({0: run.results}, {0: results})
+    run_study(problem, cases, workers=counting(asked), cache=cache)
+    assert asked == [1, 2]
+
+
+@pytest.mark.parametrize("harm", ["cut", "flipped", "emptied", "foreign", "an array"])
+def test_a_damaged_chunk_is_told_and_solved_again(study, results, tmp_path, caplog, harm):
+    """Cut short, a bit flipped, empty, or not a chunk at all: one warning, right numbers."""
+    problem, cases = study
+    cache = ResultCache(tmp_path, problem.digest)
+    run_study(problem, cases, workers=in_process, cache=cache)
+    chunk = sorted(tmp_path.iterdir())[1]
+    content = chunk.read_bytes()
+    middle = len(content) // 3
+    chunk.write_bytes(
+        {
+            "cut": content[:middle],
+            "flipped": content[:middle] + bytes([content[middle] ^ 1]) + content[middle + 1 :],
+            "emptied": b"",
+            "foreign": b"PK\x03\x04 not a chunk",
+            "an array": npy_bytes(np.zeros(3)),
+        }[harm]
+    )
+    asked = []
+    with caplog.at_level(logging.WARNING):
+        run = run_study(problem, cases, workers=counting(asked), cache=cache)
+    assert len(asked) == 1
+    assert [record.args[0] for record in caplog.records] == [chunk]
+    assert "again" in caplog.text
+    assert same_to_the_bit({0: run.results}, {0: results})
+    assert chunk.read_bytes() == content
+
+
+def test_a_chunk_of_another_size_is_not_taken(study, tmp_path, caplog):
+    """A file with a good checksum but the wrong number of cases is damaged too."""
+    problem, cases = study
+    cache = ResultCache(tmp_path, problem.digest)
+    part = cases.part(0, 4)
+    solved = solve_cases(problem.solve(), problem.rig.eras, part)
+    cache.store(part, CaseResults(solved.statistics[:3], solved.active[:3]))
+    assert cache.load(part) is None
+    assert "damaged" in caplog.text
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"frequencies": np.array([60.0, 110.0, 170.0, 251.0])},
+        {"code_version": "0.0.1+123456789abc"},
+        {"rig": make_paper_rig(14, 9)},
+        {"rig": make_paper_rig(12, 9, damping_ratio=0.06)},
+    ],
+    ids=["frequencies", "code", "mesh", "ERAs"],
+)
+def test_what_another_problem_left_is_not_used(study, tmp_path, change):
+    """Results are kept by all that made them."""
+    problem, cases = study
+    part = cases.part(0, 4)
+    solved = solve_cases(problem.solve(), problem.rig.eras, part)
+    ResultCache(tmp_path, problem.digest).store(part, solved)
+    assert ResultCache(tmp_path, problem.digest).load(part) is not None
+    assert ResultCache(tmp_path, replace(problem, **change).digest).load(part) is None
+
+
+def test_results_are_kept_by_the_cases_themselves(study, tmp_path):
+    """The same layouts of a longer list are found again, others or stiffer ones are not."""
+    problem, cases = study
+    solved = solve_cases(problem.solve(), problem.rig.eras, cases.part(0, 4))
+    cache = ResultCache(tmp_path, problem.digest)
+    cache.store(cases.part(0, 4), solved)
+    longer = placement_cases(problem.rig, layouts=900, seed=0, raster=(7, 5))
+    assert cache.load(longer.part(0, 4)) is not None
+    assert cache.load(longer.part(1, 5)) is None
+    stiffer = replace(longer.part(0, 4), stiffness_factors=np.array([1.0, 1.0, 1.0, 2.0]))
+    assert cache.load(stiffer) is None
+
+
+def test_a_worker_process_that_dies_is_replaced(study, results, caplog):
+    """All workers killed when the first chunk is there: a warning, and all results come."""
+    problem, cases = study
+    chunks = chunks_of(cases, 2)
+    others = multiprocessing.active_children()
+    solving = on_processes(2)(problem, chunks)
+    there = dict([next(solving)])
+    workers = [child for child in multiprocessing.active_children() if child not in others]
+    assert len(workers) == 2
+    for worker in workers:
+        worker.kill()
+    there |= dict(solving)
+    assert same_to_the_bit(there, dict(in_process(problem, chunks)))
+    assert "died" in caplog.text
+
+
+def test_the_ranking_is_by_the_median_of_the_drive(study, results):
+    """Best first, the middle in the middle, the worst last; the rig has its place in it."""
+    _, cases = study
+    ranking = rank(cases, results, drive=DRIVES.index("2"))
+    medians = results.statistics[:, 1, MEDIAN]
+    assert ranking.best == medians.argmax()
+    assert ranking.worst == medians.argmin()
+    assert medians[ranking.middle] == pytest.approx(np.median(medians), rel=0.01)
+    assert ranking.own == 0
+    assert ranking.recommended == ranking.best
+
+
+def test_the_rig_as_it_is_is_told_even_from_the_end_of_the_ranking(study):
+    """Ten cases and, where it is not among them, the rig's own with its rank."""
+    problem, cases = study
+    part = cases.part(0, 30)
+    statistics = np.ones((30, 3, 6))
+    statistics[:, 1, MEDIAN] = np.arange(30)  # the first one, the rig's, comes last
+    results = CaseResults(statistics, np.ones((30, 3), dtype=np.uint64))
+    told = ranking_summary(problem.rig, rank(part, results, drive=1))["ranking"]
+    assert [case["rank"] for case in told] == [*range(1, 11), 30]
+    assert told[-1]["layout"] == "own"
+
+
+def test_softer_eras_are_recommended_where_they_do_as_well():
+    """Of those within a tenth of the best median: the fewest, then the softest."""
+    rig = make_paper_rig(12, 9)
+    cases = stiffness_cases(rig, layouts=1, seed=0, raster=(7, 5))
+    statistics = np.zeros((9, 3, 6))
+    statistics[:, 1, MEDIAN] = [1, 2, 3, 8, 9.1, 9.5, 10, 9.9, 9.8]
+    results = CaseResults(statistics, np.zeros((9, 3), dtype=np.uint64))
+    ranking = rank(cases, results, drive=1)
+    assert (ranking.best, ranking.recommended) == (6, 4)
+    assert ranking.best_by(cases.stiffness_factors) == {2.0**k: k + 4 for k in range(-4, 5)}
+
+
+@pytest.mark.parametrize("frequencies", [[], [0.0], [-60.0], [np.nan], [60.0, 5000.0]])
+def test_bad_frequencies_are_refused(study, frequencies):
+    """None, nought, no number, or more than the mesh carries."""
+    problem, cases = study
+    with pytest.raises(InputError, match=r"frequenc|Hz"):
+        study_problem(problem.rig, cases, np.array(frequencies))
+
+
+def test_a_study_too_large_for_memory_is_refused_before_it_starts(study):
+    """3600 places at 27 frequencies: 27 x 3600 x (3600 + 432) complex numbers are 6.3 GB."""
+    problem, _ = study
+    cases = placement_cases(problem.rig, layouts=10, seed=0, raster=(60, 60))
+    with pytest.raises(InputError, match=r"6\.3 GB; take fewer --candidates"):
+        study_problem(problem.rig, cases, np.arange(60.0, 321.0, 10.0)).solve()

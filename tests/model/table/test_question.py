@@ -1,0 +1,220 @@
+"""Questions and answers: what is refused, what is measured."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from model.errors import InputError
+from model.fem.assembly import assemble
+from model.fem.harmonic import direct_acceleration
+from model.finger.fingertip import fingertip_points
+from model.finger.perception import detection_threshold
+from model.table.pattern import Pattern
+from model.table.question import Question
+from model.vibration.peak import tone_amplitudes
+from paper_table import contact_sets, smooth_rig, smooth_table
+
+TARGET, QUIET = (0.09, 0.07), ((0.25, 0.18),)
+
+
+@pytest.mark.parametrize(
+    ("question", "says"),
+    [
+        (lambda: Question(()), "at least one target"),
+        (lambda: Question((TARGET,), tuple((0.2, y / 50) for y in range(10))), "more than ten"),
+        (lambda: Question((TARGET,), level_db_sl=math.nan), "dB SL is none"),
+        (lambda: Question((TARGET,), level_db_sl=201.0), "dB SL is none.*from -100 to 200"),
+        (lambda: Question((TARGET,), level_db_sl=-300.0), "-300 dB SL is none"),
+        (lambda: Question((TARGET, (0.2, 0.1), TARGET)), r"target \(0.09, 0.07\) m is given twice"),
+        (lambda: Question((TARGET,), QUIET * 2), "quiet finger .* is given twice"),
+        (lambda: Question((TARGET,), (TARGET,)), "within the quiet fingertip"),
+        (lambda: Question((TARGET,), search_time=math.nan), "cannot end after nan s"),
+        (lambda: Question((TARGET,), mode="loud"), "unknown drive mode 'loud'; known: switched"),
+        (lambda: Question((TARGET,), eras_at_most=0), "at least one"),
+        (lambda: Question((TARGET,), softer_db=(0.0, 3.0)), "2 levels were given for 1 targets"),
+        (lambda: Question((TARGET,), softer_db=(-1.0,)), "cannot be softer"),
+        (lambda: Question((TARGET,), softer_db=(math.nan,)), "cannot be softer"),
+        (lambda: Question(((0.2, 0.1), TARGET), ((0.095, 0.07),)), "within the quiet fingertip"),
+    ],
+)
+def test_questions_that_nobody_can_answer_are_refused(question, says):
+    """No target, eleven fingers, no level, time, mode or ERA, levels of others, one on another."""
+    with pytest.raises(InputError, match=says):
+        question()
+
+
+@pytest.mark.parametrize(
+    ("question", "says"),
+    [
+        (Question(((0.1, math.inf),)), "not on the plate"),
+        (Question((TARGET,), ((math.nan, 0.1),)), "not on the plate"),
+        (Question((TARGET,), mode="phased", playable=("switched",)), "cannot play mode phased"),
+        (Question((TARGET,), playable=("graded",)), "cannot play mode switched"),
+        (Question((TARGET,), frequencies=(600.0, 800.0)), "none that these amplifiers play"),
+        (Question((TARGET,), eras_at_most=9), "has 4 ERAs, of which up to 9"),
+        (Question((TARGET,), eras_at_most=3, mode="graded"), "matter of mode switched"),
+        (Question((TARGET,), QUIET, level_db_sl=120.0, mode="phased"), "most that can be had"),
+        (Question((TARGET, (0.2, 0.1)), level_db_sl=120.0, mode="phased"), "most that was found"),
+        (Question((TARGET,), QUIET, level_db_sl=120.0, mode="graded"), "most that was found"),
+        (Question((TARGET, (0.2, 0.1)), level_db_sl=120.0), "most that can be had"),
+        (Question((TARGET,), QUIET, level_db_sl=120.0, eras_at_most=4), "most that was found"),
+    ],
+)
+def test_a_table_says_why_it_has_no_answer(question, says):
+    """Off the plate, beyond what the amplifiers can do, too loud."""
+    with pytest.raises(InputError, match=says):
+        smooth_table().ask(question)
+
+
+def test_four_eras_are_searched_exactly_and_what_is_loudest_is_had():
+    """The answer is its own bound; a hair below the loudest level named there is an answer."""
+    table = smooth_table()
+    pattern = table.ask(Question((TARGET,), QUIET, eras_at_most=4))
+    assert pattern.contrast_bound_db == pytest.approx(pattern.contrast_db, abs=1e-4)
+    assert table.ask(Question((TARGET,), QUIET)).contrast_bound_db is None
+    with pytest.raises(InputError) as refusal:
+        table.ask(Question((TARGET,), QUIET, eras_at_most=4, level_db_sl=120.0))
+    most = float(str(refusal.value).split(" there is ")[1].split()[0])
+    assert table.ask(Question((TARGET,), QUIET, eras_at_most=4, level_db_sl=most))
+
+
+def test_a_search_that_ran_out_of_time_does_not_say_that_there_is_nothing():
+    """What only more than two ERAs reach is not called out of reach where nobody looked for it."""
+    question = Question((TARGET,), QUIET, eras_at_most=4)
+    with pytest.raises(InputError) as refusal:
+        smooth_table().ask(replace(question, level_db_sl=120.0, eras_at_most=2))
+    most = float(str(refusal.value).split(" there is ")[1].split()[0])
+    louder = replace(question, level_db_sl=most + 0.5)
+    assert smooth_table().ask(louder).level_db_sl == most + 0.5
+    with pytest.raises(InputError, match="not all were looked at"):
+        smooth_table().ask(replace(louder, search_time=0.0))
+
+
+def test_frequencies_are_those_that_the_amplifiers_play():
+    """With amplifiers from 150 to 250 Hz no tone lies outside, in any mode."""
+    for mode in ("switched", "graded", "signed", "phased"):
+        pattern = smooth_table().ask(
+            Question((TARGET,), QUIET, mode=mode, frequencies=(150.0, 250.0))
+        )
+        assert all(150 <= tone.frequency <= 250 for tone in pattern.excitation.values())
+
+
+@pytest.mark.parametrize("mode", ["graded", "signed", "phased"])
+def test_an_answer_is_what_the_direct_solver_says(mode):
+    """Level, contrast and the loudest quiet level of a pattern, by the sparse direct solve."""
+    rig, table = smooth_rig(), smooth_table()
+    target, *quiet = contact_sets(1, fingers=4, seed=2)[0]
+    pattern = table.ask(Question((target,), tuple(quiet), level_db_sl=17.0, mode=mode))
+    discs = [fingertip_points(*place, rig.plate) for place in (target, *quiet)]
+    matrices = assemble(rig.plate, rig.mesh)
+    frequencies, amplitudes = tone_amplitudes(
+        pattern.excitation,
+        rig.eras,
+        lambda f: direct_acceleration(matrices, rig.eras, f, np.concatenate(discs)),
+    )
+    count = len(discs[0])
+    above = np.sqrt(((amplitudes.T / detection_threshold(frequencies)) ** 2).sum(axis=1))
+    peak = amplitudes.sum(axis=0)
+    assert 20 * np.log10(above[:count].mean()) == pytest.approx(17.0, abs=0.02)
+    assert pattern.quiet_level_db_sl == pytest.approx(20 * np.log10(above[count:].max()), abs=0.05)
+    contrast = 20 * np.log10(peak[:count].mean() / peak[count:].max())
+    assert pattern.contrast_db == pytest.approx(contrast, abs=0.05)
+
+
+def test_measures_follow_from_levels():
+    """By hand: 20 dB SL here and 4 there are 16 between; unaware at -10, so up to 6 is usable."""
+    pattern = Pattern({}, 0.02, 20.0, 15.0, 4.0)
+    assert pattern.contrast_db_sl == 16.0
+    assert pattern.quiet_is_unaware is False
+    assert pattern.usable_level_db_sl == 6.0
+    deaf = replace(pattern, quiet_level_db_sl=-10.0)
+    assert deaf.quiet_is_unaware is True
+    assert deaf.usable_level_db_sl == 20.0
+    alone = replace(pattern, contrast_db=None, quiet_level_db_sl=None)
+    assert alone.quiet_is_unaware is None
+    assert alone.usable_level_db_sl == 20.0
+
+
+def test_the_usable_level_leaves_quiet_fingers_unaware():
+    """Asked again for what is usable, the quiet finger is unaware."""
+    table = smooth_table()
+    loud = table.ask(Question((TARGET,), QUIET, mode="phased", level_db_sl=40.0))
+    assert loud.quiet_is_unaware is False
+    soft = table.ask(
+        Question((TARGET,), QUIET, mode="phased", level_db_sl=loud.usable_level_db_sl - 1e-3)
+    )
+    assert soft.quiet_is_unaware is True
+
+
+def test_mirrored_contacts_get_mirrored_phased_patterns():
+    """West and east swap: the same contrast, and each ERA's level at its mirror image."""
+    table = smooth_table()
+    length = table.plate.length
+    west = table.ask(Question((TARGET,), QUIET, mode="phased"))
+    east = table.ask(Question(((length - 0.09, 0.07),), ((length - 0.25, 0.18),), mode="phased"))
+    assert east.contrast_db == pytest.approx(west.contrast_db, abs=0.05)
+    for name, mirrored in {"SW": "SE", "SE": "SW", "NE": "NW", "NW": "NE"}.items():
+        assert east.excitation[mirrored].frequency == west.excitation[name].frequency
+        assert east.excitation[mirrored].amplitude == pytest.approx(
+            west.excitation[name].amplitude, rel=1e-2
+        )
+
+
+def test_the_strongest_era_of_a_frequency_has_phase_zero():
+    """No phase is absolute; the others are told from the strongest."""
+    for place, *quiet in contact_sets(4, fingers=3, seed=12):
+        pattern = smooth_table().ask(Question((place,), tuple(quiet), mode="phased"))
+        strongest = max(pattern.excitation.values(), key=lambda tone: tone.amplitude)
+        assert strongest.phase == 0.0
+        assert sum(tone.phase == 0.0 for tone in pattern.excitation.values()) == 1
+
+
+@pytest.mark.parametrize("softer", [(0.0, 0.0), (0.0, 8.0), (6.0, 0.0)])
+def test_two_targets_both_feel_it(softer):
+    """Both at the level that each wants or above, one of them right at it."""
+    table = smooth_table()
+    first, second, quiet = contact_sets(1, fingers=3, seed=9)[0]
+    question = Question(
+        (first, second), (quiet,), mode="phased", level_db_sl=15.0, softer_db=softer
+    )
+    pattern = table.ask(question)
+    levels = []
+    for place in (first, second):
+        points = fingertip_points(*place, table.plate)
+        frequencies, amplitudes = table.amplitudes(pattern.excitation, points)
+        above = np.sqrt(((amplitudes.T / detection_threshold(frequencies)) ** 2).sum(axis=1))
+        levels.append(20 * np.log10(above.mean()))
+    assert min(np.array(levels) + softer) == pytest.approx(15.0, abs=0.01)
+
+
+@pytest.mark.parametrize("mode", ["switched", "graded", "signed", "phased"])
+def test_a_lone_finger_is_told_from_the_plate_around_it(mode):
+    """The pattern's ratio to the rms of cell centres beyond 5 cm is what the answer says."""
+    table = smooth_table()
+    pattern = table.ask(Question((TARGET,), mode=mode))
+    centres = table.cell_centres
+    far = centres[np.hypot(*(centres - TARGET).T) > 0.05]
+    points = np.concatenate([fingertip_points(*TARGET, table.plate), far])
+    peak = table.amplitudes(pattern.excitation, points)[1].sum(axis=0)
+    count = len(points) - len(far)
+    ratio = 20 * np.log10(peak[:count].mean() / np.sqrt((peak[count:] ** 2).mean()))
+    assert pattern.surroundings_contrast_db == pytest.approx(ratio, abs=0.01)
+    assert pattern.contrast_db is None
+
+
+def test_two_fingers_alone_are_told_from_what_is_near_neither():
+    """Both are targets; only cells beyond 5 cm of the one and of the other are around them."""
+    table = smooth_table()
+    places = (TARGET, QUIET[0])
+    pattern = table.ask(Question(places, mode="phased"))
+    centres = table.cell_centres
+    far = centres[[min(math.dist(centre, each) for each in places) > 0.05 for centre in centres]]
+    discs = [fingertip_points(*each, table.plate) for each in places]
+    peaks = [
+        table.amplitudes(pattern.excitation, points)[1].sum(axis=0) for points in (*discs, far)
+    ]
+    felt = min(peak.mean() for peak in peaks[:2])
+    ratio = 20 * np.log10(felt / np.sqrt((peaks[2] ** 2).mean()))
+    assert pattern.surroundings_contrast_db == pytest.approx(ratio, abs=0.01)

@@ -1,0 +1,53 @@
+"""The raster: fields read between its points are those of the plate."""
+
+import numpy as np
+import pytest
+
+from model.errors import InputError
+from model.finger.fingertip import fingertip_points
+from model.reduction.free_plate import solve_free_plate
+from model.structure.plate import Material, Plate
+from model.table.raster import Raster
+from paper_table import FREQUENCIES, smooth_rig
+
+CONTACTS = [(0.15, 0.11), (0.0, 0.0), (0.3048, 0.1), (0.2, 0.225), (0.006, 0.0031)]
+
+
+def test_points_under_a_fingertip_are_those_of_the_disc():
+    """Reading x and y themselves gives back the disc's points, finger after finger, edges cut."""
+    plate = smooth_rig().plate
+    raster = Raster.for_plate(plate, frequency_max=500.0)
+    places = raster.points.astype(np.float32)
+    found = raster.fingertips(np.array(CONTACTS)).read(places)
+    expected = np.concatenate([fingertip_points(x, y, plate) for x, y in CONTACTS])
+    np.testing.assert_allclose(found, expected, atol=1e-7)
+
+
+def test_fields_between_its_points_are_those_of_the_plate():
+    """At 500 Hz as well the interpolation is within 1e-4 of the field, beside an ERA as inside."""
+    rig = smooth_rig()
+    raster = Raster.for_plate(rig.plate, frequency_max=500.0)
+    free = solve_free_plate(rig.plate, rig.mesh, frequency_max=500.0)
+    kept = free.acceleration(rig.eras, FREQUENCIES, raster.points).transpose(2, 0, 1)
+    values = np.ascontiguousarray(kept.astype(np.complex64)).reshape(len(kept), -1)
+    found = raster.fingertips(np.array(CONTACTS)).read(values.view(np.float32))
+    points = np.concatenate([fingertip_points(x, y, rig.plate) for x, y in CONTACTS])
+    solved = free.acceleration(rig.eras, FREQUENCIES, points).transpose(2, 0, 1)
+    size = np.sqrt((np.abs(kept) ** 2).mean(axis=0))
+    error = np.abs(found.view(np.complex64).reshape(solved.shape) - solved) / size
+    assert error.max() < 1e-4
+
+
+@pytest.mark.parametrize("thickness", [0.0001, 0.01])
+def test_very_thin_and_very_small_plates_have_a_raster_too(thickness):
+    """A foil of short waves, and a plate barely larger than a fingertip."""
+    plate = Plate(0.02, 0.03, thickness, Material("any", E=70e9, rho=2700.0, nu=0.33))
+    raster = Raster.for_plate(plate, frequency_max=500.0)
+    heights = (3 * raster.points[:, :1] - raster.points[:, 1:]).astype(np.float32)
+    np.testing.assert_allclose(raster.at(heights, np.array([[0.011, 0.004]])), [[0.029]], rtol=1e-5)
+
+
+def test_a_raster_too_small_to_interpolate_in_is_refused():
+    """Five points do not carry a quintic."""
+    with pytest.raises(InputError, match="6 to"):
+        Raster(5, 9, 0.1, 0.1)

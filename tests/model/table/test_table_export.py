@@ -1,0 +1,148 @@
+"""What other programs get of a table."""
+
+import csv
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.io import loadmat
+
+from model.errors import InputError
+from model.structure.point_mass import PointMass
+from model.table import export
+from model.table.export import export_csv, export_mat
+from model.table.file import save_table
+from small_table import FREQUENCIES, small_table
+
+PAGE = Path(__file__).parents[3] / "docs" / "table-file.md"
+
+
+@pytest.fixture(scope="module")
+def table():
+    """A small one."""
+    return small_table()
+
+
+@pytest.fixture
+def struct(table, tmp_path):
+    """Its .mat file as MATLAB would see it."""
+    export_mat(table, tmp_path / "t.mat")
+    return loadmat(tmp_path / "t.mat", squeeze_me=True, struct_as_record=False)["table"]
+
+
+def read_csv(path):
+    """Rows as dictionaries of text."""
+    with path.open(newline="", encoding="utf-8") as stream:
+        return list(csv.DictReader(stream))
+
+
+def test_a_mat_file_holds_the_table_by_value(table, struct):
+    """Fields, modes and provenance, to the bit and in their shapes."""
+    np.testing.assert_array_equal(struct.acceleration_m_s2, table.acceleration)
+    np.testing.assert_array_equal(struct.frequency_hz, FREQUENCIES)
+    np.testing.assert_array_equal(struct.mode_shape, table.shapes)
+    np.testing.assert_array_equal(struct.cell_centre_m, table.cell_centres)
+    assert len(struct.raster_x_m) * len(struct.raster_y_m) == len(struct.acceleration_m_s2)
+    assert struct.fingerprint == table.fingerprint
+    assert struct.mode == "switched"
+    assert struct.plate.length_m == 0.3048
+    assert struct.plate.E_pa == 70e9
+    assert [era.name for era in struct.eras] == ["SW", "SE", "NE", "NW"]
+    assert [era.stiffness_n_m for era in struct.eras] == [17000.0] * 4
+    assert struct.eras[2].x_m == 0.3048
+
+
+def test_patterns_in_a_mat_file_are_those_of_their_frequencies(table, struct):
+    """4 * 3 + 6 * 9 rows; of two ERAs at two frequencies the response is the sum of both alone."""
+    hz = struct.pattern_frequency_hz
+    assert hz.shape == (66, 4)
+    assert struct.pattern_response_m_s2.shape == (66, 12)
+
+    def response(**eras):
+        wanted = [eras.get(name, 0.0) for name in ("SW", "SE", "NE", "NW")]
+        (row,) = np.flatnonzero((hz == wanted).all(axis=1))
+        return struct.pattern_response_m_s2[row]
+
+    together = response(SW=60.0, NE=250.0)
+    np.testing.assert_allclose(together, response(SW=60.0) + response(NE=250.0), rtol=1e-6)
+    coherent = response(SW=110.0, NE=110.0)
+    assert (coherent < response(SW=110.0) + response(NE=110.0)).all()
+
+
+def test_what_the_plate_carries_is_in_a_mat_file(table, tmp_path):
+    """One mass is a struct of one, none is empty."""
+    held = np.vstack([table.held, table.held[:1]])
+    laden = replace(table, masses=(PointMass(0.1, 0.15, 0.06),), held=held)
+    export_mat(laden, tmp_path / "t.mat")
+    struct = loadmat(tmp_path / "t.mat", squeeze_me=True, struct_as_record=False)["table"]
+    assert struct.masses.mass_kg == 0.06
+    assert struct.masses.y_m == 0.15
+    export_mat(table, tmp_path / "t.mat")
+    struct = loadmat(tmp_path / "t.mat", squeeze_me=True, struct_as_record=False)["table"]
+    assert struct.masses.size == 0
+
+
+def test_a_table_that_a_mat_file_cannot_hold_is_refused(table, tmp_path, monkeypatch):
+    """Before anything is written; the error says what can be read instead."""
+    monkeypatch.setattr(export, "MOST_BYTES", 1000)
+    with pytest.raises(InputError, match="numpy"):
+        export_mat(table, tmp_path / "t.mat")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_patterns_as_csv(table, tmp_path):
+    """A row a pattern, frequencies in Hz and empty where silent, a column a cell, to the bit."""
+    export_csv(table, tmp_path / "t.csv", content="patterns")
+    rows = read_csv(tmp_path / "t.csv")
+    assert len(rows) == 66
+    assert list(rows[0])[:5] == ["SW_hz", "SE_hz", "NE_hz", "NW_hz", "x0.0381_y0.0381_m_s2"]
+    (row,) = (
+        number
+        for number, row in enumerate(rows)
+        if [row[f"{era}_hz"] for era in ("SW", "SE", "NE", "NW")] == ["", "60.0", "", "110.0"]
+    )
+    found = np.array([rows[row][name] for name in list(rows[0])[4:]], dtype=np.float32)
+    np.testing.assert_array_equal(found, table.cell_response[row])
+    # SE at 60 Hz and NW at 110 Hz: sources 1 * 3 + 0 and 3 * 3 + 1, ERA after ERA.
+    np.testing.assert_array_equal(found, table.cell_sources[3] + table.cell_sources[10])
+
+
+def test_fields_as_csv(table, tmp_path):
+    """A row for each raster point and frequency, both parts of each ERA's field, to the bit."""
+    export_csv(table, tmp_path / "t.csv", content="fields")
+    rows = read_csv(tmp_path / "t.csv")
+    assert len(rows) == table.raster.point_count * 3
+    row = rows[3 * 7 + 2]
+    assert float(row["x_m"]) == table.raster.points[7, 0]
+    assert float(row["y_m"]) == table.raster.points[7, 1]
+    assert row["frequency_hz"] == "250.0"
+    found = np.complex64(complex(float(row["NE_real_m_s2"]), float(row["NE_imag_m_s2"])))
+    assert found == table.acceleration[7, 2, 2]
+
+
+def test_the_page_names_everything_that_is_exported(struct, tmp_path, table):
+    """Every field of the struct and of its structs, every array and every key of the header."""
+    page = PAGE.read_text(encoding="utf-8")
+    names = [*struct._fieldnames, *struct.plate._fieldnames, *struct.eras[0]._fieldnames]
+    save_table(table, tmp_path / "t.npz")
+    with np.load(tmp_path / "t.npz") as content:
+        names += [*content, *json.loads(content["header"].tobytes())]
+    assert [name for name in names if f"`{name}`" not in page] == []
+
+
+@pytest.mark.parametrize("write", [export_mat, lambda t, p: export_csv(t, p, content="patterns")])
+def test_a_failed_export_leaves_the_old_file(table, tmp_path, monkeypatch, write):
+    """When the disk fails at the end, what was there before is there still, and nothing else."""
+    path = tmp_path / "t.out"
+    path.write_text("before")
+
+    def full_disk(descriptor):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("model.files.array_file.os.fsync", full_disk)
+    with pytest.raises(OSError, match="No space"):
+        write(table, path)
+    assert path.read_text() == "before"
+    assert list(tmp_path.iterdir()) == [path]

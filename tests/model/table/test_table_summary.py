@@ -1,0 +1,97 @@
+"""What `era table show` says of a table."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from model.finger.grid import Grid
+from model.table.build import build_table
+from model.table.summary import alike_share, summarize
+from model.table.weak_cells import WeakCells, find_weak_cells, text_map
+from paper_plate import make_paper_rig
+from small_table import small_table
+
+
+@pytest.fixture(scope="module")
+def table():
+    """A small one."""
+    return small_table()
+
+
+def test_the_map_of_a_symmetric_plate_is_symmetric(table):
+    """Cells that mirror each other are told from other fingers equally well."""
+    weak = find_weak_cells(table)
+    for values in (weak.median_db, weak.tenth_db):
+        rows = values.reshape(3, 4)
+        np.testing.assert_allclose(rows, rows[:, ::-1], atol=0.01)
+        np.testing.assert_allclose(rows, rows[::-1], atol=0.01)
+    assert (weak.tenth_db <= weak.median_db).all()
+    assert np.ptp(weak.median_db) > 0.5
+
+
+def test_of_a_cells_contrasts_the_median_and_the_tenth_percentile_are_kept(table, monkeypatch):
+    """Of random contrasts half are below the one, a tenth below the other, for every cell."""
+    rng = np.random.default_rng(0)
+    drawn: dict[tuple[float, float], list[float]] = {}
+
+    def at_random(table, target, other):
+        assert np.linalg.norm(target - other) >= 0.05
+        drawn.setdefault(tuple(target), []).append(float(rng.uniform(0, 30)))
+        return drawn[tuple(target)][-1]
+
+    monkeypatch.setattr("model.table.weak_cells._contrast", at_random)
+    weak = find_weak_cells(table)
+    assert len(drawn) == len(weak.centres) == 12
+    for values, share in ((weak.median_db, 0.5), (weak.tenth_db, 0.1)):
+        for value, contrasts in zip(values, drawn.values(), strict=True):
+            below = (np.array(contrasts) < value).mean()
+            assert below == pytest.approx(share, abs=1.5 / len(contrasts))
+
+
+def test_weak_and_feasible_follow_from_twelve_decibels():
+    """Feasible by the median other finger, weak by one in ten; unreachable levels are neither."""
+    weak = WeakCells(
+        Grid(4, 1),
+        np.zeros((4, 2)),
+        median_db=np.array([20.0, 13.0, 9.0, -np.inf]),
+        tenth_db=np.array([12.0, 11.9, 5.0, -np.inf]),
+    )
+    assert weak.feasible.tolist() == [True, True, False, False]
+    assert weak.weak.tolist() == [False, True, True, True]
+
+
+def test_the_map_as_text_stands_as_the_plate_does():
+    """The largest y is the first line; weak cells carry a star, those without a value a dash."""
+    weak = WeakCells(
+        Grid(2, 2),
+        np.zeros((4, 2)),
+        median_db=np.array([20.4, 9.0, -np.inf, 14.6]),
+        tenth_db=np.array([13.0, 4.0, -np.inf, 3.0]),
+    )
+    assert list(text_map(weak)) == ["   -*  15*", "  20    9*"]
+
+
+def test_where_nothing_is_felt_all_is_dead_and_weak():
+    """ERAs that move a nanometre: no cell is felt, none feasible, and no contrast is made up."""
+    rig = make_paper_rig(12, 9)
+    still = replace(rig, eras=tuple(replace(era, stroke=1e-9) for era in rig.eras))
+    table = build_table(still, frequencies=np.array([60.0, 250.0]), grid=Grid(3, 2))
+    summary = summarize(table, find_weak_cells(table))
+    assert summary["dead_zone_share"] == 1.0
+    assert summary["feasible_share"] == 0.0
+    assert summary["weak_share"] == 1.0
+    assert summary["contrast_1_quiet_median_db"] is None
+
+
+def test_alike_patterns_are_counted(table):
+    """Copies of one pattern are all alike, noise is not; a single cell tells nothing."""
+    row = table.cell_sources[0]
+    copies = np.tile(row, (len(table.cell_sources), 1))
+    copies[-1] = 0  # nothing driven beside the first source
+    assert alike_share(replace(table, cell_sources=copies)) == 1.0
+    rng = np.random.default_rng(0)
+    noise = rng.uniform(0, 1, copies.shape).astype(np.float32)
+    assert alike_share(replace(table, cell_sources=noise)) < 0.02
+    single = replace(table, grid=Grid(1, 1), cell_sources=noise[:, :1])
+    assert alike_share(single) is None

@@ -1,0 +1,101 @@
+"""Onsets, endings and transient measures of a table's patterns."""
+
+import json
+
+import numpy as np
+import pytest
+
+from model.fem.assembly import era_positions
+from model.reduction.reduced_plate import reduce_plate
+from model.table.build import build_table
+from model.table.query import answer_lines
+from model.table.question import Question
+from model.table.timing import Timing
+from model.transients.envelope import ramped_ending, ramped_onset, shaped
+from model.transients.measures import Transients
+from model.transients.time_response import plate_in_time
+from paper_plate import make_paper_rig
+
+QUESTION = Question(((0.09, 0.07),), ((0.25, 0.18), (0.05, 0.19)), mode="phased")
+
+
+@pytest.fixture(scope="module")
+def rig():
+    """A mesh that is quick to solve; what is proven here does not depend on it."""
+    return make_paper_rig(24, 18)
+
+
+@pytest.fixture(scope="module")
+def table(rig):
+    """A few frequencies are enough to choose among."""
+    return build_table(rig, frequencies=np.array([90.0, 130.0, 220.0, 300.0]), mode="phased")
+
+
+@pytest.fixture(scope="module")
+def solved(rig):
+    """The same plate solved in time without the table."""
+    reduced = reduce_plate(rig.plate, rig.mesh, era_positions(rig.eras), frequency_max=300.0)
+    return Transients(plate_in_time(reduced, rig.eras))
+
+
+def test_without_envelopes_the_measures_are_those_of_the_ramp(rig, table, solved):
+    """Nothing but a plain ramp is played, and that is what is predicted, whoever solves it."""
+    pattern = Timing(table).with_transient_measures(QUESTION, table.ask(QUESTION))
+    assert pattern.onset is None
+    assert pattern.ending is None
+    onset = ramped_onset(pattern.excitation, rig.eras, ramp=0.040)
+    ending = ramped_ending(pattern.excitation, rig.eras, ramp=0.040)
+    contrast = solved.contrast_db(onset, targets=QUESTION.targets, quiet=QUESTION.quiet)
+    assert pattern.transient_contrast_db == pytest.approx(contrast, abs=0.1)
+    left = solved.left_db(pattern.excitation, ending)
+    assert pattern.left_after_db == pytest.approx(left, abs=0.1)
+
+
+def test_envelopes_are_part_of_the_pattern_and_measured_with_it(rig, table, solved):
+    """Shaped onset and ending do better than the ramp, as another solution of the plate finds."""
+    timing = Timing(table)
+    plain = timing.with_transient_measures(QUESTION, table.ask(QUESTION))
+    pattern = timing.with_transient_measures(
+        QUESTION, timing.with_envelopes(QUESTION, table.ask(QUESTION))
+    )
+    contrast = solved.contrast_db(
+        shaped(pattern.onset, rig.eras), targets=QUESTION.targets, quiet=QUESTION.quiet
+    )
+    assert pattern.transient_contrast_db == pytest.approx(contrast, abs=0.1)
+    left = solved.left_db(pattern.excitation, shaped(pattern.ending, rig.eras))
+    assert pattern.left_after_db == pytest.approx(left, abs=0.2)
+    assert pattern.transient_contrast_db > plain.transient_contrast_db + 3
+    assert pattern.left_after_db < plain.left_after_db - 10
+    assert pattern.excitation == plain.excitation
+
+
+def test_a_lone_finger_has_an_ending_but_no_contrast(table):
+    """There is nobody to tell it from; what is left after the end can be said all the same."""
+    alone = Question(((0.09, 0.07),), mode="phased")
+    timing = Timing(table)
+    pattern = timing.with_transient_measures(alone, timing.with_envelopes(alone, table.ask(alone)))
+    assert pattern.transient_contrast_db is None
+    assert pattern.left_after_db < -20
+
+
+def test_answers_in_json_carry_knots_only_where_asked_for(table):
+    """A line that says envelopes gets 21 and 8 knots for every ERA, another one null."""
+    line = {"target": [0.09, 0.07], "quiet": [[0.25, 0.18]]}
+    plain, with_knots = answer_lines(
+        table, [json.dumps(line), json.dumps(line | {"envelopes": True})]
+    )
+    assert plain["onset"] is plain["ending"] is None
+    assert {len(each["knots"]) for each in with_knots["onset"].values()} == {21}
+    assert {len(each["knots"]) for each in with_knots["ending"].values()} == {8}
+    assert {each["start"]["level"] for each in with_knots["onset"].values()} == {0.0}
+    for era, tone in with_knots["drive"].items():
+        start = with_knots["ending"][era]["start"]
+        assert start["level"] == pytest.approx(tone["level"])
+        assert start["phase_deg"] == pytest.approx(tone["phase_deg"], abs=1e-6)
+        last = with_knots["onset"][era]["knots"][-1]
+        assert last["level"] == pytest.approx(tone["level"])
+        assert last["phase_deg"] == pytest.approx(tone["phase_deg"], abs=1e-6)
+        assert with_knots["onset"][era]["frequency_hz"] == tone["frequency_hz"]
+        assert with_knots["ending"][era]["knots"][-1]["level"] == 0
+    assert with_knots["transient_contrast_db"] > plain["transient_contrast_db"]
+    json.dumps(with_knots)

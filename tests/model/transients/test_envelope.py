@@ -1,0 +1,85 @@
+"""Envelopes: the motion of a base between knots, and what no amplifier could play."""
+
+import cmath
+import math
+
+import numpy as np
+import pytest
+
+from model.errors import InputError
+from model.transients.base_motion import Term
+from model.transients.envelope import Envelope, ramped_ending, ramped_onset, shaped
+from model.vibration.excitation import Tone
+from paper_plate import make_paper_rig
+
+
+def motion(terms: tuple[Term, ...], time: float) -> float:
+    """Displacement of a base [m] at a time [s]: the sum of the terms that hold then."""
+    return sum(
+        (
+            (term.c0 + term.c1 * (time - term.start))
+            * cmath.exp(1j * term.omega * (time - term.start))
+        ).imag
+        for term in terms
+        if term.start <= time < term.end
+    )
+
+
+def test_the_base_moves_along_straight_lines_between_knots():
+    """Half way between knots the complex amplitude is their mean, at its carrier's phase."""
+    envelope = Envelope(100.0, 0j, (2e-5 + 1e-5j, -4e-5j), step=0.005)
+    terms = envelope.terms()
+    for time, amplitude in [
+        (0.0025, 1e-5 + 0.5e-5j),
+        (0.0075, 1e-5 - 1.5e-5j),
+        (0.02, -4e-5j),  # the last knot stays
+    ]:
+        expected = (amplitude * cmath.exp(2j * math.pi * 100.0 * time)).imag
+        assert motion(terms, time) == pytest.approx(expected, abs=1e-17)
+        assert envelope.amplitude(np.array([time]))[0] == pytest.approx(amplitude)
+
+
+def test_an_envelope_that_begins_later_keeps_the_phase_of_its_carrier():
+    """The phase counts from time 0, so an ending joins the tone wherever it begins."""
+    begin = 0.01234
+    terms = Envelope(70.0, 3e-5, (3e-5, 0j), step=0.004).terms(begin=begin)
+    tone = 3e-5 * math.sin(2 * math.pi * 70.0 * (begin + 0.001))
+    assert motion(terms, begin + 0.001) == pytest.approx(tone, abs=1e-17)
+    assert motion(terms, begin + 0.0081) == 0.0
+
+
+def test_a_ramp_is_a_raised_cosine_up_and_down():
+    """Half way through a ramp, up or down, the amplitude is half, and none or all at its ends."""
+    rig = make_paper_rig(2, 2)
+    excitation = {"SE": Tone(50.0, 1e-4, 0.3)}
+    up = ramped_onset(excitation, rig.eras, ramp=0.02)
+    down = ramped_ending(excitation, rig.eras, ramp=0.02)
+    assert [len(base) > 0 for base in up] == [era.name == "SE" for era in rig.eras]
+    se = [era.name for era in rig.eras].index("SE")
+    for time, share in [(0.0, 0.0), (0.01, 0.5), (0.03, 1.0)]:
+        tone = 1e-4 * math.sin(2 * math.pi * 50.0 * time + 0.3)
+        assert motion(up[se], time) == pytest.approx(share * tone, abs=1e-17)
+        assert motion(down[se], time) == pytest.approx((1 - share) * tone, abs=1e-17)
+
+
+def test_bases_follow_the_order_of_the_rig():
+    """An envelope moves the base of the ERA that it is named for and no other."""
+    rig = make_paper_rig(2, 2)
+    bases = shaped({"NE": Envelope(90.0, 0j, (1e-5 + 0j,))}, rig.eras)
+    assert [era.name for era, base in zip(rig.eras, bases, strict=True) if base] == ["NE"]
+
+
+@pytest.mark.parametrize(
+    ("frequency", "knots", "step", "told"),
+    [
+        (100.0, (), 0.005, "0 knots"),
+        (100.0, (1e-5 + 0j,) * 33, 0.005, "33 knots"),
+        (100.0, (complex("nan"),), 0.005, "no number"),
+        (100.0, (1e-5 + 0j,), 0.0, "above"),
+        (0.0, (1e-5 + 0j,), 0.005, "above"),
+    ],
+)
+def test_what_cannot_be_played_is_refused(frequency, knots, step, told):
+    """No knots, too many, knots that are no number, no frequency and no time say what is wrong."""
+    with pytest.raises(InputError, match=told):
+        Envelope(frequency, 0j, knots, step)

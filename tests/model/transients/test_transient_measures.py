@@ -1,0 +1,217 @@
+"""Onsets and endings predicted, against a stepping solver and against sampling."""
+
+import math
+
+import numpy as np
+import pytest
+
+from model.finger.fingertip import fingertip_points
+from model.transients.envelope import Envelope, ramped_ending, ramped_onset, shaped
+from model.transients.hats import hat_accelerations
+from model.transients.measures import SAMPLE_RATE, Transients
+from model.vibration.excitation import Tone
+from plate_in_time import make_plate_in_time, stepped_acceleration
+
+STEP = 0.005
+
+
+@pytest.fixture(scope="module")
+def few_modes():
+    """Rig and plate with modes for 100 Hz only, so that a stepping solver is quick."""
+    return make_plate_in_time(frequency_max=100.0)
+
+
+@pytest.fixture(scope="module")
+def plate():
+    """Rig and plate with modes for 500 Hz."""
+    return make_plate_in_time()
+
+
+def resting(_time: float) -> tuple[float, float]:
+    """A base that does not move."""
+    return 0.0, 0.0
+
+
+def test_the_answer_to_a_hat_is_that_of_a_stepping_solver(few_modes):
+    """Closed form, back on its carrier, follows Runge-Kutta through rise, fall and ringing."""
+    rig, plate = few_modes
+    omega = 2 * math.pi * 90.0
+    samples = 4
+    hats = hat_accelerations(plate, omega, step=STEP, steps=6, samples=samples)
+    times = STEP * (np.arange(len(hats)) + 0.5) / samples
+    stroke = rig.eras[1].stroke
+
+    def hat(t: float) -> tuple[float, float]:
+        height = max(0.0, 1 - abs(t - STEP) / STEP)
+        rise = 0.0 if t >= 2 * STEP else math.copysign(1 / STEP, STEP - t)
+        sine, cosine = math.sin(omega * t), math.cos(omega * t)
+        return stroke * height * sine, stroke * (rise * sine + height * omega * cosine)
+
+    breaks = np.array([0, STEP, 2 * STEP, 6 * STEP])
+    stepped = stepped_acceleration(plate, [resting, hat, resting, resting], times, breaks=breaks)
+    found = (hats[:, 1] * np.exp(1j * omega * times)[:, None]).imag
+    np.testing.assert_allclose(found, stepped, atol=1e-5 * np.abs(stepped).max())
+
+
+def test_predicted_vibration_is_that_of_a_stepping_solver(few_modes):
+    """A ramped tone and an envelope at another frequency together follow Runge-Kutta."""
+    rig, plate = few_modes
+    envelope = Envelope(120.0, 0j, (3e-5 + 2e-5j, -1e-5j, 5e-5 + 0j))
+    tone = Tone(70.0, 8e-5, 0.4)
+    ramp = ramped_onset({"SW": tone}, rig.eras, ramp=0.01)
+    bases = (ramp[0], (), envelope.terms(), ())
+
+    def ramped(t: float) -> tuple[float, float]:
+        omega, share = 2 * math.pi * tone.frequency, math.pi * min(t, 0.01) / 0.01
+        gain = (1 - math.cos(share)) / 2
+        slope = math.pi / 0.01 * math.sin(share) / 2
+        angle = omega * t + tone.phase
+        return (
+            tone.amplitude * gain * math.sin(angle),
+            tone.amplitude * (slope * math.sin(angle) + gain * omega * math.cos(angle)),
+        )
+
+    def knotted(t: float) -> tuple[float, float]:
+        values = [0j, *envelope.knots, envelope.knots[-1]]
+        piece = min(int(t / STEP), 3)
+        slope = (values[piece + 1] - values[piece]) / STEP
+        amplitude = values[piece] + slope * (t - piece * STEP)
+        omega = 2 * math.pi * 120.0
+        turn = np.exp(1j * omega * t)
+        return (amplitude * turn).imag, ((slope + 1j * omega * amplitude) * turn).imag
+
+    points = fingertip_points(0.07, 0.16, rig.plate)
+    found = Transients(plate).acceleration(bases, points, duration=0.03)
+    times = np.arange(len(found)) / SAMPLE_RATE
+    breaks = np.array([0, 0.005, 0.01, 0.015, 0.03])
+    stepped = stepped_acceleration(plate, [ramped, resting, knotted, resting], times, breaks=breaks)
+    expected = stepped @ plate.reduced.at(points).T
+    np.testing.assert_allclose(found, expected, atol=1e-5 * np.abs(expected).max())
+
+
+def test_vibrations_of_several_eras_add_up(plate):
+    """Linear: what two ERAs do together is the sum of what each does alone."""
+    rig, in_time = plate
+    transients = Transients(in_time)
+    points = fingertip_points(0.2, 0.05, rig.plate)
+    one = {"SW": Envelope(110.0, 0j, (5e-5 + 0j, 1e-5j, 4e-5 + 0j))}
+    other = {"NE": Envelope(230.0, 0j, (0j, 7e-5j))}
+    felt = [
+        transients.acceleration(shaped(envelopes, rig.eras), points)
+        for envelopes in (one, other, one | other)
+    ]
+    np.testing.assert_allclose(felt[2], felt[0] + felt[1], atol=1e-9 * np.abs(felt[2]).max())
+
+
+def test_a_steady_vibration_stays_what_it_is(plate):
+    """A tone that goes on after having been steady neither grows nor fades."""
+    rig, in_time = plate
+    tone = Tone(110.0, 6e-5, 0.9)
+    going_on = shaped(
+        {"SE": Envelope(110.0, 6e-5 * np.exp(0.9j), (6e-5 * np.exp(0.9j),))}, rig.eras
+    )
+    points = fingertip_points(0.2, 0.05, rig.plate)
+    felt = Transients(in_time).acceleration(going_on, points, duration=0.2, after={"SE": tone})
+    period = round(SAMPLE_RATE / 10)  # 0.1 s are eleven periods
+    np.testing.assert_allclose(felt[period:], felt[:-period], atol=1e-6 * np.abs(felt).max())
+
+
+def test_contrast_is_that_of_the_peaks(plate):
+    """Mean peak over the target's points to the largest at a quiet point, within 100 ms."""
+    rig, in_time = plate
+    transients = Transients(in_time)
+    bases = ramped_onset({"SW": Tone(180.0, 1e-4)}, rig.eras, ramp=0.02)
+    target, quiet = (0.05, 0.05), [(0.2, 0.1), (0.25, 0.2)]
+    at_target = transients.acceleration(bases, fingertip_points(*target, rig.plate))
+    at_quiet = [transients.acceleration(bases, fingertip_points(*q, rig.plate)) for q in quiet]
+    loudest = max(np.abs(each).max() for each in at_quiet)
+    expected = 20 * np.log10(np.abs(at_target).max(axis=0).mean() / loudest)
+    found = transients.contrast_db(bases, targets=[target], quiet=quiet)
+    assert found == pytest.approx(expected, abs=1e-9)
+    assert len(at_target) == 0.1 * SAMPLE_RATE
+
+
+def test_of_two_targets_the_lesser_counts(plate):
+    """Contrast of an onset and of an end is that of the target which has less, as in the steady."""
+    rig, in_time = plate
+    transients = Transients(in_time)
+    excitation = {"SW": Tone(180.0, 1e-4)}
+    onset, ending = (
+        motion(excitation, rig.eras, ramp=0.02) for motion in (ramped_onset, ramped_ending)
+    )
+    targets, quiet = [(0.02, 0.02), (0.15, 0.11)], [(0.25, 0.2)]
+
+    def start(*felt):
+        return transients.contrast_db(onset, targets=felt, quiet=quiet)
+
+    def end(*felt):
+        return transients.ending_contrast_db(excitation, ending, targets=felt, quiet=quiet)
+
+    for measure in (start, end):
+        alone = [measure(target) for target in targets]
+        assert abs(alone[0] - alone[1]) > 0.3
+        assert measure(*targets) == pytest.approx(min(alone), abs=1e-9)
+
+
+def test_what_is_left_is_what_sampling_the_plate_gives(plate):
+    """Root mean square over plate, 100 ms and four phases agrees with the closed form."""
+    rig, in_time = plate
+    transients = Transients(in_time)
+    tone = Tone(110.0, 1e-4)
+    ramp = 0.015
+    x, y = np.meshgrid((np.arange(32) + 0.5) / 32, (np.arange(24) + 0.5) / 24)
+    points = np.column_stack([x.ravel() * rig.plate.length, y.ravel() * rig.plate.width])
+    left = steady = 0.0
+    for phase in (0.0, math.pi / 2):  # the two make up the mean over all phases
+        excitation = {"SE": Tone(tone.frequency, tone.amplitude, phase)}
+        ending = ramped_ending(excitation, rig.eras, ramp=ramp)
+        felt = transients.acceleration(ending, points, duration=ramp + 0.1, after=excitation)
+        left += (felt[round(ramp * SAMPLE_RATE) :] ** 2).mean()
+        steady += (
+            transients.acceleration(
+                ramped_onset(excitation, rig.eras, ramp=0.0), points, duration=0.1, after=excitation
+            )
+            ** 2
+        ).mean()
+    expected = 10 * math.log10(left / steady)
+    found = transients.left_db({"SE": tone}, ramped_ending({"SE": tone}, rig.eras, ramp=ramp))
+    assert found == pytest.approx(expected, abs=0.1)
+
+
+def test_tones_of_two_frequencies_leave_the_sum_of_their_powers(plate):
+    """What is left of two tones lies between what is left of each, weighted by their powers."""
+    rig, in_time = plate
+    transients = Transients(in_time)
+    low, high = {"SW": Tone(90.0, 1e-4)}, {"NE": Tone(300.0, 1e-4)}
+    alone = [
+        transients.left_db(each, ramped_ending(each, rig.eras, ramp=0.02)) for each in (low, high)
+    ]
+    both = transients.left_db(low | high, ramped_ending(low | high, rig.eras, ramp=0.02))
+    assert min(alone) < both < max(alone)
+
+
+def test_contrast_of_an_end_is_that_of_its_peaks(plate):
+    """What the target felt steadily, by sampling, to the loudest quiet peak from the end on."""
+    rig, in_time = plate
+    transients = Transients(in_time)
+    excitation = {"SW": Tone(110.0, 1e-4), "NE": Tone(300.0, 5e-5, 1.0)}
+    target, quiet = (0.05, 0.05), (0.2, 0.1)
+    ending = ramped_ending(excitation, rig.eras, ramp=0.02)
+    points = fingertip_points(*target, rig.plate)
+    steady = sum(
+        np.abs(
+            transients.acceleration(
+                ramped_onset({name: tone}, rig.eras, ramp=0.0),
+                points,
+                duration=0.2,
+                after={name: tone},
+            )
+        ).max(axis=0)
+        for name, tone in excitation.items()
+    )
+    felt = transients.acceleration(
+        ending, fingertip_points(*quiet, rig.plate), duration=0.12, after=excitation
+    )
+    expected = 20 * np.log10(steady.mean() / np.abs(felt).max())
+    found = transients.ending_contrast_db(excitation, ending, targets=[target], quiet=[quiet])
+    assert found == pytest.approx(expected, abs=0.1)

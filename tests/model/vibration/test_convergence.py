@@ -1,0 +1,99 @@
+"""How far meshes are from converged, against independent solvers and a different element."""
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from model.fem.mesh import Mesh
+from model.vibration.convergence import default_frequencies, meshes_to_compare, study_convergence
+from paper_plate import LENGTH, WIDTH, make_paper_rig
+
+# On four corner springs: founding paper, in-house column of Table 2, and converged (NGSolve).
+PAPER = np.array([31.98, 68.50, 76.62, 107.84, 160.77])
+CONVERGED = np.array([31.6186, 67.9034, 75.4567, 106.449, 156.821])
+
+
+@pytest.fixture(scope="module")
+def study():
+    """The paper's rig with its automatic mesh."""
+    rig = make_paper_rig(12, 9)
+    automatic = replace(rig, mesh=Mesh.auto(rig.plate, frequency_max=500.0))
+    return study_convergence(
+        automatic, meshes_to_compare(automatic), frequencies=default_frequencies(automatic)
+    )
+
+
+def test_the_papers_own_mesh_is_among_those_compared(study):
+    """12x9 and its doublings of MITC4, and the automatic mesh once, though it is the rig's."""
+    assert [str(error.mesh) for error in study.errors] == [
+        "12x9",
+        "24x18",
+        "48x36",
+        "96x72",
+        "10x8 Q5 with strips of 3 mm",
+    ]
+
+
+def test_frequency_errors_are_those_of_the_paper(study):
+    """On 12x9 the errors are the paper's Table 2 against converged values, to its last digit."""
+    np.testing.assert_allclose(study.errors[0].frequency[:5], PAPER / CONVERGED - 1, atol=2e-4)
+
+
+def test_the_automatic_mesh_keeps_its_promise(study):
+    """Frequencies within 0.1 %, acceleration at 110 Hz and 250 Hz within 1 % for every drive."""
+    automatic = study.errors[-1]
+    assert np.abs(automatic.frequency).max() < 1e-3
+    assert automatic.response.max() < 1e-2
+    assert automatic.dof < study.errors[3].dof / 2
+
+
+def test_another_element_converges_to_the_same_field(study):
+    """MITC4 knows nothing of the reference's element, yet comes ever closer to its answer."""
+    errors = np.array([error.response for error in study.errors[:4]])
+    assert (np.diff(errors, axis=0) < 0).all()
+    assert errors[-1].max() < 0.04
+
+
+def test_eras_within_the_plate_converge_too():
+    """A force within an element bends it sharply; the automatic mesh is still within 1 %."""
+    rig = make_paper_rig(12, 9)
+    inside = zip(rig.eras, [(0.051, 0.017), (0.29, 0.08), (0.12, 0.1), (0.2, 0.15)], strict=True)
+    moved = replace(rig, eras=tuple(replace(era, x=x, y=y) for era, (x, y) in inside))
+    automatic = Mesh.auto(rig.plate, frequency_max=500.0)
+    error = study_convergence(moved, [automatic], frequencies=np.array([110.0, 250.0])).errors[0]
+    assert np.abs(error.frequency).max() < 1e-3
+    assert error.response.max() < 1e-2
+
+
+@pytest.mark.parametrize(("count", "free"), [(1, 2), (2, 1)])
+def test_motion_that_nothing_holds_is_not_compared(count, free):
+    """On one ERA the plate can tilt both ways, on two about their line: 0 Hz has no error."""
+    rig = make_paper_rig(12, 9)
+    few = replace(rig, eras=rig.eras[:count])
+    study = study_convergence(few, [Mesh(24, 18, LENGTH, WIDTH)], frequencies=[110.0])
+    assert len(study.natural_frequencies) == len(study.errors[0].frequency) == 12 - free
+    assert study.natural_frequencies[0] > 1
+    assert np.abs(study.errors[0].frequency).max() < 0.03
+
+
+@pytest.mark.parametrize(("limit", "asked"), [(500.0, [110, 250]), (200.0, [110]), (80.0, [80])])
+def test_without_being_told_it_looks_where_the_paper_does(limit, asked):
+    """At 110 Hz and 250 Hz, as far as the rig's limit allows."""
+    rig = make_paper_rig(12, 9)
+    limited = replace(rig, limits=replace(rig.limits, frequency_max=limit))
+    assert default_frequencies(limited).tolist() == asked
+
+
+def test_the_documentation_shows_these_figures(study):
+    """The page on the plate model prints each mesh with the errors that are found here."""
+    page = Path(__file__).parents[3] / "docs" / "plate-model.md"
+    rows = re.findall(r"^ +(\d+x\d+) +\S+ .*?((?: +[\d.]+ %){3})", page.read_text(), re.MULTILINE)
+    assert len(rows) == len(study.errors)
+    for (mesh, printed), error in zip(rows, study.errors, strict=True):
+        assert mesh == f"{error.mesh.nx}x{error.mesh.ny}"
+        figures = [np.abs(error.frequency).max(), *error.response]
+        shown = [float(value) for value in re.findall(r"[\d.]+", printed)]
+        np.testing.assert_allclose(shown, 100 * np.array(figures), rtol=1e-3, atol=2e-3)

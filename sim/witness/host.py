@@ -131,6 +131,11 @@ class Host:
                 if self._vibrates(side, asked):
                     side.vibrated_at = time
 
+    def refused(self, time: float, asked: Asked) -> None:
+        """A request was refused."""
+        if asked.kind is Kind.ARM:  # who arms all or none takes it back from all
+            self._disarm_wished = time
+
     def pass_to(self, time: float) -> None:
         """Look at the duties whose time is over."""
         if any(duty.due < time for duty in self._duties):
@@ -312,7 +317,10 @@ class Host:
             self._owe(
                 Duty(
                     time + self._times.together,
-                    lambda side=side: token in side.told or not first.vibrates,  # type: ignore[misc]
+                    lambda side=side: (  # type: ignore[misc]
+                        # Where nobody is left on the first one's wire, its watchdog silences it.
+                        token in side.told or not first.vibrates or not first.is_open
+                    ),
                     "commit",
                     side.plan.wire,
                     f"{first.name} was told at {time:.4f} s to play set {token}, and "

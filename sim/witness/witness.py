@@ -335,6 +335,7 @@ class Witness:
         was_lost = answer.key in side.overdue
         side.overdue.discard(answer.key)
         if answer.refusal:
+            self._host.refused(time, asked)
             side.follower.was_not_fed()
         elif asked.problem:
             rule = "commit" if asked.problem.startswith("torn") else "garbage"

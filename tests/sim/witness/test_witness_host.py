@@ -1,0 +1,77 @@
+"""What a host owes its amplifiers, and what it owes no more."""
+
+import pytest
+
+from sim.witness.follower import Follower
+from sim.witness.host import Host
+from sim.witness.plan import AmplifierPlan, Limits, Times
+from sim.witness.seen import Answered, Asked, Condition, Drive, Kind
+from sim.witness.side import Side
+
+ARM = Asked(Kind.ARM, 1, key=1, watchdog=0.25)
+DISARM = Asked(Kind.DISARM, 1, key=2, ramp=0.05)
+STOP = Asked(Kind.STOP, 1, key=3, ramp=0.005)
+SET = Asked(Kind.APPLY, 1, key=4, token=5, ramp=0.01, drives={0: Drive(110.0, 0.2, 0.0)})
+ENABLED = Condition(4, 0)
+
+
+class Watched:
+    """A host of two armed amplifiers on wires of their own, and the rules that it breaks."""
+
+    def __init__(self) -> None:
+        self.broken: list[str] = []
+        self.sides = {name: self._side(name) for name in ("west", "east")}
+        self.host = Host(self.sides, times=Times())
+        for side in self.sides.values():
+            side.follower.granted(ARM, Answered(1, ARM.key, condition=ENABLED), 1.0, 1.001)
+
+    def _side(self, name: str) -> Side:
+        plan = AmplifierPlan(f"line of {name}", 1, {0: Limits(40.0, 500.0, 1.0)})
+        follower = Follower(
+            name, plan, times=Times(), complain=self._complain, insist=self._complain
+        )
+        return Side(name, plan, follower, self._complain, lambda: False)
+
+    def _complain(self, invariant: str, time: float, sentence: str) -> None:
+        self.broken.append(invariant)
+
+
+@pytest.mark.parametrize(
+    ("closed", "broken"),
+    [
+        ((), ["commit"]),
+        (("east",), ["commit"]),  # who has lost the other can silence the one that plays
+        (("west", "east"), []),  # it died: nobody is there to tell anybody anything
+    ],
+)
+def test_what_one_plays_all_play_as_long_as_there_is_a_host(
+    closed: tuple[str, ...], broken: list[str]
+) -> None:
+    """A set goes to one of two amplifiers only, then 20 ms pass."""
+    watched = Watched()
+    watched.host.asked(watched.sides["west"], 1.01, SET)
+    for name in closed:
+        watched.sides[name].is_open = False
+    watched.host.pass_to(1.05)
+    assert watched.broken == broken
+
+
+@pytest.mark.parametrize(
+    ("refused_at", "broken"),
+    [
+        (None, ["stop"]),  # a Disarm that nobody wished, and a ramp ten times as long
+        (0.9, ["stop"]),  # long ago
+        (1.009, []),  # all or none are armed: what was armed of them is disarmed before the stop
+    ],
+)
+def test_a_refused_arm_is_taken_back_before_a_stop(
+    refused_at: float | None, broken: list[str]
+) -> None:
+    """A stop is wished, and a Disarm is what the amplifier is told next."""
+    watched = Watched()
+    if refused_at is not None:
+        watched.host.refused(refused_at, ARM)
+    watched.host.wish(1.010, "stop")
+    watched.host.asked(watched.sides["west"], 1.011, DISARM)
+    watched.host.asked(watched.sides["west"], 1.013, STOP)
+    assert watched.broken == broken

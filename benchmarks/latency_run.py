@@ -101,8 +101,9 @@ def attempt(
             return measured()
         # A daemon that has lost its amplifier, or has too little time, answers its clients so.
         except (Disturbed, Ended, RpcError, OSError) as error:
-            load = os.getloadavg()[0]
-            why.append(f"{error} (load average {load:.1f})")
+            # What the daemon then says to whoever disarms it is no more than what follows.
+            first = error.__context__ if isinstance(error.__context__, Disturbed) else error
+            why.append(f"{first} (load average {os.getloadavg()[0]:.1f})")
     return Failed(case, tuple(why))
 
 

@@ -1,8 +1,10 @@
 """Which lines that wait are made moot by the next one: touches, of which the newest counts.
 
-A client that floods sends more than anybody needs. To see that one is moot costs a third of doing
-what it says, so the newest is not far behind even then, and others wait less.
+A client that floods sends more than anybody needs. To see that one is moot costs a fraction of
+doing what it says, so the newest is not far behind even then, and others wait less.
 """
+
+from functools import lru_cache
 
 from pydantic_core import from_json
 
@@ -13,6 +15,7 @@ def is_moot(line: bytes, following: bytes) -> bool:
     return source is not None and source == _source(following)
 
 
+@lru_cache(maxsize=2)  # what followed is asked about again, as the line that it is then
 def _source(line: bytes) -> str | None:
     """The source of a touch that wants no answer; None of any other line."""
     try:

@@ -11,6 +11,7 @@ from benchmarks.latency_match import Command, Matched, match
 from benchmarks.latency_programs import Ended
 from benchmarks.latency_report import HEAD_CELLS, cases, report, write_report
 from benchmarks.latency_run import Case, Disturbed, Failed, Found, attempt
+from controller.api.jsonrpc import ErrorCode, RpcError
 from controller.api.parts import LatencySummary
 
 CASES = cases(0.01, 1)
@@ -46,6 +47,20 @@ def test_a_disturbed_case_is_tried_once_more() -> None:
     failed = attempt(case, measuring(Disturbed("FAULT"), Ended("the panel")))
     assert isinstance(failed, Failed)
     assert [why.partition(" (load average")[0] for why in failed.why] == ["FAULT", "the panel"]
+
+
+def test_what_disturbed_is_told_and_not_what_follows() -> None:
+    """A daemon that has lost its amplifier cannot be disarmed either: that says nothing."""
+
+    def measured() -> Found:
+        try:
+            raise Disturbed("COMM_LOST")
+        finally:
+            raise RpcError(ErrorCode.LINK, "the link is lost")
+
+    failed = attempt(CASES[0], measured)
+    assert isinstance(failed, Failed)
+    assert all(why.startswith("COMM_LOST (load average") for why in failed.why)
 
 
 def test_a_bug_is_no_disturbance() -> None:

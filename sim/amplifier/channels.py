@@ -5,7 +5,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
-from drivers.command import CommandSet, DriveCommand, Envelope
+from drivers.command import CommandSet, DriveCommand, Envelope, Knot
 from drivers.protocol.messages import Achieved
 from sim.waveform.output import Output, end_along, fade_to, level_of, shape_to
 
@@ -97,8 +97,7 @@ class Channels:
                     time,
                     ramp=ramp,
                     frequency=command.frequency,
-                    level=command.level,
-                    phase=math.radians(command.phase),
+                    amplitude=_amplitude(command),
                     keep_phase=command.keep_phase,
                 )
             self._outputs[channel] = output
@@ -125,14 +124,12 @@ class Channels:
         for channel, playing in enumerate(self._outputs):
             tone = next((tone for tone in playing if tone.lasts), None)
             if tone is not None:
-                level, phase = cmath.polar(tone.settled_amplitude)
                 self._outputs[channel] = fade_to(
                     playing,
                     time,
                     ramp=_DERATING_RAMP,
                     frequency=tone.frequency,
-                    level=level * factor,
-                    phase=phase,
+                    amplitude=factor * tone.settled_amplitude,
                     keep_phase=True,
                 )
         self._endings = _derated(self._endings, factor)
@@ -158,7 +155,7 @@ def _shaped(
         step=onset.step,
         knots=_amplitudes(onset),
         frequency=command.frequency,
-        amplitude=cmath.rect(command.level, math.radians(command.phase)),
+        amplitude=_amplitude(command),
         keep_phase=command.keep_phase,
     )
 
@@ -168,4 +165,9 @@ def _ended(playing: Output, time: float, ending: Envelope, ramp: float) -> Outpu
 
 
 def _amplitudes(envelope: Envelope) -> tuple[complex, ...]:
-    return tuple(cmath.rect(knot.level, math.radians(knot.phase)) for knot in envelope.knots)
+    return tuple(_amplitude(knot) for knot in envelope.knots)
+
+
+def _amplitude(told: DriveCommand | Knot) -> complex:
+    """In full strokes, of a level and a phase in degrees."""
+    return cmath.rect(told.level, math.radians(told.phase))

@@ -14,9 +14,9 @@ def terms_of(tone: FadingTone | ShapedTone, *, stroke: float) -> tuple[Term, ...
     omega = 2 * math.pi * tone.frequency
     if isinstance(tone, ShapedTone):
         return _along_knots(tone, omega, stroke)
-    turn = cmath.exp(1j * (tone.phase + omega * (tone.start - tone.origin)))
+    turn = cmath.exp(1j * omega * (tone.start - tone.origin))
     return fade(
-        stroke * tone.level * turn,
+        stroke * tone.full * turn,
         omega=omega,
         start=tone.start,
         ramp=tone.ramp,

@@ -1,22 +1,20 @@
 """A sinusoid that fades in or out along a raised cosine."""
 
-import cmath
 import math
 from dataclasses import dataclass, replace
 
 
 @dataclass(frozen=True, slots=True)
 class FadingTone:
-    """gain(t) level sin(2 pi frequency (t - origin) + phase) from start on.
+    """gain(t) Im[full exp(2 pi i frequency (t - origin))] from start on.
 
-    frequency [Hz]; level: 0..1 of full stroke; phase [rad]; origin: when the phase was set [s].
-    The gain goes from gain_from at start [s] to gain_to along a raised cosine of ramp [s] and stays
-    there; a ramp of 0 is a jump.
+    frequency [Hz]; full: complex amplitude at gain 1, in full strokes; origin: when its phase was
+    set [s]. The gain goes from gain_from at start [s] to gain_to along a raised cosine of ramp [s]
+    and stays there; a ramp of 0 is a jump.
     """
 
     frequency: float
-    level: float
-    phase: float
+    full: complex
     origin: float
     start: float
     ramp: float
@@ -36,7 +34,7 @@ class FadingTone:
     @property
     def settled_amplitude(self) -> complex:
         """Complex amplitude in full strokes once it has settled."""
-        return cmath.rect(self.level * self.gain_to, self.phase)
+        return self.full * self.gain_to
 
     @property
     def silent_from(self) -> float:
@@ -52,7 +50,7 @@ class FadingTone:
 
     def amplitude(self, time: float) -> complex:
         """Complex amplitude in full strokes at a time [s] not before start."""
-        return cmath.rect(self.level * self.gain(time), self.phase)
+        return self.full * self.gain(time)
 
     def fade_out(self, time: float, *, ramp: float) -> "FadingTone":
         """This tone, silent within ramp [s]; a fade-out that ends sooner is left as it is.

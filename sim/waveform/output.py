@@ -24,26 +24,25 @@ def fade_to(
     *,
     ramp: float,
     frequency: float = 0.0,
-    level: float = 0.0,
-    phase: float = 0.0,
+    amplitude: complex = 0j,
     keep_phase: bool = False,
 ) -> Output:
     """What a channel plays once it was told at time [s] to go to this tone within ramp [s].
 
-    Units as in `FadingTone`; level 0 is silence. The phase counts from now, unless keep_phase is
+    amplitude in full strokes, 0 is silence. Its phase counts from now, unless keep_phase is
     set and the channel is about to play this frequency already: then it counts from where that
     one's does.
     """
     faded = (tone.fade_out(time, ramp=ramp) for tone in playing)
     fading = tuple(tone for tone in faded if tone.silent_from > time)
-    if level == 0:
+    if amplitude == 0:
         return fading
     origin = time
     if keep_phase:
         same = [tone for tone in playing if tone.lasts and tone.frequency == frequency]
         origin = same[0].origin if same else time
     gain_from = 1.0 if ramp == 0 else 0.0
-    return (*fading, FadingTone(frequency, level, phase, origin, time, ramp, gain_from, 1.0))
+    return (*fading, FadingTone(frequency, amplitude, origin, time, ramp, gain_from, 1.0))
 
 
 def shape_to(

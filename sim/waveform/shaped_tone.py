@@ -1,6 +1,5 @@
 """A sinusoid whose amplitude and phase follow the knots of an envelope."""
 
-import cmath
 import math
 from dataclasses import dataclass
 
@@ -57,5 +56,5 @@ class ShapedTone:
         """
         if self.silent_from <= time + ramp:
             return self
-        level, phase = cmath.polar(self.amplitude(time))
-        return FadingTone(self.frequency, level, phase, self.origin, time, ramp, 1.0, 0.0)
+        reached = self.amplitude(time)
+        return FadingTone(self.frequency, reached, self.origin, time, ramp, 1.0, 0.0)

@@ -48,7 +48,7 @@ class Station:
         assert all(0 <= level <= can.level_max + 1e-9 for level in levels)
         for tone in (tone for output in self.amplifier.outputs for tone in output):
             assert can.frequency_min <= tone.frequency <= can.frequency_max
-            assert isinstance(tone, ShapedTone) or 0 <= tone.level <= can.level_max
+            assert isinstance(tone, ShapedTone) or abs(tone.full) <= can.level_max + 1e-9
             is_armed = self.amplifier.state is State.OPERATION_ENABLED
             assert is_armed or tone.silent_from <= self.now + can.ramp_max
 

@@ -475,8 +475,8 @@ FAR_ENDS: dict[str, Bug] = {
         "plays",
         Edit(
             "sim.amplifier.channels:Channels.play",
-            "level=command.level,",
-            "level=command.level / 10,",
+            "amplitude=_amplitude(command),",
+            "amplitude=_amplitude(command) / 10,",
         ),
     ),
     "it says that nothing plays": _bug(

@@ -1,5 +1,6 @@
 """Fades of a channel, by hand calculation."""
 
+import cmath
 import math
 
 import pytest
@@ -23,7 +24,7 @@ def moved(terms: tuple[Term, ...], t: float) -> float:
 
 def test_raised_cosine_in_and_out() -> None:
     """A quarter, half and three quarters into a 20 ms ramp the gain is as the cosine says."""
-    playing = fade_to((), 1.0, ramp=0.02, frequency=100.0, level=0.8)
+    playing = fade_to((), 1.0, ramp=0.02, frequency=100.0, amplitude=0.8)
     quarter = (1 - math.sqrt(0.5)) / 2
     for time, share in [(1.0, 0), (1.005, quarter), (1.01, 0.5), (1.015, 1 - quarter), (1.02, 1)]:
         assert level_of(playing, time) == pytest.approx(0.8 * share, abs=1e-12)
@@ -34,7 +35,7 @@ def test_raised_cosine_in_and_out() -> None:
 
 def test_base_motion_is_the_tone_under_its_ramp() -> None:
     """The exponentials add up to stroke x level x gain(t) x sin(2 pi f (t - origin) + phase)."""
-    tone = FadingTone(110.0, 0.5, 0.7, 0.95, 1.0, 0.02, 0.3, 1.0)
+    tone = FadingTone(110.0, cmath.rect(0.5, 0.7), 0.95, 1.0, 0.02, 0.3, 1.0)
     terms = terms_of(tone, stroke=1e-4)
     for t in [1.0, 1.003, 1.0125, 1.0199, 1.02, 1.5]:
         gain = 1.0 if t >= 1.02 else 0.3 + 0.7 * (1 - math.cos(math.pi * (t - 1.0) / 0.02)) / 2
@@ -44,7 +45,7 @@ def test_base_motion_is_the_tone_under_its_ramp() -> None:
 
 def test_ramp_of_zero_is_a_jump() -> None:
     """Without a ramp the new tone is there at full level and the old one is gone."""
-    playing = fade_to((), 1.0, ramp=0.0, frequency=100.0, level=0.5)
+    playing = fade_to((), 1.0, ramp=0.0, frequency=100.0, amplitude=0.5)
     assert level_of(playing, 1.0) == 0.5
     assert fade_to(playing, 2.0, ramp=0.0) == ()
 
@@ -55,16 +56,16 @@ def test_phase_counts_from_the_commit_or_runs_on() -> None:
     def motion(playing: Output, t: float) -> float:
         return sum(moved(terms_of(tone, stroke=1.0), t) for tone in playing)
 
-    first = fade_to((), 0.0, ramp=0.0, frequency=110.0, level=1.0)
-    kept = fade_to(first, 1.0023, ramp=0.01, frequency=110.0, level=0.5, keep_phase=True)
-    fresh = fade_to(first, 1.0023, ramp=0.01, frequency=110.0, level=0.5)
-    other = fade_to(first, 1.0023, ramp=0.01, frequency=120.0, level=0.5, keep_phase=True)
+    first = fade_to((), 0.0, ramp=0.0, frequency=110.0, amplitude=1.0)
+    kept = fade_to(first, 1.0023, ramp=0.01, frequency=110.0, amplitude=0.5, keep_phase=True)
+    fresh = fade_to(first, 1.0023, ramp=0.01, frequency=110.0, amplitude=0.5)
+    other = fade_to(first, 1.0023, ramp=0.01, frequency=120.0, amplitude=0.5, keep_phase=True)
     t = 1.1
     assert motion(kept, t) == pytest.approx(0.5 * math.sin(2 * math.pi * 110 * t))
     assert motion(fresh, t) == pytest.approx(0.5 * math.sin(2 * math.pi * 110 * (t - 1.0023)))
     assert motion(other, t) == pytest.approx(0.5 * math.sin(2 * math.pi * 120 * (t - 1.0023)))
     # undisturbed in time: same tone again, no dip while one fades into the other
-    same = fade_to(first, 1.0023, ramp=0.01, frequency=110.0, level=1.0, keep_phase=True)
+    same = fade_to(first, 1.0023, ramp=0.01, frequency=110.0, amplitude=1.0, keep_phase=True)
     for t in [1.0023, 1.004, 1.0073, 1.01]:
         assert motion(same, t) == pytest.approx(math.sin(2 * math.pi * 110 * t))
         assert level_of(same, t) == pytest.approx(1.0)
@@ -72,8 +73,8 @@ def test_phase_counts_from_the_commit_or_runs_on() -> None:
 
 def test_a_change_within_a_ramp_is_continuous_and_prolongs_nothing() -> None:
     """A tone caught half faded in leaves from half; one fading out keeps its own, earlier end."""
-    first = fade_to((), 0.0, ramp=0.02, frequency=100.0, level=1.0)
-    second = fade_to(first, 0.01, ramp=0.02, frequency=150.0, level=1.0)
+    first = fade_to((), 0.0, ramp=0.02, frequency=100.0, amplitude=1.0)
+    second = fade_to(first, 0.01, ramp=0.02, frequency=150.0, amplitude=1.0)
     assert level_of(second, 0.01) == pytest.approx(0.5)
     third = fade_to(second, 0.02, ramp=0.05)
     assert level_of(third, 0.02) == pytest.approx(level_of(second, 0.02))

@@ -1,4 +1,4 @@
-"""A simulated amplifier as a Modbus master sees it: request PDUs in, answer PDUs out.
+"""The registers of a simulated amplifier: request PDUs of a Modbus master in, answer PDUs out.
 
 Written apart from the host's side, from protocol.yaml alone, so that the two check each other. What
 is refused is not applied and does not feed the watchdog; what is damaged is not answered.
@@ -31,8 +31,8 @@ from drivers.protocol.messages import (
     Status,
     Stop,
 )
+from sim.far_ends.modbus.identification import IDENTIFY, IdentificationRequest
 from sim.far_ends.modbus.pdu import (
-    IDENTIFY,
     ILLEGAL_ADDRESS,
     ILLEGAL_FUNCTION,
     ILLEGAL_VALUE,
@@ -59,7 +59,6 @@ from sim.far_ends.modbus.words import (
     identity_words,
     playing,
     status_words,
-    text_bytes,
     value_of,
 )
 
@@ -72,27 +71,29 @@ _CONTROL: int = MAP["holding"]["control"]["address"]
 _SET: int = MAP["holding"]["set"]["address"]
 _ENVELOPE: int = MAP["holding"]["envelope"]["address"]
 _CHANNELS, _KNOTS = 16, 32
+# How many registers follow those of a block that have names of their own.
+_FOLLOWING = {
+    "control": 0,
+    "set": _CHANNELS * _GROUP,
+    "envelope": 2 * _KNOTS,
+    "status": _CHANNELS,
+    "refusal": 0,
+    "capabilities": 0,
+    "identity": len(MAP["input"]["identity"]["texts"]) * MAP["text_registers"],
+    "achieved": _CHANNELS * _GROUP,
+    "faults": MAP["fault_count"] * MAP["fault_registers"],
+}
+_SIZES = {
+    name: _HEAD + len(block["registers"]) + _FOLLOWING[name]
+    for name, block in {**MAP["holding"], **MAP["input"]}.items()
+}
 # Of the blocks that are written: by their first register, the one after their last.
 _ENDS = {
-    _CONTROL: _CONTROL + _HEAD + 3,
-    _SET: _SET + _HEAD + 4 + _CHANNELS * _GROUP,
-    _ENVELOPE: _ENVELOPE + _HEAD + 3 + 2 * _KNOTS,
-}
-# How many registers the blocks have that are read.
-_SIZES = {
-    "status": _HEAD + 8 + _CHANNELS,
-    "refusal": _HEAD + 3,
-    "capabilities": _HEAD + 15,
-    "identity": _HEAD + 1 + 4 * MAP["text_registers"],
-    "achieved": _HEAD + 4 + _CHANNELS * _GROUP,
-    "faults": _HEAD + 1 + MAP["fault_count"] * MAP["fault_registers"],
+    block["address"]: block["address"] + _SIZES[name] for name, block in MAP["holding"].items()
 }
 _STARTS = {*_ENDS, *(block["address"] for block in MAP["input"].values())}
 _WORDS: Mapping[int, str] = {word: name for name, word in MAP["controlwords"].items()}
 _END = MAP["input"]["faults"]["address"] + _SIZES["faults"]
-_OBJECTS: Mapping[str, int] = MAP["device_identification"]
-_EXTENDED = 0x80  # device identification objects from here on are the vendor's own
-_CONFORMITY = 0x83  # extended identification, as a stream and one by one
 
 
 class Amplifier(Protocol):
@@ -162,7 +163,8 @@ class ModbusUnit:
             self._write(*to_write(READ_WRITE, body[4:]))
             return registers_read(function, self._read(*wanted))
         if function == IDENTIFY and body[:1] == b"\x0e":
-            return self._identify(body)
+            asked = IdentificationRequest.of(body)
+            return asked.answered(_of(Identity, self._asked(Hello())))
         raise ModbusException(ILLEGAL_FUNCTION)
 
     def _ask(self, request: Request) -> Reply:
@@ -280,28 +282,6 @@ class ModbusUnit:
                 return Clear()
             case _:
                 raise Unfit(NakCode.BAD_VALUE)
-
-    # Identification
-
-    def _identify(self, body: bytes) -> bytes:
-        if len(body) != 3 or not 1 <= body[1] <= 4:
-            raise ModbusException(ILLEGAL_VALUE)
-        _, code, first = body
-        who = _of(Identity, self._asked(Hello()))
-        objects = {
-            number: text_bytes(getattr(who, name))
-            for name, number in _OBJECTS.items()
-            if code >= 3 or number < _EXTENDED
-        }
-        if code == 4 and first not in objects:
-            raise ModbusException(ILLEGAL_ADDRESS)
-        if code == 4:
-            told = {first: objects[first]}
-        else:
-            begin = first if first in objects else 0
-            told = {number: text for number, text in objects.items() if number >= begin}
-        listed = b"".join(bytes([number, len(text)]) + text for number, text in told.items())
-        return bytes([IDENTIFY, 0x0E, code, _CONFORMITY, 0, 0, len(told)]) + listed
 
 
 def _of(kind: type[_T], reply: Reply) -> _T:

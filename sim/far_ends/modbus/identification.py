@@ -1,0 +1,46 @@
+"""Device identification over Modbus (function 43/14): who the amplifier is, in texts by number."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from drivers.protocol.messages import Identity
+from sim.far_ends.modbus.pdu import ILLEGAL_ADDRESS, ILLEGAL_VALUE, ModbusException
+from sim.far_ends.modbus.words import MAP, text_bytes
+
+IDENTIFY = 43
+_READ = 0x0E  # the one kind of function 43 that is understood
+_BASIC, _ONE = (1, 2), 4  # codes: 1 and 2 without the vendor's own objects, 3 with them, 4 one
+_NUMBERS: Mapping[str, int] = MAP["device_identification"]
+_EXTENDED = 0x80  # objects from here on are the vendor's own
+_CONFORMITY = 0x83  # extended identification, as a stream and one by one
+
+
+@dataclass(frozen=True)
+class IdentificationRequest:
+    """Which texts are asked for: by a code, and the number of the first."""
+
+    code: int
+    first: int
+
+    @classmethod
+    def of(cls, body: bytes) -> "IdentificationRequest":
+        """What the bytes after the function ask for; raises ModbusException."""
+        if len(body) != 3 or not 1 <= body[1] <= _ONE:
+            raise ModbusException(ILLEGAL_VALUE)
+        return cls(code=body[1], first=body[2])
+
+    def answered(self, who: Identity) -> bytes:
+        """The answer PDU; raises ModbusException."""
+        texts = {
+            number: text_bytes(getattr(who, name))
+            for name, number in _NUMBERS.items()
+            if self.code not in _BASIC or number < _EXTENDED
+        }
+        if self.code == _ONE:
+            if self.first not in texts:
+                raise ModbusException(ILLEGAL_ADDRESS)
+            texts = {self.first: texts[self.first]}
+        elif self.first in texts:
+            texts = {number: text for number, text in texts.items() if number >= self.first}
+        listed = b"".join(bytes([number, len(text)]) + text for number, text in texts.items())
+        return bytes([IDENTIFY, _READ, self.code, _CONFORMITY, 0, 0, len(texts)]) + listed

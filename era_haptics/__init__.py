@@ -30,12 +30,12 @@ if TYPE_CHECKING:
     from model.errors import InputError
     from model.finger.grid import Grid
     from model.finger.load import FingerLoad
+    from model.reduction.supported_modes import SupportedModes
     from model.rig.file import example_rig_path, load_rig
     from model.rig.rig import Rig
     from model.table.file import load_table, save_table
     from model.table.pattern import Pattern
     from model.table.table import LocalizationTable
-    from model.transients.supported_modes import SupportedModes
     from model.vibration.excitation import Tone
     from model.vibration.maps import PlateMap
     from sim.plant.playback import Playback
@@ -61,7 +61,7 @@ _HOMES = {
     "Rig": "model.rig.rig",
     "RpcError": "controller.api.jsonrpc",
     "SolvedPlate": "era_haptics.solved_plate",
-    "SupportedModes": "model.transients.supported_modes",
+    "SupportedModes": "model.reduction.supported_modes",
     "Tone": "model.vibration.excitation",
     "Unreachable": "controller.api.replies",
     "commands_for": "era_haptics.amplifiers",

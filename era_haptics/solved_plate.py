@@ -11,11 +11,11 @@ from model.fem.assembly import era_positions
 from model.finger.load import FingerLoad
 from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.reduction.reduced_plate import ReducedPlate, reduce_free_plate
+from model.reduction.supported_modes import SupportedModes, supported_modes
 from model.rig.rig import Rig
 from model.structure.point_load import load_positions
 from model.table.pattern import ONSET_RAMP, Pattern
 from model.table.question import Question
-from model.transients.supported_modes import SupportedModes, supported_modes
 from model.vibration.excitation import Excitation
 from model.vibration.maps import PlateMap, plate_map
 from sim.plant.playback import Playback, play

@@ -3,21 +3,10 @@
     M q'' + C q' + K q = sum over ERAs of phi (k_b y + c y')
 
 q are the coordinates of the reduced free plate, phi its shapes at an ERA, y the motion of the
-ERA's base. M = I + sum m_b phi phi^T, K = diag(omega²) + sum k_b phi phi^T, C = C_s + sum c phi
-phi^T; what else the plate carries adds to M in the same way, and a finger in contact adds its mass,
-stiffness and damping where it rests. The first-order system is diagonalised once for as long as
-nothing comes or goes; the base moves in terms with closed-form particular solutions
-(`model.transients.base_motion`), so no step size enters and no error grows with time.
-
-Structural damping. The frequency domain uses a hysteretic stiffness (1 + i eta) diag(omega²),
-which no causal equation in time has. C_s is its viscous equivalent: in the modes psi_j, omega_j of
-the plate *on its ERAs*, C_s,jk = eta psi_j^T diag(omega²) psi_k / sqrt(omega_j omega_k). That is
-positive semidefinite, and at every resonance of the supported plate it takes exactly the power that
-the hysteretic one takes; a ratio eta/2 on the modes of the *free* plate would not, because the
-springs' share of a mode's energy has no loss. It is the plate's own: contacts do not change it.
-What is left differs off resonance: with eta = 1 % the steady accelerations of the paper's plate
-differ by at most 0.5 % (relative L2 over the plate, 40 to 500 Hz), in proportion to eta; deep nulls
-are moved a little, not filled.
+ERA's base; M, C and K are those of `model.reduction.modal_matrices`. The first-order system is
+diagonalised once for as long as nothing comes or goes; the base moves in terms with closed-form
+particular solutions (`model.transients.base_motion`), so no step size enters and no error grows
+with time.
 
 Not modelled: large deflections, air, the ERAs' own dynamics beyond spring, damper and bolt mass,
 rocking and drag at the bolts, and the impulse c times the jump that the damper would pass on if a
@@ -27,7 +16,6 @@ base jumped (ramp 0): displacement and velocity of the plate are continuous thro
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,31 +24,12 @@ from scipy import linalg
 from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
 from model.fem.assembly import era_positions
+from model.reduction.modal_matrices import Reduced, modal_matrices
 from model.structure.actuator import Era
-from model.structure.plate import Plate
 from model.structure.point_load import PointLoad, load_positions
 from model.transients.base_motion import Term
 
 _ANSWERED_MAX = 1024  # unit answers that are kept, some kilobytes each
-
-
-class Reduced(Protocol):
-    """A free plate in few coordinates, its mass the identity and its stiffness diag(omega²).
-
-    As `ReducedPlate` of `model.reduction`: omega (r,) [rad/s]; at(points) gives its shapes
-    (p, r).
-    """
-
-    @property
-    def plate(self) -> Plate:
-        """What it is made of."""
-
-    @property
-    def omega(self) -> FloatArray:
-        """Natural frequencies [rad/s], (r,)."""
-
-    def at(self, points: FloatArray) -> FloatArray:
-        """Shapes at points [m] (p, 2), (p, r)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -209,7 +178,7 @@ def plate_in_time(
         held = reduced.at(
             np.vstack([era_positions(eras), load_positions(loads), load_positions(contacts)])
         )
-    M, C, K = _matrices(reduced, held, [*_as_loads(eras), *loads], contacts)
+    M, C, K = modal_matrices(reduced, eras, loads=loads, contacts=contacts, held=held)
     r = len(K)
     inverse = linalg.inv(M)
     A = np.block([[np.zeros((r, r)), np.eye(r)], [-inverse @ K, -inverse @ C]])
@@ -225,53 +194,3 @@ def plate_in_time(
     return PlateInTime(
         reduced, tuple(eras), eigenvalues, vectors, inverse_vectors, inverse_vectors @ push
     )
-
-
-def modal_matrices(
-    reduced: Reduced,
-    eras: Sequence[Era],
-    *,
-    loads: Sequence[PointLoad] = (),
-    contacts: Sequence[PointLoad] = (),
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """M, C, K (r, r) of the plate on its ERAs, in the coordinates of the reduced free plate."""
-    fixed = [*_as_loads(eras), *loads]
-    return _matrices(reduced, reduced.at(load_positions([*fixed, *contacts])), fixed, contacts)
-
-
-def _as_loads(eras: Sequence[Era]) -> list[PointLoad]:
-    return [PointLoad(e.x, e.y, e.stiffness, e.damping, e.bolt_mass) for e in eras]
-
-
-def _matrices(
-    reduced: Reduced,
-    phi: FloatArray,
-    fixed: Sequence[PointLoad],
-    contacts: Sequence[PointLoad],
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """phi: shapes at what is fixed to the plate and at the contacts, one after the other."""
-    elastic = np.diag(reduced.omega**2)
-    M, C, K = _attached(phi[: len(fixed)], fixed)
-    M += np.eye(len(elastic))
-    K += elastic
-    squares, psi = linalg.eigh(K, M)
-    if squares[0] < 1.0:  # (rad/s)²: slower than one sway in six seconds is not held at all
-        raise InputError(
-            "the plate does not stand on its ERAs and would tip over; put at least three under it "
-            "that do not lie in one line"
-        )
-    omega = np.sqrt(squares)
-    viscous = reduced.plate.loss_factor * (psi.T @ elastic @ psi) / np.sqrt(np.outer(omega, omega))
-    back = M @ psi
-    C += back @ viscous @ back.T
-    added = _attached(phi[len(fixed) :], contacts)
-    return M + added[0], C + added[1], K + added[2]
-
-
-def _attached(
-    phi: FloatArray, loads: Sequence[PointLoad]
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """What loads with these shapes (n, r) add to M, C and K."""
-    mass = (phi.T * [load.mass for load in loads]) @ phi
-    damping = (phi.T * [load.damping for load in loads]) @ phi
-    return mass, damping, (phi.T * [load.stiffness for load in loads]) @ phi

@@ -37,7 +37,7 @@ def record_responses(
     """Measure the frequency responses of a rig's plate in time, at a level 0..1 of full stroke.
 
     The plate vibrates with all that the rig says, gains of its ERAs among them; its structural
-    damping is the viscous equivalent of `model.transients.time_response`. Raises InputError for
+    damping is the viscous equivalent of `model.reduction.modal_matrices`. Raises InputError for
     frequencies [Hz] that the sampling rate [Hz] cannot tell.
     """
     if frequencies.max() >= 0.4 * sample_rate:

@@ -8,9 +8,10 @@ from scipy.integrate import solve_ivp
 
 from model.arrays import FloatArray
 from model.fem.assembly import era_positions
+from model.reduction.modal_matrices import modal_matrices
 from model.reduction.reduced_plate import reduce_plate
 from model.rig.rig import Rig
-from model.transients.time_response import PlateInTime, modal_matrices, plate_in_time
+from model.transients.time_response import PlateInTime, plate_in_time
 from paper_plate import make_paper_rig
 
 Motion = Callable[[float], tuple[float, float]]

@@ -10,11 +10,11 @@ from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
 from model.fem.mesh import Mesh
 from model.finger.fingertip import fingertip_points
+from model.reduction.modal_matrices import modal_matrices
 from model.reduction.reduced_plate import ReducedPlate, reduce_plate
 from model.structure.actuator import Era
 from model.structure.plate import Material, Plate
 from model.transients.base_motion import Term
-from model.transients.time_response import modal_matrices
 from sim.plant.plant import Plant
 
 PLATE = Plate(0.3048, 0.2286, 0.0015, Material("aluminium", 70e9, 2700.0, 0.33), loss_factor=0.01)

@@ -12,11 +12,11 @@ from model.arrays import FloatArray
 from model.fem.assembly import era_positions
 from model.fem.mesh import Mesh
 from model.finger.load import FingerLoad, finger_loads
+from model.reduction.modal_matrices import modal_matrices
 from model.reduction.reduced_plate import ReducedPlate, reduce_plate
 from model.rig.rig import Rig
 from model.structure.point_load import PointLoad, load_positions
 from model.transients.base_motion import Term
-from model.transients.time_response import modal_matrices
 from sim.plant.plant import Plant
 
 STROKE = 1e-4

@@ -11,10 +11,10 @@ from driven_bases import STILL, faded_base, shaped_base
 from finger_energy import held_by_fingers
 from model.fem.assembly import era_positions
 from model.finger.load import finger_loads
+from model.reduction.modal_matrices import modal_matrices
 from model.reduction.reduced_plate import reduce_plate
 from model.rig.rig import Rig
 from model.structure.point_load import PointLoad, load_positions
-from model.transients.time_response import modal_matrices
 from paper_plate import make_paper_rig
 from sim.plant.plant import Plant
 

@@ -7,9 +7,9 @@ import numpy as np
 from model.fem.assembly import era_positions
 from model.fem.mesh import Mesh
 from model.reduction.reduced_plate import reduce_plate
+from model.reduction.supported_modes import SupportedModes, supported_modes
 from model.rig.rig import Rig
 from model.structure.actuator import damping_from_ratio
-from model.transients.supported_modes import SupportedModes, supported_modes
 from paper_plate import make_paper_rig
 
 # Founding paper, in-house column of Table 2 [Hz].

@@ -12,10 +12,10 @@ import numpy as np
 from scipy import linalg
 
 from model.arrays import FloatArray
+from model.reduction.modal_matrices import modal_matrices
 from model.reduction.reduced_plate import ReducedPlate
 from model.structure.actuator import Era
 from model.structure.point_load import PointLoad
-from model.transients.time_response import modal_matrices
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,0 +1,89 @@
+"""Mass, damping and stiffness of the plate on its ERAs, in the coordinates of the free plate.
+
+M = I + sum m_b phi phi^T, K = diag(omega²) + sum k_b phi phi^T, C = C_s + sum c phi phi^T; phi are
+the free plate's shapes at an ERA. What else the plate carries adds to M in the same way, and a
+finger in contact adds its mass, stiffness and damping where it rests.
+
+Structural damping. The frequency domain uses a hysteretic stiffness (1 + i eta) diag(omega²),
+which no causal equation in time has. C_s is its viscous equivalent: in the modes psi_j, omega_j of
+the plate *on its ERAs*, C_s,jk = eta psi_j^T diag(omega²) psi_k / sqrt(omega_j omega_k). That is
+positive semidefinite, and at every resonance of the supported plate it takes exactly the power that
+the hysteretic one takes; a ratio eta/2 on the modes of the *free* plate would not, because the
+springs' share of a mode's energy has no loss. It is the plate's own: contacts do not change it.
+What is left differs off resonance: with eta = 1 % the steady accelerations of the paper's plate
+differ by at most 0.5 % (relative L2 over the plate, 40 to 500 Hz), in proportion to eta; deep nulls
+are moved a little, not filled.
+"""
+
+from collections.abc import Sequence
+from typing import Protocol
+
+import numpy as np
+from scipy import linalg
+
+from model.arrays import FloatArray
+from model.errors import InputError
+from model.structure.actuator import Era
+from model.structure.plate import Plate
+from model.structure.point_load import PointLoad, load_positions
+
+
+class Reduced(Protocol):
+    """A free plate in few coordinates, its mass the identity and its stiffness diag(omega²).
+
+    As `ReducedPlate`: omega (r,) [rad/s]; at(points) gives its shapes (p, r).
+    """
+
+    @property
+    def plate(self) -> Plate:
+        """What it is made of."""
+
+    @property
+    def omega(self) -> FloatArray:
+        """Natural frequencies [rad/s], (r,)."""
+
+    def at(self, points: FloatArray) -> FloatArray:
+        """Shapes at points [m] (p, 2), (p, r)."""
+
+
+def modal_matrices(
+    reduced: Reduced,
+    eras: Sequence[Era],
+    *,
+    loads: Sequence[PointLoad] = (),
+    contacts: Sequence[PointLoad] = (),
+    held: FloatArray | None = None,
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """M, C, K (r, r) of the plate on its ERAs, with what it carries and the fingers in contact.
+
+    held: shapes at the ERAs, loads and contacts (n, r) where they are known already. Raises
+    InputError for ERAs that do not hold the plate (fewer than three, or all in one line).
+    """
+    fixed = [PointLoad(e.x, e.y, e.stiffness, e.damping, e.bolt_mass) for e in eras]
+    fixed += loads
+    phi = reduced.at(load_positions([*fixed, *contacts])) if held is None else held
+    elastic = np.diag(reduced.omega**2)
+    M, C, K = _attached(phi[: len(fixed)], fixed)
+    M += np.eye(len(elastic))
+    K += elastic
+    squares, psi = linalg.eigh(K, M)
+    if squares[0] < 1.0:  # (rad/s)²: slower than one sway in six seconds is not held at all
+        raise InputError(
+            "the plate does not stand on its ERAs and would tip over; put at least three under it "
+            "that do not lie in one line"
+        )
+    omega = np.sqrt(squares)
+    viscous = reduced.plate.loss_factor * (psi.T @ elastic @ psi) / np.sqrt(np.outer(omega, omega))
+    back = M @ psi
+    C += back @ viscous @ back.T
+    added = _attached(phi[len(fixed) :], contacts)
+    return M + added[0], C + added[1], K + added[2]
+
+
+def _attached(
+    phi: FloatArray, loads: Sequence[PointLoad]
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """What loads with these shapes (n, r) add to M, C and K."""
+    mass = (phi.T * [load.mass for load in loads]) @ phi
+    damping = (phi.T * [load.damping for load in loads]) @ phi
+    return mass, damping, (phi.T * [load.stiffness for load in loads]) @ phi

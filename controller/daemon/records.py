@@ -8,6 +8,7 @@ import os
 import time
 from collections import deque
 from collections.abc import Callable, Iterable
+from contextlib import AbstractContextManager
 from dataclasses import asdict, is_dataclass
 from enum import Enum
 from pathlib import Path
@@ -106,6 +107,15 @@ class RecordedBackend(Backend):
     def bus(self) -> str | None:
         """Of the inner one."""
         return self._inner.bus
+
+    @property
+    def is_unsent(self) -> bool:
+        """Of the inner one."""
+        return self._inner.is_unsent
+
+    def silencing(self, request: Request) -> AbstractContextManager[None]:
+        """As the inner one."""
+        return self._inner.silencing(request)
 
     async def broadcast(self, request: Broadcast) -> None:
         """As the inner one."""

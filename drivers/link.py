@@ -5,7 +5,6 @@ What is lost stays lost until it is opened anew, and says so at once to whoever 
 
 import asyncio
 from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext
 from typing import TypeVar, final
 
 from drivers import clock
@@ -117,8 +116,12 @@ class Link:
         FrameError for a reply to another kind of request.
         """
         self._raise_if_lost()
-        with self._ahead(request, kind):
-            reply = await self._in_turn(request, kind, timeout or self._reply_timeout)
+        timeout = timeout or self._reply_timeout
+        if kind.silences:
+            with self.backend.silencing(request):
+                reply = await self._in_turn(request, kind, timeout)
+        else:
+            reply = await self._in_turn(request, kind, timeout)
         name = type(request).__name__
         if isinstance(reply, Nak):
             self._refusals += 1
@@ -132,10 +135,6 @@ class Link:
         self._raise_if_lost()
         async with self._turns.take(kind):
             await self.backend.broadcast(request)
-
-    def _ahead(self, request: Request, kind: Kind) -> AbstractContextManager[None]:
-        """In which it goes before what others say on the wire, if it may."""
-        return self.backend.silencing(request) if kind.silences else nullcontext()
 
     async def _in_turn(self, request: Request, kind: Kind, timeout: float) -> Reply:
         while True:

@@ -115,17 +115,12 @@ class SerialBackend(WireBackend):
         need longer.
         """
         line = self._open_line()
-
-        async def exchange() -> Reply:
-            reply = await self._exchange(line, request, timeout)
-            if isinstance(request, Hello):
-                await self._check_alone()
-            return reply
-
-        if len(line.addresses) == 1:
-            return await exchange()
+        if not line.is_shared:
+            return await self._exchange(line, request, timeout)
         return await line.turns.carry_out(
-            kind_on_line(request), exchange, address=self._url.address
+            kind_on_line(request),
+            lambda: self._exchange(line, request, timeout),
+            address=self._url.address,
         )
 
     async def broadcast(self, request: Broadcast) -> None:
@@ -162,7 +157,7 @@ class SerialBackend(WireBackend):
             self._last_sent = line.last_sent
             self._counters.frames_out += 1
             on_line = exchange_time(len(data), baud=self._url.baud)
-            return await reply_within(pending.reply, max(timeout, on_line + PROTOCOL.reaction))
+            reply = await reply_within(pending.reply, max(timeout, on_line + PROTOCOL.reaction))
         except LinkError:
             raise
         except TimeoutError:
@@ -174,6 +169,9 @@ class SerialBackend(WireBackend):
         finally:
             del self._pending[frame.sequence]
             pending.reply.cancel()  # one that was given an error nobody came for
+        if isinstance(request, Hello):
+            await self._check_alone()
+        return reply
 
     def _frame(self, request: Request, address: int) -> Frame:
         self._sequence = (self._sequence + 1) & 0xFFFF

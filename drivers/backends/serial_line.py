@@ -40,9 +40,9 @@ class SerialLine:
         return self._reader.counters.bad
 
     @property
-    def addresses(self) -> tuple[int, ...]:
-        """Those in use."""
-        return tuple(self._users)
+    def is_shared(self) -> bool:
+        """Whether more than one address is in use."""
+        return len(self._users) > 1
 
     @property
     def is_idle(self) -> bool:

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +32,7 @@ class Quantity:
     maximum: int
     wraps: bool = False
 
-    @property
+    @cached_property
     def struct_code(self) -> str:
         """Its character in the format strings of `struct`."""
         return _STRUCT_CODES[self.wire]
@@ -56,9 +57,11 @@ class Quantity:
 
         Raises CommandError for NaN, infinities and values out of range: nothing is clipped.
         """
+        scaled = value * self.per_unit
+        if self.minimum <= scaled <= self.maximum:
+            return round(scaled)
         if not math.isfinite(value):
             raise CommandError(f"{self.name} is {value}, which is not a number that can be sent")
-        scaled = value * self.per_unit
         if self.wraps:
             span = self.maximum - self.minimum + 1
             return (round(scaled) - self.minimum) % span + self.minimum

@@ -29,6 +29,19 @@ class Malformed(FrameError):
         self.channel = channel
 
 
+class Record:
+    """Numbers that always stand one after the other, written and read at once."""
+
+    def __init__(self, *quantities: Quantity) -> None:
+        self.quantities = quantities
+        self.layout = struct.Struct("<" + "".join(each.struct_code for each in quantities))
+
+    def pack(self, *values: float) -> bytes:
+        """Their values, each in its unit; CommandError for one out of range."""
+        wanted = zip(self.quantities, values, strict=True)
+        return self.layout.pack(*[quantity.to_wire(value) for quantity, value in wanted])
+
+
 class Cursor:
     """Reads a payload from front to back; raises Malformed for what is missing or out of range."""
 
@@ -40,15 +53,20 @@ class Cursor:
         """A whole number."""
         value = self._raw(quantity.struct_code)
         if not quantity.holds(value):
-            code = {
-                "channel": NakCode.BAD_CHANNEL,
-                "token": NakCode.BAD_TOKEN,
-            }.get(quantity.name, NakCode.BAD_VALUE)
-            raise Malformed(
-                f"{quantity.name} {value} is not within {quantity.minimum}..{quantity.maximum}",
-                code=code,
-            )
+            raise _out_of_range(quantity, value)
         return value
+
+    def record(self, record: Record) -> tuple[int, ...]:
+        """All whole numbers of a record."""
+        at = self._at
+        self._at += record.layout.size
+        if self._at > len(self._payload):
+            raise Malformed("the payload ends too early", code=NakCode.BAD_LENGTH)
+        values: tuple[int, ...] = record.layout.unpack_from(self._payload, at)
+        for quantity, value in zip(record.quantities, values, strict=True):
+            if not quantity.minimum <= value <= quantity.maximum:
+                raise _out_of_range(quantity, value)
+        return values
 
     def number(self, quantity: Quantity) -> float:
         """A value in its unit."""
@@ -123,6 +141,14 @@ class Cursor:
             raise Malformed("the payload ends too early", code=NakCode.BAD_LENGTH)
         self._at += length
         return piece
+
+
+def _out_of_range(quantity: Quantity, value: int) -> Malformed:
+    code = {"channel": NakCode.BAD_CHANNEL, "token": NakCode.BAD_TOKEN}.get(quantity.name)
+    return Malformed(
+        f"{quantity.name} {value} is not within {quantity.minimum}..{quantity.maximum}",
+        code=code or NakCode.BAD_VALUE,
+    )
 
 
 def pack(*pairs: tuple[Quantity, float]) -> bytes:

@@ -6,9 +6,9 @@ raised.
 
 from drivers.command import CommandSet, DriveCommand, Envelope, Knot
 from drivers.guard import SafeCommand, SafeEnvelope
-from drivers.protocol.definition import PROTOCOL
+from drivers.protocol.definition import PROTOCOL, Quantity
 from drivers.protocol.messages import Achieved, NakCode
-from drivers.protocol.payload import Cursor, Malformed, pack
+from drivers.protocol.payload import Cursor, Malformed, Record, pack
 
 _Q = PROTOCOL.quantities
 _KEEP_PHASE = 0x01
@@ -16,45 +16,47 @@ _SKIP_ENDING = 0x02
 _ENVELOPES = 0x04  # onset and ending follow the command
 
 
+_FLAGS = Quantity("flags", "u8", 1, "", 0, _KEEP_PHASE | _SKIP_ENDING | _ENVELOPES)
+_COMMAND = Record(_Q.channel, _FLAGS, _Q.frequency, _Q.level, _Q.phase)
+_SLOTS = Record(_Q.envelope_slot, _Q.envelope_slot)
+_TIMES = Record(_Q.token, _Q.ramp, _Q.valid_for)
+
+
 def _pack_commands(commands: tuple[DriveCommand, ...]) -> bytes:
-    packed = pack((_Q.channel_count, len(commands)))
+    packed = [pack((_Q.channel_count, len(commands)))]
     for command in commands:
-        packed += pack((_Q.channel, command.channel))
         is_shaped = command.onset or command.ending
         flags = _KEEP_PHASE if command.keep_phase else 0
         flags |= _SKIP_ENDING if command.skip_ending else 0
-        packed += bytes([flags | (_ENVELOPES if is_shaped else 0)])
-        packed += pack(
-            (_Q.frequency, command.frequency),
-            (_Q.level, command.level),
-            (_Q.phase, command.phase),
+        flags |= _ENVELOPES if is_shaped else 0
+        packed.append(
+            _COMMAND.pack(command.channel, flags, command.frequency, command.level, command.phase)
         )
         if is_shaped:
-            packed += pack((_Q.envelope_slot, command.onset), (_Q.envelope_slot, command.ending))
-    return packed
+            packed.append(_SLOTS.pack(command.onset, command.ending))
+    return b"".join(packed)
 
 
 def _unpack_commands(cursor: Cursor) -> tuple[DriveCommand, ...]:
     commands: list[DriveCommand] = []
     seen: set[int] = set()
     for _ in range(cursor.integer(_Q.channel_count)):
-        channel = cursor.integer(_Q.channel)
+        channel, flags, frequency, level, phase = cursor.record(_COMMAND)
         if channel in seen:
             raise Malformed(
                 f"channel {channel} is named twice", code=NakCode.BAD_CHANNEL, channel=channel
             )
         seen.add(channel)
-        flags = cursor.flags(_KEEP_PHASE | _SKIP_ENDING | _ENVELOPES)
-        is_shaped = bool(flags & _ENVELOPES)
+        onset, ending = cursor.record(_SLOTS) if flags & _ENVELOPES else (0, 0)
         commands.append(
             DriveCommand(
                 channel=channel,
-                frequency=cursor.number(_Q.frequency),
-                level=cursor.number(_Q.level),
-                phase=cursor.number(_Q.phase),
+                frequency=_Q.frequency.from_wire(frequency),
+                level=_Q.level.from_wire(level),
+                phase=_Q.phase.from_wire(phase),
                 keep_phase=bool(flags & _KEEP_PHASE),
-                onset=cursor.integer(_Q.envelope_slot) if is_shaped else 0,
-                ending=cursor.integer(_Q.envelope_slot) if is_shaped else 0,
+                onset=onset,
+                ending=ending,
                 skip_ending=bool(flags & _SKIP_ENDING),
             )
         )
@@ -68,21 +70,18 @@ def pack_set(command_set: CommandSet) -> bytes:
             f"only a SafeCommand goes on the wire, not a {type(command_set).__name__}: "
             "let Guard.check make one"
         )
-    times = pack(
-        (_Q.token, command_set.token),
-        (_Q.ramp, command_set.ramp),
-        (_Q.valid_for, command_set.valid_for),
-    )
+    times = _TIMES.pack(command_set.token, command_set.ramp, command_set.valid_for)
     return times + _pack_commands(command_set.commands)
 
 
 def unpack_set(cursor: Cursor) -> CommandSet:
     """The set of a payload, which must pass a guard before it can be sent on."""
-    token = cursor.integer(_Q.token)
-    ramp = cursor.number(_Q.ramp)
-    valid_for = cursor.number(_Q.valid_for)
+    token, ramp, valid_for = cursor.record(_TIMES)
     return CommandSet(
-        token=token, commands=_unpack_commands(cursor), ramp=ramp, valid_for=valid_for
+        token=token,
+        commands=_unpack_commands(cursor),
+        ramp=_Q.ramp.from_wire(ramp),
+        valid_for=_Q.valid_for.from_wire(valid_for),
     )
 
 

@@ -111,101 +111,70 @@ def sim(
     from sim.process.endings import gone_when_told
 
     with gone_when_told():  # until there is something to end in order
-        _simulate(
-            rig,
-            common={
-                "serial": ("--serial", 0) if serial else None,
-                "modbus-tcp": ("--modbus-tcp", modbus_tcp) if modbus_tcp is not None else None,
-                "modbus-rtu": ("--modbus-rtu", 0) if modbus_rtu else None,
-                "socketcand": ("--socketcand", socketcand) if socketcand is not None else None,
-                "slcan": ("--slcan", 0) if slcan else None,
+        from model.config.points import parse_point
+        from model.finger.load import parse_finger_load
+        from model.rig.file import load_rig
+        from sim.far_ends.wire_choice import choose_wires
+        from sim.far_ends.wires import Wire
+        from sim.faults.file import FaultFile, load_faults
+        from sim.process.far_end import FarEnd
+
+        plain = Wire("serial", speed=speed, shared=shared, unpluggable=faults is not None)
+        common = _common_wire(
+            plain,
+            {
+                "serial": 0 if serial else None,
+                "modbus-tcp": modbus_tcp,
+                "modbus-rtu": 0 if modbus_rtu else None,
+                "socketcand": socketcand,
+                "slcan": 0 if slcan else None,
             },
-            own=wire or [],
-            shared=shared,
-            speed=speed,
-            faults=faults,
-            fingers=finger or [],
-            finger_load=finger_load,
-            sensors=sensor or [],
-            record=record,
-            rate=rate,
+        )
+        if virtual_time and control is None:
+            raise InputError("--virtual-time: who lets time pass? Add --control PATH")
+        loaded = load_rig(rig)
+        _check_rate(rate, frequency_max=loaded.limits.frequency_max)
+        far_end = FarEnd(
+            loaded,
+            choose_wires(loaded.amplifiers, common=common, own=wire or [], plain=plain),
+            faults=load_faults(faults, amplifiers=loaded.amplifiers) if faults else FaultFile(()),
+            fingers={
+                str(number): parse_point(text, what="--finger")
+                for number, text in enumerate(finger or [], start=1)
+            },
+            finger_load=(
+                parse_finger_load(finger_load, what="--finger-load") if finger_load else None
+            ),
+            sensors=[_sensor(text) for text in sensor or []],
+            sample_rate=rate,
             control=control,
-            virtual_time=virtual_time,
+            record=record,
             until_eof=until_eof,
         )
+        _run(far_end, virtual_time=virtual_time)
 
 
-def _simulate(
-    rig: Path,
-    *,
-    common: Mapping[str, tuple[str, int] | None],
-    own: list[str],
-    shared: bool,
-    speed: int | None,
-    faults: Path | None,
-    fingers: list[str],
-    finger_load: str | None,
-    sensors: list[str],
-    record: Path | None,
-    rate: float,
-    control: Path | None,
-    virtual_time: bool,
-    until_eof: bool,
-) -> None:
-    """As told on the command line; common: by kind of wire, its option and port, if it stands."""
-    from model.config.points import parse_point
-    from model.finger.load import parse_finger_load
-    from model.rig.file import load_rig
-    from sim.far_ends.wire_choice import choose_wires
-    from sim.far_ends.wires import Wire
-    from sim.faults.file import FaultFile, load_faults
-    from sim.process.far_end import FarEnd
+def _common_wire(plain: "Wire", ports: Mapping[str, int | None]) -> "Wire | None":
+    """The wire that all amplifiers are on, by the port of the one kind that was asked for."""
+    from dataclasses import replace
 
-    given = {kind: option for kind, option in common.items() if option is not None}
+    given = {kind: port for kind, port in ports.items() if port is not None}
     if len(given) > 1:
-        named = " and ".join(option for option, _ in given.values())
+        named = " and ".join(f"--{kind}" for kind in given)
         raise InputError(
             f"{named}: all amplifiers can be on one of them only; leave one, or say which "
             "amplifier is where, as in --wire main=serial --wire side=slcan"
         )
-    if virtual_time and control is None:
-        raise InputError("--virtual-time: who lets time pass? Add --control PATH")
-    loaded = load_rig(rig)
-    least = 2.5 * loaded.limits.frequency_max
+    return next((replace(plain, kind=kind, port=port) for kind, port in given.items()), None)
+
+
+def _check_rate(rate: float, *, frequency_max: float) -> None:
+    least = 2.5 * frequency_max
     if not least <= rate <= 1e6:
         raise InputError(
-            f"--rate {rate:g}: the plate is driven at up to {loaded.limits.frequency_max:g} Hz, "
+            f"--rate {rate:g}: the plate is driven at up to {frequency_max:g} Hz, "
             f"which {least:g} to 1e+06 Hz can follow"
         )
-    plain = Wire("serial", speed=speed, shared=shared, unpluggable=faults is not None)
-    wires = choose_wires(
-        loaded.amplifiers,
-        common=next((_of_kind(plain, kind, port) for kind, (_, port) in given.items()), None),
-        own=own,
-        plain=plain,
-    )
-    far_end = FarEnd(
-        loaded,
-        wires,
-        faults=load_faults(faults, amplifiers=loaded.amplifiers) if faults else FaultFile(()),
-        fingers={
-            str(number): parse_point(text, what="--finger")
-            for number, text in enumerate(fingers, start=1)
-        },
-        finger_load=parse_finger_load(finger_load, what="--finger-load") if finger_load else None,
-        sensors=[_sensor(text) for text in sensors],
-        sample_rate=rate,
-        control=control,
-        record=record,
-        until_eof=until_eof,
-    )
-    _run(far_end, virtual_time=virtual_time)
-
-
-def _of_kind(plain: "Wire", kind: str, port: int) -> "Wire":
-    from dataclasses import replace
-
-    return replace(plain, kind=kind, port=port)
 
 
 def _sensor(text: str) -> "Accelerometer":

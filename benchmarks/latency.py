@@ -49,7 +49,7 @@ def main() -> None:
             checked = check_case(options.check, options.seconds, options.seed)
             one = attempt(checked, partial(measure, checked, file, table))
             if isinstance(one, Failed):
-                sys.exit(f"disturbed: {'; '.join(one.why)}")
+                sys.exit(f"no figures: {'; then: '.join(one.why)}")
             print(json.dumps(as_json(one)))
             return
         begun = time.monotonic()
@@ -62,7 +62,7 @@ def main() -> None:
         write_report(found, seconds=options.seconds, seed=options.seed, minutes=minutes)
     failed = [each for each in found if isinstance(each, Failed)]
     if failed:
-        sys.exit(f"{len(failed)} of {len(found)} cases were disturbed: leave the machine alone")
+        sys.exit(f"no figures of {len(failed)} of {len(found)} cases: leave the machine alone")
 
 
 if __name__ == "__main__":

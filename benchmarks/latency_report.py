@@ -190,7 +190,7 @@ def _disturbance(one: Found | Failed) -> str | None:
     """What disturbed a case, None where nothing did."""
     if isinstance(one, Failed):
         attempts = "; then: ".join(one.why)
-        return f"**No figures of *{one.case.name}***, which was disturbed each time: {attempts}."
+        return f"**No figures of *{one.case.name}***: {attempts}."
     if one.others > QUIET:
         return (
             f"***{one.case.name}* was disturbed**: others kept {one.others:.1f} processors busy, "
@@ -201,7 +201,7 @@ def _disturbance(one: Found | Failed) -> str | None:
 
 def _row(found: Found | Failed) -> str:
     if isinstance(found, Failed):
-        return f"| {' | '.join([found.case.name, 'disturbed', *[''] * (HEAD_CELLS - 2)])} |"
+        return f"| {' | '.join([found.case.name, 'no figures', *[''] * (HEAD_CELLS - 2)])} |"
     matched = found.matched
     cells = [
         found.case.name + ("" if found.is_urgent else " (nice not allowed)"),

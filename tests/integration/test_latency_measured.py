@@ -36,7 +36,7 @@ def measured(request: pytest.FixtureRequest) -> dict[str, Any]:
         if run.returncode == 0:
             found: dict[str, Any] = json.loads(run.stdout)
             return found
-        assert "disturbed: " in run.stderr, run.stderr
+        assert "the daemon went to" in run.stderr, run.stderr
     pytest.fail("the daemon lost its amplifier every time: leave the machine alone, then try again")
 
 

@@ -79,7 +79,7 @@ def test_a_case_that_failed_leaves_the_rest_of_the_report(tmp_path: Path) -> Non
     rows = [line for line in page.splitlines() if line.startswith("|")]
     assert {row.count("|") for row in rows} == {HEAD_CELLS + 1}
     assert [row.split("|")[1].strip() for row in rows[2:]] == [case.name for case in CASES]
-    assert "each time: COMM_LOST in a hurry; then: FAULT again." in page
+    assert "**No figures of *taps, loaded***: COMM_LOST in a hurry; then: FAULT again." in page
     assert "--seconds 4 --seed 2" in page
     assert (tmp_path / "pictures" / "latency.png").stat().st_size > 10_000
 

@@ -1,6 +1,7 @@
 """`era witness`: stand in the wires of amplifiers, or read a capture, and say what is wrong."""
 
 import json
+import math
 import sys
 from contextlib import ExitStack
 from pathlib import Path
@@ -51,10 +52,20 @@ def witness(
     from sim.witness.place import place_of
     from sim.witness.witness import Witness
 
-    limits: dict[str, Any] = {"frequency_hz": _band(frequency), "level": level}
+    limits: dict[str, Any] = {
+        "frequency_hz": _band(frequency),
+        "level": _in_range("--level", level, least=0.0, most=1.0, unit="of full stroke"),
+    }
     if slew is not None:
-        limits["slew_per_s"] = slew
+        limits["slew_per_s"] = _in_range("--slew", slew, least=0.0, unit="of full stroke a second")
+    slack = _in_range("--slack", slack, least=0.0, unit="ms")
+    if replay is not None and record is not None:
+        raise InputError(
+            "--record writes what passes a wire, and with --replay nothing passes one: leave out "
+            "one of the two"
+        )
     places = [place_of(url) for url in urls]
+    _check_apart(places)
     wires = {place: f"wire{n}" for n, place in enumerate(dict.fromkeys(p.place for p in places), 1)}
     plan = {
         "wires": {wires[place.place]: place.kind for place in places},
@@ -88,8 +99,37 @@ def _band(text: str) -> list[float]:
     try:
         low, high = (float(part) for part in text.split(","))
     except ValueError:
-        raise InputError(f"--frequency {text!r} is not LOW,HIGH in Hz, as in 40,500") from None
+        low = high = math.nan
+    if not 0 <= low <= high < math.inf:
+        raise InputError(f"--frequency {text!r} is not LOW,HIGH in Hz, as in 40,500")
     return [low, high]
+
+
+def _in_range(
+    option: str, given: float, *, least: float, most: float = math.inf, unit: str
+) -> float:
+    if not least <= given <= most or math.isinf(given):
+        to = "or more" if math.isinf(most) else f"to {most:g}"
+        raise InputError(f"{option} {given:g} is out of range; write {least:g} {to}, {unit}")
+    return given
+
+
+def _check_apart(places: list["Place"]) -> None:
+    """That no two URLs mean one amplifier, or one wire in two ways."""
+    for number, place in enumerate(places):
+        for other in places[:number]:
+            if place.place != other.place:
+                continue
+            if place.kind != other.kind:
+                raise InputError(
+                    f"{other.url} and {place.url} are one wire in two ways, {other.kind} and "
+                    f"{place.kind}; give the URL of the way that is spoken there"
+                )
+            if place.address == other.address:
+                raise InputError(
+                    f"{other.url} and {place.url} are one amplifier, number {place.address}; give "
+                    "each once, and by the number that it has on the wire"
+                )
 
 
 def _opened(path: Path) -> Any:
@@ -103,16 +143,21 @@ def _replay(path: Path, seen: "Witness") -> list["Violation"]:
     from sim.witness.capture import read_capture
 
     end = None
-    for piece in read_capture(path):
-        if piece.wire not in seen.wires:
-            raise InputError(
-                f"{path} has bytes of {piece.wire}; the URLs given are {', '.join(seen.wires)}"
-            )
+    for piece in read_capture(path, wires=seen.wires):
         seen.bytes(piece.wire, piece.toward, piece.time, piece.data)
         end = piece.time
     if end is None:
-        raise InputError(f"{path} holds no bytes at all")
-    return seen.finish(end)
+        raise InputError(
+            f"{path} holds no bytes at all; a capture has a line TIME WIRE > HEX for each piece of "
+            "them, as --record writes it"
+        )
+    found = seen.finish(end)
+    if not seen.frames:
+        raise InputError(
+            f"in the bytes of {path} is not one frame, so nothing was checked; give URLs of the "
+            "kind of wire from which the capture is"
+        )
+    return found
 
 
 def _stand_in(

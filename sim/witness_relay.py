@@ -7,6 +7,7 @@ hand them over twice.
 
 import asyncio
 import contextlib
+import logging
 import os
 import time
 from collections.abc import AsyncIterator, Callable, Sequence
@@ -22,6 +23,8 @@ from sim.witness.seen import Toward
 from sim.witness.witness import Witness
 
 _READ_MAX = 4096
+
+_logger = logging.getLogger(__name__)
 
 
 @asynccontextmanager
@@ -117,7 +120,13 @@ async def _network(
             _, back = await loop.create_connection(
                 lambda: _Half("host", shown, lambda _: None, lambda _: None), host, int(number)
             )
-        except OSError:
+        except OSError as problem:
+            _logger.warning(
+                "%s takes no connection (%s), so whoever comes to the relay is hung up on: is the "
+                "amplifier switched on, and its URL right?",
+                place.place,
+                problem.strerror or problem,
+            )
             front.hang_up()
             return
         back.meet(front)

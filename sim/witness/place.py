@@ -13,6 +13,15 @@ _KINDS = {
     "can+slcan": "slcan",
 }
 _BAUD = {"serial": 921_600, "modbus-rtu": 115_200, "slcan": 115_200}
+# Of amplifiers, as docs/wire-*.md have them; over TCP 255 is whoever is alone.
+_NUMBERS = {
+    "serial": range(1, 248),
+    "modbus-tcp": range(1, 256),
+    "modbus-rtu": range(1, 248),
+    "socketcand": range(1, 64),
+    "slcan": range(1, 64),
+}
+_PORTS = range(1, 65536)
 _URL = re.compile(
     r"(?P<scheme>[a-z+]+)://(?P<place>/[^?#]*|[^/?#]+)(?P<path>/[^?#]*)?(?P<query>\?[^#]*)?"
     r"(?P<fragment>#.*)?"
@@ -55,9 +64,19 @@ def place_of(url: str) -> Place:
         number = (found["path"] or "/1")[1:]
     else:
         number = (found["fragment"] or "#1")[1:]
-    speed = options.get("baud", str(_BAUD.get(kind, 0)))
-    if not (number.isdecimal() and speed.isdecimal()):
-        raise InputError(f"{url}: the number of the amplifier, or the speed, is no whole number")
-    if not (found["place"].startswith("/") or found["place"].rpartition(":")[2].isdecimal()):
-        raise InputError(f"{url}: {found['place']} is neither a device nor HOST:PORT")
-    return Place(url, kind, found["place"], int(number), int(speed))
+    place, speed = found["place"], options.get("baud", str(_BAUD.get(kind, 0)))
+    if not (number.isdecimal() and int(number) in _NUMBERS[kind]):
+        among = _NUMBERS[kind]
+        raise InputError(
+            f"{url}: {number!r} is no number of an amplifier; on this kind of wire they go from "
+            f"{among[0]} to {among[-1]}"
+        )
+    if not speed.isdecimal():
+        raise InputError(f"{url}: baud {speed!r} is no whole number of bit/s, as in baud=115200")
+    port = place.rpartition(":")[2]
+    if not (place.startswith("/") or (port.isdecimal() and int(port) in _PORTS)):
+        raise InputError(
+            f"{url}: {place} is neither a device, as in /dev/ttyUSB0, nor HOST:PORT with a port of "
+            f"{_PORTS[0]} to {_PORTS[-1]}"
+        )
+    return Place(url, kind, place, int(number), int(speed))

@@ -64,8 +64,9 @@ def test_a_capture_with_a_fault_does_not(tmp_path: Path) -> None:
         ("0.1 wire1 = 00\n", "line 1"),
         ("0.2 wire1 > 00\n0.1 wire1 > 00\n", "line 2"),
         ("nan wire1 > 00\n", "line 1"),
-        ("0.1 other > 00\n", "other"),
-        ("\udcff", "cannot be read"),
+        ("# begin\n0.1 wire1 > 00\n0.1 other > 00\n", "line 3: 'other' is none of the wires"),
+        ("0.1 wire1 > 00\n\udcff\n", "line 2"),
+        ("0.1 wire1 > 00 04\n", "not one frame"),
     ],
 )
 def test_what_is_no_capture_is_refused(tmp_path: Path, text: str, named: str) -> None:
@@ -75,6 +76,40 @@ def test_what_is_no_capture_is_refused(tmp_path: Path, text: str, named: str) ->
     result = CliRunner().invoke(app, ["witness", URL, "--replay", str(capture)])
     assert isinstance(result.exception, InputError)
     assert named in str(result.exception)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (["--frequency", "500,40"], "--frequency '500,40'"),
+        (["--frequency", "nan,40"], "--frequency 'nan,40'"),
+        (["--level", "7"], "--level 7"),
+        (["--level", "nan"], "--level nan"),
+        (["--slew", "-1"], "--slew -1"),
+        (["--slack", "-4"], "--slack -4"),
+        (["--slack", "inf"], "--slack inf"),
+        (["--replay", "missing.txt"], "missing.txt: no such file"),
+        (["--replay", "."], "Is a directory"),
+        ([f"{URL}?address=1"], "one amplifier, number 1"),
+        (["modbus+rtu:///dev/ttyUSB0"], "one wire in two ways, serial and modbus-rtu"),
+    ],
+)
+def test_what_cannot_be_witnessed_is_said(
+    arguments: list[str], named: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The option, the file or the URLs are named before anything is opened."""
+    monkeypatch.chdir(tmp_path)
+    result = CliRunner().invoke(app, ["witness", URL, *arguments])
+    assert isinstance(result.exception, InputError)
+    assert named in str(result.exception)
+
+
+def test_a_capture_is_not_written_over_while_it_is_read(tmp_path: Path) -> None:
+    """To record what is replayed is refused, and the capture is what it was."""
+    status, said = _replay(tmp_path, SESSION, "--record", str(tmp_path / "capture.txt"))
+    assert status == 2
+    assert "leave out one" in said
+    assert (tmp_path / "capture.txt").read_text(encoding="utf-8") == SESSION
 
 
 def test_a_capture_is_read_as_it_was_written(tmp_path: Path) -> None:

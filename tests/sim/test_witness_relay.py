@@ -1,6 +1,7 @@
 """A relay in every real wire: the host notices nothing, and the witness sees it all."""
 
 import asyncio
+import socket
 from typing import Any
 
 import pytest
@@ -89,3 +90,36 @@ def test_urls_that_lead_to_no_wire_are_refused(url: str) -> None:
     """What a relay cannot stand in is said in one sentence."""
     with pytest.raises(InputError, match=r"URL|HOST:PORT"):
         place_of(url)
+
+
+@pytest.mark.parametrize(
+    ("url", "named"),
+    [
+        ("serial:///dev/ttyUSB0?address=300", "1 to 247"),
+        ("modbus+tcp://127.0.0.1:502/0", "1 to 255"),
+        ("can+slcan:///dev/ttyACM0#64", "1 to 63"),
+        ("modbus+rtu:///dev/ttyS1#two", "'two'"),
+        ("serial:///dev/ttyUSB0?baud=fast", "'fast'"),
+        ("modbus+tcp://127.0.0.1:99999/1", "1 to 65535"),
+    ],
+)
+def test_numbers_that_none_can_have_are_refused(url: str, named: str) -> None:
+    """Who watches for an amplifier that cannot be there would find nothing wrong with it."""
+    with pytest.raises(InputError) as refused:
+        place_of(url)
+    assert url in str(refused.value)
+    assert named in str(refused.value)
+
+
+async def test_a_relay_before_nobody_says_so(caplog: pytest.LogCaptureFixture) -> None:
+    """Whoever comes is hung up on, and the wire that takes no connection is named."""
+    with socket.socket() as bound:  # and nobody listens there
+        bound.bind(("127.0.0.1", 0))
+        url = f"modbus+tcp://127.0.0.1:{bound.getsockname()[1]}/1"
+        async with relays([place_of(url)], ["line"], _witness(url, level=0.5)) as (end,):
+            host, _, port = place_of(end).place.rpartition(":")
+            reader, writer = await asyncio.open_connection(host, int(port))
+            assert await reader.read() == b""
+            writer.close()
+    (record,) = caplog.records
+    assert place_of(url).place in record.getMessage()

@@ -113,9 +113,11 @@ class ModbusBackend(WireBackend):
     async def close(self) -> None:
         """Leave the line; the last one closes it."""
         link, self._link = self._link, None
-        if link is not None:
-            link.leave(self._url.unit)
-        self._sole_host.release()
+        try:
+            if link is not None:
+                await link.leave(self._url.unit)
+        finally:  # also where this is cancelled
+            self._sole_host.release()
 
     async def exchange(self, request: Request, *, timeout: float) -> Reply:
         """Send a request and wait for its reply; LinkTimeout, LinkError or FrameError.

@@ -13,8 +13,9 @@ from weakref import WeakKeyDictionary
 from drivers import clock
 from drivers.backends.line_turns import LineTurns
 from drivers.backends.modbus_frames import Answer, AnswerReader, Telegram, make_telegram
-from drivers.backends.modbus_stream import Stream, open_stream
+from drivers.backends.modbus_stream import open_stream
 from drivers.backends.modbus_url import ModbusUrl
+from drivers.backends.stand_in import Port
 from drivers.backends.waiting import reply_within
 from drivers.errors import LinkError, LinkTimeout
 from drivers.protocol.definition import PROTOCOL
@@ -41,8 +42,8 @@ class ModbusLink:
         self.line = line
         self.counters = WireCounters()
         self.last_sent = 0.0
-        self._stream: Stream | None = None
-        self._opening = asyncio.Lock()
+        self._stream: Port | None = None
+        self._changing = asyncio.Lock()  # held while the line is opened or closed
         self._turns = LineTurns()
         self._reader = AnswerReader(is_rtu=line.is_rtu, counters=self.counters)
         self._users: dict[int, Callable[[str], None]] = {}  # by their units
@@ -68,9 +69,11 @@ class ModbusLink:
         Raises LinkError, also for a unit that this program has open already.
         """
         links = _links.setdefault(asyncio.get_running_loop(), {})
-        link = links.get(line)
+        before = link = links.get(line)
         if link is None or link._loss is not None:
             link = links[line] = cls(line)
+            if before is not None:
+                link._changing = before._changing
         if unit in link._users:
             raise LinkError(
                 f"unit {unit} on {line.place}: this program has it open already; give every "
@@ -78,26 +81,33 @@ class ModbusLink:
             )
         link._users[unit] = on_loss
         try:
-            async with link._opening:
+            async with link._changing:
+                if before is not None and before is not link:
+                    await before._close()
                 if link._stream is None:
                     link._stream = await open_stream(line, link._received, link._lost)
         except BaseException:
-            link.leave(unit)
+            await link.leave(unit)
             raise
         return link
 
-    def leave(self, unit: int) -> None:
+    async def leave(self, unit: int) -> None:
         """Use it no more; safe to call twice."""
         self._users.pop(unit, None)
         if self._users:
             return
         self._lose(f"{self.line.place} was closed")
+        async with self._changing:  # who comes meanwhile waits until the line is free
+            await self._close()
         links = _links.get(asyncio.get_running_loop(), {})
-        if links.get(self.line) is self:
+        if links.get(self.line) is self and not self._users:
             del links[self.line]
+
+    async def _close(self) -> None:
         stream, self._stream = self._stream, None
         if stream is not None:
             stream.close()
+            await stream.wait_closed()
 
     async def transact(
         self,

@@ -1,26 +1,20 @@
-"""The bytes of a Modbus line, both ways: a TCP connection or a serial port.
-
-A serial port is read by the event loop itself; loops that cannot (those of Windows) have TCP only.
-"""
+"""The bytes of a Modbus line, both ways: a TCP connection or a serial port."""
 
 import asyncio
 import contextlib
-import errno
 import os
 from collections.abc import Callable
-from typing import Protocol, cast
+from typing import cast
 
 import serial
 
 from drivers.backends.modbus_url import ModbusUrl
-from drivers.backends.serial_write import write_all
-from drivers.backends.stand_in import STAND_IN
+from drivers.backends.stand_in import STAND_IN, Port
+from drivers.backends.watched_port import READ_TIMEOUT, WRITE_TIMEOUT, WatchedPort, remedy_of
 from drivers.errors import LinkError, LinkTimeout
 
 _CONNECT_TIMEOUT = 1.0  # s; an amplifier in the same building answers a hundred times faster
-_WRITE_TIMEOUT = 0.02  # s; a frame fits into any driver's buffer unless the line is stuck
 _UNSENT_MAX = 4096  # bytes; sixteen frames that a peer does not take are no slow network any more
-_READ_MAX = 4096
 _FAILURES: tuple[type[Exception], ...] = (OSError, ValueError)  # of pyserial, at opening
 with contextlib.suppress(ImportError):  # Windows has no terminals
     import termios
@@ -28,19 +22,9 @@ with contextlib.suppress(ImportError):  # Windows has no terminals
     _FAILURES += (termios.error,)
 
 
-class Stream(Protocol):
-    """An open line. What it reads, and once why it was lost, goes to who opened it."""
-
-    def write(self, data: bytes) -> None:
-        """Send bytes; LinkTimeout where the line takes no more, LinkError where it is gone."""
-
-    def close(self) -> None:
-        """Close it; nothing is told any more."""
-
-
 async def open_stream(
     line: ModbusUrl, on_data: Callable[[bytes], None], on_loss: Callable[[str], None]
-) -> Stream:
+) -> Port:
     """Open a line; LinkError says what to do about one that cannot be opened."""
     if line.device:
         return await _open_serial(line, on_data, on_loss)
@@ -87,10 +71,13 @@ class _Connection(asyncio.Protocol):
         if self._transport is not None:
             self._transport.abort()  # nothing that waits to be sent shall arrive later
 
+    async def wait_closed(self) -> None:
+        """Nothing is left to be waited for."""
+
 
 async def _connect(
     line: ModbusUrl, on_data: Callable[[bytes], None], on_loss: Callable[[str], None]
-) -> Stream:
+) -> Port:
     loop = asyncio.get_running_loop()
     try:
         async with asyncio.timeout(_CONNECT_TIMEOUT):
@@ -110,72 +97,9 @@ async def _connect(
     return connection
 
 
-class _SerialPort:
-    """A serial port that the event loop reads."""
-
-    def __init__(
-        self,
-        port: serial.Serial,
-        name: str,
-        on_data: Callable[[bytes], None],
-        on_loss: Callable[[str], None],
-    ) -> None:
-        self._port = port
-        self._name = name
-        self._on_data = on_data
-        self._on_loss = on_loss
-        self._loop = asyncio.get_running_loop()
-        self._descriptor: int | None = port.fileno()
-        self._loop.add_reader(port.fileno(), self._readable)
-
-    def write(self, data: bytes) -> None:
-        if self._descriptor is None:
-            raise LinkError(f"serial port {self._name} is closed")
-        try:
-            write_all(self._port, data)
-        except serial.SerialTimeoutException:
-            raise LinkTimeout(
-                f"{self._name} takes no more bytes; check flow control and the adapter"
-            ) from None
-        except OSError as problem:
-            raise LinkError(self._lost(str(problem))) from problem
-
-    def close(self) -> None:
-        if self._descriptor is None:
-            return
-        self._loop.remove_reader(self._descriptor)
-        self._descriptor = None
-        with contextlib.suppress(OSError):
-            self._port.close()
-
-    def _readable(self) -> None:
-        if self._descriptor is None:
-            return
-        try:
-            data = os.read(self._descriptor, _READ_MAX)
-        except BlockingIOError:
-            return
-        except OSError as problem:
-            self._lost(str(problem))
-            return
-        if data:
-            self._on_data(data)
-        else:
-            self._lost("the adapter is gone")
-
-    def _lost(self, why: str) -> str:
-        what = (
-            f"serial line {self._name} was lost ({why}): check the cable and the adapter, then "
-            "open the amplifier again"
-        )
-        self.close()
-        self._on_loss(what)
-        return what
-
-
 async def _open_serial(
     line: ModbusUrl, on_data: Callable[[bytes], None], on_loss: Callable[[str], None]
-) -> Stream:
+) -> Port:
     stand_in = STAND_IN.get()
     if stand_in is not None:
         return await stand_in.open_port(line.device, on_data=on_data, on_loss=on_loss)
@@ -183,14 +107,7 @@ async def _open_serial(
         port = await asyncio.to_thread(_open_port, line)
     except _FAILURES as problem:
         raise LinkError(_why_not_open(line.device, problem)) from problem
-    try:
-        return _SerialPort(port, line.device, on_data, on_loss)
-    except (NotImplementedError, OSError) as problem:
-        port.close()
-        raise LinkError(
-            f"this system cannot wait for serial port {line.device}; reach the amplifier by "
-            "modbus+tcp:// or through a serial server, modbus+rtu://HOST:PORT#UNIT"
-        ) from problem
+    return WatchedPort(port, line.device, on_data, on_loss)
 
 
 def _open_port(line: ModbusUrl) -> serial.Serial:
@@ -201,8 +118,8 @@ def _open_port(line: ModbusUrl) -> serial.Serial:
         baudrate=line.baud,
         parity=serial.PARITY_NONE if is_pseudo else line.parity,
         stopbits=line.stop,
-        timeout=0,
-        write_timeout=_WRITE_TIMEOUT,
+        timeout=READ_TIMEOUT,
+        write_timeout=WRITE_TIMEOUT,
         exclusive=True,
     )
     port.reset_input_buffer()
@@ -210,16 +127,5 @@ def _open_port(line: ModbusUrl) -> serial.Serial:
 
 
 def _why_not_open(device: str, problem: Exception) -> str:
-    code = getattr(problem, "errno", None)
-    if code == errno.ENOENT:
-        remedy = "there is no such port; plug the adapter in and look at its name in /dev"
-    elif code in (errno.EACCES, errno.EPERM):
-        remedy = (
-            "this user may not use it; add the user to the group that owns the port "
-            "(often dialout: sudo usermod -aG dialout $USER) and log in again"
-        )
-    elif code in (errno.EAGAIN, errno.EBUSY):
-        remedy = "another program has it open; close that one"
-    else:
-        remedy = "check its name, that it is plugged in, its speed and its parity"
+    remedy = remedy_of(problem) or "check its name, that it is plugged in, its speed and its parity"
     return f"serial port {device} cannot be opened: {remedy} (the system says: {problem})"

@@ -369,7 +369,7 @@ async def test_an_echo_of_another_write_is_dropped(place: int) -> None:
         with pytest.raises(LinkTimeout):
             await link.transact(None, Write(8, (99,)), unit=1, timeout=SHORT, accept=lambda _: True)
         assert link.counters.foreign == 2
-        link.leave("test")
+        await link.leave("test")
 
 
 async def test_an_answer_out_of_range_is_refused(far: Peer, backend: ModbusBackend) -> None:
@@ -583,7 +583,7 @@ async def test_a_server_that_is_not_ours_understands_the_frames(framer: FramerTy
     assert (await ask(Read(99, 5))).exception == 2
     assert (await ask(Read(0, 100))).registers[9] == 900
     assert link.counters.bad == link.counters.foreign == 0
-    link.leave("test")
+    await link.leave("test")
     await server.shutdown()
 
 

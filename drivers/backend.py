@@ -66,6 +66,11 @@ class Backend(ABC):
         return None
 
     @property
+    def takes_turns(self) -> bool:
+        """Whether all who share its bus are asked one after the other, and wait for each other."""
+        return False
+
+    @property
     def is_unsent(self) -> bool:
         """Whether nothing of the request that is being exchanged has gone out yet.
 

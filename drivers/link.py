@@ -35,6 +35,15 @@ BUSY_PAUSE = 0.005  # s; before a busy amplifier is asked again: short enough fo
 _ReplyT = TypeVar("_ReplyT", Identity, Capabilities, Status, Achieved, FaultList, Loaded)
 
 
+def retries_on(round_trip: float, *, reply_timeout: float = REPLY_TIMEOUT) -> int:
+    """How often a request is repeated on a wire whose longest exchange takes round_trip [s].
+
+    Once less than else where that, and the amplifier's own delay, take more than the timeout [s].
+    """
+    is_slow = round_trip + PROTOCOL.reaction > reply_timeout
+    return RETRIES - 1 if is_slow else RETRIES
+
+
 @final
 class Link:
     """A backend with its turns, retries, loss and statistics.
@@ -95,8 +104,7 @@ class Link:
 
     def allow_for(self, round_trip: float) -> None:
         """Repeat once less on a wire whose longest exchange [s] takes more than the timeout."""
-        is_slow = round_trip + PROTOCOL.reaction > self._reply_timeout
-        self._retries_allowed = RETRIES - 1 if is_slow else RETRIES
+        self._retries_allowed = retries_on(round_trip, reply_timeout=self._reply_timeout)
 
     def beaten(self) -> None:
         """A heartbeat was answered."""

@@ -10,7 +10,7 @@ from drivers.amplifier import WATCHDOG
 from drivers.backend import Backend
 from drivers.errors import CommandError
 from drivers.registry import open_backend
-from drivers.watchdog import check_watchdog
+from drivers.watchdog import HEARTBEAT, HEARTBEATS_BORNE, check_watchdog, told_after
 
 # s; how far apart commits on two links may arrive although they are sent together: USB adapters
 # send in frames of 1 ms, networks and operating systems are no better. See docs/several-amplifiers.
@@ -43,7 +43,12 @@ def check_links(
         for name, backend in backends.items()
         if channels.get(name) and name not in wrong and not urls[name].startswith("sim://")
     }
-    return wrong, _warnings(sorted(links), frequency_max)
+    used = {
+        name: backend
+        for name, backend in backends.items()
+        if channels.get(name) and name not in wrong
+    }
+    return wrong, [*_apart(sorted(links), frequency_max), *_told_late(used, channels)]
 
 
 def phase_error(frequency: float, apart: float) -> float:
@@ -60,7 +65,27 @@ def contrast_left(frequency: float, apart: float) -> float:
     return max(0.0, -20.0 * math.log10(2.0 * math.sin(phase / 2.0)))
 
 
-def _warnings(links: Sequence[str], frequency_max: float) -> list[str]:
+def _told_late(backends: Mapping[str, Backend], channels: Mapping[str, int]) -> list[str]:
+    """Lines on which a loss cannot be told within three heartbeats, by arithmetic."""
+    lines: dict[str, list[str]] = {}
+    for name, backend in backends.items():
+        lines.setdefault((backend.takes_turns and backend.bus) or name, []).append(name)
+    bound = HEARTBEATS_BORNE * HEARTBEAT
+    warnings = []
+    for names in lines.values():
+        took = told_after(backends[name].round_trip(channels[name]) for name in names)
+        if took > bound:
+            who = f"amplifier {names[0]} falls" if len(names) == 1 else f"{', '.join(names)} fall"
+            warnings.append(
+                f"where {who} silent without the port being lost, that is told after up to "
+                f"{took * 1e3:.0f} ms instead of {HEARTBEATS_BORNE} heartbeats, {bound * 1e3:.0f} "
+                "ms, for so long the wire may take to ask again; the watchdog silences all the "
+                "same: use a faster line, or one for each amplifier, if that is too late"
+            )
+    return warnings
+
+
+def _apart(links: Sequence[str], frequency_max: float) -> list[str]:
     if len(links) < 2:
         return []
     low = 100.0

@@ -1,6 +1,13 @@
-"""How short a watchdog the wire allows, worked out when a configuration is read."""
+"""What the wire allows: how short a watchdog, and how soon a loss is told of.
+
+Worked out when a configuration is read.
+"""
+
+from collections.abc import Iterable
 
 from drivers.errors import CommandError
+from drivers.link import REPLY_TIMEOUT, retries_on
+from drivers.protocol.definition import PROTOCOL
 from drivers.registry import open_backend
 
 HEARTBEAT = 0.05  # s; the control loop's own
@@ -34,3 +41,16 @@ def check_watchdog(watchdog: float, round_trip: float, *, heartbeat: float = HEA
             f"{heartbeat * 1e3:g} ms and a round trip of {round_trip * 1e3:.1f} ms need at least "
             f"{shortest * 1e3:.0f} ms; lengthen it, or use a faster line"
         )
+
+
+def told_after(round_trips: Iterable[float], *, heartbeat: float = HEARTBEAT) -> float:
+    """How long [s] it takes at most until amplifiers on one line that fall silent count as lost.
+
+    All of them at once, right after an answer, and each is asked for a set next: one after the
+    other, as often as `drivers.link` repeats it. round_trips [s]: of the longest exchange with
+    each, see `round_trip_of`.
+    """
+    return heartbeat + sum(
+        (1 + retries_on(round_trip)) * max(REPLY_TIMEOUT, round_trip + PROTOCOL.reaction)
+        for round_trip in round_trips
+    )

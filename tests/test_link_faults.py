@@ -26,7 +26,7 @@ from drivers.link import REPLY_TIMEOUT as USUAL_TIMEOUT
 from drivers.protocol.messages import Event, Fault, State
 from drivers.registry import open_backend
 from drivers.supervision import reopen
-from drivers.watchdog import HEARTBEAT, HEARTBEATS_BORNE
+from drivers.watchdog import HEARTBEAT, HEARTBEATS_BORNE, told_after
 from memory_machine import MemoryMachine
 from model.rig.rig import Rig
 from sim.far_ends.wires import Wire
@@ -219,6 +219,32 @@ def test_an_amplifier_that_is_silent_is_told_within_three_heartbeats(
             with pytest.raises(LinkError):
                 await beat_on(host.amplifier)
             assert clock.now() - hung <= HEARTBEATS_BORNE * HEARTBEAT
+
+    in_virtual_time(name, coarse_rig, use)
+
+
+@pytest.mark.parametrize("name", [*WIRES, *SLOW_WIRES])
+def test_a_loss_in_the_middle_of_a_set_is_told_as_soon_as_the_rig_check_says(
+    name: str, coarse_rig: Rig
+) -> None:
+    """Right after an answer it hangs, and four channels are asked of it next: within the time by
+    arithmetic, which is three heartbeats except at 19 200 Bd, where it takes longer indeed."""
+
+    async def use(host: Link) -> None:
+        bound = told_after([host.amplifier.round_trip()])
+        is_late = name == "modbus+rtu, 19 200 baud"
+        assert (bound > HEARTBEATS_BORNE * HEARTBEAT) == is_late
+        for _ in range(5):
+            await host.again()
+            host.far.station.befall(Episode("hang"))
+            hung = clock.now()
+            await asyncio.sleep(HEARTBEAT)
+            commands = tuple(DriveCommand(channel, 110.0, 0.2) for channel in range(4))
+            wanted = CommandSet(host.amplifier.next_token(), commands, ramp=0.0, valid_for=0.0)
+            with pytest.raises(LinkError):
+                await host.amplifier.apply(host.guard.check(wanted))
+            assert clock.now() - hung <= bound
+            assert (clock.now() - hung > HEARTBEATS_BORNE * HEARTBEAT) == is_late
 
     in_virtual_time(name, coarse_rig, use)
 

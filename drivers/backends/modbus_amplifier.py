@@ -92,6 +92,11 @@ class ModbusBackend(WireBackend):
         return loading_time(knots, baud=self._url.baud, bits_per_byte=bits)
 
     @property
+    def takes_turns(self) -> bool:
+        """One answer at a time is on the line."""
+        return True
+
+    @property
     def is_unsent(self) -> bool:
         """Whether what is asked waits for others, or for the line to be silent."""
         return self._link is not None and self._link.is_unsent(self._url.unit)

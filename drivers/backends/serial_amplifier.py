@@ -78,6 +78,11 @@ class SerialBackend(WireBackend):
         return loading_time(knots, baud=self._url.baud) if self._url.is_local else 0.0
 
     @property
+    def takes_turns(self) -> bool:
+        """One answer at a time is on the line."""
+        return True
+
+    @property
     def is_unsent(self) -> bool:
         """Whether what is asked waits for others on the line."""
         return self._line is not None and self._line.turns.is_unsent(self._url.address)

@@ -48,13 +48,42 @@ def test_two_amplifiers_of_one_address_are_named() -> None:
 def test_only_ERAs_on_several_links_are_warned_of() -> None:  # noqa: N802
     """One bus, one link, or another link without ERAs: nothing. Two links: the numbers of both."""
     assert checked(f"{BUS}#1", f"{BUS}#5") == ({}, [])
-    assert checked("serial:///dev/ttyUSB0?address=1", "serial:///dev/ttyUSB0?address=2") == ({}, [])
+    assert checked("modbus+tcp://host/1", "sim://rig.yaml") == ({}, [])
     urls = {"a": "serial:///dev/ttyUSB0", "b": f"{BUS}#1"}
     assert check_links(urls, channels={"a": 4}, frequency_max=250.0) == ({}, [])
     wrong, (warning,) = check_links(urls, channels={"a": 2, "b": 2}, frequency_max=250.0)
     assert wrong == {}
     assert "2 links (/dev/ttyUSB0, can+socketcan://can0)" in warning
     assert "36 degrees out of phase at 100 Hz and 90 at 250 Hz" in warning
+
+
+@pytest.mark.parametrize(
+    ("urls", "told"),
+    [
+        # 57 + 49 bytes of 11 bits there and back, twice 3.5 characters of silence (Modbus over
+        # serial line), 10 ms for the amplifier's answer to begin: 74.7 ms, asked twice.
+        (["modbus+rtu:///dev/ttyS1?baud=19200#1"], ["199 ms"]),
+        (["modbus+rtu:///dev/ttyS1?baud=115200#1"], []),
+        (["serial:///dev/ttyUSB0"], []),
+        # Three times 30 ms each, after a heartbeat of 50 ms.
+        (["serial:///dev/ttyUSB0?address=1", "serial:///dev/ttyUSB0?address=2"], ["230 ms"]),
+        (["serial:///dev/ttyUSB0", "modbus+tcp://host/1"], []),
+        (["modbus+tcp://host/1", "modbus+tcp://host/2", "modbus+tcp://host/3"], ["320 ms"]),
+        ([f"{BUS}#1", f"{BUS}#5"], []),  # each is missed by its own heartbeats
+    ],
+)
+def test_what_cannot_be_told_within_three_heartbeats_is_warned_of(
+    urls: list[str], told: list[str]
+) -> None:
+    """A line that is too slow for its sets, and several that are asked one after the other: with
+    how long it may take, in one line each; by hand."""
+    wrong, warnings = checked(*urls, channels=4)
+    assert wrong == {}
+    late = [warning for warning in warnings if "3 heartbeats, 150 ms" in warning]
+    assert len(late) == len(told)
+    for warning, time in zip(late, told, strict=True):
+        assert f"told after up to {time}" in warning
+        assert "\n" not in warning
 
 
 def test_what_skew_costs_is_arithmetic() -> None:

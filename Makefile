@@ -7,8 +7,8 @@ PYTHON ?= $(shell for python in $(PYTHONS); do \
 BIN := .venv/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet --editable
 
-.PHONY: demo test lint format docs fuzz soak bench bench-latency bench-localization bench-plant \
-	bench-wires clean
+.PHONY: demo test lint format docs fuzz kill-test fault-test soak bench bench-latency \
+	bench-localization bench-plant bench-wires dist smoke smoke-lowest sbom licences clean
 .NOTPARALLEL:
 
 demo: .venv/installed
@@ -68,8 +68,36 @@ docs: .venv/installed-docs
 	$(BIN)/sphinx-build -b html -W --keep-going -q docs docs/_build/html
 	@echo "Next: open docs/_build/html/index.html"
 
+# The same bytes for the same sources, wherever and whenever; from a clean checkout.
+dist: .venv/installed-release
+	rm -rf dist
+	$(BIN)/python -m build --outdir dist .
+
+# The wheel alone, in a clean environment for each of python3.11 to python3.14 that is found.
+# Others: make smoke SMOKE='--python /path/to/python3.13'
+smoke: dist
+	$(BIN)/python tests/support/smoke.py dist/*.whl $(SMOKE)
+
+# The same with the lowest version of every dependency that its bound allows.
+smoke-lowest: dist
+	$(BIN)/python tests/support/smoke.py dist/*.whl --python python3.11 --lowest $(SMOKE)
+
+# What comes with the wheel, as CycloneDX: dist/sbom.json of the plain installation, and
+# dist/sbom-extras.json with those extras that users install.
+sbom: dist
+	for extras in '' '-extras'; do \
+		rm -rf out/clean && $(PYTHON) -m venv out/clean && \
+		out/clean/bin/python -m pip install -qq "$$(ls dist/*.whl)$${extras:+[gateway,cluster]}" && \
+		out/clean/bin/python -m pip uninstall -qq --yes pip setuptools && \
+		$(BIN)/cyclonedx-py environment --output-reproducible --validate \
+			-o dist/sbom$$extras.json out/clean || exit 1; \
+	done
+
+licences: sbom
+	$(BIN)/python tests/support/licences.py dist/sbom.json dist/sbom-extras.json > docs/licences.md
+
 clean:
-	rm -rf .venv docs/_build .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache out
+	rm -rf .venv dist docs/_build .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache out
 
 # A half-made environment is taken away, or the next run would take it for a whole one.
 $(BIN)/python:
@@ -89,6 +117,10 @@ $(BIN)/python:
 
 .venv/installed-docs: $(BIN)/python pyproject.toml
 	$(PIP) '.[docs]'
+	touch $@ .venv/installed
+
+.venv/installed-release: $(BIN)/python pyproject.toml
+	$(PIP) '.[release]'
 	touch $@ .venv/installed
 
 .venv/installed-peers: $(BIN)/python pyproject.toml

@@ -1,0 +1,166 @@
+"""What is built to be installed: the same every time, complete, nothing besides, and it works."""
+
+import re
+import subprocess
+import sys
+import sysconfig
+import tarfile
+import zipfile
+from configparser import ConfigParser
+from pathlib import Path
+
+import pytest
+
+from installed_era import InstalledEra, try_files
+from licences import NOTES
+from smoke import lowest, requirements
+
+ROOT = Path(__file__).parents[1]
+PACKAGES = ("controller", "drivers", "era_haptics", "model", "sim")
+
+# Of the sources: what is neither a program nor made by one.
+DATA = re.compile(r"\.(py|typed|yaml|csv|js|css|html|svg)$")
+
+
+def build(target: str, root: Path, folder: Path) -> Path:
+    """The wheel or the sdist of the sources in root."""
+    command = [sys.executable, "-m", "hatchling", "build", "--target", target, "-d", str(folder)]
+    subprocess.run(command, cwd=root, capture_output=True, check=True)
+    return next(folder.glob("*.whl" if target == "wheel" else "*.tar.gz"))
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Built from the checkout."""
+    return build("wheel", ROOT, tmp_path_factory.mktemp("wheel"))
+
+
+@pytest.fixture(scope="module")
+def sdist(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Built from the checkout."""
+    return build("sdist", ROOT, tmp_path_factory.mktemp("sdist"))
+
+
+def test_wheel_holds_the_sources_and_their_data(wheel: Path) -> None:
+    """Every module, page and data file of the packages, what examples lend, and nothing else."""
+    with zipfile.ZipFile(wheel) as archive:
+        names = set(archive.namelist())
+    made = {name for name in names if ".dist-info/" in name}
+    lent = {"model/data/paper_plate.yaml", "controller/data/touches.tuio"}
+    sources = {
+        path.relative_to(ROOT).as_posix()
+        for package in PACKAGES
+        for path in (ROOT / package).rglob("*.*")
+        if "__pycache__" not in path.parts
+    }
+    assert names - made == sources | lent
+    assert [name for name in sources if not DATA.search(name)] == []
+    assert {f"{package}/py.typed" for package in PACKAGES} <= names
+    assert {
+        "controller/gateway/page/index.html",
+        "controller/gateway/page/app.js",
+        "controller/gateway/page/style.css",
+        "drivers/protocol/protocol.yaml",
+    } <= names
+    assert {name.partition(".dist-info/")[2] for name in made} == {
+        "METADATA",
+        "RECORD",
+        "WHEEL",
+        "entry_points.txt",
+        "licenses/LICENSE",
+    }
+
+
+def test_entry_points_lead_into_the_wheel(wheel: Path) -> None:
+    """Commands, wires, touch sources and effects are modules that it holds."""
+    with zipfile.ZipFile(wheel) as archive:
+        names = set(archive.namelist())
+        text = next(name for name in names if name.endswith("entry_points.txt"))
+        points = ConfigParser(delimiters="=")
+        points.read_string(archive.read(text).decode("utf-8"))
+    modules = {
+        value.partition(":")[0]
+        for group in points.sections()
+        for value in dict(points[group]).values()
+    }
+    assert len(modules) > 15
+    assert [
+        module
+        for module in sorted(modules)
+        if not names & {f"{module.replace('.', '/')}{end}" for end in (".py", "/__init__.py")}
+    ] == []
+
+
+def test_sdist_makes_the_same_wheel(wheel: Path, sdist: Path, tmp_path: Path) -> None:
+    """Byte for byte, so whoever builds it for a distribution has what the index has."""
+    with tarfile.open(sdist) as archive:
+        archive.extractall(tmp_path, filter="data")
+    root = next(tmp_path.iterdir())
+    again = build("wheel", root, tmp_path / "again")
+    assert again.name == wheel.name
+    assert again.read_bytes() == wheel.read_bytes()
+
+
+def test_sdist_holds_what_is_needed_to_test_and_document_it(sdist: Path) -> None:
+    """No caches and nothing built; tests, pages and examples are there."""
+    with tarfile.open(sdist) as archive:
+        names = {name.partition("/")[2] for name in archive.getnames()}
+    assert {"Makefile", "CHANGELOG.md", "CONTRIBUTING.md", "SECURITY.md", "LICENSE"} <= names
+    assert {"tests/test_wheel.py", "docs/conf.py", "examples/paper_plate.yaml"} <= names
+    unwanted = re.compile(r"(^|/)(_build|dist|out|\.venv|__pycache__|\.[a-z_]+_cache)(/|$)|\.pyc$")
+    assert [name for name in names if unwanted.search(name)] == []
+
+
+def test_it_works_without_the_checkout(wheel: Path, tmp_path: Path) -> None:
+    """What a user types first, from an empty folder, with the wheel and its dependencies alone."""
+    environment, folder = tmp_path / "environment", tmp_path / "empty"
+    folder.mkdir()
+    subprocess.run([sys.executable, "-m", "venv", "--without-pip", environment], check=True)
+    python = environment / "bin" / "python"
+    # The dependencies of the tests' own environment, but not its editable era-haptics: only the
+    # .pth files of an environment's own folder are followed.
+    site = next(environment.glob("lib/python*/site-packages"))
+    (site / "dependencies.pth").write_text(sysconfig.get_path("purelib"), encoding="utf-8")
+    pip = [sys.executable, "-m", "pip", "--disable-pip-version-check", "--python", str(python)]
+    subprocess.run([*pip, "install", "-qq", "--no-deps", "--no-index", str(wheel)], check=True)
+    era = InstalledEra(python, folder)
+    assert era.script("import model; print(model.__file__)").startswith(str(site))
+    assert (
+        Path(
+            era.script(
+                "from controller.demo.run import example_touches_path as path; print(path())"
+            )
+        )
+        .stat()
+        .st_size
+        > 100_000
+    )
+    try_files(era)
+    for name in ("era-amplifier.eds", "era-amplifier.dbc"):
+        assert (folder / name).read_bytes() == (ROOT / "docs" / name).read_bytes()
+
+
+def test_every_dependency_has_a_bound_that_can_be_tried(wheel: Path) -> None:
+    """`make smoke-lowest` pins each to its bound; every one of the plain wheel has one."""
+    pinned = {line.partition("==")[0] for line in lowest(wheel).split()}
+    assert pinned == {
+        one.name
+        for one in requirements(wheel)
+        if one.marker is None or one.marker.evaluate({"extra": "gateway"})
+    }
+
+
+def test_licences_are_told_of_everything_that_is_installed(wheel: Path) -> None:
+    """Each direct dependency of the wheel and its users' extras; copyleft by its name."""
+    page = (ROOT / "docs" / "licences.md").read_text(encoding="utf-8")
+    told = dict(re.findall(r"^\| (\S+) \| \S+ \| ([^|]+) \|", page, re.MULTILINE))
+    told = {re.sub(r"[-_.]+", "-", name).lower(): licence for name, licence in told.items()}
+    users = ("", "gateway", "cluster")
+    needed = {
+        re.sub(r"[-_.]+", "-", one.name).lower()
+        for one in requirements(wheel)
+        if one.marker is None or any(one.marker.evaluate({"extra": extra}) for extra in users)
+    }
+    assert needed - told.keys() == set()
+    assert {name for name, licence in told.items() if licence == "not told"} <= NOTES.keys()
+    assert told["python-can"].startswith("LGPL")

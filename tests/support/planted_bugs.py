@@ -226,8 +226,8 @@ DRIVERS: dict[str, Bug] = {
         "pattern",
         Edit(
             "drivers.protocol.serial_sets:_pack_commands",
-            "(_Q.level, command.level)",
-            "(_Q.level, command.level / 10)",
+            "command.frequency, command.level,",
+            "command.frequency, command.level / 10,",
         ),
     ),
     "integers are sent with the high byte first": _bug(

@@ -12,9 +12,9 @@ from sim.witness.achieved import check_achieved
 from sim.witness.outputs import Outputs
 from sim.witness.plan import AmplifierPlan, Times
 from sim.witness.seen import FEEDING, Answered, Asked, Complain, Condition, Drive, Kind
+from sim.witness.watchdog import Watchdog
 
 SILENCING_RAMP = 0.005  # s; along which the watchdog and faults silence
-_LEFT = 0.003  # s; the same of the watchdog's time
 _REMEMBERED = 16  # tokens since Arm
 _WARM = 60.0  # °C; from here on an amplifier may play less than it was told
 _ENABLED, _STOPPED, _REACTING, _FAULT = 4, 5, 6, 7
@@ -51,7 +51,6 @@ class Follower:
     ) -> None:
         self._name = name
         self._plan = plan
-        self._slack = times.slack
         self._complain = complain
         self._insist = insist
         self.state: int | None = None
@@ -59,9 +58,7 @@ class Follower:
         self._is_reported = True  # the state, by the amplifier itself
         self.is_answered = True  # and in an answer to its host
         self.faulted_at = -math.inf  # when it was seen to go into a fault last
-        self._watchdog = math.inf
-        self._fed = (-math.inf, math.inf)
-        self._fed_before = math.inf
+        self.watchdog = Watchdog(name, slack=times.slack, complain=complain)
         self._seen_at = -math.inf  # when it last said how it is
         self._token: int | None = None
         self._token_before: tuple[int | None, float] = (None, -math.inf)  # and until when it counts
@@ -82,7 +79,7 @@ class Follower:
     def lose_track(self) -> None:
         """What it does now is not known until it says so."""
         self.state = self._token = None
-        self._fed = (-math.inf, math.inf)
+        self.watchdog.forget()
         self._staged = None
         self._outputs.free(math.inf)
 
@@ -96,23 +93,13 @@ class Follower:
     def fed(self, time: float) -> None:
         """Its watchdog was filled."""
         if self.state == _ENABLED:
-            self._fed = (time, time)
-
-    def may_be_fed(self, time: float) -> None:
-        """Something may have filled its watchdog; `was_not_fed` takes that back."""
-        self._fed_before = self._fed[1]
-        self._fed = (self._fed[0], max(self._fed[1], time))
-
-    def was_not_fed(self) -> None:
-        """What may have filled its watchdog was refused."""
-        self._fed = (self._fed[0], self._fed_before)
+            self.watchdog.fed((time, time))
 
     def pass_to(self, time: float) -> None:
         """Let happen what it must have done by itself until now."""
         self._outputs.pass_to(time)
-        if self.state == _ENABLED and time > self._fed[1] + self._watchdog + self._slack:
-            begin = (self._fed[0] + self._watchdog, self._fed[1] + self._watchdog)
-            self._silence(begin, SILENCING_RAMP, "the watchdog")
+        if self.state == _ENABLED and self.watchdog.has_run_out(time):
+            self._silence(self.watchdog.runs_out, SILENCING_RAMP, "the watchdog")
             self.state, self._fault, self._is_reported = _REACTING, 1, False
             self.is_answered = False
             self.faulted_at = time
@@ -124,12 +111,12 @@ class Follower:
         self.pass_to(begin)
         self._check_state_allows(asked, end)
         if asked.kind in FEEDING:
-            self._fed = (begin, end)
+            self.watchdog.fed((begin, end))
         match asked.kind:
             case Kind.ARM:
                 self._silence((begin, end), SILENCING_RAMP, "Arm")
                 self.state, self._fault, self._token = _ENABLED, 0, 0
-                self._watchdog = asked.watchdog
+                self.watchdog.time = asked.watchdog
                 self._played.clear()
             case Kind.DISARM | Kind.STOP:
                 self._stopped(asked, begin, end)
@@ -155,7 +142,7 @@ class Follower:
         self.pass_to(time)
         if self.state is None:
             return
-        self.may_be_fed(time)
+        self.watchdog.may_be_fed(time)
         soon = (time, time + 0.010)  # as an answer would take
         if asked.kind is Kind.STOP:
             self._stopped(asked, *soon)
@@ -184,7 +171,7 @@ class Follower:
         self._silence((begin, end), asked.ramp, asked.kind.value)
         if asked.kind is Kind.STOP:
             if self.state is None:  # it may have been in a fault for long
-                self._fed = (-math.inf, end)
+                self.watchdog.fed((-math.inf, end))
             self.state = self.state if self.state in (_REACTING, _FAULT) else _STOPPED
         elif self.state == _ENABLED:
             self.state = 3
@@ -257,7 +244,7 @@ class Follower:
                 )
             self._token = said.token
         if said.watchdog_left is not None:
-            self._check_left(said, begin, end)
+            self._check_left(said.watchdog_left, said.state, begin, end)
         if said.levels is not None:
             may_be_off = self._may_trip(end)
             self._outputs.check_levels(said.levels, begin, end, may_be_off=may_be_off)
@@ -278,7 +265,7 @@ class Follower:
             self._outputs.rest(NAMES[said.state])
         else:
             self._outputs.free(math.inf)
-            self._fed = (-math.inf, time)
+            self.watchdog.fed((-math.inf, time))
 
     def _check_state(self, said: Condition, begin: float, end: float) -> None:
         here, now = self.state, said.state
@@ -304,17 +291,10 @@ class Follower:
 
     def _check_trip(self, said: Condition, end: float) -> None:
         """A fault of its own, or the watchdog, not before its time."""
-        earliest = self._fed[0] + self._watchdog
         since = (min(self._seen_at, end), end)
         if said.fault == 1:
-            if end < earliest - self._slack:
-                self._complain(
-                    "watchdog",
-                    end,
-                    f"{self._name}'s watchdog ran out {end - self._fed[0]:.4f} s after it was fed, "
-                    f"but it was set to {self._watchdog:g} s",
-                )
-            since = (min(max(earliest, self._seen_at), end), end)
+            self.watchdog.check_trip(end)
+            since = (min(max(self.watchdog.runs_out[0], self._seen_at), end), end)
         elif said.fault == 0:
             self._complain("state", end, f"{self._name} is in {NAMES[said.state]} without a fault")
         self._silence(since, SILENCING_RAMP, "a fault")
@@ -328,26 +308,13 @@ class Follower:
 
     def _what_is_wrong(self, now: int) -> str:
         if not self._is_reported and now == _ENABLED:
-            return (
-                f"{self._name} is still enabled although it was fed last at {self._fed[1]:.4f} s "
-                f"and its watchdog is set to {self._watchdog:g} s"
-            )
+            return f"{self._name} is still enabled although {self.watchdog}"
         return f"{self._name} must be in {self._named()}, but it says {NAMES[now]}"
 
-    def _check_left(self, said: Condition, begin: float, end: float) -> None:
-        left = said.watchdog_left or 0.0
-        if said.state == _ENABLED and self._watchdog < math.inf:
-            low = self._watchdog - (end - self._fed[0]) - _LEFT
-            high = self._watchdog - max(0.0, begin - self._fed[1]) + _LEFT
-            if not low <= left <= high:
-                self._complain(
-                    "watchdog",
-                    end,
-                    f"{self._name} says its watchdog has {left:g} s left; it must be {low:.3f} to "
-                    f"{high:.3f} s, for it was set to {self._watchdog:g} s and fed at "
-                    f"{self._fed[0]:.4f} s",
-                )
-        elif said.state in _OFF and left:
+    def _check_left(self, left: float, state: int, begin: float, end: float) -> None:
+        if state == _ENABLED:
+            self.watchdog.check_left(left, begin, end)
+        elif state in _OFF and left:
             self._complain("watchdog", end, f"{self._name}'s watchdog runs while it is disarmed")
 
     # what it plays
@@ -377,7 +344,7 @@ class Follower:
         check_achieved(self._name, asked, answer, time, is_warm=is_warm, complain=self._complain)
 
     def _may_trip(self, time: float) -> bool:
-        return self.state == _ENABLED and time > self._fed[0] + self._watchdog - self._slack
+        return self.state == _ENABLED and self.watchdog.may_have_run_out(time)
 
     def _named(self) -> str:
         return NAMES[self.state] if self.state is not None else "some state"

@@ -272,7 +272,7 @@ class Witness:
         """What nobody answers: a broadcast, a heartbeat of a host on CAN, a transfer of objects."""
         if asked.kind is Kind.PING and side.follower.state is not None:
             if self._is_troubled(side.plan.wire):
-                side.follower.may_be_fed(time)
+                side.follower.watchdog.may_be_fed(time)
             else:
                 side.follower.fed(time)
         elif asked.kind is Kind.HELLO:
@@ -283,7 +283,7 @@ class Witness:
 
     def _may_feed(self, side: Side, time: float, asked: Asked) -> None:
         if asked.kind in MOVING or asked.kind is Kind.PING:
-            side.follower.may_be_fed(time)
+            side.follower.watchdog.may_be_fed(time)
 
     def _said(self, link: str, wire: _Wire, time: float, meaning: Meaning) -> None:
         """A frame toward the host."""
@@ -314,7 +314,7 @@ class Witness:
 
     def _answered(self, link: str, side: Side, time: float, answer: Answered) -> None:
         if answer.key == "objects":
-            side.follower.may_be_fed(time)
+            side.follower.watchdog.may_be_fed(time)
             return
         if answer.problem == ANSWERS_DAMAGE:
             side.complain("damage", time, f"{side.name} carries out and answers a damaged frame")
@@ -336,7 +336,7 @@ class Witness:
         side.overdue.discard(answer.key)
         if answer.refusal:
             self._host.refused(time, asked)
-            side.follower.was_not_fed()
+            side.follower.watchdog.was_not_fed()
         elif asked.problem:
             rule = "commit" if asked.problem.startswith("torn") else "garbage"
             side.complain(rule, time, f"{side.name} took {asked.kind.value}: {asked.problem}")

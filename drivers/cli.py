@@ -1,6 +1,5 @@
 """The `era amp` commands: talk to one amplifier by hand."""
 
-import asyncio
 import json
 import sys
 from collections.abc import Coroutine
@@ -69,6 +68,8 @@ def discover(
     json_: Json = False,
 ) -> None:
     """List serial ports and CAN interfaces, and the amplifiers that answer on them."""
+    import asyncio
+
     from drivers.discovery import ask, candidates
 
     places = candidates()
@@ -177,6 +178,8 @@ def conformance(
     json_: Json = False,
 ) -> None:
     """Check that an amplifier keeps the contract: looking only, then at its channels if told so."""
+    import asyncio
+
     from drivers.conformance import CHECKS, LEVEL
 
     looking = tuple(check for check in CHECKS if not check.drives)
@@ -220,6 +223,8 @@ async def _conform(url: str, checks: "tuple[Check, ...]", *, quiet: bool) -> "li
 
 
 def _run(result: Coroutine[Any, Any, dict[str, Any]]) -> dict[str, Any]:
+    import asyncio
+
     return asyncio.run(result)
 
 

@@ -1,6 +1,5 @@
 """`era gateway`: the daemon's API and its page in browsers."""
 
-import asyncio
 import os
 import threading
 from pathlib import Path
@@ -49,6 +48,8 @@ def gateway(
 
     Prints the URL to open; it holds the token. An operational interface, no emergency stop.
     """
+    import asyncio
+
     try:
         from controller.api.socket_path import find_socket
         from controller.gateway.serving import serve

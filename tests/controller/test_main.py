@@ -258,17 +258,47 @@ def test_linear_algebra_gets_one_thread_unless_told_otherwise(
         assert good.communicate()[0] == f"number 1 {seen}\n"
 
 
-def test_help_loads_nothing_heavy() -> None:
-    """`era --help` is quick because no numerical library, no drawing and no rich is loaded."""
-    script = (
-        "import sys; sys.argv = ['era', '--help']; from controller.main import main; main(); "
-        "heavy = {'numpy', 'scipy', 'matplotlib', 'pydantic', 'pint', 'yaml', 'rich'}; "
-        "print('heavy:', sorted(heavy & sys.modules.keys()))"
-    )
+LOADED = """
+import contextlib, io, sys
+from importlib.metadata import entry_points, packages_distributions
+from controller.main import _put_together
+from controller.main import run
+
+points = entry_points(group="era_haptics.commands")
+if "all" in sys.argv:
+    def help_of(command, path):
+        yield path
+        for name, part in getattr(command, "commands", {}).items():
+            yield from help_of(part, [*path, name])
+    paths = list(help_of(_put_together(points, debug=True)[0], []))
+else:
+    paths = [[]]
+with contextlib.redirect_stdout(io.StringIO()):
+    assert [run([*path, "--help"], points) for path in paths] == [0] * len(paths)
+heavy = {"asyncio", "ssl", *packages_distributions()}
+print(len(paths), *sorted(heavy & {name.partition(".")[0] for name in sys.modules}))
+"""
+
+
+@pytest.mark.parametrize(
+    ("which", "others"),
+    [
+        ("", set()),
+        # typer describes the options of a command with pydantic where that is installed.
+        ("all", {"asyncio", "ssl", "pydantic", "pydantic_core", "annotated_types"}),
+    ],
+)
+def test_help_loads_nothing_heavy(which: str, others: set[str]) -> None:
+    """Help is quick because of all that is installed it loads our commands and typer alone."""
     done = subprocess.run(
-        [sys.executable, "-c", script], capture_output=True, text=True, check=True
+        [sys.executable, "-c", LOADED, which], capture_output=True, text=True, check=True
     )
-    assert done.stdout.splitlines()[-1] == "heavy: []"
+    count, *loaded = done.stdout.split()
+    assert int(count) == 1 if not which else int(count) > 40
+    ours = {"controller", "drivers", "model", "sim"}
+    typers = {"typer", "annotated_doc", "shellingham", "typing_extensions", "typing_inspection"}
+    of_the_environment = {"_distutils_hack"}  # of setuptools
+    assert set(loaded) - ours - typers - of_the_environment - others == set()
 
 
 def test_every_package_of_the_project_can_be_loaded(

@@ -18,6 +18,7 @@ from model.errors import InputError
 if TYPE_CHECKING:
     from controller.api.client import Client
     from controller.api.messages import StatusResult
+    from controller.api.parts import RigSummary
 
 app = typer.Typer()
 
@@ -85,7 +86,7 @@ def status(socket: Socket = None, as_json: Json = False) -> None:
     """How the daemon, its amplifiers and the plate are."""
     with _client(socket) as era:
         told = era.status()
-    typer.echo(told.model_dump_json() if as_json else _shown(told))
+    typer.echo(told.model_dump_json() if as_json else show_status(told))
 
 
 @app.command()
@@ -152,8 +153,9 @@ def touch(
     """Put fingers on the plate for a while; the last one is felt, the others are kept quiet."""
     from model.config.points import parse_point
 
-    places = [parse_point(text, what="X,Y") for text in at]
+    places = [parse_point(text, what="era touch") for text in at]
     with _client(socket) as era:
+        _check_places(places, era.hello("era").rig)
         era.touch(places, source="era touch")
         end = time.monotonic() + duration
         time.sleep(min(duration, 2 * _REPEAT))
@@ -162,7 +164,7 @@ def touch(
             era.touch(places, source="era touch")
             time.sleep(min(left, _REPEAT))
         era.touch([], source="era touch")
-    typer.echo(told.model_dump_json() if as_json else _shown(told))
+    typer.echo(told.model_dump_json() if as_json else show_status(told))
 
 
 @app.command()
@@ -224,6 +226,16 @@ def _renew(era: "Client", lease: str) -> None:
         raise CommandRefused(f"not armed any more, {told.state}: {told.cause}{remedy}") from error
 
 
+def _check_places(places: "list[tuple[float, float]]", rig: "RigSummary") -> None:
+    """Refuse fingers beyond the plate, which the daemon would only count."""
+    for x, y in places:
+        if not (0 <= x <= rig.length_m and 0 <= y <= rig.width_m):
+            raise InputError(
+                f"era touch {x:g},{y:g} is beyond the plate, which is {rig.length_m:g} m by "
+                f"{rig.width_m:g} m; places count from its south-west corner"
+            )
+
+
 def _tell_state(era: "Client", *, as_json: bool) -> None:
     told = era.status()
     if as_json:
@@ -232,7 +244,7 @@ def _tell_state(era: "Client", *, as_json: bool) -> None:
         typer.echo(f"{told.state}: {told.cause}")
 
 
-def _shown(told: "StatusResult") -> str:
+def show_status(told: "StatusResult") -> str:
     """A status for people to read."""
     lines = [f"{told.state}: {told.cause}"]
     if told.remedy:

@@ -25,13 +25,19 @@ class Unreachable(LinkError):
     @classmethod
     def at(cls, path: Path, error: OSError) -> "Unreachable":
         """With what to do about it."""
+        if path.exists() and not path.is_socket():
+            return cls(f"{path} is no socket; give the one that `era daemon` says it serves at")
         if isinstance(error, FileNotFoundError | ConnectionRefusedError):
-            return cls(f"no daemon runs at {path}; start one with  era daemon CONFIG")
+            return cls(
+                f"no daemon runs at {path}; start one with  era daemon CONFIG , or give the socket "
+                "of the one that runs"
+            )
         if isinstance(error, PermissionError):
             return cls(f"{path} belongs to somebody else; ask whoever runs the daemon")
         if isinstance(error, TimeoutError):
             return cls(f"the daemon at {path} does not answer; see its log, or start it anew")
-        return cls(f"the daemon at {path} is gone ({error}); see its log, or start it anew")
+        why = error.strerror or error
+        return cls(f"the daemon at {path} is gone ({why}); see its log, or start it anew")
 
 
 @dataclass(frozen=True)

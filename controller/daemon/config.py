@@ -8,7 +8,7 @@ from urllib.parse import quote
 from controller.api.socket_path import default_socket
 from controller.daemon.sections import CalibrationSection, DaemonSection, TouchSection
 from controller.effects.layout import Layout, usual_effects
-from controller.effects.layout_file import load_layout
+from controller.effects.layout_file import is_layout_document, load_layout
 from controller.touch import TouchSource
 from controller.touch_calibration import CalibratedSource, TouchCalibration, fitted, turned
 from controller.touch_registry import open_source
@@ -68,6 +68,7 @@ class DaemonConfig:
 def load_daemon_config(path: Path) -> DaemonConfig:
     """Read a daemon's file and the rig that it names; raises ConfigError with every problem."""
     document = read_document(path)
+    _check_kind(document)
     validation = Validation(document, DaemonSection)
     rig_file = _file(document, "rig")
     rig, rig_text = _rig(validation, rig_file)
@@ -78,6 +79,9 @@ def load_daemon_config(path: Path) -> DaemonConfig:
         validation.add(("table",), f"there is no file {table}; check its name and folder")
     layout = _layout(validation, document, rig)
     _check_serial_numbers(validation, rig)
+    log_file = _beside(document, _named(document, "log", "file"))
+    dump_folder = _beside(document, _named(document, "dumps", "folder"))
+    _check_places(validation, log_file, dump_folder)
     validation.finish()
     if rig is None or rig_file is None:  # finish has raised by then
         raise InputError(f"{path}: rig: is missing; add it")
@@ -93,8 +97,8 @@ def load_daemon_config(path: Path) -> DaemonConfig:
         layout=layout,
         touch=touch,
         socket=_file(document, "socket") or default_socket(),
-        log_file=_beside(document, section.log.file),
-        dump_folder=_beside(document, section.dumps.folder if section.dumps else None),
+        log_file=log_file,
+        dump_folder=dump_folder,
     )
 
 
@@ -103,10 +107,30 @@ def is_daemon_document(document: Document) -> bool:
     return "rig" in document.data and "plate" not in document.data
 
 
+def _check_kind(document: Document) -> None:
+    """Refuse another kind of file as a whole, in place of all the keys that it does not know."""
+    if "rig" in document.data:
+        return
+    is_layout = is_layout_document(document)
+    if is_layout or "plate" in document.data:
+        raise InputError(
+            f"{document.source}: is a {'surface layout' if is_layout else 'rig'}, and a daemon's "
+            f"file names it with {'layout' if is_layout else 'rig'}: ; "
+            "era config init daemon.yaml --kind daemon  writes one"
+        )
+
+
 def _file(document: Document, key: str) -> Path | None:
     """A file that a key names, from the folder of the configuration; None for none."""
-    value = document.data.get(key)
-    return _beside(document, value) if isinstance(value, str) and "\0" not in value else None
+    return _beside(document, _named(document, key))
+
+
+def _named(document: Document, *keys: str) -> str | None:
+    """What keys name, section by section; None where it is no file's name."""
+    value: object = document.data
+    for key in keys:
+        value = value.get(key) if isinstance(value, dict) else None
+    return value if isinstance(value, str) and "\0" not in value else None
 
 
 def _beside(document: Document, name: str | None) -> Path | None:
@@ -213,6 +237,21 @@ def _calibration(section: CalibrationSection, rig: Rig | None) -> TouchCalibrati
         [each.at for each in section.points],
         plate,
     )
+
+
+def _check_places(validation: Validation, log: Path | None, dumps: Path | None) -> None:
+    """What is written only later must have a place; who may write there is seen at the start.
+
+    The log's folder must be there, that of the dumps is made when it is needed.
+    """
+    if log is not None and log.is_dir():
+        validation.add(("log", "file"), f"{log} is a folder; name a file in it")
+    elif log is not None and not log.parent.is_dir():
+        validation.add(("log", "file"), f"there is no folder {log.parent}; make it")
+    if dumps is not None:
+        there = next(each for each in (dumps, *dumps.absolute().parents) if each.exists())
+        if not there.is_dir():
+            validation.add(("dumps", "folder"), f"{there} is no folder; name another")
 
 
 def _check_serial_numbers(validation: Validation, rig: Rig | None) -> None:

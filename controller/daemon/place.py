@@ -24,7 +24,13 @@ class Place:
         self.path = path
         if len(os.fsencode(path)) > _LONGEST_PATH:
             raise InputError(
-                f"{path}: a socket's path has at most {_LONGEST_PATH} bytes; choose a shorter one"
+                f"{path}: a socket's path has at most {_LONGEST_PATH} bytes; name a shorter one "
+                "with socket: in the daemon's file"
+            )
+        if os.path.lexists(path) and not path.is_socket():
+            raise InputError(
+                f"{path}: something else than a socket is there; move it away, or name another "
+                "path with socket: in the daemon's file"
             )
         try:
             path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -65,7 +71,10 @@ class Place:
             bound.bind(str(self.path))
         except OSError as error:
             bound.close()
-            raise InputError(f"{self.path}: no socket can be here: {error.strerror}") from error
+            raise InputError(
+                f"{self.path}: no socket can be here ({error.strerror}); name another path with "
+                "socket: in the daemon's file"
+            ) from error
         finally:
             os.umask(before)
         return bound

@@ -11,6 +11,7 @@ from controller.daemon.log import LogThread, start_log
 from controller.daemon.notify import ServiceManager
 from controller.daemon.place import Place
 from controller.daemon.sections import loopback_address
+from drivers.errors import DriverError
 from model.errors import InputError
 from model.table.cache import cached_table
 from model.table.file import load_table
@@ -42,6 +43,7 @@ def run_daemon(path: Path, *, dashboard: str | None) -> None:
     except ValueError as error:
         raise InputError(f"--dashboard {error}") from error
     config = load_daemon_config(path)
+    _try_log(config)
     place = Place(config.socket)
     try:
         log = start_log(config.log_file, level=config.section.log.level)
@@ -51,6 +53,19 @@ def run_daemon(path: Path, *, dashboard: str | None) -> None:
             log.close()
     finally:
         place.leave()
+
+
+def _try_log(config: DaemonConfig) -> None:
+    """Refuse to begin with a log that cannot be written; later that only costs lines."""
+    file = config.log_file
+    try:
+        if file is not None:
+            file.open("a", encoding="utf-8").close()
+    except OSError as error:
+        raise InputError(
+            f"{config.source}: log.file: {file} cannot be written ({error.strerror}); give this "
+            "user the right to, or name another file"
+        ) from error
 
 
 def _run(config: DaemonConfig, place: Place, *, log: LogThread, dashboard: str | None) -> None:
@@ -65,6 +80,9 @@ def _run(config: DaemonConfig, place: Place, *, log: LogThread, dashboard: str |
 
     try:
         asyncio.run(run())
+    except (InputError, DriverError) as error:
+        _logger.error("the daemon ends: %s", error)
+        raise
     except Exception:
         _logger.exception("the daemon ends")
         raise

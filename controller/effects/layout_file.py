@@ -72,6 +72,7 @@ def load_layout(path: Path, plate: Plate | None, *, level_db_sl: float = STRONG_
     without being written down.
     """
     document = read_document(path)
+    _check_kind(document)
     validation = Validation(document, LayoutSection)
     effects = _effects(validation, level_db_sl)
     for name in validation.mapping(("regions",)):
@@ -92,6 +93,16 @@ def is_layout_document(document: Document) -> bool:
     """Whether a configuration file is a surface layout."""
     own = {"effects", "regions", "elsewhere", "most_at_once"}
     return bool(document.data.keys() & own) and not document.data.keys() & {"plate", "rig"}
+
+
+def _check_kind(document: Document) -> None:
+    """Refuse another kind of file as a whole, in place of all the keys that it does not know."""
+    if not is_layout_document(document) and document.data.keys() & {"plate", "rig"}:
+        kind = "a rig" if "plate" in document.data else "a daemon's file"
+        raise InputError(
+            f"{document.source}: is {kind}, and no surface layout; "
+            "era config init layout.yaml --kind layout  writes one"
+        )
 
 
 def _effects(validation: Validation, level_db_sl: float) -> dict[str, Effect | None]:

@@ -58,7 +58,9 @@ class Settings:
             raise InputError("TLS needs a certificate and its key: give both or none of them")
         for path in (self.certificate, self.key):
             if path is not None and not path.is_file():
-                raise InputError(f"{path}: there is no such file; it was to be used for TLS")
+                raise InputError(
+                    f"{path}: there is no such file; --certificate and --key want PEM files"
+                )
         if not address.is_loopback and not (self.certificate and self.chose_token):
             raise InputError(
                 f"the gateway listens on {self.host}, beyond this machine, only with TLS and a "
@@ -109,9 +111,12 @@ def read_token(path: Path) -> str:
             about = os.fstat(f.fileno())
             said = f.read(_LARGEST_TOKEN_FILE) if stat.S_ISREG(about.st_mode) else b""
     except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
+        raise InputError(
+            f"{path}: cannot be read ({error.strerror}); --token-file wants a file that holds the "
+            "token and that you alone may read"
+        ) from error
     if not stat.S_ISREG(about.st_mode) or not said.isascii():
-        raise InputError(f"{path}: not a text file, so no token")
+        raise InputError(f"{path}: is no text file, and so holds no token; give one that does")
     if about.st_mode & 0o077:
         raise InputError(f"{path}: others may read this token; forbid it with chmod 600 {path}")
     if about.st_uid not in (0, os.geteuid()):

@@ -25,7 +25,16 @@ def serve(
 
     registry = CollectorRegistry(auto_describe=False)
     registry.register(DaemonCollector(ask))
-    server, _ = start_http_server(port, addr="127.0.0.1", registry=registry)
+    try:
+        server, _ = start_http_server(port, addr="127.0.0.1", registry=registry)
+    except OSError as error:
+        typer.echo(
+            f"era: error: metrics cannot be served on 127.0.0.1 port {port} ({error.strerror}); "
+            "another program may use it: stop that, or name another port with metrics: in the "
+            "daemon's file",
+            err=True,
+        )
+        raise typer.Exit(2) from error
     typer.echo(f"metrics: http://127.0.0.1:{server.server_port}/metrics")
     signal.sigwait({signal.SIGTERM, signal.SIGINT})
 

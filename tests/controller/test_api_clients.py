@@ -187,6 +187,13 @@ def test_a_daemon_that_does_not_answer_is_given_up(tmp_path: Path) -> None:
             Client.connect(tmp_path / "s", timeout=0.05)
 
 
+def test_what_is_no_socket_is_named_as_such(tmp_path: Path) -> None:
+    """A file where the socket was meant: nobody should start a daemon for it."""
+    (tmp_path / "rig.yaml").write_text("", encoding="utf-8")
+    with pytest.raises(Unreachable, match=r"rig\.yaml is no socket; give the one"):
+        Client.connect(tmp_path / "rig.yaml")
+
+
 def test_a_daemon_of_others_is_named_as_such(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where one may not even look into its folder, connecting is what tells whose it is."""
 
@@ -197,4 +204,5 @@ def test_a_daemon_of_others_is_named_as_such(monkeypatch: pytest.MonkeyPatch) ->
 
     monkeypatch.setattr(Path, "stat", forbidden)
     assert find_socket(None) == SYSTEM_SOCKET
+    monkeypatch.undo()
     assert "belongs to somebody else" in str(Unreachable.at(SYSTEM_SOCKET, PermissionError()))

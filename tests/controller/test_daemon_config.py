@@ -65,6 +65,28 @@ def test_files_count_from_the_folder_of_the_configuration(
     assert config.dump_folder == Path("/d")
 
 
+def test_what_is_written_later_has_a_place(folder: Path) -> None:
+    """No folder for the log, a folder in its place, a file where the dumps' folder shall be."""
+    text = "rig: rig.yaml\nlog: {file: none/log}\ndumps: {folder: rig.yaml/dumps}\n"
+    assert problems(written(folder, text)) == [(2, "log.file"), (3, "dumps.folder")]
+    assert problems(written(folder, "rig: rig.yaml\nlog: {file: .}\n")) == [(2, "log.file")]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("plate: {}\neras: {}\n", "is a rig, and a daemon's file names it with rig:"),
+        ("regions: {}\n", "is a surface layout, and a daemon's file names it with layout:"),
+    ],
+)
+def test_another_kind_of_file_is_named_as_such(folder: Path, text: str, message: str) -> None:
+    """In one sentence, not by every key that a daemon's file has not."""
+    with pytest.raises(InputError) as caught:
+        load_daemon_config(written(folder, text))
+    assert message in str(caught.value)
+    assert "unknown key" not in str(caught.value)
+
+
 def test_everything_that_is_wrong_is_said_at_once(folder: Path) -> None:
     """Each error with the line and the key that it stands at."""
     path = written(

@@ -50,17 +50,6 @@ def test_a_socket_that_a_killed_daemon_left_is_no_obstacle(tmp_path: Path) -> No
     place.leave()
 
 
-def test_what_is_no_socket_is_not_removed(tmp_path: Path) -> None:
-    """A file of somebody's at the path stays as it is."""
-    path = tmp_path / "era.sock"
-    path.write_text("mine", "utf-8")
-    place = Place(path)
-    with pytest.raises(InputError, match="no socket can be here"):
-        place.bound()
-    assert path.read_text("utf-8") == "mine"
-    place.leave()
-
-
 def test_a_folder_where_others_may_write_is_refused(tmp_path: Path) -> None:
     """Or somebody could listen in our place."""
     folder = tmp_path / "open"
@@ -98,3 +87,19 @@ def test_two_places_in_one_folder_are_two(tmp_path: Path) -> None:
         assert isinstance(bound, socket.socket)
         bound.close()
         place.leave()
+
+
+@pytest.mark.parametrize("what", ["file", "folder", "link"])
+def test_what_is_no_socket_is_left_alone(tmp_path: Path, what: str) -> None:
+    """It stays as it is, and is refused before anything is opened; no lock stays behind."""
+    path = tmp_path / "there"
+    match what:
+        case "file":
+            path.write_text("mine", encoding="utf-8")
+        case "folder":
+            path.mkdir()
+        case _:
+            path.symlink_to(tmp_path / "nowhere")
+    with pytest.raises(InputError, match="something else than a socket is there; move it away"):
+        Place(path)
+    assert [each.name for each in tmp_path.iterdir()] == ["there"]

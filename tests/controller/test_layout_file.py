@@ -9,6 +9,7 @@ from controller.effects.moving import Detents
 from controller.effects.shapes import Rectangle
 from controller.effects.timed import Click
 from model.config.document import ConfigError
+from model.errors import InputError
 from model.rig.file import example_rig_path, load_rig
 
 EXAMPLE = Path(__file__).parents[2] / "controller" / "effects" / "example.yaml"
@@ -116,3 +117,15 @@ def test_all_problems_at_once(tmp_path: Path) -> None:
     )
     keys = ("effects.a.kind", "effects.b.level", "regions.c", "regions.c.on_press", "elsewhere")
     assert [key for key in keys if f"{key}:" not in told] == []
+
+
+@pytest.mark.parametrize(
+    ("text", "kind"), [("plate: {}\n", "is a rig"), ("rig: rig.yaml\n", "is a daemon's file")]
+)
+def test_another_kind_of_file_is_named_as_such(tmp_path: Path, text: str, kind: str) -> None:
+    """In one sentence, not by every key that a layout has not."""
+    path = tmp_path / "other.yaml"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(InputError, match=kind) as caught:
+        load_layout(path, None)
+    assert "unknown key" not in str(caught.value)

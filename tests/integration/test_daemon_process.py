@@ -40,6 +40,8 @@ async def test_a_second_daemon_is_refused_and_disturbs_nothing(tmp_path: Path) -
         (tmp_path / "other.yaml").write_text(text.replace("era.sock", "b.sock"), "utf-8")
         status, _, err = await run_era("daemon", tmp_path / "other.yaml")
         assert status == 3
+        assert "the daemon ends: " in err
+        assert "Traceback" not in err
         assert (await era.status()).state == "OPERATION_ENABLED"
         await until(lambda: any(far.station.status().levels))
 

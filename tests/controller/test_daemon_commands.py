@@ -1,0 +1,63 @@
+"""What the daemon's commands tell their users, beyond what the daemon itself says."""
+
+import asyncio
+import socket
+from pathlib import Path
+
+import pytest
+import typer
+
+from controller.daemon.run import run_daemon
+from controller.daemon_cli import show_status, touch
+from controller.metrics.__main__ import serve
+from daemon_bench import running_daemon, until_state, write_daemon
+from model.errors import InputError
+
+
+async def test_a_touch_beyond_the_plate_is_refused(tmp_path: Path) -> None:
+    """With the plate's size, though the daemon itself only counts such touches."""
+
+    def beyond(place: str) -> None:
+        touch([place], duration=0.0, socket=tmp_path / "era.sock")
+
+    async with running_daemon(tmp_path) as bench, await bench.client() as era:
+        await until_state(era, "READY_TO_SWITCH_ON")
+        for place in ("0.31,0.1", "0.1,-0.001"):
+            with pytest.raises(InputError, match=r"which is 0\.3048 m by 0\.2286 m"):
+                await asyncio.to_thread(beyond, place)
+        await asyncio.to_thread(beyond, "0.3048,0")
+        with pytest.raises(InputError, match="era touch 'a' is not X,Y"):
+            beyond("a")
+
+
+async def test_a_status_says_why_touches_begin_along_plain_ramps(tmp_path: Path) -> None:
+    """Where that is for a while only, and not otherwise."""
+    async with running_daemon(tmp_path) as bench, await bench.client() as era:
+        status = await era.status()
+    assert "plain ramps" not in show_status(status)
+    slow = status.model_copy(update={"plain_because": "it took 50 ms"})
+    assert "  plain ramps: it took 50 ms\n" in show_status(slow)
+
+
+def test_a_log_that_cannot_be_written_keeps_the_daemon_from_beginning(tmp_path: Path) -> None:
+    """Before it drives anything, with the key in its file; a socket is no file to write to."""
+    path = write_daemon(tmp_path, {"main": "sim://"}, "log: {file: taken}\n")
+    with socket.socket(socket.AF_UNIX) as taken:
+        taken.bind(str(tmp_path / "taken"))
+        with pytest.raises(InputError, match=r"daemon\.yaml: log\.file: .*taken cannot be written"):
+            run_daemon(path, dashboard=None)
+    assert not (tmp_path / "era.sock").exists()
+
+
+def test_a_port_for_metrics_that_is_taken(capsys: pytest.CaptureFixture[str]) -> None:
+    """One line that names the port and the key, and no traceback."""
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        with pytest.raises(typer.Exit) as caught:
+            serve(port)
+    assert caught.value.exit_code == 2
+    said = capsys.readouterr().err
+    assert f"127.0.0.1 port {port} (Address already in use)" in said
+    assert "name another port with metrics:" in said

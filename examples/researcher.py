@@ -3,8 +3,9 @@
 # A plate, its table, and what fingers feel
 
 For who asks what localized vibration can be. Open it as a notebook in VS Code or, with jupytext, in
-Jupyter; or run it: `python examples/researcher.py`. With ERA_PICTURES=FOLDER in the environment the
-pictures are written there; otherwise nothing is.
+Jupyter, and begin with `%matplotlib inline` to see its pictures; or run it:
+`python examples/researcher.py`. With ERA_PICTURES=FOLDER in the environment the pictures are
+written there; otherwise nothing is.
 
 Places are metres from the corner SW, x along the plate's length, y along its width. A vibration is
 felt from 12 dB SL on, decibels above what a fingertip just detects, and strong at 20.
@@ -135,6 +136,8 @@ for name, (asked, felt) in played.items():
         f"{asked.level_db_sl:11.1f} {felt.level_db_sl:8.1f}"
     )
 show(era.draw_playback(played["ramp"][1]), "ramp")
+
+# %%
 show(era.draw_playback(played["shaped"][1]), "shaped")
 
 # %% [markdown]

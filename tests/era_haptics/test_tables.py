@@ -57,7 +57,7 @@ def test_a_table_is_what_was_asked_for(table: era.LocalizationTable) -> None:
 
 def test_several_targets_and_no_quiet_finger(table: era.LocalizationTable) -> None:
     """Both targets feel at least what was asked for; alone there is nobody to be told from."""
-    targets = [TARGET, (0.25, 0.2)]
+    targets = [(0.25, 0.2), TARGET]
     both = era.query(table, targets, quiet=(0.15, 0.11))
     levels = [
         mean_level_db_sl(*table.amplitudes(both.excitation, fingertip_points(*target, table.plate)))

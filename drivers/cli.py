@@ -65,15 +65,25 @@ def discover(
         bool,
         typer.Option(help="Ask at every port who is there; nothing else is sent."),
     ] = True,
+    slcan: Annotated[
+        bool,
+        typer.Option(
+            "--slcan",
+            help="Ask first whether a serial port is a CAN adapter, by the characters V and CR, "
+            "which a device of another kind may take for a command of its own; then listen to its "
+            "bus at 500 kbit/s, onto which nothing is written.",
+        ),
+    ] = False,
     json_: Json = False,
 ) -> None:
     """List serial ports and CAN interfaces, and the amplifiers that answer on them."""
     import asyncio
 
-    from drivers.discovery import ask, candidates
+    from drivers.discovery import ask, candidates, with_slcan
 
-    places = candidates()
-    usable = [one for place in places if place.remedy is None for one in place.urls]
+    places = [with_slcan(place) if slcan else place for place in candidates()]
+    asked = [place for place in places if place.remedy is None and not place.is_slcan]
+    usable = [one for place in asked for one in place.urls]
     found = asyncio.run(ask([*(url or []), *(usable if probe else [])]))
     who = {one.url: one.identity for one in found if one.identity is not None}
     unusable = {one.url: one.problem for one in found if not one.was_asked}
@@ -82,6 +92,7 @@ def discover(
             "place": place.place,
             "description": place.description,
             "urls": list(place.urls),
+            "heard": list(place.urls) if place.is_slcan else [],
             "answers": [one for one in place.urls if one in who],
             "remedy": place.remedy
             or next((unusable[one] for one in place.urls if one in unusable), None),
@@ -111,7 +122,10 @@ def discover(
             print(f"{one.url}: {one.problem}")
     for amplifier in amplifiers:
         print("  ".join(str(value) for value in amplifier.values()))
-    if not amplifiers:
+    heard = [one for place in places if place.is_slcan for one in place.urls]
+    if not amplifiers and heard:
+        print(f"Next: era amp identify {heard[0]}")
+    elif not amplifiers:
         print("no amplifier answered")
     else:
         print(f"Next: era amp identify {amplifiers[0]['url']}")

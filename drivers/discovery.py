@@ -5,7 +5,7 @@ Whoever is asked is asked who it is, and nothing else: no output is written.
 
 import os
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from serial.tools.list_ports import comports
@@ -15,6 +15,7 @@ from drivers.errors import DriverError, FrameError, LinkTimeout
 from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.messages import Identity
 from drivers.registry import known_schemes, open_backend
+from drivers.slcan_discovery import ask_for_slcan
 
 _NETWORK = Path("/sys/class/net")
 _CAN_TYPE = "280"  # ARPHRD_CAN of Linux
@@ -31,6 +32,8 @@ class Candidate:
     description: str
     urls: tuple[str, ...]
     remedy: str | None = None
+    is_serial: bool = False
+    is_slcan: bool = False
 
 
 @dataclass(frozen=True)
@@ -56,6 +59,29 @@ async def ask(urls: Iterable[str]) -> list[Found]:
     return [await _ask(url) for url in urls]
 
 
+def with_slcan(place: Candidate) -> Candidate:
+    """The same serial port, as a CAN adapter if it answers as one: its amplifiers are not asked.
+
+    Blocks; see `drivers.slcan_discovery` for what is sent.
+    """
+    if not place.is_serial or place.remedy is not None:
+        return place
+    try:
+        adapter = ask_for_slcan(place.place)
+    except (OSError, ValueError) as problem:
+        return replace(place, remedy=f"{place.place} cannot be used: {problem}")
+    if adapter is None:
+        return place
+    heard = adapter.nodes or ("none",)
+    what = adapter.problem or f"heartbeats of nodes: {', '.join(map(str, heard))}"
+    bitrate = PROTOCOL.canopen["bitrate"]
+    urls = tuple(
+        f"can+slcan://{_absolute(place.place)}?bitrate={bitrate}#{node}" for node in adapter.nodes
+    )
+    description = f"{place.description}: slcan adapter {adapter.version}, {what}"
+    return Candidate(place.place, description, urls, is_slcan=True)
+
+
 async def _ask(url: str) -> Found:
     try:
         amplifier = Amplifier(open_backend(url))
@@ -73,7 +99,7 @@ def _serial_ports() -> Iterator[Candidate]:
         path = port.device
         urls = tuple(f"serial://{_absolute(path)}?baud={speed}" for speed in _SPEEDS)
         urls += (f"modbus+rtu://{_absolute(path)}?baud={_MODBUS['baud']}#{_MODBUS['unit']}",)
-        yield Candidate(path, port.description, urls, remedy=_why_not_usable(path))
+        yield Candidate(path, port.description, urls, _why_not_usable(path), is_serial=True)
 
 
 def _absolute(path: str) -> str:

@@ -14,6 +14,7 @@ from drivers.backends import modbus_link
 from drivers.backends.modbus_amplifier import ModbusBackend
 from drivers.backends.modbus_link import ModbusLink
 from drivers.backends.modbus_url import ModbusUrl
+from drivers.backends.stand_in import STAND_IN, Adapter, Port, StandIn, Worker
 from drivers.command import CommandSet
 from drivers.errors import CommandError, FrameError, LinkError, LinkTimeout
 from drivers.guard import SafeCommand
@@ -614,3 +615,58 @@ async def test_two_amplifiers_of_one_unit_are_refused() -> None:
         far.answer = answered_by(far.unit, far.unit)
         await amplifier.open()
         await amplifier.close()
+
+
+class _Ports(StandIn):
+    """Ports that only remember how they were opened and closed."""
+
+    def __init__(self) -> None:
+        self.happened: list[str] = []
+        self.lose: Callable[[str], None] = lambda what: None
+
+    async def open_port(
+        self, name: str, *, on_data: Callable[[bytes], None], on_loss: Callable[[str], None]
+    ) -> Port:
+        self.happened.append("opened")
+        self.lose = on_loss
+        return _NotedPort(self.happened)
+
+    async def open_adapter(self, *_: object, **__: object) -> Adapter:
+        raise NotImplementedError
+
+    def make_worker(self) -> Worker:
+        raise NotImplementedError
+
+    def below(self, limit: int) -> int:
+        return 0
+
+
+class _NotedPort:
+    def __init__(self, happened: list[str]) -> None:
+        self._happened = happened
+
+    def write(self, data: bytes) -> None:
+        """Nobody is there."""
+
+    def close(self) -> None:
+        self._happened.append("closed")
+
+    async def wait_closed(self) -> None:
+        self._happened.append("gone")
+
+
+async def test_a_lost_port_is_given_back_before_it_is_opened_again() -> None:
+    """Also where only one of two amplifiers on it comes back: the system gives it out once."""
+    ports = _Ports()
+    STAND_IN.set(ports)
+    east, west = (ModbusBackend(f"modbus+rtu:///dev/none?baud=115200#{unit}") for unit in (1, 2))
+    await east.open()
+    await west.open()
+    ports.lose("pulled out")
+    await east.close()
+    await east.open()
+    assert ports.happened == ["opened", "closed", "gone", "opened"]
+    await west.close()
+    assert ports.happened == ["opened", "closed", "gone", "opened"]
+    await east.close()
+    assert ports.happened == ["opened", "closed", "gone", "opened", "closed", "gone"]

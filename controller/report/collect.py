@@ -94,7 +94,8 @@ def _with_named(path: Path, missing: list[str]) -> Iterable[Path]:
     try:
         document = read_document(path)
     except InputError as error:
-        missing.append(str(error))
+        if path.is_file():  # else what is left out says it
+            missing.append(f"what this file names: {error}")
         return
     if not is_daemon_document(document):
         return

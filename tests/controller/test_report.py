@@ -67,6 +67,20 @@ def test_everything_that_a_daemon_names(tmp_path: Path) -> None:
     assert "SerialBackend" in told["plug-ins"]["backends"]["serial"]
 
 
+def test_files_that_cannot_be_read_as_they_should(tmp_path: Path) -> None:
+    """A broken one may be what it is about: it is put in, without secrets, and nothing fails.
+
+    One that is not there, and what a broken one names, are told once.
+    """
+    (tmp_path / "broken.yaml").write_text("rig: [\napi_token: abc\n\tx", "utf-8")
+    (tmp_path / "bytes.yaml").write_bytes(b"\xff\x00: \x80")
+    files = [tmp_path / name for name in ("broken.yaml", "bytes.yaml", "none.yaml")]
+    report = collect(files, socket=tmp_path / "no.sock", home=HOME)
+    assert set(report.files) == {"broken.yaml", "bytes.yaml", "versions.json"}
+    assert report.files["broken.yaml"] == "rig: [\napi_token: [hidden]\n\tx"
+    assert [sum(path.name in each for each in report.missing) for path in files] == [1, 1, 1]
+
+
 def test_command(tmp_path: Path) -> None:
     """It writes one file for its owner alone, and never over another."""
     era = Path(sys.executable).with_name("era")

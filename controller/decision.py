@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 from controller.contacts import Change, Contact, ContactTracker
-from controller.envelopes import ENVELOPE_TIME, PLAIN, Shaping
+from controller.envelopes import ENVELOPE_TIME, PLAIN
 from controller.loadings import LoadingTimes
 from controller.means import Means
 from controller.orders import FADE_RAMP, Order, OrderMaker, PatternTiming
@@ -70,7 +70,9 @@ class Decider:
         self._means = means
         self._loadings = LoadingTimes(envelope_time)
         self._tracker = ContactTracker(rig.plate)
-        self._selector = Selector(table, wishes, means)
+        self._wishes = wishes
+        self._wish_due: float | None = None  # when it may be another
+        self._selector = Selector(table)
         self._orders = OrderMaker(rig, guards, timing=timing)
         self._decided: Selection | None = None
         self._is_silent = False
@@ -119,7 +121,7 @@ class Decider:
         guard lets through what it refused.
         """
         moments = (
-            *(self._tracker.next_expiry, self._selector.until),
+            *(self._tracker.next_expiry, self._wish_due),
             *(self._brake_due, self._again_at),
         )
         return min((moment for moment in moments if moment is not None), default=None)
@@ -163,7 +165,7 @@ class Decider:
             return
         if ordered.is_brake:
             self._has_brakes = True
-        elif self._shaping(now).endings and self._timing is not None:
+        elif self._means_at(now).shaping.endings and self._timing is not None:
             self._brake_due = now + ordered.settled_after
 
     def loaded_in(self, duration: float, *, now: float) -> None:
@@ -179,18 +181,19 @@ class Decider:
         self.expire(now)
         contacts = self._tracker.contacts
         order: Order | None = None
-        shaping = self._shaping(now)
-        if shaping != self._selector.means.shaping:
-            self._selector.means = replace(self._means, shaping=shaping)
+        means = self._means_at(now)
         is_calm = True
         try:
-            selection = self._selector.select(contacts, now)
+            self._wish_due = None
+            wish = self._wishes.wish(contacts, now)
+            self._wish_due = wish.due(now)
+            selection = self._selector.select(contacts, wish, means)
             is_new = selection != self._decided or self._is_due_again(now)
             if is_new and selection.pattern is not None and selection.question is not None:
                 order = self._orders.play(
                     selection.pattern,
                     selection.question,
-                    is_shaped=shaping.onsets,
+                    is_shaped=means.shaping.onsets,
                     playing=self._playing,
                 )
             elif not is_new and self._brake_due is not None and now >= self._brake_due:
@@ -229,9 +232,9 @@ class Decider:
         """The order that brings every wired channel to zero along a ramp [s]; never fails."""
         return self._orders.silence(ramp=ramp)
 
-    def _shaping(self, now: float) -> Shaping:
-        """Which envelopes are played at a time [s]."""
-        return PLAIN if self._loadings.problem(now) else self._means.shaping
+    def _means_at(self, now: float) -> Means:
+        """What is to be played by at a time [s]: without envelopes while these take too long."""
+        return replace(self._means, shaping=PLAIN) if self._loadings.problem(now) else self._means
 
     def _is_due_again(self, now: float) -> bool:
         """Whether a guard lets through by now [s] what it refused."""

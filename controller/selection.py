@@ -10,7 +10,7 @@ import numpy as np
 
 from controller.contacts import Contact
 from controller.means import Means
-from controller.wishes import Target, Wish, Wishes
+from controller.wishes import Target, Wish
 from model.arrays import FloatArray
 from model.errors import InputError
 from model.finger.contrast import contrast_db, mean_level_db_sl
@@ -29,8 +29,6 @@ MOVE_TOLERANCE = 0.008
 MOST_DB_SL = 26.0
 """Where `as strongly as the neighbours allow` ends: at twice what is strong, lest a finger without
 neighbours be numbed."""
-
-_SHORTEST_WAIT = 0.001  # s
 
 _logger = logging.getLogger(__name__)
 
@@ -90,37 +88,24 @@ class Selection:
 
 
 class Selector:
-    """Chooses the pattern that does what is wished for the contacts on a plate.
+    """Chooses the pattern of a table that does what is wished for the contacts on its plate.
 
     A pattern stays while its targets and their levels do and no contact has moved more than 8 mm
     from where it was chosen for; a quiet contact that lifts leaves it as it is, since less is asked
     of it then and a change would be felt.
     """
 
-    def __init__(self, table: PatternTable, wishes: Wishes, means: Means) -> None:
+    def __init__(self, table: PatternTable) -> None:
         self._table = table
-        self._wishes = wishes
-        self.means = means
         self._current = Selection((), (), None, None)
-        self._until: float | None = None
 
-    @property
-    def until(self) -> float | None:
-        """When [s] the wish may be another though no contact has changed."""
-        return self._until
-
-    def select(self, contacts: Sequence[Contact], now: float) -> Selection:
+    def select(self, contacts: Sequence[Contact], wish: Wish, means: Means) -> Selection:
         """The selection for contacts in their order of arrival; the same object if it stays."""
-        self._until = None
-        wish = self._wishes.wish(contacts, now)
-        if wish.until is not None:
-            # One that has run out already must not keep the loop from everything else.
-            self._until = wish.until if wish.until > now else now + _SHORTEST_WAIT
         wanted = {target.key: target for target in wish.targets}
         targets = tuple((each, wanted[each.key]) for each in contacts if each.key in wanted)
         quiet = tuple(each for each in contacts if each.key not in wanted)
         if not self._holds(wish, targets, quiet):
-            self._current = self._choose(wish, targets, quiet)
+            self._current = self._choose(wish, targets, quiet, means)
         return self._current
 
     def _holds(
@@ -148,13 +133,16 @@ class Selector:
         wish: Wish,
         targets: tuple[tuple[Contact, Target], ...],
         quiet: tuple[Contact, ...],
+        means: Means,
     ) -> Selection:
         """Ask the table; whatever goes wrong there is silence until something else is wanted."""
         if not targets:
             return Selection((), quiet, None, wish.reason)
         try:
             question, pattern = self._ask(
-                self._question(targets, quiet), [target for _, target in targets]
+                _question(targets, quiet, means),
+                [target for _, target in targets],
+                largest=means.largest,
             )
             felt = self._felt(targets, quiet, pattern)
         except InputError as error:
@@ -164,9 +152,10 @@ class Selector:
             return Selection(targets, quiet, None, f"{type(error).__name__}: {error}")
         return Selection(targets, quiet, pattern, None, question, felt)
 
-    def _ask(self, question: Question, targets: Sequence[Target]) -> tuple[Question, Pattern]:
+    def _ask(
+        self, question: Question, targets: Sequence[Target], *, largest: Mapping[str, float]
+    ) -> tuple[Question, Pattern]:
         """The pattern, and what the table was asked in the end; raises InputError."""
-        largest = self.means.largest
         if all(target.level_db_sl is None for target in targets):
             return question, strongest(self._table.ask(question), largest)
         try:
@@ -177,23 +166,6 @@ class Selector:
         wanted = question.level_db_sl
         question = replace(question, level_db_sl=min(wanted, FELT_DB_SL))
         return question, strongest(self._table.ask(question), largest, at_most=wanted)
-
-    def _question(
-        self, targets: tuple[tuple[Contact, Target], ...], quiet: tuple[Contact, ...]
-    ) -> Question:
-        given = [target.level_db_sl for _, target in targets if target.level_db_sl is not None]
-        level = max(given, default=FELT_DB_SL)
-        levels = [level if t.level_db_sl is None else t.level_db_sl for _, t in targets]
-        return Question(
-            targets=tuple((contact.x, contact.y) for contact, _ in targets),
-            quiet=tuple((contact.x, contact.y) for contact in quiet),
-            level_db_sl=level,
-            softer_db=tuple(level - each for each in levels),
-            mode=self.means.mode,
-            playable=self.means.playable,
-            frequencies=self.means.frequencies,
-            envelopes=self.means.shaping.onsets,
-        )
 
     def _felt(
         self,
@@ -220,6 +192,25 @@ class Selector:
             )
             for (contact, target), field in zip(targets, fields, strict=True)
         )
+
+
+def _question(
+    targets: tuple[tuple[Contact, Target], ...], quiet: tuple[Contact, ...], means: Means
+) -> Question:
+    """What the table is to be asked."""
+    given = [target.level_db_sl for _, target in targets if target.level_db_sl is not None]
+    level = max(given, default=FELT_DB_SL)
+    levels = [level if t.level_db_sl is None else t.level_db_sl for _, t in targets]
+    return Question(
+        targets=tuple((contact.x, contact.y) for contact, _ in targets),
+        quiet=tuple((contact.x, contact.y) for contact in quiet),
+        level_db_sl=level,
+        softer_db=tuple(level - each for each in levels),
+        mode=means.mode,
+        playable=means.playable,
+        frequencies=means.frequencies,
+        envelopes=means.shaping.onsets,
+    )
 
 
 def strongest(

@@ -11,6 +11,8 @@ from typing import Protocol
 from controller.contacts import Contact, ContactKey
 from model.finger.perception import STRONG_DB_SL
 
+_SHORTEST_WAIT = 0.001  # s
+
 NOBODY_TOUCHES = "nobody touches the plate"
 
 
@@ -39,6 +41,12 @@ class Wish:
     targets: tuple[Target, ...]
     reason: str = "nobody is to feel anything"
     until: float | None = None
+
+    def due(self, now: float) -> float | None:
+        """When [s] to ask again; a wish that has run out already does not keep the loop busy."""
+        if self.until is None:
+            return None
+        return self.until if self.until > now else now + _SHORTEST_WAIT
 
 
 class Wishes(Protocol):

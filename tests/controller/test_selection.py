@@ -1,7 +1,6 @@
 """What the table is asked for wishes, and when a pattern is chosen anew."""
 
 import math
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -60,17 +59,10 @@ class Table:
         return frequencies, detection_threshold(frequencies)[:, None] * 100 * points[None, :, 0]
 
 
-class Wanted:
-    """Wishes as a test sets them: level by id."""
-
-    def __init__(self, **levels: float | None) -> None:
-        self.levels = {int(name[1:]): level for name, level in levels.items()}
-        self.until: float | None = None
-
-    def wish(self, contacts: Sequence[Contact], now: float) -> Wish:
-        """What is set, for contacts on the plate or not."""
-        targets = tuple(Target(ContactKey("a", id), each) for id, each in self.levels.items())
-        return Wish(targets, "nothing is wanted", self.until)
+def wanting(**levels: float | None) -> Wish:
+    """A wish for contacts c1, c2 and so on, at their levels, be they on the plate or not."""
+    targets = (Target(ContactKey("a", int(name[1:])), each) for name, each in levels.items())
+    return Wish(tuple(targets), "nothing is wanted")
 
 
 def at(id: int, x: float, y: float = 0.1) -> Contact:
@@ -86,8 +78,8 @@ def table() -> Table:
 
 def test_all_others_are_quiet(table: Table) -> None:
     """The table is asked for the target at its level, in the mode and band of the amplifiers."""
-    selection = Selector(table, Wanted(c3=17.0), MEANS).select(
-        (at(1, 0.1), at(2, 0.2), at(3, 0.25)), 0.0
+    selection = Selector(table).select(
+        (at(1, 0.1), at(2, 0.2), at(3, 0.25)), wanting(c3=17.0), MEANS
     )
     (question,) = table.asked
     assert (question.targets, question.quiet) == (((0.25, 0.1),), ((0.1, 0.1), (0.2, 0.1)))
@@ -104,8 +96,8 @@ def test_several_targets_are_told_one_by_one(table: Table) -> None:
     By hand: amplitudes go with x, so the mean over a fingertip is that at its centre, 20 dB SL at
     0.1 m and 26 at 0.2; the loudest point of the quiet one, on a rim of 13 mm, lies at 0.063 m.
     """
-    selection = Selector(table, Wanted(c1=12.0, c2=20.0), MEANS).select(
-        (at(1, 0.1), at(2, 0.2), at(3, 0.05)), 0.0
+    selection = Selector(table).select(
+        (at(1, 0.1), at(2, 0.2), at(3, 0.05)), wanting(c1=12.0, c2=20.0), MEANS
     )
     (question,) = table.asked
     assert question.targets == ((0.1, 0.1), (0.2, 0.1))
@@ -120,8 +112,8 @@ def test_several_targets_are_told_one_by_one(table: Table) -> None:
 
 def test_beside_a_level_no_level_means_the_strongest_of_them(table: Table) -> None:
     """One that takes what the neighbours allow does not turn the others up or down."""
-    selector = Selector(table, Wanted(c1=None, c2=15.0, c3=9.0), MEANS)
-    selector.select((at(1, 0.1), at(2, 0.2), at(3, 0.25)), 0.0)
+    selector, wish = Selector(table), wanting(c1=None, c2=15.0, c3=9.0)
+    selector.select((at(1, 0.1), at(2, 0.2), at(3, 0.25)), wish, MEANS)
     assert table.asked[0].level_db_sl == 15.0
     assert table.asked[0].softer_db == (0.0, 0.0, 6.0)
 
@@ -129,7 +121,7 @@ def test_beside_a_level_no_level_means_the_strongest_of_them(table: Table) -> No
 def test_as_strong_as_the_neighbours_allow(table: Table) -> None:
     """Asked for at 12 dB SL; with 14 dB less at the quiet finger, -10 dB there leave 4 here."""
     table.quiet_level = -2.0
-    selection = Selector(table, Wanted(c1=None), MEANS).select((at(1, 0.1), at(2, 0.2)), 0.0)
+    selection = Selector(table).select((at(1, 0.1), at(2, 0.2)), wanting(c1=None), MEANS)
     assert table.asked[0].level_db_sl == 12.0
     assert selection.pattern is not None
     assert selection.felt[0].level_db_sl == pytest.approx(4.0)
@@ -161,15 +153,9 @@ def test_what_cannot_be_felt_alone_is_not_played() -> None:
         strongest(pattern, {"SW": 1.0})
 
 
-class OrLess:
-    """Wishes one level at contact 1, or less where that cannot be had."""
-
-    def __init__(self, level: float) -> None:
-        self.level = level
-
-    def wish(self, contacts: Sequence[Contact], now: float) -> Wish:
-        """As `Wishes`."""
-        return Wish((Target(ContactKey("a", 1), self.level, or_less=True),))
+def or_less(level: float) -> Wish:
+    """One level at contact 1, or less where that cannot be had."""
+    return Wish((Target(ContactKey("a", 1), level, or_less=True),))
 
 
 def test_a_level_or_less(table: Table) -> None:
@@ -182,12 +168,12 @@ def test_a_level_or_less(table: Table) -> None:
     means = replace(MEANS, largest={"SW": 2e-6})
     contacts = (at(1, 0.1), at(2, 0.2))
     for wanted, level in ((14.0, 14.0), (30.0, 12 + 20 * math.log10(2)), (17.0, 17.0)):
-        selection = Selector(table, OrLess(wanted), means).select(contacts, 0.0)
+        selection = Selector(table).select(contacts, or_less(wanted), means)
         assert selection.pattern is not None
         assert selection.felt[0].level_db_sl == pytest.approx(level)
         assert selection.question is table.asked[-1]
     table.most = 11.0
-    selection = Selector(table, OrLess(30.0), means).select(contacts, 0.0)
+    selection = Selector(table).select(contacts, or_less(30.0), means)
     assert (selection.pattern, selection.reason) == (None, "too loud")
 
 
@@ -195,7 +181,7 @@ def test_a_level_or_less_on_a_plate() -> None:
     """60 dB SL is more than the paper's ERAs can do: what they can is played, at full stroke."""
     table, full = small_table(), dict.fromkeys(("SW", "SE", "NE", "NW"), 0.0001)
     means = Means("switched", ("switched",), (40.0, 500.0), full, PLAIN)
-    selection = Selector(table, OrLess(60.0), means).select((at(1, 0.1),), 0.0)
+    selection = Selector(table).select((at(1, 0.1),), or_less(60.0), means)
     assert selection.pattern is not None
     assert 12 < selection.felt[0].level_db_sl < 60
     loudest = max(tone.amplitude for tone in selection.pattern.excitation.values())
@@ -204,10 +190,10 @@ def test_a_level_or_less_on_a_plate() -> None:
 
 def test_nothing_wanted(table: Table) -> None:
     """No target, or none that is on the plate: nothing is asked, and the reason is the wish's."""
-    for wishes in (Wanted(), Wanted(c9=20.0)):
-        selector = Selector(table, wishes, MEANS)
+    for wish in (wanting(), wanting(c9=20.0)):
+        selector = Selector(table)
         for contacts in [(), (at(1, 0.1),), (at(1, 0.29),)]:
-            selection = selector.select(contacts, 0.0)
+            selection = selector.select(contacts, wish, MEANS)
             assert (selection.targets, selection.pattern) == ((), None)
             assert selection.reason == "nothing is wanted"
     assert table.asked == []
@@ -219,80 +205,65 @@ def test_moves(table: Table, mover: int) -> None:
 
     It is the way from there that counts, not from the frame before, and of any contact.
     """
-    selector = Selector(table, Wanted(c2=20.0), MEANS)
+    selector, wish = Selector(table), wanting(c2=20.0)
 
     def contacts(distance: float) -> tuple[Contact, ...]:
         moved = [0.0, 0.0]
         moved[mover] = distance
         return (at(1, 0.1, 0.1 + moved[0]), at(2, 0.2, 0.1 - moved[1]))
 
-    first = selector.select(contacts(0.0), 0.0)
-    assert selector.select(contacts(0.004), 0.1) is first
-    assert selector.select(contacts(0.0079), 0.2) is first
-    second = selector.select(contacts(0.0081), 0.3)
+    first = selector.select(contacts(0.0), wish, MEANS)
+    assert selector.select(contacts(0.004), wish, MEANS) is first
+    assert selector.select(contacts(0.0079), wish, MEANS) is first
+    second = selector.select(contacts(0.0081), wish, MEANS)
     assert second.pattern != first.pattern
-    assert selector.select(contacts(0.0), 0.4) is not second
+    assert selector.select(contacts(0.0), wish, MEANS) is not second
 
 
 def test_other_wishes_are_another_pattern(table: Table) -> None:
     """Another level, one more target, one fewer."""
-    wishes = Wanted(c1=20.0)
-    selector = Selector(table, wishes, MEANS)
-    contacts = (at(1, 0.1), at(2, 0.2))
-    for levels in ({1: 20.0}, {1: 14.0}, {1: 14.0, 2: 14.0}, {2: 14.0}):
-        wishes.levels = dict(levels)
-        chosen = selector.select(contacts, 0.0)
-        assert selector.select(contacts, 0.0) is chosen
+    selector, contacts = Selector(table), (at(1, 0.1), at(2, 0.2))
+    for levels in ({"c1": 20.0}, {"c1": 14.0}, {"c1": 14.0, "c2": 14.0}, {"c2": 14.0}):
+        chosen = selector.select(contacts, wanting(**levels), MEANS)
+        assert selector.select(contacts, wanting(**levels), MEANS) is chosen
     assert len(table.asked) == 4
 
 
 def test_a_quiet_contact_that_lifts_changes_nothing(table: Table) -> None:
     """The target goes on feeling the same."""
-    selector = Selector(table, Wanted(c2=20.0), MEANS)
-    first = selector.select((at(1, 0.1), at(2, 0.2)), 0.0)
-    assert selector.select((at(2, 0.2),), 0.0) is first
+    selector, wish = Selector(table), wanting(c2=20.0)
+    first = selector.select((at(1, 0.1), at(2, 0.2)), wish, MEANS)
+    assert selector.select((at(2, 0.2),), wish, MEANS) is first
 
 
 def test_refused_by_the_table(table: Table) -> None:
     """A table's refusal is silence with its words, asked again when it may have changed."""
     table.refuse_below = 0.2
-    selector = Selector(table, Wanted(c2=20.0), MEANS)
-    refused = selector.select((at(1, 0.25), at(2, 0.1)), 0.0)
+    selector, wish = Selector(table), wanting(c2=20.0)
+    refused = selector.select((at(1, 0.25), at(2, 0.1)), wish, MEANS)
     assert [contact.key.id for contact, _ in refused.targets] == [2]
     assert (refused.pattern, refused.reason) == (None, "nothing is felt there")
-    assert selector.select((at(1, 0.25), at(2, 0.1)), 0.0) is refused
+    assert selector.select((at(1, 0.25), at(2, 0.1)), wish, MEANS) is refused
     assert len(table.asked) == 1
-    assert selector.select((at(2, 0.1),), 0.0).reason == "nothing is felt there"
+    assert selector.select((at(2, 0.1),), wish, MEANS).reason == "nothing is felt there"
     assert len(table.asked) == 2  # without the quiet contact it might have been possible
-    assert selector.select((at(2, 0.21),), 0.0).pattern is not None
+    assert selector.select((at(2, 0.21),), wish, MEANS).pattern is not None
 
 
 def test_a_table_that_fails_is_not_asked_again_for_the_same(table: Table) -> None:
     """Whatever it raises is silence with its words until something else is wanted."""
     table.error = ZeroDivisionError("by no ERA")
-    selector = Selector(table, Wanted(c1=20.0), MEANS)
-    failed = selector.select((at(1, 0.1),), 0.0)
+    selector, wish = Selector(table), wanting(c1=20.0)
+    failed = selector.select((at(1, 0.1),), wish, MEANS)
     assert (failed.pattern, failed.reason) == (None, "ZeroDivisionError: by no ERA")
-    assert selector.select((at(1, 0.1),), 0.0) is failed
+    assert selector.select((at(1, 0.1),), wish, MEANS) is failed
     assert len(table.asked) == 1
     table.error = None
-    assert selector.select((at(1, 0.2),), 0.0).pattern is not None
-
-
-@pytest.mark.parametrize(
-    ("until", "looked_at"), [(None, None), (7.0, 7.0), (3.0, 5.001), (math.nan, 5.001)]
-)
-def test_a_wish_runs_out(table: Table, until: float | None, looked_at: float | None) -> None:
-    """The loop comes back when it does; one that has run out does not keep it busy."""
-    wishes = Wanted(c1=20.0)
-    wishes.until = until
-    selector = Selector(table, wishes, MEANS)
-    selector.select((at(1, 0.1),), 5.0)
-    assert selector.until == looked_at
+    assert selector.select((at(1, 0.2),), wish, MEANS).pattern is not None
 
 
 def test_with_envelopes_the_table_is_told_so(table: Table) -> None:
     """It may choose by steady contrast then."""
     means = replace(MEANS, shaping=replace(PLAIN, onsets=True))
-    Selector(table, Wanted(c1=20.0), means).select((at(1, 0.1),), 0.0)
+    Selector(table).select((at(1, 0.1),), wanting(c1=20.0), means)
     assert table.asked[0].envelopes

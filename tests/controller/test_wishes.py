@@ -1,9 +1,11 @@
 """Who is the target where nobody gave touches another meaning."""
 
+import math
+
 import pytest
 
 from controller.contacts import Contact, ContactKey
-from controller.wishes import NewestBuzzes, Target
+from controller.wishes import NewestBuzzes, Target, Wish
 
 
 def at(id: int) -> Contact:
@@ -49,3 +51,11 @@ def test_it_says_why_nobody_is_to_feel_anything() -> None:
     wishes.wish((at(1), at(2)), 0.0)
     assert wishes.wish((at(1),), 0.0).reason == "the target was lifted"
     assert wishes.wish((), 0.0).reason == "nobody touches the plate"
+
+
+@pytest.mark.parametrize(
+    ("until", "due"), [(None, None), (7.0, 7.0), (3.0, 5.001), (math.nan, 5.001)]
+)
+def test_a_wish_runs_out(until: float | None, due: float | None) -> None:
+    """The loop comes back when it does; one that has run out does not keep it busy."""
+    assert Wish((), until=until).due(5.0) == due

@@ -1,16 +1,16 @@
-"""What a host owes: to the fingers, to the amplifiers, and to whoever arms and stops it.
+"""What a host may send: to each amplifier, for those who touch, and for whoever arms and stops it.
 
-Rules about single frames are checked as a frame passes; what must happen within a time is noted as
-a duty and looked at when the time is over.
+These rules are checked as a frame passes; what it owes within a time is in `duties`.
 """
 
-import math
 from collections.abc import Collection, Hashable, Mapping
 
+from sim.witness.duties import Duties
+from sim.witness.people import People
 from sim.witness.plan import Times
 from sim.witness.seen import FEEDING, Asked, Drive, Kind
 from sim.witness.set_rules import Expected, check_set, check_shape
-from sim.witness.side import Duty, Side
+from sim.witness.side import Side
 
 _SETS = (Kind.APPLY, Kind.STAGE)
 _BEGUN = 0.020  # s; for so long what was wished first may go before what was wished next
@@ -23,51 +23,21 @@ class Host:
     def __init__(self, sides: Mapping[str, Side], *, times: Times) -> None:
         self._sides = sides
         self._times = times
-        self._duties: list[Duty] = []
-        self._contacts: frozenset[Hashable] | None = None
-        self._lifted = -math.inf
-        self._touched = -math.inf  # by whoever came last
-        self._hung: float | None = None
-        self._arm_wished: bool | None = None  # None: wishes are not told
-        self._wished = -math.inf  # when anything was last
-        self._disarm_wished = -math.inf
-        self._silence_wished = -math.inf
+        self._people = People()
+        self._duties = Duties(sides, self._people, times=times)
         self._expected: Expected | None = None
 
     # what the witness is told beside the wires
 
     def contacts(self, time: float, contacts: Collection[Hashable], *, is_answerable: bool) -> None:
         """These fingers are on the plate from now on."""
-        before = self._contacts or frozenset()
-        self._contacts = now = frozenset(contacts)
-        if before and not now:
-            self._lifted = time
-            for side in self._sides.values():
-                self._owe(
-                    Duty(
-                        time + self._times.lift,
-                        lambda side=side: self._is_released(side, time),  # type: ignore[misc]
-                        "lift",
-                        side.plan.wire,
-                        f"the last finger was lifted at {time:.4f} s, and "
-                        f"{self._times.lift * 1e3:g} ms later {side.name} was not told to be "
-                        "silent",
-                    )
-                )
-        if now - before:
-            self._touched = time
-        for new in now - before:
-            if is_answerable and self._can_play():
-                self._owe(
-                    Duty(
-                        time + self._times.touch,
-                        lambda new=new: self._is_answered(new, time),  # type: ignore[misc]
-                        "touch",
-                        next(iter(self._sides.values())).plan.wire,
-                        f"a finger came at {time:.4f} s, and {self._times.touch * 1e3:g} ms later "
-                        "no amplifier plays a pattern for it",
-                    )
-                )
+        was_touched = bool(self._people.contacts)
+        come = self._people.touch(time, contacts)
+        if was_touched and not self._people.contacts:
+            self._duties.silence(time)
+        if is_answerable:
+            for contact in come:
+                self._duties.pattern(contact, time)
 
     def expect(self, expected: Expected | None) -> None:
         """What every pattern must be from now on; None: any."""
@@ -75,20 +45,15 @@ class Host:
 
     def wish(self, time: float, what: str) -> None:
         """Somebody wants it to arm, disarm, stop or clear."""
-        self._wished = time
-        if what == "disarm":
-            self._disarm_wished = time
-        self._arm_wished = what == "arm" or (self._arm_wished is True and what == "clear")
-        if what in ("stop", "disarm"):
-            self._silence_wished = time
+        self._people.wish(time, what)
         if what == "stop":
             for side in self._sides.values():
                 if side.is_open and not side.is_troubled():
-                    self._owe_stop(side, time)
+                    self._duties.stop(side, time)
 
     def hang(self, time: float | None) -> None:
         """The control loop hangs from a time [s] on; None: it runs again."""
-        self._hung = time
+        self._people.hung = time
         if time is None:
             for side in self._sides.values():
                 side.last_life = None  # it owes the next after it has run
@@ -134,21 +99,15 @@ class Host:
     def refused(self, time: float, asked: Asked) -> None:
         """A request was refused."""
         if asked.kind is Kind.ARM:  # who arms all or none takes it back from all
-            self._disarm_wished = time
+            self._people.disarm_wished = time
 
     def pass_to(self, time: float) -> None:
-        """Look at the duties whose time is over."""
-        if any(duty.due < time for duty in self._duties):
-            over = [duty for duty in self._duties if duty.due < time]
-            self._duties = [duty for duty in self._duties if duty.due >= time]
-            for duty in over:
-                side = next(s for s in self._sides.values() if s.plan.wire == duty.wire)
-                if not (side.is_troubled() or duty.is_done()):
-                    side.complain(duty.invariant, duty.due, duty.sentence)
+        """Look at what was to be done by now."""
+        self._duties.pass_to(time)
         for side in self._sides.values():
             self._check_pulse(side, time)
-            if side.follower.faulted_at > self._wished and self._arm_wished:
-                self._arm_wished = False  # a fault ends what was wished before it
+            if side.follower.faulted_at > self._people.wished and self._people.arm_wished:
+                self._people.arm_wished = False  # a fault ends what was wished before it
 
     # rules
 
@@ -160,7 +119,7 @@ class Host:
         for at, other in side.pending.values():
             # After a last lift it is waited for no more, though a finger may have come since.
             if (
-                at > max(side.overtaken, self._lifted)
+                at > max(side.overtaken, self._people.lifted)
                 and time - at < self._times.reply - self._times.slack
             ):
                 side.complain(
@@ -175,7 +134,7 @@ class Host:
         is_other = asked.kind is not Kind.STOP and asked.kind not in _UNCOUNTED
         # What was asked before it, at the same moment, may go before it.
         if side.stop_wished is not None and time > side.stop_wished and is_other:
-            if asked.kind is Kind.DISARM and side.stop_wished < self._disarm_wished + _BEGUN:
+            if asked.kind is Kind.DISARM and side.stop_wished < self._people.disarm_wished + _BEGUN:
                 return  # which silences as well
             side.complain(
                 "stop",
@@ -186,7 +145,7 @@ class Host:
             side.stop_wished = None
 
     def _check_life(self, side: Side, time: float, asked: Asked) -> None:
-        hung = self._hung
+        hung = self._people.hung
         is_by_loop = asked.kind in (Kind.PING, Kind.COMMIT, Kind.STAGE) or asked.vibrates
         if hung is not None and time > hung + self._times.slack and is_by_loop:
             side.complain(
@@ -201,8 +160,10 @@ class Host:
         if side.is_troubled():
             side.last_life = None  # who has given an amplifier up owes it nothing
         last = side.last_life
-        is_ending = self._silence_wished >= side.armed_at  # heartbeats would only be in the way
-        is_running = self._hung is None and not is_ending
+        is_ending = (
+            self._people.silence_wished >= side.armed_at
+        )  # heartbeats would only be in the way
+        is_running = self._people.hung is None and not is_ending
         is_owed = side.is_open and side.follower.is_enabled and is_running
         if last is None or not is_owed:
             return
@@ -214,8 +175,8 @@ class Host:
 
     def _check_arm(self, side: Side, time: float) -> None:
         # What was begun may be sent yet, and is followed by what withdraws it.
-        is_withdrawn = time > self._silence_wished + self._times.stop
-        if self._arm_wished is False and is_withdrawn:
+        is_withdrawn = time > self._people.silence_wished + self._times.stop
+        if self._people.arm_wished is False and is_withdrawn:
             side.complain("armed", time, f"{side.name} is armed although nobody wished it")
         if side.is_identified is False:
             side.complain("identified", time, f"{side.name} is armed without being asked who it is")
@@ -232,13 +193,13 @@ class Host:
             side.complain(
                 "enabled", time, f"{side.name} is told to vibrate although it is not enabled"
             )
-        is_touched = self._contacts is None or self._contacts
-        if not is_touched and time > self._lifted + self._times.lift + self._times.slack:
+        is_touched = self._people.contacts is None or self._people.contacts
+        if not is_touched and time > self._people.lifted + self._times.lift + self._times.slack:
             side.complain(
                 "justified",
                 time,
                 f"{side.name} is told to vibrate although nobody touches the plate since "
-                f"{self._lifted:.4f} s",
+                f"{self._people.lifted:.4f} s",
             )
 
     def _knows_of_disarmed(self, side: Side) -> bool:
@@ -264,7 +225,7 @@ class Host:
                 side.last_token = asked.token
                 side.levels = {channel: drive for channel, drive in drives.items() if drive.level}
                 if is_new and side.vibrates:
-                    self._owe_company(side, time, asked.token)
+                    self._duties.company(side, time, asked.token)
                 if not side.vibrates:
                     self._check_release(side, time, asked.ramp, drives)
             case Kind.STOP | Kind.DISARM | Kind.ARM:
@@ -273,8 +234,8 @@ class Host:
                 side.staged = {}
                 if asked.kind is Kind.STOP:
                     side.is_stopped, side.stop_wished = True, None
-                    if self._arm_wished:
-                        self._arm_wished, self._silence_wished = False, time
+                    if self._people.arm_wished:
+                        self._people.arm_wished, self._people.silence_wished = False, time
             case _:
                 pass
 
@@ -282,50 +243,18 @@ class Host:
         self, side: Side, time: float, ramp: float, drives: Mapping[int, Drive]
     ) -> None:
         """Zero itself, not only its command, is there soon after the last lift."""
-        if self._contacts or not 0 <= time - self._lifted <= self._times.lift:
+        if self._people.contacts or not 0 <= time - self._people.lifted <= self._times.lift:
             return
         has_endings = any(not drive.skip_ending for drive in drives.values()) and side.staged
-        if time + ramp > self._lifted + self._times.release + self._times.slack and not has_endings:
+        if (
+            time + ramp > self._people.lifted + self._times.release + self._times.slack
+            and not has_endings
+        ):
             side.complain(
                 "lift",
                 time,
-                f"the last finger was lifted at {self._lifted:.4f} s, but {side.name} is silent "
-                f"only after a ramp of {ramp:g} s",
-            )
-
-    def _owe(self, duty: Duty) -> None:
-        self._duties.append(duty)
-
-    def _owe_stop(self, side: Side, time: float) -> None:
-        side.stop_wished = time
-        self._owe(
-            Duty(
-                time + self._times.stop,
-                lambda: side.stop_wished != time or not side.is_open,
-                "stop",
-                side.plan.wire,
-                f"a stop was wished at {time:.4f} s, and {self._times.stop * 1e3:g} ms later "
-                f"{side.name} has not been told",
-            )
-        )
-
-    def _owe_company(self, first: Side, time: float, token: int) -> None:
-        """Where one amplifier plays a set, all do, or it is silenced."""
-        for side in self._sides.values():
-            if side is first or not side.follower.is_enabled:
-                continue
-            self._owe(
-                Duty(
-                    time + self._times.together,
-                    lambda side=side: (  # type: ignore[misc]
-                        # Where nobody is left on the first one's wire, its watchdog silences it.
-                        token in side.told or not first.vibrates or not first.is_open
-                    ),
-                    "commit",
-                    side.plan.wire,
-                    f"{first.name} was told at {time:.4f} s to play set {token}, and "
-                    f"{self._times.together * 1e3:g} ms later {side.name} was not",
-                )
+                f"the last finger was lifted at {self._people.lifted:.4f} s, but {side.name} is "
+                f"silent only after a ramp of {ramp:g} s",
             )
 
     def _drives(self, side: Side, asked: Asked) -> Mapping[int, Drive]:
@@ -340,26 +269,3 @@ class Host:
     def _silences(self, asked: Asked) -> bool:
         is_silent_set = asked.kind is Kind.APPLY and not asked.vibrates
         return is_silent_set or asked.kind in (Kind.STOP, Kind.DISARM)
-
-    def _is_released(self, side: Side, lifted: float) -> bool:
-        """Whether it was told to be silent after a lift, or has a good reason not to be."""
-        is_touched_again = self._touched >= lifted
-        told = not side.vibrates or side.follower.is_in_fault or not side.is_open
-        has_given_up = side.last_life is None  # since some trouble
-        return told or is_touched_again or has_given_up or self._hung is not None
-
-    def _can_play(self) -> bool:
-        sides = self._sides.values()
-        return self._hung is None and all(
-            side.is_open and side.follower.is_enabled and not side.is_stopped for side in sides
-        )
-
-    def _is_answered(self, contact: Hashable, since: float) -> bool:
-        """Whether a pattern plays since then, or there is a good reason why none does."""
-        return (
-            any(side.vibrated_at >= since for side in self._sides.values())
-            or contact not in (self._contacts or ())
-            or self._silence_wished >= since
-            or self._hung is not None
-            or any(side.follower.is_in_fault or not side.is_open for side in self._sides.values())
-        )

@@ -1,4 +1,4 @@
-"""What is remembered of a host: for each amplifier, and of what it owes."""
+"""What is remembered of a host for each amplifier."""
 
 import math
 from collections import deque
@@ -10,17 +10,6 @@ from sim.witness.plan import AmplifierPlan
 from sim.witness.seen import Asked, Complain, Drive
 
 _REMEMBERED = 16  # tokens since Arm
-
-
-@dataclass
-class Duty:
-    """What must have happened when a time [s] is over; is_done is asked then."""
-
-    due: float
-    is_done: Callable[[], bool]
-    invariant: str
-    wire: str
-    sentence: str
 
 
 @dataclass

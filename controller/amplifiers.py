@@ -5,15 +5,15 @@ import logging
 from collections.abc import Coroutine, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from enum import Enum, auto
-from functools import partial
 from typing import Any, TypeVar
 
+from controller.joint_play import JointPlay
 from controller.read_backs import ReadBacks
+from controller.together import gathered, to_the_end
 from drivers.amplifier import WATCHDOG, Amplifier
 from drivers.errors import CommandError, CommandRefused, DriverError, LinkError
 from drivers.guard import SafeCommand, SafeEnvelope
-from drivers.protocol.messages import Achieved, State, Status
-from drivers.simultaneous import at_one_moment
+from drivers.protocol.messages import Achieved, State
 from drivers.turns import PATIENCE
 from drivers.watchdog import check_watchdog
 
@@ -44,9 +44,8 @@ class AmplifierGroup:
 
     def __init__(self, amplifiers: Mapping[str, Amplifier]) -> None:
         self.phase = Phase.CLOSED
-        self.loading_time = 0.0  # s; that of the last envelopes
-        self.is_torn = False  # whether a set may have been committed by some of them only
         self._amplifiers = dict(amplifiers)
+        self._joint = JointPlay(self._amplifiers, goes_on=lambda: self.phase is Phase.ARMED)
         self._closing = asyncio.Lock()  # who closes again must not hang up on who still silences
         self._silencings = 0  # how often they were disarmed, stopped or closed
         self._being_silenced = 0  # by how many who stop or disarm them just now
@@ -60,6 +59,16 @@ class AmplifierGroup:
         return max(amplifier.last_sent for amplifier in self._all)
 
     @property
+    def is_torn(self) -> bool:
+        """Whether a set may have been committed by some of them only."""
+        return self._joint.is_torn
+
+    @property
+    def loading_time(self) -> float:
+        """How long [s] it took to load the last envelopes."""
+        return self._joint.loading_time
+
+    @property
     def _all(self) -> Iterable[Amplifier]:
         return self._amplifiers.values()
 
@@ -69,7 +78,7 @@ class AmplifierGroup:
         Also CommandError, for a wire that is too slow for the amplifiers' watchdog.
         """
         try:
-            await _gathered(amplifier.open() for amplifier in self._all)
+            await gathered(amplifier.open() for amplifier in self._all)
             for amplifier in self._all:
                 check_watchdog(WATCHDOG, amplifier.round_trip())
         except BaseException:
@@ -101,10 +110,10 @@ class AmplifierGroup:
                 )
         except BaseException:
             self._leave_armed()
-            await _to_the_end(self._each(amplifier.disarm() for amplifier in self._all))
+            await to_the_end(self._each(amplifier.disarm() for amplifier in self._all))
             raise
         self._read_backs.forget()
-        self.is_torn = False
+        self._joint.begin()
         self.phase = Phase.ARMED
 
     async def play(
@@ -119,7 +128,9 @@ class AmplifierGroup:
         `hurry` ended it. Raises DriverError.
         """
         self._read_backs.forget()
-        achieved = await self._or_stop(self._play(commands, envelopes or {}))
+        achieved = await self._or_stop(
+            self._on_the_link(self._joint.play(commands, envelopes or {}))
+        )
         if achieved is not None:
             now = asyncio.get_running_loop().time()
             self._read_backs.expect(commands, achieved, now=now)
@@ -154,7 +165,7 @@ class AmplifierGroup:
         """Quick stop of every amplifier that can be reached; latched until `clear`."""
         self._leave_armed()
         with self._silencing():
-            await _to_the_end(self._each(amplifier.stop() for amplifier in self._all))
+            await to_the_end(self._each(amplifier.stop() for amplifier in self._all))
 
     async def clear(self) -> None:
         """Acknowledge stops, and faults whose cause is gone."""
@@ -179,7 +190,7 @@ class AmplifierGroup:
                 await self._wind_down(silence)
             elif self._may_be_armed:
                 reachable = [amplifier for amplifier in self._all if not amplifier.lost]
-                await _to_the_end(self._each(amplifier.disarm() for amplifier in reachable))
+                await to_the_end(self._each(amplifier.disarm() for amplifier in reachable))
         except BaseException as error:
             await self.stop()
             if not isinstance(error, DriverError):
@@ -188,70 +199,18 @@ class AmplifierGroup:
         finally:
             await self._close_wires()
 
-    async def _play(
-        self,
-        commands: Mapping[str, SafeCommand],
-        envelopes: Mapping[str, Sequence[SafeEnvelope]],
-    ) -> dict[str, Achieved] | None:
-        if any(envelopes.values()):
-            begin = asyncio.get_running_loop().time()
-            await self._together(self._load(name, each) for name, each in envelopes.items())
-            self.loading_time = asyncio.get_running_loop().time() - begin
-            if self.phase is not Phase.ARMED:
-                return None  # whatever is played now would undo the silence that came in between
-        if len(commands) == 1 or all(safe.is_silent for safe in commands.values()):
-            # One has nobody to wait for, and silence waits for nobody.
-            applied = await self._together(
-                self._amplifiers[name].apply(safe) for name, safe in commands.items()
-            )
-            self.is_torn = False
-            return dict(zip(commands, applied, strict=True))
-        achieved = await self._together(
-            self._amplifiers[name].stage(safe) for name, safe in commands.items()
-        )
-        if self.phase is not Phase.ARMED:
-            return None  # a commit now would undo the silence that came in between
-        self.is_torn = True
-        await self._together(self._commits(commands))
-        for name, status in (await self._statuses()).items():
-            if status.token != commands[name].token:
-                raise CommandRefused(
-                    f"amplifier {name} plays set {status.token} instead of {commands[name].token}"
-                )
-        self.is_torn = False
-        return dict(zip(commands, achieved, strict=True))
-
-    async def _load(self, name: str, envelopes: Sequence[SafeEnvelope]) -> None:
-        for envelope in envelopes:
-            if self.phase is not Phase.ARMED:
-                return  # nothing will be played
-            await self._amplifiers[name].load_envelope(envelope)
-
-    def _commits(self, sets: Mapping[str, SafeCommand]) -> Iterable[Coroutine[Any, Any, object]]:
-        """Commit everything that is staged, to arrive at one moment; once where a bus is shared."""
-        together: dict[tuple[str, int], list[Amplifier]] = {}
-        for name, safe in sets.items():
-            amplifier = self._amplifiers[name]
-            together.setdefault((amplifier.bus or name, safe.token), []).append(amplifier)
-        return at_one_moment(
-            [
-                (first, partial(first.commit_on_bus if others else first.commit, token))
-                for (_, token), (first, *others) in together.items()
-            ]
-        )
-
     async def _wind_down(self, silence: Mapping[str, SafeCommand]) -> None:
         """Silence, proof of it, and high voltage off."""
-        await _gathered(self._amplifiers[name].apply(safe) for name, safe in silence.items())
+        await gathered(self._amplifiers[name].apply(safe) for name, safe in silence.items())
         await asyncio.sleep(max(safe.ramp for safe in silence.values()))
         for _ in range(_READ_BACKS):
-            statuses = await self._statuses()
+            statuses = await self._on_the_link(self._joint.statuses())
             if not any(level for status in statuses.values() for level in status.levels):
                 break
             await asyncio.sleep(_READ_BACK_PAUSE)
         else:
             raise CommandRefused("an amplifier reports a level after it was told to be silent")
-        await _gathered(amplifier.disarm() for amplifier in self._all)
+        await gathered(amplifier.disarm() for amplifier in self._all)
 
     async def _beat(self) -> bool:
         """A heartbeat to every amplifier; True, or CommandRefused from one that is not enabled."""
@@ -290,15 +249,14 @@ class AmplifierGroup:
         finally:
             self._limit = None
 
-    async def _statuses(self) -> dict[str, Status]:
-        """The status of every amplifier, by name."""
-        statuses = await self._together(amplifier.status() for amplifier in self._all)
-        return dict(zip(self._amplifiers, statuses, strict=True))
-
     async def _together(self, requests: Iterable[Coroutine[Any, Any, _T]]) -> list[_T]:
-        """Wait for the replies of all; after a lost link nothing is played any more."""
+        """Wait for the replies of all."""
+        return await self._on_the_link(gathered(requests))
+
+    async def _on_the_link(self, exchange: Coroutine[Any, Any, _T]) -> _T:
+        """Ask amplifiers something; after a lost link nothing is played any more."""
         try:
-            return await _gathered(requests)
+            return await exchange
         except LinkError:
             if self.phase is not Phase.CLOSED:
                 self.phase = Phase.LOST
@@ -312,7 +270,7 @@ class AmplifierGroup:
 
     async def _close_wires(self) -> None:
         """Close every wire, whatever the others say."""
-        await _to_the_end(self._each(amplifier.close() for amplifier in self._all))
+        await to_the_end(self._each(amplifier.close() for amplifier in self._all))
 
     @contextmanager
     def _silencing(self) -> Iterator[None]:
@@ -328,28 +286,3 @@ class AmplifierGroup:
         self._silencings += 1
         if self.phase is Phase.ARMED:
             self.phase = Phase.DISARMED
-
-
-async def _gathered(requests: Iterable[Coroutine[Any, Any, _T]]) -> list[_T]:
-    """Wait for all, then raise the gravest of what they raised: a lost link before a refusal.
-
-    A single one goes out at once, without a turn of the event loop in between.
-    """
-    pending = list(requests)
-    if len(pending) == 1:
-        return [await pending[0]]
-    results = await asyncio.gather(*pending, return_exceptions=True)
-    failures = [result for result in results if isinstance(result, BaseException)]
-    if failures:
-        raise next((error for error in failures if isinstance(error, LinkError)), failures[0])
-    return [result for result in results if not isinstance(result, BaseException)]
-
-
-async def _to_the_end(work: Coroutine[Any, Any, None]) -> None:
-    """See work through, also where the caller is cancelled meanwhile; that is raised afterwards."""
-    task = asyncio.ensure_future(work)
-    try:
-        await asyncio.shield(task)
-    except asyncio.CancelledError:
-        await task
-        raise

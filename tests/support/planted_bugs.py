@@ -157,12 +157,12 @@ CONTROLLER: dict[str, Bug] = {
     "a set is committed by one amplifier only": _bug(
         "commit",
         Edit(
-            "controller.amplifiers:AmplifierGroup._commits",
+            "controller.joint_play:JointPlay._commits",
             "in together.items()",
             "in list(together.items())[:1]",
         ),
         Edit(
-            "controller.amplifiers:AmplifierGroup._play",
+            "controller.joint_play:JointPlay.play",
             "if status.token != commands[name].token:",
             "if False:",
         ),

@@ -1,0 +1,93 @@
+"""How several amplifiers play one set together: load, stage, commit at one moment, look at it."""
+
+import asyncio
+from collections.abc import Callable, Coroutine, Iterable, Mapping, Sequence
+from functools import partial
+from typing import Any
+
+from controller.together import gathered
+from drivers.amplifier import Amplifier
+from drivers.errors import CommandRefused
+from drivers.guard import SafeCommand, SafeEnvelope
+from drivers.protocol.messages import Achieved, Status
+from drivers.simultaneous import at_one_moment
+
+
+class JointPlay:
+    """Sets for amplifiers by their names in the rig; what goes wrong is raised, and left so.
+
+    goes_on: whether anything is to be played still; silence may come in between at any step.
+    is_torn: whether a set may have been committed by some of them only. loading_time [s]: how long
+    it took to load the last envelopes.
+    """
+
+    def __init__(self, amplifiers: Mapping[str, Amplifier], *, goes_on: Callable[[], bool]) -> None:
+        self.is_torn = False
+        self.loading_time = 0.0
+        self._amplifiers = amplifiers
+        self._goes_on = goes_on
+
+    def begin(self) -> None:
+        """All of them are at zero."""
+        self.is_torn = False
+
+    async def play(
+        self,
+        commands: Mapping[str, SafeCommand],
+        envelopes: Mapping[str, Sequence[SafeEnvelope]],
+    ) -> dict[str, Achieved] | None:
+        """What they make of their sets, by name; None where silence came in between.
+
+        Raises DriverError.
+        """
+        if any(envelopes.values()):
+            begin = asyncio.get_running_loop().time()
+            await gathered(self._load(name, each) for name, each in envelopes.items())
+            self.loading_time = asyncio.get_running_loop().time() - begin
+            if not self._goes_on():
+                return None  # whatever is played now would undo that silence
+        if len(commands) == 1 or all(safe.is_silent for safe in commands.values()):
+            # One has nobody to wait for, and silence waits for nobody.
+            applied = await gathered(
+                self._amplifiers[name].apply(safe) for name, safe in commands.items()
+            )
+            self.is_torn = False
+            return dict(zip(commands, applied, strict=True))
+        achieved = await gathered(
+            self._amplifiers[name].stage(safe) for name, safe in commands.items()
+        )
+        if not self._goes_on():
+            return None  # a commit now would undo that silence
+        self.is_torn = True
+        await gathered(self._commits(commands))
+        for name, status in (await self.statuses()).items():
+            if status.token != commands[name].token:
+                raise CommandRefused(
+                    f"amplifier {name} plays set {status.token} instead of {commands[name].token}"
+                )
+        self.is_torn = False
+        return dict(zip(commands, achieved, strict=True))
+
+    async def statuses(self) -> dict[str, Status]:
+        """The status of every amplifier, by name; raises DriverError."""
+        statuses = await gathered(amplifier.status() for amplifier in self._amplifiers.values())
+        return dict(zip(self._amplifiers, statuses, strict=True))
+
+    async def _load(self, name: str, envelopes: Sequence[SafeEnvelope]) -> None:
+        for envelope in envelopes:
+            if not self._goes_on():
+                return  # nothing will be played
+            await self._amplifiers[name].load_envelope(envelope)
+
+    def _commits(self, sets: Mapping[str, SafeCommand]) -> Iterable[Coroutine[Any, Any, object]]:
+        """Commit everything that is staged, to arrive at one moment; once where a bus is shared."""
+        together: dict[tuple[str, int], list[Amplifier]] = {}
+        for name, safe in sets.items():
+            amplifier = self._amplifiers[name]
+            together.setdefault((amplifier.bus or name, safe.token), []).append(amplifier)
+        return at_one_moment(
+            [
+                (first, partial(first.commit_on_bus if others else first.commit, token))
+                for (_, token), (first, *others) in together.items()
+            ]
+        )

@@ -12,8 +12,8 @@ from controller.decision import RELEASE_RAMP, Decider, Decision
 from controller.envelopes import ENVELOPE_TIME
 from controller.guards import make_guards
 from controller.means import Means, means_of
-from controller.observer import Applied, Observer, Silenced
-from controller.orders import PatternTiming
+from controller.observer import Observer, applied_by, silenced_by
+from controller.orders import Order, PatternTiming
 from controller.routing import drive_of_eras
 from controller.selection import PatternTable
 from controller.tally import Tally
@@ -21,6 +21,7 @@ from controller.touch import TouchFrame, TouchSource
 from controller.wishes import NewestBuzzes, Wishes
 from drivers import clock
 from drivers.amplifier import Amplifier
+from drivers.command import DriveCommand
 from drivers.errors import CommandError, DriverError, LinkError
 from drivers.watchdog import HEARTBEAT
 from model.errors import InputError
@@ -244,58 +245,52 @@ class Controller:
 
     async def _carry_out(self, decision: Decision) -> None:
         """Send the commands of a decision and tell what came of them; raises DriverError."""
-        latency = None
-        drive = {}
+        drive: Mapping[str, DriveCommand] | None = {}
+        if decision.order is not None:
+            drive = await self._play(decision.order)
+        if drive is not None:
+            self._tell_outcome(decision, drive)
+
+    async def _play(self, order: Order) -> Mapping[str, DriveCommand] | None:
+        """Have an order played; what plays then, by ERA. None if silence came in between."""
+        achieved = None
+        try:
+            if self._group.is_torn and order.pattern is not None:
+                # Half of a set is none: silence goes before whatever shall be played instead.
+                silence = self._decider.silence(ramp=RELEASE_RAMP).commands
+                if await self._group.play(silence) is None:
+                    return None
+            achieved = await self._group.play(order.commands, envelopes=order.envelopes)
+        finally:
+            if achieved is None:  # whoever goes on from here must not count on it
+                self._decider.forget()
+        if achieved is None:
+            return None
+        commands = {name: several.commands for name, several in achieved.items()}
+        drive = drive_of_eras(commands, self._rig)
+        self._decider.confirm(drive, now=self._clock())
+        if any(order.envelopes.values()):
+            self._decider.loaded_in(self._group.loading_time, now=self._clock())
+        return drive
+
+    def _tell_outcome(self, decision: Decision, drive: Mapping[str, DriveCommand]) -> None:
+        """Tell what a decision has led to; what plays now, by ERA."""
         order = decision.order
-        if order is not None:
-            achieved = None
-            try:
-                if self._group.is_torn and order.pattern is not None:
-                    # Half of a set is none: silence goes before whatever shall be played instead.
-                    silence = self._decider.silence(ramp=RELEASE_RAMP).commands
-                    if await self._group.play(silence) is None:
-                        return
-                achieved = await self._group.play(order.commands, envelopes=order.envelopes)
-            finally:
-                if achieved is None:  # whoever goes on from here must not count on it
-                    self._decider.forget()
-            if achieved is None:
-                return
-            commands = {name: several.commands for name, several in achieved.items()}
-            drive = drive_of_eras(commands, self._rig)
-            self._decider.confirm(drive, now=self._clock())
-            if any(order.envelopes.values()):
-                self._decider.loaded_in(self._group.loading_time, now=self._clock())
-            latency = self._group.last_sent - decision.since
-        problem = order.problem if order is not None else None
-        if problem is not None:
-            self._tell(self._observer.refused, problem)
+        if order is not None and order.problem is not None:
+            self._tell(self._observer.refused, order.problem)
         if order is not None and order.is_brake:
-            return
-        selection = decision.selection
-        if order is None or order.pattern is None:
-            silenced = Silenced(
-                contacts=decision.contacts,
-                selection=selection,
-                reason=problem or selection.reason or "",
-                latency=latency,
-                time=self._clock(),
+            return  # nothing else is felt by it
+        sent = self._group.last_sent
+        if order is not None and order.pattern is not None:
+            self._tell(
+                self._observer.pattern_applied,
+                applied_by(decision, order.pattern, drive=drive, sent=sent, timing=self._timing),
             )
-            self._tell(self._observer.silenced, silenced)
-        elif latency is not None:
-            applied = Applied(
-                contacts=decision.contacts,
-                targets=selection.felt,
-                quiet=selection.quiet,
-                pattern=order.pattern,
-                drive=drive,
-                latency=latency,
-                time=decision.since + latency,
-                from_rest=decision.from_rest,
-                question=selection.question,
-                timing=self._timing,
+        else:
+            self._tell(
+                self._observer.silenced,
+                silenced_by(decision, sent=None if order is None else sent, now=self._clock()),
             )
-            self._tell(self._observer.pattern_applied, applied)
 
     async def _listen(self, source: TouchSource) -> None:
         """Take what a source says; one that fails is told, and leaves its contacts to expire."""

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 from controller.contacts import Change, Contact
+from controller.decision import Decision
 from controller.orders import PatternTiming
 from controller.selection import Felt, Selection
 from drivers.command import DriveCommand
@@ -60,6 +61,41 @@ class Silenced:
     reason: str
     latency: float | None
     time: float
+
+
+def applied_by(
+    decision: Decision,
+    pattern: Pattern,
+    *,
+    drive: Mapping[str, DriveCommand],
+    sent: float,
+    timing: PatternTiming | None,
+) -> Applied:
+    """What is told of a decision by which a pattern plays; sent [s]: its last byte."""
+    return Applied(
+        contacts=decision.contacts,
+        targets=decision.selection.felt,
+        quiet=decision.selection.quiet,
+        pattern=pattern,
+        drive=drive,
+        latency=sent - decision.since,
+        time=sent,
+        from_rest=decision.from_rest,
+        question=decision.selection.question,
+        timing=timing,
+    )
+
+
+def silenced_by(decision: Decision, *, sent: float | None, now: float) -> Silenced:
+    """What is told of a decision by which nothing plays; sent, now [s]: None where none was."""
+    problem = None if decision.order is None else decision.order.problem
+    return Silenced(
+        contacts=decision.contacts,
+        selection=decision.selection,
+        reason=problem or decision.selection.reason or "",
+        latency=None if sent is None else sent - decision.since,
+        time=now,
+    )
 
 
 def _ignore(*_: object) -> None:

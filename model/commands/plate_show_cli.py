@@ -2,6 +2,7 @@
 
 import json
 import math
+import sys
 from typing import Any
 
 from model.commands.plate_cli import JsonOption, RigArgument
@@ -9,30 +10,39 @@ from model.commands.plate_cli import JsonOption, RigArgument
 
 def materials(as_json: JsonOption = False) -> None:
     """The materials known by name, their numbers, and where these come from."""
-    from model.structure.materials import KNOWN_MATERIALS
+    from model.errors import InputError
+    from model.structure.materials import known_material, material_names
 
+    known, problems = {}, []
+    for name in material_names():
+        try:
+            known[name] = known_material(name)
+        except InputError as error:  # of one plug-in; the others are as good as before
+            problems.append(str(error))
     if as_json:
         entries = [
             {
                 "name": name,
-                "E_pa": known.material.E,
-                "rho_kg_m3": known.material.rho,
-                "nu": known.material.nu,
-                "source": known.source,
-                "spread": known.spread,
-                "loss_factor": known.loss_factor,
+                "E_pa": one.material.E,
+                "rho_kg_m3": one.material.rho,
+                "nu": one.material.nu,
+                "source": one.source,
+                "spread": one.spread,
+                "loss_factor": one.loss_factor,
             }
-            for name, known in KNOWN_MATERIALS.items()
+            for name, one in known.items()
         ]
-        print(json.dumps({"materials": entries}))
+        print(json.dumps({"materials": entries, "problems": problems}))
         return
-    for name, known in KNOWN_MATERIALS.items():
-        numbers = known.material
+    for name, one in known.items():
+        numbers = one.material
         print(f"{name}: E {numbers.E / 1e9:g} GPa, rho {numbers.rho:g} kg/m³, nu {numbers.nu:g}")
-        print(f"    source  {known.source}")
-        print(f"    spread  {known.spread}")
-        print(f"    loss factor of the bare material, about  {known.loss_factor}")
+        print(f"    source  {one.source}")
+        print(f"    spread  {one.spread}")
+        print(f"    loss factor of the bare material, about  {one.loss_factor}")
     print("Any other goes by its numbers: material: {E: 70 GPa, rho: 2700, nu: 0.33}")
+    for problem in problems:
+        print(f"era: warning: {problem}", file=sys.stderr)
 
 
 def show(rig_file: RigArgument, as_json: JsonOption = False) -> None:

@@ -32,7 +32,7 @@ from model.config.units import (
     TIME,
 )
 from model.structure.laminate import Bond
-from model.structure.materials import KNOWN_MATERIALS, material
+from model.structure.materials import material, material_names
 
 
 class _MaterialByName:
@@ -53,7 +53,7 @@ class _MaterialByName:
     def __get_pydantic_json_schema__(
         self, schema: CoreSchema, handler: GetJsonSchemaHandler
     ) -> dict[str, Any]:
-        return {"anyOf": [{"enum": list(KNOWN_MATERIALS)}, handler(schema)]}
+        return {"anyOf": [{"enum": list(material_names())}, handler(schema)]}
 
 
 def _identifier(text: str) -> str:

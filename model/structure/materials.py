@@ -1,12 +1,13 @@
 """Materials by name, each with where its numbers come from and how far real ones differ.
 
-To add one, add an entry to the list; rig files, their schema and `era plate materials` follow.
+An installed package adds one by an entry point of the group `era_haptics.materials` that leads to
+a `KnownMaterial` of that name; rig files, their schema and `era plate materials` follow.
 """
 
 from dataclasses import dataclass
-from difflib import get_close_matches
 
 from model.errors import InputError
+from model.plugins import Catalogue
 from model.structure.plate import Material
 
 
@@ -69,19 +70,37 @@ _KNOWN = (
 )
 
 KNOWN_MATERIALS = {known.material.name: known for known in _KNOWN}
+"""Those that come with this package."""
+
+_MATERIALS = Catalogue(
+    "material",
+    KnownMaterial,
+    KNOWN_MATERIALS,
+    group="era_haptics.materials",
+    otherwise="; any other can be given by its numbers, {E: 70 GPa, rho: 2700, nu: 0.33}",
+)
 
 
-def material(name: str) -> Material:
-    """The material of this name; raises InputError, with what may have been meant.
+def material_names() -> tuple[str, ...]:
+    """All that go by a name, those of installed plug-ins too; none of these is loaded."""
+    return _MATERIALS.names()
+
+
+def known_material(name: str) -> KnownMaterial:
+    """The material of this name with its papers; raises InputError, with what may have been meant.
 
     Case does not matter, nor whether words are joined by hyphen, underscore or space.
     """
     plain = "-".join(name.lower().replace("_", " ").replace("-", " ").split())
-    if plain in KNOWN_MATERIALS:
-        return KNOWN_MATERIALS[plain].material
-    close = get_close_matches(plain, KNOWN_MATERIALS, n=1, cutoff=0.6)
-    meant = f"did you mean {close[0]}? " if close else ""
-    raise InputError(
-        f"unknown material {name[:40]!r}; {meant}known are: {', '.join(KNOWN_MATERIALS)}; any "
-        "other can be given by its numbers, {E: 70 GPa, rho: 2700, nu: 0.33}"
-    )
+    known = _MATERIALS.find(plain)
+    if known.material.name != plain:
+        raise InputError(
+            f"material {plain}: the plug-in of this name gives one that is called "
+            f"{known.material.name!r}; its entry point and its Material need the same name"
+        )
+    return known
+
+
+def material(name: str) -> Material:
+    """The material of this name; raises InputError as `known_material` does."""
+    return known_material(name).material

@@ -94,7 +94,7 @@ sbom: dist
 	done
 
 licences: sbom
-	$(BIN)/python tests/support/licences.py dist/sbom.json dist/sbom-extras.json > docs/licences.md
+	$(BIN)/python tests/support/licences.py dist/sbom.json dist/sbom-extras.json > docs/reference/licences.md
 
 clean:
 	rm -rf .venv dist docs/_build .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache out

@@ -7,8 +7,8 @@ processes of their own (`benchmarks.latency_run`). Leave the machine alone meanw
 minutes; with --seconds 2 it takes one, which shows that it works. A case that is disturbed is
 tried once more; where that fails too, the others are measured all the same.
 
-With --report, docs/latency.md and its picture are written as well. With --check only taps at 100 Hz
-are measured, over `tcp` or a `pty`, and what was measured is printed as JSON: for tests.
+With --report, docs/measured/latency.md and its picture are written as well. With --check only taps
+at 100 Hz are measured, over `tcp` or a `pty`, and what was measured is printed as JSON: for tests.
 """
 
 import argparse

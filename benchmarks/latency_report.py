@@ -48,7 +48,7 @@ that answer none would be counted under *no touch's*.
   daemon writes is at the far end when the system call returns. The same over a **pseudo-terminal**
   stands beside it, where a thread of the kernel carries the bytes on, which is as urgent as any
   program and has to get a core first, there and back: that is no part of a real port, which has its
-  own way and its own time, by arithmetic ([wires](wire-protocol.md)).
+  own way and its own time, by arithmetic ([wires](../reference/wire-protocol.md)).
 - **Devices of their own**: an amplifier and a panel do not share the daemon's processors. The
   programs that stand for them have to, so they come first (SCHED_RR, else nice {device}), and
   what they compute is lost to the daemon, as it would not be.
@@ -80,16 +80,18 @@ does nothing else shows next to none.
 WITHOUT = "No figures yet: the command writes them here, with the histogram.\n"
 
 END = """
-**Shaped onsets.** With `touch_wait: 30 ms`, the default of the [daemon](daemon.md), a touch that
-starts from rest waits until its [shaped onset](transients.md) is found and loaded: four envelopes,
-each with an answer of its own. With `touch_wait: 0 ms` it starts along a plain ramp, at once. That
-costs contrast while it starts, not afterwards: over the first 100 ms 19 dB in place of 28 to one
-quiet finger, 12 in place of 16 to two ([measured](transients.md)). A finger that slides waits in
-neither case, for what plays already needs no onset.
+**Shaped onsets.** With `touch_wait: 30 ms`, the default of the [daemon](../reference/daemon.md), a
+touch that starts from rest waits until its [shaped onset](../concepts/transients.md) is found and
+loaded: four envelopes, each with an answer of its own. With `touch_wait: 0 ms` it starts along a
+plain ramp, at once. That costs contrast while it starts, not afterwards: over the first 100 ms
+19 dB in place of 28 to one quiet finger, 12 in place of 16 to two
+([measured](../concepts/transients.md)). A finger that slides waits in neither case,
+for what plays already needs no onset.
 
 **Nice and sessions.** Where the system shares the cores among sessions first (autogroup, see
 sched(7)), nice counts within a session only: the daemon has a session of its own here, as urgent as
-itself. Why it is not scheduled in real time is a [decision](decisions/0019-nice-not-real-time.md).
+itself. Why it is not scheduled in real time is a
+[decision](../decisions/0019-nice-not-real-time.md).
 """
 
 
@@ -147,7 +149,7 @@ def write_report(
 
     minutes: how long it all took.
     """
-    page = docs / "latency.md"
+    page = docs / "measured" / "latency.md"
     page.write_text(report(found, seconds=seconds, seed=seed, minutes=minutes), encoding="utf-8")
     measured = [one for one in found if isinstance(one, Found) and is_drawn(one.case)]
     if measured:
@@ -177,7 +179,7 @@ def report(found: Sequence[Found | Failed], *, seconds: float, seed: int, minute
     if isinstance(first, Found) and isinstance(second, Found):
         parts.append(_verdict(first, second))
     if any(isinstance(one, Found) and is_drawn(one.case) for one in found):
-        parts.append(f"![Histogram]({PICTURE})")
+        parts.append(f"![Histogram](../{PICTURE})")
     return text + "\n\n".join(parts) + "\n" + END
 
 

@@ -6,7 +6,7 @@ Contact sets: fingertips anywhere on the plate, at least 5 cm apart, one the tar
 quiet; 27 frequencies from 40 to 500 Hz; the target at 1 m/s² or more at full stroke. Realised:
 gains wrong by 5 % and phases by 5 degrees (standard deviations, normal); of each set the median of
 its draws counts. Printed: the median over the sets, in brackets the tenth percentile. With
---report, docs/localization-benchmarks.md and its pictures are written as well.
+--report, docs/measured/localization-benchmarks.md and its pictures are written as well.
 """
 
 import argparse

@@ -8,7 +8,7 @@ from benchmarks.localization_contrast import GOALS, QUIET
 from benchmarks.localization_picture import modes_figure
 
 DOCS = Path(__file__).parent.parent / "docs"
-PAGE = "localization-benchmarks.md"
+PAGE = "measured/localization-benchmarks.md"
 
 INTRODUCTION = """# What contrast can be had, and how fast
 
@@ -50,9 +50,9 @@ def write_report(sections, options):
     _save(_contrast_figure(contrast), pictures[0])
     _save(_growth_figure(growth), pictures[1])
     _save(modes_figure(), pictures[2])
-    parts = [page, _markdown(contrast), f"![contrast](pictures/{pictures[0]})", READING]
+    parts = [page, _markdown(contrast), f"![contrast](../pictures/{pictures[0]})", READING]
     parts += [_markdown(each) for each in (two, ensemble, freedom, speed, growth)]
-    parts += [f"![growth](pictures/{pictures[1]})"]
+    parts += [f"![growth](../pictures/{pictures[1]})"]
     (DOCS / PAGE).write_text("\n\n".join(part.strip() for part in parts) + "\n", encoding="utf-8")
     print(f"wrote {DOCS / PAGE}")
 

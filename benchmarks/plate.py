@@ -3,7 +3,8 @@
     python -m benchmarks.plate [--runs 5] [-o docs]
 
 Checks first that everybody gives the same answer, then measures, each measurement in a process of
-its own and on one thread; writes benchmarks.md and its picture. Needs the extras group `peers`.
+its own and on one thread; writes measured/benchmarks.md and its picture. Needs the extras group
+`peers`.
 """
 
 import argparse

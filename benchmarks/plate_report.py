@@ -13,7 +13,7 @@ VERSIONS = ("numpy", "scipy", "scikit-fem", "pyfe3d", "ngsolve")
 
 
 def write_report(measured, agreement, *, peers, fastest, loads, folder: Path) -> None:
-    """Write benchmarks.md and pictures/benchmarks.png; measured holds medians by name."""
+    """Write measured/benchmarks.md and pictures/benchmarks.png; measured holds medians by name."""
     ours = measured["nothing ours"]
     peer_first = measured[f"nothing {fastest}"]
     peer_again = measured[f"layout {fastest}"]
@@ -111,9 +111,9 @@ points for every set of active ERAs of every layout; the memory is that of the l
 
 Factoring every layout again, {name} would take {hours:.1f} hours on both cores, by its time above.
 
-![Times of era-haptics and its peers](pictures/benchmarks.png)
+![Times of era-haptics and its peers](../pictures/benchmarks.png)
 """
-    (folder / "benchmarks.md").write_text(page)
+    (folder / "measured" / "benchmarks.md").write_text(page)
     figure = _picture(measured, peers)
     FigureCanvasAgg(figure)
     figure.savefig(folder / "pictures" / "benchmarks.png", dpi=130)

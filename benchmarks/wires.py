@@ -1,6 +1,6 @@
 """`make bench-wires`: what the drivers cost beside the bare library of each wire.
 
-Writes docs/wire-benchmarks.md. A wire is one entry in WIRES.
+Writes docs/measured/wire-benchmarks.md. A wire is one entry in WIRES.
 """
 
 import asyncio
@@ -42,7 +42,7 @@ from drivers.protocol.serial_frame import FrameReader, encode_frame
 from sim.far_ends.modbus.unit import ModbusUnit
 
 ROOT = Path(__file__).parent.parent
-PAGE = ROOT / "docs" / "wire-benchmarks.md"
+PAGE = ROOT / "docs" / "measured" / "wire-benchmarks.md"
 COUNT = 1500
 ROUNDS = 5  # ours and bare take turns, so that both see the same machine
 WIDE = Capabilities(

@@ -13,7 +13,8 @@ from drivers.registry import open_backend
 from drivers.watchdog import HEARTBEAT, HEARTBEATS_BORNE, check_watchdog, told_after
 
 # s; how far apart commits on two links may arrive although they are sent together: USB adapters
-# send in frames of 1 ms, networks and operating systems are no better. See docs/several-amplifiers.
+# send in frames of 1 ms, networks and operating systems are no better. See
+# docs/reference/several-amplifiers.md.
 APART = 0.001
 
 

@@ -64,8 +64,8 @@ class SolvedPlate:
 
         A pattern starts along its envelopes or its ramp, anything else along a ramp of 40 ms.
         finger_load: what each finger does to the plate, None for fingers that only feel. The plate
-        in time is solved exactly, without steps (`docs/plant.md`). Raises InputError for fingers
-        off the plate, and a duration in which nothing becomes steady.
+        in time is solved exactly, without steps (`docs/concepts/plant.md`). Raises InputError for
+        fingers off the plate, and a duration in which nothing becomes steady.
         """
         fingers = Question(as_points(target, what="target"), as_points(quiet, what="quiet"))
         return play(

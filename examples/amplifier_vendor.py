@@ -3,9 +3,10 @@
 # An amplifier's side of the wire, byte by byte
 
 For who builds an amplifier. Run it: `python examples/amplifier_vendor.py`, or open it as a notebook
-in VS Code or, with jupytext, in Jupyter. The protocol is told in docs/wire-protocol.md; here frames
-are made by hand and by the project's codec, a simulated amplifier answers them on a serial line,
-and the contract that every amplifier must keep is run against it.
+in VS Code or, with jupytext, in Jupyter. The protocol is told in
+docs/reference/wire-protocol.md; here frames are made by hand and by the project's codec, a
+simulated amplifier answers them on a serial line, and the contract that every amplifier must keep
+is run against it.
 """
 
 # %%

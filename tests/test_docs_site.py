@@ -38,8 +38,10 @@ def test_site(tmp_path: Path) -> None:
 
 
 def test_every_page_can_be_found() -> None:
-    """Each page of the docs stands in the index's tables of contents."""
-    index = (ROOT / "docs" / "index.md").read_text("utf-8")
-    listed = set(re.findall(r"^[a-z-]+$", index, re.MULTILINE))
-    pages = {path.stem for path in (ROOT / "docs").glob("*.md")} - {"index"}
-    assert pages - listed == set()
+    """Each page of the docs stands in the index's tables of contents, records by their pattern."""
+    docs = ROOT / "docs"
+    index = (docs / "index.md").read_text("utf-8")
+    listed = set(re.findall(r"^[a-z-]+(?:/[\w-]+)?$", index, re.MULTILINE))
+    pages = {path.relative_to(docs) for path in docs.rglob("*.md")}
+    names = {page.with_suffix("").as_posix() for page in pages if page.parts[0] != "_build"}
+    assert names - listed - {name for name in names if name.startswith("decisions/00")} == {"index"}

@@ -137,7 +137,7 @@ def test_it_works_without_the_checkout(wheel: Path, tmp_path: Path) -> None:
     )
     try_files(era)
     for name in ("era-amplifier.eds", "era-amplifier.dbc"):
-        assert (folder / name).read_bytes() == (ROOT / "docs" / name).read_bytes()
+        assert (folder / name).read_bytes() == (ROOT / "docs" / "reference" / name).read_bytes()
 
 
 def test_every_dependency_has_a_bound_that_can_be_tried(wheel: Path) -> None:
@@ -152,7 +152,7 @@ def test_every_dependency_has_a_bound_that_can_be_tried(wheel: Path) -> None:
 
 def test_licences_are_told_of_everything_that_is_installed(wheel: Path) -> None:
     """Each direct dependency of the wheel and its users' extras; copyleft by its name."""
-    page = (ROOT / "docs" / "licences.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "reference" / "licences.md").read_text(encoding="utf-8")
     told = dict(re.findall(r"^\| (\S+) \| \S+ \| ([^|]+) \|", page, re.MULTILINE))
     told = {re.sub(r"[-_.]+", "-", name).lower(): licence for name, licence in told.items()}
     users = ("", "gateway", "cluster")

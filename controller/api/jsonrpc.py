@@ -126,7 +126,7 @@ def read_params(model: type[Message], request: Request) -> Message:
             ErrorCode.INVALID_PARAMS,
             f"{request.method}: {_first_problem(error)}",
             where=_where(error),
-            remedy="see the method in docs/api.md",
+            remedy="see the method in docs/reference/api.md",
         ) from error
 
 

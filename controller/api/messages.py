@@ -1,7 +1,7 @@
 """The methods of the API: what is asked, and what is answered.
 
 One table, `METHODS`, says which parameters and which result belong to a method; the server, the
-clients, the reference in docs/api.md and the gateway's description all go by it.
+clients, the reference in docs/reference/api.md and the gateway's description all go by it.
 """
 
 from typing import Annotated, Any, NamedTuple

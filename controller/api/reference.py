@@ -1,6 +1,7 @@
-"""The reference in docs/api.md: tables of methods, topics, types and errors, from the models.
+"""The reference in docs/reference/api.md: methods, topics, types and errors, from the models.
 
-`python -m controller.api.reference docs/api.md` writes them anew between the page's two marks.
+`python -m controller.api.reference docs/reference/api.md` writes the tables anew between the page's
+two marks.
 """
 
 import re

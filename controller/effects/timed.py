@@ -16,7 +16,8 @@ from model.config.sections import Quantity
 from model.config.units import RATIO, TIME
 from model.finger.perception import STRONG_DB_SL
 
-# The plate needs some 20 ms to follow, see docs/transients.md; a shorter click would be none.
+# The plate needs some 20 ms to follow, see docs/concepts/transients.md; a shorter click would be
+# none.
 SHORTEST = 0.020
 LONGEST = 10.0
 

@@ -60,8 +60,8 @@ def openapi() -> dict[str, Any]:
             "version": API_VERSION,
             "description": (
                 "The API of the daemon over HTTP. The same methods and, beside them, notifications "
-                "go over the WebSocket /api/v1/ws, see docs/gateway.md. This is an operational "
-                "interface, not an emergency stop."
+                "go over the WebSocket /api/v1/ws, see docs/reference/gateway.md. This is an "
+                "operational interface, not an emergency stop."
             ),
         },
         "security": [{"token": []}],

@@ -65,7 +65,7 @@ def export(
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Write a table for other programs; docs/table-file.md says what is in it."""
+    """Write a table for other programs; docs/reference/table-file.md says what is in it."""
     from model.errors import InputError
     from model.files.replacing import check_replaceable
     from model.table.export import export_csv, export_mat

@@ -1,6 +1,6 @@
 """A table for other programs: a .mat file that holds all of it, or .csv files for a part each.
 
-`docs/table-file.md` lists every name with its shape and unit.
+`docs/reference/table-file.md` lists every name with its shape and unit.
 """
 
 import csv

@@ -10,7 +10,7 @@ ONSET_RAMP = 0.040
 
 At 20 dB SL the target feels it after a fifth of that, and half of it after half; twice as long as
 what just does not click, since a plate that is stirred less rings less at the quiet fingers: 4 dB
-of contrast over the first 100 ms (docs/transients.md).
+of contrast over the first 100 ms (docs/concepts/transients.md).
 """
 
 UNAWARE_DB_SL = -10.0

@@ -1,4 +1,4 @@
-"""CAN, from docs/wire-can.md: orders and answers, sets, heartbeats and emergencies.
+"""CAN, from docs/reference/wire-can.md: orders and answers, sets, heartbeats and emergencies.
 
 A set is the commands that came under its order's sequence number. SDO and NMT mean nothing here but
 that somebody was identified, that an envelope was loaded, or that an amplifier starts anew.

@@ -1,4 +1,4 @@
-"""Between which levels a channel must be while it fades, from docs/wire-protocol.md.
+"""Between which levels a channel must be while it fades, from docs/reference/wire-protocol.md.
 
 What it played is multiplied by (1 + cos(pi s)) / 2, what it shall play by (1 - cos(pi s)) / 2, and
 both are added; tones add with any phase, so that a level is known within bounds only.

@@ -1,4 +1,4 @@
-"""Modbus, from docs/wire-modbus.md: registers that are written and read, and what they ask."""
+"""Modbus, from docs/reference/wire-modbus.md: registers written and read, and what they ask."""
 
 import binascii
 import struct

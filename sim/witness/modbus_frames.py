@@ -1,4 +1,4 @@
-"""Modbus telegrams out of a stream of bytes, from docs/wire-modbus.md: over TCP and RTU."""
+"""Modbus telegrams out of a stream of bytes, TCP and RTU, from docs/reference/wire-modbus.md."""
 
 import struct
 from typing import NamedTuple, Protocol

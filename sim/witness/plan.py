@@ -113,7 +113,9 @@ def _limits(raw: Any, where: str) -> Limits:
 def _mapping(raw: Mapping[str, Any], key: str, where: str = "the plan") -> Mapping[Any, Any]:
     found = raw.get(key)
     if not isinstance(found, Mapping) or not found:
-        raise InputError(f"{where} names no {key}; see docs/witness.md for what a plan looks like")
+        raise InputError(
+            f"{where} names no {key}; see docs/reference/witness.md for what a plan looks like"
+        )
     return found
 
 

@@ -1,4 +1,4 @@
-"""The numbers of docs/wire-protocol.md, typed off its table: step, smallest and largest integer."""
+"""The numbers of docs/reference/wire-protocol.md, typed off its table: step and bounds."""
 
 from typing import NamedTuple
 

@@ -1,4 +1,4 @@
-"""The serial wire, from docs/wire-protocol.md: COBS between zeros, CRC-32, messages."""
+"""The serial wire, from docs/reference/wire-protocol.md: COBS between zeros, CRC-32, messages."""
 
 import struct
 import zlib

@@ -22,7 +22,7 @@ from controller.api.replies import Unreachable
 from controller.api.socket_path import SYSTEM_SOCKET, find_socket
 from daemon_bench import PLACE, running_daemon, until_state
 
-PAGE = Path(controller.__file__).parent.parent / "docs" / "api.md"
+PAGE = Path(controller.__file__).parent.parent / "docs" / "reference" / "api.md"
 READY, ENABLED = "READY_TO_SWITCH_ON", "OPERATION_ENABLED"
 
 
@@ -91,7 +91,7 @@ async def _all_events(era: AsyncClient) -> int:
 async def test_the_example_of_the_page_runs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The Python lines of docs/api.md, as they stand there, with the socket in its usual place."""
+    """The Python lines of the page, as they stand there, with the socket in its usual place."""
     found = re.search(r"## In Python\n\n((?:    .*\n|\n)+)", PAGE.read_text("utf-8"))
     assert found is not None
     code = re.sub(r"^    ", "", found[1], flags=re.MULTILINE)

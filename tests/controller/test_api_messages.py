@@ -23,7 +23,7 @@ from controller.api.messages import METHODS, ArmParams, ArmResult, SubscribePara
 from controller.api.parts import Nothing
 from controller.api.reference import BEGIN, END, insert, reference
 
-PAGE = Path(controller.__file__).parent.parent / "docs" / "api.md"
+PAGE = Path(controller.__file__).parent.parent / "docs" / "reference" / "api.md"
 
 
 def code_of(line: bytes) -> ErrorCode:
@@ -259,9 +259,11 @@ def test_any_parameters_are_the_methods_or_an_error(method: str, params: dict[st
 
 
 def test_the_page_names_every_method_topic_key_and_code() -> None:
-    """docs/api.md holds the reference that the models give; after a change write it anew."""
+    """The API's page holds the reference that the models give; after a change write it anew."""
     page = PAGE.read_text("utf-8")
-    assert insert(page, reference()) == page, "python -m controller.api.reference docs/api.md"
+    assert insert(page, reference()) == page, (
+        "python -m controller.api.reference docs/reference/api.md"
+    )
     for name in [*METHODS, *(f"topic {topic}" for topic in TOPICS)]:
         assert re.search(rf"^#### {name}$", page, re.MULTILINE)
 

@@ -18,7 +18,9 @@ from sim.far_ends.modbus.frames import rtu_frame, tcp_frame
 from sim.far_ends.modbus.unit import ModbusUnit
 from sim.far_ends.modbus.words import checksum
 
-PAGE = (Path(drivers.__file__).parent.parent / "docs" / "wire-modbus.md").read_text("utf-8")
+PAGE = (Path(drivers.__file__).parent.parent / "docs" / "reference" / "wire-modbus.md").read_text(
+    "utf-8"
+)
 FRAMES = {
     name: bytes.fromhex(data)
     for name, data in re.findall(

@@ -166,7 +166,7 @@ ANSWERS = st.one_of(
     ),
 )
 
-# Payloads counted out by hand from docs/wire-protocol.md, all little-endian.
+# Payloads counted out by hand from docs/reference/wire-protocol.md, all little-endian.
 GOLDEN_REQUESTS: list[tuple[Request, int, str]] = [
     (Hello(), 1, ""),
     (GetCaps(), 2, ""),

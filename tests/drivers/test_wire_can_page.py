@@ -10,7 +10,7 @@ from drivers.protocol.canopen_objects import entries
 from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.generate import FILES, main
 
-DOCS = Path(drivers.__file__).parent.parent / "docs"
+DOCS = Path(drivers.__file__).parent.parent / "docs" / "reference"
 PAGE = (DOCS / "wire-can.md").read_text("utf-8")
 STEPS = session()
 

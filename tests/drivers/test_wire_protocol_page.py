@@ -39,7 +39,9 @@ from drivers.protocol.messages import (
 from drivers.protocol.serial_codec import encode_event, encode_reply, encode_request
 from drivers.protocol.serial_frame import encode_frame
 
-PAGE = (Path(drivers.__file__).parent.parent / "docs" / "wire-protocol.md").read_text("utf-8")
+PAGE = (Path(drivers.__file__).parent.parent / "docs" / "reference" / "wire-protocol.md").read_text(
+    "utf-8"
+)
 EXAMPLES = dict(re.findall(r"^(\w[\w -]*): `((?:[0-9A-F]{2} )+00)`$", PAGE, re.MULTILINE))
 
 CAPABILITIES = Capabilities(

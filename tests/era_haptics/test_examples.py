@@ -15,8 +15,8 @@ import pytest
 
 ROOT = Path(__file__).parents[2]
 EXAMPLES = ROOT / "examples"
-PAGE = (ROOT / "docs" / "python-api.md").read_text("utf-8")
-WIRE_PAGE = (ROOT / "docs" / "wire-protocol.md").read_text("utf-8")
+PAGE = (ROOT / "docs" / "reference" / "python-api.md").read_text("utf-8")
+WIRE_PAGE = (ROOT / "docs" / "reference" / "wire-protocol.md").read_text("utf-8")
 
 # Founding paper, in-house column of Table 2 [Hz].
 TABLE_2 = ["31.98", "68.50", "76.62", "107.84", "160.77"]

@@ -72,10 +72,11 @@ def test_a_bug_is_no_disturbance() -> None:
 def test_a_case_that_failed_leaves_the_rest_of_the_report(tmp_path: Path) -> None:
     """The page tells what disturbed it, and has a full row for it and each other, and a picture."""
     (tmp_path / "pictures").mkdir()
+    (tmp_path / "measured").mkdir()
     outcomes: list[Found | Failed] = [found(case, milliseconds=1.0) for case in CASES]
     outcomes[0] = Failed(CASES[0], ("COMM_LOST in a hurry", "FAULT again"))
     write_report(outcomes, seconds=4, seed=2, minutes=1.4, docs=tmp_path)
-    page = (tmp_path / "latency.md").read_text("utf-8")
+    page = (tmp_path / "measured" / "latency.md").read_text("utf-8")
     rows = [line for line in page.splitlines() if line.startswith("|")]
     assert {row.count("|") for row in rows} == {HEAD_CELLS + 1}
     assert [row.split("|")[1].strip() for row in rows[2:]] == [case.name for case in CASES]

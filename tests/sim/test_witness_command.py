@@ -20,7 +20,8 @@ from sim.witness.plan import plan_of
 from wires import WIRES, far_side
 
 URL = "serial:///dev/ttyUSB0"
-# docs/wire-protocol.md: Hello, Arm and Stop with their answers; then an Apply although stopped.
+# docs/reference/wire-protocol.md: Hello, Arm and Stop with their answers; then an Apply although
+# stopped.
 SESSION = """
 0.000 wire1 > 00 04 21 01 07 05 B7 EB 49 77 00   # Hello
 0.002 wire1 < 0004A1010719010441636D65045175616404412D313703312E323BC169D100

@@ -1,4 +1,4 @@
-"""A session between a host and one amplifier, frame by frame, as docs/wire-can.md shows it.
+"""A session between a host and one amplifier, by frames, as docs/reference/wire-can.md shows it.
 
 The host's frames are those of its encoder, or written here by hand where a library of others makes
 them; the amplifier's are those of the far end, which knows nothing of the encoder.

@@ -1,6 +1,7 @@
 """The licences of what comes with era-haptics, as a page, from its bills of materials.
 
-    python tests/support/licences.py dist/sbom.json dist/sbom-extras.json > docs/licences.md
+    python tests/support/licences.py dist/sbom.json dist/sbom-extras.json \
+        > docs/reference/licences.md
 
 `make licences` makes both bills and the page.
 """

@@ -1,4 +1,4 @@
-"""Which fingers are on the plate, by the touch frames alone and docs/touch.md."""
+"""Which fingers are on the plate, by the touch frames alone and docs/reference/touch.md."""
 
 import math
 from collections.abc import Sequence

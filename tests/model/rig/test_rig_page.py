@@ -25,7 +25,7 @@ from model.rig.sections import (
 from model.structure.materials import KNOWN_MATERIALS
 
 ROOT = Path(model.__file__).parent.parent
-PAGE = (ROOT / "docs" / "rig.md").read_text("utf-8")
+PAGE = (ROOT / "docs" / "reference" / "rig.md").read_text("utf-8")
 SECTIONS = {
     "The file": RigSection,
     "plate": PlateSection,

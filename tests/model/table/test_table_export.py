@@ -16,7 +16,7 @@ from model.table.export import export_csv, export_mat
 from model.table.file import save_table
 from small_table import FREQUENCIES, small_table
 
-PAGE = Path(__file__).parents[3] / "docs" / "table-file.md"
+PAGE = Path(__file__).parents[3] / "docs" / "reference" / "table-file.md"
 
 
 @pytest.fixture(scope="module")

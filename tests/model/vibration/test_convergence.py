@@ -89,7 +89,7 @@ def test_without_being_told_it_looks_where_the_paper_does(limit, asked):
 
 def test_the_documentation_shows_these_figures(study):
     """The page on the plate model prints each mesh with the errors that are found here."""
-    page = Path(__file__).parents[3] / "docs" / "plate-model.md"
+    page = Path(__file__).parents[3] / "docs" / "concepts" / "plate-model.md"
     rows = re.findall(r"^ +(\d+x\d+) +\S+ .*?((?: +[\d.]+ %){3})", page.read_text(), re.MULTILINE)
     assert len(rows) == len(study.errors)
     for (mesh, printed), error in zip(rows, study.errors, strict=True):

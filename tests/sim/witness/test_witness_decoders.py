@@ -23,7 +23,7 @@ from sim.witness.seen import (
 from sim.witness.serial_decoder import SerialDecoder
 from sim.witness.witness import Witness
 
-DOCS = Path(__file__).parents[3] / "docs"
+DOCS = Path(__file__).parents[3] / "docs" / "reference"
 # As the pages put it in words: 110 Hz, 0.2, 0 degrees; 250.5 Hz, 1, -90 degrees, keeping phase.
 SET = {0: Drive(110.0, 0.2, 0.0), 3: Drive(250.5, 1.0, -90.0, keep_phase=True)}
 
@@ -159,8 +159,8 @@ def _over_tcp(number: int, pdu: str) -> bytes:
     return number.to_bytes(2, "big") + b"\0\0" + len(body).to_bytes(2, "big") + body
 
 
-# docs/wire-modbus.md: a Ping with tag 22, refused with exception 2, and the block refusal that is
-# read then: tag, no check, BUSY, no channel, refused_tag.
+# docs/reference/wire-modbus.md: a Ping with tag 22, refused with exception 2, and the block
+# refusal that is read then: tag, no check, BUSY, no channel, refused_tag.
 PING = _over_tcp(1, "17 03E8 000E 0008 0001 02 0016")
 REFUSED = _over_tcp(1, "97 02")
 WHY = _over_tcp(2, "04 0408 0005")

@@ -9,7 +9,7 @@ from sim.witness.seen import Answered, Asked, Condition, Kind
 PLAN = AmplifierPlan("line", 1, {0: Limits(40.0, 500.0, 1.0)})
 ARM = Asked(Kind.ARM, 1, key=1, watchdog=0.25)
 STOP = Asked(Kind.STOP, 1, key=2)
-# docs/wire-protocol.md, States and Fault.
+# docs/reference/wire-protocol.md, States and Fault.
 ENABLED, STOPPED, REACTING, FAULT = 4, 5, 6, 7
 WATCHDOG = 1
 

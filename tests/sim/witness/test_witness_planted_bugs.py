@@ -25,7 +25,7 @@ RULES = {
     *("stop", "heartbeat", "armed", "identified", "credit", "answer", "damage", "watchdog"),
     *("latched", "state", "ramp", "plays", "silent", "high_voltage"),
 }
-"""As docs/witness.md lists them."""
+"""As docs/reference/witness.md lists them."""
 
 SERIAL_ONLY = {"noise", "late_copy", "damaged_answer", "foreign_answer"}
 # Over RTU an answer begins within 10 ms, and nothing may be sent before it: 25 ms are a fault.
@@ -88,8 +88,10 @@ def test_a_planted_bug_is_found(name: str, monkeypatch: pytest.MonkeyPatch) -> N
 
 
 def test_the_page_lists_every_rule() -> None:
-    """docs/witness.md has a row for each rule, and no other."""
-    page = (Path(__file__).parents[3] / "docs" / "witness.md").read_text(encoding="utf-8")
+    """docs/reference/witness.md has a row for each rule, and no other."""
+    page = (Path(__file__).parents[3] / "docs" / "reference" / "witness.md").read_text(
+        encoding="utf-8"
+    )
     rules = page.partition("## The rules")[2].partition("## In tests")[0]
     assert set(re.findall(r"^\| (\w+) \|", rules, flags=re.M)) - {"name"} == RULES
 

@@ -15,7 +15,7 @@ from model.rig.rig import Rig
 from sim.far_ends.wires import Wire
 from wires import far_side
 
-DATA_SHEET = Path(drivers.__file__).parent.parent / "docs" / "era-amplifier.eds"
+DATA_SHEET = Path(drivers.__file__).parent.parent / "docs" / "reference" / "era-amplifier.eds"
 HOST = 100
 WATCHDOG = 600  # ms; shorter than the heartbeats go on
 PATIENCE = 5.0  # s; for a loaded machine, not an expectation

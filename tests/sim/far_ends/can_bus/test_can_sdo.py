@@ -18,7 +18,7 @@ from sim.far_ends.can_bus.node import CanNode
 from sim.far_ends.can_bus.sdo import NO_OBJECT, SdoAbort, SdoServer
 
 INDEX = 0x2100
-DOCS = Path(drivers.__file__).parent.parent / "docs"
+DOCS = Path(drivers.__file__).parent.parent / "docs" / "reference"
 
 
 class Memory(canopen.Network):

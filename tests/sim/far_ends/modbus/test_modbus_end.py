@@ -25,7 +25,9 @@ from sim.far_ends.modbus.frames import PAUSE, crc
 from sim.far_ends.wires import Wire
 from wires import FarSide, far_side
 
-PAGE = (example_rig_path().parent.parent / "docs" / "wire-modbus.md").read_text("utf-8")
+PAGE = (example_rig_path().parent.parent / "docs" / "reference" / "wire-modbus.md").read_text(
+    "utf-8"
+)
 FRAMES = {
     name: bytes.fromhex(data)
     for name, data in re.findall(

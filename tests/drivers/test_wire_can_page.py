@@ -83,7 +83,7 @@ def test_the_codes_are_those_of_the_definition(table: str) -> None:
         if table == "emergencies":
             expected = f"| {name} | {code['code']:04X} | {code['error_register']:02X} |"
         else:
-            expected = f"| {name} | {code:08X} |"
+            expected = f"| {name} | {PROTOCOL.naks[name]} | {code:08X} |"
         assert expected in PAGE
 
 

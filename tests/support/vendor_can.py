@@ -1,0 +1,375 @@
+"""A CAN amplifier as somebody else would build it: from docs/wire-can.md, and the sections of
+docs/wire-protocol.md that it names, and from nothing else of this project.
+
+Four channels, classic frames, no envelopes, no faults but the watchdog's. It talks through
+python-can and runs in a thread of its own.
+"""
+
+import math
+import struct
+import threading
+import time
+from collections import deque
+
+import can
+
+NODE = 1
+BOOT_UP, STOPPED, OPERATIONAL, PRE_OPERATIONAL = 0, 4, 5, 127
+STATUS, APPLY, STAGE, COMMIT, ARM, DISARM, STOP, CLEAR = range(8)
+DISARMED, SWITCHED_ON, ARMED, STOPPED_QUICKLY, REACTING, FAULTY = 1, 3, 4, 5, 6, 7
+DONE, BAD_VALUE, BAD_CHANNEL, WRONG_STATE, BAD_TOKEN, NO_ENVELOPE, TORN = 0, 3, 4, 5, 6, 9, 15
+NO_CHANNEL = 255
+CHANNELS = 4
+LOWEST, HIGHEST = 2000, 60000  # 0.01 Hz
+HEARTBEAT, WATCHDOG_FADE = 0.05, 0.005  # s
+
+TEXTS = {1: "Elsewhere Ltd", 2: "From the page", 3: "EL-0042", 4: "0.1"}
+CAPABILITIES = "BHHHHHHHHHBBHH"
+LIMITS = (CHANNELS, LOWEST, HIGHEST, 1, 10000, 1, 1, 1000, 100, 2000, 0, 0, 0, 0)
+
+
+def bits(data: bytes, first: int, count: int) -> int:
+    """A field of a frame."""
+    return int.from_bytes(data, "little") >> first & (1 << count) - 1
+
+
+def frame(*fields: tuple[int, int, int]) -> bytes:
+    """Eight bytes of fields: value, first bit, number of bits."""
+    whole = sum((value & (1 << count) - 1) << first for value, first, count in fields)
+    return whole.to_bytes(8, "little")
+
+
+def _achieved(token: int, commands: dict[int, bytes]) -> bytes:
+    """Object 2006 of a set: it plays every step, so what was asked."""
+    rows = [data[:7] + b"\0\0\0" for _, data in sorted(commands.items())]
+    return struct.pack("<HB", token, len(rows)) + b"".join(rows)
+
+
+class Channel:
+    """What one output does: its level goes from one to another along a raised cosine."""
+
+    def __init__(self) -> None:
+        self.now, self.goal, self.begin, self.ramp = 0, 0, 0.0, 0.0
+
+    def level(self, time: float) -> int:
+        """0 to 10000."""
+        s = min((time - self.begin) / self.ramp, 1.0) if self.ramp > 0 else 1.0
+        gain = (1 - math.cos(math.pi * s)) / 2
+        return round(self.now + (self.goal - self.now) * gain)
+
+    def go(self, goal: int, ramp: float, time: float) -> None:
+        """Fade to another level."""
+        self.now, self.goal, self.begin, self.ramp = self.level(time), goal, time, ramp
+
+
+class VendorAmplifier:
+    """The amplifier; a context in which it is on the bus."""
+
+    def __init__(self, channel: str) -> None:
+        self._thread = threading.Thread(target=self._run, name="an amplifier from elsewhere")
+        self._bus = can.Bus(interface="virtual", channel=channel)
+        self._ending = threading.Event()
+        self._beat_due = 0.0
+        self.nmt = PRE_OPERATIONAL
+        self.state, self.fault = DISARMED, 0
+        self.faults: list[tuple[int, float]] = []
+        self.channels = [Channel() for _ in range(CHANNELS)]
+        self._forget()
+        self.host, self.watchdog, self.fed = 0, 0.0, 0.0
+        self.commands: dict[int, bytes] = {}
+        self.order: bytes | None = None
+        self.ends_at, self.end_ramp = math.inf, 0.0
+        self.upload = b""
+        self.achieved = self.playing = b""
+        self.exact = True
+        self.period = HEARTBEAT
+
+    def __enter__(self) -> "VendorAmplifier":
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._ending.set()
+        self._thread.join()
+        self._bus.shutdown()
+
+    def _run(self) -> None:
+        """Be an amplifier until told to end."""
+        self._send(0x700 + NODE, bytes([BOOT_UP]))
+        while not self._ending.is_set():
+            message = self._bus.recv(timeout=0.001)
+            if message is not None and not message.is_extended_id:
+                self._take(message.arbitration_id, bytes(message.data))
+            self._tick(time.monotonic())
+
+    def _send(self, identifier: int, data: bytes) -> None:
+        self._bus.send(can.Message(arbitration_id=identifier, data=data, is_extended_id=False))
+
+    def _forget(self) -> None:
+        self.staged: tuple[int, dict[int, bytes], float, float] | None = None
+        self.token = 0
+        self.played: deque[int] = deque(maxlen=16)
+
+    # What comes
+
+    def _take(self, identifier: int, data: bytes) -> None:
+        now = time.monotonic()
+        if identifier == 0x000 and len(data) == 2 and data[1] in (0, NODE):
+            self._manage(data[0], now)
+        elif identifier == 0x600 + NODE and len(data) == 8:
+            self._send(0x580 + NODE, self._sdo(data, now))
+        elif self.host and identifier == 0x700 + self.host and len(data) == 1:
+            self.fed = now
+        elif self.nmt != OPERATIONAL:
+            return
+        elif identifier in (0x200 + NODE, 0x300 + NODE, 0x400 + NODE, 0x500 + NODE):
+            if len(data) == 8:
+                self.commands[(identifier - 0x200) >> 8] = data
+        elif identifier == 0x480 + NODE and len(data) == 8:
+            self._ordered(data, now)
+        elif identifier == 0x480 and len(data) == 8:
+            if bits(data, 48, 3) == STOP:
+                self._stop(bits(data, 16, 16), now)
+            elif bits(data, 48, 3) == COMMIT:
+                self.order = data
+        elif identifier == 0x080:
+            self._sync(now)
+
+    def _manage(self, command: int, now: float) -> None:
+        if command == 129:
+            self._reset()
+            self._send(0x700 + NODE, bytes([BOOT_UP]))
+            return
+        self.nmt = {1: OPERATIONAL, 2: STOPPED}.get(command, PRE_OPERATIONAL)
+        if self.nmt != OPERATIONAL and self.state == ARMED:
+            self._stop(5, now)
+
+    def _reset(self) -> None:
+        self.nmt, self.state, self.fault = PRE_OPERATIONAL, DISARMED, 0
+        self.channels = [Channel() for _ in range(CHANNELS)]
+        self.host = 0
+        self._forget()
+
+    def _ordered(self, order: bytes, now: float) -> None:
+        action, sequence = bits(order, 48, 3), bits(order, 56, 8)
+        if sequence == 0:
+            return
+        if action in (APPLY, STAGE, COMMIT):
+            self.order = order  # until the SYNC
+            return
+        result = DONE
+        ramp, span = bits(order, 16, 16), bits(order, 32, 16)
+        if action == ARM:
+            host = bits(order, 0, 16)
+            if self.state not in (DISARMED, SWITCHED_ON, ARMED):
+                result = WRONG_STATE
+            elif not 100 <= span <= 2000 or not 1 <= host <= 127:
+                result = BAD_VALUE
+            else:
+                self._silence(0.005, now)
+                self._forget()
+                self.host, self.watchdog, self.fed = host, span / 1000, now
+                self._become(ARMED)
+        elif action == DISARM:
+            self._silence(min(ramp, 1000) / 1000, now)
+            self.staged = None
+            if self.state == ARMED:
+                self._become(SWITCHED_ON)
+        elif action == STOP:
+            self._stop(ramp, now)
+        elif action == CLEAR and self._is_silent(now) and self.state in (STOPPED_QUICKLY, FAULTY):
+            was_fault, self.fault = self.state == FAULTY, 0
+            self._become(DISARMED, tells_fault=was_fault)
+        if result == DONE and action != STATUS:
+            self.fed = now
+        if result == DONE:
+            self._tell_condition(sequence, now)
+        self._answer(sequence, action, result, now)
+
+    def _sync(self, now: float) -> None:
+        commands, order = self.commands, self.order
+        self.commands, self.order = {}, None
+        if order is None:
+            for data in list(commands.values())[:1]:
+                self._answer(bits(data, 56, 8), APPLY, TORN, now)
+            return
+        action, sequence = bits(order, 48, 3), bits(order, 56, 8)
+        result, channel = self._set(order, commands, now)
+        if sequence:
+            if result == DONE:
+                self.fed = now
+            self._answer(sequence, action, result, now, channel=channel)
+
+    def _set(self, order: bytes, commands: dict[int, bytes], now: float) -> tuple[int, int]:
+        """What comes of a set or a commit at its SYNC: the result, and the channel it is about."""
+        action, token = bits(order, 48, 3), bits(order, 0, 16)
+        mine = {c: data for c, data in commands.items() if data[7] == order[7]}
+        if action != COMMIT and len(mine) != bits(order, 51, 5):
+            return TORN, NO_CHANNEL
+        if self.state != ARMED:
+            return WRONG_STATE, NO_CHANNEL
+        if token == 0:
+            return BAD_TOKEN, NO_CHANNEL
+        if action != STAGE and token == self.token:
+            self.achieved, asked = self.playing, _achieved(token, mine)
+            self.exact = action == COMMIT or asked == self.playing
+            return DONE, NO_CHANNEL
+        if token in self.played:
+            return BAD_TOKEN, NO_CHANNEL
+        if action == COMMIT:
+            if self.staged is None or self.staged[0] != token:
+                return BAD_TOKEN, NO_CHANNEL
+            self.achieved, self.exact = _achieved(token, self.staged[1]), True
+            self._play(now)
+            return DONE, NO_CHANNEL
+        for place, data in mine.items():
+            if bits(data, 52, 4) != place:
+                return BAD_CHANNEL, bits(data, 52, 4)
+            frequency, level = bits(data, 0, 16), bits(data, 16, 16)
+            if level > 10000 or (level and not LOWEST <= frequency <= HIGHEST):
+                return BAD_VALUE, place
+            if bits(data, 50, 1):
+                return NO_ENVELOPE, place  # no envelope is ever loaded here
+        ramp, span = bits(order, 16, 16), bits(order, 32, 16)
+        if ramp > 1000 or span > 60000:
+            return BAD_VALUE, NO_CHANNEL
+        self.staged = (token, mine, ramp / 1000, span / 1000)
+        self.achieved, self.exact = _achieved(token, mine), True
+        if action == APPLY:
+            self._play(now)
+        return DONE, NO_CHANNEL
+
+    def _play(self, now: float) -> None:
+        assert self.staged is not None
+        self.token, commands, ramp, span = self.staged
+        self.staged = None
+        self.playing = self.achieved
+        self.played.append(self.token)
+        for number, channel in enumerate(self.channels):
+            data = commands.get(number)
+            channel.go(bits(data, 16, 16) if data else 0, ramp, now)
+        self.ends_at, self.end_ramp = (now + span if span else math.inf), ramp
+
+    # What it does by itself
+
+    def _tick(self, now: float) -> None:
+        if self.period and now >= self._beat_due:
+            self._beat_due = now + self.period
+            self._send(0x700 + NODE, bytes([self.nmt]))
+        if now >= self.ends_at:
+            self._silence(self.end_ramp, now)
+        if self.state == ARMED and now - self.fed > self.watchdog:
+            self._silence(WATCHDOG_FADE, now)
+            self.staged = None
+            self.fault = 1
+            self.faults.insert(0, (1, now))
+            self._become(REACTING, tells_fault=True)
+        if self.state == REACTING and self._is_silent(now):
+            self._become(FAULTY, tells_fault=True)
+        if self.state == SWITCHED_ON and self._is_silent(now):
+            self._become(DISARMED)
+
+    def _stop(self, ramp: int, now: float) -> None:
+        self._silence(min(ramp, 1000) / 1000, now)
+        self.staged = None
+        if self.state in (DISARMED, SWITCHED_ON, ARMED):
+            self._become(STOPPED_QUICKLY)
+
+    def _silence(self, ramp: float, now: float) -> None:
+        self.ends_at = math.inf
+        for channel in self.channels:
+            if channel.goal or channel.level(now):
+                channel.go(0, ramp, now)
+
+    def _is_silent(self, now: float) -> bool:
+        return not any(channel.level(now) for channel in self.channels)
+
+    # What it says
+
+    def _become(self, state: int, *, tells_fault: bool = False) -> None:
+        if state == self.state:
+            return
+        self.state = state
+        if tells_fault:
+            code, register = (0x8130, 0x11) if self.fault else (0, 0)
+            self._send(
+                0x080 + NODE,
+                frame(
+                    *((code, 0, 16), (register, 16, 8), (state, 24, 4), (self.fault, 28, 4)),
+                    (NO_CHANNEL, 32, 8),
+                ),
+            )
+        else:
+            self._send(0x180 + NODE, frame((state, 16, 4), (self.fault, 20, 4), (255, 24, 8)))
+
+    def _tell_condition(self, sequence: int, now: float) -> None:
+        levels = [(one.level(now), 14 * place, 14) for place, one in enumerate(self.channels)]
+        self._send(0x380 + NODE, frame(*levels, (sequence, 56, 8)))
+        is_on = self.state in (SWITCHED_ON, ARMED) or not self._is_silent(now)
+        self._send(
+            0x280 + NODE,
+            frame((sequence, 0, 8), (is_on, 8, 1), (250, 16, 16), (CHANNELS, 48, 5)),
+        )
+
+    def _answer(
+        self, sequence: int, action: int, result: int, now: float, *, channel: int = NO_CHANNEL
+    ) -> None:
+        is_exact = result == DONE and action in (APPLY, STAGE, COMMIT) and self.exact
+        left = 0.0
+        if self.state == ARMED:
+            left = max(0.0, self.watchdog - (now - self.fed))
+        self._send(
+            0x180 + NODE,
+            frame(
+                *(
+                    (sequence, 0, 8),
+                    (action, 8, 3),
+                    (is_exact, 11, 1),
+                ),
+                *((result, 12, 4), (self.state, 16, 4), (self.fault, 20, 4), (channel, 24, 8)),
+                *((self.token, 32, 16), (round(left * 1000), 48, 16)),
+            ),
+        )
+
+    # Objects (CiA 301): expedited and segmented uploads, expedited downloads
+
+    def _sdo(self, data: bytes, now: float) -> bytes:
+        command, place = data[0] >> 5, data[1:4]
+        index, subindex = struct.unpack("<HB", place)
+        if command == 2:
+            value = self._object(index, subindex, now)
+            if value is None:
+                return struct.pack("<B3sL", 0x80, place, 0x06020000)
+            if 1 <= len(value) <= 4:
+                return bytes([0x43 | (4 - len(value)) << 2]) + place + value.ljust(4, b"\0")
+            self.upload = value
+            return struct.pack("<B3sL", 0x41, place, len(value))
+        if command == 3:
+            piece, self.upload = self.upload[:7], self.upload[7:]
+            head = data[0] & 0x10 | (7 - len(piece)) << 1 | (not self.upload)
+            return bytes([head]) + piece.ljust(7, b"\0")
+        if command == 1 and (index, subindex) == (0x1017, 0):
+            self.period = struct.unpack("<H", data[4:6])[0] / 1000
+            return struct.pack("<B3sL", 0x60, place, 0)
+        return struct.pack("<B3sL", 0x80, place, 0x06020000)
+
+    def _object(self, index: int, subindex: int, now: float) -> bytes | None:
+        match index, subindex:
+            case 0x1017, 0:
+                return struct.pack("<H", round(self.period * 1000))
+            case 0x1018, 4:
+                return struct.pack("<L", 42)
+            case 0x2000, number if number in TEXTS:
+                return TEXTS[number].encode()
+            case 0x2001, 1:
+                return b"\x01"
+            case 0x2001, number if 2 <= number <= 15:
+                return struct.pack("<" + CAPABILITIES[number - 2], LIMITS[number - 2])
+            case 0x2006, 0:
+                return self.achieved
+            case 0x2008, 0:
+                return b"".join(
+                    struct.pack("<BBL", fault, NO_CHANNEL, round((now - when) * 1000))
+                    for fault, when in self.faults
+                )
+        return None

@@ -134,9 +134,9 @@ async def test_a_client_that_is_gone_leaves_no_finger(
         other = await bench.client()
         await other.touch([(0.25, 0.2)])
         await era.touch([PLACE])
-        await until(lambda: len(bench.daemon._scene.contacts) == 2)
+        await until(lambda: len(bench.daemon._news.scene.contacts) == 2)
         await other.close()
-        await until(lambda: len(bench.daemon._scene.contacts) == 1)
+        await until(lambda: len(bench.daemon._news.scene.contacts) == 1)
         (left,) = (await era.status()).contacts
         assert (left.x_m, left.y_m) == pytest.approx(PLACE)
 
@@ -281,14 +281,14 @@ async def test_a_fault_stops_is_dumped_and_needs_to_be_cleared(tmp_path: Path) -
 
 
 async def test_a_dump_that_cannot_be_written_changes_nothing(tmp_path: Path) -> None:
-    """Where the folder is a file, the daemon reacts to the fault as ever."""
-    (tmp_path / "dumps").write_text("in the way", "utf-8")
+    """Where a file has come in its folder's way, the daemon reacts to the fault as ever."""
     async with (
         running_daemon(tmp_path, "dumps: {folder: dumps}\n") as bench,
         await bench.client() as era,
     ):
         await until_state(era, READY)
         await era.arm("me", lease_s=30)
+        (tmp_path / "dumps").write_text("in the way", "utf-8")
         bench.far.station.befall(Episode("arc"))
         await until_state(era, "FAULT")
         await era.clear()

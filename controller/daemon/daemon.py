@@ -4,29 +4,24 @@ import asyncio
 import contextlib
 import logging
 import signal
-import threading
-from collections.abc import Mapping
-from pathlib import Path
 
-from controller.api.events import LinkEvent, LogEvent
 from controller.api.server import ApiServer
-from controller.contacts import Change, Contact
 from controller.daemon.companions import Companion, Companions
 from controller.daemon.config import DaemonConfig, load_daemon_config
+from controller.daemon.dumps import Dumps
 from controller.daemon.inputs import ApiTouches, TouchInputs
-from controller.daemon.latency import Latencies
 from controller.daemon.log import LogThread
 from controller.daemon.meaning import Meaning
+from controller.daemon.news import News
 from controller.daemon.notify import ServiceManager
 from controller.daemon.place import Place
-from controller.daemon.records import RecordedBackend, Recorder, write_dump
+from controller.daemon.records import RecordedBackend, Recorder
 from controller.daemon.reload import plan_reload
 from controller.daemon.service import Service
 from controller.daemon.states import Machine, State
 from controller.daemon.supervisor import Supervisor
-from controller.daemon.view import Scene
+from controller.daemon.view import amplifier_statuses
 from controller.loop import Controller
-from controller.observer import Applied, Observer, Silenced
 from controller.touch import TouchFrame
 from drivers import clock
 from drivers.amplifier import Amplifier
@@ -38,7 +33,6 @@ from model.table.table import LocalizationTable
 from model.table.timing import Timing
 
 _END_PATIENCE = 0.2  # s; by then whoever can be silenced has been
-_DUMP_PAUSE = 1.0  # s; between two dumps, for faults come in company
 
 _logger = logging.getLogger(__name__)
 
@@ -69,9 +63,8 @@ class Daemon:
         self._reload_is_due = False
         self._ended = asyncio.Event()
         self._end_cause = "the daemon ends"
-        self._latencies = Latencies()
         self._recorder = Recorder()
-        self._dumped_at = float("-inf")
+        self._dumps = Dumps(self._recorder)
         backends = self._make_backends(config)
         amplifiers = {
             name: Amplifier(backend, serial_number=config.section.serial_numbers.get(name))
@@ -85,12 +78,17 @@ class Daemon:
             alive=lambda: manager.alive(clock.now()),
         )
         self._meaning = Meaning(config.meaning)
-        self._scene = Scene(self._meaning.effect_of)
+        self._news = News(
+            machine=lambda: self._supervisor.machine,
+            amplifiers=lambda: amplifier_statuses(amplifiers, backends, config.urls),
+            effect_of=self._meaning.effect_of,
+            layout=config.layout,
+        )
         self._controller = Controller(
             config.rig,
             table,
             amplifiers=amplifiers,
-            observer=self._supervisor.observe(self._observer()),
+            observer=self._supervisor.observe(self._news.observer()),
             wishes=self._meaning,
             timing=Timing(table),
             mode=config.section.mode,
@@ -104,9 +102,7 @@ class Daemon:
             self._controller,
             self._supervisor,
             amplifiers=amplifiers,
-            backends=backends,
-            scene=self._scene,
-            latencies=self._latencies,
+            news=self._news,
             touches=self._touches,
             meaning=self._meaning,
         )
@@ -133,7 +129,7 @@ class Daemon:
                 return
             await self._server.open(place.bound())
             await self._inputs.exchange(self._config.touch)
-            self._log.listener = self._tell_log
+            self._log.listener = self._news.logged
             running = asyncio.create_task(self._supervisor.run(), name="control loop")
             self._start_companions()
             ended = asyncio.create_task(self._ended.wait())
@@ -193,7 +189,7 @@ class Daemon:
                     await self._inputs.exchange(new.touch)
                 case "layout":
                     self._meaning.exchange(new.meaning)
-                    self._service.layout_changed(new.layout)
+                    self._news.layout_changed(new.layout)
                     self._controller.reconsider()
                 case "longest_lease":
                     self._service.longest_lease = new.section.longest_lease
@@ -221,7 +217,7 @@ class Daemon:
             for step in (self._inputs.close(), self._companions.close(), self._server.close()):
                 with contextlib.suppress(OSError):
                     await step
-            self._service.hub.close()
+            self._news.hub.close()
 
     def _make_backends(self, config: DaemonConfig) -> dict[str, RecordedBackend]:
         return {
@@ -241,29 +237,6 @@ class Daemon:
                 Companion("controller.metrics", ("--socket", socket, "--port", port))
             )
 
-    def _observer(self) -> Observer:
-        return Observer(
-            contacts_changed=self._contacts_changed,
-            pattern_applied=self._pattern_applied,
-            silenced=self._silenced,
-            refused=lambda reason: _logger.warning("refused: %s", reason),
-        )
-
-    def _contacts_changed(self, contacts: tuple[Contact, ...], change: Change) -> None:
-        self._scene.changed(contacts)
-        self._service.hub.publish("contacts", self._scene.contacts_event)
-
-    def _pattern_applied(self, applied: Applied) -> None:
-        self._scene.played(applied)
-        self._latencies.note(applied.latency)
-        self._service.hub.publish("pattern", self._scene.pattern_event)
-
-    def _silenced(self, silenced: Silenced) -> None:
-        self._scene.fell_silent(silenced)
-        if silenced.latency is not None:
-            self._latencies.note(silenced.latency)
-        self._service.hub.publish("silence", self._scene.silence_event)
-
     def _deliver(self, frame: TouchFrame) -> None:
         """Hand touches to the control loop; where there is none just now, they are not felt."""
         with contextlib.suppress(DriverError):
@@ -273,59 +246,20 @@ class Daemon:
         _logger.error("touch source %s has failed, and is tried again: %s", name, error)
 
     def _state_changed(self, old: Machine, new: Machine) -> None:
-        self._service.state_changed(old, new)
+        self._service.state_changed(new)
+        self._news.state_changed(old, new)
         self._manager.status(f"{new.state.value}: {new.cause}")
         if new.state in (State.FAULT_REACTION_ACTIVE, State.COMM_LOST):
             self._dump(new.cause)
 
     def _link_told(self, event: str, message: str) -> None:
-        kinds: Mapping[str, str] = {"lost": "error", "retry": "warning", "reopened": "info"}
-        _logger.log(getattr(logging, kinds[event].upper()), "link %s: %s", event, message)
-        if event != "retry":  # fingers are not followed without a link, and begin anew with one
-            self._contacts_changed((), Change())
-        remedy = None if event == "reopened" else "look at cables and supply"
-        # When it is tried again all have been closed.
         lost = [name for name, amplifier in self._amplifiers.items() if amplifier.lost]
-        name = lost[0] if event == "lost" and len(lost) == 1 else None
-        self._service.hub.publish(
-            "link",
-            lambda: LinkEvent.model_validate(
-                {"event": event, "amplifier": name, "message": message, "remedy": remedy}
-            ),
-        )
+        self._news.link_told(event, message, lost=lost)
 
     def _dump(self, cause: str) -> None:
-        """Write the last messages to a file, in a thread: a disk may be slow, full or gone."""
         folder, dumps = self._config.dump_folder, self._config.section.dumps
-        if folder is None or dumps is None or clock.now() - self._dumped_at < _DUMP_PAUSE:
-            return
-        self._dumped_at = clock.now()
-        records, keep = self._recorder.last(), dumps.keep
-
-        def write() -> None:
-            try:
-                path: Path = write_dump(folder, records, cause=cause, keep=keep)
-                _logger.info("the last messages are in %s", path)
-            except OSError as error:
-                _logger.warning("the last messages could not be written to %s: %s", folder, error)
-
-        threading.Thread(target=write, name="dump", daemon=True).start()
-
-    def _tell_log(self, record: logging.LogRecord) -> None:
-        """Tell subscribers of a line of the log; called in any thread."""
-        told = {
-            "level": "error" if record.levelno >= logging.ERROR else record.levelname.lower(),
-            # A file's name may hold bytes that are no text, and JSON has none of these.
-            "message": record.getMessage()[:1000].encode(errors="backslashreplace").decode(),
-            "cause": getattr(record, "cause", None),
-            "remedy": getattr(record, "remedy", None),
-        }
-
-        def publish() -> None:
-            self._service.hub.publish("log", lambda: LogEvent.model_validate(told))
-
-        with contextlib.suppress(RuntimeError):  # the loop may be over
-            self._loop.call_soon_threadsafe(publish)
+        if folder is not None and dumps is not None:
+            self._dumps.write(folder, cause=cause, keep=dumps.keep)
 
     def _reload_soon(self) -> None:
         """Reload; while another one goes on, once after it, however often that is asked for."""

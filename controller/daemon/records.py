@@ -1,17 +1,8 @@
-"""The last messages of every link, kept in memory, and written to a file when a fault has come.
+"""The last messages of every link, kept in memory: what the frames meant, with their times."""
 
-They are what the frames meant, on whatever wire, with their times; the file is JSON, one a line.
-"""
-
-import json
-import os
-import time
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from contextlib import AbstractContextManager
-from dataclasses import asdict, is_dataclass
-from enum import Enum
-from pathlib import Path
 from typing import NamedTuple
 
 from drivers import clock
@@ -20,8 +11,6 @@ from drivers.protocol.messages import Broadcast, Event, Reply, Request, Status
 from drivers.statistics import WireCounters
 
 KEPT = 400  # messages over all links: the last seconds under load, ten at rest
-DUMPS = "era-fault-*.jsonl"
-"""What the files with the last messages are called."""
 
 
 class Record(NamedTuple):
@@ -109,6 +98,11 @@ class RecordedBackend(Backend):
         return self._inner.bus
 
     @property
+    def takes_turns(self) -> bool:
+        """Of the inner one."""
+        return self._inner.takes_turns
+
+    @property
     def is_unsent(self) -> bool:
         """Of the inner one."""
         return self._inner.is_unsent
@@ -133,52 +127,3 @@ class RecordedBackend(Backend):
     def loading_time(self, knots: int) -> float:
         """Of the inner one."""
         return self._inner.loading_time(knots)
-
-
-def write_dump(folder: Path, records: Iterable[Record], *, cause: str, keep: int) -> Path:
-    """Write records to a new file, and take away the oldest beyond `keep`; raises OSError.
-
-    Where there is no room for all of it, nothing is left of it. To be called in a thread of its
-    own: a disk may be slow.
-    """
-    folder.mkdir(parents=True, exist_ok=True)
-    stamp = time.strftime("%Y%m%dT%H%M%S", time.gmtime())
-    path = folder / DUMPS.replace("*", f"{stamp}-{time.monotonic_ns() % 10**9:09d}")
-    opened = open(path, "x", encoding="utf-8", opener=_for_the_owner)  # noqa: SIM115
-    try:
-        with opened as stream:
-            stream.write(json.dumps({"cause": cause, "unix_time_s": time.time()}) + "\n")
-            for record in records:
-                stream.write(json.dumps(_as_json(record)) + "\n")
-    except OSError:
-        path.unlink(missing_ok=True)
-        raise
-    # By its name this one may be the oldest: clocks are set, and some boards begin in 1970.
-    others = sorted(each for each in folder.glob(DUMPS) if each != path)
-    for old in others[: max(0, len(others) + 1 - keep)]:
-        old.unlink(missing_ok=True)
-    return path
-
-
-def _for_the_owner(path: str, flags: int) -> int:
-    """Open a file that nobody else could open before it had something in it."""
-    return os.open(path, flags, 0o600)
-
-
-def _as_json(record: Record) -> dict[str, object]:
-    what = record.what
-    said: dict[str, object] = {"time_s": round(record.time, 6), "link": record.link}
-    said |= {"way": record.way, "message": type(what).__name__}
-    if is_dataclass(what) and not isinstance(what, type):
-        said["content"] = _plain(asdict(what))
-    elif what:
-        said["content"] = str(what)
-    return said
-
-
-def _plain(value: object) -> object:
-    if isinstance(value, dict):
-        return {str(key): _plain(each) for key, each in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(each) for each in value]
-    return value.name if isinstance(value, Enum) else value

@@ -3,11 +3,8 @@
 import asyncio
 import time
 from collections.abc import Mapping
-from importlib.metadata import version
 
 from controller.api.connection import Connection
-from controller.api.events import AmplifiersEvent, LatencyEvent, LayoutEvent, StateEvent
-from controller.api.hub import Hub
 from controller.api.jsonrpc import ErrorCode, RpcError
 from controller.api.messages import (
     ArmParams,
@@ -23,29 +20,21 @@ from controller.api.messages import (
     UnsubscribeParams,
 )
 from controller.api.parts import (
-    API_VERSION,
-    AmplifierStatus,
-    EraPlace,
     Nothing,
     PhaseName,
-    RigSummary,
-    TableSummary,
 )
 from controller.api.server import Handler
 from controller.daemon.config import DaemonConfig
 from controller.daemon.inputs import ApiTouches
-from controller.daemon.latency import Latencies
+from controller.daemon.introduction import introduction
 from controller.daemon.lease import LeaseBook
 from controller.daemon.meaning import Meaning
-from controller.daemon.records import RecordedBackend
+from controller.daemon.news import News
 from controller.daemon.states import Event, Kind, Machine, State
 from controller.daemon.supervisor import Supervisor
-from controller.daemon.view import Scene, amplifier_statuses
-from controller.effects.layout import Layout
 from controller.loop import Controller
 from drivers import clock
 from drivers.amplifier import Amplifier
-from drivers.errors import CommandError
 from model.table.table import LocalizationTable
 
 _ARMABLE = (State.SWITCHED_ON, State.OPERATION_ENABLED)
@@ -70,22 +59,17 @@ class Service:
         supervisor: Supervisor,
         *,
         amplifiers: Mapping[str, Amplifier],
-        backends: Mapping[str, RecordedBackend],
-        scene: Scene,
-        latencies: Latencies,
+        news: News,
         touches: ApiTouches,
         meaning: Meaning,
     ) -> None:
         self.longest_lease = config.section.longest_lease
-        self._layout = config.layout
         self._config = config
         self._table = table
         self._controller = controller
         self._supervisor = supervisor
         self._amplifiers = amplifiers
-        self._backends = backends
-        self._scene = scene
-        self._latencies = latencies
+        self._news = news
         self._touches = touches
         self._meaning = meaning
         self._lease = LeaseBook()
@@ -93,18 +77,6 @@ class Service:
         self._numbers: dict[Connection, int] = {}
         self._clients = 0
         self._begun = clock.now()
-        self.hub = Hub(
-            {
-                "state": self._state_event,
-                "contacts": scene.contacts_event,
-                "pattern": scene.pattern_event,
-                "silence": scene.silence_event,
-                "amplifiers": lambda: AmplifiersEvent(amplifiers=self._amplifier_statuses()),
-                "latency": lambda: LatencyEvent(latency_ms=latencies.summary()),
-                "layout": self._layout_event,
-            },
-            clock=clock.now,
-        )
 
     def handlers(self) -> Mapping[str, Handler]:
         """By method."""
@@ -123,36 +95,25 @@ class Service:
             "unsubscribe": self._unsubscribe,
         }
 
-    def state_changed(self, old: Machine, new: Machine) -> None:
-        """Tell clients; whatever ends the armed state ends the lease with it."""
+    def state_changed(self, new: Machine) -> None:
+        """Whatever ends the armed state ends the lease with it."""
         if new.state not in _ARMABLE:
             self._lease.end()
-            self._scene.ended()
-        self.hub.publish(
-            "state",
-            lambda: StateEvent(
-                old=old.state.value, new=new.state.value, cause=new.cause, remedy=new.remedy
-            ),
-        )
-
-    def layout_changed(self, layout: Layout | None) -> None:
-        """Tell clients of another surface layout, or of other effects without one."""
-        self._layout = layout
-        self.hub.publish("layout", self._layout_event)
+            self._news.scene.ended()
 
     def left(self, client: Connection) -> None:
         """A client is gone: its fingers are lifted."""
-        self.hub.forget(client)
+        self._news.hub.forget(client)
         self._numbers.pop(client, None)
         self._touches.leave(client, now=clock.now())
 
     def keeps(self, client: Connection) -> bool:
         """Whether a client must not give way to another: it listens to something."""
-        return self.hub.is_told(client)
+        return self._news.hub.is_told(client)
 
     def status(self) -> StatusResult:
         """How everything is."""
-        machine, scene, now = self._supervisor.machine, self._scene, clock.now()
+        machine, scene, now = self._supervisor.machine, self._news.scene, clock.now()
         held = self._lease.held(now)
         pattern = scene.pattern_event()
         return StatusResult(
@@ -172,44 +133,20 @@ class Service:
             predicted_contrast_db=pattern.predicted_contrast_db if pattern else None,
             robust_contrast_db=pattern.robust_contrast_db if pattern else None,
             predicted_level_db_sl=pattern.predicted_level_db_sl if pattern else None,
-            amplifiers=self._amplifier_statuses(),
-            latency_ms=self._latencies.summary(),
+            amplifiers=self._news.amplifiers(),
+            latency_ms=self._news.latencies.summary(),
             rejected_touches=dict(self._controller.rejected_touches),
             uptime_s=now - self._begun,
         )
 
     def _hello(self, client: Connection, params: HelloParams) -> HelloResult:
         client.name = params.client
-        rig, table = self._config.rig, self._table
-        products = [_product(amplifier) for amplifier in self._amplifiers.values()]
-        return HelloResult(
-            api_version=API_VERSION,
-            software_version=version("era-haptics"),
-            rig=RigSummary(
-                length_m=rig.plate.length,
-                width_m=rig.plate.width,
-                eras=[
-                    EraPlace(
-                        name=era.name,
-                        x_m=era.x,
-                        y_m=era.y,
-                        amplifier=rig.wiring[era.name].amplifier,
-                        channel=rig.wiring[era.name].number,
-                    )
-                    for era in rig.eras
-                ],
-                simulated=any("simulated" in product for product in products),
-                frequency_hz=[rig.limits.frequency_min, rig.limits.frequency_max],
-            ),
-            table=TableSummary(
-                fingerprint=table.fingerprint,
-                mode=self._controller.means.mode,
-                frequencies_hz=[float(each) for each in table.frequencies],
-                cells_x=table.grid.nx,
-                cells_y=table.grid.ny,
-            ),
-            rig_text=self._config.rig_text,
-            layout=self._layout_event().layout,
+        return introduction(
+            self._config,
+            self._table,
+            self._amplifiers,
+            mode=self._controller.means.mode,
+            layout=self._news.layout_event().layout,
         )
 
     async def _arm(self, client: Connection, params: ArmParams) -> ArmResult:
@@ -269,7 +206,7 @@ class Service:
         machine = self._supervisor.machine
         if machine.state is not State.OPERATION_ENABLED:
             raise _wrong_state(machine)
-        self._meaning.play(params, self._scene.contacts, now=clock.now())
+        self._meaning.play(params, self._news.scene.contacts, now=clock.now())
         self._controller.reconsider()
         return Nothing()
 
@@ -280,10 +217,10 @@ class Service:
 
     def _subscribe_now(self, client: Connection, params: SubscribeParams) -> None:
         if client.is_open:
-            self.hub.subscribe(client, params.topics, rate=params.rate_hz)
+            self._news.hub.subscribe(client, params.topics, rate=params.rate_hz)
 
     def _unsubscribe(self, client: Connection, params: UnsubscribeParams) -> Nothing:
-        self.hub.unsubscribe(client, params.topics)
+        self._news.hub.unsubscribe(client, params.topics)
         return Nothing()
 
     def _end_lease(self, token: str) -> None:
@@ -313,18 +250,6 @@ class Service:
             Event(Kind.LEASE_LOST, "whoever armed has not renewed the lease", "arm again")
         )
 
-    def _state_event(self) -> StateEvent:
-        now = self._supervisor.machine
-        return StateEvent(
-            old=now.state.value, new=now.state.value, cause=now.cause, remedy=now.remedy
-        )
-
-    def _layout_event(self) -> LayoutEvent:
-        return LayoutEvent(layout=None if self._layout is None else self._layout.drawn())
-
-    def _amplifier_statuses(self) -> list[AmplifierStatus]:
-        return amplifier_statuses(self._amplifiers, self._backends, self._config.urls)
-
 
 def _wrong_state(machine: Machine) -> RpcError:
     return RpcError(
@@ -343,10 +268,3 @@ def _phase(controller: Controller) -> PhaseName:
         "LOST": "lost",
     }
     return names[controller.phase.name]
-
-
-def _product(amplifier: Amplifier) -> str:
-    try:
-        return amplifier.identity.product
-    except CommandError:
-        return ""

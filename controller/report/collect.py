@@ -14,7 +14,7 @@ from packaging.requirements import Requirement
 from controller.api.client import Client
 from controller.api.jsonrpc import RpcError
 from controller.daemon.config import is_daemon_document
-from controller.daemon.records import DUMPS
+from controller.daemon.dumps import DUMPS
 from controller.report.redaction import redacted
 from drivers.errors import LinkError
 from model.config.document import read_document

@@ -167,7 +167,7 @@ async def test_a_name_that_is_no_text_is_told_all_the_same(tmp_path: Path) -> No
         await era.subscribe("log")
         record = logging.makeLogRecord({"msg": "written to %s", "args": ("/tmp/\udcff",)})
         record.levelno, record.levelname = logging.WARNING, "WARNING"
-        bench.daemon._tell_log(record)
+        bench.daemon._news.logged(record)
         async with asyncio.timeout(20):
             async for told in era.events():
                 if told.topic == "log" and "written" in told.data["message"]:

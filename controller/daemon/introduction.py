@@ -1,0 +1,64 @@
+"""How the daemon introduces itself to a client that says hello."""
+
+from collections.abc import Mapping
+from importlib.metadata import version
+
+from controller.api.messages import HelloResult
+from controller.api.parts import API_VERSION, EraPlace, RigSummary, TableSummary
+from controller.daemon.config import DaemonConfig
+from drivers.amplifier import Amplifier
+from drivers.errors import CommandError
+from model.rig.rig import Rig
+from model.table.table import LocalizationTable
+
+
+def introduction(
+    config: DaemonConfig,
+    table: LocalizationTable,
+    amplifiers: Mapping[str, Amplifier],
+    *,
+    mode: str,
+    layout: dict[str, object] | None,
+) -> HelloResult:
+    """What the daemon drives, in which mode, by which surface layout."""
+    return HelloResult(
+        api_version=API_VERSION,
+        software_version=version("era-haptics"),
+        rig=_rig_summary(config.rig, amplifiers),
+        table=TableSummary(
+            fingerprint=table.fingerprint,
+            mode=mode,
+            frequencies_hz=[float(each) for each in table.frequencies],
+            cells_x=table.grid.nx,
+            cells_y=table.grid.ny,
+        ),
+        rig_text=config.rig_text,
+        layout=layout,
+    )
+
+
+def _rig_summary(rig: Rig, amplifiers: Mapping[str, Amplifier]) -> RigSummary:
+    return RigSummary(
+        length_m=rig.plate.length,
+        width_m=rig.plate.width,
+        eras=[
+            EraPlace(
+                name=era.name,
+                x_m=era.x,
+                y_m=era.y,
+                amplifier=rig.wiring[era.name].amplifier,
+                channel=rig.wiring[era.name].number,
+            )
+            for era in rig.eras
+        ],
+        simulated=any("simulated" in _product(amplifier) for amplifier in amplifiers.values()),
+        frequency_hz=[rig.limits.frequency_min, rig.limits.frequency_max],
+    )
+
+
+def _product(amplifier: Amplifier) -> str:
+    """What an amplifier calls itself; nothing before it has answered."""
+    try:
+        return amplifier.identity.product
+    except CommandError:
+        return ""

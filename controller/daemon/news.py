@@ -1,0 +1,141 @@
+"""What happens in the daemon, as its clients are told of it: the news, and what is so now."""
+
+import asyncio
+import contextlib
+import logging
+from collections.abc import Callable, Sequence
+
+from controller.api.events import (
+    AmplifiersEvent,
+    LatencyEvent,
+    LayoutEvent,
+    LinkEvent,
+    LogEvent,
+    StateEvent,
+)
+from controller.api.hub import Hub
+from controller.api.parts import AmplifierStatus
+from controller.contacts import Change, Contact, ContactKey
+from controller.daemon.latency import Latencies
+from controller.daemon.states import Machine
+from controller.daemon.view import Scene
+from controller.effects.layout import Layout
+from controller.observer import Applied, Observer, Silenced
+from drivers import clock
+
+_LINK_LEVELS = {"lost": logging.ERROR, "retry": logging.WARNING, "reopened": logging.INFO}
+
+_logger = logging.getLogger(__name__)
+
+
+class News:
+    """Keeps what is so now, and tells every change of it to whoever has subscribed at `hub`.
+
+    machine: the daemon's state; amplifiers: how they are; effect_of: what plays for a finger;
+    layout: the surface layout, None without one.
+    """
+
+    def __init__(
+        self,
+        *,
+        machine: Callable[[], Machine],
+        amplifiers: Callable[[], list[AmplifierStatus]],
+        effect_of: Callable[[ContactKey], str | None],
+        layout: Layout | None,
+    ) -> None:
+        self.scene = Scene(effect_of)
+        self.latencies = Latencies()
+        self.amplifiers = amplifiers
+        self._machine = machine
+        self._layout = layout
+        self._loop = asyncio.get_running_loop()
+        self.hub = Hub(
+            {
+                "state": self._state_event,
+                "contacts": self.scene.contacts_event,
+                "pattern": self.scene.pattern_event,
+                "silence": self.scene.silence_event,
+                "amplifiers": lambda: AmplifiersEvent(amplifiers=amplifiers()),
+                "latency": lambda: LatencyEvent(latency_ms=self.latencies.summary()),
+                "layout": self.layout_event,
+            },
+            clock=clock.now,
+        )
+
+    def observer(self) -> Observer:
+        """Hears of the control loop."""
+        return Observer(
+            contacts_changed=self._contacts_changed,
+            pattern_applied=self._pattern_applied,
+            silenced=self._silenced,
+            refused=lambda reason: _logger.warning("refused: %s", reason),
+        )
+
+    def state_changed(self, old: Machine, new: Machine) -> None:
+        """The daemon's state is another."""
+        self.hub.publish(
+            "state",
+            lambda: StateEvent(
+                old=old.state.value, new=new.state.value, cause=new.cause, remedy=new.remedy
+            ),
+        )
+
+    def layout_changed(self, layout: Layout | None) -> None:
+        """There is another surface layout, or there are other effects without one."""
+        self._layout = layout
+        self.hub.publish("layout", self.layout_event)
+
+    def link_told(self, event: str, message: str, *, lost: Sequence[str]) -> None:
+        """A link was lost (lost: to which amplifiers), is tried again (retry), or is reopened."""
+        _logger.log(_LINK_LEVELS[event], "link %s: %s", event, message)
+        if event != "retry":  # fingers are not followed without a link, and begin anew with one
+            self._contacts_changed((), Change())
+        told = {
+            "event": event,
+            # When it is tried again all have been closed.
+            "amplifier": lost[0] if event == "lost" and len(lost) == 1 else None,
+            "message": message,
+            "remedy": None if event == "reopened" else "look at cables and supply",
+        }
+        self.hub.publish("link", lambda: LinkEvent.model_validate(told))
+
+    def logged(self, record: logging.LogRecord) -> None:
+        """There is a line in the log; called in any thread."""
+        told = {
+            "level": "error" if record.levelno >= logging.ERROR else record.levelname.lower(),
+            # A file's name may hold bytes that are no text, and JSON has none of these.
+            "message": record.getMessage()[:1000].encode(errors="backslashreplace").decode(),
+            "cause": getattr(record, "cause", None),
+            "remedy": getattr(record, "remedy", None),
+        }
+
+        def publish() -> None:
+            self.hub.publish("log", lambda: LogEvent.model_validate(told))
+
+        with contextlib.suppress(RuntimeError):  # the loop may be over
+            self._loop.call_soon_threadsafe(publish)
+
+    def layout_event(self) -> LayoutEvent:
+        """The surface layout as it is told."""
+        return LayoutEvent(layout=None if self._layout is None else self._layout.drawn())
+
+    def _state_event(self) -> StateEvent:
+        now = self._machine()
+        return StateEvent(
+            old=now.state.value, new=now.state.value, cause=now.cause, remedy=now.remedy
+        )
+
+    def _contacts_changed(self, contacts: tuple[Contact, ...], change: Change) -> None:
+        self.scene.changed(contacts)
+        self.hub.publish("contacts", self.scene.contacts_event)
+
+    def _pattern_applied(self, applied: Applied) -> None:
+        self.scene.played(applied)
+        self.latencies.note(applied.latency)
+        self.hub.publish("pattern", self.scene.pattern_event)
+
+    def _silenced(self, silenced: Silenced) -> None:
+        self.scene.fell_silent(silenced)
+        if silenced.latency is not None:
+            self.latencies.note(silenced.latency)
+        self.hub.publish("silence", self.scene.silence_event)

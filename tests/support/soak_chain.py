@@ -464,9 +464,11 @@ _BACKENDS: dict[str, type[Backend]] = {}
 def _backend(url: str) -> Backend:
     """A backend for a URL; to look among all that is installed for each run would take long."""
     scheme = url.partition("://")[0]
-    if scheme not in _BACKENDS:
-        _BACKENDS[scheme] = type(open_backend(url))
-    return _BACKENDS[scheme](url)
+    if scheme in _BACKENDS:
+        return _BACKENDS[scheme](url)
+    first = open_backend(url)  # made once as all others are, for it throws the run's dice
+    _BACKENDS[scheme] = type(first)
+    return first
 
 
 @contextmanager

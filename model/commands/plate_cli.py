@@ -12,7 +12,10 @@ plate_app = typer.Typer(help="The plate: natural frequencies and vibration maps.
 
 RigArgument = Annotated[Path, typer.Argument(metavar="RIG", help="Rig file, e.g. RIG.yaml.")]
 MeshOption = Annotated[
-    str | None, typer.Option(metavar="NXxNY", help="Elements along x and y, in place of the rig's.")
+    str | None,
+    typer.Option(
+        metavar="NXxNY", help="Elements along x and y, in place of the rig's; or '12x9 ELEMENT'."
+    ),
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="One JSON object, nothing else.")]
 

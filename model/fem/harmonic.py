@@ -15,7 +15,7 @@ from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
 from model.fem.assembly import PlateMatrices, era_positions
 from model.fem.factorisation import factorise
-from model.fem.mesh import LEAST_NODES_PER_WAVELENGTH, Mesh
+from model.fem.mesh import LEAST_NODES_PER_WAVELENGTH, PAPER_ELEMENT, Mesh
 from model.structure.actuator import Era
 from model.structure.plate import Plate
 from model.structure.point_load import PointLoad, load_positions
@@ -35,7 +35,7 @@ def check_frequencies(plate: Plate, mesh: Mesh, frequencies: FloatArray) -> None
             f"{LEAST_NODES_PER_WAVELENGTH / mesh.kind.order:g} of {mesh.element} are the least; "
             + (
                 f"use {Mesh.coarsest(plate, frequency=highest)} or finer"
-                if mesh.element == "MITC4"
+                if mesh.element == PAPER_ELEMENT
                 else f"raise the upper limits.frequency to {highest:g} Hz, which mesh: auto follows"
             )
         )

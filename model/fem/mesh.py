@@ -9,8 +9,11 @@ from scipy import sparse
 
 from model.arrays import FloatArray, IntArray, lattice
 from model.errors import InputError
-from model.fem.elements import ELEMENTS, Element
+from model.fem.elements import Element, element_of
 from model.structure.plate import Plate
+
+PAPER_ELEMENT = "MITC4"
+"""What a mesh is made of where nothing else is said."""
 
 # What the automatic mesh is made of. The lowest twelve natural frequencies of the paper's plate are
 # then within 0.01 % of converged, and its accelerations (relative L2) within 0.1 % on ERAs at the
@@ -29,26 +32,23 @@ LEAST_NODES_PER_WAVELENGTH = 6
 class Mesh:
     """nx by ny equal rectangles over length by width [m], and if wanted a strip along every edge.
 
-    element: a name in ELEMENTS. strip [m]: the width of one more row of elements along every edge,
-    for the layer at a free edge; the nx by ny elements then share what is left. The nodes form a
-    lattice: node j * columns + i lies at (node_x[i], node_y[j]).
+    element: the name of one that `element_of` finds. strip [m]: the width of one more row of
+    elements along every edge, for the layer at a free edge; the nx by ny elements then share what
+    is left. The nodes form a lattice: node j * columns + i lies at (node_x[i], node_y[j]).
     """
 
     nx: int
     ny: int
     length: float
     width: float
-    element: str = "MITC4"
+    element: str = PAPER_ELEMENT
     strip: float = 0.0
 
     def __post_init__(self) -> None:
         """Refuse a mesh without elements, of unknown ones, or with strips that fill the plate."""
         if self.nx < 1 or self.ny < 1:
             raise InputError(f"mesh: {self.nx}x{self.ny} has no elements; at least 1x1 is needed")
-        if self.element not in ELEMENTS:
-            raise InputError(
-                f"mesh: unknown element {self.element!r}; known are: {', '.join(ELEMENTS)}"
-            )
+        element_of(self.element)
         if not 0 <= 2 * self.strip < min(self.length, self.width):
             raise InputError(
                 f"mesh: strips of {self.strip:g} m along the edges leave nothing of a plate of "
@@ -79,7 +79,7 @@ class Mesh:
 
     def __str__(self) -> str:
         text = f"{self.nx}x{self.ny}"
-        if self.kind.order > 1:
+        if self.element != PAPER_ELEMENT:
             text += f" {self.element}"
         if self.strip:
             text += f" with strips of {1000 * self.strip:.3g} mm"
@@ -88,7 +88,7 @@ class Mesh:
     @property
     def kind(self) -> Element:
         """The element that the mesh is made of."""
-        return ELEMENTS[self.element]
+        return element_of(self.element)
 
     @property
     def element_size(self) -> tuple[float, float]:

@@ -4,7 +4,7 @@ import math
 import re
 
 from model.errors import InputError
-from model.fem.mesh import Mesh
+from model.fem.mesh import PAPER_ELEMENT, Mesh
 from model.rig.rig import Limits
 from model.rig.sections import EraSection, LimitsSection, MassSection, MaterialSection, PlateSection
 from model.structure.actuator import Era, damping_from_ratio
@@ -79,7 +79,7 @@ def limits_of(section: LimitsSection) -> Limits:
 
 
 def mesh_of(text: str, plate: Plate, *, frequency_max: float) -> Mesh:
-    """The mesh `auto`, good up to a frequency [Hz], or NXxNY; raises InputError as parse_mesh."""
+    """The mesh `auto`, good up to a frequency [Hz], or one as parse_mesh reads it."""
     if text != "auto":
         return parse_mesh(text, plate)
     mesh = Mesh.auto(plate, frequency_max=frequency_max)
@@ -92,20 +92,24 @@ def mesh_of(text: str, plate: Plate, *, frequency_max: float) -> Mesh:
 
 
 def parse_mesh(text: str, plate: Plate) -> Mesh:
-    """The mesh `NXxNY` over a plate; raises InputError for what is none or beyond all reason."""
-    match = re.fullmatch(r"\s*(\d{1,6})\s*[xX×]\s*(\d{1,6})\s*", text, re.ASCII)
+    """The mesh `NXxNY`, or `NXxNY ELEMENT`, over a plate.
+
+    Raises InputError for what is none, for an element that nobody knows, and beyond all reason.
+    """
+    match = re.fullmatch(r"\s*(\d{1,6})\s*[xX×]\s*(\d{1,6})(?:\s+(\S{1,40}))?\s*", text, re.ASCII)
     if match is None:
         raise InputError(
             f"mesh {text[:40]!r} is not understood; write the number of elements along x and y, "
-            "for example 48x36"
+            "for example 48x36, and if wanted an element's name after them: 12x9 Q3"
         )
-    nx, ny = (int(count) for count in match.groups())
+    nx, ny = int(match[1]), int(match[2])
     if not 1 <= min(nx, ny) <= max(nx, ny) <= _MOST_ELEMENTS_PER_SIDE:
         raise InputError(
             f"mesh {nx}x{ny} cannot be used; each side takes 1 to {_MOST_ELEMENTS_PER_SIDE}"
             " elements"
         )
-    return Mesh(nx=nx, ny=ny, length=plate.length, width=plate.width)
+    element = match[3] or PAPER_ELEMENT
+    return Mesh(nx=nx, ny=ny, length=plate.length, width=plate.width, element=element)
 
 
 def _material(section: MaterialSection) -> Material:

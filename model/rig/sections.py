@@ -184,7 +184,7 @@ class LimitsSection(Section):
 
 
 class RigSection(Section):
-    """A rig file. mesh: auto or NXxNY."""
+    """A rig file. mesh: auto, NXxNY, or NXxNY ELEMENT."""
 
     plate: PlateSection
     mesh: str = "auto"

@@ -1,9 +1,37 @@
-"""Plate elements, a file each; a mesh names the one that it is made of."""
+"""Plate elements, a file each; a mesh names the one that it is made of.
 
+An installed package adds one by an entry point of the group `era_haptics.elements` that leads to
+an `Element` of that name; `model.fem.element_checks` says what it must keep.
+"""
+
+from functools import cache
+
+from model.errors import InputError
 from model.fem.elements.element import DOF_PER_NODE, Element
 from model.fem.elements.lagrange import Q3, Q4, Q5
 from model.fem.elements.mitc4 import MITC4
+from model.plugins import Catalogue
 
-__all__ = ["DOF_PER_NODE", "ELEMENTS", "Element"]
+__all__ = ["DOF_PER_NODE", "ELEMENTS", "Element", "element_names", "element_of"]
 
 ELEMENTS = {element.name: element for element in (MITC4, Q3, Q4, Q5)}
+"""Those that come with this package."""
+
+_CATALOGUE = Catalogue("element", Element, ELEMENTS, group="era_haptics.elements")
+
+
+def element_names() -> tuple[str, ...]:
+    """All that a mesh can be made of, those of installed plug-ins too; none of these is loaded."""
+    return _CATALOGUE.names()
+
+
+@cache
+def element_of(name: str) -> Element:
+    """The element of this name; raises InputError, with what may have been meant."""
+    element = _CATALOGUE.find(name)
+    if element.name != name:
+        raise InputError(
+            f"element {name}: the plug-in of this name gives one that is called {element.name!r}; "
+            "its entry point and its Element need the same name"
+        )
+    return element

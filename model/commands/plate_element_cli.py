@@ -1,0 +1,79 @@
+"""`era plate elements` and `era plate conformance`: what meshes are made of, and if it holds."""
+
+import json
+from typing import Annotated
+
+import typer
+
+from model.commands.plate_cli import JsonOption
+
+
+def elements(as_json: JsonOption = False) -> None:
+    """The elements that a mesh can be made of, as in mesh: 12x9 Q3."""
+    from model.errors import InputError
+    from model.fem.elements import element_names, element_of
+
+    orders, problems = {}, []
+    for name in element_names():
+        try:
+            orders[name] = element_of(name).order
+        except InputError as error:  # of one plug-in; the others are as good as before
+            problems.append(str(error))
+    if as_json:
+        rows = [{"name": name, "order": order} for name, order in orders.items()]
+        print(json.dumps({"elements": rows, "problems": problems}))
+        return
+    for name, order in orders.items():
+        print(f"{name}: order {order}, {(order + 1) ** 2} nodes")
+    for problem in problems:
+        typer.echo(f"era: warning: {problem}", err=True)
+
+
+def conformance(
+    name: Annotated[str, typer.Argument(metavar="ELEMENT", help="As era plate elements lists it.")],
+    as_json: JsonOption = False,
+) -> None:
+    """Check that a plate element keeps what every element must; exit status 1 if it does not."""
+    from model.fem.element_checks import CHECKS, COARSE, frequency_error, rate
+    from model.fem.elements import element_of
+
+    element = element_of(name)
+    problems = {}
+    for check in CHECKS:
+        problem = problems[check.name] = check.problem(element)
+        if not as_json:
+            print(f"{'kept  ' if problem is None else 'BROKEN'}  {check.proves}.")
+            if problem is not None:
+                print(f"        {problem}")
+        if problem is not None and check.name in ("nodes", "matrices"):
+            break  # the others would fall over it
+    broken = [problem for problem in problems.values() if problem is not None]
+    errors = [] if broken else [frequency_error(element, count) for count in (COARSE, 2 * COARSE)]
+    if as_json:
+        rows = [
+            {"check": check.name, "proves": check.proves, "problem": problems[check.name]}
+            for check in CHECKS
+            if check.name in problems
+        ]
+        print(
+            json.dumps(
+                {
+                    "element": name,
+                    "kept": not broken,
+                    "checks": rows,
+                    "frequency_error": errors,
+                    "rate": rate(*errors) if errors else None,
+                }
+            )
+        )
+    else:
+        if errors:
+            coarse, fine = errors
+            print(
+                f"lowest frequency of a thin plate: off by {coarse:.2g} with {COARSE}x{COARSE} "
+                f"elements, by {fine:.2g} with {2 * COARSE}x{2 * COARSE}, rate "
+                f"{rate(coarse, fine):.1f}"
+            )
+        print(f"{len(problems) - len(broken)} kept, {len(broken)} broken")
+    if broken:
+        raise typer.Exit(1)

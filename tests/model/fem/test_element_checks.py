@@ -1,0 +1,113 @@
+"""The checks of plate elements: ours keep them all, and each fault is found by the check for it."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from model.cli import app
+from model.fem.element_checks import CHECKS, frequency_error, rate
+from model.fem.elements import ELEMENTS, Element, element_of
+from model.fem.elements.lagrange import Q3
+from model.fem.elements.mitc4 import MITC4, _curvature, _shear, rigidities
+
+RUNNER = CliRunner()
+
+
+def test_our_own_elements_keep_all() -> None:
+    """Of each element not one check finds anything."""
+    found = {
+        (name, check.name): check.problem(element)
+        for name, element in ELEMENTS.items()
+        for check in CHECKS
+    }
+    assert {key: problem for key, problem in found.items() if problem} == {}
+
+
+def locking(plate, dx, dy):
+    """The stiffness of MITC4 with its shear integrated fully in place of tied."""
+    bending, shear, _ = rigidities(plate)
+    total = np.zeros((12, 12))
+    for xi in (-(3**-0.5), 3**-0.5):
+        for eta in (-(3**-0.5), 3**-0.5):
+            curvature, strain = _curvature(xi, eta, dx, dy), _shear(xi, eta, dx, dy)
+            total += (curvature.T @ bending @ curvature + shear * strain.T @ strain) * dx * dy / 4
+    return total
+
+
+def one_point(plate, dx, dy):
+    """The stiffness with shear at the middle alone: it has spurious modes."""
+    bending, shear, _ = rigidities(plate)
+    strain = _shear(0.0, 0.0, dx, dy)
+    total = dx * dy * shear * strain.T @ strain
+    for xi in (-(3**-0.5), 3**-0.5):
+        for eta in (-(3**-0.5), 3**-0.5):
+            curvature = _curvature(xi, eta, dx, dy)
+            total += curvature.T @ bending @ curvature * dx * dy / 4
+    return total
+
+
+def skewed(plate, dx, dy):
+    """The right stiffness with a bit more at one of its corners."""
+    wrong = MITC4.stiffness(plate, dx, dy)
+    wrong[0, 0] *= 1.01
+    return wrong
+
+
+FAULTS = {
+    "nodes": replace(Q3, side=(-1.0, -0.4, 0.5, 1.0)),
+    "matrices": replace(MITC4, mass=lambda plate, dx, dy: np.zeros((12, 12))),
+    "mirror": replace(MITC4, stiffness=skewed),
+    "rigid_motions": replace(
+        MITC4, stiffness=lambda plate, dx, dy: MITC4.stiffness(plate, dx, dy) + np.eye(12)
+    ),
+    "no_other_free_motion": replace(MITC4, stiffness=one_point),
+    "bending": replace(Q3, stiffness=lambda plate, dx, dy: 1.01 * Q3.stiffness(plate, dx, dy)),
+    "shear": replace(
+        MITC4,
+        stiffness=lambda plate, dx, dy: MITC4.stiffness(plate, dx, dy) + one_point(plate, dx, dy),
+    ),
+    "inertia": replace(MITC4, mass=lambda plate, dx, dy: 1.01 * MITC4.mass(plate, dx, dy)),
+    "convergence": replace(MITC4, stiffness=locking),
+}
+
+
+@pytest.fixture(params=FAULTS.items(), ids=FAULTS)
+def fault(
+    request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[tuple[str, Element]]:
+    """An element with a fault, there by name, and which check is to find it."""
+    check, element = request.param
+    element = replace(element, name=f"bad-{check}")
+    monkeypatch.setitem(ELEMENTS, element.name, element)
+    yield check, element
+    element_of.cache_clear()
+
+
+def test_a_fault_is_found(fault: tuple[str, Element]) -> None:
+    """The check for it says what is wrong, and the command ends with status 1."""
+    name, element = fault
+    (check,) = (check for check in CHECKS if check.name == name)
+    problem = check.problem(element)
+    assert problem is not None
+    result = RUNNER.invoke(app, ["plate", "conformance", element.name])
+    assert result.exit_code == 1
+    assert f"BROKEN  {check.proves}.\n        {problem}\n" in result.stdout
+
+
+def test_there_is_a_fault_for_every_check() -> None:
+    """None that cannot fail."""
+    assert FAULTS.keys() == {check.name for check in CHECKS}
+
+
+@pytest.mark.parametrize(("name", "expected"), [("MITC4", 2.0), ("Q3", 4.0), ("Q4", 6.0)])
+def test_rates_are_those_of_theory(name: str, expected: float) -> None:
+    """A frequency errs as the energy does (Strang and Fix, ch. 6).
+
+    By h² where rotations are linear; by h^2(p - 1) where slopes and rotations of order p are made
+    equal by being thin alone.
+    """
+    errors = [frequency_error(ELEMENTS[name], count) for count in (4, 8)]
+    assert rate(*errors) == pytest.approx(expected, abs=0.2)

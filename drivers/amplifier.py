@@ -196,9 +196,13 @@ class Amplifier:
             )
 
     async def stage(self, safe: SafeCommand) -> Achieved:
-        """Keep a set ready under its token; returns what commit would play."""
+        """Keep a set ready under its token; returns what commit would play.
+
+        Raises CommandRefused where a newer set, a stop or a disarm came before its turn.
+        """
         request = Stage(_safe(safe))
-        return _of_token(await self._link.ask(request, expect=Achieved), safe.token)
+        achieved = await self._link.ask(request, expect=Achieved, kind=Kind.APPLY)
+        return _of_token(achieved, safe.token)
 
     async def commit(self, token: int) -> Achieved:
         """Play the staged set of this token; playing it twice is playing it once."""

@@ -319,6 +319,25 @@ async def test_nothing_arms_after_it_was_silenced(
     assert [type(request) for request in backend.requests[1:]] == [Disarm]
 
 
+async def test_nothing_is_staged_after_it_was_silenced(
+    amplifier: Amplifier, backend: ScriptedBackend, safe: MakeSafe
+) -> None:
+    """A set that still waits to be staged when a disarm comes is never sent."""
+    answer: asyncio.Future[Reply] = asyncio.get_running_loop().create_future()
+    backend.script.append(answer)
+    status = asyncio.create_task(amplifier.status())
+    await settle()
+    stage = asyncio.create_task(amplifier.stage(safe(1)))
+    await settle()
+    disarm = asyncio.create_task(amplifier.disarm())
+    await settle()
+    answer.set_result(STATUS)
+    await asyncio.gather(status, disarm)
+    with pytest.raises(CommandRefused, match="superseded"):
+        await stage
+    assert [type(request) for request in backend.requests[1:]] == [Disarm]
+
+
 async def test_an_apply_is_not_repeated_before_a_stop(
     amplifier: Amplifier, backend: ScriptedBackend, safe: MakeSafe
 ) -> None:

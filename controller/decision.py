@@ -6,7 +6,7 @@ decide(now)  ->  contacts -> wishes -> selection -> routing -> guard -> order, i
 
 import logging
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 from controller.contacts import Change, Contact, ContactTracker
 from controller.envelopes import ENVELOPE_TIME, PLAIN
@@ -45,6 +45,27 @@ class Decision:
     since: float
 
 
+@dataclass(frozen=True)
+class _Playing:
+    """What the amplifiers do since the last order, as far as that is known.
+
+    drive: what they made of it, by ERA, nothing until they have confirmed; has_brakes: whether it
+    ends by these; brake_due [s]: when they fit; again_at [s]: when what a guard refused may be
+    asked for again.
+    """
+
+    order: Order | None = None
+    drive: Mapping[str, DriveCommand] = field(default_factory=dict)
+    has_brakes: bool = False
+    brake_due: float | None = None
+    again_at: float | None = None
+
+    @property
+    def is_silent(self) -> bool:
+        """Whether nothing plays, for certain."""
+        return self.order is not None and self.order.is_silence
+
+
 class Decider:
     """Contacts, wishes, selection and orders of one plate; reads no clock and waits for nothing.
 
@@ -75,12 +96,7 @@ class Decider:
         self._selector = Selector(table)
         self._orders = OrderMaker(rig, guards, timing=timing)
         self._decided: Selection | None = None
-        self._is_silent = False
-        self._playing: Mapping[str, DriveCommand] = {}
-        self._ordered: Order | None = None
-        self._brake_due: float | None = None  # when endings fit what plays
-        self._has_brakes = False
-        self._again_at: float | None = None  # when a guard lets through what it refused
+        self._playing = _Playing()
         self._changes: list[Change] = []
         self._since: float | None = None
 
@@ -122,7 +138,7 @@ class Decider:
         """
         moments = (
             *(self._tracker.next_expiry, self._wish_due),
-            *(self._brake_due, self._again_at),
+            *(self._playing.brake_due, self._playing.again_at),
         )
         return min((moment for moment in moments if moment is not None), default=None)
 
@@ -134,7 +150,7 @@ class Decider:
     @property
     def owes_silence(self) -> bool:
         """Whether nobody touches the plate any more, but what was decided last is no silence."""
-        return not self._tracker.contacts and not self._is_silent
+        return not self._tracker.contacts and not self._playing.is_silent
 
     def take(self, frame: TouchFrame) -> Change:
         """Take over a touch frame; a decision is due if anything changed."""
@@ -151,22 +167,18 @@ class Decider:
     def forget(self) -> None:
         """What the amplifiers play is not known any more: the next decision has commands."""
         self._decided = None
-        self._is_silent = False
-        self._playing = {}
-        self._brake_due = None
-        self._has_brakes = False
-        self._again_at = None
+        self._playing = _Playing()
 
     def confirm(self, drive: Mapping[str, DriveCommand], *, now: float) -> None:
         """This is what the amplifiers made of the last order, by ERA, silent ones left out."""
-        self._playing = drive
-        ordered = self._ordered
-        if ordered is None or ordered.pattern is None:
+        self._playing = replace(self._playing, drive=drive)
+        order = self._playing.order
+        if order is None or order.pattern is None:
             return
-        if ordered.is_brake:
-            self._has_brakes = True
+        if order.is_brake:
+            self._playing = replace(self._playing, has_brakes=True)
         elif self._means_at(now).shaping.endings and self._timing is not None:
-            self._brake_due = now + ordered.settled_after
+            self._playing = replace(self._playing, brake_due=now + order.settled_after)
 
     def loaded_in(self, duration: float, *, now: float) -> None:
         """Loading the envelopes took so long [s]; where that is too long, ramps serve for now."""
@@ -180,41 +192,28 @@ class Decider:
         """Decide at a time [s]."""
         self.expire(now)
         contacts = self._tracker.contacts
-        order: Order | None = None
-        means = self._means_at(now)
+        before = self._playing
         is_calm = True
         try:
-            self._wish_due = None
-            wish = self._wishes.wish(contacts, now)
-            self._wish_due = wish.due(now)
-            selection = self._selector.select(contacts, wish, means)
-            is_new = selection != self._decided or self._is_due_again(now)
-            if is_new and selection.pattern is not None and selection.question is not None:
-                order = self._orders.play(
-                    selection.pattern,
-                    selection.question,
-                    is_shaped=means.shaping.onsets,
-                    playing=self._playing,
-                )
-            elif not is_new and self._brake_due is not None and now >= self._brake_due:
-                order = self._brake(selection)
+            selection = self._select(contacts, now)
+            is_new = selection != self._decided or _has_come(before.again_at, now)
+            order = self._order_for(selection, now, is_new=is_new)
         except Exception as error:
             is_calm = False
             selection = Selection((), contacts, None, f"{type(error).__name__}: {error}")
-            is_new = selection != self._decided
+            is_new, order = selection != self._decided, None
             if is_new:
                 _logger.exception("the decision failed, all channels fall silent")
-        if is_new and order is None and not self._is_silent:
-            order = self._ending(contacts, is_calm=is_calm)
-        from_rest = not self._playing
+        if is_new and order is None and not before.is_silent:
+            order = self._ending(contacts, by_brakes=before.has_brakes and is_calm)
         if order is not None:
-            self._is_silent = order.is_silence
-            self._ordered = order
-            self._playing = {}  # until the amplifiers have confirmed
-            self._brake_due = None
-            self._has_brakes = False
-        if is_new:
-            self._again_at = order.again_at if order is not None else None
+            self._playing = _Playing(order, again_at=order.again_at)
+        else:
+            self._playing = replace(
+                before,
+                again_at=None if is_new else before.again_at,
+                brake_due=None if _has_come(before.brake_due, now) else before.brake_due,
+            )
         self._decided = selection
         decision = Decision(
             contacts=contacts,
@@ -222,7 +221,7 @@ class Decider:
             selection=selection,
             is_new=is_new,
             order=order,
-            from_rest=from_rest,
+            from_rest=not before.drive,
             since=now if self._since is None else min(self._since, now),
         )
         self._changes, self._since = [], None
@@ -236,27 +235,38 @@ class Decider:
         """What is to be played by at a time [s]: without envelopes while these take too long."""
         return replace(self._means, shaping=PLAIN) if self._loadings.problem(now) else self._means
 
-    def _is_due_again(self, now: float) -> bool:
-        """Whether a guard lets through by now [s] what it refused."""
-        return self._again_at is not None and now >= self._again_at
+    def _select(self, contacts: tuple[Contact, ...], now: float) -> Selection:
+        """What is wished for, and what the table has for it."""
+        self._wish_due = None
+        wish = self._wishes.wish(contacts, now)
+        self._wish_due = wish.due(now)
+        return self._selector.select(contacts, wish, self._means_at(now))
 
-    def _brake(self, selection: Selection) -> Order | None:
-        """The order that gives what plays its brakes, now that it has settled."""
-        self._brake_due = None
-        if selection.pattern is None or selection.question is None or not self._playing:
+    def _order_for(self, selection: Selection, now: float, *, is_new: bool) -> Order | None:
+        """The order that a selection with a pattern needs: to play it, or to give it its brakes."""
+        playing, pattern, question = self._playing, selection.pattern, selection.question
+        if pattern is None or question is None:
             return None
-        return self._orders.brake(selection.pattern, selection.question, playing=self._playing)
+        if is_new:
+            is_shaped = self._means_at(now).shaping.onsets
+            return self._orders.play(pattern, question, is_shaped=is_shaped, playing=playing.drive)
+        if playing.drive and _has_come(playing.brake_due, now):
+            return self._orders.brake(pattern, question, playing=playing.drive)
+        return None
 
-    def _ending(self, contacts: tuple[Contact, ...], *, is_calm: bool) -> Order:
-        """How what plays ends: by its brakes only for fingers that stay, and without any fault."""
+    def _ending(self, contacts: tuple[Contact, ...], *, by_brakes: bool) -> Order:
+        """How what plays ends: by its brakes only for fingers that stay."""
         if not contacts:
             return self.silence(ramp=RELEASE_RAMP)
-        if self._has_brakes and is_calm:
-            return self._orders.end()
-        return self.silence(ramp=FADE_RAMP)
+        return self._orders.end() if by_brakes else self.silence(ramp=FADE_RAMP)
 
     def _note(self, change: Change, time: float) -> None:
         """Keep a change for the next decision, with the time of the first."""
         if change:
             self._changes.append(change)
             self._since = time if self._since is None else self._since
+
+
+def _has_come(moment: float | None, now: float) -> bool:
+    """Whether it is time [s]."""
+    return moment is not None and now >= moment

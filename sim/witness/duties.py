@@ -34,7 +34,7 @@ class Duties:
             over = [duty for duty in self._due if duty.due < time]
             self._due = [duty for duty in self._due if duty.due >= time]
             for duty in over:
-                if not (duty.side.is_troubled() or duty.is_done()):
+                if not (duty.side.is_troubled(duty.due) or duty.is_done()):
                     duty.side.complain(duty.invariant, duty.due, duty.sentence)
 
     def silence(self, lifted: float) -> None:

@@ -36,13 +36,13 @@ class Exchanges:
 
     def look_for_overdue(self, side: Side, now: float) -> None:
         """Complain of answers that ought to be there by now."""
-        times = self._times
         for key, (at, asked) in list(side.pending.items()):
-            if now > at + times.reply + times.slack and key not in side.overdue:
+            due = at + self._times.reply + self._times.slack
+            if now > due and key not in side.overdue:
                 side.overdue.add(key)
                 if asked.kind in MOVING:
                     side.follower.lose_track()
-                if not side.is_troubled():
+                if not side.is_troubled(due):
                     what = f"{side.name} has not answered {asked.kind.value} of {at:.4f} s"
                     side.complain("answer", now, what)
             if now > at + _FORGOTTEN:
@@ -52,10 +52,10 @@ class Exchanges:
     def sent(self, wire: Wire, time: float, raw: Data, meaning: Meaning) -> None:
         """A frame toward the amplifiers."""
         is_torn = isinstance(meaning, Asked) and meaning.problem.startswith("torn")
-        is_copy = wire.is_troubled and (raw in wire.recent or is_torn)
+        is_copy = wire.is_troubled(time) and (raw in wire.recent or is_torn)
         wire.recent.append(raw)
         if isinstance(meaning, Damaged):
-            if not wire.is_troubled:
+            if not wire.is_troubled(time):
                 self._report.add("garbage", wire.name, time, f"the host sent {meaning.why}")
             return
         if not isinstance(meaning, Asked):
@@ -78,7 +78,7 @@ class Exchanges:
     def _unanswered(self, side: Side, time: float, asked: Asked) -> None:
         """What nobody answers: a broadcast, a heartbeat of a host on CAN, a transfer of objects."""
         if asked.kind is Kind.PING and side.follower.state is not None:
-            if side.is_troubled():
+            if side.is_troubled(time):
                 side.follower.watchdog.may_be_fed(time)
             else:
                 side.follower.fed(time)
@@ -95,7 +95,7 @@ class Exchanges:
     def said(self, wire: Wire, time: float, meaning: Meaning) -> None:
         """A frame toward the host."""
         if isinstance(meaning, Damaged):
-            if not wire.is_troubled:
+            if not wire.is_troubled(time):
                 self._report.add("garbage", wire.name, time, f"an amplifier sent {meaning.why}")
             return
         if isinstance(meaning, Asked):
@@ -114,7 +114,7 @@ class Exchanges:
             self._answered(side, time, meaning)
 
     def _restarted(self, side: Side, time: float) -> None:
-        if side.follower.is_enabled and not side.is_troubled():
+        if side.follower.is_enabled and not side.is_troubled(time):
             side.complain("state", time, f"{side.name} has started anew while it was enabled")
         side.follower.restarted(time)
         side.vibrates = False
@@ -130,19 +130,18 @@ class Exchanges:
         if asked is None:
             was_abandoned = answer.key in side.abandoned
             side.abandoned.discard(answer.key)
-            if not (was_abandoned or side.is_troubled()):
+            if not (was_abandoned or side.is_troubled(time)):
                 why = f": {answer.problem}" if answer.problem else ""
                 what = f"{side.name} answers what nobody has asked it, or asks no more{why}"
                 side.complain("credit", time, what)
             return
-        if answer.problem and not side.is_troubled():
+        if answer.problem and not side.is_troubled(time):
             side.complain(
                 "answer", time, f"an answer of {side.name} is not whole: {answer.problem}"
             )
         was_lost = answer.key in side.overdue
         side.overdue.discard(answer.key)
         if answer.refusal:
-            self._host.refused(time, asked)
             side.follower.watchdog.was_not_fed()
         elif asked.problem:
             rule = "commit" if asked.problem.startswith("torn") else "garbage"
@@ -160,7 +159,7 @@ class Exchanges:
             same = [before for before, one in side.pending.values() if _is_repeated(one, asked)]
             at = min([at, *same])
         self._host.granted(side, time, asked)
-        if side.is_troubled() and asked.kind is Kind.ARM:
+        if side.is_troubled(time) and asked.kind is Kind.ARM:
             side.follower.lose_track()
         side.follower.granted(asked, answer, at, time)
 

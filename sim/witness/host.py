@@ -48,7 +48,7 @@ class Host:
         self._people.wish(time, what)
         if what == "stop":
             for side in self._sides.values():
-                if side.is_open and not side.is_troubled():
+                if side.is_open and not side.is_troubled(time):
                     self._duties.stop(side, time)
 
     def hang(self, time: float | None) -> None:
@@ -95,11 +95,6 @@ class Host:
             case Kind.APPLY | Kind.COMMIT:
                 if self._vibrates(side, asked):
                     side.vibrated_at = time
-
-    def refused(self, time: float, asked: Asked) -> None:
-        """A request was refused."""
-        if asked.kind is Kind.ARM:  # who arms all or none takes it back from all
-            self._people.disarm_wished = time
 
     def pass_to(self, time: float) -> None:
         """Look at what was to be done by now."""
@@ -157,7 +152,7 @@ class Host:
         side.last_life = time
 
     def _check_pulse(self, side: Side, time: float) -> None:
-        if side.is_troubled():
+        if side.is_troubled(time):
             side.last_life = None  # who has given an amplifier up owes it nothing
         last = side.last_life
         is_ending = (

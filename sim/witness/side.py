@@ -20,7 +20,7 @@ class Side:
     plan: AmplifierPlan
     follower: Follower
     complain: Complain
-    is_troubled: Callable[[], bool]
+    is_troubled: Callable[[float], bool]  # at a time [s]
     pending: dict[Hashable, tuple[float, Asked]] = field(default_factory=dict)
     overdue: set[Hashable] = field(default_factory=set)
     abandoned: set[Hashable] = field(default_factory=set)  # asked by a host that has hung up since

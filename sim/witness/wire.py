@@ -2,7 +2,7 @@
 
 import math
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Protocol
 
 from sim.witness.can_decoder import CanDecoder
@@ -23,19 +23,16 @@ class Decoder(Protocol):
 
 
 class Wire:
-    """A wire by its name; sides: by the addresses of the amplifiers; clock: what time it is [s].
+    """A wire by its name; sides: by the addresses of the amplifiers.
 
     recent: the last frames toward the amplifiers.
     """
 
-    def __init__(
-        self, name: str, kind: str, sides: Mapping[int, Side], *, clock: Callable[[], float]
-    ) -> None:
+    def __init__(self, name: str, kind: str, sides: Mapping[int, Side]) -> None:
         self.name = name
         self.kind = kind
         self.sides = sides
         self.recent: deque[Data] = deque(maxlen=_COPIES)
-        self._clock = clock
         self._troubled_until = -math.inf
         self.begin()
 
@@ -54,10 +51,9 @@ class Wire:
                 }
                 self.decoder = CanDecoder(self.kind, channels)
 
-    @property
-    def is_troubled(self) -> bool:
-        """Whether faults are put on it, or were shortly before."""
-        return self._clock() <= self._troubled_until
+    def is_troubled(self, time: float) -> bool:
+        """Whether faults are put on it at a time [s], or were shortly before."""
+        return time <= self._troubled_until
 
     def trouble(self, time: float, *, is_on: bool) -> None:
         """Faults are put on it from now on, or no more."""

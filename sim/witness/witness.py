@@ -40,7 +40,7 @@ class Witness:
             for name, one in self._plan.amplifiers.items():
                 if one.wire == wire:
                     sides[one.address] = self._sides[name] = self._side(name)
-            self._wires[wire] = Wire(wire, kind, sides, clock=lambda: self._now)
+            self._wires[wire] = Wire(wire, kind, sides)
         times = self._plan.times
         self._host = Host(self._sides, times=times)
         self._exchanges = Exchanges(self._host, times=times, report=self._report)
@@ -51,11 +51,11 @@ class Witness:
         def complain(invariant: str, time: float, sentence: str) -> None:
             self._report.add(invariant, plan.wire, time, sentence)
 
-        def is_troubled() -> bool:
-            return self._wires[plan.wire].is_troubled
+        def is_troubled(time: float) -> bool:
+            return self._wires[plan.wire].is_troubled(time)
 
         def complain_unless_troubled(invariant: str, time: float, sentence: str) -> None:
-            if not is_troubled():
+            if not is_troubled(self._now):
                 complain(invariant, time, sentence)
 
         follower = Follower(
@@ -158,7 +158,7 @@ class Witness:
                     "limits", time, f"channel {channel} of {amplifier} has level {level:.4f}"
                 )
         is_amid = any(asked.kind in MOVING for _, asked in side.pending.values())
-        if not (is_amid or side.is_troubled()):
+        if not (is_amid or side.is_troubled(time)):
             side.follower.plays(levels, frequencies or {}, time)
 
     def finish(self, time: float | None = None) -> list[Violation]:

@@ -165,6 +165,16 @@ PING = _over_tcp(1, "17 03E8 000E 0008 0001 02 0016")
 REFUSED = _over_tcp(1, "97 02")
 WHY = _over_tcp(2, "04 0408 0005")
 EARLIER = _over_tcp(2, "04 0A 0015 0000 0007 00FF 0003")
+PLAN = {
+    "wires": {"line": "modbus-tcp"},
+    "amplifiers": {
+        "main": {
+            "wire": "line",
+            "address": 1,
+            "channels": {0: {"frequency_hz": [40, 500], "level": 1.0}},
+        }
+    },
+}
 
 
 def test_a_refusal_of_an_earlier_write_answers_who_reads_it() -> None:
@@ -184,17 +194,7 @@ def test_a_refusal_of_an_earlier_write_answers_who_reads_it() -> None:
 @pytest.mark.parametrize("are_on", [False, True])
 def test_a_refusal_of_an_earlier_write_is_wrong_where_nothing_damages(are_on: bool) -> None:
     """Faults excuse it, and who goes on then asks nothing amid it; without faults it is told of."""
-    plan = {
-        "wires": {"line": "modbus-tcp"},
-        "amplifiers": {
-            "main": {
-                "wire": "line",
-                "address": 1,
-                "channels": {0: {"frequency_hz": [40, 500], "level": 1.0}},
-            }
-        },
-    }
-    witness = Witness(plan)
+    witness = Witness(PLAN)
     if are_on:
         witness.faults(0.0, "line", are_on=True)
     again = PING[:1] + b"\3" + PING[2:-1] + b"\x17"
@@ -209,3 +209,15 @@ def test_a_refusal_of_an_earlier_write_is_wrong_where_nothing_damages(are_on: bo
         witness.bytes("line", toward, time, data)
     found = [violation.invariant for violation in witness.finish(0.010)]
     assert found == ([] if are_on else ["answer"])
+
+
+@pytest.mark.parametrize(("over", "broken"), [(0.02, ["answer"]), (0.04, [])])
+def test_what_was_due_amid_trouble_is_not_owed_later(over: float, broken: list[str]) -> None:
+    """A Ping at 0.5 s that nobody answers, and nothing more until 2 s; 0.5 s count as trouble yet.
+
+    Its answer is due after 31 ms.
+    """
+    witness = Witness(PLAN)
+    witness.faults(over, "line", are_on=False)
+    witness.bytes("line", "amplifier", 0.5, PING)
+    assert [violation.invariant for violation in witness.finish(2.0)] == broken

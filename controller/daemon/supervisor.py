@@ -2,12 +2,12 @@
 
 import asyncio
 import logging
-from collections.abc import Awaitable, Callable, Coroutine, Mapping
+from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import replace
 from functools import partial
-from typing import Any
 
 from controller.amplifiers import Phase
+from controller.daemon.reopening import TICK, reopen
 from controller.daemon.states import Action, Event, Kind, Machine, State, step
 from controller.loop import Controller
 from controller.observer import Observer
@@ -17,11 +17,8 @@ from drivers.errors import CommandRefused, DriverError, LinkError
 from drivers.protocol.messages import Event as AmplifierEvent
 from drivers.protocol.messages import Fault, Status
 from drivers.protocol.messages import State as AmplifierState
-from drivers.supervision import pauses
-from model.errors import InputError
 
 LOOK_EVERY = 0.5  # s; how often a disarmed amplifier is asked how it is
-_TICK = 0.05  # s; how often it is looked whether a lost amplifier may be taken for silent
 _READ_BACKS = 15
 _READ_BACK_PAUSE = 0.02  # s
 
@@ -235,45 +232,18 @@ class Supervisor:
         await self.handle(Event(Kind.LINK_LOST, str(error), remedy))
 
     async def _come_back(self) -> None:
-        """One attempt to leave COMM_LOST, with the pause after it."""
-        controller = self._the_controller
-        if self.machine.reopened:
-            await asyncio.sleep(_TICK)
+        """Do the next thing towards leaving COMM_LOST."""
+        if self.machine.reopened:  # it lasts as long as a lost amplifier may play
+            await asyncio.sleep(TICK)
             self._alive()
             await self._quietly(self.handle(Event(Kind.TICK)))
-            return
-        for pause in pauses():
-            if self.machine.state is not State.COMM_LOST:
-                return
-            try:
-                await self._attended(controller.open())
-                await controller.disarm()  # one was lost for less than its watchdog, perhaps
-            except (DriverError, InputError) as error:
-                self._link_told("retry", str(error))
-                await controller.close()
-            else:
-                self._link_told("reopened", "every amplifier answers again, and is disarmed")
-                await self._quietly(self.handle(Event(Kind.REOPENED)))
-                return
-            await self._pause(pause)
-
-    async def _attended(self, work: Coroutine[Any, Any, None]) -> None:
-        """Wait for something that may take seconds, such as a connection; the loop runs on."""
-        task = asyncio.create_task(work)
-        try:
-            while not (await asyncio.wait({task}, timeout=_TICK))[0]:
-                self._alive()
-        except asyncio.CancelledError:
-            task.cancel()
-            await asyncio.gather(task, return_exceptions=True)
-            raise
-        task.result()
-
-    async def _pause(self, seconds: float) -> None:
-        end = clock.now() + seconds
-        while (left := end - clock.now()) > 0 and self.machine.state is State.COMM_LOST:
-            self._alive()
-            await asyncio.sleep(min(left, _TICK))
+        elif await reopen(
+            self._the_controller,
+            is_wanted=lambda: self.machine.state is State.COMM_LOST,
+            told=self._link_told,
+            alive=self._alive,
+        ):
+            await self._quietly(self.handle(Event(Kind.REOPENED)))
 
     async def _watch(self) -> None:
         """Ask disarmed amplifiers how they are; armed ones are asked by the control loop."""

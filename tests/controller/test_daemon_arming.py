@@ -150,14 +150,14 @@ async def test_the_service_manager_hears_of_a_daemon_that_waits_for_an_amplifier
             tries.set()
             await asyncio.Event().wait()
 
-        def count() -> None:
+        def count(now: float) -> None:
             nonlocal alive
             alive += 1
 
         monkeypatch.setattr(bench.daemon._controller, "open", endless)
         bench.far.station.befall(Episode("hang"))
         await asyncio.wait_for(tries.wait(), 20)
-        monkeypatch.setattr(bench.daemon._supervisor, "_alive", count)
+        monkeypatch.setattr(bench.daemon._manager, "alive", count)
         await until(lambda: alive >= 3)
 
 

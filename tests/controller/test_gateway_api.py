@@ -28,13 +28,6 @@ ALLOWED = "https://panel.example"
 
 
 @pytest.fixture(scope="module")
-def daemon(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ScriptedDaemon]:
-    """One for all tests here."""
-    with ScriptedDaemon(tmp_path_factory.mktemp("daemon")) as made:
-        yield made
-
-
-@pytest.fixture(scope="module")
 def gateway(
     daemon: ScriptedDaemon, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[GatewayProcess]:

@@ -32,13 +32,6 @@ Misuse: TypeAlias = Callable[[RawWebSocket], None]
 
 
 @pytest.fixture(scope="module")
-def daemon(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ScriptedDaemon]:
-    """One for all attacks."""
-    with ScriptedDaemon(tmp_path_factory.mktemp("daemon")) as made:
-        yield made
-
-
-@pytest.fixture(scope="module")
 def gateway(
     daemon: ScriptedDaemon, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[GatewayProcess]:

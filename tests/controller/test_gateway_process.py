@@ -7,7 +7,6 @@ import ssl
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -26,13 +25,6 @@ from gateway_bench import (
     wait_for_daemon,
 )
 from model.errors import InputError
-
-
-@pytest.fixture(scope="module")
-def daemon(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ScriptedDaemon]:
-    """One for all tests here."""
-    with ScriptedDaemon(tmp_path_factory.mktemp("daemon")) as made:
-        yield made
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,14 @@
+"""What tests of the gateway share: a daemon that only notes what it is asked."""
+
+from collections.abc import Iterator
+
+import pytest
+
+from gateway_bench import ScriptedDaemon
+
+
+@pytest.fixture(scope="module")
+def daemon(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ScriptedDaemon]:
+    """One for all tests of a module."""
+    with ScriptedDaemon(tmp_path_factory.mktemp("daemon")) as made:
+        yield made

@@ -142,7 +142,7 @@ class Controller:
         await self._group.arm()
         decider.forget()
         self._heartbeat_due = self._clock()
-        self._expire()  # and from now on: fingers may have rested since before
+        self._watch_leases()  # from now on: fingers may have rested since before
         self._wake.set()
 
     async def disarm(self) -> None:
@@ -231,6 +231,10 @@ class Controller:
             self._wake.set()
         if self._decider.owes_silence:
             self._group.hurry()
+        self._watch_leases()
+
+    def _watch_leases(self) -> None:
+        """Look again when the next source is overdue."""
         if self._expiry is not None:
             self._expiry.cancel()
             self._expiry = None

@@ -20,6 +20,7 @@ from drivers.protocol.messages import (
     Hello,
     Ping,
     Request,
+    State,
 )
 from drivers.watchdog import HEARTBEAT
 from model.errors import InputError
@@ -433,6 +434,26 @@ async def test_a_finger_that_is_overdue_amid_a_slow_answer_is_silenced_as_one_th
             if isinstance(request, Apply) and request.command_set.is_silent and time >= over
         ]
         assert silenced[0] - over == pytest.approx(0.008, abs=1e-4)
+
+
+@in_virtual_time
+async def test_arming_again_gives_no_heartbeat_up() -> None:
+    """Arm has silenced all: a heartbeat that waited behind it gets its answer, as slow as that is.
+
+    Each answer takes 20 ms, and nothing is asked before it has come.
+    """
+    async with running() as bench:
+        await asyncio.sleep(2.5 * HEARTBEAT)
+        last = max(time for time, request in bench.far_end.asked if isinstance(request, Ping))
+        await asyncio.sleep(last + 0.9 * HEARTBEAT - asyncio.get_running_loop().time())
+        bench.far_end.delay = 0.02
+        bench.far_end.state = State.SWITCH_ON_DISABLED  # from where this one lets itself be armed
+        begin = len(bench.far_end.asked)
+        await bench.controller.arm()
+        await asyncio.sleep(0.1)
+        times, requests = zip(*bench.far_end.asked[begin:], strict=True)
+        assert [type(request) for request in requests[:3]] == [Arm, Ping, Apply]
+        assert min(after - before for before, after in pairwise(times)) > 0.0199
 
 
 @in_virtual_time

@@ -61,7 +61,11 @@ class LeaseBook:
                 ErrorCode.LEASE, "the lease is over: nothing is armed by it", remedy="arm again"
             )
         if not secrets.compare_digest(held.token.encode(), token.encode()):
-            raise RpcError(ErrorCode.LEASE, f"the lease that runs is {held.owner!a}'s, not yours")
+            raise RpcError(
+                ErrorCode.LEASE,
+                f"the lease that runs is {held.owner!a}'s, not yours",
+                remedy="wait until it is over, or disarm first: anyone may",
+            )
         return self.begin(held.token, now=now)
 
     def end(self) -> None:

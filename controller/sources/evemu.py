@@ -123,7 +123,10 @@ def _lines(path: Path) -> Iterator[tuple[int, str]]:
     except UnicodeDecodeError as error:
         raise InputError(f"{path}: not a text file, so no evemu recording") from error
     except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
+        raise InputError(
+            f"{path}: cannot be read ({error.strerror}); give the whole path, for a name counts from "
+            "the folder in which this was started, and look who may read it"
+        ) from error
 
 
 def _axis(path: Path, header: dict[tuple[int, str], int], code: int, name: str) -> tuple[int, int]:

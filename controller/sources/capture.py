@@ -40,8 +40,8 @@ def read_capture(path: Path | str) -> list[Datagram]:
         raise InputError(f"{path}: not a text file, so no TUIO capture") from error
     except OSError as error:
         raise InputError(
-            f"{path}: cannot be read ({error.strerror}); give the whole path, for a name counts from "
-            "the folder in which this was started, and look who may read it"
+            f"{path}: cannot be read ({error.strerror}); give the whole path, for a name "
+            "counts from the folder in which this was started, and look who may read it"
         ) from error
     if not lines or lines[0] != HEADER:
         raise InputError(f"{path}, line 1: no TUIO capture; its first line must be {HEADER!r}")

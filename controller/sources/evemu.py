@@ -124,8 +124,8 @@ def _lines(path: Path) -> Iterator[tuple[int, str]]:
         raise InputError(f"{path}: not a text file, so no evemu recording") from error
     except OSError as error:
         raise InputError(
-            f"{path}: cannot be read ({error.strerror}); give the whole path, for a name counts from "
-            "the folder in which this was started, and look who may read it"
+            f"{path}: cannot be read ({error.strerror}); give the whole path, for a name "
+            "counts from the folder in which this was started, and look who may read it"
         ) from error
 
 

@@ -245,8 +245,10 @@ def test_a_browser_is_told_what_is_so_and_what_happens(
 
 
 def test_the_field_is_that_of_the_drive(gateway: GatewayProcess, daemon: ScriptedDaemon) -> None:
-    """By the layout of docs/reference/gateway.md. Below all natural frequencies the plate is a
-    board on four springs: pushed at its south-west corner it moves most there, least at the far one.
+    """By the layout of docs/reference/gateway.md.
+
+    Below all natural frequencies the plate is a board on four springs: pushed at its south-west
+    corner it moves most there, least at the far one.
     """
     with RawWebSocket(gateway) as ws:
         subscribe(ws, "field")

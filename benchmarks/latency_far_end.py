@@ -17,9 +17,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import cast
 
+from drivers.codec.serial_line.exchanges import decode_request, encode_reply
+from drivers.codec.serial_line.frame import Frame, FrameReader, encode_frame
 from drivers.protocol.definition import PROTOCOL
-from drivers.protocol.serial_codec import decode_request, encode_reply
-from drivers.protocol.serial_frame import Frame, FrameReader, encode_frame
 from model.rig.file import load_rig
 from sim.amplifier.amplifier import SimulatedAmplifier
 from sim.transport.pseudo_terminal import make_terminal

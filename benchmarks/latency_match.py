@@ -17,10 +17,10 @@ from controller.means import Means
 from controller.routing import route
 from controller.selection import MOVE_TOLERANCE, Selector
 from controller.wishes import NewestBuzzes
+from drivers.codec.serial_line.exchanges import decode_request
+from drivers.codec.serial_line.frame import Frame
 from drivers.command import DriveCommand
 from drivers.protocol.messages import Apply
-from drivers.protocol.serial_codec import decode_request
-from drivers.protocol.serial_frame import Frame
 from model.rig.rig import Rig
 from model.table.table import LocalizationTable
 

@@ -23,10 +23,10 @@ import serial
 from pythonosc.osc_packet import OscPacket
 
 from benchmarks.wire_bench import make_sets
-from drivers.backends.serial_url import SerialUrl
+from drivers.backends.urls.serial_line import SerialUrl
+from drivers.codec.serial_line.exchanges import encode_request
+from drivers.codec.serial_line.frame import encode_frame
 from drivers.protocol.messages import Apply, Arm
-from drivers.protocol.serial_codec import encode_request
-from drivers.protocol.serial_frame import encode_frame
 from sim.amplifier.amplifier import capabilities
 
 SETS = 100

@@ -11,13 +11,13 @@ from collections.abc import Sequence
 import serial
 from pymodbus.client import AsyncModbusSerialClient, AsyncModbusTcpClient
 
-from drivers.backends.modbus_url import ModbusUrl
-from drivers.backends.serial_url import SerialUrl
+from drivers.backends.urls.modbus import ModbusUrl
+from drivers.backends.urls.serial_line import SerialUrl
+from drivers.codec.modbus.exchanges import to_exchange
+from drivers.codec.serial_line.exchanges import encode_request
+from drivers.codec.serial_line.frame import encode_frame
 from drivers.guard import SafeCommand
 from drivers.protocol.messages import Apply, Arm, Request
-from drivers.protocol.modbus_map import to_exchange
-from drivers.protocol.serial_codec import encode_request
-from drivers.protocol.serial_frame import encode_frame
 
 
 def bare_serial(url: str, sets: Sequence[SafeCommand]) -> list[float]:

@@ -6,10 +6,10 @@ from collections.abc import Sequence
 
 import can
 
-from drivers.backends.can_url import CanUrl
+from drivers.backends.urls.can_bus import CanUrl
+from drivers.codec.can_bus.frame import CanFrame, cob_id
+from drivers.codec.can_bus.orders import encode_order
 from drivers.guard import SafeCommand
-from drivers.protocol.can_frame import CanFrame, cob_id
-from drivers.protocol.canopen_map import encode_order
 from drivers.protocol.messages import Apply, Arm
 from sim.far_ends.can_bus.sets import Action, Order, SetBuffer
 

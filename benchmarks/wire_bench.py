@@ -14,9 +14,9 @@ from pathlib import Path
 from drivers.amplifier import Amplifier
 from drivers.command import CommandSet, DriveCommand
 from drivers.guard import Guard, GuardLimits, SafeCommand
+from drivers.operation.simultaneous import at_one_moment
 from drivers.protocol.messages import Capabilities
 from drivers.registry import open_backend
-from drivers.simultaneous import at_one_moment
 
 CHANNELS = 4
 CALM = 2.0  # s; the longest watchdog

@@ -23,7 +23,10 @@ from benchmarks.wire_bench import (
     ours,
     sent_apart,
 )
-from drivers.backends.modbus_frames import make_telegram
+from drivers.codec.modbus.exchanges import to_exchange
+from drivers.codec.modbus.telegrams import make_telegram
+from drivers.codec.serial_line.exchanges import decode_request, encode_request
+from drivers.codec.serial_line.frame import FrameReader, encode_frame
 from drivers.guard import SafeCommand
 from drivers.protocol.messages import (
     Achieved,
@@ -36,9 +39,6 @@ from drivers.protocol.messages import (
     State,
     Status,
 )
-from drivers.protocol.modbus_map import to_exchange
-from drivers.protocol.serial_codec import decode_request, encode_request
-from drivers.protocol.serial_frame import FrameReader, encode_frame
 from sim.far_ends.modbus.unit import ModbusUnit
 
 ROOT = Path(__file__).parent.parent

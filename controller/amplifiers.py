@@ -13,9 +13,9 @@ from controller.together import gathered, to_the_end
 from drivers.amplifier import WATCHDOG, Amplifier
 from drivers.errors import CommandError, CommandRefused, DriverError, LinkError
 from drivers.guard import SafeCommand, SafeEnvelope
+from drivers.link.turns import PATIENCE
+from drivers.operation.watchdog import check_watchdog
 from drivers.protocol.messages import Achieved, State
-from drivers.turns import PATIENCE
-from drivers.watchdog import check_watchdog
 
 # How often, and how far apart [s], zero is looked for after the closing ramp has ended.
 _READ_BACKS = 5

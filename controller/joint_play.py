@@ -9,8 +9,8 @@ from controller.together import gathered
 from drivers.amplifier import Amplifier
 from drivers.errors import CommandRefused
 from drivers.guard import SafeCommand, SafeEnvelope
+from drivers.operation.simultaneous import at_one_moment
 from drivers.protocol.messages import Achieved, Status
-from drivers.simultaneous import at_one_moment
 
 
 class JointPlay:

@@ -23,7 +23,7 @@ from drivers import clock
 from drivers.amplifier import Amplifier
 from drivers.command import DriveCommand
 from drivers.errors import CommandError, DriverError, LinkError
-from drivers.watchdog import HEARTBEAT
+from drivers.operation.watchdog import HEARTBEAT
 from model.errors import InputError
 from model.finger.perception import STRONG_DB_SL
 from model.rig.rig import Rig

@@ -7,9 +7,10 @@ from typing import Protocol
 
 from controller.envelopes import wire_envelopes
 from controller.routing import goes_on, route, route_again, route_end
-from drivers.command import DriveCommand, token_after
+from drivers.command import DriveCommand
 from drivers.errors import CommandRefused
 from drivers.guard import Guard, SafeCommand, SafeEnvelope
+from drivers.protocol.definition import token_after
 from model.rig.rig import Rig
 from model.table.pattern import Pattern
 from model.table.question import Question

@@ -4,8 +4,8 @@ from collections.abc import Mapping
 
 from drivers.errors import CommandRefused
 from drivers.guard import SafeCommand
+from drivers.operation.read_back import BORNE, Expectation, is_fault, read_back
 from drivers.protocol.messages import Achieved, Status
-from drivers.read_back import BORNE, Expectation, is_fault, read_back
 
 
 class ReadBacks:

@@ -1,1 +1,1 @@
-"""Amplifiers: drive commands, the guard, the wire protocol and its backends."""
+"""Amplifiers: drive commands, the guard, the protocol, its codecs and backends."""

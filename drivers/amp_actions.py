@@ -11,10 +11,10 @@ from drivers.command import CommandSet, DriveCommand
 from drivers.conformance import Check, Outcome, run_check
 from drivers.errors import CommandError, CommandRefused, DriverError
 from drivers.guard import FREQUENCY_CEILING, FREQUENCY_FLOOR, LEVEL_CEILING, Guard, GuardLimits
+from drivers.operation.watchdog import check_watchdog, shortest_watchdog
 from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.messages import Achieved, State, Status
 from drivers.registry import open_backend
-from drivers.watchdog import check_watchdog, shortest_watchdog
 
 _RAMP = 0.05  # s; neither start nor end of a drive clicks
 

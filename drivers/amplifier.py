@@ -4,11 +4,11 @@ from collections.abc import Callable
 from typing import final
 
 from drivers.backend import Backend
-from drivers.command import token_after
 from drivers.errors import CommandError, FrameError, LinkError
 from drivers.guard import SafeCommand, SafeEnvelope
-from drivers.link import REPLY_TIMEOUT, Link
-from drivers.protocol.definition import PROTOCOL
+from drivers.link.link import REPLY_TIMEOUT, Link
+from drivers.link.turns import Kind
+from drivers.protocol.definition import PROTOCOL, token_after
 from drivers.protocol.messages import (
     Achieved,
     Apply,
@@ -33,7 +33,6 @@ from drivers.protocol.messages import (
     Stop,
 )
 from drivers.statistics import LinkStatistics
-from drivers.turns import Kind
 
 WATCHDOG = 0.25  # s; five heartbeats of 50 ms
 OPEN_TIMEOUT = 0.5  # s; boards that restart when their port is opened need a moment

@@ -18,9 +18,9 @@ from drivers.amplifier import WATCHDOG, Amplifier
 from drivers.command import CommandSet, DriveCommand, Envelope
 from drivers.errors import CommandRefused
 from drivers.guard import Guard, GuardLimits
+from drivers.operation.watchdog import HEARTBEAT
 from drivers.protocol.messages import Achieved, Capabilities, FaultRecord, Identity, State, Status
 from drivers.registry import open_backend
-from drivers.watchdog import HEARTBEAT
 
 _RAMP = 0.02  # s; neither start nor end of a vibration clicks
 

@@ -79,7 +79,7 @@ def discover(
     """List serial ports and CAN interfaces, and the amplifiers that answer on them."""
     import asyncio
 
-    from drivers.discovery import ask, candidates, with_slcan
+    from drivers.discovery.search import ask, candidates, with_slcan
 
     places = [with_slcan(place) if slcan else place for place in candidates()]
     asked = [place for place in places if place.remedy is None and not place.is_slcan]

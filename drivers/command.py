@@ -7,8 +7,6 @@ step, and reaches what the command says one step after the last knot. So nothing
 
 from dataclasses import dataclass
 
-from drivers.protocol.definition import PROTOCOL
-
 
 @dataclass(frozen=True, slots=True)
 class DriveCommand:
@@ -74,8 +72,3 @@ class CommandSet:
     def is_silent(self) -> bool:
         """Whether the set asks for no vibration at all."""
         return all(command.level == 0 for command in self.commands)
-
-
-def token_after(token: int) -> int:
-    """The token that follows one, or 0 for the first: 1..65535, then from 1 again."""
-    return token % PROTOCOL.quantities.token.maximum + 1

@@ -9,8 +9,8 @@ from collections.abc import Mapping, Sequence
 from drivers.amplifier import WATCHDOG
 from drivers.backend import Backend
 from drivers.errors import CommandError
+from drivers.operation.watchdog import HEARTBEAT, HEARTBEATS_BORNE, check_watchdog, told_after
 from drivers.registry import open_backend
-from drivers.watchdog import HEARTBEAT, HEARTBEATS_BORNE, check_watchdog, told_after
 
 # s; how far apart commits on two links may arrive although they are sent together: USB adapters
 # send in frames of 1 ms, networks and operating systems are no better. See

@@ -22,10 +22,10 @@ import serial
 
 import era_haptics as era
 from drivers.amplifier import Amplifier
+from drivers.codec.serial_line.exchanges import decode_reply, encode_request
+from drivers.codec.serial_line.frame import FrameReader, encode_frame
 from drivers.conformance import CHECKS, run_check
 from drivers.protocol.messages import Hello, Ping
-from drivers.protocol.serial_codec import decode_reply, encode_request
-from drivers.protocol.serial_frame import FrameReader, encode_frame
 from drivers.registry import open_backend
 
 # %% [markdown]

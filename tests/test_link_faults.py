@@ -22,11 +22,11 @@ from drivers.backends.stand_in import STAND_IN
 from drivers.command import CommandSet, DriveCommand
 from drivers.errors import CommandRefused, DriverError, LinkError
 from drivers.guard import Guard, GuardLimits, SafeCommand
-from drivers.link import REPLY_TIMEOUT as USUAL_TIMEOUT
+from drivers.link.link import REPLY_TIMEOUT as USUAL_TIMEOUT
+from drivers.operation.supervision import reopen
+from drivers.operation.watchdog import HEARTBEAT, HEARTBEATS_BORNE, told_after
 from drivers.protocol.messages import Event, Fault, State
 from drivers.registry import open_backend
-from drivers.supervision import reopen
-from drivers.watchdog import HEARTBEAT, HEARTBEATS_BORNE, told_after
 from memory_machine import MemoryMachine
 from model.rig.rig import Rig
 from sim.far_ends.wires import Wire

@@ -13,9 +13,9 @@ from drivers.amplifier import Amplifier
 from drivers.command import CommandSet, DriveCommand
 from drivers.errors import LinkError
 from drivers.guard import Guard, GuardLimits, SafeCommand
+from drivers.operation.supervision import reopen
 from drivers.protocol.messages import State, Status
 from drivers.registry import open_backend
-from drivers.supervision import reopen
 from model.rig.rig import Channel, Rig
 from sim.far_ends.wires import Wire
 from sim.faults.episodes import Episode

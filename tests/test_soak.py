@@ -13,7 +13,7 @@ import pytest
 from controller.loop import Controller
 from controller.selection import Selector
 from controller.touch import TouchFrame
-from drivers.backends.modbus_link import ModbusLink
+from drivers.backends.modbus.line import ModbusLink
 from planted_bugs import BUGS as BUGS_OF_THE_WITNESS
 from planted_bugs import plant
 from sim.amplifier.amplifier import SimulatedAmplifier

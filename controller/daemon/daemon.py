@@ -26,8 +26,8 @@ from controller.touch import TouchFrame
 from drivers import clock
 from drivers.amplifier import Amplifier
 from drivers.errors import DriverError
+from drivers.operation.steady import no_long_collections
 from drivers.registry import open_backend
-from drivers.steady import no_long_collections
 from model.errors import InputError
 from model.table.table import LocalizationTable
 from model.table.timing import Timing

@@ -7,7 +7,7 @@ from typing import Any
 from controller.loop import Controller
 from drivers import clock
 from drivers.errors import DriverError
-from drivers.supervision import pauses
+from drivers.operation.supervision import pauses
 from model.errors import InputError
 
 TICK = 0.05  # s; how often it is told meanwhile that we are alive

@@ -17,7 +17,7 @@ from enum import Enum, StrEnum, auto
 from typing import NamedTuple
 
 from drivers.amplifier import WATCHDOG
-from drivers.supervision import assume_energised
+from drivers.operation.supervision import assume_energised
 
 
 class State(StrEnum):

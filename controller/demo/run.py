@@ -17,8 +17,8 @@ from controller.sources.tuio import TuioSource
 from controller.touch import TouchSource
 from drivers.amplifier import Amplifier
 from drivers.errors import LinkError
+from drivers.operation.steady import no_long_collections
 from drivers.registry import open_backend
-from drivers.steady import no_long_collections
 from model.figures import save_figure
 from model.rig.file import load_rig
 from model.table.table import LocalizationTable

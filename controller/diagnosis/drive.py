@@ -15,9 +15,9 @@ from controller.guards import make_guards
 from controller.routing import route
 from drivers import clock
 from drivers.amplifier import Amplifier
-from drivers.command import token_after
 from drivers.errors import CommandRefused
 from drivers.guard import Guard, SafeCommand
+from drivers.protocol.definition import token_after
 from model.arrays import ComplexArray, FloatArray
 from model.diagnosis.observation import Observation, Pair
 from model.rig.rig import Rig

@@ -1,1 +1,1 @@
-"""Backends: an amplifier over one kind of wire, a file each."""
+"""Backends: an amplifier over one kind of wire, a package each."""

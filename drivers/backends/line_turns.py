@@ -9,8 +9,8 @@ from contextlib import contextmanager
 from typing import TypeVar, final
 
 from drivers.errors import CommandRefused
+from drivers.link.turns import SUPERSEDED, GaveWay, Kind, Turns
 from drivers.protocol.messages import Apply, Disarm, Request, Stop
-from drivers.turns import SUPERSEDED, GaveWay, Kind, Turns
 
 _T = TypeVar("_T")
 

@@ -15,8 +15,8 @@ from concurrent.futures import ThreadPoolExecutor
 from contextvars import ContextVar
 from typing import Protocol, TypeVar, final
 
-from drivers.backends.can_url import CanBusUrl
-from drivers.protocol.can_frame import CanFrame
+from drivers.backends.urls.can_bus import CanBusUrl
+from drivers.codec.can_bus.frame import CanFrame
 
 _T = TypeVar("_T")
 

@@ -1,1 +1,1 @@
-"""The amplifier protocol without I/O: bytes in, messages out."""
+"""The amplifier protocol: what is said, in which numbers, whatever the wire."""

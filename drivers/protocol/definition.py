@@ -168,3 +168,8 @@ def _load() -> Protocol:
 
 
 PROTOCOL = _load()
+
+
+def token_after(token: int) -> int:
+    """The token that follows one, or 0 for the first: 1..65535, then from 1 again."""
+    return token % PROTOCOL.quantities.token.maximum + 1

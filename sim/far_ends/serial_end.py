@@ -9,11 +9,11 @@ Not modelled: noise, parity, two that speak at once.
 import contextlib
 from collections.abc import Sequence
 
+from drivers.codec.payload import Malformed
+from drivers.codec.serial_line.exchanges import decode_request, encode_event, encode_reply
+from drivers.codec.serial_line.frame import Frame, FrameCounters, FrameReader, encode_frame
 from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.messages import Commit, Event, Nak, Reply, Stop
-from drivers.protocol.payload import Malformed
-from drivers.protocol.serial_codec import decode_request, encode_event, encode_reply
-from drivers.protocol.serial_frame import Frame, FrameCounters, FrameReader, encode_frame
 from sim.bench.station import Station
 from sim.transport.line import TwoWayLine
 from sim.transport.pseudo_terminal import make_terminal

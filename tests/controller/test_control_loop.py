@@ -13,6 +13,7 @@ from controller.amplifiers import Phase
 from controller.observer import Observer
 from controller.touch import Touch, TouchFrame, TouchSource
 from controller_bench import FINGER, OTHER, make_bench, running
+from drivers.operation.watchdog import HEARTBEAT
 from drivers.protocol.messages import (
     Apply,
     Arm,
@@ -22,7 +23,6 @@ from drivers.protocol.messages import (
     Request,
     State,
 )
-from drivers.watchdog import HEARTBEAT
 from model.errors import InputError
 from model.vibration.excitation import Excitation, Tone
 from virtual_loop import in_virtual_time

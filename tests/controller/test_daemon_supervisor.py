@@ -18,6 +18,7 @@ from controller.touch import Touch, TouchFrame
 from controller_bench import make_bench
 from drivers.amplifier import Amplifier
 from drivers.errors import CommandRefused, LinkError
+from drivers.operation.watchdog import HEARTBEAT
 from drivers.protocol.messages import (
     Apply,
     Arm,
@@ -34,7 +35,6 @@ from drivers.protocol.messages import (
     Status,
     Stop,
 )
-from drivers.watchdog import HEARTBEAT
 from virtual_loop import in_virtual_time
 
 ARM = Event(Kind.ARM, "somebody armed")

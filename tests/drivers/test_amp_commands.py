@@ -15,7 +15,7 @@ from serial.tools.list_ports_common import ListPortInfo
 from typer.testing import CliRunner
 
 from drivers.cli import EXIT_STATUS, app
-from drivers.discovery import candidates
+from drivers.discovery.search import candidates
 from drivers.errors import CommandError, CommandRefused, FrameError, LinkError, LinkTimeout
 from drivers.protocol.messages import (
     Apply,
@@ -221,8 +221,8 @@ def test_discover_asks_who_is_there_and_nothing_else(background: BackgroundFarEn
 
 def test_discover_tells_how_to_mend_permissions(monkeypatch: pytest.MonkeyPatch) -> None:
     """A port that this user may not use is listed with its group, and is not asked."""
-    monkeypatch.setattr("drivers.discovery.comports", lambda: [ListPortInfo("/dev/null")])
-    monkeypatch.setattr("drivers.discovery.os.access", lambda path, mode: False)
+    monkeypatch.setattr("drivers.discovery.search.comports", lambda: [ListPortInfo("/dev/null")])
+    monkeypatch.setattr("drivers.discovery.search.os.access", lambda path, mode: False)
     (place,) = [one for one in candidates() if one.place == "/dev/null"]
     assert "usermod -aG" in (place.remedy or "")
     assert "chmod a+rw /dev/null" in (place.remedy or "")
@@ -234,8 +234,8 @@ def test_discover_suggests_no_group_that_may_not_either(
     """A port that only its owner may use is not mended by joining its group."""
     port = tmp_path / "tty"
     port.touch(mode=0o600)
-    monkeypatch.setattr("drivers.discovery.comports", lambda: [ListPortInfo(str(port))])
-    monkeypatch.setattr("drivers.discovery.os.access", lambda path, mode: False)
+    monkeypatch.setattr("drivers.discovery.search.comports", lambda: [ListPortInfo(str(port))])
+    monkeypatch.setattr("drivers.discovery.search.os.access", lambda path, mode: False)
     (place,) = [one for one in candidates() if one.place == str(port)]
     assert "usermod" not in (place.remedy or "")
     assert f"chmod a+rw {port}" in (place.remedy or "")
@@ -243,8 +243,10 @@ def test_discover_suggests_no_group_that_may_not_either(
 
 def test_discover_says_why_a_port_could_not_be_asked(monkeypatch: pytest.MonkeyPatch) -> None:
     """A port that cannot be opened is told with the reason, one where nobody answers without."""
-    monkeypatch.setattr("drivers.discovery.comports", lambda: [ListPortInfo("/dev/no-such-port")])
-    monkeypatch.setattr("drivers.discovery.os.access", lambda path, mode: True)
+    monkeypatch.setattr(
+        "drivers.discovery.search.comports", lambda: [ListPortInfo("/dev/no-such-port")]
+    )
+    monkeypatch.setattr("drivers.discovery.search.os.access", lambda path, mode: True)
     result = CliRunner().invoke(app, ["amp", "discover"])
     assert result.exit_code == 0, result.output
     assert "there is no such port" in result.stdout

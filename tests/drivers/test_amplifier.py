@@ -5,12 +5,13 @@ from dataclasses import replace
 
 import pytest
 
-from drivers import turns
 from drivers.amplifier import Amplifier
 from drivers.backend import Backend
 from drivers.command import CommandSet
 from drivers.errors import CommandError, CommandRefused, FrameError, LinkError, LinkTimeout
 from drivers.guard import SafeCommand
+from drivers.link import turns
+from drivers.operation.watchdog import check_watchdog, round_trip_of
 from drivers.protocol.messages import (
     Achieved,
     Apply,
@@ -31,7 +32,6 @@ from drivers.protocol.messages import (
     Status,
     Stop,
 )
-from drivers.watchdog import check_watchdog, round_trip_of
 
 IDENTITY = Identity("Acme", "Quad", "A-17", "1.2", 1)
 STATUS = Status(State.OPERATION_ENABLED, Fault.NONE, 0, True, 25.0, 0.25, (0.0,) * 4)

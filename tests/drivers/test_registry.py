@@ -7,13 +7,13 @@ from pathlib import Path
 import pytest
 
 from drivers import registry
-from drivers.backends.serial_amplifier import SerialBackend
+from drivers.backends.serial_line.backend import SerialBackend
 from drivers.errors import CommandError
 from drivers.registry import known_schemes, open_backend
 
 Install = Callable[..., None]
 GROUP = "era_haptics.backends"
-SERIAL = EntryPoint("serial", "drivers.backends.serial_amplifier:SerialBackend", GROUP)
+SERIAL = EntryPoint("serial", "drivers.backends.serial_line.backend:SerialBackend", GROUP)
 
 
 @pytest.fixture

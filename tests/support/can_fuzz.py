@@ -10,17 +10,17 @@ import struct
 from collections.abc import Sequence
 from typing import cast
 
-from drivers.errors import DriverError
-from drivers.protocol.can_frame import CanFrame
-from drivers.protocol.can_text import (
+from drivers.codec.can_bus.adapter_text import (
     SlcanReader,
     SocketcandReader,
     slcan_line,
     socketcand_element,
 )
-from drivers.protocol.canopen_answers import AnswerReader, decode_emergency
-from drivers.protocol.canopen_map import encode_order
-from drivers.protocol.canopen_objects import achieved_of, encode_envelope, faults_of
+from drivers.codec.can_bus.answers import AnswerReader, decode_emergency
+from drivers.codec.can_bus.frame import CanFrame
+from drivers.codec.can_bus.objects import achieved_of, encode_envelope, faults_of
+from drivers.codec.can_bus.orders import encode_order
+from drivers.errors import DriverError
 from drivers.protocol.messages import (
     Arm,
     Clear,

@@ -10,11 +10,11 @@ from dataclasses import dataclass, replace
 from typing import cast
 
 from can_fuzz import Station
+from drivers.codec.can_bus.frame import CanFrame
+from drivers.codec.can_bus.objects import encode_envelope
+from drivers.codec.can_bus.orders import Order, encode_broadcast, encode_order
 from drivers.command import CommandSet, DriveCommand, Envelope, Knot
 from drivers.guard import Guard, GuardLimits, SafeCommand
-from drivers.protocol.can_frame import CanFrame
-from drivers.protocol.canopen_map import Order, encode_broadcast, encode_order
-from drivers.protocol.canopen_objects import encode_envelope
 from drivers.protocol.messages import (
     Apply,
     Arm,

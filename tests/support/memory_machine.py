@@ -15,16 +15,16 @@ from typing import Any, TypeVar, cast
 
 from greenlet import getcurrent, greenlet
 
-from drivers.backends.can_url import CanBusUrl
 from drivers.backends.stand_in import Adapter, StandIn, Worker
-from drivers.errors import LinkError
-from drivers.protocol.can_frame import CanFrame
-from drivers.protocol.can_text import (
+from drivers.backends.urls.can_bus import CanBusUrl
+from drivers.codec.can_bus.adapter_text import (
     SlcanReader,
     SocketcandReader,
     slcan_line,
     socketcand_element,
 )
+from drivers.codec.can_bus.frame import CanFrame
+from drivers.errors import LinkError
 from sim.transport.pseudo_terminal import Terminal
 from virtual_loop import VirtualLoop
 

@@ -3,9 +3,9 @@
 import random
 from collections.abc import Iterator, Sequence
 
-from drivers.backends.modbus_frames import AnswerReader, make_telegram
+from drivers.codec.modbus import exchanges
+from drivers.codec.modbus.telegrams import AnswerReader, make_telegram
 from drivers.errors import FrameError
-from drivers.protocol import modbus_map
 from drivers.protocol.messages import Arm, Clear, Reply, Request, State
 from drivers.statistics import WireCounters
 from sim.amplifier.amplifier import SimulatedAmplifier
@@ -71,7 +71,7 @@ class ModbusEnds:
         self._requests_by_size: dict[int, Request] = {}  # in bytes that are read
         self.telegrams: list[bytes] = []
         for request in requests:
-            exchange = modbus_map.to_exchange(request, tag=_TAG, channels=4)
+            exchange = exchanges.to_exchange(request, tag=_TAG, channels=4)
             telegram = make_telegram(
                 exchange.read, exchange.write, unit=1, transaction=0, is_rtu=True
             )
@@ -131,7 +131,7 @@ class ModbusEnds:
         """What the host takes for the answer to a request, and can read."""
         size = data[2] if self._is_rtu else data[8] if len(data) > 8 else 0
         request = self._requests_by_size.get(size, self._requests[0])
-        exchange = modbus_map.to_exchange(request, tag=_TAG, channels=4)
+        exchange = exchanges.to_exchange(request, tag=_TAG, channels=4)
         telegram = make_telegram(
             exchange.read,
             exchange.write,
@@ -141,11 +141,11 @@ class ModbusEnds:
         )
         replies: list[object] = []
         for answer in self._host.feed(data, telegram):
-            if not answer.exception and modbus_map.is_of(answer.registers, tag=_TAG):
+            if not answer.exception and exchanges.is_of(answer.registers, tag=_TAG):
                 try:
-                    modbus_map.condition(request, answer.registers)
-                    modbus_map.faults_beyond(request, answer.registers)
-                    replies.append(modbus_map.to_reply(request, answer.registers))
+                    exchanges.condition(request, answer.registers)
+                    exchanges.faults_beyond(request, answer.registers)
+                    replies.append(exchanges.to_reply(request, answer.registers))
                 except FrameError:
                     continue
         self._host.clear()

@@ -12,6 +12,8 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
+from drivers.codec.serial_line.exchanges import decode_reply, decode_request, encode_request
+from drivers.codec.serial_line.frame import Frame, FrameReader, encode_frame
 from drivers.command import CommandSet, DriveCommand, Envelope, Knot
 from drivers.errors import FrameError
 from drivers.guard import Guard, GuardLimits
@@ -28,8 +30,6 @@ from drivers.protocol.messages import (
     Stage,
     Stop,
 )
-from drivers.protocol.serial_codec import decode_reply, decode_request, encode_request
-from drivers.protocol.serial_frame import Frame, FrameReader, encode_frame
 
 WIDE = Capabilities(
     *(16, 20.0, 600.0, 0.01, 1.0, 0.0001, 0.01, 1.0, 0.1, 2.0, 32, 63, 0.001, 0.1, True)

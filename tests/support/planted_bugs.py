@@ -201,17 +201,17 @@ CONTROLLER: dict[str, Bug] = {
 DRIVERS: dict[str, Bug] = {
     "the frequency clamp is removed": _bug(
         "limits",
-        Edit("drivers.guard_rules:_RULES", "", _WITHOUT.format("_check_frequencies")),
+        Edit("drivers.guard.rules:_RULES", "", _WITHOUT.format("_check_frequencies")),
         scenario=scenarios.too_high,
     ),
     "the level clamp is removed": _bug(
         "limits",
-        Edit("drivers.guard_rules:_RULES", "", _WITHOUT.format("_check_levels")),
+        Edit("drivers.guard.rules:_RULES", "", _WITHOUT.format("_check_levels")),
         scenario=scenarios.too_loud,
     ),
     "the check for NaN is skipped": _bug(
         "garbage",
-        Edit("drivers.guard_rules:_RULES", "", _WITHOUT.format("_check_finite")),
+        Edit("drivers.guard.rules:_RULES", "", _WITHOUT.format("_check_finite")),
         Edit(
             "drivers.protocol.definition:Quantity.to_wire",
             "if not math.isfinite(value):",
@@ -220,12 +220,15 @@ DRIVERS: dict[str, Bug] = {
         scenario=scenarios.not_a_number,
     ),
     "every set has the same token": _bug(
-        "token", Edit("drivers.command:token_after", "token %", "0 *", also=("controller.orders",))
+        "token",
+        Edit(
+            "drivers.protocol.definition:token_after", "token %", "0 *", also=("controller.orders",)
+        ),
     ),
     "levels have 1000 steps": _bug(
         "pattern",
         Edit(
-            "drivers.protocol.serial_sets:_pack_commands",
+            "drivers.codec.serial_line.sets:_pack_commands",
             "command.frequency, command.level,",
             "command.frequency, command.level / 10,",
         ),
@@ -233,7 +236,7 @@ DRIVERS: dict[str, Bug] = {
     "integers are sent with the high byte first": _bug(
         "garbage",
         Edit(
-            "drivers.protocol.payload:_LAYOUTS",
+            "drivers.codec.payload:_LAYOUTS",
             "",
             "{code: struct.Struct('>' + code) for code in 'BHIh'}",
         ),
@@ -241,7 +244,7 @@ DRIVERS: dict[str, Bug] = {
     "the host does not check the CRC": _bug(
         "credit",
         Edit(
-            "drivers.protocol.serial_frame:FrameReader._finish",
+            "drivers.codec.serial_line.frame:FrameReader._finish",
             "if _CRC.unpack(crc) != (zlib.crc32(body),):",
             "if False:",
         ),
@@ -250,7 +253,7 @@ DRIVERS: dict[str, Bug] = {
     "a reply is credited to whoever waits": _bug(
         "credit",
         Edit(
-            "drivers.backends.serial_amplifier:SerialBackend._received",
+            "drivers.backends.serial_line.backend:SerialBackend._received",
             "self._pending.get(frame.sequence)",
             "next(iter(self._pending.values()), None)",
         ),
@@ -258,17 +261,17 @@ DRIVERS: dict[str, Bug] = {
     ),
     "two requests are on the line at once": _bug(
         "credit",
-        Edit("drivers.turns:Turns.come", "if self._taken or", "if False and"),
+        Edit("drivers.link.turns:Turns.come", "if self._taken or", "if False and"),
         scenario=scenarios.slow_touch,
     ),
     "a stop is queued behind": _bug(
         "stop",
-        Edit("drivers.turns:PATIENCE", "", "10.0"),
+        Edit("drivers.link.turns:PATIENCE", "", "10.0"),
         scenario=scenarios.slow_stop,
     ),
     "silence waits its turn": _bug(
         "lift",
-        Edit("drivers.turns:PATIENCE", "", "10.0"),
+        Edit("drivers.link.turns:PATIENCE", "", "10.0"),
         Edit("controller.amplifiers:PATIENCE", "", "10.0"),
         scenario=scenarios.slow_lift,
     ),
@@ -291,7 +294,7 @@ DRIVERS: dict[str, Bug] = {
     "sets are sent without their SYNC": _bug(
         "answer",
         Edit(
-            "drivers.protocol.canopen_map:_frames",
+            "drivers.codec.can_bus.orders:_frames",
             "head, wanted.commands, node, sequence), SYNC)",
             "head, wanted.commands, node, sequence))",
         ),
@@ -300,7 +303,7 @@ DRIVERS: dict[str, Bug] = {
     "a command has the sequence number before": _bug(
         "commit",
         Edit(
-            "drivers.protocol.canopen_map:_in_classic_frames",
+            "drivers.codec.can_bus.orders:_in_classic_frames",
             "_command(command, sequence))",
             "_command(command, sequence - (command.channel == 1)))",
         ),
@@ -309,7 +312,7 @@ DRIVERS: dict[str, Bug] = {
     "the frame of a channel has its neighbour's identifier": _bug(
         "garbage",
         Edit(
-            "drivers.protocol.canopen_map:_in_classic_frames",
+            "drivers.codec.can_bus.orders:_in_classic_frames",
             "command_id(node, command.channel)",
             "command_id(node, (1, 0, 2)[command.channel])",
         ),
@@ -318,14 +321,16 @@ DRIVERS: dict[str, Bug] = {
     "a block carries a wrong check": _bug(
         "garbage",
         Edit(
-            "drivers.protocol.modbus_map:_block", "check_of(registers)", "check_of(registers[1:])"
+            "drivers.codec.modbus.exchanges:_block",
+            "check_of(registers)",
+            "check_of(registers[1:])",
         ),
         wire="modbus-tcp",
     ),
     "registers of channels begin with the level": _bug(
         "limits",
         Edit(
-            "drivers.protocol.modbus_map:_channel_registers",
+            "drivers.codec.modbus.exchanges:_channel_registers",
             "*_unsigned(\n            (_Q.frequency, command.frequency),\n"
             "            (_Q.level, command.level),",
             "*_unsigned(\n            (_Q.level, command.level),\n"
@@ -436,7 +441,7 @@ FAR_ENDS: dict[str, Bug] = {
     "a damaged frame is carried out": _bug(
         "damage",
         Edit(
-            "drivers.protocol.serial_frame:FrameReader._finish",
+            "drivers.codec.serial_line.frame:FrameReader._finish",
             "if _CRC.unpack(crc) != (zlib.crc32(body),):",
             "if False:",
         ),

@@ -7,6 +7,8 @@ import pty
 import tty
 from collections.abc import Callable
 
+from drivers.codec.serial_line.exchanges import decode_request, encode_reply
+from drivers.codec.serial_line.frame import Frame, FrameReader, encode_frame
 from drivers.protocol.messages import (
     Achieved,
     Apply,
@@ -24,8 +26,6 @@ from drivers.protocol.messages import (
     State,
     Status,
 )
-from drivers.protocol.serial_codec import decode_request, encode_reply
-from drivers.protocol.serial_frame import Frame, FrameReader, encode_frame
 
 IDENTITY = Identity("Acme", "Quad", "A-17", "1.2", 1)
 CAPABILITIES = Capabilities(4, 20.0, 600.0, 0.01, 1.0, 0.0001, 0.01, 1.0, 0.1, 2.0, 0)

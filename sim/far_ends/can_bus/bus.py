@@ -9,7 +9,7 @@ import struct
 import zlib
 from collections.abc import Callable
 
-from drivers.protocol.can_frame import CanFrame
+from drivers.codec.can_bus.frame import CanFrame
 from sim.faults.episodes import Faults
 from sim.transport.line import TwoWayLine
 

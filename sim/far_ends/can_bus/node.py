@@ -11,7 +11,7 @@ from collections.abc import Callable
 from typing import TypeAlias
 
 from drivers import clock
-from drivers.protocol.can_frame import CanFrame
+from drivers.codec.can_bus.frame import CanFrame
 from drivers.protocol.messages import Event, Fault, Ping, State, Stop
 from sim.bench.station import Station
 from sim.far_ends.can_bus.objects import CANOPEN, IDS, ObjectDictionary

@@ -7,7 +7,7 @@ node, from protocol.yaml's description, with nothing of the host's code in it.
 import struct
 from collections.abc import Callable, Sequence
 
-from drivers.protocol.can_frame import CanFrame
+from drivers.codec.can_bus.frame import CanFrame
 from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.messages import (
     Achieved,

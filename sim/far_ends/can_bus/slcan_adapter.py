@@ -8,7 +8,7 @@ accepted and do nothing.
 import re
 from collections.abc import Callable
 
-from drivers.protocol.can_frame import CanFrame
+from drivers.codec.can_bus.frame import CanFrame
 from sim.far_ends.can_bus.bus import LENGTHS, CanBus
 from sim.transport.pseudo_terminal import make_terminal
 

@@ -10,8 +10,8 @@ import re
 from dataclasses import dataclass
 
 from drivers import clock
+from drivers.codec.can_bus.frame import CanFrame
 from drivers.errors import LinkError
-from drivers.protocol.can_frame import CanFrame
 from sim.far_ends.can_bus.bus import LENGTHS, CanBus
 
 BUS_NAME = "can0"

@@ -9,6 +9,8 @@ from collections.abc import AsyncIterator
 
 import pytest
 
+from drivers.codec.serial_line.exchanges import decode_reply, encode_request
+from drivers.codec.serial_line.frame import Frame, FrameReader, encode_frame
 from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.messages import (
     GetStatus,
@@ -22,8 +24,6 @@ from drivers.protocol.messages import (
     Status,
     Stop,
 )
-from drivers.protocol.serial_codec import decode_reply, encode_request
-from drivers.protocol.serial_frame import Frame, FrameReader, encode_frame
 from model.rig.rig import Rig
 from sim.bench.bench import Bench
 from sim.bench.station import Station

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from drivers.amplifier import Amplifier
-from drivers.backends.serial_amplifier import SerialBackend
+from drivers.backends.serial_line.backend import SerialBackend
 from drivers.command import CommandSet, DriveCommand
 from drivers.guard import Guard, GuardLimits
 from drivers.protocol.messages import State

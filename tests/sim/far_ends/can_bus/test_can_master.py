@@ -9,7 +9,7 @@ import canopen
 import pytest
 
 import drivers
-from drivers.backends.can_url import CanUrl
+from drivers.backends.urls.can_bus import CanUrl
 from drivers.protocol.messages import Fault, State
 from model.rig.rig import Rig
 from sim.far_ends.wires import Wire

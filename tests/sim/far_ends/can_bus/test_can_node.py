@@ -7,7 +7,7 @@ import pytest
 
 from can_fuzz import Station
 from can_session import Timers
-from drivers.protocol.can_frame import CanFrame
+from drivers.codec.can_bus.frame import CanFrame
 from drivers.protocol.messages import Fault, Ping, State
 from sim.far_ends.can_bus.node import CanNode
 

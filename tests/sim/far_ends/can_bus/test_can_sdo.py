@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 
 import drivers
 from can_fuzz import Station
-from drivers.protocol.can_frame import CanFrame
-from drivers.protocol.eds import eds_text
+from drivers.codec.can_bus.eds import eds_text
+from drivers.codec.can_bus.frame import CanFrame
 from sim.far_ends.can_bus.node import CanNode
 from sim.far_ends.can_bus.sdo import NO_OBJECT, SdoAbort, SdoServer
 

@@ -1,0 +1,160 @@
+"""A CAN adapter, open: a thread reads it, for python-can knows no other way with all of them."""
+
+import asyncio
+import contextlib
+import errno
+import logging
+import threading
+from collections.abc import Callable, Sequence
+from typing import final
+
+import can
+import serial
+
+from drivers.backends.can_bus.interfaces import open_bus, send_all, wake
+from drivers.backends.stand_in import STAND_IN, Adapter
+from drivers.backends.urls.can_bus import CanBusUrl
+from drivers.codec.can_bus.frame import CanFrame
+from drivers.errors import LinkError, LinkTimeout
+
+_READ_TIMEOUT = 0.05  # s; how long the reader of a bus that cannot be woken notices its end
+_BUS_OFF = 0x40  # of the class of an error frame, as SocketCAN numbers them
+_OFF = "the adapter went bus-off; check wiring, termination and bit rate"
+_TROUBLE = (can.CanError, OSError, ValueError, TypeError)  # TypeError: closed while it was read
+
+logging.getLogger("can").addHandler(logging.NullHandler())  # what it says comes as errors of ours
+
+
+async def open_adapter(
+    url: CanBusUrl, *, on_frame: Callable[[CanFrame], None], on_loss: Callable[[str], None]
+) -> Adapter:
+    """Open the adapter to a bus; raises LinkError.
+
+    on_frame is called with each frame, in the reader's thread, on_loss once, in the event loop,
+    with why the bus was lost.
+    """
+    stand_in = STAND_IN.get()
+    if stand_in is not None:
+        return await stand_in.open_adapter(url, on_frame=on_frame, on_loss=on_loss)
+    try:
+        bus = await asyncio.to_thread(open_bus, url)
+    except _TROUBLE as problem:
+        raise LinkError(_why_not_open(url, problem)) from problem
+    except ImportError as problem:
+        raise LinkError(
+            f"{url} cannot be opened: this system lacks what python-can needs for "
+            f"{url.interface} ({problem})"
+        ) from problem
+    return _ThreadedAdapter(bus, url, on_frame, on_loss)
+
+
+@final
+class _ThreadedAdapter:
+    """An adapter as `open_adapter` opens it."""
+
+    def __init__(
+        self,
+        bus: can.BusABC,
+        url: CanBusUrl,
+        on_frame: Callable[[CanFrame], None],
+        on_loss: Callable[[str], None],
+    ) -> None:
+        self._bus = bus
+        self._url = url
+        self._on_frame = on_frame
+        self._on_loss = on_loss
+        self._loop = asyncio.get_running_loop()
+        self._is_lost = False
+        self._closing = threading.Event()
+        self._sending = threading.Lock()
+        self._thread = threading.Thread(target=self._read, name=f"era-can {url}", daemon=True)
+        self._thread.start()
+
+    def send(self, frames: Sequence[CanFrame]) -> None:
+        """Send frames without another's in between; LinkTimeout where it is stuck, LinkError."""
+        try:
+            with self._sending:
+                send_all(self._bus, frames)
+        except serial.SerialTimeoutException as stuck:
+            raise LinkTimeout(
+                f"{self._url} takes no more frames; check the adapter and flow control"
+            ) from stuck
+        except _TROUBLE as problem:
+            what = self._what_was_lost(problem)
+            self._loop.call_soon_threadsafe(self._lose, what)
+            raise LinkError(what) from problem
+
+    def close(self) -> None:
+        """Let the reader end and close the adapter."""
+        self._closing.set()
+        wake(self._bus)
+
+    async def wait_closed(self) -> None:
+        """Wait until it has."""
+        await asyncio.to_thread(self._thread.join)
+
+    def _read(self) -> None:
+        """Read until the bus is closed or lost; runs in the reader's thread, and closes it."""
+        problem: Exception | str = ""
+        try:
+            while not self._closing.is_set() and not problem:
+                message = self._bus.recv(timeout=_READ_TIMEOUT)
+                if message is not None:
+                    problem = self._take(message)
+        except _TROUBLE as error:
+            problem = error
+        finally:
+            with contextlib.suppress(*_TROUBLE):
+                self._bus.shutdown()
+        if not self._closing.is_set():
+            with contextlib.suppress(RuntimeError):  # of a loop that is closed: nobody waits
+                self._loop.call_soon_threadsafe(self._lose, self._what_was_lost(problem))
+
+    def _take(self, message: can.Message) -> str:
+        """Pass a frame on; says what is wrong with the bus where it tells."""
+        if message.is_error_frame:
+            return _OFF if message.arbitration_id & _BUS_OFF else ""
+        if not (message.is_remote_frame or message.is_extended_id):
+            data = bytes(message.data)
+            self._on_frame(CanFrame(message.arbitration_id, data, fd=message.is_fd))
+        return ""
+
+    def _lose(self, what: str) -> None:
+        if self._is_lost or self._closing.is_set():
+            return
+        self._is_lost = True
+        self.close()
+        self._on_loss(what)
+
+    def _what_was_lost(self, problem: Exception | str) -> str:
+        return (
+            f"the CAN bus {self._url} was lost ({problem}): check the adapter and the cable, then "
+            "open the amplifier again"
+        )
+
+
+def _why_not_open(url: CanBusUrl, problem: Exception) -> str:
+    cause: BaseException | None = problem
+    code = None
+    while cause is not None and code is None:
+        code = getattr(cause, "errno", None)
+        cause = cause.__cause__ or cause.__context__
+    if url.interface == "slcan" and code in (errno.EACCES, errno.EPERM):
+        remedy = (
+            "this user may not use the port; add the user to the group that owns it (often "
+            "dialout: sudo usermod -aG dialout $USER) and log in again"
+        )
+    elif url.interface == "slcan" and code in (errno.EAGAIN, errno.EBUSY):
+        remedy = "another program has the port open; close that one"
+    elif url.interface == "slcan":
+        remedy = "check the port's name, that the adapter is plugged in, and the bit rate"
+    elif url.interface == "socketcand":
+        remedy = "check address and port, that socketcand runs there, and that it serves this bus"
+    elif url.interface == "socketcan":
+        remedy = (
+            f"check that the interface is there (ip link) and up: sudo ip link set {url.channel} "
+            f"up type can bitrate {url.bitrate}"
+        )
+    else:
+        remedy = "check its name"
+    return f"CAN bus {url} cannot be opened: {remedy} (the system says: {problem})"

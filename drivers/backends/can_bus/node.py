@@ -1,0 +1,175 @@
+"""What one node of a CAN bus says: answers, events, and the heartbeat that it must not miss."""
+
+import asyncio
+import contextlib
+import math
+from collections.abc import Callable
+from typing import TypeVar
+
+from canopen.emcy import EmcyConsumer, EmcyError
+from canopen.nmt import NmtMaster
+
+from drivers import clock
+from drivers.backends.can_bus.bus import CanWire
+from drivers.backends.can_bus.objects import ObjectClient
+from drivers.backends.urls.can_bus import CanUrl
+from drivers.codec.can_bus.answers import Answer, AnswerReader, decode_emergency
+from drivers.codec.can_bus.frame import CANOPEN, CanFrame, cob_id
+from drivers.codec.can_bus.orders import host_number
+from drivers.errors import FrameError, LinkError
+from drivers.protocol.messages import Event
+from drivers.statistics import WireCounters
+
+HEARTBEATS_BORNE = 3  # of the amplifier's that may be missing before it counts as lost
+_LATE = 0.005  # s; by so much a timer is late, and a loss is to be told by the third heartbeat
+_SHORTEST = 1e-4  # s; of a pause
+_HOST_HEARTBEAT = CANOPEN["heartbeat_ms"] / 1000  # s; as every host sends it while it is armed
+_OPERATIONAL = CANOPEN["nmt_states"]["OPERATIONAL"]
+_BOOT_UP = CANOPEN["nmt_states"]["BOOT_UP"]
+_T = TypeVar("_T")
+
+
+class NodeWatch:
+    """Listens to a node; `answered`, `told` (events) and `lost` are called in the event loop.
+
+    What comes from the bus comes in the reader's thread, and is put together there.
+    """
+
+    def __init__(
+        self,
+        url: CanUrl,
+        *,
+        answered: Callable[[Answer], None],
+        told: Callable[[Event], None],
+        lost: Callable[[str], None],
+    ) -> None:
+        self._url = url
+        self._on_answer, self._on_event, self._on_loss = answered, told, lost
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._counters = WireCounters()
+        self._answers = AnswerReader(url.node)
+        self._emergencies = EmcyConsumer()
+        self._subscribed: list[tuple[int, Callable[..., None]]] = []
+        self._is_watched = False
+        self._was_operational = False
+        self._joined = 0.0
+        self._heard = 0.0  # the node
+        self._host_heard = -math.inf  # another host of this node
+        self._next_look: asyncio.TimerHandle | None = None
+        self._look_due = 0.0
+
+    def join(self, wire: CanWire, objects: ObjectClient, counters: WireCounters) -> None:
+        """Listen on a bus from now on, in the running event loop."""
+        self._loop = asyncio.get_running_loop()
+        self._counters = counters
+        self._answers = AnswerReader(self._url.node)
+        self._joined = clock.now()
+        self._host_heard = -math.inf
+        node, nmt = self._url.node, NmtMaster(self._url.node)
+        self._emergencies = EmcyConsumer()
+        nmt.add_heartbeat_callback(self._heartbeat)
+        self._emergencies.add_callback(self._emergency)
+        self._subscribed = [
+            (cob_id("sdo_answer", node), objects.feed),
+            (cob_id("heartbeat", node), nmt.on_heartbeat),
+            (cob_id("heartbeat", host_number(node)), self._other_host),
+            (cob_id("emergency", node), self._emergencies.on_emcy),
+            *((can_id, self._answer_frame) for can_id in self._answers.ids),
+        ]
+        for can_id, callback in self._subscribed:
+            wire.network.subscribe(can_id, callback)
+
+    def leave(self, wire: CanWire) -> None:
+        """Listen no more."""
+        self.stop()
+        for can_id, callback in self._subscribed:
+            with contextlib.suppress(KeyError, ValueError):
+                wire.network.unsubscribe(can_id, callback)
+        self._subscribed.clear()
+
+    def start(self) -> None:
+        """From now on the node must be heard, and stay in operation."""
+        self._heard = self._look_due = clock.now()
+        self._was_operational = False
+        if not self._is_watched:
+            self._is_watched = True
+            self._look()
+
+    def stop(self) -> None:
+        """It may be silent again."""
+        self._is_watched = False
+        if self._next_look is not None:
+            self._next_look.cancel()
+            self._next_look = None
+
+    async def check_no_other_host(self) -> None:
+        """Listen for the heartbeat of another host before arming; LinkError where there is one."""
+        await asyncio.sleep(max(0.0, self._joined + 1.2 * _HOST_HEARTBEAT - clock.now()))
+        if clock.now() - self._host_heard < HEARTBEATS_BORNE * _HOST_HEARTBEAT:
+            raise LinkError(
+                f"another program drives node {self._url.node} on {self._url.bus}; end that one"
+            )
+
+    def _answer_frame(self, can_id: int, data: bytearray, timestamp: float) -> None:
+        self._counters.frames_in += 1
+        try:
+            answer = self._answers.feed(CanFrame(can_id, bytes(data)))
+        except FrameError:
+            self._counters.bad += 1
+            return
+        if answer is not None:
+            self._post(self._on_answer, answer)
+
+    def _emergency(self, error: EmcyError) -> None:
+        self._emergencies.reset()  # it would keep them all
+        data = error.code.to_bytes(2, "little") + bytes([error.register]) + error.data
+        try:
+            self._post(self._on_event, decode_emergency(data))
+        except FrameError:
+            self._counters.bad += 1
+
+    def _heartbeat(self, state: int) -> None:
+        self._heard = clock.now()
+        if not self._is_watched:
+            return
+        if state == _BOOT_UP:
+            what = "has started anew, or another with its number has"
+        elif self._was_operational and state != _OPERATIONAL:
+            what = "was taken out of operation by somebody else"
+        else:
+            self._was_operational = self._was_operational or state == _OPERATIONAL
+            return
+        self._post(
+            self._on_loss,
+            f"node {self._url.node} on {self._url.bus} {what}: open it again and arm it anew",
+        )
+
+    def _other_host(self, can_id: int, data: bytearray, timestamp: float) -> None:
+        self._host_heard = clock.now()
+        self._counters.foreign += 1
+
+    def _post(self, callback: Callable[[_T], None], argument: _T) -> None:
+        """Call back in the event loop."""
+        if self._loop is not None:
+            with contextlib.suppress(RuntimeError):  # it is closed: nobody waits any more
+                self._loop.call_soon_threadsafe(callback, argument)
+
+    def _look(self) -> None:
+        """See whether the node was heard lately, by the reader's clock.
+
+        Where this process itself was held up, what the node said meanwhile may not be read yet.
+        """
+        now = clock.now()
+        silent = now - self._heard
+        limit = HEARTBEATS_BORNE * self._url.heartbeat - _LATE
+        was_held_up = now - self._look_due > self._url.heartbeat / 2
+        if silent < limit or was_held_up:
+            # A rest that rounding leaves must not be looked at again in this very moment.
+            pause = max(limit - silent, _SHORTEST) if silent < limit else self._url.heartbeat
+            self._look_due = now + pause
+            self._next_look = asyncio.get_running_loop().call_later(pause, self._look)
+            return
+        self._on_loss(
+            f"node {self._url.node} on {self._url.bus} was not heard for {silent * 1e3:.0f} ms: "
+            "check its supply and the cable, then open the amplifier again"
+        )

@@ -1,0 +1,256 @@
+"""An amplifier that speaks Modbus, over TCP or RTU.
+
+A request is one transaction, FC23: a block is written and one read back. An amplifier that cannot
+do that is found out by the first one and gets FC16 and FC4 in turn from then on. Why a write was
+refused is read afterwards. Every write carries a tag that is read back, so that no late answer is
+taken for another; identity and capabilities do not change and are read without one.
+
+An amplifier cannot speak unasked here: events are what its answers show to have changed.
+"""
+
+import asyncio
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
+
+from drivers.backends.line_turns import kind_on_line
+from drivers.backends.modbus.line import ModbusLink
+from drivers.backends.sole_host import SoleHost
+from drivers.backends.stand_in import number_below
+from drivers.backends.urls.modbus import ModbusUrl
+from drivers.backends.waiting import SETTLE
+from drivers.backends.wire_backend import WireBackend
+from drivers.codec.modbus import exchanges
+from drivers.codec.modbus.exchanges import Exchange, Read, Write
+from drivers.codec.modbus.telegrams import Answer
+from drivers.codec.modbus.timing import commit_time, loading_time, round_trip_time
+from drivers.errors import LinkError, LinkTimeout
+from drivers.link.turns import Kind
+from drivers.protocol.messages import (
+    Arm,
+    Broadcast,
+    Capabilities,
+    Event,
+    Fault,
+    Hello,
+    Nak,
+    NakCode,
+    Reply,
+    Request,
+    State,
+)
+
+_ILLEGAL_FUNCTION = 1
+_GATEWAY = (10, 11)  # a gateway has no path to the amplifier, or heard nothing from it
+_TAGS = (1 << 16) - 1
+
+
+@dataclass(frozen=True)
+class _Asked:
+    """How a request stands to others on the line, and how long each transaction may take [s]."""
+
+    kind: Kind
+    timeout: float
+
+
+class ModbusBackend(WireBackend):
+    """Carries requests over a Modbus line given by its URL (see `ModbusUrl`)."""
+
+    def __init__(self, url: str) -> None:
+        super().__init__()
+        self._url = ModbusUrl.parse(url)
+        self._link: ModbusLink | None = None
+        self._sole_host = SoleHost(f"{self._url.place}/{self._url.unit}")
+        # Not from zero, so that an answer to an earlier run is no answer to this one.
+        self._tag = number_below(_TAGS)
+        self._can_read_back = True
+        self._channels: int | None = None
+        self._condition: tuple[State, Fault] | None = None
+
+    @property
+    def bus(self) -> str:
+        """The line, whose units a broadcast reaches."""
+        return f"modbus {self._url.place}"
+
+    def round_trip(self, channels: int) -> float:
+        """Time [s] on a serial line of an apply of so many channels and its answer; else 0."""
+        if not self._url.baud:
+            return 0.0
+        bits = self._url.bits_per_byte
+        return round_trip_time(channels, baud=self._url.baud, bits_per_byte=bits)
+
+    def commit_time(self) -> float:
+        """Time [s] on a serial line until a commit has arrived; else 0."""
+        if not self._url.baud:
+            return 0.0
+        return commit_time(baud=self._url.baud, bits_per_byte=self._url.bits_per_byte)
+
+    def loading_time(self, knots: int) -> float:
+        """Time [s] on a serial line of loading an envelope; else 0."""
+        if not self._url.baud:
+            return 0.0
+        bits = self._url.bits_per_byte
+        return loading_time(knots, baud=self._url.baud, bits_per_byte=bits)
+
+    @property
+    def takes_turns(self) -> bool:
+        """One answer at a time is on the line."""
+        return True
+
+    @property
+    def is_unsent(self) -> bool:
+        """Whether what is asked waits for others, or for the line to be silent."""
+        return self._link is not None and self._link.is_unsent(self._url.unit)
+
+    def silencing(self, request: Request) -> AbstractContextManager[None]:
+        """See `Backend.silencing`."""
+        if self._link is None:
+            return nullcontext()
+        return self._link.silencing(request, self._url.unit)
+
+    async def open(self) -> None:
+        """Open the line, or join those who have it open in this process; raises LinkError."""
+        if self._link is not None:
+            return
+        self._condition = None
+        self._link = await ModbusLink.of(self._url.line, self._url.unit, self._lost)
+        self._counters = self._link.counters
+
+    async def close(self) -> None:
+        """Leave the line; the last one closes it."""
+        link, self._link = self._link, None
+        try:
+            if link is not None:
+                await link.leave(self._url.unit)
+        finally:  # also where this is cancelled
+            self._sole_host.release()
+
+    async def exchange(self, request: Request, *, timeout: float) -> Reply:
+        """Send a request and wait for its reply; LinkTimeout, LinkError or FrameError.
+
+        timeout [s]: for each transaction; longer where a slow line needs it (see `ModbusLink`), so
+        that a loss is told after three heartbeats on a line that is fast enough for them.
+        """
+        if isinstance(request, Arm) and not self._url.device:
+            self._sole_host.claim()
+        asked = _Asked(kind_on_line(request), timeout)
+        records = 0
+        while True:
+            tag = self._next_tag()
+            exchange = self._exchange_of(request, tag, records)
+            answer = await self._carry_out(exchange, tag, asked)
+            if answer.exception:
+                return await self._refusal(answer, tag, asked)
+            self._look_at(request, answer)
+            beyond = exchanges.faults_beyond(request, answer.registers)
+            if records or not beyond:
+                break
+            records = beyond
+        if isinstance(request, Hello) and self._url.is_rtu:
+            await self._check_alone()
+        reply = exchanges.to_reply(request, answer.registers)
+        if isinstance(reply, Capabilities):
+            self._channels = reply.channels
+        return reply
+
+    async def broadcast(self, request: Broadcast) -> None:
+        """Write a commit or a stop to all units of the line; a stop goes before all that wait."""
+        link = self._opened()
+        kind = kind_on_line(request)
+        unit = None if kind.silences else self._url.unit
+        await link.broadcast(exchanges.to_broadcast(request), kind, unit=unit)
+        self._last_sent = link.last_sent
+
+    async def _check_alone(self) -> None:
+        """Leave a second amplifier of this unit the time to answer; LinkError where one does."""
+        link = self._opened()
+        await asyncio.sleep(SETTLE)
+        if link.is_contradicted:
+            raise LinkError(
+                f"more than one amplifier answers as unit {self._url.unit} on {self._url.place}; "
+                "give each on the line a unit of its own"
+            )
+
+    def _next_tag(self) -> int:
+        self._tag = self._tag % _TAGS + 1
+        return self._tag
+
+    def _exchange_of(self, request: Request, tag: int, records: int) -> Exchange:
+        options = {}
+        if self._channels is not None:
+            options["channels"] = self._channels
+        if records:
+            options["records"] = records
+        return exchanges.to_exchange(request, tag=tag, **options)
+
+    async def _carry_out(self, exchange: Exchange, tag: int, asked: "_Asked") -> Answer:
+        read, write = exchange.read, exchange.write
+        if write is None:
+            return await self._transact(read, None, asked, tag=None)
+        if self._can_read_back:
+            answer = await self._transact(read, write, asked, tag=tag)
+            if answer.exception != _ILLEGAL_FUNCTION:
+                return answer
+            self._can_read_back = False
+        answer = await self._transact(None, write, asked, tag=None)
+        return answer if answer.exception else await self._transact(read, None, asked, tag=tag)
+
+    async def _transact(
+        self, read: Read | None, write: Write | None, asked: "_Asked", *, tag: int | None
+    ) -> Answer:
+        def accept(answer: Answer) -> bool:
+            if answer.exception or read is None:
+                return True
+            return exchanges.is_of(answer.registers, tag=tag)
+
+        link = self._opened()
+        try:
+            answer = await link.transact(
+                read,
+                write,
+                unit=self._url.unit,
+                kind=asked.kind,
+                timeout=asked.timeout,
+                accept=accept,
+            )
+        finally:
+            self._last_sent = link.last_sent
+        if answer.exception in _GATEWAY:
+            raise LinkTimeout(
+                f"the gateway at {self._url.place} gets no answer from unit {self._url.unit}; "
+                "check that the amplifier is switched on and has this unit"
+            )
+        return answer
+
+    async def _refusal(self, answer: Answer, tag: int, asked: "_Asked") -> Nak:
+        """Why a write was refused; exceptions that only one refusal leads to need no asking."""
+        if answer.exception == _ILLEGAL_FUNCTION:
+            return Nak(NakCode.UNKNOWN_TYPE)
+        only = exchanges.nak_of_exception(answer.exception)
+        if only is not None and only.code is NakCode.BUSY:
+            return only
+        told = await self._transact(exchanges.refusal_read(), None, asked, tag=None)
+        nak = None if told.exception else exchanges.to_nak(told.registers, tag=tag)
+        if nak is not None:
+            return nak
+        # Not of this write: a late exception to an earlier one, so this one's answer was missed.
+        raise LinkTimeout(
+            f"unit {self._url.unit} on {self._url.place} answered with Modbus exception "
+            f"{answer.exception} and names no reason for it"
+        )
+
+    def _look_at(self, request: Request, answer: Answer) -> None:
+        """Tell who listens what an answer shows to have changed."""
+        condition = exchanges.condition(request, answer.registers)
+        if condition is None or condition == self._condition:
+            return
+        before, self._condition = self._condition, condition
+        if before is not None:
+            self._on_event(Event(*condition))
+
+    def _opened(self) -> ModbusLink:
+        if self._link is None:
+            raise LinkError(f"{self._url.place} is not open")
+        return self._link
+
+    def _lost(self, what: str) -> None:
+        self._on_loss(what)

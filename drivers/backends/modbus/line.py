@@ -1,0 +1,242 @@
+"""One Modbus line, for all amplifiers of this process that are on it: a telegram at a time.
+
+Over RTU the line is silent for 3.5 characters before a telegram. Where nobody waits any more for an
+answer it is given the time to come all the same, or it would run into the next telegram.
+"""
+
+import asyncio
+import contextlib
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from weakref import WeakKeyDictionary
+
+from drivers import clock
+from drivers.backends.line_turns import LineTurns
+from drivers.backends.modbus.stream import open_stream
+from drivers.backends.stand_in import Port
+from drivers.backends.urls.modbus import ModbusUrl
+from drivers.backends.waiting import reply_within
+from drivers.codec.modbus.exchanges import Read, Write
+from drivers.codec.modbus.telegrams import Answer, AnswerReader, Telegram, make_telegram
+from drivers.codec.modbus.timing import silence
+from drivers.errors import LinkError, LinkTimeout
+from drivers.link.turns import Kind
+from drivers.protocol.definition import PROTOCOL
+from drivers.protocol.messages import Request
+from drivers.statistics import WireCounters
+
+_REACTION = PROTOCOL.reaction
+_BROADCAST: int = PROTOCOL.modbus["broadcast"]
+_TRANSACTIONS = 1 << 16
+_RTU_OVERHEAD = 3  # bytes of an answer around its PDU
+
+_links: "WeakKeyDictionary[asyncio.AbstractEventLoop, dict[ModbusUrl, ModbusLink]]" = (
+    WeakKeyDictionary()
+)
+
+
+class ModbusLink:
+    """An open line; made by `ModbusLink.of`, closed when the last who uses it has left."""
+
+    def __init__(self, line: ModbusUrl) -> None:
+        self.line = line
+        self.counters = WireCounters()
+        self.last_sent = 0.0
+        self._stream: Port | None = None
+        self._changing = asyncio.Lock()  # held while the line is opened or closed
+        self._turns = LineTurns()
+        self._reader = AnswerReader(is_rtu=line.is_rtu, counters=self.counters)
+        self._users: dict[int, Callable[[str], None]] = {}  # by their units
+        self.is_contradicted = False  # whether the last answer was followed by another
+        self._given: Answer | None = None
+        self._loss: str | None = None
+        self._transaction = 0
+        self._telegram: Telegram | None = None
+        self._accept: Callable[[Answer], bool] = _any
+        self._answer: asyncio.Future[Answer] | None = None
+        # Of a serial line: when it is free again, at the latest where an answer is owed.
+        self._free_from = 0.0
+        self._is_owed = False
+        self._came = asyncio.Event()
+        self._gap = 0.0
+        if line.device:
+            self._gap = silence(baud=line.baud, bits_per_byte=line.bits_per_byte)
+
+    @classmethod
+    async def of(cls, line: ModbusUrl, unit: int, on_loss: Callable[[str], None]) -> "ModbusLink":
+        """The link of a line for a unit, opened if it is not; on_loss: see `Backend.listen`.
+
+        Raises LinkError, also for a unit that this program has open already.
+        """
+        links = _links.setdefault(asyncio.get_running_loop(), {})
+        before = link = links.get(line)
+        if link is None or link._loss is not None:
+            link = links[line] = cls(line)
+            if before is not None:
+                link._changing = before._changing
+        if unit in link._users:
+            raise LinkError(
+                f"unit {unit} on {line.place}: this program has it open already; give every "
+                "amplifier a unit of its own"
+            )
+        link._users[unit] = on_loss
+        try:
+            async with link._changing:
+                if before is not None and before is not link:
+                    await before._close()
+                if link._stream is None:
+                    link._stream = await open_stream(line, link._received, link._lost)
+        except BaseException:
+            await link.leave(unit)
+            raise
+        return link
+
+    async def leave(self, unit: int) -> None:
+        """Use it no more; safe to call twice."""
+        self._users.pop(unit, None)
+        if self._users:
+            return
+        self._lose(f"{self.line.place} was closed")
+        async with self._changing:  # who comes meanwhile waits until the line is free
+            await self._close()
+        links = _links.get(asyncio.get_running_loop(), {})
+        if links.get(self.line) is self and not self._users:
+            del links[self.line]
+
+    async def _close(self) -> None:
+        stream, self._stream = self._stream, None
+        if stream is not None:
+            stream.close()
+            await stream.wait_closed()
+
+    async def transact(
+        self,
+        read: Read | None,
+        write: Write | None,
+        *,
+        unit: int,
+        kind: Kind = Kind.ORDINARY,
+        timeout: float,
+        accept: Callable[[Answer], bool],
+    ) -> Answer:
+        """Write, read, or both in one transaction, and wait for the answer.
+
+        kind: how this stands to what others ask on the line (see `kind_on_line`); accept: whether
+        an answer in the right form is the right one. timeout [s]: for all of it; longer where a
+        slow line and an amplifier that reacts in time need longer. Raises LinkTimeout, LinkError.
+        """
+
+        async def exchange() -> Answer:
+            await self._await_silence()
+            telegram = self._make(read, write, unit=unit)
+            self._telegram, self._accept = telegram, accept
+            self._answer = asyncio.get_running_loop().create_future()
+            on_line = self._time_of(len(telegram.frame) + _RTU_OVERHEAD + telegram.answer_size)
+            on_line += 2 * self._gap  # before the answer, and for the far end to see its end
+            try:
+                self._send(telegram.frame)
+                self._is_owed = True
+                self._free_from = self.last_sent + on_line + _REACTION
+                return await reply_within(self._answer, max(timeout, on_line + _REACTION))
+            except LinkError:
+                raise
+            except TimeoutError:
+                raise LinkTimeout(
+                    f"no answer from unit {unit} on {self.line.place} within {timeout * 1e3:g} ms; "
+                    "check that the amplifier is switched on and has this unit"
+                    + (f" and {self.line.baud} baud" if self.line.device else "")
+                ) from None
+            finally:
+                self._answer = None
+
+        return await self._turns.carry_out(kind, exchange, address=unit)
+
+    async def broadcast(self, write: Write, kind: Kind, *, unit: int | None) -> None:
+        """Write to all units, in the turn of this kind and unit; nobody answers.
+
+        unit: whose stop this gives way to, and which may be one that others ask meanwhile; or None.
+        """
+
+        async def send() -> None:
+            await self._await_silence()
+            self._telegram = None
+            telegram = self._make(None, write, unit=_BROADCAST)
+            self._send(telegram.frame)
+            self._free_from = self.last_sent + self._time_of(len(telegram.frame)) + self._gap
+
+        await self._turns.carry_out(kind, send, address=unit)
+
+    def is_unsent(self, unit: int) -> bool:
+        """Whether what is asked of a unit waits for others, or for the line to be silent."""
+        return self._turns.is_unsent(unit)
+
+    def silencing(self, request: Request, unit: int) -> AbstractContextManager[None]:
+        """See `Backend.silencing`."""
+        return self._turns.silencing(request, unit)
+
+    def _make(self, read: Read | None, write: Write | None, *, unit: int) -> Telegram:
+        self._transaction = (self._transaction + 1) % _TRANSACTIONS
+        number = 0 if self.line.is_rtu else self._transaction
+        return make_telegram(read, write, unit=unit, transaction=number, is_rtu=self.line.is_rtu)
+
+    def _send(self, frame: bytes) -> None:
+        if self._stream is None or self._loss is not None:
+            raise LinkError(self._loss or f"{self.line.place} is not open")
+        if self.line.is_rtu:
+            self._reader.clear()
+        self._is_owed = False
+        self._given, self.is_contradicted = None, False
+        self._came.clear()
+        self._stream.write(frame)
+        self._turns.sent()
+        self.last_sent = clock.now()
+        self.counters.frames_out += 1
+
+    async def _await_silence(self) -> None:
+        """Wait until a serial line is free."""
+        if not self.line.is_rtu:
+            return
+        if self._is_owed and (wait := self._free_from - clock.now()) > 0:
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(wait):
+                    await self._came.wait()
+        if (wait := self._free_from - clock.now()) > 0:
+            await asyncio.sleep(wait)
+
+    def _time_of(self, size: int) -> float:
+        """Time [s] that so many bytes take on a serial line, be it behind a gateway."""
+        return size * self.line.bits_per_byte / self.line.baud if self.line.baud else 0.0
+
+    def _received(self, data: bytes) -> None:
+        for answer in self._reader.feed(data, self._telegram):
+            if not self._accept(answer):
+                self.counters.foreign += 1
+                continue
+            self._is_owed = False
+            self._came.set()
+            if self._answer is None or self._answer.done():
+                self.counters.foreign += 1
+                self.is_contradicted = self.is_contradicted or answer != self._given
+            else:
+                self._given = answer
+                self._answer.set_result(answer)
+        if not self._is_owed:
+            self._free_from = clock.now() + self._gap
+
+    def _lost(self, what: str) -> None:
+        """The stream has found that it is gone."""
+        is_asked = self._answer is not None and not self._answer.done()
+        self._lose(what)
+        if not is_asked:
+            for on_loss in tuple(self._users.values()):
+                on_loss(what)
+
+    def _lose(self, what: str) -> None:
+        if self._loss is None:
+            self._loss = what
+        if self._answer is not None and not self._answer.done():
+            self._answer.set_exception(LinkError(self._loss))
+
+
+def _any(answer: Answer) -> bool:
+    return True

@@ -1,0 +1,131 @@
+"""The bytes of a Modbus line, both ways: a TCP connection or a serial port."""
+
+import asyncio
+import contextlib
+import os
+from collections.abc import Callable
+from typing import cast
+
+import serial
+
+from drivers.backends.ports.watched import READ_TIMEOUT, WRITE_TIMEOUT, WatchedPort, remedy_of
+from drivers.backends.stand_in import STAND_IN, Port
+from drivers.backends.urls.modbus import ModbusUrl
+from drivers.errors import LinkError, LinkTimeout
+
+_CONNECT_TIMEOUT = 1.0  # s; an amplifier in the same building answers a hundred times faster
+_UNSENT_MAX = 4096  # bytes; sixteen frames that a peer does not take are no slow network any more
+_FAILURES: tuple[type[Exception], ...] = (OSError, ValueError)  # of pyserial, at opening
+with contextlib.suppress(ImportError):  # Windows has no terminals
+    import termios
+
+    _FAILURES += (termios.error,)
+
+
+async def open_stream(
+    line: ModbusUrl, on_data: Callable[[bytes], None], on_loss: Callable[[str], None]
+) -> Port:
+    """Open a line; LinkError says what to do about one that cannot be opened."""
+    if line.device:
+        return await _open_serial(line, on_data, on_loss)
+    return await _connect(line, on_data, on_loss)
+
+
+class _Connection(asyncio.Protocol):
+    """A TCP connection."""
+
+    def __init__(
+        self, place: str, on_data: Callable[[bytes], None], on_loss: Callable[[str], None]
+    ) -> None:
+        self._place = place
+        self._on_data = on_data
+        self._on_loss = on_loss
+        self._is_closed = False
+        self._transport: asyncio.Transport | None = None
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        self._transport = cast(asyncio.Transport, transport)
+
+    def data_received(self, data: bytes) -> None:
+        if not self._is_closed:
+            self._on_data(data)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        if not self._is_closed:
+            self._is_closed = True
+            why = str(exc) if exc else "the other side hung up"
+            self._on_loss(
+                f"the Modbus connection to {self._place} was lost ({why}): check the amplifier and "
+                "the network, then open the amplifier again"
+            )
+
+    def write(self, data: bytes) -> None:
+        if self._transport is None or self._is_closed:
+            raise LinkError(f"the Modbus connection to {self._place} is closed")
+        if self._transport.get_write_buffer_size() > _UNSENT_MAX:
+            raise LinkTimeout(f"{self._place} takes no more bytes; check the network")
+        self._transport.write(data)
+
+    def close(self) -> None:
+        self._is_closed = True
+        if self._transport is not None:
+            self._transport.abort()  # nothing that waits to be sent shall arrive later
+
+    async def wait_closed(self) -> None:
+        """Nothing is left to be waited for."""
+
+
+async def _connect(
+    line: ModbusUrl, on_data: Callable[[bytes], None], on_loss: Callable[[str], None]
+) -> Port:
+    loop = asyncio.get_running_loop()
+    try:
+        async with asyncio.timeout(_CONNECT_TIMEOUT):
+            _, connection = await loop.create_connection(
+                lambda: _Connection(line.place, on_data, on_loss), line.host, line.port
+            )
+    except TimeoutError:
+        raise LinkError(
+            f"{line.place} does not answer within {_CONNECT_TIMEOUT:g} s; check the address, the "
+            "network and that the amplifier is switched on"
+        ) from None
+    except OSError as problem:
+        raise LinkError(
+            f"{line.place} takes no Modbus connection: check the address and the port, and that "
+            f"the amplifier is switched on (the system says: {problem})"
+        ) from problem
+    return connection
+
+
+async def _open_serial(
+    line: ModbusUrl, on_data: Callable[[bytes], None], on_loss: Callable[[str], None]
+) -> Port:
+    stand_in = STAND_IN.get()
+    if stand_in is not None:
+        return await stand_in.open_port(line.device, on_data=on_data, on_loss=on_loss)
+    try:
+        port = await asyncio.to_thread(_open_port, line)
+    except _FAILURES as problem:
+        raise LinkError(_why_not_open(line.device, problem)) from problem
+    return WatchedPort(port, line.device, on_data, on_loss)
+
+
+def _open_port(line: ModbusUrl) -> serial.Serial:
+    # A pseudo-terminal has no parity, and where it is asked for one it may refuse everything.
+    is_pseudo = os.path.realpath(line.device).startswith("/dev/pts/")
+    port = serial.Serial(
+        line.device,
+        baudrate=line.baud,
+        parity=serial.PARITY_NONE if is_pseudo else line.parity,
+        stopbits=line.stop,
+        timeout=READ_TIMEOUT,
+        write_timeout=WRITE_TIMEOUT,
+        exclusive=True,
+    )
+    port.reset_input_buffer()
+    return port
+
+
+def _why_not_open(device: str, problem: Exception) -> str:
+    remedy = remedy_of(problem) or "check its name, that it is plugged in, its speed and its parity"
+    return f"serial port {device} cannot be opened: {remedy} (the system says: {problem})"

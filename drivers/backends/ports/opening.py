@@ -1,0 +1,72 @@
+"""A serial port of this machine, a USB adapter, or a serial server, as pyserial names it."""
+
+import asyncio
+import contextlib
+import errno
+import socket
+from collections.abc import Callable
+
+import serial
+
+from drivers.backends.ports.watched import (
+    READ_TIMEOUT,
+    WRITE_TIMEOUT,
+    WatchedPort,
+    connection_of,
+    remedy_of,
+)
+from drivers.backends.stand_in import STAND_IN, Port
+from drivers.errors import LinkError
+
+
+async def open_port(
+    name: str, *, baud: int, on_data: Callable[[bytes], None], on_loss: Callable[[str], None]
+) -> Port:
+    """Open a port, for this process alone where the system can; raises LinkError.
+
+    on_data is called with what comes in, on_loss once with why the port was lost.
+    """
+    stand_in = STAND_IN.get()
+    if stand_in is not None:
+        return await stand_in.open_port(name, on_data=on_data, on_loss=on_loss)
+    try:
+        port = await asyncio.to_thread(_open_port, name, baud)
+    except (OSError, ValueError) as problem:
+        raise LinkError(_why_not_open(name, problem)) from problem
+    return WatchedPort(port, name, on_data, on_loss)
+
+
+def _open_port(name: str, baud: int) -> serial.Serial:
+    port = serial.serial_for_url(
+        name,
+        do_not_open=True,
+        baudrate=baud,
+        timeout=READ_TIMEOUT,
+        # pyserial has none over RFC 2217
+        write_timeout=None if name.startswith("rfc2217://") else WRITE_TIMEOUT,
+        exclusive=True,
+    )
+    port.open()
+    # USB adapters hold bytes back for 16 ms unless they are told not to; most can be.
+    with contextlib.suppress(OSError, ValueError, AttributeError, NotImplementedError):
+        port.set_low_latency_mode(True)
+    connection = connection_of(port)
+    if connection is not None:
+        # Else the system holds a frame back until the one before is acknowledged, 40 ms perhaps:
+        # a stop must not wait for the answer to what it overtakes.
+        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    port.reset_input_buffer()
+    return port
+
+
+def _why_not_open(port: str, problem: Exception) -> str:
+    refused = getattr(problem, "errno", None) == errno.ECONNREFUSED
+    if (remedy := remedy_of(problem)) is not None:
+        pass
+    elif refused or port.startswith(("socket://", "rfc2217://")):
+        remedy = "nobody answers there; check the address, and that the serial server runs"
+    elif port.startswith("hwgrep://"):
+        remedy = "no port fits the pattern; list them: python -m serial.tools.list_ports -v"
+    else:
+        remedy = "check its name, that it is plugged in, and its speed"
+    return f"serial port {port} cannot be opened: {remedy} (the system says: {problem})"

@@ -1,0 +1,1 @@
+"""An amplifier on a serial line, and the line that several share."""

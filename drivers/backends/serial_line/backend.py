@@ -1,0 +1,232 @@
+"""An amplifier on a serial line: a tty, a USB adapter, or a serial server on the network.
+
+A reply belongs to the request whose sequence number it carries. Several amplifiers may share a
+line, each at its own address.
+"""
+
+import asyncio
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, replace
+
+from drivers.backends.line_turns import kind_on_line
+from drivers.backends.serial_line.line import SerialLine, shared_line
+from drivers.backends.stand_in import number_below
+from drivers.backends.urls.serial_line import SerialUrl
+from drivers.backends.waiting import SETTLE, reply_within
+from drivers.backends.wire_backend import WireBackend
+from drivers.codec.serial_line.exchanges import decode_event, decode_reply, encode_request, is_event
+from drivers.codec.serial_line.frame import Frame, encode_frame
+from drivers.codec.serial_line.timing import (
+    commit_time,
+    exchange_time,
+    loading_time,
+    round_trip_time,
+)
+from drivers.errors import DriverError, LinkError, LinkTimeout
+from drivers.link.turns import Kind
+from drivers.protocol.definition import PROTOCOL
+from drivers.protocol.messages import Broadcast, Hello, Reply, Request, Stop
+from drivers.statistics import WireCounters
+
+
+@dataclass
+class _Pending:
+    """A request on the wire and who waits for its reply."""
+
+    request: Frame
+    reply: asyncio.Future[Reply]
+
+
+class SerialBackend(WireBackend):
+    """Carries requests over a serial line given by its URL (see `SerialUrl`)."""
+
+    def __init__(self, url: str) -> None:
+        super().__init__()
+        self._url = SerialUrl.parse(url)
+        self._line: SerialLine | None = None
+        self._pending: dict[int, _Pending] = {}
+        # Not from zero, so that an answer to an earlier run is no answer to this one.
+        self._sequence = number_below(1 << 16)
+        self._answered: Frame | None = None  # the reply to the last request, once it is there
+        self._is_contradicted = False  # by another reply to that
+        self._why_closed = f"{self._url.port} is not open"
+        self._loss: str | None = None  # until it is opened anew, even if others have the line back
+
+    @property
+    def counters(self) -> WireCounters:
+        """What was seen for this amplifier; damaged frames are those of the whole line."""
+        bad = self._counters.bad if self._line is None else self._line.bad
+        return replace(self._counters, bad=bad)
+
+    @property
+    def bus(self) -> str:
+        """The port: a broadcast reaches all that share it."""
+        return self._url.port
+
+    def round_trip(self, channels: int) -> float:
+        """Time [s] on the line of an apply and its answer; 0 where the line's end is a server."""
+        if not self._url.is_local:
+            return 0.0
+        return round_trip_time(channels, baud=self._url.baud)
+
+    def commit_time(self) -> float:
+        """Time [s] on the line until a commit has arrived; 0 where the line's end is a server."""
+        return commit_time(baud=self._url.baud) if self._url.is_local else 0.0
+
+    def loading_time(self, knots: int) -> float:
+        """Time [s] on the line of loading an envelope; 0 where the line's end is a server."""
+        return loading_time(knots, baud=self._url.baud) if self._url.is_local else 0.0
+
+    @property
+    def takes_turns(self) -> bool:
+        """One answer at a time is on the line."""
+        return True
+
+    @property
+    def is_unsent(self) -> bool:
+        """Whether what is asked waits for others on the line."""
+        return self._line is not None and self._line.turns.is_unsent(self._url.address)
+
+    def silencing(self, request: Request) -> AbstractContextManager[None]:
+        """See `Backend.silencing`."""
+        if self._line is None:
+            return nullcontext()
+        return self._line.turns.silencing(request, self._url.address)
+
+    async def open(self) -> None:
+        """Open the port, for this process alone where the system can; raises LinkError."""
+        if self._line is not None:
+            return
+        line = shared_line(self._url.port, baud=self._url.baud)
+        self._counters = WireCounters()
+        self._loss = None
+        await line.join(self._url.address, self._received, self._lost)
+        self._line = line
+
+    async def close(self) -> None:
+        """Close the port if nobody else uses it; what waits for a reply gets LinkError."""
+        line, self._line = self._line, None
+        if line is None:
+            return
+        self._counters.bad = line.bad
+        self._why_closed = f"{self._url.port} was closed"
+        self._fail(LinkError(self._why_closed))
+        await line.leave(self._url.address)
+
+    async def exchange(self, request: Request, *, timeout: float) -> Reply:
+        """Send a request and wait for its reply; LinkTimeout, LinkError or FrameError.
+
+        timeout [s]: for all of it; longer where a slow line and an amplifier that reacts in time
+        need longer.
+        """
+        line = self._open_line()
+        if not line.is_shared:
+            return await self._exchange(line, request, timeout)
+        return await line.turns.carry_out(
+            kind_on_line(request),
+            lambda: self._exchange(line, request, timeout),
+            address=self._url.address,
+        )
+
+    async def broadcast(self, request: Broadcast) -> None:
+        """Send a commit to every amplifier of the line in its turn, or a stop at once."""
+        line = self._open_line()
+        data = encode_frame(self._frame(request, PROTOCOL.serial.broadcast))
+        if isinstance(request, Stop):
+            line.send(data)
+            return
+
+        async def send() -> None:
+            line.send(data)
+
+        await line.turns.carry_out(Kind.ORDINARY, send, address=self._url.address)
+
+    async def _check_alone(self) -> None:
+        """Leave a second amplifier of this address the time to answer; LinkError where one does."""
+        await asyncio.sleep(SETTLE)
+        if self._is_contradicted:
+            raise LinkError(
+                f"more than one amplifier answers at address {self._url.address} on "
+                f"{self._url.port}; give each on the line an address of its own"
+            )
+
+    async def _exchange(self, line: SerialLine, request: Request, timeout: float) -> Reply:
+        frame = self._frame(request, self._url.address)
+        data = encode_frame(frame)
+        pending = _Pending(frame, asyncio.get_running_loop().create_future())
+        self._pending[frame.sequence] = pending
+        self._answered, self._is_contradicted = None, False
+        try:
+            line.send(data)
+            line.turns.sent()
+            self._last_sent = line.last_sent
+            self._counters.frames_out += 1
+            on_line = exchange_time(len(data), baud=self._url.baud)
+            reply = await reply_within(pending.reply, max(timeout, on_line + PROTOCOL.reaction))
+        except LinkError:
+            raise
+        except TimeoutError:
+            raise LinkTimeout(
+                f"no answer from address {self._url.address} on {self._url.port} within "
+                f"{timeout * 1e3:g} ms; check that the amplifier is switched on and set to "
+                f"{self._url.baud} baud"
+            ) from None
+        finally:
+            del self._pending[frame.sequence]
+            pending.reply.cancel()  # one that was given an error nobody came for
+        if isinstance(request, Hello):
+            await self._check_alone()
+        return reply
+
+    def _frame(self, request: Request, address: int) -> Frame:
+        self._sequence = (self._sequence + 1) & 0xFFFF
+        return encode_request(request, address=address, sequence=self._sequence)
+
+    def _open_line(self) -> SerialLine:
+        if self._line is None or self._loss is not None:
+            raise LinkError(self._loss or self._why_closed)
+        return self._line
+
+    def _received(self, frame: Frame) -> None:
+        self._counters.frames_in += 1
+        if frame.address == self._url.address and is_event(frame):
+            self._told(frame)
+            return
+        first = self._answered
+        if first is not None and (frame.sequence, frame.address) == (first.sequence, first.address):
+            self._is_contradicted = self._is_contradicted or frame != first
+        pending = self._pending.get(frame.sequence)
+        if (
+            pending is None
+            or pending.reply.done()
+            or not frame.is_reply
+            or frame.address != self._url.address
+        ):
+            self._counters.foreign += 1
+            return
+        self._answered = frame
+        try:
+            pending.reply.set_result(decode_reply(frame, pending.request))
+        except DriverError as problem:
+            pending.reply.set_exception(problem)
+
+    def _told(self, frame: Frame) -> None:
+        try:
+            event = decode_event(frame)
+        except DriverError:
+            self._counters.bad += 1
+            return
+        self._counters.events += 1
+        self._on_event(event)
+
+    def _lost(self, what: str) -> None:
+        self._loss = what
+        was_waiting = bool(self._pending)
+        self._fail(LinkError(what))
+        if not was_waiting:
+            self._on_loss(what)
+
+    def _fail(self, problem: LinkError) -> None:
+        for pending in self._pending.values():
+            if not pending.reply.done():
+                pending.reply.set_exception(problem)

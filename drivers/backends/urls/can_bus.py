@@ -1,0 +1,101 @@
+"""CAN amplifier URLs: can+socketcan://can0#NODE and so on, the node after the hash sign."""
+
+import re
+from dataclasses import dataclass
+from urllib.parse import unquote, urlsplit
+
+from drivers.backends.urls.options import options_of, whole_number
+from drivers.codec.can_bus.frame import CANOPEN
+from drivers.errors import CommandError
+
+_FORMS = (
+    "can+socketcan://can0#1, can+slcan:///dev/ttyACM0?bitrate=500000#1, "
+    "can+socketcand://HOST:PORT/can0#1 or can+virtual://CHANNEL#1"
+)
+_OPTIONS = {  # smallest and largest
+    "bitrate": (10_000, 1_000_000),
+    "fd": (1, 8_000_000),  # bit/s of the data of CAN FD
+    "heartbeat": (10, 10_000),  # ms
+    "baud": (9_600, 12_000_000),  # of the serial port of an slcan adapter
+}
+
+
+@dataclass(frozen=True)
+class CanBusUrl:
+    """A bus: interface as python-can names it, channel, host and port of a server.
+
+    bitrate [bit/s]; fd: that of the data in CAN FD frames, 0 for classic frames only; baud of the
+    adapter's serial port.
+    """
+
+    interface: str
+    channel: str
+    host: str
+    port: int
+    bitrate: int
+    fd: int
+    baud: int
+
+    def __str__(self) -> str:
+        where = f"{self.host}:{self.port}/" if self.host else ""
+        return f"can+{self.interface}://{where}{self.channel}"
+
+
+@dataclass(frozen=True)
+class CanUrl:
+    """Where a CAN amplifier is: its bus and node, and how often it says that it is there [s]."""
+
+    bus: CanBusUrl
+    node: int
+    heartbeat: float
+
+    @classmethod
+    def parse(cls, url: str) -> "CanUrl":
+        """Take a URL apart; CommandError says which part is wrong and what it should be."""
+        try:
+            parts = urlsplit(url)
+            port = parts.port if parts.scheme == "can+socketcand" else None
+        except ValueError as problem:
+            raise CommandError(f"{url!r} is no CAN URL: {problem}; use {_FORMS}") from None
+        options = options_of(parts.query, known=_OPTIONS, url=url, kind="a CAN")
+        interface, host = parts.scheme.removeprefix("can+"), ""
+        match interface:
+            case "socketcan" | "virtual":
+                channel, rest = parts.netloc, parts.path.strip("/")
+            case "slcan":
+                channel, rest = unquote(parts.path), parts.netloc
+                if re.fullmatch(r"/COM\d+", channel, re.IGNORECASE):
+                    channel = channel[1:]
+            case "socketcand":
+                channel, rest = parts.path.strip("/"), "" if port else "no port"
+                host = parts.hostname or ""
+            case _:
+                raise CommandError(f"{url!r} names no CAN interface; use {_FORMS}")
+        if not channel.strip("/") or rest or (interface == "socketcand" and not host):
+            raise CommandError(f"{url!r} does not say where the bus is; use {_FORMS}")
+        bus = CanBusUrl(
+            interface=interface,
+            channel=channel,
+            host=host,
+            port=port or 0,
+            bitrate=_whole(options, "bitrate", default=CANOPEN["bitrate"], url=url),
+            fd=_whole(options, "fd", default=0, url=url),
+            baud=_whole(options, "baud", default=115_200, url=url),
+        )
+        heartbeat = _whole(options, "heartbeat", default=CANOPEN["heartbeat_ms"], url=url)
+        return cls(bus=bus, node=_node(parts.fragment, url), heartbeat=heartbeat / 1000)
+
+
+def _node(text: str, url: str) -> int:
+    highest = int(CANOPEN["node_max"])
+    if not text:
+        return int(CANOPEN["node"])
+    return whole_number(text, "the node after #", high=highest, url=url)
+
+
+def _whole(options: dict[str, str], name: str, *, default: int, url: str) -> int:
+    text = options.get(name)
+    if text is None:
+        return default
+    low, high = _OPTIONS[name]
+    return whole_number(text, name, low=low, high=high, url=url)

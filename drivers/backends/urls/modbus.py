@@ -1,0 +1,113 @@
+"""Modbus amplifier URLs: modbus+tcp://HOST:PORT/UNIT and modbus+rtu:///dev/ttyS1?baud=115200#UNIT."""
+
+import re
+from dataclasses import dataclass, replace
+from urllib.parse import SplitResult, unquote, urlsplit
+
+from drivers.backends.urls.options import options_of, whole_number
+from drivers.errors import CommandError
+from drivers.protocol.definition import PROTOCOL
+
+_MAP = PROTOCOL.modbus
+_TCP_FORM = "modbus+tcp://HOST:PORT/UNIT (behind a gateway: ?baud=19200, that of its line)"
+_RTU_FORM = "modbus+rtu:///dev/ttyS1?baud=115200#UNIT"
+_BAUD_MAX = 12_000_000  # the fastest USB adapters
+_PARITIES = {"even": "E", "odd": "O", "none": "N"}
+
+
+@dataclass(frozen=True)
+class ModbusUrl:
+    """Where a Modbus amplifier is: a host and port, or a serial device; and its unit there.
+
+    is_rtu: whether its frames are those of RTU, which a serial server passes on as well. baud,
+    parity (as pyserial names it) and stop bits are of a serial device, or of the line behind a
+    gateway or server; baud is 0 where nothing is known of such a line.
+    """
+
+    is_rtu: bool
+    host: str = ""
+    port: int = 0
+    device: str = ""
+    baud: int = 0
+    parity: str = "E"
+    stop: int = 1
+    unit: int = 0
+
+    @property
+    def line(self) -> "ModbusUrl":
+        """The same without the unit: what several amplifiers share."""
+        return replace(self, unit=0)
+
+    @property
+    def place(self) -> str:
+        """How to name the line to a person."""
+        return self.device or f"{self.host}:{self.port}"
+
+    @property
+    def bits_per_byte(self) -> int:
+        """On a serial line: start, eight data, parity, stop."""
+        return 9 + (self.parity != "N") + self.stop
+
+    @classmethod
+    def parse(cls, url: str) -> "ModbusUrl":
+        """Take a URL apart; CommandError says which part is wrong and what it should be."""
+        try:
+            parts = urlsplit(url)
+            _ = parts.port
+        except ValueError as problem:
+            raise CommandError(f"{url!r} is no Modbus URL: {problem}; use {_TCP_FORM}") from None
+        if parts.scheme == "modbus+tcp":
+            return _tcp(parts, url)
+        if parts.scheme == "modbus+rtu":
+            return _rtu(parts, url)
+        raise CommandError(f"{url!r} is no Modbus URL; use {_TCP_FORM} or {_RTU_FORM}")
+
+
+def _tcp(parts: SplitResult, url: str) -> ModbusUrl:
+    options = options_of(parts.query, known=("baud",), url=url, kind="a Modbus TCP")
+    if not parts.hostname or parts.fragment:
+        raise CommandError(f"{url!r}: a Modbus TCP URL has a host, a port and a unit: {_TCP_FORM}")
+    return ModbusUrl(
+        False,
+        host=parts.hostname,
+        port=parts.port or _MAP["tcp_port"],
+        baud=_baud(options, 0, url),
+        unit=_unit(unquote(parts.path).strip("/"), url),
+    )
+
+
+def _rtu(parts: SplitResult, url: str) -> ModbusUrl:
+    known = ("baud", "parity", "stop")
+    options = options_of(parts.query, known=known, url=url, kind="a Modbus RTU")
+    device = unquote(parts.path)
+    if re.fullmatch(r"/COM\d+", device, re.IGNORECASE):
+        device = device[1:]
+    if parts.netloc:
+        if not parts.hostname or parts.port is None or device.strip("/"):
+            raise CommandError(f"{url!r} names no host and port; use modbus+rtu://HOST:PORT#UNIT")
+        device = ""
+    elif not device.strip("/"):
+        raise CommandError(f"{url!r} names no port; use {_RTU_FORM}")
+    parity = options.get("parity", "even")
+    if parity not in _PARITIES:
+        raise CommandError(f"{url!r}: parity is {parity!r}; it must be {', '.join(_PARITIES)}")
+    return ModbusUrl(
+        True,
+        host=parts.hostname or "",
+        port=parts.port or 0,
+        device=device,
+        baud=_baud(options, _MAP["baud"] if device else 0, url),
+        parity=_PARITIES[parity],
+        stop=whole_number(options.get("stop", "1"), "stop", high=2, url=url),
+        unit=_unit(parts.fragment, url),
+    )
+
+
+def _baud(options: dict[str, str], default: int, url: str) -> int:
+    text = options.get("baud")
+    return default if text is None else whole_number(text, "baud", high=_BAUD_MAX, url=url)
+
+
+def _unit(text: str, url: str) -> int:
+    unit: int = _MAP["unit"]
+    return whole_number(text, "unit", high=_MAP["unit_max"], url=url) if text else unit

@@ -1,0 +1,72 @@
+"""Serial amplifier URLs.
+
+serial:///dev/ttyUSB0?baud=921600&address=1     a port of this machine
+socket://HOST:PORT (or serial://HOST:PORT)      a serial server that passes bytes on
+rfc2217://HOST:PORT?baud=115200                 one whose speed is set from here
+hwgrep://0403:6001                              the port whose description fits the pattern
+"""
+
+import re
+from dataclasses import dataclass
+from urllib.parse import unquote, urlsplit
+
+from drivers.backends.urls.options import options_of, whole_number
+from drivers.errors import CommandError
+from drivers.protocol.definition import PROTOCOL
+
+_FORM = "serial:///dev/ttyUSB0?baud=921600 (or serial://HOST:PORT for a serial server)"
+_BAUD_MAX = 12_000_000  # the fastest USB adapters
+
+
+@dataclass(frozen=True)
+class SerialUrl:
+    """Where a serial amplifier is: port as pyserial names it, speed [baud], address on the line."""
+
+    port: str
+    baud: int
+    address: int
+
+    @property
+    def is_local(self) -> bool:
+        """Whether the speed is that of a line to the amplifier, and nothing else is in between."""
+        return not self.port.startswith(("socket://", "rfc2217://"))
+
+    @classmethod
+    def parse(cls, url: str) -> "SerialUrl":
+        """Take a URL apart; CommandError says which part is wrong and what it should be."""
+        try:
+            parts = urlsplit(url)
+            number = None if parts.scheme == "hwgrep" else parts.port
+        except ValueError as problem:
+            raise CommandError(f"{url!r} is no serial URL: {problem}; use {_FORM}") from None
+        if parts.fragment:
+            raise CommandError(
+                f"{url!r}: a serial URL has no #; the address on the line is ?address="
+                f"{parts.fragment}"
+            )
+        options = options_of(parts.query, known=("baud", "address"), url=url, kind="a serial")
+        path = unquote(parts.path)
+        if parts.scheme == "hwgrep":
+            pattern = unquote(parts.netloc) + path
+            if not pattern:
+                raise CommandError(f"{url!r} names no pattern; use hwgrep://VENDOR:PRODUCT")
+            port = f"hwgrep://{pattern}"
+        elif parts.netloc:
+            if parts.hostname is None or number is None or path.strip("/"):
+                raise CommandError(f"{url!r} names no host and port; use {_FORM}")
+            kind = "rfc2217" if parts.scheme == "rfc2217" else "socket"
+            port = f"{kind}://{parts.netloc}"
+        elif re.fullmatch(r"/COM\d+", path, re.IGNORECASE):
+            port = path[1:]
+        elif path.strip("/"):
+            port = path
+        else:
+            raise CommandError(f"{url!r} names no port; use {_FORM}")
+        line = PROTOCOL.serial
+        return cls(
+            port=port,
+            baud=whole_number(options.get("baud", str(line.baud)), "baud", high=_BAUD_MAX, url=url),
+            address=whole_number(
+                options.get("address", str(line.address)), "address", high=line.address_max, url=url
+            ),
+        )

@@ -1,0 +1,184 @@
+"""Replies and events from the frames in which an amplifier tells them on CAN; no I/O."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from drivers.codec.can_bus.frame import BLOCK, CANOPEN, LAYOUTS, CanFrame, cob_id
+from drivers.errors import FrameError
+from drivers.protocol.definition import PROTOCOL
+from drivers.protocol.messages import Event, Fault, Nak, NakCode, Reply, State, Status
+
+UNASKED = 0  # the sequence number of what an amplifier says by itself
+_Q = PROTOCOL.quantities
+_ACTIONS: Mapping[str, int] = CANOPEN["actions"]
+_TORN: int = CANOPEN["torn"]
+_NO_CHANNEL: int = CANOPEN["no_channel"]
+_STATES = {state.value: state for state in State}
+_FAULTS = {fault.value: fault for fault in Fault}
+_NAKS = {code.value: code for code in NakCode}
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """What an amplifier says to an order, or, with sequence 0, by itself.
+
+    refusal: None where it was carried out; exact: a set plays to the last step as it was asked for.
+    status is there in the answers to all orders but those about sets, unless they were refused.
+    """
+
+    sequence: int
+    action: int
+    state: State
+    fault: Fault
+    token: int
+    exact: bool
+    refusal: Nak | None
+    channel: int | None
+    status: Status | None
+
+    @property
+    def event(self) -> Event:
+        """What it tells where nobody asked."""
+        return Event(self.state, self.fault, self.channel)
+
+
+@dataclass
+class AnswerReader:
+    """Puts the frames of one amplifier's answers together.
+
+    An answer in several frames is whole when the last, the answer itself, has come with the
+    sequence number of the others; what is not is dropped.
+    """
+
+    node: int
+    _condition: dict[str, int] = field(default_factory=dict)
+    _levels: dict[int, dict[str, int]] = field(default_factory=dict)
+
+    @property
+    def ids(self) -> tuple[int, ...]:
+        """The identifiers of the frames that belong here."""
+        each = CANOPEN["channels_per_node"]
+        groups = range(_Q.channel_count.maximum // each)
+        return (
+            cob_id("answer", self.node),
+            cob_id("condition", self.node),
+            *(cob_id("levels", self.node + group) for group in groups),
+        )
+
+    def feed(self, frame: CanFrame) -> Answer | None:
+        """Take a frame with one of `ids`; an Answer once it is whole, else None.
+
+        Raises FrameError for a frame that makes no sense.
+        """
+        if frame.id == cob_id("answer", self.node):
+            return self._answer(frame.data)
+        if frame.id == cob_id("condition", self.node):
+            self._condition = _unpack("condition", frame.data)
+        else:
+            group = frame.id - cob_id("levels", self.node)
+            self._levels[group] = _unpack("levels", frame.data)
+        return None
+
+    def _answer(self, data: bytes) -> Answer | None:
+        if len(data) > BLOCK:  # CAN FD: condition and levels follow in the same frame
+            self._condition = _unpack("condition", data[BLOCK : 2 * BLOCK])
+            count = min(self._condition["channel_count"], _Q.channel_count.maximum)
+            for group in range(-(-count // CANOPEN["channels_per_node"])):
+                begin = (2 + group) * BLOCK
+                self._levels[group] = _unpack("levels", data[begin : begin + BLOCK])
+        values = _unpack("answer", data[:BLOCK])
+        sequence, action, result = values["sequence"], values["action"], values["result"]
+        if values["state"] not in _STATES or values["fault"] not in _FAULTS:
+            raise FrameError(f"an answer names state {values['state']}, fault {values['fault']}")
+        if result not in (0, _TORN) and result not in _NAKS:
+            raise FrameError(f"an answer has the result {result}")
+        channel = values["channel"]
+        if channel != _NO_CHANNEL and not _Q.channel.holds(channel):
+            raise FrameError(f"an answer names channel {channel}")
+        about_set = action in (_ACTIONS["apply"], _ACTIONS["stage"], _ACTIONS["commit"])
+        status = None
+        if sequence != UNASKED and not result and not about_set:
+            status = self._status(values)
+            if status is None:
+                return None
+        blamed = None if channel == _NO_CHANNEL else channel
+        return Answer(
+            sequence=sequence,
+            action=action,
+            state=_STATES[values["state"]],
+            fault=_FAULTS[values["fault"]],
+            token=values["active_token"],
+            exact=bool(values["exact"]),
+            refusal=_refusal(result, _STATES[values["state"]], blamed),
+            channel=blamed,
+            status=status,
+        )
+
+    def _status(self, answer: dict[str, int]) -> Status | None:
+        """The status that came with an answer; None where a frame of it is missing."""
+        condition = self._condition
+        each = CANOPEN["channels_per_node"]
+        if condition.get("sequence") != answer["sequence"]:
+            return None
+        count = condition["channel_count"]
+        groups = [self._levels.get(group, {}) for group in range(-(-count // each))]
+        if any(group.get("sequence") != answer["sequence"] for group in groups):
+            return None
+        levels = [group[f"level_{place}"] for group in groups for place in range(each)][:count]
+        if not (
+            _Q.channel_count.holds(count)
+            and all(_Q.level.holds(level) for level in levels)
+            and _Q.temperature.holds(condition["temperature"])
+            and _Q.watchdog_left.holds(answer["watchdog_left"])
+        ):
+            raise FrameError("a status has numbers out of range")
+        return Status(
+            state=_STATES[answer["state"]],
+            fault=_FAULTS[answer["fault"]],
+            token=answer["active_token"],
+            high_voltage=bool(condition["high_voltage"]),
+            temperature=_Q.temperature.from_wire(condition["temperature"]),
+            watchdog_left=_Q.watchdog_left.from_wire(answer["watchdog_left"]),
+            levels=tuple(_Q.level.from_wire(level) for level in levels),
+            voltage=_Q.voltage.from_wire(condition["voltage"]),
+        )
+
+
+def decode_emergency(data: bytes) -> Event:
+    """The event in an EMCY message; raises FrameError."""
+    values = _unpack("emergency", data)
+    channel = values["channel"]
+    if (
+        values["state"] not in _STATES
+        or values["fault"] not in _FAULTS
+        or not (channel == _NO_CHANNEL or _Q.channel.holds(channel))
+    ):
+        raise FrameError(f"an emergency that makes no sense: {data.hex(' ')}")
+    return Event(
+        _STATES[values["state"]],
+        _FAULTS[values["fault"]],
+        None if channel == _NO_CHANNEL else channel,
+    )
+
+
+def plain_reply(answer: Answer) -> Reply | None:
+    """The reply that an answer holds by itself; None where it is about a set that was taken."""
+    return answer.refusal or answer.status
+
+
+def _refusal(result: int, state: State, channel: int | None) -> Nak | None:
+    if result == 0:
+        return None
+    if result != _TORN:
+        return Nak(_NAKS[result], channel)
+    # A frame of the set was lost: the amplifier has done nothing, and can be asked again, unless it
+    # says at once that it would refuse the whole set as well.
+    is_armed = state is State.OPERATION_ENABLED
+    return Nak(NakCode.BUSY if is_armed else NakCode.WRONG_STATE, channel)
+
+
+def _unpack(layout: str, data: bytes) -> dict[str, int]:
+    values = LAYOUTS[layout].unpack(data)
+    if values is None:
+        raise FrameError(f"a frame that is no {layout}: {data.hex(' ')}")
+    return values

@@ -1,0 +1,89 @@
+"""CAN frames as values, and the fields that their eight bytes hold.
+
+Where the fields lie stands in protocol.yaml; every number is little-endian. Packing and unpacking
+is all that happens here: what the numbers mean is in `orders`, `answers` and `objects`.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from drivers.protocol.definition import PROTOCOL
+
+BLOCK = 8  # bytes; a classic frame holds one, a CAN FD frame up to eight
+
+CANOPEN: Mapping[str, Any] = PROTOCOL.canopen
+
+
+@dataclass(frozen=True, slots=True)
+class CanFrame:
+    """A data frame with an 11-bit identifier; fd: sent as CAN FD."""
+
+    id: int
+    data: bytes
+    fd: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Field:
+    """Some bits of a block: first [bit, from the lowest of byte 0], bits; signed ones exist."""
+
+    name: str
+    first: int
+    bits: int
+    signed: bool = False
+
+
+class BlockLayout:
+    """How the fields of one kind of block lie in its eight bytes."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        signed = {"phase", "temperature"}
+        self.fields: Mapping[str, Field] = {
+            field: Field(field, first, bits, signed=field in signed)
+            for field, (first, bits) in CANOPEN["frames"][name].items()
+        }
+        used = 0
+        for field in self.fields.values():
+            used |= ((1 << field.bits) - 1) << field.first
+        self._unused = ~used
+
+    def pack(self, **values: int) -> bytes:
+        """A block; fields that are not named are 0. Every value must fit into its bits."""
+        block = 0
+        for name, value in values.items():
+            field = self.fields[name]
+            low = -(1 << field.bits - 1) if field.signed else 0
+            if not low <= value < low + (1 << field.bits):
+                raise ValueError(f"{name} {value} does not fit into {field.bits} bits")
+            block |= (value & (1 << field.bits) - 1) << field.first
+        return block.to_bytes(BLOCK, "little")
+
+    def unpack(self, block: bytes) -> dict[str, int] | None:
+        """The fields of a block, or None where it has another length or unused bits are set."""
+        whole = int.from_bytes(block, "little")
+        if len(block) != BLOCK or whole & self._unused:
+            return None
+        values = {}
+        for name, field in self.fields.items():
+            value = whole >> field.first & (1 << field.bits) - 1
+            if field.signed and value >> field.bits - 1:
+                value -= 1 << field.bits
+            values[name] = value
+        return values
+
+
+LAYOUTS: Mapping[str, BlockLayout] = {name: BlockLayout(name) for name in CANOPEN["frames"]}
+"""The blocks of protocol.yaml by their names."""
+
+
+def cob_id(kind: str, node: int = 0) -> int:
+    """The identifier of a kind of frame (a key of `cob_ids`) of a node."""
+    return int(CANOPEN["cob_ids"][kind]) + node
+
+
+def command_id(node: int, channel: int) -> int:
+    """The identifier of the RPDO that carries the command of a channel."""
+    each = int(CANOPEN["channels_per_node"])
+    return cob_id("command", node + channel // each) + 0x100 * (channel % each)

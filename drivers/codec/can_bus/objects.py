@@ -1,0 +1,203 @@
+"""The object dictionary of an amplifier, and what its objects mean as messages; no I/O."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from drivers.codec.can_bus.frame import BLOCK, CANOPEN, LAYOUTS
+from drivers.codec.payload import Cursor, pack
+from drivers.command import DriveCommand
+from drivers.errors import FrameError
+from drivers.guard import SafeEnvelope
+from drivers.protocol.definition import PROTOCOL, Quantity
+from drivers.protocol.messages import (
+    Achieved,
+    Capabilities,
+    Fault,
+    FaultList,
+    FaultRecord,
+    Identity,
+    NakCode,
+)
+
+_Q = PROTOCOL.quantities
+_QUANTITIES: Mapping[str, Quantity] = vars(_Q)
+_OBJECTS: Mapping[str, Mapping[str, Any]] = CANOPEN["objects"]
+_NAKS = {code: NakCode[name] for name, code in CANOPEN["aborts"].items()}
+_WIDTHS = {"u8": 1, "u16": 2, "u32": 4, "u64": 8, "i16": 2}
+TEXTS = ("vendor", "product", "serial_number", "firmware")
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """One subindex of an object: type u8..u64, i16, text or domain; access ro, wo, rw or const.
+
+    alone: the object has no other; quantity: whose integer it holds, where it is one.
+    """
+
+    index: int
+    subindex: int
+    name: str
+    type: str
+    access: str
+    alone: bool
+    mappable: bool
+    quantity: Quantity | None
+
+
+def index_of(name: str) -> int:
+    """The index of an object of protocol.yaml."""
+    return int(_OBJECTS[name]["index"])
+
+
+def entries(channels: int) -> Iterator[Entry]:
+    """Every subindex, those with the counts aside, of an amplifier with so many channels."""
+    for name, declared in _OBJECTS.items():
+        index = index_of(name)
+        access, mappable = str(declared["access"]), bool(declared.get("pdo"))
+        types = declared.get("types")
+        per = declared.get("per")
+        if types is not None:
+            for subindex, (field, kind) in enumerate(types.items(), start=1):
+                yield _entry(index, subindex, field, kind, access, mappable=mappable)
+        elif per is None:
+            yield _entry(
+                index, 0, name, str(declared["type"]), access, mappable=mappable, alone=True
+            )
+        else:
+            for number in range(_count(per, channels)):
+                kind = str(declared["type"])
+                title = f"{name} {number + 1 if isinstance(per, int) else number}"
+                yield _entry(index, number + 1, title, kind, access, mappable=mappable)
+
+
+def _count(per: str | int, channels: int) -> int:
+    if per == "channel":
+        return channels
+    if per == "four_channels":
+        return int(-(-channels // CANOPEN["channels_per_node"]))
+    return int(per)
+
+
+def _entry(
+    index: int,
+    subindex: int,
+    name: str,
+    kind: str,
+    access: str,
+    *,
+    mappable: bool,
+    alone: bool = False,
+) -> Entry:
+    quantity = _QUANTITIES.get(kind)
+    wire = kind if quantity is None else quantity.wire
+    return Entry(index, subindex, name, wire, access, alone, mappable, quantity)
+
+
+def capability_entries() -> tuple[Entry, ...]:
+    """Those that say what an amplifier can play, in their order; each is a field of its name."""
+    return tuple(entry for entry in entries(0) if entry.index == index_of("capabilities"))
+
+
+def read_integer(entry: Entry, data: bytes) -> int:
+    """The integer of an entry; FrameError where it has another length or is out of range."""
+    if len(data) != _WIDTHS[entry.type]:
+        raise FrameError(f"object {entry.index:04X}sub{entry.subindex} has {len(data)} bytes")
+    value = int.from_bytes(data, "little", signed=entry.type.startswith("i"))
+    if entry.quantity is not None and not entry.quantity.holds(value):
+        raise FrameError(f"{entry.name} is {value}, which is out of range")
+    return value
+
+
+def identity_of(texts: Mapping[str, bytes], version: int) -> Identity:
+    """Who it is, by the texts of its object dictionary; FrameError for what is no text."""
+    read = {}
+    for name in TEXTS:
+        try:
+            read[name] = texts[name].rstrip(b"\0").decode("utf-8")
+        except UnicodeDecodeError:
+            raise FrameError(f"{name} is no UTF-8") from None
+        if not read[name].isprintable():
+            raise FrameError(f"{name} has control characters")
+    return Identity(**read, protocol_version=version)
+
+
+def capabilities_of(values: Mapping[str, int]) -> Capabilities:
+    """What it can play, from the integers of `capability_entries` by their names."""
+    fields: dict[str, float] = {}
+    for entry in capability_entries():
+        value, quantity = values[entry.name], entry.quantity
+        if quantity is not None and quantity.per_unit > 1:
+            fields[entry.name] = quantity.from_wire(value)
+        elif entry.name != "protocol_version":  # which is told with the identity
+            fields[entry.name] = value
+    return Capabilities(**fields, events=True)  # type: ignore[arg-type]  # by their own names
+
+
+def faults_of(data: bytes) -> FaultList:
+    """The faults in their domain: fault, channel and age each, newest first; raises FrameError."""
+    cursor = Cursor(data)
+    record = 2 + _WIDTHS[_Q.age.wire]
+    return FaultList(
+        tuple(
+            FaultRecord(
+                fault=cursor.one_of(Fault),
+                channel=cursor.optional_channel(),
+                age=cursor.number(_Q.age),
+            )
+            for _ in range(-(-len(data) // record))
+        )
+    )
+
+
+def achieved_of(data: bytes) -> Achieved:
+    """What a set plays, in its domain; raises FrameError."""
+    cursor = Cursor(data)
+    token = cursor.integer(_Q.token)
+    count = cursor.integer(_Q.channel_count)
+    commands = []
+    each = BLOCK + 2
+    for begin in range(3, 3 + each * count, each):
+        values = LAYOUTS["command"].unpack(data[begin : begin + BLOCK])
+        slots = data[begin + BLOCK : begin + each]
+        if values is None or len(slots) < 2:
+            raise FrameError(f"what a set plays makes no sense: {data.hex(' ')}")
+        checked = (
+            (_Q.level, values["level"]),
+            (_Q.phase, values["phase"]),
+            (_Q.envelope_slot, slots[0]),
+            (_Q.envelope_slot, slots[1]),
+        )
+        if not all(quantity.holds(value) for quantity, value in checked):
+            raise FrameError(f"what a set plays is out of range: {data.hex(' ')}")
+        commands.append(
+            DriveCommand(
+                channel=values["channel"],
+                frequency=_Q.frequency.from_wire(values["frequency"]),
+                level=_Q.level.from_wire(values["level"]),
+                phase=_Q.phase.from_wire(values["phase"]),
+                keep_phase=bool(values["keep_phase"]),
+                onset=slots[0],
+                ending=slots[1],
+                skip_ending=bool(values["skip_ending"]),
+            )
+        )
+    return Achieved(token, tuple(commands))
+
+
+def encode_envelope(envelope: SafeEnvelope) -> bytes:
+    """The domain of an envelope; TypeError for one that has not passed a guard."""
+    if type(envelope) is not SafeEnvelope:
+        raise TypeError(
+            f"only a SafeEnvelope goes on the wire, not a {type(envelope).__name__}: "
+            "let Guard.check_envelope make one"
+        )
+    head = pack((_Q.envelope_step, envelope.step), (_Q.envelope_knots, len(envelope.knots)))
+    return head + b"".join(
+        pack((_Q.level, knot.level), (_Q.phase, knot.phase)) for knot in envelope.knots
+    )
+
+
+def nak_of(abort: int) -> NakCode | None:
+    """Why an amplifier refused, by its SDO abort code; None for a code of CANopen's own."""
+    return _NAKS.get(abort)

@@ -1,0 +1,1 @@
+"""The Modbus codec, the host's side: messages, their registers, telegrams."""

@@ -1,0 +1,260 @@
+"""Messages to registers and back, for the host's side of Modbus.
+
+An exchange is one block written and one read back, by FC23 in one transaction or by FC16 and FC4 in
+two; its tag, written with the one and read with the other, says what answers what, since an RTU
+frame carries no number. Identity and capabilities are only read, so that nothing is written to a
+device before it is known. Nothing here knows of frames.
+"""
+
+import binascii
+import struct
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from drivers.codec.modbus import blocks
+from drivers.command import CommandSet, DriveCommand, Envelope
+from drivers.errors import CommandError
+from drivers.guard import SafeCommand, SafeEnvelope
+from drivers.protocol.definition import PROTOCOL, Quantity
+from drivers.protocol.messages import (
+    Apply,
+    Arm,
+    Broadcast,
+    Clear,
+    Commit,
+    Disarm,
+    Fault,
+    GetCaps,
+    GetFaults,
+    GetStatus,
+    Hello,
+    LoadEnvelope,
+    Nak,
+    NakCode,
+    Ping,
+    Reply,
+    Request,
+    Stage,
+    State,
+    Stop,
+)
+
+_MAP = PROTOCOL.modbus
+_Q = PROTOCOL.quantities
+_HEAD = len(_MAP["head"])
+_CHANNEL_SIZE: int = _MAP["channel_registers"]
+_FAULT_SIZE: int = _MAP["fault_registers"]
+_TEXT_SIZE: int = _MAP["text_registers"]
+_CONTROLWORDS: Mapping[str, int] = _MAP["controlwords"]
+_CHANNELS_MAX = _Q.channel_count.maximum
+_RECORDS_FIRST = 4  # mostly there are fewer; where there are more they are asked for
+
+
+@dataclass(frozen=True, slots=True)
+class Write:
+    """Registers for consecutive addresses from here on."""
+
+    address: int
+    registers: tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Read:
+    """So many registers from this address on."""
+
+    address: int
+    count: int
+
+
+@dataclass(frozen=True, slots=True)
+class Exchange:
+    """What a request is on this wire: a block that is read, and one that is written before."""
+
+    read: Read
+    write: Write | None = None
+
+
+def to_exchange(
+    request: Request, *, tag: int, channels: int = _CHANNELS_MAX, records: int = _RECORDS_FIRST
+) -> Exchange:
+    """The exchange of a request; TypeError if a set in it has not passed a guard.
+
+    tag: 1..65535; channels: how many of them are read; records: how many faults.
+    """
+    match request:
+        case Hello():
+            texts = len(_MAP["input"]["identity"]["texts"])
+            return Exchange(_read("identity", beyond=texts * _TEXT_SIZE))
+        case GetCaps():
+            return Exchange(_read("capabilities"))
+        case GetStatus():
+            return Exchange(_read("status", beyond=channels), Write(_MAP["look"], (tag,)))
+        case GetFaults():
+            beyond = min(records, _MAP["fault_count"]) * _FAULT_SIZE
+            return Exchange(_read("faults", beyond=beyond), Write(_MAP["look"], (tag,)))
+        case Ping():
+            return Exchange(_read("status", beyond=channels), Write(_MAP["heartbeat"], (tag,)))
+        case Arm() | Disarm() | Stop() | Clear():
+            return Exchange(
+                _read("status", beyond=channels), _block("control", tag, _order(request))
+            )
+        case Stage(command_set=wanted) | Apply(command_set=wanted):
+            commit = wanted.token if isinstance(request, Apply) else 0
+            write = _block("set", tag, [commit, *_set_registers(wanted)])
+            return Exchange(_read("achieved", beyond=channels * _CHANNEL_SIZE), write)
+        case Commit(token=token):
+            write = _block("set", tag, [_Q.token.to_wire(token)])
+            return Exchange(_read("achieved", beyond=channels * _CHANNEL_SIZE), write)
+        case LoadEnvelope(envelope=envelope):
+            kept = _MAP["holding"]["envelope"]
+            return Exchange(
+                Read(kept["address"], _HEAD + len(kept["registers"])),
+                _block("envelope", tag, _envelope_registers(envelope)),
+            )
+
+
+def to_broadcast(request: Broadcast) -> Write:
+    """What is written to all units; a commit is one register."""
+    if isinstance(request, Commit):
+        address = _MAP["holding"]["set"]["address"] + _HEAD
+        return Write(address, (_Q.token.to_wire(request.token),))
+    return _block("control", 0, _order(request))
+
+
+def to_nak(registers: Sequence[int], *, tag: int) -> Nak | None:
+    """The refusal of the write that carried this tag; None where it is that of another."""
+    told = blocks.refusal(registers)
+    return told[0] if told is not None and told[1] == tag else None
+
+
+def refusal_read() -> Read:
+    """Where the amplifier says why it answered with an exception."""
+    return _read("refusal")
+
+
+def is_of(registers: Sequence[int], *, tag: int | None) -> bool:
+    """Whether a block that was read belongs to this tag; None: whether it is sound at all."""
+    if len(registers) < _HEAD or (tag is not None and registers[0] != tag):
+        return False
+    return registers[1] in (0, check_of(registers[_HEAD:]))
+
+
+def check_of(registers: Sequence[int]) -> int:
+    """CRC-16 (polynomial 1021, from FFFF) of registers, high byte first; FFFF where that is 0."""
+    return binascii.crc_hqx(struct.pack(f">{len(registers)}H", *registers), 0xFFFF) or 0xFFFF
+
+
+def to_reply(request: Request, registers: Sequence[int]) -> Reply:
+    """The reply in the block that the exchange of this request has read; raises FrameError."""
+    match request:
+        case Hello():
+            return blocks.identity(registers)
+        case GetCaps():
+            return blocks.capabilities(registers)
+        case GetFaults():
+            return blocks.faults(registers)
+        case Stage() | Apply() | Commit():
+            return blocks.achieved(registers)
+        case LoadEnvelope():
+            return blocks.loaded(registers)
+        case _:
+            return blocks.status(registers)
+
+
+def condition(request: Request, registers: Sequence[int]) -> tuple[State, Fault] | None:
+    """State and fault where the block that was read tells them; raises FrameError."""
+    if isinstance(request, Hello | GetCaps | GetFaults | LoadEnvelope):
+        return None
+    return blocks.condition(registers)
+
+
+def faults_beyond(request: Request, registers: Sequence[int]) -> int:
+    """How many fault records there are if they are more than were read, else 0."""
+    if not isinstance(request, GetFaults):
+        return 0
+    count = blocks.fault_count(registers)
+    return count if count > len(blocks.faults(registers).faults) else 0
+
+
+def nak_of_exception(code: int) -> Nak | None:
+    """The refusal that an exception stands for where only one does."""
+    codes = [name for name, number in _MAP["exceptions"].items() if number == code]
+    return Nak(NakCode[codes[0]]) if len(codes) == 1 else None
+
+
+def _read(name: str, *, beyond: int = 0) -> Read:
+    block = _MAP["input"][name]
+    return Read(block["address"], _HEAD + len(block["registers"]) + beyond)
+
+
+def _block(name: str, tag: int, registers: Sequence[int]) -> Write:
+    address: int = _MAP["holding"][name]["address"]
+    return Write(address, (tag, check_of(registers), *registers))
+
+
+def _order(request: Arm | Disarm | Stop | Clear) -> list[int]:
+    """Controlword, watchdog and ramp; those that do not belong to it are at their least."""
+    watchdog = request.watchdog if isinstance(request, Arm) else _Q.watchdog.low
+    ramp = request.ramp if isinstance(request, Disarm | Stop) else 0.0
+    word = _CONTROLWORDS[type(request).__name__.upper()]
+    return [word, _Q.watchdog.to_wire(watchdog), _Q.ramp.to_wire(ramp)]
+
+
+def _unsigned(*pairs: tuple[Quantity, float]) -> list[int]:
+    return [quantity.to_wire(value) & 0xFFFF for quantity, value in pairs]
+
+
+def _set_registers(command_set: CommandSet) -> list[int]:
+    if type(command_set) is not SafeCommand:
+        raise TypeError(
+            f"only a SafeCommand goes on the wire, not a {type(command_set).__name__}: "
+            "let Guard.check make one"
+        )
+    by_channel = {command.channel: command for command in command_set.commands}
+    if len(by_channel) < len(command_set.commands) or min(by_channel, default=0) < 0:
+        raise CommandError("a channel of the set does not exist, or is named twice")
+    registers = _unsigned(
+        (_Q.token, command_set.token),
+        (_Q.ramp, command_set.ramp),
+        (_Q.valid_for, command_set.valid_for),
+    )
+    for channel in range(max(by_channel, default=-1) + 1):
+        command = by_channel.get(channel)
+        registers += [0] * _CHANNEL_SIZE if command is None else _channel_registers(command)
+    return registers
+
+
+def _channel_registers(command: DriveCommand) -> list[int]:
+    _Q.channel.to_wire(command.channel)
+    shape = _unsigned((_Q.envelope_slot, command.onset), (_Q.envelope_slot, command.ending))
+    values = {
+        "keep_phase": int(command.keep_phase),
+        "skip_ending": int(command.skip_ending),
+        "onset": shape[0],
+        "ending": shape[1],
+    }
+    flags = sum(value << _MAP["flags"][name]["bit"] for name, value in values.items())
+    return [
+        *_unsigned(
+            (_Q.frequency, command.frequency),
+            (_Q.level, command.level),
+            (_Q.phase, command.phase),
+        ),
+        flags,
+    ]
+
+
+def _envelope_registers(envelope: Envelope) -> list[int]:
+    if type(envelope) is not SafeEnvelope:
+        raise TypeError(
+            f"only a SafeEnvelope goes on the wire, not a {type(envelope).__name__}: "
+            "let Guard.check_envelope make one"
+        )
+    registers = _unsigned(
+        (_Q.envelope_slot, envelope.slot),
+        (_Q.envelope_step, envelope.step),
+        (_Q.envelope_knots, len(envelope.knots)),
+    )
+    for knot in envelope.knots:
+        registers += _unsigned((_Q.level, knot.level), (_Q.phase, knot.phase))
+    return registers

@@ -1,0 +1,194 @@
+"""Modbus frames around register requests, over TCP and RTU; the one file that meets pymodbus.
+
+Its frames and messages are used, its client is not: over RTU that gives a late answer to the next
+request, a damaged answer makes it close a TCP connection, and what has half arrived is thrown away
+when the next request goes out. So what comes in is taken apart here; see `AnswerReader`.
+"""
+
+from dataclasses import dataclass
+
+from pymodbus.exceptions import ModbusException
+from pymodbus.framer import FramerRTU, FramerSocket
+from pymodbus.pdu import DecodePDU, ExceptionResponse, ModbusPDU
+from pymodbus.pdu.register_message import (
+    ReadInputRegistersRequest,
+    ReadWriteMultipleRegistersRequest,
+    WriteMultipleRegistersRequest,
+    WriteSingleRegisterRequest,
+)
+
+from drivers.codec.modbus.exchanges import Read, Write
+from drivers.statistics import WireCounters
+
+_DECODER = DecodePDU(False)
+_RTU = FramerRTU(_DECODER)
+_TCP = FramerSocket(_DECODER)
+_MBAP = 7  # transaction, protocol, length, unit
+_LENGTH_MAX = 254  # unit and PDU
+_RTU_MAX = 256
+_EXCEPTION = 0x80
+_READS = (3, 4, 23)
+_WRITES = (5, 6, 15, 16)
+
+
+@dataclass(frozen=True)
+class Telegram:
+    """A request for one unit: its frame, and by what its answer is known.
+
+    transaction: of a TCP frame, 0 for RTU; answer_size: of the PDU, in bytes.
+    """
+
+    unit: int
+    transaction: int
+    function: int
+    frame: bytes
+    answer_size: int
+    read: Read | None
+    write: Write | None
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What came back: the registers that were read, or the code of an exception."""
+
+    registers: tuple[int, ...] = ()
+    exception: int = 0
+
+
+def make_telegram(
+    read: Read | None, write: Write | None, *, unit: int, transaction: int, is_rtu: bool
+) -> Telegram:
+    """The frame that writes, reads, or does both in one transaction; one of the two is given."""
+    pdu = _pdu(read, write)
+    pdu.dev_id = unit
+    pdu.transaction_id = transaction
+    frame = (_RTU if is_rtu else _TCP).buildFrame(pdu)
+    size = 5 if read is None else 2 + 2 * read.count
+    return Telegram(unit, transaction, pdu.function_code, frame, size, read, write)
+
+
+def _pdu(read: Read | None, write: Write | None) -> ModbusPDU:
+    if write is None:
+        assert read is not None  # noqa: S101  one of the two
+        return ReadInputRegistersRequest(address=read.address, count=read.count)
+    registers = list(write.registers)
+    if read is not None:
+        return ReadWriteMultipleRegistersRequest(
+            read_address=read.address,
+            read_count=read.count,
+            write_address=write.address,
+            write_registers=registers,
+        )
+    if len(registers) == 1:
+        return WriteSingleRegisterRequest(address=write.address, registers=registers)
+    return WriteMultipleRegistersRequest(address=write.address, registers=registers)
+
+
+class AnswerReader:
+    """Finds the answer to a telegram in whatever arrives, and counts what is something else.
+
+    An answer has the unit, the function and the length that were asked for, over TCP the
+    transaction number, over RTU a good CRC, and echoes address and count of what was written.
+    """
+
+    def __init__(self, *, is_rtu: bool, counters: WireCounters) -> None:
+        self._is_rtu = is_rtu
+        self._counters = counters
+        self._buffer = bytearray()
+
+    def clear(self) -> None:
+        """Forget what has half arrived."""
+        if self._buffer:
+            self._counters.bad += 1
+            self._buffer.clear()
+
+    def feed(self, data: bytes, to: Telegram | None) -> list[Answer]:
+        """The answers to a telegram in these bytes; to: None where nothing was asked."""
+        self._buffer += data
+        split = self._next_rtu if self._is_rtu else self._next_tcp
+        answers = []
+        while (frame := split(to)) is not None:
+            self._counters.frames_in += 1
+            transaction, unit, pdu = frame
+            answer = None
+            if to is not None and (transaction, unit) == (to.transaction, to.unit):
+                answer = _answer(pdu, to)
+            if answer is None:
+                self._counters.foreign += 1
+            else:
+                answers.append(answer)
+        return answers
+
+    def _next_tcp(self, to: Telegram | None) -> tuple[int, int, bytes] | None:
+        if len(self._buffer) < _MBAP:
+            return None
+        transaction, protocol, length = (
+            int.from_bytes(self._buffer[at : at + 2], "big") for at in (0, 2, 4)
+        )
+        if protocol != 0 or not 2 <= length <= _LENGTH_MAX:
+            self.clear()  # nothing says where the next frame begins
+            return None
+        end = _MBAP - 1 + length
+        if len(self._buffer) < end:
+            return None
+        unit, pdu = self._buffer[_MBAP - 1], bytes(self._buffer[_MBAP:end])
+        del self._buffer[:end]
+        return transaction, unit, pdu
+
+    def _next_rtu(self, to: Telegram | None) -> tuple[int, int, bytes] | None:
+        for start in range(len(self._buffer) - 4):
+            size = self._rtu_size(start, to)
+            if size and start + size <= len(self._buffer):
+                frame = bytes(self._buffer[start : start + size])
+                if FramerRTU.check_CRC(frame[:-2], int.from_bytes(frame[-2:], "big")):
+                    self._counters.bad += start > 0
+                    del self._buffer[: start + size]
+                    return 0, frame[0], frame[1:-2]
+        if len(self._buffer) > 2 * _RTU_MAX:
+            self.clear()
+        return None
+
+    def _rtu_size(self, start: int, to: Telegram | None) -> int:
+        """How long a frame would be that begins here; 0 where none can.
+
+        After bytes that are none of a frame only the answer itself is looked for: anything may look
+        like the frame of somebody.
+        """
+        unit, function, count = self._buffer[start : start + 3]
+        if start and (to is None or unit != to.unit or function & ~_EXCEPTION != to.function):
+            return 0
+        if function & _EXCEPTION:
+            return 5
+        if function in _READS:
+            size = 5 + count
+            return size if not start or (to is not None and size == to.answer_size + 3) else 0
+        return 8 if function in _WRITES else 0
+
+
+def _answer(pdu: bytes, to: Telegram) -> Answer | None:
+    """What a PDU answers to a telegram, if it does."""
+    if not _has_form(pdu, to):
+        return None
+    try:
+        message = _DECODER.decode(pdu)
+    except ModbusException:
+        return None
+    if message is None:
+        return None
+    if isinstance(message, ExceptionResponse):
+        return Answer(exception=message.exception_code)
+    if to.read is not None:
+        return Answer(tuple(message.registers))
+    assert to.write is not None  # noqa: S101  one of the two
+    wanted = to.write.registers
+    echo = tuple(message.registers) if len(wanted) == 1 else message.count
+    is_echo = echo == (wanted if len(wanted) == 1 else len(wanted))
+    return Answer() if is_echo and message.address == to.write.address else None
+
+
+def _has_form(pdu: bytes, to: Telegram) -> bool:
+    """Whether function and lengths are those of an answer, or of an exception."""
+    if pdu[0] == to.function | _EXCEPTION:
+        return len(pdu) == 2
+    is_long = to.read is None or pdu[1:2] == bytes([2 * to.read.count])
+    return pdu[0] == to.function and len(pdu) == to.answer_size and is_long

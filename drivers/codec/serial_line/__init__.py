@@ -1,0 +1,1 @@
+"""The serial wire's codec: messages, their payloads, frames."""

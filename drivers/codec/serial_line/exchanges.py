@@ -1,0 +1,235 @@
+"""Messages to frames and back, for both ends of a serial line.
+
+Each message has its layout as a pair of functions, pack and unpack (`sets` and `reports` have the
+longer ones). Decoding is total: any payload becomes a message with every value in range, or
+`Malformed`. Encoding a set or an envelope asks for what a guard made of it;
+decoding gives the plain one, which must pass a guard before it can be sent on.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from drivers.codec.payload import Cursor, Malformed, pack, pack_optional_channel
+from drivers.codec.serial_line.frame import REPLY, Frame
+from drivers.codec.serial_line.reports import (
+    pack_capabilities,
+    pack_faults,
+    pack_identity,
+    pack_status,
+    unpack_capabilities,
+    unpack_faults,
+    unpack_identity,
+    unpack_status,
+)
+from drivers.codec.serial_line.sets import (
+    pack_achieved,
+    pack_envelope,
+    pack_set,
+    unpack_achieved,
+    unpack_envelope,
+    unpack_set,
+)
+from drivers.protocol.definition import PROTOCOL
+from drivers.protocol.messages import (
+    Achieved,
+    Apply,
+    Arm,
+    Capabilities,
+    Clear,
+    Commit,
+    Disarm,
+    Event,
+    Fault,
+    FaultList,
+    GetCaps,
+    GetFaults,
+    GetStatus,
+    Hello,
+    Identity,
+    Loaded,
+    LoadEnvelope,
+    Nak,
+    NakCode,
+    Ping,
+    Reply,
+    Request,
+    Stage,
+    State,
+    Status,
+    Stop,
+)
+
+_NAK = PROTOCOL.types["nak"]
+_EVENT = PROTOCOL.types["event"]
+_Q = PROTOCOL.quantities
+
+
+@dataclass(frozen=True)
+class _Layout:
+    """How one message and its payload become each other."""
+
+    message: type[Any]
+    pack: Callable[[Any], bytes]
+    unpack: Callable[[Cursor], Any]
+
+
+def _empty(message: type[Any]) -> _Layout:
+    return _Layout(message, lambda _: b"", lambda _: message())
+
+
+_IDENTITY = _Layout(Identity, pack_identity, unpack_identity)
+_CAPABILITIES = _Layout(Capabilities, pack_capabilities, unpack_capabilities)
+_STATUS = _Layout(Status, pack_status, unpack_status)
+_ACHIEVED = _Layout(Achieved, pack_achieved, unpack_achieved)
+_FAULTS = _Layout(FaultList, pack_faults, unpack_faults)
+
+_ARM = _Layout(
+    Arm,
+    lambda arm: pack((_Q.watchdog, arm.watchdog)),
+    lambda cursor: Arm(watchdog=cursor.number(_Q.watchdog)),
+)
+_DISARM = _Layout(
+    Disarm,
+    lambda disarm: pack((_Q.ramp, disarm.ramp)),
+    lambda cursor: Disarm(ramp=cursor.nearest(_Q.ramp)),
+)
+_STAGE = _Layout(
+    Stage,
+    lambda stage: pack_set(stage.command_set),
+    lambda cursor: Stage(unpack_set(cursor)),
+)
+_COMMIT = _Layout(
+    Commit,
+    lambda commit: pack((_Q.token, commit.token)),
+    lambda cursor: Commit(token=cursor.integer(_Q.token)),
+)
+_APPLY = _Layout(
+    Apply,
+    lambda apply: pack_set(apply.command_set),
+    lambda cursor: Apply(unpack_set(cursor)),
+)
+_STOP = _Layout(
+    Stop,
+    lambda stop: pack((_Q.ramp, stop.ramp)),
+    lambda cursor: Stop(ramp=cursor.nearest(_Q.ramp)),
+)
+_LOAD_ENVELOPE = _Layout(
+    LoadEnvelope,
+    lambda load: pack_envelope(load.envelope),
+    lambda cursor: LoadEnvelope(unpack_envelope(cursor)),
+)
+_LOADED = _Layout(
+    Loaded,
+    lambda loaded: pack((_Q.envelope_slot, loaded.slot), (_Q.envelope_knots, loaded.knots)),
+    lambda cursor: Loaded(
+        slot=cursor.integer(_Q.envelope_slot), knots=cursor.integer(_Q.envelope_knots)
+    ),
+)
+_EVENT_LAYOUT = _Layout(
+    Event,
+    lambda event: bytes([event.state, event.fault]) + pack_optional_channel(event.channel),
+    lambda cursor: Event(
+        state=cursor.one_of(State), fault=cursor.one_of(Fault), channel=cursor.optional_channel()
+    ),
+)
+
+# Request and reply of every message type.
+_EXCHANGES: dict[int, tuple[_Layout, _Layout]] = {
+    PROTOCOL.types["hello"]: (_empty(Hello), _IDENTITY),
+    PROTOCOL.types["get_caps"]: (_empty(GetCaps), _CAPABILITIES),
+    PROTOCOL.types["arm"]: (_ARM, _STATUS),
+    PROTOCOL.types["disarm"]: (_DISARM, _STATUS),
+    PROTOCOL.types["stage"]: (_STAGE, _ACHIEVED),
+    PROTOCOL.types["commit"]: (_COMMIT, _ACHIEVED),
+    PROTOCOL.types["apply"]: (_APPLY, _ACHIEVED),
+    PROTOCOL.types["stop"]: (_STOP, _STATUS),
+    PROTOCOL.types["get_status"]: (_empty(GetStatus), _STATUS),
+    PROTOCOL.types["get_faults"]: (_empty(GetFaults), _FAULTS),
+    PROTOCOL.types["clear"]: (_empty(Clear), _STATUS),
+    PROTOCOL.types["ping"]: (_empty(Ping), _STATUS),
+    PROTOCOL.types["load_envelope"]: (_LOAD_ENVELOPE, _LOADED),
+}
+_TYPE_OF = {request.message: code for code, (request, _) in _EXCHANGES.items()}
+
+
+def encode_request(request: Request, *, address: int, sequence: int) -> Frame:
+    """The frame of a request; TypeError if a set in it has not passed a guard."""
+    code = _TYPE_OF[type(request)]
+    payload = _EXCHANGES[code][0].pack(request)
+    return Frame(kind=code, address=address, sequence=sequence, payload=payload)
+
+
+def decode_request(frame: Frame) -> Request:
+    """The request in a frame; raises Malformed."""
+    if frame.is_reply or frame.type not in _EXCHANGES:
+        raise Malformed(f"no request has type {frame.kind:#04x}", code=NakCode.UNKNOWN_TYPE)
+    request: Request = _decode(_EXCHANGES[frame.type][0], frame.payload)
+    return request
+
+
+def encode_reply(reply: Reply, to: Frame) -> Frame:
+    """The frame that answers the request frame `to`; TypeError if this reply does not answer it."""
+    if isinstance(reply, Nak):
+        payload = bytes([to.type, reply.code]) + pack_optional_channel(reply.channel)
+        kind = REPLY | _NAK
+    else:
+        layout = _EXCHANGES[to.type][1]
+        if not isinstance(reply, layout.message):
+            raise TypeError(f"{type(reply).__name__} does not answer message type {to.type}")
+        payload = layout.pack(reply)
+        kind = REPLY | to.type
+    return Frame(kind=kind, address=to.address, sequence=to.sequence, payload=payload)
+
+
+def decode_reply(frame: Frame, to: Frame) -> Reply:
+    """The reply in a frame that carries the sequence number of the request frame `to`.
+
+    Raises Malformed, also where the frame answers another type of request.
+    """
+    if frame.kind == REPLY | _NAK:
+        return _decode_nak(frame.payload, to)
+    if frame.kind != REPLY | to.type:
+        raise Malformed(
+            f"a request of type {to.type} was answered with type {frame.kind:#04x}",
+            code=NakCode.UNKNOWN_TYPE,
+        )
+    reply: Reply = _decode(_EXCHANGES[to.type][1], frame.payload)
+    return reply
+
+
+def is_event(frame: Frame) -> bool:
+    """Whether a frame is no answer: its sequence number counts the amplifier's events."""
+    return frame.kind == REPLY | _EVENT
+
+
+def encode_event(event: Event, *, address: int, sequence: int) -> Frame:
+    """The frame in which an amplifier speaks unasked."""
+    payload = _EVENT_LAYOUT.pack(event)
+    return Frame(kind=REPLY | _EVENT, address=address, sequence=sequence, payload=payload)
+
+
+def decode_event(frame: Frame) -> Event:
+    """The event in a frame for which `is_event` holds; raises Malformed."""
+    event: Event = _decode(_EVENT_LAYOUT, frame.payload)
+    return event
+
+
+def _decode_nak(payload: bytes, to: Frame) -> Nak:
+    cursor = Cursor(payload)
+    refused = cursor.byte()
+    nak = Nak(code=cursor.one_of(NakCode), channel=cursor.optional_channel())
+    cursor.end()
+    if refused != to.type:
+        raise Malformed(
+            f"a request of type {to.type} was answered with a refusal of type {refused}",
+            code=NakCode.UNKNOWN_TYPE,
+        )
+    return nak
+
+
+def _decode(layout: _Layout, payload: bytes) -> Any:
+    cursor = Cursor(payload)
+    message = layout.unpack(cursor)
+    cursor.end()
+    return message

@@ -1,0 +1,139 @@
+"""Payloads of what an amplifier tells of itself on a serial line: pairs of pack and unpack.
+
+Unpacking gives values that are in range, or raises Malformed.
+"""
+
+from drivers.codec.payload import Cursor, pack, pack_optional_channel, pack_text
+from drivers.protocol.definition import PROTOCOL
+from drivers.protocol.messages import (
+    Capabilities,
+    Fault,
+    FaultList,
+    FaultRecord,
+    Identity,
+    State,
+    Status,
+)
+
+_Q = PROTOCOL.quantities
+_HIGH_VOLTAGE = 0x01
+_EVENTS = 0x01
+
+
+def pack_identity(identity: Identity) -> bytes:
+    """The payload of an identity."""
+    version = pack((_Q.protocol_version, identity.protocol_version))
+    texts = (identity.vendor, identity.product, identity.serial_number, identity.firmware)
+    return version + b"".join(pack_text(text) for text in texts)
+
+
+def unpack_identity(cursor: Cursor) -> Identity:
+    """Who answers."""
+    version = cursor.integer(_Q.protocol_version)
+    return Identity(
+        vendor=cursor.text(),
+        product=cursor.text(),
+        serial_number=cursor.text(),
+        firmware=cursor.text(),
+        protocol_version=version,
+    )
+
+
+def pack_capabilities(capabilities: Capabilities) -> bytes:
+    """The payload of capabilities."""
+    return pack(
+        (_Q.channel_count, capabilities.channels),
+        (_Q.frequency, capabilities.frequency_min),
+        (_Q.frequency, capabilities.frequency_max),
+        (_Q.frequency, capabilities.frequency_step),
+        (_Q.level, capabilities.level_max),
+        (_Q.level, capabilities.level_step),
+        (_Q.phase_step, capabilities.phase_step),
+        (_Q.ramp, capabilities.ramp_max),
+        (_Q.watchdog, capabilities.watchdog_min),
+        (_Q.watchdog, capabilities.watchdog_max),
+        (_Q.envelope_knots, capabilities.envelope_knots),
+        (_Q.envelope_slots, capabilities.envelope_slots),
+        (_Q.envelope_step, capabilities.envelope_step_min),
+        (_Q.envelope_step, capabilities.envelope_step_max),
+    ) + bytes([_EVENTS if capabilities.events else 0])
+
+
+def unpack_capabilities(cursor: Cursor) -> Capabilities:
+    """What it can play."""
+    return Capabilities(
+        channels=cursor.integer(_Q.channel_count),
+        frequency_min=cursor.number(_Q.frequency),
+        frequency_max=cursor.number(_Q.frequency),
+        frequency_step=cursor.number(_Q.frequency),
+        level_max=cursor.number(_Q.level),
+        level_step=cursor.number(_Q.level),
+        phase_step=cursor.number(_Q.phase_step),
+        ramp_max=cursor.number(_Q.ramp),
+        watchdog_min=cursor.number(_Q.watchdog),
+        watchdog_max=cursor.number(_Q.watchdog),
+        envelope_knots=cursor.integer(_Q.envelope_knots),
+        envelope_slots=cursor.integer(_Q.envelope_slots),
+        envelope_step_min=cursor.number(_Q.envelope_step),
+        envelope_step_max=cursor.number(_Q.envelope_step),
+        events=bool(cursor.flags(_EVENTS)),
+    )
+
+
+def pack_status(status: Status) -> bytes:
+    """The payload of a status."""
+    head = bytes([status.state, status.fault]) + pack((_Q.active_token, status.token))
+    head += bytes([_HIGH_VOLTAGE if status.high_voltage else 0])
+    head += pack(
+        (_Q.temperature, status.temperature),
+        (_Q.watchdog_left, status.watchdog_left),
+        (_Q.voltage, status.voltage),
+        (_Q.channel_count, len(status.levels)),
+    )
+    return head + b"".join(pack((_Q.level, level)) for level in status.levels)
+
+
+def unpack_status(cursor: Cursor) -> Status:
+    """How it is."""
+    state = cursor.one_of(State)
+    fault = cursor.one_of(Fault)
+    token = cursor.integer(_Q.active_token)
+    flags = cursor.flags(_HIGH_VOLTAGE)
+    temperature = cursor.number(_Q.temperature)
+    watchdog_left = cursor.number(_Q.watchdog_left)
+    voltage = cursor.number(_Q.voltage)
+    channels = cursor.integer(_Q.channel_count)
+    return Status(
+        state=state,
+        fault=fault,
+        token=token,
+        high_voltage=bool(flags & _HIGH_VOLTAGE),
+        temperature=temperature,
+        watchdog_left=watchdog_left,
+        voltage=voltage,
+        levels=tuple(cursor.number(_Q.level) for _ in range(channels)),
+    )
+
+
+def pack_faults(faults: FaultList) -> bytes:
+    """The payload of the newest faults, as many as fit."""
+    newest = faults.faults[: _Q.fault_count.maximum]
+    packed = pack((_Q.fault_count, len(newest)))
+    for record in newest:
+        packed += bytes([record.fault]) + pack_optional_channel(record.channel)
+        packed += pack((_Q.age, min(record.age, _Q.age.high)))
+    return packed
+
+
+def unpack_faults(cursor: Cursor) -> FaultList:
+    """What went wrong."""
+    return FaultList(
+        faults=tuple(
+            FaultRecord(
+                fault=cursor.one_of(Fault),
+                channel=cursor.optional_channel(),
+                age=cursor.number(_Q.age),
+            )
+            for _ in range(cursor.integer(_Q.fault_count))
+        )
+    )

@@ -1,0 +1,120 @@
+"""Payloads of sets and envelopes on a serial line, written down as pairs: pack and unpack.
+
+Packing asks for what a guard made; unpacking gives plain values, each in range, or Malformed is
+raised.
+"""
+
+from drivers.codec.payload import Cursor, Malformed, Record, pack
+from drivers.command import CommandSet, DriveCommand, Envelope, Knot
+from drivers.guard import SafeCommand, SafeEnvelope
+from drivers.protocol.definition import PROTOCOL, Quantity
+from drivers.protocol.messages import Achieved, NakCode
+
+_Q = PROTOCOL.quantities
+_KEEP_PHASE = 0x01
+_SKIP_ENDING = 0x02
+_ENVELOPES = 0x04  # onset and ending follow the command
+
+
+_FLAGS = Quantity("flags", "u8", 1, "", 0, _KEEP_PHASE | _SKIP_ENDING | _ENVELOPES)
+_COMMAND = Record(_Q.channel, _FLAGS, _Q.frequency, _Q.level, _Q.phase)
+_SLOTS = Record(_Q.envelope_slot, _Q.envelope_slot)
+_TIMES = Record(_Q.token, _Q.ramp, _Q.valid_for)
+
+
+def _pack_commands(commands: tuple[DriveCommand, ...]) -> bytes:
+    packed = [pack((_Q.channel_count, len(commands)))]
+    for command in commands:
+        is_shaped = command.onset or command.ending
+        flags = _KEEP_PHASE if command.keep_phase else 0
+        flags |= _SKIP_ENDING if command.skip_ending else 0
+        flags |= _ENVELOPES if is_shaped else 0
+        packed.append(
+            _COMMAND.pack(command.channel, flags, command.frequency, command.level, command.phase)
+        )
+        if is_shaped:
+            packed.append(_SLOTS.pack(command.onset, command.ending))
+    return b"".join(packed)
+
+
+def _unpack_commands(cursor: Cursor) -> tuple[DriveCommand, ...]:
+    commands: list[DriveCommand] = []
+    seen: set[int] = set()
+    for _ in range(cursor.integer(_Q.channel_count)):
+        channel, flags, frequency, level, phase = cursor.record(_COMMAND)
+        if channel in seen:
+            raise Malformed(
+                f"channel {channel} is named twice", code=NakCode.BAD_CHANNEL, channel=channel
+            )
+        seen.add(channel)
+        onset, ending = cursor.record(_SLOTS) if flags & _ENVELOPES else (0, 0)
+        commands.append(
+            DriveCommand(
+                channel=channel,
+                frequency=_Q.frequency.from_wire(frequency),
+                level=_Q.level.from_wire(level),
+                phase=_Q.phase.from_wire(phase),
+                keep_phase=bool(flags & _KEEP_PHASE),
+                onset=onset,
+                ending=ending,
+                skip_ending=bool(flags & _SKIP_ENDING),
+            )
+        )
+    return tuple(commands)
+
+
+def pack_set(command_set: CommandSet) -> bytes:
+    """The payload of a set; TypeError for one that no guard has seen."""
+    if type(command_set) is not SafeCommand:
+        raise TypeError(
+            f"only a SafeCommand goes on the wire, not a {type(command_set).__name__}: "
+            "let Guard.check make one"
+        )
+    times = _TIMES.pack(command_set.token, command_set.ramp, command_set.valid_for)
+    return times + _pack_commands(command_set.commands)
+
+
+def unpack_set(cursor: Cursor) -> CommandSet:
+    """The set of a payload, which must pass a guard before it can be sent on."""
+    token, ramp, valid_for = cursor.record(_TIMES)
+    return CommandSet(
+        token=token,
+        commands=_unpack_commands(cursor),
+        ramp=_Q.ramp.from_wire(ramp),
+        valid_for=_Q.valid_for.from_wire(valid_for),
+    )
+
+
+def pack_envelope(envelope: Envelope) -> bytes:
+    """The payload of an envelope; TypeError for one that no guard has seen."""
+    if type(envelope) is not SafeEnvelope:
+        raise TypeError(
+            f"only a SafeEnvelope goes on the wire, not a {type(envelope).__name__}: "
+            "let Guard.check_envelope make one"
+        )
+    head = pack((_Q.envelope_slot, envelope.slot), (_Q.envelope_step, envelope.step))
+    head += pack((_Q.envelope_knots, len(envelope.knots)))
+    return head + b"".join(
+        pack((_Q.level, knot.level), (_Q.phase, knot.phase)) for knot in envelope.knots
+    )
+
+
+def unpack_envelope(cursor: Cursor) -> Envelope:
+    """The envelope of a payload, which must pass a guard before it can be sent on."""
+    slot = cursor.integer(_Q.envelope_slot)
+    step = cursor.number(_Q.envelope_step)
+    count = cursor.integer(_Q.envelope_knots)
+    knots = tuple(
+        Knot(level=cursor.number(_Q.level), phase=cursor.number(_Q.phase)) for _ in range(count)
+    )
+    return Envelope(slot=slot, step=step, knots=knots)
+
+
+def pack_achieved(achieved: Achieved) -> bytes:
+    """The payload of what a set plays."""
+    return pack((_Q.token, achieved.token)) + _pack_commands(achieved.commands)
+
+
+def unpack_achieved(cursor: Cursor) -> Achieved:
+    """What a set plays."""
+    return Achieved(token=cursor.integer(_Q.token), commands=_unpack_commands(cursor))

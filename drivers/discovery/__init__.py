@@ -1,0 +1,1 @@
+"""Which amplifiers can be reached from this machine."""

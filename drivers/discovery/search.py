@@ -1,0 +1,140 @@
+"""What amplifiers could be reached from this machine, and which of them answer.
+
+Whoever is asked is asked who it is, and nothing else: no output is written.
+"""
+
+import os
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from serial.tools.list_ports import comports
+
+from drivers.amplifier import Amplifier
+from drivers.discovery.slcan import ask_for_slcan
+from drivers.errors import DriverError, FrameError, LinkTimeout
+from drivers.protocol.definition import PROTOCOL
+from drivers.protocol.messages import Identity
+from drivers.registry import known_schemes, open_backend
+
+_NETWORK = Path("/sys/class/net")
+_CAN_TYPE = "280"  # ARPHRD_CAN of Linux
+_SPEEDS = (PROTOCOL.serial.baud, 115_200)
+_MODBUS = PROTOCOL.modbus
+_GROUP_MAY = 0o060  # read and write
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A port or an interface: the URLs to try there, and what stands in the way, if anything."""
+
+    place: str
+    description: str
+    urls: tuple[str, ...]
+    remedy: str | None = None
+    is_serial: bool = False
+    is_slcan: bool = False
+
+
+@dataclass(frozen=True)
+class Found:
+    """What came of asking at a URL: who answered, or why nobody did.
+
+    was_asked: whether the port could be used at all, so that the problem is the silence there.
+    """
+
+    url: str
+    identity: Identity | None
+    problem: str | None = None
+    was_asked: bool = True
+
+
+def candidates() -> list[Candidate]:
+    """Serial ports and CAN interfaces of this machine, whether or not they can be used."""
+    return [*_serial_ports(), *_can_interfaces()]
+
+
+async def ask(urls: Iterable[str]) -> list[Found]:
+    """Who answers at these URLs, one after the other."""
+    return [await _ask(url) for url in urls]
+
+
+def with_slcan(place: Candidate) -> Candidate:
+    """The same serial port, as a CAN adapter if it answers as one: its amplifiers are not asked.
+
+    Blocks; see `drivers.discovery.slcan` for what is sent.
+    """
+    if not place.is_serial or place.remedy is not None:
+        return place
+    try:
+        adapter = ask_for_slcan(place.place)
+    except (OSError, ValueError) as problem:
+        return replace(place, remedy=f"{place.place} cannot be used: {problem}")
+    if adapter is None:
+        return place
+    heard = adapter.nodes or ("none",)
+    what = adapter.problem or f"heartbeats of nodes: {', '.join(map(str, heard))}"
+    bitrate = PROTOCOL.canopen["bitrate"]
+    urls = tuple(
+        f"can+slcan://{_absolute(place.place)}?bitrate={bitrate}#{node}" for node in adapter.nodes
+    )
+    description = f"{place.description}: slcan adapter {adapter.version}, {what}"
+    return Candidate(place.place, description, urls, is_slcan=True)
+
+
+async def _ask(url: str) -> Found:
+    try:
+        amplifier = Amplifier(open_backend(url))
+        await amplifier.open()
+    except DriverError as problem:
+        was_asked = isinstance(problem, LinkTimeout | FrameError)
+        return Found(url, None, str(problem), was_asked=was_asked)
+    identity = amplifier.identity
+    await amplifier.close()
+    return Found(url, identity)
+
+
+def _serial_ports() -> Iterator[Candidate]:
+    for port in sorted(comports()):
+        path = port.device
+        urls = tuple(f"serial://{_absolute(path)}?baud={speed}" for speed in _SPEEDS)
+        urls += (f"modbus+rtu://{_absolute(path)}?baud={_MODBUS['baud']}#{_MODBUS['unit']}",)
+        yield Candidate(path, port.description, urls, _why_not_usable(path), is_serial=True)
+
+
+def _absolute(path: str) -> str:
+    return path if path.startswith("/") else f"/{path}"
+
+
+def _why_not_usable(path: str) -> str | None:
+    if not path.startswith("/") or os.access(path, os.R_OK | os.W_OK):
+        return None
+    momentary = f"sudo chmod a+rw {path}"
+    try:
+        is_for_group = Path(path).stat().st_mode & _GROUP_MAY == _GROUP_MAY
+        group = Path(path).group()
+    except (OSError, KeyError):  # it has just gone; or a group that has no name
+        is_for_group = False
+    if not is_for_group:
+        return f"this user may not use it, nor may its group; for a moment only: {momentary}"
+    return (
+        f"this user may not use it: sudo usermod -aG {group} $USER, then log in again "
+        f"(for a moment only: {momentary})"
+    )
+
+
+def _can_interfaces() -> Iterator[Candidate]:
+    if not _NETWORK.is_dir():
+        return
+    for interface in sorted(_NETWORK.iterdir()):
+        kind = interface / "type"
+        if not kind.is_file() or kind.read_text(encoding="ascii").strip() != _CAN_TYPE:
+            continue
+        name = interface.name
+        is_up = (interface / "operstate").read_text(encoding="ascii").strip() != "down"
+        node = PROTOCOL.canopen["node"]
+        scheme = "can+socketcan"
+        urls = (f"{scheme}://{name}#{node}",) if scheme in known_schemes() else ()
+        bitrate = PROTOCOL.canopen["bitrate"]
+        remedy = f"it is down: sudo ip link set {name} up type can bitrate {bitrate}"
+        yield Candidate(name, "CAN interface", urls, remedy=None if is_up else remedy)

@@ -1,0 +1,93 @@
+"""Whether a serial port is a CAN adapter that speaks slcan, and which amplifiers are heard there.
+
+A device of another kind gets two characters, V and CR, and nothing more unless it answers as an
+adapter does. The adapter is opened to listen only, and nothing is written onto the bus.
+"""
+
+import re
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+
+import serial
+
+from drivers.codec.can_bus.adapter_text import SlcanReader
+from drivers.codec.can_bus.frame import CANOPEN, cob_id
+
+_BAUD = 115_200  # most adapters are USB devices, to which it does not matter
+_ANSWER_TIME = 0.1  # s; USB adapters and their drivers hold bytes back for 16 ms at most
+_LISTENING_TIME = 0.2  # s; four heartbeats of 50 ms
+_SPEEDS = (10_000, 20_000, 50_000, 100_000, 125_000, 250_000, 500_000, 750_000, 1_000_000)
+_VERSION = re.compile(rb"V([0-9A-Fa-f]{4})\r")
+_END = re.compile(rb"[\r\x07]")  # done, or refused
+_DONE = b"\r"
+
+
+@dataclass(frozen=True)
+class SlcanAdapter:
+    """An adapter that has answered.
+
+    version: of hardware and firmware, as it says it; nodes: whose heartbeats were heard, those that
+    an amplifier may have; problem: why it could not be listened to, if so.
+    """
+
+    version: str
+    nodes: tuple[int, ...] = ()
+    problem: str | None = None
+
+
+def ask_for_slcan(port: str, *, bitrate: int = CANOPEN["bitrate"]) -> SlcanAdapter | None:
+    """The adapter on a serial port; None where nobody answers as one. Blocks for half a second.
+
+    bitrate [bit/s]: of the bus. Raises OSError where the port cannot be used.
+    """
+    with serial.Serial(
+        port, _BAUD, timeout=_ANSWER_TIME, write_timeout=_ANSWER_TIME, exclusive=True
+    ) as line:
+        line.reset_input_buffer()
+        line.write(b"V\r")
+        found = _VERSION.search(_text_until(line, _VERSION))
+        if found is None:
+            return None
+        version = found.group(1).decode()
+        with _listening(line, bitrate) as is_listening:
+            if not is_listening:
+                return SlcanAdapter(version, problem="it cannot only listen, so it was not opened")
+            return SlcanAdapter(version, nodes=tuple(sorted(set(_heard(line)))))
+
+
+@contextmanager
+def _listening(line: serial.Serial, bitrate: int) -> Iterator[bool]:
+    """With the adapter open to listen only, if it can be; closed again afterwards."""
+    line.write(b"C\r")  # it may have been left open
+    _text_until(line, _END)
+    try:
+        yield _is_done(line, b"S%d\r" % _SPEEDS.index(bitrate)) and _is_done(line, b"L\r")
+    finally:
+        with suppress(serial.SerialException):
+            line.write(b"C\r")
+            line.flush()
+
+
+def _is_done(line: serial.Serial, command: bytes) -> bool:
+    line.write(command)
+    return _text_until(line, _END).startswith(_DONE)
+
+
+def _text_until(line: serial.Serial, end: re.Pattern[bytes]) -> bytes:
+    """What comes until this does, or until its time is over."""
+    text, deadline = b"", time.monotonic() + _ANSWER_TIME
+    while not end.search(text) and time.monotonic() < deadline:
+        text += line.read(max(1, line.in_waiting))
+    return text
+
+
+def _heard(line: serial.Serial) -> Iterator[int]:
+    """The nodes whose heartbeats come while it is listened."""
+    reader, deadline = SlcanReader(), time.monotonic() + _LISTENING_TIME
+    nodes = {cob_id("heartbeat", node): node for node in range(1, int(CANOPEN["node_max"]) + 1)}
+    while time.monotonic() < deadline:
+        for frame in reader.feed(line.read(max(1, line.in_waiting))):
+            if frame.id in nodes:
+                yield nodes[frame.id]

@@ -1,0 +1,14 @@
+"""The guard: nothing is played that it has not let through."""
+
+from drivers.guard.guard import Guard, SafeCommand, SafeEnvelope
+from drivers.guard.limits import FREQUENCY_CEILING, FREQUENCY_FLOOR, LEVEL_CEILING, GuardLimits
+
+__all__ = [
+    "FREQUENCY_CEILING",
+    "FREQUENCY_FLOOR",
+    "LEVEL_CEILING",
+    "Guard",
+    "GuardLimits",
+    "SafeCommand",
+    "SafeEnvelope",
+]

@@ -1,0 +1,200 @@
+"""One request at a time over one backend: repeated where no answer comes, given up where none does.
+
+What is lost stays lost until it is opened anew, and says so at once to whoever asks.
+"""
+
+import asyncio
+from collections.abc import Callable
+from typing import TypeVar, final
+
+from drivers import clock
+from drivers.backend import Backend
+from drivers.errors import FrameError, LinkError, LinkTimeout
+from drivers.link.refusals import is_busy, refusal
+from drivers.link.turns import GaveWay, Kind, Turns
+from drivers.protocol.definition import PROTOCOL
+from drivers.protocol.messages import (
+    Achieved,
+    Broadcast,
+    Capabilities,
+    Event,
+    FaultList,
+    Identity,
+    Loaded,
+    Nak,
+    Reply,
+    Request,
+    Status,
+)
+from drivers.statistics import LinkStatistics
+
+REPLY_TIMEOUT = 0.030  # s; a heartbeat and three of these are less than three heartbeats of 50 ms
+RETRIES = 2
+BUSY_PAUSE = 0.005  # s; before a busy amplifier is asked again: short enough for a touch to be felt
+
+_ReplyT = TypeVar("_ReplyT", Identity, Capabilities, Status, Achieved, FaultList, Loaded)
+
+
+def retries_on(round_trip: float, *, reply_timeout: float = REPLY_TIMEOUT) -> int:
+    """How often a request is repeated on a wire whose longest exchange takes round_trip [s].
+
+    Once less than else where that, and the amplifier's own delay, take more than the timeout [s].
+    """
+    is_slow = round_trip + PROTOCOL.reaction > reply_timeout
+    return RETRIES - 1 if is_slow else RETRIES
+
+
+@final
+class Link:
+    """A backend with its turns, retries, loss and statistics.
+
+    reply_timeout [s]: how long one exchange may take, longer where the wire itself needs longer.
+    Three unanswered ones in a row are a loss; two, once `allow_for` was told of a wire too slow for
+    three within three heartbeats. on_event: told, in the event loop, what comes unasked.
+    """
+
+    def __init__(
+        self, backend: Backend, *, reply_timeout: float, on_event: Callable[[Event], None]
+    ) -> None:
+        self.backend = backend
+        self._reply_timeout = reply_timeout
+        self._retries_allowed = RETRIES
+        self._turns = Turns(lambda: backend.is_unsent)
+        self._loss: str | None = "the amplifier is not open yet; call open() first"
+        self._unanswered = 0
+        self._is_stuck = False  # it was busy to the last: until it is not, nothing is repeated
+        self._retries = self._timeouts = self._refusals = 0
+        self._last_round_trip: float | None = None
+        self._last_heartbeat: float | None = None
+        backend.listen(on_event, self._found_lost)
+
+    @property
+    def lost(self) -> bool:
+        """Whether every further request raises LinkError."""
+        return self._loss is not None
+
+    @property
+    def statistics(self) -> LinkStatistics:
+        """How well it does; counts since it was opened, retries since it was made."""
+        seen, beat = self.backend.counters, self._last_heartbeat
+        return LinkStatistics(
+            frames_out=seen.frames_out,
+            frames_in=seen.frames_in,
+            bad=seen.bad,
+            foreign=seen.foreign,
+            events=seen.events,
+            retries=self._retries,
+            timeouts=self._timeouts,
+            refusals=self._refusals,
+            last_round_trip=self._last_round_trip,
+            heartbeat_age=None if beat is None else clock.now() - beat,
+        )
+
+    async def open(self) -> None:
+        """Open the wire; raises LinkError."""
+        await self.backend.open()
+        self._loss = None
+        self._unanswered = 0
+
+    async def close(self) -> None:
+        """Close the wire."""
+        if self._loss is None:
+            self._loss = "the amplifier was closed; open a new one"
+        await self.backend.close()
+
+    def allow_for(self, round_trip: float) -> None:
+        """Repeat once less on a wire whose longest exchange [s] takes more than the timeout."""
+        self._retries_allowed = retries_on(round_trip, reply_timeout=self._reply_timeout)
+
+    def beaten(self) -> None:
+        """A heartbeat was answered."""
+        self._last_heartbeat = clock.now()
+
+    async def ask(
+        self,
+        request: Request,
+        *,
+        expect: type[_ReplyT],
+        kind: Kind = Kind.ORDINARY,
+        timeout: float | None = None,
+    ) -> _ReplyT:
+        """The reply to a request in its turn; timeout [s] in place of the usual one.
+
+        Raises LinkError, CommandRefused for a refusal or where something else took its place, and
+        FrameError for a reply to another kind of request.
+        """
+        self._raise_if_lost()
+        timeout = timeout or self._reply_timeout
+        if kind.silences:
+            with self.backend.silencing(request):
+                reply = await self._in_turn(request, kind, timeout)
+        else:
+            reply = await self._in_turn(request, kind, timeout)
+        name = type(request).__name__
+        if isinstance(reply, Nak):
+            self._refusals += 1
+            raise refusal(name, reply)
+        if not isinstance(reply, expect):
+            raise FrameError(f"the amplifier answered {name} with {type(reply).__name__}")
+        return reply
+
+    async def broadcast(self, request: Broadcast, kind: Kind) -> None:
+        """Say something to all of the bus in its turn; raises LinkError, CommandError."""
+        self._raise_if_lost()
+        async with self._turns.take(kind):
+            await self.backend.broadcast(request)
+
+    async def _in_turn(self, request: Request, kind: Kind, timeout: float) -> Reply:
+        while True:
+            try:
+                async with self._turns.take(kind):
+                    self._raise_if_lost()
+                    return await self._exchange(request, kind, timeout)
+            except GaveWay:
+                if not kind.silences:  # what silences is still wanted after the stop before it
+                    raise
+
+    async def _exchange(self, request: Request, kind: Kind, timeout: float) -> Reply:
+        busy = 0
+        while True:
+            begin = clock.now()
+            try:
+                reply = await self.backend.exchange(request, timeout=timeout)
+            except LinkTimeout as problem:
+                self._timeouts += 1
+                # Counted across requests: a stream of superseded ones must not hide a dead link.
+                self._unanswered += 1
+                if self._unanswered > self._retries_allowed:
+                    what = f"{problem} ({self._unanswered} requests in a row were left unanswered)"
+                    raise LinkTimeout(self._lose(what)) from problem
+            except LinkError as problem:
+                raise LinkError(self._lose(str(problem))) from problem
+            else:
+                self._unanswered = 0
+                self._last_round_trip = clock.now() - begin
+                if not is_busy(reply):
+                    self._is_stuck = False
+                    return reply
+                if self._is_stuck or busy == RETRIES:
+                    self._is_stuck = True
+                    return reply
+                busy += 1
+                await asyncio.sleep(BUSY_PAUSE)
+            self._turns.raise_if_overtaken(kind)
+            self._retries += 1
+
+    def _found_lost(self, what: str) -> None:
+        """The wire is gone, and no request was on its way to notice."""
+        if self._loss is None:
+            self._lose(what)
+
+    def _lose(self, what: str) -> str:
+        self._loss = (
+            f"{what}. Assume that the amplifier is energised until its watchdog has passed; once "
+            "it is opened again it is disarmed"
+        )
+        return self._loss
+
+    def _raise_if_lost(self) -> None:
+        if self._loss is not None:
+            raise LinkError(self._loss)

@@ -1,0 +1,1 @@
+"""Amplifiers in operation: begun together, looked after, and opened again after a loss."""

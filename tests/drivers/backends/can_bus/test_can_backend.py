@@ -1,0 +1,657 @@
+"""The CAN backend: what is its own, beside the contract that holds on every wire."""
+
+import asyncio
+import contextlib
+import gc
+import itertools
+import threading
+import time
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import can
+import pytest
+import serial
+
+from drivers.amplifier import Amplifier
+from drivers.backends.can_bus.backend import CanBackend
+from drivers.backends.can_bus.orders import PendingOrders
+from drivers.backends.urls.can_bus import CanUrl
+from drivers.codec.can_bus.frame import CanFrame
+from drivers.codec.can_bus.objects import index_of
+from drivers.command import CommandSet, DriveCommand, Envelope, Knot
+from drivers.errors import CommandError, CommandRefused, LinkError
+from drivers.guard import Guard, GuardLimits, SafeCommand
+from drivers.protocol.messages import Apply, Event, Fault, Ping, State
+from model.rig.rig import Rig
+from sim.bench.bench import Bench
+from sim.bench.station import Station
+from sim.far_ends.can_bus.bus import CanBus
+from sim.far_ends.can_bus.ends import nodes_on
+from sim.far_ends.can_bus.node import CanNode
+from sim.far_ends.wires import Wire
+from sim.faults.episodes import Episode
+from wires import FarSide, far_side
+
+PATIENCE = 5.0  # s; for a loaded machine, not an expectation
+_NUMBERS = itertools.count()
+LIMITS = GuardLimits(20.0, 600.0, 1.0)
+
+
+class Gateway:
+    """Joins a bus of the far end with a virtual one of python-can; `sent` is what hosts sent."""
+
+    def __init__(self, bus: CanBus) -> None:
+        self.sent: list[CanFrame] = []
+        self.bus = bus
+        self.channel = f"test-{next(_NUMBERS)}"
+        self.virtual = can.Bus(interface="virtual", channel=self.channel, ignore_config=True)
+        self.passing = True  # to hosts
+        self.listening = True  # to them
+        self._loop = asyncio.get_running_loop()
+        self._listener = self.say
+        bus.join(self._listener)
+        self._thread = threading.Thread(target=self._read, daemon=True)
+        self._closing = False
+        self._thread.start()
+
+    def say(self, frame: CanFrame) -> None:
+        """Let hosts hear a frame."""
+        if self.passing:
+            self.virtual.send(
+                can.Message(
+                    arbitration_id=frame.id,
+                    data=frame.data,
+                    is_fd=frame.fd,
+                    is_extended_id=False,
+                )
+            )
+
+    def _read(self) -> None:
+        while not self._closing:
+            message = self.virtual.recv(0.05)
+            if message is not None:
+                frame = CanFrame(message.arbitration_id, bytes(message.data), fd=message.is_fd)
+                self._loop.call_soon_threadsafe(self._pass, frame)
+
+    def _pass(self, frame: CanFrame) -> None:
+        self.sent.append(frame)
+        if self.listening:
+            self.bus.send(frame, sender=self._listener)
+
+    async def close(self) -> None:
+        """Part them."""
+        self._closing = True
+        await asyncio.to_thread(self._thread.join)
+        self.virtual.shutdown()
+
+
+@dataclass
+class Virtual:
+    """Amplifiers on a virtual bus within this process."""
+
+    gateway: Gateway
+    far: FarSide
+
+    def url(self, node: int = 1, options: str = "") -> str:
+        """Of a node."""
+        return f"can+virtual://{self.gateway.channel}{options}#{node}"
+
+
+@asynccontextmanager
+async def virtual_side(rig: Rig) -> AsyncIterator[Virtual]:
+    """The amplifiers of a rig on a virtual bus."""
+    bench = Bench(rig, now=time.monotonic())
+    stations = {name: Station(bench, name) for name in bench.amplifiers}
+    bus = CanBus()
+    async with nodes_on(bus, list(stations.values())):
+        gateway = Gateway(bus)
+        try:
+            yield Virtual(gateway, FarSide({}, stations, bench))
+        finally:
+            await gateway.close()
+            for station in stations.values():
+                station.close()
+
+
+@pytest.fixture
+async def virtual(coarse_rig: Rig) -> AsyncIterator[Virtual]:
+    """The paper's amplifier, node 1 of a virtual bus."""
+    async with virtual_side(coarse_rig) as virtual:
+        yield virtual
+
+
+@asynccontextmanager
+async def opened(url: str) -> AsyncIterator[Amplifier]:
+    """An open amplifier."""
+    amplifier = Amplifier(CanBackend(url), reply_timeout=0.5)
+    await amplifier.open()
+    try:
+        yield amplifier
+    finally:
+        await amplifier.close()
+
+
+def tones(amplifier: Amplifier, *levels: float, onset: int = 0) -> SafeCommand:
+    """A set at 110 Hz, a level for each channel from 0 on."""
+    guard = Guard(LIMITS, amplifier.capabilities)
+    if onset:
+        guard.check_envelope(SHAPE)
+    commands = tuple(
+        DriveCommand(channel, 110.0, level, onset=onset) for channel, level in enumerate(levels)
+    )
+    return guard.check(CommandSet(amplifier.next_token(), commands, ramp=0.0, valid_for=0.0))
+
+
+SHAPE = Envelope(7, 0.005, tuple(Knot(0.01 * number, 10.0 * number) for number in range(32)))
+
+
+async def eventually(condition: Callable[[], object]) -> None:
+    """Wait for what comes by itself."""
+    async with asyncio.timeout(PATIENCE):
+        while not condition():  # noqa: ASYNC110  what is waited for tells nobody
+            await asyncio.sleep(0.002)
+
+
+@pytest.mark.parametrize(
+    "url",
+    [
+        *("can+nothing://can0#1", "can+socketcan://#1", "can+socketcan://can0/x#1"),
+        *("can+slcan://#1", "can+slcan://host/dev/ttyACM0#1", "can+socketcand://host/can0#1"),
+        *("can+socketcand://:29536/can0#1", "can+socketcand://host:29536#1"),
+        *("can+socketcan://can0#0", "can+socketcan://can0#64", "can+socketcan://can0#one"),
+        *("can+socketcan://can0?bitrate=5#1", "can+socketcan://can0?node=1#1"),
+        *("can+socketcan://can0?fd=x#1", "can+socketcand://host:99999/can0#1"),
+    ],
+)
+def test_urls_that_name_no_amplifier_are_refused(url: str) -> None:
+    """Whatever part is wrong, one CommandError says so."""
+    with pytest.raises(CommandError):
+        CanBackend(url)
+
+
+def test_urls_are_taken_apart() -> None:
+    """Interface, channel, options and node of each kind of bus."""
+    url = CanUrl.parse("can+socketcand://10.0.0.7:29536/can1?bitrate=250000&heartbeat=20#9")
+    bus = url.bus
+    assert (bus.interface, bus.channel, bus.host, bus.port) == (
+        *("socketcand", "can1"),
+        *("10.0.0.7", 29536),
+    )
+    assert (bus.bitrate, url.node, url.heartbeat) == (250_000, 9, 0.02)
+    assert CanUrl.parse("can+slcan:///dev/ttyACM0").bus.channel == "/dev/ttyACM0"
+    assert CanUrl.parse("can+slcan:///COM7").bus.channel == "COM7"
+    assert CanUrl.parse("can+socketcan://can0").node == 1
+
+
+def test_the_time_on_the_bus_is_known_beforehand() -> None:
+    """Four channels at 500 kbit/s, worst stuffing: six frames of 135 bits, a SYNC of 55."""
+    backend = CanBackend("can+socketcan://can0#1")
+    assert backend.round_trip(4) == pytest.approx((6 * 135 + 55) / 500_000)
+    # 3 + 4 * 20 bytes are twelve segments of seven, and five frames frame them.
+    assert backend.loading_time(20) == pytest.approx(17 * 135 / 500_000)
+    assert CanBackend("can+socketcan://can0?fd=2000000#1").round_trip(4) < 0.6e-3
+
+
+@pytest.mark.parametrize(
+    ("url", "words"),
+    [
+        ("can+socketcand://127.0.0.1:1/can0#1", "socketcand runs there"),
+        ("can+slcan:///dev/no-such-port#1", "adapter is plugged in"),
+        ("can+socketcan://no-such-can#1", "ip link"),
+    ],
+)
+async def test_a_bus_that_is_not_there_is_told_with_what_to_do(url: str, words: str) -> None:
+    """Neither a traceback nor ten seconds of trying."""
+    async with asyncio.timeout(PATIENCE):
+        with pytest.raises(LinkError, match=words):
+            await CanBackend(url).open()
+
+
+async def test_on_a_virtual_bus_the_whole_session_works(virtual: Virtual) -> None:
+    """Identify, arm, play, beat, read faults, stop and clear within one process."""
+    async with opened(virtual.url()) as amplifier:
+        assert amplifier.identity.serial_number == "SIM-main"
+        await amplifier.arm(2.0)
+        achieved = await amplifier.apply(tones(amplifier, 0.1, 0.2, 0.3, 0.4))
+        assert [command.level for command in achieved.commands] == [0.1, 0.2, 0.3, 0.4]
+        status = await amplifier.heartbeat()
+        assert status.levels == pytest.approx((0.1, 0.2, 0.3, 0.4))
+        assert await amplifier.faults() == ()
+        assert (await amplifier.stop(0.0)).state is State.QUICK_STOP_ACTIVE
+        assert (await amplifier.clear()).state is State.SWITCH_ON_DISABLED
+
+
+async def test_the_heartbeat_is_sent_by_the_call_and_by_nothing_else(virtual: Virtual) -> None:
+    """As many host heartbeats as calls, however long one waits between them."""
+    async with opened(virtual.url()) as amplifier:
+        await amplifier.arm(2.0)
+        for _ in range(3):
+            await amplifier.heartbeat()
+        await asyncio.sleep(0.15)
+        await amplifier.status()
+    assert [frame for frame in virtual.gateway.sent if frame.id == 0x77F] == [
+        CanFrame(0x77F, b"\x05")
+    ] * 3
+
+
+@pytest.mark.parametrize("kind", ["slcan", "virtual"])
+async def test_over_can_fd_a_set_is_one_frame(kind: str, coarse_rig: Rig) -> None:
+    """The set in one frame of 48 bytes; status, set and faults come as they do in classic ones."""
+    async with virtual_side(coarse_rig) as virtual, far_side(Wire(kind="slcan"), coarse_rig) as far:
+        url = virtual.url(options="?fd=2000000")
+        if kind == "slcan":
+            url = far.url.replace("#", "&fd=2000000#")
+        async with opened(url) as amplifier:
+            await amplifier.arm(2.0)
+            await amplifier.apply(tones(amplifier, 0.1, 0.2, 0.3, 0.4))
+            status = await amplifier.heartbeat()
+            assert status.levels == pytest.approx((0.1, 0.2, 0.3, 0.4))
+        if kind == "virtual":
+            sets = [frame for frame in virtual.gateway.sent if len(frame.data) > 8]
+            assert [(frame.id, len(frame.data), frame.fd) for frame in sets] == [(0x481, 48, True)]
+
+
+async def test_what_is_not_played_as_asked_is_read_back(virtual: Virtual) -> None:
+    """An amplifier that is warm plays half, and says so in the answer and the achieved levels."""
+    async with opened(virtual.url()) as amplifier:
+        await amplifier.arm(2.0)
+        virtual.far.station.befall(Episode("over_temperature", lasts=60.0))
+        wanted = tones(amplifier, 0.4, 0.2)
+        achieved = await amplifier.apply(wanted)
+        assert achieved.token == wanted.token
+        assert [command.level for command in achieved.commands] == pytest.approx([0.2, 0.1])
+
+
+@pytest.mark.parametrize("takes_blocks", [True, False])
+async def test_envelopes_are_loaded_in_blocks_or_segments(
+    virtual: Virtual, takes_blocks: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """131 bytes: by block transfer, or in segments where the amplifier refuses blocks."""
+    if not takes_blocks:
+        from sim.far_ends.can_bus import sdo
+
+        def refuse(self: object, data: bytes) -> None:
+            raise sdo.SdoAbort(sdo.UNKNOWN_COMMAND)
+
+        monkeypatch.setattr(sdo.SdoServer, "_block_command", refuse)
+    async with opened(virtual.url()) as amplifier:
+        guard = Guard(LIMITS, amplifier.capabilities)
+        await amplifier.load_envelope(guard.check_envelope(SHAPE))
+        kept = virtual.far.amplifier._sets.slots[7]
+        assert (kept.step, len(kept.knots)) == (0.005, 32)
+        assert kept.knots[31] == Knot(0.31, -50.0)
+        await amplifier.arm(2.0)
+        achieved = await amplifier.apply(tones(amplifier, 0.5, onset=7))
+        assert achieved.commands[0].onset == 7
+
+
+async def test_an_object_that_was_given_up_for_its_time_is_asked_for_again(
+    virtual: Virtual, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A node that waited too long for a frame of a busy host says so (0504 0000 h, CiA 301)."""
+    from sim.far_ends.can_bus import sdo
+
+    begin = sdo.SdoServer._begin_upload
+    given_up: list[bytes] = []
+
+    def give_up_once(server: sdo.SdoServer, data: bytes) -> None:
+        is_capability = data[1:3] == index_of("capabilities").to_bytes(2, "little")
+        if is_capability and not given_up:
+            given_up.append(data)
+            raise sdo.SdoAbort(0x0504_0000)
+        begin(server, data)
+
+    monkeypatch.setattr(sdo.SdoServer, "_begin_upload", give_up_once)
+    async with opened(virtual.url()) as amplifier:
+        assert amplifier.capabilities.channels == 4
+    assert given_up
+
+
+class Telling(CanBackend):
+    """A backend whose losses are noted as well."""
+
+    def __init__(self, url: str, told: list[str]) -> None:
+        super().__init__(url)
+        self._told_losses = told
+
+    def listen(self, on_event: Callable[[Event], None], on_loss: Callable[[str], None]) -> None:
+        """Note and pass on."""
+
+        def note(what: str) -> None:
+            self._told_losses.append(what)
+            on_loss(what)
+
+        super().listen(on_event, note)
+
+
+@pytest.mark.parametrize("how", ["silent", "boot-up", "stopped", "bus-off"])
+async def test_an_amplifier_that_is_gone_is_told_unasked(virtual: Virtual, how: str) -> None:
+    """Within three of its heartbeats, without a request on the way; nothing works afterwards."""
+    told: list[str] = []
+    amplifier = Amplifier(Telling(virtual.url(), told), reply_timeout=0.5)
+    await amplifier.open()
+    try:
+        await amplifier.arm(2.0)
+        loop = asyncio.get_running_loop()
+        await asyncio.sleep(0.06)  # a heartbeat has been heard
+        begin = loop.time()
+        match how:
+            case "silent":
+                virtual.gateway.passing = False
+            case "boot-up":
+                virtual.gateway.say(CanFrame(0x701, b"\x00"))
+            case "stopped":
+                virtual.gateway.say(CanFrame(0x701, b"\x7f"))
+            case _:
+                virtual.gateway.virtual.send(
+                    can.Message(arbitration_id=0x40, is_error_frame=True, data=bytes(8))
+                )
+        await eventually(lambda: told)
+        if how == "silent":
+            assert loop.time() - begin >= 0.09  # not for a heartbeat or two that are late
+        assert len(told) == 1
+        with pytest.raises(LinkError):
+            await amplifier.heartbeat()
+    finally:
+        await amplifier.close()
+
+
+async def test_a_boot_up_is_noticed_before_the_first_heartbeat(virtual: Virtual) -> None:
+    """An amplifier that starts anew right after it was identified is not the one that was."""
+    amplifier = Amplifier(CanBackend(virtual.url(options="?heartbeat=10000")), reply_timeout=0.5)
+    await amplifier.open()
+    try:
+        virtual.gateway.say(CanFrame(0x701, b"\x00"))
+        await eventually(lambda: amplifier.lost)
+    finally:
+        await amplifier.close()
+
+
+def descriptors() -> int:
+    """How many are open."""
+    return len(list(Path("/dev/fd").iterdir()))
+
+
+async def served(*says: bytes) -> tuple[str | None, int]:
+    """What comes of opening a bus of a server that says this, an answer to each element that it
+    hears; and how many descriptors are left."""
+
+    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        with contextlib.suppress(asyncio.IncompleteReadError):
+            for say in says:
+                writer.write(say)
+                await reader.readuntil(b">")
+            await reader.read()
+        writer.close()
+
+    server = await asyncio.start_server(serve, "127.0.0.1", 0)
+    async with server:
+        host, port = server.sockets[0].getsockname()
+        before = descriptors()
+        backend = CanBackend(f"can+socketcand://{host}:{port}/can0#1")
+        problem = None
+        try:
+            await backend.open()
+        except LinkError as error:
+            problem = str(error)
+        await backend.close()
+        for _ in range(1000):  # the server's side of it goes when the server has noticed
+            left = descriptors() - before
+            if not left:
+                break
+            await asyncio.sleep(0.001)
+    return problem, left
+
+
+@pytest.mark.parametrize(
+    "says",
+    [
+        (b"< hi >", b"< ok >", b"< ok >"),
+        (b"< hi >< frame 701 1.0 05 >", b"< frame 701 1.5 05 >< ok >", b"< ok >< frame 701 2 05 >"),
+    ],
+)
+async def test_a_server_may_pass_frames_on_at_once(says: tuple[bytes, ...]) -> None:
+    """The bus is open, whatever others say on it meanwhile; closed, nothing is left."""
+    assert await served(*says) == (None, 0)
+
+
+@pytest.mark.parametrize(
+    "says",
+    [
+        (b"",),
+        (b"< hi >",),
+        (b"SSH-2.0-x\r\n",),
+        (b"< hi >", b"< error could not open bus >"),
+        (b"<" * 5000,),
+    ],
+)
+async def test_a_server_that_opens_no_bus_is_told(
+    says: tuple[bytes, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One that is silent, stuck, another one, or has no such bus: an error, and nothing is left."""
+    monkeypatch.setattr("drivers.backends.can_bus.interfaces._CONNECT_TIMEOUT", 0.1)
+    problem, left = await served(*says)
+    assert "check address and port" in (problem or "")
+    assert left == 0
+
+
+async def test_a_server_that_hangs_up_is_noticed_at_once(coarse_rig: Rig) -> None:
+    """Without a request, and long before three heartbeats of ten seconds."""
+    async with far_side(Wire(kind="socketcand"), coarse_rig) as far:
+        url = far.url.replace("#", "?heartbeat=10000#")
+        amplifier = Amplifier(CanBackend(url), reply_timeout=0.5)
+        await amplifier.open()
+        try:
+            far.station.befall(Episode("unplug"))
+            await eventually(lambda: amplifier.lost)
+        finally:
+            await amplifier.close()
+
+
+async def test_two_amplifiers_of_one_number_are_refused(virtual: Virtual) -> None:
+    """A second, different answer to who is there: neither is talked to."""
+    other = replace(virtual.far.amplifier.identity, serial_number="TWIN")
+    station = type("Twin", (), {})()
+    for name in ("capabilities", "faults", "is_answering", "listen", "status", "exchange"):
+        setattr(station, name, getattr(virtual.far.station, name))
+    station.identity = other
+    bus = virtual.gateway.bus
+    twin = CanNode(station, 1, send=lambda frame: bus.send(frame, sender=hear))
+
+    def hear(frame: CanFrame) -> None:
+        twin.receive(frame)
+
+    bus.join(hear)
+    twin.start()
+    amplifier = Amplifier(CanBackend(virtual.url()), reply_timeout=0.5)
+    with pytest.raises(LinkError, match="more than one amplifier"):
+        await amplifier.open()
+    bus.leave(hear)
+    twin.close()
+    await amplifier.open()
+    await amplifier.close()
+
+
+async def test_a_late_answer_is_no_second_amplifier(virtual: Virtual) -> None:
+    """What is told of another object, while a second amplifier is listened for, is of the first."""
+    late = CanFrame(0x581, bytes.fromhex("4F 01 10 00 00 00 00 00"))  # of the error register
+
+    def hear(frame: CanFrame) -> None:
+        if frame.id == 0x601 and frame.data[:4] == bytes.fromhex("40 18 10 04"):
+            virtual.gateway.say(late)
+
+    virtual.gateway.bus.join(hear)
+    async with opened(virtual.url()) as amplifier:
+        assert amplifier.identity.serial_number == virtual.far.amplifier.identity.serial_number
+
+
+def test_orders_are_numbered_from_1_to_255() -> None:
+    """255 numbers and then the first again: 0 is nobody's."""
+    orders = PendingOrders()
+    numbers = [orders.next_sequence() for _ in range(3 * 255)]
+    assert sorted(numbers) == sorted([*range(1, 256)] * 3)
+    assert numbers[:255] == numbers[255:510]
+
+
+async def test_a_channel_that_it_has_not_is_not_sent(virtual: Virtual) -> None:
+    """Its frame would be a command for the next node: refused here, and nothing goes out."""
+    async with opened(virtual.url()) as amplifier:
+        await amplifier.arm(2.0)
+        guard = Guard(LIMITS, replace(amplifier.capabilities, channels=16))
+        wanted = CommandSet(1, (DriveCommand(4, 110.0, 0.2),), ramp=0.0, valid_for=0.0)
+        before = amplifier.statistics.frames_out
+        with pytest.raises(CommandRefused, match="no such channel"):
+            await amplifier.apply(guard.check(wanted))
+        assert amplifier.statistics.frames_out == before
+
+
+async def test_a_second_host_does_not_arm(virtual: Virtual) -> None:
+    """Another program's heartbeat for this amplifier is heard before arming."""
+    async with opened(virtual.url()) as amplifier:
+        virtual.gateway.say(CanFrame(0x77F, b"\x05"))
+        await asyncio.sleep(0.02)
+        with pytest.raises(LinkError, match="another program"):
+            await amplifier.arm(2.0)
+
+
+async def test_events_are_told(virtual: Virtual) -> None:
+    """Emergencies and changes of state without a fault, each once."""
+    events: list[Event] = []
+    amplifier = Amplifier(CanBackend(virtual.url()), reply_timeout=0.5)
+    amplifier.listen(events.append)
+    await amplifier.open()
+    try:
+        await amplifier.arm(2.0)
+        virtual.far.station.befall(Episode("arc"))
+        await eventually(lambda: virtual.far.station.status().state is State.FAULT)
+        await amplifier.clear()
+        await eventually(lambda: Event(State.SWITCH_ON_DISABLED, Fault.NONE) in events)
+        assert events == [
+            Event(State.OPERATION_ENABLED, Fault.NONE),
+            Event(State.FAULT_REACTION_ACTIVE, Fault.ARC),
+            Event(State.FAULT, Fault.ARC),
+            Event(State.SWITCH_ON_DISABLED, Fault.NONE),
+        ]
+    finally:
+        await amplifier.close()
+
+
+async def test_a_late_answer_is_nobody_s(virtual: Virtual) -> None:
+    """An answer of another sequence number, action or token changes nothing, and is counted."""
+    backend = CanBackend(virtual.url())
+    amplifier = Amplifier(backend, reply_timeout=0.5)
+    await amplifier.open()
+    try:
+        await amplifier.arm(2.0)
+        before = backend.counters.foreign
+        virtual.gateway.listening = False  # the amplifier hears nothing, so no answer is its own
+        safe = tones(amplifier, 0.3)
+        asking = asyncio.create_task(backend.exchange(Apply(safe), timeout=PATIENCE))
+        await asyncio.sleep(0)
+        sequence, token = backend._orders._sequence, safe.token
+        for number, action, named in (
+            (sequence % 255 + 1, 1, token),
+            (sequence, 2, token),
+            (sequence, 1, token + 1),
+        ):
+            answer = bytes([number, action | 8, 4, 255, named, 0, 0, 0])
+            virtual.gateway.say(CanFrame(0x181, answer))
+        await eventually(lambda: backend.counters.foreign == before + 3)
+        assert not asking.done()
+        virtual.gateway.say(CanFrame(0x181, bytes([sequence, 1 | 8, 4, 255, token, 0, 0, 0])))
+        assert (await asking).token == token
+    finally:
+        await amplifier.close()
+
+
+async def test_a_flooded_bus_is_borne(virtual: Virtual) -> None:
+    """Thousands of frames of others and of broken answers between request and reply."""
+    backend = CanBackend(virtual.url())
+    amplifier = Amplifier(backend, reply_timeout=PATIENCE)
+    await amplifier.open()
+    try:
+        await amplifier.arm(2.0)
+        for number in range(3000):
+            virtual.gateway.say(CanFrame(number % 0x700, bytes(number % 9)))
+            virtual.gateway.say(CanFrame(0x181, bytes(number % 8)))
+            virtual.gateway.say(CanFrame(0x581, bytes(8)))
+        safe = tones(amplifier, 0.3)
+        assert (await amplifier.apply(safe)).token == safe.token
+        assert backend.counters.bad >= 3000
+        assert await amplifier.faults() == ()
+    finally:
+        await amplifier.close()
+
+
+async def test_whoever_asks_only_looks(virtual: Virtual) -> None:
+    """Status and faults of an amplifier that nobody has started leave the outputs alone."""
+    async with opened(virtual.url()) as amplifier:
+        await amplifier.status()
+        await amplifier.faults()
+    orders = [frame for frame in virtual.gateway.sent if frame.id in (0x481, 0x080)]
+    assert [frame.data[6] & 7 for frame in orders] == [0]
+
+
+async def test_a_ping_is_two_frames_and_an_unarmed_one_is_answered(virtual: Virtual) -> None:
+    """The backend alone: heartbeat and order, answered with the status."""
+    async with opened(virtual.url()) as amplifier:
+        backend = amplifier._link.backend
+        sent = backend.counters.frames_out
+        reply = await backend.exchange(Ping(), timeout=1.0)
+        assert backend.counters.frames_out == sent + 2
+        assert reply.state is State.SWITCH_ON_DISABLED  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize("kind", ["socketcand", "slcan", "virtual"])
+@pytest.mark.skipif(not Path("/proc/self/fd").exists(), reason="counts descriptors by /proc")
+async def test_a_hundred_openings_leak_nothing(kind: str, coarse_rig: Rig) -> None:
+    """Descriptors, threads and tasks are as many as before, also where a request was given up."""
+
+    def counts() -> tuple[int, int, int]:
+        descriptors = len(list(Path("/proc/self/fd").iterdir()))
+        threads = [one for one in threading.enumerate() if one.name.startswith("era-")]
+        return descriptors, len(threads), len(asyncio.all_tasks())
+
+    wire = Wire(kind="slcan" if kind == "virtual" else kind)
+    async with virtual_side(coarse_rig) as virtual, far_side(wire, coarse_rig) as far:
+        url = virtual.url() if kind == "virtual" else far.url
+        before = (0, 0, 0)
+        for number in range(104):
+            backend = CanBackend(url)
+            await backend.open()
+            asking = asyncio.create_task(backend.exchange(Ping(), timeout=1.0))
+            await asyncio.sleep(0)
+            asking.cancel()
+            await asyncio.gather(asking, return_exceptions=True)
+            await backend.close()
+            if number == 3:
+                await asyncio.sleep(0.05)  # the far end is in this process, and hangs up later
+                before = counts()
+        gc.collect()
+        await eventually(
+            lambda: all(now <= then for now, then in zip(counts(), before, strict=True))
+        )
+        assert counts()[1] == 0
+
+
+async def test_an_adapter_that_takes_no_more_for_a_moment_is_not_lost(
+    coarse_rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A write that times out half-way is a missing answer: it is asked again, and understood."""
+    async with far_side(Wire(kind="slcan"), coarse_rig) as far, opened(far.url) as amplifier:
+        await amplifier.arm(2.0)
+        write_all = "drivers.backends.can_bus.interfaces.write_all"
+
+        def half(port: serial.Serial, data: bytes) -> None:
+            port.write(data[: len(data) // 2])
+            monkeypatch.undo()
+            raise serial.SerialTimeoutException("Write timeout")
+
+        monkeypatch.setattr(write_all, half)
+        safe = tones(amplifier, 0.3)
+        assert (await amplifier.apply(safe)).token == safe.token
+        assert amplifier.statistics.retries >= 1
+        assert not amplifier.lost

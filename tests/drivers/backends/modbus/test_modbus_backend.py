@@ -1,0 +1,672 @@
+"""The host's side of Modbus against a server that a test scripts, and one that is not ours."""
+
+import asyncio
+from collections.abc import AsyncIterator, Callable
+from dataclasses import replace
+
+import pytest
+from pymodbus.framer import FramerType
+from pymodbus.server import ModbusTcpServer
+from pymodbus.simulator import DataType, SimData, SimDevice
+
+from drivers.amplifier import Amplifier
+from drivers.backends.modbus import line as modbus_line
+from drivers.backends.modbus.backend import ModbusBackend
+from drivers.backends.modbus.line import ModbusLink
+from drivers.backends.stand_in import STAND_IN, Adapter, Port, StandIn, Worker
+from drivers.backends.urls.modbus import ModbusUrl
+from drivers.codec.modbus.exchanges import Read, Write
+from drivers.codec.modbus.timing import loading_time, round_trip_time, silence
+from drivers.command import CommandSet
+from drivers.errors import CommandError, FrameError, LinkError, LinkTimeout
+from drivers.guard import SafeCommand
+from drivers.operation.watchdog import check_watchdog
+from drivers.protocol.definition import PROTOCOL
+from drivers.protocol.messages import (
+    Achieved,
+    Apply,
+    Arm,
+    Commit,
+    Event,
+    Fault,
+    FaultList,
+    FaultRecord,
+    GetCaps,
+    GetFaults,
+    GetStatus,
+    Hello,
+    Loaded,
+    LoadEnvelope,
+    Nak,
+    NakCode,
+    Ping,
+    Reply,
+    Request,
+    Stage,
+    State,
+    Stop,
+)
+from modbus_peer import Peer, peer
+from modbus_session import (
+    ARMED,
+    CAPABILITIES,
+    COMMANDS,
+    IDENTITY,
+    SET,
+    SHAPE,
+    TRIPPED,
+    ScriptedStation,
+)
+from sim.far_ends.modbus.frames import Request as Telegram
+from sim.far_ends.modbus.unit import ModbusUnit
+from sim.transport.pseudo_terminal import PseudoTerminal
+
+PATIENCE = 5.0  # s; for what is expected to come
+SHORT = 0.02  # s; for what is expected not to come
+MAP = PROTOCOL.modbus
+
+
+@pytest.fixture(params=["TCP", "RTU"])
+async def far(request: pytest.FixtureRequest) -> AsyncIterator[Peer]:
+    """A scripted amplifier in both kinds of frames, well-behaved until a test says otherwise."""
+    async with peer(is_rtu=request.param == "RTU") as far:
+        yield far
+
+
+@pytest.fixture
+async def backend(far: Peer) -> AsyncIterator[ModbusBackend]:
+    """An open backend to it."""
+    backend = ModbusBackend(far.url)
+    await backend.open()
+    yield backend
+    await backend.close()
+
+
+@pytest.mark.parametrize(
+    ("url", "expected"),
+    [
+        ("modbus+tcp://10.0.0.7", ModbusUrl(False, host="10.0.0.7", port=502, unit=1)),
+        ("modbus+tcp://amp:1502/247", ModbusUrl(False, host="amp", port=1502, unit=247)),
+        ("modbus+tcp://[::1]:1502/2", ModbusUrl(False, host="::1", port=1502, unit=2)),
+        (
+            "modbus+rtu:///dev/ttyS1?baud=19200&parity=none&stop=2#9",
+            ModbusUrl(True, device="/dev/ttyS1", baud=19200, parity="N", stop=2, unit=9),
+        ),
+        ("modbus+rtu:///dev/ttyS1", ModbusUrl(True, device="/dev/ttyS1", baud=115200, unit=1)),
+        ("modbus+rtu:///COM3", ModbusUrl(True, device="COM3", baud=115200, unit=1)),
+        ("modbus+tcp://gw/3?baud=9600", ModbusUrl(False, host="gw", port=502, baud=9600, unit=3)),
+        ("modbus+rtu://srv:4001#2", ModbusUrl(True, host="srv", port=4001, unit=2)),
+    ],
+)
+def test_urls_are_taken_apart(url: str, expected: ModbusUrl) -> None:
+    """Host, port and unit; device, speed, parity, stop bits and unit; with the usual defaults.
+
+    Of the line behind a gateway or a server nothing is known unless it is said.
+    """
+    assert ModbusUrl.parse(url) == expected
+
+
+async def test_a_slow_line_behind_a_gateway_is_waited_for() -> None:
+    """Told of 9600 baud, it waits for what they take: 0.13 s for a set of four and its answer."""
+    async with peer(is_rtu=False) as far:
+        backend = ModbusBackend(f"{far.url}?baud=9600")
+        assert backend.round_trip(4) == pytest.approx(0.12948, abs=1e-5)
+        await backend.open()
+        try:
+            at_once = far.answer
+            loop = asyncio.get_running_loop()
+
+            def later(request: Telegram) -> None:
+                pdu = at_once(request)
+                assert pdu is not None
+                loop.call_later(0.035, far.send, request, pdu)
+
+            far.answer = later
+            assert await backend.exchange(Ping(), timeout=0.001) == ARMED
+        finally:
+            await backend.close()
+
+
+@pytest.mark.parametrize(
+    ("url", "words"),
+    [
+        ("modbus+tcp://", "a host, a port and a unit"),
+        ("modbus+tcp://h:99999/1", "no Modbus URL"),
+        ("modbus+tcp://h/0", "unit is '0'; it must be a whole number from 1 to 247"),
+        ("modbus+tcp://h/1?speed=5", "unknown option speed; a Modbus TCP URL has baud"),
+        ("modbus+tcp://h/1?baud=0", "baud is .0.; it must be a whole number"),
+        ("modbus+tcp://h/one", "unit is 'one'"),
+        ("modbus+rtu://", "names no port"),
+        ("modbus+rtu://h#1", "names no host and port"),
+        ("modbus+rtu:///dev/x#248", "from 1 to 247"),
+        ("modbus+rtu:///dev/x?speed=3", "unknown option speed"),
+        ("modbus+rtu:///dev/x?baud=fast", "baud is 'fast'"),
+        ("modbus+rtu:///dev/x?parity=some", "parity is 'some'"),
+        ("modbus://h/1", "use modbus\\+tcp"),
+    ],
+)
+def test_bad_urls_say_what_is_wrong(url: str, words: str) -> None:
+    """CommandError with the part to blame."""
+    with pytest.raises(CommandError, match=words):
+        ModbusBackend(url)
+
+
+@pytest.mark.parametrize(
+    ("request_", "expected"),
+    [
+        (Hello(), IDENTITY),
+        (GetCaps(), CAPABILITIES),
+        (Arm(0.25), ARMED),
+        (Apply(SET), Achieved(513, COMMANDS)),
+        (Stage(SET), Achieved(513, COMMANDS)),
+        (Ping(), ARMED),
+        (GetFaults(), FaultList(())),
+        (LoadEnvelope(SHAPE), Loaded(5, 2)),
+    ],
+    ids=lambda value: type(value).__name__,
+)
+async def test_every_request_is_one_transaction(
+    far: Peer, backend: ModbusBackend, request_: Request, expected: Reply
+) -> None:
+    """A block written and one read back, by function 23; identity and capabilities only read."""
+    assert await backend.exchange(request_, timeout=PATIENCE) == expected
+    assert far.functions == [4 if isinstance(request_, Hello | GetCaps) else 23]
+    assert backend.last_sent > 0
+
+
+async def test_more_faults_than_usual_are_read_in_two_steps(
+    far: Peer, backend: ModbusBackend
+) -> None:
+    """All of them come, newest first, up to as many as fit into a read."""
+    records = tuple(FaultRecord(Fault.ARC, number % 4, float(number)) for number in range(32))
+    for count, reads in ((4, 1), (5, 2), (30, 2)):
+        far.requests.clear()
+        far.station.answer = lambda _, count=count: FaultList(records[:count])
+        assert await backend.exchange(GetFaults(), timeout=PATIENCE) == FaultList(records[:count])
+        assert len(far.requests) == reads
+    far.station.answer = lambda _: FaultList(records)
+    answer = await backend.exchange(GetFaults(), timeout=PATIENCE)
+    assert answer == FaultList(records[:30])
+
+
+async def test_without_function_23_it_goes_on_with_two(far: Peer, backend: ModbusBackend) -> None:
+    """Exception 1 to the first one is remembered: from then on 16 (or 6) and 4."""
+    far.answer = lambda request: (
+        bytes([0x97, 1]) if request.pdu[0] == 23 else far.unit.answer(request.pdu)
+    )
+    assert await backend.exchange(Apply(SET), timeout=PATIENCE) == Achieved(513, COMMANDS)
+    assert await backend.exchange(Ping(), timeout=PATIENCE) == ARMED
+    assert far.functions == [23, 16, 4, 6, 4]
+    carried_out = [one for one in far.station.asked if not isinstance(one, GetStatus)]
+    assert [type(request) for request in carried_out] == [Apply, Ping]
+
+
+REFUSALS = [code for code in NakCode if code is not NakCode.UNKNOWN_TYPE]  # that is a function's
+
+
+@pytest.mark.parametrize("combined", [True, False], ids=["function 23", "functions 16 and 4"])
+@pytest.mark.parametrize("code", REFUSALS, ids=lambda code: code.name)
+async def test_every_refusal_is_told_with_its_reason(
+    far: Peer, backend: ModbusBackend, code: NakCode, combined: bool
+) -> None:
+    """Whatever exception it came as; busy is taken at its word, the others are read."""
+    backend._can_read_back = combined
+    far.station.answer = lambda _: Nak(code, 2)
+    nak = await backend.exchange(Apply(SET), timeout=PATIENCE)
+    is_busy = code is NakCode.BUSY
+    assert nak == Nak(code, None if is_busy else 2)
+    assert far.functions == [23 if combined else 16, 4][: 1 if is_busy else 2]
+
+
+async def test_a_gateway_without_an_amplifier_is_no_answer(
+    far: Peer, backend: ModbusBackend
+) -> None:
+    """Exceptions 10 and 11 count as a timeout, and say that it is the gateway that speaks."""
+    for code in (10, 11):
+        far.answer = lambda request, code=code: bytes([request.pdu[0] | 0x80, code])
+        with pytest.raises(LinkTimeout, match="gateway"):
+            await backend.exchange(Ping(), timeout=PATIENCE)
+
+
+async def test_no_answer_is_a_timeout(far: Peer, backend: ModbusBackend) -> None:
+    """A silent amplifier gives LinkTimeout with the unit; the line stays usable."""
+    far.answer = lambda _: None
+    with pytest.raises(LinkTimeout, match="no answer from unit 1"):
+        await backend.exchange(Ping(), timeout=SHORT)
+    far.answer = lambda request: far.unit.answer(request.pdu)
+    assert await backend.exchange(Ping(), timeout=PATIENCE) == ARMED
+
+
+async def test_a_late_answer_is_not_credited_to_the_next_request(
+    far: Peer, backend: ModbusBackend
+) -> None:
+    """A status that comes after its time is dropped; the next one gets its own, behind it."""
+    late: list[bytes] = []
+
+    def answer(request: object) -> bytes | None:
+        pdu = far.unit.answer(far.requests[-1].pdu)
+        if not late:
+            assert pdu is not None
+            late.append(far.frame(far.requests[-1], pdu))
+            return None
+        far.send_raw(late[0])
+        return pdu
+
+    far.answer = answer
+    far.station.answer = lambda _: replace(ARMED, token=1)
+    with pytest.raises(LinkTimeout):
+        await backend.exchange(GetStatus(), timeout=SHORT)
+    far.station.answer = lambda _: replace(ARMED, token=2)
+    for _ in range(3):  # and copies of it later
+        status = await backend.exchange(GetStatus(), timeout=PATIENCE)
+        assert status == replace(ARMED, token=2)
+    assert backend.counters.foreign == 3
+
+
+async def test_a_late_refusal_is_not_credited_to_the_next_request(
+    far: Peer, backend: ModbusBackend
+) -> None:
+    """Over RTU an exception carries no tag: the refusal's own shows that it is of another write."""
+    late: list[bytes] = []
+
+    def answer(request: object) -> bytes | None:
+        pdu = far.unit.answer(far.requests[-1].pdu)
+        if not late:
+            assert pdu is not None
+            late.append(far.frame(far.requests[-1], pdu))
+            return None
+        if len(late) == 1:
+            late.append(b"")
+            far.send_raw(late[0])
+        return pdu
+
+    far.answer = answer
+    far.station.answer = lambda _: Nak(NakCode.WRONG_STATE)
+    with pytest.raises(LinkTimeout):
+        await backend.exchange(Apply(SET), timeout=SHORT)
+    far.station.answer = far.station.usual_answer
+    if far.is_rtu:
+        with pytest.raises(LinkTimeout, match="names no reason"):
+            await backend.exchange(Arm(0.25), timeout=PATIENCE)
+    assert await backend.exchange(Arm(0.25), timeout=PATIENCE) == ARMED
+
+
+async def test_numbers_begin_again_after_the_last(far: Peer, backend: ModbusBackend) -> None:
+    """Transactions and tags have 16 bits: the next after the last of them is understood as well."""
+    backend._opened()._transaction = backend._tag = 0xFFFF - 1
+    for _ in range(3):
+        assert await backend.exchange(Arm(0.25), timeout=PATIENCE) == ARMED
+
+
+async def test_an_exception_without_a_refusal_is_no_answer(
+    far: Peer, backend: ModbusBackend
+) -> None:
+    """An exception before anything was refused: what was written is asked for again."""
+
+    def answer(request: object) -> bytes | None:
+        pdu = far.requests[-1].pdu
+        return far.unit.answer(pdu) if pdu[0] == 4 else bytes([pdu[0] | 0x80, 3])
+
+    far.answer = answer
+    with pytest.raises(LinkTimeout, match="names no reason"):
+        await backend.exchange(Arm(0.25), timeout=PATIENCE)
+
+
+def off_by(place: int, bit: int = 1) -> Callable[[bytes], bytes]:
+    """The same answer with one bit of a byte the other way round."""
+
+    def change(frame: bytes) -> bytes:
+        changed = bytearray(frame)
+        changed[place] ^= bit
+        return bytes(changed)
+
+    return change
+
+
+@pytest.mark.parametrize("place", range(12))
+async def test_an_answer_that_is_none_is_dropped(
+    far: Peer, backend: ModbusBackend, place: int
+) -> None:
+    """Transaction, protocol, length, unit, function, count, tag or check is wrong; the next is not.
+
+    Over RTU any flipped bit is found by the CRC; over TCP by what the frame says of itself.
+    """
+    spoil = off_by(place)
+
+    def answer(request: object) -> bytes | None:
+        pdu = far.unit.answer(far.requests[-1].pdu)
+        assert pdu is not None
+        asyncio.get_running_loop().call_later(0.01, far.send, far.requests[-1], pdu)
+        far.send_raw(spoil(far.frame(far.requests[-1], pdu)))
+        return None
+
+    far.answer = answer
+    try:
+        assert await backend.exchange(Ping(), timeout=PATIENCE / 10) == ARMED
+    except LinkTimeout:
+        assert not far.is_rtu
+        assert place == 5  # a length that is longer swallows the beginning of the next frame
+    counters = backend.counters
+    assert counters.bad + counters.foreign >= 1
+    far.answer = lambda request: far.unit.answer(request.pdu)
+    assert await backend.exchange(Ping(), timeout=PATIENCE) == ARMED
+
+
+@pytest.mark.parametrize("place", [-4, -3, -2, -1])
+async def test_an_echo_of_another_write_is_dropped(place: int) -> None:
+    """Function 16 echoes address and count: where they are others, that write was not confirmed."""
+    async with peer(is_rtu=False) as far:
+        link = await ModbusLink.of(ModbusUrl.parse(far.url).line, "test", lambda _: None)
+
+        def answer(request: object) -> bytes | None:
+            pdu = far.unit.answer(far.requests[-1].pdu)
+            assert pdu is not None
+            return off_by(place)(pdu)
+
+        far.answer = answer
+        write = Write(2, (15, 250, 0))
+        with pytest.raises(LinkTimeout):
+            await link.transact(None, write, unit=1, timeout=SHORT, accept=lambda _: True)
+        with pytest.raises(LinkTimeout):
+            await link.transact(None, Write(8, (99,)), unit=1, timeout=SHORT, accept=lambda _: True)
+        assert link.counters.foreign == 2
+        await link.leave("test")
+
+
+async def test_an_answer_out_of_range_is_refused(far: Peer, backend: ModbusBackend) -> None:
+    """A state that does not exist, with a good check, is the amplifier's mistake: FrameError."""
+    await backend.exchange(GetCaps(), timeout=PATIENCE)
+    far.station.answer = lambda _: replace(ARMED, state=9)  # type: ignore[arg-type]
+    with pytest.raises(FrameError, match="9 is no state"):
+        await backend.exchange(Ping(), timeout=PATIENCE)
+    far.station.answer = lambda _: replace(ARMED, levels=(0.0,) * 5)
+    with pytest.raises(FrameError, match="5 channels where 4 were read"):
+        await backend.exchange(Ping(), timeout=PATIENCE)
+
+
+async def test_a_hang_up_is_told_at_once(far: Peer, backend: ModbusBackend) -> None:
+    """LinkError to who asks, and to who listens where nobody does; closing is safe afterwards."""
+    far.answer = lambda _: far.hang_up()
+    with pytest.raises(LinkError, match=r"was lost.*open the amplifier again"):
+        await backend.exchange(Ping(), timeout=PATIENCE)
+    with pytest.raises(LinkError, match="was lost"):
+        await backend.exchange(Ping(), timeout=PATIENCE)
+    await backend.close()
+    lost = asyncio.get_running_loop().create_future()
+    backend.listen(lambda _: None, lost.set_result)
+    await backend.open()
+    far.answer = lambda request: far.unit.answer(request.pdu)
+    assert await backend.exchange(Ping(), timeout=PATIENCE) == ARMED
+    far.hang_up()
+    assert "was lost" in await asyncio.wait_for(lost, PATIENCE)
+
+
+async def test_nobody_there_says_so(far: Peer) -> None:
+    """LinkError that names the address and what to check."""
+    with pytest.raises(LinkError, match=r"127\.0\.0\.1:1 takes no Modbus connection"):
+        await ModbusBackend("modbus+tcp://127.0.0.1:1/1").open()
+    with pytest.raises(LinkError, match="no such port"):
+        await ModbusBackend("modbus+rtu:///dev/no-such-port#1").open()
+    with pytest.raises(LinkError, match="cannot be opened"):
+        await ModbusBackend("modbus+rtu:///dev/null#1").open()
+    with pytest.raises(LinkError, match="is not open"):
+        await ModbusBackend(far.url).exchange(Ping(), timeout=SHORT)
+
+
+async def test_a_serial_port_is_for_one_program() -> None:
+    """Who finds it in use is told so, and the first goes on undisturbed."""
+    terminal = PseudoTerminal(lambda _: None)
+    first = ModbusBackend(f"modbus+rtu://{terminal.port}#1")
+    await first.open()
+    with pytest.raises(LinkError, match="another program has it open"):
+        await ModbusBackend(f"modbus+rtu://{terminal.port}?baud=9600#1").open()
+    with pytest.raises(LinkTimeout):
+        await first.exchange(Ping(), timeout=SHORT)
+    await first.close()
+    again = ModbusBackend(f"modbus+rtu://{terminal.port}?baud=9600#1")
+    await again.open()
+    await again.close()
+    terminal.listen()
+    terminal.close()
+
+
+async def test_units_of_one_line_share_it(far: Peer) -> None:
+    """One connection for all, one telegram at a time; it closes with the last who uses it."""
+    first, second = ModbusBackend(far.url), ModbusBackend(far.url[:-1] + "2")
+    await first.open()
+    await second.open()
+    await second.open()
+    assert far.connections == 1
+    assert first.bus == second.bus
+    waiting: list[int] = []
+
+    def answer(request: object) -> bytes | None:
+        waiting.append(far.requests[-1].unit)
+        assert len(waiting) == 1
+
+        def reply() -> None:
+            waiting.clear()
+            pdu = far.unit.answer(far.requests[-1].pdu)
+            assert pdu is not None
+            far.send(far.requests[-1], pdu)
+
+        asyncio.get_running_loop().call_later(0.003, reply)
+        return None
+
+    far.answer = answer
+    replies = await asyncio.gather(
+        *(backend.exchange(Ping(), timeout=PATIENCE) for backend in (first, second) * 5)
+    )
+    assert replies == [ARMED] * 10
+    assert sorted(request.unit for request in far.requests) == [1] * 5 + [2] * 5
+    await first.close()
+    assert await second.exchange(Ping(), timeout=PATIENCE) == ARMED
+    await second.close()
+    await second.close()
+
+
+async def test_a_broadcast_goes_to_unit_0_and_waits_for_nobody(
+    far: Peer, backend: ModbusBackend
+) -> None:
+    """The commit is one register, the stop a control block; the next request is answered."""
+    await backend.broadcast(Commit(513))
+    await backend.broadcast(Stop(0.005))
+    assert await backend.exchange(Ping(), timeout=PATIENCE) == ARMED
+    assert [request.unit for request in far.requests] == [0, 0, 1]
+    assert far.requests[0].pdu == bytes.fromhex("06 00 10 02 01")  # as on the vendor page
+    far.unit.hear(far.requests[0].pdu)
+    far.unit.hear(far.requests[1].pdu)
+    assert far.station.heard == [Commit(513), Stop(0.005)]
+
+
+async def test_what_is_cancelled_leaves_its_answer_the_time_to_come(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Over RTU the next telegram waits until the abandoned answer was there, over TCP not."""
+    monkeypatch.setattr(modbus_line, "_REACTION", 60.0)
+    for is_rtu in (True, False):
+        async with peer(is_rtu=is_rtu) as far:
+            backend = ModbusBackend(far.url)
+            await backend.open()
+            far.answer = lambda _: None
+            asking = asyncio.create_task(backend.exchange(Ping(), timeout=PATIENCE))
+            await far.count(1)
+            asking.cancel()
+            await asyncio.gather(asking, return_exceptions=True)
+            far.answer = lambda request, far=far: far.unit.answer(request.pdu)
+            stopping = asyncio.create_task(backend.exchange(Stop(0.0), timeout=PATIENCE))
+            await asyncio.sleep(SHORT)
+            assert len(far.requests) == (1 if is_rtu else 2)
+            pdu = far.unit.answer(far.requests[0].pdu)
+            assert pdu is not None
+            far.send(far.requests[0], pdu)
+            assert await asyncio.wait_for(stopping, PATIENCE) == ARMED
+            await backend.close()
+
+
+async def test_events_are_what_answers_show_to_have_changed(
+    far: Peer, backend: ModbusBackend
+) -> None:
+    """One a change of state or fault, none for the first answer, and none for looking on."""
+    told: list[Event] = []
+    backend.listen(told.append, lambda _: None)
+    for status in (ARMED, ARMED, TRIPPED, TRIPPED, ARMED):
+        far.station.answer = lambda _, status=status: status
+        await backend.exchange(GetStatus(), timeout=PATIENCE)
+    assert told == [Event(State.FAULT, Fault.WATCHDOG), Event(State.OPERATION_ENABLED, Fault.NONE)]
+
+
+async def test_only_what_a_guard_has_seen_is_sent(far: Peer, backend: ModbusBackend) -> None:
+    """A plain set is a TypeError, and nothing of it is on the wire."""
+    plain = CommandSet(1, SET.commands, 0.0, 0.0)
+    for request in (Apply(plain), Stage(plain)):
+        with pytest.raises(TypeError, match="SafeCommand"):
+            await backend.exchange(request, timeout=PATIENCE)
+    assert far.requests == []
+
+
+async def test_an_amplifier_stands_on_it(far: Peer, safe: Callable[..., SafeCommand]) -> None:
+    """Open, arm, play, and no answer three times: lost, by the one implementation of all wires."""
+    amplifier = Amplifier(ModbusBackend(far.url), reply_timeout=SHORT)
+    await amplifier.open()
+    assert amplifier.identity == IDENTITY
+    assert amplifier.capabilities == CAPABILITIES
+    assert (await amplifier.apply(safe(7))).token == 7
+    far.answer = lambda _: None
+    with pytest.raises(LinkTimeout, match="3 requests in a row"):
+        await amplifier.heartbeat()
+    assert amplifier.lost
+    await amplifier.close()
+
+
+def test_wire_time_is_arithmetic() -> None:
+    """Four channels: 57 bytes out and 49 back, 11 bits each, and twice 3.5 characters of silence.
+
+    By hand: 106 * 11 / 115200 = 10.12 ms and two gaps of 1.75 ms, the standard's least; at
+    9600 baud 121.46 ms and two of 4.01 ms.
+    """
+    assert round_trip_time(4, baud=115200) == pytest.approx(0.01362, abs=1e-5)
+    assert round_trip_time(4, baud=9600) == pytest.approx(0.12948, abs=1e-5)
+    # The frames of the vendor's page, of two knots.
+    assert loading_time(2, baud=9600) == pytest.approx((31 + 15 + 7) * 11 / 9600)
+    assert silence(baud=9600) == pytest.approx(3.5 * 11 / 9600)
+    assert silence(baud=115200) == 0.00175
+    assert ModbusBackend("modbus+tcp://h/1").round_trip(4) == 0
+    assert ModbusBackend("modbus+tcp://h/1").loading_time(20) == 0
+    slow = ModbusBackend("modbus+rtu:///dev/ttyS1?baud=9600#1").round_trip(4)
+    with pytest.raises(CommandError, match=r"round trip of 129\.5 ms need at least 279 ms"):
+        check_watchdog(0.25, slow)
+    check_watchdog(0.25, ModbusBackend("modbus+rtu:///dev/ttyS1?baud=19200#1").round_trip(4))
+
+
+@pytest.mark.parametrize("framer", [FramerType.SOCKET, FramerType.RTU], ids=["TCP", "RTU"])
+async def test_a_server_that_is_not_ours_understands_the_frames(framer: FramerType) -> None:
+    """pymodbus's own server takes each function that is sent, and its answers are understood."""
+    device = SimDevice(
+        1, simdata=[SimData(0, values=list(range(100)), datatype=DataType.REGISTERS)]
+    )
+    server = ModbusTcpServer(device, framer=framer, address=("127.0.0.1", 0))
+    await server.serve_forever(background=True)
+    port = server.transport.sockets[0].getsockname()[1]
+    is_rtu = framer is FramerType.RTU
+    scheme, unit = ("modbus+rtu", "#1") if is_rtu else ("modbus+tcp", "/1")
+    line = ModbusUrl.parse(f"{scheme}://127.0.0.1:{port}{unit}").line
+    link = await ModbusLink.of(line, "test", lambda _: None)
+
+    async def ask(read: Read | None, write: Write | None = None) -> object:
+        return await link.transact(read, write, unit=1, timeout=PATIENCE, accept=lambda _: True)
+
+    assert (await ask(Read(5, 3))).registers == (5, 6, 7)
+    await ask(None, Write(5, (500, 600)))
+    await ask(None, Write(7, (700,)))
+    both = await ask(Read(5, 4), Write(8, (800, 900)))
+    assert both.registers == (500, 600, 700, 800)
+    assert (await ask(Read(99, 5))).exception == 2
+    assert (await ask(Read(0, 100))).registers[9] == 900
+    assert link.counters.bad == link.counters.foreign == 0
+    await link.leave("test")
+    await server.shutdown()
+
+
+async def test_two_amplifiers_of_one_unit_are_refused() -> None:
+    """Over RTU two different answers to one Hello; one that came twice is no second amplifier."""
+    async with peer(is_rtu=True) as far:
+        second = ScriptedStation()
+        second.answer = lambda request: (
+            replace(IDENTITY, serial_number="B-18")
+            if isinstance(request, Hello)
+            else second.usual_answer(request)
+        )
+        other = ModbusUnit(second)
+
+        def answered_by(*units: ModbusUnit) -> Callable[[Telegram], None]:
+            def answer(request: Telegram) -> None:
+                for unit in units:
+                    pdu = unit.answer(request.pdu)
+                    assert pdu is not None
+                    far.send(request, pdu)
+
+            return answer
+
+        far.answer = answered_by(far.unit, other)
+        amplifier = Amplifier(ModbusBackend(far.url), reply_timeout=PATIENCE)
+        with pytest.raises(LinkError, match="more than one amplifier answers as unit 1 on"):
+            await amplifier.open()
+        far.answer = answered_by(far.unit, far.unit)
+        await amplifier.open()
+        await amplifier.close()
+
+
+class _Ports(StandIn):
+    """Ports that only remember how they were opened and closed."""
+
+    def __init__(self) -> None:
+        self.happened: list[str] = []
+        self.lose: Callable[[str], None] = lambda what: None
+
+    async def open_port(
+        self, name: str, *, on_data: Callable[[bytes], None], on_loss: Callable[[str], None]
+    ) -> Port:
+        self.happened.append("opened")
+        self.lose = on_loss
+        return _NotedPort(self.happened)
+
+    async def open_adapter(self, *_: object, **__: object) -> Adapter:
+        raise NotImplementedError
+
+    def make_worker(self) -> Worker:
+        raise NotImplementedError
+
+    def below(self, limit: int) -> int:
+        return 0
+
+
+class _NotedPort:
+    def __init__(self, happened: list[str]) -> None:
+        self._happened = happened
+
+    def write(self, data: bytes) -> None:
+        """Nobody is there."""
+
+    def close(self) -> None:
+        self._happened.append("closed")
+
+    async def wait_closed(self) -> None:
+        self._happened.append("gone")
+
+
+async def test_a_lost_port_is_given_back_before_it_is_opened_again() -> None:
+    """Also where only one of two amplifiers on it comes back: the system gives it out once."""
+    ports = _Ports()
+    STAND_IN.set(ports)
+    east, west = (ModbusBackend(f"modbus+rtu:///dev/none?baud=115200#{unit}") for unit in (1, 2))
+    await east.open()
+    await west.open()
+    ports.lose("pulled out")
+    await east.close()
+    await east.open()
+    assert ports.happened == ["opened", "closed", "gone", "opened"]
+    await west.close()
+    assert ports.happened == ["opened", "closed", "gone", "opened"]
+    await east.close()
+    assert ports.happened == ["opened", "closed", "gone", "opened", "closed", "gone"]

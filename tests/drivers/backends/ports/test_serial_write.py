@@ -1,0 +1,48 @@
+"""What a serial port takes, on a pseudo-terminal."""
+
+import os
+import pty
+import tty
+from collections.abc import Iterator
+
+import pytest
+import serial
+
+from drivers.backends.ports.writing import write_all
+
+
+@pytest.fixture
+def ends() -> Iterator[tuple[serial.Serial, int]]:
+    """A port, and the descriptor at its other end."""
+    far, near = pty.openpty()
+    tty.setraw(near)
+    port = serial.Serial(os.ttyname(near), timeout=0, write_timeout=0.02)
+    yield port, far
+    port.close()
+    os.close(near)
+    os.close(far)
+
+
+def test_what_was_taken_is_no_time_out(
+    ends: tuple[serial.Serial, int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A process that is held up while it writes has written all the same."""
+    port, far = ends
+    monkeypatch.setattr("serial.serialposix.Timeout.expired", lambda self: True)
+    write_all(port, b"all of it")
+    assert os.read(far, 100) == b"all of it"
+
+
+def test_a_port_that_takes_no_more_is_told(ends: tuple[serial.Serial, int]) -> None:
+    """Nobody reads at the other end, so its buffer fills up."""
+    port, _ = ends
+    with pytest.raises(serial.SerialTimeoutException):
+        write_all(port, bytes(1 << 20))
+
+
+def test_a_port_that_is_closed_is_told(ends: tuple[serial.Serial, int]) -> None:
+    """As an error of the system, which is what a lost one gives, too."""
+    port, _ = ends
+    port.close()
+    with pytest.raises(OSError, match="not open"):
+        write_all(port, b"x")

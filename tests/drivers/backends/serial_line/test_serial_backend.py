@@ -1,0 +1,374 @@
+import asyncio
+import contextlib
+import errno
+import gc
+import socket
+import sys
+import threading
+from collections.abc import AsyncIterator, Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import serial
+
+from drivers.amplifier import Amplifier
+from drivers.backends.ports import opening
+from drivers.backends.serial_line.backend import SerialBackend
+from drivers.backends.urls.serial_line import SerialUrl
+from drivers.codec.serial_line.exchanges import decode_request, encode_reply
+from drivers.codec.serial_line.frame import Frame, FrameReader, encode_frame
+from drivers.errors import CommandError, FrameError, LinkError, LinkTimeout
+from drivers.guard import SafeCommand
+from drivers.protocol.messages import Achieved, GetStatus, Hello, Nak, NakCode, Ping
+from scripted_amplifier import IDENTITY, STATUS, FarEnd, usual_answer
+
+PATIENCE = 5.0  # s; for what is expected to come
+SHORT = 0.02  # s; for what is expected not to come
+
+
+def reader_threads() -> list[threading.Thread]:
+    """The reader threads of serial backends that live."""
+    return [thread for thread in threading.enumerate() if thread.name.startswith("era-serial")]
+
+
+def open_files() -> set[str]:
+    """Targets of this process's descriptors that are terminals or pipes."""
+    found = set()
+    for descriptor in Path("/proc/self/fd").iterdir():
+        with contextlib.suppress(OSError):
+            target = str(descriptor.readlink()).removesuffix(" (deleted)")
+            if "pipe" in target or "pts" in target:
+                found.add(f"{descriptor.name} {target}")
+    return found
+
+
+@pytest.fixture
+async def backend(far_end: FarEnd) -> AsyncIterator[SerialBackend]:
+    """An open backend to the scripted far end."""
+    backend = SerialBackend(far_end.url)
+    await backend.open()
+    yield backend
+    await backend.close()
+
+
+async def test_a_request_gets_its_reply(backend: SerialBackend, far_end: FarEnd) -> None:
+    """Requests go out with rising sequence numbers to the address; replies and Naks come back."""
+    assert await backend.exchange(Hello(), timeout=PATIENCE) == IDENTITY
+    far_end.answer = lambda request, frame: Nak(NakCode.BUSY)
+    assert await backend.exchange(Ping(), timeout=PATIENCE) == Nak(NakCode.BUSY)
+    first, second = far_end.frames
+    assert (second.sequence - first.sequence) % 65536 == 1
+    assert (first.address, second.address) == (1, 1)
+    assert backend.last_sent > 0
+
+
+async def test_no_answer_is_a_timeout(backend: SerialBackend, far_end: FarEnd) -> None:
+    """A far end that stays silent gives LinkTimeout with what to check."""
+    far_end.answer = lambda request, frame: None
+    with pytest.raises(LinkTimeout, match=r"no answer from address 1.*921600 baud"):
+        await backend.exchange(Ping(), timeout=SHORT)
+
+
+async def test_a_slow_line_has_its_time_on_top(far_end: FarEnd) -> None:
+    """At 300 baud a Ping and its answer take 2 s on the line, whatever the amplifier may take."""
+    backend = SerialBackend(f"{far_end.url}?baud=300")
+    await backend.open()
+    far_end.answer = lambda request, frame: None
+    asking = asyncio.create_task(backend.exchange(Ping(), timeout=0.001))
+    await far_end.count(1)
+    await asyncio.sleep(SHORT)
+    far_end.send(STATUS, far_end.frames[0])
+    assert await asking == STATUS
+    await backend.close()
+
+
+async def test_late_and_foreign_replies_are_dropped(
+    backend: SerialBackend, far_end: FarEnd
+) -> None:
+    """A late reply, one from another address and an echo are counted, never credited."""
+    far_end.answer = lambda request, frame: None
+    with pytest.raises(LinkTimeout):
+        await backend.exchange(GetStatus(), timeout=SHORT)
+    late = far_end.frames[0]
+
+    def answer(request: object, frame: Frame) -> bytes:
+        other = Frame(frame.kind, address=2, sequence=frame.sequence, payload=frame.payload)
+        return b"".join(
+            encode_frame(one)
+            for one in (
+                encode_reply(STATUS, late),
+                encode_reply(replace(IDENTITY, serial_number="B-1"), other),
+                frame,
+                encode_reply(IDENTITY, frame),
+                encode_reply(IDENTITY, frame),
+            )
+        )
+
+    far_end.answer = answer
+    assert await backend.exchange(Hello(), timeout=PATIENCE) == IDENTITY
+    far_end.answer = lambda request, frame: usual_answer(request)
+    assert await backend.exchange(Ping(), timeout=PATIENCE) == STATUS
+    assert backend.counters.foreign == 4
+
+
+async def test_noise_before_a_reply_is_skipped(backend: SerialBackend, far_end: FarEnd) -> None:
+    """Garbage and a damaged copy in front of a reply cost nothing but a count."""
+
+    def answer(request: object, frame: Frame) -> bytes:
+        good = encode_frame(encode_reply(STATUS, frame))
+        damaged = bytearray(good)
+        damaged[6] ^= 0x10
+        return b"\x55\xff" + bytes(damaged) + good
+
+    far_end.answer = answer
+    assert await backend.exchange(Ping(), timeout=PATIENCE) == STATUS
+    assert backend.counters.bad == 2
+
+
+async def test_a_wrong_answer_is_the_far_ends_fault(
+    backend: SerialBackend, far_end: FarEnd
+) -> None:
+    """The right sequence number with the wrong type or a bad payload is FrameError."""
+    far_end.answer = lambda request, frame: encode_frame(
+        Frame(kind=0x81, address=1, sequence=frame.sequence, payload=b"")
+    )
+    with pytest.raises(FrameError, match="answered"):
+        await backend.exchange(Ping(), timeout=PATIENCE)
+    with pytest.raises(FrameError, match="too early"):
+        await backend.exchange(Hello(), timeout=PATIENCE)
+
+
+async def test_an_unplugged_line_fails_what_waits_and_what_comes(far_end: FarEnd) -> None:
+    """When the adapter vanishes the waiting exchange fails at once, and later ones too."""
+    before = open_files()
+    backend = SerialBackend(far_end.url)
+    await backend.open()
+    far_end.answer = lambda request, frame: far_end.unplug()
+    lost = r"serial line /dev/\S+ was lost .*check the cable"
+    with pytest.raises(LinkError, match=lost) as caught:
+        await backend.exchange(Ping(), timeout=PATIENCE)
+    assert not isinstance(caught.value, LinkTimeout)
+    with pytest.raises(LinkError, match=lost):
+        await backend.exchange(Ping(), timeout=PATIENCE)
+    await backend.close()
+    await backend.close()
+    assert reader_threads() == []
+    assert open_files() <= before
+
+
+async def test_the_amplifier_over_an_unplugged_line_stays_lost(
+    far_end: FarEnd, safe: Callable[[int], SafeCommand]
+) -> None:
+    """An unplugged line is one clear paragraph from every later call."""
+    amplifier = Amplifier(SerialBackend(far_end.url), reply_timeout=PATIENCE)
+    await amplifier.open()
+    far_end.unplug()
+    for _ in range(2):
+        with pytest.raises(LinkError, match=r"was lost.*check the cable.*it is disarmed"):
+            await amplifier.apply(safe(1))
+    await amplifier.close()
+    assert reader_threads() == []
+
+
+async def test_closing_ends_the_reader_and_what_waits(far_end: FarEnd) -> None:
+    """Close leaves no thread and no descriptor, and a waiting exchange gets LinkError."""
+    before = open_files()
+    far_end.answer = lambda request, frame: None
+    backend = SerialBackend(far_end.url)
+    await backend.open()
+    assert reader_threads() == []  # the event loop watches a port of this machine itself
+    waiting = asyncio.create_task(backend.exchange(Ping(), timeout=PATIENCE))
+    await far_end.count(1)
+    await backend.close()
+    with pytest.raises(LinkError, match="was closed"):
+        await waiting
+    assert reader_threads() == []
+    assert open_files() <= before
+
+
+async def test_a_line_lost_while_writing_is_told_once(
+    far_end: FarEnd, caplog: pytest.LogCaptureFixture
+) -> None:
+    """The error reaches the caller, and no future is left behind with a copy of it."""
+    backend = SerialBackend(far_end.url)
+    await backend.open()
+    far_end.unplug()
+    with pytest.raises(LinkError, match="was lost"):
+        await backend.exchange(Ping(), timeout=PATIENCE)
+    gc.collect()
+    assert caplog.text == ""
+    await backend.close()
+
+
+async def test_it_can_be_opened_again(far_end: FarEnd) -> None:
+    """After a close the same backend opens the same line anew."""
+    backend = SerialBackend(far_end.url)
+    for _ in range(2):
+        await backend.open()
+        assert await backend.exchange(Hello(), timeout=PATIENCE) == IDENTITY
+        await backend.close()
+    with pytest.raises(LinkError, match="was closed"):
+        await backend.exchange(Hello(), timeout=PATIENCE)
+
+
+async def test_cancelling_leaves_the_link_usable(backend: SerialBackend, far_end: FarEnd) -> None:
+    """A cancelled exchange raises CancelledError; its late reply is dropped by its number."""
+    far_end.answer = lambda request, frame: None
+    waiting = asyncio.create_task(backend.exchange(GetStatus(), timeout=PATIENCE))
+    await far_end.count(1)
+    waiting.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await waiting
+    far_end.send(STATUS, far_end.frames[0])
+    far_end.answer = lambda request, frame: usual_answer(request)
+    assert await backend.exchange(Hello(), timeout=PATIENCE) == IDENTITY
+    assert backend.counters.foreign == 1
+
+
+async def test_a_lost_reply_is_asked_for_again_over_the_wire(
+    far_end: FarEnd, safe: Callable[[int], SafeCommand]
+) -> None:
+    """The amplifier repeats an apply with the same token under a new sequence number."""
+    amplifier = Amplifier(SerialBackend(far_end.url), reply_timeout=0.2)
+    await amplifier.open()
+    del far_end.frames[:]
+    far_end.answer = lambda request, frame: (
+        Achieved(9, request.command_set.commands) if len(far_end.frames) == 2 else None
+    )
+    achieved = await amplifier.apply(safe(9))
+    assert achieved.token == 9
+    first, second = far_end.frames
+    assert first.payload == second.payload
+    assert first.sequence != second.sequence
+    await amplifier.close()
+
+
+async def test_a_line_is_opened_by_one_only(far_end: FarEnd, backend: SerialBackend) -> None:
+    """Whoever opens the port a second time is told that it is in use, within a program too."""
+    with pytest.raises(LinkError, match="this program has it open already"):
+        await SerialBackend(far_end.url).open()
+    script = (
+        "import asyncio, sys; from drivers.backends.serial_line.backend import SerialBackend; "
+        "asyncio.run(SerialBackend(sys.argv[1]).open())"
+    )
+    process = await asyncio.create_subprocess_exec(
+        *(sys.executable, "-c", script, far_end.url), stderr=asyncio.subprocess.PIPE
+    )
+    _, errors = await process.communicate()
+    assert b"another program has it open" in errors
+
+
+async def test_a_missing_port_says_what_to_do() -> None:
+    """One paragraph: which port, why, and what to do."""
+    with pytest.raises(LinkError, match=r"/dev/no-such-port cannot be opened: there is no such"):
+        await SerialBackend("serial:///dev/no-such-port").open()
+
+
+async def test_a_forbidden_port_says_what_to_do(
+    far_end: FarEnd, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without permission the remedy is the group that owns the port."""
+
+    def forbidden(*args: object, **kwargs: object) -> None:
+        raise serial.SerialException(errno.EACCES, "could not open port: Permission denied")
+
+    monkeypatch.setattr(opening.serial, "serial_for_url", forbidden)
+    with pytest.raises(LinkError, match="dialout"):
+        await SerialBackend(far_end.url).open()
+
+
+async def test_a_serial_server_works_and_its_end_is_noticed() -> None:
+    """The same over TCP: replies come, and a server that hangs up is a lost line."""
+    loop = asyncio.get_running_loop()
+    listener = socket.create_server(("127.0.0.1", 0))
+    listener.setblocking(False)
+    backend = SerialBackend(f"serial://127.0.0.1:{listener.getsockname()[1]}")
+    opening = asyncio.create_task(backend.open())
+    connection, _ = await loop.sock_accept(listener)
+    await opening
+
+    async def answer_once() -> None:
+        reader = FrameReader()
+        while not (frames := reader.feed(await loop.sock_recv(connection, 4096))):
+            pass
+        reply = encode_reply(usual_answer(decode_request(frames[0])), frames[0])
+        await loop.sock_sendall(connection, encode_frame(reply))
+
+    answering = asyncio.create_task(answer_once())
+    assert await backend.exchange(Hello(), timeout=PATIENCE) == IDENTITY
+    await answering
+    connection.close()
+    with pytest.raises(LinkError, match="was lost"):
+        await backend.exchange(Hello(), timeout=PATIENCE)
+    await backend.close()
+    listener.close()
+    assert reader_threads() == []
+
+
+async def test_a_server_that_is_not_there_says_what_to_do() -> None:
+    """A refused connection is a sentence about the server, not about dialout."""
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        port = listener.getsockname()[1]
+    with pytest.raises(LinkError, match="nobody answers there"):
+        await SerialBackend(f"serial://127.0.0.1:{port}").open()
+
+
+@pytest.mark.parametrize(
+    ("url", "expected"),
+    [
+        ("serial:///dev/ttyUSB0", SerialUrl("/dev/ttyUSB0", 921_600, 1)),
+        ("serial:///dev/ttyS1?baud=115200&address=7", SerialUrl("/dev/ttyS1", 115_200, 7)),
+        ("serial:///COM3?baud=9600", SerialUrl("COM3", 9600, 1)),
+        ("socket://box.local:4001", SerialUrl("socket://box.local:4001", 921_600, 1)),
+        ("rfc2217://box:4001?baud=9600", SerialUrl("rfc2217://box:4001", 9600, 1)),
+        ("hwgrep://0403:6001?address=3", SerialUrl("hwgrep://0403:6001", 921_600, 3)),
+        ("serial://box.local:4001", SerialUrl("socket://box.local:4001", 921_600, 1)),
+    ],
+)
+def test_urls_are_understood(url: str, expected: SerialUrl) -> None:
+    """Port, speed and address come out of the URL, the latter two with their defaults."""
+    assert SerialUrl.parse(url) == expected
+
+
+@pytest.mark.parametrize(
+    ("url", "problem"),
+    [
+        ("serial://", "names no port"),
+        ("hwgrep://", "names no pattern"),
+        ("serial://host", "no host and port"),
+        ("serial://host:99999", "no serial URL"),
+        ("serial:///dev/x?baud=fast", "baud is 'fast'"),
+        ("serial:///dev/x?baud=0", "baud is '0'"),
+        ("serial:///dev/x?baud=", "baud is ''"),
+        ("serial:///dev/x?address=248", "from 1 to 247"),
+        ("serial:///dev/x?speed=9600", "unknown option speed"),
+        ("serial:///dev/x?baud=9600&baud=1200", "given twice"),
+        (f"serial:///dev/x?baud={'9' * 5000}", "baud is '999"),
+        ("serial:///dev/x#7", "the address on the line is .address=7"),
+    ],
+)
+def test_bad_urls_are_refused(url: str, problem: str) -> None:
+    """Each bad part of a URL is named."""
+    with pytest.raises(CommandError, match=problem):
+        SerialBackend(url)
+
+
+async def test_two_amplifiers_of_one_address_are_refused(far_end: FarEnd) -> None:
+    """Two different replies to one Hello; one that came twice is no second amplifier."""
+    other = replace(IDENTITY, serial_number="B-18")
+
+    def both(request: object, frame: Frame) -> bytes:
+        replies = [IDENTITY, other if isinstance(request, Hello) else usual_answer(request)]
+        return b"".join(encode_frame(encode_reply(reply, frame)) for reply in replies)
+
+    def twice(request: object, frame: Frame) -> bytes:
+        return 2 * encode_frame(encode_reply(usual_answer(request), frame))
+
+    far_end.answer = both
+    amplifier = Amplifier(SerialBackend(far_end.url), reply_timeout=PATIENCE)
+    with pytest.raises(LinkError, match="more than one amplifier answers at address 1 on"):
+        await amplifier.open()
+    far_end.answer = twice
+    await amplifier.open()
+    await amplifier.close()

@@ -1,0 +1,291 @@
+"""Requests as CAN frames and answers from them, against bytes worked out by hand."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import cantools
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from drivers.codec.can_bus.answers import AnswerReader, decode_emergency
+from drivers.codec.can_bus.dbc import dbc_text
+from drivers.codec.can_bus.frame import LAYOUTS, CanFrame
+from drivers.codec.can_bus.objects import (
+    achieved_of,
+    capabilities_of,
+    encode_envelope,
+    faults_of,
+    identity_of,
+)
+from drivers.codec.can_bus.orders import SYNC, encode_broadcast, encode_order, wanted_commands
+from drivers.command import CommandSet, DriveCommand
+from drivers.errors import FrameError
+from drivers.guard import Guard, GuardLimits, SafeCommand
+from drivers.protocol.messages import (
+    Apply,
+    Arm,
+    Capabilities,
+    Commit,
+    Disarm,
+    Event,
+    Fault,
+    FaultRecord,
+    Nak,
+    NakCode,
+    Ping,
+    Stage,
+    State,
+    Status,
+    Stop,
+)
+
+WIDE = Capabilities(
+    *(16, 20.0, 600.0, 0.01, 1.0, 0.0001, 0.01, 1.0, 0.1, 2.0, 32, 63, 0.001, 0.1, True)
+)
+
+
+def make(channels: int) -> SafeCommand:
+    """A set of so many channels, each at its own frequency."""
+    commands = tuple(
+        DriveCommand(channel, 100.0 + channel, 0.01 * channel) for channel in range(channels)
+    )
+    guard = Guard(GuardLimits(20.0, 600.0, 1.0), WIDE)
+    return guard.check(CommandSet(token=258, commands=commands, ramp=0.001, valid_for=0.0))
+
+
+def test_orders_are_these_bytes() -> None:
+    """Token, ramp, time, action and count, sequence: each where it belongs."""
+    frames = {
+        "arm": encode_order(Arm(0.25), node=3, sequence=1),
+        "disarm": encode_order(Disarm(0.05), node=3, sequence=2),
+        "stop": encode_order(Stop(0.005), node=3, sequence=255),
+        "commit": encode_order(Commit(0x1234), node=3, sequence=4),
+        "ping": encode_order(Ping(), node=3, sequence=5),
+    }
+    order = 0x483
+    assert frames == {
+        "arm": (CanFrame(order, bytes.fromhex("7D00 0000 FA00 04 01")),),
+        "disarm": (CanFrame(order, bytes.fromhex("0000 3200 0000 05 02")),),
+        "stop": (CanFrame(order, bytes.fromhex("0000 0500 0000 06 FF")),),
+        "commit": (CanFrame(order, bytes.fromhex("3412 0000 0000 03 04")), SYNC),
+        "ping": (
+            CanFrame(0x77D, b"\x05"),
+            CanFrame(order, bytes.fromhex("0000 0000 0000 00 05")),
+        ),
+    }
+
+
+def test_a_set_is_a_frame_a_channel_its_order_and_a_sync() -> None:
+    """Channels 4 and on have the identifiers of the next node; the count stands in the order."""
+    frames = encode_order(Apply(make(6)), node=2, sequence=9)
+    assert [frame.id for frame in frames] == [
+        *(0x202, 0x302, 0x402, 0x502, 0x203, 0x303),
+        *(0x482, 0x080),
+    ]
+    assert frames[5].data == bytes.fromhex("0429 F401 0000 50 09")  # 105 Hz, 0.05, channel 5
+    assert frames[6].data == bytes.fromhex("0201 0100 0000 31 09")  # six times eight plus apply
+
+
+def test_over_can_fd_a_set_of_seven_is_one_frame() -> None:
+    """Eight bytes of order, seven commands; of sixteen channels the rest goes before it."""
+    (one, sync) = encode_order(Apply(make(7)), node=1, sequence=2, fd=True)
+    assert (one.id, len(one.data), one.fd, sync) == (0x481, 64, True, SYNC)
+    frames = encode_order(Apply(make(16)), node=1, sequence=2, fd=True)
+    assert [(frame.id, len(frame.data)) for frame in frames] == [
+        *((0x201, 64), (0x201, 8)),
+        *((0x481, 64), (0x080, 0)),
+    ]
+    five = encode_order(Stage(make(4)), node=1, sequence=2, fd=True)[0]
+    assert len(five.data) == 48
+    assert five.data[40:] == b"\xff" * 8
+
+
+def test_broadcasts_are_for_node_zero() -> None:
+    """A commit waits for the SYNC behind it, a stop for nothing."""
+    assert encode_broadcast(Commit(7)) == (
+        CanFrame(0x480, bytes.fromhex("0700 0000 0000 03 00")),
+        SYNC,
+    )
+    assert encode_broadcast(Stop(0.01)) == (CanFrame(0x480, bytes.fromhex("0000 0A00 0000 06 00")),)
+
+
+def test_only_what_a_guard_let_through_is_encoded(safe: Callable[..., SafeCommand]) -> None:
+    """A plain command set raises TypeError, as does a plain envelope."""
+    plain = CommandSet(token=1, commands=safe(1).commands, ramp=0.0, valid_for=0.0)
+    for wrap in (Apply, Stage):
+        with pytest.raises(TypeError, match="SafeCommand"):
+            encode_order(wrap(plain), node=1, sequence=1)
+    with pytest.raises(TypeError, match="SafeEnvelope"):
+        encode_envelope(object())  # type: ignore[arg-type]
+
+
+@given(
+    frequency=st.floats(20.0, 600.0),
+    level=st.floats(0.0, 1.0),
+    phase=st.floats(-180.0, 179.9),
+    keep=st.booleans(),
+)
+def test_cantools_reads_from_the_dbc_what_was_asked(
+    frequency: float, level: float, phase: float, keep: bool
+) -> None:
+    """Another decoder, by the DBC file alone, finds frequency, level and phase to their steps."""
+    wanted = DriveCommand(2, frequency, level, phase, keep_phase=keep)
+    guard = Guard(GuardLimits(20.0, 600.0, 1.0), WIDE)
+    safe = guard.check(CommandSet(token=77, commands=(wanted,), ramp=0.25, valid_for=1.5))
+    frames = encode_order(Apply(safe), node=1, sequence=5)
+    command, order = (DATABASE.decode_message(frame.id, frame.data) for frame in frames[:2])
+    achieved = wanted_commands(safe)[0]
+    assert command["frequency"] == pytest.approx(achieved.frequency, abs=1e-9)
+    assert command["level"] == pytest.approx(level, abs=0.51e-4)
+    assert command["phase"] == pytest.approx(achieved.phase, abs=1e-9)
+    assert (command["keep_phase"], command["channel"], command["sequence"]) == (keep, 2, 5)
+    assert order["token"] == 77
+    assert order["ramp"] == pytest.approx(0.25)
+    assert order["time"] == pytest.approx(1.5)
+    assert (order["action"], order["count"]) == ("apply", 1)
+
+
+DATABASE = cantools.database.load_string(dbc_text(), database_format="dbc")
+LEVELS = bytes.fromhex("D007 0000 0040 9C 04")  # 0.2, 0, 0, 1 in 14 bits each
+CONDITION = bytes.fromhex("04 01 FA00 0807 04 00")
+ANSWER = bytes.fromhex("04 00 04 FF 0102 FA00")
+STATUS = Status(
+    State.OPERATION_ENABLED, Fault.NONE, 513, True, 25.0, 0.25, (0.2, 0.0, 0.0, 1.0), 1800.0
+)
+
+
+def feed(*frames: tuple[int, bytes]) -> list[object]:
+    """What a reader of node 1 makes of frames."""
+    reader = AnswerReader(1)
+    answers = [reader.feed(CanFrame(id, data)) for id, data in frames]
+    return [answer for answer in answers if answer is not None]
+
+
+def test_a_status_is_whole_when_its_answer_comes() -> None:
+    """Three frames of one sequence number make the status; any one missing makes none."""
+    whole = [(0x381, LEVELS), (0x281, CONDITION), (0x181, ANSWER)]
+    (answer,) = feed(*whole)
+    assert answer.status == STATUS
+    assert (answer.sequence, answer.refusal) == (4, None)
+    assert feed(*whole[1:]) == []
+    assert feed(whole[0], whole[2]) == []
+    stale = (0x281, bytes([3]) + CONDITION[1:])
+    assert feed(whole[0], stale, whole[2]) == []
+    assert feed((0x381, LEVELS[:7] + b"\x03"), *whole[1:]) == []
+
+
+def test_over_can_fd_a_status_is_one_frame() -> None:
+    """Answer, condition and levels in a row; the same status comes of it."""
+    (answer,) = feed((0x181, ANSWER + CONDITION + LEVELS))
+    assert answer.status == STATUS
+
+
+@pytest.mark.parametrize(
+    ("result", "nak"),
+    [
+        (0x40, Nak(NakCode.BAD_CHANNEL, 9)),
+        (0x50, Nak(NakCode.WRONG_STATE, 9)),
+        (0xF0, Nak(NakCode.BUSY, 9)),  # torn: ask again
+    ],
+)
+def test_refusals_say_why_and_which_channel(result: int, nak: Nak) -> None:
+    """The result of an answer is a Nak; a torn set can be asked again."""
+    (answer,) = feed((0x181, bytes([7, 1 | result, 4, 9, 0, 0, 0, 0])))
+    assert answer.refusal == nak
+
+
+@pytest.mark.parametrize("both", [0x01, 0x05, 0x17])  # disarmed, stopped, the watchdog's fault
+def test_a_torn_set_is_not_asked_again_where_no_set_is_taken(both: int) -> None:
+    """What says that it is not armed would refuse the whole set, too."""
+    (answer,) = feed((0x181, bytes([7, 0xF1, both, 0xFF, 0, 0, 0, 0])))
+    assert answer.refusal == Nak(NakCode.WRONG_STATE)
+
+
+def test_what_nobody_asked_for_is_an_event() -> None:
+    """An answer with sequence 0, and an emergency."""
+    (answer,) = feed((0x181, bytes([0, 0, 5, 0xFF, 0, 0, 0, 0])))
+    assert answer.event == Event(State.QUICK_STOP_ACTIVE, Fault.NONE)
+    told = decode_emergency(bytes.fromhex("4023 03 46 02 000000"))
+    assert told == Event(State.FAULT_REACTION_ACTIVE, Fault.ARC, 2)
+
+
+@pytest.mark.parametrize(
+    ("id", "data"),
+    [
+        (0x181, ANSWER[:7]),
+        (0x181, bytes([4, 0, 0x0F, 0xFF, 0, 0, 0, 0])),  # no such state
+        (0x181, bytes([4, 0, 0x74, 0xFF, 0, 0, 0, 0])),  # no such fault
+        (0x181, bytes([4, 0xA0, 4, 0xFF, 0, 0, 0, 0])),  # no such result
+        (0x181, bytes([4, 0, 4, 16, 0, 0, 0, 0])),  # no such channel
+        (0x281, CONDITION[:6]),
+        (0x281, bytes([4, 2, *CONDITION[2:]])),  # a bit that is none
+        (0x381, b""),
+    ],
+)
+def test_frames_that_make_no_sense_are_told(id: int, data: bytes) -> None:
+    """A wrong length, an unknown code, a bit that must be 0: FrameError."""
+    with pytest.raises(FrameError):
+        feed((id, data))
+
+
+@given(data=st.binary(max_size=64), at=st.integers(0, 6))
+def test_any_bytes_are_an_answer_or_a_frame_error(data: bytes, at: int) -> None:
+    """Nothing that comes raises anything else, whatever identifier it has."""
+    reader = AnswerReader(1)
+    for id in (reader.ids[at % len(reader.ids)], 0x181):
+        try:
+            reader.feed(CanFrame(id, data))
+        except FrameError:
+            continue
+    for read in (decode_emergency, faults_of, achieved_of):
+        try:
+            read(data)
+        except FrameError:
+            continue
+
+
+def test_objects_mean_what_they_say() -> None:
+    """Faults, achieved commands, texts and capabilities from bytes written by hand."""
+    faults = faults_of(bytes.fromhex("01FF DC050000 0402 00000100"))
+    assert faults.faults == (
+        FaultRecord(Fault.WATCHDOG, None, 1.5),
+        FaultRecord(Fault.ARC, 2, 65.536),
+    )
+    achieved = achieved_of(bytes.fromhex("0102 01 F82A D007 D8DC 35 00 05 06"))
+    assert achieved.token == 513
+    assert achieved.commands == (
+        DriveCommand(3, 110.0, 0.2, -90.0, keep_phase=True, onset=5, ending=6),
+    )
+    texts = {"vendor": b"Acme", "product": b"Quad\0", "serial_number": b"A", "firmware": b"1"}
+    assert identity_of(texts, 1).product == "Quad"
+    with pytest.raises(FrameError, match="control"):
+        identity_of({**texts, "vendor": b"A\nB"}, 1)
+    numbers = {
+        **{"protocol_version": 1, "channels": 4, "frequency_min": 2000, "frequency_max": 60000},
+        **{"frequency_step": 1, "level_max": 10000, "level_step": 1, "phase_step": 1},
+        **{"ramp_max": 1000, "watchdog_min": 100, "watchdog_max": 2000, "envelope_knots": 32},
+        **{"envelope_slots": 63, "envelope_step_min": 10, "envelope_step_max": 1000},
+    }
+    assert capabilities_of(numbers) == replace(WIDE, channels=4)
+
+
+@given(st.data())
+def test_blocks_come_back_as_they_were_packed(data: st.DataObject) -> None:
+    """Any values of any layout survive; unused bits are 0, and are refused where they are not."""
+    layout = LAYOUTS[data.draw(st.sampled_from(sorted(LAYOUTS)))]
+    values = {
+        field.name: data.draw(
+            st.integers(-(1 << field.bits - 1), (1 << field.bits - 1) - 1)
+            if field.signed
+            else st.integers(0, (1 << field.bits) - 1)
+        )
+        for field in layout.fields.values()
+    }
+    block = layout.pack(**values)
+    assert layout.unpack(block) == values
+    used = sum((1 << field.bits) - 1 << field.first for field in layout.fields.values())
+    for bit in range(64):
+        if not used >> bit & 1:
+            wrong = int.from_bytes(block, "little") | 1 << bit
+            assert layout.unpack(wrong.to_bytes(8, "little")) is None

@@ -1,0 +1,114 @@
+import re
+from pathlib import Path
+
+import pytest
+
+import drivers
+from can_session import session
+from drivers.codec.can_bus.frame import CANOPEN, LAYOUTS
+from drivers.codec.can_bus.generate import FILES, main
+from drivers.codec.can_bus.objects import entries
+from drivers.protocol.definition import PROTOCOL
+
+DOCS = Path(drivers.__file__).parent.parent / "docs" / "reference"
+PAGE = (DOCS / "wire-can.md").read_text("utf-8")
+STEPS = session()
+
+
+def shown() -> dict[str, list[str]]:
+    """The steps of the session on the page: title and frames; titles that come twice get a mark."""
+    steps: dict[str, list[str]] = {}
+    title = ""
+    for line in PAGE[PAGE.index("## A session") :].splitlines():
+        if line.startswith("    # "):
+            title = line.removeprefix("    # ")
+            title += " (again)" if title in steps else ""
+            steps[title] = []
+        elif line.startswith(("    >", "    <")):
+            steps[title].append(line.strip())
+    return steps
+
+
+def test_the_session_is_what_encoder_and_far_end_say() -> None:
+    """Every frame of the page, host's and amplifier's, to the byte and in its order."""
+    played: dict[str, list[str]] = {}
+    for step in STEPS:
+        played[step.title + (" (again)" if step.title in played else "")] = list(step.lines())
+    assert len(played) >= 25
+    assert shown() == played
+
+
+def test_the_fields_are_those_of_the_definition() -> None:
+    """The table of frames gives first bit and length of every field of protocol.yaml."""
+    rows = {
+        (frame, field): (int(first), int(bits))
+        for frame, field, first, bits in re.findall(
+            r"^\| (\w+) \| (\w+) \| (\d+) \| (\d+) \|", PAGE, re.MULTILINE
+        )
+    }
+    declared = {
+        (frame, field): tuple(place)
+        for frame, fields in CANOPEN["frames"].items()
+        for field, place in fields.items()
+    }
+    assert rows == declared
+
+
+def test_no_two_fields_share_a_bit() -> None:
+    """The fields of a frame lie side by side within its eight bytes."""
+    for layout in LAYOUTS.values():
+        bits = [
+            bit
+            for field in layout.fields.values()
+            for bit in range(field.first, field.first + field.bits)
+        ]
+        assert len(set(bits)) == len(bits)
+        assert max(bits) < 64
+
+
+def test_the_objects_are_those_of_the_definition() -> None:
+    """Every object stands in the table with its index and access."""
+    rows = set(
+        re.findall(r"^\| ([0-9A-F]{4}) \| [^|]+ \| ([\w ]+) \| \w+ \| (\w+) \|$", PAGE, re.M)
+    )
+    for entry in entries(4):
+        name = re.sub(r" \d+$", "", entry.name)
+        assert (f"{entry.index:04X}", name, entry.access) in rows
+
+
+@pytest.mark.parametrize("table", ["emergencies", "aborts"])
+def test_the_codes_are_those_of_the_definition(table: str) -> None:
+    """Emergency and abort codes stand in hexadecimal beside their names."""
+    for name, code in CANOPEN[table].items():
+        if table == "emergencies":
+            expected = f"| {name} | {code['code']:04X} | {code['error_register']:02X} |"
+        else:
+            expected = f"| {name} | {PROTOCOL.naks[name]} | {code:08X} |"
+        assert expected in PAGE
+
+
+def test_every_fault_and_nak_has_a_code() -> None:
+    """Nothing that can go wrong lacks its emergency or its abort code."""
+    assert CANOPEN["emergencies"].keys() == PROTOCOL.faults.keys()
+    assert CANOPEN["aborts"].keys() == PROTOCOL.naks.keys()
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_the_files_are_up_to_date(name: str) -> None:
+    """EDS and DBC in docs/ are what `python -m drivers.codec.can_bus.generate docs` writes."""
+    assert (DOCS / name).read_text("utf-8") == FILES[name]()
+
+
+def test_the_files_are_written_where_they_are_wanted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Into the folder; help ends well, and a folder that is none is bad usage without a trace."""
+    monkeypatch.setattr("sys.argv", ["generate", str(tmp_path)])
+    assert main() == 0
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(FILES)
+    for argument, status in (("--help", 0), (str(tmp_path / "none"), 2)):
+        monkeypatch.setattr("sys.argv", ["generate", argument])
+        with pytest.raises(SystemExit) as ended:
+            main()
+        assert ended.value.code == status
+    assert "there is no folder" in capsys.readouterr().err

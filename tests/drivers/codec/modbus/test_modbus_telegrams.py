@@ -1,0 +1,109 @@
+"""Modbus frames as the host takes them: in any pieces, behind anything, with any bit flipped."""
+
+from itertools import pairwise
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from drivers.codec.modbus import exchanges
+from drivers.codec.modbus.telegrams import Answer, AnswerReader, Telegram, make_telegram
+from drivers.errors import FrameError
+from drivers.protocol.messages import Apply, Ping, Status
+from drivers.statistics import WireCounters
+from modbus_session import ARMED, SET, ScriptedStation
+from sim.far_ends.modbus.frames import PAUSE, Request, RtuReader, TcpReader, rtu_frame, tcp_frame
+from sim.far_ends.modbus.unit import ModbusUnit
+
+
+def asked_and_answered(is_rtu: bool) -> tuple[Telegram, bytes]:
+    """A heartbeat with tag 4711 and the frame that answers it."""
+    exchange = exchanges.to_exchange(Ping(), tag=4711, channels=4)
+    telegram = make_telegram(
+        exchange.read, exchange.write, unit=1, transaction=0 if is_rtu else 300, is_rtu=is_rtu
+    )
+    unit = ModbusUnit(ScriptedStation())
+    pdu = unit.answer(telegram.frame[1:-2] if is_rtu else telegram.frame[7:])
+    assert pdu is not None
+    return telegram, rtu_frame(1, pdu) if is_rtu else tcp_frame(Request(1, b"", 300), pdu)
+
+
+EXAMPLES = {is_rtu: asked_and_answered(is_rtu) for is_rtu in (True, False)}
+
+
+def read(is_rtu: bool, *pieces: bytes) -> tuple[list[Answer], WireCounters]:
+    """What the host finds in some pieces of bytes, and what it counts."""
+    counters = WireCounters()
+    reader = AnswerReader(is_rtu=is_rtu, counters=counters)
+    telegram = EXAMPLES[is_rtu][0]
+    return [one for piece in pieces for one in reader.feed(piece, telegram)], counters
+
+
+def accepted(answers: list[Answer]) -> list[Status]:
+    """Those that a backend would take for the answer to this request."""
+    return [
+        exchanges.to_reply(Ping(), one.registers)
+        for one in answers
+        if not one.exception and exchanges.is_of(one.registers, tag=4711)
+    ]
+
+
+@given(is_rtu=st.booleans(), cuts=st.lists(st.integers(0, 40)), garbage=st.binary(max_size=12))
+def test_any_split_and_anything_before_it(is_rtu: bool, cuts: list[int], garbage: bytes) -> None:
+    """However the stream is cut, the answer is found; over RTU behind any garbage as well."""
+    stream = (garbage if is_rtu else b"") + EXAMPLES[is_rtu][1]
+    edges = sorted({0, len(stream), *(cut for cut in cuts if cut < len(stream))})
+    pieces = [stream[a:b] for a, b in pairwise(edges)]
+    answers, _ = read(is_rtu, *pieces)
+    assert accepted(answers) == [ARMED]
+
+
+@given(is_rtu=st.booleans(), data=st.data())
+def test_flipped_bits_are_no_answer(is_rtu: bool, data: st.DataObject) -> None:
+    """One to three flipped bits anywhere, and nothing is accepted.
+
+    CRC-16 finds any three in a frame as short as this, RTU's own and the check of a block.
+    """
+    frame = bytearray(EXAMPLES[is_rtu][1])
+    bits = data.draw(st.sets(st.integers(0, 8 * len(frame) - 1), min_size=1, max_size=3))
+    for bit in bits:
+        frame[bit // 8] ^= 1 << bit % 8
+    answers, counters = read(is_rtu, bytes(frame))
+    assert accepted(answers) == []
+    assert is_rtu is False or counters.frames_in == 0 or counters.foreign == counters.frames_in
+
+
+@given(is_rtu=st.booleans(), stream=st.lists(st.binary(max_size=300), max_size=6))
+def test_any_bytes_are_borne(is_rtu: bool, stream: list[bytes]) -> None:
+    """Whatever comes: no exception but FrameError, and the buffer does not grow without end."""
+    reader = AnswerReader(is_rtu=is_rtu, counters=WireCounters())
+    for piece in stream:
+        for answer in reader.feed(piece, EXAMPLES[is_rtu][0]):
+            try:
+                exchanges.to_reply(Ping(), answer.registers)
+            except FrameError:
+                continue
+    assert len(reader._buffer) <= 1024
+    reader.clear()
+    good = EXAMPLES[is_rtu][1]
+    assert accepted(reader.feed(good, EXAMPLES[is_rtu][0])) == [ARMED]
+
+
+@pytest.mark.parametrize("reader_type", [RtuReader, TcpReader])
+def test_what_was_cut_off_is_gone_before_the_host_asks_again(
+    reader_type: type[RtuReader] | type[TcpReader],
+) -> None:
+    """A set that ends early, and 50 ms later a whole one: nothing of the one is in the other.
+
+    Without the pause the missing end of the first would be filled up with the second.
+    """
+    is_rtu = reader_type is RtuReader
+    exchange = exchanges.to_exchange(Apply(SET), tag=1, channels=4)
+    frame = make_telegram(exchange.read, exchange.write, unit=1, transaction=0, is_rtu=is_rtu).frame
+    for missing in range(1, len(frame)):
+        reader = reader_type()
+        assert reader.feed(frame[:-missing], 10.0) == []
+        found = reader.feed(frame, 10.0 + 0.05)
+        assert [request.pdu for request in found] == [frame[1:-2] if is_rtu else frame[7:]]
+        assert reader.counters.good == 1
+    assert PAUSE < 0.05

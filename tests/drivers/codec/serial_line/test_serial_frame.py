@@ -1,0 +1,131 @@
+import struct
+import zlib
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from drivers.codec.serial_line.frame import REPLY, Frame, FrameReader, encode_frame, frame_length
+from drivers.codec.serial_line.timing import loading_time, round_trip_time, wire_time
+from drivers.protocol.definition import PROTOCOL
+
+FRAMES = st.builds(
+    Frame,
+    kind=st.sampled_from([1, 7, 12, 31, 0x81, 0x9F]),
+    address=st.integers(0, 255),
+    sequence=st.integers(0, 65535),
+    payload=st.binary(max_size=PROTOCOL.serial.payload_max),
+)
+
+
+def cobs_by_hand(data: bytes) -> bytes:
+    """Stuffing for blocks below 254 bytes, straight from the paper's definition."""
+    return b"".join(bytes([len(part) + 1]) + part for part in data.split(b"\0"))
+
+
+def frame_by_hand(first: int, address: int, sequence: int, payload: bytes) -> bytes:
+    """A frame from the specification, without the code under test."""
+    body = struct.pack("<BBH", first, address, sequence) + payload
+    return b"\0" + cobs_by_hand(body + struct.pack("<I", zlib.crc32(body))) + b"\0"
+
+
+def test_ping_is_these_bytes() -> None:
+    """A ping to address 1, sequence 7, is what the page for vendors and paper and pencil say."""
+    # 2C = version 1 << 5 | type 12; the zero of the sequence's high byte is stuffed.
+    body = bytes.fromhex("2c 01 07 00")
+    crc = zlib.crc32(body)
+    expected = b"\0\x04\x2c\x01\x07\x05" + crc.to_bytes(4, "little") + b"\0"
+    assert encode_frame(Frame(kind=12, address=1, sequence=7, payload=b"")) == expected
+
+
+def test_crc_is_the_standard_one() -> None:
+    """The CRC's check value over "123456789" is the catalogued 0xCBF43926, sent low byte first."""
+    # A frame whose CRC-covered bytes are exactly "123456789": 0x31 is version 1, type 17.
+    stuffed = b"\x0e123456789\x26\x39\xf4\xcb"
+    frames = FrameReader().feed(b"\0" + stuffed + b"\0")
+    assert frames == [Frame(kind=0x11, address=0x32, sequence=0x3433, payload=b"56789")]
+
+
+@given(FRAMES)
+def test_frames_as_by_hand(frame: Frame) -> None:
+    """Every frame is the specification's bytes, is as long as arithmetic says, and comes back."""
+    wire = encode_frame(frame)
+    first = (frame.kind & REPLY) | 1 << 5 | (frame.kind & 0x1F)
+    assert wire == frame_by_hand(first, frame.address, frame.sequence, frame.payload)
+    assert len(wire) == frame_length(len(frame.payload))
+    assert FrameReader().feed(wire) == [frame]
+
+
+@given(st.lists(FRAMES, min_size=1, max_size=5), st.data())
+def test_any_split_gives_the_same_frames(frames: list[Frame], data: st.DataObject) -> None:
+    """Where the stream is cut into reads does not matter."""
+    stream = b"".join(encode_frame(frame) for frame in frames)
+    cuts = data.draw(st.lists(st.integers(0, len(stream)), max_size=8).map(sorted))
+    reader = FrameReader()
+    got = []
+    for start, end in zip([0, *cuts], [*cuts, len(stream)], strict=True):
+        got += reader.feed(stream[start:end])
+    assert got == frames
+    assert reader.counters.good == len(frames)
+
+
+@given(FRAMES, st.integers(0, 10**6))
+def test_a_flipped_bit_is_never_another_message(frame: Frame, where: int) -> None:
+    """One bit flipped anywhere loses the frame at most; it is never read as another one."""
+    wire = bytearray(encode_frame(frame))
+    where %= len(wire) * 8
+    wire[where // 8] ^= 1 << where % 8
+    after = Frame(kind=12, address=9, sequence=1, payload=b"")
+    # The first frame after it may be swallowed with a lost delimiter; the second is understood.
+    got = FrameReader().feed(bytes(wire) + encode_frame(after) + encode_frame(after))
+    assert [one for one in got if one not in (frame, after)] == []
+    assert got[-1] == after
+
+
+@given(st.binary(max_size=2000))
+def test_noise_is_no_frame_and_does_no_harm(noise: bytes) -> None:
+    """Random bytes give no frame, and the next good frame is understood."""
+    reader = FrameReader()
+    after = Frame(kind=12, address=1, sequence=1, payload=b"x")
+    assert reader.feed(noise) == []
+    assert reader.feed(b"\0" + encode_frame(after)) == [after]
+
+
+def test_each_kind_of_damage_is_counted() -> None:
+    """The counters tell damage apart: CRC, length, truncation, version."""
+    good = frame_by_hand(0x2C, 1, 7, b"")
+    bad_crc = bytearray(frame_by_hand(0x2C, 1, 7, b"abc"))
+    bad_crc[-2] ^= 0x40
+    reader = FrameReader()
+    reader.feed(bytes(bad_crc))
+    reader.feed(b"\0" + b"\x01" * 1000 + b"\0")
+    reader.feed(good[:5] + b"\0")
+    reader.feed(frame_by_hand(0x4C, 1, 7, b""))
+    assert reader.feed(good) != []
+    counters = reader.counters
+    assert (counters.bad_crc, counters.too_long, counters.truncated) == (1, 1, 1)
+    assert (counters.bad_version, counters.good) == (1, 1)
+
+
+def test_the_buffer_is_bounded() -> None:
+    """A megabyte without a delimiter is one frame too long, and is not kept."""
+    reader = FrameReader()
+    for _ in range(256):
+        reader.feed(b"\x55" * 4096)
+    assert reader.counters.too_long == 1
+    assert len(reader._stuffed) == 0
+
+
+def test_a_payload_that_does_not_fit_is_refused() -> None:
+    """A frame stays within one COBS block."""
+    with pytest.raises(ValueError, match="does not fit"):
+        encode_frame(Frame(kind=7, address=1, sequence=1, payload=bytes(241)))
+
+
+def test_wire_times_are_those_of_the_arithmetic() -> None:
+    """Four channels take 50 bytes of ten bits: 4.3 ms at 115 200 baud, 0.5 ms at 921 600."""
+    assert wire_time(4, baud=115_200) == pytest.approx(50 * 10 / 115_200)
+    assert wire_time(4, baud=921_600) == pytest.approx(0.5e-3, rel=0.1)
+    assert round_trip_time(4, baud=115_200) == pytest.approx((50 + 46) * 10 / 115_200)
+    # The frames of the vendor's page, of two knots.
+    assert loading_time(2, baud=115_200) == pytest.approx((23 + 13) * 10 / 115_200)

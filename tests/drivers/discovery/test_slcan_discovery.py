@@ -1,0 +1,132 @@
+"""Serial ports that are CAN adapters: found by two characters, and only listened to."""
+
+import asyncio
+import json
+import os
+import pty
+import threading
+import tty
+from collections.abc import Callable, Iterator
+from functools import partial
+
+import pytest
+from serial.tools.list_ports_common import ListPortInfo
+from typer.testing import CliRunner
+
+from drivers.cli import app
+from drivers.codec.can_bus.frame import CanFrame
+from drivers.discovery.slcan import SlcanAdapter, ask_for_slcan
+from sim.far_ends.can_bus.bus import CanBus
+from sim.far_ends.can_bus.slcan_adapter import SlcanAdapter as FarAdapter
+
+
+class Adapter:
+    """A serial port and the far end's adapter behind it, in a thread; nodes 1 and 5 beat."""
+
+    def __init__(self) -> None:
+        self.said = b""
+        self._came = threading.Condition()
+        self.on_bus: list[CanFrame] = []
+        self._far, near = pty.openpty()
+        tty.setraw(near)
+        self._near = near
+        self.port = os.ttyname(near)
+        self._bus = CanBus()
+        self._bus.join(self.on_bus.append)
+        self._adapter = FarAdapter(self._bus, lambda data: void(os.write(self._far, data)))
+        self.receive: Callable[[bytes], None] = self._adapter.receive
+        self._loop = asyncio.new_event_loop()
+        self._loop.add_reader(self._far, self._read)
+        self._thread = threading.Thread(target=self._run)
+        self._thread.start()
+
+    def _run(self) -> None:
+        self._loop.call_soon(self._beat)
+        self._loop.run_forever()
+
+    def _beat(self) -> None:
+        for can_id, data in ((0x701, b"\x05"), (0x705, b"\x7f"), (0x77F, b"\x05"), (0x181, b"\0")):
+            self._bus.send(CanFrame(can_id, data), sender=self.on_bus.append)
+        self._loop.call_later(0.05, self._beat)
+
+    def _read(self) -> None:
+        data = os.read(self._far, 4096)
+        with self._came:
+            self.said += data
+            self._came.notify()
+        self.receive(data)
+
+    def has_got(self, text: bytes) -> bool:
+        """Whether this is all that was written to it, once that has arrived."""
+        with self._came:
+            return self._came.wait_for(lambda: len(self.said) >= len(text), 5) and self.said == text
+
+    def close(self) -> None:
+        """End all of it."""
+        self._loop.call_soon_threadsafe(self._loop.stop)
+        self._thread.join()
+        self._loop.close()
+        os.close(self._far)
+        os.close(self._near)
+
+
+def reply(adapter: Adapter, answer: bytes, data: bytes) -> None:
+    """Say this, whatever is asked."""
+    os.write(adapter._far, answer)
+
+
+def void(_: object) -> None:
+    """Of what is returned nothing is wanted."""
+
+
+@pytest.fixture
+def adapter() -> Iterator[Adapter]:
+    """One on a port of its own."""
+    adapter = Adapter()
+    yield adapter
+    adapter.close()
+
+
+def test_an_adapter_is_listened_to_and_left_closed(adapter: Adapter) -> None:
+    """Its version, and the amplifiers' nodes that beat there, not the host's; L and no other
+    opening, closed at the end, and not a frame of ours on the bus."""
+    assert ask_for_slcan(adapter.port) == SlcanAdapter("1013", nodes=(1, 5))
+    assert adapter.has_got(b"V\rC\rS6\rL\rC\r")
+    assert {frame.id for frame in adapter.on_bus} == {0x701, 0x705, 0x77F, 0x181}
+
+
+def test_another_device_gets_two_characters(adapter: Adapter) -> None:
+    """Whatever else it says or does not say: nothing is sent but V and CR."""
+    for answer in (b"", b"?\r", b"Version 2\r", b"V10"):
+        adapter.said = b""
+        adapter.receive = partial(reply, adapter, answer)
+        assert ask_for_slcan(adapter.port) is None
+        assert adapter.said == b"V\r"
+
+
+def test_an_adapter_that_cannot_only_listen_is_not_opened(adapter: Adapter) -> None:
+    """It refuses L: it is named, and O is never tried."""
+    usual = adapter.receive
+    adapter.receive = lambda data: usual(data.replace(b"L\r", b"nonsense\r"))
+    found = ask_for_slcan(adapter.port)
+    assert found is not None
+    assert found.nodes == ()
+    assert "cannot only listen" in (found.problem or "")
+    assert b"O" not in adapter.said
+
+
+@pytest.mark.parametrize("is_wanted", [True, False])
+def test_discover_asks_for_adapters_only_if_told_to(
+    adapter: Adapter, is_wanted: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With --slcan the port is named with the URLs of what was heard, and no other protocol is
+    tried on it; without, no such command goes out."""
+    monkeypatch.setattr("drivers.discovery.search.comports", lambda: [ListPortInfo(adapter.port)])
+    options = ["--slcan"] if is_wanted else ["--no-probe"]
+    result = CliRunner().invoke(app, ["amp", "discover", "--json", *options])
+    assert result.exit_code == 0, result.output
+    (place,) = [one for one in json.loads(result.stdout)["places"] if one["place"] == adapter.port]
+    url = f"can+slcan://{adapter.port}?bitrate=500000#"
+    assert place["heard"] == ([f"{url}1", f"{url}5"] if is_wanted else [])
+    assert ("slcan adapter 1013, heartbeats of nodes: 1, 5" in place["description"]) == is_wanted
+    assert adapter.has_got(b"V\rC\rS6\rL\rC\r" if is_wanted else b"")

@@ -1,0 +1,127 @@
+"""Turns on a link and on a line, in the moments between two steps of the event loop."""
+
+import asyncio
+
+import pytest
+
+from drivers.backends.line_turns import LineTurns
+from drivers.errors import CommandRefused
+from drivers.link.turns import Kind, Turns
+from drivers.protocol.messages import Disarm
+
+
+async def settle() -> None:
+    """Let every task run until it waits."""
+    for _ in range(10):
+        await asyncio.sleep(0)
+
+
+class Users:
+    """Those who take turns, and in which order they had them."""
+
+    def __init__(self, turns: Turns) -> None:
+        self.turns = turns
+        self.order: list[str] = []
+        self.ends: dict[str, asyncio.Event] = {}
+
+    def take(self, name: str, kind: Kind = Kind.ORDINARY) -> "asyncio.Task[None]":
+        """Somebody who keeps the turn until told to end."""
+        self.ends[name] = asyncio.Event()
+
+        async def use() -> None:
+            async with self.turns.take(kind):
+                self.order.append(name)
+                await self.ends[name].wait()
+
+        return asyncio.create_task(use(), name=name)
+
+
+@pytest.fixture
+def users() -> Users:
+    """Nobody has the turn yet."""
+    return Users(Turns())
+
+
+async def test_silence_goes_before_what_was_just_handed_the_turn(users: Users) -> None:
+    """An ordinary request that has the turn but has not run yet gives it back, keeps its place
+    before the others, and gets it next."""
+    tasks = [users.take(name) for name in ("first", "second", "third")]
+    await settle()
+    users.ends["first"].set()
+    tasks.append(users.take("stop", Kind.SILENCE))  # runs after the first and before the second
+    await settle()
+    for end in users.ends.values():
+        end.set()
+    await asyncio.gather(*tasks)
+    assert users.order == ["first", "stop", "second", "third"]
+
+
+async def test_a_stop_goes_before_what_else_silences(users: Users) -> None:
+    """Silent sets and disarms that wait, with their longer ramps, come after it, in their order."""
+    tasks = [users.take("first")]
+    await settle()
+    tasks += [users.take(name, Kind.SILENCE) for name in ("zero", "disarm")]
+    await settle()
+    tasks.append(users.take("stop", Kind.STOP))
+    await settle()
+    for end in users.ends.values():
+        end.set()
+    await asyncio.gather(*tasks)
+    assert users.order == ["first", "stop", "zero", "disarm"]
+
+
+async def test_an_apply_that_was_just_handed_the_turn_gives_way_for_good() -> None:
+    """It was superseded before any of it was sent; the silence comes, and what was behind it."""
+    users = Users(Turns())
+    first, apply = users.take("first"), users.take("apply", Kind.APPLY)
+    await settle()
+    behind = users.take("behind")
+    await settle()
+    users.ends["first"].set()
+    stop = users.take("stop", Kind.SILENCE)
+    await settle()
+    for end in users.ends.values():
+        end.set()
+    await asyncio.gather(first, stop, behind)
+    with pytest.raises(CommandRefused, match="superseded"):
+        await apply
+    assert users.order == ["first", "stop", "behind"]
+
+
+async def test_a_link_that_was_kept_free_for_nothing_is_handed_on(users: Users) -> None:
+    """Where what silences was given up, those who have waited meanwhile come; also the new."""
+    users.turns.keep_free("west", Kind.SILENCE)
+    early = users.take("early")
+    await settle()
+    assert users.order == []
+    users.turns.release("west")
+    users.turns.release("west")
+    await settle()
+    late = users.take("late")
+    for end in users.ends.values():
+        end.set()
+    await asyncio.gather(early, late)
+    assert users.order == ["early", "late"]
+
+
+async def test_what_an_amplifier_still_has_to_say_ends_with_its_own_stop() -> None:
+    """The second half of an exchange that takes two is refused while its amplifier is about to be
+    silenced, instead of waiting for it; that of another waits."""
+    line = LineTurns()
+    said: list[str] = []
+
+    async def say(what: str) -> None:
+        said.append(what)
+
+    with line.silencing(Disarm(0.05), 1):
+        with pytest.raises(CommandRefused, match="superseded"):
+            async with asyncio.timeout(5):
+                await line.carry_out(Kind.ORDINARY, lambda: say("own"), address=1)
+        other = asyncio.create_task(line.carry_out(Kind.ORDINARY, lambda: say("other"), address=2))
+        await settle()
+        assert line.is_unsent(2)
+        assert not line.is_unsent(1)
+        await line.carry_out(Kind.SILENCE, lambda: say("stop"), address=1)
+        await other
+    assert said == ["stop", "other"]
+    assert not line.is_unsent(2)

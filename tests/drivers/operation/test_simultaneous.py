@@ -1,0 +1,94 @@
+"""Commits over wires of different speed, in virtual time: when each goes out, when it arrives."""
+
+import asyncio
+from collections.abc import Callable, Coroutine
+from dataclasses import dataclass, field
+from typing import Any
+
+import pytest
+
+from drivers.backends.can_bus.backend import CanBackend
+from drivers.backends.modbus.backend import ModbusBackend
+from drivers.backends.serial_line.backend import SerialBackend
+from drivers.operation.simultaneous import at_one_moment
+from virtual_loop import VirtualLoop
+
+
+@dataclass
+class Wire:
+    """An amplifier whose commits take so long [s] to arrive, and when they did."""
+
+    takes: float
+    sent: list[float] = field(default_factory=list)
+
+    def commit_time(self) -> float:
+        """See `Starter`."""
+        return self.takes
+
+    async def commit(self) -> float:
+        """Goes out now; its answer takes a while."""
+        self.sent.append(asyncio.get_running_loop().time())
+        await asyncio.sleep(0.01)
+        return self.takes
+
+
+def in_virtual_time(work: Callable[[], Coroutine[Any, Any, None]]) -> None:
+    """Run it on a clock that jumps."""
+    loop = VirtualLoop()
+    try:
+        loop.run_until_complete(work())
+    finally:
+        loop.close()
+
+
+def test_all_arrive_together_and_the_slowest_goes_first() -> None:
+    """6.5, 2 and 0 ms on the wire: sent at once, after 4.5 and after 6.5 ms."""
+
+    async def work() -> None:
+        wires = [Wire(0.002), Wire(0.0), Wire(0.0065)]
+        begin = asyncio.get_running_loop().time()
+        answers = await asyncio.gather(*at_one_moment([(wire, wire.commit) for wire in wires]))
+        assert answers == [0.0065, 0.002, 0.0]
+        assert [wire.sent[0] - begin for wire in wires] == pytest.approx([0.0045, 0.0065, 0.0])
+
+    in_virtual_time(work)
+
+
+def test_equal_wires_wait_for_nothing() -> None:
+    """They go out in one go, without the loop being left in between."""
+
+    async def work() -> None:
+        wires = [Wire(0.003) for _ in range(4)]
+        tasks = [
+            asyncio.ensure_future(each) for each in at_one_moment([(w, w.commit) for w in wires])
+        ]
+        await asyncio.sleep(0)
+        assert all(len(wire.sent) == 1 for wire in wires)
+        await asyncio.gather(*tasks)
+
+    in_virtual_time(work)
+
+
+def test_the_time_of_a_commit_is_arithmetic() -> None:
+    """Frames of the vendor pages: 13 bytes; 19 bytes and the silence; an order and a SYNC."""
+    serial = SerialBackend("serial:///dev/ttyUSB0?baud=115200")
+    assert serial.commit_time() == pytest.approx(13 * 10 / 115_200)
+    assert SerialBackend("socket://h:1").commit_time() == 0
+    modbus = ModbusBackend("modbus+rtu:///dev/ttyS1?baud=19200#1")
+    assert modbus.commit_time() == pytest.approx((19 + 3.5) * 11 / 19_200)
+    assert ModbusBackend("modbus+tcp://h/1").commit_time() == 0
+    assert CanBackend("can+socketcan://can0#1").commit_time() == pytest.approx((135 + 55) / 500_000)
+
+
+def test_a_rest_that_the_clock_cannot_count_is_waited_for() -> None:
+    """2 ms and 0.4 ps to wait, on a clock whose steps are 0.9 ps: it goes out after 2 ms."""
+
+    async def work() -> None:
+        loop = asyncio.get_running_loop()
+        assert isinstance(loop, VirtualLoop)
+        loop.now = begin = 4552.311810074659
+        wires = [Wire(0.0), Wire(0.0020000000004)]
+        await asyncio.gather(*at_one_moment([(wire, wire.commit) for wire in wires]))
+        assert [wire.sent[0] - begin for wire in wires] == pytest.approx([0.002, 0.0])
+
+    in_virtual_time(work)

@@ -47,6 +47,7 @@ class Exchanges:
                     side.complain("answer", now, what)
             if now > at + _FORGOTTEN:
                 side.overdue.discard(key)
+                side.settled.discard(key)
                 del side.pending[key]
 
     def sent(self, wire: Wire, time: float, raw: Data, meaning: Meaning) -> None:
@@ -72,6 +73,7 @@ class Exchanges:
             else:
                 side.pending[meaning.key] = (time, meaning)
                 side.overdue.discard(meaning.key)
+                side.settled.discard(meaning.key)
                 if not meaning.problem and meaning.kind is not Kind.LOOK:
                     self._may_feed(side, time, meaning)
 
@@ -139,8 +141,9 @@ class Exchanges:
             side.complain(
                 "answer", time, f"an answer of {side.name} is not whole: {answer.problem}"
             )
-        was_lost = answer.key in side.overdue
+        was_lost = answer.key in side.overdue or answer.key in side.settled
         side.overdue.discard(answer.key)
+        side.settled.discard(answer.key)
         if answer.refusal:
             side.follower.watchdog.was_not_fed()
         elif asked.problem:
@@ -156,8 +159,13 @@ class Exchanges:
             return
         if asked.kind in MOVING:
             # It may have been carried out when it was asked first, and that answer was lost.
-            same = [before for before, one in side.pending.values() if _is_repeated(one, asked)]
-            at = min([at, *same])
+            same = {
+                key: before
+                for key, (before, one) in side.pending.items()
+                if _is_repeated(one, asked)
+            }
+            at = min([at, *same.values()])
+            side.settled.update(same)
         self._host.granted(side, time, asked)
         if side.is_troubled(time) and asked.kind is Kind.ARM:
             side.follower.lose_track()

@@ -23,6 +23,7 @@ class Side:
     is_troubled: Callable[[float], bool]  # at a time [s]
     pending: dict[Hashable, tuple[float, Asked]] = field(default_factory=dict)
     overdue: set[Hashable] = field(default_factory=set)
+    settled: set[Hashable] = field(default_factory=set)  # the same was asked again, and answered
     abandoned: set[Hashable] = field(default_factory=set)  # asked by a host that has hung up since
     vibrates: bool = False  # the last that it was told
     vibrated_at: float = -math.inf  # when a set that vibrates was granted last
@@ -45,3 +46,4 @@ class Side:
             self.abandoned = set(self.pending)
         self.pending.clear()
         self.overdue.clear()
+        self.settled.clear()

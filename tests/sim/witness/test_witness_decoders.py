@@ -171,7 +171,7 @@ PLAN = {
         "main": {
             "wire": "line",
             "address": 1,
-            "channels": {0: {"frequency_hz": [40, 500], "level": 1.0}},
+            "channels": dict.fromkeys(range(4), {"frequency_hz": [40, 500], "level": 1.0}),
         }
     },
 }
@@ -221,3 +221,32 @@ def test_what_was_due_amid_trouble_is_not_owed_later(over: float, broken: list[s
     witness.faults(over, "line", are_on=False)
     witness.bytes("line", "amplifier", 0.5, PING)
     assert [violation.invariant for violation in witness.finish(2.0)] == broken
+
+
+def test_a_late_answer_to_what_was_repeated_tells_nothing_new() -> None:
+    """A set asked for twice, then another: the first answer comes last, and no set is taken back.
+
+    docs/reference/wire-modbus.md: Arm, and the Apply of token 513; the other one has token 514.
+    """
+    frames = {name: data for name, _, data in _modbus("TCP")}
+    witness = Witness(PLAN)
+    witness.faults(0.9, "line", are_on=True)
+
+    def passes(time: float, toward: Toward, name: str, number: int, token: int = 513) -> None:
+        data = bytearray(number.to_bytes(2, "big") + frames[name][2:])
+        if token != 513:  # with no check, for other words have another one
+            at = data.index((513).to_bytes(2, "big"), 14)
+            data = data[:at] + data[at:].replace(b"\2\1", token.to_bytes(2, "big"))
+            check = data.index(b"\xc9\xd5" if toward == "amplifier" else b"\xe3\x48")
+            data[check : check + 2] = b"\0\0"
+        witness.bytes("line", toward, time, bytes(data))
+
+    passes(1.000, "amplifier", "Arm request", 3)
+    passes(1.001, "host", "Arm reply", 3)
+    passes(1.010, "amplifier", "Apply request", 4)
+    passes(1.040, "amplifier", "Apply request", 5)
+    passes(1.0401, "host", "Apply reply", 5)
+    passes(1.0402, "amplifier", "Apply request", 6, 514)
+    passes(1.0403, "host", "Apply reply", 6, 514)
+    passes(1.0404, "host", "Apply reply", 4)
+    assert [str(violation) for violation in witness.finish(1.05)] == []

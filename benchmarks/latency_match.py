@@ -160,8 +160,8 @@ class Expected:
                 Contact(ContactKey("bench", number), x, y, since=float(number))
                 for number, (x, y) in enumerate([*self._others, self._places[touch]])
             ]
-            selector = Selector(self._table, NewestBuzzes(), self._means)
-            pattern = selector.select(contacts, 0.0).pattern
+            wish = NewestBuzzes().wish(contacts, 0.0)
+            pattern = Selector(self._table).select(contacts, wish, self._means).pattern
             commands: Sequence[DriveCommand] = ()
             if pattern is not None:
                 sets = route(pattern.excitation, self._rig, token=1, ramp=pattern.ramp)

@@ -171,7 +171,7 @@ PLAN = {
         "main": {
             "wire": "line",
             "address": 1,
-            "channels": dict.fromkeys(range(4), {"frequency_hz": [40, 500], "level": 1.0}),
+            "channels": {n: {"frequency_hz": [40, 500], "level": 1.0} for n in range(4)},
         }
     },
 }

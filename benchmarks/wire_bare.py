@@ -13,7 +13,7 @@ from pymodbus.client import AsyncModbusSerialClient, AsyncModbusTcpClient
 
 from drivers.backends.urls.modbus import ModbusUrl
 from drivers.backends.urls.serial_line import SerialUrl
-from drivers.codec.modbus.exchanges import to_exchange
+from drivers.codec.modbus import exchanges
 from drivers.codec.serial_line.exchanges import encode_request
 from drivers.codec.serial_line.frame import encode_frame
 from drivers.guard import SafeCommand
@@ -61,7 +61,7 @@ async def _with_pymodbus(url: ModbusUrl, sets: Sequence[SafeCommand]) -> list[fl
     await client.connect()
 
     async def ask(request: Request, tag: int) -> None:
-        exchange = to_exchange(request, tag=tag, channels=4)
+        exchange = exchanges.encode_request(request, tag=tag, channels=4)
         assert exchange.write is not None
         words = list(exchange.write.registers)
         begin = time.perf_counter()

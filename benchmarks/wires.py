@@ -23,7 +23,7 @@ from benchmarks.wire_bench import (
     ours,
     sent_apart,
 )
-from drivers.codec.modbus.exchanges import to_exchange
+from drivers.codec.modbus import exchanges
 from drivers.codec.modbus.telegrams import make_telegram
 from drivers.codec.serial_line.exchanges import decode_request, encode_request
 from drivers.codec.serial_line.frame import FrameReader, encode_frame
@@ -89,7 +89,7 @@ _UNIT = ModbusUnit(_Taker())
 
 
 def _modbus_codec(safe: SafeCommand) -> None:
-    exchange = to_exchange(Apply(safe), tag=1, channels=CHANNELS)
+    exchange = exchanges.encode_request(Apply(safe), tag=1, channels=CHANNELS)
     telegram = make_telegram(exchange.read, exchange.write, unit=1, transaction=1, is_rtu=False)
     answer = _UNIT.answer(telegram.frame[7:])
     assert answer is not None

@@ -18,7 +18,7 @@ from drivers.codec.can_bus.adapter_text import (
 )
 from drivers.codec.can_bus.answers import AnswerReader, decode_emergency
 from drivers.codec.can_bus.frame import CanFrame
-from drivers.codec.can_bus.objects import achieved_of, encode_envelope, faults_of
+from drivers.codec.can_bus.objects import pack_envelope, unpack_achieved, unpack_faults
 from drivers.codec.can_bus.orders import encode_order
 from drivers.errors import DriverError
 from drivers.protocol.messages import (
@@ -147,7 +147,7 @@ class CanEnds:
         except DriverError:
             pass
         self.events.clear()
-        for read in (faults_of, achieved_of):
+        for read in (unpack_faults, unpack_achieved):
             try:
                 read(frame.data)
             except DriverError:
@@ -168,7 +168,7 @@ class CanEnds:
             case GetCaps() | GetFaults():
                 return _pack([_read_object(0x2008, 0), _segment(0x60)])
             case LoadEnvelope(envelope=envelope):
-                return _pack(_write_object(0x2100, _ENVELOPE_SLOT, encode_envelope(envelope)))
+                return _pack(_write_object(0x2100, _ENVELOPE_SLOT, pack_envelope(envelope)))
             case _:
                 return _pack(list(encode_order(request, node=1, sequence=7)))
 

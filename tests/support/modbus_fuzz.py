@@ -71,7 +71,7 @@ class ModbusEnds:
         self._requests_by_size: dict[int, Request] = {}  # in bytes that are read
         self.telegrams: list[bytes] = []
         for request in requests:
-            exchange = exchanges.to_exchange(request, tag=_TAG, channels=4)
+            exchange = exchanges.encode_request(request, tag=_TAG, channels=4)
             telegram = make_telegram(
                 exchange.read, exchange.write, unit=1, transaction=0, is_rtu=True
             )
@@ -131,7 +131,7 @@ class ModbusEnds:
         """What the host takes for the answer to a request, and can read."""
         size = data[2] if self._is_rtu else data[8] if len(data) > 8 else 0
         request = self._requests_by_size.get(size, self._requests[0])
-        exchange = exchanges.to_exchange(request, tag=_TAG, channels=4)
+        exchange = exchanges.encode_request(request, tag=_TAG, channels=4)
         telegram = make_telegram(
             exchange.read,
             exchange.write,
@@ -145,7 +145,7 @@ class ModbusEnds:
                 try:
                     exchanges.condition(request, answer.registers)
                     exchanges.faults_beyond(request, answer.registers)
-                    replies.append(exchanges.to_reply(request, answer.registers))
+                    replies.append(exchanges.decode_reply(request, answer.registers))
                 except FrameError:
                     continue
         self._host.clear()

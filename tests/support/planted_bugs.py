@@ -330,7 +330,7 @@ DRIVERS: dict[str, Bug] = {
     "registers of channels begin with the level": _bug(
         "limits",
         Edit(
-            "drivers.codec.modbus.exchanges:_channel_registers",
+            "drivers.codec.modbus.exchanges:_pack_channel",
             "*_unsigned(\n            (_Q.frequency, command.frequency),\n"
             "            (_Q.level, command.level),",
             "*_unsigned(\n            (_Q.level, command.level),\n"

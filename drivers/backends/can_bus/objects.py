@@ -19,15 +19,15 @@ from drivers.backends.waiting import SETTLE
 from drivers.codec.can_bus.frame import cob_id
 from drivers.codec.can_bus.objects import (
     TEXTS,
-    achieved_of,
-    capabilities_of,
     capability_entries,
-    encode_envelope,
-    faults_of,
-    identity_of,
     index_of,
-    nak_of,
+    nak_of_abort,
+    pack_envelope,
     read_integer,
+    unpack_achieved,
+    unpack_capabilities,
+    unpack_faults,
+    unpack_identity,
 )
 from drivers.errors import FrameError, LinkError, LinkTimeout
 from drivers.guard import SafeEnvelope
@@ -110,7 +110,7 @@ class ObjectClient:
             }
             version = capability_entries()[0]
             data = self._client.upload(version.index, version.subindex)
-            return identity_of(texts, read_integer(version, data))
+            return unpack_identity(texts, read_integer(version, data))
 
         return self._transfer(read, timeout)
 
@@ -132,32 +132,32 @@ class ObjectClient:
             for entry in capability_entries():
                 data = self._client.upload(entry.index, entry.subindex)
                 values[entry.name] = read_integer(entry, data)
-            return capabilities_of(values)
+            return unpack_capabilities(values)
 
         return self._transfer(read, timeout)
 
     def faults(self, *, timeout: float) -> FaultList:
         """What went wrong."""
         return self._transfer(
-            lambda: faults_of(self._client.upload(index_of("faults"), 0)), timeout
+            lambda: unpack_faults(self._client.upload(index_of("faults"), 0)), timeout
         )
 
     def achieved(self, *, timeout: float) -> Achieved:
         """What the last set that was answered plays, where it is not what was asked for."""
         return self._transfer(
-            lambda: achieved_of(self._client.upload(index_of("achieved"), 0)), timeout
+            lambda: unpack_achieved(self._client.upload(index_of("achieved"), 0)), timeout
         )
 
     def load_envelope(self, envelope: SafeEnvelope, *, timeout: float) -> Loaded | Nak:
         """Keep an envelope under its slot."""
-        data = encode_envelope(envelope)
+        data = pack_envelope(envelope)
         index = index_of("envelope")
 
         def write() -> Loaded | Nak:
             try:
                 self._download(index, envelope.slot, data)
             except SdoAbortedError as abort:
-                code = nak_of(abort.code)
+                code = nak_of_abort(abort.code)
                 if code is None:
                     raise
                 return Nak(code)

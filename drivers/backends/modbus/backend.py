@@ -147,7 +147,7 @@ class ModbusBackend(WireBackend):
             records = beyond
         if isinstance(request, Hello) and self._url.is_rtu:
             await self._check_alone()
-        reply = exchanges.to_reply(request, answer.registers)
+        reply = exchanges.decode_reply(request, answer.registers)
         if isinstance(reply, Capabilities):
             self._channels = reply.channels
         return reply
@@ -157,7 +157,7 @@ class ModbusBackend(WireBackend):
         link = self._opened()
         kind = kind_on_line(request)
         unit = None if kind.silences else self._url.unit
-        await link.broadcast(exchanges.to_broadcast(request), kind, unit=unit)
+        await link.broadcast(exchanges.encode_broadcast(request), kind, unit=unit)
         self._last_sent = link.last_sent
 
     async def _check_alone(self) -> None:
@@ -180,7 +180,7 @@ class ModbusBackend(WireBackend):
             options["channels"] = self._channels
         if records:
             options["records"] = records
-        return exchanges.to_exchange(request, tag=tag, **options)
+        return exchanges.encode_request(request, tag=tag, **options)
 
     async def _carry_out(self, exchange: Exchange, tag: int, asked: "_Asked") -> Answer:
         read, write = exchange.read, exchange.write
@@ -229,7 +229,7 @@ class ModbusBackend(WireBackend):
         if only is not None and only.code is NakCode.BUSY:
             return only
         told = await self._transact(exchanges.refusal_read(), None, asked, tag=None)
-        nak = None if told.exception else exchanges.to_nak(told.registers, tag=tag)
+        nak = None if told.exception else exchanges.decode_refusal(told.registers, tag=tag)
         if nak is not None:
             return nak
         # Not of this write: a late exception to an earlier one, so this one's answer was missed.

@@ -109,7 +109,7 @@ def read_integer(entry: Entry, data: bytes) -> int:
     return value
 
 
-def identity_of(texts: Mapping[str, bytes], version: int) -> Identity:
+def unpack_identity(texts: Mapping[str, bytes], version: int) -> Identity:
     """Who it is, by the texts of its object dictionary; FrameError for what is no text."""
     read = {}
     for name in TEXTS:
@@ -122,7 +122,7 @@ def identity_of(texts: Mapping[str, bytes], version: int) -> Identity:
     return Identity(**read, protocol_version=version)
 
 
-def capabilities_of(values: Mapping[str, int]) -> Capabilities:
+def unpack_capabilities(values: Mapping[str, int]) -> Capabilities:
     """What it can play, from the integers of `capability_entries` by their names."""
     fields: dict[str, float] = {}
     for entry in capability_entries():
@@ -134,7 +134,7 @@ def capabilities_of(values: Mapping[str, int]) -> Capabilities:
     return Capabilities(**fields, events=True)  # type: ignore[arg-type]  # by their own names
 
 
-def faults_of(data: bytes) -> FaultList:
+def unpack_faults(data: bytes) -> FaultList:
     """The faults in their domain: fault, channel and age each, newest first; raises FrameError."""
     cursor = Cursor(data)
     record = 2 + _WIDTHS[_Q.age.wire]
@@ -150,7 +150,7 @@ def faults_of(data: bytes) -> FaultList:
     )
 
 
-def achieved_of(data: bytes) -> Achieved:
+def unpack_achieved(data: bytes) -> Achieved:
     """What a set plays, in its domain; raises FrameError."""
     cursor = Cursor(data)
     token = cursor.integer(_Q.token)
@@ -185,7 +185,7 @@ def achieved_of(data: bytes) -> Achieved:
     return Achieved(token, tuple(commands))
 
 
-def encode_envelope(envelope: SafeEnvelope) -> bytes:
+def pack_envelope(envelope: SafeEnvelope) -> bytes:
     """The domain of an envelope; TypeError for one that has not passed a guard."""
     if type(envelope) is not SafeEnvelope:
         raise TypeError(
@@ -198,6 +198,6 @@ def encode_envelope(envelope: SafeEnvelope) -> bytes:
     )
 
 
-def nak_of(abort: int) -> NakCode | None:
+def nak_of_abort(abort: int) -> NakCode | None:
     """Why an amplifier refused, by its SDO abort code; None for a code of CANopen's own."""
     return _NAKS.get(abort)

@@ -77,7 +77,7 @@ def _channel(register: int) -> int | None:
     return None if register == _NO_CHANNEL else _integer("channel", register)
 
 
-def identity(registers: Sequence[int]) -> Identity:
+def unpack_identity(registers: Sequence[int]) -> Identity:
     """Who it is."""
     block = _MAP["input"]["identity"]
     found, rest = _fields(block["registers"], registers)
@@ -100,7 +100,7 @@ def _text(registers: Sequence[int]) -> str:
     return text
 
 
-def capabilities(registers: Sequence[int]) -> Capabilities:
+def unpack_capabilities(registers: Sequence[int]) -> Capabilities:
     """What it can play."""
     found, _ = _fields(_MAP["input"]["capabilities"]["registers"], registers)
     _integer("protocol_version", found.pop("protocol_version"))
@@ -112,7 +112,7 @@ def capabilities(registers: Sequence[int]) -> Capabilities:
     return Capabilities(channels=channels, **numbers, **whole)
 
 
-def status(registers: Sequence[int]) -> Status:
+def unpack_status(registers: Sequence[int]) -> Status:
     """How it is."""
     found, levels = _fields(_MAP["input"]["status"]["registers"], registers)
     channels = _integer("channel_count", found["channel_count"])
@@ -136,7 +136,7 @@ def _groups(registers: Sequence[int], size: int) -> Iterable[Sequence[int]]:
     return (registers[at : at + size] for at in range(0, len(registers) - size + 1, size))
 
 
-def achieved(registers: Sequence[int]) -> Achieved:
+def unpack_achieved(registers: Sequence[int]) -> Achieved:
     """What it plays, or would; the channels that were named, in their order."""
     found, rest = _fields(_MAP["input"]["achieved"]["registers"], registers)
     if _integer("channel_count", found["channel_count"]) * _CHANNEL_SIZE > len(rest):
@@ -167,8 +167,8 @@ def _command(channel: int, group: Sequence[int]) -> DriveCommand:
     )
 
 
-def faults(registers: Sequence[int]) -> FaultList:
-    """What went wrong, as far as it was read; see `fault_count`."""
+def unpack_faults(registers: Sequence[int]) -> FaultList:
+    """What went wrong, as far as it was read; see `unpack_fault_count`."""
     found, rest = _fields(_MAP["input"]["faults"]["registers"], registers)
     count = _integer("fault_count", found["fault_count"])
     records = list(_groups(rest, _FAULT_SIZE))[:count]
@@ -184,13 +184,13 @@ def faults(registers: Sequence[int]) -> FaultList:
     )
 
 
-def fault_count(registers: Sequence[int]) -> int:
+def unpack_fault_count(registers: Sequence[int]) -> int:
     """How many faults there are to be read."""
     found, _ = _fields(_MAP["input"]["faults"]["registers"], registers)
     return _integer("fault_count", found["fault_count"])
 
 
-def loaded(registers: Sequence[int]) -> Loaded:
+def unpack_loaded(registers: Sequence[int]) -> Loaded:
     """The envelope that was loaded last."""
     found, _ = _fields(_MAP["holding"]["envelope"]["registers"], registers)
     return Loaded(
@@ -199,7 +199,7 @@ def loaded(registers: Sequence[int]) -> Loaded:
     )
 
 
-def refusal(registers: Sequence[int]) -> tuple[Nak, int] | None:
+def unpack_refusal(registers: Sequence[int]) -> tuple[Nak, int] | None:
     """Why a write was refused, and its tag; None where none has been."""
     found, _ = _fields(_MAP["input"]["refusal"]["registers"], registers)
     if not found["nak"]:
@@ -207,7 +207,7 @@ def refusal(registers: Sequence[int]) -> tuple[Nak, int] | None:
     return Nak(_one_of(NakCode, found["nak"]), _channel(found["channel"])), found["refused_tag"]
 
 
-def condition(registers: Sequence[int]) -> tuple[State, Fault]:
+def unpack_condition(registers: Sequence[int]) -> tuple[State, Fault]:
     """With which a status and what was achieved begin."""
     found, _ = _fields(("state", "fault"), registers)
     return _one_of(State, found["state"]), _one_of(Fault, found["fault"])

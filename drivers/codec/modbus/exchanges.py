@@ -74,7 +74,7 @@ class Exchange:
     write: Write | None = None
 
 
-def to_exchange(
+def encode_request(
     request: Request, *, tag: int, channels: int = _CHANNELS_MAX, records: int = _RECORDS_FIRST
 ) -> Exchange:
     """The exchange of a request; TypeError if a set in it has not passed a guard.
@@ -100,7 +100,7 @@ def to_exchange(
             )
         case Stage(command_set=wanted) | Apply(command_set=wanted):
             commit = wanted.token if isinstance(request, Apply) else 0
-            write = _block("set", tag, [commit, *_set_registers(wanted)])
+            write = _block("set", tag, [commit, *_pack_set(wanted)])
             return Exchange(_read("achieved", beyond=channels * _CHANNEL_SIZE), write)
         case Commit(token=token):
             write = _block("set", tag, [_Q.token.to_wire(token)])
@@ -109,11 +109,11 @@ def to_exchange(
             kept = _MAP["holding"]["envelope"]
             return Exchange(
                 Read(kept["address"], _HEAD + len(kept["registers"])),
-                _block("envelope", tag, _envelope_registers(envelope)),
+                _block("envelope", tag, _pack_envelope(envelope)),
             )
 
 
-def to_broadcast(request: Broadcast) -> Write:
+def encode_broadcast(request: Broadcast) -> Write:
     """What is written to all units; a commit is one register."""
     if isinstance(request, Commit):
         address = _MAP["holding"]["set"]["address"] + _HEAD
@@ -121,9 +121,9 @@ def to_broadcast(request: Broadcast) -> Write:
     return _block("control", 0, _order(request))
 
 
-def to_nak(registers: Sequence[int], *, tag: int) -> Nak | None:
+def decode_refusal(registers: Sequence[int], *, tag: int) -> Nak | None:
     """The refusal of the write that carried this tag; None where it is that of another."""
-    told = blocks.refusal(registers)
+    told = blocks.unpack_refusal(registers)
     return told[0] if told is not None and told[1] == tag else None
 
 
@@ -144,36 +144,36 @@ def check_of(registers: Sequence[int]) -> int:
     return binascii.crc_hqx(struct.pack(f">{len(registers)}H", *registers), 0xFFFF) or 0xFFFF
 
 
-def to_reply(request: Request, registers: Sequence[int]) -> Reply:
+def decode_reply(request: Request, registers: Sequence[int]) -> Reply:
     """The reply in the block that the exchange of this request has read; raises FrameError."""
     match request:
         case Hello():
-            return blocks.identity(registers)
+            return blocks.unpack_identity(registers)
         case GetCaps():
-            return blocks.capabilities(registers)
+            return blocks.unpack_capabilities(registers)
         case GetFaults():
-            return blocks.faults(registers)
+            return blocks.unpack_faults(registers)
         case Stage() | Apply() | Commit():
-            return blocks.achieved(registers)
+            return blocks.unpack_achieved(registers)
         case LoadEnvelope():
-            return blocks.loaded(registers)
+            return blocks.unpack_loaded(registers)
         case _:
-            return blocks.status(registers)
+            return blocks.unpack_status(registers)
 
 
 def condition(request: Request, registers: Sequence[int]) -> tuple[State, Fault] | None:
     """State and fault where the block that was read tells them; raises FrameError."""
     if isinstance(request, Hello | GetCaps | GetFaults | LoadEnvelope):
         return None
-    return blocks.condition(registers)
+    return blocks.unpack_condition(registers)
 
 
 def faults_beyond(request: Request, registers: Sequence[int]) -> int:
     """How many fault records there are if they are more than were read, else 0."""
     if not isinstance(request, GetFaults):
         return 0
-    count = blocks.fault_count(registers)
-    return count if count > len(blocks.faults(registers).faults) else 0
+    count = blocks.unpack_fault_count(registers)
+    return count if count > len(blocks.unpack_faults(registers).faults) else 0
 
 
 def nak_of_exception(code: int) -> Nak | None:
@@ -204,7 +204,7 @@ def _unsigned(*pairs: tuple[Quantity, float]) -> list[int]:
     return [quantity.to_wire(value) & 0xFFFF for quantity, value in pairs]
 
 
-def _set_registers(command_set: CommandSet) -> list[int]:
+def _pack_set(command_set: CommandSet) -> list[int]:
     if type(command_set) is not SafeCommand:
         raise TypeError(
             f"only a SafeCommand goes on the wire, not a {type(command_set).__name__}: "
@@ -220,11 +220,11 @@ def _set_registers(command_set: CommandSet) -> list[int]:
     )
     for channel in range(max(by_channel, default=-1) + 1):
         command = by_channel.get(channel)
-        registers += [0] * _CHANNEL_SIZE if command is None else _channel_registers(command)
+        registers += [0] * _CHANNEL_SIZE if command is None else _pack_channel(command)
     return registers
 
 
-def _channel_registers(command: DriveCommand) -> list[int]:
+def _pack_channel(command: DriveCommand) -> list[int]:
     _Q.channel.to_wire(command.channel)
     shape = _unsigned((_Q.envelope_slot, command.onset), (_Q.envelope_slot, command.ending))
     values = {
@@ -244,7 +244,7 @@ def _channel_registers(command: DriveCommand) -> list[int]:
     ]
 
 
-def _envelope_registers(envelope: Envelope) -> list[int]:
+def _pack_envelope(envelope: Envelope) -> list[int]:
     if type(envelope) is not SafeEnvelope:
         raise TypeError(
             f"only a SafeEnvelope goes on the wire, not a {type(envelope).__name__}: "

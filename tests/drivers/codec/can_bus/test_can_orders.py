@@ -12,11 +12,11 @@ from drivers.codec.can_bus.answers import AnswerReader, decode_emergency
 from drivers.codec.can_bus.dbc import dbc_text
 from drivers.codec.can_bus.frame import LAYOUTS, CanFrame
 from drivers.codec.can_bus.objects import (
-    achieved_of,
-    capabilities_of,
-    encode_envelope,
-    faults_of,
-    identity_of,
+    pack_envelope,
+    unpack_achieved,
+    unpack_capabilities,
+    unpack_faults,
+    unpack_identity,
 )
 from drivers.codec.can_bus.orders import SYNC, encode_broadcast, encode_order, wanted_commands
 from drivers.command import CommandSet, DriveCommand
@@ -117,7 +117,7 @@ def test_only_what_a_guard_let_through_is_encoded(safe: Callable[..., SafeComman
         with pytest.raises(TypeError, match="SafeCommand"):
             encode_order(wrap(plain), node=1, sequence=1)
     with pytest.raises(TypeError, match="SafeEnvelope"):
-        encode_envelope(object())  # type: ignore[arg-type]
+        pack_envelope(object())  # type: ignore[arg-type]
 
 
 @given(
@@ -238,7 +238,7 @@ def test_any_bytes_are_an_answer_or_a_frame_error(data: bytes, at: int) -> None:
             reader.feed(CanFrame(id, data))
         except FrameError:
             continue
-    for read in (decode_emergency, faults_of, achieved_of):
+    for read in (decode_emergency, unpack_faults, unpack_achieved):
         try:
             read(data)
         except FrameError:
@@ -247,27 +247,27 @@ def test_any_bytes_are_an_answer_or_a_frame_error(data: bytes, at: int) -> None:
 
 def test_objects_mean_what_they_say() -> None:
     """Faults, achieved commands, texts and capabilities from bytes written by hand."""
-    faults = faults_of(bytes.fromhex("01FF DC050000 0402 00000100"))
+    faults = unpack_faults(bytes.fromhex("01FF DC050000 0402 00000100"))
     assert faults.faults == (
         FaultRecord(Fault.WATCHDOG, None, 1.5),
         FaultRecord(Fault.ARC, 2, 65.536),
     )
-    achieved = achieved_of(bytes.fromhex("0102 01 F82A D007 D8DC 35 00 05 06"))
+    achieved = unpack_achieved(bytes.fromhex("0102 01 F82A D007 D8DC 35 00 05 06"))
     assert achieved.token == 513
     assert achieved.commands == (
         DriveCommand(3, 110.0, 0.2, -90.0, keep_phase=True, onset=5, ending=6),
     )
     texts = {"vendor": b"Acme", "product": b"Quad\0", "serial_number": b"A", "firmware": b"1"}
-    assert identity_of(texts, 1).product == "Quad"
+    assert unpack_identity(texts, 1).product == "Quad"
     with pytest.raises(FrameError, match="control"):
-        identity_of({**texts, "vendor": b"A\nB"}, 1)
+        unpack_identity({**texts, "vendor": b"A\nB"}, 1)
     numbers = {
         **{"protocol_version": 1, "channels": 4, "frequency_min": 2000, "frequency_max": 60000},
         **{"frequency_step": 1, "level_max": 10000, "level_step": 1, "phase_step": 1},
         **{"ramp_max": 1000, "watchdog_min": 100, "watchdog_max": 2000, "envelope_knots": 32},
         **{"envelope_slots": 63, "envelope_step_min": 10, "envelope_step_max": 1000},
     }
-    assert capabilities_of(numbers) == replace(WIDE, channels=4)
+    assert unpack_capabilities(numbers) == replace(WIDE, channels=4)
 
 
 @given(st.data())

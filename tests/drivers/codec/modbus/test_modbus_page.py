@@ -42,7 +42,7 @@ def pdu_of(frame: bytes, wire: str) -> bytes:
 
 def exchange_of(name: str, number: int) -> Exchange:
     """What the host writes and reads; before GetCaps it does not know how many channels it has."""
-    return exchanges.to_exchange(
+    return exchanges.encode_request(
         EXAMPLES[name].request, tag=number, channels=16 if name in ("Hello", "GetCaps") else 4
     )
 
@@ -107,7 +107,7 @@ def test_the_host_understands_the_reply(name: str, number: int, wire: str) -> No
         return
     assert exchanges.is_of(answer.registers, tag=number if exchange.write else None)
     assert answer.registers[1] != 0
-    assert exchanges.to_reply(example.request, answer.registers) == example.reply
+    assert exchanges.decode_reply(example.request, answer.registers) == example.reply
 
 
 @every_wire
@@ -134,8 +134,8 @@ def test_the_reason_of_a_refusal_can_be_read(wire: str) -> None:
     assert pdu == pdu_of(FRAMES[f"Refusal reply, {wire}"], wire)
     reader = AnswerReader(is_rtu=wire == "RTU", counters=WireCounters())
     (answer,) = reader.feed(FRAMES[f"Refusal reply, {wire}"], sent)
-    assert exchanges.to_nak(answer.registers, tag=number) == EXAMPLES[name].reply
-    assert exchanges.to_nak(answer.registers, tag=number - 1) is None
+    assert exchanges.decode_refusal(answer.registers, tag=number) == EXAMPLES[name].reply
+    assert exchanges.decode_refusal(answer.registers, tag=number - 1) is None
 
 
 @every_wire
@@ -154,7 +154,7 @@ def test_without_function_23_it_takes_two(wire: str) -> None:
         reader = AnswerReader(is_rtu=wire == "RTU", counters=WireCounters())
         (answer,) = reader.feed(FRAMES[f"{name} reply, {wire}"], sent)
     assert exchanges.is_of(answer.registers, tag=20)
-    assert exchanges.to_reply(example.request, answer.registers) == example.reply
+    assert exchanges.decode_reply(example.request, answer.registers) == example.reply
 
 
 @every_wire
@@ -162,7 +162,7 @@ def test_without_function_23_it_takes_two(wire: str) -> None:
 def test_broadcasts_are_heard(name: str, wire: str) -> None:
     """What the host sends to unit 0 is on the page, and every unit carries it out."""
     number, request = BROADCASTS[name]
-    sent = telegram(None, exchanges.to_broadcast(request), number, wire, unit=0)
+    sent = telegram(None, exchanges.encode_broadcast(request), number, wire, unit=0)
     assert sent.frame == FRAMES[f"{name} request, {wire}"]
     station = ScriptedStation()
     ModbusUnit(station).hear(pdu_of(sent.frame, wire))

@@ -18,7 +18,7 @@ from sim.far_ends.modbus.unit import ModbusUnit
 
 def asked_and_answered(is_rtu: bool) -> tuple[Telegram, bytes]:
     """A heartbeat with tag 4711 and the frame that answers it."""
-    exchange = exchanges.to_exchange(Ping(), tag=4711, channels=4)
+    exchange = exchanges.encode_request(Ping(), tag=4711, channels=4)
     telegram = make_telegram(
         exchange.read, exchange.write, unit=1, transaction=0 if is_rtu else 300, is_rtu=is_rtu
     )
@@ -42,7 +42,7 @@ def read(is_rtu: bool, *pieces: bytes) -> tuple[list[Answer], WireCounters]:
 def accepted(answers: list[Answer]) -> list[Status]:
     """Those that a backend would take for the answer to this request."""
     return [
-        exchanges.to_reply(Ping(), one.registers)
+        exchanges.decode_reply(Ping(), one.registers)
         for one in answers
         if not one.exception and exchanges.is_of(one.registers, tag=4711)
     ]
@@ -80,7 +80,7 @@ def test_any_bytes_are_borne(is_rtu: bool, stream: list[bytes]) -> None:
     for piece in stream:
         for answer in reader.feed(piece, EXAMPLES[is_rtu][0]):
             try:
-                exchanges.to_reply(Ping(), answer.registers)
+                exchanges.decode_reply(Ping(), answer.registers)
             except FrameError:
                 continue
     assert len(reader._buffer) <= 1024
@@ -98,7 +98,7 @@ def test_what_was_cut_off_is_gone_before_the_host_asks_again(
     Without the pause the missing end of the first would be filled up with the second.
     """
     is_rtu = reader_type is RtuReader
-    exchange = exchanges.to_exchange(Apply(SET), tag=1, channels=4)
+    exchange = exchanges.encode_request(Apply(SET), tag=1, channels=4)
     frame = make_telegram(exchange.read, exchange.write, unit=1, transaction=0, is_rtu=is_rtu).frame
     for missing in range(1, len(frame)):
         reader = reader_type()

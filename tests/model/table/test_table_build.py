@@ -70,11 +70,30 @@ def test_two_processes_make_the_same_file(problem, whole, tmp_path):
 def test_an_interrupted_build_goes_on(problem, whole, tmp_path):
     """What was done is not done again, and the file is that of a build without interruption."""
     kept = interrupted(problem, tmp_path, after=3)
-    build = build_in_parts(problem, mode="switched", kept=kept)
+    told: list[int] = []
+    build = build_in_parts(
+        problem, mode="switched", kept=kept, progress=lambda done, of: told.append(done)
+    )
     assert build.reused_count == 3
+    assert told == [3, PARTS]
     assert file_of(build, tmp_path) == whole
     kept.clear()
     assert not kept.folder.exists()
+
+
+def test_whichever_part_is_missing_comes_where_it_belongs(problem, tmp_path, monkeypatch):
+    """Twelve cells in shares of five: one share lost, the table is that of a build in one go."""
+    monkeypatch.setattr(parts, "CELLS_AT_ONCE", 5)
+    whole = file_of(build_in_parts(problem, mode="switched"), tmp_path)
+    kept = KeptParts.beside(tmp_path / "t.npz", problem.digest)
+    build_in_parts(problem, mode="switched", kept=kept)
+    shares = sorted(kept.folder.glob("cells-*"))
+    assert len(shares) == 3
+    for share in shares:
+        share.unlink()
+        build = build_in_parts(problem, mode="switched", kept=kept)
+        assert (build.reused_count, build.part_count) == (5, 6)
+        assert file_of(build, tmp_path) == whole
 
 
 def test_kept_parts_are_for_any_mode(problem, tmp_path):
@@ -110,9 +129,9 @@ def test_parts_of_another_table_are_not_used(problem, tmp_path, caplog, what):
     assert caplog.text == ""
 
 
-@pytest.mark.parametrize("harm", ["flip", "cut", "swap", "edit"])
+@pytest.mark.parametrize("harm", ["flip", "cut", "swap", "stray", "edit"])
 def test_a_damaged_part_is_told_and_solved_again(problem, whole, tmp_path, caplog, harm):
-    """A flipped bit, a file cut short, another part's, an edited one: never used, and named."""
+    """A flipped bit, a cut file, another part's or table's, an edited one: not used, named."""
     kept = interrupted(problem, tmp_path, after=3)
     (path,) = kept.folder.glob("fields-*")
     data = bytearray(path.read_bytes())
@@ -126,6 +145,11 @@ def test_a_damaged_part_is_told_and_solved_again(problem, whole, tmp_path, caplo
         arrays["acceleration"][0] = 1
         np.savez(path, **arrays)
         data = bytearray(path.read_bytes())
+    elif harm == "stray":
+        (tmp_path / "other").mkdir()
+        elsewhere = replace(problem, frequencies=FREQUENCIES + 1)
+        (other,) = interrupted(elsewhere, tmp_path / "other", after=3).folder.glob("fields-*")
+        data = bytearray(other.read_bytes())
     else:
         (other,) = kept.folder.glob("modes-*")
         data = bytearray(other.read_bytes())

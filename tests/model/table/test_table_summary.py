@@ -8,7 +8,7 @@ import pytest
 from model.finger.grid import Grid
 from model.table.build import build_table
 from model.table.summary import alike_share, summarize
-from model.table.weak_cells import WeakCells, find_weak_cells, text_map
+from model.table.weak_cells import WeakCells, find_weak_cells, map_grid, text_map
 from paper_plate import make_paper_rig
 from small_table import small_table
 
@@ -49,12 +49,32 @@ def test_of_a_cells_contrasts_the_median_and_the_tenth_percentile_are_kept(table
             assert below == pytest.approx(share, abs=1.5 / len(contrasts))
 
 
+def test_other_fingers_are_tried_all_over_the_plate(table, monkeypatch):
+    """One in each twelfth of a quarter and at its mirror images: one in each of 8 by 6 fields."""
+    tried = set()
+    monkeypatch.setattr(
+        "model.table.weak_cells._contrast",
+        lambda table, target, other: tried.add(tuple(other)) or 0.0,
+    )
+    find_weak_cells(table)
+    x, y = np.array(sorted(tried)).T
+    size = (table.plate.length, table.plate.width)
+    counts, *_ = np.histogram2d(x, y, bins=(8, 6), range=[(0, side) for side in size])
+    assert (counts == 1).all()
+
+
+def test_a_fine_grid_is_asked_about_more_coarsely(table):
+    """A cell of the map is no smaller than a sixteenth by a twelfth of the plate."""
+    assert map_grid(replace(table, grid=Grid(24, 5))) == Grid(16, 5)
+    assert map_grid(replace(table, grid=Grid(4, 20))) == Grid(4, 12)
+
+
 def test_weak_and_feasible_follow_from_twelve_decibels():
     """Feasible by the median other finger, weak by one in ten; unreachable levels are neither."""
     weak = WeakCells(
         Grid(4, 1),
         np.zeros((4, 2)),
-        median_db=np.array([20.0, 13.0, 9.0, -np.inf]),
+        median_db=np.array([20.0, 12.0, 9.0, -np.inf]),
         tenth_db=np.array([12.0, 11.9, 5.0, -np.inf]),
     )
     assert weak.feasible.tolist() == [True, True, False, False]
@@ -82,6 +102,18 @@ def test_where_nothing_is_felt_all_is_dead_and_weak():
     assert summary["feasible_share"] == 0.0
     assert summary["weak_share"] == 1.0
     assert summary["contrast_1_quiet_median_db"] is None
+
+
+def test_a_cell_that_is_felt_but_not_strongly_is_not_feasible(table):
+    """Strokes with which the loudest cell reaches 19 dB SL: of 20 dB SL there is none to tell."""
+    rig = make_paper_rig(12, 9)
+    least = 10 ** ((19.0 - table.available_level_db_sl.max()) / 20)
+    weaker = replace(rig, eras=tuple(replace(era, stroke=least * era.stroke) for era in rig.eras))
+    table = build_table(weaker, frequencies=table.frequencies, grid=table.grid)
+    assert table.available_level_db_sl.max() == pytest.approx(19.0, abs=0.01)
+    weak = find_weak_cells(table)
+    assert np.isneginf(weak.median_db).all()
+    assert not weak.feasible.any()
 
 
 def test_alike_patterns_are_counted(table):

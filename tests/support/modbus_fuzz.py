@@ -144,7 +144,6 @@ class ModbusEnds:
             if not answer.exception and exchanges.is_of(answer.registers, tag=_TAG):
                 try:
                     exchanges.condition(request, answer.registers)
-                    exchanges.faults_beyond(request, answer.registers)
                     replies.append(exchanges.decode_reply(request, answer.registers))
                 except FrameError:
                     continue

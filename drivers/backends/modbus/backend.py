@@ -20,6 +20,7 @@ from drivers.backends.urls.modbus import ModbusUrl
 from drivers.backends.waiting import SETTLE
 from drivers.backends.wire_backend import WireBackend
 from drivers.codec.modbus import exchanges
+from drivers.codec.modbus.blocks import unpack_fault_count
 from drivers.codec.modbus.exchanges import Exchange, Read, Write
 from drivers.codec.modbus.telegrams import Answer
 from drivers.codec.modbus.timing import commit_time, loading_time, round_trip_time
@@ -31,6 +32,7 @@ from drivers.protocol.messages import (
     Capabilities,
     Event,
     Fault,
+    FaultList,
     Hello,
     Nak,
     NakCode,
@@ -63,7 +65,7 @@ class ModbusBackend(WireBackend):
         # Not from zero, so that an answer to an earlier run is no answer to this one.
         self._tag = number_below(_TAGS)
         self._can_read_back = True
-        self._channels: int | None = None
+        self._channels = exchanges.CHANNELS_MAX
         self._condition: tuple[State, Fault] | None = None
 
     @property
@@ -133,23 +135,13 @@ class ModbusBackend(WireBackend):
         if isinstance(request, Arm) and not self._url.device:
             self._sole_host.claim()
         asked = _Asked(kind_on_line(request), timeout)
-        records = 0
-        while True:
-            tag = self._next_tag()
-            exchange = self._exchange_of(request, tag, records)
-            answer = await self._carry_out(exchange, tag, asked)
-            if answer.exception:
-                return await self._refusal(answer, tag, asked)
-            self._look_at(request, answer)
-            beyond = exchanges.faults_beyond(request, answer.registers)
-            if records or not beyond:
-                break
-            records = beyond
-        if isinstance(request, Hello) and self._url.is_rtu:
-            await self._check_alone()
-        reply = exchanges.decode_reply(request, answer.registers)
+        reply, registers = await self._ask(request, asked)
         if isinstance(reply, Capabilities):
             self._channels = reply.channels
+        elif isinstance(reply, FaultList):
+            count = unpack_fault_count(registers)
+            if count > len(reply.faults):
+                reply, _ = await self._ask(request, asked, records=count)
         return reply
 
     async def broadcast(self, request: Broadcast) -> None:
@@ -174,13 +166,21 @@ class ModbusBackend(WireBackend):
         self._tag = self._tag % _TAGS + 1
         return self._tag
 
-    def _exchange_of(self, request: Request, tag: int, records: int) -> Exchange:
-        options = {}
-        if self._channels is not None:
-            options["channels"] = self._channels
-        if records:
-            options["records"] = records
-        return exchanges.encode_request(request, tag=tag, **options)
+    async def _ask(
+        self, request: Request, asked: "_Asked", *, records: int = exchanges.RECORDS_FIRST
+    ) -> tuple[Reply, tuple[int, ...]]:
+        """The reply to a request and the registers that it stands in; records: how many faults."""
+        tag = self._next_tag()
+        exchange = exchanges.encode_request(
+            request, tag=tag, channels=self._channels, records=records
+        )
+        answer = await self._carry_out(exchange, tag, asked)
+        if answer.exception:
+            return await self._refusal(answer, tag, asked), ()
+        self._look_at(request, answer)
+        if isinstance(request, Hello) and self._url.is_rtu:
+            await self._check_alone()
+        return exchanges.decode_reply(request, answer.registers), answer.registers
 
     async def _carry_out(self, exchange: Exchange, tag: int, asked: "_Asked") -> Answer:
         read, write = exchange.read, exchange.write

@@ -46,8 +46,8 @@ _CHANNEL_SIZE: int = _MAP["channel_registers"]
 _FAULT_SIZE: int = _MAP["fault_registers"]
 _TEXT_SIZE: int = _MAP["text_registers"]
 _CONTROLWORDS: Mapping[str, int] = _MAP["controlwords"]
-_CHANNELS_MAX = _Q.channel_count.maximum
-_RECORDS_FIRST = 4  # mostly there are fewer; where there are more they are asked for
+CHANNELS_MAX = _Q.channel_count.maximum
+RECORDS_FIRST = 4  # mostly there are fewer; where there are more they are asked for
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,7 +75,7 @@ class Exchange:
 
 
 def encode_request(
-    request: Request, *, tag: int, channels: int = _CHANNELS_MAX, records: int = _RECORDS_FIRST
+    request: Request, *, tag: int, channels: int = CHANNELS_MAX, records: int = RECORDS_FIRST
 ) -> Exchange:
     """The exchange of a request; TypeError if a set in it has not passed a guard.
 
@@ -166,14 +166,6 @@ def condition(request: Request, registers: Sequence[int]) -> tuple[State, Fault]
     if isinstance(request, Hello | GetCaps | GetFaults | LoadEnvelope):
         return None
     return blocks.unpack_condition(registers)
-
-
-def faults_beyond(request: Request, registers: Sequence[int]) -> int:
-    """How many fault records there are if they are more than were read, else 0."""
-    if not isinstance(request, GetFaults):
-        return 0
-    count = blocks.unpack_fault_count(registers)
-    return count if count > len(blocks.unpack_faults(registers).faults) else 0
 
 
 def nak_of_exception(code: int) -> Nak | None:

@@ -294,7 +294,7 @@ DRIVERS: dict[str, Bug] = {
     "sets are sent without their SYNC": _bug(
         "answer",
         Edit(
-            "drivers.codec.can_bus.orders:_frames",
+            "drivers.codec.can_bus.orders:encode_order",
             "head, wanted.commands, node, sequence), SYNC)",
             "head, wanted.commands, node, sequence))",
         ),

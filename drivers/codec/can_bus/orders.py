@@ -58,25 +58,17 @@ def encode_order(
 
     sequence: 1..255. fd: as CAN FD, which is answered in one frame of the same kind.
     """
-    frames = _frames(order, node, sequence, fd=fd)
-    order_id = cob_id("order", node)
-    return tuple(
-        replace(frame, fd=True) if fd and frame.id == order_id else frame for frame in frames
-    )
-
-
-def _frames(order: Order, node: int, sequence: int, *, fd: bool) -> tuple[CanFrame, ...]:
     match order:
         case Ping():
             beat = CanFrame(cob_id("heartbeat", host_number(node)), bytes([_OPERATIONAL]))
-            return (beat, _order(order, node, sequence))
+            return (beat, _order(order, node, sequence, fd=fd))
         case Arm(watchdog=watchdog):
             time = _Q.watchdog.to_wire(watchdog)
-            return (_order(order, node, sequence, token=host_number(node), time=time),)
+            return (_order(order, node, sequence, fd=fd, token=host_number(node), time=time),)
         case Disarm(ramp=ramp) | Stop(ramp=ramp):
-            return (_order(order, node, sequence, ramp=_Q.ramp.to_wire(ramp)),)
+            return (_order(order, node, sequence, fd=fd, ramp=_Q.ramp.to_wire(ramp)),)
         case Commit(token=token):
-            return (_order(order, node, sequence, token=_Q.token.to_wire(token)), SYNC)
+            return (_order(order, node, sequence, fd=fd, token=_Q.token.to_wire(token)), SYNC)
         case Apply(command_set=wanted) | Stage(command_set=wanted):
             if type(wanted) is not SafeCommand:
                 raise TypeError(
@@ -87,6 +79,7 @@ def _frames(order: Order, node: int, sequence: int, *, fd: bool) -> tuple[CanFra
                 order,
                 node,
                 sequence,
+                fd=fd,
                 token=_Q.token.to_wire(wanted.token),
                 ramp=_Q.ramp.to_wire(wanted.ramp),
                 time=_Q.valid_for.to_wire(wanted.valid_for),
@@ -96,15 +89,14 @@ def _frames(order: Order, node: int, sequence: int, *, fd: bool) -> tuple[CanFra
             together = _in_fd_frames if fd else _in_classic_frames
             return (*shapes, *together(head, wanted.commands, node, sequence), SYNC)
         case _:
-            return (_order(order, node, sequence),)
+            return (_order(order, node, sequence, fd=fd),)
 
 
 def encode_broadcast(request: Broadcast) -> tuple[CanFrame, ...]:
     """The frames of what every amplifier of the bus shall do; nobody answers."""
     match request:
         case Commit(token=token):
-            order = _order(request, 0, 0, token=_Q.token.to_wire(token))
-            return (order, SYNC)
+            return (_order(request, 0, 0, token=_Q.token.to_wire(token)), SYNC)
         case Stop(ramp=ramp):
             return (_order(request, 0, 0, ramp=_Q.ramp.to_wire(ramp)),)
 
@@ -131,6 +123,7 @@ def _order(
     node: int,
     sequence: int,
     *,
+    fd: bool = False,
     token: int = 0,
     ramp: int = 0,
     time: int = 0,
@@ -144,7 +137,7 @@ def _order(
         count=count,
         sequence=sequence,
     )
-    return CanFrame(cob_id("order", node), data)
+    return CanFrame(cob_id("order", node), data, fd=fd)
 
 
 def _command(command: DriveCommand, sequence: int) -> bytes:
@@ -179,7 +172,7 @@ def _in_fd_frames(
         CanFrame(cob_id("command", node), _filled(rest[at : at + _FD_BLOCKS]), fd=True)
         for at in range(0, len(rest), _FD_BLOCKS)
     ]
-    return [*frames, CanFrame(head.id, _filled([head.data, *first]), fd=True)]
+    return [*frames, replace(head, data=_filled([head.data, *first]))]
 
 
 def _filled(blocks: list[bytes]) -> bytes:

@@ -297,6 +297,7 @@ DRIVERS: dict[str, Bug] = {
             "drivers.codec.can_bus.orders:encode_order",
             "head, wanted.commands, node, sequence), SYNC)",
             "head, wanted.commands, node, sequence))",
+            also=("drivers.backends.can_bus.backend",),
         ),
         wire="slcan",
     ),

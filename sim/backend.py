@@ -11,10 +11,9 @@ from pathlib import Path
 from urllib.parse import parse_qsl, unquote
 
 from drivers import clock
-from drivers.backend import Backend
+from drivers.backend import Backend, require_safe
 from drivers.errors import CommandError, LinkError
-from drivers.guard import SafeCommand, SafeEnvelope
-from drivers.protocol.messages import Apply, Event, LoadEnvelope, Reply, Request, Stage
+from drivers.protocol.messages import Event, Reply, Request
 from drivers.statistics import WireCounters
 from model.errors import InputError
 from model.rig.file import load_rig
@@ -92,7 +91,7 @@ class SimulatedBackend(Backend):
 
     async def exchange(self, request: Request, *, timeout: float) -> Reply:
         """Hand a request over; the answer is there at once. LinkError if it is not open."""
-        _require_safe(request)
+        require_safe(request)
         if self._bench is None:
             raise LinkError(f"{self._url} is not open")
         self._last_sent = clock.now()
@@ -112,21 +111,6 @@ class SimulatedBackend(Backend):
         raise CommandError(
             f"{self._url}: the rig has the amplifiers {', '.join(names)}; name one of them with "
             "amplifier=NAME"
-        )
-
-
-def _require_safe(request: Request) -> None:
-    match request:
-        case Stage(command_set=asked) | Apply(command_set=asked):
-            is_safe = type(asked) is SafeCommand
-        case LoadEnvelope(envelope=asked):
-            is_safe = type(asked) is SafeEnvelope
-        case _:
-            return
-    if not is_safe:
-        raise TypeError(
-            f"only a SafeCommand or a SafeEnvelope is played, not a {type(asked).__name__}: "
-            "let a Guard make one"
         )
 
 

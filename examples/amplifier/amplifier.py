@@ -1,0 +1,193 @@
+"""An amplifier without its wire: states, watchdog, sets and fades, by the wire protocol's page.
+
+It imports nothing of era-haptics, and could be rewritten in C. Numbers are the wire's: frequency in
+0.01 Hz, level in 1/10000 of full stroke, phase in 0.01 degrees, times in ms. Envelopes are left
+out. Where `levels` is read, your waveform generator goes: each channel plays level * sin(2 pi
+frequency t + phase) from the commit on.
+"""
+
+import math
+import time
+from collections import deque
+
+DISARMED, SWITCHED_ON, ARMED, STOPPED, REACTING, FAULT = 1, 3, 4, 5, 6, 7
+NO_FAULT, WATCHDOG = 0, 1
+BAD_VALUE, BAD_CHANNEL, WRONG_STATE, BAD_TOKEN, NO_ENVELOPE = 3, 4, 5, 6, 9
+
+CHANNELS = 4
+FREQUENCY = (2000, 60000)  # what it can play
+LONGEST_RAMP = 1000
+WATCHDOG_RANGE = (100, 2000)
+SHORT_FADE = 5
+REMEMBERED = 16  # tokens that were played, so that no late copy is played again
+
+
+class Refused(Exception):
+    """A request that is not carried out: the code of its Nak, and the channel to blame or None."""
+
+    def __init__(self, code, channel=None):
+        self.code, self.channel = code, channel
+
+
+class Amplifier:
+    """Requests are its methods; call `live` before each, and now and then in between."""
+
+    def __init__(self, clock=lambda: 1000 * time.monotonic()):
+        self._clock = clock
+        self.state, self.fault = DISARMED, NO_FAULT
+        self._faults = deque(maxlen=16)
+        self._before = self._after = [0] * CHANNELS
+        self._ramp, self._begin = 0, clock()
+        self._forget()
+
+    # What it does by itself
+
+    def live(self):
+        """Let happen what time has brought: the watchdog, the end of a vibration or of a fade."""
+        if self._ends_at is not None and self._clock() >= self._ends_at:
+            self._fade_to([0] * CHANNELS, ramp=self._end_ramp, begin=self._ends_at)
+            self._ends_at = None
+        if self.state == ARMED and self._clock() >= self._bites_at:
+            self._fade_to([0] * CHANNELS, ramp=SHORT_FADE, begin=self._bites_at)
+            self._ends_at = self._staged = None
+            self.state, self.fault = REACTING, WATCHDOG
+            self._faults.appendleft((WATCHDOG, self._bites_at))
+        if self._is_silent():
+            self.state = {SWITCHED_ON: DISARMED, REACTING: FAULT}.get(self.state, self.state)
+
+    @property
+    def levels(self):
+        """Of each channel at this moment of a fade."""
+        return self._levels_at(self._clock())
+
+    @property
+    def faults(self):
+        """Each with its age, newest first."""
+        return [(fault, round(self._clock() - since)) for fault, since in self._faults]
+
+    @property
+    def high_voltage(self):
+        """Whether it is on."""
+        return self.state in (SWITCHED_ON, ARMED, REACTING) or not self._is_silent()
+
+    @property
+    def watchdog_left(self):
+        """How long the host may still be silent, 0 while disarmed."""
+        return max(0, round(self._bites_at - self._clock())) if self.state == ARMED else 0
+
+    def _levels_at(self, moment):
+        share = 1.0
+        if self._ramp > 0:
+            share = min(max((moment - self._begin) / self._ramp, 0.0), 1.0)
+        rising = (1 - math.cos(math.pi * share)) / 2
+        return [
+            round(before * (1 - rising) + after * rising)
+            for before, after in zip(self._before, self._after, strict=True)
+        ]
+
+    def _fade_to(self, levels, *, ramp, begin=None):
+        begin = self._clock() if begin is None else begin
+        self._before = self._levels_at(begin)
+        self._after, self._ramp, self._begin = levels, ramp, begin
+
+    def _is_silent(self):
+        return not any(self._after) and self._clock() >= self._begin + self._ramp
+
+    def _forget(self):
+        self.token, self._staged, self._ends_at = 0, None, None
+        self._playing, self._played = [], deque(maxlen=REMEMBERED)
+
+    # What it is asked to do
+
+    def feed(self):
+        """The host is alive: after every request but those that only look on."""
+        if self.state == ARMED:
+            self._bites_at = self._clock() + self._watchdog
+
+    def arm(self, watchdog):
+        """High voltage on, every channel enabled at level zero."""
+        if not WATCHDOG_RANGE[0] <= watchdog <= WATCHDOG_RANGE[1]:
+            raise Refused(BAD_VALUE)
+        if self.state not in (DISARMED, SWITCHED_ON, ARMED):
+            raise Refused(WRONG_STATE)
+        self._silence(SHORT_FADE)
+        self._forget()
+        self.state, self._watchdog = ARMED, watchdog
+
+    def disarm(self, ramp):
+        """Silent, then high voltage off; a latch stays."""
+        self._silence(ramp)
+        if self.state == ARMED:
+            self.state = SWITCHED_ON
+
+    def stop(self, ramp):
+        """Quick stop, latched."""
+        self._silence(ramp)
+        if self.state in (DISARMED, SWITCHED_ON, ARMED):
+            self.state = STOPPED
+
+    def clear(self):
+        """Leave a stop or a fault, once silent."""
+        if self.state == FAULT or (self.state == STOPPED and self._is_silent()):
+            self.state, self.fault = DISARMED, NO_FAULT
+
+    def stage(self, token, ramp, valid_for, commands):
+        """Keep a set, with (channel, frequency, level, phase) for each command; returns it."""
+        self._check(token, ramp, valid_for, commands)
+        if token == self.token or token in self._played:
+            raise Refused(BAD_TOKEN)
+        self._staged = (token, ramp, valid_for, commands)
+        return token, commands
+
+    def commit(self, token):
+        """Play what is staged under a token; again the same for one that is playing."""
+        self._check_token(token)
+        if token != self.token:
+            if self._staged is None or token != self._staged[0] or token in self._played:
+                raise Refused(BAD_TOKEN)
+            staged, self._staged = self._staged, None
+            self._play(*staged)
+        return token, self._playing
+
+    def apply(self, token, ramp, valid_for, commands):
+        """Stage and commit at once; what is staged under another token stays."""
+        self._check(token, ramp, valid_for, commands)
+        if token != self.token:
+            if token in self._played:
+                raise Refused(BAD_TOKEN)
+            self._play(token, ramp, valid_for, commands)
+        return token, self._playing
+
+    def _play(self, token, ramp, valid_for, commands):
+        levels = [0] * CHANNELS  # a channel that is not named falls silent
+        for channel, _, level, _ in commands:
+            levels[channel] = level
+        self._fade_to(levels, ramp=ramp)
+        self._ends_at = self._clock() + valid_for if valid_for else None
+        self._end_ramp = ramp
+        self.token, self._playing = token, commands
+        self._played.append(token)
+
+    def _silence(self, ramp):
+        self._fade_to([0] * CHANNELS, ramp=min(max(ramp, 0), LONGEST_RAMP))
+        self._staged, self._ends_at = None, None
+
+    def _check_token(self, token):
+        if self.state != ARMED:
+            raise Refused(WRONG_STATE)
+        if not 1 <= token <= 65535:
+            raise Refused(BAD_TOKEN)
+
+    def _check(self, token, ramp, valid_for, commands):
+        """The whole set or nothing of it."""
+        self._check_token(token)
+        if not (0 <= ramp <= LONGEST_RAMP and 0 <= valid_for <= 60000):
+            raise Refused(BAD_VALUE)
+        seen = set()
+        for channel, frequency, level, phase in commands:
+            if not 0 <= channel < CHANNELS or channel in seen:
+                raise Refused(BAD_CHANNEL, channel)
+            seen.add(channel)
+            in_range = FREQUENCY[0] <= frequency <= FREQUENCY[1] or level == 0
+            if not (in_range and 0 <= level <= 10000 and -18000 <= phase <= 17999):
+                raise Refused(BAD_VALUE, channel)

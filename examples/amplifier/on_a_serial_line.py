@@ -1,0 +1,179 @@
+"""The amplifier of `amplifier.py` on a serial line, by the wire protocol's page and nothing else.
+
+    python on_a_serial_line.py
+
+The line is a pseudo-terminal, whose URL is printed first.
+"""
+
+import os
+import select
+import struct
+import tty
+import zlib
+
+import amplifier as parts
+from amplifier import Amplifier, Refused
+
+ADDRESS = 1
+LONGEST = 249  # bytes between two zeros
+IDENTITY = ("Example", "Bench amplifier", "EX-1", "0.1")
+HELLO, GET_CAPS, ARM, DISARM, STAGE, COMMIT, APPLY, STOP = range(1, 9)
+GET_STATUS, GET_FAULTS, CLEAR, PING, LOAD_ENVELOPE, NAK = 9, 10, 11, 12, 13, 31
+LOOKING_ON = (HELLO, GET_CAPS, GET_STATUS, GET_FAULTS)
+UNKNOWN_TYPE, BAD_LENGTH = 1, 2
+REPLY, VERSION_1 = 0x80, 0x20
+
+
+def stuff(data):
+    """COBS: in front of each piece between zeros its length plus one."""
+    return b"".join(bytes([len(piece) + 1]) + piece for piece in data.split(b"\0"))
+
+
+def unstuff(data):
+    """The reverse; None for what cannot be."""
+    pieces = []
+    while data:
+        length, data = data[0], data[1:]
+        if length == 0 or length - 1 > len(data):
+            return None
+        pieces.append(data[: length - 1])
+        data = data[length - 1 :]
+    return b"\0".join(pieces)
+
+
+def framed(kind, address, sequence, payload):
+    """A frame with its delimiters."""
+    body = struct.pack("<BBH", VERSION_1 | kind, address, sequence) + payload
+    return b"\0" + stuff(body + struct.pack("<I", zlib.crc32(body))) + b"\0"
+
+
+class SerialEnd:
+    """Bytes in, bytes out."""
+
+    def __init__(self):
+        self.amplifier = Amplifier()
+        self._waiting = b""
+
+    def take(self, data):
+        """What is to be answered to bytes as they come."""
+        *frames, self._waiting = (self._waiting + data).split(b"\0")
+        self._waiting = self._waiting[: LONGEST + 1]  # whatever else comes before the next zero
+        return b"".join(self._frame(frame) for frame in frames if 0 < len(frame) <= LONGEST)
+
+    def _frame(self, stuffed):
+        frame = unstuff(stuffed)
+        if frame is None or len(frame) < 8:
+            return b""
+        body, (crc,) = frame[:-4], struct.unpack("<I", frame[-4:])
+        first, address, sequence = struct.unpack("<BBH", body[:4])
+        if crc != zlib.crc32(body) or first & 0xE0 != VERSION_1 or address not in (0, ADDRESS):
+            return b""
+        kind, payload = first & 0x1F, body[4:]
+        if address == 0 and kind not in (COMMIT, STOP):
+            return b""
+        self.amplifier.live()
+        try:
+            reply_kind, reply = REPLY | kind, self._answer(kind, payload)
+        except Refused as refused:
+            channel = 255 if refused.channel is None else refused.channel
+            reply_kind, reply = REPLY | NAK, bytes([kind, refused.code, channel])
+        return framed(reply_kind, address, sequence, reply) if address else b""
+
+    def _answer(self, kind, payload):
+        """The payload of the reply; raises Refused."""
+        if kind in LOOKING_ON:
+            return self._tell(kind, payload)
+        done = self._carry_out(kind, payload)
+        self.amplifier.feed()
+        return self._status() if done is None else achieved(*done)
+
+    def _carry_out(self, kind, payload):
+        """What comes of a request that is no mere look: token and commands, of one about sets."""
+        a = self.amplifier
+        if kind in (STAGE, APPLY):
+            asked = read_set(payload)
+            return a.stage(*asked) if kind == STAGE else a.apply(*asked)
+        if kind in (ARM, DISARM, COMMIT, STOP):
+            if len(payload) != 2:
+                raise Refused(BAD_LENGTH)
+            number = int.from_bytes(payload, "little")
+            return {ARM: a.arm, DISARM: a.disarm, COMMIT: a.commit, STOP: a.stop}[kind](number)
+        if kind == LOAD_ENVELOPE:
+            raise Refused(parts.BAD_VALUE)  # it has no slots
+        if kind not in (CLEAR, PING):
+            raise Refused(UNKNOWN_TYPE)
+        if payload:
+            raise Refused(BAD_LENGTH)
+        return a.clear() if kind == CLEAR else None
+
+    def _tell(self, kind, payload):
+        a = self.amplifier
+        if payload:
+            raise Refused(BAD_LENGTH)
+        if kind == HELLO:
+            texts = (text.encode() for text in IDENTITY)
+            return b"\1" + b"".join(bytes([len(text)]) + text for text in texts)
+        if kind == GET_CAPS:
+            steps = (1, 10000, 1, 1, parts.LONGEST_RAMP, *parts.WATCHDOG_RANGE)
+            no_envelopes, no_events = bytes(6), bytes(1)
+            numbers = struct.pack("<B9H", parts.CHANNELS, *parts.FREQUENCY, *steps)
+            return numbers + no_envelopes + no_events
+        if kind == GET_FAULTS:
+            records = [struct.pack("<BBI", fault, 255, age) for fault, age in a.faults]
+            return bytes([len(records)]) + b"".join(records)
+        return self._status()
+
+    def _status(self):
+        a = self.amplifier
+        a.live()
+        head = struct.pack("<BBHB", a.state, a.fault, a.token, a.high_voltage)
+        rest = struct.pack("<hHHB", 250, a.watchdog_left, 0, parts.CHANNELS)
+        return head + rest + struct.pack(f"<{parts.CHANNELS}H", *a.levels)
+
+
+def read_set(payload):
+    """Token, ramp, valid_for and commands of a set; raises Refused."""
+    if len(payload) < 7:
+        raise Refused(BAD_LENGTH)
+    token, ramp, valid_for, count = struct.unpack("<HHHB", payload[:7])
+    commands, payload = [], payload[7:]
+    for _ in range(count):
+        if len(payload) < 8:
+            raise Refused(BAD_LENGTH)
+        channel, flags, frequency, level, phase = struct.unpack("<BBHHh", payload[:8])
+        payload = payload[8:]
+        if flags & ~0b111:
+            raise Refused(parts.BAD_VALUE, channel)
+        if flags & 0b100:  # onset and ending follow
+            if len(payload) < 2:
+                raise Refused(BAD_LENGTH)
+            if any(payload[:2]):
+                raise Refused(parts.NO_ENVELOPE, channel)
+            payload = payload[2:]
+        commands.append((channel, frequency, level, phase))
+    if payload:
+        raise Refused(BAD_LENGTH)
+    return token, ramp, valid_for, commands
+
+
+def achieved(token, commands):
+    """Its payload: this amplifier plays every step of the wire."""
+    packed = (struct.pack("<BBHHh", c, 0, f, level, phase) for c, f, level, phase in commands)
+    return struct.pack("<HB", token, len(commands)) + b"".join(packed)
+
+
+def main():
+    """Serve until it is ended."""
+    line, host_side = os.openpty()
+    tty.setraw(line)
+    print(f"serial://{os.ttyname(host_side)}", flush=True)
+    end = SerialEnd()
+    while True:
+        ready, _, _ = select.select([line], [], [], 0.005)
+        if ready:
+            os.write(line, end.take(os.read(line, 4096)))
+        end.amplifier.live()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,113 @@
+"""The amplifier of `amplifier.py` behind a protocol of its own: lines of JSON over TCP.
+
+    python on_text_lines.py 7010
+
+It serves one host at a time, on 127.0.0.1. A request is a line as {"id": 7, "ask": "arm",
+"watchdog": 250}, its answer one as {"id": 7, "state": 4, ...} or {"id": 7, "refused": 5}. It feeds
+the watchdog as the wire protocol's page says.
+"""
+
+import json
+import socket
+import sys
+
+import amplifier as parts
+from amplifier import Amplifier, Refused
+
+HELLO = {"vendor": "Example", "product": "Lines", "serial_number": "LN-1", "firmware": "0.1"}
+CAPABILITIES = {
+    "channels": parts.CHANNELS,
+    "frequency": parts.FREQUENCY,
+    "longest_ramp": parts.LONGEST_RAMP,
+    "watchdog": parts.WATCHDOG_RANGE,
+}
+
+
+def answer(amplifier, line):
+    """The line that answers a line; None for one that is no request."""
+    try:
+        request = json.loads(line)
+        number, ask = request.pop("id"), request.pop("ask")
+    except (ValueError, KeyError, AttributeError, RecursionError):
+        return None
+    amplifier.live()
+    try:
+        told = carry_out(amplifier, ask, request)
+    except Refused as refused:
+        told = {"refused": refused.code, "channel": refused.channel}
+    except (TypeError, ValueError):  # values that are missing, too many, or no numbers
+        told = {"refused": parts.BAD_VALUE, "channel": None}
+    return json.dumps({"id": number, **told})
+
+
+def carry_out(amplifier, ask, values):
+    """What comes of a request; raises Refused."""
+    if ask == "hello":
+        return HELLO
+    if ask == "capabilities":
+        return CAPABILITIES
+    if ask == "faults":
+        return {"faults": amplifier.faults}
+    if ask in ("arm", "disarm", "stop", "clear", "stage", "commit", "apply"):
+        done = getattr(amplifier, ask)(**values)
+    elif ask in ("ping", "status"):
+        done = None
+    else:
+        raise Refused(1)
+    if ask != "status":
+        amplifier.feed()
+    if done is not None:
+        return {"token": done[0], "commands": done[1]}
+    amplifier.live()
+    return {
+        "state": amplifier.state,
+        "fault": amplifier.fault,
+        "token": amplifier.token,
+        "high_voltage": amplifier.high_voltage,
+        "watchdog_left": amplifier.watchdog_left,
+        "levels": amplifier.levels,
+    }
+
+
+def serve(amplifier, connection):
+    """One host, until it is gone; the amplifier lives on meanwhile."""
+    connection.settimeout(0.005)
+    waiting = b""
+    while True:
+        try:
+            data = connection.recv(4096)
+        except TimeoutError:
+            amplifier.live()
+            continue
+        if not data:
+            return
+        *lines, waiting = (waiting + data).split(b"\n")
+        waiting = waiting[:4096]  # of a line without an end
+        for line in lines:
+            told = answer(amplifier, line)
+            if told is not None:
+                connection.sendall(told.encode() + b"\n")
+
+
+def main():
+    """Serve one host after the other until it is ended."""
+    amplifier = Amplifier()
+    with socket.create_server(("127.0.0.1", int(sys.argv[1]))) as server:
+        host, port = server.getsockname()
+        print(f"lines://{host}:{port}", flush=True)
+        server.settimeout(0.005)
+        while True:
+            try:
+                connection, _ = server.accept()
+            except TimeoutError:
+                amplifier.live()
+                continue
+            with connection:
+                try:
+                    serve(amplifier, connection)
+                except ConnectionError:
+                    continue  # the host is gone; the watchdog knows what to do
+
+
+if __name__ == "__main__":
+    main()

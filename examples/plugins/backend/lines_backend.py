@@ -1,0 +1,214 @@
+"""An amplifier that speaks lines of JSON over TCP, at lines://HOST:PORT.
+
+A backend says the messages of `drivers.protocol.messages` in the words and units of its own wire,
+and nothing else: retries, tokens, turns and states belong to the `Amplifier` above it.
+"""
+
+import asyncio
+import json
+from urllib.parse import urlsplit
+
+from drivers import clock
+from drivers.backend import require_safe
+from drivers.backends.wire_backend import WireBackend
+from drivers.command import DriveCommand
+from drivers.errors import CommandError, LinkError, LinkTimeout
+from drivers.protocol.messages import (
+    Achieved,
+    Apply,
+    Arm,
+    Capabilities,
+    Clear,
+    Commit,
+    Disarm,
+    Fault,
+    FaultList,
+    FaultRecord,
+    GetCaps,
+    GetFaults,
+    GetStatus,
+    Hello,
+    Identity,
+    Nak,
+    NakCode,
+    Ping,
+    Stage,
+    State,
+    Status,
+    Stop,
+)
+
+HERTZ, LEVEL, DEGREES, SECONDS = 0.01, 1e-4, 0.01, 1e-3  # what one is worth on this wire
+PLAIN = {Hello: "hello", GetCaps: "capabilities", GetFaults: "faults"} | {
+    GetStatus: "status",
+    Ping: "ping",
+    Clear: "clear",
+}
+
+
+class LinesBackend(WireBackend):
+    """Carries requests over a TCP connection, one line each way."""
+
+    def __init__(self, url):
+        super().__init__()
+        try:
+            place = urlsplit(url)
+            self._host, self._port = place.hostname, place.port
+        except ValueError:
+            self._host = self._port = None
+        if not self._host or not self._port or place.path or place.query or place.fragment:
+            raise CommandError(f"{url!r} is no address; write lines://HOST:PORT")
+        self._url = url
+        self._reader = self._writer = None
+        self._number = 0
+
+    async def open(self):
+        """Connect; the amplifier serves one host at a time."""
+        if self._writer is not None:
+            return
+        try:
+            self._reader, self._writer = await asyncio.wait_for(
+                asyncio.open_connection(self._host, self._port), timeout=2.0
+            )
+        except OSError as error:  # a timeout is one, too
+            raise LinkError(
+                f"nobody answers at {self._url} ({str(error) or 'no answer'}); check that the "
+                "amplifier is switched on, and its address"
+            ) from error
+
+    async def close(self):
+        """Hang up."""
+        writer, self._reader, self._writer = self._writer, None, None
+        if writer is not None:
+            writer.close()
+
+    async def exchange(self, request, *, timeout):
+        """Send a request and wait for the answer that carries its number."""
+        require_safe(request)
+        if self._writer is None:
+            raise LinkError(f"{self._url} is not open")
+        question = in_words(request)
+        if question is None:
+            return Nak(NakCode.UNKNOWN_TYPE)  # envelopes: this wire has none
+        self._number += 1
+        try:
+            async with asyncio.timeout(timeout):
+                self._writer.write(json.dumps({"id": self._number, **question}).encode() + b"\n")
+                self._last_sent = clock.now()
+                self._counters.frames_out += 1
+                await self._writer.drain()
+                while True:
+                    reply = await self._reply_to(request)
+                    if reply is not None:
+                        return reply
+        except TimeoutError:
+            raise LinkTimeout(f"no answer from {self._url} within {timeout * 1e3:g} ms") from None
+        except OSError as error:
+            raise LinkError(f"{self._url} is lost: {error}") from error
+
+    async def _reply_to(self, request):
+        """The next line, if it is the answer; a damaged or a late one is counted and dropped."""
+        try:
+            line = await self._reader.readline()
+        except ValueError:  # longer than any answer
+            self._counters.bad += 1
+            return None
+        if not line.endswith(b"\n"):
+            raise ConnectionResetError("the amplifier has hung up")
+        self._counters.frames_in += 1
+        try:
+            told = json.loads(line, parse_constant=refuse)
+            if told["id"] == self._number:
+                return read(request, told)
+            self._counters.foreign += 1
+        except (ValueError, TypeError, LookupError, AttributeError, RecursionError):
+            self._counters.bad += 1
+        return None
+
+
+def refuse(constant):
+    """NaN and Infinity are none of JSON's numbers, and none of ours."""
+    raise ValueError(constant)
+
+
+def in_words(request):
+    """A request in the words and units of the wire; None for one that it does not know."""
+    if type(request) in PLAIN:
+        return {"ask": PLAIN[type(request)]}
+    match request:
+        case Arm(watchdog):
+            return {"ask": "arm", "watchdog": round(watchdog / SECONDS)}
+        case Disarm(ramp):
+            return {"ask": "disarm", "ramp": round(ramp / SECONDS)}
+        case Stop(ramp):
+            return {"ask": "stop", "ramp": round(ramp / SECONDS)}
+        case Commit(token):
+            return {"ask": "commit", "token": token}
+        case Stage(asked) | Apply(asked):
+            return {
+                "ask": "stage" if isinstance(request, Stage) else "apply",
+                "token": asked.token,
+                "ramp": round(asked.ramp / SECONDS),
+                "valid_for": round(asked.valid_for / SECONDS),
+                "commands": [
+                    (
+                        one.channel,
+                        round(one.frequency / HERTZ),
+                        round(one.level / LEVEL),
+                        (round(one.phase / DEGREES) + 18000) % 36000 - 18000,
+                    )
+                    for one in asked.commands
+                ],
+            }
+    return None
+
+
+def read(request, told):
+    """The reply that an answer means; raises what goes with an answer that is none."""
+    if "refused" in told:
+        return Nak(NakCode(told["refused"]), told["channel"])
+    match request:
+        case Hello():
+            return Identity(
+                told["vendor"],
+                told["product"],
+                told["serial_number"],
+                told["firmware"],
+                protocol_version=1,
+            )
+        case GetCaps():
+            (lowest, highest), (shortest, longest) = told["frequency"], told["watchdog"]
+            return Capabilities(
+                channels=told["channels"],
+                frequency_min=lowest * HERTZ,
+                frequency_max=highest * HERTZ,
+                frequency_step=HERTZ,
+                level_max=1.0,
+                level_step=LEVEL,
+                phase_step=DEGREES,
+                ramp_max=told["longest_ramp"] * SECONDS,
+                watchdog_min=shortest * SECONDS,
+                watchdog_max=longest * SECONDS,
+                envelope_knots=0,
+            )
+        case GetFaults():
+            return FaultList(
+                tuple(FaultRecord(Fault(kind), None, age * SECONDS) for kind, age in told["faults"])
+            )
+        case Stage() | Apply() | Commit():
+            return Achieved(
+                told["token"],
+                tuple(
+                    DriveCommand(channel, frequency * HERTZ, level * LEVEL, phase * DEGREES)
+                    for channel, frequency, level, phase in told["commands"]
+                ),
+            )
+    return Status(
+        state=State(told["state"]),
+        fault=Fault(told["fault"]),
+        token=told["token"],
+        high_voltage=told["high_voltage"],
+        temperature=25.0,
+        watchdog_left=told["watchdog_left"] * SECONDS,
+        levels=tuple(level * LEVEL for level in told["levels"]),
+    )

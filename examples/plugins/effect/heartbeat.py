@@ -1,0 +1,53 @@
+"""A heartbeat: two pulses, the second one weaker, again and again while the finger is there."""
+
+from dataclasses import dataclass
+from typing import Annotated, ClassVar
+
+from controller.effects.effect import Course, Effect, Feeling, Nothing
+from model.config.sections import Quantity
+from model.config.units import TIME
+
+PULSE = 0.08  # s; the plate needs 20 ms to follow, and a pulse that is felt as one some more
+SECOND = 0.25  # s; from the first pulse of a beat to its second
+WEAKER = 6.0  # dB
+_ROUNDING = 1e-6  # s; who asks at the very end of a pulse is told what comes after it
+
+
+@dataclass(frozen=True)
+class Beating(Course):
+    """One play of it at one finger."""
+
+    start: float
+    period: float
+    level_db_sl: float | None
+
+    def feel(self, contact, now):
+        """The pulse or the pause that is on, and when it is over."""
+        beats, into = divmod(now - self.start + _ROUNDING, self.period)
+        begin = self.start + beats * self.period
+        if into < PULSE:
+            return Feeling(self.level_db_sl, until=begin + PULSE)
+        if into < SECOND:
+            return Nothing(until=begin + SECOND)
+        if into < SECOND + PULSE:
+            weaker = None if self.level_db_sl is None else self.level_db_sl - WEAKER
+            return Feeling(weaker, until=begin + SECOND + PULSE, or_less=True)
+        return Nothing(until=begin + self.period)
+
+
+class Heartbeat(Effect):
+    """Its fields are its parameters in a layout; `level` is there already."""
+
+    kind: ClassVar[str] = "heartbeat"
+    moves: ClassVar[bool] = False  # it goes by itself: for on_press
+
+    period: Annotated[float, Quantity(TIME, least=0.4, most=5.0)] = 0.9
+
+    def begin(self, contact, now, *, level_db_sl):
+        """Begin at a finger."""
+        return Beating(now, self.period, level_db_sl)
+
+    @property
+    def ends(self):
+        """Not before the finger goes."""
+        return False

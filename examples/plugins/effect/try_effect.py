@@ -1,0 +1,27 @@
+"""What a finger that rests for two seconds feels of a kind of effect with its usual parameters.
+
+python try_effect.py KIND
+"""
+
+import sys
+
+from controller.contacts import Contact, ContactKey
+from controller.effects.effect import Feeling
+from controller.effects.kinds import effect_kind
+
+effect = effect_kind(sys.argv[1])()
+finger = Contact(ContactKey("try", 1), x=0.1, y=0.1, since=0.0)
+course = effect.begin(finger, 0.0, level_db_sl=effect.level_db_sl)
+now = 0.0
+while now is not None and now < 2.0:
+    felt = course.feel(finger, now)
+    if felt is None:
+        print(f"{now:5.2f} s  over")
+        break
+    level = "nothing"
+    if isinstance(felt, Feeling):
+        level = "all that can be" if felt.level_db_sl is None else f"{felt.level_db_sl:g} dB SL"
+    print(f"{now:5.2f} s  {level}")
+    if felt.until is not None and felt.until <= now:
+        sys.exit(f"its `until` is {felt.until}, which is not after {now}: it would never go on")
+    now = felt.until

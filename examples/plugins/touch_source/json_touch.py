@@ -1,0 +1,50 @@
+"""Touches as JSON over UDP: [[1, 0.25, 0.5], ...], id, x and y of every finger that is down.
+
+x and y are 0 to 1 from the top left corner. The sender repeats itself every 50 ms while a finger is
+down, and says [] when the last one goes: whoever is not heard for 150 ms is taken for dead.
+"""
+
+import asyncio
+import json
+import logging
+
+from controller.sources.datagrams import listen
+from controller.tally import Tally
+from controller.touch import Touch, TouchFrame, TouchSource
+from model.errors import InputError
+
+LONGEST = 4096  # bytes of a datagram; ten fingers need 400
+
+
+class JsonTouch(TouchSource):
+    """Listens at jsontouch:HOST:PORT."""
+
+    def __init__(self, url):
+        host, _, port = url.removeprefix("jsontouch:").rpartition(":")
+        if not host or not (port.isascii() and port.isdecimal() and 0 < int(port) < 65536):
+            raise InputError(f"touch source {url}: write jsontouch:HOST:PORT, as 127.0.0.1:4444")
+        self._host, self._port = host, int(port)
+        self.tally = Tally(logging.getLogger(__name__))  # counts, and logs once a second at most
+
+    async def run(self, deliver):
+        """Deliver a frame a datagram until cancelled; malformed ones are counted, never raised."""
+
+        def received(data, peer, arrived):
+            try:
+                touches = tuple(Touch(int(id), float(x), float(y)) for id, x, y in json.loads(data))
+            except (ValueError, TypeError, OverflowError, RecursionError) as error:
+                self.tally.count("malformed", f"datagram from {peer[0]}: {error}")
+                return
+            deliver(TouchFrame(f"{peer[0]}:{peer[1]}", arrived, touches))
+
+        try:
+            line = await listen(self._host, self._port, received, largest=LONGEST)
+        except OSError as error:
+            raise InputError(
+                f"jsontouch: cannot listen on {self._host}:{self._port} ({error.strerror}); "
+                "name another port, or stop the program that has it"
+            ) from error
+        try:
+            await asyncio.get_running_loop().create_future()
+        finally:
+            line.close()

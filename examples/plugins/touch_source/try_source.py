@@ -1,0 +1,52 @@
+"""What a touch source delivers, as contacts on the paper's plate, until the last finger lifts.
+
+python try_source.py URL
+"""
+
+import asyncio
+import sys
+
+import era_haptics as era
+from controller.contacts import LEASE, ContactTracker
+from controller.touch_registry import open_source
+
+
+async def main(url):
+    """Follow its contacts; a finger that is not heard of in time is lifted, as in the daemon."""
+    tracker = ContactTracker(era.load_rig(era.example_rig_path()).plate)
+    source = open_source(url)
+    ended = asyncio.Event()
+    told = {"frames": 0, "moves": 0}
+
+    def show(change):
+        told["moves"] += len(change.moved)
+        for word, contacts in (("down", change.down), ("up  ", change.up)):
+            for contact in contacts:
+                print(f"{word} at {100 * contact.x:.1f}, {100 * contact.y:.1f} cm")
+        for reason in change.rejected:
+            print(f"rejected: {reason}")
+        if change.up and not tracker.contacts:
+            ended.set()
+
+    def deliver(frame):
+        told["frames"] += 1
+        show(tracker.update(frame))
+
+    async def expire():
+        while True:
+            await asyncio.sleep(LEASE / 10)
+            show(tracker.expire(asyncio.get_running_loop().time()))
+
+    tasks = [asyncio.create_task(work) for work in (source.run(deliver), expire(), ended.wait())]
+    await asyncio.sleep(0.1)  # for it to open, or to say why it cannot
+    print(f"listening to {url}", flush=True)
+    done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+    for task in tasks:
+        task.cancel()
+    await asyncio.gather(*tasks, return_exceptions=True)
+    for task in done:
+        task.result()
+    print(f"{told['frames']} frames, {told['moves']} moves")
+
+
+asyncio.run(main(sys.argv[1]))

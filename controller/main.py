@@ -56,7 +56,7 @@ def run(
     on_loaded is called once these are there.
     """
     debug, arguments = _take_debug(arguments)
-    group, statuses = _put_together(modules, debug=debug)
+    group, statuses = put_together(modules, debug=debug)
     try:
         on_loaded()
         status = _invoke(group, arguments)
@@ -81,7 +81,7 @@ def _take_debug(arguments: Sequence[str]) -> tuple[bool, list[str]]:
     return len(kept) < end, [*kept, *arguments[end:]]
 
 
-def _put_together(modules: Iterable[EntryPoint], *, debug: bool) -> tuple[TyperGroup, ExitStatus]:
+def put_together(modules: Iterable[EntryPoint], *, debug: bool) -> tuple[TyperGroup, ExitStatus]:
     """One group with the commands of all modules; one that cannot be loaded is left out."""
     app = typer.Typer(no_args_is_help=True)
     app.callback()(_root)

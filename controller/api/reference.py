@@ -4,7 +4,6 @@
 two marks.
 """
 
-import re
 import sys
 import types
 from collections.abc import Iterable, Iterator
@@ -15,9 +14,9 @@ from controller.api.events import TOPICS, EventParams
 from controller.api.jsonrpc import MEANINGS
 from controller.api.messages import METHODS
 from controller.api.parts import Message
+from controller.written_part import insert
 
-BEGIN = "<!-- begin: written by controller/api/reference.py -->"
-END = "<!-- end -->"
+WRITER = "controller/api/reference.py"
 
 
 def reference() -> str:
@@ -43,14 +42,6 @@ def reference() -> str:
     lines += ["### Errors", "", "| code | name | meaning |", "|---|---|---|"]
     lines += [f"| {code.value} | {code.name} | {meaning} |" for code, meaning in MEANINGS.items()]
     return "\n".join(lines) + "\n"
-
-
-def insert(page: str, tables: str) -> str:
-    """The page with these tables between its marks; ValueError for a page without."""
-    found = re.fullmatch(rf"(.*{BEGIN}\n).*({END}\n.*)", page, re.DOTALL)
-    if found is None:
-        raise ValueError(f"the page has no lines {BEGIN} and {END}")
-    return f"{found[1]}\n{tables}\n{found[2]}"
 
 
 def _table(head: str, model: type[Message], models: dict[str, type[Message]]) -> Iterator[str]:
@@ -127,7 +118,7 @@ def _sentence(text: str) -> str:
 
 
 def _main(path: Path) -> None:
-    path.write_text(insert(path.read_text("utf-8"), reference()), encoding="utf-8")
+    path.write_text(insert(path.read_text("utf-8"), reference(), writer=WRITER), encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -21,7 +21,8 @@ from controller.api.jsonrpc import (
 )
 from controller.api.messages import METHODS, ArmParams, ArmResult, SubscribeParams, TouchParams
 from controller.api.parts import Nothing
-from controller.api.reference import BEGIN, END, insert, reference
+from controller.api.reference import WRITER, reference
+from controller.written_part import insert
 
 PAGE = Path(controller.__file__).parent.parent / "docs" / "reference" / "api.md"
 
@@ -261,18 +262,11 @@ def test_any_parameters_are_the_methods_or_an_error(method: str, params: dict[st
 def test_the_page_names_every_method_topic_key_and_code() -> None:
     """The API's page holds the reference that the models give; after a change write it anew."""
     page = PAGE.read_text("utf-8")
-    assert insert(page, reference()) == page, (
+    assert insert(page, reference(), writer=WRITER) == page, (
         "python -m controller.api.reference docs/reference/api.md"
     )
     for name in [*METHODS, *(f"topic {topic}" for topic in TOPICS)]:
         assert re.search(rf"^#### {name}$", page, re.MULTILINE)
-
-
-def test_a_page_without_marks_is_left_alone() -> None:
-    """The reference goes nowhere else than between its marks."""
-    assert insert(f"a\n{BEGIN}\nold\n{END}\nb\n", "new") == f"a\n{BEGIN}\n\nnew\n{END}\nb\n"
-    with pytest.raises(ValueError, match="no lines"):
-        insert("a\nb\n", "new")
 
 
 def test_every_link_of_the_reference_leads_somewhere() -> None:

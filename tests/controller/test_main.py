@@ -261,7 +261,7 @@ def test_linear_algebra_gets_one_thread_unless_told_otherwise(
 LOADED = """
 import contextlib, io, sys
 from importlib.metadata import entry_points, packages_distributions
-from controller.main import _put_together
+from controller.main import put_together
 from controller.main import run
 
 points = entry_points(group="era_haptics.commands")
@@ -270,7 +270,7 @@ if "all" in sys.argv:
         yield path
         for name, part in getattr(command, "commands", {}).items():
             yield from help_of(part, [*path, name])
-    paths = list(help_of(_put_together(points, debug=True)[0], []))
+    paths = list(help_of(put_together(points, debug=True)[0], []))
 else:
     paths = [[]]
 with contextlib.redirect_stdout(io.StringIO()):

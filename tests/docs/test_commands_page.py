@@ -1,0 +1,82 @@
+"""The reference of commands against the commands."""
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from controller.command_page import WRITER, command_reference
+from controller.written_part import insert
+from model.cli import app
+
+ROOT = Path(__file__).parents[2]
+PAGE = (ROOT / "docs" / "reference" / "commands.md").read_text("utf-8")
+RIG = str(ROOT / "examples" / "paper_plate.yaml")
+COARSE = ["--frequencies", "100:200:50", "--grid", "4x3", "--mesh", "12x9"]
+
+
+def test_every_command_stands_on_the_page() -> None:
+    """As the commands themselves say it; after a change write it anew."""
+    remedy = "python -m controller.command_page docs/reference/commands.md"
+    assert insert(PAGE, command_reference(), writer=WRITER) == PAGE, remedy
+
+
+def test_the_page_has_commands_of_every_group_and_their_options() -> None:
+    """Those of COMMANDS that a user is told of first, with an option of each."""
+    for command, option in [
+        ("era demo", "--wire <str>"),
+        ("era table query", "--target X,Y"),
+        ("era amp drive", "--channel"),
+        ("era daemon", "--dashboard [HOST:PORT]"),
+        ("era sim", "--modbus-tcp PORT"),
+    ]:
+        part = PAGE.partition(f"\n### {command}\n")[2].partition("\n### ")[0]
+        assert option in part, command
+
+
+def test_every_command_with_json_tells_its_keys() -> None:
+    """A command that has the option is in the table of keys."""
+    table = PAGE.partition("## What `--json` prints")[2].partition("## All commands")[0]
+    listed = " ".join(re.findall(r"^\| (`era .*?) \|", table, re.MULTILINE))
+    parts = re.split(r"^### era ", PAGE, flags=re.MULTILINE)[1:]
+    with_json = [part.splitlines()[0] for part in parts if "| `--json` |" in part]
+    assert len(with_json) > 30
+    for name in with_json:
+        assert f"`era {name}`" in listed or f"`{name.split()[-1]}`" in listed, name
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["config", "check", RIG],
+        ["plate", "modes", RIG, "--mesh", "12x9"],
+        ["plate", "map", RIG, "--mesh", "12x9", "--drive", "SW=110"],
+        ["plate", "show", RIG],
+        ["plate", "materials"],
+        ["plate", "elements"],
+        ["table", "build", RIG, "-o", "table.npz", *COARSE],
+        ["table", "show", "table.npz"],
+        ["table", "query", "table.npz", "--target", "0.06,0.05", "--quiet", "0.2,0.1"],
+        ["table", "export", "table.npz", "--format", "csv", "-o", "table.csv"],
+    ],
+    ids=lambda arguments: " ".join(arguments[:2]),
+)
+def test_the_keys_are_those_that_are_printed(
+    arguments: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The table names the keys at the top of what `--json` prints, and no others."""
+    monkeypatch.chdir(tmp_path)
+    if "table.npz" in arguments and arguments[1] != "build":
+        built = ["table", "build", RIG, "-o", "table.npz", *COARSE]
+        assert CliRunner().invoke(app, built).exit_code == 0
+    result = CliRunner().invoke(app, [*arguments, "--json"])
+    assert result.exit_code == 0, result.output
+    name = " ".join(["era", *arguments[:2]])
+    (row,) = re.findall(rf"^\| .*`{name}`.* \| (.*) \|$", PAGE, re.MULTILINE)
+    row = re.sub(r"\(.*?\)", "", row)
+    keys = set(re.findall(r"`(\w+)`", row))
+    for key in [key for key in keys if "_N_" in key]:
+        keys = keys - {key} | {key.replace("N", number) for number in "123"}
+    assert keys == set(json.loads(result.stdout))

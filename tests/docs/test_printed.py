@@ -1,0 +1,109 @@
+"""What counts as printed as shown, and how a page is read."""
+
+from pathlib import Path
+
+import pytest
+
+from printed import difference
+from tutorial_page import Edited, Interrupted, PageError, Typed, Written, read_steps
+
+PAGE = """# A page
+
+Read this.
+
+```sh
+first
+```
+```text
+says 1
+```
+
+<!-- not typed: needs another machine -->
+```sh
+elsewhere
+```
+
+<!-- file: a.yaml -->
+```yaml
+a: 1
+b: 2
+```
+<!-- edit: a.yaml -->
+```diff
+ a: 1
+-b: 2
++b: 3
+```
+
+```yaml
+to: read
+```
+
+<!-- terminal: one -->
+```sh
+goes on
+```
+
+<!-- interrupt: one -->
+<!-- status: 2 -->
+```sh
+fails
+```
+"""
+
+
+@pytest.mark.parametrize(
+    ("shown", "printed"),
+    [
+        ("level 20.0 dB", "level  20.1 dB\n"),  # the last digit
+        ("median 31.9 dB", "median 32.4 dB"),  # two in a hundred
+        ("wrote x ... s", "wrote x in 0.3 s"),
+        ("first\n...\nlast", "first\nbetween\nbetween\nlast"),
+        ("...\nlast", "last"),
+        ("first\n...", "first"),
+        ("-13.4 dB SL, unaware", "-13.5 dB SL, unaware"),
+    ],
+)
+def test_this_is_printed_as_shown(shown: str, printed: str) -> None:
+    """Blanks, last digits and what `...` stands for make no difference."""
+    assert difference(shown, printed) is None
+
+
+@pytest.mark.parametrize(
+    ("shown", "printed", "line"),
+    [
+        ("level 20.0 dB", "level 21.0 dB", "line 1"),
+        ("level 20.0 dB", "contrast 20.0 dB", "line 1"),
+        ("5 ERAs", "6 ERAs", "line 1"),  # a count is exact
+        ("a\nb", "a", "line 2"),
+        ("a", "a\nb", "beyond"),
+        ("first\n...\nlast", "first\nbetween", "line 3"),
+        ("33.4 dB", "-33.4 dB", "line 1"),
+    ],
+)
+def test_this_is_not(shown: str, printed: str, line: str) -> None:
+    """Another word, number, sign, count, or line is told, with its place."""
+    assert line in (difference(shown, printed) or "")
+
+
+def test_a_page_is_what_its_reader_does(tmp_path: Path) -> None:
+    """Commands with what they print, files, edits, terminals; what is for reading is left out."""
+    page = tmp_path / "page.md"
+    page.write_text(PAGE, encoding="utf-8")
+    assert read_steps(page) == [
+        Typed(5, "first\n", None, 0, "says 1\n"),
+        Written(18, "a.yaml", "a: 1\nb: 2\n"),
+        Edited(23, "a.yaml", "a: 1\nb: 2\n", "a: 1\nb: 3\n"),
+        Typed(34, "goes on\n", "one", 0, None),
+        Interrupted(38, "one"),
+        Typed(40, "fails\n", None, 2, None),
+    ]
+
+
+@pytest.mark.parametrize("comment", ["statsu: 1", "edit: a.yaml"])
+def test_a_comment_without_a_meaning_is_refused(tmp_path: Path, comment: str) -> None:
+    """One that is misspelt, or stands over the wrong kind of fence, would else go unnoticed."""
+    page = tmp_path / "page.md"
+    page.write_text(f"<!-- {comment} -->\n```yaml\na: 1\n```\n", encoding="utf-8")
+    with pytest.raises(PageError, match=r"page\.md:[12]"):
+        read_steps(page)

@@ -74,6 +74,16 @@ def test_it_equals_trying_everything(is_alone, wanted, targets):
             assert outcome.sensation >= wanted * (1 - 1e-5)
 
 
+def test_a_front_that_is_cut_in_pieces_holds_the_same(monkeypatch):
+    """One choice at a time is extended, and still the best of all patterns is found."""
+    monkeypatch.setattr("model.drive_modes.exact_search.FRONT", 1)
+    for seed in range(6):
+        given = random_fields(seed, is_alone=False, wanted=2.0)
+        found = search_exactly(given, eras_at_most=E)
+        assert found.contrast == pytest.approx(by_brute_force(given), rel=1e-5)
+        assert found.is_complete
+
+
 def test_where_nothing_is_loud_enough_there_is_no_drive():
     """A level beyond all ERAs together."""
     found = search_exactly(random_fields(0, is_alone=False, wanted=100.0), eras_at_most=E)

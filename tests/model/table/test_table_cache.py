@@ -69,6 +69,17 @@ def test_a_damaged_cache_is_built_anew(rig, builds):
     assert len(builds) == 2
 
 
+def test_another_rigs_table_under_its_name_is_built_anew(rig, builds):
+    """A file that was copied over the right one is whole, and of another plate."""
+    stiffer = replace(rig, eras=(replace(rig.eras[0], stiffness=18000.0), *rig.eras[1:]))
+    _, path = cached_table(rig)
+    _, other = cached_table(stiffer)
+    path.write_bytes(other.read_bytes())
+    table, again = cached_table(rig)
+    assert (len(builds), again) == (3, path)
+    assert table.fingerprint == rig.fingerprint
+
+
 def test_what_other_code_made_is_built_anew(rig, builds, monkeypatch):
     """A table that an older model left behind is not what this one would say, so it is replaced."""
     with monkeypatch.context() as older:

@@ -1,13 +1,15 @@
 """What `era table show` says of a table."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from model.errors import InputError
 from model.finger.grid import Grid
 from model.table.build import build_table
-from model.table.summary import alike_share, summarize
+from model.table.summary import alike_share, contrast_distribution, summarize
 from model.table.weak_cells import WeakCells, find_weak_cells, map_grid, text_map
 from paper_plate import make_paper_rig
 from small_table import small_table
@@ -114,6 +116,68 @@ def test_a_cell_that_is_felt_but_not_strongly_is_not_feasible(table):
     weak = find_weak_cells(table)
     assert np.isneginf(weak.median_db).all()
     assert not weak.feasible.any()
+
+
+def test_the_numbers_of_a_table(table, monkeypatch):
+    """Levels from 12 dB SL count as felt; shares are of the cells for which there is a value."""
+    asked = []
+
+    def one_to_hundred(table, *, others, rng, progress):
+        asked.append(others)
+        return np.arange(101.0)
+
+    monkeypatch.setattr("model.table.summary.contrast_distribution", one_to_hundred)
+    levels = np.sort(table.available_level_db_sl)
+    lower = 10 ** ((12.0 - levels[5:7].mean()) / 20)  # six of twelve cells are below 12 dB SL then
+    rig = make_paper_rig(12, 9)
+    eras = tuple(replace(era, stroke=lower * era.stroke) for era in rig.eras)
+    quieter = build_table(replace(rig, eras=eras), frequencies=table.frequencies, grid=table.grid)
+    values = np.array([20.0, 12.0, 9.0, -np.inf, *[np.nan] * 8])
+    weak = WeakCells(table.grid, np.zeros((12, 2)), median_db=values, tenth_db=values - 0.1)
+    summary = summarize(quieter, weak)
+    assert asked == [1, 2, 3]
+    assert summary["frequencies_hz"] == [60.0, 250.0]
+    expected = {
+        "dead_zone_share": 0.5,
+        "least_level_at_full_stroke_db_sl": levels[0] + 20 * np.log10(lower),
+        "feasible_share": 0.5,
+        "weak_share": 0.75,
+        "frequency_count": 3,
+        "patterns": 4 * 3 + 6 * 3**2,
+        "contrast_2_quiet_median_db": 50.0,
+        "contrast_2_quiet_tenth_percentile_db": 10.0,
+        "discretisation_error_percent": 100 * max(quieter.discretisation_error),
+    }
+    assert {name: summary[name] for name in expected} == pytest.approx(expected, rel=1e-4)
+
+
+@pytest.mark.parametrize("others", [1, 3])
+def test_contrast_is_asked_of_fingers_apart(table, others):
+    """Two hundred sets at least 5 cm apart; where no target is reached it ends at four hundred."""
+    asked = []
+
+    def answer(target, *, quiet):
+        asked.append(np.array([target, *quiet]))
+        return SimpleNamespace(contrast_db=float(len(asked)))
+
+    def refuse(target, *, quiet):
+        answer(target, quiet=quiet)
+        raise InputError("out of reach")
+
+    found, none = (
+        contrast_distribution(
+            SimpleNamespace(plate=table.plate, answer=each),
+            others=others,
+            rng=np.random.default_rng(1),
+        )
+        for each in (answer, refuse)
+    )
+    assert found.tolist() == list(range(1, 201))
+    assert (len(none), len(asked)) == (0, 200 + 400)
+    for contacts in asked:
+        assert contacts.shape == (others + 1, 2)
+        gaps = np.linalg.norm(contacts[:, None] - contacts, axis=-1)
+        assert gaps[np.triu_indices(others + 1, 1)].min() >= 0.05
 
 
 def test_alike_patterns_are_counted(table):

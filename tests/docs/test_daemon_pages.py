@@ -1,0 +1,68 @@
+"""The references of the daemon's file and metrics against what they describe."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from controller.daemon.sections import (
+    CalibrationSection,
+    DaemonSection,
+    DumpSection,
+    LogSection,
+    TouchSection,
+)
+from controller.metrics.collector import DaemonCollector
+from daemon_bench import running_daemon, until_state
+from model.config.sections import Section
+
+REFERENCE = Path(__file__).parents[2] / "docs" / "reference"
+
+
+def rows(page: str, head: str) -> list[list[str]]:
+    """The cells of the table that begins with this head, one list a row."""
+    text = (REFERENCE / page).read_text("utf-8")
+    table = text[text.index(head) :].partition("\n\n")[0]
+    return [[cell.strip() for cell in line[1:-1].split("|")] for line in table.splitlines()[2:]]
+
+
+def test_every_key_of_the_daemons_file_is_in_its_table() -> None:
+    """As the configuration's model has them, and no others."""
+    keys = [row[0].strip("`") for row in rows("daemon.md", "| key | meaning | default |")]
+    assert sorted(keys) == sorted(DaemonSection.model_fields)
+
+
+@pytest.mark.parametrize(
+    ("key", "section"), [("touch", TouchSection), ("log", LogSection), ("dumps", DumpSection)]
+)
+def test_a_section_is_told_in_its_row(key: str, section: type[Section]) -> None:
+    """`{name, url, ...}`: the keys that it takes, and no others."""
+    (row,) = [
+        row for row in rows("daemon.md", "| key | meaning | default |") if row[0] == f"`{key}`"
+    ]
+    found = re.search(r"`\{(.*?)\}`", row[1])
+    assert found is not None
+    assert found[1].split(", ") == list(section.model_fields)
+
+
+def test_a_calibration_is_told_below() -> None:
+    """Every way to say how a sensor lies stands in the paragraph below the table."""
+    text = (REFERENCE / "daemon.md").read_text("utf-8")
+    below = text.partition("`calibration` is ")[2].partition("\n\n")[0]
+    assert [key for key in CalibrationSection.model_fields if key not in below] == []
+
+
+async def test_every_metric_is_on_its_page(tmp_path: Path) -> None:
+    """Name, kind, labels and meaning, as a daemon that plays would serve them."""
+    async with running_daemon(tmp_path) as bench, await bench.client() as era:
+        await until_state(era, "READY_TO_SWITCH_ON")
+        status = await era.status()
+    playing = {"predicted_contrast_db": 20.0, "predicted_level_db_sl": 20.0}
+    touched = status.model_copy(update={**playing, "rejected_touches": {"off_plate": 1}})
+    served = []
+    for family in DaemonCollector(lambda: touched).collect():
+        name = family.name + ("_total" if family.type == "counter" else "")
+        labels = sorted({label for sample in family.samples for label in sample.labels} - {"le"})
+        listed = ", ".join(f"`{label}`" for label in labels)
+        served.append([f"`{name}`", family.type, listed, family.documentation])
+    assert rows("metrics.md", "| metric | kind | labels | |") == served

@@ -62,8 +62,8 @@ def modes(
             )
         )
         return
-    mesh_text = f"{rig.mesh} ({rig.mesh.element}), {matrices.dof} dof"
-    print(f"{rig_file}: {mesh_text}, support: {support.value}")
+    element = "" if rig.mesh.element in str(rig.mesh) else f" {rig.mesh.element}"
+    print(f"{rig_file}: {rig.mesh}{element}, {matrices.dof} dof, support: {support.value}")
     for number, frequency in enumerate(solved.natural_frequencies, start=1):
         beyond = "  beyond what the mesh carries" if frequency > carried else ""
         print(f"mode {number:3d}  {frequency:9.2f} Hz{beyond}")

@@ -22,7 +22,7 @@ class JsonTouch(TouchSource):
     def __init__(self, url):
         host, _, port = url.removeprefix("jsontouch:").rpartition(":")
         if not host or not (port.isascii() and port.isdecimal() and 0 < int(port) < 65536):
-            raise InputError(f"touch source {url}: write jsontouch:HOST:PORT, as 127.0.0.1:4444")
+            raise InputError(f"touch source {url}: write jsontouch:HOST:PORT")
         self._host, self._port = host, int(port)
         self.tally = Tally(logging.getLogger(__name__))  # counts, and logs once a second at most
 

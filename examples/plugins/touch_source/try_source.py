@@ -49,4 +49,7 @@ async def main(url):
     print(f"{told['frames']} frames, {told['moves']} moves")
 
 
-asyncio.run(main(sys.argv[1]))
+try:
+    asyncio.run(main(sys.argv[1]))
+except era.InputError as error:
+    sys.exit(f"error: {error}")

@@ -79,6 +79,7 @@ class Follower:
     def lose_track(self) -> None:
         """What it does now is not known until it says so."""
         self.state = self._token = None
+        self._fault = 0
         self.watchdog.forget()
         self._staged = None
         self._outputs.free(math.inf)

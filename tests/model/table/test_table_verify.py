@@ -89,6 +89,14 @@ def test_other_content_that_was_changed_is_found_out(table, rig, tmp_path, name,
     assert [check.holds for check in found.content] == verdicts
 
 
+def test_content_that_is_no_number_is_found_out(table, rig):
+    """One mode without a frequency: what cannot be compared does not hold."""
+    omega = table.omega.copy()
+    omega[-1] = math.nan
+    found = verify_table(replace(table, omega=omega), rig, samples=1)
+    assert [check.holds for check in found.content] == [True, False, True]
+
+
 def test_an_era_at_another_phase_is_found_out(table, rig, tmp_path):
     """Magnitudes alone would not show it: one ERA's field turned by ten degrees."""
     turned = table.acceleration.copy()
@@ -102,7 +110,9 @@ def test_an_era_at_another_phase_is_found_out(table, rig, tmp_path):
     [
         ({}, True),
         ({"direct_level_db_sl": 20.2}, False),
+        ({"direct_level_db_sl": 19.8}, False),
         ({"direct_contrast_db": 18.5}, False),
+        ({"direct_contrast_db": 17.5}, False),
         ({"contrast_in_time_db": 16.5}, False),
         ({"contrast_in_time_db": 18.9}, True),
         ({"contrast_in_time_db": math.nan}, False),

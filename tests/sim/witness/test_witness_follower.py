@@ -42,6 +42,16 @@ def test_who_is_not_known_may_have_been_in_a_fault_before_a_stop() -> None:
     assert watched.broken == []
 
 
+def test_a_fault_that_was_cleared_out_of_sight_is_not_latched() -> None:
+    """In a fault, lost sight of, cleared and armed meanwhile, stopped: it has no fault any more."""
+    watched = Watched()
+    watched.grants(ARM, 1.0, ENABLED)
+    watched.follower.told(FAULT, WATCHDOG, 2.0)
+    watched.follower.lose_track()
+    watched.grants(STOP, 9.0, STOPPED)
+    assert watched.broken == []
+
+
 def test_who_is_known_may_not() -> None:
     """Ten milliseconds after Arm no watchdog of 250 ms has run out."""
     watched = Watched()

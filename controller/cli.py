@@ -64,9 +64,11 @@ def demo(
     from model.table.cache import cached_table
 
     if wire not in WIRES:
-        raise InputError(f"--wire {wire}: there is no such wire yet; choose {' or '.join(WIRES)}")
+        raise InputError(f"--wire {wire}: there is no such wire; choose one of {', '.join(WIRES)}")
     if dashboard and (touches is not None or as_json):
-        raise InputError("--dashboard takes its touches from the page; leave --touches, --json out")
+        raise InputError(
+            "--dashboard takes its touches from the page; leave --touches and --json out"
+        )
     recorded = read_touches(touches or example_touches_path())
     rig_file = example_rig_path()
     rig = load_rig(rig_file)

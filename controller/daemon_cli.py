@@ -13,7 +13,7 @@ import typer
 from typer.core import TyperCommand
 
 from drivers.errors import CommandError, CommandRefused, FrameError, LinkError
-from model.errors import InputError
+from model.errors import InputError, did_you_mean
 
 if TYPE_CHECKING:
     from controller.api.client import Client
@@ -183,7 +183,10 @@ def watch(
     wanted = topics or ["state", "contacts", "pattern", "silence", "link", "log"]
     unknown = [topic for topic in wanted if topic not in TOPICS]
     if unknown:
-        raise InputError(f"there is no topic {unknown[0]!r}; known are {', '.join(TOPICS)}")
+        raise InputError(
+            f"there is no topic {unknown[0]!r}; {did_you_mean(unknown[0], TOPICS)}"
+            f"known are {', '.join(TOPICS)}"
+        )
     with _client(socket) as era:
         era.subscribe(*cast("list[Topic]", wanted), rate_hz=rate)
         for told in era.events():

@@ -5,12 +5,14 @@ A package offers its commands through the entry-point group `era_haptics.command
 for each exception that it raises on purpose. Nothing here knows the packages by name.
 """
 
+import errno
 import os
 import signal
 import sys
 import traceback
 from collections.abc import Callable, Iterable, Sequence
 from importlib.metadata import EntryPoint, entry_points, version
+from pathlib import Path
 from typing import Annotated, TypeAlias
 
 import typer
@@ -149,7 +151,7 @@ def _report(error: Exception, statuses: ExitStatus) -> int:
     if isinstance(error, typer.TyperException):
         return _report_usage(error)
     if isinstance(error, OSError) and error.filename is not None:
-        _say(f"error: {error.filename}: {error.strerror}; check the name and who may use it")
+        _say(f"error: {error.filename}: {_of_system(error)}")
         return BAD_INPUT
     _say(
         f"error: this is a bug in era-haptics, please report it ({type(error).__name__}: {error}). "
@@ -158,9 +160,29 @@ def _report(error: Exception, statuses: ExitStatus) -> int:
     return BUG
 
 
+def _of_system(error: OSError) -> str:
+    """What the system has against a file, and what to do about it."""
+    path = Path(str(error.filename))
+    match error.errno:
+        case errno.ENOENT if not path.parent.is_dir():
+            return f"there is no folder {path.parent}; make it, or name another"
+        case errno.ENOENT:
+            return "no such file; check its name and folder"
+        case errno.EEXIST | errno.ENOTDIR:
+            return "a file is there, where a folder is wanted; give another name"
+        case errno.EISDIR:
+            return "is a folder, where a file is wanted; give the name of a file"
+        case errno.EACCES | errno.EPERM:
+            return "you may not use this; get the right to, or give another name"
+        case errno.ENOSPC | errno.EDQUOT:
+            return "there is no room left; make some, or write elsewhere"
+        case _:
+            return f"{error.strerror}; check the name and who may use it"
+
+
 def _report_usage(error: typer.TyperException) -> int:
     """Say what was wrong with the command line, or the help where a command was left out."""
-    message = error.format_message()
+    message = _in_our_words(error.format_message())
     context = getattr(error, "ctx", None)
     if context is None:
         _say(f"error: {message}")
@@ -170,6 +192,15 @@ def _report_usage(error: typer.TyperException) -> int:
         stop = "" if message.endswith((".", "?")) else "."
         _say(f"error: {message}{stop} See  {context.command_path} --help")
     return BAD_INPUT
+
+
+def _in_our_words(message: str) -> str:
+    """Without the words of the library that reads numbers and choices."""
+    return (
+        message.replace("Value error, ", "")
+        .replace("Input should be a valid ", "must be a valid ")
+        .replace("Input should be ", "must be ")
+    )
 
 
 def _say(text: str) -> None:

@@ -14,7 +14,7 @@ from model.table.cache import cached_table
 from model.table.pattern import Pattern
 from model.table.question import Question
 from model.table.robust import with_robust_contrast
-from model.table.table import PAPER_FREQUENCIES, PAPER_GRID, LocalizationTable
+from model.table.table import PAPER_GRID, LocalizationTable
 from model.table.timing import Timing
 
 
@@ -22,16 +22,17 @@ def table(
     rig: Rig,
     *,
     mode: str = "switched",
-    frequencies: Sequence[float] | FloatArray = PAPER_FREQUENCIES,
+    frequencies: Sequence[float] | FloatArray | None = None,
     grid: Grid = PAPER_GRID,
 ) -> LocalizationTable:
     """The rig's localization table, from the user's cache, or built in a second or two and kept.
 
     mode: what it answers in unless asked otherwise, `switched`, `graded`, `signed` or `phased`;
-    frequencies (f,) [Hz], ascending, within the rig's limits; grid: target cells. It is what
+    frequencies (f,) [Hz], ascending, within the rig's limits, unless given
+    60 to 320 in steps of 10 as far as these allow; grid: target cells. It is what
     `era table build` writes; `load_table` and `save_table` are for such files. Raises InputError.
     """
-    wanted = np.asarray(frequencies, dtype=float)
+    wanted = None if frequencies is None else np.asarray(frequencies, dtype=float)
     found, _ = cached_table(rig, frequencies=wanted, grid=grid, mode=mode)
     return found
 

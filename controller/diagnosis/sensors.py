@@ -113,8 +113,8 @@ async def simulated_sensors(
         reader, writer = await asyncio.open_unix_connection(str(control), limit=_LINE_MAX)
     except OSError as error:
         raise LinkError(
-            f"no simulated plate listens at {control} ({error}); start `era sim RIG ... "
-            f"--control {control}`, or give measured responses with --measured FILE"
+            f"no simulated plate listens at {control} ({error.strerror or error}); start `era sim "
+            f"RIG ... --control {control}`, or give measured responses with --measured FILE"
         ) from error
     try:
         sensors = SimulatedSensors(reader, writer, np.array(points, dtype=float))

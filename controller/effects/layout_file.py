@@ -12,7 +12,7 @@ from controller.effects.shapes import Circle, Polygon, Rectangle, Shape
 from model.config.document import Document, KeyPath, read_document
 from model.config.sections import Quantity, Section, Validation
 from model.config.units import LENGTH
-from model.errors import InputError
+from model.errors import InputError, did_you_mean
 from model.finger.perception import STRONG_DB_SL
 from model.rig.sections import Identifier
 from model.structure.plate import Plate
@@ -160,7 +160,11 @@ def _check_use(
     if name is None:
         return
     if name not in effects:
-        validation.add(path, f"there is no effect {name!r}; known are {', '.join(effects)}")
+        validation.add(
+            path,
+            f"there is no effect {name!r}; {did_you_mean(name, effects)}"
+            f"known are {', '.join(effects)}",
+        )
         return
     effect = effects[name]
     if effect is None or moves is None:

@@ -81,9 +81,11 @@ def _check_enough(alive: NDArray[np.bool_], responses: Responses) -> None:
     if alive.sum() < _LEAST_SENSORS:
         dead = [n for n, live in zip(responses.sensors, alive, strict=True) if not live]
         said = f" ({', '.join(dead)} without a usable signal)" if dead else ""
+        count = int(alive.sum())
         raise InputError(
-            f"{int(alive.sum())} sensors were measured{said}; at least {_LEAST_SENSORS} are "
-            "needed, better eight or more, since gains of the ERAs take up what one alone says"
+            f"{count} sensor{'' if count == 1 else 's'} measured{said}; at least "
+            f"{_LEAST_SENSORS} are needed, better eight or more, since gains of the ERAs take up "
+            "what one alone says"
         )
 
 

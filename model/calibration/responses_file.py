@@ -98,7 +98,7 @@ def _read_csv(path: Path) -> list[MeasuredFunction]:
     try:
         text = read_bytes(path).decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise InputError(f"{path}: is no text in UTF-8; save it as CSV") from error
+        raise InputError(f"{path}: is no text in UTF-8; save it as CSV in UTF-8") from error
     rows = csv.reader(io.StringIO(text), strict=True)
     grouped: dict[tuple[str, str], list[tuple[tuple[float, ...], int]]] = {}
     try:
@@ -123,7 +123,10 @@ def _read_csv(path: Path) -> list[MeasuredFunction]:
                 raise InputError(f"{path}:{line}: frequency_hz is {numbers[2]:g}, not above zero")
             grouped.setdefault(key, []).append((numbers, line))
     except csv.Error as error:
-        raise InputError(f"{path}:{rows.line_num}: is no CSV: {error}") from error
+        raise InputError(
+            f"{path}:{rows.line_num}: is no CSV: {error}; is a quote not closed, or "
+            "the file cut off?"
+        ) from error
     if not grouped:
         raise InputError(f"{path}:1: no measured value stands below the columns' names")
     return [_csv_function(path, *key, found) for key, found in grouped.items()]

@@ -4,7 +4,7 @@ import math
 import re
 from collections.abc import Sequence
 
-from model.errors import InputError
+from model.errors import InputError, did_you_mean
 from model.rig.rig import Rig
 from model.vibration.excitation import Excitation, Tone
 
@@ -28,7 +28,8 @@ def parse_drives(texts: Sequence[str], rig: Rig) -> Excitation:
         name = match["era"]
         if name not in names:
             raise InputError(
-                f"--drive {text!r}: the rig has no ERA {name!r}, only {', '.join(names)}"
+                f"--drive {text!r}: the rig has no ERA {name!r}; "
+                f"{did_you_mean(name, names)}it has {', '.join(names)}"
             )
         if name in excitation:
             raise InputError(f"--drive {text!r}: {name} is driven twice; one tone per ERA")

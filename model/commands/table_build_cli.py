@@ -14,8 +14,13 @@ def build(
     rig_file: RigArgument,
     output: Annotated[Path, typer.Option("--output", "-o", metavar="TABLE", help="File to write.")],
     frequencies: Annotated[
-        str, typer.Option(metavar="LO:HI:STEP", help="Frequencies in Hz, both ends included.")
-    ] = "60:320:10",
+        str | None,
+        typer.Option(
+            metavar="LO:HI:STEP",
+            help="Frequencies in Hz, both ends included; default 60:320:10 within limits.frequency "
+            "of the rig.",
+        ),
+    ] = None,
     mode: Annotated[
         str, typer.Option(help="Drive mode to answer in: switched, graded, signed or phased.")
     ] = "switched",
@@ -41,6 +46,7 @@ def build(
     from model.table.kept_parts import KeptParts
     from model.table.parts import TableProblem
     from model.table.summary import pattern_count
+    from model.table.table import usual_frequencies
 
     if mode not in MODES:
         raise InputError(f"unknown drive mode --mode {mode!r}; known: {', '.join(MODES)}")
@@ -52,7 +58,8 @@ def build(
     rig = load_rig(rig_file, mesh=mesh)
     started = time.perf_counter()
     cells = Grid(*parse_pair(grid, what="--grid"))
-    problem = TableProblem(rig, parse_frequencies(frequencies), cells)
+    asked = usual_frequencies(rig.limits) if frequencies is None else parse_frequencies(frequencies)
+    problem = TableProblem(rig, asked, cells)
     kept = KeptParts.beside(output, problem.digest)
     with progress_bar("parts") as progress:
         try:

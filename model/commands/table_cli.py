@@ -105,7 +105,11 @@ def _answer_batch(table_file: Path, batch: Path) -> None:
             for answer in answer_lines(table, lines):
                 failed = failed or "error" in answer
                 print(json.dumps(answer))
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"--batch {batch} cannot be read: {error}") from error
+    except OSError as error:
+        raise InputError(
+            f"--batch {batch} cannot be read: {error.strerror}; give a file with a question a line"
+        ) from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"--batch {batch} is no text in UTF-8; save it as UTF-8") from error
     if failed:
         raise typer.Exit(1)

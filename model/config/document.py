@@ -151,9 +151,11 @@ class _Builder:
         while isinstance(event, yaml.StreamStartEvent | yaml.DocumentStartEvent):
             event = self._next()
         if isinstance(event, yaml.StreamEndEvent):
-            raise _whole(self._source, "is empty")
+            raise _whole(self._source, "is empty; `era config init` writes one to begin with")
         if not isinstance(event, yaml.MappingStartEvent):
-            raise self._error(event, (), "expected `key: value` lines")
+            raise self._error(
+                event, (), "expected `key: value` lines, as `era config init` writes them"
+            )
         self._check(event, ())
         data = self._mapping(())
         self._next()  # the document's end
@@ -176,7 +178,7 @@ class _Builder:
             raise ConfigError(self._source, [Problem(line, "", message)]) from error
         except yaml.reader.ReaderError as error:
             line = text.count("\n", 0, error.position) + 1
-            message = f"character {error.character!r} is not allowed in YAML; remove it"
+            message = f"character U+{error.character:04X} is not allowed in YAML; remove it"
             raise ConfigError(self._source, [Problem(line, "", message)]) from error
 
     def _next(self) -> yaml.Event:
@@ -192,7 +194,7 @@ class _Builder:
             raise self._error(event, path, "anchors and aliases are not used; write the value out")
         tag = getattr(event, "tag", None)
         if tag is not None:
-            raise self._error(event, path, f"tags are not used; remove {tag!r}")
+            raise self._error(event, path, "tags are not used; remove what begins with !")
         if len(path) > _DEPTH_LIMIT:
             raise self._error(event, path[:3], "is nested too deeply")
 

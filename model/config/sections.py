@@ -1,8 +1,8 @@
 """The shape of a configuration file: sections as pydantic models, every error found at once."""
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
-from difflib import get_close_matches
 from functools import cache
 from types import UnionType
 from typing import Annotated, Any, TypeVar, Union, get_args, get_origin
@@ -11,7 +11,8 @@ from pydantic import BaseModel, ConfigDict, GetCoreSchemaHandler, TypeAdapter, V
 from pydantic_core import CoreSchema, ErrorDetails, core_schema
 
 from model.config.document import ConfigError, Document, KeyPath, Problem, Value
-from model.config.units import Dimension, quantity
+from model.config.units import Dimension, quantity, shown
+from model.errors import did_you_mean
 
 
 class Section(BaseModel):
@@ -151,25 +152,39 @@ def _problem(
             message = f"must be a whole number, not {_shown(details)}"
         case "string_type":
             message = f"must be a text, not {_shown(details)}"
+        case "greater_than_equal":
+            message = f"must be {context['ge']} or more, not {_shown(details)}"
+        case "less_than_equal":
+            message = f"must be {context['le']} or less, not {_shown(details)}"
+        case "literal_error" | "enum":
+            message = _no_choice(details, context["expected"])
+        case "string_too_short":
+            message = "is empty; write something, or leave the key out"
         case "too_short" | "too_long":
             bound = f"at least {context['min_length']}" if "min_length" in context else ""
             bound = bound or f"at most {context['max_length']}"
-            message = f"has {context['actual_length']} entries, must have {bound}"
+            count = context["actual_length"]
+            message = f"has {count} {'entry' if count == 1 else 'entries'}, must have {bound}"
         case _:
             message = f"{_shown(details)} cannot be used: {details['msg']}"
     return document.problem((*below, *path), message)
 
 
+def _no_choice(details: ErrorDetails, expected: str) -> str:
+    """pydantic lists what is expected as `'x', 'y' or 'z'`."""
+    choices = expected.replace("'", "")
+    meant = did_you_mean(str(details["input"]), re.findall(r"'([^']+)'", expected))
+    return f"must be {choices}, not {_shown(details)}" + (f"; {meant.strip()}" if meant else "")
+
+
 def _shown(details: ErrorDetails) -> str:
-    text = "nothing" if details["input"] is None else repr(details["input"])
+    text = shown(details["input"])
     return text if len(text) <= 40 else f"{text[:40]}..."
 
 
 def _unknown_key(key: str, section: type[Section]) -> str:
     known = list(section.model_fields)
-    close = get_close_matches(key.lower(), known, n=1, cutoff=0.6)
-    meant = f"did you mean {close[0]}? " if close else ""
-    return f"unknown key; {meant}known here are: {', '.join(known)}"
+    return f"unknown key; {did_you_mean(key, known)}known here are: {', '.join(known)}"
 
 
 def _section_at(root: type[Section], path: KeyPath) -> type[Section]:

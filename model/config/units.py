@@ -114,7 +114,14 @@ def _to_float(value: float | str | Decimal, dimension: Dimension) -> float:
 
 def _refusal(value: object, dimension: Dimension, why: str) -> InputError:
     """The error for a value, with what should stand in its place."""
-    text = repr(value)
-    shown = text if len(text) <= _LONGEST else f"{text[:_LONGEST]}..."
+    text = shown(value)
+    text = text if len(text) <= _LONGEST else f"{text[:_LONGEST]}..."
     bare = f"a bare number in {dimension.unit}" if dimension.unit else "a bare number"
-    return InputError(f"{shown} {why}; write {bare}, or for example {dimension.example}")
+    return InputError(f"{text} {why}; write {bare}, or for example {dimension.example}")
+
+
+def shown(value: object) -> str:
+    """A value of a file as it stands there, not as Python writes it."""
+    if value is None:
+        return "nothing"
+    return str(value).lower() if isinstance(value, bool) else repr(value)

@@ -4,7 +4,7 @@ import math
 
 from model.config.document import key_name
 from model.config.sections import Validation
-from model.errors import InputError
+from model.errors import InputError, did_you_mean
 from model.fem.mesh import LEAST_NODES_PER_WAVELENGTH, Mesh
 from model.rig.parts import laminate_of, mesh_of, plate_of
 from model.rig.rig import SAME_POINT
@@ -127,7 +127,8 @@ def _check_wiring(validation: Validation, names: tuple[str, ...]) -> None:
             known = ", ".join(key_name((key,)) for key in amplifiers) or "none"
             validation.add(
                 ("eras", name, "amplifier"),
-                f"unknown amplifier {amplifier}; known under amplifiers: {known}",
+                f"unknown amplifier {amplifier}; {did_you_mean(amplifier, amplifiers)}"
+                f"known under amplifiers: {known}",
             )
         if amplifier is None or channel is None:
             continue

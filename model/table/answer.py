@@ -119,7 +119,7 @@ def _too_loud(question: Question, mode: str, *, most: float) -> str:
     what = "the most that can be had there is" if sure else "the most that was found there is"
     return (
         f"no pattern reaches {question.level_db_sl:g} dB SL at {where} m in mode {mode}; "
-        f"{what} {math.floor(10 * most) / 10:.1f} dB SL"
+        f"{what} {math.floor(10 * most) / 10:.1f} dB SL: ask for that or less"
     )
 
 

@@ -27,7 +27,7 @@ from model.fem.mesh import Mesh
 from model.finger.contrast import SURROUNDINGS_RADIUS, decibels
 from model.finger.grid import Grid
 from model.finger.perception import STRONG_DB_SL, detection_threshold
-from model.rig.rig import physics_fingerprint
+from model.rig.rig import Limits, physics_fingerprint
 from model.structure.actuator import Era
 from model.structure.plate import Plate
 from model.structure.point_load import PointLoad
@@ -46,6 +46,17 @@ PAPER_FREQUENCIES = np.arange(60.0, 321.0, 10.0)
 """The 27 excitation frequencies [Hz]: 60 to 320 in steps of 10 holds every one the paper names."""
 
 PAPER_GRID = Grid(12, 9)
+
+
+def usual_frequencies(limits: Limits) -> FloatArray:
+    """What a table of a rig is built for unless somebody says: the paper's within its limits.
+
+    Steps of 10 Hz from its lowest where it may play none of those; (f,) [Hz], never empty.
+    """
+    low, high = limits.frequency_min, limits.frequency_max
+    first, past = np.searchsorted(PAPER_FREQUENCIES, [low, np.nextafter(high, np.inf)])
+    within = PAPER_FREQUENCIES[first:past]
+    return within if len(within) else np.arange(low, high + 1e-9, 10.0)
 
 
 @dataclass(frozen=True, eq=False)

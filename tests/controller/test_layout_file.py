@@ -70,7 +70,7 @@ def test_later_regions_lie_on_top(tmp_path: Path) -> None:
         ),
         (
             "regions:\n  a:\n    circle: {at: [0.1, 0.1], radius: 1 cm}\n    on_press: tick\n",
-            ["layout.yaml:4:", "there is no effect 'tick'; known are buzz, click"],
+            ["layout.yaml:4:", "no effect 'tick'; did you mean click? known are buzz, click"],
         ),
         (
             "effects:\n  cloth: {kind: texture, slow: 1 cm}\n",

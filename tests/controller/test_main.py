@@ -113,7 +113,7 @@ def test_a_command_runs_and_its_status_is_zero(
         ("refused", 1, ""),
         ("worse", 2, "era: error: rig.yaml:3: plate.length: is missing; add it\n"),
         ("unplugged", 3, "era: error: the line is gone; plug it in\n"),
-        ("file", 2, "era: error: /no/such/file: No such file or directory; check the name"),
+        ("file", 2, "era: error: /no/such/file: there is no folder /no/such; make it"),
         (
             "bug",
             70,

@@ -90,10 +90,10 @@ def test_other_content_that_was_changed_is_found_out(table, rig, tmp_path, name,
 
 
 def test_content_that_is_no_number_is_found_out(table, rig):
-    """One mode without a frequency: what cannot be compared does not hold."""
-    omega = table.omega.copy()
-    omega[-1] = math.nan
-    found = verify_table(replace(table, omega=omega), rig, samples=1)
+    """A point at which a mode has no shape: what cannot be compared does not hold."""
+    shapes = table.shapes.copy()
+    shapes[0, -1] = math.nan
+    found = verify_table(replace(table, shapes=shapes), rig, samples=1)
     assert [check.holds for check in found.content] == [True, False, True]
 
 

@@ -1,7 +1,8 @@
 """Follows one amplifier by the documented protocol, and says where it does something else.
 
 State, fault, active set, watchdog and levels are known within the time between a request and its
-answer, and what is said about them holds for all of that time.
+answer, and what is said about them holds for all of that time. What it grants and what it says are
+told here together: each is judged by what the other has left.
 """
 
 import math

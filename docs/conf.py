@@ -14,6 +14,7 @@ myst_enable_extensions = ["dollarmath", "deflist", "colon_fence"]
 myst_heading_anchors = 4
 exclude_patterns = ["_build"]
 root_doc = "index"
+highlight_language = "text"  # of what names none: what is typed and printed, hardly ever Python
 
 autodoc_typehints_format = "short"
 autodoc_member_order = "bysource"
@@ -21,7 +22,8 @@ python_use_unqualified_type_names = True
 
 html_theme = "furo"
 html_title = "era-haptics"
-html_static_path = []
+html_static_path = ["_static"]
+html_css_files = ["site.css"]
 html_show_sphinx = False
 html_theme_options = {
     "light_css_variables": {"color-brand-primary": "#0b5cad", "color-brand-content": "#0b5cad"},

@@ -13,7 +13,7 @@ import pytest
 from controller.loop import Controller
 from controller.selection import Selector
 from controller.touch import TouchFrame
-from drivers.backends.modbus.line import ModbusLink
+from drivers.backends.modbus.line import ModbusLine
 from planted_bugs import BUGS as BUGS_OF_THE_WITNESS
 from planted_bugs import plant
 from sim.amplifier.amplifier import SimulatedAmplifier
@@ -132,7 +132,7 @@ BUGS: dict[str, tuple[Any, str, Any, Plan, str]] = {
     ),
     "a choice that fails": (Selector, "select", lambda *_: 1 / 0, held(), "logged"),
     "an answer nobody takes": (
-        ModbusLink,
+        ModbusLine,
         "_received",
         lambda link, data: None,
         held(wire="modbus-tcp"),

@@ -6,12 +6,11 @@ else; each amplifier hears one of its own, so that one that was lost is not fed 
 """
 
 import asyncio
-import contextlib
 from collections.abc import Callable
 from typing import Any, TypeVar
 
 from drivers import clock
-from drivers.backends.can_bus.bus import CanWire, acquire, release
+from drivers.backends.can_bus.bus import CanBus, can_bus
 from drivers.backends.can_bus.node import NodeWatch
 from drivers.backends.can_bus.objects import ObjectClient
 from drivers.backends.can_bus.orders import PendingOrders
@@ -60,7 +59,7 @@ class CanBackend(WireBackend):
     def __init__(self, url: str) -> None:
         super().__init__()
         self._url = CanUrl.parse(url)
-        self._wire: CanWire | None = None
+        self._bus: CanBus | None = None
         self._objects: ObjectClient | None = None
         self._worker: Worker | None = None
         self._node = NodeWatch(self._url, answered=self._answered, told=self._told, lost=self._lose)
@@ -95,39 +94,31 @@ class CanBackend(WireBackend):
 
     async def open(self) -> None:
         """Join the bus, which is opened by the first of its amplifiers; raises LinkError."""
-        if self._wire is not None:
+        if self._bus is not None:
             return
-        wire = await acquire(self._url.bus)
-        try:
-            wire.claim(self._url.node)
-        except LinkError:
-            await release(wire)
-            raise
-        self._wire = wire
+        bus = can_bus(self._url.bus)
+        await bus.join(self._url.node, self._lose)
+        self._bus = bus
         self._loss = None
         self._counters = WireCounters()
         self._worker = make_worker(f"era-sdo {self._url.node}")
-        self._objects = ObjectClient(wire.network, self._url.node, self._worker)
-        self._node.join(wire, self._objects, self._counters)
-        wire.on_loss.append(self._lose)
+        self._objects = ObjectClient(bus.network, self._url.node, self._worker)
+        self._node.join(bus, self._objects, self._counters)
 
     async def close(self) -> None:
         """Leave the bus; what still waits for an answer gets LinkError."""
-        wire, self._wire = self._wire, None
+        bus, self._bus = self._bus, None
         worker, self._worker = self._worker, None
         self._node.stop()
         self._fail(f"{self._url.bus} was closed")
-        if wire is None or worker is None or self._objects is None:
+        if bus is None or worker is None or self._objects is None:
             return
         self._objects.abandon()
         try:
             await worker.close()
         finally:  # also where this is cancelled
-            self._node.leave(wire)
-            wire.give_back(self._url.node)
-            with contextlib.suppress(ValueError):
-                wire.on_loss.remove(self._lose)
-            await release(wire)
+            self._node.leave(bus)
+            await bus.leave(self._url.node)
 
     async def exchange(self, request: Request, *, timeout: float) -> Reply:
         """Send a request and wait for its answer; LinkTimeout, LinkError or FrameError.
@@ -135,7 +126,7 @@ class CanBackend(WireBackend):
         timeout [s]: for all of it, of objects for each of their frames; longer where the bus and an
         amplifier that reacts in time need longer.
         """
-        self._raise_if_lost()
+        self._opened()
         match request:
             case Hello():
                 return await self._hello(timeout)
@@ -156,7 +147,7 @@ class CanBackend(WireBackend):
 
     async def broadcast(self, request: Broadcast) -> None:
         """Say a commit or a stop to every amplifier of the bus; raises LinkError."""
-        self._raise_if_lost()
+        self._opened()
         self._send(encode_broadcast(request))
 
     async def _hello(self, timeout: float) -> Reply:
@@ -266,9 +257,7 @@ class CanBackend(WireBackend):
         return result
 
     def _send(self, frames: Any) -> None:
-        if self._wire is None:
-            raise LinkError(f"{self._url.bus} is not open")
-        self._wire.send(frames)
+        self._opened().send(frames)
         self._last_sent = clock.now()
         self._counters.frames_out += len(frames)
 
@@ -284,7 +273,7 @@ class CanBackend(WireBackend):
             self._counters.foreign += 1
 
     def _lose(self, what: str) -> None:
-        if self._loss is not None or self._wire is None:
+        if self._loss is not None or self._bus is None:
             return
         self._node.stop()
         self._fail(what)
@@ -296,9 +285,10 @@ class CanBackend(WireBackend):
             self._objects.abandon()
         self._orders.fail(self._loss)
 
-    def _raise_if_lost(self) -> None:
-        if self._wire is None or self._loss is not None:
+    def _opened(self) -> CanBus:
+        if self._bus is None or self._loss is not None:
             raise LinkError(self._loss or f"{self._url.bus} is not open")
+        return self._bus
 
 
 def _in_order_of(wanted: Achieved, achieved: Achieved) -> Achieved:

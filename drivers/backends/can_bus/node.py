@@ -10,7 +10,7 @@ from canopen.emcy import EmcyConsumer, EmcyError
 from canopen.nmt import NmtMaster
 
 from drivers import clock
-from drivers.backends.can_bus.bus import CanWire
+from drivers.backends.can_bus.bus import CanBus
 from drivers.backends.can_bus.objects import ObjectClient
 from drivers.backends.urls.can_bus import CanUrl
 from drivers.codec.can_bus.answers import Answer, AnswerReader, decode_emergency
@@ -58,7 +58,7 @@ class NodeWatch:
         self._next_look: asyncio.TimerHandle | None = None
         self._look_due = 0.0
 
-    def join(self, wire: CanWire, objects: ObjectClient, counters: WireCounters) -> None:
+    def join(self, bus: CanBus, objects: ObjectClient, counters: WireCounters) -> None:
         """Listen on a bus from now on, in the running event loop."""
         self._loop = asyncio.get_running_loop()
         self._counters = counters
@@ -77,14 +77,14 @@ class NodeWatch:
             *((can_id, self._answer_frame) for can_id in self._answers.ids),
         ]
         for can_id, callback in self._subscribed:
-            wire.network.subscribe(can_id, callback)
+            bus.network.subscribe(can_id, callback)
 
-    def leave(self, wire: CanWire) -> None:
+    def leave(self, bus: CanBus) -> None:
         """Listen no more."""
         self.stop()
         for can_id, callback in self._subscribed:
             with contextlib.suppress(KeyError, ValueError):
-                wire.network.unsubscribe(can_id, callback)
+                bus.network.unsubscribe(can_id, callback)
         self._subscribed.clear()
 
     def start(self) -> None:

@@ -13,7 +13,7 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 
 from drivers.backends.line_turns import kind_on_line
-from drivers.backends.modbus.line import ModbusLink
+from drivers.backends.modbus.line import ModbusLine, modbus_line
 from drivers.backends.sole_host import SoleHost
 from drivers.backends.stand_in import number_below
 from drivers.backends.urls.modbus import ModbusUrl
@@ -60,13 +60,15 @@ class ModbusBackend(WireBackend):
     def __init__(self, url: str) -> None:
         super().__init__()
         self._url = ModbusUrl.parse(url)
-        self._link: ModbusLink | None = None
+        self._line: ModbusLine | None = None
         self._sole_host = SoleHost(f"{self._url.place}/{self._url.unit}")
         # Not from zero, so that an answer to an earlier run is no answer to this one.
         self._tag = number_below(_TAGS)
         self._can_read_back = True
         self._channels = exchanges.CHANNELS_MAX
         self._condition: tuple[State, Fault] | None = None
+        self._loss: str | None = None  # until it is opened anew, even if others have the line back
+        self._is_asking = False
 
     @property
     def bus(self) -> str:
@@ -101,62 +103,69 @@ class ModbusBackend(WireBackend):
     @property
     def is_unsent(self) -> bool:
         """Whether what is asked waits for others, or for the line to be silent."""
-        return self._link is not None and self._link.is_unsent(self._url.unit)
+        return self._line is not None and self._line.is_unsent(self._url.unit)
 
     def silencing(self, request: Request) -> AbstractContextManager[None]:
         """See `Backend.silencing`."""
-        if self._link is None:
+        if self._line is None:
             return nullcontext()
-        return self._link.silencing(request, self._url.unit)
+        return self._line.silencing(request, self._url.unit)
 
     async def open(self) -> None:
         """Open the line, or join those who have it open in this process; raises LinkError."""
-        if self._link is not None:
+        if self._line is not None:
             return
         self._condition = None
-        self._link = await ModbusLink.of(self._url.line, self._url.unit, self._lost)
-        self._counters = self._link.counters
+        self._loss = None
+        line = modbus_line(self._url)
+        await line.join(self._url.unit, self._lost)
+        self._line = line
+        self._counters = line.counters
 
     async def close(self) -> None:
         """Leave the line; the last one closes it."""
-        link, self._link = self._link, None
+        line, self._line = self._line, None
         try:
-            if link is not None:
-                await link.leave(self._url.unit)
+            if line is not None:
+                await line.leave(self._url.unit)
         finally:  # also where this is cancelled
             self._sole_host.release()
 
     async def exchange(self, request: Request, *, timeout: float) -> Reply:
         """Send a request and wait for its reply; LinkTimeout, LinkError or FrameError.
 
-        timeout [s]: for each transaction; longer where a slow line needs it (see `ModbusLink`), so
+        timeout [s]: for each transaction; longer where a slow line needs it (see `ModbusLine`), so
         that a loss is told after three heartbeats on a line that is fast enough for them.
         """
         if isinstance(request, Arm) and not self._url.device:
             self._sole_host.claim()
         asked = _Asked(kind_on_line(request), timeout)
-        reply, registers = await self._ask(request, asked)
-        if isinstance(reply, Capabilities):
-            self._channels = reply.channels
-        elif isinstance(reply, FaultList):
-            count = unpack_fault_count(registers)
-            if count > len(reply.faults):
-                reply, _ = await self._ask(request, asked, records=count)
+        self._is_asking = True
+        try:
+            reply, registers = await self._ask(request, asked)
+            if isinstance(reply, Capabilities):
+                self._channels = reply.channels
+            elif isinstance(reply, FaultList):
+                count = unpack_fault_count(registers)
+                if count > len(reply.faults):
+                    reply, _ = await self._ask(request, asked, records=count)
+        finally:
+            self._is_asking = False
         return reply
 
     async def broadcast(self, request: Broadcast) -> None:
         """Write a commit or a stop to all units of the line; a stop goes before all that wait."""
-        link = self._opened()
+        line = self._opened()
         kind = kind_on_line(request)
         unit = None if kind.silences else self._url.unit
-        await link.broadcast(exchanges.encode_broadcast(request), kind, unit=unit)
-        self._last_sent = link.last_sent
+        await line.broadcast(exchanges.encode_broadcast(request), kind, unit=unit)
+        self._last_sent = line.last_sent
 
     async def _check_alone(self) -> None:
         """Leave a second amplifier of this unit the time to answer; LinkError where one does."""
-        link = self._opened()
+        line = self._opened()
         await asyncio.sleep(SETTLE)
-        if link.is_contradicted:
+        if line.is_contradicted:
             raise LinkError(
                 f"more than one amplifier answers as unit {self._url.unit} on {self._url.place}; "
                 "give each on the line a unit of its own"
@@ -202,9 +211,9 @@ class ModbusBackend(WireBackend):
                 return True
             return exchanges.is_of(answer.registers, tag=tag)
 
-        link = self._opened()
+        line = self._opened()
         try:
-            answer = await link.transact(
+            answer = await line.transact(
                 read,
                 write,
                 unit=self._url.unit,
@@ -213,7 +222,7 @@ class ModbusBackend(WireBackend):
                 accept=accept,
             )
         finally:
-            self._last_sent = link.last_sent
+            self._last_sent = line.last_sent
         if answer.exception in _GATEWAY:
             raise LinkTimeout(
                 f"the gateway at {self._url.place} gets no answer from unit {self._url.unit}; "
@@ -247,10 +256,12 @@ class ModbusBackend(WireBackend):
         if before is not None:
             self._on_event(Event(*condition))
 
-    def _opened(self) -> ModbusLink:
-        if self._link is None:
-            raise LinkError(f"{self._url.place} is not open")
-        return self._link
+    def _opened(self) -> ModbusLine:
+        if self._line is None or self._loss is not None:
+            raise LinkError(self._loss or f"{self._url.place} is not open")
+        return self._line
 
     def _lost(self, what: str) -> None:
-        self._on_loss(what)
+        self._loss = what
+        if not self._is_asking:
+            self._on_loss(what)

@@ -8,11 +8,11 @@ import asyncio
 import contextlib
 from collections.abc import Callable
 from contextlib import AbstractContextManager
-from weakref import WeakKeyDictionary
 
 from drivers import clock
 from drivers.backends.line_turns import LineTurns
 from drivers.backends.modbus.stream import open_stream
+from drivers.backends.shared_line import SharedLine, shared_line
 from drivers.backends.stand_in import Port
 from drivers.backends.urls.modbus import ModbusUrl
 from drivers.backends.waiting import reply_within
@@ -30,26 +30,22 @@ _BROADCAST: int = PROTOCOL.modbus["broadcast"]
 _TRANSACTIONS = 1 << 16
 _RTU_OVERHEAD = 3  # bytes of an answer around its PDU
 
-_links: "WeakKeyDictionary[asyncio.AbstractEventLoop, dict[ModbusUrl, ModbusLink]]" = (
-    WeakKeyDictionary()
-)
 
+class ModbusLine(SharedLine):
+    """A line, whose units are its numbers; see `modbus_line`."""
 
-class ModbusLink:
-    """An open line; made by `ModbusLink.of`, closed when the last who uses it has left."""
+    number = "unit"
 
-    def __init__(self, line: ModbusUrl) -> None:
-        self.line = line
+    def __init__(self, url: ModbusUrl) -> None:
+        super().__init__(url.place)
+        self.url = url
         self.counters = WireCounters()
         self.last_sent = 0.0
         self._stream: Port | None = None
-        self._changing = asyncio.Lock()  # held while the line is opened or closed
         self._turns = LineTurns()
-        self._reader = AnswerReader(is_rtu=line.is_rtu, counters=self.counters)
-        self._users: dict[int, Callable[[str], None]] = {}  # by their units
+        self._reader = AnswerReader(is_rtu=url.is_rtu, counters=self.counters)
         self.is_contradicted = False  # whether the last answer was followed by another
         self._given: Answer | None = None
-        self._loss: str | None = None
         self._transaction = 0
         self._telegram: Telegram | None = None
         self._accept: Callable[[Answer], bool] = _any
@@ -59,49 +55,15 @@ class ModbusLink:
         self._is_owed = False
         self._came = asyncio.Event()
         self._gap = 0.0
-        if line.device:
-            self._gap = silence(baud=line.baud, bits_per_byte=line.bits_per_byte)
+        if url.device:
+            self._gap = silence(baud=url.baud, bits_per_byte=url.bits_per_byte)
 
-    @classmethod
-    async def of(cls, line: ModbusUrl, unit: int, on_loss: Callable[[str], None]) -> "ModbusLink":
-        """The link of a line for a unit, opened if it is not; on_loss: see `Backend.listen`.
-
-        Raises LinkError, also for a unit that this program has open already.
-        """
-        links = _links.setdefault(asyncio.get_running_loop(), {})
-        before = link = links.get(line)
-        if link is None or link._loss is not None:
-            link = links[line] = cls(line)
-            if before is not None:
-                link._changing = before._changing
-        if unit in link._users:
-            raise LinkError(
-                f"unit {unit} on {line.place}: this program has it open already; give every "
-                "amplifier a unit of its own"
-            )
-        link._users[unit] = on_loss
-        try:
-            async with link._changing:
-                if before is not None and before is not link:
-                    await before._close()
-                if link._stream is None:
-                    link._stream = await open_stream(line, link._received, link._lost)
-        except BaseException:
-            await link.leave(unit)
-            raise
-        return link
-
-    async def leave(self, unit: int) -> None:
-        """Use it no more; safe to call twice."""
-        self._users.pop(unit, None)
-        if self._users:
-            return
-        self._lose(f"{self.line.place} was closed")
-        async with self._changing:  # who comes meanwhile waits until the line is free
-            await self._close()
-        links = _links.get(asyncio.get_running_loop(), {})
-        if links.get(self.line) is self and not self._users:
-            del links[self.line]
+    async def _open(self) -> None:
+        self.counters = WireCounters()
+        self._reader = AnswerReader(is_rtu=self.url.is_rtu, counters=self.counters)
+        self._telegram = self._given = None
+        self._is_owed, self._free_from = False, 0.0
+        self._stream = await open_stream(self.url, self._received, self._lose)
 
     async def _close(self) -> None:
         stream, self._stream = self._stream, None
@@ -128,6 +90,7 @@ class ModbusLink:
 
         async def exchange() -> Answer:
             await self._await_silence()
+            self.raise_if_lost(unit)
             telegram = self._make(read, write, unit=unit)
             self._telegram, self._accept = telegram, accept
             self._answer = asyncio.get_running_loop().create_future()
@@ -142,9 +105,9 @@ class ModbusLink:
                 raise
             except TimeoutError:
                 raise LinkTimeout(
-                    f"no answer from unit {unit} on {self.line.place} within {timeout * 1e3:g} ms; "
+                    f"no answer from unit {unit} on {self.place} within {timeout * 1e3:g} ms; "
                     "check that the amplifier is switched on and has this unit"
-                    + (f" and {self.line.baud} baud" if self.line.device else "")
+                    + (f" and {self.url.baud} baud" if self.url.device else "")
                 ) from None
             finally:
                 self._answer = None
@@ -176,13 +139,14 @@ class ModbusLink:
 
     def _make(self, read: Read | None, write: Write | None, *, unit: int) -> Telegram:
         self._transaction = (self._transaction + 1) % _TRANSACTIONS
-        number = 0 if self.line.is_rtu else self._transaction
-        return make_telegram(read, write, unit=unit, transaction=number, is_rtu=self.line.is_rtu)
+        number = 0 if self.url.is_rtu else self._transaction
+        return make_telegram(read, write, unit=unit, transaction=number, is_rtu=self.url.is_rtu)
 
     def _send(self, frame: bytes) -> None:
-        if self._stream is None or self._loss is not None:
-            raise LinkError(self._loss or f"{self.line.place} is not open")
-        if self.line.is_rtu:
+        self.raise_if_lost()
+        if self._stream is None:
+            raise LinkError(f"{self.place} is not open")
+        if self.url.is_rtu:
             self._reader.clear()
         self._is_owed = False
         self._given, self.is_contradicted = None, False
@@ -194,7 +158,7 @@ class ModbusLink:
 
     async def _await_silence(self) -> None:
         """Wait until a serial line is free."""
-        if not self.line.is_rtu:
+        if not self.url.is_rtu:
             return
         if self._is_owed and (wait := self._free_from - clock.now()) > 0:
             with contextlib.suppress(TimeoutError):
@@ -205,7 +169,7 @@ class ModbusLink:
 
     def _time_of(self, size: int) -> float:
         """Time [s] that so many bytes take on a serial line, be it behind a gateway."""
-        return size * self.line.bits_per_byte / self.line.baud if self.line.baud else 0.0
+        return size * self.url.bits_per_byte / self.url.baud if self.url.baud else 0.0
 
     def _received(self, data: bytes) -> None:
         for answer in self._reader.feed(data, self._telegram):
@@ -223,19 +187,14 @@ class ModbusLink:
         if not self._is_owed:
             self._free_from = clock.now() + self._gap
 
-    def _lost(self, what: str) -> None:
-        """The stream has found that it is gone."""
-        is_asked = self._answer is not None and not self._answer.done()
-        self._lose(what)
-        if not is_asked:
-            for on_loss in tuple(self._users.values()):
-                on_loss(what)
-
-    def _lose(self, what: str) -> None:
-        if self._loss is None:
-            self._loss = what
+    def _give_up(self, what: str) -> None:
         if self._answer is not None and not self._answer.done():
-            self._answer.set_exception(LinkError(self._loss))
+            self._answer.set_exception(LinkError(what))
+
+
+def modbus_line(url: ModbusUrl) -> ModbusLine:
+    """The line of a URL in the running event loop."""
+    return shared_line(ModbusLine, url.line, lambda: ModbusLine(url.line))
 
 
 def _any(answer: Answer) -> bool:

@@ -9,7 +9,7 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 
 from drivers.backends.line_turns import kind_on_line
-from drivers.backends.serial_line.line import SerialLine, shared_line
+from drivers.backends.serial_line.line import SerialLine, serial_line
 from drivers.backends.stand_in import number_below
 from drivers.backends.urls.serial_line import SerialUrl
 from drivers.backends.waiting import SETTLE, reply_within
@@ -97,10 +97,11 @@ class SerialBackend(WireBackend):
         """Open the port, for this process alone where the system can; raises LinkError."""
         if self._line is not None:
             return
-        line = shared_line(self._url.port, baud=self._url.baud)
+        line = serial_line(self._url.port, baud=self._url.baud)
         self._counters = WireCounters()
         self._loss = None
-        await line.join(self._url.address, self._received, self._lost)
+        await line.join(self._url.address, self._lost)
+        line.listen(self._url.address, self._received)
         self._line = line
 
     async def close(self) -> None:
@@ -111,6 +112,7 @@ class SerialBackend(WireBackend):
         self._counters.bad = line.bad
         self._why_closed = f"{self._url.port} was closed"
         self._fail(LinkError(self._why_closed))
+        line.listen(self._url.address, None)
         await line.leave(self._url.address)
 
     async def exchange(self, request: Request, *, timeout: float) -> Reply:
@@ -119,7 +121,7 @@ class SerialBackend(WireBackend):
         timeout [s]: for all of it; longer where a slow line and an amplifier that reacts in time
         need longer.
         """
-        line = self._open_line()
+        line = self._opened()
         if not line.is_shared:
             return await self._exchange(line, request, timeout)
         return await line.turns.carry_out(
@@ -130,7 +132,7 @@ class SerialBackend(WireBackend):
 
     async def broadcast(self, request: Broadcast) -> None:
         """Send a commit to every amplifier of the line in its turn, or a stop at once."""
-        line = self._open_line()
+        line = self._opened()
         data = encode_frame(self._frame(request, PROTOCOL.serial.broadcast))
         if isinstance(request, Stop):
             line.send(data)
@@ -157,6 +159,7 @@ class SerialBackend(WireBackend):
         self._pending[frame.sequence] = pending
         self._answered, self._is_contradicted = None, False
         try:
+            line.raise_if_lost(self._url.address)
             line.send(data)
             line.turns.sent()
             self._last_sent = line.last_sent
@@ -182,7 +185,7 @@ class SerialBackend(WireBackend):
         self._sequence = (self._sequence + 1) & 0xFFFF
         return encode_request(request, address=address, sequence=self._sequence)
 
-    def _open_line(self) -> SerialLine:
+    def _opened(self) -> SerialLine:
         if self._line is None or self._loss is not None:
             raise LinkError(self._loss or self._why_closed)
         return self._line

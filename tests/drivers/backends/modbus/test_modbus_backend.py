@@ -10,9 +10,9 @@ from pymodbus.server import ModbusTcpServer
 from pymodbus.simulator import DataType, SimData, SimDevice
 
 from drivers.amplifier import Amplifier
-from drivers.backends.modbus import line as modbus_line
+from drivers.backends.modbus import line as line_of_modbus
 from drivers.backends.modbus.backend import ModbusBackend
-from drivers.backends.modbus.line import ModbusLink
+from drivers.backends.modbus.line import modbus_line
 from drivers.backends.stand_in import STAND_IN, Adapter, Port, StandIn, Worker
 from drivers.backends.urls.modbus import ModbusUrl
 from drivers.codec.modbus.exchanges import Read, Write
@@ -356,7 +356,8 @@ async def test_an_answer_that_is_none_is_dropped(
 async def test_an_echo_of_another_write_is_dropped(place: int) -> None:
     """Function 16 echoes address and count: where they are others, that write was not confirmed."""
     async with peer(is_rtu=False) as far:
-        link = await ModbusLink.of(ModbusUrl.parse(far.url).line, "test", lambda _: None)
+        link = modbus_line(ModbusUrl.parse(far.url))
+        await link.join(1, lambda _: None)
 
         def answer(request: object) -> bytes | None:
             pdu = far.unit.answer(far.requests[-1].pdu)
@@ -370,7 +371,7 @@ async def test_an_echo_of_another_write_is_dropped(place: int) -> None:
         with pytest.raises(LinkTimeout):
             await link.transact(None, Write(8, (99,)), unit=1, timeout=SHORT, accept=lambda _: True)
         assert link.counters.foreign == 2
-        await link.leave("test")
+        await link.leave(1)
 
 
 async def test_an_answer_out_of_range_is_refused(far: Peer, backend: ModbusBackend) -> None:
@@ -483,7 +484,7 @@ async def test_what_is_cancelled_leaves_its_answer_the_time_to_come(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Over RTU the next telegram waits until the abandoned answer was there, over TCP not."""
-    monkeypatch.setattr(modbus_line, "_REACTION", 60.0)
+    monkeypatch.setattr(line_of_modbus, "_REACTION", 60.0)
     for is_rtu in (True, False):
         async with peer(is_rtu=is_rtu) as far:
             backend = ModbusBackend(far.url)
@@ -570,8 +571,8 @@ async def test_a_server_that_is_not_ours_understands_the_frames(framer: FramerTy
     port = server.transport.sockets[0].getsockname()[1]
     is_rtu = framer is FramerType.RTU
     scheme, unit = ("modbus+rtu", "#1") if is_rtu else ("modbus+tcp", "/1")
-    line = ModbusUrl.parse(f"{scheme}://127.0.0.1:{port}{unit}").line
-    link = await ModbusLink.of(line, "test", lambda _: None)
+    link = modbus_line(ModbusUrl.parse(f"{scheme}://127.0.0.1:{port}{unit}"))
+    await link.join(1, lambda _: None)
 
     async def ask(read: Read | None, write: Write | None = None) -> object:
         return await link.transact(read, write, unit=1, timeout=PATIENCE, accept=lambda _: True)
@@ -584,7 +585,7 @@ async def test_a_server_that_is_not_ours_understands_the_frames(framer: FramerTy
     assert (await ask(Read(99, 5))).exception == 2
     assert (await ask(Read(0, 100))).registers[9] == 900
     assert link.counters.bad == link.counters.foreign == 0
-    await link.leave("test")
+    await link.leave(1)
     await server.shutdown()
 
 

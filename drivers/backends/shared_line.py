@@ -1,0 +1,128 @@
+"""What several amplifiers of a process are on: opened by the first, closed by the last."""
+
+import asyncio
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Hashable
+from typing import ClassVar, TypeVar
+from weakref import WeakKeyDictionary
+
+from drivers.errors import LinkError
+
+
+class SharedLine(ABC):
+    """A serial line, a Modbus line or a CAN bus; whoever is on it is known by a number.
+
+    Who comes while it is opened or closed waits for that. A loss is one for all who are on it until
+    each joins again; the first of them opens it anew. place: its name for people.
+    """
+
+    number: ClassVar[str]
+    """What the number is called on this wire."""
+
+    def __init__(self, place: str) -> None:
+        self.place = place
+        self._users: dict[int, Callable[[str], None]] = {}
+        self._told: set[int] = set()  # of the loss, and not back since
+        self._loss: str | None = None
+        self._is_open = False
+        self._changing = asyncio.Lock()  # held while it is opened or closed
+
+    @property
+    def is_shared(self) -> bool:
+        """Whether more than one is on it."""
+        return len(self._users) > 1
+
+    async def join(self, number: int, on_loss: Callable[[str], None]) -> None:
+        """Be on it from now on; on_loss: told once, in the event loop, why it was lost.
+
+        Raises LinkError: where it cannot be opened, and for a number that is in use.
+        """
+        if number in self._users:
+            raise LinkError(
+                f"{self.number} {number} on {self.place}: this program has it open already; give "
+                f"every amplifier there a {self.number} of its own"
+            )
+        self._users[number] = on_loss
+        try:
+            async with self._changing:
+                if self._loss is not None:
+                    await self._shut()
+                if not self._is_open:
+                    self._loss = None
+                    await self._open()
+                    self._is_open = True
+        except BaseException:
+            await self.leave(number)
+            raise
+
+    async def leave(self, number: int) -> None:
+        """Be on it no longer; the last to go closes it. Safe to call twice."""
+        self._users.pop(number, None)
+        self._told.discard(number)
+        if self._users:
+            return
+        self._give_up(f"{self.place} was closed")
+        async with self._changing:
+            if not self._users:  # nobody has come meanwhile
+                await self._shut()
+        if not self._users:
+            _forget(self)
+
+    def raise_if_lost(self, number: int | None = None) -> None:
+        """Raise LinkError where it is lost, or was, and this one is not back since.
+
+        To be called when something goes out: it may have waited while others opened it anew.
+        """
+        if self._loss is not None:
+            raise LinkError(self._loss)
+        if number in self._told:
+            raise LinkError(f"{self.place} was lost, and {self.number} {number} is not back on it")
+
+    def _lose(self, what: str) -> None:
+        """It is gone; to be called in the event loop by what notices."""
+        if self._loss is not None:
+            return
+        self._loss = what
+        self._give_up(what)
+        for number, on_loss in tuple(self._users.items()):
+            if number not in self._told:
+                self._told.add(number)
+                on_loss(what)
+
+    async def _shut(self) -> None:
+        self._is_open = False
+        await self._close()
+
+    @abstractmethod
+    async def _open(self) -> None:
+        """Open it; raises LinkError."""
+
+    @abstractmethod
+    async def _close(self) -> None:
+        """Close it and wait until it is; safe where it is not open."""
+
+    def _give_up(self, what: str) -> None:
+        """End what still waits for an answer."""
+        return
+
+
+_LineT = TypeVar("_LineT", bound=SharedLine)
+
+_LINES: "WeakKeyDictionary[asyncio.AbstractEventLoop, dict[Hashable, SharedLine]]" = (
+    WeakKeyDictionary()
+)
+
+
+def shared_line(kind: type[_LineT], key: Hashable, make: Callable[[], _LineT]) -> _LineT:
+    """The line of this kind and key in the running event loop; made where nobody is on it yet."""
+    lines = _LINES.setdefault(asyncio.get_running_loop(), {})
+    line = lines.get((kind, key))
+    if not isinstance(line, kind):
+        line = lines[kind, key] = make()
+    return line
+
+
+def _forget(line: SharedLine) -> None:
+    lines = _LINES.get(asyncio.get_running_loop(), {})
+    for key in [key for key, known in lines.items() if known is line]:
+        del lines[key]

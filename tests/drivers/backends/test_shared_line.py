@@ -1,0 +1,222 @@
+"""Lines that several amplifiers are on: opened by the first, lost for all, closed by the last."""
+
+import asyncio
+from collections.abc import Callable
+
+import pytest
+
+from drivers.backends.can_bus.backend import CanBackend
+from drivers.backends.modbus.backend import ModbusBackend
+from drivers.backends.serial_line.backend import SerialBackend
+from drivers.backends.shared_line import SharedLine, shared_line
+from drivers.backends.stand_in import STAND_IN, Adapter, Port, StandIn, ThreadWorker, Worker
+from drivers.backends.wire_backend import WireBackend
+from drivers.errors import LinkError
+from drivers.protocol.messages import Arm, Ping
+
+
+class Line(SharedLine):
+    """One that notes what happens to it; `blocks` holds up opening and closing."""
+
+    number = "place"
+
+    def __init__(self) -> None:
+        super().__init__("the line")
+        self.happened: list[str] = []
+        self.blocks: asyncio.Event | None = None
+        self.fails = False
+
+    async def _open(self) -> None:
+        if self.fails:
+            raise LinkError("there is no such line")
+        await self._note("opened")
+
+    async def _close(self) -> None:
+        await self._note("closed")
+
+    async def _note(self, what: str) -> None:
+        if self.blocks is not None:
+            await self.blocks.wait()
+        self.happened.append(what)
+
+    def _give_up(self, what: str) -> None:
+        self.happened.append(f"gave up: {what}")
+
+    def lose(self, what: str) -> None:
+        """As when its cable is pulled out."""
+        self._lose(what)
+
+
+def the_line() -> Line:
+    """The one that is in use, or a new one."""
+    return shared_line(Line, "key", Line)
+
+
+async def test_the_first_opens_and_the_last_closes() -> None:
+    """In between it is one line, whoever comes and goes; afterwards the next gets another."""
+    line = the_line()
+    await line.join(1, lambda _: None)
+    assert the_line() is line
+    await line.join(2, lambda _: None)
+    assert line.is_shared
+    await line.leave(1)
+    assert line.happened == ["opened"]
+    await line.leave(2)
+    assert line.happened == ["opened", "gave up: the line was closed", "closed"]
+    assert the_line() is not line
+
+
+async def test_a_number_is_for_one() -> None:
+    """Who comes second is told what to do, and the first is not disturbed."""
+    line = the_line()
+    await line.join(1, lambda _: None)
+    with pytest.raises(LinkError, match=r"place 1 on the line.*has it open already.*of its own"):
+        await line.join(1, lambda _: None)
+    assert line.happened == ["opened"]
+    await line.leave(1)
+
+
+async def test_one_that_cannot_be_opened_is_as_if_nobody_had_come() -> None:
+    """The same number may try again, on a line made anew."""
+    line = the_line()
+    line.fails = True
+    with pytest.raises(LinkError, match="no such line"):
+        await line.join(1, lambda _: None)
+    again = the_line()
+    assert again is not line
+    await again.join(1, lambda _: None)
+    assert again.happened == ["opened"]
+    await again.leave(1)
+
+
+async def test_who_comes_while_it_closes_waits_and_opens_it_anew() -> None:
+    """The system gives a port out once: it is open again only after it was closed."""
+    line = the_line()
+    await line.join(1, lambda _: None)
+    line.blocks = asyncio.Event()
+    going = asyncio.create_task(line.leave(1))
+    await asyncio.sleep(0)
+    coming = asyncio.create_task(the_line().join(2, lambda _: None))
+    await asyncio.sleep(0)
+    line.blocks.set()
+    await asyncio.gather(going, coming)
+    assert [what for what in line.happened if what != "gave up: the line was closed"] == [
+        "opened",
+        "closed",
+        "opened",
+    ]
+    assert the_line() is line
+    await line.leave(2)
+
+
+async def test_who_comes_before_it_is_closed_keeps_it_open() -> None:
+    """The last was about to close it, and waited for somebody who opens or closes it as well."""
+    line = the_line()
+    await line.join(1, lambda _: None)
+    async with line._changing:
+        going = asyncio.create_task(line.leave(1))
+        await asyncio.sleep(0)
+        coming = asyncio.create_task(line.join(2, lambda _: None))
+        await asyncio.sleep(0)
+    await asyncio.gather(going, coming)
+    assert "closed" not in line.happened
+    assert the_line() is line
+    await line.leave(2)
+
+
+async def test_a_loss_is_told_once_to_each_and_over_for_who_comes_back() -> None:
+    """Another loss is told to who was back only, and who is not back may send nothing meanwhile."""
+    told: list[tuple[int, str]] = []
+    line = the_line()
+    for number in (1, 2):
+        await line.join(number, lambda what, number=number: told.append((number, what)))
+    line.lose("pulled out")
+    line.lose("pulled out again")
+    assert told == [(1, "pulled out"), (2, "pulled out")]
+    with pytest.raises(LinkError, match="pulled out"):
+        line.raise_if_lost(1)
+    await line.leave(1)
+    await line.join(1, lambda what: told.append((1, what)))
+    assert line.happened == ["opened", "gave up: pulled out", "closed", "opened"]
+    line.raise_if_lost(1)
+    with pytest.raises(LinkError, match="place 2 is not back"):
+        line.raise_if_lost(2)
+    line.lose("burnt")
+    assert told[2:] == [(1, "burnt")]
+    await line.leave(1)
+    await line.leave(2)
+
+
+class _Machine(StandIn):
+    """A machine with a line that takes everything and says nothing, until it is lost."""
+
+    def __init__(self) -> None:
+        self.sent: list[object] = []
+        self.lose: Callable[[str], None] = lambda what: None
+
+    async def open_port(
+        self, name: str, *, on_data: object, on_loss: Callable[[str], None]
+    ) -> Port:
+        self.lose = on_loss
+        return _Open(self.sent)
+
+    async def open_adapter(
+        self, url: object, *, on_frame: object, on_loss: Callable[[str], None]
+    ) -> Adapter:
+        self.lose = on_loss
+        return _Open(self.sent)
+
+    def make_worker(self) -> Worker:
+        return ThreadWorker("era-test")
+
+    def below(self, limit: int) -> int:
+        return 0
+
+
+class _Open:
+    def __init__(self, sent: list[object]) -> None:
+        self._sent = sent
+
+    def write(self, data: bytes) -> None:
+        """Nobody is there."""
+        self._sent.append(data)
+
+    send = write  # type: ignore[assignment]
+
+    def close(self) -> None:
+        """Nobody was there."""
+
+    async def wait_closed(self) -> None:
+        """Nor is anybody."""
+
+
+WAITING = {
+    SerialBackend: ("serial:///dev/none?address={}", [Ping(), Arm(watchdog=0.25)]),
+    ModbusBackend: ("modbus+rtu:///dev/none#{}", [Ping(), Arm(watchdog=0.25)]),
+    CanBackend: ("can+slcan:///dev/none#{}", [Arm(watchdog=0.25)]),  # listens first
+}
+
+
+@pytest.mark.parametrize("kind", WAITING)
+async def test_what_waited_while_the_line_was_lost_is_not_sent_when_others_open_it(
+    kind: type[WireBackend],
+) -> None:
+    """An amplifier that was lost is armed by nobody before it was opened anew."""
+    url, requests = WAITING[kind]
+    machine = _Machine()
+    STAND_IN.set(machine)
+    east, west = (kind(url.format(number)) for number in (1, 2))
+    await east.open()
+    await west.open()
+    asked = [asyncio.create_task(west.exchange(each, timeout=0.2)) for each in requests]
+    await asyncio.sleep(0.01)
+    before = len(machine.sent)
+    machine.lose("pulled out")
+    await east.close()
+    await east.open()
+    for each in asked:
+        with pytest.raises(LinkError, match=r"pulled out|not back"):
+            await each
+    assert len(machine.sent) == before
+    await west.close()
+    await east.close()

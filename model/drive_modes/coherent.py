@@ -20,14 +20,21 @@ from itertools import product
 import numpy as np
 
 from model.arrays import IntArray
-from model.drive_modes.fields import ERROR_SHARE, Drive, Fields, Single, SingleComplex
+from model.drive_modes.fields import (
+    ERROR_SHARE,
+    Drive,
+    Fields,
+    Single,
+    SingleComplex,
+    added_by_errors,
+)
 
 Solve = Callable[[SingleComplex, SingleComplex], SingleComplex]
 """Weights (n, eras) for R (n, eras, eras) and c (n, eras), within what a mode allows."""
 
 PROMISING = 12  # frequencies at which shares are moved, at the most
-STEPS = np.array([1.0] + [0.7] * 6, dtype=np.float32)  # how far, round by round, at the most
-FEWER_STEPS, MANY_POINTS = 5, 100  # of six fingers and more, where a round takes longer
+MOVES = np.array([1.0] + [0.7] * 5, dtype=np.float32)  # how far, one after the other, at the most
+FEWER_MOVES, MANY_POINTS = 4, 100  # of six fingers and more, where one takes longer
 CLOSE = 1.03  # a frequency that cannot be better than this times the best is left
 
 # Where nothing reaches the level, quieter fingers are given up for a louder target, step by step:
@@ -58,45 +65,62 @@ class Coherent:
         richer mode then has what a poorer one would have found.
         """
         found = _Best(fields, least)
-        near = CLOSE if least == 0 else 1.0
-        chosen, some, shares = np.arange(fields.frequency_count), fields, _even_shares(fields)
-        for step in STEPS[: _rounds(fields)]:
-            weights, bound = self._weights(some, shares, sigma=ERROR_SHARE)
-            found.bound[chosen] = np.minimum(found.bound[chosen], bound)
-            likely = found.offer(chosen, weights, some)
+        weights, bound = self._weights(fields, _even_form(fields, sigma=ERROR_SHARE))
+        likely = _likely_power(fields, weights)
+        every = np.arange(fields.frequency_count)
+        found.offer(every, weights, fields, likely=likely)
+        found.limit(every, bound)
+        if not found.reaches:
+            self._offer_louder(fields, found)
+        elif not fields.is_alone:  # a mean needs no moving
+            self._move_shares(fields, found, likely=likely, bound=bound)
+        return found.search()
+
+    def _move_shares(
+        self, fields: Fields, found: "_Best", *, likely: Single, bound: Single
+    ) -> None:
+        """Let the loud quiet points count for more, time and again, where that may find better.
+
+        likely (f, q), bound (f,): what came of points that count the same. A touch waits for this:
+        every call of numpy that is spared counts.
+        """
+        near = CLOSE if found.least == 0 else 1.0
+        chosen, shares = np.arange(fields.frequency_count), np.ones_like(likely)
+        many = fields.quiet.shape[-1] > MANY_POINTS
+        for move in MOVES[:FEWER_MOVES] if many else MOVES:
             kept = np.flatnonzero(bound > near * found.score)
-            if not found.reaches or len(kept) == 0:
-                break
+            if len(kept) == 0:
+                return
             if len(kept) > PROMISING:
                 kept = kept[np.argsort(-bound[kept])[:PROMISING]]
             if len(kept) < len(chosen):
-                chosen = chosen[kept]
-                some = fields.at(chosen)
-            shares = shares[kept] * likely[kept] ** step
-            shares /= shares.sum(axis=-1, keepdims=True)
-        if not found.reaches:
-            self._offer_louder(fields, found)
-        return Search(found.scores, found.weights, found.bound, found.refused > found.score)
+                chosen, fields = chosen[kept], fields.at(kept)
+                shares, likely = shares[kept], likely[kept]
+            shares = shares * likely**move
+            shares /= np.add.reduce(shares, axis=-1, keepdims=True)
+            weights, bound = self._weights(fields, _mean_form(fields, shares))
+            likely = _likely_power(fields, weights)
+            found.offer(chosen, weights, fields, likely=likely)
+            found.limit(chosen, bound)
 
     def loudest(self, fields: Fields) -> float:
         """How many times above threshold the targets can be made to feel it."""
         sigma, gain = GIVEN_UP[-1]
-        weights, _ = self._weights(fields, _even_shares(fields), sigma=sigma)
+        weights, _ = self._weights(fields, _even_form(fields, sigma=sigma))
         peak = _peak(fields, _raised(weights, gain))
         return float((peak / fields.threshold).max())
 
     def _offer_louder(self, fields: Fields, found: "_Best") -> None:
         for sigma, gain in GIVEN_UP:
-            weights, _ = self._weights(fields, _even_shares(fields), sigma=sigma)
-            found.offer(np.arange(fields.frequency_count), _raised(weights, gain), fields)
+            weights, _ = self._weights(fields, _even_form(fields, sigma=sigma))
+            weights = _raised(weights, gain)
+            every = np.arange(fields.frequency_count)
+            found.offer(every, weights, fields, likely=_likely_power(fields, weights))
             if found.reaches:
                 break
 
-    def _weights(
-        self, fields: Fields, shares: Single, *, sigma: float
-    ) -> tuple[SingleComplex, Single]:
+    def _weights(self, fields: Fields, R: SingleComplex) -> tuple[SingleComplex, Single]:
         """Weights (n, eras), and what they reach per root of w^H R w, (n,)."""
-        R = _quiet_form(fields, shares, sigma=sigma)
         targets = fields.mean_targets
         starts = _starts(len(targets), self.phases)
         ascents = self.ascents if len(starts) > 1 else 1
@@ -124,56 +148,58 @@ class Search:
 
 
 class _Best:
-    """The best of the weights that were offered, at each frequency; score: of all, or the least.
+    """The best of the weights that were offered; least: a score that is there already.
 
-    reaches: whether any of them reached the level; refused: the best score of those that did not.
+    score: of all that reach the level, or the least; reaches: whether any do; refused: the best
+    score of those that do not.
     """
 
     def __init__(self, fields: Fields, least: float) -> None:
-        count = fields.frequency_count
-        self.scores: Single = np.zeros(count, dtype=np.float32)
-        self.weights: SingleComplex = np.zeros((count, fields.era_count), dtype=np.complex64)
-        self.bound: Single = np.full(count, np.inf, dtype=np.float32)
-        self.score, self.refused, self.reaches = least, 0.0, False
+        self._shape = fields.frequency_count, fields.era_count
+        self._offers: list[tuple[IntArray, SingleComplex, Single]] = []
+        self._bounds: list[tuple[IntArray, Single]] = []
+        self.least = self.score = least
+        self.refused, self.reaches = 0.0, False
 
-    def offer(self, frequencies: IntArray, weights: SingleComplex, fields: Fields) -> Single:
-        """Power at the quiet points, errors included (n, q), of weights (n, eras).
+    def offer(
+        self, frequencies: IntArray, weights: SingleComplex, fields: Fields, *, likely: Single
+    ) -> None:
+        """Weights (n, eras) with their power at the quiet points (n, q), errors included.
 
         fields: at these frequencies only.
         """
-        # A touch waits for this, round by round: every call of numpy that is spared counts.
-        row = weights[:, None, :]
-        wrong = (_squared(weights)[:, None, :] @ fields.quiet_power)[:, 0]
-        likely = _squared((row @ fields.quiet)[:, 0]) + np.float32(ERROR_SHARE**2) * wrong
         power = likely.mean(axis=-1) if fields.is_alone else np.maximum.reduce(likely, axis=-1)
         peak = _peak(fields, weights)
         reaches = peak >= fields.wanted * fields.threshold
-        score = peak / np.sqrt(power + _TINY * peak**2)
+        score = peak / np.sqrt(power + _TINY * (peak * peak))
         count = int(np.count_nonzero(reaches))
         if count < len(reaches):
             self.refused = max(self.refused, float(score[~reaches].max()))
             score = np.where(reaches, score, 0)
-        better = np.flatnonzero(score > self.scores[frequencies])
-        if len(better) > 0:
-            at = frequencies[better]
-            self.scores[at] = score[better]
-            self.weights[at] = weights[better]
-            self.score = max(self.score, float(score.max()))
+        self._offers.append((frequencies, weights, score))
+        self.score = max(self.score, float(score.max()))
         self.reaches = self.reaches or count > 0
-        return np.asarray(likely, dtype=np.float32)
 
+    def limit(self, frequencies: IntArray, bound: Single) -> None:
+        """No weights at frequencies (n,) can have more than (n,)."""
+        self._bounds.append((frequencies, bound))
 
-def _rounds(fields: Fields) -> int:
-    """How often the quiet points' shares are worth moving; a mean needs no moving."""
-    if fields.is_alone:
-        return 1
-    return FEWER_STEPS if fields.quiet.shape[-1] > MANY_POINTS else len(STEPS)
-
-
-def _even_shares(fields: Fields) -> Single:
-    """Every quiet point counts the same, (f, q)."""
-    f, _, q = fields.quiet.shape
-    return np.full((f, q), 1 / q, dtype=np.float32)
+    def search(self) -> "Search":
+        """The best at each frequency."""
+        at, weights, score = (np.concatenate(each) for each in zip(*self._offers, strict=True))
+        # The best is written last, and so stays.
+        order = np.argsort(-score, kind="stable")[::-1]
+        found = Search(
+            score=np.zeros(self._shape[0], dtype=np.float32),
+            weights=np.zeros(self._shape, dtype=np.complex64),
+            bound=np.full(self._shape[0], np.inf, dtype=np.float32),
+            is_held_back=self.refused > self.score,
+        )
+        found.score[at[order]] = score[order]
+        found.weights[at[order]] = weights[order]
+        for frequencies, bound in self._bounds:
+            found.bound[frequencies] = np.minimum(found.bound[frequencies], bound)
+        return found
 
 
 def _raised(weights: SingleComplex, gain: float) -> SingleComplex:
@@ -191,21 +217,33 @@ def _peak(fields: Fields, weights: SingleComplex) -> Single:
     return each[0] if len(each) == 1 else np.asarray(np.min(each, axis=0))
 
 
-def _quiet_form(fields: Fields, shares: Single, *, sigma: float) -> SingleComplex:
-    """R (n, eras, eras) for shares (n, q) of the quiet points."""
-    R = np.asarray(fields.quiet_conjugate @ (fields.quiet * shares[:, None, :]).transpose(0, 2, 1))
+def _even_form(fields: Fields, *, sigma: float) -> SingleComplex:
+    """R (f, eras, eras) of quiet points that all count the same."""
+    quiet = fields.quiet
+    R = np.asarray(quiet.conj() @ quiet.transpose(0, 2, 1), dtype=np.complex64)
+    R /= np.float32(quiet.shape[-1])
     diagonal = R.reshape(len(R), -1)[:, :: R.shape[1] + 1]
-    wrong = diagonal.real
-    # An ERA that does not move the quiet points must still have a weight that is a number.
-    floor = _TINY * np.maximum.reduce(wrong, axis=-1, keepdims=True) + np.float32(1e-20)
-    diagonal += np.float32(sigma**2) * wrong + floor
+    diagonal += added_by_errors(diagonal.real, sigma=sigma)
     return R
+
+
+def _mean_form(fields: Fields, shares: Single) -> SingleComplex:
+    """R (n, eras, eras) for shares (n, q) of the quiet points."""
+    mean = np.matvec(fields.quiet_forms, shares).view(np.complex64)
+    return np.asarray(mean.reshape(len(mean), fields.era_count, -1))
+
+
+def _likely_power(fields: Fields, weights: SingleComplex) -> Single:
+    """Power at the quiet points, errors included (n, q), of weights (n, eras)."""
+    wrong = np.vecmat(_squared(weights), fields.quiet_power)
+    right = _squared((weights[:, None, :] @ fields.quiet)[:, 0])
+    return np.asarray(right + np.float32(ERROR_SHARE**2) * wrong)
 
 
 def _squared(values: SingleComplex) -> Single:
     """The squared magnitude."""
-    real, imaginary = values.real, values.imag
-    return np.asarray(real * real + imaginary * imaginary)
+    magnitude = np.abs(values)
+    return np.asarray(magnitude * magnitude)
 
 
 @lru_cache(maxsize=16)
@@ -238,7 +276,7 @@ def _ascend(
         c = conjugate[0] if len(targets) == 1 else conjugate.sum(axis=0)
         w = solve(R, c)
         # Of the solution w^H R w is |c^H w|.
-        value = np.sqrt(np.abs(np.add.reduce(c.conj() * w, axis=-1)))
+        value = np.sqrt(np.abs(np.vecdot(c, w)))
     else:
         s = len(starts)
         turned = np.repeat(starts[:, :, None], n, axis=2)

@@ -20,6 +20,8 @@ SILENT = -1
 ERROR_SHARE = 0.1
 """How wrong an ERA's share of a field is, relative to itself, root mean square (sigma)."""
 
+_TINY, _LEAST = np.float32(1e-7), np.float32(1e-20)
+
 SingleComplex = NDArray[np.complex64]
 Single = NDArray[np.float32]
 
@@ -41,7 +43,7 @@ class Drive:
 
     def tones(self) -> list[tuple[int, SingleComplex]]:
         """Index of each distinct frequency, and the weights (eras,) at it."""
-        frequencies = sorted({int(index) for index in self.index} - {SILENT})
+        frequencies = sorted({*self.index.tolist()} - {SILENT})
         return [
             (index, np.where(self.index == index, self.weight, 0).astype(np.complex64))
             for index in frequencies
@@ -76,36 +78,56 @@ class Fields:
     def at(self, frequencies: NDArray[np.int64]) -> "Fields":
         """The same at some of the frequencies, by index (n,)."""
         some = Fields(
-            targets=tuple(field[frequencies] for field in self.targets),
-            quiet=self.quiet[frequencies],
+            targets=tuple(field.take(frequencies, axis=0) for field in self.targets),
+            quiet=self.quiet.take(frequencies, axis=0),
             is_alone=self.is_alone,
-            threshold=self.threshold[frequencies],
+            threshold=self.threshold.take(frequencies),
             wanted=self.wanted,
         )
         # What was worked out already is not worked out anew, round by round.
         known, also = vars(self), vars(some)
-        if "quiet_conjugate" in known:
-            also["quiet_conjugate"] = self.quiet_conjugate[frequencies]
         if "quiet_power" in known:
-            also["quiet_power"] = self.quiet_power[frequencies]
+            also["quiet_power"] = self.quiet_power.take(frequencies, axis=0)
+        if "quiet_forms" in known:
+            also["quiet_forms"] = self.quiet_forms.take(frequencies, axis=0)
         if "mean_targets" in known:
-            also["mean_targets"] = self.mean_targets[:, frequencies]
+            also["mean_targets"] = self.mean_targets.take(frequencies, axis=1)
         return some
 
     @cached_property
     def quiet_power(self) -> Single:
         """Squared magnitude at the quiet points, (f, eras, q)."""
-        return np.asarray(self.quiet.real**2 + self.quiet.imag**2)
+        return np.asarray(np.abs(self.quiet) ** 2)
 
     @cached_property
-    def quiet_conjugate(self) -> SingleComplex:
-        """The conjugate of the fields at the quiet points, (f, eras, q)."""
-        return np.asarray(self.quiet.conj())
+    def quiet_forms(self) -> Single:
+        """Power at each quiet point, errors included, as a form w^H R w of weights w.
+
+        R = conj(h) h^T, (eras, eras), with the errors on its diagonal; of every element the real
+        and the imaginary part, (f, 2 eras², q).
+        """
+        f, eras, q = self.quiet.shape
+        products = self.quiet.conj()[:, :, None] * self.quiet[:, None]
+        forms = np.empty((f, eras * eras, 2, q), dtype=np.float32)
+        forms[:, :, 0] = products.real.reshape(f, -1, q)
+        forms[:, :, 1] = products.imag.reshape(f, -1, q)
+        diagonal = forms[:, :: eras + 1, 0]
+        diagonal += added_by_errors(diagonal, sigma=ERROR_SHARE)
+        return forms.reshape(f, -1, q)
 
     @cached_property
     def mean_targets(self) -> SingleComplex:
         """Each ERA's field, mean over the points of each target, (targets, f, eras)."""
         return np.stack([field.mean(axis=-1) for field in self.targets])
+
+
+def added_by_errors(power: Single, *, sigma: float) -> Single:
+    """What errors of a share sigma of each ERA add to its own power (f, eras, ...).
+
+    An ERA that does not move the quiet points must still have a weight that is a number.
+    """
+    floor = _TINY * np.maximum.reduce(power, axis=1, keepdims=True) + _LEAST
+    return np.asarray(np.float32(sigma**2) * power + floor)
 
 
 @dataclass(frozen=True)
@@ -126,14 +148,16 @@ class Outcome:
 def judge(fields: Fields, drive: Drive) -> Outcome:
     """What a drive does; tones of different frequencies add as magnitudes (paper Eq. 28)."""
     tones = drive.tones()
-    threshold = np.array([fields.threshold[index] for index, _ in tones])[:, None]
+    at = [index for index, _ in tones]
+    rows = np.array([weight for _, weight in tones])[:, None]
+    threshold = fields.threshold[at][:, None]
     peaks, sensations = [], []
     for target in fields.targets:
-        amplitudes = np.abs([weight @ target[index] for index, weight in tones])
+        amplitudes = np.abs(rows @ target[at])[:, 0]
         peaks.append(amplitudes.sum(axis=0).mean())
         sensations.append(np.sqrt(((amplitudes / threshold) ** 2).sum(axis=0)).mean())
-    quiet = np.abs([weight @ fields.quiet[index] for index, weight in tones])
-    wrong = np.array([(np.abs(weight) ** 2) @ fields.quiet_power[index] for index, weight in tones])
+    quiet = np.abs(rows @ fields.quiet[at])[:, 0]
+    wrong = (np.abs(rows) ** 2 @ fields.quiet_power[at])[:, 0]
     likely = np.sqrt(quiet**2 + ERROR_SHARE**2 * wrong).sum(axis=0)
     return Outcome(
         peak=float(min(peaks)),

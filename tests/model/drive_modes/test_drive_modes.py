@@ -154,6 +154,21 @@ def test_what_is_near_the_best_is_within_three_decibels(scores, near):
     assert found.score == pytest.approx([scores[place] for place in near])
 
 
+def test_the_forms_of_the_quiet_points_are_their_power_with_errors():
+    """For any weights: |w h|² and a hundredth of each ERA's own, at some of the frequencies too."""
+    given = random_fields(3)
+    assert given.quiet_forms.dtype == np.float32
+    chosen = np.array([4, 1])
+    rng = np.random.default_rng(3)
+    w = rng.standard_normal(E) + 1j * rng.standard_normal(E)
+    for f, forms in zip(chosen, given.at(chosen).quiet_forms, strict=True):
+        for q in range(given.quiet.shape[2]):
+            h = given.quiet[f, :, q].astype(complex)
+            power = abs(w @ h) ** 2 + 0.01 * (abs(w) ** 2 @ abs(h) ** 2)
+            R = np.ascontiguousarray(forms[:, q]).view(np.complex64).reshape(E, E)
+            assert (w.conj() @ R @ w).real == pytest.approx(power, rel=1e-5)
+
+
 def test_phased_for_one_quiet_point_is_the_closed_form():
     """With one point at the target and one quiet, the best score is sqrt(h^H R^-1 h)."""
     for seed in range(5):

@@ -61,14 +61,12 @@ def all_patterns(era_count: int, frequency_count: int) -> Patterns:
 
 def magnitudes_of_sources(acceleration: SingleComplex | ComplexArray) -> Single:
     """Peak acceleration (sources, p) of all sources from each ERA's field (f, eras, p)."""
-    _, eras, p = acceleration.shape
-    pairs = list(combinations(range(eras), 2))
-    one, other = np.array(pairs, dtype=int).reshape(-1, 2).T
+    f, eras, p = acceleration.shape
+    one, other = _pairs(eras)
     by_era = acceleration.transpose(1, 0, 2)
-    fields = np.concatenate([by_era, by_era[one] + by_era[other]]).reshape(-1, p)
-    rows = np.zeros((len(fields) + 1, p), dtype=acceleration.real.dtype)
-    # Half the time of np.abs, which guards against overflow.
-    np.sqrt(fields.real**2 + fields.imag**2, out=rows[:-1])
+    fields = np.concatenate([by_era, by_era.take(one, axis=0) + by_era.take(other, axis=0)])
+    rows = np.zeros((len(fields) * f + 1, p), dtype=acceleration.real.dtype)
+    np.abs(fields.reshape(-1, p), out=rows[:-1])
     return rows
 
 
@@ -83,7 +81,7 @@ def sums_of_sources(rows: Single, eras: int) -> Single:
     c = len(rows)
     f = (rows.shape[1] - 1) // (eras * (eras + 1) // 2)
     alone = rows[:, : eras * f].reshape(c, eras, f)
-    one, other = np.array(list(combinations(range(eras), 2)), dtype=int).reshape(-1, 2).T
+    one, other = _pairs(eras)
     sums = np.empty((c, eras * f + len(one) * f * f), dtype=rows.dtype)
     sums[:, : eras * f] = rows[:, : eras * f]
     pairs = sums[:, eras * f :].reshape(c, len(one), f, f)
@@ -91,3 +89,10 @@ def sums_of_sources(rows: Single, eras: int) -> Single:
     same = np.arange(f)
     pairs[:, :, same, same] = rows[:, eras * f : -1].reshape(c, len(one), f)
     return sums
+
+
+@lru_cache(maxsize=8)
+def _pairs(eras: int) -> tuple[IntArray, IntArray]:
+    """The first and the second of every pair of ERAs."""
+    one, other = np.array(list(combinations(range(eras), 2)), dtype=int).reshape(-1, 2).T
+    return one, other

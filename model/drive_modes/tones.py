@@ -1,5 +1,6 @@
 """From what a drive mode finds to physics: a tone for each ERA."""
 
+import cmath
 from collections.abc import Sequence
 
 import numpy as np
@@ -23,12 +24,14 @@ def excitation_of(
     for index, weight in drive.tones():
         strongest = weight[np.argmax(np.abs(weight))]
         turned = weight * (np.conj(strongest) / np.abs(strongest))
-        for era, w in zip(eras, turned, strict=True):
+        frequency = float(frequencies[index])
+        # Numbers of Python's own: those of numpy take ten times as long, one by one.
+        for era, w in zip(eras, turned.tolist(), strict=True):
             if w != 0:
                 in_phase = w.real > 0 and abs(w.imag) < ROUNDING * w.real
                 tones[era.name] = Tone(
-                    frequency=float(frequencies[index]),
-                    amplitude=float(gain * min(abs(w), 1.0) * era.stroke),
-                    phase=0.0 if in_phase else float(np.angle(w)),
+                    frequency=frequency,
+                    amplitude=gain * min(abs(w), 1.0) * era.stroke,
+                    phase=0.0 if in_phase else cmath.phase(w),
                 )
     return tones

@@ -21,6 +21,8 @@ POINTS_PER_WAVELENGTH = 20
 COARSEST, FINEST = 0.008, 0.003  # m
 PATCH = 6  # points along a side that an interpolation takes in, at the least
 
+_DISC = FINGERTIP_RADIUS * UNIT_DISC
+
 
 @dataclass(frozen=True)
 class Raster:
@@ -66,9 +68,8 @@ class Raster:
 
     def fingertips(self, centres: FloatArray) -> "Fingertips":
         """Where the discs of fingertips centred at (k, 2) [m] lie; centres must be on the plate."""
-        size = np.array([self.length, self.width])
-        discs = centres[:, None, :] + FINGERTIP_RADIUS * UNIT_DISC
-        within = np.clip(discs, 0.0, size)
+        discs = centres[:, None, :] + _DISC
+        within = np.minimum(np.maximum(discs, 0.0), (self.length, self.width))
         index, weights = self._patches(centres, within)
         return Fingertips(index, weights, (within == discs).all(axis=2))
 
@@ -92,13 +93,17 @@ class Raster:
         return np.asarray((np.arange(side_y)[:, None] * self.nx + np.arange(side_x)).ravel())
 
     @cached_property
-    def _lagrange(self) -> tuple[FloatArray, FloatArray]:
-        """Coefficients of a patch's Lagrange polynomials along x and y, for powers of -1..1."""
-        side_x, side_y = (
-            np.asarray(np.linalg.inv(np.vander(np.linspace(-1, 1, side), increasing=True)), float)
-            for side in self._sides[2]
-        )
-        return side_x, side_y
+    def _lagrange(self) -> FloatArray:
+        """Coefficients of a patch's Lagrange polynomials along x and y, for powers of -1..1.
+
+        (2, 1, powers, powers); the shorter side's have zeros beside them.
+        """
+        side = self._sides[2]
+        found = np.zeros((2, 1, max(side), max(side)))
+        for axis, count in enumerate(side):
+            powers = np.vander(np.linspace(-1, 1, count), increasing=True)
+            found[axis, 0, :count, :count] = np.linalg.inv(powers)
+        return found
 
     def _patches(
         self, centres: FloatArray, points: FloatArray
@@ -111,10 +116,8 @@ class Raster:
         start = np.rint(centres / spacing - (side - 1) / 2).astype(int)
         start = np.minimum(np.maximum(start, 0), count - side)
         local = (points / spacing - start[:, None]) * (2 / (side - 1)) - 1
-        weight_x, weight_y = (
-            _powers(local[:, :, axis], side[axis]) @ self._lagrange[axis] for axis in (0, 1)
-        )
-        weights = weight_y[:, :, :, None] * weight_x[:, :, None, :]
+        along_x, along_y = _powers(local.transpose(2, 0, 1), max(side)) @ self._lagrange
+        weights = along_y[:, :, : side[1], None] * along_x[:, :, None, : side[0]]
         index = (start[:, 1] * self.nx + start[:, 0])[:, None] + self._patch_index
         return index, weights.reshape(*points.shape[:2], -1).astype(np.float32)
 
@@ -138,7 +141,7 @@ class Fingertips:
 
     def read(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
         """Values (point_count, c) of the raster at all points: (n, c)."""
-        found = self.weights @ values[self.index]
+        found = self.weights @ values.take(self.index, axis=0)
         whole = self.ends[-1] == self.on_plate.size
         return found.reshape(-1, values.shape[1]) if whole else found[self.on_plate]
 
@@ -147,6 +150,6 @@ def _powers(x: FloatArray, count: int) -> FloatArray:
     """1, x, x², ... along a new last axis of `count`."""
     powers = np.empty((*x.shape, count))
     powers[..., 0] = 1.0
-    for power in range(1, count):
-        np.multiply(powers[..., power - 1], x, out=powers[..., power])
+    powers[..., 1:] = x[..., None]
+    np.multiply.accumulate(powers, axis=-1, out=powers)
     return powers

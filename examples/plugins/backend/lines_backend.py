@@ -6,6 +6,7 @@ and nothing else: retries, tokens, turns and states belong to the `Amplifier` ab
 
 import asyncio
 import json
+from contextlib import suppress
 from urllib.parse import urlsplit
 
 from drivers import clock
@@ -81,6 +82,8 @@ class LinesBackend(WireBackend):
         writer, self._reader, self._writer = self._writer, None, None
         if writer is not None:
             writer.close()
+            with suppress(OSError):  # of a line that was lost before
+                await writer.wait_closed()
 
     async def exchange(self, request, *, timeout):
         """Send a request and wait for the answer that carries its number."""

@@ -1,4 +1,4 @@
-"""Materials of one's own, by name. The numbers of this one are an example: measure yours."""
+"""A material of one's own, by name. The numbers are an example: measure yours."""
 
 from model.structure.materials import KnownMaterial
 from model.structure.plate import Material

@@ -1,0 +1,114 @@
+"""The example amplifier, in a time of its own: silent when it must be, deaf to damaged bytes."""
+
+import math
+import re
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+WIRE_PAGE = (ROOT / "docs" / "reference" / "wire-protocol.md").read_text("utf-8")
+WATCHDOG = 250
+WRONG_STATE = 5
+
+
+@pytest.fixture
+def serial(monkeypatch: pytest.MonkeyPatch) -> Iterator[ModuleType]:
+    """Its modules, that find each other as they lie in their folder."""
+    monkeypatch.syspath_prepend(str(ROOT / "examples" / "amplifier"))
+    import on_a_serial_line
+
+    yield on_a_serial_line
+    for name in ("on_a_serial_line", "amplifier"):
+        del sys.modules[name]
+
+
+def frame_of(name: str) -> bytes:
+    """The bytes of an example on the wire's page."""
+    (text,) = re.findall(rf"^{name}: `([0-9A-F ]+)`$", WIRE_PAGE, re.MULTILINE)
+    return bytes.fromhex(text)
+
+
+def amplifier_at(serial: ModuleType, now: list[float]) -> Any:
+    """One whose clock stands at now [ms]."""
+    return serial.Amplifier(clock=lambda: now[0])
+
+
+def test_it_is_silent_5_ms_after_its_watchdog(serial: ModuleType) -> None:
+    """Along a raised cosine from when it bites, however late anybody looks; the fault latches."""
+    now = [1000.0]
+    amplifier = amplifier_at(serial, now)
+    amplifier.arm(WATCHDOG)
+    amplifier.feed()
+    amplifier.apply(1, 0, 0, [(0, 11000, 10000, 0), (3, 11000, 5000, 0)])
+    for after, share in ((-0.1, 1.0), (1.25, (1 + math.cos(math.pi / 4)) / 2), (2.5, 0.5)):
+        now[0] = 1000.0 + WATCHDOG + after
+        amplifier.live()
+        assert amplifier.levels == [round(10000 * share), 0, 0, round(5000 * share)]
+    now[0] = 1000.0 + WATCHDOG + 5
+    amplifier.live()
+    assert amplifier.levels == [0, 0, 0, 0]
+    assert (amplifier.state, amplifier.fault) == (7, 1)
+    assert not amplifier.high_voltage
+    with pytest.raises(serial.Refused) as refused:
+        amplifier.arm(WATCHDOG)
+    assert refused.value.code == WRONG_STATE
+
+
+def test_a_set_ends_by_itself_however_late_anybody_looks(serial: ModuleType) -> None:
+    """valid_for counts from the commit; the amplifier stays armed."""
+    now = [0.0]
+    amplifier = amplifier_at(serial, now)
+    amplifier.arm(2000)
+    amplifier.feed()
+    amplifier.apply(1, 10, 100, [(0, 11000, 10000, 0)])
+    now[0] = 105.0
+    amplifier.live()
+    assert amplifier.levels == [5000, 0, 0, 0]
+    now[0] = 111.0
+    amplifier.live()
+    assert amplifier.levels == [0, 0, 0, 0]
+    assert amplifier.state == 4
+
+
+def test_frames_of_the_page_are_answered(serial: ModuleType) -> None:
+    """Byte for byte where the page's amplifier would say the same, also byte by byte."""
+    end = serial.SerialEnd()
+    assert end.take(frame_of("Commit request")) != b""
+    refused = end.take(frame_of("Refused Apply request"))  # disarmed: WRONG_STATE
+    assert serial.unstuff(refused[1:-1])[:7] == bytes.fromhex("BF 01 07 00 07 05 FF")
+    assert end.take(frame_of("LoadEnvelope request")) != b""
+    stop = frame_of("Stop request")
+    assert b"".join(end.take(bytes([byte])) for byte in stop) != b""
+    assert end.amplifier.state == 5
+
+
+def test_what_is_damaged_has_no_effect_and_no_answer(serial: ModuleType) -> None:
+    """Any byte of a Stop changed, any beginning of it, too much without an end; then a good one."""
+    end = serial.SerialEnd()
+    stop = frame_of("Stop request")
+    for place in range(1, len(stop) - 1):
+        for change in (0x01, 0x80, 0xFF):
+            damaged = bytearray(stop)
+            damaged[place] ^= change
+            assert end.take(bytes(damaged)) == b""
+        assert end.take(stop[:place] + b"\0") == b""
+    assert end.take(b"\x07" * 10_000 + b"\0") == b""
+    assert end.amplifier.state == 1
+    assert end.take(stop) != b""
+    assert end.amplifier.state == 5
+
+
+def test_of_broadcasts_stop_and_commit_are_carried_out_without_an_answer(
+    serial: ModuleType,
+) -> None:
+    """Other requests to address 0 are dropped."""
+    end = serial.SerialEnd()
+    assert end.take(serial.framed(serial.ARM, 0, 1, (250).to_bytes(2, "little"))) == b""
+    assert end.amplifier.state == 1
+    assert end.take(serial.framed(serial.STOP, 0, 1, bytes(2))) == b""
+    assert end.amplifier.state == 5

@@ -1,0 +1,157 @@
+"""The example backend against an amplifier that answers late, wrongly, or not at all."""
+
+import asyncio
+import json
+import sys
+from collections.abc import AsyncIterator, Callable
+from importlib import util
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from drivers.backend import Backend
+from drivers.command import CommandSet, DriveCommand
+from drivers.errors import CommandError, LinkError, LinkTimeout
+from drivers.protocol.messages import Apply, Nak, NakCode, Ping, State, Status
+
+MODULE = Path(__file__).parents[2] / "examples" / "plugins" / "backend" / "lines_backend.py"
+STATUS = {"state": 1, "fault": 0, "token": 0, "high_voltage": False} | {
+    "watchdog_left": 0,
+    "levels": [0, 2500],
+}
+SOON, LONG = 0.05, 5.0  # s
+
+Answers = Callable[[int], bytes | None]
+"""The bytes that follow the request of a number; None to hang up."""
+
+
+def line(number: int, told: dict[str, Any]) -> bytes:
+    """An answer."""
+    return json.dumps({"id": number, **told}).encode() + b"\n"
+
+
+class FarEnd:
+    """Answers as it is told."""
+
+    def __init__(self) -> None:
+        self.answers: Answers = lambda number: line(number, STATUS)
+        self.is_over = asyncio.Event()
+
+    async def serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        """One host, until it is hung up."""
+        while request := await reader.readline():
+            said = self.answers(json.loads(request)["id"])
+            if said is None:
+                break
+            writer.write(said)
+        writer.close()
+        await writer.wait_closed()
+        self.is_over.set()
+
+
+@pytest.fixture
+def far_end() -> FarEnd:
+    """The other side."""
+    return FarEnd()
+
+
+@pytest.fixture
+async def backend(far_end: FarEnd) -> AsyncIterator[Backend]:
+    """The example, open."""
+    spec = util.spec_from_file_location("lines_backend", MODULE)
+    assert spec is not None
+    assert spec.loader is not None
+    module = util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    server = await asyncio.start_server(far_end.serve, "127.0.0.1", 0)
+    port = server.sockets[0].getsockname()[1]
+    made = module.LinesBackend(f"lines://127.0.0.1:{port}")
+    await made.open()
+    yield made
+    await made.close()
+    await far_end.is_over.wait()
+    server.close()
+    assert sys.modules.get("lines_backend") is None
+
+
+async def test_units_are_those_of_the_wire(backend: Backend) -> None:
+    """2500 on the wire is a level of a quarter."""
+    status = await backend.exchange(Ping(), timeout=LONG)
+    assert isinstance(status, Status)
+    assert status.levels == pytest.approx((0.0, 0.25))
+
+
+async def test_a_late_reply_is_no_answer_to_the_next_request(
+    backend: Backend, far_end: FarEnd
+) -> None:
+    """It is dropped and counted, and the next request gets its own."""
+    late: list[bytes] = []
+
+    def later(number: int) -> bytes:
+        if not late:
+            late.append(line(number, STATUS | {"state": 7}))
+            return b""
+        return late[0] + line(number, STATUS)
+
+    far_end.answers = later
+    with pytest.raises(LinkTimeout, match="no answer from lines://"):
+        await backend.exchange(Ping(), timeout=SOON)
+    status = await backend.exchange(Ping(), timeout=LONG)
+    assert isinstance(status, Status)
+    assert status.state is State.SWITCH_ON_DISABLED
+    assert backend.counters.foreign == 1
+
+
+@pytest.mark.parametrize(
+    "damaged",
+    [
+        b"\xff\xfe\n",
+        b"7\n",
+        b"{}\n",
+        b'{"id": 1}\n',
+        b'{"id": 1, "state": 99}\n',
+        line(1, STATUS | {"levels": [float("nan")]}),
+        b"[" * 100_000 + b"\n",
+    ],
+    ids=range(7),
+)
+async def test_damaged_lines_are_counted_and_dropped(
+    damaged: bytes, backend: Backend, far_end: FarEnd
+) -> None:
+    """Whatever they hold; the good one after them is understood."""
+    far_end.answers = lambda number: damaged + line(number, STATUS)
+    assert isinstance(await backend.exchange(Ping(), timeout=LONG), Status)
+    assert backend.counters.bad >= 1
+
+
+async def test_a_refusal_is_returned(backend: Backend, far_end: FarEnd) -> None:
+    """As a Nak, with its channel."""
+    far_end.answers = lambda number: line(number, {"refused": 4, "channel": 3})
+    assert await backend.exchange(Ping(), timeout=LONG) == Nak(NakCode.BAD_CHANNEL, 3)
+
+
+async def test_a_line_that_is_cut_is_told_of(backend: Backend, far_end: FarEnd) -> None:
+    """While it waits, and of one that is closed; closing twice is no error."""
+    far_end.answers = lambda number: None
+    with pytest.raises(LinkError, match="is lost: the amplifier has hung up"):
+        await backend.exchange(Ping(), timeout=LONG)
+    for _ in range(2):
+        await backend.close()
+    with pytest.raises(LinkError, match="is not open"):
+        await backend.exchange(Ping(), timeout=LONG)
+
+
+async def test_what_no_guard_has_seen_is_not_sent(backend: Backend) -> None:
+    """A TypeError, before anything is on the wire."""
+    plain = CommandSet(1, (DriveCommand(0, 110.0, 0.5),), ramp=0.0, valid_for=0.0)
+    with pytest.raises(TypeError, match="SafeCommand"):
+        await backend.exchange(Apply(plain), timeout=LONG)
+    assert backend.counters.frames_out == 0
+
+
+@pytest.mark.parametrize("url", ["lines://", "lines://host", "lines://host:x", "lines://h:1/2?a=b"])
+async def test_a_url_that_makes_no_sense_is_refused(url: str, backend: Backend) -> None:
+    """Before any wire is touched."""
+    with pytest.raises(CommandError, match="write lines://HOST:PORT"):
+        type(backend)(url)

@@ -11,7 +11,7 @@ level is then found by trial, and the poorer modes may have found better. Elsewh
 contains theirs but for unfinished rounds: 0.1 dB on average, 0.5 dB at the most.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -88,8 +88,9 @@ class Choice:
         if self.score.max(initial=0.0) < 0.999 * self.outcome.score:
             left = left[:0]
         left = left[np.argsort(-self.score[left])[:NEAR]]
-        return replace(
-            self,
+        return Choice(
+            self.drive,
+            self.outcome,
             frequencies=self.frequencies[left],
             weights=self.weights[left],
             score=self.score[left],

@@ -8,6 +8,7 @@ decibel of what `model.transients.measures` finds sample by sample, at a hundred
 """
 
 from collections.abc import Sequence
+from itertools import accumulate, pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,16 +48,15 @@ class RampedOnsets:
         targets, quiet: shapes (p, r) of the reduced plate at their points.
         """
         n = len(frequencies)
-        parts = self._parts[frequencies].reshape(n, self._eras, -1)
+        parts = self._parts.take(frequencies, axis=0).reshape(n, self._eras, -1)
         answers = (weights[:, None, :] @ parts).reshape(n * MOMENTS, -1)
         rows = np.concatenate([answers.real, answers.imag])
-
-        def peaks(shapes: NDArray[np.float32]) -> NDArray[np.float32]:
-            real, imaginary = (rows @ shapes.T).reshape(2, n, MOMENTS, -1)
-            return np.asarray((real**2 + imaginary**2).max(axis=1))
-
-        felt = np.min([np.sqrt(peaks(shapes)).mean(axis=1) for shapes in targets], axis=0)
-        return np.asarray(felt / np.sqrt(peaks(quiet).max(axis=1)), dtype=float)
+        real, imaginary = (rows @ np.concatenate([*targets, quiet]).T).reshape(2, n, MOMENTS, -1)
+        peaks = np.sqrt(np.maximum.reduce(real * real + imaginary * imaginary, axis=1))
+        ends = list(accumulate(map(len, targets), initial=0))
+        felt = [peaks[:, begin:end].mean(axis=1) for begin, end in pairwise(ends)]
+        loudest = peaks[:, ends[-1] :].max(axis=1)
+        return np.asarray(np.minimum.reduce(felt) / loudest, dtype=float)
 
 
 def _ramp_answers(

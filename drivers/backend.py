@@ -10,16 +10,7 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 
 from drivers.errors import CommandError
-from drivers.guard import SafeCommand, SafeEnvelope
-from drivers.protocol.messages import (
-    Apply,
-    Broadcast,
-    Event,
-    LoadEnvelope,
-    Reply,
-    Request,
-    Stage,
-)
+from drivers.protocol.messages import Broadcast, Event, Reply, Request
 from drivers.statistics import WireCounters
 
 
@@ -48,7 +39,7 @@ class Backend(ABC):
         timeout [s]: for all of it; longer where the wire itself needs longer. Raises LinkTimeout,
         LinkError. A Nak is returned, not raised. Cancelling leaves the wire usable.
         Sets and envelopes must be a SafeCommand and a SafeEnvelope: TypeError for others, as
-        `require_safe` raises it.
+        `drivers.guard.require_safe` raises it.
         """
 
     @property
@@ -113,19 +104,3 @@ class Backend(ABC):
     def loading_time(self, knots: int) -> float:
         """Time [s] on the wire of loading an envelope of so many knots; 0 if unknown."""
         return 0.0
-
-
-def require_safe(request: Request) -> None:
-    """Raise TypeError for a request with a set or an envelope that no guard has let through."""
-    match request:
-        case Stage(command_set=asked) | Apply(command_set=asked):
-            is_safe = type(asked) is SafeCommand
-        case LoadEnvelope(envelope=asked):
-            is_safe = type(asked) is SafeEnvelope
-        case _:
-            return
-    if not is_safe:
-        raise TypeError(
-            f"only a SafeCommand or a SafeEnvelope is played, not a {type(asked).__name__}: "
-            "let a Guard make one"
-        )

@@ -11,8 +11,9 @@ from pathlib import Path
 from urllib.parse import parse_qsl, unquote
 
 from drivers import clock
-from drivers.backend import Backend, require_safe
+from drivers.backend import Backend
 from drivers.errors import CommandError, LinkError
+from drivers.guard import require_safe
 from drivers.protocol.messages import Event, Reply, Request
 from drivers.statistics import WireCounters
 from model.errors import InputError

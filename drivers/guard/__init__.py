@@ -2,6 +2,7 @@
 
 from drivers.guard.guard import Guard, SafeCommand, SafeEnvelope
 from drivers.guard.limits import FREQUENCY_CEILING, FREQUENCY_FLOOR, LEVEL_CEILING, GuardLimits
+from drivers.guard.required import require_safe
 
 __all__ = [
     "FREQUENCY_CEILING",
@@ -11,4 +12,5 @@ __all__ = [
     "GuardLimits",
     "SafeCommand",
     "SafeEnvelope",
+    "require_safe",
 ]

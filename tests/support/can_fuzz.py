@@ -167,8 +167,8 @@ class CanEnds:
                 return _pack([_read_object(0x2000, 1), _segment(0x60), _segment(0x70)])
             case GetCaps() | GetFaults():
                 return _pack([_read_object(0x2008, 0), _segment(0x60)])
-            case LoadEnvelope(envelope=envelope):
-                return _pack(_write_object(0x2100, _ENVELOPE_SLOT, pack_envelope(envelope)))
+            case LoadEnvelope() as load:
+                return _pack(_write_object(0x2100, _ENVELOPE_SLOT, pack_envelope(load)))
             case _:
                 return _pack(list(encode_order(request, node=1, sequence=7)))
 

@@ -22,6 +22,7 @@ from drivers.protocol.messages import (
     Commit,
     Disarm,
     GetStatus,
+    LoadEnvelope,
     Ping,
     Stage,
     Stop,
@@ -123,7 +124,10 @@ class Session:
         )
         yield self._asked("Apply token 516, but the frame of channel 3 is lost", torn[0], *torn[2:])
         shape = self.guard.check_envelope(Envelope(5, 0.005, (Knot(0.1, 90.0), Knot(1.0, -0.01))))
-        assert pack_envelope(shape) == b"".join(frame.data[1:] for frame in _ENVELOPE[1:])[:11]
+        assert (
+            pack_envelope(LoadEnvelope(shape))
+            == b"".join(frame.data[1:] for frame in _ENVELOPE[1:])[:11]
+        )
         yield self._asked("Load an envelope into slot 5, 2100sub5", *_ENVELOPE)
         shaped = self.guard.check(CommandSet(517, _SHAPED, ramp=0.0, valid_for=0.0))
         yield self._ordered("Apply token 517 with this onset", Apply(shaped), 9)

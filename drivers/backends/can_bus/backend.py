@@ -28,7 +28,6 @@ from drivers.codec.can_bus.orders import (
 )
 from drivers.codec.can_bus.timing import commit_time, frames_time, loading_time, round_trip_time
 from drivers.errors import FrameError, LinkError, LinkTimeout
-from drivers.guard import SafeEnvelope
 from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.messages import (
     Achieved,
@@ -140,8 +139,10 @@ class CanBackend(WireBackend):
                 return await self._objects_job(
                     lambda objects: objects.faults(timeout=timeout), timeout
                 )
-            case LoadEnvelope(envelope=envelope):
-                return await self._load(envelope, timeout)
+            case LoadEnvelope() as load:
+                return await self._objects_job(
+                    lambda objects: objects.load_envelope(load, timeout=timeout), timeout
+                )
             case _:
                 return await self._order(request, timeout)
 
@@ -162,16 +163,6 @@ class CanBackend(WireBackend):
         self._send([CanFrame(cob_id("nmt"), bytes([_START, self._url.node]))])
         self._node.start()
         return identity
-
-    async def _load(self, envelope: Any, timeout: float) -> Reply:
-        if type(envelope) is not SafeEnvelope:
-            raise TypeError(
-                f"only a SafeEnvelope goes on the wire, not a {type(envelope).__name__}: "
-                "let Guard.check_envelope make one"
-            )
-        return await self._objects_job(
-            lambda objects: objects.load_envelope(envelope, timeout=timeout), timeout
-        )
 
     async def _order(self, order: Order, timeout: float) -> Reply:
         if isinstance(order, Arm):

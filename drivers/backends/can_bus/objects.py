@@ -30,13 +30,13 @@ from drivers.codec.can_bus.objects import (
     unpack_identity,
 )
 from drivers.errors import FrameError, LinkError, LinkTimeout
-from drivers.guard import SafeEnvelope
 from drivers.protocol.messages import (
     Achieved,
     Capabilities,
     FaultList,
     Identity,
     Loaded,
+    LoadEnvelope,
     Nak,
 )
 
@@ -148,9 +148,10 @@ class ObjectClient:
             lambda: unpack_achieved(self._client.upload(index_of("achieved"), 0)), timeout
         )
 
-    def load_envelope(self, envelope: SafeEnvelope, *, timeout: float) -> Loaded | Nak:
+    def load_envelope(self, request: LoadEnvelope, *, timeout: float) -> Loaded | Nak:
         """Keep an envelope under its slot."""
-        data = pack_envelope(envelope)
+        data = pack_envelope(request)
+        envelope = request.envelope
         index = index_of("envelope")
 
         def write() -> Loaded | Nak:

@@ -8,7 +8,7 @@ from drivers.codec.can_bus.frame import BLOCK, CANOPEN, LAYOUTS
 from drivers.codec.payload import Cursor, pack
 from drivers.command import DriveCommand
 from drivers.errors import FrameError
-from drivers.guard import SafeEnvelope
+from drivers.guard import require_safe
 from drivers.protocol.definition import PROTOCOL, Quantity
 from drivers.protocol.messages import (
     Achieved,
@@ -17,6 +17,7 @@ from drivers.protocol.messages import (
     FaultList,
     FaultRecord,
     Identity,
+    LoadEnvelope,
     NakCode,
 )
 
@@ -185,13 +186,10 @@ def unpack_achieved(data: bytes) -> Achieved:
     return Achieved(token, tuple(commands))
 
 
-def pack_envelope(envelope: SafeEnvelope) -> bytes:
+def pack_envelope(request: LoadEnvelope) -> bytes:
     """The domain of an envelope; TypeError for one that has not passed a guard."""
-    if type(envelope) is not SafeEnvelope:
-        raise TypeError(
-            f"only a SafeEnvelope goes on the wire, not a {type(envelope).__name__}: "
-            "let Guard.check_envelope make one"
-        )
+    require_safe(request)
+    envelope = request.envelope
     head = pack((_Q.envelope_step, envelope.step), (_Q.envelope_knots, len(envelope.knots)))
     return head + b"".join(
         pack((_Q.level, knot.level), (_Q.phase, knot.phase)) for knot in envelope.knots

@@ -12,7 +12,7 @@ from dataclasses import replace
 
 from drivers.codec.can_bus.frame import CANOPEN, LAYOUTS, CanFrame, cob_id, command_id
 from drivers.command import CommandSet, DriveCommand
-from drivers.guard import SafeCommand
+from drivers.guard import require_safe
 from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.messages import (
     Apply,
@@ -58,6 +58,7 @@ def encode_order(
 
     sequence: 1..255. fd: as CAN FD, which is answered in one frame of the same kind.
     """
+    require_safe(order)
     match order:
         case Ping():
             beat = CanFrame(cob_id("heartbeat", host_number(node)), bytes([_OPERATIONAL]))
@@ -70,11 +71,6 @@ def encode_order(
         case Commit(token=token):
             return (_order(order, node, sequence, fd=fd, token=_Q.token.to_wire(token)), SYNC)
         case Apply(command_set=wanted) | Stage(command_set=wanted):
-            if type(wanted) is not SafeCommand:
-                raise TypeError(
-                    f"only a SafeCommand goes on the wire, not a {type(wanted).__name__}: "
-                    "let Guard.check make one"
-                )
             head = _order(
                 order,
                 node,

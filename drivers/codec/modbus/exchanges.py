@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from drivers.codec.modbus import blocks
 from drivers.command import CommandSet, DriveCommand, Envelope
 from drivers.errors import CommandError
-from drivers.guard import SafeCommand, SafeEnvelope
+from drivers.guard import require_safe
 from drivers.protocol.definition import PROTOCOL, Quantity
 from drivers.protocol.messages import (
     Apply,
@@ -81,6 +81,7 @@ def encode_request(
 
     tag: 1..65535; channels: how many of them are read; records: how many faults.
     """
+    require_safe(request)
     match request:
         case Hello():
             texts = len(_MAP["input"]["identity"]["texts"])
@@ -197,11 +198,6 @@ def _unsigned(*pairs: tuple[Quantity, float]) -> list[int]:
 
 
 def _pack_set(command_set: CommandSet) -> list[int]:
-    if type(command_set) is not SafeCommand:
-        raise TypeError(
-            f"only a SafeCommand goes on the wire, not a {type(command_set).__name__}: "
-            "let Guard.check make one"
-        )
     by_channel = {command.channel: command for command in command_set.commands}
     if len(by_channel) < len(command_set.commands) or min(by_channel, default=0) < 0:
         raise CommandError("a channel of the set does not exist, or is named twice")
@@ -237,11 +233,6 @@ def _pack_channel(command: DriveCommand) -> list[int]:
 
 
 def _pack_envelope(envelope: Envelope) -> list[int]:
-    if type(envelope) is not SafeEnvelope:
-        raise TypeError(
-            f"only a SafeEnvelope goes on the wire, not a {type(envelope).__name__}: "
-            "let Guard.check_envelope make one"
-        )
     registers = _unsigned(
         (_Q.envelope_slot, envelope.slot),
         (_Q.envelope_step, envelope.step),

@@ -30,6 +30,7 @@ from drivers.codec.serial_line.sets import (
     unpack_envelope,
     unpack_set,
 )
+from drivers.guard import require_safe
 from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.messages import (
     Achieved,
@@ -155,6 +156,7 @@ _TYPE_OF = {request.message: code for code, (request, _) in _EXCHANGES.items()}
 
 def encode_request(request: Request, *, address: int, sequence: int) -> Frame:
     """The frame of a request; TypeError if a set in it has not passed a guard."""
+    require_safe(request)
     code = _TYPE_OF[type(request)]
     payload = _EXCHANGES[code][0].pack(request)
     return Frame(kind=code, address=address, sequence=sequence, payload=payload)

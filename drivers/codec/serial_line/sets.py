@@ -1,12 +1,10 @@
 """Payloads of sets and envelopes on a serial line, written down as pairs: pack and unpack.
 
-Packing asks for what a guard made; unpacking gives plain values, each in range, or Malformed is
-raised.
+Unpacking gives plain values, each in range, or Malformed is raised.
 """
 
 from drivers.codec.payload import Cursor, Malformed, Record, pack
 from drivers.command import CommandSet, DriveCommand, Envelope, Knot
-from drivers.guard import SafeCommand, SafeEnvelope
 from drivers.protocol.definition import PROTOCOL, Quantity
 from drivers.protocol.messages import Achieved, NakCode
 
@@ -64,12 +62,7 @@ def _unpack_commands(cursor: Cursor) -> tuple[DriveCommand, ...]:
 
 
 def pack_set(command_set: CommandSet) -> bytes:
-    """The payload of a set; TypeError for one that no guard has seen."""
-    if type(command_set) is not SafeCommand:
-        raise TypeError(
-            f"only a SafeCommand goes on the wire, not a {type(command_set).__name__}: "
-            "let Guard.check make one"
-        )
+    """The payload of a set."""
     times = _TIMES.pack(command_set.token, command_set.ramp, command_set.valid_for)
     return times + _pack_commands(command_set.commands)
 
@@ -86,12 +79,7 @@ def unpack_set(cursor: Cursor) -> CommandSet:
 
 
 def pack_envelope(envelope: Envelope) -> bytes:
-    """The payload of an envelope; TypeError for one that no guard has seen."""
-    if type(envelope) is not SafeEnvelope:
-        raise TypeError(
-            f"only a SafeEnvelope goes on the wire, not a {type(envelope).__name__}: "
-            "let Guard.check_envelope make one"
-        )
+    """The payload of an envelope."""
     head = pack((_Q.envelope_slot, envelope.slot), (_Q.envelope_step, envelope.step))
     head += pack((_Q.envelope_knots, len(envelope.knots)))
     return head + b"".join(

@@ -10,10 +10,10 @@ from contextlib import suppress
 from urllib.parse import urlsplit
 
 from drivers import clock
-from drivers.backend import require_safe
 from drivers.backends.wire_backend import WireBackend
 from drivers.command import DriveCommand
 from drivers.errors import CommandError, LinkError, LinkTimeout
+from drivers.guard import require_safe
 from drivers.protocol.messages import (
     Achieved,
     Apply,

@@ -19,7 +19,7 @@ from drivers.codec.can_bus.objects import (
     unpack_identity,
 )
 from drivers.codec.can_bus.orders import SYNC, encode_broadcast, encode_order, wanted_commands
-from drivers.command import CommandSet, DriveCommand
+from drivers.command import CommandSet, DriveCommand, Envelope
 from drivers.errors import FrameError
 from drivers.guard import Guard, GuardLimits, SafeCommand
 from drivers.protocol.messages import (
@@ -31,6 +31,7 @@ from drivers.protocol.messages import (
     Event,
     Fault,
     FaultRecord,
+    LoadEnvelope,
     Nak,
     NakCode,
     Ping,
@@ -117,7 +118,7 @@ def test_only_what_a_guard_let_through_is_encoded(safe: Callable[..., SafeComman
         with pytest.raises(TypeError, match="SafeCommand"):
             encode_order(wrap(plain), node=1, sequence=1)
     with pytest.raises(TypeError, match="SafeEnvelope"):
-        pack_envelope(object())  # type: ignore[arg-type]
+        pack_envelope(LoadEnvelope(Envelope(1, 0.005, ())))
 
 
 @given(

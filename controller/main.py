@@ -19,6 +19,8 @@ import typer
 from typer.core import TyperGroup
 from typer.main import get_group
 
+from model.errors import in_our_words
+
 BAD_INPUT = 2
 BUG = 70  # EX_SOFTWARE of sysexits.h
 INTERRUPTED = 130
@@ -182,7 +184,7 @@ def _of_system(error: OSError) -> str:
 
 def _report_usage(error: typer.TyperException) -> int:
     """Say what was wrong with the command line, or the help where a command was left out."""
-    message = _in_our_words(error.format_message())
+    message = in_our_words(error.format_message())
     context = getattr(error, "ctx", None)
     if context is None:
         _say(f"error: {message}")
@@ -192,15 +194,6 @@ def _report_usage(error: typer.TyperException) -> int:
         stop = "" if message.endswith((".", "?")) else "."
         _say(f"error: {message}{stop} See  {context.command_path} --help")
     return BAD_INPUT
-
-
-def _in_our_words(message: str) -> str:
-    """Without the words of the library that reads numbers and choices."""
-    return (
-        message.replace("Value error, ", "")
-        .replace("Input should be a valid ", "must be a valid ")
-        .replace("Input should be ", "must be ")
-    )
 
 
 def _say(text: str) -> None:

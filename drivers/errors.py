@@ -10,6 +10,8 @@
 Third-party exceptions are translated into these where a backend meets its library, cause kept.
 """
 
+import re
+
 
 class DriverError(Exception):
     """Anything that the driver layer raises on purpose."""
@@ -44,3 +46,8 @@ class CommandRefused(DriverError):
 
 class CommandError(DriverError, ValueError):
     """A request that makes no sense: bad URL, unknown channel, value out of range."""
+
+
+def said_by_system(problem: BaseException) -> str:
+    """What the system says of a port or a connection, once and without its number."""
+    return re.sub(r"^.*\[Errno -?\d+\] ", "", str(problem), flags=re.DOTALL)

@@ -14,3 +14,22 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
     by_lower = {each.lower(): each for each in known}
     close = get_close_matches(name.lower(), by_lower, n=1, cutoff=0.6)
     return f"did you mean {by_lower[close[0]]}? " if close else ""
+
+
+def in_our_words(message: str) -> str:
+    """What the libraries that check values say of one, in the words of all other errors."""
+    for theirs, ours in _WORDS.items():
+        message = message.replace(theirs, ours)
+    return message
+
+
+_WORDS = {
+    "Value error, ": "",
+    "Field required": "is missing",
+    "Extra inputs are not permitted": "is unknown",
+    "Input should be ": "must be ",
+    "String should have ": "must have ",
+    "List should have ": "must have ",
+    "greater than or equal to": "at least",
+    "less than or equal to": "at most",
+}

@@ -57,9 +57,11 @@ async def _line(
     try:
         port = serial.Serial(place.place, baudrate=place.baud, timeout=0, exclusive=True)
     except (OSError, ValueError) as problem:
+        number = getattr(problem, "errno", None)
+        said = os.strerror(number) if number else problem
         raise LinkError(
             f"serial port {place.place} cannot be opened: check its name, and that nobody else has "
-            f"it open (the system says: {problem})"
+            f"it open (the system says: {said})"
         ) from problem
     loop = asyncio.get_running_loop()
 

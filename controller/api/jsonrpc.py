@@ -14,6 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic_core import from_json
 
 from controller.api.parts import Message
+from model.errors import in_our_words
 
 LONGEST_LINE = 1 << 16  # bytes, with the line feed
 _LONGEST_TEXT = 600  # characters of an error's message
@@ -169,7 +170,7 @@ def _first_problem(error: ValidationError) -> str:
     problems = error.errors(include_url=False, include_context=False, include_input=False)
     more = f" ({len(problems) - 1} more)" if len(problems) > 1 else ""
     where = _where(error)
-    return f"{where + ': ' if where else ''}{problems[0]['msg']}{more}"
+    return f"{where + ': ' if where else ''}{in_our_words(problems[0]['msg'])}{more}"
 
 
 def _where(error: ValidationError) -> str | None:

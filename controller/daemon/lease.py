@@ -63,7 +63,7 @@ class LeaseBook:
         if not secrets.compare_digest(held.token.encode(), token.encode()):
             raise RpcError(
                 ErrorCode.LEASE,
-                f"the lease that runs is {held.owner!a}'s, not yours",
+                f"the lease that runs belongs to {held.owner!a}, not to you",
                 remedy="wait until it is over, or disarm first: anyone may",
             )
         return self.begin(held.token, now=now)

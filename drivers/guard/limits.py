@@ -56,15 +56,20 @@ class Bounds:
     envelope_step_max: float
 
 
+_NEEDED = ("frequency_min", "frequency_max", "level_max", "ramp_max")
+
+
 def tightest(limits: GuardLimits, capabilities: Capabilities) -> Bounds:
     """The bounds in force; raises CommandError for limits that leave nothing to play."""
-    numbers = (
-        *(limits.frequency_min, limits.frequency_max, limits.level),
-        *(capabilities.frequency_min, capabilities.frequency_max),
-        *(capabilities.level_max, capabilities.ramp_max),
-    )
-    if not all(math.isfinite(number) for number in numbers):
-        raise CommandError(f"guard limits must be finite; got {limits} and {capabilities}")
+    for whose, told, names in (
+        ("the configured", limits, ("frequency_min", "frequency_max", "level")),
+        ("the amplifier's", capabilities, _NEEDED),
+    ):
+        for name in names:
+            if not math.isfinite(getattr(told, name)):
+                raise CommandError(
+                    f"{whose} {name} is {getattr(told, name)}; it must be a finite number"
+                )
     for name in ("slew", "power", "on_time", "duty", "rate"):
         if not getattr(limits, name) > 0:
             raise CommandError(

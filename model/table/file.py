@@ -13,13 +13,14 @@ import json
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from model.drive_modes import MODES
-from model.errors import InputError
+from model.errors import InputError, in_our_words
 from model.fem.mesh import Mesh
 from model.files.array_file import UNREADABLE, digest_of, read_arrays, write_arrays
 from model.finger.grid import Grid
@@ -137,8 +138,9 @@ def load_table(path: Path | str, *, fingerprint: str | None = None) -> Localizat
             f"there is no table {path}; build one: era table build RIG -o {path}"
         ) from None
     except UNREADABLE as error:
+        why = "it is no .npz file" if isinstance(error, BadZipFile) else error
         raise InputError(
-            f"{path} is not a readable localization table ({error}); give a file that era table "
+            f"{path} is not a readable localization table ({why}); give a file that era table "
             "build has written, or, if this was one, build it again"
         ) from error
     try:
@@ -146,7 +148,9 @@ def load_table(path: Path | str, *, fingerprint: str | None = None) -> Localizat
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(str(part) for part in first["loc"]) or "header"
-        raise InputError(f"{path}: bad header ({where}: {first['msg']}); {rebuild}") from error
+        raise InputError(
+            f"{path}: bad header ({where}: {in_our_words(first['msg'])}); {rebuild}"
+        ) from error
     if header.format != FORMAT or header.format_version != FORMAT_VERSION:
         raise InputError(
             f"{path} has format {header.format!r} version {header.format_version}; this program "
@@ -154,7 +158,10 @@ def load_table(path: Path | str, *, fingerprint: str | None = None) -> Localizat
         )
     if _digest(header.model_dump(exclude={"sha256"}), content) != header.sha256:
         raise InputError(f"{path} is damaged: its content does not match its checksum; {rebuild}")
-    table = _assemble(header, content, path)
+    try:
+        table = _assemble(header, content, path)
+    except InputError as error:
+        raise InputError(f"{error}; {rebuild}") from error
     if table.fingerprint != header.fingerprint:
         raise InputError(f"{path}: the fingerprint is not that of the plate in it; {rebuild}")
     if fingerprint is not None and fingerprint != table.fingerprint:

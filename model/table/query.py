@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from model.errors import InputError
+from model.errors import InputError, in_our_words
 from model.finger.perception import STRONG_DB_SL
 from model.table.question import Question
 from model.table.robust import with_robust_contrast
@@ -44,7 +44,7 @@ def question_from_json(line: str) -> Question:
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(str(part) for part in first["loc"])
-        raise InputError(f"{where or 'line'}: {first['msg']}") from None
+        raise InputError(f"{where or 'line'}: {in_our_words(first['msg'])}") from None
     targets = [*([] if asked.target is None else [asked.target]), *asked.targets]
     return Question(
         targets=tuple((x, y) for x, y in targets),

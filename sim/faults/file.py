@@ -17,7 +17,7 @@ from pydantic import ValidationError
 from model.config.document import read_document
 from model.config.sections import Quantity, Section, Validation
 from model.config.units import RATIO, TIME
-from model.errors import InputError
+from model.errors import InputError, in_our_words
 from sim.faults.episodes import Episode, FaultKind, Faults, Toward
 
 
@@ -73,7 +73,7 @@ def episode_of(told: Mapping[str, Any]) -> Episode:
         return Episode(**_EpisodeSection.model_validate(dict(told)).model_dump())
     except ValidationError as error:
         problems = (
-            f"{'.'.join(map(str, details['loc']))}: {details['msg']}"
+            f"{'.'.join(map(str, details['loc']))}: {in_our_words(details['msg'])}"
             for details in error.errors(include_url=False)
         )
         raise InputError("; ".join(problems)) from None

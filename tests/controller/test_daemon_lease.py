@@ -32,7 +32,7 @@ def test_only_the_token_renews(token: str) -> None:
     """Whoever has not got the token cannot keep the plate armed, whatever is sent."""
     book = LeaseBook()
     book.grant("me", lasts=5, now=0)
-    with pytest.raises(RpcError, match="not yours; wait until it is over"):
+    with pytest.raises(RpcError, match="not to you; wait until it is over"):
         book.renew(token, now=1)
     assert book.ends == 5
 

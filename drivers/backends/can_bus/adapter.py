@@ -15,7 +15,7 @@ from drivers.backends.can_bus.interfaces import open_bus, send_all, wake
 from drivers.backends.stand_in import STAND_IN, Adapter
 from drivers.backends.urls.can_bus import CanBusUrl
 from drivers.codec.can_bus.frame import CanFrame
-from drivers.errors import LinkError, LinkTimeout
+from drivers.errors import LinkError, LinkTimeout, said_by_system
 
 _READ_TIMEOUT = 0.05  # s; how long the reader of a bus that cannot be woken notices its end
 _BUS_OFF = 0x40  # of the class of an error frame, as SocketCAN numbers them
@@ -157,4 +157,4 @@ def _why_not_open(url: CanBusUrl, problem: Exception) -> str:
         )
     else:
         remedy = "check its name"
-    return f"CAN bus {url} cannot be opened: {remedy} (the system says: {problem})"
+    return f"CAN bus {url} cannot be opened: {remedy} (the system says: {said_by_system(problem)})"

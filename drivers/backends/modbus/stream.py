@@ -11,7 +11,7 @@ import serial
 from drivers.backends.ports.watched import READ_TIMEOUT, WRITE_TIMEOUT, WatchedPort, remedy_of
 from drivers.backends.stand_in import STAND_IN, Port
 from drivers.backends.urls.modbus import ModbusUrl
-from drivers.errors import LinkError, LinkTimeout
+from drivers.errors import LinkError, LinkTimeout, said_by_system
 
 _CONNECT_TIMEOUT = 1.0  # s; an amplifier in the same building answers a hundred times faster
 _UNSENT_MAX = 4096  # bytes; sixteen frames that a peer does not take are no slow network any more
@@ -92,7 +92,7 @@ async def _connect(
     except OSError as problem:
         raise LinkError(
             f"{line.place} takes no Modbus connection: check the address and the port, and that "
-            f"the amplifier is switched on (the system says: {problem})"
+            f"the amplifier is switched on (the system says: {said_by_system(problem)})"
         ) from problem
     return connection
 
@@ -128,4 +128,5 @@ def _open_port(line: ModbusUrl) -> serial.Serial:
 
 def _why_not_open(device: str, problem: Exception) -> str:
     remedy = remedy_of(problem) or "check its name, that it is plugged in, its speed and its parity"
-    return f"serial port {device} cannot be opened: {remedy} (the system says: {problem})"
+    said = said_by_system(problem)
+    return f"serial port {device} cannot be opened: {remedy} (the system says: {said})"

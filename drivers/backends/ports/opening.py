@@ -16,7 +16,7 @@ from drivers.backends.ports.watched import (
     remedy_of,
 )
 from drivers.backends.stand_in import STAND_IN, Port
-from drivers.errors import LinkError
+from drivers.errors import LinkError, said_by_system
 
 
 async def open_port(
@@ -69,4 +69,5 @@ def _why_not_open(port: str, problem: Exception) -> str:
         remedy = "no port fits the pattern; list them: python -m serial.tools.list_ports -v"
     else:
         remedy = "check its name, that it is plugged in, and its speed"
-    return f"serial port {port} cannot be opened: {remedy} (the system says: {problem})"
+    said = said_by_system(problem)
+    return f"serial port {port} cannot be opened: {remedy} (the system says: {said})"

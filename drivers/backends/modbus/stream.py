@@ -1,25 +1,16 @@
 """The bytes of a Modbus line, both ways: a TCP connection or a serial port."""
 
 import asyncio
-import contextlib
-import os
 from collections.abc import Callable
 from typing import cast
 
-import serial
-
-from drivers.backends.ports.watched import READ_TIMEOUT, WRITE_TIMEOUT, WatchedPort, remedy_of
-from drivers.backends.stand_in import STAND_IN, Port
+from drivers.backends.ports.opening import open_port
+from drivers.backends.stand_in import Port
 from drivers.backends.urls.modbus import ModbusUrl
 from drivers.errors import LinkError, LinkTimeout, said_by_system
 
 _CONNECT_TIMEOUT = 1.0  # s; an amplifier in the same building answers a hundred times faster
 _UNSENT_MAX = 4096  # bytes; sixteen frames that a peer does not take are no slow network any more
-_FAILURES: tuple[type[Exception], ...] = (OSError, ValueError)  # of pyserial, at opening
-with contextlib.suppress(ImportError):  # Windows has no terminals
-    import termios
-
-    _FAILURES += (termios.error,)
 
 
 async def open_stream(
@@ -27,7 +18,14 @@ async def open_stream(
 ) -> Port:
     """Open a line; LinkError says what to do about one that cannot be opened."""
     if line.device:
-        return await _open_serial(line, on_data, on_loss)
+        return await open_port(
+            line.device,
+            baud=line.baud,
+            parity=line.parity,
+            stop=line.stop,
+            on_data=on_data,
+            on_loss=on_loss,
+        )
     return await _connect(line, on_data, on_loss)
 
 
@@ -95,38 +93,3 @@ async def _connect(
             f"the amplifier is switched on (the system says: {said_by_system(problem)})"
         ) from problem
     return connection
-
-
-async def _open_serial(
-    line: ModbusUrl, on_data: Callable[[bytes], None], on_loss: Callable[[str], None]
-) -> Port:
-    stand_in = STAND_IN.get()
-    if stand_in is not None:
-        return await stand_in.open_port(line.device, on_data=on_data, on_loss=on_loss)
-    try:
-        port = await asyncio.to_thread(_open_port, line)
-    except _FAILURES as problem:
-        raise LinkError(_why_not_open(line.device, problem)) from problem
-    return WatchedPort(port, line.device, on_data, on_loss)
-
-
-def _open_port(line: ModbusUrl) -> serial.Serial:
-    # A pseudo-terminal has no parity, and where it is asked for one it may refuse everything.
-    is_pseudo = os.path.realpath(line.device).startswith("/dev/pts/")
-    port = serial.Serial(
-        line.device,
-        baudrate=line.baud,
-        parity=serial.PARITY_NONE if is_pseudo else line.parity,
-        stopbits=line.stop,
-        timeout=READ_TIMEOUT,
-        write_timeout=WRITE_TIMEOUT,
-        exclusive=True,
-    )
-    port.reset_input_buffer()
-    return port
-
-
-def _why_not_open(device: str, problem: Exception) -> str:
-    remedy = remedy_of(problem) or "check its name, that it is plugged in, its speed and its parity"
-    said = said_by_system(problem)
-    return f"serial port {device} cannot be opened: {remedy} (the system says: {said})"

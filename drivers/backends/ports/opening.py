@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 import errno
+import os
 import socket
 from collections.abc import Callable
 
@@ -18,29 +19,46 @@ from drivers.backends.ports.watched import (
 from drivers.backends.stand_in import STAND_IN, Port
 from drivers.errors import LinkError, said_by_system
 
+_FAILURES: tuple[type[Exception], ...] = (OSError, ValueError)  # of pyserial, at opening
+with contextlib.suppress(ImportError):  # Windows has no terminals
+    import termios
+
+    _FAILURES += (termios.error,)
+
 
 async def open_port(
-    name: str, *, baud: int, on_data: Callable[[bytes], None], on_loss: Callable[[str], None]
+    name: str,
+    *,
+    baud: int,
+    parity: str = serial.PARITY_NONE,
+    stop: int = 1,
+    on_data: Callable[[bytes], None],
+    on_loss: Callable[[str], None],
 ) -> Port:
     """Open a port, for this process alone where the system can; raises LinkError.
 
-    on_data is called with what comes in, on_loss once with why the port was lost.
+    parity, stop bits: as pyserial names them. on_data is called with what comes in, on_loss once
+    with why the port was lost.
     """
     stand_in = STAND_IN.get()
     if stand_in is not None:
         return await stand_in.open_port(name, on_data=on_data, on_loss=on_loss)
     try:
-        port = await asyncio.to_thread(_open_port, name, baud)
-    except (OSError, ValueError) as problem:
+        port = await asyncio.to_thread(_open_port, name, baud, parity, stop)
+    except _FAILURES as problem:
         raise LinkError(_why_not_open(name, problem)) from problem
     return WatchedPort(port, name, on_data, on_loss)
 
 
-def _open_port(name: str, baud: int) -> serial.Serial:
+def _open_port(name: str, baud: int, parity: str, stop: int) -> serial.Serial:
+    # A pseudo-terminal has no parity, and where it is asked for one it may refuse everything.
+    is_pseudo = os.path.realpath(name).startswith("/dev/pts/")
     port = serial.serial_for_url(
         name,
         do_not_open=True,
         baudrate=baud,
+        parity=serial.PARITY_NONE if is_pseudo else parity,
+        stopbits=stop,
         timeout=READ_TIMEOUT,
         # pyserial has none over RFC 2217
         write_timeout=None if name.startswith("rfc2217://") else WRITE_TIMEOUT,
@@ -68,6 +86,6 @@ def _why_not_open(port: str, problem: Exception) -> str:
     elif port.startswith("hwgrep://"):
         remedy = "no port fits the pattern; list them: python -m serial.tools.list_ports -v"
     else:
-        remedy = "check its name, that it is plugged in, and its speed"
+        remedy = "check its name, that it is plugged in, its speed and its parity"
     said = said_by_system(problem)
     return f"serial port {port} cannot be opened: {remedy} (the system says: {said})"

@@ -13,7 +13,7 @@ from model.errors import InputError
 def test_a_full_disk_costs_nothing_that_was_there(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The rig of before stays as it was, nothing half written stands beside it, the cause is told."""
+    """The rig of before stays as it was, nothing half written is beside it, the cause is told."""
 
     def full(_: int) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))

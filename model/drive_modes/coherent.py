@@ -68,8 +68,7 @@ class Coherent:
         weights, bound = self._weights(fields, _even_form(fields, sigma=ERROR_SHARE))
         likely = _likely_power(fields, weights)
         every = np.arange(fields.frequency_count)
-        found.offer(every, weights, fields, likely=likely)
-        found.limit(every, bound)
+        found.offer(every, weights, fields, likely=likely, bound=bound)
         if not found.reaches:
             self._offer_louder(fields, found)
         elif not fields.is_alone:  # a mean needs no moving
@@ -100,8 +99,7 @@ class Coherent:
             shares /= np.add.reduce(shares, axis=-1, keepdims=True)
             weights, bound = self._weights(fields, _mean_form(fields, shares))
             likely = _likely_power(fields, weights)
-            found.offer(chosen, weights, fields, likely=likely)
-            found.limit(chosen, bound)
+            found.offer(chosen, weights, fields, likely=likely, bound=bound)
 
     def loudest(self, fields: Fields) -> float:
         """How many times above threshold the targets can be made to feel it."""
@@ -111,11 +109,13 @@ class Coherent:
         return float((peak / fields.threshold).max())
 
     def _offer_louder(self, fields: Fields, found: "_Best") -> None:
+        every = np.arange(fields.frequency_count)
+        unknown = np.full(len(every), np.inf, dtype=np.float32)
         for sigma, gain in GIVEN_UP:
             weights, _ = self._weights(fields, _even_form(fields, sigma=sigma))
             weights = _raised(weights, gain)
-            every = np.arange(fields.frequency_count)
-            found.offer(every, weights, fields, likely=_likely_power(fields, weights))
+            likely = _likely_power(fields, weights)
+            found.offer(every, weights, fields, likely=likely, bound=unknown)
             if found.reaches:
                 break
 
@@ -156,17 +156,22 @@ class _Best:
 
     def __init__(self, fields: Fields, least: float) -> None:
         self._shape = fields.frequency_count, fields.era_count
-        self._offers: list[tuple[IntArray, SingleComplex, Single]] = []
-        self._bounds: list[tuple[IntArray, Single]] = []
+        self._offers: list[tuple[IntArray, SingleComplex, Single, Single]] = []
         self.least = self.score = least
         self.refused, self.reaches = 0.0, False
 
     def offer(
-        self, frequencies: IntArray, weights: SingleComplex, fields: Fields, *, likely: Single
+        self,
+        frequencies: IntArray,
+        weights: SingleComplex,
+        fields: Fields,
+        *,
+        likely: Single,
+        bound: Single,
     ) -> None:
         """Weights (n, eras) with their power at the quiet points (n, q), errors included.
 
-        fields: at these frequencies only.
+        fields: at these frequencies only; bound (n,): what no weights can have at them.
         """
         power = likely.mean(axis=-1) if fields.is_alone else np.maximum.reduce(likely, axis=-1)
         peak = _peak(fields, weights)
@@ -176,29 +181,24 @@ class _Best:
         if count < len(reaches):
             self.refused = max(self.refused, float(score[~reaches].max()))
             score = np.where(reaches, score, 0)
-        self._offers.append((frequencies, weights, score))
+        self._offers.append((frequencies, weights, score, bound))
         self.score = max(self.score, float(score.max()))
         self.reaches = self.reaches or count > 0
 
-    def limit(self, frequencies: IntArray, bound: Single) -> None:
-        """No weights at frequencies (n,) can have more than (n,)."""
-        self._bounds.append((frequencies, bound))
-
     def search(self) -> "Search":
         """The best at each frequency."""
-        at, weights, score = (np.concatenate(each) for each in zip(*self._offers, strict=True))
-        # The best is written last, and so stays.
-        order = np.argsort(-score, kind="stable")[::-1]
+        at, weights, score, bound = map(np.concatenate, zip(*self._offers, strict=True))
         found = Search(
             score=np.zeros(self._shape[0], dtype=np.float32),
             weights=np.zeros(self._shape, dtype=np.complex64),
             bound=np.full(self._shape[0], np.inf, dtype=np.float32),
             is_held_back=self.refused > self.score,
         )
+        # The best is written last, and so stays.
+        order = np.argsort(-score, kind="stable")[::-1]
         found.score[at[order]] = score[order]
         found.weights[at[order]] = weights[order]
-        for frequencies, bound in self._bounds:
-            found.bound[frequencies] = np.minimum(found.bound[frequencies], bound)
+        np.minimum.at(found.bound, at, bound)
         return found
 
 

@@ -5,6 +5,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).parents[1]
 
 
@@ -45,3 +47,24 @@ def test_every_page_can_be_found() -> None:
     pages = {path.relative_to(docs) for path in docs.rglob("*.md")}
     names = {page.with_suffix("").as_posix() for page in pages if page.parts[0] != "_build"}
     assert names - listed - {name for name in names if name.startswith("decisions/00")} == {"index"}
+
+
+@pytest.mark.parametrize("name", ["README.md", "CONTRIBUTING.md", "SECURITY.md", "CHANGELOG.md"])
+def test_links_beside_the_docs_lead_somewhere(name: str) -> None:
+    """What a link to a file of the project names is there."""
+    links = re.findall(r"\]\(([^)#:\s]+)(?:#[^)]*)?\)", (ROOT / name).read_text("utf-8"))
+    assert [link for link in links if not (ROOT / link).exists()] == []
+
+
+def test_pages_that_are_named_in_code_are_there() -> None:
+    """Messages, docstrings and the changelog name pages by their path."""
+    folders = ["benchmarks", "controller", "drivers", "era_haptics", "examples", "model", "sim"]
+    files = [path for name in folders for path in (ROOT / name).rglob("*.py")]
+    files += [ROOT / "CHANGELOG.md", ROOT / "Makefile", ROOT / "SECURITY.md"]
+    named = {
+        (page, path.name)
+        for path in files
+        for page in re.findall(r"\bdocs/[a-z][\w/-]+\.md\b", path.read_text("utf-8"))
+    }
+    assert len(named) > 30
+    assert {(page, path) for page, path in named if not (ROOT / page).is_file()} == set()

@@ -95,7 +95,7 @@ def test_every_fault_and_nak_has_a_code() -> None:
 
 @pytest.mark.parametrize("name", FILES)
 def test_the_files_are_up_to_date(name: str) -> None:
-    """EDS and DBC in docs/ are what `python -m drivers.codec.can_bus.generate docs` writes."""
+    """EDS and DBC are what `python -m drivers.codec.can_bus.generate docs/reference` writes."""
     assert (DOCS / name).read_text("utf-8") == FILES[name]()
 
 

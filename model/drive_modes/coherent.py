@@ -87,7 +87,7 @@ class Coherent:
         chosen, shares = np.arange(fields.frequency_count), np.ones_like(likely)
         many = fields.quiet.shape[-1] > MANY_POINTS
         for move in MOVES[:FEWER_MOVES] if many else MOVES:
-            kept = np.flatnonzero(bound > near * found.score)
+            kept = (bound > near * found.score).nonzero()[0]
             if len(kept) == 0:
                 return
             if len(kept) > PROMISING:

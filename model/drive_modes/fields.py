@@ -153,18 +153,19 @@ def judge(fields: Fields, drive: Drive) -> Outcome:
     threshold = fields.threshold[at][:, None]
     peaks, sensations = [], []
     for target in fields.targets:
-        amplitudes = np.abs(rows @ target[at])[:, 0]
-        peaks.append(amplitudes.sum(axis=0).mean())
-        sensations.append(np.sqrt(((amplitudes / threshold) ** 2).sum(axis=0)).mean())
-    quiet = np.abs(rows @ fields.quiet[at])[:, 0]
-    wrong = (np.abs(rows) ** 2 @ fields.quiet_power[at])[:, 0]
+        amplitudes = np.abs(rows @ target.take(at, axis=0))[:, 0]
+        peaks.append(float(amplitudes.sum()) / target.shape[-1])
+        felt = np.sqrt(((amplitudes / threshold) ** 2).sum(axis=0))
+        sensations.append(float(felt.sum()) / target.shape[-1])
+    quiet = np.abs(rows @ fields.quiet.take(at, axis=0))[:, 0]
+    wrong = (np.abs(rows) ** 2 @ fields.quiet_power.take(at, axis=0))[:, 0]
     likely = np.sqrt(quiet**2 + ERROR_SHARE**2 * wrong).sum(axis=0)
     return Outcome(
-        peak=float(min(peaks)),
-        sensation=float(min(sensations)),
+        peak=min(peaks),
+        sensation=min(sensations),
         quiet_peak=quietness(quiet.sum(axis=0), fields),
         quiet_sensation=float(np.sqrt(((quiet / threshold) ** 2).sum(axis=0)).max()),
-        score=float(min(peaks)) / quietness(likely, fields),
+        score=min(peaks) / quietness(likely, fields),
     )
 
 

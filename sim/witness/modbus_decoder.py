@@ -32,8 +32,9 @@ _READ_TAGS = (*_TAGGED, _STATUS, _REFUSAL, _CAPABILITIES, _IDENTITY, _ACHIEVED, 
 
 @dataclass(frozen=True, slots=True)
 class _Open:
-    """A telegram that waits for its answer."""
+    """A telegram that waits for its answer, from the unit that was asked."""
 
+    unit: int
     key: object
     function: int
     read_from: int | None
@@ -79,7 +80,7 @@ class ModbusDecoder:
         try:
             return self._asked_by(telegram, pdu, key)
         except (OutOfRange, struct.error, IndexError) as problem:
-            self._remember(telegram, _Open(key, pdu[0], None, 0, None))
+            self._remember(telegram, _Open(telegram.unit, key, pdu[0], None, 0, None))
             return Asked(Kind.LOOK, telegram.unit, key, problem=str(problem) or "too short")
 
     def _asked_by(self, telegram: Telegram, pdu: bytes, key: object) -> Meaning:
@@ -106,7 +107,7 @@ class ModbusDecoder:
             tag = self._tag(telegram.unit, *written)
         expected = tag if tag is not None else self._tags.get(telegram.unit)
         at, count = read or (None, 0)
-        self._remember(telegram, _Open(key, function, at, count, expected))
+        self._remember(telegram, _Open(telegram.unit, key, function, at, count, expected))
         if written is not None:
             return _of_write(telegram.unit, key, *written, read_from=at)
         kind = _READ_KINDS.get(at or 0, Kind.LOOK)
@@ -133,7 +134,7 @@ class ModbusDecoder:
     def _answer(self, telegram: Telegram) -> Meaning:
         pdu = telegram.pdu or b""
         asked = self._open.get(telegram.number)
-        if asked is None or pdu[0] & 0x7F != asked.function:
+        if asked is None or (telegram.unit, pdu[0] & 0x7F) != (asked.unit, asked.function):
             problem = ANSWERS_DAMAGE if self._is_damaged else ""
             return Answered(telegram.unit, problem=problem)
         key = asked.key

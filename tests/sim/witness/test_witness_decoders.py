@@ -9,6 +9,7 @@ import pytest
 from sim.witness.can_decoder import CanDecoder
 from sim.witness.can_text import CanFrame, SlcanText, SocketcandText
 from sim.witness.modbus_decoder import ModbusDecoder
+from sim.witness.modbus_frames import crc16
 from sim.witness.seen import (
     Answered,
     Asked,
@@ -209,6 +210,28 @@ def test_a_refusal_of_an_earlier_write_is_wrong_where_nothing_damages(are_on: bo
         witness.bytes("line", toward, time, data)
     found = [violation.invariant for violation in witness.finish(0.010)]
     assert found == ([] if are_on else ["answer"])
+
+
+def test_what_comes_again_from_another_unit_answers_nothing() -> None:
+    """Two units of one RTU line are asked who they are; the first says it twice, then the other.
+
+    The page's Hello, once more with 2 for its unit.
+    """
+    frames = {name: data for name, _, data in _modbus("RTU")}
+    first = [frames["Hello request"], frames["Hello reply"]]
+    other = [b"\2" + data[1:-2] for data in first]
+    decoder = ModbusDecoder(over_tcp=False)
+    pieces: tuple[tuple[Toward, bytes], ...] = (
+        ("amplifier", first[0]),
+        ("host", first[1]),
+        ("amplifier", other[0] + crc16(other[0])),
+        ("host", first[1]),
+        ("host", other[1] + crc16(other[1])),
+    )
+    seen = [decoder.feed(toward, 0.0, data)[0][1] for toward, data in pieces]
+    asked = [one.key for one in seen if isinstance(one, Asked)]
+    answered = [(one.address, one.key) for one in seen if isinstance(one, Answered)]
+    assert answered == [(1, asked[0]), (1, None), (2, asked[1])]
 
 
 @pytest.mark.parametrize(("over", "broken"), [(0.02, ["answer"]), (0.04, [])])

@@ -4,7 +4,7 @@ Reading is total: registers become a message with every value in range, or Frame
 """
 
 import struct
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from enum import IntEnum
 from typing import Any, TypeVar
 
@@ -33,20 +33,20 @@ _FAULT_SIZE: int = _MAP["fault_registers"]
 _TEXT_SIZE: int = _MAP["text_registers"]
 _NO_CHANNEL = 255
 
-# Registers that are not named as their quantity is.
-_QUANTITIES: dict[str, Quantity] = {
-    **vars(_Q),
-    **dict.fromkeys(("frequency_min", "frequency_max", "frequency_step"), _Q.frequency),
-    **dict.fromkeys(("level_max", "level_step"), _Q.level),
-    **dict.fromkeys(("watchdog_min", "watchdog_max"), _Q.watchdog),
-    **dict.fromkeys(("envelope_step_min", "envelope_step_max"), _Q.envelope_step),
-    **{"ramp_max": _Q.ramp, "slot": _Q.envelope_slot, "step": _Q.envelope_step},
+# By register, as protocol.yaml says; those of channels and faults have their quantities' names.
+_QUANTITIES: dict[str, Quantity] = vars(_Q) | {
+    register: vars(_Q)[kind]
+    for block in (*_MAP["input"].values(), *_MAP["holding"].values())
+    for register, kind in block["registers"].items()
+    if kind in vars(_Q)
 }
 
 _EnumT = TypeVar("_EnumT", bound=IntEnum)
 
 
-def _fields(names: Sequence[str], registers: Sequence[int]) -> tuple[dict[str, int], Sequence[int]]:
+def _fields(
+    names: Collection[str], registers: Sequence[int]
+) -> tuple[dict[str, int], Sequence[int]]:
     """The named registers after the head, and what follows them."""
     end = _HEAD + len(names)
     if len(registers) < end:

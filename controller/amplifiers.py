@@ -13,7 +13,7 @@ from controller.together import gathered, to_the_end
 from drivers.amplifier import WATCHDOG, Amplifier
 from drivers.errors import CommandError, CommandRefused, DriverError, LinkError
 from drivers.guard import SafeCommand, SafeEnvelope
-from drivers.link.turns import PATIENCE
+from drivers.link.turns import PATIENCE, GaveWay
 from drivers.operation.watchdog import check_watchdog
 from drivers.protocol.messages import Achieved, State
 
@@ -45,7 +45,10 @@ class AmplifierGroup:
     def __init__(self, amplifiers: Mapping[str, Amplifier]) -> None:
         self.phase = Phase.CLOSED
         self._amplifiers = dict(amplifiers)
-        self._joint = JointPlay(self._amplifiers, goes_on=lambda: self.phase is Phase.ARMED)
+        self._joint = JointPlay(
+            self._amplifiers,
+            goes_on=lambda: self.phase is Phase.ARMED and not self._is_hurried,
+        )
         self._closing = asyncio.Lock()  # who closes again must not hang up on who still silences
         self._silencings = 0  # how often they were disarmed, stopped or closed
         self._being_silenced = 0  # by how many who stop or disarm them just now
@@ -67,6 +70,11 @@ class AmplifierGroup:
     def loading_time(self) -> float:
         """How long [s] it took to load the last envelopes."""
         return self._joint.loading_time
+
+    @property
+    def _is_hurried(self) -> bool:
+        """Whether what is under way is to be given up."""
+        return self._limit is not None and self._limit.when() is not None
 
     @property
     def _all(self) -> Iterable[Amplifier]:
@@ -147,9 +155,14 @@ class AmplifierGroup:
         return await self._or_stop(self._beat()) is not None
 
     def hurry(self) -> None:
-        """Let a `play` or `heartbeat` that is under way end within 8 ms, answered or not."""
-        if self._limit is not None and self._limit.when() is None:
+        """Let a `play` or `heartbeat` that is under way end within 8 ms, answered or not.
+
+        Nothing more is asked for it meanwhile, but for silence, and nothing is asked again.
+        """
+        if self._limit is not None and not self._is_hurried:
             self._limit.reschedule(asyncio.get_running_loop().time() + PATIENCE)
+            for amplifier in self._all:
+                amplifier.hurry()
 
     async def disarm(self) -> None:
         """Silent along a short ramp, then high voltage off."""
@@ -242,6 +255,10 @@ class AmplifierGroup:
         try:
             async with limit as self._limit:
                 return await exchange
+        except GaveWay:
+            if limit.when() is None:
+                raise
+            return None
         except TimeoutError as error:
             if limit.expired() and not isinstance(error, LinkError):  # a LinkTimeout is both
                 return None

@@ -235,6 +235,13 @@ class Amplifier:
         self._link.beaten()
         return status
 
+    def hurry(self) -> None:
+        """Do not ask again what is being asked: whoever asks gives it up soon.
+
+        Where no answer comes, or it is busy, GaveWay is raised; what silences is repeated as ever.
+        """
+        self._link.hurry()
+
     async def commit_on_bus(self, token: int) -> None:
         """Have every amplifier of the bus play what it has staged under this token, at one moment.
 

@@ -11,7 +11,7 @@ from drivers import clock
 from drivers.backend import Backend
 from drivers.errors import FrameError, LinkError, LinkTimeout
 from drivers.link.refusals import is_busy, refusal
-from drivers.link.turns import GaveWay, Kind, Turns
+from drivers.link.turns import SUPERSEDED, GaveWay, Kind, Turns
 from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.messages import (
     Achieved,
@@ -62,6 +62,7 @@ class Link:
         self._turns = Turns(lambda: backend.is_unsent)
         self._loss: str | None = "the amplifier is not open yet; call open() first"
         self._unanswered = 0
+        self._is_hurried = False  # whoever waits for an answer soon gives it up
         self._is_stuck = False  # it was busy to the last: until it is not, nothing is repeated
         self._retries = self._timeouts = self._refusals = 0
         self._last_round_trip: float | None = None
@@ -138,6 +139,10 @@ class Link:
             raise FrameError(f"the amplifier answered {name} with {type(reply).__name__}")
         return reply
 
+    def hurry(self) -> None:
+        """Do not repeat what is on its way, unless it silences; it raises GaveWay instead."""
+        self._is_hurried = True
+
     async def broadcast(self, request: Broadcast, kind: Kind) -> None:
         """Say something to all of the bus in its turn; raises LinkError, CommandError."""
         self._raise_if_lost()
@@ -156,6 +161,7 @@ class Link:
 
     async def _exchange(self, request: Request, kind: Kind, timeout: float) -> Reply:
         busy = 0
+        self._is_hurried = False
         while True:
             begin = clock.now()
             try:
@@ -181,6 +187,8 @@ class Link:
                 busy += 1
                 await asyncio.sleep(BUSY_PAUSE)
             self._turns.raise_if_overtaken(kind)
+            if self._is_hurried and not kind.silences:
+                raise GaveWay(SUPERSEDED)
             self._retries += 1
 
     def _found_lost(self, what: str) -> None:

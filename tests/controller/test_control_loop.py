@@ -13,13 +13,16 @@ from controller.amplifiers import Phase
 from controller.observer import Observer
 from controller.touch import Touch, TouchFrame, TouchSource
 from controller_bench import FINGER, OTHER, make_bench, running
+from drivers.errors import LinkTimeout
 from drivers.operation.watchdog import HEARTBEAT
 from drivers.protocol.messages import (
     Apply,
     Arm,
+    Commit,
     GetCaps,
     Hello,
     Ping,
+    Reply,
     Request,
     State,
 )
@@ -132,6 +135,55 @@ async def test_last_finger_up_while_an_answer_is_awaited(kind: type[Request]) ->
         await asyncio.sleep(0.06)
         assert len(bench.far_end.times(Ping)) > beats
         assert bench.controller.phase is Phase.ARMED
+
+
+@in_virtual_time
+async def test_what_a_lift_has_hurried_is_not_asked_again() -> None:
+    """A Ping that nobody has answered in time gives way to what is due since, and is no fault.
+
+    The last finger lifts 25 ms after it, and another comes at once, so that a pattern is due.
+    """
+    async with running() as bench:
+        await bench.hold(FINGER, seconds=0.1)
+        beat = bench.far_end.times(Ping)[-1] + HEARTBEAT
+        bench.touch(FINGER)
+        await asyncio.sleep(beat - 0.001 - asyncio.get_running_loop().time())
+
+        def nobody(request: Request) -> Reply | None:
+            if isinstance(request, Ping):
+                raise LinkTimeout("no answer")
+            return None
+
+        bench.far_end.delay, bench.far_end.answer = 0.030, nobody
+        asked = len(bench.far_end.asked)
+        await asyncio.sleep(0.026)
+        bench.touch()
+        bench.touch(OTHER)
+        await asyncio.sleep(0.010)
+        bench.far_end.delay, bench.far_end.answer = 0.0, lambda request: None
+        (first, ping), (second, pattern), *_ = bench.far_end.asked[asked:]
+        assert isinstance(ping, Ping)
+        assert isinstance(pattern, Apply)
+        assert not pattern.command_set.is_silent
+        assert second == pytest.approx(first + 0.030)
+        assert bench.controller.phase is Phase.ARMED
+        assert bench.told.refused == []
+
+
+@in_virtual_time
+async def test_a_set_whose_finger_has_lifted_is_not_committed() -> None:
+    """Two amplifiers, one of which takes 5 ms to stage: the finger lifts meanwhile."""
+    async with running("a", "b") as bench:
+        bench.far_ends[0].delay = 0.005
+        bench.touch(FINGER)
+        await asyncio.sleep(0.003)
+        bench.touch()
+        await asyncio.sleep(0.010)
+        for far_end in bench.far_ends:
+            assert far_end.requests(Commit) == []
+            assert far_end.sets()[-1].is_silent
+        assert bench.controller.phase is Phase.ARMED
+        assert bench.told.refused == []
 
 
 @in_virtual_time

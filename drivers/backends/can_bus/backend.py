@@ -6,7 +6,7 @@ else; each amplifier hears one of its own, so that one that was lost is not fed 
 """
 
 import asyncio
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
 
 from drivers import clock
@@ -34,6 +34,7 @@ from drivers.protocol.messages import (
     Apply,
     Arm,
     Broadcast,
+    Commit,
     Event,
     GetCaps,
     GetFaults,
@@ -208,7 +209,7 @@ class CanBackend(WireBackend):
         if isinstance(order, Apply | Stage):
             token = order.command_set.token
             wanted = Achieved(token, wanted_commands(order.command_set))
-        elif self._staged is not None and self._staged.token == order.token:  # type: ignore[union-attr]
+        elif isinstance(order, Commit) and self._staged and self._staged.token == order.token:
             wanted = self._staged
         if wanted is not None and answer.exact:
             achieved = wanted
@@ -247,7 +248,7 @@ class CanBackend(WireBackend):
         self._counters.frames_in += 1
         return result
 
-    def _send(self, frames: Any) -> None:
+    def _send(self, frames: Sequence[CanFrame]) -> None:
         self._opened().send(frames)
         self._last_sent = clock.now()
         self._counters.frames_out += len(frames)

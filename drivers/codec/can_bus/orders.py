@@ -100,15 +100,11 @@ def encode_broadcast(request: Broadcast) -> tuple[CanFrame, ...]:
 def wanted_commands(wanted: CommandSet) -> tuple[DriveCommand, ...]:
     """The commands of a set as they read on the other side of the wire."""
     return tuple(
-        DriveCommand(
-            channel=command.channel,
+        replace(
+            command,
             frequency=_Q.frequency.quantise(command.frequency),
             level=_Q.level.quantise(command.level),
             phase=_Q.phase.quantise(command.phase),
-            keep_phase=command.keep_phase,
-            onset=command.onset,
-            ending=command.ending,
-            skip_ending=command.skip_ending,
         )
         for command in wanted.commands
     )

@@ -1,0 +1,64 @@
+"""How a serial port is opened, whatever is spoken on it."""
+
+import os
+
+import pytest
+import serial
+
+from drivers.backends.modbus.stream import open_stream
+from drivers.backends.ports import opening
+from drivers.backends.urls.modbus import ModbusUrl
+
+
+class _Port:
+    """What pyserial would open, as far as it is looked at; nothing ever comes in."""
+
+    def __init__(self, port: str, **settings: object) -> None:
+        self.port = port
+        self.settings = settings
+        self.is_low_latency = False
+        self.in_waiting = 0
+        self._read, self._write = os.pipe()
+
+    def open(self) -> None:
+        """It is open already."""
+
+    def set_low_latency_mode(self, low_latency: bool) -> None:
+        """As Linux passes it on to the adapter."""
+        self.is_low_latency = low_latency
+
+    def reset_input_buffer(self) -> None:
+        """Nothing is there."""
+
+    def fileno(self) -> int:
+        """Of a pipe into which nobody writes."""
+        return self._read
+
+    def close(self) -> None:
+        """Both ends."""
+        os.close(self._read)
+        os.close(self._write)
+
+
+@pytest.mark.parametrize(
+    ("device", "parity"), [("/dev/ttyUSB9", serial.PARITY_ODD), ("/dev/pts/9", serial.PARITY_NONE)]
+)
+async def test_modbus_asks_an_adapter_for_low_latency_and_its_parity(
+    monkeypatch: pytest.MonkeyPatch, device: str, parity: str
+) -> None:
+    """USB adapters hold bytes back for 16 ms else; a pseudo-terminal has no parity."""
+    opened: list[_Port] = []
+
+    def make(port: str, **settings: object) -> _Port:
+        opened.append(_Port(port, **settings))
+        return opened[0]
+
+    monkeypatch.setattr(opening.serial, "serial_for_url", make)
+    url = ModbusUrl.parse(f"modbus+rtu://{device}?baud=19200&parity=odd&stop=2#1")
+    port = await open_stream(url, lambda data: None, lambda what: None)
+    (made,) = opened
+    assert made.is_low_latency
+    asked = {key: made.settings[key] for key in ("baudrate", "parity", "stopbits", "exclusive")}
+    assert asked == {"baudrate": 19200, "parity": parity, "stopbits": 2, "exclusive": True}
+    port.close()
+    await port.wait_closed()

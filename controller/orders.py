@@ -207,4 +207,5 @@ class OrderMaker:
 
 def _as_played(pattern: Pattern, commands: Mapping[str, SafeCommand]) -> Pattern:
     """The pattern with the ramp that its sets have, which a limit of slew may have lengthened."""
-    return replace(pattern, ramp=max(safe.ramp for safe in commands.values()))
+    ramp = max(safe.ramp for safe in commands.values())
+    return pattern if ramp == pattern.ramp else replace(pattern, ramp=ramp)

@@ -54,6 +54,10 @@ class CanDecoder:
                 seen += [(text.raw, meaning) for meaning in self.take(toward, text.frame)]
         return seen
 
+    def is_amid(self, toward: Toward) -> bool:
+        """Whether the last bytes that went this way have begun what others may complete."""
+        return self._text[toward].is_amid
+
     def take(self, toward: Toward, frame: CanFrame) -> list[Meaning | None]:
         """What one frame means, to each amplifier that it concerns."""
         try:

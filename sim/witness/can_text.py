@@ -44,6 +44,11 @@ class SocketcandText:
         self._toward: Toward = toward
         self._rest = b""
 
+    @property
+    def is_amid(self) -> bool:
+        """Whether the last bytes have begun what others may complete."""
+        return bool(self._rest)
+
     def feed(self, data: bytes) -> list[Text]:
         """What these bytes complete."""
         *elements, self._rest = re.split(rb"(?<=>)", self._rest + data)
@@ -73,6 +78,11 @@ class SlcanText:
 
     def __init__(self, toward: Toward) -> None:
         self._rest = b""
+
+    @property
+    def is_amid(self) -> bool:
+        """Whether the last bytes have begun what others may complete."""
+        return bool(self._rest)
 
     def feed(self, data: bytes) -> list[Text]:
         """What these bytes complete."""

@@ -15,6 +15,7 @@ from sim.witness.seen import (
     Meaning,
     Restarted,
     Told,
+    Toward,
 )
 from sim.witness.side import Side
 from sim.witness.violation import Report
@@ -55,10 +56,6 @@ class Exchanges:
         is_torn = isinstance(meaning, Asked) and meaning.problem.startswith("torn")
         is_copy = wire.is_troubled(time) and (raw in wire.recent or is_torn)
         wire.recent.append(raw)
-        if isinstance(meaning, Damaged):
-            if not wire.is_troubled(time):
-                self._report.add("garbage", wire.name, time, f"the host sent {meaning.why}")
-            return
         if not isinstance(meaning, Asked):
             return
         sides = wire.sides.values() if meaning.address == 0 else ()
@@ -76,6 +73,14 @@ class Exchanges:
                 side.settled.discard(meaning.key)
                 if not meaning.problem and meaning.kind is not Kind.LOOK:
                     self._may_feed(side, time, meaning)
+
+    def damaged(
+        self, wire: Wire, time: float, toward: Toward, damaged: Damaged, *, begun: float
+    ) -> None:
+        """A frame that is none; begun [s]: when the first of it has passed, maybe amid trouble."""
+        if not wire.is_troubled(begun):
+            who = "the host" if toward == "amplifier" else "an amplifier"
+            self._report.add("garbage", wire.name, time, f"{who} sent {damaged.why}")
 
     def _unanswered(self, side: Side, time: float, asked: Asked) -> None:
         """What nobody answers: a broadcast, a heartbeat of a host on CAN, a transfer of objects."""
@@ -96,11 +101,7 @@ class Exchanges:
 
     def said(self, wire: Wire, time: float, meaning: Meaning) -> None:
         """A frame toward the host."""
-        if isinstance(meaning, Damaged):
-            if not wire.is_troubled(time):
-                self._report.add("garbage", wire.name, time, f"an amplifier sent {meaning.why}")
-            return
-        if isinstance(meaning, Asked):
+        if isinstance(meaning, Asked | Damaged):
             return
         side = wire.sides.get(meaning.address)
         if side is None and meaning.address == 255:

@@ -70,6 +70,10 @@ class ModbusDecoder:
                 self._is_damaged = True
         return seen
 
+    def is_amid(self, toward: Toward) -> bool:
+        """Whether the last bytes that went this way have begun what others may complete."""
+        return self._split[toward].is_amid
+
     # what the host asks
 
     def _request(self, telegram: Telegram) -> Meaning:

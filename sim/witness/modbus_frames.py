@@ -30,6 +30,10 @@ class Telegram(NamedTuple):
 class Splitter(Protocol):
     """Takes telegrams that go one way out of a stream."""
 
+    @property
+    def is_amid(self) -> bool:
+        """Whether the last bytes have begun what others may complete."""
+
     def feed(self, time: float, data: bytes) -> list[Telegram]:
         """What these bytes complete."""
 
@@ -39,6 +43,11 @@ class TcpSplitter:
 
     def __init__(self) -> None:
         self._buffer = b""
+
+    @property
+    def is_amid(self) -> bool:
+        """Whether the last bytes have begun what others may complete."""
+        return bool(self._buffer)
 
     def feed(self, time: float, data: bytes) -> list[Telegram]:
         """What these bytes complete."""
@@ -64,6 +73,11 @@ class RtuSplitter:
         self._toward: Toward = toward
         self._buffer = b""
         self._last = 0.0
+
+    @property
+    def is_amid(self) -> bool:
+        """Whether the last bytes have begun what others may complete."""
+        return bool(self._buffer)
 
     def feed(self, time: float, data: bytes) -> list[Telegram]:
         """What these bytes complete."""

@@ -57,6 +57,10 @@ class SerialDecoder:
         self._rest[toward] = rest[-2 * _LONGEST :]
         return [(b"\0" + one + b"\0", self._meaning(toward, one)) for one in pieces if one]
 
+    def is_amid(self, toward: Toward) -> bool:
+        """Whether the last bytes that went this way have begun what others may complete."""
+        return bool(self._rest[toward])
+
     def _meaning(self, toward: Toward, piece: bytes) -> Meaning:
         meaning = _meaning(toward, piece)
         if toward == "amplifier":

@@ -21,6 +21,9 @@ class Decoder(Protocol):
     def feed(self, toward: Toward, time: float, data: Data) -> list[Decoded]:
         """What these bytes complete."""
 
+    def is_amid(self, toward: Toward) -> bool:
+        """Whether the last bytes that went this way have begun what others may complete."""
+
 
 class Wire:
     """A wire by its name; sides: by the addresses of the amplifiers.
@@ -38,6 +41,7 @@ class Wire:
 
     def begin(self) -> None:
         """As after it was opened."""
+        self._begun: dict[Toward, float] = {}  # when [s] what is not complete yet has begun
         self.decoder: Decoder
         match self.kind:
             case "serial":
@@ -50,6 +54,14 @@ class Wire:
                     for address, side in self.sides.items()
                 }
                 self.decoder = CanDecoder(self.kind, channels)
+
+    def feed(self, toward: Toward, time: float, data: Data) -> list[tuple[float, Decoded]]:
+        """What these bytes complete, each with when [s] the first of its bytes have passed."""
+        begun = self._begun.pop(toward, time)
+        found = self.decoder.feed(toward, time, data)
+        if self.decoder.is_amid(toward):
+            self._begun[toward] = time if found else begun
+        return [(time if number else begun, one) for number, one in enumerate(found)]
 
     def is_troubled(self, time: float) -> bool:
         """Whether faults are put on it at a time [s], or were shortly before."""

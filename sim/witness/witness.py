@@ -8,7 +8,7 @@ from sim.witness.exchanges import Exchanges
 from sim.witness.follower import Follower
 from sim.witness.host import Host
 from sim.witness.plan import Plan, plan_of
-from sim.witness.seen import MOVING, Data, Toward
+from sim.witness.seen import MOVING, Damaged, Data, Toward
 from sim.witness.set_rules import Expected
 from sim.witness.side import Side
 from sim.witness.violation import Report, Violation
@@ -79,11 +79,13 @@ class Witness:
         if self._record is not None:
             arrow = ">" if direction == "amplifier" else "<"
             self._record(f"{time:.6f} {link} {arrow} {data.hex()}")
-        for raw, meaning in wire.decoder.feed(direction, time, data):
+        for begun, (raw, meaning) in wire.feed(direction, time, data):
             self.frames += 1
             self._report.frame(link, time, direction, raw)
             if meaning is None:
                 continue
+            if isinstance(meaning, Damaged):
+                self._exchanges.damaged(wire, time, direction, meaning, begun=begun)
             if direction == "amplifier":
                 self._exchanges.sent(wire, time, raw, meaning)
             else:

@@ -212,6 +212,26 @@ def test_a_refusal_of_an_earlier_write_is_wrong_where_nothing_damages(are_on: bo
     assert found == ([] if are_on else ["answer"])
 
 
+@pytest.mark.parametrize(("over", "broken"), [(1.0, []), (0.4, ["garbage"])])
+@pytest.mark.parametrize("kind", ["serial", "modbus-rtu", "slcan", "socketcand"])
+def test_what_was_cut_amid_trouble_is_none_of_what_comes_later(
+    kind: str, over: float, broken: list[str]
+) -> None:
+    """A frame is cut at 1 s, which shows when the next comes at 4 s; trouble counts 0.5 s more."""
+    whole = {
+        "serial": next(data for name, _, data in _serial() if name == "Ping request"),
+        "modbus-rtu": next(data for name, _, data in _modbus("RTU") if name == "Ping request"),
+        "slcan": b"t77F105\r",
+        "socketcand": b"< send 77F 1 5 >",
+    }[kind]
+    witness = Witness(PLAN | {"wires": {"line": kind}})
+    witness.faults(0.0, "line", are_on=True)
+    witness.faults(over, "line", are_on=False)
+    witness.bytes("line", "amplifier", 1.0, whole[:-3])
+    witness.bytes("line", "amplifier", 4.0, whole)
+    assert [violation.invariant for violation in witness.finish(4.001)] == broken
+
+
 def test_what_comes_again_from_another_unit_answers_nothing() -> None:
     """Two units of one RTU line are asked who they are; the first says it twice, then the other.
 

@@ -9,7 +9,7 @@ import asyncio
 import logging
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 from pythonosc.osc_bundle_builder import IMMEDIATELY, OscBundleBuilder
 from pythonosc.osc_message_builder import OscMessageBuilder
@@ -133,20 +133,23 @@ class TuioReader:
 
 def _read_bundle(datagram: bytes) -> _Bundle:
     """Read the cursor messages of a datagram; raises OscError."""
-    bundle = _Bundle()
+    source: str | None = None
+    alive: tuple[int, ...] | None = None
+    positions: dict[int, tuple[float, float]] = {}
+    sequence: int | None = None
     for arguments in osc_messages(datagram, address=ADDRESS):
         match arguments:
             case ("source", str(name)) if len(name) <= _LONGEST_NAME:
-                bundle = replace(bundle, source=name)
+                source = name
             case ("alive", *ids) if all(isinstance(id, int) for id in ids):
-                bundle = replace(bundle, alive=tuple(int(id) for id in ids))
+                alive = tuple(int(id) for id in ids)
             case ("set", int(id), float(x), float(y), float(), float(), float()):
-                bundle.positions[id] = (x, y)
+                positions[id] = (x, y)
             case ("fseq", int(number)):
-                bundle = replace(bundle, sequence=number)
+                sequence = number
             case _:
                 raise OscError(f"arguments that TUIO 1.1 does not know: {arguments!s:.80}")
-    return bundle
+    return _Bundle(source, alive, positions, sequence)
 
 
 def without_moot(waiting: Sequence[Datagram]) -> list[Datagram]:

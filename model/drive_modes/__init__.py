@@ -115,9 +115,9 @@ def find_drives(fields: Fields, mode: str) -> Choice | None:
         elif len(open_) > 0:
             some = fields if len(open_) == fields.frequency_count else fields.at(open_)
             found = coherent.search(some, least)
-            better = found.score > score[open_]
-            score[open_[better]] = found.score[better]
-            weights[open_[better]] = found.weights[better]
+            better = (found.score > score[open_]).nonzero()[0]
+            at = open_[better]
+            score[at], weights[at] = found.score[better], found.weights[better]
             top = int(score.argmax())
             drive = Drive.at(top, weights[top]) if score[top] > least else None
         else:

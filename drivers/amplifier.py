@@ -204,8 +204,12 @@ class Amplifier:
         return _of_token(achieved, safe.token)
 
     async def commit(self, token: int) -> Achieved:
-        """Play the staged set of this token; playing it twice is playing it once."""
-        return _of_token(await self._link.ask(Commit(token=token), expect=Achieved), token)
+        """Play the staged set of this token; playing it twice is playing it once.
+
+        Raises CommandRefused where a newer set, a stop or a disarm came before its turn.
+        """
+        achieved = await self._link.ask(Commit(token=token), expect=Achieved, kind=Kind.APPLY)
+        return _of_token(achieved, token)
 
     async def apply(self, safe: SafeCommand) -> Achieved:
         """Play a set now; returns what the amplifier makes of it.
@@ -226,8 +230,11 @@ class Amplifier:
         return (await self._link.ask(GetFaults(), expect=FaultList)).faults
 
     async def clear(self) -> Status:
-        """Acknowledge a stop, or faults whose cause is gone; the amplifier stays disarmed."""
-        return await self._link.ask(Clear(), expect=Status)
+        """Acknowledge a stop, or faults whose cause is gone; the amplifier stays disarmed.
+
+        Raises CommandRefused where another stop came before its turn: that is not acknowledged.
+        """
+        return await self._link.ask(Clear(), expect=Status, kind=Kind.CLEAR)
 
     async def heartbeat(self) -> Status:
         """Feed the watchdog; to be called by the control loop itself, after it has run."""

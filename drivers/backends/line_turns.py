@@ -8,7 +8,6 @@ from collections.abc import Awaitable, Callable, Iterator
 from contextlib import contextmanager
 from typing import TypeVar, final
 
-from drivers.errors import CommandRefused
 from drivers.link.turns import SUPERSEDED, GaveWay, Kind, Turns
 from drivers.protocol.messages import Apply, Disarm, Request, Stop
 
@@ -43,12 +42,13 @@ class LineTurns:
 
     @contextmanager
     def silencing(self, request: Request, address: int) -> Iterator[None]:
-        """See `Backend.silencing`; until what silences this amplifier has its turn."""
-        self._turns.keep_free(address, kind_on_line(request))
+        """See `Backend.silencing`; also between two attempts at what silences."""
+        kind = kind_on_line(request)
+        self._turns.keep_free(address, kind)
         try:
             yield
         finally:
-            self._turns.release(address)
+            self._turns.release(address, kind)
 
     async def carry_out(
         self, kind: Kind, exchange: Callable[[], Awaitable[_T]], *, address: int | None
@@ -56,19 +56,18 @@ class LineTurns:
         """Do an exchange when it has its turn, and again where it had to give way.
 
         Repeating is safe: a token is played once, and the other requests may be repeated anyway.
-        address: whose it is; None for one to all. Raises CommandRefused instead of beginning where
-        this amplifier itself is being silenced.
+        address: whose it is; None for one to all. Raises GaveWay instead of beginning where this
+        amplifier itself is being silenced: what silences it waits for this to end, so that this
+        must not wait for the line.
         """
         while True:
-            if not kind.silences and self._turns.is_awaited(address):
-                raise CommandRefused(SUPERSEDED)
+            if self._turns.is_kept_from_own(address, kind):
+                raise GaveWay(SUPERSEDED)
             if address is not None:
                 self._unsent.add(address)
             try:
                 async with self._turns.take(kind):
                     self._present = address
-                    if kind.silences:
-                        self._turns.release(address)
                     return await exchange()
             except GaveWay:
                 continue

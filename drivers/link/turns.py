@@ -1,8 +1,9 @@
 """Whose turn it is on a link that carries one request at a time.
 
 Stops come first, then what else silences, then the others in order. One apply waits at most: a
-newer one takes its place, and a request that silences drops it. What has its turn gives way to what
-comes before it: at once while none of it is on the wire, else, unless it silences, after a moment.
+newer one takes its place, and a request that silences drops it; a stop drops acknowledgements,
+which were not meant for it. What has its turn gives way to what comes before it: at once while none
+of it is on the wire, else after a moment; what silences is repeated then.
 """
 
 import asyncio
@@ -25,6 +26,7 @@ class Kind(Enum):
     """How a request stands to the others that wait."""
 
     ORDINARY = auto()
+    CLEAR = auto()
     APPLY = auto()
     SILENCE = auto()
     STOP = auto()
@@ -33,6 +35,16 @@ class Kind(Enum):
     def silences(self) -> bool:
         """Whether it goes before what does not."""
         return self is Kind.SILENCE or self is Kind.STOP
+
+    def precedes(self, other: "Kind") -> bool:
+        """Whether it goes before one of another kind that came earlier."""
+        return self is Kind.STOP is not other or (self.silences and not other.silences)
+
+    def voids(self, other: "Kind") -> bool:
+        """Whether one of another kind that waits is not wanted any more once this has come."""
+        if other is Kind.CLEAR:
+            return self is Kind.STOP
+        return other is Kind.APPLY and (self is Kind.APPLY or self.silences)
 
 
 class GaveWay(CommandRefused):
@@ -53,46 +65,43 @@ class Turns:
         self._stops: deque[asyncio.Future[None]] = deque()
         self._silences: deque[asyncio.Future[None]] = deque()
         self._others: deque[asyncio.Future[None]] = deque()
-        self._apply: asyncio.Future[None] | None = None
+        self._voidable: dict[asyncio.Future[None], Kind] = {}  # of the others
         self._present: _Turn | None = None
-        self._awaited: dict[Hashable, Kind] = {}
+        self._awaited: list[tuple[Hashable, Kind]] = []
 
     def raise_if_overtaken(self, kind: Kind) -> None:
-        """Raise CommandRefused where a request that has the turn must not be repeated.
+        """Raise GaveWay where a request that has the turn must not be repeated in it.
 
-        Something that silences waits, or for an apply a newer one.
+        Something that goes before it waits, or for an apply a newer one.
         """
-        newer = kind is Kind.APPLY and self._apply is not None
-        if newer or (not kind.silences and (self._stops or self._silences)):
-            raise CommandRefused(SUPERSEDED)
+        if self._is_behind(kind) or (kind is Kind.APPLY and kind in self._voidable.values()):
+            raise GaveWay(SUPERSEDED)
 
     def take(self, kind: Kind) -> "_Turn":
         """A context: waits for the turn and holds it; GaveWay, CommandRefused for what gave way."""
         return _Turn(self, kind)
 
-    def is_awaited(self, who: Hashable) -> bool:
-        """Whether this one's request that silences is awaited; see `keep_free`."""
-        return who in self._awaited
+    def is_kept_from_own(self, who: Hashable, kind: Kind) -> bool:
+        """Whether what silences this one itself is awaited, and goes before one of a kind."""
+        return any(one == who and awaited.precedes(kind) for one, awaited in self._awaited)
 
     def keep_free(self, who: Hashable, kind: Kind) -> None:
         """Give no turn to what a request of this one's that is to come, and silences, goes before.
 
-        kind: of that request.
+        kind: of that request; until `release`, as often.
         """
-        if self._awaited.get(who) is not Kind.STOP:
-            self._awaited[who] = kind
+        self._awaited.append((who, kind))
         self._limit_turn()
 
-    def release(self, who: Hashable) -> None:
-        """It has come, or will not; safe to call twice."""
-        self._awaited.pop(who, None)
+    def release(self, who: Hashable, kind: Kind) -> None:
+        """It is answered, or will not come."""
+        self._awaited.remove((who, kind))
         if not self._taken:
             self._pass_on()
 
     async def come(self, kind: Kind) -> None:
         """Wait for the turn; for `_Turn`."""
-        if kind is not Kind.ORDINARY:
-            self._drop_apply()
+        self._drop_what_is_void(kind)
         if self._taken or self._is_kept_from(kind):
             await self._wait(kind)
         self._taken = True
@@ -106,12 +115,15 @@ class Turns:
         self._present = None
         self._pass_on()
 
+    def _is_behind(self, kind: Kind) -> bool:
+        """Whether something waits that goes before one of a kind."""
+        return (bool(self._stops) and Kind.STOP.precedes(kind)) or (
+            bool(self._silences) and Kind.SILENCE.precedes(kind)
+        )
+
     def _is_kept_from(self, kind: Kind) -> bool:
-        if kind is Kind.STOP:
-            return False
-        if self._stops or Kind.STOP in self._awaited.values():
-            return True
-        return not kind.silences and bool(self._silences or self._awaited)
+        """Whether something waits, or is awaited, that goes before one of a kind."""
+        return self._is_behind(kind) or any(one.precedes(kind) for _, one in self._awaited)
 
     def _limit_turn(self) -> None:
         """Let the present turn end now or soon if something before it waits, else when it likes."""
@@ -120,59 +132,69 @@ class Turns:
             return
         if self._is_kept_from(turn.kind) and self._is_unsent():
             turn.give_way()
-        elif not turn.kind.silences and (self._stops or self._silences):
+        elif self._is_behind(turn.kind):
             turn.limit(PATIENCE)
         else:
             turn.let_be()
 
-    async def _wait(self, kind: Kind) -> None:
-        queue = {Kind.STOP: self._stops, Kind.SILENCE: self._silences}.get(kind, self._others)
+    def _queue_of(self, kind: Kind) -> "deque[asyncio.Future[None]]":
+        return {Kind.STOP: self._stops, Kind.SILENCE: self._silences}.get(kind, self._others)
+
+    def _queue_up(self, kind: Kind, *, at_first: bool) -> "asyncio.Future[None]":
+        """What is done when the turn of a request has come."""
         turn = asyncio.get_running_loop().create_future()
-        queue.append(turn)
-        if kind is Kind.APPLY:
-            self._apply = turn
+        queue = self._queue_of(kind)
+        if at_first:
+            queue.appendleft(turn)
+        else:
+            queue.append(turn)
+        if any(one.voids(kind) for one in Kind):
+            self._voidable[turn] = kind
+        return turn
+
+    async def _wait(self, kind: Kind) -> None:
+        turn = self._queue_up(kind, at_first=False)
         self._limit_turn()
         try:
             await turn
             while self._is_kept_from(kind):  # by what came while the turn was being handed over
-                if kind is Kind.APPLY:
+                before = Kind.STOP if self._is_kept_from(Kind.SILENCE) else Kind.SILENCE
+                if before.voids(kind):
                     self._pass_on()
                     raise CommandRefused(SUPERSEDED)
-                turn = asyncio.get_running_loop().create_future()
-                queue.appendleft(turn)
+                turn = self._queue_up(kind, at_first=True)
                 self._pass_on()
                 await turn
         except asyncio.CancelledError:
             if not turn.cancelled() and turn.exception() is None:
                 # The turn was handed over in the very moment of the cancellation.
                 self._pass_on()
-            elif turn in queue:
+            elif turn in (queue := self._queue_of(kind)):
                 queue.remove(turn)
                 self._limit_turn()
             raise
         finally:
-            if self._apply is turn:
-                self._apply = None
+            self._voidable.pop(turn, None)
 
-    def _drop_apply(self) -> None:
-        waiting, self._apply = self._apply, None
-        if waiting is not None:
-            self._others.remove(waiting)
-            if not waiting.done():  # it may have been cancelled and not run since
-                waiting.set_exception(CommandRefused(SUPERSEDED))
+    def _drop_what_is_void(self, kind: Kind) -> None:
+        """Refuse what waits and is not wanted any more once one of this kind has come."""
+        for turn in [turn for turn, waiting in self._voidable.items() if kind.voids(waiting)]:
+            del self._voidable[turn]
+            self._others.remove(turn)
+            if not turn.done():  # it may have been cancelled and not run since
+                turn.set_exception(CommandRefused(SUPERSEDED))
 
     def _next(self) -> "deque[asyncio.Future[None]]":
         """Those of whom the first may come now."""
-        if self._stops or Kind.STOP in self._awaited.values():
+        if self._is_kept_from(Kind.SILENCE):
             return self._stops
-        return self._silences if self._silences or self._awaited else self._others
+        return self._silences if self._is_kept_from(Kind.ORDINARY) else self._others
 
     def _pass_on(self) -> None:
         """Hand the turn, which nobody has, to the next."""
         while queue := self._next():
             turn = queue.popleft()
-            if self._apply is turn:
-                self._apply = None
+            self._voidable.pop(turn, None)
             if not turn.done():
                 self._taken = True
                 turn.set_result(None)

@@ -17,10 +17,12 @@ from drivers.protocol.messages import (
     Apply,
     Arm,
     Capabilities,
+    Clear,
     Commit,
     Disarm,
     Fault,
     GetCaps,
+    GetStatus,
     Hello,
     Identity,
     Nak,
@@ -336,6 +338,75 @@ async def test_nothing_is_staged_after_it_was_silenced(
     with pytest.raises(CommandRefused, match="superseded"):
         await stage
     assert [type(request) for request in backend.requests[1:]] == [Disarm]
+
+
+async def test_a_stop_is_not_acknowledged_by_who_asked_before_it(
+    amplifier: Amplifier, backend: ScriptedBackend
+) -> None:
+    """A clear that still waits when a stop comes is never sent; a disarm, which latches nothing,
+    only goes before it."""
+    for silence in (amplifier.disarm, amplifier.stop):
+        answer: asyncio.Future[Reply] = asyncio.get_running_loop().create_future()
+        backend.script.append(answer)
+        status = asyncio.create_task(amplifier.status())
+        await settle()
+        clear = asyncio.create_task(amplifier.clear())
+        await settle()
+        silent = asyncio.create_task(silence())
+        await settle()
+        answer.set_result(STATUS)
+        await asyncio.gather(status, silent)
+        if silence == amplifier.disarm:
+            await clear
+        else:
+            with pytest.raises(CommandRefused, match="superseded"):
+                await clear
+    kinds = [type(request) for request in backend.requests]
+    assert kinds == [GetStatus, Disarm, Clear, GetStatus, Stop]
+
+
+@pytest.mark.parametrize("handed_over", [False, True])
+async def test_a_clear_that_was_just_handed_the_turn_gives_way_to_a_stop_for_good(
+    amplifier: Amplifier, backend: ScriptedBackend, handed_over: bool
+) -> None:
+    """Whether it has the turn, but nothing has run since, or is next to have it."""
+    answer: asyncio.Future[Reply] = asyncio.get_running_loop().create_future()
+    backend.script.append(answer)
+    stopping: list[asyncio.Task[Status]] = []
+
+    async def ask_then_stop() -> None:
+        await amplifier.status()
+        stopping.append(asyncio.create_task(amplifier.stop()))
+
+    first = asyncio.create_task(ask_then_stop())
+    await settle()
+    clears = [asyncio.create_task(amplifier.clear()) for _ in range(1 + handed_over)]
+    await settle()
+    answer.set_result(STATUS)
+    await first
+    await settle()
+    await asyncio.gather(*stopping, *clears, return_exceptions=True)
+    kinds = [type(request) for request in backend.requests]
+    assert kinds[kinds.index(Stop) :] == [Stop]
+
+
+async def test_a_commit_that_waits_plays_nothing_after_silence(
+    amplifier: Amplifier, backend: ScriptedBackend, safe: MakeSafe
+) -> None:
+    """A staged set whose commit still waits when a silent set comes is never played."""
+    answer: asyncio.Future[Reply] = asyncio.get_running_loop().create_future()
+    backend.script.append(answer)
+    status = asyncio.create_task(amplifier.status())
+    await settle()
+    commit = asyncio.create_task(amplifier.commit(1))
+    await settle()
+    silent = asyncio.create_task(amplifier.apply(safe(2, level=0.0)))
+    await settle()
+    answer.set_result(STATUS)
+    await asyncio.gather(status, silent)
+    with pytest.raises(CommandRefused, match="superseded"):
+        await commit
+    assert [type(request) for request in backend.requests] == [GetStatus, Apply]
 
 
 async def test_an_apply_is_not_repeated_before_a_stop(

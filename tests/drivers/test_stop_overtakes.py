@@ -21,6 +21,8 @@ from drivers.protocol.messages import (
     Apply,
     Disarm,
     GetStatus,
+    Nak,
+    NakCode,
     Reply,
     Request,
     Stage,
@@ -33,7 +35,7 @@ from model.rig.rig import Channel, Rig
 from sim.far_ends.wires import Wire
 from sim.transport.pseudo_terminal import TERMINAL_MAKER
 from virtual_loop import VirtualLoop, run_virtual
-from wires import far_side
+from wires import FarSide, far_side
 
 LINES = {
     "serial": Wire("serial", speed=115_200, shared=True),
@@ -47,26 +49,33 @@ MOMENTS = [number * 0.0005 for number in range(1, 30)]  # s; one of them is in e
 class Chain:
     """Two armed amplifiers, east and west, and all that they were told since.
 
-    frames: how many the host has put on the line since.
+    sent_at: when [s] the host has put a frame on the line since.
     """
 
     def __init__(self) -> None:
         self.asked: list[tuple[str, Request]] = []
-        self.frames = 0
+        self.sent_at: list[float] = []
 
-    def begin(self, amplifiers: dict[str, Amplifier]) -> None:
+    def begin(self, amplifiers: dict[str, Amplifier], far: FarSide) -> None:
         """They are ready."""
+        self.far = far
         self.east, self.west = amplifiers["east"], amplifiers["west"]
         self.forget()
 
     def forget(self) -> None:
         """Count anew."""
         self.asked.clear()
-        self.frames = 0
+        self.sent_at.clear()
+
+    @property
+    def frames(self) -> int:
+        """How many the host has put on the line since."""
+        return len(self.sent_at)
 
     def seen(self, link: str, toward: str, data: bytes) -> None:
         """Bytes go out."""
-        self.frames += toward == "amplifier"
+        if toward == "amplifier":
+            self.sent_at.append(asyncio.get_running_loop().time())
 
     def kinds(self) -> list[tuple[str, str]]:
         """Whom, and what, by its name."""
@@ -105,7 +114,7 @@ def on_a_line(line: str, rig: Rig, use: Callable[[Chain], Coroutine[Any, Any, No
                 await amplifier.open()
                 await amplifier.arm(2.0)
             await asyncio.sleep(0.1)
-            chain.begin(both)
+            chain.begin(both, far)
             await use(chain)
             for amplifier in both.values():
                 await amplifier.close()
@@ -340,5 +349,49 @@ def test_who_is_cancelled_as_it_gives_way_is_cancelled(line: str, coarse_rig: Ri
             await waiting
         await asyncio.gather(beat, stop)
         assert chain.kinds() == [("west", "Ping"), ("east", "Stop")]
+
+    on_a_line(line, coarse_rig, use)
+
+
+@pytest.mark.parametrize("line", LINES)
+@pytest.mark.parametrize("silencing", [Disarm, Apply])
+@pytest.mark.parametrize("first", [None, Nak(NakCode.BUSY)], ids=["no answer", "busy"])
+def test_a_stop_goes_before_the_repetition_of_what_else_silences(
+    line: str, silencing: type[Request], first: Reply | None, coarse_rig: Rig
+) -> None:
+    """Where a disarm or a silent set has to be repeated, a stop that was wished meanwhile is out
+    8 ms later at the latest, and 10 ms where an answer is owed; the repetition follows it."""
+
+    async def use(chain: Chain) -> None:
+        east = chain.far.stations["east"]
+        usual: Callable[[Request], Reply | None] = east.exchange
+        given = [first]
+
+        def answer(request: Request) -> Reply | None:
+            if isinstance(request, silencing) and given:
+                chain.asked.append(("east", request))
+                return given.pop()
+            return usual(request)
+
+        east.exchange = answer  # type: ignore[method-assign]
+        silent = (
+            chain.east.disarm()
+            if silencing is Disarm
+            else chain.east.apply(chain.tone(chain.east, 7, 0.0))
+        )
+        waiting = asyncio.create_task(silent)
+        await asyncio.sleep(0.004)  # it is out
+        begin = asyncio.get_running_loop().time()
+        async with asyncio.timeout(1):
+            status = await chain.east.stop()
+            await asyncio.gather(waiting, return_exceptions=True)
+        assert status.state is State.QUICK_STOP_ACTIVE
+        assert [kind for _, kind in chain.kinds()] == [
+            silencing.__name__,
+            "Stop",
+            silencing.__name__,
+        ]
+        assert chain.sent_at[1] - begin <= 0.0181
+        await chain.west.heartbeat()
 
     on_a_line(line, coarse_rig, use)

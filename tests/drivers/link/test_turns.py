@@ -7,7 +7,7 @@ import pytest
 from drivers.backends.line_turns import LineTurns
 from drivers.errors import CommandRefused
 from drivers.link.turns import Kind, Turns
-from drivers.protocol.messages import Disarm
+from drivers.protocol.messages import Disarm, Stop
 
 
 async def settle() -> None:
@@ -94,14 +94,34 @@ async def test_a_link_that_was_kept_free_for_nothing_is_handed_on(users: Users) 
     early = users.take("early")
     await settle()
     assert users.order == []
-    users.turns.release("west")
-    users.turns.release("west")
+    users.turns.release("west", Kind.SILENCE)
     await settle()
     late = users.take("late")
     for end in users.ends.values():
         end.set()
     await asyncio.gather(early, late)
     assert users.order == ["early", "late"]
+
+
+async def test_of_two_stops_the_one_that_is_given_up_keeps_the_line_no_less_free() -> None:
+    """Who stops an amplifier that another is already stopping, and whose stop never comes, takes
+    nothing from the other's: others wait until that has come, too."""
+    line = LineTurns()
+    said: list[str] = []
+
+    async def say(what: str) -> None:
+        said.append(what)
+
+    with line.silencing(Stop(0.005), 1):
+        with line.silencing(Stop(0.005), 1):
+            other = asyncio.create_task(
+                line.carry_out(Kind.ORDINARY, lambda: say("other"), address=2)
+            )
+            await settle()
+        await settle()
+        await line.carry_out(Kind.STOP, lambda: say("stop"), address=1)
+    await other
+    assert said == ["stop", "other"]
 
 
 async def test_what_an_amplifier_still_has_to_say_ends_with_its_own_stop() -> None:
@@ -122,6 +142,6 @@ async def test_what_an_amplifier_still_has_to_say_ends_with_its_own_stop() -> No
         assert line.is_unsent(2)
         assert not line.is_unsent(1)
         await line.carry_out(Kind.SILENCE, lambda: say("stop"), address=1)
-        await other
+    await other
     assert said == ["stop", "other"]
     assert not line.is_unsent(2)

@@ -1,6 +1,7 @@
 """Runs the daemon's state table on a controller: events in, actions done, the link kept up."""
 
 import asyncio
+import contextlib
 import logging
 from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import replace
@@ -14,6 +15,7 @@ from controller.observer import Observer
 from drivers import clock
 from drivers.amplifier import Amplifier
 from drivers.errors import CommandRefused, DriverError, LinkError
+from drivers.link.turns import GaveWay
 from drivers.protocol.messages import Event as AmplifierEvent
 from drivers.protocol.messages import Fault, Status
 from drivers.protocol.messages import State as AmplifierState
@@ -168,6 +170,8 @@ class Supervisor:
         except LinkError as error:
             await self._lost(error)
             raise
+        except GaveWay:
+            raise  # no fault of the amplifiers': what it gave way to is an event of its own
         except DriverError as error:
             await self.handle(Event(Kind.FAULT, str(error), _CLEAR))
             raise
@@ -191,6 +195,8 @@ class Supervisor:
         if any(each.state is AmplifierState.OPERATION_ENABLED for each in statuses.values()):
             await self._the_controller.disarm()
         problem = await self._unsound()
+        if self.machine.state is not State.SWITCH_ON_DISABLED:
+            return  # somebody has stopped them meanwhile: that is why they are not as they should be
         if problem is None:
             await self.handle(Event(Kind.SOUND, "all amplifiers are sound, disarmed and at zero"))
         else:
@@ -198,32 +204,53 @@ class Supervisor:
 
     async def _clear(self) -> None:
         # An amplifier that still falls silent overhears it, so it is said again at each look.
-        problem = await self._unsound(before_each=self._the_controller.clear)
+        problem = await self._unsound(before_each=self._acknowledge)
+        self._check_acknowledged()
         if problem is None:
             await self.handle(Event(Kind.SOUND, "acknowledged, and the cause is gone"))
             return
         await self.handle(Event(Kind.FAULT, problem, _CLEAR))
         raise CommandRefused(f"{problem}; the cause is not gone, so nothing was cleared")
 
+    async def _acknowledge(self) -> None:
+        """Clear what was acknowledged; raises GaveWay where there is something since."""
+        self._check_acknowledged()
+        try:
+            await self._the_controller.clear()
+        except GaveWay:
+            self._check_acknowledged()
+            raise
+
+    def _check_acknowledged(self) -> None:
+        if not self.machine.acknowledged:
+            raise GaveWay(
+                "somebody has stopped the amplifiers since, or there is a fault since: that is not "
+                "cleared; find the cause, then clear again"
+            )
+
     async def _unsound(
         self, *, before_each: Callable[[], Awaitable[None]] | None = None
     ) -> str | None:
         """What is wrong with an amplifier that should be disarmed, once ramps had their time.
 
-        before_each: to be done before each look.
+        before_each: to be done before each look. It ends where the state is another.
         """
-        problem = None
+        problem, begun_in = None, self.machine.state
         for _ in range(_READ_BACKS):
             if before_each is not None:
                 await before_each()
             problem = _problem(await self._statuses())
-            if problem is None:
+            if problem is None or self.machine.state is not begun_in:
                 break
             await asyncio.sleep(_READ_BACK_PAUSE)
         return problem
 
     async def _statuses(self) -> dict[str, Status]:
-        return {name: await each.status() for name, each in self._amplifiers.items()}
+        """How each amplifier is; asked again where a stop or disarm went before it."""
+        while True:
+            with contextlib.suppress(GaveWay):
+                return {name: await each.status() for name, each in self._amplifiers.items()}
+            await asyncio.sleep(_READ_BACK_PAUSE)
 
     async def _lost(self, error: LinkError) -> None:
         if self.machine.state is not State.COMM_LOST:  # told already

@@ -48,7 +48,7 @@ class Kind(Enum):
 
 
 class GaveWay(CommandRefused):
-    """What had its turn has lost it to something that goes before it."""
+    """Something that goes before it has taken its turn, or made it void."""
 
 
 @final
@@ -78,7 +78,7 @@ class Turns:
             raise GaveWay(SUPERSEDED)
 
     def take(self, kind: Kind) -> "_Turn":
-        """A context: waits for the turn and holds it; GaveWay, CommandRefused for what gave way."""
+        """A context: waits for the turn and holds it; GaveWay for what gave way."""
         return _Turn(self, kind)
 
     def is_kept_from_own(self, who: Hashable, kind: Kind) -> bool:
@@ -161,7 +161,7 @@ class Turns:
                 before = Kind.STOP if self._is_kept_from(Kind.SILENCE) else Kind.SILENCE
                 if before.voids(kind):
                     self._pass_on()
-                    raise CommandRefused(SUPERSEDED)
+                    raise GaveWay(SUPERSEDED)
                 turn = self._queue_up(kind, at_first=True)
                 self._pass_on()
                 await turn
@@ -182,7 +182,7 @@ class Turns:
             del self._voidable[turn]
             self._others.remove(turn)
             if not turn.done():  # it may have been cancelled and not run since
-                turn.set_exception(CommandRefused(SUPERSEDED))
+                turn.set_exception(GaveWay(SUPERSEDED))
 
     def _next(self) -> "deque[asyncio.Future[None]]":
         """Those of whom the first may come now."""

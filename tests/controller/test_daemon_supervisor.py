@@ -266,6 +266,47 @@ async def test_clear_right_after_a_stop_waits_for_the_ramp() -> None:
         assert daemon.state is DaemonState.READY_TO_SWITCH_ON
 
 
+@pytest.mark.parametrize("later", [0.001, 0.015, 0.030])
+@in_virtual_time
+async def test_a_stop_is_not_acknowledged_by_who_asked_before_it(later: float) -> None:
+    """A clear that is said again and again ends with the next stop: who asked is told, nothing
+    more is said to the amplifier, and the state is that of the stop."""
+    async with watched() as daemon:
+        await daemon.supervisor.handle(Event(Kind.STOP, "the first"))
+        stopping = daemon.status(State.QUICK_STOP_ACTIVE)
+        daemon.far_end.answer = lambda request: stopping
+        daemon.far_end.delay = 0.004
+        clearing = asyncio.create_task(daemon.supervisor.handle(Event(Kind.CLEAR)))
+        await asyncio.sleep(later)
+        await daemon.supervisor.handle(Event(Kind.STOP, "the second"))
+        daemon.far_end.answer = lambda request: None
+        with pytest.raises(CommandRefused, match="stopped"):
+            await clearing
+        await asyncio.sleep(1)
+        assert daemon.state is DaemonState.QUICK_STOP_ACTIVE
+        orders = daemon.far_end.requests(Stop, Clear)
+        assert isinstance(orders[-1], Stop)
+        await daemon.supervisor.handle(Event(Kind.CLEAR))
+        assert daemon.state is DaemonState.READY_TO_SWITCH_ON
+
+
+@pytest.mark.parametrize("later", [0.001, 0.005, 0.009, 0.013])
+@in_virtual_time
+async def test_a_stop_while_disarming_is_a_stop_and_no_fault(later: float) -> None:
+    """At whatever moment of the disarm and the look whether all are silent it comes."""
+    async with watched() as daemon:
+        await daemon.supervisor.handle(ARM)
+        await asyncio.sleep(0.005)
+        daemon.far_end.delay = 0.010
+        disarming = asyncio.create_task(daemon.supervisor.handle(Event(Kind.DISARM)))
+        await asyncio.sleep(later)
+        await daemon.supervisor.handle(Event(Kind.STOP, "stop"))
+        await asyncio.gather(disarming, return_exceptions=True)
+        assert daemon.state is DaemonState.QUICK_STOP_ACTIVE
+        assert DaemonState.FAULT not in daemon.states
+        assert daemon.far_end.state is State.QUICK_STOP_ACTIVE
+
+
 @in_virtual_time
 async def test_an_amplifier_that_will_not_be_armed_is_a_fault() -> None:
     """Whoever asked is told, nothing stays armed, and somebody must acknowledge."""

@@ -111,6 +111,8 @@ class FarEnd(Backend):
                 self.state = State.OPERATION_ENABLED
             case Arm():
                 return Nak(NakCode.WRONG_STATE)
+            case Disarm() if self.state is State.QUICK_STOP_ACTIVE:
+                self.levels = (0.0,) * self.channels  # silence undoes no latched stop
             case Disarm() | Clear():
                 self.state = State.SWITCH_ON_DISABLED
                 self.levels = (0.0,) * self.channels

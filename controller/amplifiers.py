@@ -52,6 +52,7 @@ class AmplifierGroup:
         self._closing = asyncio.Lock()  # who closes again must not hang up on who still silences
         self._silencings = 0  # how often they were disarmed, stopped or closed
         self._being_silenced = 0  # by how many who stop or disarm them just now
+        self._stopping: asyncio.Task[None] | None = None  # the last stop
         self._may_be_armed = False  # since they were opened
         self._read_backs = ReadBacks()
         self._limit: asyncio.Timeout | None = None  # of a play or heartbeat that is under way
@@ -175,13 +176,21 @@ class AmplifierGroup:
             raise
 
     async def stop(self) -> None:
-        """Quick stop of every amplifier that can be reached; latched until `clear`."""
+        """Quick stop of every amplifier that can be reached; latched until `clear`.
+
+        Who asks while they are being stopped waits for that: nothing arms before it is over.
+        """
         self._leave_armed()
+        if self._stopping is None or self._stopping.done():
+            self._stopping = asyncio.ensure_future(
+                self._each(amplifier.stop() for amplifier in self._all)
+            )
         with self._silencing():
-            await to_the_end(self._each(amplifier.stop() for amplifier in self._all))
+            await to_the_end(self._stopping)
 
     async def clear(self) -> None:
         """Acknowledge stops, and faults whose cause is gone."""
+        self._stopping = None  # a stop that is asked for from here on is another
         try:
             await self._together(amplifier.clear() for amplifier in self._all)
         except LinkError:

@@ -40,6 +40,8 @@ class JointPlay:
 
         Raises DriverError.
         """
+        if not self._goes_on():
+            return None  # silence came after whatever this follows
         if any(envelopes.values()):
             begin = asyncio.get_running_loop().time()
             await gathered(self._load(name, each) for name, each in envelopes.items())
@@ -60,6 +62,8 @@ class JointPlay:
             return None  # a commit now would undo that silence
         self.is_torn = True
         await gathered(self._commits(commands))
+        if not self._goes_on():
+            return None
         for name, status in (await self.statuses()).items():
             if status.token != commands[name].token:
                 raise CommandRefused(
@@ -79,6 +83,11 @@ class JointPlay:
                 return  # nothing will be played
             await self._amplifiers[name].load_envelope(envelope)
 
+    async def _commit(self, amplifier: Amplifier, token: int, *, for_all: bool) -> None:
+        """Commit, unless silence came while this waited for those whose wires are slower."""
+        if self._goes_on():
+            await (amplifier.commit_on_bus(token) if for_all else amplifier.commit(token))
+
     def _commits(self, sets: Mapping[str, SafeCommand]) -> Iterable[Coroutine[Any, Any, object]]:
         """Commit everything that is staged, to arrive at one moment; once where a bus is shared."""
         together: dict[tuple[str, int], list[Amplifier]] = {}
@@ -87,7 +96,7 @@ class JointPlay:
             together.setdefault((amplifier.bus or name, safe.token), []).append(amplifier)
         return at_one_moment(
             [
-                (first, partial(first.commit_on_bus if others else first.commit, token))
+                (first, partial(self._commit, first, token, for_all=bool(others)))
                 for (_, token), (first, *others) in together.items()
             ]
         )

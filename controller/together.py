@@ -1,7 +1,7 @@
 """Waiting for several amplifiers at once."""
 
 import asyncio
-from collections.abc import Coroutine, Iterable
+from collections.abc import Awaitable, Coroutine, Iterable
 from typing import Any, TypeVar
 
 from drivers.errors import LinkError
@@ -24,11 +24,18 @@ async def gathered(requests: Iterable[Coroutine[Any, Any, _T]]) -> list[_T]:
     return [result for result in results if not isinstance(result, BaseException)]
 
 
-async def to_the_end(work: Coroutine[Any, Any, None]) -> None:
-    """See work through, also where the caller is cancelled meanwhile; that is raised afterwards."""
+async def to_the_end(work: Awaitable[None]) -> None:
+    """See work through, however often the caller is cancelled meanwhile; that is raised afterwards.
+
+    work: a coroutine, or a task that others see through as well.
+    """
     task = asyncio.ensure_future(work)
-    try:
-        await asyncio.shield(task)
-    except asyncio.CancelledError:
-        await task
-        raise
+    cancellation = None
+    while not task.done():
+        try:
+            await asyncio.wait({task})
+        except asyncio.CancelledError as error:
+            cancellation = error
+    if cancellation is not None:
+        raise cancellation
+    task.result()

@@ -196,7 +196,7 @@ class Supervisor:
             await self._the_controller.disarm()
         problem = await self._unsound()
         if self.machine.state is not State.SWITCH_ON_DISABLED:
-            return  # somebody has stopped them meanwhile: that is why they are not as they should be
+            return  # somebody has stopped them meanwhile: that is why they are not settled
         if problem is None:
             await self.handle(Event(Kind.SOUND, "all amplifiers are sound, disarmed and at zero"))
         else:

@@ -405,3 +405,59 @@ async def test_a_half_committed_set_is_silenced_before_another() -> None:
         assert sets[2].command_set.is_silent
     await bench.controller.close()
     await task
+
+
+@in_virtual_time
+async def test_a_stop_is_seen_through_however_often_its_caller_is_cancelled() -> None:
+    """Cancelled twice while the amplifiers take 20 ms: they are stopped all the same."""
+    async with running("a", "b") as bench:
+        for far_end in bench.far_ends:
+            far_end.delay = 0.02
+        stopping = asyncio.create_task(bench.controller.stop())
+        for _ in range(2):
+            await asyncio.sleep(0.005)
+            stopping.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await stopping
+        assert {far_end.state for far_end in bench.far_ends} == {State.QUICK_STOP_ACTIVE}
+
+
+@in_virtual_time
+async def test_who_stops_what_is_being_stopped_waits_for_that() -> None:
+    """A thousand stops within 10 ms are one to amplifiers that take as long; one that is asked for
+    after a clear, or once that is over, is another."""
+    async with running("a", "b") as bench:
+        bench.far_ends[0].delay = 0.01
+        stops = []
+        for _ in range(1000):
+            stops.append(asyncio.create_task(bench.controller.stop()))
+            await asyncio.sleep(5e-6)
+        clearing = asyncio.create_task(bench.controller.clear())
+        await asyncio.sleep(0)
+        await bench.controller.stop()
+        await asyncio.gather(*stops)
+        await asyncio.gather(clearing, return_exceptions=True)
+        assert [len(far_end.requests(Stop)) for far_end in bench.far_ends] == [2, 2]
+        assert {far_end.state for far_end in bench.far_ends} == {State.QUICK_STOP_ACTIVE}
+        await bench.controller.stop()
+        assert [len(far_end.requests(Stop)) for far_end in bench.far_ends] == [3, 3]
+
+
+@pytest.mark.parametrize("silencing", ["stop", "disarm"])
+@in_virtual_time
+async def test_nothing_is_committed_after_silence_on_wires_of_different_speed(
+    silencing: str,
+) -> None:
+    """Where the commit of a fast wire waits for that of a slow one, a stop or disarm that comes
+    meanwhile is the last that both hear."""
+    async with running("a", "b") as bench:
+        bench.far_ends[0].commit_time = lambda: 0.005
+        for far_end in bench.far_ends:
+            far_end.delay = 0.001
+        bench.touch(FINGER)
+        await asyncio.sleep(0.003)
+        assert [len(far_end.requests(Commit)) for far_end in bench.far_ends] == [1, 0]
+        await getattr(bench.controller, silencing)()
+        await asyncio.sleep(0.1)
+        assert bench.far_ends[1].requests(Commit) == []
+        assert bench.told.refused == []

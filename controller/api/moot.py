@@ -2,11 +2,18 @@
 
 A client that floods sends more than anybody needs. To see that one is moot costs a fraction of
 doing what it says, so the newest is not far behind even then, and others wait less.
+
+A frame holds all fingers of its source, so that with the newest nothing is left down that was
+lifted; who lifted and touched again within the time that lines wait has moved. What would be
+refused takes no other's place, or a lift could get lost.
 """
 
+from contextlib import suppress
 from functools import lru_cache
 
-from pydantic_core import from_json
+from pydantic_core import ValidationError, from_json
+
+from controller.api.messages import TouchParams
 
 
 def is_moot(line: bytes, following: bytes) -> bool:
@@ -23,6 +30,8 @@ def _source(line: bytes) -> str | None:
     except ValueError:
         return None
     match said:
-        case {"method": "touch", "params": {"source": str(source), "touches": list()}}:
-            return None if "id" in said else source
+        # Nothing else is in it, least of all an id.
+        case {"jsonrpc": "2.0", "method": "touch", "params": params} if len(said) == 3:
+            with suppress(ValidationError):
+                return TouchParams.model_validate(params).source
     return None

@@ -262,10 +262,19 @@ async def test_of_touches_that_wait_the_newest_counts(served: Served) -> None:
     lines += [touch("b", x=0.04), touch("a", x=0.05)]
     lines += [b'{"jsonrpc":"2.0","method":"disarm"}\n', touch("a", x=0.06, id='"id":7,')]
     lines += [touch("a", x=0.07), b'{"jsonrpc":"2.0","method":"touch","params":{"source":"a"}}\n']
+    refused = [
+        touch("a", x=0.5).replace(b"0.1}", b'"here"}'),
+        touch("a", x=0.5).replace(b'"2.0"', b'"1.0"'),
+        touch("a", x=0.5).replace(b'"method"', b'"more":1,"method"'),
+    ]
+    for number, line in enumerate(refused):  # what is refused takes nobody's place, a lift's least
+        lines += [touch("a", x=0.08 + 0.01 * number), line]
     wire.send(b"".join(lines))
     wire.ask("stop", id=8)
-    assert [(await wire.line())["id"] for _ in range(2)] == [7, 8]
-    assert served.touched == [("a", 0.03), ("b", 0.04), ("a", 0.05), ("a", 0.06), ("a", 0.07)]
+    # Two of the refused are no requests at all, which is told without a number.
+    assert [(await wire.line())["id"] for _ in range(4)] == [7, None, None, 8]
+    before = [("a", 0.03), ("b", 0.04), ("a", 0.05), ("a", 0.06), ("a", 0.07)]
+    assert served.touched == [*before, ("a", 0.08), ("a", 0.09), ("a", 0.1)]
 
 
 async def test_what_a_touch_sets_off_goes_before_the_next_turn(

@@ -7,7 +7,7 @@ from functools import cache
 
 import numpy as np
 
-from benchmarks.plant_time import FINGERS, RIG, Case
+from benchmarks.plant_problem import FINGERS, RIG, Case
 from drivers.command import CommandSet, DriveCommand
 from drivers.protocol.messages import Achieved, Apply, Arm
 from model.fem.assembly import era_positions

@@ -38,7 +38,7 @@ def main() -> None:
         both = np.array([first, plate.sweep(INSET, RASTER)])
         result["answers"] = [both.real.tolist(), both.imag.tolist()]
     elif task == "layout":
-        result["seconds"] = _time(plate, sweep=lambda places: plate.sweep(places, RASTER))
+        result["seconds"] = _time(lambda places: plate.sweep(places, RASTER))
     elif task == "places":
         x, y = np.meshgrid(np.linspace(0, LENGTH, 13), np.linspace(0, WIDTH, 13))
         candidates = program.Candidates(plate, np.column_stack([x.ravel(), y.ravel()]), RASTER)
@@ -53,7 +53,7 @@ def main() -> None:
     print(json.dumps(result | {"peak_mb": kilobytes / 1024}))
 
 
-def _time(plate, sweep):
+def _time(sweep):
     """Seconds a layout: of one where that takes long, else the mean of many, each elsewhere."""
     started = time.perf_counter()
     sweep(INSET)

@@ -44,7 +44,7 @@ def collect(configs: Iterable[Path], *, socket: Path | None, home: Path) -> Repo
     missing: list[str] = []
     for path in configs:
         for named in _with_named(path, missing):
-            _take(named, files, missing, home)
+            _take(named, files, missing)
     files["versions.json"] = json.dumps(versions(), indent=2)
     try:
         with Client.connect(socket, name="era report") as daemon:
@@ -110,7 +110,7 @@ def _with_named(path: Path, missing: list[str]) -> Iterable[Path]:
         yield from sorted(found, key=lambda file: file.name)[-MOST_DUMPS:]
 
 
-def _take(path: Path, files: dict[str, str], missing: list[str], home: Path) -> None:
+def _take(path: Path, files: dict[str, str], missing: list[str]) -> None:
     """Put a text file in under its name; one that is too large with its end only."""
     try:
         with path.open("rb") as stream:

@@ -46,7 +46,7 @@ def dbc_text(*, node: int = 1, channels: int = 4) -> str:
     for message in messages:
         receiver = _AMPLIFIER if message.sender == _HOST else _HOST
         lines.append(f"BO_ {message.id} {message.name}: {message.length} {message.sender}")
-        lines += [_signal(message, field, receiver) for field in message.fields]
+        lines += [_signal(field, receiver) for field in message.fields]
         lines.append("")
     for message in messages:
         for field in message.fields:
@@ -81,7 +81,7 @@ def _block(id: int, name: str, sender: str, layout: str) -> _Message:
     return _Message(id, name, sender, tuple(LAYOUTS[layout].fields.values()))
 
 
-def _signal(message: _Message, field: Field, receiver: str) -> str:
+def _signal(field: Field, receiver: str) -> str:
     sign = "-" if field.signed else "+"
     quantity = _quantity(field)
     scale, low, high, unit = "1", "0", f"{(1 << field.bits) - 1}", ""

@@ -19,6 +19,9 @@ from typing import NamedTuple
 from drivers.amplifier import WATCHDOG
 from drivers.operation.supervision import assume_energised
 
+ACKNOWLEDGE = "find the cause, then clear (era clear) and arm again"
+"""What somebody has to do about a fault."""
+
 
 class State(StrEnum):
     """States by their CiA 402 names, and COMM_LOST."""
@@ -214,7 +217,9 @@ def _entered(before: Machine, after: Machine, to: State, event: Event) -> Machin
         told = event.kind is Kind.FAULT and bool(event.cause)
         return replace(after, cause=event.cause, remedy=event.remedy) if told else after
     latched = to in _LATCHING or (to is State.COMM_LOST and after.latched)
-    # Back on a link, what it was lost for is still the reason.
-    cause = event.cause or before.cause
-    remedy = event.remedy
+    # Back on a link, what it was lost for is still the reason, but no longer how it is.
+    cause, remedy = event.cause or before.cause, event.remedy
+    if before.state is State.COMM_LOST and to is State.FAULT:
+        cause = f"all amplifiers answer again, and are disarmed; before that: {cause}"
+        remedy = ACKNOWLEDGE
     return replace(after, state=to, cause=cause, remedy=remedy, latched=latched, acknowledged=False)

@@ -9,7 +9,7 @@ from functools import partial
 
 from controller.amplifiers import Phase
 from controller.daemon.reopening import TICK, reopen
-from controller.daemon.states import Action, Event, Kind, Machine, State, step
+from controller.daemon.states import ACKNOWLEDGE, Action, Event, Kind, Machine, State, step
 from controller.loop import Controller
 from controller.observer import Observer
 from drivers import clock
@@ -26,7 +26,6 @@ _READ_BACK_PAUSE = 0.02  # s
 
 _SETTLED = (AmplifierState.SWITCH_ON_DISABLED, AmplifierState.READY_TO_SWITCH_ON)
 
-_CLEAR = "find the cause, then clear (era clear) and arm again"
 
 _logger = logging.getLogger(__name__)
 
@@ -173,7 +172,7 @@ class Supervisor:
         except GaveWay:
             raise  # no fault of the amplifiers': what it gave way to is an event of its own
         except DriverError as error:
-            await self.handle(Event(Kind.FAULT, str(error), _CLEAR))
+            await self.handle(Event(Kind.FAULT, str(error), ACKNOWLEDGE))
             raise
 
     async def _arm(self) -> None:
@@ -185,7 +184,7 @@ class Supervisor:
         except DriverError as error:
             # Where somebody stopped or disarmed meanwhile, that is why, and it is no fault.
             if self.machine.state is State.SWITCHED_ON:
-                await self.handle(Event(Kind.FAULT, str(error), _CLEAR))
+                await self.handle(Event(Kind.FAULT, str(error), ACKNOWLEDGE))
             raise
         await self.handle(Event(Kind.ARMED, self.machine.cause))
 
@@ -200,7 +199,7 @@ class Supervisor:
         if problem is None:
             await self.handle(Event(Kind.SOUND, "all amplifiers are sound, disarmed and at zero"))
         else:
-            await self.handle(Event(Kind.FAULT, problem, _CLEAR))
+            await self.handle(Event(Kind.FAULT, problem, ACKNOWLEDGE))
 
     async def _clear(self) -> None:
         # An amplifier that still falls silent overhears it, so it is said again at each look.
@@ -209,7 +208,7 @@ class Supervisor:
         if problem is None:
             await self.handle(Event(Kind.SOUND, "acknowledged, and the cause is gone"))
             return
-        await self.handle(Event(Kind.FAULT, problem, _CLEAR))
+        await self.handle(Event(Kind.FAULT, problem, ACKNOWLEDGE))
         raise CommandRefused(f"{problem}; the cause is not gone, so nothing was cleared")
 
     async def _acknowledge(self) -> None:
@@ -289,14 +288,14 @@ class Supervisor:
                 _quiet_logger.exception("the amplifiers could not be asked how they are")
             else:
                 if problem is not None and self.machine.state is State.READY_TO_SWITCH_ON:
-                    await self._quietly(self.handle(Event(Kind.FAULT, problem, _CLEAR)))
+                    await self._quietly(self.handle(Event(Kind.FAULT, problem, ACKNOWLEDGE)))
 
     def _look_at_phase(self) -> None:
         """After a turn of the control loop: whether it has stopped the amplifiers by itself."""
         if self.machine.state is not State.OPERATION_ENABLED:
             return
         if self._the_controller.phase is Phase.DISARMED:
-            self.tell(Event(Kind.FAULT, self._refusal or "an amplifier refused", _CLEAR))
+            self.tell(Event(Kind.FAULT, self._refusal or "an amplifier refused", ACKNOWLEDGE))
 
     def _heard(self, name: str, event: AmplifierEvent) -> None:
         """What an amplifier says unasked; a heartbeat would tell later."""
@@ -304,7 +303,7 @@ class Supervisor:
             return
         channel = "" if event.channel is None else f", channel {event.channel}"
         cause = f"amplifier {name} reports {event.fault.name}{channel}"
-        self.tell(Event(Kind.FAULT, cause, _CLEAR))
+        self.tell(Event(Kind.FAULT, cause, ACKNOWLEDGE))
 
     async def _quietly(self, work: Awaitable[None]) -> None:
         """Do something for nobody who could be told what goes wrong: the state tells it."""

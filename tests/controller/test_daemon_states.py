@@ -121,9 +121,14 @@ def test_a_lost_link_stops_the_others_and_reconnects(state: State) -> None:
 @pytest.mark.parametrize("state", [State.SWITCHED_ON, State.OPERATION_ENABLED, *LATCHED])
 def test_a_link_that_was_lost_while_energised_comes_back_latched(state: State) -> None:
     """Nothing is armed again before somebody has acknowledged that it was lost."""
-    lost, _ = step(Machine(state, latched=state in LATCHED), Event(Kind.LINK_LOST), LOST_AT)
+    before = Machine(state, latched=state in LATCHED)
+    lost, _ = step(before, Event(Kind.LINK_LOST, "unplugged", "look at cables"), LOST_AT)
     back, _ = step(lost, Event(Kind.REOPENED), ENERGISED_UNTIL)
     assert back.state is State.FAULT
+    # What it was lost for is no longer how it is, and somebody has to be told what to do now.
+    assert back.cause.startswith("all amplifiers answer again")
+    assert back.cause.endswith("unplugged")
+    assert "era clear" in (back.remedy or "")
 
 
 @pytest.mark.parametrize("kind", [Kind.REOPENED, Kind.TICK])

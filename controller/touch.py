@@ -22,7 +22,7 @@ class Touch:
 class TouchFrame:
     """All touches a source sees at a moment; a touch that is no longer in it has been lifted.
 
-    time: when the news arrived, on time.monotonic() [s].
+    time: when the news arrived, by the event loop's clock [s].
     """
 
     source: str

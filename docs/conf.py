@@ -35,6 +35,10 @@ intersphinx_mapping: dict[str, tuple[str, str | None]] = {}
 
 
 _ARRAY_TYPE = re.compile(r"~numpy\.ndarray\[.*?~numpy\.dtype\[[^]]*\]\]")
+_MESSAGES = {
+    name: re.compile(rf"~drivers\.protocol\.messages\.{first} \|.*?\.{last}\b")
+    for name, first, last in (("Request", "Hello", "LoadEnvelope"), ("Reply", "Identity", "Nak"))
+}
 _LONG_ARRAY = re.compile(r"array\(\[([^,]+),.+?, *([^,]+)\]\)")
 
 
@@ -47,11 +51,18 @@ def _shorten(
     signature: str | None,
     gives: str | None,
 ) -> tuple[str, str | None] | None:
-    """Say of an array that it is one, for its shape stands in the words below."""
+    """Say types by their names; an array's shape stands in the words below."""
     if signature is None:
         return None
-    short = _LONG_ARRAY.sub(r"[\1, ..., \2]", _ARRAY_TYPE.sub("ndarray", signature))
-    return short, None if gives is None else _ARRAY_TYPE.sub("ndarray", gives)
+    return _LONG_ARRAY.sub(r"[\1, ..., \2]", _named(signature)), gives and _named(gives)
+
+
+def _named(text: str) -> str:
+    """Types that are long by the names they go by."""
+    text = _ARRAY_TYPE.sub("ndarray", text)
+    for name, pattern in _MESSAGES.items():
+        text = pattern.sub(name, text)
+    return text
 
 
 def setup(app: Sphinx) -> None:

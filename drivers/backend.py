@@ -38,8 +38,8 @@ class Backend(ABC):
 
         timeout [s]: for all of it; longer where the wire itself needs longer. Raises LinkTimeout,
         LinkError. A Nak is returned, not raised. Cancelling leaves the wire usable.
-        Sets and envelopes must be a SafeCommand and a SafeEnvelope: TypeError for others, as
-        `drivers.guard.require_safe` raises it.
+        Sets and envelopes must have been let through by a guard: TypeError for others, as
+        `require_safe` raises it.
         """
 
     @property

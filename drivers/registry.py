@@ -60,6 +60,6 @@ def _load(entry: EntryPoint) -> type[Backend]:
     if not (isinstance(backend, type) and issubclass(backend, Backend)):
         raise CommandError(
             f"{entry.value}, registered for {entry.name}://, is not a class derived from "
-            "drivers.backend.Backend; report this to whoever made it"
+            "era_haptics.plugins.backends.Backend; report this to whoever made it"
         )
     return backend

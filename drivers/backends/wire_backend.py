@@ -8,7 +8,11 @@ from drivers.statistics import WireCounters
 
 
 class WireBackend(Backend):
-    """A backend that counts, and tells of events and of a loss that nobody asked about."""
+    """A backend that counts, and tells of events and of a loss that nobody asked about.
+
+    What derives from it counts in `_counters`, puts the time into `_last_sent` when a request has
+    gone out, and calls `_on_event` and `_on_loss`, which nobody hears before `listen`.
+    """
 
     def __init__(self) -> None:
         self._counters = WireCounters()

@@ -1,27 +1,25 @@
 """An amplifier that speaks lines of JSON over TCP, at lines://HOST:PORT.
 
-A backend says the messages of `drivers.protocol.messages` in the words and units of its own wire,
+A backend says the messages that amplifiers know in the words and units of its own wire,
 and nothing else: retries, tokens, turns and states belong to the `Amplifier` above it.
 """
 
 import asyncio
 import json
 from contextlib import suppress
+from typing import Any, NoReturn
 from urllib.parse import urlsplit
 
-from drivers import clock
-from drivers.backends.wire_backend import WireBackend
-from drivers.command import DriveCommand
-from drivers.errors import CommandError, LinkError, LinkTimeout
-from drivers.guard import require_safe
-from drivers.protocol.messages import (
+from era_haptics.plugins.backends import (
     Achieved,
     Apply,
     Arm,
     Capabilities,
     Clear,
+    CommandError,
     Commit,
     Disarm,
+    DriveCommand,
     Fault,
     FaultList,
     FaultRecord,
@@ -30,17 +28,27 @@ from drivers.protocol.messages import (
     GetStatus,
     Hello,
     Identity,
+    LinkError,
+    LinkTimeout,
     Nak,
     NakCode,
     Ping,
+    Reply,
+    Request,
     Stage,
     State,
     Status,
     Stop,
+    WireBackend,
+    now,
+    require_safe,
 )
 
 HERTZ, LEVEL, DEGREES, SECONDS = 0.01, 1e-4, 0.01, 1e-3  # what one is worth on this wire
-PLAIN = {Hello: "hello", GetCaps: "capabilities", GetFaults: "faults"} | {
+PLAIN: dict[type[Request], str] = {
+    Hello: "hello",
+    GetCaps: "capabilities",
+    GetFaults: "faults",
     GetStatus: "status",
     Ping: "ping",
     Clear: "clear",
@@ -50,25 +58,25 @@ PLAIN = {Hello: "hello", GetCaps: "capabilities", GetFaults: "faults"} | {
 class LinesBackend(WireBackend):
     """Carries requests over a TCP connection, one line each way."""
 
-    def __init__(self, url):
+    def __init__(self, url: str) -> None:
         super().__init__()
         try:
             place = urlsplit(url)
-            self._host, self._port = place.hostname, place.port
+            host, port = place.hostname, place.port
         except ValueError:
-            self._host = self._port = None
-        if not self._host or not self._port or place.path or place.query or place.fragment:
+            host = port = None
+        if not host or not port or place.path or place.query or place.fragment:
             raise CommandError(f"{url!r} is no address; write lines://HOST:PORT")
-        self._url = url
-        self._reader = self._writer = None
+        self._url, self._host, self._port = url, host, port
+        self._line: tuple[asyncio.StreamReader, asyncio.StreamWriter] | None = None
         self._number = 0
 
-    async def open(self):
+    async def open(self) -> None:
         """Connect; the amplifier serves one host at a time."""
-        if self._writer is not None:
+        if self._line is not None:
             return
         try:
-            self._reader, self._writer = await asyncio.wait_for(
+            self._line = await asyncio.wait_for(
                 asyncio.open_connection(self._host, self._port), timeout=2.0
             )
         except OSError as error:  # a timeout is one, too
@@ -77,31 +85,33 @@ class LinesBackend(WireBackend):
                 "amplifier is switched on, and its address"
             ) from error
 
-    async def close(self):
+    async def close(self) -> None:
         """Hang up."""
-        writer, self._reader, self._writer = self._writer, None, None
-        if writer is not None:
+        line, self._line = self._line, None
+        if line is not None:
+            _, writer = line
             writer.close()
             with suppress(OSError):  # of a line that was lost before
                 await writer.wait_closed()
 
-    async def exchange(self, request, *, timeout):
+    async def exchange(self, request: Request, *, timeout: float) -> Reply:
         """Send a request and wait for the answer that carries its number."""
         require_safe(request)
-        if self._writer is None:
+        if self._line is None:
             raise LinkError(f"{self._url} is not open")
+        reader, writer = self._line
         question = in_words(request)
         if question is None:
             return Nak(NakCode.UNKNOWN_TYPE)  # envelopes: this wire has none
         self._number += 1
         try:
             async with asyncio.timeout(timeout):
-                self._writer.write(json.dumps({"id": self._number, **question}).encode() + b"\n")
-                self._last_sent = clock.now()
+                writer.write(json.dumps({"id": self._number, **question}).encode() + b"\n")
+                self._last_sent = now()
                 self._counters.frames_out += 1
-                await self._writer.drain()
+                await writer.drain()
                 while True:
-                    reply = await self._reply_to(request)
+                    reply = await self._reply_to(request, reader)
                     if reply is not None:
                         return reply
         except TimeoutError:
@@ -109,10 +119,10 @@ class LinesBackend(WireBackend):
         except OSError as error:
             raise LinkError(f"{self._url} is lost: {error}") from error
 
-    async def _reply_to(self, request):
+    async def _reply_to(self, request: Request, reader: asyncio.StreamReader) -> Reply | None:
         """The next line, if it is the answer; a damaged or a late one is counted and dropped."""
         try:
-            line = await self._reader.readline()
+            line = await reader.readline()
         except ValueError:  # longer than any answer
             self._counters.bad += 1
             return None
@@ -129,12 +139,12 @@ class LinesBackend(WireBackend):
         return None
 
 
-def refuse(constant):
+def refuse(constant: str) -> NoReturn:
     """NaN and Infinity are none of JSON's numbers, and none of ours."""
     raise ValueError(constant)
 
 
-def in_words(request):
+def in_words(request: Request) -> dict[str, Any] | None:
     """A request in the words and units of the wire; None for one that it does not know."""
     if type(request) in PLAIN:
         return {"ask": PLAIN[type(request)]}
@@ -166,7 +176,7 @@ def in_words(request):
     return None
 
 
-def read(request, told):
+def read(request: Request, told: dict[str, Any]) -> Reply:
     """The reply that an answer means; raises what goes with an answer that is none."""
     if "refused" in told:
         return Nak(NakCode(told["refused"]), told["channel"])

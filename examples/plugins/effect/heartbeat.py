@@ -3,9 +3,15 @@
 from dataclasses import dataclass
 from typing import Annotated, ClassVar
 
-from controller.effects.effect import Course, Effect, Feeling, Nothing
-from model.config.sections import Quantity
-from model.config.units import TIME
+from era_haptics.plugins.effects import (
+    TIME,
+    Contact,
+    Course,
+    Effect,
+    Feeling,
+    Nothing,
+    Quantity,
+)
 
 PULSE = 0.08  # s; the plate needs 20 ms to follow, and a pulse that is felt as one some more
 SECOND = 0.25  # s; from the first pulse of a beat to its second
@@ -21,7 +27,7 @@ class Beating(Course):
     period: float
     level_db_sl: float | None
 
-    def feel(self, contact, now):
+    def feel(self, contact: Contact, now: float) -> Feeling | Nothing:
         """The pulse or the pause that is on, and when it is over."""
         beats, into = divmod(now - self.start + _ROUNDING, self.period)
         begin = self.start + beats * self.period
@@ -43,11 +49,11 @@ class Heartbeat(Effect):
 
     period: Annotated[float, Quantity(TIME, least=0.4, most=5.0)] = 0.9
 
-    def begin(self, contact, now, *, level_db_sl):
+    def begin(self, contact: Contact, now: float, *, level_db_sl: float | None) -> Course:
         """Begin at a finger."""
         return Beating(now, self.period, level_db_sl)
 
     @property
-    def ends(self):
+    def ends(self) -> bool:
         """Not before the finger goes."""
         return False

@@ -5,14 +5,12 @@ python try_effect.py KIND
 
 import sys
 
-from controller.contacts import Contact, ContactKey
-from controller.effects.effect import Feeling
-from controller.effects.kinds import effect_kind
+from era_haptics.plugins.effects import Contact, ContactKey, Feeling, effect_kind
 
 effect = effect_kind(sys.argv[1])()
 finger = Contact(ContactKey("try", 1), x=0.1, y=0.1, since=0.0)
 course = effect.begin(finger, 0.0, level_db_sl=effect.level_db_sl)
-now = 0.0
+now: float | None = 0.0
 while now is not None and now < 2.0:
     felt = course.feel(finger, now)
     if felt is None:

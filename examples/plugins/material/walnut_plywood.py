@@ -1,7 +1,6 @@
 """A material of one's own, by name. The numbers are an example: measure yours."""
 
-from model.structure.materials import KnownMaterial
-from model.structure.plate import Material
+from era_haptics.plugins.materials import KnownMaterial, Material
 
 WALNUT_PLYWOOD = KnownMaterial(
     Material("walnut-plywood", E=9.5e9, rho=620.0, nu=0.3),

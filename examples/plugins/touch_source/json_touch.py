@@ -7,11 +7,16 @@ down, and says [] when the last one goes: whoever is not heard for 150 ms is tak
 import asyncio
 import json
 import logging
+from collections.abc import Callable
 
-from controller.sources.datagrams import listen
-from controller.tally import Tally
-from controller.touch import Touch, TouchFrame, TouchSource
-from model.errors import InputError
+from era_haptics.plugins.touch_sources import (
+    InputError,
+    Tally,
+    Touch,
+    TouchFrame,
+    TouchSource,
+    listen,
+)
 
 LONGEST = 4096  # bytes of a datagram; ten fingers need 400
 
@@ -19,17 +24,17 @@ LONGEST = 4096  # bytes of a datagram; ten fingers need 400
 class JsonTouch(TouchSource):
     """Listens at jsontouch:HOST:PORT."""
 
-    def __init__(self, url):
+    def __init__(self, url: str) -> None:
         host, _, port = url.removeprefix("jsontouch:").rpartition(":")
         if not host or not (port.isascii() and port.isdecimal() and 0 < int(port) < 65536):
             raise InputError(f"touch source {url}: write jsontouch:HOST:PORT")
         self._host, self._port = host, int(port)
         self.tally = Tally(logging.getLogger(__name__))  # counts, and logs once a second at most
 
-    async def run(self, deliver):
+    async def run(self, deliver: Callable[[TouchFrame], None]) -> None:
         """Deliver a frame a datagram until cancelled; malformed ones are counted, never raised."""
 
-        def received(data, peer, arrived):
+        def received(data: bytes, peer: tuple[str, int], arrived: float) -> None:
             try:
                 touches = tuple(Touch(int(id), float(x), float(y)) for id, x, y in json.loads(data))
             except (ValueError, TypeError, OverflowError, RecursionError) as error:

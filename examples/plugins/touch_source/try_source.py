@@ -7,18 +7,25 @@ import asyncio
 import sys
 
 import era_haptics as era
-from controller.contacts import LEASE, ContactTracker
-from controller.touch_registry import open_source
+from era_haptics.plugins.touch_sources import (
+    Change,
+    ContactTracker,
+    TouchFrame,
+    now,
+    open_source,
+)
+
+LOOK = 0.015  # s; whoever is silent for 150 ms is found soon after
 
 
-async def main(url):
+async def main(url: str) -> None:
     """Follow its contacts; a finger that is not heard of in time is lifted, as in the daemon."""
     tracker = ContactTracker(era.load_rig(era.example_rig_path()).plate)
     source = open_source(url)
     ended = asyncio.Event()
     told = {"frames": 0, "moves": 0}
 
-    def show(change):
+    def show(change: Change) -> None:
         told["moves"] += len(change.moved)
         for word, contacts in (("down", change.down), ("up  ", change.up)):
             for contact in contacts:
@@ -28,14 +35,14 @@ async def main(url):
         if change.up and not tracker.contacts:
             ended.set()
 
-    def deliver(frame):
+    def deliver(frame: TouchFrame) -> None:
         told["frames"] += 1
         show(tracker.update(frame))
 
-    async def expire():
+    async def expire() -> None:
         while True:
-            await asyncio.sleep(LEASE / 10)
-            show(tracker.expire(asyncio.get_running_loop().time()))
+            await asyncio.sleep(LOOK)
+            show(tracker.expire(now()))
 
     tasks = [asyncio.create_task(work) for work in (source.run(deliver), expire(), ended.wait())]
     await asyncio.sleep(0.1)  # for it to open, or to say why it cannot

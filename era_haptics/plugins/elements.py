@@ -1,0 +1,7 @@
+"""For plate elements: entry points `era_haptics.elements`."""
+
+from model.arrays import FloatArray
+from model.fem.elements.element import Element, rigidities
+from model.structure.plate import Material, Plate
+
+__all__ = ["Element", "FloatArray", "Material", "Plate", "rigidities"]

@@ -1,0 +1,6 @@
+"""For materials by name: entry points `era_haptics.materials`."""
+
+from model.structure.materials import KnownMaterial
+from model.structure.plate import Material
+
+__all__ = ["KnownMaterial", "Material"]

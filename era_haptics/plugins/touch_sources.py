@@ -1,0 +1,29 @@
+"""For panels with a protocol of their own: entry points `era_haptics.touch_sources`.
+
+`open_source`, `ContactTracker` and what it tells are for trying one, as contacts on a plate.
+"""
+
+from controller.contacts import Change, Contact, ContactKey, ContactTracker
+from controller.sources.datagrams import Datagram, Datagrams, listen
+from controller.tally import Tally
+from controller.touch import Touch, TouchFrame, TouchSource
+from controller.touch_registry import open_source
+from drivers.clock import now
+from model.errors import InputError
+
+__all__ = [
+    "Change",
+    "Contact",
+    "ContactKey",
+    "ContactTracker",
+    "Datagram",
+    "Datagrams",
+    "InputError",
+    "Tally",
+    "Touch",
+    "TouchFrame",
+    "TouchSource",
+    "listen",
+    "now",
+    "open_source",
+]

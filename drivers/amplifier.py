@@ -172,8 +172,8 @@ class Amplifier:
         """Quick stop along a ramp [s], latched until clear; overtakes all that waits.
 
         It is on the wire within 8 ms, as disarm is: what else waits for an answer there gives way
-        and raises CommandRefused, unless it silences too. What is not on the wire yet gives way at
-        once.
+        and raises CommandRefused, or follows where it silences. What is not on the wire yet gives
+        way at once.
         """
         return await self._link.ask(Stop(ramp=self._ramp(ramp)), expect=Status, kind=Kind.STOP)
 

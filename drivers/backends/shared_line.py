@@ -27,11 +27,6 @@ class SharedLine(ABC):
         self._is_open = False
         self._changing = asyncio.Lock()  # held while it is opened or closed
 
-    @property
-    def is_shared(self) -> bool:
-        """Whether more than one is on it."""
-        return len(self._users) > 1
-
     async def join(self, number: int, on_loss: Callable[[str], None]) -> None:
         """Be on it from now on; on_loss: told once, in the event loop, why it was lost.
 

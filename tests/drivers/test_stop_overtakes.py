@@ -395,3 +395,32 @@ def test_a_stop_goes_before_the_repetition_of_what_else_silences(
         await chain.west.heartbeat()
 
     on_a_line(line, coarse_rig, use)
+
+
+@pytest.mark.parametrize("line", LINES)
+def test_who_joins_a_line_waits_for_the_answer_that_is_owed_there(
+    line: str, coarse_rig: Rig
+) -> None:
+    """East had the line for itself and is being asked when west is opened: west's first request
+    goes out after east's answer, for two on one pair of wires would spoil each other."""
+
+    async def use(chain: Chain) -> None:
+        await chain.west.close()
+        answered: list[float] = []
+
+        async def beat() -> None:
+            await chain.east.heartbeat()
+            answered.append(asyncio.get_running_loop().time())
+
+        for moment in MOMENTS[:8]:
+            chain.forget()
+            beating = asyncio.create_task(beat())
+            await asyncio.sleep(moment)
+            await chain.west.open()
+            await beating
+            assert chain.kinds()[:2] == [("east", "Ping"), ("west", "Hello")]
+            assert chain.sent_at[1] >= answered.pop()
+            await chain.west.close()
+            await asyncio.sleep(0.05)
+
+    on_a_line(line, coarse_rig, use)

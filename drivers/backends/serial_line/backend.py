@@ -122,8 +122,7 @@ class SerialBackend(WireBackend):
         need longer.
         """
         line = self._opened()
-        if not line.is_shared:
-            return await self._exchange(line, request, timeout)
+        # Also where nobody else is on the line: who joins it while an answer is owed must wait.
         return await line.turns.carry_out(
             kind_on_line(request),
             lambda: self._exchange(line, request, timeout),

@@ -58,7 +58,6 @@ async def test_the_first_opens_and_the_last_closes() -> None:
     await line.join(1, lambda _: None)
     assert the_line() is line
     await line.join(2, lambda _: None)
-    assert line.is_shared
     await line.leave(1)
     assert line.happened == ["opened"]
     await line.leave(2)

@@ -22,7 +22,7 @@ from model.errors import InputError
 
 LARGEST_FILE = 1 << 20  # bytes of one file that is put in
 MOST_DUMPS = 5
-_GROUPS = ("backends", "touch_sources", "effects", "commands", "config_kinds")
+_GROUPS = "era_haptics."  # what the groups of our entry points begin with
 _NAMED = ("rig", "layout")  # files that a daemon's file names; a table is large and can be built
 
 
@@ -67,11 +67,12 @@ def versions() -> dict[str, Any]:
         except PackageNotFoundError:
             needed[name] = "not installed"
     plug_ins = {
-        group: {
+        group.removeprefix(_GROUPS): {
             point.name: f"{point.value} ({_package(point.dist)})"
-            for point in sorted(entry_points(group=f"era_haptics.{group}"))
+            for point in sorted(entry_points(group=group))
         }
-        for group in _GROUPS
+        for group in sorted(entry_points().groups)
+        if group.startswith(_GROUPS)
     }
     return {
         "era-haptics": version("era-haptics"),

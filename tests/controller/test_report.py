@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from controller.report.collect import MOST_DUMPS, collect
+from controller.report.collect import MOST_DUMPS, collect, versions
 from controller.report.redaction import redacted
 from model.rig.file import example_rig_path
 
@@ -65,6 +65,18 @@ def test_everything_that_a_daemon_names(tmp_path: Path) -> None:
     told = json.loads(report.files["versions.json"])
     assert told["packages"]["numpy"][0].isdigit()
     assert "SerialBackend" in told["plug-ins"]["backends"]["serial"]
+
+
+def test_plug_ins_of_every_kind_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A package that adds a material is named with it, as one of any other kind is."""
+    package = tmp_path / "cork-1.5.dist-info"
+    package.mkdir()
+    (package / "METADATA").write_text("Metadata-Version: 2.1\nName: cork\nVersion: 1.5\n", "utf-8")
+    (package / "entry_points.txt").write_text(
+        "[era_haptics.materials]\ncork = cork:CORK\n", "utf-8"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    assert versions()["plug-ins"]["materials"] == {"cork": "cork:CORK (cork 1.5)"}
 
 
 def test_files_that_cannot_be_read_as_they_should(tmp_path: Path) -> None:

@@ -241,6 +241,9 @@ def _shape(body: list[int]) -> Shape:
     knots = body[3:]
     if len(knots) != 2 * count:
         raise OutOfRange("an envelope of another length than its knots")
+    whole(q.KNOTS, count, "envelope_knots")
+    for phase in knots[1::2]:
+        value(q.PHASE, signed(phase), "phase of a knot")
     return Shape(
         whole(q.SLOT, slot, "slot"),
         value(q.STEP, step, "step"),

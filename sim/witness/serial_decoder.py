@@ -188,6 +188,7 @@ def _shape(payload: bytes) -> Shape:
     knots = [struct.unpack_from("<Hh", payload, 4 + 4 * number) for number in range(count)]
     if len(payload) != 4 + 4 * count:
         raise OutOfRange("an envelope of another length than its knots")
+    whole(q.KNOTS, count, "envelope_knots")
     for _, phase in knots:
         value(q.PHASE, phase, "phase of a knot")
     return Shape(

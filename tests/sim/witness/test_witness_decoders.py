@@ -1,14 +1,17 @@
 """The witness's decoders against the examples of the three pages from which they were written."""
 
 import re
+import struct
+import zlib
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from cobs import cobs
 
 from sim.witness.can_decoder import CanDecoder
 from sim.witness.can_text import CanFrame, SlcanText, SocketcandText
-from sim.witness.modbus_decoder import ModbusDecoder
+from sim.witness.modbus_decoder import ModbusDecoder, check
 from sim.witness.modbus_frames import crc16
 from sim.witness.seen import (
     Answered,
@@ -293,3 +296,31 @@ def test_a_late_answer_to_what_was_repeated_tells_nothing_new() -> None:
     passes(1.0403, "host", "Apply reply", 6, 514)
     passes(1.0404, "host", "Apply reply", 4)
     assert [str(violation) for violation in witness.finish(1.05)] == []
+
+
+@pytest.mark.parametrize(
+    ("count", "phase", "problem"),
+    [
+        (2, 17999, ""),
+        (32, 0, ""),
+        (33, 0, "envelope_knots 33 is not within 0 to 32"),
+        (2, 18000, "phase of a knot 18000 is not within -18000 to 17999"),
+    ],
+)
+def test_an_envelope_is_held_to_its_bounds_on_every_wire(
+    count: int, phase: int, problem: str
+) -> None:
+    """The bounds of the page's table: an envelope beyond them is wrong, whichever wire it is on."""
+    knots = [1000, phase] * count
+    head = bytes.fromhex("2D 01 07 00")  # of the page's LoadEnvelope
+    body = head + struct.pack(f"<BHB{2 * count}H", 5, 50, count, *knots)
+    line = b"\0" + cobs.encode(body + struct.pack("<I", zlib.crc32(body))) + b"\0"
+    block = struct.pack(f">{3 + 2 * count}H", 5, 50, count, *knots)
+    written = struct.pack(">HH", 8, check([5, 50, count, *knots])) + block
+    pdu = bytes.fromhex("17 00 64 00 05 00 64")
+    pdu += struct.pack(">HB", len(written) // 2, len(written)) + written
+    tcp = struct.pack(">HHHB", 8, 0, len(pdu) + 1, 1) + pdu
+    for decoder, data in ((SerialDecoder(), line), (ModbusDecoder(over_tcp=True), tcp)):
+        ((_, meaning),) = decoder.feed("amplifier", 0.0, data)
+        assert isinstance(meaning, Asked)
+        assert meaning.problem == problem

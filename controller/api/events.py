@@ -43,7 +43,7 @@ class PatternEvent(Message):
 
 
 class SilenceEvent(Message):
-    """All channels were brought to zero, or stay there."""
+    """All channels are brought to zero, or stay there, or cannot be reached: the state tells."""
 
     contacts: list[ContactStatus]
     reason: str

@@ -246,8 +246,8 @@ class Daemon:
         _logger.error("touch source %s has failed, and is tried again: %s", name, error)
 
     def _state_changed(self, old: Machine, new: Machine) -> None:
-        self._service.state_changed(new)
         self._news.state_changed(old, new)
+        self._service.state_changed(new)
         self._manager.status(f"{new.state.value}: {new.cause}")
         if new.state in (State.FAULT_REACTION_ACTIVE, State.COMM_LOST):
             self._dump(new.cause)

@@ -11,13 +11,14 @@ from controller.api.events import (
     LayoutEvent,
     LinkEvent,
     LogEvent,
+    SilenceEvent,
     StateEvent,
 )
 from controller.api.hub import Hub
 from controller.api.parts import AmplifierStatus
 from controller.contacts import Change, Contact, ContactKey
 from controller.daemon.latency import Latencies
-from controller.daemon.states import Machine
+from controller.daemon.states import Machine, State
 from controller.daemon.view import Scene
 from controller.effects.layout import Layout
 from controller.observer import Applied, Observer, Silenced
@@ -79,6 +80,13 @@ class News:
                 old=old.state.value, new=new.state.value, cause=new.cause, remedy=new.remedy
             ),
         )
+        if self.scene.applied is not None and new.state is not State.OPERATION_ENABLED:
+            # The control loop does not tell of what others end; without a link it cannot.
+            self.scene.ended()
+            over = SilenceEvent(
+                contacts=self.scene.contact_statuses(), reason=new.cause, latency_ms=None
+            )
+            self.hub.publish("silence", lambda: over)
 
     def layout_changed(self, layout: Layout | None) -> None:
         """There is another surface layout, or there are other effects without one."""

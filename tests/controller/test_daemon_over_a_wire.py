@@ -246,6 +246,20 @@ async def test_a_cut_link_is_told_and_comes_back_disarmed(tmp_path: Path) -> Non
         await era.arm("me")
 
 
+async def test_a_pattern_that_a_cut_link_ends_is_told_to_be_over(tmp_path: Path) -> None:
+    """Who draws what is played does not draw it for ever."""
+    async with running_daemon(tmp_path) as bench, await bench.client() as era:
+        await until_state(era, READY)
+        await era.arm("me", lease_s=30)
+        async with holding(era, bench):
+            await era.subscribe("pattern", "silence")
+            assert (await told_of(era, "pattern")).data["drive"]
+            bench.far.station.befall(Episode("hang"))
+            await until_state(era, "COMM_LOST")
+            assert "answer" in (await told_of(era, "silence")).data["reason"]
+        assert (await era.status()).drive == {}
+
+
 async def test_a_cut_link_is_noticed_while_disarmed(tmp_path: Path) -> None:
     """Nobody has to arm to find out; back again, nothing has to be acknowledged."""
     async with running_daemon(tmp_path) as bench, await bench.client() as era:

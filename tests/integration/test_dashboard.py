@@ -432,6 +432,19 @@ async def test_what_others_are_called_is_text(page: Page, era: Client) -> None:
     assert page.complaints == []
 
 
+async def test_an_event_that_is_told_again_takes_one_line(page: Page) -> None:
+    """A link that is tried every few seconds does not push out why it was lost."""
+    shown = await page.evaluate(
+        "import('./side.js').then(({ addEvent }) => {"
+        " const log = document.createElement('ol');"
+        " for (const text of ['lost', 'retry', 'retry', 'retry', 'back', 'retry'])"
+        "   addEvent(log, 'error', text, null);"
+        " return [...log.querySelectorAll('span')].map(e => e.textContent);"
+        "})"
+    )
+    assert shown == ["retry", "back", "retry (3 times)", "lost"]
+
+
 async def test_the_door_lets_in_with_the_token_alone(
     browser: Page, gateway: GatewayProcess, era: Client
 ) -> None:
@@ -453,6 +466,9 @@ async def test_the_door_lets_in_with_the_token_alone(
                 "document.querySelector('#door-problem')?.innerText",
                 lambda text: "has another token" in (text or ""),
             )
+            # It answers: whoever reads that it does not looks for the wrong thing.
+            banner = await browser.evaluate("document.querySelector('#banner').innerText")
+            assert "refuses the token" in banner
 
 
 async def test_it_comes_back_after_gateway_and_daemon(browser: Page, tmp_path: Path) -> None:

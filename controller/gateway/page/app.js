@@ -15,12 +15,15 @@ const STATES = {
   FAULT_REACTION_ACTIVE: "fault", FAULT: "fault", COMM_LOST: "link lost",
 };
 
+const LINK_NEWS = /^link (lost|retry|reopened): /;
+
 const at = (id) => document.getElementById(id);
 const log = at("log");
 let link;
 let lease = null;  // ends with a refusal to renew: states may be told later than the answer to arm
 let state = null;
 let daemon;  // undefined until it is told; null while it is away
+let isRefused = false;  // the gateway answers, but not to this token
 
 const overlay = new PlateOverlay(at("plate"), at("overlay"));
 const picture = new FieldPicture(at("field"), at("scale"), (low, high) => {
@@ -83,7 +86,8 @@ function showButtons() {
 // What everybody should know before they look at anything else.
 function showBanner() {
   let text = "";
-  if (!link?.isOpen) text = "The gateway does not answer. Amplifiers may still be energised.";
+  if (isRefused) text = "The gateway refuses the token of this page. Amplifiers may still be energised.";
+  else if (!link?.isOpen) text = "The gateway does not answer. Amplifiers may still be energised.";
   else if (daemon === null) text = "The daemon does not answer. Amplifiers may still be energised.";
   else if (state === "COMM_LOST") text = "The link to an amplifier is lost. It may still be energised.";
   else if (daemon?.rig.simulated) text = "Simulated amplifiers: nothing vibrates but numbers.";
@@ -151,7 +155,7 @@ const HANDLERS = {
     showLatency(at("latency-numbers"), at("latency"), latency_ms);
   },
   log({ level, message, cause, remedy }) {
-    if (isTransition(message)) return;  // is told by the topic state, in words
+    if (isTransition(message) || LINK_NEWS.test(message)) return;  // told by state and link, in words
     addEvent(log, level, cause ? `${message}: ${cause}` : message, remedy);
   },
   link({ event, amplifier, message, remedy }) {
@@ -173,6 +177,7 @@ function play(effect) {
 
 function connected(isConnected) {
   if (isConnected) {
+    isRefused = false;
     at("door").hidden = true;
     at("main").hidden = false;
     addEvent(log, "info", "connected to the gateway");
@@ -180,7 +185,7 @@ function connected(isConnected) {
   }
   lease = null;
   daemon = undefined;
-  showState(null, "the gateway does not answer; it is tried again");
+  showState(null, isRefused ? "the gateway has another token" : "the gateway does not answer; it is tried again");
   if (!link?.wasOpen) showDoor("The gateway cannot be reached. It is tried again.");
 }
 
@@ -189,10 +194,16 @@ function showDoor(problem) {
   at("door-problem").textContent = problem;
 }
 
+function refused() {
+  isRefused = true;
+  showState(null, "the gateway has another token");
+  showDoor("The gateway has another token: open the URL that it printed when it started.");
+}
+
 function enter(token) {
   link = new Link(token, TOPICS, {
     connected,
-    refused: () => showDoor("The gateway has another token: open the URL that it printed when it started."),
+    refused,
     event: ({ topic, data }) => HANDLERS[topic]?.(data),
     field: (buffer) => picture.show(decodeField(buffer)),
   });

@@ -34,8 +34,8 @@ function tile(amplifier, eras) {
   made.append(channels);
   const list = element("dl");
   const voltage = high_voltage_v === null ? (high_voltage === null ? "–" : high_voltage ? "on" : "off") : `${shown(high_voltage_v)} V`;
-  const age = reply_age_s === null ? "–" : reply_age_s > OLD_REPLY_S ? `${shown(reply_age_s, 1)} s (old)` : `${shown(1000 * reply_age_s)} ms`;
-  for (const [key, value] of [["Temperature", `${shown(temperature_c)} °C`], ["High voltage", voltage], ["Last reply", `${age}${age === "–" ? "" : " ago"}`]]) {
+  const age = reply_age_s === null ? "–" : reply_age_s > OLD_REPLY_S ? `${shown(reply_age_s, 1)} s ago, old` : `${shown(1000 * reply_age_s)} ms ago`;
+  for (const [key, value] of [["Temperature", `${shown(temperature_c)} °C`], ["High voltage", voltage], ["Last reply", age]]) {
     list.append(element("dt", key), element("dd", value));
   }
   made.append(list);
@@ -52,7 +52,7 @@ export function showLatency(numbers, svg, { count, median, p99, p999, histogram 
     : "no touch has led to a command yet";
   const most = Math.max(1, ...histogram.map(([, number]) => number));
   const width = 320 / Math.max(1, histogram.length);
-  const parts = [];
+  const parts = [];  // bars end below the line of text at the top
   const add = (name, attributes, text) => {
     const made = document.createElementNS(SVG, name);
     for (const [key, value] of Object.entries(attributes)) made.setAttribute(key, value);
@@ -60,7 +60,7 @@ export function showLatency(numbers, svg, { count, median, p99, p999, histogram 
     parts.push(made);
   };
   histogram.forEach(([upper, number], index) => {
-    const height = number ? Math.max(2, 78 * Math.log1p(number) / Math.log1p(most)) : 0;
+    const height = number ? Math.max(2, 64 * Math.log1p(number) / Math.log1p(most)) : 0;
     add("rect", { x: index * width + 1, y: 80 - height, width: Math.max(1, width - 2), height });
     if (index % Math.ceil(histogram.length / 6) === 0) {
       add("text", { x: (index + 1) * width, y: 96, "text-anchor": "middle" }, `${upper}`);
@@ -82,11 +82,15 @@ export function showEffects(section, into, effects, play) {
   }));
 }
 
-// An event of the log, the newest first; all of it as text.
+// An event of the log, the newest first; all of it as text. One that is told again takes no other's place.
 export function addEvent(log, level, message, remedy) {
+  const newest = log.firstElementChild;
+  const times = newest?.dataset.message === message ? Number(newest.dataset.times) + 1 : 1;
+  if (times > 1) newest.remove();
   const item = element("li");
+  Object.assign(item.dataset, { message, times });
   const time = element("time", new Date().toLocaleTimeString());
-  item.append(time, element("span", message, level));
+  item.append(time, element("span", times > 1 ? `${message} (${times} times)` : message, level));
   if (remedy) item.append(element("span", remedy, "remedy"));
   log.prepend(item);
   while (log.children.length > MOST_EVENTS) log.lastElementChild.remove();

@@ -42,10 +42,13 @@ def supported_modes(
     loads: Sequence[PointLoad] = (),
     frequency_max: float,
 ) -> SupportedModes:
-    """All modes up to a frequency [Hz], to which the plate must have been reduced."""
+    """All modes up to a frequency [Hz], to which the plate must have been reduced.
+
+    Raises InputError for ERAs that do not hold the plate.
+    """
     M, C, K = modal_matrices(reduced, eras, loads=loads)
     squared, psi = linalg.eigh(K, M)
-    omega = np.sqrt(np.maximum(squared, 0))
+    omega = np.sqrt(squared)
     low = omega <= 2 * np.pi * frequency_max
     omega, psi = omega[low], psi[:, low]
     ratios = np.einsum("rn,rs,sn->n", psi, C, psi) / (2 * omega)

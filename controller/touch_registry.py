@@ -9,11 +9,6 @@ from model.errors import InputError
 GROUP = "era_haptics.touch_sources"
 
 
-def touch_schemes() -> list[str]:
-    """Schemes of all installed touch sources, without loading any."""
-    return sorted(_plugins())
-
-
 def open_source(url: str) -> TouchSource:
     """Make the touch source of a URL such as `tuio:127.0.0.1:3333` or `evemu:taps.events`.
 

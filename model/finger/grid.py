@@ -41,12 +41,6 @@ class Grid:
         """Points [m] spread evenly, cell after cell, (cell_count * CELL_SAMPLES², 2)."""
         return self._points(plate, samples=CELL_SAMPLES)
 
-    def cell_of(self, x: float, y: float, plate: Plate) -> int:
-        """Number of the cell that a point [m] of the plate lies in."""
-        i = min(int(x / plate.length * self.nx), self.nx - 1)
-        j = min(int(y / plate.width * self.ny), self.ny - 1)
-        return j * self.nx + i
-
     def _points(self, plate: Plate, *, samples: int) -> FloatArray:
         inside = (np.arange(samples) + 0.5) / samples
         cell_y, cell_x, sample_y, sample_x = np.meshgrid(

@@ -49,11 +49,6 @@ def equal_area_points(plate: Plate, *, frequency_max: float) -> FloatArray:
     return grid.centres(plate)
 
 
-def cumulative_peak(acceleration: ComplexArray, active: ActivationSet) -> FloatArray:
-    """Peak acceleration of a set added up over the frequencies (p,), from (f, eras, p)."""
-    return np.asarray(np.abs(acceleration[:, list(active)].sum(axis=1)).sum(axis=0))
-
-
 def cumulative_statistics(
     acceleration: ComplexArray, *, felt: FloatArray | None = None
 ) -> FloatArray:

@@ -1,6 +1,6 @@
 """The session of the Modbus vendor page: what is asked, what is answered, and by whom."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from drivers.command import CommandSet, DriveCommand, Envelope, Knot
@@ -151,8 +151,3 @@ class ScriptedStation:
 
     def listen(self, on_event: Callable[[Event], None]) -> None:
         """It never speaks unasked."""
-
-
-def as_hex(frames: Sequence[bytes]) -> list[str]:
-    """Frames as the page writes them."""
-    return [frame.hex(" ").upper() for frame in frames]

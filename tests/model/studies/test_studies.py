@@ -21,7 +21,7 @@ from model.studies.ranking import era_counts, rank
 from model.studies.run import CHUNK, run_study
 from model.studies.solve import DRIVES, CaseResults, solve_cases, study_problem
 from model.studies.workers import in_process, on_processes
-from model.vibration.activation import MEDIAN, cumulative_peak, cumulative_statistics
+from model.vibration.activation import MEDIAN, cumulative_statistics
 from paper_plate import make_paper_rig
 from studies import FREQUENCIES, chunks_of, same_to_the_bit, small_study
 
@@ -37,6 +37,11 @@ def results(study):
     """All cases solved in this process, without a cache."""
     problem, cases = study
     return solve_cases(problem.solve(), problem.rig.eras, cases)
+
+
+def median_peak(acceleration, active):
+    """Median over the points of what the peaks add up to, from (f, eras, p): Eq. 28 as it reads."""
+    return np.median(np.abs(acceleration[:, list(active)].sum(axis=1)).sum(axis=0))
 
 
 def npy_bytes(array):
@@ -67,7 +72,7 @@ def test_statistics_are_those_of_the_direct_solve(study, results):
             active = results.active_eras(case, drive)
             assert len(active) == size
             median = results.statistics[case, drive, MEDIAN]
-            assert median == pytest.approx(np.median(cumulative_peak(direct, active)), rel=1e-4)
+            assert median == pytest.approx(median_peak(direct, active), rel=1e-4)
         best = cumulative_statistics(direct)[:4, MEDIAN].max()
         assert results.statistics[case, 0, MEDIAN] == pytest.approx(best, rel=1e-4)
 
@@ -104,7 +109,7 @@ def test_what_the_plate_carries_is_in_the_answer(study):
         carried.points,
         loads=[PointLoad(mass.x, mass.y, mass=mass.mass)],
     )
-    expected = np.median(cumulative_peak(direct, solved.active_eras(0, 1)))
+    expected = median_peak(direct, solved.active_eras(0, 1))
     assert solved.statistics[0, 1, MEDIAN] == pytest.approx(expected, rel=1e-4)
 
 

@@ -12,7 +12,7 @@ from model.config.document import ConfigError
 from model.errors import InputError
 from model.rig.file import example_rig_path, load_rig
 
-EXAMPLE = Path(__file__).parents[2] / "controller" / "effects" / "example.yaml"
+EXAMPLE = Path(__file__).parents[3] / "controller" / "effects" / "example.yaml"
 
 
 def refused(path: Path, text: str) -> str:

@@ -2,14 +2,14 @@
 
 import asyncio
 import logging
-from collections.abc import Coroutine, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Awaitable, Coroutine, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from enum import Enum, auto
 from typing import Any, TypeVar
 
 from controller.joint_play import JointPlay
 from controller.read_backs import ReadBacks
-from controller.together import gathered, to_the_end
+from controller.together import OncePerWish, gathered, to_the_end
 from drivers.amplifier import WATCHDOG, Amplifier
 from drivers.errors import CommandError, CommandRefused, DriverError, LinkError
 from drivers.guard import SafeCommand, SafeEnvelope
@@ -45,6 +45,7 @@ class AmplifierGroup:
     def __init__(self, amplifiers: Mapping[str, Amplifier]) -> None:
         self.phase = Phase.CLOSED
         self._amplifiers = dict(amplifiers)
+        self._stops = [OncePerWish(amplifier.stop) for amplifier in amplifiers.values()]
         self._joint = JointPlay(
             self._amplifiers,
             goes_on=lambda: self.phase is Phase.ARMED and not self._is_hurried,
@@ -52,7 +53,6 @@ class AmplifierGroup:
         self._closing = asyncio.Lock()  # who closes again must not hang up on who still silences
         self._silencings = 0  # how often they were disarmed, stopped or closed
         self._being_silenced = 0  # by how many who stop or disarm them just now
-        self._stopping: asyncio.Task[None] | None = None  # the last stop
         self._may_be_armed = False  # since they were opened
         self._read_backs = ReadBacks()
         self._limit: asyncio.Timeout | None = None  # of a play or heartbeat that is under way
@@ -178,19 +178,14 @@ class AmplifierGroup:
     async def stop(self) -> None:
         """Quick stop of every amplifier that can be reached; latched until `clear`.
 
-        Who asks while they are being stopped waits for that: nothing arms before it is over.
+        All who ask while one is being stopped have it stopped once more, together.
         """
         self._leave_armed()
-        if self._stopping is None or self._stopping.done():
-            self._stopping = asyncio.ensure_future(
-                self._each(amplifier.stop() for amplifier in self._all)
-            )
         with self._silencing():
-            await to_the_end(self._stopping)
+            await to_the_end(self._each(stop.wish() for stop in self._stops))
 
     async def clear(self) -> None:
         """Acknowledge stops, and faults whose cause is gone."""
-        self._stopping = None  # a stop that is asked for from here on is another
         try:
             await self._together(amplifier.clear() for amplifier in self._all)
         except LinkError:
@@ -288,7 +283,7 @@ class AmplifierGroup:
                 self.phase = Phase.LOST
             raise
 
-    async def _each(self, requests: Iterable[Coroutine[Any, Any, object]]) -> None:
+    async def _each(self, requests: Iterable[Awaitable[object]]) -> None:
         """Do something with every amplifier that can be reached; failures are only logged."""
         for result in await asyncio.gather(*requests, return_exceptions=True):
             if isinstance(result, Exception):

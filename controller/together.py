@@ -1,12 +1,36 @@
 """Waiting for several amplifiers at once."""
 
 import asyncio
-from collections.abc import Awaitable, Coroutine, Iterable
-from typing import Any, TypeVar
+from collections.abc import Awaitable, Callable, Coroutine, Iterable
+from typing import Any, TypeVar, final
 
 from drivers.errors import LinkError
 
 _T = TypeVar("_T")
+
+
+@final
+class OncePerWish:
+    """Does something so that it begins after each wish for it, one after the other.
+
+    However many wish for it while it is being done, it is done once more for all of them.
+    """
+
+    def __init__(self, do: Callable[[], Awaitable[object]]) -> None:
+        self._do = do
+        self._doing = asyncio.Lock()
+        self._next: asyncio.Task[None] | None = None
+
+    def wish(self) -> "asyncio.Task[None]":
+        """The one that begins next; raises what that raises."""
+        if self._next is None:
+            self._next = asyncio.ensure_future(self._begin())
+        return self._next
+
+    async def _begin(self) -> None:
+        async with self._doing:
+            self._next = None
+            await self._do()
 
 
 async def gathered(requests: Iterable[Coroutine[Any, Any, _T]]) -> list[_T]:
@@ -24,11 +48,8 @@ async def gathered(requests: Iterable[Coroutine[Any, Any, _T]]) -> list[_T]:
     return [result for result in results if not isinstance(result, BaseException)]
 
 
-async def to_the_end(work: Awaitable[None]) -> None:
-    """See work through, however often the caller is cancelled meanwhile; that is raised afterwards.
-
-    work: a coroutine, or a task that others see through as well.
-    """
+async def to_the_end(work: Coroutine[Any, Any, None]) -> None:
+    """See work through, however often the caller is cancelled meanwhile; that is raised then."""
     task = asyncio.ensure_future(work)
     cancellation = None
     while not task.done():

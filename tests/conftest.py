@@ -1,7 +1,6 @@
 """What all tests share: one thread for linear algebra, the paper's plate, what is begun first."""
 
 import os
-from pathlib import Path
 
 for _variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ[_variable] = "1"  # before numpy loads: two threads are slower here, and erratic
@@ -11,22 +10,21 @@ import pytest  # noqa: E402
 from model.rig.rig import Rig  # noqa: E402
 from paper_plate import make_paper_rig  # noqa: E402
 
-TESTS = Path(__file__).parent
 DEAREST = (
     "test_soak.py",
-    "docs/test_tutorials.py",
+    "test_tutorials.py",
     "test_docs_site.py",
-    "model/commands/test_study_cli.py",
+    "test_study_cli.py",
     "test_link_faults.py",
-    "integration/test_dashboard.py",
-    "controller/test_gateway_process.py",
-    "model/commands/test_table_commands.py",
-    "controller/test_daemon_over_a_wire.py",
-    "model/diagnosis/test_diagnosis.py",
-    "model/commands/test_plate_commands.py",
-    "errors/test_errors_read.py",
-    "model/studies/test_studies.py",
-    "era_haptics/test_examples.py",
+    "test_dashboard.py",
+    "test_gateway_process.py",
+    "test_table_commands.py",
+    "test_daemon_over_a_wire.py",
+    "test_diagnosis.py",
+    "test_plate_commands.py",
+    "test_errors_read.py",
+    "test_studies.py",
+    "test_examples.py",
     "test_wheel.py",
 )
 """Begun in this order, before all others: one that began last would go on when a core is idle."""
@@ -34,10 +32,8 @@ DEAREST = (
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """The dearest files first; the order within each file stays."""
-    if missing := [name for name in DEAREST if not (TESTS / name).is_file()]:
-        raise pytest.UsageError(f"tests/conftest.py, DEAREST: there is no {', '.join(missing)}")
-    place = {TESTS / name: number for number, name in enumerate(DEAREST)}
-    items.sort(key=lambda item: place.get(item.path, len(DEAREST)))
+    place = {name: number for number, name in enumerate(DEAREST)}
+    items.sort(key=lambda item: place.get(item.path.name, len(DEAREST)))
 
 
 @pytest.fixture(scope="session")

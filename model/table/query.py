@@ -44,7 +44,13 @@ def question_from_json(line: str) -> Question:
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(str(part) for part in first["loc"])
-        raise InputError(f"{where or 'line'}: {in_our_words(first['msg'])}") from None
+        said = in_our_words(first["msg"])
+        if not where:
+            raise InputError(
+                'a line is a question such as {"target": [0.08, 0.06], "quiet": [[0.22, 0.16]]}; '
+                f"{said}"
+            ) from None
+        raise InputError(f"{where}: {said}") from None
     targets = [*([] if asked.target is None else [asked.target]), *asked.targets]
     return Question(
         targets=tuple((x, y) for x, y in targets),

@@ -1,6 +1,7 @@
 """Questions as JSON lines, and `era table query`."""
 
 import json
+from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner
@@ -37,8 +38,8 @@ def test_a_line_is_a_question():
 @pytest.mark.parametrize(
     ("line", "says"),
     [
-        ("nonsense", "Invalid JSON"),
-        ("[]", "valid dictionary|object"),
+        ("nonsense", r'such as \{"target".*Invalid JSON'),
+        ("[]", r'such as \{"target".*object'),
         ('{"target": [0.1]}', "target"),
         ('{"target": [0.1, 0.1], "loud": 3}', "loud"),
         ('{"target": [0.1, "x"]}', "target.1"),
@@ -49,6 +50,15 @@ def test_lines_that_are_no_question_say_why(line, says):
     """The key that is wrong is named."""
     with pytest.raises(InputError, match=says):
         question_from_json(line)
+
+
+def test_the_questions_on_the_page_are_questions():
+    """Whoever types what the page of commands shows has an answer to each line."""
+    page = (Path(__file__).parents[3] / "docs/reference/commands.md").read_text(encoding="utf-8")
+    block = page.split("```json\n")[1].split("```")[0]
+    first, second = [question_from_json(line) for line in block.splitlines()]
+    assert (first.targets, first.quiet) == (((0.08, 0.06),), ((0.22, 0.16),))
+    assert (len(second.targets), second.level_db_sl, second.mode) == (2, 15.0, "signed")
 
 
 def test_a_bad_line_does_not_end_the_run():

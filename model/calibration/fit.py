@@ -102,14 +102,15 @@ def solve(problem: Problem, x: FloatArray, scales: FloatArray) -> Fit:
 
 
 def with_free(problem: Problem, free: NDArray[np.bool_]) -> Problem:
-    """The same with other parameters free."""
+    """The same with other parameters free; free (n,), true for those that are fitted."""
     return replace(problem, free=free)
 
 
 def misfit(problem: Problem, x: FloatArray) -> float:
     """How badly shapes over the sensors fit, 0 to 1, whatever gains: median of 1 - MAC.
 
-    MAC: modal assurance criterion of each row of values, for one frequency and ERA.
+    x (n,): of every parameter, free or not. MAC: modal assurance criterion of each row of values,
+    for one frequency and ERA.
     """
     model = problem.plate.responses(rig_with(problem.rig, problem.parameters, x))
     used = np.isfinite(problem.values)

@@ -44,7 +44,7 @@ def hold_out(problem: Problem, fit: Fit, names: tuple[str, ...]) -> HeldOut | No
 
 
 def as_it_was(problem: Problem) -> ComplexArray:
-    """Responses of the rig before, with the gains that it had."""
+    """Responses (f, e, s) of the rig before, with the gains that it had."""
     frequencies = problem.plate.omega / (2 * np.pi)
     gains = np.column_stack([era.gain(frequencies) for era in problem.rig.eras])
     return np.asarray(gains[:, :, None] * problem.plate.responses(problem.rig))

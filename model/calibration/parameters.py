@@ -108,7 +108,7 @@ def rig_with(rig: Rig, parameters: Sequence[Parameter], x: FloatArray) -> Rig:
 
 
 def starts(parameters: Sequence[Parameter]) -> list[FloatArray]:
-    """Where to begin looking: the rig's own values, its modulus and stiffnesses scaled together."""
+    """Where to begin, x (n,) each: the rig's own, its modulus and stiffnesses scaled together."""
     own = np.array([parameter.start for parameter in parameters])
     found = []
     for modulus in np.log(np.linspace(0.6, 1.6, 11)):

@@ -36,7 +36,7 @@ def parse_pair(text: str, *, what: str) -> tuple[int, int]:
 
 
 def parse_frequencies(text: str) -> FloatArray:
-    """Frequencies [Hz] from `LO:HI:STEP`, both ends included, or from a list `60,110,250`.
+    """Frequencies (f,) [Hz] from `LO:HI:STEP`, both ends included, or from a list `60,110,250`.
 
     Raises InputError for what is neither, and for one that is given twice.
     """

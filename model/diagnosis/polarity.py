@@ -57,7 +57,10 @@ def phases_of_drive(observation: Observation, predicted: ComplexArray) -> list[P
 def signs_of_pairs(
     observation: Observation, predicted: ComplexArray, groups: Sequence[Sequence[int]]
 ) -> list[Phase]:
-    """From pairs; groups: the channels of one amplifier each, whose phases begin together."""
+    """From pairs, by responses predicted (f, e, s).
+
+    groups: the channels of one amplifier each, whose phases begin together.
+    """
     evidence = np.zeros((predicted.shape[1], predicted.shape[1]))
     for pair in observation.pairs:
         first, second = (_row(observation, predicted, pair.frequency, era) for era in pair.eras)

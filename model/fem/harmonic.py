@@ -22,7 +22,7 @@ from model.structure.point_load import PointLoad, load_positions
 
 
 def check_frequencies(plate: Plate, mesh: Mesh, frequencies: FloatArray) -> None:
-    """Raise InputError for a frequency [Hz] that is none or that the mesh cannot carry."""
+    """Raise InputError if one of frequencies (f,) [Hz] is none or the mesh cannot carry it."""
     for frequency in frequencies:
         if not (np.isfinite(frequency) and frequency > 0):
             raise InputError(f"frequency is {frequency} Hz, must be above zero")

@@ -127,7 +127,7 @@ class Mesh:
 
     @cached_property
     def lines(self) -> tuple[FloatArray, FloatArray]:
-        """Where elements meet along x and along y [m], the plate's edges included."""
+        """Where elements meet along x (n,) and along y (m,) [m], the plate's edges included."""
         lines = []
         for length, count in ((self.length, self.nx), (self.width, self.ny)):
             inner = np.linspace(self.strip, length - self.strip, count + 1)
@@ -136,12 +136,12 @@ class Mesh:
 
     @cached_property
     def node_x(self) -> FloatArray:
-        """Positions of the columns of nodes [m]."""
+        """Positions of the columns of nodes [m], (columns,)."""
         return self._along(self.lines[0])
 
     @cached_property
     def node_y(self) -> FloatArray:
-        """Positions of the rows of nodes [m]."""
+        """Positions of the rows of nodes [m], (rows,)."""
         return self._along(self.lines[1])
 
     def _along(self, lines: FloatArray) -> FloatArray:

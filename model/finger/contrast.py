@@ -18,7 +18,7 @@ def contrast_db(target: FloatArray, quiet: FloatArray) -> FloatArray:
 
 
 def decibels(ratio: FloatArray) -> FloatArray:
-    """20 log10 of an amplitude ratio; -inf for zero."""
+    """20 log10 of an amplitude ratio, of the same shape; -inf for zero."""
     with np.errstate(divide="ignore"):
         return np.asarray(20 * np.log10(ratio))
 

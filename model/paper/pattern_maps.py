@@ -153,7 +153,7 @@ def with_stiffness(eras: Sequence[Era], stiffness: float) -> tuple[Era, ...]:
 
 
 def correlation(first: FloatArray, second: FloatArray) -> float:
-    """Correlation coefficient of two maps, point by point."""
+    """Correlation coefficient of two maps of one shape, (ny, nx), point by point."""
     return float(np.corrcoef(first.ravel(), second.ravel())[0, 1])
 
 

@@ -93,7 +93,7 @@ class FreePlate:
         *,
         loads: Sequence[PointLoad] = (),
     ) -> Response:
-        """The same with its error; any ERAs and loads, at any points [m] of the plate.
+        """The same with its error, per frequency (f,) [Hz], at any points [m] (p, 2) of the plate.
 
         Raises InputError for a frequency that is none, above frequency_max or above what the mesh
         carries, and for points off the plate.

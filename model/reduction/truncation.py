@@ -32,7 +32,10 @@ def truncation_weights(zeta: ComplexArray, largest: float, terms: int) -> Comple
 
 
 def truncation_error(zeta: ComplexArray, largest: float, terms: int) -> FloatArray:
-    """By how much of itself any truncated mode's share is wrong at the most, (f,)."""
+    """By how much of itself any truncated mode's share is wrong at the most, (f,).
+
+    zeta (f,), largest and terms are those of `truncation_weights`.
+    """
     t = 2 / (largest * zeta) - 1
     # |T_k| = |cosh(k arccosh t)|; written so that a far pole does not overflow.
     rho = t + np.sqrt(t - 1) * np.sqrt(t + 1)

@@ -82,7 +82,7 @@ class CaseResults:
 
 
 def study_problem(rig: Rig, cases: Cases, frequencies: FloatArray) -> StudyProblem:
-    """The problem of a study; raises InputError for frequencies [Hz] that the mesh cannot carry."""
+    """The problem of a study; raises InputError for frequencies (f,) [Hz] that no mesh carries."""
     if len(frequencies) == 0:
         raise InputError("a study needs at least one frequency")
     check_frequencies(rig.plate, rig.mesh, frequencies)

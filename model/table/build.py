@@ -41,7 +41,8 @@ def build_table(
 ) -> LocalizationTable:
     """Solve the rig's plate on its mesh and keep what localization needs.
 
-    frequencies [Hz], ascending, within the rig's limits; mode: one of MODES. Raises InputError.
+    frequencies (f,) [Hz], ascending, within the rig's limits; mode: one of MODES. Raises
+    InputError.
     """
     return build_in_parts(TableProblem(rig, frequencies, grid), mode=mode).table
 

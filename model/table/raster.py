@@ -53,12 +53,12 @@ class Raster:
 
     @cached_property
     def x(self) -> FloatArray:
-        """Positions of the columns [m]."""
+        """Positions of the columns [m], (nx,)."""
         return np.linspace(0, self.length, self.nx)
 
     @cached_property
     def y(self) -> FloatArray:
-        """Positions of the rows [m]."""
+        """Positions of the rows [m], (ny,)."""
         return np.linspace(0, self.width, self.ny)
 
     @cached_property

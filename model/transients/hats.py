@@ -17,7 +17,7 @@ from model.transients.time_response import PlateInTime
 
 
 def steady_states(plate: PlateInTime, omega: float) -> ComplexArray:
-    """State z of the plate vibrating steadily, each ERA alone at full stroke, (eras, 2 r)."""
+    """State z of the plate at omega [rad/s], steady, each ERA alone at full stroke, (eras, 2 r)."""
     count = len(plate.eras)
     strokes = np.array([era.stroke for era in plate.eras], dtype=complex)
     carrier = np.full(count, 1j * omega)

@@ -31,7 +31,7 @@ def activation_sets(era_count: int) -> tuple[ActivationSet, ...]:
 
 
 def felt_acceleration(frequencies: FloatArray) -> FloatArray:
-    """Peak acceleration [m/s²] from which a tone is felt well, 12 dB SL, at frequencies [Hz]."""
+    """Peak acceleration (f,) [m/s²] from which tones (f,) [Hz] are felt well, 12 dB SL."""
     return detection_threshold(frequencies) * 10 ** (FELT_DB_SL / 20)
 
 

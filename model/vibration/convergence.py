@@ -89,7 +89,8 @@ def study_convergence(
 ) -> Convergence:
     """Solve a rig on each mesh and on the reference.
 
-    frequencies [Hz] up to the rig's limit. Raises InputError for those that a mesh cannot carry.
+    frequencies (f,) [Hz] up to the rig's limit. Raises InputError for those that a mesh cannot
+    carry.
     """
     high = rig.limits.frequency_max
     asked = np.asarray(frequencies, dtype=float)

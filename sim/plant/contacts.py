@@ -43,7 +43,7 @@ class Carried:
     _tables: dict[float, FloatArray] = field(default_factory=dict)
 
     def exponentials(self, sample_rate: float) -> FloatArray:
-        """Re and -Im of exp(eigenvalue k / sample_rate) for k up to a block, (BLOCK, 2 m)."""
+        """Re and -Im of exp(eigenvalue k / sample_rate [Hz]), k up to a block, (BLOCK, 2 m)."""
         if sample_rate not in self._tables:
             grid = np.exp(np.outer(np.arange(BLOCK) / sample_rate, self.plate.decay))
             self._tables.clear()

@@ -75,7 +75,10 @@ def stiffness(plate: Plate, dx: float, dy: float) -> FloatArray:
 
 
 def mass(plate: Plate, dx: float, dy: float) -> FloatArray:
-    """Consistent element mass (12, 12) with rotary inertia (paper Eq. 19)."""
+    """Consistent element mass (12, 12) of a dx by dy rectangle [m] (paper Eq. 19).
+
+    With rotary inertia.
+    """
     _, _, inertia = rigidities(plate)
     area = dx * dy / 4
     total = np.zeros((12, 12))

@@ -6,12 +6,11 @@ that name is asked for and never before, so one that is broken harms nobody else
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from difflib import get_close_matches
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from typing import Generic, TypeVar
 
-from model.errors import InputError
+from model.errors import InputError, did_you_mean
 
 _T = TypeVar("_T")
 
@@ -40,8 +39,7 @@ class Catalogue(Generic[_T]):
         if name in self.own and not found:
             return self.own[name]
         if not found:
-            close = get_close_matches(name, self.names(), n=1, cutoff=0.6)
-            meant = f"did you mean {close[0]}? " if close else ""
+            meant = did_you_mean(name, self.names())
             raise InputError(
                 f"unknown {self.what} {name[:40]!r}; {meant}known are: {', '.join(self.names())}"
                 f"{self.otherwise}"

@@ -89,7 +89,9 @@ class ApiTouches:
             mine.discard(source)
         elif source not in mine:
             if len(mine) >= MOST_SOURCES:
-                raise InputError(f"a client has fingers of at most {MOST_SOURCES} touch sources")
+                raise InputError(
+                    f"a client has fingers of at most {MOST_SOURCES} touch sources; lift some first"
+                )
             mine.add(source)
         touches = tuple(
             Touch(point.id, point.x_m / self._plate.length, 1 - point.y_m / self._plate.width)

@@ -12,6 +12,7 @@ from controller.daemon.notify import ServiceManager
 from controller.daemon.place import Place
 from controller.daemon.sections import loopback_address
 from drivers.errors import DriverError
+from model.config.document import ConfigError, read_document
 from model.errors import InputError
 from model.table.cache import cached_table
 from model.table.file import load_table
@@ -28,7 +29,7 @@ def check_daemon(path: Path) -> str:
     if config.table is None:
         table = "its table is built, or taken from the cache, when it starts"
     else:
-        loaded = load_table(config.table, fingerprint=config.rig.fingerprint)
+        loaded = _load_table(config, config.table)
         table = f"its table has {len(loaded.frequencies)} frequencies"
     return f"{path}: good: {len(config.rig.eras)} ERAs, {len(config.urls)} amplifiers; {table}"
 
@@ -90,9 +91,19 @@ def _run(config: DaemonConfig, place: Place, *, log: LogThread, dashboard: str |
         manager.close()
 
 
+def _load_table(config: DaemonConfig, file: Path) -> LocalizationTable:
+    """The table that the file names; ConfigError says on which line of it."""
+    try:
+        return load_table(file, fingerprint=config.rig.fingerprint)
+    except InputError as error:
+        document = read_document(config.source)
+        problem = document.problem(("table",), str(error))
+        raise ConfigError(document.source, [problem]) from error
+
+
 def _table(config: DaemonConfig) -> LocalizationTable:
     if config.table is not None:
-        return load_table(config.table, fingerprint=config.rig.fingerprint)
+        return _load_table(config, config.table)
     table, file = cached_table(config.rig)
     _logger.info("the localization table is %s", file or "not kept for the next start")
     return table

@@ -38,6 +38,12 @@ from drivers.amplifier import Amplifier
 from model.table.table import LocalizationTable
 
 _ARMABLE = (State.SWITCHED_ON, State.OPERATION_ENABLED)
+_NEXT = {
+    State.SWITCH_ON_DISABLED: "wait a moment and ask again",
+    State.READY_TO_SWITCH_ON: "arm first (era arm)",
+}
+"""What to do in states that need no remedy, for whoever asks for more than they allow."""
+
 _LOST = RpcError(
     ErrorCode.LINK,
     "the link to an amplifier is lost",
@@ -256,7 +262,7 @@ def _wrong_state(machine: Machine) -> RpcError:
         ErrorCode.WRONG_STATE,
         f"the daemon is in {machine.state.value}: {machine.cause}",
         where="state",
-        remedy=machine.remedy,
+        remedy=machine.remedy or _NEXT.get(machine.state),
     )
 
 

@@ -122,20 +122,20 @@ async def _body(request: Request) -> dict[str, Any]:
     """The JSON object in a request's body; raises RpcError and HTTPException."""
     media = request.headers.get("content-type", "").partition(";")[0].strip().lower()
     if media not in ("application/json", ""):
-        raise HTTPException(415, "send application/json")
+        raise HTTPException(415, "the body is of another type; send application/json")
     body = b""
     async for chunk in request.stream():
         body += chunk
         if len(body) > LARGEST_BODY:
             raise HTTPException(413, f"a request has at most {LARGEST_BODY} bytes")
     if body and not media:  # what has no parameters needs no type either
-        raise HTTPException(415, "send application/json")
+        raise HTTPException(415, "the body has no type; send application/json")
     try:
         params = json.loads(body or b"{}")
     except (ValueError, RecursionError) as error:
-        raise HTTPException(400, "the body is no JSON") from error
+        raise HTTPException(400, "the body is no JSON; send one JSON object") from error
     if not isinstance(params, dict):
-        raise HTTPException(400, "the body is no JSON object")
+        raise HTTPException(400, "the body is no JSON object; send one, such as {}")
     return params
 
 

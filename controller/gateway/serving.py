@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 import os
+import re
 import resource
 import signal
 import socket
@@ -102,7 +103,8 @@ def _check_certificate(settings: Settings) -> None:
             password="",  # of a key that has one; nobody shall be asked for it at a start
         )
     except (OSError, ValueError) as error:
-        reason = getattr(error, "reason", None) or getattr(error, "strerror", None) or error
+        said = getattr(error, "reason", None) or getattr(error, "strerror", None) or error
+        reason = re.sub(r"^\[\w+\] | \(_ssl\.c:\d+\)$", "", str(said))
         raise InputError(
             f"{settings.certificate} and {settings.key} cannot be used for TLS ({reason}): give a "
             "certificate chain and the key that belongs to it, PEM both, the key without password"

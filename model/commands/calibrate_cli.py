@@ -36,6 +36,8 @@ def calibrate(
     from model.calibration.calibrate import calibrate as fit
     from model.calibration.responses import responses_of
     from model.calibration.responses_file import read_functions
+    from model.files.picture_name import check_picture
+    from model.files.replacing import check_place
     from model.rig.file import load_rig
 
     if output.suffix not in (".yaml", ".yml"):
@@ -43,6 +45,9 @@ def calibrate(
     for taken in (rig_file, measured_file):
         if output.resolve() == taken.resolve():
             raise InputError(f"{output}: the new rig would overwrite {taken}; choose another name")
+    check_place(output, example="rig2.yaml")
+    if picture is not None:
+        check_picture(picture)
     rig = load_rig(rig_file, mesh=mesh)
     responses = responses_of(read_functions(measured_file), rig)
     started = time.perf_counter()

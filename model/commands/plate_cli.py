@@ -96,10 +96,13 @@ def plate_map(
 
     from model.commands.drive_option import parse_drives
     from model.config.points import parse_pair
+    from model.files.picture_name import check_picture
     from model.rig.file import load_rig
     from model.vibration.maps import plate_map as solve
     from model.vibration.peak import G
 
+    if output is not None:
+        check_picture(output)
     rig = load_rig(rig_file, mesh=mesh)
     excitation = parse_drives(drive, rig)
     started = time.perf_counter()

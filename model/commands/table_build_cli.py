@@ -38,7 +38,7 @@ def build(
     from model.config.points import parse_frequencies, parse_pair
     from model.drive_modes import MODES
     from model.errors import InputError
-    from model.files.replacing import begins_with, check_replaceable
+    from model.files.replacing import begins_with, check_place, check_replaceable
     from model.finger.grid import Grid
     from model.rig.file import load_rig
     from model.table.build import build_in_parts
@@ -50,10 +50,7 @@ def build(
 
     if mode not in MODES:
         raise InputError(f"unknown drive mode --mode {mode!r}; known: {', '.join(MODES)}")
-    if output.is_dir() or not output.absolute().parent.is_dir():
-        raise InputError(
-            f"--output {output}: give the name of a file in a folder that exists, e.g. table.npz"
-        )
+    check_place(output, example="table.npz")
     check_replaceable(output, is_own=begins_with(output, ZIP), what="localization table")
     rig = load_rig(rig_file, mesh=mesh)
     started = time.perf_counter()

@@ -151,7 +151,7 @@ def _problem(
         case "int_type" | "int_from_float":
             message = f"must be a whole number, not {_shown(details)}"
         case "string_type":
-            message = f"must be a text, not {_shown(details)}"
+            message = f"must be a text, not {_shown(details)}{_in_quotes(details)}"
         case "greater_than_equal":
             message = f"must be {context['ge']} or more, not {_shown(details)}"
         case "less_than_equal":
@@ -168,6 +168,12 @@ def _problem(
         case _:
             message = f"{_shown(details)} cannot be used: {details['msg']}"
     return document.problem((*below, *path), message)
+
+
+def _in_quotes(details: ErrorDetails) -> str:
+    """What to do about a name that YAML takes for a number, a truth value or a date."""
+    given = details["input"]
+    return "" if given is None or isinstance(given, dict | list) else "; write it in quotes"
 
 
 def _no_choice(details: ErrorDetails, expected: str) -> str:

@@ -70,7 +70,8 @@ def check_enough(observation: Observation, bad: Sequence[tuple[str, str]]) -> No
     if count < LEAST_SENSORS or frequencies < _LEAST_FREQUENCIES:
         said = f" ({', '.join(name for name, _ in bad)} read nothing)" if bad else ""
         raise InputError(
-            f"{count} usable sensors{said} at {frequencies} frequencies cannot tell ERAs apart; "
+            f"{count} usable sensor{'s' * (count != 1)}{said} at {frequencies} "
+            f"{'frequency' if frequencies == 1 else 'frequencies'} cannot tell ERAs apart; "
             f"measure with {LEAST_SENSORS} at least, better eight, at {_LEAST_FREQUENCIES} "
             "frequencies at least"
         )

@@ -10,7 +10,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.figure import Figure
 
 from model.arrays import FloatArray
-from model.errors import InputError
+from model.files.picture_name import check_picture_name
 from model.rig.rig import Rig
 from model.structure.actuator import Era
 from model.structure.plate import Plate
@@ -22,9 +22,6 @@ ACTIVE_COLOR = "#d62728"
 RESTING_COLOR = "#2ca02c"
 
 POINTS_ALONG = 97
-
-PICTURE_ENDINGS = (".png", ".svg", ".pdf")
-"""Which kinds of pictures can be written."""
 
 
 def raster(plate: Plate) -> tuple[int, int]:
@@ -117,11 +114,7 @@ def save_figure(figure: Figure, path: Path, *, dpi: int = 150) -> None:
     Raises InputError for an ending that is not in PICTURE_ENDINGS, OSError where the file cannot be
     written.
     """
-    if path.suffix.lower() not in PICTURE_ENDINGS:
-        raise InputError(
-            f"{path}: a picture's name must end in {', '.join(PICTURE_ENDINGS[:-1])} or "
-            f"{PICTURE_ENDINGS[-1]}, for instance {path.stem}.png"
-        )
+    check_picture_name(path)
     FigureCanvasAgg(figure)
     figure.savefig(path, dpi=dpi)
 

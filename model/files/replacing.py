@@ -1,4 +1,4 @@
-"""What may stand where a result is written: nothing, or a result of the same kind."""
+"""Where a result may be written: in a folder that is there, and over nothing but its own kind."""
 
 from pathlib import Path
 
@@ -15,6 +15,17 @@ def check_replaceable(path: Path, *, is_own: bool, what: str) -> None:
         raise InputError(
             f"--output {path}: a file is there that is no {what}; it is left alone. Give another "
             "name, or remove it first"
+        )
+
+
+def check_place(path: Path, *, example: str) -> None:
+    """Raise InputError where no file can be written: at a folder, or in one that is not there.
+
+    To be asked before whatever takes long.
+    """
+    if path.is_dir() or not path.absolute().parent.is_dir():
+        raise InputError(
+            f"--output {path}: give the name of a file in a folder that exists, e.g. {example}"
         )
 
 

@@ -37,7 +37,7 @@ def tone_phasors(recording: Recording, frequencies: Sequence[float]) -> ComplexA
     count = len(frequencies)
     if len(recording.samples) < 2 * count + 1:
         raise InputError(
-            f"{len(recording.samples)} samples are too few to tell {count} tones; record longer"
+            f"{count} tones cannot be told by {len(recording.samples)} samples; record longer"
         )
     angles = 2 * np.pi * np.outer(recording.times, np.asarray(frequencies, dtype=float))
     basis = np.hstack([np.sin(angles), np.cos(angles), np.ones((len(angles), 1))])
@@ -49,7 +49,7 @@ def spectrum(recording: Recording) -> Spectrum:
     """Amplitude spectrum with a Hann window: a tone within its bins is at most 15 % low."""
     count = len(recording.samples)
     if count < 4:
-        raise InputError(f"{count} samples have no spectrum; record longer")
+        raise InputError(f"a spectrum needs four samples, not {count}; record longer")
     window = np.hanning(count + 1)[:-1]
     level = recording.samples - recording.samples.mean(axis=0)
     lines = np.fft.rfft(level * window[:, None], axis=0)

@@ -60,7 +60,9 @@ def _read(path: Path) -> Recording:
             warnings.simplefilter("error")  # scipy only warns of a file that was cut off
             rate, samples = wavfile.read(io.BytesIO(content))
     except Exception as error:  # whatever a damaged file leads scipy into
-        raise InputError(f"{path}: is no WAV, or damaged: {error}") from error
+        raise InputError(
+            f"{path}: is no WAV, or damaged or cut off; make the recording again"
+        ) from error
     if samples.dtype != np.float32:
         raise InputError(
             f"{path}: holds {samples.dtype} samples, a recording has 32-bit float; export it so"
@@ -68,7 +70,7 @@ def _read(path: Path) -> Recording:
     samples = samples.reshape(len(samples), -1)
     if rate != told["sample_rate_hz"] or samples.shape[1] != len(told["sensors"]):
         raise InputError(
-            f"{path}: {samples.shape[1]} channels at {rate} Hz, {sidecar(path).name} tells of "
+            f"{path}: channels: {samples.shape[1]} at {rate} Hz, {sidecar(path).name} tells of "
             f"{len(told['sensors'])} at {told['sample_rate_hz']:g} Hz; they do not belong together"
         )
     if len(samples) < 2 or not np.isfinite(samples).all():

@@ -60,7 +60,7 @@ def test_every_problem_is_said_in_the_order_of_lines(tmp_path: Path) -> None:
         "a bare number is in m",
         "5 parts.a.sise: unknown key; did you mean size? known here are: size, word",
         "6 parts.b.size: is missing; add it",
-        "6 parts.b.word: must be a text, not 5",
+        "6 parts.b.word: must be a text, not 5; write it in quotes",
         "7 parts.c: must be a mapping, `key: value` each on a line, not nothing",
     ]
 

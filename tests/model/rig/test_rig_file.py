@@ -175,7 +175,7 @@ def test_a_mesh_asked_for_stands_in_place_of_the_files(tmp_path: Path) -> None:
         (5, "  material: {E: 70 GPa, nu: 0.3}", (5, "plate.material.rho"), "is missing"),
         (5, "  material: {E: 1, rho: 0, nu: 0, F: 1}", (5, "plate.material.F"), "unknown key"),
         (5, "  material: aluminium\n  loss_factor: 1", (6, "plate.loss_factor"), "below 1"),
-        (6, "mesh: 48", (6, "mesh"), "must be a text, not 48"),
+        (6, "mesh: 48", (6, "mesh"), "must be a text, not 48; write it in quotes"),
         (6, "mesh: fine", (6, "mesh"), "for example 48x36"),
         (6, "mesh: 0x36", (6, "mesh"), "1 to 1000 elements"),
         (6, "mesh: 1001x36", (6, "mesh"), "1 to 1000 elements"),

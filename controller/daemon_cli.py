@@ -40,6 +40,9 @@ Json = Annotated[bool, typer.Option("--json", help="One JSON object, nothing els
 DASHBOARD = "127.0.0.1:8137"
 """Where the page is served unless another place is named; the gateway's own default, too."""
 
+_WATCHED = ["state", "contacts", "pattern", "silence", "link", "log"]
+"""What `era watch` tells unless it is told what: amplifiers and latency would come without end."""
+
 _REPEAT = 0.05  # s; a touch that is not repeated for 150 ms is lifted
 
 
@@ -146,7 +149,9 @@ def clear(socket: Socket = None, as_json: Json = False) -> None:
 @app.command()
 def touch(
     at: Annotated[list[str], typer.Argument(metavar="X,Y ...", help="Fingers on the plate [m].")],
-    duration: Annotated[float, typer.Option("--for", metavar="S", min=0, max=3600)] = 1.0,
+    duration: Annotated[
+        float, typer.Option("--for", metavar="S", min=0, max=3600, help="How long.")
+    ] = 1.0,
     socket: Socket = None,
     as_json: Json = False,
 ) -> None:
@@ -169,7 +174,13 @@ def touch(
 
 @app.command()
 def watch(
-    topics: Annotated[list[str] | None, typer.Argument(metavar="[TOPIC ...]")] = None,
+    topics: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="[TOPIC ...]",
+            help=f"{', '.join(_WATCHED)} if none is named; also amplifiers, latency, layout.",
+        ),
+    ] = None,
     rate: Annotated[float, typer.Option(min=1, max=60, help="Of amplifiers and latency, Hz.")] = 1,
     socket: Socket = None,
     as_json: Annotated[bool, typer.Option("--json", help="A JSON object a line.")] = False,
@@ -180,7 +191,7 @@ def watch(
     from controller.api.events import TOPICS
     from controller.api.parts import Topic
 
-    wanted = topics or ["state", "contacts", "pattern", "silence", "link", "log"]
+    wanted = topics or _WATCHED
     unknown = [topic for topic in wanted if topic not in TOPICS]
     if unknown:
         raise InputError(

@@ -84,7 +84,7 @@ async def drive(
     """Let one channel vibrate for a while [s]; ends silent and disarmed."""
     longest = PROTOCOL.quantities.valid_for.high
     if not 0 < duration <= longest:
-        raise CommandError(f"--for is {duration:g} s; it must lie between 0 and {longest:g} s")
+        raise CommandError(f"--for is {duration:g} s; it must be above 0 and at most {longest:g} s")
     ceiling = GuardLimits(FREQUENCY_FLOOR, FREQUENCY_CEILING, LEVEL_CEILING)
     async with _opened(url) as amplifier:
         guard = Guard(ceiling, amplifier.capabilities)

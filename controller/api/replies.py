@@ -30,7 +30,7 @@ class Unreachable(LinkError):
         if isinstance(error, FileNotFoundError | ConnectionRefusedError):
             return cls(
                 f"no daemon runs at {path}; start one with  era daemon CONFIG , or give the socket "
-                "of the one that runs"
+                "of the one that runs (--socket PATH)"
             )
         if isinstance(error, PermissionError):
             return cls(f"{path} belongs to somebody else; ask whoever runs the daemon")

@@ -31,8 +31,8 @@ def loopback_address(text: str) -> str:
     match = re.fullmatch(r"(127\.0\.0\.1|localhost|\[::1\]):(\d{1,5})", text)
     if match is None or int(match[2]) > 65535:
         raise ValueError(
-            f"{text[:40]!r} is no loopback address with a port, such as 127.0.0.1:8000; for others "
-            "run the gateway by itself: python -m controller.gateway --help"
+            f"{text[:40]!r} is no loopback address with a port, such as 127.0.0.1:8137; for others "
+            "run the gateway by itself: era gateway --help"
         )
     return text
 

@@ -45,11 +45,14 @@ def parse_drives(texts: Sequence[str], rig: Rig) -> Excitation:
     return excitation
 
 
+_PLAIN = "hertz, a share of full stroke and degrees are plain numbers here, without a unit"
+
+
 def _number(text: str, drive: str, *, what: str) -> float:
     try:
         value = float(text)
     except ValueError:
-        raise InputError(f"--drive {drive!r}: {what} {text!r} is not a number") from None
+        raise InputError(f"--drive {drive!r}: {what} {text!r} is not a number; {_PLAIN}") from None
     if not math.isfinite(value):
         raise InputError(f"--drive {drive!r}: {what} {text!r} is not a finite number")
     return value

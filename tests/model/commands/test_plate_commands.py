@@ -96,6 +96,7 @@ def test_level_scales_a_map(era):
         ("SW", "is not ERA=HZ"),
         ("XX=110", "no ERA 'XX'"),
         ("SW=fast", "frequency 'fast' is not a number"),
+        ("SW=110hz", "without a unit"),
         ("SW=nan", "not a finite number"),
         ("SW=-110", "above zero"),
         ("SW=110@1.5", "between 0 and 1"),

@@ -5,6 +5,7 @@
 The line is a pseudo-terminal, whose URL is printed first.
 """
 
+import contextlib
 import os
 import select
 import struct
@@ -176,4 +177,5 @@ def main():
 
 
 if __name__ == "__main__":
-    main()
+    with contextlib.suppress(KeyboardInterrupt):  # Ctrl-C
+        main()

@@ -7,6 +7,7 @@ It serves one host at a time, on 127.0.0.1. A request is a line as {"id": 7, "as
 the watchdog as the wire protocol's page says.
 """
 
+import contextlib
 import json
 import socket
 import sys
@@ -111,4 +112,5 @@ def main():
 
 
 if __name__ == "__main__":
-    main()
+    with contextlib.suppress(KeyboardInterrupt):  # Ctrl-C
+        main()

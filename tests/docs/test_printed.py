@@ -1,11 +1,13 @@
 """What counts as printed as shown, and how a page is read."""
 
+import re
 from pathlib import Path
 
 import pytest
 
+from page_reader import PORTS, Reader
 from printed import difference
-from tutorial_page import Edited, Interrupted, PageError, Typed, Written, read_steps
+from typed_page import Edited, Interrupted, PageError, Seen, Typed, Written, read_steps
 
 PAGE = """# A page
 
@@ -42,6 +44,11 @@ to: read
 <!-- terminal: one -->
 ```sh
 goes on
+```
+
+<!-- seen in: one -->
+```text
+by and by
 ```
 
 <!-- interrupt: one -->
@@ -95,8 +102,9 @@ def test_a_page_is_what_its_reader_does(tmp_path: Path) -> None:
         Written(18, "a.yaml", "a: 1\nb: 2\n"),
         Edited(23, "a.yaml", "a: 1\nb: 2\n", "a: 1\nb: 3\n"),
         Typed(34, "goes on\n", "one", 0, None),
-        Interrupted(38, "one"),
-        Typed(40, "fails\n", None, 2, None),
+        Seen(39, "one", "by and by\n"),
+        Interrupted(43, "one"),
+        Typed(45, "fails\n", None, 2, None),
     ]
 
 
@@ -107,3 +115,36 @@ def test_a_comment_without_a_meaning_is_refused(tmp_path: Path, comment: str) ->
     page.write_text(f"<!-- {comment} -->\n```yaml\na: 1\n```\n", encoding="utf-8")
     with pytest.raises(PageError, match=r"page\.md:[12]"):
         read_steps(page)
+
+
+def test_a_reader_takes_ports_that_are_free(tmp_path: Path) -> None:
+    """In what is written, typed and shown, as whole numbers alone; all that a page says agrees."""
+    page = tmp_path / "page.md"
+    page.write_text(
+        "<!-- file: a.yaml -->\n```yaml\nurl: tcp://127.0.0.1:5020/1\nelse: 15020 0.5020\n```\n"
+        "```sh\ncat a.yaml; grep -c 127.0.0.1:5020/1 a.yaml\n```\n"
+        "```text\nurl: tcp://127.0.0.1:5020/1\nelse: 15020 0.5020\n1\n```\n",
+        encoding="utf-8",
+    )
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    with Reader(folder, home=tmp_path) as reader:
+        for step in read_steps(page):
+            reader.follow(step)
+    text = (folder / "a.yaml").read_text("utf-8")
+    assert ":5020" not in text
+    assert text.endswith("else: 15020 0.5020\n")
+
+
+def test_readers_know_every_port_that_pages_name() -> None:
+    """One that was not replaced would be taken, one day, by somebody else on this machine."""
+    docs = Path(__file__).parents[2] / "docs"
+    pages = [*docs.glob("tutorials/*.md"), *docs.glob("how-to/*.md")]
+    named = {
+        port
+        for page in pages
+        for step in read_steps(page)
+        for port in re.findall(r"(?:127\.0\.0\.1:|--port )(\d+)", str(step))
+    }
+    assert len(named) > 4
+    assert named <= set(PORTS)

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from tutorial_page import Typed, Written, read_steps
-from tutorial_reader import Reader
+from page_reader import Reader
+from typed_page import Typed, Written, read_steps
 
 ROOT = Path(__file__).parents[2]
 PAGES = ROOT / "docs" / "tutorials"

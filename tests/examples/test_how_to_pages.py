@@ -1,16 +1,21 @@
 """The pages that tell how to add something: followed to the letter, they work as they say."""
 
 import re
+import shlex
 import shutil
-import socket
+import sys
+import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from page_commands import Terminal, steps_of
+from page_reader import Reader
+from typed_page import Typed, read_steps
 
 ROOT = Path(__file__).parents[2]
 PAGES = ROOT / "docs" / "how-to"
+PIP = ROOT / "tests" / "support" / "built_pip.py"
 NAMES = [
     "add-a-material",
     "add-a-backend",
@@ -21,19 +26,21 @@ NAMES = [
 ]
 
 
-def free_port(kind: socket.SocketKind) -> str:
-    """A port that nobody holds just now."""
-    with socket.socket(socket.AF_INET, kind) as free:
-        free.bind(("127.0.0.1", 0))
-        return str(free.getsockname()[1])
-
-
 @pytest.fixture
-def terminal(tmp_path: Path, installed: Path) -> Terminal:
-    """In a checkout that has nothing but the examples."""
-    shutil.copytree(ROOT / "examples", tmp_path / "examples")
-    swaps = {"7010": free_port(socket.SOCK_STREAM), "4444": free_port(socket.SOCK_DGRAM)}
-    return Terminal(tmp_path, installed=installed, swaps=swaps)
+def reader(tmp_path: Path, installed: Path) -> Iterator[Reader]:
+    """In a checkout that has nothing but the examples; what `pip` installs was built before."""
+    home = Path(tempfile.mkdtemp(prefix="era"))
+    folder, site, programs = tmp_path / "checkout", home / "site", home / "bin"
+    folder.mkdir()
+    programs.mkdir()
+    shutil.copytree(ROOT / "examples", folder / "examples")
+    pip = programs / "pip"
+    words = [sys.executable, str(PIP), str(installed), str(site)]
+    pip.write_text(f'#!/bin/sh\nexec {shlex.join(words)} "$@"\n', encoding="utf-8")
+    pip.chmod(0o755)
+    with Reader(folder, home=home, programs=programs, site=site) as made:
+        yield made
+    shutil.rmtree(home)
 
 
 def _run_alone(name: str) -> object:
@@ -43,13 +50,12 @@ def _run_alone(name: str) -> object:
 
 
 @pytest.mark.parametrize("name", [_run_alone(name) for name in NAMES])
-def test_a_page_is_followed(name: str, terminal: Terminal) -> None:
+def test_a_page_is_followed(name: str, reader: Reader) -> None:
     """Every command of the page, in order, prints what the page shows."""
-    steps = steps_of(PAGES / f"{name}.md")
-    assert len(steps) > 2
-    with terminal:
-        for step in steps:
-            terminal.type(step)
+    steps = read_steps(PAGES / f"{name}.md")
+    assert sum(isinstance(step, Typed) and step.shown is not None for step in steps) > 2
+    for step in steps:
+        reader.follow(step)
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -4,6 +4,7 @@ A fence of `sh` is typed; a fence of `text` right below it is what that prints. 
 reader sees, say of the next fence:
 
     <!-- terminal: NAME -->    typed in a terminal of its own, where it goes on
+    <!-- seen in: NAME -->     a `text`: what that terminal prints by and by, on lines of their own
     <!-- interrupt: NAME -->   Ctrl-C there, now
     <!-- status: N -->         ends with this exit status; 0 where nothing is said
     <!-- file: NAME -->        is written as this file
@@ -20,7 +21,7 @@ from pathlib import Path
 from markdown_it import MarkdownIt
 
 _COMMENT = re.compile(r"<!-- ([a-z ]+): (.+) -->")
-_OF_A_FENCE = {"terminal", "status", "file", "edit", "not typed"}
+_OF_A_FENCE = {"terminal", "seen in", "status", "file", "edit", "not typed"}
 
 
 class PageError(ValueError):
@@ -36,6 +37,15 @@ class Typed:
     terminal: str | None
     status: int
     shown: str | None
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What a terminal goes on to print."""
+
+    line: int
+    terminal: str
+    shown: str
 
 
 @dataclass(frozen=True)
@@ -65,7 +75,7 @@ class Edited:
     new: str
 
 
-Step = Typed | Interrupted | Written | Edited
+Step = Typed | Seen | Interrupted | Written | Edited
 
 
 def read_steps(page: Path) -> list[Step]:
@@ -88,7 +98,7 @@ def read_steps(page: Path) -> list[Step]:
                     raise PageError(f"{where}: no comment is called {key!r}")
         elif token.type == "fence":
             kind = token.info.strip()
-            if kind == "text" and may_print:
+            if kind == "text" and may_print and "seen in" not in said:
                 steps[-1] = _with_output(steps[-1], token.content, where=where)
                 may_print = False
             elif "not typed" not in said:
@@ -104,6 +114,8 @@ def read_steps(page: Path) -> list[Step]:
 def _step(kind: str, text: str, said: dict[str, str], *, line: int) -> Step | None:
     if kind == "sh":
         return Typed(line, text, said.get("terminal"), int(said.get("status", "0")), None)
+    if kind == "text" and "seen in" in said:
+        return Seen(line, said["seen in"], text)
     if "file" in said:
         return Written(line, said["file"], text)
     if kind == "diff" and "edit" in said:

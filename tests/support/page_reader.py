@@ -1,39 +1,74 @@
 """Somebody who follows a page to the letter: types, edits, opens terminals and ends them."""
 
 import os
+import re
 import signal
+import socket
 import subprocess
 import sys
 import time
+from contextlib import ExitStack
+from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 from printed import difference
-from tutorial_page import Edited, Interrupted, PageError, Step, Typed, Written
+from typed_page import Edited, Interrupted, PageError, Seen, Step, Typed, Written
 
 PATIENCE = 60.0  # s; for one command, on a machine that is busy with other things
 LOOK_AGAIN = 0.05  # s
+PORTS = {
+    "3333": socket.SOCK_DGRAM,
+    "4444": socket.SOCK_DGRAM,
+    "5020": socket.SOCK_STREAM,
+    "7010": socket.SOCK_STREAM,
+    "8137": socket.SOCK_STREAM,
+    "8786": socket.SOCK_STREAM,
+}
+"""Those that pages name; a reader takes others, for on this machine they may be taken."""
+_TERMINAL = re.compile(r"/dev/pts/\d+")
+
+
+def free_ports() -> dict[str, str]:
+    """For every port that pages name one that nobody holds just now."""
+    with ExitStack() as held:
+        here = {}
+        for port, kind in PORTS.items():
+            free = held.enter_context(socket.socket(socket.AF_INET, kind))
+            free.bind(("127.0.0.1", 0))
+            here[port] = str(free.getsockname()[1])
+        return here
 
 
 class Reader:
     """Does steps in a folder; leave the block to have every terminal closed.
 
     folder: where the files go. home: a short path for what programs keep, sockets among them.
+    programs: a folder of those that come before all others. site: where Python finds what is
+    installed. What a page names and what is another one here, ports and
+    pseudo-terminals, is replaced in all that is typed, written and shown.
     """
 
-    def __init__(self, folder: Path, *, home: Path) -> None:
+    def __init__(
+        self, folder: Path, *, home: Path, programs: Path | None = None, site: Path | None = None
+    ) -> None:
         self._folder = folder
+        self._swaps = free_ports()
+        first = [str(programs)] if programs else []
         self._environment = {
             "HOME": str(home),
             "LANG": "C.UTF-8",
             "NO_COLOR": "1",
             "COLUMNS": "100",
-            "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}",
+            "PATH": ":".join([*first, str(Path(sys.executable).parent), os.environ["PATH"]]),
             "PYTHONUNBUFFERED": "1",
             "OPENBLAS_NUM_THREADS": "1",
             "TMPDIR": str(home),
             "XDG_CACHE_HOME": str(home / "cache"),
             "XDG_RUNTIME_DIR": str(home),
+            **({"PYTHONPATH": str(site)} if site else {}),
         }
+        self._held: list[int] = []
         self._terminals: dict[str, tuple[subprocess.Popen[bytes], Path]] = {}
 
     def __enter__(self) -> "Reader":
@@ -44,9 +79,12 @@ class Reader:
             if process.poll() is None:
                 os.killpg(process.pid, signal.SIGKILL)
             process.wait()
+        for line in self._held:
+            os.close(line)
 
     def follow(self, step: Step) -> None:
         """Do one step; raises PageError where anything else comes of it than the page says."""
+        step = self._here(step)
         match step:
             case Written():
                 (self._folder / step.name).write_text(step.text, encoding="utf-8")
@@ -58,6 +96,18 @@ class Reader:
                 self._type(step)
             case Typed():
                 self._begin(step)
+            case Seen():
+                self._wait_for(step.line, step.terminal, f"...\n{step.shown}")
+
+    def _here(self, step: Step) -> Step:
+        told: dict[str, Any] = {k: self._swapped(v) for k, v in asdict(step).items()}
+        return replace(step, **told)
+
+    def _swapped(self, told: object) -> object:
+        if isinstance(told, str):
+            for theirs, ours in self._swaps.items():
+                told = re.sub(rf"(?<![\w.]){theirs}(?!\w)", ours, told)
+        return told
 
     def _edit(self, step: Edited) -> None:
         path = self._folder / step.name
@@ -93,15 +143,34 @@ class Reader:
                 stdout=file,
                 stderr=subprocess.STDOUT,
                 start_new_session=True,
+                preexec_fn=_heed_ctrl_c,
             )
         self._terminals[step.terminal] = process, output
-        shown = (step.shown or "").rstrip("\n") + "\n..."
+        self._wait_for(step.line, step.terminal, step.shown or "")
+
+    def _wait_for(self, line: int, terminal: str, shown: str) -> None:
+        process, output = self._terminals[terminal]
         latest = time.monotonic() + PATIENCE
-        while difference(shown, output.read_text(encoding="utf-8")) is not None:
-            if time.monotonic() > latest or process.poll() is not None:
-                _compare(step.line, shown, output.read_text(encoding="utf-8"))
-                break
+        while True:
+            ended = process.poll() is not None or time.monotonic() > latest
+            printed = output.read_text(encoding="utf-8")
+            wanted = self._with_its_terminal(shown.rstrip("\n") + "\n...", printed)
+            if difference(wanted, printed) is None:
+                return
+            if ended:  # and whatever it has printed until then has been read since
+                _compare(line, wanted, printed)
             time.sleep(LOOK_AGAIN)
+
+    def _with_its_terminal(self, shown: str, printed: str) -> str:
+        """What is shown, with the pseudo-terminal that a program has got, from here on known."""
+        theirs, ours = _TERMINAL.search(shown), _TERMINAL.search(printed)
+        if theirs is None or ours is None:
+            return shown
+        if theirs[0] not in self._swaps:
+            # As long as we hold it, the system gives its name to nobody else once it is closed.
+            self._held.append(os.open(ours[0], os.O_RDWR | os.O_NOCTTY))
+        self._swaps[theirs[0]] = ours[0]
+        return shown.replace(theirs[0], ours[0])
 
     def _interrupt(self, step: Interrupted) -> None:
         process, output = self._terminals[step.terminal]
@@ -110,6 +179,11 @@ class Reader:
             process.wait(PATIENCE)
         except subprocess.TimeoutExpired:
             raise PageError(f"line {step.line}: goes on\n{output.read_text('utf-8')}") from None
+
+
+def _heed_ctrl_c() -> None:
+    """Programs that a shell has put into the background ignore it, and what they start does."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 def _compare(line: int, shown: str | None, printed: str) -> None:

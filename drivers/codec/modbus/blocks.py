@@ -27,10 +27,10 @@ from drivers.protocol.messages import (
 
 _MAP = PROTOCOL.modbus
 _Q = PROTOCOL.quantities
-_HEAD = len(_MAP["head"])
-_CHANNEL_SIZE: int = _MAP["channel_registers"]
-_FAULT_SIZE: int = _MAP["fault_registers"]
-_TEXT_SIZE: int = _MAP["text_registers"]
+HEAD = len(_MAP["head"])  # registers that every block begins with
+CHANNEL_SIZE: int = _MAP["channel_registers"]
+FAULT_SIZE: int = _MAP["fault_registers"]
+TEXT_SIZE: int = _MAP["text_registers"]
 _NO_CHANNEL = 255
 
 # By register, as protocol.yaml says; those of channels and faults have their quantities' names.
@@ -48,10 +48,10 @@ def _fields(
     names: Collection[str], registers: Sequence[int]
 ) -> tuple[dict[str, int], Sequence[int]]:
     """The named registers after the head, and what follows them."""
-    end = _HEAD + len(names)
+    end = HEAD + len(names)
     if len(registers) < end:
         raise FrameError(f"{len(registers)} registers were read where {end} are needed")
-    return dict(zip(names, registers[_HEAD:end], strict=True)), registers[end:]
+    return dict(zip(names, registers[HEAD:end], strict=True)), registers[end:]
 
 
 def _integer(name: str, register: int) -> int:
@@ -82,7 +82,7 @@ def unpack_identity(registers: Sequence[int]) -> Identity:
     block = _MAP["input"]["identity"]
     found, rest = _fields(block["registers"], registers)
     texts = {
-        name: _text(rest[number * _TEXT_SIZE : (number + 1) * _TEXT_SIZE])
+        name: _text(rest[number * TEXT_SIZE : (number + 1) * TEXT_SIZE])
         for number, name in enumerate(block["texts"])
     }
     version = _integer("protocol_version", found["protocol_version"])
@@ -139,11 +139,11 @@ def _groups(registers: Sequence[int], size: int) -> Iterable[Sequence[int]]:
 def unpack_achieved(registers: Sequence[int]) -> Achieved:
     """What it plays, or would; the channels that were named, in their order."""
     found, rest = _fields(_MAP["input"]["achieved"]["registers"], registers)
-    if _integer("channel_count", found["channel_count"]) * _CHANNEL_SIZE > len(rest):
+    if _integer("channel_count", found["channel_count"]) * CHANNEL_SIZE > len(rest):
         raise FrameError("the amplifier has more channels than were read")
     commands = tuple(
         _command(channel, group)
-        for channel, group in enumerate(_groups(rest, _CHANNEL_SIZE))
+        for channel, group in enumerate(_groups(rest, CHANNEL_SIZE))
         if any(group)
     )
     return Achieved(token=_integer("token", found["token"]), commands=commands)
@@ -171,7 +171,7 @@ def unpack_faults(registers: Sequence[int]) -> FaultList:
     """What went wrong, as far as it was read; see `unpack_fault_count`."""
     found, rest = _fields(_MAP["input"]["faults"]["registers"], registers)
     count = _integer("fault_count", found["fault_count"])
-    records = list(_groups(rest, _FAULT_SIZE))[:count]
+    records = list(_groups(rest, FAULT_SIZE))[:count]
     return FaultList(
         tuple(
             FaultRecord(

@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from drivers.codec.modbus import blocks
+from drivers.codec.modbus.blocks import CHANNEL_SIZE, FAULT_SIZE, HEAD, TEXT_SIZE
 from drivers.command import CommandSet, DriveCommand, Envelope
 from drivers.errors import CommandError
 from drivers.guard import require_safe
@@ -41,10 +42,6 @@ from drivers.protocol.messages import (
 
 _MAP = PROTOCOL.modbus
 _Q = PROTOCOL.quantities
-_HEAD = len(_MAP["head"])
-_CHANNEL_SIZE: int = _MAP["channel_registers"]
-_FAULT_SIZE: int = _MAP["fault_registers"]
-_TEXT_SIZE: int = _MAP["text_registers"]
 _CONTROLWORDS: Mapping[str, int] = _MAP["controlwords"]
 CHANNELS_MAX = _Q.channel_count.maximum
 RECORDS_FIRST = 4  # mostly there are fewer; where there are more they are asked for
@@ -85,13 +82,13 @@ def encode_request(
     match request:
         case Hello():
             texts = len(_MAP["input"]["identity"]["texts"])
-            return Exchange(_read("identity", beyond=texts * _TEXT_SIZE))
+            return Exchange(_read("identity", beyond=texts * TEXT_SIZE))
         case GetCaps():
             return Exchange(_read("capabilities"))
         case GetStatus():
             return Exchange(_read("status", beyond=channels), Write(_MAP["look"], (tag,)))
         case GetFaults():
-            beyond = min(records, _MAP["fault_count"]) * _FAULT_SIZE
+            beyond = min(records, _MAP["fault_count"]) * FAULT_SIZE
             return Exchange(_read("faults", beyond=beyond), Write(_MAP["look"], (tag,)))
         case Ping():
             return Exchange(_read("status", beyond=channels), Write(_MAP["heartbeat"], (tag,)))
@@ -102,14 +99,14 @@ def encode_request(
         case Stage(command_set=wanted) | Apply(command_set=wanted):
             commit = wanted.token if isinstance(request, Apply) else 0
             write = _block("set", tag, [commit, *_pack_set(wanted)])
-            return Exchange(_read("achieved", beyond=channels * _CHANNEL_SIZE), write)
+            return Exchange(_read("achieved", beyond=channels * CHANNEL_SIZE), write)
         case Commit(token=token):
             write = _block("set", tag, [_Q.token.to_wire(token)])
-            return Exchange(_read("achieved", beyond=channels * _CHANNEL_SIZE), write)
+            return Exchange(_read("achieved", beyond=channels * CHANNEL_SIZE), write)
         case LoadEnvelope(envelope=envelope):
             kept = _MAP["holding"]["envelope"]
             return Exchange(
-                Read(kept["address"], _HEAD + len(kept["registers"])),
+                Read(kept["address"], HEAD + len(kept["registers"])),
                 _block("envelope", tag, _pack_envelope(envelope)),
             )
 
@@ -117,7 +114,7 @@ def encode_request(
 def encode_broadcast(request: Broadcast) -> Write:
     """What is written to all units; a commit is one register."""
     if isinstance(request, Commit):
-        address = _MAP["holding"]["set"]["address"] + _HEAD
+        address = _MAP["holding"]["set"]["address"] + HEAD
         return Write(address, (_Q.token.to_wire(request.token),))
     return _block("control", 0, _order(request))
 
@@ -135,9 +132,9 @@ def refusal_read() -> Read:
 
 def is_of(registers: Sequence[int], *, tag: int | None) -> bool:
     """Whether a block that was read belongs to this tag; None: whether it is sound at all."""
-    if len(registers) < _HEAD or (tag is not None and registers[0] != tag):
+    if len(registers) < HEAD or (tag is not None and registers[0] != tag):
         return False
-    return registers[1] in (0, check_of(registers[_HEAD:]))
+    return registers[1] in (0, check_of(registers[HEAD:]))
 
 
 def check_of(registers: Sequence[int]) -> int:
@@ -177,7 +174,7 @@ def nak_of_exception(code: int) -> Nak | None:
 
 def _read(name: str, *, beyond: int = 0) -> Read:
     block = _MAP["input"][name]
-    return Read(block["address"], _HEAD + len(block["registers"]) + beyond)
+    return Read(block["address"], HEAD + len(block["registers"]) + beyond)
 
 
 def _block(name: str, tag: int, registers: Sequence[int]) -> Write:
@@ -208,7 +205,7 @@ def _pack_set(command_set: CommandSet) -> list[int]:
     )
     for channel in range(max(by_channel, default=-1) + 1):
         command = by_channel.get(channel)
-        registers += [0] * _CHANNEL_SIZE if command is None else _pack_channel(command)
+        registers += [0] * CHANNEL_SIZE if command is None else _pack_channel(command)
     return registers
 
 

@@ -1,14 +1,14 @@
 """What Modbus RTU frames cost in time, by arithmetic."""
 
+from drivers.codec.modbus.blocks import CHANNEL_SIZE, HEAD
 from drivers.protocol.definition import PROTOCOL
 
 _MAP = PROTOCOL.modbus
-_SET_HEAD = len(_MAP["head"]) + len(_MAP["holding"]["set"]["registers"])
-_ACHIEVED_HEAD = len(_MAP["head"]) + len(_MAP["input"]["achieved"]["registers"])
-_ENVELOPE_HEAD = len(_MAP["head"]) + len(_MAP["holding"]["envelope"]["registers"])
+_SET_HEAD = HEAD + len(_MAP["holding"]["set"]["registers"])
+_ACHIEVED_HEAD = HEAD + len(_MAP["input"]["achieved"]["registers"])
+_ENVELOPE_HEAD = HEAD + len(_MAP["holding"]["envelope"]["registers"])
 _KNOT = 2  # registers: level, phase
-_COMMIT = len(_MAP["head"]) + 1  # registers, the last for the token
-_CHANNEL: int = _MAP["channel_registers"]
+_COMMIT = HEAD + 1  # registers, the last for the token
 _READ_WRITE = 13  # bytes of an FC23 request without its registers
 _READ = 5  # bytes of its answer without its registers
 _GAP = 3.5  # characters of silence between two frames
@@ -22,7 +22,7 @@ def silence(*, baud: int, bits_per_byte: int = 11) -> float:
 
 def apply_time(channels: int, *, baud: int, bits_per_byte: int = 11) -> float:
     """Time [s] that an apply of so many channels takes on the line, without its answer."""
-    registers = _SET_HEAD + channels * _CHANNEL
+    registers = _SET_HEAD + channels * CHANNEL_SIZE
     return (_READ_WRITE + 2 * registers) * bits_per_byte / baud
 
 
@@ -31,7 +31,7 @@ def round_trip_time(channels: int, *, baud: int, bits_per_byte: int = 11) -> flo
 
     In one transaction, FC23, with what was achieved read back.
     """
-    registers = _ACHIEVED_HEAD + channels * _CHANNEL
+    registers = _ACHIEVED_HEAD + channels * CHANNEL_SIZE
     answer = (_READ + 2 * registers) * bits_per_byte / baud
     gaps = 2 * silence(baud=baud, bits_per_byte=bits_per_byte)
     return apply_time(channels, baud=baud, bits_per_byte=bits_per_byte) + answer + gaps

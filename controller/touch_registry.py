@@ -1,10 +1,9 @@
 """Touch sources by the scheme of their URL, our own and those of installed plug-ins alike."""
 
-import difflib
 from importlib.metadata import EntryPoint, entry_points
 
 from controller.touch import TouchSource
-from model.errors import InputError
+from model.errors import InputError, did_you_mean
 
 GROUP = "era_haptics.touch_sources"
 
@@ -18,11 +17,10 @@ def open_source(url: str) -> TouchSource:
     plugins = _plugins()
     scheme, colon, _ = url.partition(":")
     if not colon or scheme not in plugins:
-        close = difflib.get_close_matches(scheme, plugins, n=1)
-        hint = f"did you mean {close[0]}:? " if close else ""
+        known = [f"{name}:" for name in sorted(plugins)]
         raise InputError(
-            f"touch source {url}: unknown kind {scheme!r}; {hint}"
-            f"known are {', '.join(f'{name}:' for name in sorted(plugins))}"
+            f"touch source {url}: unknown kind {scheme!r}; {did_you_mean(f'{scheme}:', known)}"
+            f"known are {', '.join(known)}"
         )
     plugin = plugins[scheme]
     try:

@@ -1,7 +1,9 @@
 """Cases that provoke errors, what each says, and the page that all of them make.
 
 A case is an entry of a file in tests/errors/cases: what is typed (`run`, a command line of `era`,
-or `python`, code of the library), with files of its own (`files`, `edit` of the prepared ones).
+or `python`, code of the library), with files of its own (`files`, `edit` of the prepared ones) and
+code that comes before a command (`before`). Code has an ExitStack, `until_over`, and raises, or
+names what was `told` to it. A case that names era.sock finds a daemon there.
 What it says stands in docs/reference/errors.md alone, which
 `python tests/support/error_cases.py` writes anew; read every changed line of it.
 """
@@ -25,6 +27,7 @@ import yaml
 from controller.api.jsonrpc import RpcError
 from controller.main import run
 from drivers.errors import DriverError
+from gateway_bench import real_daemon
 from model.errors import InputError
 
 HERE = Path(__file__).parents[1] / "errors"
@@ -54,9 +57,15 @@ _PREPARED = {
 }
 
 
+SOCKET, _DAEMON = "era.sock", "running"
+
+
 @dataclass(frozen=True)
 class Case:
-    """One way to get an error. status: None for code, which raises."""
+    """One way to get an error. status: None for code, which raises; said: begins what came first.
+
+    blur: a pattern of what is another at each run.
+    """
 
     name: str
     subject: str
@@ -66,6 +75,8 @@ class Case:
     files: dict[str, str | bytes] = field(default_factory=dict)
     edit: dict[str, list[str]] = field(default_factory=dict)
     blur: str | None = None
+    before: str = ""
+    said: str = ""
     prelude: str = ""
 
 
@@ -128,13 +139,16 @@ def _files(folder: Path) -> set[tuple[Path, bytes]]:
 
 
 def _lay_out(case: Case, folder: Path, shelf: Path) -> None:
-    asked = f"{case.prelude} {case.run} {case.python} {' '.join(map(str, case.files.values()))}"
+    typed = (case.prelude, case.before, case.run, case.python, *case.files.values())
+    asked = " ".join(map(str, typed))
     for name, text in _PREPARED.items():
         if name in asked or name in case.edit or name == "rig.yaml":
             (folder / name).write_text(text, encoding="utf-8")
     for path in shelf.iterdir():
-        if path.name in asked:
+        if path.name in asked and path.is_file():
             (folder / path.name).write_bytes(path.read_bytes())
+    if SOCKET in asked:
+        (folder / SOCKET).symlink_to(shelf / _DAEMON / SOCKET)
     for name, (old, new) in case.edit.items():
         text = (folder / name).read_text("utf-8")
         assert old in text, f"{case.name}: {name} has no {old!r} to be changed"
@@ -170,24 +184,33 @@ def _run(case: Case) -> Told:
     program, *arguments = shlex.split(case.run)
     assert program == "era"
     out, err = io.StringIO(), io.StringIO()
-    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-        status = run(arguments, entry_points(group="era_haptics.commands"))
+    with contextlib.ExitStack() as until_over:
+        if case.before:
+            names: dict[str, Any] = {"until_over": until_over}
+            exec(case.prelude, names)
+            exec(case.before, names)
+        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+            status = run(arguments, entry_points(group="era_haptics.commands"))
     return Told(err.getvalue(), status, out.getvalue())
 
 
 def _call(case: Case) -> Told:
     assert case.python is not None
-    names: dict[str, Any] = {}
-    try:
-        exec(case.prelude, names)
-        exec(case.python, names)
-    except (InputError, DriverError, RpcError) as error:
-        return Told(f"{type(error).__name__}: {error}\n", None, "")
+    with contextlib.ExitStack() as until_over:
+        names: dict[str, Any] = {"until_over": until_over}
+        try:
+            exec(case.prelude, names)
+            exec(case.python, names)
+        except (InputError, DriverError, RpcError) as error:
+            return Told(f"{type(error).__name__}: {error}\n", None, "")
+    if "told" in names:
+        return Told(f"{names['told']}\n", None, "")
     raise AssertionError(f"{case.name}: nothing was wrong")
 
 
-def fill(shelf: Path) -> None:
-    """Make what is dear to make: a small table, and copies of examples."""
+@contextlib.contextmanager
+def filled(shelf: Path) -> Iterator[None]:
+    """What is dear to make: a small table, copies of examples, and a daemon that runs meanwhile."""
     (shelf / "rig.yaml").write_text(RIG, encoding="utf-8")
     table = f"table build {shelf}/rig.yaml -o {shelf}/table.npz --frequencies 60:120:30 --grid 4x3"
     with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
@@ -195,6 +218,9 @@ def fill(shelf: Path) -> None:
     (shelf / "rig.yaml").unlink()
     for name in ("measured.csv", "measured.uff", "touches.tuio"):
         (shelf / name).write_bytes((HERE.parents[1] / "examples" / name).read_bytes())
+    (shelf / _DAEMON).mkdir()
+    with real_daemon(shelf / _DAEMON):
+        yield
 
 
 def page(told: dict[str, Told]) -> str:
@@ -224,10 +250,16 @@ def _typed(case: Case) -> list[str]:
         shown = content.decode(errors="backslashreplace") if isinstance(content, bytes) else content
         lines += [f"# {name}:", *(f"#     {_short(line)}" for line in shown.splitlines()[:12])]
     if case.run is not None:
-        return [*lines, f"$ {case.run}"]
+        return [*lines, *_code(case.before), f"$ {case.run}"]
     assert case.python is not None
-    first, *others = case.python.rstrip("\n").splitlines()
-    return [*lines, f">>> {first}", *(f"... {line}" for line in others)]
+    return [*lines, *_code(case.python)]
+
+
+def _code(text: str) -> list[str]:
+    return [
+        f"{'...' if number else '>>>'} {line}"
+        for number, line in enumerate(text.rstrip("\n").splitlines())
+    ]
 
 
 def _short(line: str) -> str:
@@ -238,8 +270,7 @@ def _short(line: str) -> str:
 def _main(wanted: list[str]) -> None:
     """Write the page; with names of subjects say what their cases say, and write nothing."""
     told: dict[str, Told] = {}
-    with tempfile.TemporaryDirectory() as shelf:
-        fill(Path(shelf))
+    with tempfile.TemporaryDirectory() as shelf, filled(Path(shelf)):
         for subject in subjects():
             for case in subject.cases:
                 if wanted and case.subject not in wanted:

@@ -142,7 +142,7 @@ class Client:
     def _ask(self, call: Call[_ResultT]) -> _ResultT:
         number, line = self._conversation.ask(call)
         try:
-            self._socket.sendall(line)
+            self._send(line)
             while True:
                 for answer in self._read():
                     if answer.number in (number, None):
@@ -151,6 +151,14 @@ class Client:
             raise
         except OSError as error:
             raise Unreachable.at(self.path, error) from error
+
+    def _send(self, line: bytes) -> None:
+        """Send a line whole, or hang up: the next one would be taken for the rest of this."""
+        try:
+            self._socket.sendall(line)
+        except OSError:
+            self.close()
+            raise
 
     def _read(self) -> list[Answer]:
         """The answers that came next; notifications are kept for `events`. Raises OSError."""

@@ -18,6 +18,7 @@ from controller.api.async_client import AsyncClient
 from controller.api.client import Client
 from controller.api.jsonrpc import ErrorCode, RpcError
 from controller.api.messages import METHODS, ArmResult
+from controller.api.parts import Message
 from controller.api.replies import Unreachable
 from controller.api.socket_path import SYSTEM_SOCKET, find_socket
 from daemon_bench import PLACE, running_daemon, until_state
@@ -185,6 +186,37 @@ def test_a_daemon_that_does_not_answer_is_given_up(tmp_path: Path) -> None:
         server.listen()
         with pytest.raises(Unreachable, match="does not answer"):
             Client.connect(tmp_path / "s", timeout=0.05)
+
+
+class Note(Message):
+    """More than fits into a socket's buffer."""
+
+    text: str
+
+
+def test_half_a_line_is_never_gone_on_with(tmp_path: Path) -> None:
+    """A daemon that reads no more got half of a question: the connection is over, as for all."""
+    with socket.socket(socket.AF_UNIX) as server:
+        server.bind(str(tmp_path / "s"))
+        server.listen()
+        peers: list[socket.socket] = []
+
+        def greet() -> None:
+            peers.append(server.accept()[0])
+            peers[0].recv(1000)
+            peers[0].sendall(HELLO.replace(b'"2.0","soft', b'"1.0","soft'))
+
+        thread = threading.Thread(target=greet)
+        thread.start()
+        with Client.connect(tmp_path / "s", timeout=0.2) as era:
+            thread.join()
+            peers[0].settimeout(5)
+            with peers[0] as daemon, daemon.makefile("rb") as lines:
+                with pytest.raises(Unreachable, match="does not answer"):
+                    era.call("note", Note(text="x" * 10_000_000), Note)
+                with pytest.raises(Unreachable):
+                    era.stop()
+                assert lines.read().endswith(b"x")
 
 
 def test_what_is_no_socket_is_named_as_such(tmp_path: Path) -> None:

@@ -277,6 +277,8 @@ def show_status(told: "StatusResult") -> str:
         )
     if told.silent_because is not None and told.contacts:
         lines.append(f"  silent: {told.silent_because}")
+    elif told.contacts and told.state == "READY_TO_SWITCH_ON":
+        lines.append("  silent: nobody has armed it; era arm does")
     if told.plain_because is not None:
         lines.append(f"  plain ramps: {told.plain_because}")
     for era, tone in told.drive.items():

@@ -179,6 +179,14 @@ async def test_the_field_is_drawn_and_frames_go_on(page: Page, era: Client) -> N
     assert await page.until(colours, lambda count: count == 1)  # still again
 
 
+async def test_a_finger_before_anybody_has_armed_is_told_why_it_feels_nothing(page: Page) -> None:
+    """For as long as it is down."""
+    summary = "document.querySelector('#summary').textContent"
+    async with fingers_down(page, PLACES[0]):
+        await page.until(summary, lambda text: text == "silent: arm, and touches are felt")
+    await page.until(summary, lambda text: not text)
+
+
 async def test_fingers_on_the_glass_are_the_daemons_contacts(page: Page, era: Client) -> None:
     """Two at once, where they are in metres, moved and lifted; the last one is the target."""
     await arm(page, era)

@@ -139,6 +139,7 @@ const HANDLERS = {
   contacts({ contacts }) {
     overlay.show({ contacts });
     if (!contacts.length) at("summary").textContent = "";
+    else if (["SWITCH_ON_DISABLED", "READY_TO_SWITCH_ON"].includes(state)) at("summary").textContent = "silent: arm, and touches are felt";
   },
   pattern(pattern) {
     overlay.show(pattern);

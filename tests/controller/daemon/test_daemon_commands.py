@@ -30,6 +30,22 @@ async def test_a_touch_beyond_the_plate_is_refused(tmp_path: Path) -> None:
             beyond("a")
 
 
+async def test_a_status_says_that_touches_wait_for_somebody_to_arm(tmp_path: Path) -> None:
+    """Only where a finger is down and nobody has armed: the command that helps."""
+    async with running_daemon(tmp_path) as bench, await bench.client() as era:
+        await until_state(era, "READY_TO_SWITCH_ON")
+        assert "era arm" not in show_status(await era.status())
+        for _ in range(500):
+            await era.touch([(0.1, 0.1)])
+            status = await era.status()
+            if status.contacts:
+                break
+            await asyncio.sleep(0.01)
+        assert "  silent: nobody has armed it; era arm does\n" in show_status(status)
+        await era.arm("me", lease_s=30)
+        assert "era arm does" not in show_status(await era.status())
+
+
 async def test_a_status_says_why_touches_begin_along_plain_ramps(tmp_path: Path) -> None:
     """Where that is for a while only, and not otherwise."""
     async with running_daemon(tmp_path) as bench, await bench.client() as era:

@@ -21,14 +21,13 @@ def route(
     *,
     token: int,
     ramp: float,
-    valid_for: float = 0.0,
     playing: Mapping[str, DriveCommand] | None = None,
     onset: Envelopes | None = None,
 ) -> dict[str, CommandSet]:
     """One command set per amplifier of the rig, by its name, all under the same token.
 
     Every wired channel is named: level = amplitude / stroke, phase in degrees within (-180, 180];
-    level 0 where the ERA is not driven. ramp, valid_for [s] as in `CommandSet`; the ramp becomes as
+    level 0 where the ERA is not driven. ramp [s] as in `CommandSet`; it becomes as
     long as the rig's limit of slew asks for, on all amplifiers alike. playing: what ERAs
     play now, as `drive_of_eras` tells it; a frequency that only ERAs play which play it already
     runs on undisturbed in time. onset: envelopes that stand in the slots of `controller.envelopes`;
@@ -57,7 +56,7 @@ def route(
             token=token,
             commands=tuple(sorted(wired, key=lambda command: command.channel)),
             ramp=ramp,
-            valid_for=valid_for,
+            valid_for=0.0,
         )
         for name, wired in commands.items()
     }

@@ -32,8 +32,6 @@ async def relays(
     places: Sequence[Place],
     names: Sequence[str],
     witness: Witness,
-    *,
-    clock: Callable[[], float] = time.monotonic,
 ) -> AsyncIterator[list[str]]:
     """Stand in these wires, each the witness's wire of its name; the URLs to use instead.
 
@@ -45,14 +43,12 @@ async def relays(
             if place.place in ends:
                 continue
             make = _line if place.is_device else _network
-            ends[place.place] = await stack.enter_async_context(make(place, name, witness, clock))
+            ends[place.place] = await stack.enter_async_context(make(place, name, witness))
         yield [place.through(ends[place.place]) for place in places]
 
 
 @asynccontextmanager
-async def _line(
-    place: Place, name: str, witness: Witness, clock: Callable[[], float]
-) -> AsyncIterator[str]:
+async def _line(place: Place, name: str, witness: Witness) -> AsyncIterator[str]:
     """A pseudo-terminal in front of a serial port."""
     try:
         port = serial.Serial(place.place, baudrate=place.baud, timeout=0, exclusive=True)
@@ -68,7 +64,7 @@ async def _line(
     def to_amplifier(data: bytes) -> None:
         with contextlib.suppress(OSError):
             port.write(data)
-        witness.bytes(name, "amplifier", clock(), data)
+        witness.bytes(name, "amplifier", time.monotonic(), data)
 
     terminal = PseudoTerminal(to_amplifier)
 
@@ -81,10 +77,10 @@ async def _line(
             data = b""
         if not data:
             loop.remove_reader(port.fileno())
-            witness.closed(name, clock())
+            witness.closed(name, time.monotonic())
             return
         terminal.write(data)
-        witness.bytes(name, "host", clock(), data)
+        witness.bytes(name, "host", time.monotonic(), data)
 
     with contextlib.closing(port), contextlib.closing(terminal):
         loop.add_reader(port.fileno(), to_host)
@@ -96,9 +92,7 @@ async def _line(
 
 
 @asynccontextmanager
-async def _network(
-    place: Place, name: str, witness: Witness, clock: Callable[[], float]
-) -> AsyncIterator[str]:
+async def _network(place: Place, name: str, witness: Witness) -> AsyncIterator[str]:
     """A port of the loopback interface in front of a server."""
     loop = asyncio.get_running_loop()
     host, _, number = place.place.rpartition(":")
@@ -107,15 +101,15 @@ async def _network(
 
     def opened(half: "_Half") -> None:
         open_now.add(half)
-        witness.opened(name, clock())
+        witness.opened(name, time.monotonic())
 
     def closed(half: "_Half") -> None:
         open_now.discard(half)
         if not open_now:
-            witness.closed(name, clock())
+            witness.closed(name, time.monotonic())
 
     def shown(toward: Toward, data: bytes) -> None:
-        witness.bytes(name, toward, clock(), data)
+        witness.bytes(name, toward, time.monotonic(), data)
 
     async def connect(front: "_Half") -> None:
         try:

@@ -37,10 +37,10 @@ class SlcanAdapter:
     problem: str | None = None
 
 
-def ask_for_slcan(port: str, *, bitrate: int = CANOPEN["bitrate"]) -> SlcanAdapter | None:
+def ask_for_slcan(port: str) -> SlcanAdapter | None:
     """The adapter on a serial port; None where nobody answers as one. Blocks for half a second.
 
-    bitrate [bit/s]: of the bus. Raises OSError where the port cannot be used.
+    Raises OSError where the port cannot be used.
     """
     with serial.Serial(
         port, _BAUD, timeout=_ANSWER_TIME, write_timeout=_ANSWER_TIME, exclusive=True
@@ -51,19 +51,21 @@ def ask_for_slcan(port: str, *, bitrate: int = CANOPEN["bitrate"]) -> SlcanAdapt
         if found is None:
             return None
         version = found.group(1).decode()
-        with _listening(line, bitrate) as is_listening:
+        with _listening(line) as is_listening:
             if not is_listening:
                 return SlcanAdapter(version, problem="it cannot only listen, so it was not opened")
             return SlcanAdapter(version, nodes=tuple(sorted(set(_heard(line)))))
 
 
 @contextmanager
-def _listening(line: serial.Serial, bitrate: int) -> Iterator[bool]:
+def _listening(line: serial.Serial) -> Iterator[bool]:
     """With the adapter open to listen only, if it can be; closed again afterwards."""
     line.write(b"C\r")  # it may have been left open
     _text_until(line, _END)
     try:
-        yield _is_done(line, b"S%d\r" % _SPEEDS.index(bitrate)) and _is_done(line, b"L\r")
+        yield _is_done(line, b"S%d\r" % _SPEEDS.index(CANOPEN["bitrate"])) and _is_done(
+            line, b"L\r"
+        )
     finally:
         with suppress(serial.SerialException):
             line.write(b"C\r")

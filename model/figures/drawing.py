@@ -21,6 +21,7 @@ COLORS = "viridis"
 ACTIVE_COLOR = "#d62728"
 RESTING_COLOR = "#2ca02c"
 
+_DPI = 150
 POINTS_ALONG = 97
 
 
@@ -108,7 +109,7 @@ def map_figure(rig: Rig, plate_map: PlateMap, *, active: Collection[str], title:
     return maps_figure([MapPanel(title, plate_map, rig.eras, active)], columns=1)
 
 
-def save_figure(figure: Figure, path: Path, *, dpi: int = 150) -> None:
+def save_figure(figure: Figure, path: Path) -> None:
     """Write a figure as what its file's name ends in; needs no display.
 
     Raises InputError for an ending that is not in PICTURE_ENDINGS, OSError where the file cannot be
@@ -116,7 +117,7 @@ def save_figure(figure: Figure, path: Path, *, dpi: int = 150) -> None:
     """
     check_picture_name(path)
     FigureCanvasAgg(figure)
-    figure.savefig(path, dpi=dpi)
+    figure.savefig(path, dpi=_DPI)
 
 
 def _label_plate(axes: Axes) -> None:

@@ -58,11 +58,10 @@ class Shaper:
         *,
         targets: Sequence[Position],
         quiet: Sequence[Position] = (),
-        rise: float = RISE,
     ) -> Envelopes:
         """Envelopes that lead from rest to an excitation and keep quiet fingers [m] quiet.
 
-        targets [m] follow their steady vibration along a raised cosine of rise [s]. Without quiet
+        targets [m] follow their steady vibration along a raised cosine of RISE. Without quiet
         fingers the plate beyond 50 mm of the targets takes their place. An ERA that the excitation
         leaves silent helps where there is one frequency only.
         """
@@ -71,7 +70,7 @@ class Shaper:
         envelopes: dict[str, Envelope] = {}
         for frequency, amplitudes, active in self._groups(excitation):
             knots = onset_knots(
-                self._carrier(frequency), amplitudes, active, felt=felt, still=still, rise=rise
+                self._carrier(frequency), amplitudes, active, felt=felt, still=still, rise=RISE
             )
             envelopes.update(self._envelopes(frequency, np.vstack([0 * knots[0], knots]), active))
         return envelopes

@@ -11,7 +11,7 @@ from drivers.command import CommandSet
 from drivers.errors import CommandError, CommandRefused, FrameError, LinkError, LinkTimeout
 from drivers.guard import SafeCommand
 from drivers.link import turns
-from drivers.operation.watchdog import check_watchdog, round_trip_of
+from drivers.operation.watchdog import check_watchdog
 from drivers.protocol.messages import (
     Achieved,
     Apply,
@@ -34,6 +34,7 @@ from drivers.protocol.messages import (
     Status,
     Stop,
 )
+from drivers.registry import open_backend
 
 IDENTITY = Identity("Acme", "Quad", "A-17", "1.2", 1)
 STATUS = Status(State.OPERATION_ENABLED, Fault.NONE, 0, True, 25.0, 0.25, (0.0,) * 4)
@@ -602,4 +603,4 @@ def test_watchdog_bears_three_heartbeats(watchdog: float, round_trip: float, fit
 )
 def test_the_round_trip_follows_from_the_url(url: str, milliseconds: float) -> None:
     """Four channels at the speed in the URL; what is not known there counts as nothing."""
-    assert round_trip_of(url, channels=4) * 1e3 == pytest.approx(milliseconds, abs=0.01)
+    assert open_backend(url).round_trip(4) * 1e3 == pytest.approx(milliseconds, abs=0.01)

@@ -65,7 +65,11 @@ class AsyncClient:
 
     @classmethod
     async def connect(
-        cls, path: Path | None = None, *, name: str = "python", timeout: float = ANSWER_TIMEOUT
+        cls,
+        path: Path | str | None = None,
+        *,
+        name: str = "python",
+        timeout: float = ANSWER_TIMEOUT,
     ) -> Self:
         """A connection that has said hello; as `Client.connect`."""
         at = find_socket(path)

@@ -59,7 +59,11 @@ class Client:
 
     @classmethod
     def connect(
-        cls, path: Path | None = None, *, name: str = "python", timeout: float = ANSWER_TIMEOUT
+        cls,
+        path: Path | str | None = None,
+        *,
+        name: str = "python",
+        timeout: float = ANSWER_TIMEOUT,
     ) -> Self:
         """A connection that has said hello; path: of the socket, the usual one if None.
 

@@ -20,10 +20,10 @@ def default_socket(environment: Mapping[str, str] = os.environ) -> Path:
     return Path(tempfile.gettempdir()) / f"era-haptics-{os.getuid()}" / "daemon.sock"
 
 
-def find_socket(given: Path | None) -> Path:
+def find_socket(given: Path | str | None) -> Path:
     """The socket to connect to: the given one, this user's, or else that of the system service."""
     if given is not None:
-        return given
+        return Path(given)
     own = default_socket()
     return own if own.exists() or not _is_there(SYSTEM_SOCKET) else SYSTEM_SOCKET
 

@@ -226,6 +226,14 @@ def test_what_is_no_socket_is_named_as_such(tmp_path: Path) -> None:
         Client.connect(tmp_path / "rig.yaml")
 
 
+async def test_a_socket_may_be_named_by_text() -> None:
+    """As rigs and tables may: whoever types a name at a prompt gets what is wrong with it."""
+    with pytest.raises(Unreachable, match=r"no daemon runs at nosuch\.sock; start one"):
+        Client.connect("nosuch.sock")
+    with pytest.raises(Unreachable, match=r"no daemon runs at nosuch\.sock; start one"):
+        await AsyncClient.connect("nosuch.sock")
+
+
 def test_a_daemon_of_others_is_named_as_such(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where one may not even look into its folder, connecting is what tells whose it is."""
 

@@ -37,7 +37,7 @@ kill-test: .venv/installed-test
 fault-test: .venv/installed-test
 	$(BIN)/pytest -q -s tests/integration/test_daemon_faults_*.py
 
-# The whole chain in virtual time, thousands of seeds; `make test` takes a few hundred short ones.
+# The whole chain in virtual time, thousands of seeds; `make test` takes 160 short ones.
 # Others: make soak SOAK='--hours 10 --wire serial', or one again: make soak SOAK='--seed 17'
 soak: .venv/installed-test
 	$(BIN)/python tests/support/soak.py $(SOAK)

@@ -1,4 +1,4 @@
-"""The whole chain in virtual time: a few hundred seeds, the same each time, and it notices bugs."""
+"""The whole chain in virtual time: 160 seeds, the same each time, and it notices bugs."""
 
 import os
 import subprocess
@@ -33,11 +33,11 @@ from soak_plan import (
     make_plan,
 )
 
-SEEDS = 240
+SEEDS = 160
 SOAK = Path(__file__).parent / "support" / "soak.py"
 
 
-def test_hundreds_of_seeds_break_no_rule() -> None:
+def test_more_than_a_hundred_seeds_break_no_rule() -> None:
     """Every wire, every fault, every gesture: silence in time, nothing beyond, touches are felt.
 
     What was tried is counted, so that seeds under which nothing happens would show.

@@ -14,8 +14,14 @@ from paper_plate import make_paper_rig
 
 @pytest.fixture
 def rig():
-    """A mesh that is quick to solve."""
-    return make_paper_rig(12, 9)
+    """A mesh that is quick to solve, at five frequencies: 60 to 100 Hz."""
+    return quick_rig(12, 9)
+
+
+def quick_rig(nx, ny):
+    """The paper's plate, which is not to be driven beyond 100 Hz."""
+    rig = make_paper_rig(nx, ny)
+    return replace(rig, limits=replace(rig.limits, frequency_min=60.0, frequency_max=100.0))
 
 
 @pytest.fixture(autouse=True)
@@ -53,7 +59,7 @@ def test_the_second_time_it_is_read(rig, builds):
 def test_another_plate_or_mesh_is_another_table(rig, builds):
     """A stiffer ERA, and a finer mesh, each get a table of their own."""
     stiffer = replace(rig, eras=(replace(rig.eras[0], stiffness=18000.0), *rig.eras[1:]))
-    paths = {cached_table(r)[1] for r in (rig, stiffer, make_paper_rig(16, 12))}
+    paths = {cached_table(r)[1] for r in (rig, stiffer, quick_rig(16, 12))}
     assert len(builds) == len(paths) == 3
 
 
@@ -95,9 +101,9 @@ def test_what_other_code_made_is_built_anew(rig, builds, monkeypatch):
 
 def test_every_choice_has_a_table_of_its_own(rig, builds):
     """Other frequencies, as many of them, another grid and another mode are not mixed up."""
-    low, high = np.array([100.0, 200.0]), np.array([100.0, 300.0])
+    low, high = np.array([70.0, 80.0]), np.array([70.0, 90.0])
     cached_table(rig, frequencies=low)
-    assert cached_table(rig, frequencies=high)[0].frequencies.tolist() == [100.0, 300.0]
+    assert cached_table(rig, frequencies=high)[0].frequencies.tolist() == [70.0, 90.0]
     assert cached_table(rig, frequencies=low, grid=Grid(3, 2))[0].grid == Grid(3, 2)
     assert cached_table(rig, frequencies=low, mode="phased")[0].mode == "phased"
     assert len(builds) == 4
@@ -108,4 +114,4 @@ def test_without_a_place_to_keep_it_the_table_is_built_all_the_same(rig, cache, 
     cache.write_text("a file where the folder should be")
     table, path = cached_table(rig)
     assert path is None
-    assert len(table.patterns) == 4482
+    assert table.frequencies.tolist() == [60.0, 70.0, 80.0, 90.0, 100.0]

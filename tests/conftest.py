@@ -12,19 +12,22 @@ from paper_plate import make_paper_rig  # noqa: E402
 
 DEAREST = (
     "test_soak.py",
+    "test_demo.py",
     "test_tutorials.py",
-    "test_docs_site.py",
     "test_study_cli.py",
+    "test_docs_site.py",
     "test_link_faults.py",
     "test_dashboard.py",
     "test_gateway_process.py",
     "test_table_commands.py",
     "test_daemon_over_a_wire.py",
+    "test_daemon_process.py",
     "test_diagnosis.py",
     "test_plate_commands.py",
     "test_errors_read.py",
     "test_studies.py",
     "test_examples.py",
+    "test_calibration.py",
     "test_wheel.py",
 )
 """Begun in this order, before all others: one that began last would go on when a core is idle."""

@@ -155,11 +155,18 @@ def _report(error: Exception, statuses: ExitStatus) -> int:
     if isinstance(error, OSError) and error.filename is not None:
         _say(f"error: {error.filename}: {_of_system(error)}")
         return BAD_INPUT
+    if isinstance(error, OSError) and error.errno in _NO_ROOM:
+        _say("error: there is no room left for what is written; make some, or write elsewhere")
+        return BAD_INPUT
     _say(
         f"error: this is a bug in era-haptics, please report it ({type(error).__name__}: {error}). "
         "Run the same command again with --debug to see where it arose"
     )
     return BUG
+
+
+_NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+"""What the system says of a file that is written, without its name."""
 
 
 def _of_system(error: OSError) -> str:

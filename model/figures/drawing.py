@@ -10,6 +10,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.figure import Figure
 
 from model.arrays import FloatArray
+from model.files.array_file import whole_or_nothing
 from model.files.picture_name import check_picture_name
 from model.rig.rig import Rig
 from model.structure.actuator import Era
@@ -117,7 +118,8 @@ def save_figure(figure: Figure, path: Path) -> None:
     """
     check_picture_name(path)
     FigureCanvasAgg(figure)
-    figure.savefig(path, dpi=_DPI)
+    with whole_or_nothing(path) as stream:
+        figure.savefig(stream, dpi=_DPI, format=path.suffix[1:].lower())
 
 
 def _label_plate(axes: Axes) -> None:

@@ -6,10 +6,12 @@ import signal
 import subprocess
 import sys
 import time
+from importlib.metadata import entry_points
 from pathlib import Path
 
 import pytest
 
+from controller.main import run
 from controller.sources.capture import Datagram, write_capture
 from controller.sources.tuio import tuio_datagram
 from controller.touch import Touch, TouchFrame
@@ -181,17 +183,19 @@ def far_end_of(pid):
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        (["--wire", "modem"], "choose serial or modbus or"),
+        (["--wire", "modem"], "choose one of serial, modbus, can"),
         (["--touches", "none.tuio"], "none.tuio"),
         (["--touches", "none.events"], "none.events"),
         (["--touches", ERA], "no TUIO capture"),
     ],
 )
-def test_bad_options_are_refused_with_status_2(arguments, says, environment, tmp_path):
+def test_bad_options_are_refused_with_status_2(arguments, says, monkeypatch, capsys, tmp_path):
     """An unknown wire, a recording that is missing or none: one paragraph, nothing else."""
-    done = run_era(["demo", *arguments], environment, tmp_path)
-    assert done.returncode == 2
-    assert done.stdout == ""
-    assert says in done.stderr
-    assert "Traceback" not in done.stderr
+    monkeypatch.chdir(tmp_path)
+    commands = entry_points(group="era_haptics.commands")
+    assert run(["demo", *map(str, arguments)], commands) == 2
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    assert says in printed.err
+    assert "Traceback" not in printed.err
     assert list(tmp_path.iterdir()) == []

@@ -13,7 +13,7 @@ _KINDS = {
     "can+slcan": "slcan",
 }
 _BAUD = {"serial": 921_600, "modbus-rtu": 115_200, "slcan": 115_200}
-# Of amplifiers, as docs/wire-*.md have them; over TCP 255 is whoever is alone.
+# Of amplifiers, as docs/reference/wire-*.md have them; over TCP 255 is whoever is alone.
 _NUMBERS = {
     "serial": range(1, 248),
     "modbus-tcp": range(1, 256),

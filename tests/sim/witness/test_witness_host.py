@@ -12,6 +12,8 @@ ARM = Asked(Kind.ARM, 1, key=1, watchdog=0.25)
 DISARM = Asked(Kind.DISARM, 1, key=2, ramp=0.05)
 STOP = Asked(Kind.STOP, 1, key=3, ramp=0.005)
 SET = Asked(Kind.APPLY, 1, key=4, token=5, ramp=0.01, drives={0: Drive(110.0, 0.2, 0.0)})
+SILENT = Asked(Kind.APPLY, 1, key=5, token=6, ramp=0.01, drives={0: Drive(110.0, 0.0, 0.0)})
+NEXT = Asked(Kind.APPLY, 1, key=6, token=7, ramp=0.01, drives={0: Drive(110.0, 0.3, 0.0)})
 ENABLED = Condition(4, 0)
 
 
@@ -54,6 +56,20 @@ def test_what_one_plays_all_play_as_long_as_there_is_a_host(
         watched.sides[name].is_open = False
     watched.host.pass_to(1.05)
     assert watched.broken == broken
+
+
+def test_a_set_that_was_given_up_is_silenced_first() -> None:
+    """One plays a set, the last finger lifts before the other does, and for the next finger both
+    play another one: right where the first was told to be silent in between, and only there."""
+    for silences, broken in (((SILENT,), []), ((), ["commit"])):
+        watched = Watched()
+        watched.host.asked(watched.sides["west"], 1.010, SET)
+        for silent in silences:
+            watched.host.asked(watched.sides["west"], 1.014, silent)
+        for side in watched.sides.values():
+            watched.host.asked(side, 1.020, NEXT)
+        watched.host.pass_to(1.05)
+        assert watched.broken == broken
 
 
 def test_a_disarm_is_not_what_a_stop_is() -> None:

@@ -170,6 +170,24 @@ async def test_a_wire_that_is_pulled_out_is_told_within_60_ms(far: FarSide) -> N
     raise AssertionError(f"told after {', '.join(f'{1e3 * one:.0f} ms' for one in took)}")
 
 
+@pytest.mark.parametrize("name", WIRES)
+def test_a_wire_comes_back_once_nothing_holds_it_out(name: str, coarse_rig: Rig) -> None:
+    """It is pulled out for 0.2 s, and 0.1 s later for 0.3 s: it is there again after 0.4 s."""
+
+    async def use(host: Link) -> None:
+        host.far.station.befall(Episode("unplug", lasts=0.2))
+        await asyncio.sleep(0.1)
+        host.far.station.befall(Episode("unplug", lasts=0.3))
+        await asyncio.sleep(0.2)
+        with pytest.raises(LinkError):
+            await host.amplifier.open()
+        await asyncio.sleep(0.2)
+        await host.amplifier.open()
+        assert (await host.amplifier.status()).state is State.SWITCH_ON_DISABLED
+
+    in_virtual_time(name, coarse_rig, use)
+
+
 SLOW_WIRES = {
     "serial, 115 200 baud": Wire("serial", speed=115_200),
     "modbus+rtu, 115 200 baud": Wire("modbus-rtu", speed=115_200),

@@ -50,6 +50,7 @@ class Station:
         self._bench = bench
         self._amplifier = bench.amplifiers[name]
         self._on_plug: list[Callable[[bool], None]] = []
+        self._pulled_out = 0  # how many faults hold the wire out now
         self._expected: list[asyncio.TimerHandle] = []
 
     @property
@@ -148,9 +149,14 @@ class Station:
         now = clock.now()
         self._bench.advance(now)
         match episode.fault, edge:
-            case "unplug", "begin" | "end":
-                for on_plug in self._on_plug:
-                    on_plug(edge == "end")
+            case "unplug", "begin":
+                self._pulled_out += 1
+                if self._pulled_out == 1:
+                    self._plug(is_plugged=False)
+            case "unplug", "end":
+                self._pulled_out -= 1
+                if self._pulled_out == 0:
+                    self._plug(is_plugged=True)
             case "reboot", "begin":
                 self._amplifier.restart(now)
             case ("over_voltage" | "arc" | "channel") as fault, "begin":
@@ -158,6 +164,10 @@ class Station:
             case "over_temperature", _:
                 self._amplifier.set_temperature(_WARMTH[edge], now)
         self._bench.advance(now)
+
+    def _plug(self, *, is_plugged: bool) -> None:
+        for on_plug in self._on_plug:
+            on_plug(is_plugged)
 
 
 _Edge: TypeAlias = Literal["begin", "half", "end"]

@@ -4,6 +4,7 @@ from importlib.metadata import EntryPoint, entry_points
 
 from controller.touch import TouchSource
 from model.errors import InputError, did_you_mean
+from model.plugins import blamed
 
 GROUP = "era_haptics.touch_sources"
 
@@ -23,16 +24,8 @@ def open_source(url: str) -> TouchSource:
             f"known are {', '.join(known)}"
         )
     plugin = plugins[scheme]
-    try:
+    with blamed(plugin, f"touch source {url}", but=(InputError,)):
         source = plugin.load()(url)
-    except InputError:
-        raise
-    except Exception as error:
-        package = plugin.dist.name if plugin.dist else "an unknown package"
-        raise InputError(
-            f"touch source {url}: the plug-in {plugin.value} of {package} does not work "
-            f"({type(error).__name__}: {error}); repair or remove that package"
-        ) from error
     if not isinstance(source, TouchSource):
         raise InputError(
             f"touch source {url}: the plug-in {plugin.value} does not make a TouchSource"

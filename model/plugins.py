@@ -4,7 +4,8 @@ A plug-in is an entry point: its group says what it adds, its name which one. It
 that name is asked for and never before, so one that is broken harms nobody else.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
@@ -53,20 +54,35 @@ class Catalogue(Generic[_T]):
         return self._load(found[0])
 
     def _load(self, point: EntryPoint) -> _T:
-        origin = f"the plug-in {point.value} of {_package(point)}"
-        try:
+        asker = f"{self.what} {point.name}"
+        with blamed(point, asker):
             loaded = point.load()
-        except Exception as error:  # a plug-in may fail in any way while it is imported
-            raise InputError(
-                f"{self.what} {point.name}: {origin} does not work "
-                f"({type(error).__name__}: {error}); repair or remove that package"
-            ) from error
         if not isinstance(loaded, self.kind):
             raise InputError(
-                f"{self.what} {point.name}: {origin} leads to {type(loaded).__name__}, not "
-                f"to {self.kind.__name__}; repair or remove that package"
+                f"{asker}: the plug-in {point.value} of {_package(point)} leads to "
+                f"{type(loaded).__name__}, not to {self.kind.__name__}; repair or remove that "
+                "package"
             )
         return loaded
+
+
+@contextmanager
+def blamed(
+    point: EntryPoint, asker: str, *, but: tuple[type[Exception], ...] = ()
+) -> Iterator[None]:
+    """Tell of whatever a plug-in raises as InputError that names its package.
+
+    asker: what needs the plug-in, in words; but: what the plug-in may raise, and is passed on.
+    """
+    try:
+        yield
+    except but:
+        raise
+    except Exception as error:  # a plug-in may fail in any way
+        raise InputError(
+            f"{asker}: the plug-in {point.value} of {_package(point)} does not work "
+            f"({type(error).__name__}: {error}); repair or remove that package"
+        ) from error
 
 
 @cache

@@ -5,6 +5,7 @@ from importlib.metadata import entry_points
 
 from controller.effects.effect import Effect
 from model.errors import InputError
+from model.plugins import blamed
 
 GROUP = "era_haptics.effects"
 
@@ -18,14 +19,8 @@ def effect_kinds() -> list[str]:
 def effect_kind(name: str) -> type[Effect]:
     """The kind of a name; raises InputError if there is none, or its plug-in does not work."""
     for point in entry_points(group=GROUP, name=name):
-        package = point.dist.name if point.dist else "an unknown package"
-        try:
+        with blamed(point, f"effect kind {name}"):
             kind = point.load()
-        except Exception as error:
-            raise InputError(
-                f"effect kind {name}: the plug-in {point.value} of {package} does not work "
-                f"({type(error).__name__}: {error}); repair or remove that package"
-            ) from error
         if not (isinstance(kind, type) and issubclass(kind, Effect)):
             raise InputError(f"effect kind {name}: the plug-in {point.value} is no Effect")
         return kind

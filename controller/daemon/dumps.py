@@ -22,17 +22,24 @@ _logger = logging.getLogger(__name__)
 
 
 class Dumps:
-    """Writes what a recorder has kept, each time in a thread: a disk may be slow, full or gone."""
+    """Writes what a recorder has kept, in a thread: a disk may be slow, full or gone.
+
+    One at a time: on a disk that hangs, faults would leave a thread each.
+    """
 
     def __init__(self, recorder: Recorder) -> None:
         self._recorder = recorder
         self._written_at = float("-inf")
+        self._writing: threading.Thread | None = None
 
     def write(self, folder: Path, *, cause: str, keep: int) -> None:
         """Write a dump, unless there was one just now; the newest `keep` files stay."""
         if clock.now() - self._written_at < _PAUSE:
             return
         self._written_at = clock.now()
+        if self._writing is not None and self._writing.is_alive():
+            _logger.warning("no dump in %s: the one before is still being written", folder)
+            return
         records = self._recorder.last()
 
         def write() -> None:
@@ -42,7 +49,8 @@ class Dumps:
             except OSError as error:
                 _logger.warning("the last messages could not be written to %s: %s", folder, error)
 
-        threading.Thread(target=write, name="dump", daemon=True).start()
+        self._writing = threading.Thread(target=write, name="dump", daemon=True)
+        self._writing.start()
 
 
 def write_dump(folder: Path, records: Iterable[Record], *, cause: str, keep: int) -> Path:

@@ -9,7 +9,8 @@ from typing import Any, TypeVar
 
 from controller.joint_play import JointPlay
 from controller.read_backs import ReadBacks
-from controller.together import OncePerWish, gathered, to_the_end
+from controller.stops import Stops
+from controller.together import gathered, to_the_end
 from drivers.amplifier import WATCHDOG, Amplifier
 from drivers.errors import CommandError, CommandRefused, DriverError, LinkError
 from drivers.guard import SafeCommand, SafeEnvelope
@@ -45,7 +46,7 @@ class AmplifierGroup:
     def __init__(self, amplifiers: Mapping[str, Amplifier]) -> None:
         self.phase = Phase.CLOSED
         self._amplifiers = dict(amplifiers)
-        self._stops = [OncePerWish(amplifier.stop) for amplifier in amplifiers.values()]
+        self._stops = Stops(self._amplifiers.values())
         self._joint = JointPlay(
             self._amplifiers,
             goes_on=lambda: self.phase is Phase.ARMED and not self._is_hurried,
@@ -59,8 +60,8 @@ class AmplifierGroup:
 
     @property
     def last_sent(self) -> float:
-        """When the last byte went out to any of them, on time.monotonic() [s]."""
-        return max(amplifier.last_sent for amplifier in self._all)
+        """When the last byte of the last set went out to any, by the event loop's clock [s]."""
+        return self._joint.last_sent
 
     @property
     def is_torn(self) -> bool:
@@ -182,7 +183,7 @@ class AmplifierGroup:
         """
         self._leave_armed()
         with self._silencing():
-            await to_the_end(self._each(stop.wish() for stop in self._stops))
+            await to_the_end(self._each(self._stops.wish()))
 
     async def clear(self) -> None:
         """Acknowledge stops, and faults whose cause is gone."""

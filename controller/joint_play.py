@@ -18,12 +18,14 @@ class JointPlay:
 
     goes_on: whether anything is to be played still; silence may come in between at any step.
     is_torn: whether a set may have been committed by some of them only. loading_time [s]: how long
-    it took to load the last envelopes.
+    it took to load the last envelopes; last_sent [s]: when the last byte that the last set needed
+    went out to any of them, by the event loop's clock.
     """
 
     def __init__(self, amplifiers: Mapping[str, Amplifier], *, goes_on: Callable[[], bool]) -> None:
         self.is_torn = False
         self.loading_time = 0.0
+        self.last_sent = 0.0
         self._amplifiers = amplifiers
         self._goes_on = goes_on
 
@@ -53,6 +55,7 @@ class JointPlay:
             applied = await gathered(
                 self._amplifiers[name].apply(safe) for name, safe in commands.items()
             )
+            self._note_sent()
             self.is_torn = False
             return dict(zip(commands, applied, strict=True))
         achieved = await gathered(
@@ -62,6 +65,7 @@ class JointPlay:
             return None  # a commit now would undo that silence
         self.is_torn = True
         await gathered(self._commits(commands))
+        self._note_sent()  # what is asked from here on is no part of it
         if not self._goes_on():
             return None
         for name, status in (await self.statuses()).items():
@@ -76,6 +80,9 @@ class JointPlay:
         """The status of every amplifier, by name; raises DriverError."""
         statuses = await gathered(amplifier.status() for amplifier in self._amplifiers.values())
         return dict(zip(self._amplifiers, statuses, strict=True))
+
+    def _note_sent(self) -> None:
+        self.last_sent = max(amplifier.last_sent for amplifier in self._amplifiers.values())
 
     async def _load(self, name: str, envelopes: Sequence[SafeEnvelope]) -> None:
         for envelope in envelopes:

@@ -59,6 +59,18 @@ async def test_touch_to_wire() -> None:
 
 
 @in_virtual_time
+async def test_with_several_amplifiers_latency_counts_to_the_commit() -> None:
+    """To its last byte, 10 ms after the stage whose answer takes as long; not to the read-back."""
+    async with running("west", "east") as bench:
+        for far_end in bench.far_ends:
+            far_end.delay = 0.010
+        bench.touch(FINGER, ago=0.003)
+        await asyncio.sleep(0.040)
+        (applied,) = bench.told.applied
+        assert applied.latency == pytest.approx(0.013)
+
+
+@in_virtual_time
 async def test_a_moved_finger_does_not_restart_the_vibration() -> None:
     """The same ERA at the same frequency runs on, another level or not; after silence it starts."""
     async with running() as bench:

@@ -148,9 +148,9 @@ CONTROLLER: dict[str, Bug] = {
     "a stop reaches one amplifier only": _bug(
         "stop",
         Edit(
-            "controller.amplifiers:AmplifierGroup.stop",
-            "for stop in self._stops",
-            "for stop in list(self._stops)[:1]",
+            "controller.stops:Stops.wish",
+            "(*self._on_buses, *reachable)",
+            "reachable[:1]",
         ),
         amplifiers=_TWO,
     ),

@@ -133,14 +133,14 @@ class SerialBackend(WireBackend):
         """Send a commit to every amplifier of the line in its turn, or a stop at once."""
         line = self._opened()
         data = encode_frame(self._frame(request, PROTOCOL.serial.broadcast))
-        if isinstance(request, Stop):
-            line.send(data)
-            return
 
         async def send() -> None:
-            line.send(data)
+            self._send(line, data)
 
-        await line.turns.carry_out(Kind.ORDINARY, send, address=self._url.address)
+        if isinstance(request, Stop):
+            await send()
+        else:
+            await line.turns.carry_out(Kind.ORDINARY, send, address=self._url.address)
 
     async def _check_alone(self) -> None:
         """Leave a second amplifier of this address the time to answer; LinkError where one does."""
@@ -159,10 +159,8 @@ class SerialBackend(WireBackend):
         self._answered, self._is_contradicted = None, False
         try:
             line.raise_if_lost(self._url.address)
-            line.send(data)
+            self._send(line, data)
             line.turns.sent()
-            self._last_sent = line.last_sent
-            self._counters.frames_out += 1
             on_line = exchange_time(len(data), baud=self._url.baud)
             reply = await reply_within(pending.reply, max(timeout, on_line + PROTOCOL.reaction))
         except LinkError:
@@ -179,6 +177,11 @@ class SerialBackend(WireBackend):
         if isinstance(request, Hello):
             await self._check_alone()
         return reply
+
+    def _send(self, line: SerialLine, data: bytes) -> None:
+        line.send(data)
+        self._last_sent = line.last_sent
+        self._counters.frames_out += 1
 
     def _frame(self, request: Request, address: int) -> Frame:
         self._sequence = (self._sequence + 1) & 0xFFFF

@@ -1,0 +1,101 @@
+"""Amplifiers that share a bus are stopped by one frame, whoever of them answers.
+
+In virtual time over real far ends; what is told is what the amplifiers heard, and when.
+"""
+
+import asyncio
+from collections.abc import Callable, Coroutine
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import pytest
+
+from controller.amplifiers import AmplifierGroup
+from drivers.amplifier import Amplifier
+from drivers.backends.stand_in import STAND_IN
+from drivers.protocol.messages import Reply, Request, State, Stop
+from drivers.registry import open_backend
+from memory_machine import MemoryMachine
+from model.rig.rig import Channel, Rig
+from sim.far_ends.wires import Wire
+from sim.faults.episodes import Episode
+from sim.transport.pseudo_terminal import TERMINAL_MAKER
+from virtual_loop import VirtualLoop, run_virtual
+from wires import FarSide, far_side
+
+BUSES = {
+    "serial": Wire("serial", speed=115_200, shared=True),
+    "modbus+rtu": Wire("modbus-rtu", speed=115_200, shared=True),
+    "can+slcan": Wire("slcan", shared=True),
+}
+FRAME = 0.004  # s; a broadcast stop on the slowest of these, with the silence before it
+NAMES = ("first", "second", "third")
+
+
+def on_a_bus(
+    bus: str,
+    rig: Rig,
+    use: Callable[[FarSide, AmplifierGroup, list[tuple[str, float]]], Coroutine[Any, Any, None]],
+) -> None:
+    """Use three armed amplifiers in virtual time; the last of use's arguments is who heard a Stop,
+    and when [s]."""
+    wiring = {era: Channel(NAMES[number % 3], number // 3) for number, era in enumerate(rig.wiring)}
+    three = replace(rig, wiring=wiring, amplifiers=dict.fromkeys(NAMES, "sim://"))
+    heard: list[tuple[str, float]] = []
+
+    def note(
+        name: str, exchange: Callable[[Request], Reply | None], request: Request
+    ) -> Reply | None:
+        if isinstance(request, Stop):
+            heard.append((name, asyncio.get_running_loop().time()))
+        return exchange(request)
+
+    async def run() -> None:
+        loop = asyncio.get_running_loop()
+        assert isinstance(loop, VirtualLoop)
+        machine = MemoryMachine(loop)
+        STAND_IN.set(machine)
+        TERMINAL_MAKER.set(machine.make_terminal)
+        async with far_side(BUSES[bus], three) as far:
+            for name, station in far.stations.items():
+                station.exchange = partial(note, name, station.exchange)  # type: ignore[method-assign]
+            group = AmplifierGroup(
+                {name: Amplifier(open_backend(url)) for name, url in far.urls.items()}
+            )
+            await group.open()
+            await group.arm()
+            await asyncio.sleep(0.02)  # the line has been silent for long
+            await use(far, group, heard)
+            await group.close({})
+
+    run_virtual(run())
+
+
+@pytest.mark.parametrize("bus", BUSES)
+def test_one_that_does_not_answer_holds_up_no_other_stop(bus: str, coarse_rig: Rig) -> None:
+    """The first is asked for its status 30 ms and more; the others are silent a frame after the
+    stop was wished all the same, and latched."""
+
+    async def use(far: FarSide, group: AmplifierGroup, heard: list[tuple[str, float]]) -> None:
+        far.stations["first"].befall(Episode("hang"))
+        begin = asyncio.get_running_loop().time()
+        await group.stop()
+        for name in NAMES[1:]:
+            assert min(moment for who, moment in heard if who == name) - begin < FRAME
+            assert far.stations[name].status().state is State.QUICK_STOP_ACTIVE
+
+    on_a_bus(bus, coarse_rig, use)
+
+
+@pytest.mark.parametrize("bus", BUSES)
+def test_each_is_asked_as_well(bus: str, coarse_rig: Rig) -> None:
+    """One frame tells all at a moment, and then each is asked for its answer."""
+
+    async def use(far: FarSide, group: AmplifierGroup, heard: list[tuple[str, float]]) -> None:
+        await group.stop()
+        assert sorted(name for name, _ in heard[:3]) == sorted(NAMES)
+        assert heard[2][1] - heard[0][1] < 0.001
+        assert sorted(name for name, _ in heard[3:]) == sorted(NAMES)
+
+    on_a_bus(bus, coarse_rig, use)

@@ -49,7 +49,7 @@ def on_processes(
         except BrokenProcessPool:
             _logger.warning("a worker process died; starting anew with what is left")
     raise InputError(
-        f"worker processes died {_MOST_POOLS} times; perhaps memory is short: try fewer workers"
+        f"worker processes died {_MOST_POOLS} times; perhaps memory is short: give fewer --workers"
     )
 
 

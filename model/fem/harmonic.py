@@ -15,7 +15,7 @@ from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
 from model.fem.assembly import PlateMatrices, era_positions
 from model.fem.factorisation import factorise
-from model.fem.mesh import LEAST_NODES_PER_WAVELENGTH, PAPER_ELEMENT, Mesh
+from model.fem.mesh import LEAST_NODES_PER_WAVELENGTH, Mesh
 from model.structure.actuator import Era
 from model.structure.plate import Plate
 from model.structure.point_load import PointLoad, load_positions
@@ -30,13 +30,13 @@ def check_frequencies(plate: Plate, mesh: Mesh, frequencies: FloatArray) -> None
     if highest > mesh.highest_frequency(plate):
         wavelength = plate.bending_wavelength(highest)
         raise InputError(
-            f"the {mesh} mesh has {wavelength / max(mesh.element_size):.1f} elements in a bending "
+            f"the mesh {mesh} has {wavelength / max(mesh.element_size):.1f} elements in a bending "
             f"wavelength at {highest:g} Hz, too few to answer: "
             f"{LEAST_NODES_PER_WAVELENGTH / mesh.kind.order:g} of {mesh.element} are the least; "
             + (
-                f"use {Mesh.coarsest(plate, frequency=highest)} or finer"
-                if mesh.element == PAPER_ELEMENT
-                else f"raise the upper limits.frequency to {highest:g} Hz, which mesh: auto follows"
+                f"raise the upper limits.frequency to {highest:g} Hz, which mesh: auto follows"
+                if mesh.strip
+                else f"use {Mesh.coarsest(plate, frequency=highest, element=mesh.element)} or finer"
             )
         )
 

@@ -69,13 +69,14 @@ class Mesh:
         return cls(nx, ny, plate.length, plate.width, AUTO_ELEMENT, strip)
 
     @classmethod
-    def coarsest(cls, plate: Plate, *, frequency: float) -> "Mesh":
-        """The coarsest mesh of the paper's element that carries a frequency [Hz]."""
-        size = plate.bending_wavelength(frequency) / LEAST_NODES_PER_WAVELENGTH
+    def coarsest(cls, plate: Plate, *, frequency: float, element: str = PAPER_ELEMENT) -> "Mesh":
+        """The coarsest mesh of an element that carries a frequency [Hz]."""
+        order = element_of(element).order
+        size = plate.bending_wavelength(frequency) * order / LEAST_NODES_PER_WAVELENGTH
         # Rounding shall not put a mesh that fits exactly just beyond what it carries.
         size *= 1 - 1e-9
         nx, ny = (math.ceil(side / size) for side in (plate.length, plate.width))
-        return cls(nx, ny, plate.length, plate.width)
+        return cls(nx, ny, plate.length, plate.width, element)
 
     def __str__(self) -> str:
         text = f"{self.nx}x{self.ny}"

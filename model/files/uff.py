@@ -23,8 +23,10 @@ DISPLACEMENT, ACCELERATION, TIME, FREQUENCY = 8, 12, 17, 18  # kinds of data
 _LARGEST = 512 << 20
 _HEADER_LINES = 13  # of dataset 58, from its opening mark on
 _SI = 1  # units code of dataset 164
-_DELIMITER = re.compile(rb"^    -1[ \t]*\r?$", re.MULTILINE)
-_AFTER_BYTES = re.compile(rb"    -1[ \t]*\r?$", re.MULTILINE)  # binary data end without a line
+# The mark between datasets, as pyuff knows it: wherever a line ends in it. Only binary data may
+# really end so; any other that is no line of its own would shift all that comes after it.
+_MARK = re.compile(rb"    -1(?=[\r\n]|\Z| {74}.)", re.DOTALL)
+_DELIMITER = re.compile(rb"^    -1(?=[\r\n]|\Z| {74}.)", re.DOTALL | re.MULTILINE)
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,12 +62,14 @@ def write_universal(path: Path, content: Universal) -> None:
     """Write nodes, units and functions in ASCII, double precision (12 digits).
 
     An evenly spaced abscissa has six digits for its step. Raises OSError where it cannot be
-    written, ValueError for numbers that are not finite: pyuff would write zeros in their place.
+    written, InputError for numbers that are not finite: pyuff would write zeros in their place.
     """
     import pyuff
 
     if any(not np.isfinite(function.data).all() for function in content.functions):
-        raise ValueError(f"{path}: only finite numbers can be written")
+        raise InputError(
+            f"{path}: a universal file takes finite numbers only; leave out the others"
+        )
     count = len(content.nodes)
     x, y, z = np.array(list(content.nodes.values()), dtype=float).reshape(-1, 3).T
     zeros = np.zeros(count, dtype=int)
@@ -94,8 +98,6 @@ def read_universal(path: Path) -> Universal:
     blocks = _blocks(path, content)
     file = pyuff.UFF(str(path))
     kinds = [int(kind) for kind in file.get_set_types()]
-    if len(kinds) != len(blocks):
-        raise InputError(f"{path}: its datasets cannot be told apart; export it again as ASCII")
     nodes: dict[int, tuple[float, float, float]] = {}
     functions = []
     for number, (kind, (line, block)) in enumerate(zip(kinds, blocks, strict=True)):
@@ -138,23 +140,31 @@ def read_bytes(path: Path) -> bytes:
 
 def _blocks(path: Path, content: bytes) -> list[tuple[int, bytes]]:
     """Every dataset's line and content, its opening mark included and its closing one not."""
-    blocks, end = [], 0
+    blocks, marks, end = [], set(), 0
     while start := _DELIMITER.search(content, end):
         line = content.count(b"\n", 0, start.start()) + 1
-        mark = _AFTER_BYTES if _is_binary(content[start.start() : start.start() + 200]) else None
-        stop = (mark or _DELIMITER).search(content, start.end())
+        mark = _MARK if _is_binary(content[start.start() : start.start() + 200]) else _DELIMITER
+        stop = mark.search(content, start.end())
         if stop is None:
             raise InputError(
                 f"{path}:{line}: the dataset that begins here has no end; the file was cut off, "
                 "export it again"
             )
         blocks.append((line, content[start.start() : stop.start()]))
+        marks |= {start.start(), stop.start()}
         end = stop.end()
     if not blocks:
         raise InputError(
             f"{path}: is no universal file, for no line of it holds `    -1` alone; export the "
             "measurement as UFF, datasets 58 with 15 or 2411"
         )
+    for stray in _MARK.finditer(content):
+        if stray.start() not in marks:
+            line = content.count(b"\n", 0, stray.start()) + 1
+            raise InputError(
+                f"{path}:{line}: the line ends in `    -1`, as only the lines between datasets do; "
+                "export it again with another number there, or binary data as ASCII"
+            )
     return blocks
 
 

@@ -2,9 +2,10 @@
 
 import math
 
+from by_name.nearness import did_you_mean
 from model.config.document import key_name
 from model.config.sections import Validation
-from model.errors import InputError, did_you_mean
+from model.errors import InputError
 from model.fem.mesh import LEAST_NODES_PER_WAVELENGTH, Mesh
 from model.rig.parts import laminate_of, mesh_of, plate_of
 from model.rig.rig import SAME_POINT
@@ -73,12 +74,12 @@ def _check_mesh(validation: Validation, plate: Plate, *, frequency_max: float) -
         validation.add(("mesh",), str(error))
         return
     if frequency_max > mesh.highest_frequency(plate):
-        coarsest = Mesh.coarsest(plate, frequency=frequency_max)
+        coarsest = Mesh.coarsest(plate, frequency=frequency_max, element=mesh.element)
         validation.add(
             ("mesh",),
             f"{mesh} is too coarse for bending waves at {frequency_max:g} Hz (limits.frequency): "
-            f"at least {coarsest} is needed, {LEAST_NODES_PER_WAVELENGTH} elements a "
-            "wavelength; auto takes a mesh that is accurate",
+            f"at least {coarsest} is needed, {LEAST_NODES_PER_WAVELENGTH / mesh.kind.order:g} "
+            "elements a wavelength; auto takes a mesh that is accurate",
         )
 
 

@@ -23,8 +23,8 @@ def plate_of(section: PlateSection) -> Plate:
         return equivalent_plate(
             laminate, length=section.length, width=section.width, loss_factor=section.loss_factor
         )
-    if section.thickness is None or section.material is None:
-        raise InputError("plate: thickness and material are missing; add them, or layers")
+    assert section.thickness is not None  # noqa: S101  model.rig.checks has seen to both
+    assert section.material is not None  # noqa: S101
     return Plate(
         length=section.length,
         width=section.width,

@@ -183,7 +183,7 @@ def plate_in_time(
     inverse = linalg.inv(M)
     A = np.block([[np.zeros((r, r)), np.eye(r)], [-inverse @ K, -inverse @ C]])
     eigenvalues, vectors = linalg.eig(A)
-    inverse_vectors = linalg.inv(vectors)
+    inverse_vectors = _inverse(vectors)
     residual = np.abs((vectors * eigenvalues) @ inverse_vectors - A).max()
     if not residual < 1e-6 * np.abs(A).max():
         raise InputError(
@@ -194,3 +194,11 @@ def plate_in_time(
     return PlateInTime(
         reduced, tuple(eras), eigenvalues, vectors, inverse_vectors, inverse_vectors @ push
     )
+
+
+def _inverse(vectors: ComplexArray) -> ComplexArray:
+    """Of eigenvectors; not a number where two of them are one."""
+    try:
+        return np.asarray(np.linalg.inv(vectors))
+    except np.linalg.LinAlgError:
+        return np.full_like(vectors, np.nan)

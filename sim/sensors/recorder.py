@@ -34,7 +34,6 @@ class Recorder:
         *,
         sensors: Sequence[Accelerometer],
         fingers: Sequence[str],
-        seed: int = 0,
     ) -> None:
         self.path = path
         self._bench = bench
@@ -51,9 +50,10 @@ class Recorder:
         self._room = values_max(path) // len(names)
         at = [bench.fingers.layout.positions[id] for id in fingers]
         self._points = np.concatenate([positions(sensors), np.array(at).reshape(-1, 2)])
-        self._rng = np.random.default_rng(seed)
+        self._rng = np.random.default_rng(0)
         try:
-            self._spool = tempfile.TemporaryFile(dir=path.parent)  # noqa: SIM115  lives on
+            # Unbuffered, so that a full disk is told by the write, and not again at the end.
+            self._spool = tempfile.TemporaryFile(dir=path.parent, buffering=0)  # noqa: SIM115
         except OSError as error:
             raise InputError(
                 f"{path}: nothing can be written there: {error.strerror}; choose another folder"
@@ -101,8 +101,10 @@ class Recorder:
             rng=self._rng,
         )
         together = np.hstack([read.samples, accelerations[:, len(self._sensors) :]])
+        left = memoryview(np.ascontiguousarray(together, dtype=np.float64).tobytes())
         try:
-            self._spool.write(np.ascontiguousarray(together, dtype=np.float64).tobytes())
+            while left:
+                left = left[self._spool.write(left) :]
         except OSError as error:  # a full disk must not end the far end
             self._failure = error
         else:
@@ -124,7 +126,6 @@ class Recorder:
                     f"{self.path}: the recording broke off after {self.seconds:g} s, and is not "
                     f"written: {self._failure.strerror}; make room"
                 )
-            self._spool.flush()
             shape = (self._count, len(self._names))
             samples = (
                 np.memmap(self._spool, np.float64, "r", shape=shape)

@@ -42,7 +42,8 @@ def record_responses(
     """
     if frequencies.max() >= 0.4 * sample_rate:
         raise InputError(
-            f"{frequencies.max():g} Hz is too high for {sample_rate:g} samples a second"
+            f"{frequencies.max():g} Hz is too high for {sample_rate:g} samples a second; take more "
+            "than 2.5 samples in a period"
         )
     attached = np.vstack([era_positions(rig.eras), load_positions(rig.loads)])
     reduced = reduce_plate(

@@ -3,7 +3,6 @@
 import contextlib
 import io
 import os
-import resource
 import shlex
 import signal
 import subprocess
@@ -17,6 +16,7 @@ import pytest
 
 from controller.main import run
 from error_cases import RIG, filled
+from full_disk import full_disk
 
 WRITING = {
     "table build rig.yaml -o out.npz --frequencies 60:90:30 --grid 4x3": (
@@ -61,17 +61,6 @@ def said_by(command: str) -> tuple[int, str]:
     with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(err):
         status = run(shlex.split(command), entry_points(group="era_haptics.commands"))
     return status, err.getvalue()
-
-
-@contextlib.contextmanager
-def full_disk() -> Iterator[None]:
-    """No file may become longer than a kilobyte, as on a disk that is full."""
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (1024, before[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
 @pytest.mark.parametrize("command", WRITING)

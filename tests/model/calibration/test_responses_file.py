@@ -46,6 +46,17 @@ def test_what_was_written_is_read_back(
     assert back.count == 17
 
 
+def test_a_file_of_unheard_of_size_is_not_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With its limit, and what to do."""
+    monkeypatch.setattr("model.files.uff._LARGEST", 1 << 20)
+    path = tmp_path / "measured.uff"
+    path.write_bytes(b" " * (1 << 20) + b"-1")
+    with pytest.raises(InputError, match=r"measured\.uff: is larger than 1 MiB; export fewer"):
+        read_functions(path)
+
+
 def test_a_uff_of_another_program(coarse_rig: Rig, tmp_path: Path) -> None:
     """Written by pyuff alone: single precision, nodes as dataset 15, no names, sensor upside down.
 

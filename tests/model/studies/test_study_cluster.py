@@ -2,6 +2,7 @@
 
 import os
 import signal
+import sys
 from collections.abc import Iterator
 
 import pytest
@@ -83,6 +84,28 @@ def test_a_cluster_without_workers_is_refused():
         pytest.raises(InputError, match="has no workers"),
     ):
         dict(on_cluster(empty.scheduler_address)(problem, chunks_of(cases, 4)))
+
+
+def test_workers_that_die_of_a_chunk_are_given_up(address, monkeypatch):
+    """A chunk that ends whichever worker takes it, as one does for which memory is too short."""
+    problem, cases = small_study(layouts=4)
+    monkeypatch.setattr(cluster, "_solve_chunk", lambda *_: os.kill(os.getpid(), signal.SIGKILL))
+    with Client(address, set_as_default=False) as client:
+        client.run_on_scheduler(_allow_failures, 0)
+    with pytest.raises(InputError, match=r"died again and again over one chunk .* memory is short"):
+        dict(on_cluster(address)(problem, chunks_of(cases, 4)))
+
+
+def _allow_failures(count, dask_scheduler):
+    """How many workers a chunk may cost, on the scheduler."""
+    dask_scheduler.allowed_failures = count
+
+
+def test_without_dask_it_is_said_how_to_have_it(monkeypatch):
+    """The extra to install, by its name."""
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(InputError, match=r"pip install 'era-haptics\[cluster\]'"):
+        dict(on_cluster("tcp://127.0.0.1:1")(None, {}))
 
 
 def test_no_scheduler_is_told(monkeypatch):

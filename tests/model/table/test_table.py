@@ -60,7 +60,7 @@ def test_the_paper_has_4482_patterns():
 def test_patterns_that_tables_share_cannot_be_overwritten(table):
     """One table's user cannot change what another one answers."""
     with pytest.raises(ValueError, match="read-only"):
-        table.patterns[0, 0] = 5
+        all_patterns(len(table.eras), len(table.frequencies)).index[0, 0] = 5
 
 
 def test_every_pattern_is_what_adding_up_its_tones_gives():
@@ -334,6 +334,18 @@ def test_a_compressed_bomb_is_refused_before_it_is_unpacked(table, tmp_path):
         for info in good.infolist():
             bad.writestr(info.filename, good.read(info))
     with pytest.raises(InputError, match="compressed"):
+        load_table(path)
+
+
+def test_more_than_the_file_has_is_not_read(table, tmp_path):
+    """Members that declare a terabyte between them, in a file of kilobytes."""
+    path = tmp_path / "vast.npz"
+    save_table(table, tmp_path / "t.npz")
+    with zipfile.ZipFile(tmp_path / "t.npz") as good, zipfile.ZipFile(path, "w") as bad:
+        for info in good.infolist():
+            bad.writestr(info.filename, good.read(info))
+        bad.filelist[0].file_size = 1 << 40
+    with pytest.raises(InputError, match=r"it declares 1\d{12} bytes"):
         load_table(path)
 
 

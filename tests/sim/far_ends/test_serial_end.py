@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 import os
+import resource
 import time
 import tty
 from collections.abc import AsyncIterator
@@ -11,6 +12,7 @@ import pytest
 
 from drivers.codec.serial_line.exchanges import decode_reply, encode_request
 from drivers.codec.serial_line.frame import Frame, FrameReader, encode_frame
+from drivers.errors import LinkError
 from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.messages import (
     GetStatus,
@@ -28,6 +30,7 @@ from model.rig.rig import Rig
 from sim.bench.bench import Bench
 from sim.bench.station import Station
 from sim.far_ends.serial_end import SerialEnd
+from sim.transport.pseudo_terminal import PseudoTerminal
 
 ADDRESS = PROTOCOL.serial.address
 
@@ -163,3 +166,14 @@ async def test_a_host_that_never_reads_holds_nothing_up(end: SerialEnd) -> None:
                 os.write(fd, hello)
             await asyncio.sleep(0)
     os.close(fd)
+
+
+def test_a_system_that_has_no_line_to_give_is_told() -> None:
+    """As when too many files are open: LinkError with the system's reason and what to do."""
+    before = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (0, before[1]))
+    try:
+        with pytest.raises(LinkError, match=r"gives no pseudo-terminal \(Too many open files\); c"):
+            PseudoTerminal(lambda _: None)
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, before)

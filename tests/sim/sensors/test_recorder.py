@@ -7,6 +7,7 @@ import pytest
 
 from drivers.command import CommandSet, DriveCommand
 from drivers.protocol.messages import Apply, Arm
+from full_disk import full_disk
 from model.errors import InputError
 from model.rig.rig import Rig
 from sim.bench.bench import Bench
@@ -105,6 +106,26 @@ def test_what_cannot_be_recorded_is_said_at_the_start(coarse_rig: Rig, tmp_path:
             Recorder(bench, path, sensors=sensors, fingers=[])
     assert letter.read_text() == "Dear Sir"
     assert bench.taps == []
+
+
+def test_a_disk_that_fills_up_ends_the_recording_and_not_the_bench(
+    coarse_rig: Rig, tmp_path: Path
+) -> None:
+    """The plate goes on; at the end it is said for how long there was room, and nothing is left."""
+    path = tmp_path / "run.csv"
+    path.write_text("time_s,old")
+    bench = Bench(coarse_rig, now=0.0, sample_rate=4000.0)
+    recorder = Recorder(bench, path, sensors=[Accelerometer("P1", 0.1, 0.1)], fingers=[])
+    bench.advance(0.5)
+    with full_disk(at=32_000):  # bytes, those of one second
+        bench.advance(1.0)
+        bench.advance(2.0)
+        bench.advance(3.0)
+        recorder.stop()
+        with pytest.raises(InputError, match=r"broke off after 1 s.*File too large; make room"):
+            recorder.finish()
+    assert path.read_text() == "time_s,old"
+    assert list(tmp_path.iterdir()) == [path]
 
 
 def test_a_recording_without_samples_leaves_the_old_one(coarse_rig: Rig, tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ import can
 import pytest
 
 from drivers.codec.can_bus.frame import CanFrame
+from drivers.errors import LinkError
 from sim.far_ends.can_bus.bus import CanBus
 from sim.far_ends.can_bus.slcan_adapter import SlcanAdapter, SlcanEnd
 from sim.far_ends.can_bus.socketcand_server import SocketcandEnd
@@ -155,6 +156,13 @@ async def test_nonsense_sends_nothing_and_ends_nothing(
         talk.writer.write(b"< send 123 1 5 >< echo >")
         assert (await talk.reader.readuntil(b"< echo >")).endswith(b"< echo >")
     assert member.heard == [CanFrame(0x123, b"\x05")]
+
+
+async def test_a_bus_s_port_that_is_taken_is_named(server: SocketcandEnd) -> None:
+    """LinkError with the port and what to do."""
+    words = f"port {server.port} cannot be listened on .*; choose another, or 0"
+    with pytest.raises(LinkError, match=words):
+        await SocketcandEnd(CanBus(), port=server.port).open()
 
 
 async def test_another_bus_is_refused(talk: Talk) -> None:

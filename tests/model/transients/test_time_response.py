@@ -1,0 +1,43 @@
+"""A plate in time whose equations of motion cannot be taken apart."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+
+from model.arrays import FloatArray
+from model.errors import InputError
+from model.structure.actuator import Era
+from model.structure.materials import material
+from model.structure.plate import Plate
+from model.transients.time_response import plate_in_time
+
+ERA = Era("", 0, 0, stiffness=100.0**2, damping=2 * 100.0, bolt_mass=0.0, stroke=1e-4)
+"""Under one kilogram it is damped critically, in numbers that are exact."""
+
+
+@dataclass(frozen=True)
+class ThreeMasses:
+    """A kilogram on each of three ERAs, and nothing between them: as few coordinates as stand."""
+
+    plate = Plate(0.3, 0.2, 0.001, material("steel"), loss_factor=0.0)
+    omega = np.zeros(3)
+
+    def at(self, points: FloatArray) -> FloatArray:
+        """A point each."""
+        return np.eye(3)[: len(points)]
+
+
+@pytest.mark.parametrize("mass", [0.0, 3.0])
+def test_a_plate_that_is_damped_critically_says_so(mass: float) -> None:
+    """c = 2 sqrt(k m): two eigenvectors are one, and nothing must be computed with their inverse.
+
+    With 1 + 3 kg and twice the damping as well, there the numbers make it singular altogether.
+    """
+    factor = (1 + mass) ** 0.5
+    era = replace(ERA, bolt_mass=mass, damping=factor * ERA.damping)
+    with pytest.raises(InputError, match="damped critically; change an ERA's damping"):
+        plate_in_time(ThreeMasses(), [era] * 3)
+    softer = replace(era, damping=0.999 * era.damping)
+    solved = plate_in_time(ThreeMasses(), [softer] * 3)
+    assert np.abs(solved.eigenvalues) == pytest.approx(100 / factor)

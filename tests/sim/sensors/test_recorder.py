@@ -118,9 +118,8 @@ def test_a_disk_that_fills_up_ends_the_recording_and_not_the_bench(
     recorder = Recorder(bench, path, sensors=[Accelerometer("P1", 0.1, 0.1)], fingers=[])
     bench.advance(0.5)
     with full_disk(at=32_000):  # bytes, those of one second
-        bench.advance(1.0)
-        bench.advance(2.0)
-        bench.advance(3.0)
+        for moment in np.arange(0.51, 2.0, 0.01):
+            bench.advance(moment)
         recorder.stop()
         with pytest.raises(InputError, match=r"broke off after 1 s.*File too large; make room"):
             recorder.finish()

@@ -65,13 +65,15 @@ class Era:
     def gain(self, frequencies: FloatArray) -> ComplexArray:
         """Complex gain at frequencies [Hz], of their shape; 1 where none was measured.
 
-        Straight lines between what was measured, constant outside of it.
+        Straight lines between what was measured, constant outside of it. At negative frequencies,
+        such as the lower side of a quick ramp has, its conjugate: what the base does is real.
         """
         if not self.gains:
             return np.ones(np.shape(frequencies), dtype=complex)
         measured = [frequency for frequency, _, _ in self.gains]
         values = np.array([cmath.rect(size, phase) for _, size, phase in self.gains])
-        return np.asarray(np.interp(np.abs(frequencies), measured, values))
+        found = np.interp(np.abs(frequencies), measured, values)
+        return np.asarray(np.where(np.asarray(frequencies) < 0, found.conj(), found))
 
 
 def damping_from_ratio(

@@ -16,6 +16,7 @@ from model.rig.file import load_rig
 from model.rig.rig import Rig
 from model.table.build import build_table
 from model.table.file import load_table, save_table
+from model.transients.base_motion import Term
 from model.transients.time_response import plate_in_time
 
 GAINS = ((100.0, 0.9, 0.2), (200.0, 1.3, -0.4))
@@ -62,6 +63,19 @@ def test_the_plate_in_time_has_it_too(coarse_rig: Rig, uneven: Rig) -> None:
     gained, _ = plate_in_time(reduced, uneven.eras).particular([1], s, [1e-4], [0j])
     gain = uneven.eras[1].gain(np.array(125.0))
     np.testing.assert_allclose(gained, gain * plain, rtol=1e-9, atol=1e-12 * abs(plain).max())
+
+
+def test_one_motion_has_one_answer_whichever_way_its_phasor_turns(
+    coarse_rig: Rig, uneven: Rig
+) -> None:
+    """Im[c exp(i w t)] is Im[-conj(c) exp(-i w t)]: quick ramps of low tones are made of both."""
+    reduced = reduce_plate(coarse_rig.plate, coarse_rig.mesh, era_positions(coarse_rig.eras))
+    plate, omega, c = plate_in_time(reduced, uneven.eras), 2 * math.pi * 150.0, 6e-5 + 3e-5j
+    forwards, back = plate.answers(
+        1, [Term(0.0, math.inf, omega, c), Term(0.0, math.inf, -omega, -c.conjugate())]
+    )
+    expected = forwards.state(0.0123)
+    np.testing.assert_allclose(back.state(0.0123), expected, atol=1e-9 * np.abs(expected).max())
 
 
 def test_a_table_is_of_these_gains(coarse_rig: Rig, uneven: Rig, tmp_path: Path) -> None:

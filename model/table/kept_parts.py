@@ -1,19 +1,13 @@
 """Parts of a table kept beside it while it is built, so that an interrupted build goes on."""
 
-import logging
 from contextlib import suppress
 from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
 
-import numpy as np
-
-from model.files.array_file import UNREADABLE, Arrays, digest_of, read_arrays, write_arrays
+from model.files.array_file import Arrays
+from model.files.kept_arrays import keep_arrays, kept_arrays
 from model.table.parts import PART_TYPES, Part
-
-_logger = logging.getLogger(__name__)
-
-MAX_BYTES = 1 << 30
 
 _SUFFIX = ".part.npz"
 
@@ -35,26 +29,11 @@ class KeptParts:
 
     def load(self, part: Part) -> Arrays | None:
         """A part's arrays, or None; a damaged file is told of and taken for none."""
-        path = self._path(part)
-        types = {**PART_TYPES[part.what], "sha256": "|u1"}
-        try:
-            arrays = read_arrays(path, types, max_bytes=MAX_BYTES)
-        except FileNotFoundError:
-            return None
-        except UNREADABLE as error:
-            _logger.warning("%s cannot be read and is computed again: %s", path, error)
-            return None
-        digest = arrays.pop("sha256").tobytes()
-        if digest != self._digest(part, arrays):
-            _logger.warning("%s is damaged and is computed again", path)
-            return None
-        return arrays
+        return kept_arrays(self._path(part), self._text(part), PART_TYPES[part.what])
 
     def store(self, part: Part, arrays: Arrays) -> None:
         """Keep a part; its file is whole or not there. Raises OSError if it cannot be written."""
-        self.folder.mkdir(exist_ok=True)
-        digest = np.frombuffer(self._digest(part, arrays), dtype=np.uint8)
-        write_arrays(self._path(part), {**arrays, "sha256": digest})
+        keep_arrays(self._path(part), self._text(part), arrays)
 
     def clear(self) -> None:
         """Take away all parts, those of other problems and half-written ones too."""
@@ -64,8 +43,9 @@ class KeptParts:
             self.folder.rmdir()
 
     def _path(self, part: Part) -> Path:
-        name = sha256(f"{self.problem_digest} {part}".encode()).hexdigest()[:32]
+        name = sha256(self._text(part).encode()).hexdigest()[:32]
         return self.folder / f"{part.what}-{name}{_SUFFIX}"
 
-    def _digest(self, part: Part, arrays: Arrays) -> bytes:
-        return digest_of(f"{self.problem_digest} {part}", arrays).encode()
+    def _text(self, part: Part) -> str:
+        """All that made a part."""
+        return f"{self.problem_digest} {part}"

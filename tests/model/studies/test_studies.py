@@ -202,17 +202,6 @@ def test_a_damaged_chunk_is_told_and_solved_again(study, results, tmp_path, capl
     assert chunk.read_bytes() == content
 
 
-def test_a_chunk_of_another_size_is_not_taken(study, tmp_path, caplog):
-    """A file with a good checksum but the wrong number of cases is damaged too."""
-    problem, cases = study
-    cache = ResultCache(tmp_path, problem.digest)
-    part = cases.part(0, 4)
-    solved = solve_cases(problem.solve(), problem.rig.eras, part)
-    cache.store(part, CaseResults(solved.statistics[:3], solved.active[:3]))
-    assert cache.load(part) is None
-    assert "damaged" in caplog.text
-
-
 @pytest.mark.parametrize(
     "change",
     [

@@ -13,7 +13,7 @@ from model.figures.drawing import draw_eras, draw_shape, raster
 from model.files.csv_file import Column, Columns
 from model.paper.figure import PaperFigure
 from model.paper.printed import (
-    PAPER_ELEMENT,
+    ELEMENT_SIDE,
     TABLE_1_COMSOL,
     TABLE_1_PAPER,
     TABLE_2_COMSOL,
@@ -69,8 +69,8 @@ def thin_plate_frequencies(plate: Plate, count: int) -> FloatArray:
 def paper_mesh(plate: Plate) -> Mesh:
     """Elements as large as the paper's, one inch; 12x9 on its plate."""
     return Mesh(
-        max(2, round(plate.length / PAPER_ELEMENT)),
-        max(2, round(plate.width / PAPER_ELEMENT)),
+        max(2, round(plate.length / ELEMENT_SIDE)),
+        max(2, round(plate.width / ELEMENT_SIDE)),
         plate.length,
         plate.width,
     )

@@ -3,7 +3,7 @@
 from model.rig.rig import Rig
 from model.structure.plate import Plate
 
-PAPER_ELEMENT = 0.0254
+ELEMENT_SIDE = 0.0254
 """Side of an element in the paper's mesh [m], one inch: 12 x 9 elements, 390 degrees of freedom."""
 
 PAPER_STIFFNESS = 17_000.0

@@ -15,7 +15,7 @@ from model.reduction.free_plate import solve_free_plate
 from model.rig.rig import Rig
 from model.structure.plate import Plate
 
-PAPER_FREQUENCIES = (110.0, 250.0)
+MAP_FREQUENCIES = (110.0, 250.0)
 """Where the founding paper shows maps [Hz]."""
 
 MODE_COUNT = 12
@@ -80,7 +80,7 @@ def reference_mesh(plate: Plate, *, frequency_max: float) -> Mesh:
 def default_frequencies(rig: Rig) -> FloatArray:
     """Those of the paper's maps [Hz] as far as they are within the rig's limit, else the limit."""
     high = rig.limits.frequency_max
-    within = [frequency for frequency in PAPER_FREQUENCIES if frequency <= high]
+    within = [frequency for frequency in MAP_FREQUENCIES if frequency <= high]
     return np.array(within or [high])
 
 

@@ -7,7 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from model.arrays import FloatArray, lattice
+from model.arrays import FloatArray
 from model.figures.drawing import MapPanel, maps_figure, raster
 from model.files.csv_file import Columns
 from model.paper.figure import PaperFigure
@@ -22,8 +22,8 @@ from model.rig.layouts import diagonal_pair, edge_pair
 from model.rig.rig import Rig
 from model.structure.actuator import Era
 from model.vibration.excitation import Excitation, Tone
-from model.vibration.maps import PlateMap
-from model.vibration.peak import NULL_SHARE, G, find_nulls, peak_acceleration, tone_amplitudes
+from model.vibration.maps import PlateMap, plate_map
+from model.vibration.peak import NULL_SHARE, G
 
 NEARLY_STILL = 0.3
 """The paper's switched patterns are judged by where all of them stay below this share of their
@@ -39,17 +39,8 @@ class MapSolver:
 
     def __call__(self, eras: Sequence[Era], excitation: Excitation) -> PlateMap:
         """The map of an excitation of these ERAs."""
-        plate = self.rig.plate
-        columns, rows = raster(plate)
-        x = np.linspace(0, plate.length, columns)
-        y = np.linspace(0, plate.width, rows)
-        points = lattice(x, y)
-        loads = self.rig.loads
-        _, amplitudes = tone_amplitudes(
-            excitation, eras, lambda f: self.free_plate.acceleration(eras, f, points, loads=loads)
-        )
-        peak = peak_acceleration(amplitudes).reshape(rows, columns)
-        return PlateMap(x, y, peak, find_nulls(x, y, peak))
+        rig = replace(self.rig, eras=tuple(eras))
+        return plate_map(rig, excitation, raster=raster(rig.plate), free=self.free_plate)
 
 
 def activation_maps_figure(rig: Rig, free_plate: FreePlate) -> PaperFigure:

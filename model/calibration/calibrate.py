@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from model.arrays import ComplexArray, FloatArray
 from model.calibration.fast_plate import FastPlate, fast_plate
-from model.calibration.fit import Fit, Problem, misfit, row_size, solve, with_free
+from model.calibration.fit import Fit, Problem, misfit, row_size, solve
 from model.calibration.held_out import as_it_was, hold_out, relative_error
 from model.calibration.outcome import FITS, Calibration, FittedParameter, HeldOut, SensorScale
 from model.calibration.parameters import Parameter, parameters_of, rig_with, starts
@@ -127,7 +127,7 @@ def _identified(problem: Problem, fit: Fit) -> tuple[Problem, Fit]:
             return problem, fit
         free = problem.free.copy()
         free[int(excess.argmax())] = False
-        problem = with_free(problem, free)
+        problem = replace(problem, free=free)
         fit = solve(problem, np.where(free, fit.x, own), fit.scales)
 
 

@@ -101,11 +101,6 @@ def solve(problem: Problem, x: FloatArray, scales: FloatArray) -> Fit:
     return Fit(x, x_error, scales, scales_error, gains, gains_error, noise, used, residual)
 
 
-def with_free(problem: Problem, free: NDArray[np.bool_]) -> Problem:
-    """The same with other parameters free; free (n,), true for those that are fitted."""
-    return replace(problem, free=free)
-
-
 def misfit(problem: Problem, x: FloatArray) -> float:
     """How badly shapes over the sensors fit, 0 to 1, whatever gains: median of 1 - MAC.
 

@@ -23,8 +23,8 @@ _BOLT_KNOWN = 0.05  # of the plate's mass that an ERA carries
 class Parameter:
     """One number: what it is, of which ERA ("" for the plate), its value in the rig, and its unit.
 
-    A fit moves x, value = prior * exp(x) where is_factor, else unit * x; known: the largest
-    standard error of x at which it counts as identified; lower, upper: of x.
+    A fit moves x, value = prior * exp(x) where is_factor, else step * x, both in that unit; known:
+    the largest standard error of x at which it counts as identified; lower, upper: of x.
     """
 
     kind: str

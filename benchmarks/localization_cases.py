@@ -11,12 +11,12 @@ from model.finger.fingertip import fingertip_points
 from model.rig.file import load_rig
 from model.table.build import build_table
 from model.table.question import Question
+from model.vibration.excitation import GAIN_ERROR, PHASE_ERROR
 
 RIG = Path(__file__).parent.parent / "examples" / "paper_plate.yaml"
 FREQUENCIES = np.linspace(40.0, 500.0, 27)
 APART = 0.05  # m
 LEAST = 1.0  # m/s² at the target
-GAIN_ERROR, PHASE_ERROR = 0.05, np.radians(5.0)
 
 
 @cache

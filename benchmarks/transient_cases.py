@@ -11,8 +11,7 @@ from model.finger.perception import STRONG_DB_SL, detection_threshold
 from model.reduction.free_plate import solve_free_plate
 from model.rig.rig import Rig
 from model.transients.envelope import Envelopes
-from model.transients.knots import GAIN_ERROR, PHASE_ERROR
-from model.vibration.excitation import Excitation, Tone
+from model.vibration.excitation import GAIN_ERROR, PHASE_ERROR, Excitation, Tone
 
 FREQUENCIES = np.linspace(40, 500, 27)
 APART = 0.05

@@ -18,7 +18,10 @@ SILENT = -1
 """Stands for the frequency of an ERA that is not driven."""
 
 ERROR_SHARE = 0.1
-"""How wrong an ERA's share of a field is, relative to itself, root mean square (sigma)."""
+"""How wrong an ERA's share of a field is, relative to itself, root mean square (sigma).
+
+Of GAIN_ERROR and PHASE_ERROR of `model.vibration.excitation` together.
+"""
 
 _TINY, _LEAST = np.float32(1e-7), np.float32(1e-20)
 

@@ -25,11 +25,9 @@ from model.structure.point_load import PointLoad
 from model.table.pattern import Pattern
 from model.table.question import Point, Question
 from model.table.table import LocalizationTable
-from model.vibration.excitation import Excitation
+from model.vibration.excitation import GAIN_ERROR, PHASE_ERROR, Excitation
 from model.vibration.peak import base_amplitudes
 
-GAIN_DEVIATION = 0.05
-PHASE_DEVIATION = np.radians(5.0)
 STIFFNESS_RANGE = 0.10
 THICKNESS_RANGE = 0.02
 DAMPING_FACTOR = 2.0
@@ -51,28 +49,21 @@ class Ensemble:
     drive: ComplexArray
 
 
-def draw_ensemble(era_count: int, *, members: int = MEMBERS, seed: int = 0) -> Ensemble:
-    """The same plates for the same seed."""
-    rng = np.random.default_rng(seed)
-    each = (members, era_count)
-    gain = 1 + GAIN_DEVIATION * rng.standard_normal(each)
-    phase = PHASE_DEVIATION * rng.standard_normal(each)
+def draw_ensemble(era_count: int) -> Ensemble:
+    """MEMBERS plates on so many ERAs, the same ones every time."""
+    rng = np.random.default_rng(0)
+    each = (MEMBERS, era_count)
+    gain = 1 + GAIN_ERROR * rng.standard_normal(each)
+    phase = PHASE_ERROR * rng.standard_normal(each)
     return Ensemble(
-        thickness=rng.uniform(1 - THICKNESS_RANGE, 1 + THICKNESS_RANGE, members),
-        damping=DAMPING_FACTOR ** rng.uniform(-1, 1, members),
+        thickness=rng.uniform(1 - THICKNESS_RANGE, 1 + THICKNESS_RANGE, MEMBERS),
+        damping=DAMPING_FACTOR ** rng.uniform(-1, 1, MEMBERS),
         stiffness=rng.uniform(1 - STIFFNESS_RANGE, 1 + STIFFNESS_RANGE, each),
         drive=gain * np.exp(1j * phase),
     )
 
 
-def with_robust_contrast(
-    table: LocalizationTable,
-    question: Question,
-    pattern: Pattern,
-    *,
-    members: int = MEMBERS,
-    seed: int = 0,
-) -> Pattern:
+def with_robust_contrast(table: LocalizationTable, question: Question, pattern: Pattern) -> Pattern:
     """The pattern with its robust contrast, the tenth percentile [dB]; not where a finger is alone.
 
     Some milliseconds, for reports; while fingers wait, patterns are chosen by what stands against
@@ -80,7 +71,7 @@ def with_robust_contrast(
     """
     if not question.quiet:
         return pattern
-    ensemble = draw_ensemble(len(table.eras), members=members, seed=seed)
+    ensemble = draw_ensemble(len(table.eras))
     contrasts = ensemble_contrast_db(table, question, pattern.excitation, ensemble)
     return replace(pattern, robust_contrast_db=float(np.percentile(contrasts, PERCENTILE)))
 

@@ -16,18 +16,13 @@ from model.transients.bounded_solution import bounded_solution
 from model.transients.envelope import KNOT_STEP
 from model.transients.hats import ending_states, hat_accelerations, raised_cosine, steady_states
 from model.transients.time_response import PlateInTime
+from model.vibration.excitation import GAIN_ERROR, PHASE_ERROR
 
 ONSET_KNOTS = 21
 """Knots of an onset; the last, after 105 ms, is the pattern itself."""
 
 ENDING_KNOTS = 8
 """Knots of an ending; the last, after 40 ms, is silence."""
-
-GAIN_ERROR = 0.05
-"""Standard deviation of what an ERA does against what it was told, relative."""
-
-PHASE_ERROR = math.radians(5)
-"""The same for its phase [rad]."""
 
 _ERROR_VARIANCE = GAIN_ERROR**2 + PHASE_ERROR**2
 

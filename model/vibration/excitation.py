@@ -1,8 +1,15 @@
 """What drives the plate, in physics: a tone per active ERA."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TypeAlias
+
+GAIN_ERROR = 0.05
+"""Standard deviation of what an ERA does against what it was told, relative."""
+
+PHASE_ERROR = math.radians(5)
+"""The same for its phase [rad]."""
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,7 @@ import numpy as np
 from model.errors import InputError
 from model.rig.rig import Channel, Rig
 from model.transients.base_motion import Term
+from model.vibration.excitation import GAIN_ERROR, PHASE_ERROR
 from sim.waveform.output import Output
 
 NOISE_LINES = 32
@@ -84,8 +85,8 @@ class Imperfections:
 def draw_imperfections(
     rig: Rig,
     *,
-    gain: float = 0.05,
-    phase: float = math.radians(5.0),
+    gain: float = GAIN_ERROR,
+    phase: float = PHASE_ERROR,
     noise: float = 0.0,
     latency: float = 0.0,
     skew: float = 0.0,

@@ -32,14 +32,14 @@ class Timing:
         """The pattern with a shaped onset and ending, or one, for amplifiers with envelopes.
 
         A few milliseconds for both. Where nobody is to be kept quiet the plate around the targets
-        is, at the onset. An ending belongs to what plays: silent ERAs help at the onset only.
+        is, at the onset.
         """
         targets, quiet, tones = question.targets, question.quiet, pattern.excitation
         if onset:
             envelopes = self._shaper.onset(tones, targets=targets, quiet=quiet)
             pattern = replace(pattern, onset=envelopes)
         if ending:
-            envelopes = self._shaper.ending(tones, targets=targets, quiet=quiet, helped=False)
+            envelopes = self._shaper.ending(tones, targets=targets, quiet=quiet)
             pattern = replace(pattern, ending=envelopes)
         return pattern
 

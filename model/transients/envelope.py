@@ -30,8 +30,8 @@ MOST_KNOTS = 32
 class Envelope:
     """y(t) = Im[a(t) exp(2 pi i f t)] [m], with a(t) linear between knots.
 
-    a is `start` [m] when the envelope begins, knots[k] [m] after k + 1 steps [s], and what the last
-    knot says from then on. frequency f [Hz]; the phase of a counts from t = 0, not from the begin.
+    a is `start` [m] at time 0, knots[k] [m] after k + 1 steps [s], and what the last knot says from
+    then on. frequency f [Hz].
     """
 
     frequency: float
@@ -64,26 +64,24 @@ class Envelope:
         return max(abs(value) for value in (self.start, *self.knots))
 
     def amplitude(self, times: FloatArray) -> ComplexArray:
-        """a at times [s] (n,) after its begin."""
+        """a at times [s] (n,)."""
         values = np.array([self.start, *self.knots])
         moments = self.step * np.arange(len(values))
         return np.asarray(np.interp(times, moments, values))
 
-    def terms(self, *, begin: float = 0.0) -> tuple[Term, ...]:
-        """The motion of the base from the begin [s] on."""
+    def terms(self) -> tuple[Term, ...]:
+        """The motion of the base from time 0 on."""
         omega = 2 * math.pi * self.frequency
         values = (self.start, *self.knots)
         pieces = []
         for number, (here, there) in enumerate(pairwise(values)):
-            since = begin + number * self.step
+            since, until = number * self.step, (number + 1) * self.step
             turn = cmath.exp(1j * omega * since)
-            until = begin + (number + 1) * self.step
             slope = (there - here) / self.step
             pieces.append(Term(since, until, omega, here * turn, slope * turn))
         if self.knots[-1] != 0:
-            end = begin + self.duration
-            last = self.knots[-1] * cmath.exp(1j * omega * end)
-            pieces.append(Term(end, math.inf, omega, last))
+            last = self.knots[-1] * cmath.exp(1j * omega * self.duration)
+            pieces.append(Term(self.duration, math.inf, omega, last))
         return tuple(pieces)
 
 

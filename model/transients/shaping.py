@@ -68,7 +68,7 @@ class Shaper:
         felt = self._fingertips(targets)
         still = self._fingertips(quiet) if quiet else self._surroundings(targets)
         envelopes: dict[str, Envelope] = {}
-        for frequency, amplitudes, active in self._groups(excitation):
+        for frequency, amplitudes, active in self._groups(excitation, helped=True):
             knots = onset_knots(
                 self._carrier(frequency), amplitudes, active, felt=felt, still=still, rise=RISE
             )
@@ -81,18 +81,17 @@ class Shaper:
         *,
         targets: Sequence[Position] = (),
         quiet: Sequence[Position] = (),
-        helped: bool = True,
     ) -> Envelopes:
         """Envelopes that lead from an excitation to silence and bring the whole plate to rest.
 
-        With targets and quiet fingers [m] the quiet ones are kept quiet meanwhile. helped: whether
-        an ERA that the excitation leaves silent helps where there is one frequency only.
+        With targets and quiet fingers [m] the quiet ones are kept quiet meanwhile. Silent ERAs stay
+        so: an ending belongs to what plays, whatever comes next.
         """
         both = bool(targets and quiet)
         felt = self._fingertips(targets) if both else None
         still = self._fingertips(quiet) if both else None
         envelopes: dict[str, Envelope] = {}
-        for frequency, amplitudes, active in self._groups(excitation, helped=helped):
+        for frequency, amplitudes, active in self._groups(excitation, helped=False):
             knots = ending_knots(
                 self._carrier(frequency), amplitudes, active, felt=felt, still=still
             )
@@ -113,9 +112,12 @@ class Shaper:
         return envelopes
 
     def _groups(
-        self, excitation: Excitation, *, helped: bool = True
+        self, excitation: Excitation, *, helped: bool
     ) -> list[tuple[float, ComplexArray, IntArray]]:
-        """Per frequency [Hz]: amplitudes (eras,) in strokes, and which ERAs play it."""
+        """Per frequency [Hz]: amplitudes (eras,) in strokes, and which ERAs play it.
+
+        helped: whether those that the excitation leaves silent do where there is one frequency.
+        """
         eras = self._plate.eras
         frequencies = sorted({tone.frequency for tone in excitation.values()})
         groups = []

@@ -313,22 +313,15 @@ def test_an_era_plays_the_frequency_it_has(setup):
 
 
 def test_a_silent_era_helps_where_there_is_one_frequency(setup):
-    """It joins in for the onset and the brake, and is silent again at the end of either."""
-    rig, _, shaper, transients = setup
+    """It joins in for the onset, and is silent again at its end; the brake is the others' alone."""
+    rig, _, shaper, _ = setup
     excitation = {"SW": Tone(110.8, 8e-5), "NE": Tone(110.8, 6e-5, 1.0)}
     onset = shaper.onset(excitation, targets=[(0.05, 0.05)], quiet=[(0.2, 0.15)])
     ending = shaper.ending(excitation)
-    assert set(onset) == set(ending) == {era.name for era in rig.eras}
-    assert onset["SE"].knots[-1] == ending["SE"].start == 0
-    assert max(onset["SE"].largest, ending["SE"].largest) > 1e-7
-    alone = {name: ending[name] for name in excitation}
-    with_help, without = (
-        transients.left_db(excitation, shaped(each, rig.eras)) for each in (ending, alone)
-    )
-    assert with_help < without
-    unhelped = shaper.ending(excitation, helped=False)
-    assert set(unhelped) == set(excitation)
-    assert transients.left_db(excitation, shaped(unhelped, rig.eras)) < without
+    assert set(onset) == {era.name for era in rig.eras}
+    assert onset["SE"].knots[-1] == 0
+    assert onset["SE"].largest > 1e-7
+    assert set(ending) == set(excitation)
 
 
 def test_around_a_lone_finger_the_plate_takes_the_quiet_fingers_place(setup):

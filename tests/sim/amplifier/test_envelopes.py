@@ -81,7 +81,7 @@ def test_the_base_moves_as_the_model_says() -> None:
     amplifier.handle(Apply(playing(1, 0.8, onset=1)), 0.25)  # 27.5 periods: a phase of its own
     terms = [term for tone in amplifier.outputs[0] for term in terms_of(tone, stroke=STROKE)]
     knots = tuple(STROKE * value for value in (0.2j, 0.4 + 0j, 0.8 + 0j))
-    model = list(BaseEnvelope(110.0, 0j, knots, step=0.005).terms(begin=0.0))
+    model = list(BaseEnvelope(110.0, 0j, knots, step=0.005).terms())
     times = np.linspace(0.0, 0.03, 500)
     assert motion(terms, times + 0.25) == pytest.approx(motion(model, times), abs=1e-12)
 

@@ -20,7 +20,7 @@ from benchmarks.localization_methods import (
     reversed_pulse_contrast,
     time_reversal,
 )
-from model.drive_modes import MODES, best_drive
+from model.drive_modes import MODES, find_drives
 from model.drive_modes.exact_search import search_exactly
 from model.drive_modes.fields import ERROR_SHARE
 from model.table.robust import with_robust_contrast
@@ -116,9 +116,9 @@ def _methods(places, errors):
     add("switched, exact, 1 to 4 ERAs", weights_of(exact.drive, fields))
     found["  bound: any mixture of these"] = (20 * np.log10(exact.mixture), None)
     for mode in ("graded", "signed", "phased"):
-        drive, outcome = best_drive(fields, mode)
-        add(mode, weights_of(drive, fields))
-    found["  robust score of phased"] = (20 * np.log10(outcome.score), None)
+        choice = find_drives(fields, mode)
+        add(mode, weights_of(choice.drive, fields))
+    found["  robust score of phased"] = (20 * np.log10(choice.outcome.score), None)
     found["  bound of that score"] = (20 * np.log10(robust_bound(fields)), None)
     return found
 
@@ -160,10 +160,10 @@ def two_target_section(sets, draws, seed):
             errors = Errors.draw(draws, eras=4, rng=rng)
             fields = fields_of(places, targets=2)
             for mode, values in cells.items():
-                drive, _ = best_drive(fields, mode)
+                drive = find_drives(fields, mode).drive
                 values.append(np.median(errors.contrast_db(fields, weights_of(drive, fields))))
             alone = fields_of(np.delete(places, 1, axis=0))
-            drive, _ = best_drive(alone, "phased")
+            drive = find_drives(alone, "phased").drive
             for_one.append(np.median(errors.contrast_db(alone, weights_of(drive, alone))))
         rows.append(
             [f"2 targets, {quiet} quiet", *(shown(v) for v in cells.values()), shown(for_one)]
@@ -212,7 +212,7 @@ def freedom_section(sets, seed):
         scores = []
         for places in contact_sets(sets, fingers=quiet + 1, rng=rng, apart=apart):
             fields = fields_of(places)
-            scores.append([best_drive(fields, mode)[1].score for mode in names])
+            scores.append([find_drives(fields, mode).outcome.score for mode in names])
         ahead = 20 * np.log10(np.array(scores)[:, :-1] / np.array(scores)[:, 1:])
         rows.append(
             [f"{quiet} quiet"]

@@ -83,7 +83,7 @@ def demo(
         return
     if not as_json:
         print(
-            f"{rig_file.name}: {len(table.patterns)} patterns of {len(rig.eras)} ERAs on a mesh "
+            f"{rig_file.name}: {table.pattern_count} patterns of {len(rig.eras)} ERAs on a mesh "
             f"of {table.mesh}, ready in {time.perf_counter() - started:.1f} s"
         )
         print(_HEADING, end="")

@@ -45,7 +45,6 @@ def build(
     from model.table.file import ZIP, save_table
     from model.table.kept_parts import KeptParts
     from model.table.parts import TableProblem
-    from model.table.summary import pattern_count
     from model.table.table import usual_frequencies
 
     if mode not in MODES:
@@ -75,13 +74,12 @@ def build(
     save_table(table, output)
     kept.clear()
     elapsed = time.perf_counter() - started
-    patterns = pattern_count(len(table.eras), len(table.frequencies))
     error = 100 * float(table.discretisation_error.max())
     if as_json:
         print(
             json.dumps(
                 {
-                    "patterns": patterns,
+                    "patterns": table.pattern_count,
                     "cells": table.grid.cell_count,
                     "frequencies_hz": table.frequencies.tolist(),
                     "mesh": [table.mesh.nx, table.mesh.ny],
@@ -104,8 +102,8 @@ def build(
             "had done"
         )
     print(
-        f"{patterns} patterns of {len(table.frequencies)} frequencies for {table.grid.cell_count} "
-        f"cells, built in {elapsed:.2f} s"
+        f"{table.pattern_count} patterns of {len(table.frequencies)} frequencies for "
+        f"{table.grid.cell_count} cells, built in {elapsed:.2f} s"
     )
     print(f"mesh {table.mesh}: fields within {error:.3g} % of a finer one ({table.reference_mesh})")
     print(f"wrote {output} ({output.stat().st_size / 1e6:.1f} MB)")

@@ -27,7 +27,7 @@ FINE_PHASE = 10.0  # degrees
 
 NEAR, NEARLY_AS_GOOD = 4, 10 ** (-3 / 20)
 
-__all__ = ["MODES", "Choice", "Mode", "best_drive", "find_drives", "loudest", "playable_modes"]
+__all__ = ["MODES", "Choice", "Mode", "find_drives", "loudest", "playable_modes"]
 
 
 @dataclass(frozen=True)
@@ -135,15 +135,6 @@ def find_drives(fields: Fields, mode: str) -> Choice | None:
         return None
     reached = np.flatnonzero(score)
     return Choice(*best, reached, weights[reached], score[reached])
-
-
-def best_drive(fields: Fields, mode: str) -> tuple[Drive, Outcome] | None:
-    """The drive of the best robust score in a mode and the poorer ones, and what it does.
-
-    None where none reaches the wanted level.
-    """
-    choice = find_drives(fields, mode)
-    return (choice.drive, choice.outcome) if choice else None
 
 
 def loudest(fields: Fields, mode: str) -> float:

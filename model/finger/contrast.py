@@ -1,9 +1,7 @@
 """How localized a pattern is: contrast between regions of the plate, and level at the target."""
 
-import numpy as np
-
 from model.arrays import FloatArray
-from model.finger.perception import sensation_level
+from model.finger.perception import decibels, sensation_level
 
 # A lone finger is told from the rest of the plate beyond this distance [m] (about two fingertips).
 SURROUNDINGS_RADIUS = 0.05
@@ -15,12 +13,6 @@ def contrast_db(target: FloatArray, quiet: FloatArray) -> FloatArray:
     target (..., p), quiet (..., q) -> (...).
     """
     return decibels(target.mean(axis=-1) / quiet.max(axis=-1))
-
-
-def decibels(ratio: FloatArray) -> FloatArray:
-    """20 log10 of an amplitude ratio, of the same shape; -inf for zero."""
-    with np.errstate(divide="ignore"):
-        return np.asarray(20 * np.log10(ratio))
 
 
 def mean_level_db_sl(frequencies: FloatArray, amplitudes: FloatArray) -> float:

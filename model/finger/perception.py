@@ -39,6 +39,10 @@ def sensation_level(frequencies: FloatArray, amplitudes: FloatArray) -> FloatArr
     frequencies (f,) [Hz], amplitudes (f, ...) [m/s²]; -inf where nothing moves.
     """
     threshold = detection_threshold(frequencies).reshape(-1, *[1] * (amplitudes.ndim - 1))
-    ratio = np.sqrt(((amplitudes / threshold) ** 2).sum(axis=0))
+    return decibels(np.sqrt(((amplitudes / threshold) ** 2).sum(axis=0)))
+
+
+def decibels(ratio: FloatArray) -> FloatArray:
+    """20 log10 of an amplitude ratio, of the same shape; -inf for zero."""
     with np.errstate(divide="ignore"):
         return np.asarray(20 * np.log10(ratio))

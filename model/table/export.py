@@ -17,7 +17,6 @@ from model.drive_modes.sources import all_patterns
 from model.errors import InputError
 from model.files.array_file import whole_or_nothing
 from model.table.file import FORMAT_VERSION
-from model.table.summary import pattern_count
 from model.table.table import LocalizationTable
 
 MOST_BYTES = (1 << 31) - 1
@@ -31,8 +30,10 @@ def export_mat(table: LocalizationTable, path: Path) -> None:
     """
     from scipy.io import savemat
 
-    patterns = pattern_count(len(table.eras), len(table.frequencies))
-    size = patterns * (4 * table.grid.cell_count + 8 * len(table.eras)) + table.acceleration.nbytes
+    size = (
+        table.pattern_count * (4 * table.grid.cell_count + 8 * len(table.eras))
+        + table.acceleration.nbytes
+    )
     if size > MOST_BYTES:
         raise InputError(
             f"the table has {size / 1e9:.1f} GB with all its patterns, more than a .mat file of "

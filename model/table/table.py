@@ -15,18 +15,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.arrays import FloatArray
+from model.drive_modes.exact_search import pattern_count
 from model.drive_modes.fields import Fields, SingleComplex
 from model.drive_modes.sources import (
-    all_patterns,
     magnitudes_of_sources,
     per_source,
     sums_of_sources,
 )
 from model.errors import InputError
 from model.fem.mesh import Mesh
-from model.finger.contrast import SURROUNDINGS_RADIUS, decibels
+from model.finger.contrast import SURROUNDINGS_RADIUS
 from model.finger.grid import Grid
-from model.finger.perception import STRONG_DB_SL, detection_threshold
+from model.finger.perception import STRONG_DB_SL, decibels, detection_threshold
 from model.rig.rig import Limits, physics_fingerprint
 from model.structure.actuator import Era
 from model.structure.plate import Plate
@@ -95,9 +95,9 @@ class LocalizationTable:
         return physics_fingerprint(self.plate, self.eras, masses=self.masses)
 
     @property
-    def patterns(self) -> NDArray[np.int16]:
-        """Every `switched` pattern: index of each ERA's frequency, or SILENT, (n, eras)."""
-        return all_patterns(len(self.eras), len(self.frequencies)).index
+    def pattern_count(self) -> int:
+        """How many `switched` patterns of one or two ERAs there are."""
+        return pattern_count(len(self.eras), len(self.frequencies), eras_at_most=2)
 
     @property
     def cell_response(self) -> NDArray[np.float32]:

@@ -1,7 +1,7 @@
 """Where on the plate a target is told from other fingers, cell by cell, and where hardly.
 
 For the centre of each cell as the target, the best contrast to another finger at random places (the
-same for all cells, from a seed, those at least 5 cm away). A cell is *feasible* where the median
+same for all cells and every time, those at least 5 cm away). A cell is *feasible* where the median
 other finger is told from it by 12 dB at 20 dB SL: felt strongly, and what is turned down to be just
 felt well, at 12 dB SL, is then at the other's threshold. It is *weak* where more than one other
 finger in ten is not.
@@ -28,7 +28,7 @@ WANTED_LEVEL_DB_SL = STRONG_DB_SL
 STRATA = (4, 3)
 """Another finger is tried at a random place in each of so many equal parts of a quarter of the
 plate, and at the mirror images of these places in both axes: the map of a symmetric plate is then
-symmetric, and differs less from seed to seed than with places drawn freely."""
+symmetric, and depends less on what was drawn than with places drawn freely."""
 
 # A finer map takes longer and shows no more: weak places are as large as a quarter of a wave.
 _FINEST = Grid(16, 12)
@@ -65,7 +65,6 @@ def map_grid(table: LocalizationTable) -> Grid:
 def find_weak_cells(
     table: LocalizationTable,
     *,
-    seed: int = 0,
     progress: Callable[[int, int], None] = lambda done, of: None,
 ) -> WeakCells:
     """Ask the table about each cell, in its own mode; cells of a fine grid are taken together.
@@ -76,7 +75,7 @@ def find_weak_cells(
     centres = grid.centres(table.plate)
     size = np.array([table.plate.length, table.plate.width])
     corner = np.stack(np.meshgrid(*(np.arange(n) for n in STRATA)), axis=-1).reshape(-1, 1, 2)
-    drawn = np.random.default_rng(seed).uniform(0, 1, corner.shape)
+    drawn = np.random.default_rng(0).uniform(0, 1, corner.shape)
     drawn = (corner + drawn) / (2 * np.array(STRATA))
     mirrored = np.abs(drawn - [[0, 0], [1, 0], [0, 1], [1, 1]])
     places = size * mirrored.reshape(-1, 2)

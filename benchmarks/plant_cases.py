@@ -18,8 +18,8 @@ from model.rig.file import load_rig
 from model.rig.rig import Channel, Rig
 from model.structure.actuator import Era
 from model.transients.base_motion import fade
-from sim.bench.bench import SAMPLE_RATE, Bench
-from sim.plant.plant import Plant
+from sim.bench.bench import Bench
+from sim.plant.plant import SAMPLE_RATE, Plant
 
 FREQUENCIES = (110.0, 110.0, 250.0, 320.0)
 ONSETS = 0.5  # s between two new tones: a plate that only hums steadily would be no fair case

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from sim.control.site import Site
     from sim.far_ends.wires import Wire
     from sim.process.far_end import FarEnd
-    from sim.process.view import PlateMap
+    from sim.process.view import PlateView
     from sim.sensors.accelerometer import Accelerometer
 
 app = typer.Typer(pretty_exceptions_enable=False)
@@ -218,13 +218,13 @@ class _LiveView:
         from rich.live import Live
 
         self._live = Live(auto_refresh=False)
-        self._plate: PlateMap | None = None
+        self._plate: PlateView | None = None
 
     def __call__(self, site: "Site") -> None:
-        from sim.process.view import PlateMap, draw
+        from sim.process.view import PlateView, draw
 
         if self._plate is None:
-            self._plate = PlateMap(site.bench)
+            self._plate = PlateView(site.bench)
             site.bench.taps.append(self._plate)
             self._live.start()
         self._live.update(draw(site, self._plate), refresh=True)

@@ -54,11 +54,11 @@ def witness(
 
     limits: dict[str, Any] = {
         "frequency_hz": _band(frequency),
-        "level": _in_range("--level", level, least=0.0, most=1.0, unit="of full stroke"),
+        "level": _in_range("--level", level, most=1.0, unit="of full stroke"),
     }
     if slew is not None:
-        limits["slew_per_s"] = _in_range("--slew", slew, least=0.0, unit="of full stroke a second")
-    slack = _in_range("--slack", slack, least=0.0, unit="ms")
+        limits["slew_per_s"] = _in_range("--slew", slew, unit="of full stroke a second")
+    slack = _in_range("--slack", slack, unit="ms")
     if replay is not None and record is not None:
         raise InputError(
             "--record writes what passes a wire, and with --replay nothing passes one: leave out "
@@ -105,12 +105,10 @@ def _band(text: str) -> list[float]:
     return [low, high]
 
 
-def _in_range(
-    option: str, given: float, *, least: float, most: float = math.inf, unit: str
-) -> float:
-    if not least <= given <= most or math.isinf(given):
+def _in_range(option: str, given: float, *, most: float = math.inf, unit: str) -> float:
+    if not 0 <= given <= most or math.isinf(given):
         to = "or more" if math.isinf(most) else f"to {most:g}"
-        raise InputError(f"{option} {given:g} is out of range; write {least:g} {to}, {unit}")
+        raise InputError(f"{option} {given:g} is out of range; write 0 {to}, {unit}")
     return given
 
 

@@ -27,10 +27,9 @@ from sim.plant.base_motion import terms_of
 from sim.plant.felt import Felt, feel
 from sim.plant.finger import KEPT, Fingers, Position, Record
 from sim.plant.imperfections import ChannelErrors, Imperfections, delayed, draw_noise, realised
-from sim.plant.plant import Plant
+from sim.plant.plant import SAMPLE_RATE, Plant
 from sim.waveform.output import Output, Tone
 
-SAMPLE_RATE = 10_000.0  # Hz; the peak of 500 Hz is then seen to 1.3 %
 _PORTION = 1.0  # s; what is sampled at once, however long nobody asked
 _SHAPES_KEPT = 16  # sets of points; as many listeners ask for them again and again
 

@@ -25,9 +25,7 @@ from model.vibration.excitation import Excitation
 from model.vibration.peak import base_amplitudes, peak_acceleration
 from sim.plant.felt import Felt, feel
 from sim.plant.finger import Record
-from sim.plant.plant import Plant
-
-SAMPLE_RATE = 10_000.0  # Hz; the peak of 500 Hz is then seen to 1.3 %
+from sim.plant.plant import SAMPLE_RATE, Plant
 
 STEADY = 0.25
 """The last part [s] of what was played, in which steady amplitudes are read.

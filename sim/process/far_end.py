@@ -14,7 +14,7 @@ from drivers import clock
 from drivers.operation.steady import no_long_collections
 from model.finger.load import FingerLoad
 from model.rig.rig import Rig
-from sim.bench.bench import SAMPLE_RATE, Bench
+from sim.bench.bench import Bench
 from sim.bench.real_time import keep_time
 from sim.bench.station import Station
 from sim.control.server import control_socket
@@ -23,6 +23,7 @@ from sim.far_ends.wire_choice import Choice
 from sim.far_ends.wires import open_wires
 from sim.faults.file import FaultFile
 from sim.plant.finger import Position
+from sim.plant.plant import SAMPLE_RATE
 from sim.process.virtual_time import SteppedLoop
 from sim.sensors.accelerometer import Accelerometer
 

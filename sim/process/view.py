@@ -8,12 +8,12 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from model.arrays import FloatArray
+from model.arrays import FloatArray, lattice
+from model.vibration.peak import G
 from sim.bench.bench import Bench
 from sim.control.site import Site
 
 WINDOW = 0.2  # s; as long as a picture stays
-_GRAVITY = 9.8  # m/s²
 _SHADES = " ·-+*#@"
 _FULL = 5.0  # g; shown as the last shade, and what lies above
 _NOTHING = 0.002  # of it; what is less is not drawn
@@ -21,7 +21,7 @@ _COLUMNS, _ROWS = 28, 10
 _FADING = 0.5  # of the peaks from one picture to the next
 
 
-class PlateMap:
+class PlateView:
     """Peak accelerations over a lattice of the plate (rows, columns) [m/s²], fading with time."""
 
     def __init__(self, bench: Bench) -> None:
@@ -29,7 +29,7 @@ class PlateMap:
         x = (np.arange(_COLUMNS) + 0.5) / _COLUMNS * plate.length
         y = (np.arange(_ROWS) + 0.5) / _ROWS * plate.width
         self._bench = bench
-        self._points = np.array([[a, b] for b in y for a in x])
+        self._points = lattice(x, y)
         self._peaks = np.zeros(len(self._points))
 
     @property
@@ -49,7 +49,7 @@ class PlateMap:
         return peaks.reshape(_ROWS, _COLUMNS)
 
 
-def draw(site: Site, plate: PlateMap) -> RenderableType:
+def draw(site: Site, plate: PlateView) -> RenderableType:
     """The present state of a far end."""
     bench = site.bench
     amplifiers = Table("amplifier", "state", "fault", "set", "level of each channel")
@@ -64,7 +64,7 @@ def draw(site: Site, plate: PlateMap) -> RenderableType:
     fingers = Table("finger", "at", "peak acceleration")
     felt = bench.felt(bench.time - WINDOW, bench.time)
     for name, (x, y) in bench.fingers.layout.positions.items():
-        peak = f"{felt[name].peak.max() / _GRAVITY:.2f} g" if name in felt else ""
+        peak = f"{felt[name].peak.max() / G:.2f} g" if name in felt else ""
         fingers.add_row(name, f"{x * 1000:.0f}, {y * 1000:.0f} mm", peak)
     said = [f"{bench.time:.1f} s"]
     if site.recorder is not None:
@@ -75,7 +75,7 @@ def draw(site: Site, plate: PlateMap) -> RenderableType:
 
 def _picture(bench: Bench, peaks: FloatArray) -> Text:
     """The plate with y upwards; fingers are O, ERAs are E."""
-    share = np.maximum(peaks / (_FULL * _GRAVITY) - _NOTHING, 0)
+    share = np.maximum(peaks / (_FULL * G) - _NOTHING, 0)
     shade = np.ceil(share * (len(_SHADES) - 1)).astype(int)
     rows = [[_SHADES[min(cell, len(_SHADES) - 1)] for cell in row] for row in shade]
     size = bench.rig.plate.length, bench.rig.plate.width

@@ -16,11 +16,11 @@ SENSORS_MAX = 64  # ten seconds of them take 50 MB
 
 
 class Accelerometers:
-    """The sensors on a bench, none at first; noise is the same for the same seed."""
+    """The sensors on a bench, none at first; their noise is the same every time."""
 
-    def __init__(self, bench: Bench, *, seed: int = 0) -> None:
+    def __init__(self, bench: Bench) -> None:
         self._bench = bench
-        self._rng = np.random.default_rng(seed)
+        self._rng = np.random.default_rng(0)
         self._pieces: deque[Recording] = deque()
         self.sensors: tuple[Accelerometer, ...] = ()
 

@@ -8,9 +8,8 @@ import numpy as np
 
 from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
+from model.transients.measures import FIRST
 from sim.sensors.recording import Recording
-
-TRANSIENT = 0.1  # s from the onset; what decides what is felt of a short effect
 
 # T60 is read from -5 dB on, as in ISO 3382-1, and as deep as noise allows, for beats make steps: at
 # least to -25 dB, at most to -45 dB.
@@ -76,7 +75,7 @@ def transient_contrast_db(
     recording: Recording, *, onset: float, target: Sequence[str], quiet: Sequence[str]
 ) -> float:
     """The same of the peaks over the first 100 ms from an onset [s] on."""
-    peak = np.abs(recording.during(onset, onset + TRANSIENT).samples).max(axis=0)
+    peak = np.abs(recording.during(onset, onset + FIRST).samples).max(axis=0)
     return _contrast(recording, peak, target, quiet)
 
 

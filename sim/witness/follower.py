@@ -233,7 +233,7 @@ class Follower:
         if self.state is None:
             self._adopt(said, end)
         else:
-            self._check_state(said, begin, end)
+            self._check_state(said, end)
         before, until = self._token_before
         was_earlier = end <= until and said.token == before  # than a commit that nobody answers
         if said.token is not None and not was_earlier:
@@ -269,7 +269,7 @@ class Follower:
             self._outputs.free(math.inf)
             self.watchdog.fed((-math.inf, time))
 
-    def _check_state(self, said: Condition, begin: float, end: float) -> None:
+    def _check_state(self, said: Condition, end: float) -> None:
         here, now = self.state, said.state
         trips = now in (_REACTING, _FAULT) and here not in (None, *_OFF, _REACTING, _FAULT)
         follows = {

@@ -8,10 +8,10 @@ from drivers.protocol.messages import Apply, Arm
 from model.rig.rig import Rig
 from sim.bench.bench import Bench
 from sim.control.site import Site
-from sim.process.view import PlateMap, draw
+from sim.process.view import PlateView, draw
 
 
-def shown(site: Site, plate: PlateMap) -> str:
+def shown(site: Site, plate: PlateView) -> str:
     """The view as text, as wide as it likes."""
     console = Console(width=120, force_terminal=False)
     with console.capture() as capture:
@@ -28,7 +28,7 @@ def test_the_plate_is_drawn_the_right_way_up_and_as_it_shakes(coarse_rig: Rig) -
     """ERAs in the corners, the finger where it is, nothing at rest, and the most where most is."""
     bench = Bench(coarse_rig, now=0.0)
     site = Site(bench, urls={"main": "serial:///dev/pts/7?baud=921600"})
-    plate = PlateMap(bench)
+    plate = PlateView(bench)
     bench.taps.append(plate)
     bench.place_fingers({"1": (0.25, 0.05)}, now=0.0)
     still = shown(site, plate)

@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer.core import TyperCommand
 
+from by_name.nearness import did_you_mean
 from drivers.errors import CommandError, CommandRefused, FrameError, LinkError
-from model.errors import InputError, did_you_mean
+from model.errors import InputError
 
 if TYPE_CHECKING:
     from controller.api.client import Client

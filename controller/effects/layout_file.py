@@ -5,6 +5,7 @@ from typing import Annotated, Any
 
 from pydantic import Field, Strict
 
+from by_name.nearness import did_you_mean
 from controller.effects.effect import Effect, Level
 from controller.effects.kinds import effect_kind
 from controller.effects.layout import BUZZ, Layout, Region, usual_effects
@@ -12,7 +13,7 @@ from controller.effects.shapes import Circle, Polygon, Rectangle, Shape
 from model.config.document import Document, KeyPath, read_document
 from model.config.sections import Quantity, Section, Validation
 from model.config.units import LENGTH
-from model.errors import InputError, did_you_mean
+from model.errors import InputError
 from model.finger.perception import STRONG_DB_SL
 from model.rig.sections import Identifier
 from model.structure.plate import Plate

@@ -4,7 +4,8 @@ import math
 import re
 from collections.abc import Sequence
 
-from model.errors import InputError, did_you_mean
+from by_name.nearness import did_you_mean
+from model.errors import InputError
 from model.rig.rig import Rig
 from model.vibration.excitation import Excitation, Tone
 

@@ -4,16 +4,15 @@ A kind is an entry point of the group `era_haptics.config_kinds`: an object as `
 its name. Files say what they are by their keys, so that nobody has to.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
+from by_name.catalogue import Catalogue, Instance
 from model.config.document import Document
 from model.errors import InputError
 
-GROUP = "era_haptics.config_kinds"
 USUAL = "rig"
 
 
@@ -25,6 +24,7 @@ class Good:
     warnings: Sequence[str] = ()
 
 
+@runtime_checkable
 class ConfigKind(Protocol):
     """One kind of configuration file."""
 
@@ -41,28 +41,19 @@ class ConfigKind(Protocol):
         """Its JSON schema, for editors."""
 
 
+_KINDS: Catalogue[ConfigKind] = Catalogue(
+    "kind of configuration", "era_haptics.config_kinds", Instance(ConfigKind), error=InputError
+)
+
+
 def kind_called(name: str) -> ConfigKind:
     """The kind of a name; raises InputError for none."""
-    points = {point.name: point for point in _points()}
-    if name not in points:
-        raise InputError(
-            f"there is no kind {name!r} of configuration; known are {', '.join(sorted(points))}"
-        )
-    return _load(points[name])
+    return _KINDS.find(name)
 
 
 def kind_of(document: Document) -> ConfigKind:
     """The kind that a document is meant to be: a rig, unless another kind knows it for its own."""
-    for point in sorted(_points(), key=lambda point: point.name):
-        if point.name != USUAL and (kind := _load(point)).recognises(document):
+    for name in _KINDS.names():
+        if name != USUAL and (kind := kind_called(name)).recognises(document):
             return kind
     return kind_called(USUAL)
-
-
-def _points() -> Iterable[EntryPoint]:
-    return entry_points(group=GROUP)
-
-
-def _load(point: EntryPoint) -> ConfigKind:
-    kind: ConfigKind = point.load()
-    return kind

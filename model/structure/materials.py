@@ -6,8 +6,8 @@ a `KnownMaterial` of that name; rig files, their schema and `era plate materials
 
 from dataclasses import dataclass
 
+from by_name.catalogue import Catalogue, Instance
 from model.errors import InputError
-from model.plugins import Catalogue
 from model.structure.plate import Material
 
 
@@ -72,11 +72,13 @@ _KNOWN = (
 KNOWN_MATERIALS = {known.material.name: known for known in _KNOWN}
 """Those that come with this package."""
 
-_MATERIALS = Catalogue(
+_MATERIALS: Catalogue[KnownMaterial] = Catalogue(
     "material",
-    KnownMaterial,
-    KNOWN_MATERIALS,
-    group="era_haptics.materials",
+    "era_haptics.materials",
+    Instance(KnownMaterial),
+    error=InputError,
+    own=KNOWN_MATERIALS,
+    called=lambda known: known.material.name,
     otherwise="; any other can be given by its numbers, {E: 70 GPa, rho: 2700, nu: 0.33}",
 )
 
@@ -92,13 +94,7 @@ def known_material(name: str) -> KnownMaterial:
     Case does not matter, nor whether words are joined by hyphen, underscore or space.
     """
     plain = "-".join(name.lower().replace("_", " ").replace("-", " ").split())
-    known = _MATERIALS.find(plain)
-    if known.material.name != plain:
-        raise InputError(
-            f"material {plain}: the plug-in of this name gives one that is called "
-            f"{known.material.name!r}; its entry point and its Material need the same name"
-        )
-    return known
+    return _MATERIALS.find(plain)
 
 
 def material(name: str) -> Material:

@@ -20,9 +20,9 @@ def checked(*urls: str, channels: int = 2) -> tuple[dict[str, str], list[str]]:
     [
         (
             "serail:///dev/ttyUSB0",
-            r"no backend for serail.*Did you mean serial.*Known schemes: can",
+            r"unknown backend 'serail://'; did you mean serial://\? known are can",
         ),
-        ("carrier+pigeon://coop", "Known schemes: .*modbus.tcp, .*serial, sim"),
+        ("carrier+pigeon://coop", "known are .*modbus.tcp://, .*serial://, sim://"),
         ("serial:///dev/ttyUSB0?baud=fast", "baud is 'fast'"),
         ("modbus+tcp://host/999", "unit is '999'"),
         (f"{BUS}#300", "node after # is '300'"),

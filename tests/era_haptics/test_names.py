@@ -66,7 +66,9 @@ def test_the_commands_do_without() -> None:
     assert said.stdout.splitlines()[-1] == "False"
 
 
-@pytest.mark.parametrize("package", ["controller", "drivers", "era_haptics", "model", "sim"])
+@pytest.mark.parametrize(
+    "package", ["by_name", "controller", "drivers", "era_haptics", "model", "sim"]
+)
 def test_every_package_says_that_it_is_typed(package: str) -> None:
     """By the marker that type checkers look for."""
     assert (SOURCE.parents[1] / package / "py.typed").is_file()

@@ -8,7 +8,7 @@ from functools import cached_property
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
-PACKAGES = ("controller", "drivers", "era_haptics", "model", "sim")
+PACKAGES = ("by_name", "controller", "drivers", "era_haptics", "model", "sim")
 
 ERRORS = {
     *("InputError", "ConfigError", "CommandError", "CommandRefused", "LinkError", "LinkTimeout"),
@@ -91,6 +91,8 @@ class _Reader:
 
     def _is_error(self, function: ast.expr) -> bool:
         name = _name(function)
+        if name == "error":  # `raise self.error(...)`, whichever its owner was given
+            return True
         made = self._functions.get(name)
         returned = ast.unparse(made.returns) if made is not None and made.returns else name
         return returned in ERRORS

@@ -4,34 +4,34 @@ An installed package adds one by an entry point of the group `era_haptics.elemen
 an `Element` of that name; `model.fem.element_checks` says what it must keep.
 """
 
-from functools import cache
+from operator import attrgetter
 
+from by_name.catalogue import Catalogue, Instance
 from model.errors import InputError
 from model.fem.elements.element import DOF_PER_NODE, Element
 from model.fem.elements.lagrange import Q3, Q4, Q5
 from model.fem.elements.mitc4 import MITC4
-from model.plugins import Catalogue
 
 __all__ = ["DOF_PER_NODE", "ELEMENTS", "Element", "element_names", "element_of"]
 
 ELEMENTS = {element.name: element for element in (MITC4, Q3, Q4, Q5)}
 """Those that come with this package."""
 
-_CATALOGUE = Catalogue("element", Element, ELEMENTS, group="era_haptics.elements")
+_ELEMENTS: Catalogue[Element] = Catalogue(
+    "element",
+    "era_haptics.elements",
+    Instance(Element),
+    error=InputError,
+    own=ELEMENTS,
+    called=attrgetter("name"),
+)
 
 
 def element_names() -> tuple[str, ...]:
     """All that a mesh can be made of, those of installed plug-ins too; none of these is loaded."""
-    return _CATALOGUE.names()
+    return _ELEMENTS.names()
 
 
-@cache
 def element_of(name: str) -> Element:
     """The element of this name; raises InputError, with what may have been meant."""
-    element = _CATALOGUE.find(name)
-    if element.name != name:
-        raise InputError(
-            f"element {name}: the plug-in of this name gives one that is called {element.name!r}; "
-            "its entry point and its Element need the same name"
-        )
-    return element
+    return _ELEMENTS.find(name)

@@ -133,7 +133,7 @@ def test_what_is_wrong_with_the_rig_is_said_too(folder: Path) -> None:
         load_daemon_config(written(folder, "rig: rig.yaml\n"))
     assert [problem.key for problem in caught.value.problems] == ["rig"]
     (folder / "rig.yaml").write_text(text.replace("sim://", "serail:///dev/null"), "utf-8")
-    with pytest.raises(ConfigError, match=r"amplifiers\.main\.url .* Did you mean serial://"):
+    with pytest.raises(ConfigError, match=r"amplifiers\.main\.url .* did you mean serial://"):
         load_daemon_config(written(folder, "rig: rig.yaml\n"))
 
 

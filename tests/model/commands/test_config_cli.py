@@ -86,7 +86,7 @@ def test_check_names_urls_that_no_wire_knows_beside_all_else(tmp_path: Path) -> 
     url, level = json.loads(result.stdout)["errors"]
     assert (url["key"], level["key"]) == ("amplifiers.main.url", "limits.level")
     assert "seriel" in path.read_text().splitlines()[url["line"] - 1]
-    assert "Did you mean serial://?" in url["message"]
+    assert "did you mean serial://?" in url["message"]
     both = text.replace(
         'main: {url: "sim://"}',
         "main: {url: 'serial:///dev/ttyS0'}\n  two: {url: 'can+virtual://v#1'}",

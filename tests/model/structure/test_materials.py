@@ -61,7 +61,7 @@ def test_a_name_may_be_written_in_several_ways(written):
         ("aluminum", "did you mean aluminium"),
         ("polycarbonat", "did you mean polycarbonate"),
         ("strengthened glass", "did you mean chemically-strengthened-glass"),
-        ("", "known are: aluminium, steel"),
+        ("", "known are aluminium, steel"),
         ("x" * 500, "unknown material 'x{40}'; known are"),
     ],
 )

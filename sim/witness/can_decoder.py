@@ -159,6 +159,7 @@ class _Node:
         """An order, with what has come under its number."""
         token, ramp, time, what, sequence = struct.unpack_from("<HHHBB", frame.data)
         kind, count = _ACTIONS[what & 7], what >> 3
+        self.commands = {at: block for at, block in self.commands.items() if block[7] == sequence}
         if frame.is_fd:
             self.take_blocks(frame.data[8:])
         key = (self.number, sequence, kind)

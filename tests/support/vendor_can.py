@@ -129,8 +129,10 @@ class VendorAmplifier:
             self._ordered(data, now)
         elif identifier == 0x480 and len(data) == 8:
             if bits(data, 48, 3) == STOP:
+                self._take_place(0)
                 self._stop(bits(data, 16, 16), now)
             elif bits(data, 48, 3) == COMMIT:
+                self._take_place(0)
                 self.order = data
         elif identifier == 0x080:
             self._sync(now)
@@ -154,6 +156,7 @@ class VendorAmplifier:
         action, sequence = bits(order, 48, 3), bits(order, 56, 8)
         if sequence == 0:
             return
+        self._take_place(sequence)
         if action in (APPLY, STAGE, COMMIT):
             self.order = order  # until the SYNC
             return
@@ -185,6 +188,13 @@ class VendorAmplifier:
         if result == DONE:
             self._tell_condition(sequence, now)
         self._answer(sequence, action, result, now)
+
+    def _take_place(self, sequence: int) -> None:
+        """An order comes: what waits for a SYNC under another number is forgotten."""
+        self.order = None
+        self.commands = {
+            number: data for number, data in self.commands.items() if data[7] == sequence
+        }
 
     def _sync(self, now: float) -> None:
         commands, order = self.commands, self.order

@@ -1,7 +1,8 @@
 """Orders and sets that come to a node in operation, and how it answers them.
 
-An order is carried out as it comes, a set when the SYNC after it has come. Written, as all of the
-node, from protocol.yaml's description, with nothing of the host's code in it.
+An order is carried out as it comes, a set when the SYNC after it has come; whatever still waits for
+a SYNC when another order comes is forgotten. Written, as all of the node, from protocol.yaml's
+description, with nothing of the host's code in it.
 """
 
 import struct
@@ -32,6 +33,7 @@ from sim.far_ends.can_bus.objects import IDS, ObjectDictionary, channel_ids, sen
 from sim.far_ends.can_bus.sets import (
     NO_CHANNEL,
     SETS,
+    TO_ALL,
     TORN,
     Action,
     Order,
@@ -85,7 +87,7 @@ class Orders:
         order, self._waiting = self._waiting, None
         if order is not None and order.own:
             self._carry_out(order, lambda: self._set_request(order))
-        elif order is not None and order.action is Action.COMMIT and _Q.token.holds(order.token):
+        elif order is not None and _Q.token.holds(order.token):
             self._station.broadcast(Commit(order.token))
         elif order is None and self._buffer.sequence is not None:
             # Commands without their order: it was lost, and whoever sent it waits.
@@ -101,15 +103,18 @@ class Orders:
     def _order(self, data: bytes, *, own: bool, fd: bool) -> None:
         token, ramp, duration, what, sequence = struct.unpack_from("<HHHBB", data)
         order = Order(token, ramp, duration, Action(what & 7), what >> 3, sequence, own, fd)
-        if own and sequence == 0:
+        is_dropped = sequence == 0 if own else order.action not in TO_ALL
+        if is_dropped:
             return
+        self._waiting = None
+        self._buffer.clear_others(sequence)
         if fd:
             self._buffer.take_blocks(data[8:])
         if order.action in SETS:
             self._waiting = order
         elif own:
             self._carry_out(order, lambda: self._plain_request(order))
-        elif order.action is Action.STOP:
+        else:
             self._station.broadcast(Stop(_nearest_ramp(ramp)))
 
     def _carry_out(self, order: Order, make: Callable[[], Request]) -> None:

@@ -34,6 +34,9 @@ class Action(IntEnum):
 SETS = (Action.APPLY, Action.STAGE, Action.COMMIT)
 """Those that wait for a SYNC."""
 
+TO_ALL = (Action.COMMIT, Action.STOP)
+"""Those that may be said to every amplifier of the bus."""
+
 
 @dataclass(frozen=True, slots=True)
 class Order:
@@ -85,6 +88,12 @@ class SetBuffer:
         """A SYNC has come."""
         self._commands.clear()
         self._slots.clear()
+
+    def clear_others(self, sequence: int) -> None:
+        """An order has come: what is under another number than its own belongs to none any more."""
+        own = {channel: one for channel, one in self._commands.items() if one.sequence == sequence}
+        self._commands = own
+        self._slots = {channel: one for channel, one in self._slots.items() if one[1] == sequence}
 
     def take(self, channel: int, block: bytes) -> None:
         """A command; its channel is named twice, by the frame's identifier and in the flags."""

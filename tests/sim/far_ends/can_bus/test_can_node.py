@@ -124,6 +124,32 @@ def test_a_torn_set_is_not_played_and_is_told(bench: Bench, send: Callable[[Benc
 
 
 @pytest.mark.parametrize(
+    "next_order", [(ORDER, apply(0, 0, 3, action=0)), (0x480, apply(8, 0, 0, action=3))]
+)
+@pytest.mark.parametrize("has_order", [False, True])
+def test_what_has_lost_its_sync_is_never_played_nor_told(
+    bench: Bench, next_order: tuple[int, str], has_order: bool
+) -> None:
+    """A set, with its order or without, then another order before a SYNC: none of it is left."""
+    bench.tell(0x201, command(0, 2))
+    if has_order:
+        bench.tell(ORDER, apply(9, 1, 2))
+    bench.tell(*next_order)
+    assert bench.tell(SYNC.id, "") == []
+    assert not any(bench.levels)
+
+
+def test_what_has_lost_its_sync_makes_no_later_set_whole(bench: Bench) -> None:
+    """The numbers have begun again, and a command of two is lost: not the old one in its place."""
+    bench.tell(0x201, command(0, 2))
+    bench.tell(ORDER, apply(0, 0, 3, action=0))
+    bench.tell(0x301, command(1, 2))
+    bench.tell(ORDER, apply(9, 2, 2))
+    assert bench.result() == TORN
+    assert not any(bench.levels)
+
+
+@pytest.mark.parametrize(
     ("frame", "order", "result", "channel"),
     [
         (command(0, 2, level=10001), apply(9, 1, 2), BAD_VALUE, 0),

@@ -264,8 +264,13 @@ def show_status(told: "StatusResult") -> str:
     lines = [f"{told.state}: {told.cause}"]
     if told.remedy:
         lines.append(f"  what to do: {told.remedy}")
-    if told.assume_energised:
-        lines.append("  ASSUME ENERGISED: an amplifier that was lost may still be playing")
+    if told.lost_for_s is not None:
+        watchdog = f"its watchdog silences it after {told.watchdog_s:g} s without commands"
+        lines.append(
+            f"  ASSUME ENERGISED: an amplifier that was lost may still be playing; {watchdog}"
+            if told.assume_energised
+            else f"  out of reach for {told.lost_for_s:.1f} s: {watchdog}, which nothing confirms"
+        )
     if told.armed_by is not None and told.lease_left_s is not None:
         lines.append(f"  armed by {told.armed_by}, {told.lease_left_s:.1f} s left")
     for contact in told.contacts:
@@ -287,15 +292,17 @@ def show_status(told: "StatusResult") -> str:
             f"  ERA {era}: {tone.frequency_hz:g} Hz, level {tone.level:.3f}, {tone.phase_deg:g} deg"
         )
     for amplifier in told.amplifiers:
-        parts = [amplifier.state or "never heard"]
+        parts = [amplifier.state] if amplifier.state else []
+        if amplifier.lost:
+            parts.append("LOST")
         if amplifier.fault not in (None, "NONE"):
             parts.append(f"fault {amplifier.fault}")
         if amplifier.temperature_c is not None:
             parts.append(f"{amplifier.temperature_c:.1f} degC")
         if amplifier.reply_age_s is not None:
             parts.append(f"heard {amplifier.reply_age_s:.2f} s ago")
-        if amplifier.lost:
-            parts.append("LOST")
+        else:
+            parts.append("never heard")
         lines.append(f"  amplifier {amplifier.name} ({amplifier.url}): {', '.join(parts)}")
     latency = told.latency_ms
     if latency.median is not None:

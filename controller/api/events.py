@@ -60,6 +60,9 @@ class LatencyEvent(Message):
     """Latencies, at the rate that was subscribed to."""
 
     latency_ms: LatencySummary
+    plain_because: str | None = Field(
+        description="why touches begin along plain ramps though shaped onsets are possible"
+    )
 
 
 class LogEvent(Message):
@@ -100,7 +103,10 @@ TOPICS: dict[Topic, TopicData] = {
     "silence": TopicData(SilenceEvent, "nothing is played now, and why"),
     "amplifiers": TopicData(AmplifiersEvent, "how the amplifiers are, at rate_hz"),
     "latency": TopicData(LatencyEvent, "how fast touches become commands, at rate_hz"),
-    "log": TopicData(LogEvent, "what the daemon writes to its log, from info upwards"),
+    "log": TopicData(
+        LogEvent,
+        "what the daemon logs, from info upwards, but for what `state` and `link` tell",
+    ),
     "link": TopicData(LinkEvent, "links to amplifiers that are lost or come back"),
     "layout": TopicData(LayoutEvent, "touches mean something else from now on, and what"),
 }

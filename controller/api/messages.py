@@ -61,6 +61,10 @@ class StatusResult(Message):
     assume_energised: bool = Field(
         description="whether amplifiers that were lost may still be playing"
     )
+    lost_for_s: float | None = Field(description="how long a link has been lost; null if none is")
+    watchdog_s: float = Field(
+        description="an armed amplifier that hears nothing falls silent by itself after this time"
+    )
     armed_by: str | None
     lease_left_s: float | None
     contacts: list[ContactStatus] = Field(description="in order of arrival, the newest last")

@@ -131,19 +131,21 @@ class LinkCounts(Message):
 
 
 class AmplifierStatus(Message):
-    """One amplifier, as its last answer tells; what it was never asked is null."""
+    """One amplifier, as its last answer tells; what nobody knows of it is null."""
 
     name: str
     url: str
     serial_number: str | None
     state: str | None = Field(description="its own, by the names of CiA 402")
     fault: str | None
-    levels: list[float] = Field(description="0 to 1 of the full stroke, by channel, as it reports")
+    levels: list[float] = Field(
+        description="0 to 1 of the full stroke, by channel, as it reports; empty if lost"
+    )
     temperature_c: float | None
     high_voltage: bool | None
     high_voltage_v: float | None
     reply_age_s: float | None = Field(description="since its last answer")
-    lost: bool
+    lost: bool = Field(description="whether it cannot be reached: nobody knows how it is")
     statistics: LinkCounts
 
 

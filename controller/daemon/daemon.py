@@ -70,11 +70,10 @@ class Daemon:
             name: Amplifier(backend, serial_number=config.section.serial_numbers.get(name))
             for name, backend in backends.items()
         }
-        self._amplifiers = amplifiers
         self._supervisor = Supervisor(
             amplifiers,
             state_changed=self._state_changed,
-            link_told=self._link_told,
+            link_told=lambda *told: self._news.link_told(*told),
             alive=lambda: manager.alive(clock.now()),
         )
         self._meaning = Meaning(config.meaning)
@@ -83,6 +82,7 @@ class Daemon:
             amplifiers=lambda: amplifier_statuses(amplifiers, backends, config.urls),
             effect_of=self._meaning.effect_of,
             layout=config.layout,
+            plain_because=lambda: self._controller.plain_because,
         )
         self._controller = Controller(
             config.rig,
@@ -251,10 +251,6 @@ class Daemon:
         self._manager.status(f"{new.state.value}: {new.cause}")
         if new.state in (State.FAULT_REACTION_ACTIVE, State.COMM_LOST):
             self._dump(new.cause)
-
-    def _link_told(self, event: str, message: str) -> None:
-        lost = [name for name, amplifier in self._amplifiers.items() if amplifier.lost]
-        self._news.link_told(event, message, lost=lost)
 
     def _dump(self, cause: str) -> None:
         folder, dumps = self._config.dump_folder, self._config.section.dumps

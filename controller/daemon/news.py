@@ -24,8 +24,6 @@ from controller.effects.layout import Layout
 from controller.observer import Applied, Observer, Silenced
 from drivers import clock
 
-_LINK_LEVELS = {"lost": logging.ERROR, "retry": logging.WARNING, "reopened": logging.INFO}
-
 _logger = logging.getLogger(__name__)
 
 
@@ -33,7 +31,7 @@ class News:
     """Keeps what is so now, and tells every change of it to whoever has subscribed at `hub`.
 
     machine: the daemon's state; amplifiers: how they are; effect_of: what plays for a finger;
-    layout: the surface layout, None without one.
+    plain_because: why onsets are plain; layout: the surface layout, None without one.
     """
 
     def __init__(
@@ -42,6 +40,7 @@ class News:
         machine: Callable[[], Machine],
         amplifiers: Callable[[], list[AmplifierStatus]],
         effect_of: Callable[[ContactKey], str | None],
+        plain_because: Callable[[], str | None],
         layout: Layout | None,
     ) -> None:
         self.scene = Scene(effect_of)
@@ -49,6 +48,7 @@ class News:
         self.amplifiers = amplifiers
         self._machine = machine
         self._layout = layout
+        self._retried = ""  # what came of the last attempt to reopen a link
         self._loop = asyncio.get_running_loop()
         self.hub = Hub(
             {
@@ -57,7 +57,9 @@ class News:
                 "pattern": self.scene.pattern_event,
                 "silence": self.scene.silence_event,
                 "amplifiers": lambda: AmplifiersEvent(amplifiers=amplifiers()),
-                "latency": lambda: LatencyEvent(latency_ms=self.latencies.summary()),
+                "latency": lambda: LatencyEvent(
+                    latency_ms=self.latencies.summary(), plain_because=plain_because()
+                ),
                 "layout": self.layout_event,
             },
             clock=clock.now,
@@ -93,22 +95,28 @@ class News:
         self._layout = layout
         self.hub.publish("layout", self.layout_event)
 
-    def link_told(self, event: str, message: str, *, lost: Sequence[str]) -> None:
+    def link_told(self, event: str, lost: Sequence[str], message: str) -> None:
         """A link was lost (lost: to which amplifiers), is tried again (retry), or is reopened."""
-        _logger.log(_LINK_LEVELS[event], "link %s: %s", event, message)
+        if event == "retry" and message != self._retried:  # the state tells of loss and return
+            _logger.warning("the link is tried again: %s", message, extra={"topic": "link"})
+        self._retried = message
         if event != "retry":  # fingers are not followed without a link, and begin anew with one
             self._contacts_changed((), Change())
         told = {
             "event": event,
-            # When it is tried again all have been closed.
-            "amplifier": lost[0] if event == "lost" and len(lost) == 1 else None,
+            "amplifier": lost[0] if len(lost) == 1 else None,
             "message": message,
             "remedy": None if event == "reopened" else "look at cables and supply",
         }
         self.hub.publish("link", lambda: LinkEvent.model_validate(told))
 
     def logged(self, record: logging.LogRecord) -> None:
-        """There is a line in the log; called in any thread."""
+        """There is a line in the log; called in any thread.
+
+        A line that is marked with another topic is told there.
+        """
+        if hasattr(record, "topic"):
+            return
         told = {
             "level": "error" if record.levelno >= logging.ERROR else record.levelname.lower(),
             # A file's name may hold bytes that are no text, and JSON has none of these.

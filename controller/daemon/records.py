@@ -38,10 +38,14 @@ class Recorder:
 
 
 class RecordedBackend(Backend):
-    """A backend whose messages are kept; `status` is the last one that was read, with its time."""
+    """A backend whose messages are kept.
+
+    status: the last that was read since it was opened; heard_at [s]: when the last one was read.
+    """
 
     def __init__(self, inner: Backend, name: str, recorder: Recorder) -> None:
-        self.status: tuple[Status, float] | None = None
+        self.status: Status | None = None
+        self.heard_at: float | None = None
         self._inner = inner
         self._name = name
         self._recorder = recorder
@@ -49,6 +53,7 @@ class RecordedBackend(Backend):
     async def open(self) -> None:
         """As the inner one."""
         self._recorder.note(self._name, "open", "")
+        self.status = None  # how it was before says nothing of how it is
         await self._inner.open()
 
     async def close(self) -> None:
@@ -66,7 +71,7 @@ class RecordedBackend(Backend):
             raise
         self._recorder.note(self._name, "in", reply)
         if isinstance(reply, Status):
-            self.status = (reply, clock.now())
+            self.status, self.heard_at = reply, clock.now()
         return reply
 
     @property

@@ -7,6 +7,7 @@ from typing import Any
 from controller.loop import Controller
 from drivers import clock
 from drivers.errors import DriverError
+from drivers.link.link import ASSUME_ENERGISED
 from drivers.operation.supervision import pauses
 from model.errors import InputError
 
@@ -33,7 +34,7 @@ async def reopen(
             await _attended(controller.open(), alive)
             await controller.disarm()  # one was lost for less than its watchdog, perhaps
         except (DriverError, InputError) as error:
-            told("retry", str(error))
+            told("retry", str(error).removesuffix(ASSUME_ENERGISED))
             await controller.close()
         else:
             told("reopened", "every amplifier answers again, and is disarmed")

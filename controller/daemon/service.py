@@ -34,7 +34,7 @@ from controller.daemon.states import Event, Kind, Machine, State
 from controller.daemon.supervisor import Supervisor
 from controller.loop import Controller
 from drivers import clock
-from drivers.amplifier import Amplifier
+from drivers.amplifier import WATCHDOG, Amplifier
 from model.table.table import LocalizationTable
 
 _ARMABLE = (State.SWITCHED_ON, State.OPERATION_ENABLED)
@@ -130,6 +130,8 @@ class Service:
             remedy=machine.remedy,
             phase=_phase(self._controller),
             assume_energised=machine.assume_energised(now),
+            lost_for_s=machine.lost_for(now),
+            watchdog_s=WATCHDOG,
             armed_by=held.owner if held else None,
             lease_left_s=held.ends - now if held else None,
             contacts=scene.contact_statuses(),

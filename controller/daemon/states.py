@@ -94,6 +94,10 @@ class Machine:
     lost_at: float = 0.0
     reopened: bool = False
 
+    def lost_for(self, now: float) -> float | None:
+        """How long [s] a link has been lost at a time [s]; None where none is."""
+        return now - self.lost_at if self.state is State.COMM_LOST else None
+
     def assume_energised(self, now: float) -> bool:
         """Whether amplifiers that cannot be reached may still be playing at a time [s]."""
         return self.state is State.COMM_LOST and assume_energised(
@@ -219,7 +223,7 @@ def _entered(before: Machine, after: Machine, to: State, event: Event) -> Machin
     latched = to in _LATCHING or (to is State.COMM_LOST and after.latched)
     # Back on a link, what it was lost for is still the reason, but no longer how it is.
     cause, remedy = event.cause or before.cause, event.remedy
-    if before.state is State.COMM_LOST and to is State.FAULT:
+    if before.state is State.COMM_LOST and to in (State.FAULT, State.SWITCH_ON_DISABLED):
         cause = f"all amplifiers answer again, and are disarmed; before that: {cause}"
-        remedy = ACKNOWLEDGE
+        remedy = ACKNOWLEDGE if to is State.FAULT else None
     return replace(after, state=to, cause=cause, remedy=remedy, latched=latched, acknowledged=False)

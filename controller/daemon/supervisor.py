@@ -3,7 +3,7 @@
 import asyncio
 import contextlib
 import logging
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -15,6 +15,7 @@ from controller.observer import Observer
 from drivers import clock
 from drivers.amplifier import Amplifier
 from drivers.errors import CommandRefused, DriverError, LinkError
+from drivers.link.link import ASSUME_ENERGISED
 from drivers.link.turns import GaveWay
 from drivers.protocol.messages import Event as AmplifierEvent
 from drivers.protocol.messages import Fault, Status
@@ -23,6 +24,8 @@ from drivers.protocol.messages import State as AmplifierState
 LOOK_EVERY = 0.5  # s; how often a disarmed amplifier is asked how it is
 _READ_BACKS = 15
 _READ_BACK_PAUSE = 0.02  # s
+
+_LOG_LEVELS = {State.COMM_LOST: logging.ERROR, State.FAULT_REACTION_ACTIVE: logging.ERROR}
 
 _SETTLED = (AmplifierState.SWITCH_ON_DISABLED, AmplifierState.READY_TO_SWITCH_ON)
 
@@ -34,9 +37,10 @@ class Supervisor:
     """Keeps a controller's amplifiers open, armed only as the state table allows, and silent else.
 
     controller: made with `observe(observer)` of this; amplifiers: the same as the controller's.
-    state_changed is told of every change, old and new; link_told, with a message, that the link is
-    lost, of each attempt to come back (retry), and that it is reopened; alive is called whenever
-    the control loop, or what stands in for it while there is no link, has run.
+    state_changed is told of every change, old and new; link_told, with amplifiers and a message,
+    that the link to them is lost, and, without amplifiers, of each attempt to come back (retry) and
+    that it is reopened; alive is called whenever the control loop, or what stands in for it while
+    there is no link, has run.
     """
 
     def __init__(
@@ -44,7 +48,7 @@ class Supervisor:
         amplifiers: Mapping[str, Amplifier],
         *,
         state_changed: Callable[[Machine, Machine], None],
-        link_told: Callable[[str, str], None],
+        link_told: Callable[[str, Sequence[str], str], None],
         alive: Callable[[], None],
     ) -> None:
         self.machine = Machine()
@@ -134,11 +138,12 @@ class Supervisor:
         self.machine, actions = step(before, event, clock.now())
         after = self.machine
         if after.state is not before.state:
-            _logger.info(
+            _logger.log(
+                _LOG_LEVELS.get(after.state, logging.INFO),
                 "%s -> %s",
                 before.state,
                 after.state,
-                extra={"cause": after.cause, "remedy": after.remedy},
+                extra={"topic": "state", "cause": after.cause, "remedy": after.remedy},
             )
             self._state_changed(before, after)
         return actions
@@ -252,10 +257,12 @@ class Supervisor:
             await asyncio.sleep(_READ_BACK_PAUSE)
 
     async def _lost(self, error: LinkError) -> None:
+        lost = [name for name, amplifier in self._amplifiers.items() if amplifier.lost]
         if self.machine.state is not State.COMM_LOST:  # told already
-            self._link_told("lost", str(error))
+            self._link_told("lost", lost, _what(error))
+        cause = f"amplifier {', '.join(lost)}: {_what(error)}" if lost else _what(error)
         remedy = "look at cables and supply; the daemon tries again by itself, and stays disarmed"
-        await self.handle(Event(Kind.LINK_LOST, str(error), remedy))
+        await self.handle(Event(Kind.LINK_LOST, cause, remedy))
 
     async def _come_back(self) -> None:
         """Do the next thing towards leaving COMM_LOST."""
@@ -266,7 +273,7 @@ class Supervisor:
         elif await reopen(
             self._the_controller,
             is_wanted=lambda: self.machine.state is State.COMM_LOST,
-            told=self._link_told,
+            told=lambda event, message: self._link_told(event, (), message),
             alive=self._alive,
         ):
             await self._quietly(self.handle(Event(Kind.REOPENED)))
@@ -314,6 +321,11 @@ class Supervisor:
 
 
 _quiet_logger = logging.getLogger(f"{__name__}.beside")
+
+
+def _what(error: LinkError) -> str:
+    """What is wrong with a link; what to assume of the amplifier the state tells."""
+    return str(error).removesuffix(ASSUME_ENERGISED)
 
 
 def _problem(statuses: Mapping[str, Status]) -> str | None:

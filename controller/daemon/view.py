@@ -125,7 +125,10 @@ def amplifier_statuses(
     backends: Mapping[str, RecordedBackend],
     urls: Mapping[str, str],
 ) -> list[AmplifierStatus]:
-    """Every amplifier, as its last answer tells; nothing is asked for it."""
+    """Every amplifier, as its last answer tells; nothing is asked for it.
+
+    How one is that cannot be reached, nobody knows: its last answer is left out.
+    """
     return [
         _amplifier_status(name, amplifier, backends[name], urls[name])
         for name, amplifier in amplifiers.items()
@@ -135,7 +138,8 @@ def amplifier_statuses(
 def _amplifier_status(
     name: str, amplifier: Amplifier, backend: RecordedBackend, url: str
 ) -> AmplifierStatus:
-    status, heard = backend.status or (None, None)
+    status = None if amplifier.lost else backend.status  # None as well while it is being reopened
+    heard = backend.heard_at
     seen = amplifier.statistics
     round_trip = seen.last_round_trip
     return AmplifierStatus(
@@ -149,7 +153,7 @@ def _amplifier_status(
         high_voltage=status.high_voltage if status else None,
         high_voltage_v=_finite(status.voltage) if status else None,
         reply_age_s=None if heard is None else max(0.0, clock.now() - heard),
-        lost=amplifier.lost,
+        lost=status is None,
         statistics=LinkCounts(
             frames_out=seen.frames_out,
             frames_in=seen.frames_in,

@@ -31,6 +31,12 @@ from drivers.statistics import LinkStatistics
 REPLY_TIMEOUT = 0.030  # s; a heartbeat and three of these are less than three heartbeats of 50 ms
 RETRIES = 2
 BUSY_PAUSE = 0.005  # s; before a busy amplifier is asked again: short enough for a touch to be felt
+ASSUME_ENERGISED = (
+    ". Assume that the amplifier is energised until its watchdog has passed; once it is opened again "
+    "it is disarmed"
+)
+"""What the text of every loss ends with."""
+
 
 _ReplyT = TypeVar("_ReplyT", Identity, Capabilities, Status, Achieved, FaultList, Loaded)
 
@@ -201,10 +207,7 @@ class Link:
             self._lose(what)
 
     def _lose(self, what: str) -> str:
-        self._loss = (
-            f"{what}. Assume that the amplifier is energised until its watchdog has passed; once "
-            "it is opened again it is disarmed"
-        )
+        self._loss = f"{what}{ASSUME_ENERGISED}"
         return self._loss
 
     def _raise_if_lost(self) -> None:

@@ -1,6 +1,7 @@
 """A whole daemon within the test's event loop, over a pseudo-terminal to a far end beside it."""
 
 import asyncio
+import logging
 import time
 from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import asynccontextmanager
@@ -11,7 +12,7 @@ from pathlib import Path
 from controller.api.async_client import AsyncClient
 from controller.daemon.config import load_daemon_config
 from controller.daemon.daemon import Daemon
-from controller.daemon.log import LogThread
+from controller.daemon.log import LogHandler, LogThread
 from controller.daemon.notify import ServiceManager
 from controller.daemon.place import Place
 from model.rig.file import load_rig
@@ -89,8 +90,10 @@ async def daemon_at(far: FarSide, folder: Path, more: str = "") -> AsyncIterator
     config = load_daemon_config(write_daemon(folder, {"main": far.url}, more))
     place = Place(config.socket)
     log = LogThread(folder / "log")
+    handler = LogHandler(log)
     daemon = Daemon(config, daemon_table(), log=log, manager=ServiceManager({}), dashboard=None)
     task = asyncio.create_task(daemon.run(place))
+    logging.getLogger().addHandler(handler)
     try:
         await until(lambda: config.socket.is_socket() or task.done())
         if task.done():
@@ -101,6 +104,7 @@ async def daemon_at(far: FarSide, folder: Path, more: str = "") -> AsyncIterator
         try:
             await asyncio.wait_for(task, PATIENCE)
         finally:
+            logging.getLogger().removeHandler(handler)
             log.close()
             place.leave()
 

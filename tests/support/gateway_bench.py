@@ -183,6 +183,8 @@ def _status() -> StatusResult:
         remedy=None,
         phase="disarmed",
         assume_energised=False,
+        lost_for_s=None,
+        watchdog_s=0.25,
         armed_by=None,
         lease_left_s=None,
         contacts=[],

@@ -1,6 +1,7 @@
 """What the daemon's commands tell their users, beyond what the daemon itself says."""
 
 import asyncio
+import re
 import socket
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from controller.daemon_cli import show_status, touch
 from controller.metrics.__main__ import serve
 from daemon_bench import running_daemon, until_state, write_daemon
 from model.errors import InputError
+from sim.faults.episodes import Episode
 
 
 async def test_a_touch_beyond_the_plate_is_refused(tmp_path: Path) -> None:
@@ -53,6 +55,30 @@ async def test_a_status_says_why_touches_begin_along_plain_ramps(tmp_path: Path)
     assert "plain ramps" not in show_status(status)
     slow = status.model_copy(update={"plain_because": "it took 50 ms"})
     assert "  plain ramps: it took 50 ms\n" in show_status(slow)
+
+
+async def test_a_status_says_what_is_known_of_a_lost_amplifier(tmp_path: Path) -> None:
+    """How long it is lost, its watchdog time and its last answer's age, but not how it was then."""
+    async with running_daemon(tmp_path) as bench, await bench.client() as era:
+        await until_state(era, "READY_TO_SWITCH_ON")
+        before = show_status(await era.status())
+        bench.far.station.befall(Episode("hang"))
+        await until_state(era, "COMM_LOST")
+        lost = await era.status()
+    assert "READY_TO_SWITCH_ON" in before
+    assert "out of reach" not in before
+    (line,) = [line for line in show_status(lost).splitlines() if "serial://" in line]
+    assert re.search(r"\): LOST, heard [\d.]+ s ago$", line)
+    watchdog = "its watchdog silences it after 0.25 s without commands"
+    for is_energised, told in (
+        (
+            True,
+            f"  ASSUME ENERGISED: an amplifier that was lost may still be playing; {watchdog}\n",
+        ),
+        (False, f"  out of reach for 12.0 s: {watchdog}, which nothing confirms\n"),
+    ):
+        update = {"lost_for_s": 12.0, "assume_energised": is_energised}
+        assert told in show_status(lost.model_copy(update=update))
 
 
 def test_a_log_that_cannot_be_written_keeps_the_daemon_from_beginning(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 import json
+import logging
 import os
 import signal
 import socket
@@ -64,11 +65,11 @@ async def refusal(work: object) -> ErrorCode:
     return caught.value.code
 
 
-async def told_of(client: AsyncClient, topic: str) -> Notification:
-    """The next notification of a topic."""
+async def told_of(client: AsyncClient, *topics: str) -> Notification:
+    """The next notification of one of these topics."""
     async with asyncio.timeout(20):
         async for told in client.events():
-            if told.topic == topic:
+            if told.topic in topics:
                 return told
     raise AssertionError("the connection ended")
 
@@ -244,6 +245,65 @@ async def test_a_cut_link_is_told_and_comes_back_disarmed(tmp_path: Path) -> Non
         await era.clear()
         await until_state(era, READY)
         await era.arm("me")
+
+
+async def test_a_cut_link_is_one_line_of_the_log(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """With amplifier, cause and remedy; an attempt to come back is another only if it tells more.
+
+    Clients hear of all that by the topics `state` and `link`: `log` does not say it again.
+    """
+    async with running_daemon(tmp_path) as bench, await bench.client() as era:
+        await until_state(era, READY)
+        await era.arm("me", lease_s=30)
+        await era.subscribe("link", "log")
+        with caplog.at_level(logging.INFO, "controller"):
+            bench.far.station.befall(Episode("hang"))
+            told = [await told_of(era, "link", "log") for _ in range(3)]
+            lost, *retried = caplog.records
+            logging.getLogger("controller").info("something else")
+            told.append(await told_of(era, "log"))
+    assert [each.data.get("event", each.topic) for each in told] == [
+        "lost",
+        "retry",
+        "retry",
+        "log",
+    ]
+    assert told[-1].data["message"] == "something else"
+    assert (lost.levelname, lost.getMessage()) == ("ERROR", f"{ENABLED} -> COMM_LOST")
+    assert vars(lost)["cause"].startswith("amplifier main: no answer from ")
+    assert vars(lost)["cause"].endswith("requests in a row were left unanswered)")
+    assert "look at cables" in vars(lost)["remedy"]
+    (retry,) = [record.getMessage() for record in retried]
+    assert retry == f"the link is tried again: {told[1].data['message']}"
+
+
+async def test_how_a_lost_amplifier_was_is_not_told_as_how_it_is(tmp_path: Path) -> None:
+    """Neither while it is lost nor while it is being reopened: only when it was heard last."""
+    async with running_daemon(tmp_path) as bench, await bench.client() as era:
+        await until_state(era, READY)
+        (known,) = (await era.status()).amplifiers
+        assert (known.lost, known.levels, known.high_voltage) == (False, [0.0] * 4, False)
+        bench.far.station.befall(Episode("hang"))
+        await until_state(era, "COMM_LOST")
+        begun = lost_for = (await era.status()).lost_for_s or 0.0
+        while lost_for < begun + 1.0:  # two attempts to reopen it
+            status = await era.status()
+            (lost,) = status.amplifiers
+            assert lost.lost
+            unknown = (lost.state, lost.fault, lost.temperature_c, lost.high_voltage)
+            assert (unknown, lost.levels) == ((None,) * 4, [])
+            assert lost.reply_age_s is not None
+            assert status.lost_for_s is not None
+            assert lost.reply_age_s >= status.lost_for_s
+            lost_for = status.lost_for_s
+            await asyncio.sleep(0.01)
+        bench.far.station.recover()
+        await until_state(era, READY)
+        status = await era.status()
+        assert status.lost_for_s is None
+        assert [each.lost for each in status.amplifiers] == [False]
 
 
 async def test_a_pattern_that_a_cut_link_ends_is_told_to_be_over(tmp_path: Path) -> None:

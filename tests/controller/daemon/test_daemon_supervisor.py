@@ -79,7 +79,7 @@ async def watched() -> AsyncIterator[Watched]:
     supervisor = Supervisor(
         amplifiers,
         state_changed=changed,
-        link_told=lambda event, message: made.links.append(event),
+        link_told=lambda event, lost, message: made.links.append(event),
         alive=lambda: made.alive.append(loop.time()),
     )
     controller = Controller(

@@ -9,7 +9,6 @@ square, that of least distance problems), so 1 / min_n v . q_n bounds the contra
 import math
 
 import numpy as np
-from scipy.optimize import linprog, nnls
 
 from model.arrays import FloatArray
 
@@ -31,6 +30,8 @@ def mixture_bound(relative: FloatArray, *, is_rms: bool) -> tuple[FloatArray, fl
 
 def _rms_weights(relative: FloatArray) -> FloatArray:
     """Non-negative least squares, with sum x = 1 as a heavy row."""
+    from scipy.optimize import nnls  # a fifth of a second, which no daemon needs to wait for
+
     n, points = relative.shape
     heavy = np.abs(relative).max() * n
     system = np.vstack([relative.T, np.full((1, n), heavy)])
@@ -41,6 +42,8 @@ def _rms_weights(relative: FloatArray) -> FloatArray:
 
 def _loudest_weights(relative: FloatArray) -> FloatArray:
     """A linear program over the loudest points; others come in where the mixture is louder."""
+    from scipy.optimize import linprog  # as above
+
     n, points = relative.shape
     some = np.argsort(-relative.mean(axis=0))[:FIRST_POINTS]
     while True:

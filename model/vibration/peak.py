@@ -7,7 +7,6 @@ ERAs at the same frequency add as complex numbers; only magnitudes of different 
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from scipy.ndimage import minimum_filter
 
 from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
@@ -65,6 +64,8 @@ def find_nulls(x: FloatArray, y: FloatArray, peak: FloatArray) -> FloatArray:
 
     A curve of nulls shows as the lowest points along it.
     """
+    from scipy.ndimage import minimum_filter  # only maps need it, and it takes long to load
+
     low = peak <= NULL_SHARE * peak.max()
     rows, columns = np.nonzero(low & (peak == minimum_filter(peak, size=3, mode="nearest")))
     return np.column_stack([x[columns], y[rows]])

@@ -3,6 +3,8 @@
 import asyncio
 import re
 import socket
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -103,3 +105,13 @@ def test_a_port_for_metrics_that_is_taken(capsys: pytest.CaptureFixture[str]) ->
     said = capsys.readouterr().err
     assert f"127.0.0.1 port {port} (Address already in use)" in said
     assert "name another port with metrics:" in said
+
+
+def test_a_daemon_loads_nothing_that_only_others_compute_with() -> None:
+    """Not for the exact search, the nulls of maps or pictures: no start waits for these."""
+    program = "import sys, controller.daemon.run; print(*sys.modules)"
+    said = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True
+    ).stdout.split()
+    assert "scipy.linalg" in said
+    assert set(said) & {"scipy.optimize", "scipy.ndimage", "matplotlib", "starlette"} == set()

@@ -67,10 +67,7 @@ def versions() -> dict[str, Any]:
         except PackageNotFoundError:
             needed[name] = "not installed"
     plug_ins = {
-        group.removeprefix(_GROUPS): {
-            point.name: f"{point.value} ({_package(point.dist)})"
-            for point in sorted(entry_points(group=group))
-        }
+        group.removeprefix(_GROUPS): _claimed(group)
         for group in sorted(entry_points().groups)
         if group.startswith(_GROUPS)
     }
@@ -83,6 +80,14 @@ def versions() -> dict[str, Any]:
         "packages": dict(sorted(needed.items())),
         "plug-ins": plug_ins,
     }
+
+
+def _claimed(group: str) -> dict[str, str]:
+    """Every name of a group, with all that claim it."""
+    claims: dict[str, list[str]] = {}
+    for point in sorted(entry_points(group=group)):
+        claims.setdefault(point.name, []).append(f"{point.value} ({_package(point.dist)})")
+    return {name: ", ".join(claimants) for name, claimants in claims.items()}
 
 
 def _package(dist: Any) -> str:

@@ -68,15 +68,19 @@ def test_everything_that_a_daemon_names(tmp_path: Path) -> None:
 
 
 def test_plug_ins_of_every_kind_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A package that adds a material is named with it, as one of any other kind is."""
-    package = tmp_path / "cork-1.5.dist-info"
-    package.mkdir()
-    (package / "METADATA").write_text("Metadata-Version: 2.1\nName: cork\nVersion: 1.5\n", "utf-8")
-    (package / "entry_points.txt").write_text(
-        "[era_haptics.materials]\ncork = cork:CORK\n", "utf-8"
-    )
+    """Packages that add a material are named with it, as of any other kind, all that claim it."""
+    for name, version in (("cork", "1.5"), ("oak", "2.0")):
+        package = tmp_path / f"{name}-{version}.dist-info"
+        package.mkdir()
+        (package / "METADATA").write_text(
+            f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n", "utf-8"
+        )
+        (package / "entry_points.txt").write_text(
+            f"[era_haptics.materials]\ncork = {name}:CORK\n", "utf-8"
+        )
     monkeypatch.syspath_prepend(tmp_path)
-    assert versions()["plug-ins"]["materials"] == {"cork": "cork:CORK (cork 1.5)"}
+    told = versions()["plug-ins"]["materials"]
+    assert told == {"cork": "cork:CORK (cork 1.5), oak:CORK (oak 2.0)"}
 
 
 def test_files_that_cannot_be_read_as_they_should(tmp_path: Path) -> None:

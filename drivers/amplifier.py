@@ -7,6 +7,7 @@ from drivers.backend import Backend
 from drivers.errors import CommandError, FrameError, LinkError
 from drivers.guard import SafeCommand, SafeEnvelope
 from drivers.link.link import REPLY_TIMEOUT, Link
+from drivers.link.refusals import NO_PROTOCOL
 from drivers.link.turns import Kind
 from drivers.protocol.definition import PROTOCOL, token_after
 from drivers.protocol.messages import (
@@ -69,14 +70,14 @@ class Amplifier:
     def identity(self) -> Identity:
         """Who it is; known once it is open."""
         if self._identity is None:
-            raise CommandError("the amplifier is not open yet: nobody knows who it is")
+            raise CommandError("nobody knows yet who the amplifier is; call open() first")
         return self._identity
 
     @property
     def capabilities(self) -> Capabilities:
         """What it can play; known once it is open."""
         if self._capabilities is None:
-            raise CommandError("the amplifier is not open yet: nobody knows what it can play")
+            raise CommandError("nobody knows yet what the amplifier can play; call open() first")
         return self._capabilities
 
     @property
@@ -191,7 +192,7 @@ class Amplifier:
         if (loaded.slot, loaded.knots) != (safe.slot, len(safe.knots)):
             raise FrameError(
                 f"the amplifier loaded {loaded.knots} knots into slot {loaded.slot} instead of "
-                f"{len(safe.knots)} into slot {safe.slot}"
+                f"{len(safe.knots)} into slot {safe.slot}; {NO_PROTOCOL}"
             )
 
     async def stage(self, safe: SafeCommand) -> Achieved:
@@ -285,5 +286,7 @@ def _safe(safe: SafeCommand) -> SafeCommand:
 
 def _of_token(achieved: Achieved, token: int) -> Achieved:
     if achieved.token != token:
-        raise FrameError(f"the amplifier answered for token {achieved.token} instead of {token}")
+        raise FrameError(
+            f"the amplifier answered for token {achieved.token} instead of {token}; {NO_PROTOCOL}"
+        )
     return achieved

@@ -91,7 +91,10 @@ class Backend(ABC):
 
         Raises LinkError, and CommandError where there is no bus.
         """
-        raise CommandError(f"this wire cannot broadcast a {type(request).__name__}")
+        raise CommandError(
+            f"this wire knows no broadcast, so none of a {type(request).__name__}; tell each "
+            "amplifier by itself"
+        )
 
     def round_trip(self, channels: int) -> float:
         """Time [s] on the wire of an apply of so many channels and its answer; 0 if unknown."""

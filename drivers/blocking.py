@@ -135,7 +135,7 @@ class BlockingAmplifier:
             if status.state is not State.OPERATION_ENABLED:
                 raise CommandRefused(
                     f"the amplifier stopped by itself: it is in {status.state.name}, fault "
-                    f"{status.fault.name}"
+                    f"{status.fault.name}; once the cause is gone, clear() it and arm() again"
                 )
         return achieved
 

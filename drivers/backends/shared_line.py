@@ -3,13 +3,16 @@
 import asyncio
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Hashable
-from typing import ClassVar, TypeVar
+from typing import Any, ClassVar, Generic, TypeVar
 from weakref import WeakKeyDictionary
 
+from drivers.backends.stand_in import Adapter, Port
 from drivers.errors import LinkError
 
+_OpenT = TypeVar("_OpenT", bound=Port | Adapter)
 
-class SharedLine(ABC):
+
+class SharedLine(ABC, Generic[_OpenT]):
     """A serial line, a Modbus line or a CAN bus; whoever is on it is known by a number.
 
     Who comes while it is opened or closed waits for that. A loss is one for all who are on it until
@@ -24,7 +27,7 @@ class SharedLine(ABC):
         self._users: dict[int, Callable[[str], None]] = {}
         self._told: set[int] = set()  # of the loss, and not back since
         self._loss: str | None = None
-        self._is_open = False
+        self._opened: _OpenT | None = None
         self._changing = asyncio.Lock()  # held while it is opened or closed
 
     async def join(self, number: int, on_loss: Callable[[str], None]) -> None:
@@ -42,10 +45,9 @@ class SharedLine(ABC):
             async with self._changing:
                 if self._loss is not None:
                     await self._shut()
-                if not self._is_open:
+                if self._opened is None:
                     self._loss = None
-                    await self._open()
-                    self._is_open = True
+                    self._opened = await self._open()
         except BaseException:
             await self.leave(number)
             raise
@@ -71,7 +73,18 @@ class SharedLine(ABC):
         if self._loss is not None:
             raise LinkError(self._loss)
         if number in self._told:
-            raise LinkError(f"{self.place} was lost, and {self.number} {number} is not back on it")
+            raise LinkError(
+                f"{self.place} was lost, and {self.number} {number} is not back on it; open that "
+                "amplifier again"
+            )
+
+    def _ready(self) -> _OpenT:
+        """What is open, for whoever sends; LinkError where nothing is, or it is lost."""
+        self.raise_if_lost()
+        opened = self._opened  # a thread may ask while it is closed
+        if opened is None:
+            raise LinkError(f"{self.place} is not open; open the amplifier first")
+        return opened
 
     def _lose(self, what: str) -> None:
         """It is gone; to be called in the event loop by what notices."""
@@ -85,25 +98,23 @@ class SharedLine(ABC):
                 on_loss(what)
 
     async def _shut(self) -> None:
-        self._is_open = False
-        await self._close()
+        opened, self._opened = self._opened, None
+        if opened is not None:
+            opened.close()
+            await opened.wait_closed()
 
     @abstractmethod
-    async def _open(self) -> None:
+    async def _open(self) -> _OpenT:
         """Open it; raises LinkError."""
-
-    @abstractmethod
-    async def _close(self) -> None:
-        """Close it and wait until it is; safe where it is not open."""
 
     def _give_up(self, what: str) -> None:
         """End what still waits for an answer."""
         return
 
 
-_LineT = TypeVar("_LineT", bound=SharedLine)
+_LineT = TypeVar("_LineT", bound=SharedLine[Any])
 
-_LINES: "WeakKeyDictionary[asyncio.AbstractEventLoop, dict[Hashable, SharedLine]]" = (
+_LINES: "WeakKeyDictionary[asyncio.AbstractEventLoop, dict[Hashable, SharedLine[Any]]]" = (
     WeakKeyDictionary()
 )
 
@@ -117,7 +128,7 @@ def shared_line(kind: type[_LineT], key: Hashable, make: Callable[[], _LineT]) -
     return line
 
 
-def _forget(line: SharedLine) -> None:
+def _forget(line: SharedLine[Any]) -> None:
     lines = _LINES.get(asyncio.get_running_loop(), {})
     for key in [key for key, known in lines.items() if known is line]:
         del lines[key]

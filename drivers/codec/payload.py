@@ -108,13 +108,7 @@ class Cursor:
         length = self._raw("B")
         if length > _TEXT_MAX:
             raise Malformed(f"a text of {length} bytes is too long", code=NakCode.BAD_VALUE)
-        try:
-            text = self._take(length).decode("utf-8")
-        except UnicodeDecodeError:
-            raise Malformed("a text that is not UTF-8", code=NakCode.BAD_VALUE) from None
-        if not text.isprintable():
-            raise Malformed("a text with control characters", code=NakCode.BAD_VALUE)
-        return text
+        return read_text(self._take(length), "a text")
 
     def byte(self) -> int:
         """Any byte."""
@@ -149,6 +143,17 @@ def _out_of_range(quantity: Quantity, value: int) -> Malformed:
         f"{quantity.name} {value} is not within {quantity.minimum}..{quantity.maximum}",
         code=code or NakCode.BAD_VALUE,
     )
+
+
+def read_text(raw: bytes, name: str) -> str:
+    """What a far end calls itself, for terminals of ours; name: what it is, for Malformed."""
+    try:
+        text = raw.decode("utf-8")
+    except UnicodeDecodeError:
+        raise Malformed(f"{name} is not UTF-8", code=NakCode.BAD_VALUE) from None
+    if not text.isprintable():
+        raise Malformed(f"{name} has control characters", code=NakCode.BAD_VALUE)
+    return text
 
 
 def pack(*pairs: tuple[Quantity, float]) -> bytes:

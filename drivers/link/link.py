@@ -5,12 +5,13 @@ What is lost stays lost until it is opened anew, and says so at once to whoever 
 
 import asyncio
 from collections.abc import Callable
+from contextlib import nullcontext
 from typing import TypeVar, final
 
 from drivers import clock
 from drivers.backend import Backend
 from drivers.errors import FrameError, LinkError, LinkTimeout
-from drivers.link.refusals import is_busy, refusal
+from drivers.link.refusals import NO_PROTOCOL, is_busy, refusal
 from drivers.link.turns import SUPERSEDED, GaveWay, Kind, Turns
 from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.messages import (
@@ -30,13 +31,13 @@ from drivers.statistics import LinkStatistics
 
 REPLY_TIMEOUT = 0.030  # s; a heartbeat and three of these are less than three heartbeats of 50 ms
 RETRIES = 2
-BUSY_PAUSE = 0.005  # s; before a busy amplifier is asked again: short enough for a touch to be felt
 ASSUME_ENERGISED = (
-    ". Assume that the amplifier is energised until its watchdog has passed; once it is opened again "
-    "it is disarmed"
+    ". Assume that the amplifier is energised until its watchdog has passed; once it is opened "
+    "again it is disarmed"
 )
 """What the text of every loss ends with."""
 
+BUSY_PAUSE = 0.005  # s; before a busy amplifier is asked again: short enough for a touch to be felt
 
 _ReplyT = TypeVar("_ReplyT", Identity, Capabilities, Status, Achieved, FaultList, Loaded)
 
@@ -128,21 +129,26 @@ class Link:
         """The reply to a request in its turn; timeout [s] in place of the usual one.
 
         Raises LinkError, CommandRefused for a refusal or where something else took its place, and
-        FrameError for a reply to another kind of request.
+        FrameError for a reply that makes no sense, or to another kind of request.
         """
         self._raise_if_lost()
         timeout = timeout or self._reply_timeout
-        if kind.silences:
-            with self.backend.silencing(request):
-                reply = await self._in_turn(request, kind, timeout)
-        else:
-            reply = await self._in_turn(request, kind, timeout)
         name = type(request).__name__
+        silencing = self.backend.silencing(request) if kind.silences else nullcontext()
+        try:
+            with silencing:
+                reply = await self._in_turn(request, kind, timeout)
+        except FrameError as problem:
+            raise FrameError(
+                f"what the amplifier answered to {name} makes no sense: {problem}; {NO_PROTOCOL}"
+            ) from problem
         if isinstance(reply, Nak):
             self._refusals += 1
             raise refusal(name, reply)
         if not isinstance(reply, expect):
-            raise FrameError(f"the amplifier answered {name} with {type(reply).__name__}")
+            raise FrameError(
+                f"the amplifier answered {name} with {type(reply).__name__}; {NO_PROTOCOL}"
+            )
         return reply
 
     def hurry(self) -> None:

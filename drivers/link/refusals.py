@@ -16,6 +16,12 @@ _REASONS = {
     NakCode.UNSUPPORTED_VERSION: "it speaks another version of the protocol",
 }
 
+NO_PROTOCOL = (
+    "its firmware does not keep to the protocol: update it; era amp conformance tells what else it "
+    "does otherwise"
+)
+"""What to say of an amplifier whose answer is none."""
+
 
 def refusal(request: str, nak: Nak) -> CommandRefused:
     """The error for a refused request of this name."""

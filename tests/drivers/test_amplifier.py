@@ -7,9 +7,9 @@ import pytest
 
 from drivers.amplifier import Amplifier
 from drivers.backend import Backend
-from drivers.command import CommandSet
+from drivers.command import CommandSet, Envelope, Knot
 from drivers.errors import CommandError, CommandRefused, FrameError, LinkError, LinkTimeout
-from drivers.guard import SafeCommand
+from drivers.guard import Guard, GuardLimits, SafeCommand
 from drivers.link import turns
 from drivers.operation.watchdog import check_watchdog
 from drivers.protocol.messages import (
@@ -25,6 +25,7 @@ from drivers.protocol.messages import (
     GetStatus,
     Hello,
     Identity,
+    Loaded,
     Nak,
     NakCode,
     Ping,
@@ -35,9 +36,11 @@ from drivers.protocol.messages import (
     Stop,
 )
 from drivers.registry import open_backend
+from scripted_amplifier import CAPABILITIES
 
 IDENTITY = Identity("Acme", "Quad", "A-17", "1.2", 1)
 STATUS = Status(State.OPERATION_ENABLED, Fault.NONE, 0, True, 25.0, 0.25, (0.0,) * 4)
+WITH_ENVELOPES = replace(CAPABILITIES, envelope_knots=8, envelope_slots=4, envelope_step_max=0.1)
 MakeSafe = Callable[..., SafeCommand]
 
 
@@ -134,7 +137,9 @@ async def test_opening_asks_and_arms_nothing(backend: ScriptedBackend) -> None:
     amplifier = Amplifier(backend)
     with pytest.raises(LinkError, match="not open"):
         await amplifier.status()
-    with pytest.raises(CommandError, match="not open"):
+    with pytest.raises(CommandError, match=r"who the amplifier is; call open\(\) first"):
+        _ = amplifier.identity
+    with pytest.raises(CommandError, match=r"what the amplifier can play; call open\(\) first"):
         _ = amplifier.capabilities
     await amplifier.open()
     assert backend.requests == [Hello(), GetCaps()]
@@ -243,6 +248,27 @@ async def test_a_reply_of_the_wrong_type_is_no_reply(
         await amplifier.apply(safe(5))
     with pytest.raises(FrameError, match="token 6 instead of 5"):
         await amplifier.apply(safe(5))
+
+
+async def test_an_answer_that_makes_no_sense_is_told_with_what_to_do(
+    amplifier: Amplifier, backend: ScriptedBackend
+) -> None:
+    """What was asked, what is wrong with the answer, and that the firmware is to blame."""
+    what_to_do = "firmware does not keep to the protocol: update it; era amp conformance tells"
+    backend.script += [FrameError("9 is no state"), Loaded(slot=2, knots=1)]
+    with pytest.raises(FrameError, match=f"answered to GetStatus.*9 is no state.*{what_to_do}"):
+        await amplifier.status()
+    shape = Guard(GuardLimits(40.0, 500.0, 0.8), WITH_ENVELOPES).check_envelope(
+        Envelope(2, 0.005, (Knot(0.1, 0.0), Knot(0.2, 0.0)))
+    )
+    with pytest.raises(FrameError, match=f"1 knots into slot 2 instead of 2.*{what_to_do}"):
+        await amplifier.load_envelope(shape)
+
+
+async def test_a_wire_without_a_broadcast_says_so(amplifier: Amplifier) -> None:
+    """A bus is asked for where none is: nothing is sent, and each is to be told by itself."""
+    with pytest.raises(CommandError, match="knows no broadcast, so none of a Commit; tell each"):
+        await amplifier.commit_on_bus(1)
 
 
 async def test_only_safe_commands_are_taken(amplifier: Amplifier) -> None:

@@ -51,6 +51,17 @@ def test_its_limits_hold() -> None:
         assert amplifier.disarm().state is State.SWITCH_ON_DISABLED
 
 
+def test_a_script_that_is_held_up_is_told_that_the_amplifier_stopped(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Its watchdog has passed meanwhile: which state and fault, and how to go on."""
+    monkeypatch.setattr("drivers.blocking.HEARTBEAT", 0.15)
+    with BlockingAmplifier(URL, limits=LIMITS) as amplifier:
+        amplifier.arm(0.1)
+        with pytest.raises(CommandRefused, match=r"is in FAULT.*, fault WATCHDOG; .*clear\(\) it"):
+            amplifier.play([DriveCommand(0, 110.0, 0.2)], duration=1.0)
+
+
 def test_what_cannot_be_opened_leaves_no_thread() -> None:
     """The error reaches the script, and the loop's thread has ended."""
     with pytest.raises(CommandError), BlockingAmplifier("sim://no-such-rig.yaml", limits=LIMITS):

@@ -40,11 +40,6 @@ async def open_adapter(
         bus = await asyncio.to_thread(open_bus, url)
     except _TROUBLE as problem:
         raise LinkError(_why_not_open(url, problem)) from problem
-    except ImportError as problem:
-        raise LinkError(
-            f"{url} cannot be opened: this system lacks what python-can needs for "
-            f"{url.interface} ({problem})"
-        ) from problem
     return _ThreadedAdapter(bus, url, on_frame, on_loss)
 
 

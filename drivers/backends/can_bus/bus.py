@@ -16,7 +16,6 @@ from drivers.backends.shared_line import SharedLine, shared_line
 from drivers.backends.stand_in import Adapter
 from drivers.backends.urls.can_bus import CanBusUrl
 from drivers.codec.can_bus.frame import CanFrame
-from drivers.errors import LinkError
 
 # What it has to say reaches users as errors of ours.
 logging.getLogger("canopen").addHandler(logging.NullHandler())
@@ -33,7 +32,7 @@ class _Network(canopen.Network):
         self._bus.send([CanFrame(can_id, bytes(data))])
 
 
-class CanBus(SharedLine):
+class CanBus(SharedLine[Adapter]):
     """A bus, whose nodes are its numbers; see `can_bus`."""
 
     number = "node"
@@ -42,24 +41,13 @@ class CanBus(SharedLine):
         super().__init__(str(url))
         self.url = url
         self.network = _Network(self)
-        self._adapter: Adapter | None = None
 
     def send(self, frames: Sequence[CanFrame]) -> None:
         """Put frames on the bus, without another's in between; raises LinkError."""
-        adapter = self._adapter  # the thread that asks for objects sends, too
-        self.raise_if_lost()
-        if adapter is None:
-            raise LinkError(f"{self.place} is not open")
-        adapter.send(frames)
+        self._ready().send(frames)
 
-    async def _open(self) -> None:
-        self._adapter = await open_adapter(self.url, on_frame=self._take, on_loss=self._lose)
-
-    async def _close(self) -> None:
-        adapter, self._adapter = self._adapter, None
-        if adapter is not None:
-            adapter.close()
-            await adapter.wait_closed()
+    async def _open(self) -> Adapter:
+        return await open_adapter(self.url, on_frame=self._take, on_loss=self._lose)
 
     def _take(self, frame: CanFrame) -> None:
         """Pass a frame on, in the adapter's thread."""

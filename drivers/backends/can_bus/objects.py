@@ -46,6 +46,7 @@ _RESYNCHRONISE = 5  # tries
 _BLOCK_FROM = 15  # bytes; shorter ones are sooner sent in segments
 _ABORTED_COMMAND = 0x0504_0001  # the amplifier takes no block transfers
 _TIMED_OUT = 0x0504_0000  # one of the two sides has waited too long
+_DISTURBED = (_TIMED_OUT, 0x0503_0000, 0x0504_0003, 0x0504_0004)  # or toggle, sequence, CRC wrong
 _ABANDON = struct.pack("<BHBL", 0x80, 0, 0, _TIMED_OUT)
 
 _T = TypeVar("_T")
@@ -210,24 +211,28 @@ class ObjectClient:
                 self._resynchronise()
             result = work()
         except SdoAbortedError as abort:
-            if abort.code == _TIMED_OUT:
-                raise LinkTimeout(
-                    f"node {self._node} and this host took too long over an object; check that "
-                    "the bus is not overloaded"
-                ) from abort
+            if abort.code in _DISTURBED:
+                raise self._missed() from abort
             self._broken = False
-            raise FrameError(f"node {self._node} refused to tell an object: {abort}") from abort
+            raise FrameError(f"node {self._node} refuses an object ({abort})") from abort
         except SdoCommunicationError as problem:
             raise LinkTimeout(
                 f"no answer from node {self._node} within {timeout * 1e3:g} ms ({problem}); check "
                 "that the amplifier is switched on, has this number, and that the bit rates agree"
             ) from problem
-        except (struct.error, IndexError, ValueError) as problem:
-            raise FrameError(f"node {self._node} answers nonsense: {problem}") from problem
+        except (RuntimeError, ValueError, struct.error) as problem:
+            # `canopen` does not get over a last block of which the node has missed a part.
+            raise self._missed() from problem
         finally:
             self._busy = False
         self._broken = False
         return result
+
+    def _missed(self) -> LinkTimeout:
+        return LinkTimeout(
+            f"node {self._node} or this host missed a part of an object, or took too long over it; "
+            "check that the bus is not overloaded and the cable sound"
+        )
 
     def _resynchronise(self) -> None:
         for left in reversed(range(_RESYNCHRONISE)):

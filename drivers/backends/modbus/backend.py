@@ -258,7 +258,9 @@ class ModbusBackend(WireBackend):
 
     def _opened(self) -> ModbusLine:
         if self._line is None or self._loss is not None:
-            raise LinkError(self._loss or f"{self._url.place} is not open")
+            raise LinkError(
+                self._loss or f"{self._url.place} is not open; open the amplifier first"
+            )
         return self._line
 
     def _lost(self, what: str) -> None:

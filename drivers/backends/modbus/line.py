@@ -31,7 +31,7 @@ _TRANSACTIONS = 1 << 16
 _RTU_OVERHEAD = 3  # bytes of an answer around its PDU
 
 
-class ModbusLine(SharedLine):
+class ModbusLine(SharedLine[Port]):
     """A line, whose units are its numbers; see `modbus_line`."""
 
     number = "unit"
@@ -41,7 +41,6 @@ class ModbusLine(SharedLine):
         self.url = url
         self.counters = WireCounters()
         self.last_sent = 0.0
-        self._stream: Port | None = None
         self._turns = LineTurns()
         self._reader = AnswerReader(is_rtu=url.is_rtu, counters=self.counters)
         self.is_contradicted = False  # whether the last answer was followed by another
@@ -58,18 +57,12 @@ class ModbusLine(SharedLine):
         if url.device:
             self._gap = silence(baud=url.baud, bits_per_byte=url.bits_per_byte)
 
-    async def _open(self) -> None:
+    async def _open(self) -> Port:
         self.counters = WireCounters()
         self._reader = AnswerReader(is_rtu=self.url.is_rtu, counters=self.counters)
         self._telegram = self._given = None
         self._is_owed, self._free_from = False, 0.0
-        self._stream = await open_stream(self.url, self._received, self._lose)
-
-    async def _close(self) -> None:
-        stream, self._stream = self._stream, None
-        if stream is not None:
-            stream.close()
-            await stream.wait_closed()
+        return await open_stream(self.url, self._received, self._lose)
 
     async def transact(
         self,
@@ -143,15 +136,13 @@ class ModbusLine(SharedLine):
         return make_telegram(read, write, unit=unit, transaction=number, is_rtu=self.url.is_rtu)
 
     def _send(self, frame: bytes) -> None:
-        self.raise_if_lost()
-        if self._stream is None:
-            raise LinkError(f"{self.place} is not open")
+        stream = self._ready()
         if self.url.is_rtu:
             self._reader.clear()
         self._is_owed = False
         self._given, self.is_contradicted = None, False
         self._came.clear()
-        self._stream.write(frame)
+        stream.write(frame)
         self._turns.sent()
         self.last_sent = clock.now()
         self.counters.frames_out += 1

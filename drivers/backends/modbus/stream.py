@@ -39,7 +39,7 @@ class _Connection(asyncio.Protocol):
         self._on_data = on_data
         self._on_loss = on_loss
         self._is_closed = False
-        self._transport: asyncio.Transport | None = None
+        self._transport: asyncio.Transport  # from when it is connected, before anybody has it
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         self._transport = cast(asyncio.Transport, transport)
@@ -58,16 +58,16 @@ class _Connection(asyncio.Protocol):
             )
 
     def write(self, data: bytes) -> None:
-        if self._transport is None or self._is_closed:
-            raise LinkError(f"the Modbus connection to {self._place} is closed")
         if self._transport.get_write_buffer_size() > _UNSENT_MAX:
-            raise LinkTimeout(f"{self._place} takes no more bytes; check the network")
+            raise LinkTimeout(
+                f"{self._place} takes no more bytes; check the network, and whether something on "
+                "it holds them back"
+            )
         self._transport.write(data)
 
     def close(self) -> None:
         self._is_closed = True
-        if self._transport is not None:
-            self._transport.abort()  # nothing that waits to be sent shall arrive later
+        self._transport.abort()  # nothing that waits to be sent shall arrive later
 
     async def wait_closed(self) -> None:
         """Nothing is left to be waited for."""

@@ -49,7 +49,7 @@ class SerialBackend(WireBackend):
         self._sequence = number_below(1 << 16)
         self._answered: Frame | None = None  # the reply to the last request, once it is there
         self._is_contradicted = False  # by another reply to that
-        self._why_closed = f"{self._url.port} is not open"
+        self._why_closed = f"{self._url.port} is not open; open the amplifier first"
         self._loss: str | None = None  # until it is opened anew, even if others have the line back
 
     @property

@@ -11,7 +11,7 @@ from drivers.codec.serial_line.frame import Frame, FrameReader
 from drivers.errors import LinkError
 
 
-class SerialLine(SharedLine):
+class SerialLine(SharedLine[Port]):
     """A port as pyserial names it, at a speed [baud]; see `serial_line`.
 
     turns: for exchanges, for no two amplifiers may answer at once on one pair of wires.
@@ -26,7 +26,6 @@ class SerialLine(SharedLine):
         self.last_sent = 0.0
         self._reader = FrameReader()
         self._listeners: dict[int, Callable[[Frame], None]] = {}
-        self._port: Port | None = None
 
     @property
     def bad(self) -> int:
@@ -42,23 +41,14 @@ class SerialLine(SharedLine):
 
     def send(self, data: bytes) -> None:
         """Put a frame on the line; raises LinkTimeout where it is stuck, LinkError."""
-        self.raise_if_lost()
-        if self._port is None:
-            raise LinkError(f"{self.place} is not open")
-        self._port.write(data)
+        self._ready().write(data)
         self.last_sent = clock.now()
 
-    async def _open(self) -> None:
+    async def _open(self) -> Port:
         self._reader = FrameReader()
-        self._port = await open_port(
+        return await open_port(
             self.place, baud=self.baud, on_data=self._received, on_loss=self._lose
         )
-
-    async def _close(self) -> None:
-        port, self._port = self._port, None
-        if port is not None:
-            port.close()
-            await port.wait_closed()
 
     def _received(self, data: bytes) -> None:
         for frame in self._reader.feed(data):

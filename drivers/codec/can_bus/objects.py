@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from drivers.codec.can_bus.frame import BLOCK, CANOPEN, LAYOUTS
-from drivers.codec.payload import Cursor, pack
+from drivers.codec.payload import Cursor, pack, read_text
 from drivers.command import DriveCommand
 from drivers.errors import FrameError
 from drivers.guard import require_safe
@@ -103,23 +103,18 @@ def capability_entries() -> tuple[Entry, ...]:
 def read_integer(entry: Entry, data: bytes) -> int:
     """The integer of an entry; FrameError where it has another length or is out of range."""
     if len(data) != _WIDTHS[entry.type]:
-        raise FrameError(f"object {entry.index:04X}sub{entry.subindex} has {len(data)} bytes")
+        raise FrameError(f"{entry.name} has {len(data)} bytes and not {_WIDTHS[entry.type]}")
     value = int.from_bytes(data, "little", signed=entry.type.startswith("i"))
     if entry.quantity is not None and not entry.quantity.holds(value):
-        raise FrameError(f"{entry.name} is {value}, which is out of range")
+        raise FrameError(
+            f"{entry.name} {value} is not within {entry.quantity.minimum}..{entry.quantity.maximum}"
+        )
     return value
 
 
 def unpack_identity(texts: Mapping[str, bytes], version: int) -> Identity:
     """Who it is, by the texts of its object dictionary; FrameError for what is no text."""
-    read = {}
-    for name in TEXTS:
-        try:
-            read[name] = texts[name].rstrip(b"\0").decode("utf-8")
-        except UnicodeDecodeError:
-            raise FrameError(f"{name} is no UTF-8") from None
-        if not read[name].isprintable():
-            raise FrameError(f"{name} has control characters")
+    read = {name: read_text(texts[name].rstrip(b"\0"), name) for name in TEXTS}
     return Identity(**read, protocol_version=version)
 
 

@@ -191,8 +191,3 @@ def _slots(commands: tuple[DriveCommand, ...], node: int, sequence: int) -> list
         )
         for group, slots in sorted(groups.items())
     ]
-
-
-def is_about_set(order: Order) -> bool:
-    """Whether the reply to an order is what a set achieves."""
-    return isinstance(order, Apply | Stage | Commit)

@@ -1,6 +1,7 @@
 """What stands in the register blocks of an amplifier, as a Modbus host reads them.
 
-Reading is total: registers become a message with every value in range, or FrameError.
+Reading is total: registers, as many as were asked for, become a message with every value in range,
+or FrameError.
 """
 
 import struct
@@ -8,6 +9,7 @@ from collections.abc import Collection, Iterable, Sequence
 from enum import IntEnum
 from typing import Any, TypeVar
 
+from drivers.codec.payload import read_text
 from drivers.command import DriveCommand
 from drivers.errors import FrameError
 from drivers.protocol.definition import PROTOCOL, Quantity
@@ -49,8 +51,6 @@ def _fields(
 ) -> tuple[dict[str, int], Sequence[int]]:
     """The named registers after the head, and what follows them."""
     end = HEAD + len(names)
-    if len(registers) < end:
-        raise FrameError(f"{len(registers)} registers were read where {end} are needed")
     return dict(zip(names, registers[HEAD:end], strict=True)), registers[end:]
 
 
@@ -64,6 +64,13 @@ def _integer(name: str, register: int) -> int:
 
 def _number(name: str, register: int) -> float:
     return _QUANTITIES[name].from_wire(_integer(name, register))
+
+
+def _channel_count(register: int, *, read: int) -> int:
+    channels = _integer("channel_count", register)
+    if channels > read:
+        raise FrameError(f"{channels} channels where {read} were read")
+    return channels
 
 
 def _one_of(kind: type[_EnumT], register: int) -> _EnumT:
@@ -82,22 +89,15 @@ def unpack_identity(registers: Sequence[int]) -> Identity:
     block = _MAP["input"]["identity"]
     found, rest = _fields(block["registers"], registers)
     texts = {
-        name: _text(rest[number * TEXT_SIZE : (number + 1) * TEXT_SIZE])
+        name: read_text(_raw(rest[number * TEXT_SIZE : (number + 1) * TEXT_SIZE]), name)
         for number, name in enumerate(block["texts"])
     }
     version = _integer("protocol_version", found["protocol_version"])
     return Identity(protocol_version=version, **texts)
 
 
-def _text(registers: Sequence[int]) -> str:
-    raw = struct.pack(f">{len(registers)}H", *registers).rstrip(b"\0")
-    try:
-        text = raw.decode("utf-8")
-    except UnicodeDecodeError:
-        raise FrameError("a text that is not UTF-8") from None
-    if not text.isprintable():
-        raise FrameError("a text with control characters")
-    return text
+def _raw(registers: Sequence[int]) -> bytes:
+    return struct.pack(f">{len(registers)}H", *registers).rstrip(b"\0")
 
 
 def unpack_capabilities(registers: Sequence[int]) -> Capabilities:
@@ -115,9 +115,7 @@ def unpack_capabilities(registers: Sequence[int]) -> Capabilities:
 def unpack_status(registers: Sequence[int]) -> Status:
     """How it is."""
     found, levels = _fields(_MAP["input"]["status"]["registers"], registers)
-    channels = _integer("channel_count", found["channel_count"])
-    if channels > len(levels):
-        raise FrameError(f"{channels} channels where {len(levels)} were read")
+    channels = _channel_count(found["channel_count"], read=len(levels))
     if found["high_voltage"] > 1:
         raise FrameError(f"high_voltage is {found['high_voltage']}, neither 0 nor 1")
     return Status(
@@ -139,8 +137,7 @@ def _groups(registers: Sequence[int], size: int) -> Iterable[Sequence[int]]:
 def unpack_achieved(registers: Sequence[int]) -> Achieved:
     """What it plays, or would; the channels that were named, in their order."""
     found, rest = _fields(_MAP["input"]["achieved"]["registers"], registers)
-    if _integer("channel_count", found["channel_count"]) * CHANNEL_SIZE > len(rest):
-        raise FrameError("the amplifier has more channels than were read")
+    _channel_count(found["channel_count"], read=len(rest) // CHANNEL_SIZE)
     commands = tuple(
         _command(channel, group)
         for channel, group in enumerate(_groups(rest, CHANNEL_SIZE))

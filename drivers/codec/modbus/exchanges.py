@@ -14,7 +14,6 @@ from dataclasses import dataclass
 from drivers.codec.modbus import blocks
 from drivers.codec.modbus.blocks import CHANNEL_SIZE, FAULT_SIZE, HEAD, TEXT_SIZE
 from drivers.command import CommandSet, DriveCommand, Envelope
-from drivers.errors import CommandError
 from drivers.guard import require_safe
 from drivers.protocol.definition import PROTOCOL, Quantity
 from drivers.protocol.messages import (
@@ -196,8 +195,6 @@ def _unsigned(*pairs: tuple[Quantity, float]) -> list[int]:
 
 def _pack_set(command_set: CommandSet) -> list[int]:
     by_channel = {command.channel: command for command in command_set.commands}
-    if len(by_channel) < len(command_set.commands) or min(by_channel, default=0) < 0:
-        raise CommandError("a channel of the set does not exist, or is named twice")
     registers = _unsigned(
         (_Q.token, command_set.token),
         (_Q.ramp, command_set.ramp),

@@ -15,7 +15,7 @@ from drivers.errors import LinkError
 from drivers.protocol.messages import Arm, Ping
 
 
-class Line(SharedLine):
+class Line(SharedLine[Port]):
     """One that notes what happens to it; `blocks` holds up opening and closing."""
 
     number = "place"
@@ -26,12 +26,20 @@ class Line(SharedLine):
         self.blocks: asyncio.Event | None = None
         self.fails = False
 
-    async def _open(self) -> None:
+    async def _open(self) -> Port:
         if self.fails:
             raise LinkError("there is no such line")
         await self._note("opened")
+        return self
 
-    async def _close(self) -> None:
+    def write(self, data: bytes) -> None:
+        """Nobody looks."""
+
+    def close(self) -> None:
+        """Takes its time; see `wait_closed`."""
+
+    async def wait_closed(self) -> None:
+        """As long as `blocks` says."""
         await self._note("closed")
 
     async def _note(self, what: str) -> None:
@@ -45,6 +53,10 @@ class Line(SharedLine):
     def lose(self, what: str) -> None:
         """As when its cable is pulled out."""
         self._lose(what)
+
+    def send(self) -> None:
+        """Put something on it."""
+        self._ready().write(b"")
 
 
 def the_line() -> Line:
@@ -146,6 +158,27 @@ async def test_a_loss_is_told_once_to_each_and_over_for_who_comes_back() -> None
     await line.leave(2)
 
 
+async def test_nothing_is_sent_while_it_is_being_opened_anew() -> None:
+    """Neither as if it were open nor with an error that nobody expects; afterwards it goes out."""
+    line = the_line()
+    await line.join(1, lambda _: None)
+    line.lose("pulled out")
+    with pytest.raises(LinkError, match="pulled out"):
+        line.send()
+    line.blocks = asyncio.Event()
+    line.blocks.set()
+    await line.leave(1)
+    line.blocks.clear()
+    coming = asyncio.create_task(line.join(2, lambda _: None))
+    await asyncio.sleep(0)
+    with pytest.raises(LinkError, match=r"the line is not open; open the amplifier first"):
+        line.send()
+    line.blocks.set()
+    await coming
+    line.send()
+    await line.leave(2)
+
+
 class _Machine(StandIn):
     """A machine with a line that takes everything and says nothing, until it is lost."""
 
@@ -219,3 +252,11 @@ async def test_what_waited_while_the_line_was_lost_is_not_sent_when_others_open_
     assert len(machine.sent) == before
     await west.close()
     await east.close()
+
+
+@pytest.mark.parametrize("kind", WAITING)
+async def test_who_asks_before_it_is_open_is_told(kind: type[WireBackend]) -> None:
+    """In the words of the wire, and what to do."""
+    url, _ = WAITING[kind]
+    with pytest.raises(LinkError, match=r"/dev/none.* is not open; open the amplifier first"):
+        await kind(url.format(1)).exchange(Ping(), timeout=0.2)

@@ -22,9 +22,9 @@ from drivers.backends.urls.can_bus import CanUrl
 from drivers.codec.can_bus.frame import CanFrame
 from drivers.codec.can_bus.objects import index_of
 from drivers.command import CommandSet, DriveCommand, Envelope, Knot
-from drivers.errors import CommandError, CommandRefused, LinkError
+from drivers.errors import CommandError, CommandRefused, FrameError, LinkError, LinkTimeout
 from drivers.guard import Guard, GuardLimits, SafeCommand
-from drivers.protocol.messages import Apply, Event, Fault, Ping, State
+from drivers.protocol.messages import Apply, Event, Fault, Hello, Ping, State
 from model.rig.rig import Rig
 from sim.bench.bench import Bench
 from sim.bench.station import Station
@@ -286,6 +286,73 @@ async def test_envelopes_are_loaded_in_blocks_or_segments(
         await amplifier.arm(2.0)
         achieved = await amplifier.apply(tones(amplifier, 0.5, onset=7))
         assert achieved.commands[0].onset == 7
+
+
+@pytest.mark.parametrize("ends", ["refused", "taken"])
+async def test_what_a_node_missed_of_an_envelope_is_sent_again(
+    virtual: Virtual, ends: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """All of it, and so nothing is missing in what is kept; whatever the node makes of the end."""
+    from sim.far_ends.can_bus import sdo
+
+    end, passing = sdo.SdoServer._block_segment, virtual.gateway._pass
+    missed: list[CanFrame] = []
+
+    def miss_once(frame: CanFrame) -> None:
+        if frame.id == 0x601 and frame.data[0] == 3 and not missed:  # the third segment
+            missed.append(frame)
+        else:
+            passing(frame)
+
+    def take(server: sdo.SdoServer, data: bytes) -> None:
+        if len(missed) == 1 and data[0] >> 5 == 6:  # the end of the transfer
+            missed.append(CanFrame(0, data))
+            server.reset()
+            if ends == "refused":
+                raise sdo.SdoAbort(0x0504_0004)  # CiA 301: CRC error
+            server._send(bytes([0xA1, *bytes(7)]))
+        else:
+            end(server, data)
+
+    monkeypatch.setattr(sdo.SdoServer, "_block_segment", take)
+    async with opened(virtual.url()) as amplifier:
+        virtual.gateway._pass = miss_once  # type: ignore[method-assign]
+        guard = Guard(LIMITS, amplifier.capabilities)
+        await amplifier.load_envelope(guard.check_envelope(SHAPE))
+        assert len(missed) == 2
+        assert virtual.far.amplifier._sets.slots[7].knots[31] == Knot(0.31, -50.0)
+        assert amplifier.statistics.retries == 1
+
+
+async def test_a_node_without_an_object_is_told_with_what_to_do(
+    virtual: Virtual, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What it says itself, and that its firmware is to blame."""
+    from sim.far_ends.can_bus import sdo
+
+    def has_none(server: sdo.SdoServer, data: bytes) -> None:
+        raise sdo.SdoAbort(0x0602_0000)  # CiA 301: the object does not exist
+
+    async with opened(virtual.url()) as amplifier:
+        monkeypatch.setattr(sdo.SdoServer, "_begin_upload", has_none)
+        with pytest.raises(
+            FrameError, match=r"node 1 refuses an object \(.*0x06020000.*firmware does not keep"
+        ):
+            await amplifier.faults()
+
+
+async def test_a_node_that_tells_nothing_of_itself_is_no_answer(
+    virtual: Virtual, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nor is one that takes too long over all of it: each says what to check."""
+    backend = CanBackend(virtual.url(node=5))
+    await backend.open()
+    with pytest.raises(LinkTimeout, match=r"no answer from node 5 .*switched on, has this number"):
+        await backend.exchange(Hello(), timeout=0.01)
+    monkeypatch.setattr("drivers.backends.can_bus.backend._OBJECTS_WAIT", 0.1)
+    with pytest.raises(LinkTimeout, match="took too long over an object; check that the bus is"):
+        await backend.exchange(Hello(), timeout=0.2)
+    await backend.close()
 
 
 async def test_an_object_that_was_given_up_for_its_time_is_asked_for_again(

@@ -383,6 +383,13 @@ async def test_an_answer_out_of_range_is_refused(far: Peer, backend: ModbusBacke
     far.station.answer = lambda _: replace(ARMED, levels=(0.0,) * 5)
     with pytest.raises(FrameError, match="5 channels where 4 were read"):
         await backend.exchange(Ping(), timeout=PATIENCE)
+    far.station.answer = lambda request: (
+        replace(ARMED, levels=(0.0,) * 5)
+        if isinstance(request, GetStatus)
+        else Achieved(513, COMMANDS)
+    )
+    with pytest.raises(FrameError, match="5 channels where 4 were read"):
+        await backend.exchange(Apply(SET), timeout=PATIENCE)
 
 
 async def test_a_hang_up_is_told_at_once(far: Peer, backend: ModbusBackend) -> None:

@@ -8,7 +8,9 @@ from collections.abc import Iterator
 import pytest
 import serial
 
+from drivers.backends.ports.watched import WatchedPort
 from drivers.backends.ports.writing import write_all
+from drivers.errors import LinkTimeout
 
 
 @pytest.fixture
@@ -38,6 +40,18 @@ def test_a_port_that_takes_no_more_is_told(ends: tuple[serial.Serial, int]) -> N
     port, _ = ends
     with pytest.raises(serial.SerialTimeoutException):
         write_all(port, bytes(1 << 20))
+
+
+async def test_a_line_that_is_stuck_is_told_with_what_to_look_at(
+    ends: tuple[serial.Serial, int],
+) -> None:
+    """As a timeout, which is asked again and then counts as a loss."""
+    port, _ = ends
+    watched = WatchedPort(port, "/dev/ttyUSB9", lambda data: None, lambda what: None)
+    with pytest.raises(LinkTimeout, match="/dev/ttyUSB9 takes no more bytes; check flow control"):
+        watched.write(bytes(1 << 20))
+    watched.close()
+    await watched.wait_closed()
 
 
 def test_a_port_that_is_closed_is_told(ends: tuple[serial.Serial, int]) -> None:

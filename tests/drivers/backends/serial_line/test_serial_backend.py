@@ -259,6 +259,13 @@ async def test_a_line_is_opened_by_one_only(far_end: FarEnd, backend: SerialBack
     assert b"another program has it open" in errors
 
 
+async def test_a_line_has_one_speed(far_end: FarEnd, backend: SerialBackend) -> None:
+    """A second amplifier at another is refused with both, and the first is not disturbed."""
+    with pytest.raises(LinkError, match="at 921600 baud and cannot have 9600 as well; give all"):
+        await SerialBackend(f"{far_end.url}?baud=9600&address=2").open()
+    assert await backend.exchange(Hello(), timeout=PATIENCE) == IDENTITY
+
+
 async def test_a_missing_port_says_what_to_do() -> None:
     """One paragraph: which port, why, and what to do."""
     with pytest.raises(LinkError, match=r"/dev/no-such-port cannot be opened: there is no such"):

@@ -12,7 +12,9 @@ from drivers.codec.can_bus.answers import AnswerReader, decode_emergency
 from drivers.codec.can_bus.dbc import dbc_text
 from drivers.codec.can_bus.frame import LAYOUTS, CanFrame
 from drivers.codec.can_bus.objects import (
+    capability_entries,
     pack_envelope,
+    read_integer,
     unpack_achieved,
     unpack_capabilities,
     unpack_faults,
@@ -260,8 +262,10 @@ def test_objects_mean_what_they_say() -> None:
     )
     texts = {"vendor": b"Acme", "product": b"Quad\0", "serial_number": b"A", "firmware": b"1"}
     assert unpack_identity(texts, 1).product == "Quad"
-    with pytest.raises(FrameError, match="control"):
+    with pytest.raises(FrameError, match="vendor has control characters"):
         unpack_identity({**texts, "vendor": b"A\nB"}, 1)
+    with pytest.raises(FrameError, match="product is not UTF-8"):
+        unpack_identity({**texts, "product": b"\xff"}, 1)
     numbers = {
         **{"protocol_version": 1, "channels": 4, "frequency_min": 2000, "frequency_max": 60000},
         **{"frequency_step": 1, "level_max": 10000, "level_step": 1, "phase_step": 1},
@@ -269,6 +273,22 @@ def test_objects_mean_what_they_say() -> None:
         **{"envelope_slots": 63, "envelope_step_min": 10, "envelope_step_max": 1000},
     }
     assert unpack_capabilities(numbers) == replace(WIDE, channels=4)
+
+
+def test_an_integer_of_another_length_or_out_of_range_is_told_by_name() -> None:
+    """Channels are one byte, up to 16."""
+    channels = next(entry for entry in capability_entries() if entry.name == "channels")
+    assert read_integer(channels, b"\x10") == 16
+    with pytest.raises(FrameError, match="channels has 2 bytes and not 1"):
+        read_integer(channels, b"\x04\x00")
+    with pytest.raises(FrameError, match=r"channels 17 is not within 0\.\.16"):
+        read_integer(channels, b"\x11")
+
+
+def test_a_value_that_does_not_fit_would_be_another_s() -> None:
+    """It is not cut: what was beyond its bits would stand in those of its neighbour."""
+    with pytest.raises(ValueError, match="level 65536 does not fit into 16 bits"):
+        LAYOUTS["command"].pack(level=1 << 16)
 
 
 @given(st.data())

@@ -1,0 +1,43 @@
+"""A Modbus TCP connection where the network or the other side does not do its part."""
+
+import asyncio
+import socket
+
+import pytest
+
+from drivers.backends.modbus import stream
+from drivers.backends.modbus.stream import open_stream
+from drivers.backends.urls.modbus import ModbusUrl
+from drivers.errors import LinkError, LinkTimeout
+
+MEGABYTE = 1 << 20
+
+
+async def test_an_address_that_does_not_answer_is_told_with_what_to_check(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Nobody takes the connection nor refuses it, as where a router drops what is sent there."""
+    monkeypatch.setattr(stream, "_CONNECT_TIMEOUT", 0.0)
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        port = listening.getsockname()[1]
+        with pytest.raises(
+            LinkError, match=rf"127.0.0.1:{port} does not answer .*the address, the"
+        ):
+            await open_stream(
+                ModbusUrl.parse(f"modbus+tcp://127.0.0.1:{port}/1"), lambda _: None, lambda _: None
+            )
+
+
+async def test_a_peer_that_reads_no_more_is_told_before_the_memory_is_full() -> None:
+    """What it does not take fills the system's buffers, then ours; closing throws it away."""
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        port = listening.getsockname()[1]
+        connection = await open_stream(
+            ModbusUrl.parse(f"modbus+tcp://127.0.0.1:{port}/1"), lambda _: None, lambda _: None
+        )
+        connection.write(bytes(64 * MEGABYTE))
+        with pytest.raises(LinkTimeout, match="takes no more bytes; check the network"):
+            connection.write(b"x")
+        connection.close()
+        await connection.wait_closed()
+        await asyncio.sleep(0)  # the transport says that it is gone

@@ -8,6 +8,7 @@ import typer
 
 from controller.diagnosis.cli import rig_app
 from drivers.errors import CommandError, CommandRefused, FrameError, LinkError
+from model.counting import counted
 from model.errors import InputError
 
 if TYPE_CHECKING:
@@ -83,8 +84,9 @@ def demo(
         return
     if not as_json:
         print(
-            f"{rig_file.name}: {table.pattern_count} patterns of {len(rig.eras)} ERAs on a mesh "
-            f"of {table.mesh}, ready in {time.perf_counter() - started:.1f} s"
+            f"{rig_file.name}: {counted(table.pattern_count, 'pattern')} of "
+            f"{counted(len(rig.eras), 'ERA')} on a mesh of {table.mesh}, "
+            f"ready in {time.perf_counter() - started:.1f} s"
         )
         print(_HEADING, end="")
     rows = asyncio.run(
@@ -158,10 +160,10 @@ def _summary(rows: "list[TouchRow]") -> str:
         and row.played.predicted_contrast_db is not None
         and row.played.measured_contrast_db is not None
     ]
-    counted = f"{len(rows)} touches"
+    touches = counted(len(rows), "touch", plural="touches")
     if not differences:
-        return counted
+        return touches
     return (
-        f"{counted}; predicted and measured contrast differ by at most {max(differences):.1f} dB "
+        f"{touches}; predicted and measured contrast differ by at most {max(differences):.1f} dB "
         f"over the {len(differences)} with other fingers on the plate"
     )

@@ -14,6 +14,7 @@ from typer.core import TyperCommand
 
 from by_name.nearness import did_you_mean
 from drivers.errors import CommandError, CommandRefused, FrameError, LinkError
+from model.counting import counted
 from model.errors import InputError
 
 if TYPE_CHECKING:
@@ -307,7 +308,7 @@ def show_status(told: "StatusResult") -> str:
     latency = told.latency_ms
     if latency.median is not None:
         lines.append(
-            f"  latency of {latency.count} commands: median {latency.median:.2f} ms, "
+            f"  latency of {counted(latency.count, 'command')}: median {latency.median:.2f} ms, "
             f"99 % {latency.p99:.2f} ms, 99.9 % {latency.p999:.2f} ms"
         )
     for reason, count in told.rejected_touches.items():

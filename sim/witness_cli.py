@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TextIO
 
 import typer
 
+from model.counting import counted
 from model.errors import InputError
 
 if TYPE_CHECKING:
@@ -197,4 +198,4 @@ def _tell(found: list["Violation"], seen: "Witness", *, as_json: bool) -> None:
     for one in found:
         print(one)
     said = f"{len(found)} broken" if found else "no rule was broken"
-    print(f"{seen.frames} frames: {said}")
+    print(f"{counted(seen.frames, 'frame')}: {said}")

@@ -13,6 +13,7 @@ from controller.daemon.place import Place
 from controller.daemon.sections import loopback_address
 from drivers.errors import DriverError
 from model.config.document import ConfigError, read_document
+from model.counting import counted
 from model.errors import InputError
 from model.table.cache import cached_table
 from model.table.file import load_table
@@ -30,8 +31,10 @@ def check_daemon(path: Path) -> str:
         table = "its table is built, or taken from the cache, when it starts"
     else:
         loaded = _load_table(config, config.table)
-        table = f"its table has {len(loaded.frequencies)} frequencies"
-    return f"{path}: good: {len(config.rig.eras)} ERAs, {len(config.urls)} amplifiers; {table}"
+        frequencies = counted(len(loaded.frequencies), "frequency", plural="frequencies")
+        table = f"its table has {frequencies}"
+    eras, amplifiers = counted(len(config.rig.eras), "ERA"), counted(len(config.urls), "amplifier")
+    return f"{path}: good: {eras}, {amplifiers}; {table}"
 
 
 def run_daemon(path: Path, *, dashboard: str | None) -> None:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from model.counting import counted
 from model.errors import InputError
 
 if TYPE_CHECKING:
@@ -98,7 +99,8 @@ def check(
     else:
         low, high = verdict.frequencies.min(), verdict.frequencies.max()
         print(
-            f"{rig_file}: {verdict.sensor_count} sensors, {len(verdict.frequencies)} frequencies "
+            f"{rig_file}: {counted(verdict.sensor_count, 'sensor')}, "
+            f"{counted(len(verdict.frequencies), 'frequency', plural='frequencies')} "
             f"from {low:g} to {high:g} Hz, {elapsed:.1f} s"
         )
         print()

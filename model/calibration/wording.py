@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 
 from model.calibration.outcome import Calibration, FittedParameter
+from model.counting import counted
 from model.rig.rig import Rig
 
 
@@ -29,7 +30,7 @@ def gain_rows(calibration: Calibration) -> list[str]:
         rows.append(
             f"{era.name} gain  {np.median(size):.3f} ({size.min():.3f} to {size.max():.3f}), "
             f"phase {np.median(phase):+.1f} ({phase.min():+.1f} to {phase.max():+.1f}) degrees, "
-            f"± {100 * error:.2g} % at {len(size)} frequencies"
+            f"± {100 * error:.2g} % at {counted(len(size), 'frequency', plural='frequencies')}"
         )
     return rows
 

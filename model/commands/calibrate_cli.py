@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from model.counting import counted
 from model.errors import InputError
 
 NOT_THIS_PLATE = 1  # exit status: the answer is no
@@ -37,15 +38,14 @@ def calibrate(
     from model.calibration.responses import responses_of
     from model.calibration.responses_file import read_functions
     from model.files.picture_name import check_picture
-    from model.files.replacing import check_place
+    from model.files.replacing import check_ending, check_place
     from model.rig.file import load_rig
 
-    if output.suffix not in (".yaml", ".yml"):
-        raise InputError(f"{output}: a rig file ends in .yaml; try {output.with_suffix('.yaml')}")
+    check_place(output, example="rig2.yaml")
+    check_ending(output, ".yaml", ".yml", what="a rig file")
     for taken in (rig_file, measured_file):
         if output.resolve() == taken.resolve():
             raise InputError(f"{output}: the new rig would overwrite {taken}; choose another name")
-    check_place(output, example="rig2.yaml")
     if picture is not None:
         check_picture(picture)
     rig = load_rig(rig_file, mesh=mesh)
@@ -80,9 +80,10 @@ def calibrate(
         print(json.dumps({**told, "solve_time_s": elapsed}))
     else:
         print(
-            f"{measured_file}: {len(responses.sensors)} sensors, {len(responses.frequencies)} "
-            f"frequencies from {responses.frequencies[0]:g} to {responses.frequencies[-1]:g} Hz, "
-            f"{responses.count} values; fitted in {elapsed:.1f} s"
+            f"{measured_file}: {counted(len(responses.sensors), 'sensor')}, "
+            f"{counted(len(responses.frequencies), 'frequency', plural='frequencies')} "
+            f"from {responses.frequencies[0]:g} to {responses.frequencies[-1]:g} Hz, "
+            f"{counted(responses.count, 'value')}; fitted in {elapsed:.1f} s"
         )
         print()
         print("\n".join([*rows, *wording.gain_rows(calibration)]))

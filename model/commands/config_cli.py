@@ -18,10 +18,10 @@ def init(
 ) -> None:
     """Write a commented rig, daemon or layout to edit, with its JSON schema for editors."""
     from model.config.kinds import kind_called
+    from model.files.replacing import check_ending
 
     made = kind_called(kind)
-    if file.suffix not in (".yaml", ".yml"):
-        raise InputError(f"{file}: a {kind} file ends in .yaml; try {file.with_suffix('.yaml')}")
+    check_ending(file, ".yaml", ".yml", what=f"a {kind} file")
     schema = file.with_suffix(".schema.json")
     _write_new(file, f"# yaml-language-server: $schema={schema.name}\n{made.example()}")
     schema.write_text(json.dumps(made.schema(), indent=2) + "\n", encoding="utf-8")
@@ -45,7 +45,9 @@ def check(
             {"line": problem.line, "key": problem.key, "message": problem.message}
             for problem in error.problems
         ]
-        typer.echo(json.dumps({"ok": False, "errors": problems}) if as_json else str(error))
+        typer.echo(
+            json.dumps({"ok": False, "errors": problems, "warnings": []}) if as_json else str(error)
+        )
         raise typer.Exit(1) from error
     if as_json:
         answer = {"ok": True, "errors": [], "warnings": list(good.warnings)}

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from model.commands.plate_cli import JsonOption, MeshOption, RigArgument
+from model.counting import counted
 
 if TYPE_CHECKING:
     from model.studies.workers import Workers
@@ -128,8 +129,9 @@ def _show(summary: dict[str, Any]) -> None:
     from model.vibration.peak import G
 
     print(
-        f"{summary['cases']} cases in {summary['time_s']:.1f} s ({summary['from_cache']} of them "
-        f"kept from before), mesh {summary['mesh']}, {len(summary['frequencies_hz'])} frequencies"
+        f"{counted(summary['cases'], 'case')} in {summary['time_s']:.1f} s "
+        f"({summary['from_cache']} of them kept from before), mesh {summary['mesh']}, "
+        f"{counted(len(summary['frequencies_hz']), 'frequency', plural='frequencies')}"
     )
     print(f"ranked by the median over the plate, {summary['driven']} driven")
     print("rank  layout                        stiffness   lowest   median  highest    unfelt")

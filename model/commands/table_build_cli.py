@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from model.commands.plate_cli import JsonOption, MeshOption, RigArgument
+from model.counting import counted
 
 
 def build(
@@ -38,7 +39,7 @@ def build(
     from model.config.points import parse_frequencies, parse_pair
     from model.drive_modes import MODES
     from model.errors import InputError
-    from model.files.replacing import begins_with, check_place, check_replaceable
+    from model.files.replacing import begins_with, check_ending, check_place, check_replaceable
     from model.finger.grid import Grid
     from model.rig.file import load_rig
     from model.table.build import build_in_parts
@@ -50,6 +51,7 @@ def build(
     if mode not in MODES:
         raise InputError(f"unknown drive mode --mode {mode!r}; known: {', '.join(MODES)}")
     check_place(output, example="table.npz")
+    check_ending(output, ".npz", what="a localization table")
     check_replaceable(output, is_own=begins_with(output, ZIP), what="localization table")
     rig = load_rig(rig_file, mesh=mesh)
     started = time.perf_counter()
@@ -102,8 +104,9 @@ def build(
             "had done"
         )
     print(
-        f"{table.pattern_count} patterns of {len(table.frequencies)} frequencies for "
-        f"{table.grid.cell_count} cells, built in {elapsed:.2f} s"
+        f"{counted(table.pattern_count, 'pattern')} of "
+        f"{counted(len(table.frequencies), 'frequency', plural='frequencies')} for "
+        f"{counted(table.grid.cell_count, 'cell')}, built in {elapsed:.2f} s"
     )
     print(f"mesh {table.mesh}: fields within {error:.3g} % of a finer one ({table.reference_mesh})")
     print(f"wrote {output} ({output.stat().st_size / 1e6:.1f} MB)")

@@ -67,15 +67,14 @@ def export(
 ) -> None:
     """Write a table for other programs; docs/reference/table-file.md says what is in it."""
     from model.errors import InputError
-    from model.files.replacing import check_place, check_replaceable
+    from model.files.replacing import check_ending, check_place
     from model.table.export import export_csv, export_mat
     from model.table.file import load_table
 
     if content is not None and to is Format.MAT:
         raise InputError("--content is for CSV files; a .mat file holds everything")
-    suffix = f".{to.value}"
-    check_place(output, example=f"table{suffix}")
-    check_replaceable(output, is_own=output.suffix == suffix, what=f"{suffix} file")
+    check_place(output, example=f"table.{to.value}")
+    check_ending(output, f".{to.value}", what=f"a file of --format {to.value}")
     table = load_table(table_file)
     if to is Format.MAT:
         export_mat(table, output)

@@ -18,6 +18,12 @@ def check_replaceable(path: Path, *, is_own: bool, what: str) -> None:
         )
 
 
+def check_ending(path: Path, *endings: str, what: str) -> None:
+    """Raise InputError for a name that ends in none of what such a file may."""
+    if path.suffix.lower() not in endings:
+        raise InputError(f"{path}: {what} ends in {endings[0]}; try {path.with_suffix(endings[0])}")
+
+
 def check_place(path: Path, *, example: str) -> None:
     """Raise InputError where no file can be written: at a folder, or in one that is not there.
 

@@ -4,6 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from model.counting import counted
 from model.errors import InputError
 from model.rig.rig import Rig
 from model.studies.cases import Cases, all_alike
@@ -35,7 +36,7 @@ def count_cases(rig: Rig, *, layouts: int, seed: int, raster: tuple[int, int]) -
     most = max(MOST_ERAS, len(rig.eras))
     if layouts < most:
         raise InputError(
-            f"{layouts} layouts are too few to compare 1 to {most} ERAs; ask for at least {most}"
+            f"{counted(layouts, 'layout')} cannot compare 1 to {most} ERAs; ask for at least {most}"
         )
     pool = LayoutPool(rig, raster)
     rng = np.random.default_rng(seed)

@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterable, Mapping
 from matplotlib.figure import Figure
 
 from model.arrays import FloatArray
+from model.counting import counted
 from model.figures.layout_boxes import LayoutBox, layout_boxes_figure
 from model.rig.rig import Rig
 from model.studies.ranking import Ranking, era_counts
@@ -20,7 +21,7 @@ def ranking_figure(rig: Rig, ranking: Ranking) -> Figure:
         shown = {"the rig": ranking.own, **shown}
     if ranking.recommended != ranking.best:
         shown["recommended"] = ranking.recommended
-    title = f"{len(ranking.order)} cases, {DRIVE_NAMES[DRIVES[ranking.drive]]} driven"
+    title = f"{counted(len(ranking.order), 'case')}, {DRIVE_NAMES[DRIVES[ranking.drive]]} driven"
     wide = ranking.medians[ranking.best] > _WIDE * ranking.medians[ranking.worst]
     return _boxes(rig, ranking, shown.items(), title=title, logarithmic=wide)
 

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.arrays import FloatArray
+from model.counting import counted
 from model.drive_modes import Choice, find_drives, loudest
 from model.drive_modes.exact_search import loudest_found, search_exactly
 from model.drive_modes.fields import Drive, Fields, Outcome, judge
@@ -115,9 +116,9 @@ def _ask_exactly(
     found = search_exactly(fields, eras_at_most=count, time_limit=question.search_time)
     if found.drive is None and not found.is_complete:
         raise InputError(
-            f"no pattern of up to {count} ERAs that reaches {question.level_db_sl:g} dB SL was "
-            f"found within {question.search_time:g} s, and not all were looked at; search "
-            "longer, or ask for less"
+            f"no pattern of up to {counted(count, 'ERA')} that reaches "
+            f"{question.level_db_sl:g} dB SL was found within {question.search_time:g} s, "
+            "and not all were looked at; search longer, or ask for less"
         )
     if found.drive is None:
         most = loudest_found(fields, eras_at_most=count)

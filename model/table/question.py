@@ -7,6 +7,7 @@ from typing import TypeAlias
 
 import numpy as np
 
+from model.counting import counted
 from model.drive_modes import MODES
 from model.errors import InputError
 from model.finger.fingertip import FINGERTIP_RADIUS
@@ -66,8 +67,8 @@ class Question:
             )
         if self.softer_db and len(self.softer_db) != len(self.targets):
             raise InputError(
-                f"{len(self.softer_db)} levels were given for {len(self.targets)} targets; give "
-                "each its own, or none"
+                f"{counted(len(self.softer_db), 'level')} for "
+                f"{counted(len(self.targets), 'target')}; give each its own, or none"
             )
         for softer in self.softer_db:
             if not 0 <= softer <= MOST_LEVEL_DB_SL:  # not true of NaN either
@@ -124,8 +125,8 @@ class Question:
         mode = self.mode or own
         if self.eras_at_most > max(2, era_count):
             raise InputError(
-                f"the table has {era_count} ERAs, of which up to {self.eras_at_most} cannot be "
-                f"driven; allow {era_count} at the most"
+                f"the table has {counted(era_count, 'ERA')}, of which up to {self.eras_at_most} "
+                f"cannot be driven; allow {era_count} at the most"
             )
         if self.eras_at_most != 2 and mode != "switched":
             raise InputError(

@@ -68,6 +68,7 @@ def test_check_of_a_bad_rig_is_a_no(tmp_path: Path) -> None:
     assert result.exit_code == 1
     answer = json.loads(result.stdout)
     assert answer["ok"] is False
+    assert answer["warnings"] == []
     assert [error["key"] for error in answer["errors"]] == ["plate.thickness", "limits.level"]
     lines = text.splitlines()
     assert "thickness" in lines[answer["errors"][0]["line"] - 1]

@@ -33,7 +33,7 @@ TARGET, QUIET = (0.09, 0.07), ((0.25, 0.18),)
         (lambda: Question((TARGET,), search_time=math.nan), "cannot end after nan s"),
         (lambda: Question((TARGET,), mode="loud"), "unknown drive mode 'loud'; known: switched"),
         (lambda: Question((TARGET,), eras_at_most=0), "at least one"),
-        (lambda: Question((TARGET,), softer_db=(0.0, 3.0)), "2 levels were given for 1 targets"),
+        (lambda: Question((TARGET,), softer_db=(0.0, 3.0)), "2 levels for 1 target; give"),
         (lambda: Question((TARGET,), softer_db=(-1.0,)), "cannot be softer"),
         (lambda: Question((TARGET,), softer_db=(math.nan,)), "cannot be softer"),
         (lambda: Question(((0.2, 0.1), TARGET), ((0.095, 0.07),)), "within the quiet fingertip"),

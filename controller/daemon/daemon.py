@@ -28,6 +28,7 @@ from drivers.amplifier import Amplifier
 from drivers.errors import DriverError
 from drivers.operation.steady import no_long_collections
 from drivers.registry import open_backend
+from drivers.threads import in_thread
 from model.errors import InputError
 from model.table.table import LocalizationTable
 from model.table.timing import Timing
@@ -167,7 +168,8 @@ class Daemon:
             self._reload_is_due = False  # whoever asks from here on means what is there then
             self._manager.reloading()
             try:
-                new = await asyncio.to_thread(load_daemon_config, self._config.source)
+                source = self._config.source
+                new = await in_thread(lambda: load_daemon_config(source), name="reload")
                 await self._take_over(new)
             except InputError as error:
                 _logger.error("the configuration is left as it was: %s", error)

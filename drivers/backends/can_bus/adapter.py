@@ -16,6 +16,7 @@ from drivers.backends.stand_in import STAND_IN, Adapter
 from drivers.backends.urls.can_bus import CanBusUrl
 from drivers.codec.can_bus.frame import CanFrame
 from drivers.errors import LinkError, LinkTimeout, said_by_system
+from drivers.threads import in_thread
 
 _READ_TIMEOUT = 0.05  # s; how long the reader of a bus that cannot be woken notices its end
 _BUS_OFF = 0x40  # of the class of an error frame, as SocketCAN numbers them
@@ -37,7 +38,7 @@ async def open_adapter(
     if stand_in is not None:
         return await stand_in.open_adapter(url, on_frame=on_frame, on_loss=on_loss)
     try:
-        bus = await asyncio.to_thread(open_bus, url)
+        bus = await in_thread(lambda: open_bus(url), name=f"era-open {url}", undo=_shut)
     except _TROUBLE as problem:
         raise LinkError(_why_not_open(url, problem)) from problem
     return _ThreadedAdapter(bus, url, on_frame, on_loss)
@@ -99,8 +100,7 @@ class _ThreadedAdapter:
         except _TROUBLE as error:
             problem = error
         finally:
-            with contextlib.suppress(*_TROUBLE):
-                self._bus.shutdown()
+            _shut(self._bus)
         if not self._closing.is_set():
             with contextlib.suppress(RuntimeError):  # of a loop that is closed: nobody waits
                 self._loop.call_soon_threadsafe(self._lose, self._what_was_lost(problem))
@@ -126,6 +126,12 @@ class _ThreadedAdapter:
             f"the CAN bus {self._url} was lost ({problem}): check the adapter and the cable, then "
             "open the amplifier again"
         )
+
+
+def _shut(bus: can.BusABC) -> None:
+    """Close an adapter, also one that is gone."""
+    with contextlib.suppress(*_TROUBLE):
+        bus.shutdown()
 
 
 def _why_not_open(url: CanBusUrl, problem: Exception) -> str:

@@ -1,6 +1,5 @@
 """A serial port of this machine, a USB adapter, or a serial server, as pyserial names it."""
 
-import asyncio
 import contextlib
 import errno
 import os
@@ -13,11 +12,13 @@ from drivers.backends.ports.watched import (
     READ_TIMEOUT,
     WRITE_TIMEOUT,
     WatchedPort,
+    close_port,
     connection_of,
     remedy_of,
 )
 from drivers.backends.stand_in import STAND_IN, Port
 from drivers.errors import LinkError, said_by_system
+from drivers.threads import in_thread
 
 _FAILURES: tuple[type[Exception], ...] = (OSError, ValueError)  # of pyserial, at opening
 with contextlib.suppress(ImportError):  # Windows has no terminals
@@ -44,7 +45,9 @@ async def open_port(
     if stand_in is not None:
         return await stand_in.open_port(name, on_data=on_data, on_loss=on_loss)
     try:
-        port = await asyncio.to_thread(_open_port, name, baud, parity, stop)
+        port = await in_thread(
+            lambda: _open_port(name, baud, parity, stop), name=f"era-open {name}", undo=close_port
+        )
     except _FAILURES as problem:
         raise LinkError(_why_not_open(name, problem)) from problem
     return WatchedPort(port, name, on_data, on_loss)

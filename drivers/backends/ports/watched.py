@@ -77,7 +77,7 @@ class WatchedPort:
         """Wait until the reader has ended and the port is closed."""
         if self._thread is not None:
             await asyncio.to_thread(self._thread.join)
-        await asyncio.to_thread(_close_port, self._port)
+        await asyncio.to_thread(close_port, self._port)
 
     def _readable(self) -> None:
         if self._descriptor is None:
@@ -131,7 +131,8 @@ class WatchedPort:
         )
 
 
-def _close_port(port: serial.Serial) -> None:
+def close_port(port: serial.Serial) -> None:
+    """Give a port back, whatever became of it."""
     # pyserial does not close the socket of a server that hung up first, so that is done here.
     connection = connection_of(port)
     if connection is not None:

@@ -85,13 +85,13 @@ async def test_an_end_during_a_reload_starts_nothing(
         daemon = bench.daemon
         reads = asyncio.Event()
 
-        async def slowly(load: object, path: Path) -> object:
+        async def slowly(load: object, *, name: str) -> object:
             reads.set()
             await asyncio.sleep(3600)
             raise AssertionError("it was waited for")
 
         with monkeypatch.context() as patched:
-            patched.setattr("controller.daemon.daemon.asyncio.to_thread", slowly)
+            patched.setattr("controller.daemon.daemon.in_thread", slowly)
             daemon._reload_soon()
             await reads.wait()
         (reload,) = daemon._reloads

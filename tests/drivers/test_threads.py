@@ -1,0 +1,88 @@
+"""Work in a thread: what comes of it, and what of work that was given up."""
+
+import asyncio
+import contextlib
+import subprocess
+import sys
+import threading
+
+import pytest
+
+from drivers.threads import in_thread
+
+
+async def test_what_it_gives_and_raises_is_what_work_does() -> None:
+    """The result, and the very exception, from a thread of that name."""
+    assert await in_thread(lambda: threading.current_thread().name, name="opening") == "opening"
+    problem = OSError("no such port")
+
+    def fail() -> None:
+        raise problem
+
+    with pytest.raises(OSError, match="no such port") as raised:
+        await in_thread(fail, name="opening")
+    assert raised.value is problem
+
+
+async def test_what_was_given_up_is_undone_once() -> None:
+    """Who waits is cancelled at once; what is opened afterwards is closed, by its own thread."""
+    may_open, closed, closings = threading.Event(), threading.Event(), []
+
+    def open_port() -> str:
+        may_open.wait(20)
+        return "port"
+
+    def close_port(port: str) -> None:
+        closings.append(port)
+        closed.set()
+
+    opening = asyncio.create_task(in_thread(open_port, name="opening", undo=close_port))
+    await asyncio.sleep(0)
+    opening.cancel()
+    with contextlib.suppress(asyncio.CancelledError):
+        await opening
+    assert opening.cancelled()
+    assert closings == []
+    may_open.set()
+    assert await asyncio.to_thread(closed.wait, 20)
+    assert closings == ["port"]
+
+
+async def test_what_comes_in_the_moment_of_the_cancellation_is_undone() -> None:
+    """It is there already, but whoever is cancelled has not taken it over yet."""
+    closed = threading.Event()
+    loop = asyncio.get_running_loop()
+
+    def open_port() -> str:
+        opener = threading.current_thread()
+
+        def cancel_next() -> None:
+            opener.join()  # so that what it gives is before the cancellation, and nothing between
+            loop.call_soon(opening.cancel)
+
+        loop.call_soon_threadsafe(cancel_next)
+        return "port"
+
+    opening = asyncio.create_task(
+        in_thread(open_port, name="opening", undo=lambda port: closed.set())
+    )
+    with pytest.raises(asyncio.CancelledError):
+        await opening
+    assert await asyncio.to_thread(closed.wait, 20)
+
+
+def test_a_program_ends_though_work_hangs() -> None:
+    """Its end does not wait for a thread that waits for ever, unlike asyncio's own pool."""
+    program = """
+import asyncio, threading
+from drivers.threads import in_thread
+
+async def main():
+    opening = asyncio.create_task(in_thread(threading.Event().wait, name="hangs"))
+    await asyncio.sleep(0)
+    opening.cancel()
+    await asyncio.wait({opening})
+
+asyncio.run(main())
+"""
+    subprocess.run([sys.executable, "-c", program], check=True, timeout=60)

@@ -39,10 +39,8 @@ class Outputs:
     def pass_to(self, time: float) -> None:
         """Let a set end whose time is over."""
         if self._ends is not None and time > self._ends[1] + self._slack:
-            begin, self._ends = self._ends, None
-            durations = [self._duration(slot) for slot in self._endings.values()]
-            free = max(durations, default=0.0)
-            self.silence(begin, self._ramp, "the end of valid_for", free=free)
+            self._fades = {channel: self._fade_by(channel, time) for channel in self._channels}
+            self._is_silent_after("the end of valid_for")
 
     def rest(self, cause: str) -> None:
         """They have been silent for as long as matters."""
@@ -63,10 +61,10 @@ class Outputs:
     def play(self, asked: Asked, drives: Mapping[int, Drive], begin: float, end: float) -> None:
         """A set is played, taken over within two times [s]."""
         self._levels_before = {channel: fade.after for channel, fade in self._fades.items()}
-        for channel in {*self._plan.channels, *drives, *self._fades}:
+        for channel in self._channels | set(drives):
             drive = drives.get(channel)
             level = drive.level if drive is not None else 0.0
-            fade = self._fades.get(channel, Fade()).to(level, begin=(begin, end), ramp=asked.ramp)
+            fade = self._fade_by(channel, end).to(level, begin=(begin, end), ramp=asked.ramp)
             shaped = self._shaping(channel, drive)
             self._fades[channel] = fade._replace(free_until=end + shaped) if shaped else fade
         self._drives, self.cause, self._ramp = drives, "set", asked.ramp
@@ -74,20 +72,16 @@ class Outputs:
         ends = asked.valid_for > 0
         self._ends = (begin + asked.valid_for, end + asked.valid_for) if ends else None
 
-    def silence(
-        self, begin: tuple[float, float], ramp: float, cause: str, *, free: float = 0.0
-    ) -> None:
-        """All fall silent along a ramp [s]; until `free` after that nothing is known."""
-        for channel in {*self._plan.channels, *self._fades}:
-            fade = self._fades.get(channel, Fade()).to(0.0, begin=begin, ramp=ramp)
-            self._fades[channel] = fade._replace(free_until=begin[1] + free) if free else fade
-        self._drives, self.cause = {}, cause
-        self._ends = None
-        self._endings = {}
+    def silence(self, begin: tuple[float, float], ramp: float, cause: str) -> None:
+        """All fall silent along a ramp [s]."""
+        for channel in self._channels:
+            fade = self._fade_by(channel, begin[1])
+            self._fades[channel] = fade.to(0.0, begin=begin, ramp=ramp)
+        self._is_silent_after(cause)
 
     def free(self, until: float) -> None:
         """Nobody knows what they play until a time [s]."""
-        for channel in {*self._plan.channels, *self._fades}:
+        for channel in self._channels:
             fade = self._fades.get(channel, Fade())
             self._fades[channel] = fade._replace(free_until=until, before=(0.0, 1.0))
 
@@ -128,7 +122,7 @@ class Outputs:
         may_be_off: whether its watchdog may have run out by now.
         """
         for channel, level in enumerate(levels):
-            fade = self._fades.get(channel, Fade())
+            fade = self._fade_by(channel, end + self._slack)
             low, high = fade.within(begin - self._slack, end + self._slack)
             is_low = False
             if level > high + LEVEL:
@@ -149,6 +143,24 @@ class Outputs:
                 self._suspicions.append(found)
             else:
                 self._complain(*found)
+
+    @property
+    def _channels(self) -> set[int]:
+        return {*self._plan.channels, *self._fades}
+
+    def _fade_by(self, channel: int, time: float) -> Fade:
+        """What a channel does up to a time [s], by which its set may have ended."""
+        fade = self._fades.get(channel, Fade())
+        if self._ends is None or time < self._ends[0]:
+            return fade
+        fade = fade.to(0.0, begin=self._ends, ramp=self._ramp)
+        free = max((self._duration(slot) for slot in self._endings.values()), default=0.0)
+        return fade._replace(free_until=self._ends[1] + free) if free else fade
+
+    def _is_silent_after(self, cause: str) -> None:
+        self._drives, self.cause = {}, cause
+        self._ends = None
+        self._endings = {}
 
     def _rule_of_level(self, channel: int, level: float, *, is_settled: bool) -> str:
         if self.cause == "the watchdog":

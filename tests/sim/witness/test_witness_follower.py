@@ -4,11 +4,15 @@ import pytest
 
 from sim.witness.follower import Follower
 from sim.witness.plan import AmplifierPlan, Limits, Times
-from sim.witness.seen import Answered, Asked, Condition, Kind
+from sim.witness.seen import Answered, Asked, Condition, Drive, Kind
 
 PLAN = AmplifierPlan("line", 1, {0: Limits(40.0, 500.0, 1.0)})
 ARM = Asked(Kind.ARM, 1, key=1, watchdog=0.25)
 STOP = Asked(Kind.STOP, 1, key=2)
+# Plays 0.2 for 0.3 s, then fades out along 50 ms.
+BRIEF = Asked(
+    Kind.APPLY, 1, key=3, token=1, ramp=0.05, valid_for=0.3, drives={0: Drive(110.0, 0.2, 0.0)}
+)
 # docs/reference/wire-protocol.md, States and Fault.
 ENABLED, STOPPED, REACTING, FAULT = 4, 5, 6, 7
 WATCHDOG = 1
@@ -17,10 +21,11 @@ WATCHDOG = 1
 class Watched:
     """A follower with the rules that it finds broken."""
 
-    def __init__(self) -> None:
+    def __init__(self, *, slack: float = 0.001) -> None:
         self.broken: list[str] = []
+        times = Times(slack=slack)
         self.follower = Follower(
-            "main", PLAN, times=Times(), complain=self._complain, insist=self._complain
+            "main", PLAN, times=times, complain=self._complain, insist=self._complain
         )
 
     def grants(self, asked: Asked, begin: float, state: int, fault: int = 0) -> None:
@@ -66,3 +71,27 @@ def test_who_is_not_known_follows_a_stop_all_the_same(state: int) -> None:
     watched = Watched()
     watched.grants(STOP, 1.0, state)
     assert len(watched.broken) == 1
+
+
+@pytest.mark.parametrize(
+    ("time", "level", "rules"),
+    [
+        (1.370, 0.2, []),
+        (1.370, 0.18, ["plays"]),
+        (1.402, 0.2, []),
+        (1.410, 0.1809, []),
+        (1.410, 0.0, ["ramp"]),
+        (1.460, 0.0, []),
+        (1.460, 0.2, ["silent"]),
+    ],
+)
+def test_a_set_that_ends_by_itself_may_fade_from_its_end_on(
+    time: float, level: float, rules: list[str]
+) -> None:
+    """Taken at 1.100 to 1.102 s, it fades from 1.4 s on: 0.2 (1 + cos(pi/5)) / 2 after 10 ms."""
+    watched = Watched(slack=0.02)
+    watched.grants(ARM, 1.0, ENABLED)
+    watched.follower.granted(BRIEF, Answered(1, 3), 1.1, 1.102)
+    watched.follower.fed(1.3)
+    watched.follower.said(Condition(ENABLED, 0, levels=(level,)), time, time + 0.001)
+    assert watched.broken == rules

@@ -23,12 +23,12 @@ from drivers.command import CommandSet, DriveCommand
 from drivers.errors import CommandRefused, DriverError, LinkError
 from drivers.guard import Guard, GuardLimits, SafeCommand
 from drivers.link.link import REPLY_TIMEOUT as USUAL_TIMEOUT
-from drivers.operation.supervision import reopen
 from drivers.operation.watchdog import HEARTBEAT, HEARTBEATS_BORNE, told_after
 from drivers.protocol.messages import Event, Fault, State
 from drivers.registry import open_backend
 from memory_machine import MemoryMachine
 from model.rig.rig import Rig
+from reopened import reopen
 from sim.far_ends.wires import Wire
 from sim.faults.episodes import Episode, FaultKind
 from sim.transport.pseudo_terminal import TERMINAL_MAKER
@@ -61,7 +61,7 @@ class Link:
         self.amplifier.listen(self.events.append)
 
     async def __aenter__(self) -> "Link":
-        await reopen(self.amplifier, waits=iter([0.01] * 100))
+        await reopen(self.amplifier)
         self.guard = Guard(LIMITS, self.amplifier.capabilities)
         return self
 
@@ -74,7 +74,7 @@ class Link:
         async with asyncio.timeout(60):
             while True:
                 with contextlib.suppress(LinkError, CommandRefused):  # not yet silent
-                    await reopen(self.amplifier, waits=iter([0.0] * 20))
+                    await reopen(self.amplifier, tries=20, pause=0.0)
                     await self.amplifier.clear()
                     await self.amplifier.arm(2.0)
                     return
@@ -148,7 +148,7 @@ async def test_a_link_that_is_cut_leaves_silence_and_is_told(far: FarSide, kind:
         assert far.silent_from() - max(fed, fed_at(far)) <= WATCHDOG + REACTION + 1e-9
         await eventually(lambda: far.station.status().state is State.FAULT)
         far.station.recover()
-        await reopen(link.amplifier, waits=iter([0.01] * 200))
+        await reopen(link.amplifier, tries=200)
         status = await link.amplifier.status()  # that it was opened again has armed nothing
         assert (status.state, status.levels) == (State.FAULT, (0.0,) * 4)
 
@@ -166,7 +166,7 @@ async def test_a_wire_that_is_pulled_out_is_told_within_60_ms(far: FarSide) -> N
             if took[-1] <= 0.060:
                 return
             far.station.recover()
-            await reopen(host.amplifier, waits=iter([0.01] * 200))
+            await reopen(host.amplifier, tries=200)
     raise AssertionError(f"told after {', '.join(f'{1e3 * one:.0f} ms' for one in took)}")
 
 
@@ -436,7 +436,7 @@ async def test_a_reboot_is_noticed_and_nothing_is_armed(far: FarSide) -> None:
         try:
             status = await link.amplifier.heartbeat()
         except LinkError:  # of a wire that tells by itself who has started anew
-            await reopen(link.amplifier, waits=iter([0.01] * 50))
+            await reopen(link.amplifier, tries=50)
             status = await link.amplifier.status()
         assert status.state is State.SWITCH_ON_DISABLED
         with pytest.raises(CommandRefused):
@@ -449,10 +449,8 @@ async def test_another_amplifier_is_refused(far: FarSide) -> None:
         await link.amplifier.close()
         own = far.amplifier.identity
         far.amplifier.identity = type(own)(own.vendor, own.product, "OTHER", own.firmware, 1)
-        failures: list[LinkError] = []
         with pytest.raises(LinkError, match="OTHER answers where SIM-main is expected"):
-            await reopen(link.amplifier, waits=iter([0.0, 0.0]), on_failure=failures.append)
-        assert len(failures) == 3
+            await reopen(link.amplifier, tries=3, pause=0.0)
         assert link.amplifier.lost
 
 
@@ -520,7 +518,7 @@ async def test_a_hundred_replugs_leak_nothing(far: FarSide) -> None:
             with pytest.raises(LinkError):
                 await beat(link.amplifier, HEARTBEATS_BORNE)
             far.station.recover()
-            await reopen(link.amplifier, waits=iter([0.01] * 200))
+            await reopen(link.amplifier, tries=200)
             if number == 4:
                 before = in_use()
         after = in_use()

@@ -1,1 +1,1 @@
-"""Amplifiers in operation: begun together, looked after, and opened again after a loss."""
+"""Amplifiers in operation: begun together, and looked after."""

@@ -1,6 +1,7 @@
 """What all tests share: one thread for linear algebra, the paper's plate, what is begun first."""
 
 import os
+from pathlib import Path
 
 for _variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ[_variable] = "1"  # before numpy loads: two threads are slower here, and erratic
@@ -31,6 +32,13 @@ DEAREST = (
     "test_wheel.py",
 )
 """Begun in this order, before all others: one that began last would go on when a core is idle."""
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Of those that run alone, leave out files that hold none: reading all takes ten seconds."""
+    if config.option.markexpr != "alone" or collection_path.suffix != ".py":
+        return None
+    return True if "mark.alone" not in collection_path.read_text("utf-8") else None
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -2,6 +2,7 @@
 
 import ast
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 from types import ModuleType
 
@@ -24,15 +25,20 @@ FILES = files(drivers, controller)
 ASIDE = files(era_haptics, model, sim)  # what no excitation goes through on its way to a wire
 GUARD = Path(drivers.__file__).parent / "guard" / "guard.py"
 ENCODERS = {"backends", "codec"}
-TREES = {file: ast.parse(file.read_text(encoding="utf-8")) for file in (*FILES, *ASIDE)}
 
 # Messages that carry something an amplifier would play.
 CARRIERS = {"Stage", "Apply", "LoadEnvelope"}
 
 
+@cache
+def tree(file: Path) -> ast.Module:
+    """What stands in a file."""
+    return ast.parse(file.read_text(encoding="utf-8"))
+
+
 def calls(file: Path) -> Iterator[tuple[str, ast.Call]]:
     """Every call in a file, with the last part of the name of what is called."""
-    for node in ast.walk(TREES[file]):
+    for node in ast.walk(tree(file)):
         if isinstance(node, ast.Call):
             called = node.func
             yield (
@@ -44,7 +50,7 @@ def calls(file: Path) -> Iterator[tuple[str, ast.Call]]:
 def names(file: Path) -> set[str]:
     """Every name, attribute and imported name in a file."""
     found = set()
-    for node in ast.walk(TREES[file]):
+    for node in ast.walk(tree(file)):
         if isinstance(node, ast.Name):
             found.add(node.id)
         elif isinstance(node, ast.Attribute):

@@ -40,26 +40,16 @@ def route(
             f"the pattern drives {', '.join(unknown)}, which the rig does not have; "
             "build a table for this rig"
         )
-    commands: dict[str, list[DriveCommand]] = {name: [] for name in rig.amplifiers}
     restarted = _restarted(excitation, playing or {})
-    slots = onset_slots(rig)
-    for name, channel in rig.wiring.items():
-        command = _drive(excitation, rig, name, restarted=restarted)
-        if onset and name in onset:
-            command = replace(command, frequency=onset[name].frequency, onset=slots[name])
-        commands[channel.amplifier].append(command)
-    highest = max((command.level for wired in commands.values() for command in wired), default=0.0)
+    drive = {name: _drive(excitation, rig, name, restarted=restarted) for name in rig.wiring}
+    if onset:
+        slots = onset_slots(rig)
+        for name, envelope in onset.items():
+            drive[name] = replace(drive[name], frequency=envelope.frequency, onset=slots[name])
+    highest = max((command.level for command in drive.values()), default=0.0)
     slowest = highest / rig.limits.slew  # from rest: what plays now only makes it shorter
     ramp = slowest if slowest > ramp else ramp  # not finite stays so, for the guard to refuse
-    return {
-        name: CommandSet(
-            token=token,
-            commands=tuple(sorted(wired, key=lambda command: command.channel)),
-            ramp=ramp,
-            valid_for=0.0,
-        )
-        for name, wired in commands.items()
-    }
+    return _sets(drive, rig, token=token, ramp=ramp)
 
 
 def drive_of_eras(
@@ -94,18 +84,12 @@ def route_again(
     ending: Envelopes,
 ) -> dict[str, CommandSet]:
     """The sets, by amplifier, that go on with what ERAs play and give it endings."""
-    commands: dict[str, list[DriveCommand]] = {name: [] for name in rig.amplifiers}
+    drive = {name: _silent(channel.number, rig) for name, channel in rig.wiring.items()}
     slots = ending_slots(rig)
-    for name, channel in rig.wiring.items():
-        command = playing.get(name) or _silent(channel.number, rig)
-        if name in playing:
-            slot = slots[name] if name in ending else 0
-            command = replace(command, keep_phase=True, onset=0, ending=slot)
-        commands[channel.amplifier].append(command)
-    return {
-        name: CommandSet(token=token, commands=tuple(wired), ramp=ramp, valid_for=0.0)
-        for name, wired in commands.items()
-    }
+    for name, command in playing.items():
+        slot = slots[name] if name in ending else 0
+        drive[name] = replace(command, keep_phase=True, onset=0, ending=slot)
+    return _sets(drive, rig, token=token, ramp=ramp)
 
 
 def route_end(rig: Rig, *, token: int, ramp: float) -> dict[str, CommandSet]:
@@ -113,13 +97,28 @@ def route_end(rig: Rig, *, token: int, ramp: float) -> dict[str, CommandSet]:
 
     ramp [s]: for those without.
     """
-    commands: dict[str, list[DriveCommand]] = {name: [] for name in rig.amplifiers}
-    for channel in rig.wiring.values():
-        silent = _silent(channel.number, rig)
-        commands[channel.amplifier].append(replace(silent, skip_ending=False))
+    drive = {
+        name: replace(_silent(channel.number, rig), skip_ending=False)
+        for name, channel in rig.wiring.items()
+    }
+    return _sets(drive, rig, token=token, ramp=ramp)
+
+
+def _sets(
+    drive: Mapping[str, DriveCommand], rig: Rig, *, token: int, ramp: float
+) -> dict[str, CommandSet]:
+    """One command set per amplifier, by its name, of what every ERA is to play, by its own."""
+    wired: dict[str, list[DriveCommand]] = {name: [] for name in rig.amplifiers}
+    for name, channel in rig.wiring.items():
+        wired[channel.amplifier].append(drive[name])
     return {
-        name: CommandSet(token=token, commands=tuple(wired), ramp=ramp, valid_for=0.0)
-        for name, wired in commands.items()
+        name: CommandSet(
+            token=token,
+            commands=tuple(sorted(commands, key=lambda command: command.channel)),
+            ramp=ramp,
+            valid_for=0.0,
+        )
+        for name, commands in wired.items()
     }
 
 

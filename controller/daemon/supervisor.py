@@ -65,7 +65,8 @@ class Supervisor:
 
         def refused(reason: str) -> None:
             self._refusal = reason
-            observer.refused(reason)
+            if not self._is_stopped_by_itself:  # or the fault that follows tells
+                observer.refused(reason)
 
         def turned() -> None:
             self._look_at_phase()
@@ -298,11 +299,15 @@ class Supervisor:
                     await self._quietly(self.handle(Event(Kind.FAULT, problem, ACKNOWLEDGE)))
 
     def _look_at_phase(self) -> None:
-        """After a turn of the control loop: whether it has stopped the amplifiers by itself."""
-        if self.machine.state is not State.OPERATION_ENABLED:
-            return
-        if self._the_controller.phase is Phase.DISARMED:
+        """After a turn of the control loop: it is a fault if that has stopped the amplifiers."""
+        if self._is_stopped_by_itself:
             self.tell(Event(Kind.FAULT, self._refusal or "an amplifier refused", ACKNOWLEDGE))
+
+    @property
+    def _is_stopped_by_itself(self) -> bool:
+        """Whether the control loop has stopped the amplifiers, and nobody has asked for it."""
+        is_armed = self.machine.state is State.OPERATION_ENABLED
+        return is_armed and self._the_controller.phase is Phase.DISARMED
 
     def _heard(self, name: str, event: AmplifierEvent) -> None:
         """What an amplifier says unasked; a heartbeat would tell later."""

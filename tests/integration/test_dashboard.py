@@ -323,7 +323,8 @@ async def test_stop_is_uncovered_on_every_screen_wherever_it_is_scrolled(
 ) -> None:
     """All of it within the screen, nothing before any of its corners, large enough for a thumb."""
     uncovered = f"({PROBES}).isUncovered('#stop')"
-    for screen in (*SCREENS, Screen("wide", 1920, 1080), Screen("narrow", 360, 640)):
+    zoomed = Screen("400 %", 320, 215)
+    for screen in (*SCREENS, Screen("wide", 1920, 1080), Screen("narrow", 360, 640), zoomed):
         await open_dashboard(page, gateway, screen)
         bottom = await page.evaluate("document.documentElement.scrollHeight")
         for scrolled in range(0, bottom, max(200, screen.height // 2)):
@@ -440,6 +441,57 @@ async def test_what_others_are_called_is_text(page: Page, era: Client) -> None:
     assert page.complaints == []
 
 
+async def test_no_name_of_a_region_lies_under_an_era(page: Page) -> None:
+    """Wherever ERAs stand at the edges of regions, on a large plate and on a small one."""
+    hidden = (
+        "import('./plate.js').then(({ PlateOverlay }) => {"
+        " const plate = document.body.appendChild(document.createElement('div'));"
+        " const svg = document.createElementNS('http://www.w3.org/2000/svg', 'svg');"
+        " plate.append(svg);"
+        " plate.style.width = '%dpx';"
+        " const era = (x_m, y_m) => ({ name: `E${x_m}${y_m}`, x_m, y_m });"
+        " const rig = { length_m: 0.3, width_m: 0.2, eras: [era(0.15, 0.18), era(0.1, 0.1),"
+        "  era(0.07, 0.05), era(0.2, 0.1)] };"
+        " const regions = ["
+        "  { name: 'slider', shape: 'rectangle', x_m: 0.02, y_m: 0.14, width_m: 0.26,"
+        "   height_m: 0.04 },"
+        "  { name: 'keypad', shape: 'rectangle', x_m: 0.02, y_m: 0.02, width_m: 0.1,"
+        "   height_m: 0.03 },"
+        "  { name: 'knob', shape: 'circle', x_m: 0.2, y_m: 0.06, radius_m: 0.04 },"
+        "  { name: 'patch', shape: 'polygon', points_m: [[0.08, 0.1], [0.12, 0.1], [0.1, 0.06]] }];"
+        " const overlay = new PlateOverlay(plate, svg);"
+        " overlay.setUp({ rig, layout: { regions } });"
+        " const boxes = (selector) => [...svg.querySelectorAll(selector)].map((each) =>"
+        "  each.getBoundingClientRect());"
+        " const meet = (a, b) => a.left < b.right && b.left < a.right && a.top < b.bottom"
+        "  && b.top < a.bottom;"
+        " const [names, eras] = [boxes('.label.name'), boxes('.era')];"
+        " plate.remove();"
+        " return [names.length, eras.length,"
+        "  names.filter((name) => eras.some((each) => meet(name, each))).length];"
+        "})"
+    )
+    for width in (800, 360):
+        assert await page.evaluate(hidden % width) == [4, 4, 0]
+
+
+async def test_an_effect_plays_at_the_newest_finger(page: Page, era: Client) -> None:
+    """Its button can be pressed while armed only, and needs a finger anywhere on the plate."""
+    assert await page.until("document.querySelector('#effects button:disabled') !== null")
+    await arm(page, era)
+    async with fingers_down(page, PLACES[0]):
+        await contacts(era, 1)
+        await page.until("document.querySelectorAll('.contact').length")
+        await page.click("#effects button[title^=Once]")
+        await page.until("document.querySelectorAll('.contact.target').length")
+        assert await page.evaluate("document.querySelector('#problem').innerText") == ""
+    await contacts(era, 0)
+    await page.click("#effects button[title^=Once]")
+    await page.until(
+        "document.querySelector('#problem').innerText", lambda text: "no finger is within" in text
+    )
+
+
 async def test_an_event_that_is_told_again_takes_one_line(page: Page) -> None:
     """A link that is tried every few seconds does not push out why it was lost."""
     shown = await page.evaluate(
@@ -472,7 +524,7 @@ async def test_the_door_lets_in_with_the_token_alone(
         else:
             await browser.until(
                 "document.querySelector('#door-problem')?.innerText",
-                lambda text: "has another token" in (text or ""),
+                lambda text: "refuses the token" in (text or ""),
             )
             # It answers: whoever reads that it does not looks for the wrong thing.
             banner = await browser.evaluate("document.querySelector('#banner').innerText")
@@ -500,3 +552,5 @@ async def test_it_comes_back_after_gateway_and_daemon(browser: Page, tmp_path: P
             with gateway_process(tmp_path, tmp_path / "era.sock", *listen):
                 await browser.until(f"{STATE} === 'READY_TO_SWITCH_ON'")
                 await browser.until(banner, lambda text: "Simulated" in text)
+                await browser.press(" ", "Space")  # delivered: what was complained of is over
+                await browser.until("!document.querySelector('#problem').innerText")

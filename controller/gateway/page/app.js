@@ -4,18 +4,19 @@ import { decodeField, FieldPicture } from "./field.js";
 import { Fingers } from "./fingers.js";
 import { Link } from "./link.js";
 import { PlateOverlay, shown } from "./plate.js";
-import { addEvent, showAmplifiers, showEffects, showLatency } from "./side.js";
+import { addEvent, follow, showAmplifiers, showEffects, showLatency, STATES } from "./side.js";
 
 const TOPICS = ["hello", "state", "contacts", "pattern", "silence", "amplifiers", "latency", "log", "link", "field"];
 const LEASE_S = 5;
 const TOKEN_KEY = "era-haptics-token";
-const STATES = {
-  NOT_READY: "not ready", SWITCH_ON_DISABLED: "disarmed", READY_TO_SWITCH_ON: "disarmed",
-  SWITCHED_ON: "switched on", OPERATION_ENABLED: "armed", QUICK_STOP_ACTIVE: "stopped",
-  FAULT_REACTION_ACTIVE: "fault", FAULT: "fault", COMM_LOST: "link lost",
+// States that are left at once: what led to them, or what follows, is told.
+const PASSING = ["SWITCHED_ON", "FAULT_REACTION_ACTIVE", "READY_TO_SWITCH_ON"];
+// Why there is no connection to the gateway, and what is done about it.
+const SHUT = {
+  refused: ["The gateway refuses the token of this page", "open the URL that it printed when it started"],
+  full: ["The gateway answers, but does not let this page in", "it is tried again"],
+  away: ["The gateway does not answer", "it is tried again"],
 };
-
-const LINK_NEWS = /^link (lost|retry|reopened): /;
 
 const at = (id) => document.getElementById(id);
 const log = at("log");
@@ -23,7 +24,10 @@ let link;
 let lease = null;  // ends with a refusal to renew: states may be told later than the answer to arm
 let state = null;
 let daemon;  // undefined until it is told; null while it is away
-let isRefused = false;  // the gateway answers, but not to this token
+let shutBecause = "away";
+let since = null;  // when the gateway, the daemon or a link to an amplifier was lost
+let watchdog;  // s; how long an amplifier plays on that hears nothing
+let loss = null;  // the event of a lost link, and how often it was tried again
 
 const overlay = new PlateOverlay(at("plate"), at("overlay"));
 const picture = new FieldPicture(at("field"), at("scale"), (low, high) => {
@@ -54,6 +58,7 @@ async function stop() {
   try {
     if (!link) throw new Error("no token");
     await link.stop();
+    at("problem").textContent = "";
   } catch {
     complain(new Error("The stop was not delivered. Switch the amplifiers off by hand."));
   }
@@ -81,29 +86,61 @@ function showButtons() {
   at("arm").disabled = !isThere || isArmed || !["SWITCH_ON_DISABLED", "READY_TO_SWITCH_ON"].includes(state);
   at("disarm").disabled = !isThere || !isArmed;
   at("clear").disabled = !isThere || !["QUICK_STOP_ACTIVE", "FAULT"].includes(state);
+  at("effects").disabled = !isThere || !isArmed;
 }
 
 // What everybody should know before they look at anything else.
 function showBanner() {
+  const from = since ? ` (since ${since.toLocaleTimeString()})` : "";
+  const unseen = "Amplifiers may still be energised.";
   let text = "";
-  if (isRefused) text = "The gateway refuses the token of this page. Amplifiers may still be energised.";
-  else if (!link?.isOpen) text = "The gateway does not answer. Amplifiers may still be energised.";
-  else if (daemon === null) text = "The daemon does not answer. Amplifiers may still be energised.";
-  else if (state === "COMM_LOST") text = "The link to an amplifier is lost. It may still be energised.";
-  else if (daemon?.rig.simulated) text = "Simulated amplifiers: nothing vibrates but numbers.";
+  if (!link?.isOpen) text = `${SHUT[shutBecause][0]}${shutBecause === "away" ? from : ""}. ${unseen}`;
+  else if (daemon === null) text = `The daemon does not answer${from}. ${unseen}`;
+  else if (state === "COMM_LOST") {
+    text = `The link to an amplifier is lost${from}. `;
+    text += watchdog ? `Its watchdog silences it after ${watchdog} s, which nothing confirms: it` : "It";
+    text += " may still be energised.";
+  } else if (daemon?.rig.simulated) text = "Simulated amplifiers: nothing vibrates but numbers.";
   at("banner").hidden = !text;
   at("banner").textContent = text;
   at("banner").classList.toggle("grave", !text.startsWith("Simulated"));
 }
 
 function showState(next, cause) {
+  if (next !== null) since = next === "COMM_LOST" ? since ?? new Date() : null;
   state = next;
   showBanner();
-  at("state").textContent = STATES[state] ?? "daemon away";
+  at("state").textContent = STATES[state] ?? "not connected";
   at("state").dataset.state = state ?? "away";
   at("state").title = state ?? "";
-  at("cause").textContent = cause ?? "";
+  at("cause").textContent = at("cause").title = cause ?? "";
+  at("plate").classList.toggle("unknown", state === null || state === "COMM_LOST");
   showButtons();
+}
+
+// As the daemon tells it when it is asked.
+function showStatus(status) {
+  showState(status.state, status.cause);
+  watchdog = status.watchdog_s;
+  if (status.lost_for_s !== null) {
+    since = new Date(Date.now() - 1000 * status.lost_for_s);
+    tellLoss(status.cause, status.remedy);
+  }
+  showBanner();
+}
+
+// Nobody tells any more what is on the plate and how the amplifiers are.
+function forget(cause) {
+  showState(null, cause);
+  overlay.show({ contacts: [], drive: {} });
+  picture.clear();
+  at("summary").textContent = "";
+  showAmplifiers(at("amplifiers"), null, []);
+  loss = null;
+}
+
+function tellLoss(cause, remedy) {
+  loss ??= { item: addEvent(log, "error", `link lost: ${cause}`, remedy), remedy, tries: 0 };
 }
 
 function summarise({ contacts, predicted_contrast_db, robust_contrast_db, predicted_level_db_sl, latency_ms }) {
@@ -117,23 +154,27 @@ function summarise({ contacts, predicted_contrast_db, robust_contrast_db, predic
 
 const HANDLERS = {
   hello(said) {
+    if (daemon && !said) since = new Date();
     daemon = said;
-    showBanner();
     if (daemon === null) {
-      showState(null, "the gateway looks for it");
-      overlay.show({ contacts: [], drive: {} });
+      forget("the gateway looks for the daemon");
       return;
     }
     overlay.setUp(daemon);
-    link.call("status").then((status) => showState(status.state, status.cause)).catch(complain);
+    link.call("status").then(showStatus).catch(complain);
     link.call("effects").then(({ effects }) => showEffects(at("effects-section"), at("effects"), effects, play)).catch(() => {});
   },
   state({ old, new: next, cause, remedy }) {
-    const previous = state;
+    const isNews = state !== null && old !== next && !PASSING.includes(next);
     showState(next, cause);
-    if (previous !== null && old !== next) {
-      const level = ["FAULT", "COMM_LOST"].includes(next) ? "error" : "info";
-      addEvent(log, level, `${STATES[next] ?? next}: ${cause}`, remedy);
+    if (next === "COMM_LOST") {
+      tellLoss(cause, remedy);
+    } else if (loss) {
+      follow(loss.item, `${new Date().toLocaleTimeString()} all amplifiers answer again, and are disarmed`, remedy);
+      loss = null;
+    } else if (isNews) {
+      const what = STATES[next] ?? next;
+      addEvent(log, next === "FAULT" ? "error" : "info", cause.startsWith(what) ? cause : `${what}: ${cause}`, remedy);
     }
   },
   contacts({ contacts }) {
@@ -152,42 +193,48 @@ const HANDLERS = {
   amplifiers({ amplifiers }) {
     showAmplifiers(at("amplifiers"), amplifiers, overlay.rig?.eras ?? []);
   },
-  latency({ latency_ms }) {
+  latency({ latency_ms, plain_because }) {
     showLatency(at("latency-numbers"), at("latency"), latency_ms);
+    at("plain").textContent = plain_because ? `Plain ramps in place of shaped onsets: ${plain_because}` : "";
   },
   log({ level, message, cause, remedy }) {
-    if (isTransition(message) || LINK_NEWS.test(message)) return;  // told by state and link, in words
     addEvent(log, level, cause ? `${message}: ${cause}` : message, remedy);
   },
-  link({ event, amplifier, message, remedy }) {
-    addEvent(log, event === "reopened" ? "info" : "error", amplifier ? `${amplifier}: ${message}` : message, remedy);
+  link({ event, message }) {
+    if (event !== "retry" || !loss) return;  // of the others the state tells
+    const times = ++loss.tries === 1 ? "once" : `${loss.tries} times`;
+    follow(loss.item, `tried again ${times}: ${message}`, loss.remedy);
   },
 };
 
-// Whether a line of the daemon's log is its change of state, such as "SWITCHED_ON -> FAULT".
-function isTransition(message) {
-  const parts = message.split(" -> ");
-  return parts.length === 2 && parts.every((part) => part in STATES);
-}
-
+// At the keyboard's finger or the newest of all.
 function play(effect) {
-  const { rig, cursor } = overlay;
-  const place = cursor ?? { x_m: rig.length_m / 2, y_m: rig.width_m / 2 };
-  ask("play", { effect, ...place });
+  const { rig, cursor, contacts } = overlay;
+  const { x_m, y_m } = cursor ?? contacts.at(-1) ?? { x_m: rig.length_m / 2, y_m: rig.width_m / 2 };
+  ask("play", { effect, x_m, y_m });
 }
 
 function connected(isConnected) {
   if (isConnected) {
-    isRefused = false;
+    shutBecause = "away";  // if it is lost again
+    since = null;
     at("door").hidden = true;
     at("main").hidden = false;
     addEvent(log, "info", "connected to the gateway");
     return;
   }
+  if (link?.isHeard) since = new Date();
   lease = null;
   daemon = undefined;
-  showState(null, isRefused ? "the gateway has another token" : "the gateway does not answer; it is tried again");
-  if (!link?.wasOpen) showDoor("The gateway cannot be reached. It is tried again.");
+  forget(SHUT[shutBecause][1]);
+}
+
+// There is a gateway that lets this page not in, or none.
+function shut(why) {
+  shutBecause = why;
+  forget(SHUT[why][1]);
+  if (why === "refused" || !link.wasOpen) showDoor(`${SHUT[why][0]}.`);
+  else at("door").hidden = true;
 }
 
 function showDoor(problem) {
@@ -195,16 +242,10 @@ function showDoor(problem) {
   at("door-problem").textContent = problem;
 }
 
-function refused() {
-  isRefused = true;
-  showState(null, "the gateway has another token");
-  showDoor("The gateway has another token: open the URL that it printed when it started.");
-}
-
 function enter(token) {
   link = new Link(token, TOPICS, {
     connected,
-    refused,
+    shut,
     event: ({ topic, data }) => HANDLERS[topic]?.(data),
     field: (buffer) => picture.show(decodeField(buffer)),
   });

@@ -45,8 +45,13 @@ export class FieldPicture {
     this.inMotion = false;
     this.top = 0;
     this.frames = 0;
-    this.show({ columns: 2, rows: 2, frequencies: [], parts: new Float32Array(0) });
+    this.clear();
     requestAnimationFrame((now) => this.draw(now));
+  }
+
+  // Nothing is to be seen.
+  clear() {
+    this.show({ columns: 2, rows: 2, frequencies: [], parts: new Float32Array(0) });
   }
 
   // Set what is to be seen.

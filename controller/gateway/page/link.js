@@ -12,8 +12,9 @@ export class RpcError extends Error {
 }
 
 export class Link {
-  // token: the gateway's; topics: what to be told of; handlers: connected(isConnected), refused() for
-  // the sake of the token, event(params), field(ArrayBuffer).
+  // token: the gateway's; topics: what to be told of; handlers: connected(isConnected), after each
+  // attempt in vain shut(why), event(params), field(ArrayBuffer). why: "refused" for the sake of the
+  // token, "full" where it answers but lets nobody in, or "away".
   constructor(token, topics, handlers) {
     this.token = token;
     this.topics = topics;
@@ -107,9 +108,11 @@ export class Link {
     return Promise.any([this.call("stop"), overHttp]);
   }
 
-  // Whether it is for the token that no WebSocket is let in: browsers do not tell.
+  // Why no WebSocket was let in: browsers do not tell.
   ask() {
-    this.post("effects").then(({ status }) => status === 401 && this.handlers.refused()).catch(() => {});
+    this.post("effects")
+      .then(({ status }) => (status === 401 ? "refused" : "full"), () => "away")
+      .then((why) => this.isOpen || this.handlers.shut(why));
   }
 
   post(method) {

@@ -3,6 +3,8 @@
 const SVG = "http://www.w3.org/2000/svg";
 const FINGERTIP_M = 0.0065;  // radius
 const SMALL_PX = 480;  // a plate that has no room for every label
+const SIZE = 12;  // of text, in pixels
+const ERA_SIDE = 12;  // of its square
 
 function element(name, attributes, text) {
   const made = document.createElementNS(SVG, name);
@@ -10,6 +12,8 @@ function element(name, attributes, text) {
   if (text !== undefined) made.textContent = text;
   return made;
 }
+
+const textWidth = (text) => 0.62 * SIZE * text.length;  // about, in pixels
 
 export const shown = (value, digits = 0) => (value === null || value === undefined ? "–" : value.toFixed(digits));
 
@@ -74,8 +78,8 @@ export class PlateOverlay {
   }
 
   label(x, y, text, name = "label") {
-    const size = 12 * this.px;
-    const room = 0.62 * size * text.length;  // about as wide as the text
+    const size = SIZE * this.px;
+    const room = textWidth(text) * this.px;
     const anchor = x < room / 2 ? "start" : x > this.rig.length_m - room / 2 ? "end" : "middle";
     const height = Math.min(this.rig.width_m - size / 2, Math.max(size, y));
     return element("text", { class: name, x, y: height, "font-size": size, "text-anchor": anchor }, text);
@@ -83,29 +87,53 @@ export class PlateOverlay {
 
   region({ name, shape, x_m, y_m, width_m, height_m, radius_m, points_m }) {
     let outline;
-    let at;
+    let bounds;  // left, top, right, bottom
+    let middle;  // of its upper edge
     if (shape === "circle") {
       outline = this.circle({ x_m, y_m }, "region", radius_m);
-      at = [x_m, this.up(y_m + radius_m)];
+      bounds = [x_m - radius_m, this.up(y_m + radius_m), x_m + radius_m, this.up(y_m - radius_m)];
     } else if (shape === "polygon") {
       const corners = points_m.map(([x, y]) => [x, this.up(y)]);
       outline = element("polygon", { class: "region", points: corners.map((corner) => corner.join(",")).join(" ") });
       const [xs, ys] = [0, 1].map((axis) => corners.map((corner) => corner[axis]));
-      at = [(Math.min(...xs) + Math.max(...xs)) / 2, Math.min(...ys)];
+      bounds = [Math.min(...xs), Math.min(...ys), Math.max(...xs), Math.max(...ys)];
+      const upper = xs.filter((_, index) => ys[index] === bounds[1]);
+      middle = (Math.min(...upper) + Math.max(...upper)) / 2;
     } else {
       outline = element("rect", { class: "region", x: x_m, y: this.up(y_m + height_m), width: width_m, height: height_m });
-      at = [x_m + width_m / 2, this.up(y_m + height_m)];
+      bounds = [x_m, this.up(y_m + height_m), x_m + width_m, this.up(y_m)];
     }
     if (this.isSmall && this.contacts.length) return [outline];
-    // On the upper edge, where fingers that are put into the middle do not hide it.
-    return [outline, this.label(at[0], at[1] + 4 * this.px, name, "label name")];
+    middle ??= (bounds[0] + bounds[2]) / 2;
+    return [outline, this.label(...this.freePlace(bounds, middle, name), name, "label name")];
   }
 
-  era({ name, x_m, y_m }) {
+  // Where a region's name hides no ERA: on the upper edge, for fingers that are put into the middle
+  // would hide it there, or on the lower one.
+  freePlace([left, top, right, bottom], middle, name) {
+    const [width, height, gap] = [textWidth(name) * this.px, SIZE * this.px, 4 * this.px];
+    const xs = [middle, left + gap + width / 2, right - gap - width / 2];
+    const places = [top + gap, bottom - gap - height].flatMap((y) => xs.map((x) => [x, y]));
+    const isFree = ([x, y]) => this.rig.eras.every((era) => {
+      const [eraX, eraY] = this.eraPlace(era);
+      const side = ERA_SIDE * this.px;
+      return Math.abs(x - eraX) > (width + side) / 2 + gap || y > eraY + side / 2 + gap || y + height < eraY - side / 2 - gap;
+    });
+    return places.find(isFree) ?? places[0];
+  }
+
+  // Where an ERA's square is drawn: wholly on the plate.
+  eraPlace({ x_m, y_m }) {
+    const half = (ERA_SIDE * this.px) / 2;
+    const inset = (value, most) => Math.min(most - half, Math.max(half, value));
+    return [inset(x_m, this.rig.length_m), inset(this.up(y_m), this.rig.width_m)];
+  }
+
+  era(era) {
+    const { name } = era;
     const tone = this.drive[name];
-    const side = 12 * this.px;
-    const inset = (value, most) => Math.min(most - side / 2, Math.max(side / 2, value));
-    const [x, y] = [inset(x_m, this.rig.length_m), inset(this.up(y_m), this.rig.width_m)];
+    const side = ERA_SIDE * this.px;
+    const [x, y] = this.eraPlace(era);
     const square = element("rect", {
       class: tone ? "era driven" : "era", x: x - side / 2, y: y - side / 2, width: side, height: side, "data-era": name,
     });

@@ -2,9 +2,15 @@
 
 import { shown } from "./plate.js";
 
+export const STATES = {
+  NOT_READY: "not ready", SWITCH_ON_DISABLED: "disarmed", READY_TO_SWITCH_ON: "disarmed",
+  SWITCHED_ON: "switched on", OPERATION_ENABLED: "armed", QUICK_STOP_ACTIVE: "stopped",
+  FAULT_REACTION_ACTIVE: "fault", FAULT: "fault", COMM_LOST: "link lost",
+};
+
 const SVG = "http://www.w3.org/2000/svg";
 const MOST_EVENTS = 200;
-const OLD_REPLY_S = 0.5;  // ten heartbeats
+const OLD_REPLY_S = 1.5;  // thrice as long as between two looks at a disarmed amplifier
 
 function element(name, text, className) {
   const made = document.createElement(name);
@@ -16,39 +22,43 @@ function element(name, text, className) {
 // eras: those of the rig, for the names of what its channels move.
 function tile(amplifier, eras) {
   const { name, state, fault, levels, temperature_c, high_voltage, high_voltage_v, reply_age_s, lost } = amplifier;
-  const faulty = lost || (fault && fault !== "NONE");
-  const made = element("article", undefined, faulty ? "tile bad" : "tile");
+  const isFaulty = fault && fault !== "NONE";
+  const made = element("article", undefined, lost || isFaulty ? "tile bad" : "tile");
   const title = element("h3");
-  title.append(element("span", name), element("span", lost ? "lost" : faulty ? fault : (state ?? "unknown")));
+  const how = lost ? "no link" : isFaulty ? `fault: ${fault.toLowerCase().replaceAll("_", " ")}` : STATES[state] ?? "unknown";
+  title.append(element("span", name), element("span", how));
   made.append(title);
   const channels = element("div", undefined, "channels");
+  const eraOf = (channel) => eras.find((each) => each.amplifier === name && each.channel === channel)?.name;
   levels.forEach((level, channel) => {
-    const era = eras.find((each) => each.amplifier === name && each.channel === channel);
     const meter = element("meter");
     const percent = `${(100 * level).toFixed(0)} %`;
     meter.max = 1;
     meter.value = level;
-    meter.ariaLabel = `channel ${channel}${era ? `, ERA ${era.name}` : ""}: ${percent}`;
-    channels.append(element("span", era?.name ?? `${channel}`), meter, element("span", percent));
+    meter.ariaLabel = `channel ${channel}${eraOf(channel) ? `, ERA ${eraOf(channel)}` : ""}: ${percent}`;
+    channels.append(element("span", eraOf(channel) ?? `${channel}`), meter, element("span", percent));
   });
-  made.append(channels);
+  made.append(levels.length ? channels : element("p", "What its channels play is unknown.", "quiet"));
   const list = element("dl");
-  const voltage = high_voltage_v === null ? (high_voltage === null ? "–" : high_voltage ? "on" : "off") : `${shown(high_voltage_v)} V`;
-  const age = reply_age_s === null ? "–" : reply_age_s > OLD_REPLY_S ? `${shown(reply_age_s, 1)} s ago, old` : `${shown(1000 * reply_age_s)} ms ago`;
-  for (const [key, value] of [["Temperature", `${shown(temperature_c)} °C`], ["High voltage", voltage], ["Last reply", age]]) {
-    list.append(element("dt", key), element("dd", value));
-  }
+  const add = (key, value) => list.append(element("dt", key), element("dd", value));
+  if (temperature_c !== null) add("Temperature", `${shown(temperature_c)} °C`);
+  add("High voltage", high_voltage === null ? "unknown" : high_voltage_v === null ? (high_voltage ? "on" : "off") : `${shown(high_voltage_v)} V`);
+  add("Last reply", reply_age_s === null ? "none yet" : reply_age_s > OLD_REPLY_S ? `${shown(reply_age_s)} s ago` : `${shown(1000 * reply_age_s)} ms ago`);
   made.append(list);
   return made;
 }
 
+// amplifiers: null where nobody tells how they are.
 export function showAmplifiers(into, amplifiers, eras) {
-  into.replaceChildren(...amplifiers.map((amplifier) => tile(amplifier, eras)));
+  const tiles = amplifiers?.map((amplifier) => tile(amplifier, eras));
+  into.replaceChildren(...(tiles ?? [element("p", "Unknown: nobody tells how they are.", "quiet")]));
 }
+
+const threeDigits = (value) => shown(value, Math.max(0, 2 - Math.floor(Math.log10(Math.max(value, 1)))));
 
 export function showLatency(numbers, svg, { count, median, p99, p999, histogram }) {
   numbers.textContent = count
-    ? `median ${shown(median, 2)} ms, 99 % within ${shown(p99, 2)} ms, 99.9 % within ${shown(p999, 2)} ms, of ${count}`
+    ? `median ${threeDigits(median)} ms, 99 % within ${threeDigits(p99)} ms, 99.9 % within ${threeDigits(p999)} ms, of ${count}`
     : "no touch has led to a command yet";
   const most = Math.max(1, ...histogram.map(([, number]) => number));
   const width = 320 / Math.max(1, histogram.length);
@@ -62,7 +72,9 @@ export function showLatency(numbers, svg, { count, median, p99, p999, histogram 
   histogram.forEach(([upper, number], index) => {
     const height = number ? Math.max(2, 64 * Math.log1p(number) / Math.log1p(most)) : 0;
     add("rect", { x: index * width + 1, y: 80 - height, width: Math.max(1, width - 2), height });
-    if (index % Math.ceil(histogram.length / 6) === 0) {
+    if (index === histogram.length - 1) {  // what is above its edge counts there
+      add("text", { x: 320, y: 96, "text-anchor": "end" }, `> ${histogram.at(-2)?.[0] ?? 0}`);
+    } else if (index % Math.ceil(histogram.length / 6) === 0) {
       add("text", { x: (index + 1) * width, y: 96, "text-anchor": "middle" }, `${upper}`);
     }
   });
@@ -82,7 +94,8 @@ export function showEffects(section, into, effects, play) {
   }));
 }
 
-// An event of the log, the newest first; all of it as text. One that is told again takes no other's place.
+// An event of the log, the newest first; all of it as text. One that is told again takes no other's
+// place. Its item is returned, for what follows from it.
 export function addEvent(log, level, message, remedy) {
   const newest = log.firstElementChild;
   const times = newest?.dataset.message === message ? Number(newest.dataset.times) + 1 : 1;
@@ -90,8 +103,15 @@ export function addEvent(log, level, message, remedy) {
   const item = element("li");
   Object.assign(item.dataset, { message, times });
   const time = element("time", new Date().toLocaleTimeString());
-  item.append(time, element("span", times > 1 ? `${message} (${times} times)` : message, level));
-  if (remedy) item.append(element("span", remedy, "remedy"));
+  item.append(time, " ", element("span", times > 1 ? `${message} (${times} times)` : message, level));
+  follow(item, "", remedy);
   log.prepend(item);
   while (log.children.length > MOST_EVENTS) log.lastElementChild.remove();
+  return item;
+}
+
+// What has come of an event, and what is to be done now; in place of what was told of it before.
+export function follow(item, text, remedy) {
+  for (const old of item.querySelectorAll(".follows")) old.remove();
+  for (const each of [text, remedy]) if (each) item.append(element("span", each, "follows"));
 }

@@ -49,6 +49,7 @@ class Watched:
     far_end: Any
     states: list[DaemonState] = field(default_factory=list)
     links: list[str] = field(default_factory=list)
+    refusals: list[str] = field(default_factory=list)
     alive: list[float] = field(default_factory=list)
 
     @property
@@ -86,8 +87,7 @@ async def watched() -> AsyncIterator[Watched]:
         bench.rig,
         bench.table,
         amplifiers=amplifiers,
-        observer=supervisor.observe(Observer()),
-        clock=loop.time,
+        observer=supervisor.observe(Observer(refused=lambda reason: made.refusals.append(reason))),
     )
     made = Watched(supervisor, controller, bench.far_end)
     await supervisor.open(controller)
@@ -226,6 +226,7 @@ async def test_clear_is_refused_while_the_cause_is_there() -> None:
         await asyncio.sleep(0.2)
         assert daemon.state is DaemonState.FAULT
         assert "OVER_TEMPERATURE" in daemon.supervisor.machine.cause
+        assert daemon.refusals == []  # the state has told it
         assert daemon.far_end.requests(Stop)
         daemon.far_end.answer = lambda request: (
             hot if isinstance(request, Clear | GetStatus) else None

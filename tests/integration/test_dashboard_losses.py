@@ -1,0 +1,129 @@
+"""The dashboard in a real browser when something is lost: what it still knows, and no more."""
+
+import json
+from collections.abc import AsyncIterator
+from pathlib import Path
+
+import pytest
+import pytest_asyncio
+
+import dashboard_pictures
+from chromium import Page, open_page
+from controller.api.events import LatencyEvent
+from controller.api.parts import LatencySummary
+from controller.effects.layout_kind import LAYOUT
+from controller.gateway.app import MOST_SESSIONS
+from daemon_bench import running_daemon, until_state
+from dashboard_pictures import SCREENS, STATE, open_dashboard
+from gateway_bench import RawWebSocket, ScriptedDaemon, gateway_process
+from sim.faults.episodes import Episode
+
+pytestmark = pytest.mark.asyncio(loop_scope="module")
+
+DESKTOP = SCREENS[0]
+BANNER = "document.querySelector('#banner').innerText"
+EVENTS = "[...document.querySelectorAll('#log li')].map(e => e.innerText)"
+TILE = "document.querySelector('.tile').innerText"
+PROBES = (Path(dashboard_pictures.__file__).with_name("page_probes.js")).read_text(encoding="utf-8")
+
+
+@pytest_asyncio.fixture(scope="module", loop_scope="module")
+async def browser(tmp_path_factory: pytest.TempPathFactory) -> AsyncIterator[Page]:
+    """A browser's tab."""
+    async with open_page(tmp_path_factory.mktemp("profile")) as page:
+        yield page
+
+
+async def test_a_lost_link_is_one_event_with_what_has_come_of_it(
+    browser: Page, tmp_path: Path
+) -> None:
+    """The banner says since when and for how long at most the amplifier plays; how it was before is
+    not shown as how it is; attempts and the return stand below the loss.
+    """
+    (tmp_path / "layout.yaml").write_text(LAYOUT.example(), encoding="utf-8")
+    more = "layout: layout.yaml\nlog: {level: info}\n"
+    async with running_daemon(tmp_path, more) as bench, await bench.client() as era:
+        await until_state(era, "READY_TO_SWITCH_ON")
+        with gateway_process(tmp_path, bench.socket) as gateway:
+            await open_dashboard(browser, gateway, DESKTOP)
+            await era.arm("me", lease_s=30)
+            await browser.until(f"{STATE} === 'OPERATION_ENABLED'")
+            assert "%" in await browser.until(TILE)
+            before = await browser.evaluate(EVENTS)
+            bench.far.station.befall(Episode("hang"))
+            await browser.until(f"{STATE} === 'COMM_LOST'")
+            told = await browser.until(BANNER, lambda text: "watchdog" in text)
+            assert "Its watchdog silences it after 0.25 s, which nothing confirms" in told
+            assert "(since " in told
+            assert "may still be energised" in told
+            tile = await browser.until(TILE, lambda text: "no link" in text)
+            assert "What its channels play is unknown." in tile
+            assert "%" not in tile
+            assert "°C" not in tile
+            assert await browser.evaluate("document.querySelector('.plate.unknown') !== null")
+            ratios = await browser.evaluate(f"({PROBES}).contrasts()")
+            assert [each for each in ratios if each[0] < 4.5] == []
+            retried = await browser.until(EVENTS, lambda events: "tried again 2" in events[0])
+            assert retried[1:] == before
+            assert "link lost: amplifier main: no answer" in retried[0]
+            assert "look at cables and supply" in retried[0]
+            bench.far.station.recover()
+            await browser.until(f"{STATE} === 'FAULT'")
+            back = await browser.until(EVENTS, lambda events: "answer again" in events[0])
+            assert back[1:] == before
+            assert "tried again" not in back[0]
+            assert "era clear" in back[0]
+            assert "may still be energised" not in await browser.evaluate(BANNER)
+            assert "%" in await browser.until(TILE, lambda text: "no link" not in text)
+
+
+async def test_why_onsets_are_plain_is_said_for_as_long_as_they_are(
+    browser: Page, tmp_path: Path
+) -> None:
+    """Beside the latencies that it is about, in the daemon's words."""
+    summary = LatencySummary(count=0, median=None, p99=None, p999=None, histogram=[])
+    plain = "document.querySelector('#plain').innerText"
+    with ScriptedDaemon(tmp_path) as daemon, gateway_process(tmp_path, daemon.socket) as gateway:
+        await open_dashboard(browser, gateway, DESKTOP)
+        for because, shown in (
+            ("loading took 50 ms", "Plain ramps in place of shaped onsets: loading took 50 ms"),
+            (None, ""),
+        ):
+            daemon.publish("latency", LatencyEvent(latency_ms=summary, plain_because=because))
+            await browser.until(f"{plain} === {json.dumps(shown)}")
+
+
+async def test_the_banner_says_how_it_is_with_the_gateway_now(
+    browser: Page, tmp_path: Path
+) -> None:
+    """Refused for the token, gone, there with the right token again: whatever was before."""
+
+    async def until_said(words: str) -> None:
+        await browser.until(BANNER, lambda text: words in text)
+
+    daemon = tmp_path / "none.sock"
+    with gateway_process(tmp_path, daemon) as first:
+        await browser.show(f"{first.url}#token={first.token}")
+        await until_said("The daemon does not answer")
+        listen = ("--listen", f"127.0.0.1:{first.port}")
+        first.end()
+    with gateway_process(tmp_path, daemon, *listen, token="another-token-than-before"):
+        await until_said("The gateway refuses the token")
+        assert await browser.evaluate("!document.querySelector('#door').hidden")
+    await until_said("The gateway does not answer (since ")
+    assert await browser.evaluate("document.querySelector('#door').hidden")
+    with gateway_process(tmp_path, daemon, *listen):
+        await until_said("The daemon does not answer")
+    await until_said("The gateway does not answer")
+
+
+async def test_a_gateway_without_room_is_not_said_to_be_gone(browser: Page, tmp_path: Path) -> None:
+    """It answers; whoever reads that it does not looks for the wrong thing."""
+    with gateway_process(tmp_path, tmp_path / "none.sock") as gateway:
+        others = [RawWebSocket(gateway) for _ in range(MOST_SESSIONS)]
+        await browser.show(f"{gateway.url}#token={gateway.token}")
+        await browser.until(BANNER, lambda text: "does not let this page in" in text)
+        others.pop().connection.close()
+        await browser.until(BANNER, lambda text: "daemon does not answer" in text)
+        for other in others:
+            other.connection.close()

@@ -1,6 +1,6 @@
 """A guard for every amplifier of a rig, by the limits that its file sets."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 
 from drivers.amplifier import Amplifier
 from drivers.guard import Guard, GuardLimits
@@ -8,10 +8,8 @@ from model.errors import InputError
 from model.rig.rig import Limits, Rig
 
 
-def make_guards(
-    rig: Rig, amplifiers: Mapping[str, Amplifier], *, clock: Callable[[], float]
-) -> dict[str, Guard]:
-    """A guard per open amplifier, by its name; clock [s] as in `Guard`.
+def make_guards(rig: Rig, amplifiers: Mapping[str, Amplifier]) -> dict[str, Guard]:
+    """A guard per open amplifier, by its name.
 
     Raises InputError for a channel that an amplifier has not, CommandError for limits that leave
     nothing to play.
@@ -24,10 +22,7 @@ def make_guards(
                 f"{wired.amplifier}, which has channels 0 to {channels - 1}; change the rig"
             )
     limits = guard_limits(rig.limits)
-    return {
-        name: Guard(limits, amplifier.capabilities, clock=clock)
-        for name, amplifier in amplifiers.items()
-    }
+    return {name: Guard(limits, amplifier.capabilities) for name, amplifier in amplifiers.items()}
 
 
 def guard_limits(limits: Limits) -> GuardLimits:

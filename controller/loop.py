@@ -25,7 +25,6 @@ from drivers.command import DriveCommand
 from drivers.errors import CommandError, DriverError, LinkError
 from drivers.operation.watchdog import HEARTBEAT
 from model.errors import InputError
-from model.finger.perception import STRONG_DB_SL
 from model.rig.rig import Rig
 
 # On an orderly end nobody waits, so the end is soft.
@@ -43,12 +42,12 @@ class Controller:
 
     table must be for this rig; amplifiers by their names in it, not yet open. Starts disarmed: then
     contacts are followed but nothing is sent. The heartbeat is sent by the loop itself after it has
-    run, so that a loop that hangs lets the amplifiers' watchdogs trip. clock [s] is the sources'.
+    run, so that a loop that hangs lets the amplifiers' watchdogs trip.
 
-    wishes: who feels what; unless given, the newest contact buzzes where it is, at level_db_sl.
-    timing: what shapes the table's patterns; ramps only without it. mode: in which the table is
-    asked, None for the best that the amplifiers can play. envelope_time [s]: how long loading
-    envelopes may hold up a touch, 0 for ramps only.
+    wishes: who feels what; unless given, the newest contact buzzes where it is. timing: what shapes
+    the table's patterns; ramps only without it. mode: in which the table is asked, None for the
+    best that the amplifiers can play. envelope_time [s]: how long loading envelopes may hold up a
+    touch, 0 for ramps only.
     """
 
     def __init__(
@@ -60,11 +59,9 @@ class Controller:
         sources: Sequence[TouchSource] = (),
         observer: Observer | None = None,
         wishes: Wishes | None = None,
-        level_db_sl: float = STRONG_DB_SL,
         timing: PatternTiming | None = None,
         mode: str | None = None,
         envelope_time: float = ENVELOPE_TIME,
-        clock: Callable[[], float] = clock.now,
     ) -> None:
         if amplifiers.keys() != rig.amplifiers.keys():
             raise InputError(
@@ -77,12 +74,11 @@ class Controller:
         self._group = AmplifierGroup(amplifiers)
         self._sources = sources
         self._observer = observer or Observer()
-        self._wishes = wishes or NewestBuzzes(level_db_sl)
+        self._wishes = wishes or NewestBuzzes()
         self._timing = timing
         self._mode = mode
         self._envelope_time = envelope_time if timing is not None else 0.0
-        self._clock = clock
-        self._tally = Tally(_logger, clock=clock)
+        self._tally = Tally(_logger)
         self._opened_decider: Decider | None = None
         self._wake = asyncio.Event()
         self._heartbeat_due = 0.0
@@ -101,7 +97,7 @@ class Controller:
     @property
     def plain_because(self) -> str | None:
         """Why touches begin along plain ramps just now though the amplifiers play envelopes."""
-        return self._decider.plain_because(self._clock()) if self._opened_decider else None
+        return self._decider.plain_because(clock.now()) if self._opened_decider else None
 
     @property
     def rejected_touches(self) -> Mapping[str, int]:
@@ -119,7 +115,7 @@ class Controller:
             decider = Decider(
                 self._rig,
                 self._table,
-                guards=make_guards(self._rig, self._amplifiers, clock=self._clock),
+                guards=make_guards(self._rig, self._amplifiers),
                 means=means_of(
                     self._rig,
                     self._amplifiers,
@@ -141,7 +137,7 @@ class Controller:
         decider = self._decider
         await self._group.arm()
         decider.forget()
-        self._heartbeat_due = self._clock()
+        self._heartbeat_due = clock.now()
         self._watch_leases()  # from now on: fingers may have rested since before
         self._wake.set()
 
@@ -187,14 +183,14 @@ class Controller:
     async def step(self) -> None:
         """One turn of the loop: decide, send what is new, then the heartbeat if it is due."""
         self._wake.clear()
-        decision = self._decider.decide(self._clock())
+        decision = self._decider.decide(clock.now())
         for change in decision.changes:
             self._tell(self._observer.contacts_changed, decision.contacts, change)
         try:
             if self.phase is Phase.ARMED and (decision.is_new or decision.order is not None):
                 await self._carry_out(decision)
             if self._is_heartbeat_due and await self._group.heartbeat():
-                self._heartbeat_due = self._clock() + HEARTBEAT
+                self._heartbeat_due = clock.now() + HEARTBEAT
         except LinkError as error:
             self._tell(self._observer.link_lost, str(error))
             raise
@@ -215,7 +211,7 @@ class Controller:
     @property
     def _is_heartbeat_due(self) -> bool:
         """Whether the amplifiers are to be told that the loop has run; silence goes before that."""
-        is_time = self.phase is Phase.ARMED and self._clock() >= self._heartbeat_due
+        is_time = self.phase is Phase.ARMED and clock.now() >= self._heartbeat_due
         return is_time and not self._decider.owes_silence
 
     @property
@@ -240,12 +236,12 @@ class Controller:
             self._expiry = None
         due = self._decider.next_expiry
         if due is not None and self.phase is Phase.ARMED:
-            pause = max(0.0, due - self._clock())
+            pause = max(0.0, due - clock.now())
             self._expiry = asyncio.get_running_loop().call_later(pause, self._expire)
 
     def _expire(self) -> None:
         """A source may be overdue."""
-        self._follow(self._decider.expire(self._clock()))
+        self._follow(self._decider.expire(clock.now()))
 
     async def _carry_out(self, decision: Decision) -> None:
         """Send the commands of a decision and tell what came of them; raises DriverError."""
@@ -272,9 +268,9 @@ class Controller:
             return None
         commands = {name: several.commands for name, several in achieved.items()}
         drive = drive_of_eras(commands, self._rig)
-        self._decider.confirm(drive, now=self._clock())
+        self._decider.confirm(drive, now=clock.now())
         if any(order.envelopes.values()):
-            self._decider.loaded_in(self._group.loading_time, now=self._clock())
+            self._decider.loaded_in(self._group.loading_time, now=clock.now())
         return drive
 
     def _tell_outcome(self, decision: Decision, drive: Mapping[str, DriveCommand]) -> None:
@@ -293,7 +289,7 @@ class Controller:
         else:
             self._tell(
                 self._observer.silenced,
-                silenced_by(decision, sent=None if order is None else sent, now=self._clock()),
+                silenced_by(decision, sent=None if order is None else sent, now=clock.now()),
             )
 
     async def _listen(self, source: TouchSource) -> None:
@@ -306,7 +302,7 @@ class Controller:
 
     async def _next_cause(self) -> None:
         """Wait until there is a reason to run: news, a heartbeat, an overdue source or wish."""
-        now = self._clock()
+        now = clock.now()
         moments = [now + IDLE_TURN]
         if self._decider.due is not None:
             moments.append(self._decider.due)

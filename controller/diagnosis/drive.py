@@ -13,7 +13,6 @@ from controller.amplifiers import AmplifierGroup
 from controller.diagnosis.sensors import Sensors
 from controller.guards import make_guards
 from controller.routing import route
-from drivers import clock
 from drivers.amplifier import Amplifier
 from drivers.errors import CommandRefused
 from drivers.guard import Guard, SafeCommand
@@ -67,7 +66,7 @@ class Drive:
         pairs = []
         await self._group.open()
         try:
-            self._guards = make_guards(rig, self._amplifiers, clock=clock.now)
+            self._guards = make_guards(rig, self._amplifiers)
             await self._group.arm()
             floor = await self._floor(frequencies)
             for number, era in enumerate(rig.eras):

@@ -106,7 +106,6 @@ async def test_nothing_stays_vibrating(seed: int, loss: float) -> None:
         bench.table,
         amplifiers={name: Amplifier(link) for name, link in links.items()},
         timing=dice.choice((None, Shapes())),
-        clock=loop.time,
     )
     await controller.open()
     tasks = [asyncio.create_task(controller.run())]

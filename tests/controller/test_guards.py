@@ -30,7 +30,7 @@ class Reports:
 
 def in_force(rig: Rig, reports: Reports) -> GuardLimits:
     """The limits of the guard for the rig's one amplifier."""
-    return make_guards(rig, {"main": reports}, clock=lambda: 0.0)["main"].limits  # type: ignore[dict-item]
+    return make_guards(rig, {"main": reports})["main"].limits  # type: ignore[dict-item]
 
 
 def test_every_limit_of_the_file_reaches_the_guard(tmp_path: Path) -> None:
@@ -79,7 +79,7 @@ def test_the_least_holds(
 def test_a_limited_slew_makes_ramps_longer_instead_of_silencing(coarse_rig: Rig) -> None:
     """Half of the stroke at 10 a second takes 50 ms; a ramp that is long enough stays."""
     rig = replace(coarse_rig, limits=replace(coarse_rig.limits, slew=10.0))
-    guard = make_guards(rig, {"main": Reports()}, clock=lambda: 0.0)["main"]  # type: ignore[dict-item]
+    guard = make_guards(rig, {"main": Reports()})["main"]  # type: ignore[dict-item]
     half = {"SW": Tone(110.0, rig.era("SW").stroke / 2)}
     for asked, expected in ((0.02, 0.05), (0.2, 0.2)):
         wanted = route(half, rig, token=1, ramp=asked)["main"]

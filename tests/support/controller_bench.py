@@ -281,7 +281,6 @@ def make_bench(
         amplifiers={n: Amplifier(far_end) for n, far_end in zip(names, far_ends, strict=True)},
         sources=sources,
         observer=observer or told.observer(),
-        clock=asyncio.get_running_loop().time,
         **options,
     )
     return Bench(controller, rig, far_ends, table, told)

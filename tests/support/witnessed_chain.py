@@ -343,7 +343,7 @@ async def _play(
         witness.contacts(loop.time(), ())
         backends = {name: Amplifier(open_backend(url)) for name, url in urls.items()}
         table = OneTable(rig.plate)
-        controller = Controller(rig, table, amplifiers=backends, clock=loop.time)
+        controller = Controller(rig, table, amplifiers=backends)
         chain = Chain(loop, machine, between, bench, witness, table, controller, backends, links)
         async with _sensed(chain):
             await controller.open()

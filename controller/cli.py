@@ -50,7 +50,7 @@ def demo(
         bool, typer.Option("--dashboard", help="Touch it yourself, on a page in the browser.")
     ] = False,
 ) -> None:
-    """Recorded touches in, felt vibrations out: the whole chain over a simulated plate."""
+    """Recorded touches in, felt vibrations out. The whole chain over a simulated plate."""
     import asyncio
     import time
 

@@ -19,11 +19,16 @@ WRITER = "controller/command_page.py"
 _DISTRIBUTION = "era-haptics"
 
 
-def command_reference() -> str:
-    """All commands by name, groups after the single ones, as Markdown."""
+def own_commands() -> TyperGroup:
+    """Those that come with era-haptics."""
     entries = entry_points(group="era_haptics.commands")
     own = [entry for entry in entries if entry.dist and entry.dist.name == _DISTRIBUTION]
-    group, _ = put_together(own, debug=False)
+    return put_together(own, debug=False)[0]
+
+
+def command_reference() -> str:
+    """All commands by name, groups after the single ones, as Markdown."""
+    group = own_commands()
     context = typer.Context(group, info_name="era")
     return "\n".join(_group(group, context))
 

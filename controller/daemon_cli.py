@@ -142,7 +142,7 @@ def stop(socket: Socket = None, as_json: Json = False) -> None:
 
 @app.command()
 def clear(socket: Socket = None, as_json: Json = False) -> None:
-    """Acknowledge a stop, or a fault whose cause is gone; stays disarmed."""
+    """Acknowledge a stop, or a fault whose cause is gone. Stays disarmed."""
     with _client(socket) as era:
         era.clear()
         _tell_state(era, as_json=as_json)
@@ -157,7 +157,7 @@ def touch(
     socket: Socket = None,
     as_json: Json = False,
 ) -> None:
-    """Put fingers on the plate for a while; the last one is felt, the others are kept quiet."""
+    """Put fingers on the plate for a while. The last one is felt, the others are kept quiet."""
     from model.config.points import parse_point
 
     places = [parse_point(text, what="era touch") for text in at]

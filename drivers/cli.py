@@ -76,7 +76,7 @@ def discover(
     ] = False,
     json_: Json = False,
 ) -> None:
-    """List serial ports and CAN interfaces, and the amplifiers that answer on them."""
+    """List serial ports, CAN interfaces and who answers on them."""
     import asyncio
 
     from drivers.discovery.search import ask, candidates, with_slcan
@@ -133,7 +133,7 @@ def discover(
 
 @amp.command()
 def identify(url: Url, json_: Json = False) -> None:
-    """Who the amplifier is, what it can play, and what its wire allows."""
+    """Who the amplifier is and what it can play. Also what its wire allows."""
     from drivers import amp_actions
 
     _show(_run(amp_actions.identify(url)), as_json=json_)
@@ -156,7 +156,7 @@ def drive(
     duration: Annotated[float, typer.Option("--for", help="How long, in s.")] = 0.5,
     json_: Json = False,
 ) -> None:
-    """Let one channel vibrate for a while; ends silent and disarmed, whatever happens."""
+    """Let one channel vibrate for a while. Ends silent and disarmed, whatever happens."""
     from drivers import amp_actions
 
     driven = amp_actions.drive(
@@ -167,7 +167,7 @@ def drive(
 
 @amp.command()
 def stop(url: Url, json_: Json = False) -> None:
-    """Quick stop: silent at once, and refusing to play until it is cleared."""
+    """Quick stop: silent at once. Refuses to play until it is cleared."""
     from drivers import amp_actions
 
     _show(_run(amp_actions.stop(url)), as_json=json_)
@@ -177,7 +177,7 @@ def stop(url: Url, json_: Json = False) -> None:
 
 @amp.command()
 def clear(url: Url, json_: Json = False) -> None:
-    """Acknowledge a stop, or a fault whose cause is gone; the amplifier stays disarmed."""
+    """Acknowledge a stop, or a fault whose cause is gone. The amplifier stays disarmed."""
     from drivers import amp_actions
 
     _show(_run(amp_actions.clear(url)), as_json=json_)
@@ -191,7 +191,7 @@ def conformance(
     ] = False,
     json_: Json = False,
 ) -> None:
-    """Check that an amplifier keeps the contract: looking only, then at its channels if told so."""
+    """Check that an amplifier keeps the contract. Looks only, unless told to drive its channels."""
     import asyncio
 
     from drivers.conformance import CHECKS, LEVEL

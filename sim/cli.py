@@ -107,7 +107,7 @@ def sim(
         typer.Option("--until-eof", help="End with standard input, as when its writer dies."),
     ] = False,
 ) -> None:
-    """Simulate a rig behind real wires until SIGTERM or Ctrl-C; prints a URL per amplifier."""
+    """Simulate a rig behind real wires. Prints a URL per amplifier; Ctrl-C or SIGTERM ends it."""
     from sim.process.endings import gone_when_told
 
     with gone_when_told():  # until there is something to end in order

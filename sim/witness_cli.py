@@ -46,7 +46,7 @@ def witness(
     ] = 20.0,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object and no text.")] = False,
 ) -> None:
-    """Watch the wires of amplifiers by decoders of its own; exit status 1 if a rule was broken.
+    """Watch the wires of amplifiers by decoders of its own. Exit status 1 if a rule was broken.
 
     Prints a URL for each: use it in place of the amplifier's. Ends with Ctrl-C.
     """

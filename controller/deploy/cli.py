@@ -37,7 +37,9 @@ def install(
         Path, typer.Option(help="Write below this folder, as for an image of a system.")
     ] = Path("/"),
 ) -> None:
-    """Write a hardened unit, its user and the rights to its devices, then say what to run.
+    """Write a hardened unit, and say what to run then.
+
+    With it come its user and the rights to its devices.
 
     What the unit allows follows from the daemon's file, where that is there.
     """

@@ -59,9 +59,9 @@ def check(
     mesh: Annotated[str | None, typer.Option(metavar="NxM", help="In place of the rig's.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object, nothing else.")] = False,
 ) -> None:
-    """Drive each channel, or read what it did, and say whether the rig is what its file says.
+    """Say whether a rig is what its file says. Exit status 1 if it is not.
 
-    Exit status 1 if it is not.
+    Drives each channel, or reads what it did.
     """
     import time
 

@@ -44,7 +44,7 @@ def gateway(
         typer.Option(metavar="ORIGIN", help="Pages of others that may use it: https://HOST[:PORT]"),
     ] = None,
 ) -> None:
-    """Put the daemon's API and the dashboard before browsers, in a process of its own.
+    """Put the daemon's API and the dashboard before browsers.
 
     Prints the URL to open; it holds the token. An operational interface, no emergency stop.
     """

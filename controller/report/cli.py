@@ -30,7 +30,9 @@ def report(
         Path | None, typer.Option("--socket", help="Where a daemon listens, if not as usual.")
     ] = None,
 ) -> None:
-    """Gather versions, configuration, a running daemon's state and its last messages in one file.
+    """Gather in one file what a report of a bug needs.
+
+    Versions, configuration, a running daemon's state and its last messages.
 
     Passwords, tokens and the name of your home folder are taken out; look at it before you send it.
     """

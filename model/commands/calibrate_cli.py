@@ -32,7 +32,7 @@ def calibrate(
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object, nothing else.")] = False,
 ) -> None:
-    """Fit a rig to measured frequency responses: values with their uncertainty, and a new rig."""
+    """Fit a rig to measured frequency responses. Values with their uncertainty, and a new rig."""
     from model.calibration import wording
     from model.calibration.calibrate import calibrate as fit
     from model.calibration.responses import responses_of

@@ -16,7 +16,7 @@ def init(
     file: Annotated[Path, typer.Argument(metavar="FILE.yaml", help="The file to make.")],
     kind: Annotated[str, typer.Option(help="What it shall be: rig, daemon, layout.")] = "rig",
 ) -> None:
-    """Write a commented rig, daemon or layout to edit, with its JSON schema for editors."""
+    """Write a commented rig, daemon or layout to edit. Beside it lies its schema for editors."""
     from model.config.kinds import kind_called
     from model.files.replacing import check_ending
 
@@ -34,7 +34,7 @@ def check(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="The file to check.")],
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object on stdout.")] = False,
 ) -> None:
-    """Say all that is wrong with a rig, daemon or layout file; exit status 1 if anything is."""
+    """Say all that is wrong with a rig, daemon or layout file. Exit status 1 if anything is."""
     from model.config.document import ConfigError, read_document
     from model.config.kinds import kind_of
 

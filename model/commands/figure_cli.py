@@ -24,7 +24,7 @@ def figure(
     mesh: MeshOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Draw a figure of the founding paper for a rig, with a CSV file of its numbers beside it."""
+    """Draw a figure of the founding paper for a rig. A CSV file of its numbers lies beside it."""
     from model.figures import save_figure
     from model.files.csv_file import write_columns
     from model.paper.catalogue import paper_figures

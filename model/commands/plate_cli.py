@@ -36,7 +36,7 @@ def modes(
     count: Annotated[int, typer.Option("-n", min=1, help="How many modes.")] = 12,
     as_json: JsonOption = False,
 ) -> None:
-    """Natural frequencies of the undamped plate; elastic modes only where it is free."""
+    """Natural frequencies of the undamped plate. Elastic modes only where it is free."""
     from model.fem import modal
     from model.fem.assembly import assemble
     from model.rig.file import load_rig
@@ -153,7 +153,7 @@ def convergence(
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """How wrong meshes are: natural frequencies and response, against a finer mesh."""
+    """How wrong meshes are, against a finer one. In natural frequencies and in response."""
     from model.config.points import parse_frequencies
     from model.rig.file import load_rig
     from model.vibration.convergence import (

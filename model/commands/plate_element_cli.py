@@ -33,7 +33,7 @@ def conformance(
     name: Annotated[str, typer.Argument(metavar="ELEMENT", help="As era plate elements lists it.")],
     as_json: JsonOption = False,
 ) -> None:
-    """Check that a plate element keeps what every element must; exit status 1 if it does not."""
+    """Check that a plate element keeps what every one must. Exit status 1 if it does not."""
     from model.fem.element_checks import CHECKS, COARSE, frequency_error, rate
     from model.fem.elements import element_of
 

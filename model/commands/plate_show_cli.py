@@ -9,7 +9,7 @@ from model.commands.plate_cli import JsonOption, RigArgument
 
 
 def materials(as_json: JsonOption = False) -> None:
-    """The materials known by name, their numbers, and where these come from."""
+    """The materials known by name. With their numbers, and where these come from."""
     from model.errors import InputError
     from model.structure.materials import known_material, material_names
 
@@ -46,7 +46,7 @@ def materials(as_json: JsonOption = False) -> None:
 
 
 def show(rig_file: RigArgument, as_json: JsonOption = False) -> None:
-    """What the plate is made of and how it bends; of a laminate, between which bounds."""
+    """What the plate is made of and how it bends. Of a laminate, between which bounds."""
     from model.rig.file import load_rig
     from model.rig.plate_summary import plate_summary
 

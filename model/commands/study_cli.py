@@ -60,7 +60,7 @@ def study(
     mesh: MeshOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Compare layouts of ERAs by how strongly the whole plate vibrates; go on where one stopped."""
+    """Compare layouts of ERAs by how strongly the plate vibrates. Goes on where one stopped."""
     from model.config.document import read_document
     from model.config.points import parse_frequencies, parse_pair
     from model.errors import InputError

@@ -34,7 +34,7 @@ def build(
     ] = 1,
     as_json: JsonOption = False,
 ) -> None:
-    """Solve the plate and write its table; go on where an interrupted build stopped."""
+    """Solve the plate and write its table. Goes on where an interrupted build stopped."""
     from model.commands.progress import progress_bar
     from model.config.points import parse_frequencies, parse_pair
     from model.drive_modes import MODES

@@ -8,7 +8,7 @@ import typer
 
 from model.commands.plate_cli import JsonOption
 
-table_app = typer.Typer(help="The localization table: what makes one finger feel it, not others.")
+table_app = typer.Typer(help="The localization table: felt by one finger, not by others.")
 
 TableArgument = Annotated[Path, typer.Argument(metavar="TABLE", help="A table file, e.g. T.npz.")]
 
@@ -42,7 +42,7 @@ def query(
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Which ERAs, at which frequencies and levels, make one finger feel it and the others not."""
+    """Which ERAs make one finger feel it and the others not. At which frequencies and levels."""
     from model.config.points import parse_point
     from model.errors import InputError
     from model.table.file import load_table

@@ -32,7 +32,7 @@ def plot(
     ],
     as_json: JsonOption = False,
 ) -> None:
-    """Draw weak cells, levels, distributions of contrast and an example answer."""
+    """Draw weak cells, levels, contrast and an example answer."""
     from model.commands.progress import progress_bar
     from model.figures import save_figure
     from model.figures.table_pictures import table_figures
@@ -65,7 +65,7 @@ def export(
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Write a table for other programs; docs/reference/table-file.md says what is in it."""
+    """Write a table for other programs. docs/reference/table-file.md says what is in it."""
     from model.errors import InputError
     from model.files.replacing import check_ending, check_place
     from model.table.export import export_csv, export_mat

@@ -19,7 +19,7 @@ def show(
     weak: Annotated[bool, typer.Option("--weak", help="List every weak cell.")] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """What is in a table: levels, dead zones, weak cells, contrast, likeness, provenance."""
+    """What is in a table: levels, weak cells, contrast. And how it was built."""
     from model.commands.progress import progress_bar
     from model.table.file import load_table
     from model.table.summary import summarize
@@ -46,7 +46,7 @@ def verify(
     seed: Annotated[int, typer.Option(min=0, help="Of what is sampled.")] = 0,
     as_json: JsonOption = False,
 ) -> None:
-    """Recompute a sample by the reference solver and in the time domain; status 1 on a miss."""
+    """Recompute a sample by the reference solver and in time. Exit status 1 on a miss."""
     from model.commands.progress import progress_bar
     from model.errors import InputError
     from model.files.replacing import begins_with

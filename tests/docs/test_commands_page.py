@@ -5,9 +5,11 @@ import re
 from pathlib import Path
 
 import pytest
+import typer
+from typer.core import TyperGroup
 from typer.testing import CliRunner
 
-from controller.command_page import WRITER, command_reference
+from controller.command_page import WRITER, command_reference, own_commands
 from controller.written_part import insert
 from model.cli import app
 
@@ -21,6 +23,17 @@ def test_every_command_stands_on_the_page() -> None:
     """As the commands themselves say it; after a change write it anew."""
     remedy = "python -m controller.command_page docs/reference/commands.md"
     assert insert(PAGE, command_reference(), writer=WRITER) == PAGE, remedy
+
+
+def test_no_list_of_commands_cuts_a_summary_off() -> None:
+    """`era --help` and that of each group, on a terminal of 80 columns, which click fills to 78."""
+    era = own_commands()
+    groups = [era, *(one for one in era.commands.values() if isinstance(one, TyperGroup))]
+    assert len(groups) > 5
+    for one in groups:
+        context = typer.Context(one, info_name="era", terminal_width=78)
+        listed = one.get_help(context).partition("Commands:")[2]
+        assert [line for line in listed.splitlines() if line.endswith("...")] == [], one.name
 
 
 def test_the_page_has_commands_of_every_group_and_their_options() -> None:

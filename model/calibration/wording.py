@@ -6,6 +6,7 @@ import numpy as np
 
 from model.calibration.outcome import Calibration, FittedParameter
 from model.counting import counted
+from model.quantities import in_usual_unit, percent
 from model.rig.rig import Rig
 
 
@@ -62,12 +63,12 @@ def check_row(calibration: Calibration) -> str:
     if held_out is None:
         return (
             f"self-check: too few sensors to hold one out; error of the fit "
-            f"{_percent(calibration.error)}"
+            f"{percent(calibration.error)}"
         )
     return (
         f"self-check: sensors {', '.join(held_out.sensors)} held out, predicted with an error of "
-        f"{_percent(held_out.after)} (rms, relative to the response); by the old rig "
-        f"{_percent(held_out.before)}"
+        f"{percent(held_out.after)} (rms, relative to the response); by the old rig "
+        f"{percent(held_out.before)}"
     )
 
 
@@ -131,23 +132,11 @@ def _known(errors: np.ndarray[Any, np.dtype[np.float64]]) -> list[float]:
 
 def _change(fitted: FittedParameter) -> str:
     parameter = fitted.parameter
-    before = _shown(parameter.prior, parameter.unit)
+    before = in_usual_unit(parameter.prior, parameter.unit, digits=5)
     if fitted.standard_error is None:
         return f"{before}  (not identified, held)"
     note = "  (at the bound of what can be)" if fitted.at_bound else ""
-    after = _shown(fitted.value, parameter.unit)
-    error = _shown(fitted.standard_error, parameter.unit, digits=2)
+    after = in_usual_unit(fitted.value, parameter.unit, digits=5)
+    error = in_usual_unit(fitted.standard_error, parameter.unit, digits=2)
     share = f" ({100 * (fitted.value / parameter.prior - 1):+.1f} %)" if parameter.prior else ""
     return f"{before} -> {after} ± {error}{share}{note}"
-
-
-def _percent(share: float) -> str:
-    return f"{100 * share:.0f} %" if share > 0.1 else f"{100 * share:.2g} %"
-
-
-def _shown(value: float, unit: str, *, digits: int = 5) -> str:
-    if unit == "Pa":
-        return f"{value / 1e9:.{digits}g} GPa"
-    if unit == "kg":
-        return f"{1000 * value:.{digits}g} g"
-    return f"{value:.{digits}g} {unit}".strip()

@@ -7,6 +7,7 @@ from model.diagnosis.causes import Explanation
 from model.diagnosis.plate_match import FITS
 from model.diagnosis.polarity import EVEN
 from model.diagnosis.verdict import UNLIKELY, ChannelVerdict, State, Verdict
+from model.quantities import in_usual_unit, percent
 
 _TO_DO: dict[State, str] = {
     "dead": "check its supply, its cable and the amplifier's channel",
@@ -15,7 +16,6 @@ _TO_DO: dict[State, str] = {
     "inverted": "turn its two wires round",
     "out of phase": "measure it with `era calibrate`, which writes its gains into the rig",
 }
-_UNITS = {"m": (1e3, "mm"), "Pa": (1e-9, "GPa"), "N/m": (1e-3, "kN/m"), "kg": (1e3, "g")}
 _LIKELY = 0.05  # what is less likely is not worth a line
 
 
@@ -54,7 +54,7 @@ def plate_rows(verdict: Verdict) -> list[str]:
     if match is None:
         return []
     if match.error > FITS:
-        why = f"no plate like it leaves less than {_percent(match.error)} unexplained"
+        why = f"no plate like it leaves less than {percent(match.error)} unexplained"
     else:
         at = int(abs(match.z).argmax())
         why = (
@@ -64,10 +64,11 @@ def plate_rows(verdict: Verdict) -> list[str]:
     rows = [f"PLATE: the rig does not match the plate: {why}"]
     good = [each for each in verdict.explanations if explains(each) and each.share >= _LIKELY]
     for number, each in enumerate(good):
+        unit = each.cause.unit
         rows.append(
-            f"  {'or ' if number else ''}{each.cause.key} {_shown(each.value, each.cause.unit)} "
-            f"and not {_shown(each.expected, each.cause.unit)} would explain it: "
-            f"{_percent(each.match.error)} unexplained, likelihood {_percent(each.share)}"
+            f"  {'or ' if number else ''}{each.cause.key} {in_usual_unit(each.value, unit)} "
+            f"and not {in_usual_unit(each.expected, unit)} would explain it: "
+            f"{percent(each.match.error)} unexplained, likelihood {percent(each.share)}"
         )
     if good:
         rows.append(f"  correct {good[0].cause.key} in the rig, or the plate; then check again")
@@ -196,12 +197,3 @@ def _of(verdict: Verdict, era: str) -> ChannelVerdict:
 
 def _sure(verdict: Verdict, eras: Sequence[str]) -> str:
     return f"confidence {min(_of(verdict, era).confidence for era in eras):.3f}"
-
-
-def _shown(value: float, unit: str) -> str:
-    factor, shown = _UNITS.get(unit, (1.0, unit))
-    return f"{value * factor:.3g} {shown}".strip()
-
-
-def _percent(share: float) -> str:
-    return f"{100 * share:.0f} %" if share > 0.0995 else f"{100 * share:.2g} %"

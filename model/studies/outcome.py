@@ -13,8 +13,8 @@ from model.rig.rig import Rig
 from model.studies.cases import Cases
 from model.studies.pictures import PICTURES
 from model.studies.ranking import Ranking, era_counts
+from model.studies.recommended import in_words, rig_yaml
 from model.studies.solve import DRIVE_NAMES, DRIVES, CaseResults
-from model.studies.wording import in_words, rig_yaml
 from model.vibration.activation import STATISTICS
 
 SHOWN = 10

@@ -1,4 +1,4 @@
-"""A case of a study in words, and as a rig file to paste."""
+"""A case that a study recommends: in words, and as a rig file to paste."""
 
 from collections.abc import Mapping
 from copy import deepcopy

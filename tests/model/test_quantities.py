@@ -1,0 +1,32 @@
+"""Quantities and shares as people read them."""
+
+import pytest
+
+from model.quantities import in_usual_unit, percent
+
+
+@pytest.mark.parametrize(
+    ("value", "unit", "digits", "told"),
+    [
+        (70e9, "Pa", 3, "70 GPa"),
+        (19041.2, "N/m", 5, "19.041 kN/m"),
+        (0.0015, "m", 3, "1.5 mm"),
+        (0.012006, "kg", 2, "12 g"),
+        (4.8489, "N s/m", 3, "4.85 N s/m"),
+        (0.01302, "", 2, "0.013"),
+    ],
+)
+def test_a_quantity_is_told_in_the_unit_of_plates(
+    value: float, unit: str, digits: int, told: str
+) -> None:
+    """Giga, kilo and milli where plates have them; any other unit as it is, and none without."""
+    assert in_usual_unit(value, unit, digits=digits) == told
+
+
+@pytest.mark.parametrize(
+    ("share", "told"),
+    [(1.43, "143 %"), (0.124, "12 %"), (0.0999, "10 %"), (0.0123, "1.2 %"), (0.0, "0 %")],
+)
+def test_a_share_has_two_digits_that_say_something(share: float, told: str) -> None:
+    """Whole per cents from ten on, below with two digits."""
+    assert percent(share) == told

@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import shlex
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from typing import Any
@@ -139,7 +140,7 @@ async def _arm(amplifier: Amplifier, watchdog: float, url: str) -> None:
             raise
         raise CommandRefused(
             f"the amplifier does not arm: it is in {now.state.name}, fault {now.fault.name}, until "
-            f"that is acknowledged; once its cause is gone: era amp clear {url}"
+            "that is acknowledged; once its cause is gone: era amp clear " + shlex.quote(url)
         ) from refused
 
 
@@ -156,8 +157,8 @@ async def _keep_alive(amplifier: Amplifier, duration: float, *, beat: float, url
         if status.state is not State.OPERATION_ENABLED:
             raise CommandRefused(
                 f"the amplifier ended the drive by itself: it is in {status.state.name}, fault "
-                f"{status.fault.name}; see era amp status {url}, and era amp clear {url} once the "
-                "cause is gone"
+                f"{status.fault.name}; see era amp status {shlex.quote(url)}, and "
+                f"era amp clear {shlex.quote(url)} once the cause is gone"
             )
 
 

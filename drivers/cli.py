@@ -1,6 +1,7 @@
 """The `era amp` commands: talk to one amplifier by hand."""
 
 import json
+import shlex
 import sys
 from collections.abc import Coroutine
 from typing import TYPE_CHECKING, Annotated, Any
@@ -31,6 +32,7 @@ URLs:
   can+slcan:///dev/ttyACM0?bitrate=500000#NODE  CAN on a serial adapter
   can+socketcand://HOST:PORT/can0#NODE          CAN by a server
   sim://RIG.yaml                                a simulated amplifier of a rig
+Put one with ?, # or & into quotes, or the shell makes something else of these.
 """
 
 app = typer.Typer(no_args_is_help=True)
@@ -124,11 +126,11 @@ def discover(
         print("  ".join(str(value) for value in amplifier.values()))
     heard = [one for place in places if place.is_slcan for one in place.urls]
     if not amplifiers and heard:
-        print(f"Next: era amp identify {heard[0]}")
+        print(f"Next: era amp identify {shlex.quote(heard[0])}")
     elif not amplifiers:
         print("no amplifier answered")
     else:
-        print(f"Next: era amp identify {amplifiers[0]['url']}")
+        print(f"Next: era amp identify {shlex.quote(amplifiers[0]['url'])}")
 
 
 @amp.command()
@@ -172,7 +174,7 @@ def stop(url: Url, json_: Json = False) -> None:
 
     _show(_run(amp_actions.stop(url)), as_json=json_)
     if not json_:
-        print(f"Next: era amp clear {url}")
+        print(f"Next: era amp clear {shlex.quote(url)}")
 
 
 @amp.command()
@@ -217,7 +219,7 @@ def conformance(
     else:
         print(f"{len(outcomes) - len(broken)} kept, {len(broken)} broken, {left_out} left out")
         if left_out:
-            print(f"Next: era amp conformance {url} --write")
+            print(f"Next: era amp conformance {shlex.quote(url)} --write")
     if broken:
         raise typer.Exit(1)
 
@@ -248,4 +250,20 @@ def _show(result: dict[str, Any], *, as_json: bool) -> None:
         return
     width = max(len(key) for key in result)
     for key, value in result.items():
-        print(f"{key:{width}}  {value if isinstance(value, str) else json.dumps(value)}")
+        print(f"{key:{width}}  {_words(value)}")
+
+
+def _words(value: Any) -> str:
+    """A value as people read it: seven digits of a number, a row of several by their names."""
+    match value:
+        case bool():
+            return "yes" if value else "no"
+        case float():
+            return f"{value:.7g}"
+        case list():
+            between = "; " if any(isinstance(one, dict) for one in value) else ", "
+            return between.join(_words(one) for one in value) or "none"
+        case dict():
+            return ", ".join(f"{key} {_words(one)}" for key, one in value.items())
+        case _:
+            return str(value)

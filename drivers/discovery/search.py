@@ -19,6 +19,7 @@ from drivers.registry import known_schemes, open_backend
 
 _NETWORK = Path("/sys/class/net")
 _CAN_TYPE = "280"  # ARPHRD_CAN of Linux
+_UNDESCRIBED = "n/a"  # by pyserial
 _SPEEDS = (PROTOCOL.serial.baud, 115_200)
 _MODBUS = PROTOCOL.modbus
 _GROUP_MAY = 0o060  # read and write
@@ -99,7 +100,8 @@ def _serial_ports() -> Iterator[Candidate]:
         path = port.device
         urls = tuple(f"serial://{_absolute(path)}?baud={speed}" for speed in _SPEEDS)
         urls += (f"modbus+rtu://{_absolute(path)}?baud={_MODBUS['baud']}#{_MODBUS['unit']}",)
-        yield Candidate(path, port.description, urls, _why_not_usable(path), is_serial=True)
+        description = "serial port" if port.description == _UNDESCRIBED else port.description
+        yield Candidate(path, description, urls, _why_not_usable(path), is_serial=True)
 
 
 def _absolute(path: str) -> str:

@@ -1,6 +1,7 @@
 import asyncio
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -93,7 +94,11 @@ def test_status_stop_and_clear(background: BackgroundFarEnd) -> None:
     assert (answer["temperature_c"], answer["faults"]) == (25.0, [])
     result = CliRunner().invoke(app, ["amp", "stop", background.end.url])
     assert result.exit_code == 0
-    assert "OPERATION_ENABLED" in result.stdout
+    assert re.findall(r"^(?:state|high_voltage|levels) +(.*)$", result.stdout, re.MULTILINE) == [
+        "OPERATION_ENABLED",
+        "yes",
+        "0, 0, 0, 0",
+    ]
     assert isinstance(background.end.requests[-1], Stop)
     result = CliRunner().invoke(app, ["amp", "clear", background.end.url])
     assert result.exit_code == 0
@@ -224,6 +229,7 @@ def test_discover_tells_how_to_mend_permissions(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr("drivers.discovery.search.comports", lambda: [ListPortInfo("/dev/null")])
     monkeypatch.setattr("drivers.discovery.search.os.access", lambda path, mode: False)
     (place,) = [one for one in candidates() if one.place == "/dev/null"]
+    assert place.description == "serial port"  # pyserial has n/a where nothing is known
     assert "usermod -aG" in (place.remedy or "")
     assert "chmod a+rw /dev/null" in (place.remedy or "")
 
@@ -270,7 +276,7 @@ def test_a_drive_over_too_slow_a_line_never_arms(background: BackgroundFarEnd) -
 
 
 def test_a_drive_after_a_stop_says_how_to_clear(background: BackgroundFarEnd) -> None:
-    """The state, the fault and the command that acknowledges it, with the URL."""
+    """The state, the fault and the command that acknowledges it, as a shell takes the URL."""
     usual = background.end.answer
     stopped = replace(STATUS, state=State.QUICK_STOP_ACTIVE)
     background.end.answer = lambda request, frame: (
@@ -280,13 +286,13 @@ def test_a_drive_after_a_stop_says_how_to_clear(background: BackgroundFarEnd) ->
         if isinstance(request, GetStatus)
         else usual(request, frame)
     )
-    url = background.end.url
+    url = f"{background.end.url}?baud=115200"
     result = CliRunner().invoke(app, ["amp", "drive", url])
     assert isinstance(result.exception, CommandRefused)
     assert "QUICK_STOP_ACTIVE" in str(result.exception)
-    assert str(result.exception).endswith(f"era amp clear {url}")
+    assert str(result.exception).endswith(f"era amp clear '{url}'")
     result = CliRunner().invoke(app, ["amp", "stop", url])
-    assert result.stdout.splitlines()[-1] == f"Next: era amp clear {url}"
+    assert result.stdout.splitlines()[-1] == f"Next: era amp clear '{url}'"
 
 
 def test_the_help_shows_urls_of_all_wires() -> None:

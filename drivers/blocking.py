@@ -16,7 +16,7 @@ from typing import Any, TypeVar
 
 from drivers.amplifier import WATCHDOG, Amplifier
 from drivers.command import CommandSet, DriveCommand, Envelope
-from drivers.errors import CommandRefused
+from drivers.errors import CommandError, CommandRefused
 from drivers.guard import Guard, GuardLimits
 from drivers.operation.watchdog import HEARTBEAT
 from drivers.protocol.messages import Achieved, Capabilities, FaultRecord, Identity, State, Status
@@ -34,6 +34,16 @@ class BlockingAmplifier:
     """
 
     def __init__(self, url: str, *, limits: GuardLimits) -> None:
+        if not isinstance(url, str):
+            raise CommandError(
+                "the URL of an amplifier is text, such as serial:///dev/ttyUSB0, not a "
+                f"{type(url).__name__}"
+            )
+        if not isinstance(limits, GuardLimits):
+            raise CommandError(
+                f"limits is a {type(limits).__name__}; give GuardLimits with the lowest and the "
+                "highest frequency [Hz] and the highest level, such as GuardLimits(40, 500, 0.5)"
+            )
         self._url = url
         self._limits = limits
         self._loop = asyncio.new_event_loop()
@@ -110,6 +120,7 @@ class BlockingAmplifier:
         self, commands: Sequence[DriveCommand], *, ramp: float = _RAMP, valid_for: float = 0.0
     ) -> Achieved:
         """Play these commands from now on, all others silent; returns what is achieved."""
+        _expect_commands(commands)
         safe = self._guard.check(
             CommandSet(
                 token=self._amplifier.next_token(),
@@ -151,3 +162,12 @@ class BlockingAmplifier:
         self._loop.call_soon_threadsafe(self._loop.stop)
         self._thread.join()
         self._loop.close()
+
+
+def _expect_commands(given: object) -> None:
+    """Raise CommandError for what are no drive commands, those of all amplifiers by name say."""
+    if not isinstance(given, Sequence) or not all(isinstance(one, DriveCommand) for one in given):
+        raise CommandError(
+            f"what shall be played is a {type(given).__name__}, not a list of DriveCommand; give "
+            'those of one amplifier, as in commands_for(rig, pattern)["main"]'
+        )

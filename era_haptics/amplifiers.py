@@ -4,6 +4,7 @@ from controller.guards import guard_limits
 from controller.routing import route
 from drivers.blocking import BlockingAmplifier
 from drivers.command import DriveCommand
+from era_haptics.arguments import expect_rig
 from era_haptics.drive import Drives, excitation_of
 from model.errors import InputError
 from model.rig.rig import Rig
@@ -19,6 +20,7 @@ def open_amplifier(
     the rig's limits is sent. Raises InputError for one that the rig has not; in the block
     CommandError for a URL that is none, LinkError where nobody answers, CommandRefused.
     """
+    expect_rig(rig)
     known = tuple(rig.amplifiers)
     chosen = known if name is None else tuple(each for each in known if each == name)
     if len(chosen) != 1:
@@ -32,5 +34,6 @@ def commands_for(rig: Rig, drive: Pattern | Drives) -> dict[str, tuple[DriveComm
     Channels by the rig's wiring, levels 0..1 of full stroke, phases in degrees. A pattern's
     envelopes are not in it. Raises InputError for an ERA that the rig has not.
     """
+    expect_rig(rig)
     sets = route(excitation_of(drive, rig), rig, token=1, ramp=0.0)
     return {name: asked.commands for name, asked in sets.items()}

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from numbers import Real
 from typing import TypeAlias
 
+from model.arguments import expect_number, shown
 from model.errors import InputError
 from model.rig.rig import Rig
 from model.table.pattern import Pattern
@@ -41,6 +42,8 @@ class Drive:
             raise InputError(f"a phase of {self.phase_deg} degrees is none; give a finite number")
 
 
+_UNITS_OF_A_TONE = {"frequency": "hertz", "amplitude": "metres", "phase": "radians"}
+
 Drives: TypeAlias = Mapping[str, "float | Drive | Tone"]
 """By the ERA's name: a frequency [Hz] at full stroke, a `Drive`, or a `Tone` [Hz, m, rad]."""
 
@@ -49,11 +52,18 @@ def excitation_of(drive: Pattern | Drives, rig: Rig) -> Excitation:
     """The same as a tone for each ERA; raises InputError for an ERA that the rig has not."""
     if isinstance(drive, Pattern):
         return drive.excitation
+    if not isinstance(drive, Mapping):
+        raise InputError(
+            f"drive is {shown(drive)}; give a pattern, or what each ERA plays by its name, such as "
+            '{"SW": 110}'
+        )
     tones = {}
     for name, told in drive.items():
         if name not in rig.wiring:
             raise InputError(f"the rig has no ERA {name!r}, only {', '.join(rig.wiring)}")
         if isinstance(told, Tone):
+            for key, unit in _UNITS_OF_A_TONE.items():
+                expect_number(getattr(told, key), what=f"{key} of the tone of {name}", unit=unit)
             tones[name] = told
             continue
         asked = told if isinstance(told, Drive) else Drive(told)

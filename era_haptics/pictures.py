@@ -9,6 +9,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from era_haptics.drive import Drives, excitation_of
 from era_haptics.places import Places, as_points
 from era_haptics.solved_plate import SolvedPlate
+from model.arguments import expect
 from model.arrays import FloatArray
 from model.figures.drawing import map_figure
 from model.figures.fingertips import LEVEL_COLORS, LEVEL_SCALE, draw_fingertip, draw_levels
@@ -23,6 +24,7 @@ def draw_map(plate: SolvedPlate, drive: Pattern | Drives, *, title: str = "") ->
 
     As `era plate map` draws it. Raises InputError for a drive that the rig cannot play.
     """
+    expect(plate, SolvedPlate, what="plate", made_by="era.SolvedPlate(rig)")
     active = excitation_of(drive, plate.rig).keys()
     return map_figure(plate.rig, plate.map(drive), active=active, title=title)
 
@@ -34,6 +36,8 @@ def draw_pattern(
 
     target, quiet: places [m], as they were asked for. Raises InputError for what are no places.
     """
+    expect(table, LocalizationTable, what="table", made_by="era.table(rig)")
+    expect(pattern, Pattern, what="pattern", made_by="era.query(table, target)")
     figure = Figure(figsize=(6.4, 4.6), layout="constrained")
     axes = figure.subplots()
     axes.set_axis_off()
@@ -60,6 +64,7 @@ def draw_playback(playback: Playback) -> Figure:
     The largest acceleration within a period of the lowest frequency: of a target the mean over its
     fingertip, of a quiet finger its loudest point, as contrast is counted.
     """
+    expect(playback, Playback, what="playback", made_by="plate.play(pattern, target)")
     figure = Figure(figsize=(6.4, 3.8), layout="constrained")
     axes = figure.subplots()
     period = 1 / min(playback.frequencies)

@@ -1,11 +1,14 @@
 """The plate of a rig, solved once and asked many times: modes, maps, and in time."""
 
+from collections.abc import Sequence
 from functools import cached_property
 
 import numpy as np
 
+from era_haptics.arguments import expect_rig
 from era_haptics.drive import Drives, excitation_of
 from era_haptics.places import Places, as_points
+from model.arguments import expect, expect_number, is_whole, shown
 from model.errors import InputError
 from model.fem.assembly import era_positions
 from model.finger.load import FingerLoad
@@ -28,6 +31,7 @@ class SolvedPlate:
     """
 
     def __init__(self, rig: Rig) -> None:
+        expect_rig(rig)
         self.rig = rig
 
     @cached_property
@@ -49,6 +53,8 @@ class SolvedPlate:
         (paper Eq. 28). Raises InputError for a drive that the rig cannot play. The map of
         `era plate map`, which is solved directly, within some 1e-5 of it.
         """
+        if raster is not None:
+            _expect_raster(raster)
         return plate_map(self.rig, self._excitation(drive), raster=raster, free=self._free)
 
     def play(
@@ -67,6 +73,9 @@ class SolvedPlate:
         in time is solved exactly, without steps (`docs/concepts/plant.md`). Raises InputError for
         fingers off the plate, and a duration in which nothing becomes steady.
         """
+        expect_number(duration, what="duration", unit="seconds")
+        if finger_load is not None:
+            expect(finger_load, FingerLoad, what="finger_load", made_by="era.FingerLoad()")
         fingers = Question(as_points(target, what="target"), as_points(quiet, what="quiet"))
         return play(
             self.rig,
@@ -100,3 +109,13 @@ class SolvedPlate:
     def _reduced(self) -> ReducedPlate:
         attached = np.vstack([era_positions(self.rig.eras), load_positions(self.rig.loads)])
         return reduce_free_plate(self._free, attached)
+
+
+def _expect_raster(raster: object) -> None:
+    """Raise InputError for what are no two whole numbers."""
+    pair = raster if isinstance(raster, Sequence) else ()
+    if len(pair) != 2 or not all(is_whole(count) for count in pair):
+        raise InputError(
+            f"raster is {shown(raster)}, not two whole numbers; give how many points along x and "
+            "y, such as raster=(61, 46)"
+        )

@@ -5,8 +5,11 @@ from functools import lru_cache
 
 import numpy as np
 
+from era_haptics.arguments import expect_rig
 from era_haptics.places import Places, as_points
+from model.arguments import expect, expect_number, shown
 from model.arrays import FloatArray
+from model.errors import InputError
 from model.finger.grid import Grid
 from model.finger.perception import STRONG_DB_SL
 from model.rig.rig import Rig
@@ -32,7 +35,10 @@ def table(
     60 to 320 in steps of 10 as far as these allow; grid: target cells. It is what
     `era table build` writes; `load_table` and `save_table` are for such files. Raises InputError.
     """
-    wanted = None if frequencies is None else np.asarray(frequencies, dtype=float)
+    expect_rig(rig)
+    expect(grid, Grid, what="grid", made_by="era.Grid(12, 9)")
+    _expect_mode(mode)
+    wanted = None if frequencies is None else _as_frequencies(frequencies)
     found, _ = cached_table(rig, frequencies=wanted, grid=grid, mode=mode)
     return found
 
@@ -54,6 +60,10 @@ def query(
     the plate or on top of each other, and a level that cannot be reached. The same as
     `era table query`; `table.answer` is the quicker one, which predicts less.
     """
+    expect(table, LocalizationTable, what="table", made_by="era.table(rig)")
+    expect_number(level_db_sl, what="level_db_sl", unit="decibels above the threshold")
+    if mode is not None:
+        _expect_mode(mode)
     question = Question(
         as_points(target, what="target"),
         as_points(quiet, what="quiet"),
@@ -67,6 +77,26 @@ def query(
         pattern = timing.with_envelopes(question, pattern)
     pattern = timing.with_transient_measures(question, pattern)
     return with_robust_contrast(table, question, pattern)
+
+
+def _expect_mode(given: object) -> None:
+    """Raise InputError for what is no name."""
+    if not isinstance(given, str):
+        raise InputError(f"mode is {shown(given)}; give the name of one, such as mode='phased'")
+
+
+def _as_frequencies(given: object) -> FloatArray:
+    """Frequencies (f,) [Hz] in the order given."""
+    try:
+        found = np.asarray(given, dtype=float)
+    except (TypeError, ValueError):
+        found = np.empty(())
+    if found.ndim != 1:
+        raise InputError(
+            f"frequencies is {shown(given)}, which is no row of hertz; give plain numbers, such as "
+            "range(60, 321, 10)"
+        )
+    return found
 
 
 @lru_cache(maxsize=2)  # a notebook asks one table after the other, many times each

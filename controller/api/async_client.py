@@ -32,8 +32,10 @@ def _method(
 ) -> Callable[Concatenate["AsyncClient", _P], Coroutine[Any, Any, _ResultT]]:
     """The method that makes a call and gives its answer."""
 
+    checked = calls.in_words(make)
+
     async def ask(client: "AsyncClient", /, *args: _P.args, **kwargs: _P.kwargs) -> _ResultT:
-        return await client._ask(make(*args, **kwargs))
+        return await client._ask(checked(*args, **kwargs))
 
     calls.name_after(make, ask)
     return ask

@@ -1,9 +1,11 @@
 """What clients ask of a daemon, method by method: the one list that both clients have."""
 
 import inspect
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Generic, TypeVar, get_args
+from typing import Any, Generic, ParamSpec, TypeVar, cast, get_args
+
+from pydantic import ValidationError
 
 from controller.api.messages import (
     ArmParams,
@@ -21,9 +23,12 @@ from controller.api.messages import (
 )
 from controller.api.parts import Message, Nothing, Topic, TouchPoint
 from controller.api.replies import result_of
+from model.arguments import shown
+from model.errors import InputError, in_our_words
 
 USUAL_LEASE = 10.0  # s
 
+_P = ParamSpec("_P")
 _MessageT = TypeVar("_MessageT", bound=Message)
 _ResultT = TypeVar("_ResultT")
 
@@ -79,7 +84,10 @@ def clear() -> Call[None]:
 
 def touch(places: Sequence[tuple[float, float]], *, source: str = "python") -> Call[None]:
     """All fingers of a source, at x, y [m]: for 150 ms, so repeat it while they are down."""
-    touches = [TouchPoint(id=id, x_m=x, y_m=y) for id, (x, y) in enumerate(places, start=1)]
+    if not isinstance(places, Iterable):
+        raise InputError(f"places is {shown(places)}; give a list of x, y in metres")
+    at = [_place(place) for place in places]
+    touches = [TouchPoint(id=id, x_m=x, y_m=y) for id, (x, y) in enumerate(at, start=1)]
     return Call("touch", TouchParams(source=source, touches=touches), _done)
 
 
@@ -92,7 +100,7 @@ def play(
     effect: str, place: tuple[float, float], *, level_db_sl: float | None = None
 ) -> Call[None]:
     """Play an effect at x, y [m]."""
-    x, y = place
+    x, y = _place(place)
     params = PlayParams(effect=effect, x_m=x, y_m=y, level_db_sl=level_db_sl)
     return Call("play", params, _done)
 
@@ -107,6 +115,20 @@ def unsubscribe(*topics: Topic) -> Call[None]:
     return Call("unsubscribe", UnsubscribeParams(topics=list(topics)), _done)
 
 
+def in_words(make: Callable[_P, Call[_ResultT]]) -> Callable[_P, Call[_ResultT]]:
+    """The same call; what cannot be sent is an InputError that names the value."""
+
+    def checked(*args: _P.args, **kwargs: _P.kwargs) -> Call[_ResultT]:
+        try:
+            return make(*args, **kwargs)
+        except ValidationError as error:
+            first = error.errors()[0]
+            where = ".".join(str(part) for part in first["loc"])
+            raise InputError(f"{make.__name__}: {where} {in_our_words(first['msg'])}") from None
+
+    return checked
+
+
 def name_after(make: Callable[..., Call[Any]], method: Callable[..., Any]) -> None:
     """Let a client's method have the name, the description and the signature of its call."""
     own = inspect.Parameter("self", inspect.Parameter.POSITIONAL_ONLY)
@@ -116,6 +138,18 @@ def name_after(make: Callable[..., Call[Any]], method: Callable[..., Any]) -> No
     method.__signature__ = asked.replace(  # type: ignore[attr-defined]
         parameters=[own, *asked.parameters.values()], return_annotation=answer
     )
+
+
+def _place(given: object) -> tuple[float, float]:
+    """One finger's place [m]."""
+    try:
+        x, y = (float(each) for each in cast("Iterable[float]", given))
+    except (TypeError, ValueError):
+        raise InputError(
+            f"{shown(given)} is no place; a finger is at x, y in metres from the corner SW, such "
+            "as (0.10, 0.05), and fingers are a list of such"
+        ) from None
+    return x, y
 
 
 def _done(said: Mapping[str, Any]) -> None:

@@ -22,6 +22,7 @@ from controller.api.messages import ArmResult, HelloParams
 from controller.api.parts import Message
 from controller.api.replies import Answer, Greeting, Notification, Unreachable, check_version
 from controller.api.socket_path import find_socket
+from model.arguments import expect_path
 
 _P = ParamSpec("_P")
 _ResultT = TypeVar("_ResultT")
@@ -31,8 +32,10 @@ _MessageT = TypeVar("_MessageT", bound=Message)
 def _method(make: Callable[_P, Call[_ResultT]]) -> Callable[Concatenate["Client", _P], _ResultT]:
     """The method that makes a call and waits for its answer."""
 
+    checked = calls.in_words(make)
+
     def ask(client: "Client", /, *args: _P.args, **kwargs: _P.kwargs) -> _ResultT:
-        return client._ask(make(*args, **kwargs))
+        return client._ask(checked(*args, **kwargs))
 
     calls.name_after(make, ask)
     return ask
@@ -44,8 +47,8 @@ class Client:
     Every method raises Unreachable, a LinkError, where no answer comes.
     """
 
-    def __init__(self, path: Path, *, timeout: float = ANSWER_TIMEOUT) -> None:
-        self.path = path
+    def __init__(self, path: Path | str, *, timeout: float = ANSWER_TIMEOUT) -> None:
+        self.path = expect_path(path, what="path")
         self._timeout = timeout
         self._conversation = Conversation()
         self._events: deque[Notification] = deque(maxlen=MOST_EVENTS)
@@ -55,7 +58,7 @@ class Client:
             self._socket.connect(str(path))
         except OSError as error:
             self._socket.close()
-            raise Unreachable.at(path, error) from error
+            raise Unreachable.at(self.path, error) from error
 
     @classmethod
     def connect(

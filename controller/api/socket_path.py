@@ -5,6 +5,8 @@ import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 
+from model.arguments import expect_path
+
 SYSTEM_SOCKET = Path("/run/era-haptics/daemon.sock")
 """Where it is as a system service."""
 
@@ -23,7 +25,7 @@ def default_socket(environment: Mapping[str, str] = os.environ) -> Path:
 def find_socket(given: Path | str | None) -> Path:
     """The socket to connect to: the given one, this user's, or else that of the system service."""
     if given is not None:
-        return Path(given)
+        return expect_path(given, what="path")
     own = default_socket()
     return own if own.exists() or not _is_there(SYSTEM_SOCKET) else SYSTEM_SOCKET
 

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from model.arguments import is_whole
 from model.arrays import FloatArray
 from model.errors import InputError
 from model.structure.plate import Plate
@@ -22,6 +23,8 @@ class Grid:
 
     def __post_init__(self) -> None:
         """Refuse a grid without cells or too large to keep."""
+        if not (is_whole(self.nx) and is_whole(self.ny)):
+            raise InputError(f"grid {self}: cells are counted in whole numbers, as in Grid(12, 9)")
         if not (1 <= self.nx <= 200 and 1 <= self.ny <= 200):
             raise InputError(f"grid {self}: 1x1 to 200x200 cells are possible")
 

@@ -9,6 +9,7 @@ picture of a finger that presses with less than half a newton (World Haptics 200
 from collections.abc import Iterable
 from dataclasses import dataclass
 
+from model.arguments import expect_number
 from model.config.units import DAMPING, MASS, STIFFNESS, quantity
 from model.errors import InputError
 from model.structure.point_load import PointLoad
@@ -24,6 +25,8 @@ class FingerLoad:
 
     def __post_init__(self) -> None:
         """Refuse what no finger has."""
+        for what, unit in (("stiffness", "N/m"), ("damping", "N s/m"), ("mass", "kg")):
+            expect_number(getattr(self, what), what=f"{what} of a finger", unit=unit)
         self.at(0.0, 0.0)
 
     def at(self, x: float, y: float) -> PointLoad:

@@ -11,7 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import linalg
 
+from model.arguments import shown
 from model.arrays import FloatArray
+from model.errors import InputError
 from model.reduction.modal_matrices import modal_matrices
 from model.reduction.reduced_plate import ReducedPlate
 from model.structure.actuator import Era
@@ -31,8 +33,20 @@ class SupportedModes:
     coordinates: FloatArray
 
     def at(self, points: FloatArray) -> FloatArray:
-        """Mode shapes at points [m] (p, 2), (p, n), scaled to modal mass 1 [1/sqrt(kg)]."""
-        return np.asarray(self.reduced.at(points) @ self.coordinates)
+        """Mode shapes at points [m] (p, 2), (p, n), scaled to modal mass 1 [1/sqrt(kg)].
+
+        Raises InputError for points off the plate, and what are none.
+        """
+        try:
+            places = np.asarray(points, dtype=float)
+        except (TypeError, ValueError):
+            places = np.empty(0)
+        if places.shape[-1:] != (2,) or places.ndim > 2:
+            raise InputError(
+                f"points is {shown(points)}, not places on the plate; give x, y in metres, as in "
+                "[[0.1, 0.08]]"
+            )
+        return np.asarray(self.reduced.at(places) @ self.coordinates)
 
 
 def supported_modes(

@@ -3,8 +3,10 @@
 from pathlib import Path
 from typing import Any
 
+from model.arguments import expect_path, shown
 from model.config.document import Document, parse_document, read_document
 from model.config.sections import Validation
+from model.errors import InputError
 from model.rig.checks import check_across
 from model.rig.parts import era_of, laminate_of, limits_of, mass_of, mesh_of, plate_of
 from model.rig.rig import Channel, Rig
@@ -17,7 +19,9 @@ def load_rig(path: Path | str, *, mesh: str | None = None) -> Rig:
     Raises ConfigError with every problem of the file; InputError for a mesh that is none. A mesh
     asked for here may be as coarse as is wanted: how wrong it then is may be the question.
     """
-    return _rig_of(read_document(Path(path)), mesh=mesh)
+    if mesh is not None and not isinstance(mesh, str):
+        raise InputError(f"mesh is {shown(mesh)}; give text, such as mesh='48x36', or 'auto'")
+    return _rig_of(read_document(expect_path(path, what="path")), mesh=mesh)
 
 
 def parse_rig(source: str, text: str) -> Rig:

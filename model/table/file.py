@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, ValidationError
 
+from model.arguments import expect, expect_path, shown
 from model.drive_modes import MODES
 from model.errors import InputError, in_our_words
 from model.fem.mesh import Mesh
@@ -101,6 +102,8 @@ def save_table(table: LocalizationTable, path: Path | str) -> None:
 
     Raises OSError where the folder cannot be written.
     """
+    expect(table, LocalizationTable, what="table", made_by="era.table(rig)")
+    place = expect_path(path, what="path")
     arrays = _arrays(table)
     header = {
         "format": FORMAT,
@@ -120,7 +123,7 @@ def save_table(table: LocalizationTable, path: Path | str) -> None:
     }
     header["sha256"] = _digest(header, arrays)
     encoded = np.frombuffer(json.dumps(header).encode(), dtype=np.uint8)
-    write_arrays(Path(path), {"header": encoded, **arrays})
+    write_arrays(place, {"header": encoded, **arrays})
 
 
 def load_table(path: Path | str, *, fingerprint: str | None = None) -> LocalizationTable:
@@ -129,7 +132,9 @@ def load_table(path: Path | str, *, fingerprint: str | None = None) -> Localizat
     fingerprint: of the rig that the table shall serve; a table of another plate is refused. Raises
     InputError for a missing, damaged or foreign file.
     """
-    path = Path(path)
+    path = expect_path(path, what="path")
+    if fingerprint is not None and not isinstance(fingerprint, str):
+        raise InputError(f"fingerprint is {shown(fingerprint)}, not text; give rig.fingerprint")
     rebuild = f"build it again: era table build RIG -o {path}"
     try:
         content = read_arrays(path, _DTYPES, max_bytes=MAX_BYTES)

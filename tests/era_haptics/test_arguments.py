@@ -1,0 +1,88 @@
+"""Whatever else a notebook hands to a public function is told in words, never by an AttributeError.
+
+Of every function, and every argument of it, so that a new one is not forgotten.
+"""
+
+import inspect
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+
+import era_haptics as era
+from small_table import small_table
+
+RIG = era.load_rig(era.example_rig_path(), mesh="12x9")
+PLATE, DRIVE, TARGET = era.SolvedPlate(RIG), {"SW": 110}, (0.08, 0.06)
+PATTERN = era.Pattern({"SW": era.Tone(110.0, 1e-5)}, 0.04, 20.0, None, None)
+
+GOOD: dict[Callable[..., Any], dict[str, Any]] = {
+    era.load_rig: {"path": era.example_rig_path(), "mesh": "12x9"},
+    era.example_rig_path: {},
+    era.load_table: {"path": "t.npz", "fingerprint": RIG.fingerprint},
+    era.save_table: {"table": None, "path": "t.npz"},
+    era.table: {"rig": RIG, "mode": "switched", "frequencies": [60], "grid": era.Grid(4, 3)},
+    era.query: {
+        "table": None, "target": TARGET, "quiet": (), "level_db_sl": 20.0, "mode": "signed",
+    },
+    era.SolvedPlate: {"rig": RIG},
+    PLATE.map: {"drive": DRIVE, "raster": (3, 3)},
+    PLATE.play: {
+        "drive": DRIVE, "target": TARGET, "quiet": (), "duration": 0.3,
+        "finger_load": era.FingerLoad(),
+    },
+    era.draw_map: {"plate": PLATE, "drive": DRIVE},
+    era.draw_pattern: {"table": None, "pattern": PATTERN, "target": TARGET, "quiet": ()},
+    era.draw_playback: {"playback": None},
+    era.open_amplifier: {"rig": RIG, "name": "main", "url": "sim://"},
+    era.commands_for: {"rig": RIG, "drive": DRIVE},
+    era.Drive: {"frequency": 110.0, "level": 1.0, "phase_deg": 0.0},
+    era.FingerLoad: {"stiffness": 1.0, "damping": 1.0, "mass": 0.0},
+    era.Grid: {"nx": 4, "ny": 3},
+}  # fmt: skip
+"""Arguments that can be used, by function; None: a small table, or what was played before."""
+
+TAKES_ANYTHING = {"title", "envelopes"}
+
+
+STRAYS = (object(), "here", 3.5, [object()])
+
+
+@pytest.fixture(scope="module")
+def table(tmp_path_factory: pytest.TempPathFactory) -> Iterator[era.LocalizationTable]:
+    """A small one, and its file t.npz."""
+    folder = tmp_path_factory.mktemp("home")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        patch.setenv("XDG_CACHE_HOME", str(folder))
+        made = small_table()
+        era.save_table(made, "t.npz")
+        yield made
+
+
+@pytest.mark.parametrize(
+    ("function", "name"),
+    [(function, name) for function, given in GOOD.items() for name in given],
+    ids=lambda value: value if isinstance(value, str) else value.__name__,
+)
+def test_another_kind_of_thing_is_told(
+    table: era.LocalizationTable, function: Callable[..., Any], name: str
+) -> None:
+    """By an InputError, or a CommandError of an amplifier, in a sentence that says what to give."""
+    good = {key: table if value is None else value for key, value in GOOD[function].items()}
+    for stray in STRAYS:
+        if isinstance(stray, type(good[name])) or (name == "path" and isinstance(stray, str)):
+            continue
+        with pytest.raises((era.InputError, era.DriverError)) as told:
+            function(**{**good, name: stray})
+        assert len(str(told.value)) > 30
+
+
+def test_all_functions_are_here() -> None:
+    """Each public function, and each of its arguments."""
+    public = {getattr(era, name) for name in era.__all__}
+    functions = {each for each in public if inspect.isfunction(each)}
+    assert functions <= set(GOOD)
+    for function, given in GOOD.items():
+        asked = set(inspect.signature(function).parameters) - TAKES_ANYTHING
+        assert asked == set(given)

@@ -3,7 +3,7 @@
 import numpy as np
 
 from model.drive_modes.coherent import Coherent
-from model.drive_modes.fields import SingleComplex
+from model.drive_modes.fields import Single, SingleComplex
 
 EXCHANGES = 8
 SWEEPS = 2
@@ -13,29 +13,38 @@ def _solve(R: SingleComplex, c: SingleComplex) -> SingleComplex:
     """Minimise w^T Re(R) w / 2 - Re(c) w over w >= 0, for many forms at once.
 
     Block principal pivoting (Judice and Pires, Comput. Oper. Res. 21 (1994) 587-596): solve for the
-    weights taken to be above zero, then exchange those that are on the wrong side. It may circle; a
-    few sweeps over the coordinates mend what is left then.
+    weights taken to be above zero, then exchange those that are on the wrong side, of those forms
+    that have any; few do after three times. It may circle; a few sweeps over the coordinates mend
+    what is left then.
     """
-    form, pull = R.real, c.real
+    w = np.empty_like(c.real)
+    left, form, pull = np.arange(len(w)), np.ascontiguousarray(R.real), c.real
     driven = pull > 0
     # A weight outside the set is held at zero by a row of its own.
-    identity = np.eye(pull.shape[1], dtype=form.dtype)
-    w = np.zeros_like(pull)
+    identity = np.eye(w.shape[1], dtype=form.dtype)
     for _ in range(EXCHANGES):
         both = driven[:, :, None] & driven[:, None, :]
-        system = np.where(both, form, identity)
-        w[:] = np.linalg.solve(system, np.where(driven, pull, 0)[..., None])[..., 0]
-        gain = pull - (form @ w[..., None])[..., 0]
-        wrong = np.where(driven, w < 0, gain > 0)
-        if not wrong.any():
+        found = np.linalg.solve(np.where(both, form, identity), (driven * pull)[..., None])[..., 0]
+        w[left] = found
+        wrong = np.where(driven, found < 0, np.matvec(form, found) < pull)
+        again = np.flatnonzero(wrong.any(axis=1))
+        left, form, pull = left[again], form[again], pull[again]
+        if len(left) == 0:
             break
-        driven = driven ^ wrong
+        driven = driven[again] ^ wrong[again]
     np.maximum(w, 0, out=w)
+    if len(left):
+        w[left] = _swept(w[left], form, pull)
+    return np.asarray(w, dtype=np.complex64)
+
+
+def _swept(w: Single, form: Single, pull: Single) -> Single:
+    """Weights (n, eras) after the best for each ERA in turn, the others as they are."""
     for _ in range(SWEEPS):
-        for era in range(pull.shape[1]):
+        for era in range(w.shape[1]):
             others = (form[:, era] * w).sum(axis=1) - form[:, era, era] * w[:, era]
             w[:, era] = np.maximum(pull[:, era] - others, 0) / form[:, era, era]
-    return np.asarray(w, dtype=np.complex64)
+    return w
 
 
 GRADED = Coherent(_solve, phases=(7, 5), ascents=4)

@@ -83,8 +83,8 @@ def load_daemon_config(path: Path) -> DaemonConfig:
     dump_folder = _beside(document, _named(document, "dumps", "folder"))
     _check_places(validation, log_file, dump_folder)
     validation.finish()
-    if rig is None or rig_file is None:  # finish has raised by then
-        raise InputError(f"{path}: rig: is missing; add it")
+    assert rig is not None  # noqa: S101  else there was a problem
+    assert rig_file is not None  # noqa: S101  or there is no rig
     section = DaemonSection.model_validate(document.data)
     return DaemonConfig(
         source=path,

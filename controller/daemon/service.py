@@ -44,12 +44,6 @@ _NEXT = {
 }
 """What to do in states that need no remedy, for whoever asks for more than they allow."""
 
-_LOST = RpcError(
-    ErrorCode.LINK,
-    "the link to an amplifier is lost",
-    remedy="see era status; the daemon tries again by itself",
-)
-
 
 class Service:
     """Answers clients. Whoever arms has a lease; disarm and stop are anybody's.
@@ -196,8 +190,9 @@ class Service:
         return Nothing()
 
     async def _clear(self, client: Connection) -> Nothing:
-        if self._supervisor.machine.state is State.COMM_LOST:
-            raise _LOST
+        machine = self._supervisor.machine
+        if machine.state is State.COMM_LOST:
+            raise _wrong_state(machine, ErrorCode.LINK)
         await self._supervisor.handle(Event(Kind.CLEAR, f"acknowledged by {client.name!a}"))
         return Nothing()
 
@@ -259,9 +254,9 @@ class Service:
         )
 
 
-def _wrong_state(machine: Machine) -> RpcError:
+def _wrong_state(machine: Machine, code: ErrorCode = ErrorCode.WRONG_STATE) -> RpcError:
     return RpcError(
-        ErrorCode.WRONG_STATE,
+        code,
         f"the daemon is in {machine.state.value}: {machine.cause}",
         where="state",
         remedy=machine.remedy or _NEXT.get(machine.state),

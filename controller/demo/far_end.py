@@ -6,23 +6,23 @@ fingers rest, and to ask what they felt.
 
 import asyncio
 import contextlib
-import json
 import sys
 import tempfile
 from collections.abc import AsyncIterator, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import cast
 from urllib.parse import quote
 
 import numpy as np
 
+from controller.plate_control import PlateControl
 from drivers.errors import LinkError
 from model.arrays import FloatArray
 
-LINE_MAX = 1 << 20  # bytes of one answer; what ten fingers felt takes a fiftieth of it
 STARTUP_TIMEOUT = 30.0  # seconds; a machine at work on something else solves the plate slowly
 EXIT_TIMEOUT = 3.0
+_AGAIN = "start the demonstration again; what the plate said last stands above"
 
 # Options of `era sim` by wire; there is none for a plate within this process.
 OPTIONS: Mapping[str, Sequence[str]] = {
@@ -46,34 +46,20 @@ class FingerFelt:
 
 
 class BenchControl:
-    """The control socket of a simulated plate: JSON objects, one a line, answered in order.
+    """What the demonstration asks of a simulated plate; raises LinkError."""
 
-    It connects when it is first asked something, for a plate within this process is there only once
-    its amplifier is open.
-    """
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        self._streams: tuple[asyncio.StreamReader, asyncio.StreamWriter] | None = None
-        self._turn = asyncio.Lock()
-
-    async def close(self) -> None:
-        """Hang up; a further question connects again."""
-        streams, self._streams = self._streams, None
-        if streams is not None:
-            streams[1].close()
-            with contextlib.suppress(OSError):
-                await streams[1].wait_closed()
+    def __init__(self, control: PlateControl) -> None:
+        self._control = control
 
     async def place_fingers(self, positions: Mapping[str, tuple[float, float]]) -> None:
         """Let fingers rest at these positions [m], by id, and at no others."""
-        await self._ask(
+        await self._control.ask(
             {"op": "fingers", "fingers": {id: list(at) for id, at in positions.items()}}
         )
 
     async def felt(self, since: float, until: float) -> dict[str, FingerFelt]:
         """What each finger felt between two times [s] of time.monotonic(), by id."""
-        answer = await self._ask({"op": "felt", "since_s": since, "until_s": until})
+        answer = await self._control.ask({"op": "felt", "since_s": since, "until_s": until})
         return {
             id: FingerFelt(
                 frequencies=np.array(felt["frequencies_hz"], dtype=float),
@@ -84,33 +70,6 @@ class BenchControl:
             )
             for id, felt in answer["fingers"].items()
         }
-
-    async def _ask(self, question: dict[str, Any]) -> dict[str, Any]:
-        async with self._turn:
-            if self._streams is None:
-                self._streams = await self._connect()
-            reader, writer = self._streams
-            try:
-                writer.write(json.dumps(question).encode() + b"\n")
-                await writer.drain()
-                line = await reader.readline()
-            except BaseException:
-                await self.close()  # the answer would be taken for that of the next question
-                raise
-        if not line:
-            raise LinkError("the simulated plate is gone: its process closed the control socket")
-        answer: dict[str, Any] = json.loads(line)
-        if "error" in answer:
-            raise LinkError(f"the simulated plate refused {question['op']}: {answer['error']}")
-        return answer
-
-    async def _connect(self) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
-        try:
-            return await asyncio.open_unix_connection(str(self._path), limit=LINE_MAX)
-        except OSError as error:
-            raise LinkError(f"the simulated plate does not listen on {self._path}: {error}") from (
-                error
-            )
 
 
 @dataclass(frozen=True)
@@ -133,8 +92,8 @@ async def open_far_end(
     with tempfile.TemporaryDirectory(prefix="era-") as folder:
         control = Path(folder) / "control"
         async with contextlib.AsyncExitStack() as stack:
-            bench = BenchControl(control)
-            stack.push_async_callback(bench.close)
+            plate = PlateControl(control, remedy=_AGAIN)
+            stack.push_async_callback(plate.close)
             if wire == "sim":
                 query = f"?control={quote(str(control))}&amplifier="
                 base = f"sim://{quote(str(rig_file))}{query}"
@@ -143,7 +102,7 @@ async def open_far_end(
                 process, said = await _start(rig_file, wire=wire, control=control)
                 stack.push_async_callback(_end, process)
                 urls = await _read_urls(process, said, count=len(amplifiers))
-            yield FarEnd(urls, bench)
+            yield FarEnd(urls, BenchControl(plate))
 
 
 async def _start(
@@ -175,7 +134,8 @@ async def _read_urls(
                 urls[name] = url
     except TimeoutError:
         raise LinkError(
-            f"the simulated amplifiers did not start within {STARTUP_TIMEOUT:g} s"
+            f"the simulated amplifiers did not start within {STARTUP_TIMEOUT:g} s; start the "
+            "demonstration again when this machine has less to do"
         ) from None
     if len(urls) < count:
         raise LinkError(

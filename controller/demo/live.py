@@ -2,7 +2,6 @@
 
 import tempfile
 from dataclasses import replace
-from importlib.util import find_spec
 from pathlib import Path
 
 from controller.daemon.config import load_daemon_config
@@ -11,7 +10,7 @@ from controller.daemon.log import start_log
 from controller.daemon.notify import ServiceManager
 from controller.daemon.place import Place
 from controller.demo.far_end import open_far_end
-from model.errors import InputError
+from controller.gateway.installed import require_gateway
 from model.rig.file import load_rig
 from model.table.table import LocalizationTable
 
@@ -23,11 +22,7 @@ async def run_live(rig_file: Path, table: LocalizationTable, *, wire: str, dashb
     do, so that `era status` and its like reach it. Raises InputError where one runs already, or
     where the gateway is not installed, and LinkError.
     """
-    if find_spec("uvicorn") is None or find_spec("starlette") is None:
-        raise InputError(
-            "the page needs the gateway, which is not installed; "
-            "install it with  pip install 'era-haptics[gateway]'"
-        )
+    require_gateway()
     rig = load_rig(rig_file)
     with tempfile.TemporaryDirectory(prefix="era-") as folder:
         file = Path(folder) / "daemon.yaml"

@@ -13,6 +13,7 @@ from controller.demo.rows import Onset, Place, PlayedPattern, TouchRow
 from controller.observer import Applied, Observer, Silenced
 from controller.selection import Felt
 from drivers import clock
+from drivers.errors import LinkError
 from model.transients.measures import FIRST
 
 # The last part of a pattern is judged: by then the plate has settled, if the pattern was held long
@@ -61,13 +62,12 @@ class _Playing:
 class TouchRecorder:
     """Collects a row per touch: hand `observer` to the controller, await `finish` at the end.
 
-    problems: whatever went wrong meanwhile, a sentence each. on_row is called with every row as
-    soon as the touch was lifted and its pattern measured.
+    on_row is called with every row as soon as the touch was lifted and its pattern measured.
     """
 
     def __init__(self, bench: BenchControl, *, on_row: Callable[[TouchRow], None]) -> None:
         self.rows: list[TouchRow] = []
-        self.problems: list[str] = []
+        self._problems: list[str] = []
         self._bench = bench
         self._on_row = on_row
         self._start = clock.now()
@@ -89,9 +89,14 @@ class TouchRecorder:
         )
 
     async def finish(self) -> None:
-        """Wait until every touch that was lifted has its row."""
+        """Wait until every touch that was lifted has its row.
+
+        Raises LinkError where something went wrong meanwhile, with what was first.
+        """
         while self._tasks:
             await asyncio.wait(self._tasks)
+        if self._problems:
+            raise LinkError(f"the demonstration did not run through: {self._problems[0]}")
         self.rows.sort(key=lambda row: row.time)
 
     def _contacts_changed(self, contacts: tuple[Contact, ...], change: Change) -> None:
@@ -122,7 +127,7 @@ class TouchRecorder:
 
     def _failed(self, problem: str) -> None:
         self._end_pattern(clock.now())
-        self.problems.append(problem)
+        self._problems.append(problem)
 
     def _end_pattern(self, now: float) -> None:
         """Close the pattern that is played and have its last part measured."""
@@ -189,7 +194,7 @@ class TouchRecorder:
     def _finished(self, task: asyncio.Task[Any]) -> None:
         self._tasks.discard(task)
         if not task.cancelled() and (error := task.exception()) is not None:
-            self.problems.append(str(error))
+            self._problems.append(str(error))
 
 
 async def _played(touch: _Touch, longest: _Playing) -> PlayedPattern:

@@ -59,8 +59,8 @@ def install(
             path.write_text(file.text, encoding="utf-8")
         except OSError as error:
             raise InputError(
-                f"{path}: cannot be written: {error.strerror}; run it with sudo, or with --dry-run "
-                "to see what it would write"
+                f"{path}: cannot be written ({error.strerror}); run it with sudo, give another "
+                "folder with --root, or see with --dry-run what it would write"
             ) from error
         print(f"Wrote {path}")
     _print_next(NAME, config)
@@ -86,7 +86,10 @@ def _era() -> Path:
     beside = Path(sys.executable).with_name("era")
     found = beside if os.access(beside, os.X_OK) else Path(shutil.which("era") or "")
     if not found.is_absolute():
-        raise InputError("the era command is not installed; pip install era-haptics")
+        raise InputError(
+            f"there is no era command for the service to run, neither beside {sys.executable} nor "
+            "in PATH; install it with  pip install era-haptics"
+        )
     return found
 
 

@@ -137,8 +137,7 @@ class Drive:
         self._ramp = max(commands.ramp for commands in wanted.values())
         safe = {name: self._guards[name].check(commands) for name, commands in wanted.items()}
         achieved = await self._group.play(safe)
-        if achieved is None:
-            raise CommandRefused("the amplifiers were silenced while the rig was being checked")
+        assert achieved is not None  # noqa: S101  nobody else silences them
         played = None
         for name, commands in wanted.items():
             plays = {command.channel: command for command in achieved[name].commands}
@@ -146,10 +145,12 @@ class Drive:
                 if not asked.level:
                     continue
                 found = plays.get(asked.channel)
-                if found is None or not math.isclose(asked.level, found.level, rel_tol=_CHANGED):
+                level = 0.0 if found is None else found.level
+                if found is None or not math.isclose(asked.level, level, rel_tol=_CHANGED):
                     raise CommandRefused(
-                        f"amplifier {name} does not play level {asked.level:g} on channel "
-                        f"{asked.channel} as it was asked to; choose another --level"
+                        f"amplifier {name} plays level {level:g} on channel {asked.channel} in "
+                        f"place of {asked.level:g}: let it cool down, or choose a level that it "
+                        "plays with --level, then check again"
                     )
                 played = found.frequency
         return played

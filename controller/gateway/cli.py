@@ -50,15 +50,13 @@ def gateway(
     """
     import asyncio
 
-    try:
-        from controller.api.socket_path import find_socket
-        from controller.gateway.serving import serve
-        from controller.gateway.settings import Settings, read_token
-    except ModuleNotFoundError as error:
-        raise InputError(
-            f"the gateway needs {error.name}, which is not installed; "
-            "install it with  pip install 'era-haptics[gateway]'"
-        ) from error
+    from controller.gateway.installed import require_gateway
+
+    require_gateway()
+    from controller.api.socket_path import find_socket
+    from controller.gateway.serving import serve
+    from controller.gateway.settings import Settings, read_token
+
     host, port = _host_and_port(listen)
     chosen = {} if token_file is None else {"token": read_token(token_file)}
     settings = Settings(

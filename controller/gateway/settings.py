@@ -120,5 +120,7 @@ def read_token(path: Path) -> str:
     if about.st_mode & 0o077:
         raise InputError(f"{path}: others may read this token; forbid it with chmod 600 {path}")
     if about.st_uid not in (0, os.geteuid()):
-        raise InputError(f"{path}: belongs to somebody else, who can read this token; use your own")
+        raise InputError(
+            f"{path}: belongs to somebody else, who can read this token; give a file of your own"
+        )
     return said.decode().strip()

@@ -15,7 +15,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from drivers.errors import LinkError
+from drivers.errors import LinkError, said_by_system
 from model.errors import InputError
 
 HEADER = "# era-haptics TUIO capture 1"
@@ -93,18 +93,23 @@ async def replay_capture(datagrams: Sequence[Datagram], host: str, port: int) ->
     try:
         transport, _ = await loop.create_datagram_endpoint(lambda: sender, remote_addr=(host, port))
     except OSError as error:
-        raise LinkError(f"cannot send to UDP {host}:{port}: {error.strerror}") from error
+        raise _nobody_at(host, port, error) from error
     try:
         start = loop.time()
         for datagram in datagrams:
             await asyncio.sleep(max(0.0, start + datagram.time - loop.time()))
             if sender.refused is not None:
-                raise LinkError(
-                    f"nobody listens on UDP {host}:{port}; start the controller first"
-                ) from sender.refused
+                raise _nobody_at(host, port, sender.refused) from sender.refused
             transport.sendto(datagram.payload)
     finally:
         transport.close()
+
+
+def _nobody_at(host: str, port: int, problem: Exception) -> LinkError:
+    return LinkError(
+        f"nobody listens on UDP {host}:{port} ({said_by_system(problem)}); look at the address, "
+        "and start the controller first"
+    )
 
 
 class _Sender(asyncio.DatagramProtocol):

@@ -85,7 +85,8 @@ class InputDevice:
             self.close()
             if error.errno == errno.EBUSY:
                 raise InputError(
-                    f"touch source {path}: another program has grabbed this panel; stop that one"
+                    f"touch source {path}: another program has grabbed this panel; stop that one "
+                    f"(`sudo fuser -v {path}` tells which)"
                 ) from error
             raise InputError(
                 f"touch source {path}: no touch panel that reports slots ({error.strerror}); "

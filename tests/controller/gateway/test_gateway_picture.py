@@ -1,13 +1,18 @@
 """What browsers are shown of the daemon, from what it tells the gateway."""
 
+import asyncio
 import json
 from pathlib import Path
 from typing import Any
 
+import pytest
+
+from controller.api.jsonrpc import RpcError
 from controller.api.messages import HelloResult
-from controller.api.parts import API_VERSION, RigSummary, TableSummary
+from controller.api.parts import API_VERSION, Message, Nothing, RigSummary, TableSummary
 from controller.api.replies import Notification
 from controller.gateway.picture import Picture
+from gateway_bench import PATIENCE, ScriptedDaemon
 
 
 def hello(layout: dict[str, Any] | None) -> HelloResult:
@@ -57,3 +62,36 @@ def test_another_layout_is_another_hello(tmp_path: Path) -> None:
     picture._hello(picture.daemon.hello)
     picture._event(Notification("layout", 4.0, 0, {"layout": None}))
     assert shown == [one, None]
+
+
+class PatternOfTomorrow(Message):
+    """What a daemon of another version could say of a pattern."""
+
+    drive: dict[str, dict[str, str]] = {"SW": {"tone": "110 Hz"}}  # noqa: RUF012  pydantic copies it
+
+
+async def test_what_a_daemon_of_another_version_tells_is_said_with_what_to_update(
+    daemon: ScriptedDaemon, caplog: pytest.LogCaptureFixture
+) -> None:
+    """It is asked anew, for what else it tells may be understood."""
+    picture = Picture(daemon.socket, tell=lambda topic, frame: None)
+
+    async def connected() -> None:
+        while True:
+            try:
+                await picture.daemon.call("status", Nothing())
+            except RpcError:
+                await asyncio.sleep(0.005)
+            else:
+                return
+
+    following = asyncio.create_task(picture.daemon.run())
+    async with asyncio.timeout(PATIENCE):
+        await connected()
+        daemon.publish("pattern", PatternOfTomorrow())
+        while picture.daemon.hello is not None:  # noqa: ASYNC110  what is waited for tells nobody
+            await asyncio.sleep(0.005)
+        await connected()
+    following.cancel()
+    await asyncio.gather(following, return_exceptions=True)
+    assert "tells cannot be understood; update the older of daemon and gateway" in caplog.text

@@ -115,5 +115,15 @@ async def test_replay_to_nobody() -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as closed:
         closed.bind(("127.0.0.1", 0))
         port = closed.getsockname()[1]
-    with pytest.raises(LinkError, match=f"nobody listens on UDP 127.0.0.1:{port}"):
+    with pytest.raises(
+        LinkError,
+        match=rf"on UDP 127.0.0.1:{port} \(Connection refused\); look at the address, and",
+    ):
         await replay_capture([Datagram(t, b"x") for t in (0.0, 0.1, 0.2)], "127.0.0.1", port)
+
+
+@in_virtual_time_on_sockets
+async def test_replay_to_an_address_of_nobody() -> None:
+    """One to which the system sends nothing is told at once, in the same words."""
+    with pytest.raises(LinkError, match=r"nobody listens on UDP 255\.255\.255\.255:3333 \(Perm"):
+        await replay_capture([Datagram(0.0, b"x")], "255.255.255.255", 3333)

@@ -233,6 +233,37 @@ def test_what_is_no_panel(path: str, words: str) -> None:
     assert sorted(Path("/proc/self/fd").iterdir()) == before
 
 
+def kernel(monkeypatch: pytest.MonkeyPatch, *, width: int, grab: OSError | None = None) -> None:
+    """What the kernel answers of a panel with ten slots of so many units."""
+
+    def ioctl(descriptor: int, request: int, argument: bytes | int) -> bytes:
+        if request == GRAB:
+            if grab is not None:
+                raise grab
+            return b""
+        high = 9 if request == get_axis(0x2F) else width
+        return struct.pack("6i", 0, 0, high, 0, 0, 0)
+
+    monkeypatch.setattr("controller.sources.input_device.fcntl.ioctl", ioctl)
+
+
+def test_a_panel_that_another_program_keeps_to_itself(monkeypatch: pytest.MonkeyPatch) -> None:
+    """EVIOCGRAB is refused with EBUSY then: told with how to find that one; nothing stays open."""
+    kernel(monkeypatch, width=1000, grab=OSError(errno.EBUSY, "Device or resource busy"))
+    InputDevice("/dev/null").close()
+    before = sorted(Path("/proc/self/fd").iterdir())
+    with pytest.raises(InputError, match=r"/dev/null: another program.*`sudo fuser -v /dev/null`"):
+        InputDevice("/dev/null", grab=True)
+    assert sorted(Path("/proc/self/fd").iterdir()) == before
+
+
+def test_an_axis_without_a_range_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As of devices that name the axis and do not fill it in; nobody divides by its width."""
+    kernel(monkeypatch, width=0)
+    with pytest.raises(InputError, match=r"/dev/null: axis 0x35 ranges from 0 to 0, which is no"):
+        InputDevice("/dev/null")
+
+
 @pytest.mark.parametrize(
     "url", ["evdev:", "evdev:?grab=yes", "evdev:/dev/x?grab=no", "evdev:/dev/x?grab=yes&a=b"]
 )

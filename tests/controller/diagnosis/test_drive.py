@@ -1,0 +1,62 @@
+"""Driving a rig channel by channel, where an amplifier does not play what it was asked to."""
+
+import asyncio
+
+import numpy as np
+import pytest
+
+from controller.diagnosis.drive import Drive
+from controller.diagnosis.sensors import Sensors
+from controller_bench import make_bench
+from drivers.amplifier import Amplifier
+from drivers.errors import CommandRefused
+from drivers.protocol.messages import Achieved, Apply, Reply, Request, State
+from virtual_loop import in_virtual_time
+
+
+class Deaf(Sensors):
+    """One sensor at a corner, which hears nothing."""
+
+    def __init__(self) -> None:
+        self.names = ("P1",)
+        self.points = np.zeros((1, 2))
+
+    async def wait(self, seconds: float) -> None:
+        """Of virtual time."""
+        await asyncio.sleep(seconds)
+
+    async def time(self) -> float:
+        """The loop's."""
+        return asyncio.get_running_loop().time()
+
+    async def tone(self, frequency: float, *, since: float, until: float) -> "np.ndarray":
+        """Nothing."""
+        return np.zeros(1, dtype=complex)
+
+
+@in_virtual_time
+async def test_a_level_that_is_not_played_ends_the_check() -> None:
+    """By half too quiet it would pass for a dead channel: told with both levels, and disarmed."""
+    bench = make_bench()
+    far_end = bench.far_end
+
+    def warm(request: Request) -> Reply | None:
+        if not isinstance(request, Apply):
+            return None
+        played = request.command_set.commands
+        return Achieved(
+            request.command_set.token,
+            tuple(type(each)(each.channel, each.frequency, each.level / 2) for each in played),
+        )
+
+    far_end.answer = warm
+    drive = Drive(
+        bench.rig, {"main": Amplifier(far_end)}, Deaf(), level=0.1, settle=0.1, listen=0.1
+    )
+    with pytest.raises(
+        CommandRefused,
+        match=r"amplifier main plays level 0.05 on channel 0 in place of 0.1: let it cool down, or",
+    ):
+        await drive.run([110.0])
+    assert far_end.state is not State.OPERATION_ENABLED
+    assert not far_end.is_open

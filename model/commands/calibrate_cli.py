@@ -99,7 +99,7 @@ def calibrate(
         raise typer.Exit(NOT_THIS_PLATE)
     if not as_json:
         print(f"wrote {', '.join(files)}")
-        print(f"Next: era table build {output} -o table.npz")
+        print(f"Next: era table build {output} -o {output.with_suffix('.npz')}")
 
 
 def _write(path: Path, text: str) -> None:

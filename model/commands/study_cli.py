@@ -37,7 +37,13 @@ class Driven(StrEnum):
 
 @study_app.command()
 def study(
-    what: Annotated[Study, typer.Argument(help="What is varied.", metavar="|".join(Study))],
+    what: Annotated[
+        Study,
+        typer.Argument(
+            help="Where the rig's ERAs are; how many there are, one to six; how stiff they are.",
+            metavar="WHAT",
+        ),
+    ],
     rig_file: RigArgument,
     output: Annotated[
         Path, typer.Option("--output", "-o", metavar="DIR", help="Folder to write into.")
@@ -121,7 +127,7 @@ def study(
     print("wrote")
     for name in files:
         print(f"  {name}")
-    print(f"Next: era table build {files[0]} -o table.npz")
+    print(f"Next: era table build {files[0]} -o {output / 'recommended.npz'}")
 
 
 def _show(summary: dict[str, Any]) -> None:
@@ -144,7 +150,9 @@ def _show(summary: dict[str, Any]) -> None:
             f"{case['rank']:4d}  {case['layout']:28s} {stiffness:6.4g} kN/m {lowest:6.1f} g "
             f"{median:6.1f} g {highest:6.1f} g {100 * case['unfelt_share']:7.2f} %"
         )
-    print(f"Recommended: {summary['recommended']['words']}")
+    recommended = summary["recommended"]
+    why = "" if recommended["rank"] == 1 else ", fewest and softest within a tenth of the best"
+    print(f"Recommended{why}: {recommended['words']}")
 
 
 def _who(workers: int, cluster: str | None) -> "Workers":

@@ -98,7 +98,7 @@ def _show_summary(summary: dict[str, Any]) -> None:
         ("plate", f"{length:g} x {width:g} x {thickness:g} mm"),
         ("ERAs", ", ".join(summary["eras"])),
         ("frequencies", f"{summary['frequency_count']} from {low:g} to {high:g} Hz"),
-        ("mode", summary["mode"]),
+        ("mode", f"{summary['mode']}, unless a query or a daemon asks for another"),
         ("patterns", f"{summary['patterns']} of one or two ERAs"),
         ("cells", f"{summary['cells']} ({summary['grid']})"),
         ("feasible cells", f"{percent('feasible_share')} (12 dB to the median other finger)"),

@@ -7,7 +7,7 @@ import socket
 import tempfile
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
 
@@ -23,6 +23,7 @@ from controller.api.parts import LatencySummary
 from controller.means import Means, means_of
 from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.messages import Capabilities
+from drivers.protocol.wire_times import NoTimes, WireTimes
 from model.rig.file import example_rig_path, load_rig
 from model.rig.rig import Rig
 from model.table.table import LocalizationTable
@@ -82,10 +83,7 @@ class _Open:
 
     capabilities: Capabilities
     bus: str | None = None
-
-    def loading_time(self, knots: int) -> float:
-        """The wires here take no time."""
-        return 0.0
+    wire_times: WireTimes = field(default_factory=NoTimes)
 
 
 def attempt(

@@ -17,6 +17,7 @@ from typing import Protocol
 
 from drivers.command import Envelope, Knot
 from drivers.protocol.messages import Capabilities
+from drivers.protocol.wire_times import WireTimes
 from model.rig.rig import Rig
 from model.table.pattern import Pattern
 from model.transients.envelope import KNOT_STEP
@@ -57,8 +58,9 @@ class Loading(Protocol):
     def bus(self) -> str | None:
         """Names the wire, where others may share it."""
 
-    def loading_time(self, knots: int) -> float:
-        """Time [s] on the wire of loading an envelope of so many knots."""
+    @property
+    def wire_times(self) -> WireTimes:
+        """How long things take on its wire."""
 
 
 def shaping_of(rig: Rig, amplifiers: Mapping[str, Loading], *, within: float) -> Shaping:
@@ -139,5 +141,5 @@ def _fits(
             and caps.envelope_step_min <= KNOT_STEP <= caps.envelope_step_max
         ):
             return False
-        busy[amplifier.bus or name] += wired * amplifier.loading_time(knots)
+        busy[amplifier.bus or name] += wired * amplifier.wire_times.loading(knots)
     return max(busy.values(), default=0.0) <= within

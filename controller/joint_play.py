@@ -103,7 +103,7 @@ class JointPlay:
             together.setdefault((amplifier.bus or name, safe.token), []).append(amplifier)
         return at_one_moment(
             [
-                (first, partial(self._commit, first, token, for_all=bool(others)))
-                for (_, token), (first, *others) in together.items()
+                (one.wire_times.commit(), partial(self._commit, one, token, for_all=bool(others)))
+                for (_, token), (one, *others) in together.items()
             ]
         )

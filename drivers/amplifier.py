@@ -33,6 +33,7 @@ from drivers.protocol.messages import (
     Status,
     Stop,
 )
+from drivers.protocol.wire_times import WireTimes
 from drivers.statistics import LinkStatistics
 
 WATCHDOG = 0.25  # s; five heartbeats of 50 ms
@@ -100,17 +101,14 @@ class Amplifier:
         """How well the link does; counts since it was opened, retries since it was made."""
         return self._link.statistics
 
+    @property
+    def wire_times(self) -> WireTimes:
+        """How long things take on its wire."""
+        return self._link.backend.wire_times
+
     def round_trip(self) -> float:
-        """Time [s] on the wire of an apply of all channels and its answer; 0 where not known."""
-        return self._link.backend.round_trip(self.capabilities.channels)
-
-    def commit_time(self) -> float:
-        """Time [s] on the wire until a commit has arrived whole; 0 where not known."""
-        return self._link.backend.commit_time()
-
-    def loading_time(self, knots: int) -> float:
-        """Time [s] on the wire of loading an envelope of so many knots; 0 where not known."""
-        return self._link.backend.loading_time(knots)
+        """Time [s] on the wire of its longest exchange, an apply of all channels; 0 if unknown."""
+        return self.wire_times.round_trip(self.capabilities.channels)
 
     def listen(self, on_event: Callable[[Event], None]) -> None:
         """Be told, in the event loop, what the amplifier says unasked; a hint that may be lost."""

@@ -11,6 +11,7 @@ from contextlib import AbstractContextManager, nullcontext
 
 from drivers.errors import CommandError
 from drivers.protocol.messages import Broadcast, Event, Reply, Request
+from drivers.protocol.wire_times import NoTimes, WireTimes
 from drivers.statistics import WireCounters
 
 
@@ -96,14 +97,7 @@ class Backend(ABC):
             "amplifier by itself"
         )
 
-    def round_trip(self, channels: int) -> float:
-        """Time [s] on the wire of an apply of so many channels and its answer; 0 if unknown."""
-        return 0.0
-
-    def commit_time(self) -> float:
-        """Time [s] on the wire until a commit has arrived whole; 0 if unknown."""
-        return 0.0
-
-    def loading_time(self, knots: int) -> float:
-        """Time [s] on the wire of loading an envelope of so many knots; 0 if unknown."""
-        return 0.0
+    @property
+    def wire_times(self) -> WireTimes:
+        """How long things take on its wire; none where nobody knows."""
+        return NoTimes()

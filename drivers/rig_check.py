@@ -36,7 +36,7 @@ def check_links(
             continue
         try:
             backends[name] = open_backend(url)
-            check_watchdog(WATCHDOG, backends[name].round_trip(channels.get(name, 0)))
+            check_watchdog(WATCHDOG, backends[name].wire_times.round_trip(channels.get(name, 0)))
         except CommandError as error:
             wrong[name] = str(error)
     links = {
@@ -74,7 +74,7 @@ def _told_late(backends: Mapping[str, Backend], channels: Mapping[str, int]) -> 
     bound = HEARTBEATS_BORNE * HEARTBEAT
     warnings = []
     for names in lines.values():
-        took = told_after(backends[name].round_trip(channels[name]) for name in names)
+        took = told_after(backends[name].wire_times.round_trip(channels[name]) for name in names)
         if took > bound:
             who = f"amplifier {names[0]} falls" if len(names) == 1 else f"{', '.join(names)} fall"
             warnings.append(

@@ -103,4 +103,4 @@ async def test_the_backend_says_what_it_counts(amplifier: Amplifier, backend: Ba
     assert (after.bad, after.retries) == (before.bad, before.retries)
     assert after.last_round_trip is not None
     assert after.heartbeat_age is not None
-    assert backend.round_trip(4) >= 0
+    assert backend.wire_times.round_trip(4) >= 0

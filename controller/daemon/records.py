@@ -8,6 +8,7 @@ from typing import NamedTuple
 from drivers import clock
 from drivers.backend import Backend
 from drivers.protocol.messages import Broadcast, Event, Reply, Request, Status
+from drivers.protocol.wire_times import WireTimes
 from drivers.statistics import WireCounters
 
 KEPT = 400  # messages over all links: the last seconds under load, ten at rest
@@ -121,14 +122,7 @@ class RecordedBackend(Backend):
         self._recorder.note(self._name, "out", request)
         await self._inner.broadcast(request)
 
-    def round_trip(self, channels: int) -> float:
+    @property
+    def wire_times(self) -> WireTimes:
         """Of the inner one."""
-        return self._inner.round_trip(channels)
-
-    def commit_time(self) -> float:
-        """Of the inner one."""
-        return self._inner.commit_time()
-
-    def loading_time(self, knots: int) -> float:
-        """Of the inner one."""
-        return self._inner.loading_time(knots)
+        return self._inner.wire_times

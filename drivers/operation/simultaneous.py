@@ -6,30 +6,23 @@ arithmetic is made up for; what remains is how far apart the operating system le
 
 from asyncio import sleep
 from collections.abc import Awaitable, Callable, Coroutine, Sequence
-from typing import Any, Protocol
+from typing import Any
 
 from drivers import clock
 
 _SLACK = 0.002  # s; timers wake up to so much late, so the rest of a wait is spent awake
 
 
-class Starter(Protocol):
-    """What is known of an amplifier that begins with others: see `Amplifier`."""
-
-    def commit_time(self) -> float:
-        """Time [s] on the wire until a commit has arrived whole."""
-
-
 def at_one_moment(
-    commits: Sequence[tuple[Starter, Callable[[], Awaitable[object]]]],
+    commits: Sequence[tuple[float, Callable[[], Awaitable[object]]]],
 ) -> list[Coroutine[Any, Any, object]]:
-    """Commits, each with its amplifier, as what to run together so that all arrive together.
+    """Commits, each with its time [s] on the wire, as what to run so that all arrive together.
 
     The one whose wire takes longest goes first, the others later by what theirs take less.
     """
-    by_time = sorted(commits, key=lambda commit: -commit[0].commit_time())
-    arrival = clock.now() + max((one.commit_time() for one, _ in by_time), default=0.0)
-    return [_commit_at(arrival - one.commit_time(), commit) for one, commit in by_time]
+    by_time = sorted(commits, key=lambda commit: -commit[0])
+    arrival = clock.now() + max((takes for takes, _ in by_time), default=0.0)
+    return [_commit_at(arrival - takes, commit) for takes, commit in by_time]
 
 
 async def _commit_at(moment: float, commit: Callable[[], Awaitable[object]]) -> object:

@@ -36,6 +36,7 @@ from drivers.protocol.messages import (
     Status,
     Stop,
 )
+from drivers.protocol.wire_times import WireTimes
 from drivers.statistics import WireCounters
 
 __all__ = [
@@ -77,6 +78,7 @@ __all__ = [
     "Stop",
     "WireBackend",
     "WireCounters",
+    "WireTimes",
     "now",
     "require_safe",
 ]

@@ -454,7 +454,7 @@ async def test_nothing_is_committed_after_silence_on_wires_of_different_speed(
     """Where the commit of a fast wire waits for that of a slow one, a stop or disarm that comes
     meanwhile is the last that both hear."""
     async with running("a", "b") as bench:
-        bench.far_ends[0].commit_time = lambda: 0.005
+        bench.far_ends[0].commit_takes = 0.005
         for far_end in bench.far_ends:
             far_end.delay = 0.001
         bench.touch(FINGER)

@@ -12,6 +12,7 @@ from controller.means import means_of
 from drivers.command import Envelope as WireEnvelope
 from drivers.command import Knot
 from drivers.protocol.messages import Capabilities
+from drivers.protocol.wire_times import WireTimes
 from model.errors import InputError
 from model.fem.mesh import Mesh
 from model.rig.rig import Channel, Limits, Rig
@@ -21,6 +22,7 @@ from model.table.pattern import Pattern
 from model.transients.envelope import Envelope
 from model.vibration.excitation import Tone
 from sim.amplifier.amplifier import capabilities
+from told_times import ToldTimes
 
 FINE = capabilities(4)
 BOTH, ONSETS, ENDINGS = Shaping(True, True), Shaping(True, False), Shaping(False, True)
@@ -34,9 +36,10 @@ class Opened:
     bus: str | None = None
     knot_time: float = 0.0
 
-    def loading_time(self, knots: int) -> float:
+    @property
+    def wire_times(self) -> WireTimes:
         """In proportion to the knots."""
-        return knots * self.knot_time
+        return ToldTimes(knot_takes=self.knot_time)
 
 
 def rig() -> Rig:

@@ -629,4 +629,4 @@ def test_watchdog_bears_three_heartbeats(watchdog: float, round_trip: float, fit
 )
 def test_the_round_trip_follows_from_the_url(url: str, milliseconds: float) -> None:
     """Four channels at the speed in the URL; what is not known there counts as nothing."""
-    assert open_backend(url).round_trip(4) * 1e3 == pytest.approx(milliseconds, abs=0.01)
+    assert open_backend(url).wire_times.round_trip(4) * 1e3 == pytest.approx(milliseconds, abs=0.01)

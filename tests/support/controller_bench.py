@@ -37,6 +37,7 @@ from drivers.protocol.messages import (
     Status,
     Stop,
 )
+from drivers.protocol.wire_times import WireTimes
 from model.arrays import FloatArray
 from model.fem.mesh import Mesh
 from model.rig.rig import Channel, Limits, Rig
@@ -45,6 +46,7 @@ from model.structure.plate import Material, Plate
 from model.table.pattern import Pattern
 from model.table.question import Question
 from model.vibration.excitation import Excitation, Tone
+from told_times import ToldTimes
 
 FINGER = (1, 0.5, 0.5)
 OTHER = (2, 0.9, 0.9)
@@ -58,7 +60,7 @@ class FarEnd(Backend):
 
     def __init__(self, channels: int = 2) -> None:
         self.asked: list[tuple[float, Request]] = []
-        self.delay = 0.0
+        self.delay = self.commit_takes = 0.0
         self.channels = channels
         self.state = State.SWITCH_ON_DISABLED
         self.levels = (0.0,) * channels
@@ -80,6 +82,11 @@ class FarEnd(Backend):
     def last_sent(self) -> float:
         """On the loop's clock [s]."""
         return self._last_sent
+
+    @property
+    def wire_times(self) -> WireTimes:
+        """A commit is said to take `commit_takes` [s]."""
+        return ToldTimes(self.commit_takes)
 
     async def exchange(self, request: Request, *, timeout: float) -> Reply:
         """Remember, wait, answer."""

@@ -8,10 +8,12 @@ from typing import Any
 
 from drivers.backend import Backend
 from drivers.protocol.messages import Reply, Request
+from drivers.protocol.wire_times import WireTimes
 from model.table.pattern import Pattern
 from model.table.question import Question
 from model.transients.envelope import Envelope
 from sim.amplifier.amplifier import SimulatedAmplifier
+from told_times import ToldTimes
 
 
 class Shapes:
@@ -77,9 +79,10 @@ class Link(Backend):
         """On the loop's clock [s]."""
         return self._last_sent
 
-    def loading_time(self, knots: int) -> float:
+    @property
+    def wire_times(self) -> WireTimes:
         """As set."""
-        return self.loading
+        return ToldTimes(envelope_takes=self.loading)
 
     async def exchange(self, request: Request, *, timeout: float) -> Reply:
         """Obey at once, answer later."""

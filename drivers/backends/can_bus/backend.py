@@ -26,7 +26,7 @@ from drivers.codec.can_bus.orders import (
     encode_order,
     wanted_commands,
 )
-from drivers.codec.can_bus.timing import commit_time, frames_time, loading_time, round_trip_time
+from drivers.codec.can_bus.timing import CanTimes
 from drivers.errors import LinkError, LinkTimeout
 from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.messages import (
@@ -86,18 +86,10 @@ class CanBackend(WireBackend):
         """The bus, on which every amplifier hears a broadcast."""
         return str(self._url.bus)
 
-    def round_trip(self, channels: int) -> float:
-        """Time [s] on the bus of an apply of so many channels and its answer."""
-        bus = self._url.bus
-        return round_trip_time(channels, bitrate=bus.bitrate, fd=bus.fd)
-
-    def commit_time(self) -> float:
-        """Time [s] on the bus until a commit has arrived."""
-        return commit_time(bitrate=self._url.bus.bitrate)
-
-    def loading_time(self, knots: int) -> float:
-        """Time [s] on the bus of loading an envelope."""
-        return loading_time(knots, bitrate=self._url.bus.bitrate)
+    @property
+    def wire_times(self) -> CanTimes:
+        """Of the bus."""
+        return CanTimes(self._url.bus.bitrate, self._url.bus.fd)
 
     async def open(self) -> None:
         """Join the bus, which is opened by the first of its amplifiers; raises LinkError."""
@@ -186,7 +178,7 @@ class CanBackend(WireBackend):
                 if command.channel >= self._channels:  # its frame would be another node's
                     return Nak(NakCode.BAD_CHANNEL, command.channel)
         bus = self._url.bus
-        on_wire = 2 * frames_time(frames, bitrate=bus.bitrate, fd=bus.fd)
+        on_wire = 2 * self.wire_times.frames(frames)
         try:
             answer = await self._orders.answer_to(
                 order,

@@ -23,7 +23,7 @@ from drivers.codec.modbus import exchanges
 from drivers.codec.modbus.blocks import unpack_fault_count
 from drivers.codec.modbus.exchanges import Exchange, Read, Write
 from drivers.codec.modbus.telegrams import Answer
-from drivers.codec.modbus.timing import commit_time, loading_time, round_trip_time
+from drivers.codec.modbus.timing import ModbusTimes
 from drivers.errors import LinkError, LinkTimeout
 from drivers.link.turns import Kind
 from drivers.protocol.messages import (
@@ -40,6 +40,7 @@ from drivers.protocol.messages import (
     Request,
     State,
 )
+from drivers.protocol.wire_times import NoTimes, WireTimes
 
 _ILLEGAL_FUNCTION = 1
 _GATEWAY = (10, 11)  # a gateway has no path to the amplifier, or heard nothing from it
@@ -75,25 +76,12 @@ class ModbusBackend(WireBackend):
         """The line, whose units a broadcast reaches."""
         return f"modbus {self._url.place}"
 
-    def round_trip(self, channels: int) -> float:
-        """Time [s] on a serial line of an apply of so many channels and its answer; else 0."""
+    @property
+    def wire_times(self) -> WireTimes:
+        """Of a serial line, be it behind a gateway; none of a network."""
         if not self._url.baud:
-            return 0.0
-        bits = self._url.bits_per_byte
-        return round_trip_time(channels, baud=self._url.baud, bits_per_byte=bits)
-
-    def commit_time(self) -> float:
-        """Time [s] on a serial line until a commit has arrived; else 0."""
-        if not self._url.baud:
-            return 0.0
-        return commit_time(baud=self._url.baud, bits_per_byte=self._url.bits_per_byte)
-
-    def loading_time(self, knots: int) -> float:
-        """Time [s] on a serial line of loading an envelope; else 0."""
-        if not self._url.baud:
-            return 0.0
-        bits = self._url.bits_per_byte
-        return loading_time(knots, baud=self._url.baud, bits_per_byte=bits)
+            return NoTimes()
+        return ModbusTimes(self._url.baud, self._url.bits_per_byte)
 
     @property
     def takes_turns(self) -> bool:

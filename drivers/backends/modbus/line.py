@@ -18,7 +18,7 @@ from drivers.backends.urls.modbus import ModbusUrl
 from drivers.backends.waiting import reply_within
 from drivers.codec.modbus.exchanges import Read, Write
 from drivers.codec.modbus.telegrams import Answer, AnswerReader, Telegram, make_telegram
-from drivers.codec.modbus.timing import silence
+from drivers.codec.modbus.timing import ModbusTimes
 from drivers.errors import LinkError, LinkTimeout
 from drivers.link.turns import Kind
 from drivers.protocol.definition import PROTOCOL
@@ -53,9 +53,8 @@ class ModbusLine(SharedLine[Port]):
         self._free_from = 0.0
         self._is_owed = False
         self._came = asyncio.Event()
-        self._gap = 0.0
-        if url.device:
-            self._gap = silence(baud=url.baud, bits_per_byte=url.bits_per_byte)
+        self._times = ModbusTimes(url.baud, url.bits_per_byte) if url.baud else None
+        self._gap = self._times.silence if self._times and url.device else 0.0
 
     async def _open(self) -> Port:
         self.counters = WireCounters()
@@ -160,7 +159,7 @@ class ModbusLine(SharedLine[Port]):
 
     def _time_of(self, size: int) -> float:
         """Time [s] that so many bytes take on a serial line, be it behind a gateway."""
-        return size * self.url.bits_per_byte / self.url.baud if self.url.baud else 0.0
+        return self._times.of(size) if self._times else 0.0
 
     def _received(self, data: bytes) -> None:
         for answer in self._reader.feed(data, self._telegram):

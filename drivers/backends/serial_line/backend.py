@@ -16,16 +16,12 @@ from drivers.backends.waiting import SETTLE, reply_within
 from drivers.backends.wire_backend import WireBackend
 from drivers.codec.serial_line.exchanges import decode_event, decode_reply, encode_request, is_event
 from drivers.codec.serial_line.frame import Frame, encode_frame
-from drivers.codec.serial_line.timing import (
-    commit_time,
-    exchange_time,
-    loading_time,
-    round_trip_time,
-)
+from drivers.codec.serial_line.timing import SerialTimes
 from drivers.errors import DriverError, LinkError, LinkTimeout
 from drivers.link.turns import Kind
 from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.messages import Broadcast, Hello, Reply, Request, Stop
+from drivers.protocol.wire_times import NoTimes, WireTimes
 from drivers.statistics import WireCounters
 
 
@@ -43,6 +39,7 @@ class SerialBackend(WireBackend):
     def __init__(self, url: str) -> None:
         super().__init__()
         self._url = SerialUrl.parse(url)
+        self._times = SerialTimes(self._url.baud)
         self._line: SerialLine | None = None
         self._pending: dict[int, _Pending] = {}
         # Not from zero, so that an answer to an earlier run is no answer to this one.
@@ -63,19 +60,10 @@ class SerialBackend(WireBackend):
         """The port: a broadcast reaches all that share it."""
         return self._url.port
 
-    def round_trip(self, channels: int) -> float:
-        """Time [s] on the line of an apply and its answer; 0 where the line's end is a server."""
-        if not self._url.is_local:
-            return 0.0
-        return round_trip_time(channels, baud=self._url.baud)
-
-    def commit_time(self) -> float:
-        """Time [s] on the line until a commit has arrived; 0 where the line's end is a server."""
-        return commit_time(baud=self._url.baud) if self._url.is_local else 0.0
-
-    def loading_time(self, knots: int) -> float:
-        """Time [s] on the line of loading an envelope; 0 where the line's end is a server."""
-        return loading_time(knots, baud=self._url.baud) if self._url.is_local else 0.0
+    @property
+    def wire_times(self) -> WireTimes:
+        """Of the line; none where its end is a server."""
+        return self._times if self._url.is_local else NoTimes()
 
     @property
     def takes_turns(self) -> bool:
@@ -161,7 +149,7 @@ class SerialBackend(WireBackend):
             line.raise_if_lost(self._url.address)
             self._send(line, data)
             line.turns.sent()
-            on_line = exchange_time(len(data), baud=self._url.baud)
+            on_line = self._times.exchange(len(data))
             reply = await reply_within(pending.reply, max(timeout, on_line + PROTOCOL.reaction))
         except LinkError:
             raise

@@ -1,7 +1,11 @@
 """What serial frames cost in time, by arithmetic."""
 
+from dataclasses import dataclass
+from typing import final
+
 from drivers.codec.serial_line.frame import frame_length
 from drivers.protocol.definition import PROTOCOL
+from drivers.protocol.wire_times import WireTimes
 
 _BITS_PER_BYTE = 10  # start, eight data, stop
 _SET_HEAD = 7  # token, ramp, valid_for, count
@@ -14,28 +18,33 @@ _LOADED = 2  # slot, count
 _STATUS_LENGTH = frame_length(12 + 2 * PROTOCOL.quantities.channel_count.maximum)
 
 
-def wire_time(channels: int, *, baud: int = PROTOCOL.serial.baud) -> float:
-    """Time [s] that an apply of so many channels takes on the line."""
-    return frame_length(_SET_HEAD + _COMMAND * channels) * _BITS_PER_BYTE / baud
+@final
+@dataclass(frozen=True)
+class SerialTimes(WireTimes):
+    """On a line at a speed [baud]."""
 
+    baud: int = PROTOCOL.serial.baud
 
-def round_trip_time(channels: int, *, baud: int = PROTOCOL.serial.baud) -> float:
-    """Time [s] on the line of an apply and its answer, the amplifier's own delay not counted."""
-    answer = frame_length(_ACHIEVED_HEAD + _COMMAND * channels)
-    return wire_time(channels, baud=baud) + answer * _BITS_PER_BYTE / baud
+    def apply(self, channels: int) -> float:
+        """Of an apply of so many channels, without its answer."""
+        return self._of(frame_length(_SET_HEAD + _COMMAND * channels))
 
+    def round_trip(self, channels: int) -> float:
+        """See `WireTimes`."""
+        answer = frame_length(_ACHIEVED_HEAD + _COMMAND * channels)
+        return self.apply(channels) + self._of(answer)
 
-def commit_time(*, baud: int = PROTOCOL.serial.baud) -> float:
-    """Time [s] on the line until a commit has arrived."""
-    return frame_length(_COMMIT) * _BITS_PER_BYTE / baud
+    def commit(self) -> float:
+        """See `WireTimes`."""
+        return self._of(frame_length(_COMMIT))
 
+    def loading(self, knots: int) -> float:
+        """See `WireTimes`."""
+        return self._of(frame_length(_ENVELOPE_HEAD + _KNOT * knots) + frame_length(_LOADED))
 
-def loading_time(knots: int, *, baud: int = PROTOCOL.serial.baud) -> float:
-    """Time [s] on the line of loading an envelope of so many knots and of the answer."""
-    request = frame_length(_ENVELOPE_HEAD + _KNOT * knots)
-    return (request + frame_length(_LOADED)) * _BITS_PER_BYTE / baud
+    def exchange(self, request_length: int) -> float:
+        """Of a request of so many bytes and of an answer as long, or a Status."""
+        return self._of(request_length + max(request_length, _STATUS_LENGTH))
 
-
-def exchange_time(request_length: int, *, baud: int) -> float:
-    """Time [s] on the line of a request of so many bytes and of an answer as long, or a Status."""
-    return (request_length + max(request_length, _STATUS_LENGTH)) * _BITS_PER_BYTE / baud
+    def _of(self, length: int) -> float:
+        return length * _BITS_PER_BYTE / self.baud

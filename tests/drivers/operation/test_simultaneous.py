@@ -21,10 +21,6 @@ class Wire:
     takes: float
     sent: list[float] = field(default_factory=list)
 
-    def commit_time(self) -> float:
-        """See `Starter`."""
-        return self.takes
-
     async def commit(self) -> float:
         """Goes out now; its answer takes a while."""
         self.sent.append(asyncio.get_running_loop().time())
@@ -47,7 +43,7 @@ def test_all_arrive_together_and_the_slowest_goes_first() -> None:
     async def work() -> None:
         wires = [Wire(0.002), Wire(0.0), Wire(0.0065)]
         begin = asyncio.get_running_loop().time()
-        answers = await asyncio.gather(*at_one_moment([(wire, wire.commit) for wire in wires]))
+        answers = await asyncio.gather(*at_one_moment([(w.takes, w.commit) for w in wires]))
         assert answers == [0.0065, 0.002, 0.0]
         assert [wire.sent[0] - begin for wire in wires] == pytest.approx([0.0045, 0.0065, 0.0])
 
@@ -60,7 +56,8 @@ def test_equal_wires_wait_for_nothing() -> None:
     async def work() -> None:
         wires = [Wire(0.003) for _ in range(4)]
         tasks = [
-            asyncio.ensure_future(each) for each in at_one_moment([(w, w.commit) for w in wires])
+            asyncio.ensure_future(each)
+            for each in at_one_moment([(w.takes, w.commit) for w in wires])
         ]
         await asyncio.sleep(0)
         assert all(len(wire.sent) == 1 for wire in wires)
@@ -72,12 +69,13 @@ def test_equal_wires_wait_for_nothing() -> None:
 def test_the_time_of_a_commit_is_arithmetic() -> None:
     """Frames of the vendor pages: 13 bytes; 19 bytes and the silence; an order and a SYNC."""
     serial = SerialBackend("serial:///dev/ttyUSB0?baud=115200")
-    assert serial.commit_time() == pytest.approx(13 * 10 / 115_200)
-    assert SerialBackend("socket://h:1").commit_time() == 0
+    assert serial.wire_times.commit() == pytest.approx(13 * 10 / 115_200)
+    assert SerialBackend("socket://h:1").wire_times.commit() == 0
     modbus = ModbusBackend("modbus+rtu:///dev/ttyS1?baud=19200#1")
-    assert modbus.commit_time() == pytest.approx((19 + 3.5) * 11 / 19_200)
-    assert ModbusBackend("modbus+tcp://h/1").commit_time() == 0
-    assert CanBackend("can+socketcan://can0#1").commit_time() == pytest.approx((135 + 55) / 500_000)
+    assert modbus.wire_times.commit() == pytest.approx((19 + 3.5) * 11 / 19_200)
+    assert ModbusBackend("modbus+tcp://h/1").wire_times.commit() == 0
+    can = CanBackend("can+socketcan://can0#1")
+    assert can.wire_times.commit() == pytest.approx((135 + 55) / 500_000)
 
 
 def test_a_rest_that_the_clock_cannot_count_is_waited_for() -> None:
@@ -88,7 +86,7 @@ def test_a_rest_that_the_clock_cannot_count_is_waited_for() -> None:
         assert isinstance(loop, VirtualLoop)
         loop.now = begin = 4552.311810074659
         wires = [Wire(0.0), Wire(0.0020000000004)]
-        await asyncio.gather(*at_one_moment([(wire, wire.commit) for wire in wires]))
+        await asyncio.gather(*at_one_moment([(w.takes, w.commit) for w in wires]))
         assert [wire.sent[0] - begin for wire in wires] == pytest.approx([0.002, 0.0])
 
     in_virtual_time(work)

@@ -189,10 +189,10 @@ def test_urls_are_taken_apart() -> None:
 def test_the_time_on_the_bus_is_known_beforehand() -> None:
     """Four channels at 500 kbit/s, worst stuffing: six frames of 135 bits, a SYNC of 55."""
     backend = CanBackend("can+socketcan://can0#1")
-    assert backend.round_trip(4) == pytest.approx((6 * 135 + 55) / 500_000)
+    assert backend.wire_times.round_trip(4) == pytest.approx((6 * 135 + 55) / 500_000)
     # 3 + 4 * 20 bytes are twelve segments of seven, and five frames frame them.
-    assert backend.loading_time(20) == pytest.approx(17 * 135 / 500_000)
-    assert CanBackend("can+socketcan://can0?fd=2000000#1").round_trip(4) < 0.6e-3
+    assert backend.wire_times.loading(20) == pytest.approx(17 * 135 / 500_000)
+    assert CanBackend("can+socketcan://can0?fd=2000000#1").wire_times.round_trip(4) < 0.6e-3
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,7 @@ from drivers.backends.modbus.line import modbus_line
 from drivers.backends.stand_in import STAND_IN, Adapter, Port, StandIn, Worker
 from drivers.backends.urls.modbus import ModbusUrl
 from drivers.codec.modbus.exchanges import Read, Write
-from drivers.codec.modbus.timing import loading_time, round_trip_time, silence
+from drivers.codec.modbus.timing import ModbusTimes
 from drivers.command import CommandSet
 from drivers.errors import CommandError, FrameError, LinkError, LinkTimeout
 from drivers.guard import SafeCommand
@@ -110,7 +110,7 @@ async def test_a_slow_line_behind_a_gateway_is_waited_for() -> None:
     """Told of 9600 baud, it waits for what they take: 0.13 s for a set of four and its answer."""
     async with peer(is_rtu=False) as far:
         backend = ModbusBackend(f"{far.url}?baud=9600")
-        assert backend.round_trip(4) == pytest.approx(0.12948, abs=1e-5)
+        assert backend.wire_times.round_trip(4) == pytest.approx(0.12948, abs=1e-5)
         await backend.open()
         try:
             at_once = far.answer
@@ -553,18 +553,18 @@ def test_wire_time_is_arithmetic() -> None:
     By hand: 106 * 11 / 115200 = 10.12 ms and two gaps of 1.75 ms, the standard's least; at
     9600 baud 121.46 ms and two of 4.01 ms.
     """
-    assert round_trip_time(4, baud=115200) == pytest.approx(0.01362, abs=1e-5)
-    assert round_trip_time(4, baud=9600) == pytest.approx(0.12948, abs=1e-5)
+    assert ModbusTimes(115200).round_trip(4) == pytest.approx(0.01362, abs=1e-5)
+    assert ModbusTimes(9600).round_trip(4) == pytest.approx(0.12948, abs=1e-5)
     # The frames of the vendor's page, of two knots.
-    assert loading_time(2, baud=9600) == pytest.approx((31 + 15 + 7) * 11 / 9600)
-    assert silence(baud=9600) == pytest.approx(3.5 * 11 / 9600)
-    assert silence(baud=115200) == 0.00175
-    assert ModbusBackend("modbus+tcp://h/1").round_trip(4) == 0
-    assert ModbusBackend("modbus+tcp://h/1").loading_time(20) == 0
-    slow = ModbusBackend("modbus+rtu:///dev/ttyS1?baud=9600#1").round_trip(4)
+    assert ModbusTimes(9600).loading(2) == pytest.approx((31 + 15 + 7) * 11 / 9600)
+    assert ModbusTimes(9600).silence == pytest.approx(3.5 * 11 / 9600)
+    assert ModbusTimes(115200).silence == 0.00175
+    assert ModbusBackend("modbus+tcp://h/1").wire_times.round_trip(4) == 0
+    assert ModbusBackend("modbus+tcp://h/1").wire_times.loading(20) == 0
+    slow = ModbusBackend("modbus+rtu:///dev/ttyS1?baud=9600#1").wire_times.round_trip(4)
     with pytest.raises(CommandError, match=r"round trip of 129\.5 ms need at least 279 ms"):
         check_watchdog(0.25, slow)
-    check_watchdog(0.25, ModbusBackend("modbus+rtu:///dev/ttyS1?baud=19200#1").round_trip(4))
+    check_watchdog(0.25, ModbusBackend("modbus+rtu:///dev/ttyS1?baud=19200#1").wire_times.round_trip(4))
 
 
 @pytest.mark.parametrize("framer", [FramerType.SOCKET, FramerType.RTU], ids=["TCP", "RTU"])

@@ -179,12 +179,16 @@ async def test_the_field_is_drawn_and_frames_go_on(page: Page, era: Client) -> N
     assert await page.until(colours, lambda count: count == 1)  # still again
 
 
-async def test_a_finger_before_anybody_has_armed_is_told_why_it_feels_nothing(page: Page) -> None:
-    """For as long as it is down."""
+async def test_a_finger_while_nobody_has_armed_is_told_why_it_feels_nothing(
+    page: Page, era: Client
+) -> None:
+    """For as long as it is down, and what is to be done in the state that it is in by then."""
     summary = "document.querySelector('#summary').textContent"
     async with fingers_down(page, PLACES[0]):
-        await page.until(summary, lambda text: text == "silent: arm, and touches are felt")
-    await page.until(summary, lambda text: not text)
+        await page.until(f"{summary} === 'silent: arm, and touches are felt'")
+        era.stop()
+        await page.until(f"{summary} === 'silent: clear and arm, and touches are felt'")
+    await page.until(f"{summary} === ''")
 
 
 async def test_fingers_on_the_glass_are_the_daemons_contacts(page: Page, era: Client) -> None:
@@ -482,11 +486,11 @@ async def test_an_effect_plays_at_the_newest_finger(page: Page, era: Client) -> 
     async with fingers_down(page, PLACES[0]):
         await contacts(era, 1)
         await page.until("document.querySelectorAll('.contact').length")
-        await page.click("#effects button[title^=Once]")
+        await page.click("#effects button[title^=As]")
         await page.until("document.querySelectorAll('.contact.target').length")
         assert await page.evaluate("document.querySelector('#problem').innerText") == ""
     await contacts(era, 0)
-    await page.click("#effects button[title^=Once]")
+    await page.click("#effects button[title^=As]")
     await page.until(
         "document.querySelector('#problem').innerText", lambda text: "no finger is within" in text
     )

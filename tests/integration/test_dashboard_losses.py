@@ -53,7 +53,7 @@ async def test_a_lost_link_is_one_event_with_what_has_come_of_it(
             bench.far.station.befall(Episode("hang"))
             await browser.until(f"{STATE} === 'COMM_LOST'")
             told = await browser.until(BANNER, lambda text: "watchdog" in text)
-            assert "Its watchdog silences it after 0.25 s, which nothing confirms" in told
+            assert "Its watchdog silences it after 0.25\u00a0s, which nothing confirms" in told
             assert "(since " in told
             assert "may still be energised" in told
             tile = await browser.until(TILE, lambda text: "no link" in text)

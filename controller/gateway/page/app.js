@@ -9,6 +9,8 @@ import { addEvent, follow, showAmplifiers, showEffects, showLatency, STATES } fr
 const TOPICS = ["hello", "state", "contacts", "pattern", "silence", "amplifiers", "latency", "log", "link", "field"];
 const LEASE_S = 5;
 const TOKEN_KEY = "era-haptics-token";
+const DISARMED = ["SWITCH_ON_DISABLED", "READY_TO_SWITCH_ON"];
+const LATCHED = ["QUICK_STOP_ACTIVE", "FAULT"];
 // States that are left at once: what led to them, or what follows, is told.
 const PASSING = ["SWITCHED_ON", "FAULT_REACTION_ACTIVE", "READY_TO_SWITCH_ON"];
 // Why there is no connection to the gateway, and what is done about it.
@@ -83,9 +85,9 @@ setInterval(() => {
 function showButtons() {
   const isArmed = state === "OPERATION_ENABLED";
   const isThere = state !== null && link?.isOpen;
-  at("arm").disabled = !isThere || isArmed || !["SWITCH_ON_DISABLED", "READY_TO_SWITCH_ON"].includes(state);
+  at("arm").disabled = !isThere || isArmed || !DISARMED.includes(state);
   at("disarm").disabled = !isThere || !isArmed;
-  at("clear").disabled = !isThere || !["QUICK_STOP_ACTIVE", "FAULT"].includes(state);
+  at("clear").disabled = !isThere || !LATCHED.includes(state);
   at("effects").disabled = !isThere || !isArmed;
 }
 
@@ -98,7 +100,7 @@ function showBanner() {
   else if (daemon === null) text = `The daemon does not answer${from}. ${unseen}`;
   else if (state === "COMM_LOST") {
     text = `The link to an amplifier is lost${from}. `;
-    text += watchdog ? `Its watchdog silences it after ${watchdog} s, which nothing confirms: it` : "It";
+    text += watchdog ? `Its watchdog silences it after ${watchdog}\u00a0s, which nothing confirms: it` : "It";
     text += " may still be energised.";
   } else if (daemon?.rig.simulated) text = "Simulated amplifiers: nothing vibrates but numbers.";
   at("banner").hidden = !text;
@@ -152,6 +154,13 @@ function summarise({ contacts, predicted_contrast_db, robust_contrast_db, predic
   at("summary").textContent = `${contacts.length} ${contacts.length === 1 ? "finger" : "fingers"}: ${parts.join(", ")}`;
 }
 
+// Why fingers feel nothing, where that is for the state alone.
+function summariseSilence() {
+  if (!overlay.contacts.length) at("summary").textContent = "";
+  else if (DISARMED.includes(state)) at("summary").textContent = "silent: arm, and touches are felt";
+  else if (LATCHED.includes(state)) at("summary").textContent = "silent: clear and arm, and touches are felt";
+}
+
 const HANDLERS = {
   hello(said) {
     if (daemon && !said) since = new Date();
@@ -160,6 +169,7 @@ const HANDLERS = {
       forget("the gateway looks for the daemon");
       return;
     }
+    showBanner();
     overlay.setUp(daemon);
     link.call("status").then(showStatus).catch(complain);
     link.call("effects").then(({ effects }) => showEffects(at("effects-section"), at("effects"), effects, play)).catch(() => {});
@@ -167,6 +177,7 @@ const HANDLERS = {
   state({ old, new: next, cause, remedy }) {
     const isNews = state !== null && old !== next && !PASSING.includes(next);
     showState(next, cause);
+    summariseSilence();
     if (next === "COMM_LOST") {
       tellLoss(cause, remedy);
     } else if (loss) {
@@ -179,8 +190,7 @@ const HANDLERS = {
   },
   contacts({ contacts }) {
     overlay.show({ contacts });
-    if (!contacts.length) at("summary").textContent = "";
-    else if (["SWITCH_ON_DISABLED", "READY_TO_SWITCH_ON"].includes(state)) at("summary").textContent = "silent: arm, and touches are felt";
+    summariseSilence();
   },
   pattern(pattern) {
     overlay.show(pattern);
@@ -188,7 +198,8 @@ const HANDLERS = {
   },
   silence({ contacts, reason }) {
     overlay.show({ contacts, drive: {} });
-    at("summary").textContent = contacts.length ? `silent: ${reason}` : "";
+    at("summary").textContent = `silent: ${reason}`;
+    summariseSilence();
   },
   amplifiers({ amplifiers }) {
     showAmplifiers(at("amplifiers"), amplifiers, overlay.rig?.eras ?? []);

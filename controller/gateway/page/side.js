@@ -57,8 +57,10 @@ export function showAmplifiers(into, amplifiers, eras) {
 const threeDigits = (value) => shown(value, Math.max(0, 2 - Math.floor(Math.log10(Math.max(value, 1)))));
 
 export function showLatency(numbers, svg, { count, median, p99, p999, histogram }) {
+  // A share of fewer commands than it takes would say more than is known.
+  const within = [["99 %", p99, 100], ["99.9 %", p999, 1000]].filter(([, , least]) => count >= least);
   numbers.textContent = count
-    ? `median ${threeDigits(median)} ms, 99 % within ${threeDigits(p99)} ms, 99.9 % within ${threeDigits(p999)} ms, of ${count}`
+    ? [`median ${threeDigits(median)} ms`, ...within.map(([share, value]) => `${share} within ${threeDigits(value)} ms`), `of ${count}`].join(", ")
     : "no touch has led to a command yet";
   const most = Math.max(1, ...histogram.map(([, number]) => number));
   const width = 320 / Math.max(1, histogram.length);

@@ -13,7 +13,7 @@ PACKAGES = ("by_name", "controller", "drivers", "era_haptics", "model", "sim")
 ERRORS = {
     *("InputError", "ConfigError", "CommandError", "CommandRefused", "LinkError", "LinkTimeout"),
     *("FrameError", "RpcError", "HTTPException", "Unreachable", "EventError", "OscError"),
-    *("ValueError", "GaveWay", "BadParameter"),
+    *("ValueError", "GaveWay", "BadParameter", "Malformed"),
 }
 """Exceptions whose text people read. A validator's ValueError becomes a line about a key."""
 

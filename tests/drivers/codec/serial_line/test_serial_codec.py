@@ -1,5 +1,6 @@
 import itertools
 import math
+import re
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -418,6 +419,24 @@ def test_texts_that_harm_a_terminal_are_malformed(raw: bytes, problem: str) -> N
     request = Frame(kind=1, address=1, sequence=1, payload=b"")
     with pytest.raises(Malformed, match=problem):
         decode_reply(Frame(kind=0x81, address=1, sequence=1, payload=payload), request)
+
+
+@pytest.mark.parametrize(
+    ("asked", "payload", "problem"),
+    [
+        (Hello(), "01 21", "a text of 33 bytes is too long"),
+        (GetStatus(), "04 00 0000 02", "reserved flags set: 0x02"),
+        (GetFaults(), "01 04 10 00000000", "channel 16 does not exist"),
+        (GetFaults(), "00 07", "1 bytes too many"),
+        (GetFaults(), "ff", "fault_count 255 is not within 0..32"),
+    ],
+)
+def test_malformed_replies_say_what_is_wrong(asked: Request, payload: str, problem: str) -> None:
+    """In words for whoever builds the amplifier; bytes by hand."""
+    request = encode_request(asked, address=1, sequence=1)
+    frame = Frame(kind=request.kind | 0x80, address=1, sequence=1, payload=bytes.fromhex(payload))
+    with pytest.raises(Malformed, match=re.escape(problem)):
+        decode_reply(frame, request)
 
 
 def test_a_reply_to_another_type_is_malformed() -> None:

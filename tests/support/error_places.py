@@ -110,6 +110,8 @@ class _Reader:
                 lefts = self._texts(left, scope, depth=depth) or [".*?"]
                 rights = self._texts(right, scope, depth=depth) or [".*?"]
                 return [a + b for a in lefts for b in rights]
+            case ast.BoolOp(values=values):
+                return [t for n in values for t in self._texts(n, scope, depth=depth)]
             case ast.IfExp(body=body, orelse=orelse):
                 return [t for n in (body, orelse) for t in self._texts(n, scope, depth=depth)]
             case ast.Name(id=name):

@@ -22,6 +22,7 @@ _ENABLED, _STOPPED, _REACTING, _FAULT = 4, 5, 6, 7
 _OFF = (0, 1, 2)
 _LATCHED = (_STOPPED, _REACTING, _FAULT)
 _SILENT = (*_OFF, _FAULT)  # in which no level may be left
+_BY_ITSELF = {3: (3, 1), _REACTING: (_REACTING, _FAULT), **dict.fromkeys(_OFF, _OFF)}
 
 NAMES = (
     "NOT_READY",
@@ -63,6 +64,7 @@ class Follower:
         self._seen_at = -math.inf  # when it last said how it is
         self._token: int | None = None
         self._token_before: tuple[int | None, float] = (None, -math.inf)  # and until when it counts
+        self._states_before: tuple[set[int], float] = (set(), -math.inf)  # the same, of a stop
         self._played: deque[int] = deque(maxlen=_REMEMBERED)
         self._staged: Asked | None = None
         self._outputs = Outputs(name, plan, slack=times.slack, complain=complain)
@@ -147,6 +149,7 @@ class Follower:
         self.watchdog.may_be_fed(time)
         soon = (time, time + 0.010)  # as an answer would take
         if asked.kind is Kind.STOP:
+            self._states_before = ({self.state}, soon[1])
             self._stopped(asked, *soon)
         elif (
             asked.kind is Kind.COMMIT
@@ -177,6 +180,8 @@ class Follower:
             self.state = self.state if self.state in (_REACTING, _FAULT) else _STOPPED
         elif self.state == _ENABLED:
             self.state = 3
+        elif _ENABLED in self._states_before[0] and begin <= self._states_before[1]:
+            self._states_before[0].add(3)  # it may have been disarmed before it was stopped
 
     def _cleared(self, answer: Answered) -> None:
         """It may stay as it is, or go to disarmed."""
@@ -272,15 +277,13 @@ class Follower:
     def _check_state(self, said: Condition, end: float) -> None:
         here, now = self.state, said.state
         trips = now in (_REACTING, _FAULT) and here not in (None, *_OFF, _REACTING, _FAULT)
-        follows = {
-            3: (3, 1),
-            _REACTING: (_REACTING, _FAULT),
-            **dict.fromkeys(_OFF, _OFF),
-        }.get(here or 0, (here,))
+        states, until = self._states_before
+        if end <= until and any(now in _following(state) for state in states):
+            return  # it was said before the stop that nobody answers
         if trips:
             self.faulted_at = end
             self._check_trip(said, end)
-        elif now not in follows:
+        elif now not in _following(here or 0):
             self._complain(self._rule_against(now), end, self._what_is_wrong(now))
         elif now in _LATCHED and self._fault and said.fault != self._fault:
             self._complain(
@@ -350,3 +353,8 @@ class Follower:
 
     def _named(self) -> str:
         return NAMES[self.state] if self.state is not None else "some state"
+
+
+def _following(state: int) -> tuple[int, ...]:
+    """The states in which an amplifier may be that was in one, and was asked nothing since."""
+    return _BY_ITSELF.get(state, (state,))

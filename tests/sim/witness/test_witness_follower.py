@@ -9,12 +9,15 @@ from sim.witness.seen import Answered, Asked, Condition, Drive, Kind
 PLAN = AmplifierPlan("line", 1, {0: Limits(40.0, 500.0, 1.0)})
 ARM = Asked(Kind.ARM, 1, key=1, watchdog=0.25)
 STOP = Asked(Kind.STOP, 1, key=2)
+DISARM = Asked(Kind.DISARM, 1, key=4, ramp=0.05)
+STATUS = Asked(Kind.STATUS, 1, key=5)
+STOP_ALL = Asked(Kind.STOP, 0)
 # Plays 0.2 for 0.3 s, then fades out along 50 ms.
 BRIEF = Asked(
     Kind.APPLY, 1, key=3, token=1, ramp=0.05, valid_for=0.3, drives={0: Drive(110.0, 0.2, 0.0)}
 )
 # docs/reference/wire-protocol.md, States and Fault.
-ENABLED, STOPPED, REACTING, FAULT = 4, 5, 6, 7
+SWITCHED_ON, ENABLED, STOPPED, REACTING, FAULT = 3, 4, 5, 6, 7
 WATCHDOG = 1
 
 
@@ -95,3 +98,25 @@ def test_a_set_that_ends_by_itself_may_fade_from_its_end_on(
     watched.follower.fed(1.3)
     watched.follower.said(Condition(ENABLED, 0, levels=(level,)), time, time + 0.001)
     assert watched.broken == rules
+
+
+@pytest.mark.parametrize(
+    ("asked", "says", "late"), [(DISARM, SWITCHED_ON, "latched"), (STATUS, ENABLED, "armed")]
+)
+def test_an_answer_may_be_older_than_a_stop_to_all(asked: Asked, says: int, late: str) -> None:
+    """Asked, then all of the bus are stopped, and only then the answer comes: of how it was before.
+
+    Nobody answers the stop, so it counts within 10 ms; after that it is stopped.
+    """
+    for asked_at, broken in ((1.0995, []), (1.1095, [late])):
+        watched = Watched()
+        watched.grants(ARM, 1.0, ENABLED)
+        watched.follower.announced(STOP_ALL, 1.1)
+        watched.grants(asked, asked_at, says)
+        assert watched.broken == broken
+    watched = Watched()
+    watched.grants(ARM, 1.0, ENABLED)
+    watched.follower.announced(STOP_ALL, 1.1)
+    watched.grants(asked, 1.0995, says)
+    watched.grants(STATUS, 1.12, STOPPED)
+    assert watched.broken == []

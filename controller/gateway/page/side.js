@@ -60,7 +60,7 @@ export function showLatency(numbers, svg, { count, median, p99, p999, histogram 
   // A share of fewer commands than it takes would say more than is known.
   const within = [["99 %", p99, 100], ["99.9 %", p999, 1000]].filter(([, , least]) => count >= least);
   numbers.textContent = count
-    ? [`median ${threeDigits(median)} ms`, ...within.map(([share, value]) => `${share} within ${threeDigits(value)} ms`), `of ${count}`].join(", ")
+    ? [`median ${threeDigits(median)} ms`, ...within.map(([share, value]) => `${share} within ${threeDigits(value)} ms`), `of ${count} ${count === 1 ? "command" : "commands"}`].join(", ")
     : "no touch has led to a command yet";
   const most = Math.max(1, ...histogram.map(([, number]) => number));
   const width = 320 / Math.max(1, histogram.length);

@@ -5,6 +5,7 @@ import re
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from datetime import datetime
 from itertools import zip_longest
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
     from controller.api.client import Client
     from controller.api.messages import StatusResult
     from controller.api.parts import RigSummary
+    from controller.api.replies import Notification
 
 app = typer.Typer()
 
@@ -202,13 +204,13 @@ def watch(
         )
     with _client(socket) as era:
         era.subscribe(*cast("list[Topic]", wanted), rate_hz=rate)
+        now = era.status()
         for told in era.events():
             if as_json:
                 said = {"topic": told.topic, "time_s": told.time, "lost": told.lost}
                 typer.echo(json.dumps({**said, "data": told.data}))
             else:
-                lost = f"  ({told.lost} lost)" if told.lost else ""
-                typer.echo(f"{told.time:12.3f}  {told.topic:10s} {json.dumps(told.data)}{lost}")
+                typer.echo(show_event(told, ahead=now.unix_time_s - now.time_s))
 
 
 @contextmanager
@@ -258,6 +260,15 @@ def _tell_state(era: "Client", *, as_json: bool) -> None:
         typer.echo(json.dumps({"state": told.state, "cause": told.cause, "remedy": told.remedy}))
     else:
         typer.echo(f"{told.state}: {told.cause}")
+
+
+def show_event(told: "Notification", *, ahead: float) -> str:
+    """What has happened, for people to read; ahead: of the wall clock before the daemon's [s]."""
+    from drivers.cli import in_words
+
+    at = datetime.fromtimestamp(told.time + ahead).isoformat(timespec="milliseconds")[11:]
+    lost = f"  ({told.lost} lost)" if told.lost else ""
+    return f"{at}  {told.topic:10s} {in_words(told.data)}{lost}"
 
 
 def show_status(told: "StatusResult") -> str:

@@ -250,20 +250,24 @@ def _show(result: dict[str, Any], *, as_json: bool) -> None:
         return
     width = max(len(key) for key in result)
     for key, value in result.items():
-        print(f"{key:{width}}  {_words(value)}")
+        print(f"{key:{width}}  {in_words(value)}")
 
 
-def _words(value: Any) -> str:
-    """A value as people read it: seven digits of a number, a row of several by their names."""
+def in_words(value: Any) -> str:
+    """A value of JSON as people read it: of a number what counts, of an object what it has."""
     match value:
         case bool():
             return "yes" if value else "no"
         case float():
-            return f"{value:.7g}"
+            return f"{value:.5g}"
         case list():
             between = "; " if any(isinstance(one, dict) for one in value) else ", "
-            return between.join(_words(one) for one in value) or "none"
+            return between.join(in_words(one) for one in value) or "none"
         case dict():
-            return ", ".join(f"{key} {_words(one)}" for key, one in value.items())
+            words = {key: in_words(one) for key, one in value.items() if one is not None}
+            return ", ".join(
+                f"{key} ({told})" if isinstance(value[key], dict) else f"{key} {told}"
+                for key, told in words.items()
+            )
         case _:
             return str(value)

@@ -5,17 +5,38 @@ import re
 import socket
 import subprocess
 import sys
+from datetime import datetime
 from pathlib import Path
 
 import pytest
 import typer
 
+from controller.api.replies import Notification
 from controller.daemon.run import run_daemon
-from controller.daemon_cli import show_status, touch
+from controller.daemon_cli import show_event, show_status, touch
 from controller.metrics.__main__ import serve
 from daemon_bench import running_daemon, until_state, write_daemon
 from model.errors import InputError
 from sim.faults.episodes import Episode
+
+
+def test_an_event_is_told_by_the_clock_on_the_wall_and_without_what_is_not_known() -> None:
+    """On the second day of 1970 at 0:01:05.25 here; digits that no finger has are left out."""
+    finger = {"source": "panel", "id": 1, "x_m": 0.1 + 0.2, "role": None, "effect": "buzz"}
+    midnight = datetime(1970, 1, 2).timestamp()
+    event = Notification("contacts", 5.25, 3, {"contacts": [finger, finger | {"id": 2}]})
+    assert show_event(event, ahead=midnight + 60.0) == (
+        "00:01:05.250  contacts   contacts source panel, id 1, x_m 0.3, effect buzz; "
+        "source panel, id 2, x_m 0.3, effect buzz  (3 lost)"
+    )
+    drive = {"SW": {"frequency_hz": 110.0, "level": 0.05}}
+    pattern = Notification("pattern", 0.0, 0, {"contacts": [finger], "drive": drive})
+    assert show_event(pattern, ahead=midnight) == (
+        "00:00:00.000  pattern    contacts source panel, id 1, x_m 0.3, effect buzz, "
+        "drive (SW (frequency_hz 110, level 0.05))"
+    )
+    nobody = Notification("contacts", 0.0, 0, {"contacts": []})
+    assert show_event(nobody, ahead=midnight) == "00:00:00.000  contacts   contacts none"
 
 
 async def test_a_touch_beyond_the_plate_is_refused(tmp_path: Path) -> None:

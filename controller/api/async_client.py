@@ -123,7 +123,14 @@ class AsyncClient:
     @contextlib.asynccontextmanager
     async def armed(self, owner: str, *, lease_s: float = calls.USUAL_LEASE) -> AsyncIterator[None]:
         """Armed within the block, disarmed after it; a task renews the lease meanwhile."""
-        lease = await self.arm(owner, lease_s=lease_s)
+        arming = asyncio.ensure_future(self.arm(owner, lease_s=lease_s))
+        try:
+            lease = await asyncio.shield(arming)
+        except asyncio.CancelledError:
+            with contextlib.suppress(RpcError, Unreachable):  # refused, it is somebody else's
+                await arming
+                await self.disarm()
+            raise
         renewing = asyncio.create_task(self._keep_renewing(lease))
         try:
             yield

@@ -172,6 +172,8 @@ class Service:
         # Arming took a moment, longer perhaps than the lease: that counts from when it was done.
         lease = self._lease.begin(lease.token, now=clock.now())
         self._watch_lease()
+        # Once the answer has gone out, or could not.
+        asyncio.get_running_loop().call_soon(self._look_at_holder, client, lease.token)
         return ArmResult(lease=lease.token, lease_s=lease.lasts)
 
     def _renew(self, client: Connection, params: RenewParams) -> RenewResult:
@@ -240,6 +242,14 @@ class Service:
         if ends is not None:
             self._expiry = asyncio.get_running_loop().call_later(
                 max(0.0, ends - clock.now()), self._look_at_lease
+            )
+
+    def _look_at_holder(self, client: Connection, token: str) -> None:
+        """Disarm where nobody knows the lease that runs: whoever armed was gone by then."""
+        held = self._lease.held(clock.now())
+        if held is not None and held.token == token and not client.is_open:
+            self._supervisor.tell(
+                Event(Kind.LEASE_LOST, "whoever armed has hung up meanwhile", "arm again")
             )
 
     def _look_at_lease(self) -> None:

@@ -15,6 +15,7 @@ from controller.daemon.log import LogThread
 from controller.daemon.notify import ServiceManager
 from controller.daemon.place import Place
 from daemon_bench import daemon_table, far_end, running_daemon, until, until_state, write_daemon
+from drivers.errors import LinkError
 from drivers.protocol.messages import State
 from sim.faults.episodes import Episode
 
@@ -55,6 +56,59 @@ async def test_arming_that_takes_longer_than_the_lease(
         await era.renew(lease.lease)
         await until_state(era, READY)
         assert bench.far.station.status().state is State.SWITCH_ON_DISABLED
+
+
+async def test_who_hangs_up_while_arming_leaves_nothing_armed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nobody knows the lease then, which would have lasted for a minute: disarmed at once."""
+    async with running_daemon(tmp_path) as bench, await bench.client() as era:
+        await until_state(era, READY)
+        arm, goes_on = bench.daemon._controller.arm, asyncio.Event()
+
+        async def slow() -> None:
+            await goes_on.wait()
+            await arm()
+
+        monkeypatch.setattr(bench.daemon._controller, "arm", slow)
+        other = await bench.client("other")
+        arming = asyncio.ensure_future(other.arm("other", lease_s=60))
+        await until_state(era, "SWITCHED_ON")
+        await other.close()
+        with pytest.raises(LinkError):
+            await arming
+        goes_on.set()
+        await until_state(era, READY)
+        assert (await era.status()).armed_by is None
+        assert bench.far.station.status().state is State.SWITCH_ON_DISABLED
+
+
+async def test_who_is_cancelled_while_arming_leaves_nothing_armed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its connection stays, and with it a lease that nobody would renew: so it disarms."""
+    async with running_daemon(tmp_path) as bench, await bench.client() as era:
+        await until_state(era, READY)
+        arm, goes_on = bench.daemon._controller.arm, asyncio.Event()
+
+        async def slow() -> None:
+            await goes_on.wait()
+            await arm()
+
+        async def use() -> None:
+            async with era.armed("me", lease_s=60):
+                raise AssertionError("it was cancelled before")
+
+        monkeypatch.setattr(bench.daemon._controller, "arm", slow)
+        using = asyncio.create_task(use())
+        await until_state(era, "SWITCHED_ON")
+        using.cancel()
+        await asyncio.sleep(0)
+        goes_on.set()
+        with pytest.raises(asyncio.CancelledError):
+            await using
+        await until_state(era, READY)
+        assert (await era.status()).armed_by is None
 
 
 async def test_a_reload_that_fails_in_an_unheard_of_way_is_over_all_the_same(

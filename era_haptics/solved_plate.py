@@ -34,6 +34,11 @@ class SolvedPlate:
         expect_rig(rig)
         self.rig = rig
 
+    def __repr__(self) -> str:
+        plate = self.rig.plate
+        eras = ", ".join(era.name for era in self.rig.eras)
+        return f"<SolvedPlate of {plate.length:g} x {plate.width:g} m on ERAs {eras}>"
+
     @cached_property
     def modes(self) -> SupportedModes:
         """Natural frequencies (n,) [Hz], damping ratios (n,), and shapes anywhere by `at`.

@@ -32,6 +32,10 @@ class SupportedModes:
     reduced: ReducedPlate
     coordinates: FloatArray
 
+    def __repr__(self) -> str:
+        named = ", ".join(f"{frequency:.1f}" for frequency in self.natural_frequencies)
+        return f"<SupportedModes at {named} Hz>"
+
     def at(self, points: FloatArray) -> FloatArray:
         """Mode shapes at points [m] (p, 2), (p, n), scaled to modal mass 1 [1/sqrt(kg)].
 

@@ -89,6 +89,13 @@ class LocalizationTable:
     reference_mesh: Mesh
     discretisation_error: FloatArray
 
+    def __repr__(self) -> str:
+        low, high = self.frequencies[[0, -1]]
+        return (
+            f"<LocalizationTable of {self.plate.length:g} x {self.plate.width:g} m on ERAs "
+            f"{', '.join(era.name for era in self.eras)}, {low:g} to {high:g} Hz, mode {self.mode}>"
+        )
+
     @property
     def fingerprint(self) -> str:
         """Fingerprint of the plate on its ERAs that this table is for."""

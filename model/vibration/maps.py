@@ -6,6 +6,7 @@ from functools import partial
 import numpy as np
 
 from model.arrays import FloatArray, lattice
+from model.counting import counted
 from model.errors import InputError
 from model.fem.assembly import assemble
 from model.fem.harmonic import direct_acceleration
@@ -29,6 +30,12 @@ class PlateMap:
     y: FloatArray
     peak: FloatArray
     nulls: FloatArray
+
+    def __repr__(self) -> str:
+        return (
+            f"<PlateMap of {len(self.x)} x {len(self.y)} points, at most {self.peak.max():.3g} m/s², "
+            f"{counted(len(self.nulls), 'null')}>"
+        )
 
 
 def plate_map(

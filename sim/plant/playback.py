@@ -10,6 +10,7 @@ from functools import cached_property
 import numpy as np
 
 from model.arrays import FloatArray
+from model.counting import counted
 from model.errors import InputError
 from model.finger.contrast import contrast_db, mean_level_db_sl
 from model.finger.fingertip import fingertip_points
@@ -51,6 +52,11 @@ class Playback:
     targets: tuple[Record, ...]
     quiet: tuple[Record, ...]
     settled: float
+
+    def __repr__(self) -> str:
+        driven = ", ".join(f"{frequency:g}" for frequency in self.frequencies)
+        felt = f"{counted(len(self.targets), 'target')} and {len(self.quiet)} quiet"
+        return f"<Playback of {driven} Hz for {self.targets[0].times[-1]:g} s at {felt}>"
 
     @property
     def level_db_sl(self) -> float:

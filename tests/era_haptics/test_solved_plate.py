@@ -87,3 +87,18 @@ def test_what_it_is_not_solved_for_is_refused(plate: era.SolvedPlate) -> None:
     for ask in (plate.map, lambda drive: plate.play(drive, TARGET)):
         with pytest.raises(era.InputError, match=r"limits end at 500 Hz.*raise limits\.freq"):
             ask({"SW": 501})
+
+
+def test_what_a_cell_of_a_notebook_ends_with_is_shown_in_a_line(
+    plate: era.SolvedPlate, table: era.LocalizationTable
+) -> None:
+    """What it is of, not the thousands of numbers in it; the plate and the table as made above."""
+    field = plate.map({"SW": 110}, raster=(5, 4))
+    felt = plate.play({"SW": 110}, TARGET, quiet=QUIET, duration=0.3)
+    assert repr(plate) == "<SolvedPlate of 0.3048 x 0.2286 m on ERAs SW, SE, NE, NW>"
+    assert repr(plate.modes).startswith("<SupportedModes at 31.6, 67.9, 75.5, ")
+    assert repr(field).startswith(f"<PlateMap of 5 x 4 points, at most {field.peak.max():.3g} m")
+    assert repr(felt) == "<Playback of 110 Hz for 0.3 s at 1 target and 1 quiet>"
+    assert repr(table) == (
+        "<LocalizationTable of 0.3048 x 0.2286 m on ERAs SW, SE, NE, NW, 60 to 250 Hz, mode phased>"
+    )

@@ -33,8 +33,8 @@ class PlateMap:
 
     def __repr__(self) -> str:
         return (
-            f"<PlateMap of {len(self.x)} x {len(self.y)} points, at most {self.peak.max():.3g} m/s², "
-            f"{counted(len(self.nulls), 'null')}>"
+            f"<PlateMap of {len(self.x)} x {len(self.y)} points, "
+            f"at most {self.peak.max():.3g} m/s², {counted(len(self.nulls), 'null')}>"
         )
 
 

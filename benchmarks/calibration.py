@@ -56,7 +56,7 @@ def reached(
 
     def peak(place: tuple[float, float]) -> np.ndarray:
         points = fingertip_points(*place, truth.plate)
-        return truth.amplitudes(excitation, points)[1].sum(axis=0)
+        return np.asarray(truth.amplitudes(excitation, points)[1].sum(axis=0))
 
     return float(20 * np.log10(peak(target).mean() / max(peak(place).max() for place in quiet)))
 

@@ -12,6 +12,7 @@ import json
 import socket
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -73,4 +74,5 @@ def _wait_until(moment: int) -> None:
 
 
 if __name__ == "__main__":
-    {"panel": panel, "flood": flood, "work": work}[sys.argv[1]](*sys.argv[2:])
+    programs: dict[str, Callable[..., None]] = {"panel": panel, "flood": flood, "work": work}
+    programs[sys.argv[1]](*sys.argv[2:])

@@ -1,5 +1,6 @@
 """The touches of the latency benchmark: the same for the same seed, in every process of it."""
 
+import math
 import random
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -62,4 +63,4 @@ def _anywhere(dice: random.Random, plate: Plate) -> tuple[float, float]:
 
 
 def _distance(a: tuple[float, float], b: tuple[float, float], plate: Plate) -> float:
-    return float(((a[0] - b[0]) * plate.length) ** 2 + ((a[1] - b[1]) * plate.width) ** 2) ** 0.5
+    return math.hypot((a[0] - b[0]) * plate.length, (a[1] - b[1]) * plate.width)

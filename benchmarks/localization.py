@@ -11,6 +11,7 @@ its draws counts. Printed: the median over the sets, in brackets the tenth perce
 
 import argparse
 import os
+from functools import partial
 
 
 def main() -> None:
@@ -35,18 +36,18 @@ def main() -> None:
     print(f"{options.sets} contact sets for each count, {options.draws} draws, seed {options.seed}")
     sections = []
     for section in (
-        lambda: contrast_section(options.sets, options.draws, options.seed),
-        lambda: two_target_section(options.sets, options.draws, options.seed),
-        lambda: ensemble_section(options.sets, options.seed),
-        lambda: freedom_section(options.sets, options.seed),
-        lambda: speed_section(options.seed),
-        lambda: growth_section(options.seed),
+        partial(contrast_section, options.sets, options.draws, options.seed),
+        partial(two_target_section, options.sets, options.draws, options.seed),
+        partial(ensemble_section, options.sets, options.seed),
+        partial(freedom_section, options.sets, options.seed),
+        partial(speed_section, options.seed),
+        partial(growth_section, options.seed),
     ):
         sections.append(section())
         print()
         print(sections[-1].text())
     if options.report:
-        write_report(sections, options)
+        write_report(sections, sets=options.sets, draws=options.draws, seed=options.seed)
 
 
 if __name__ == "__main__":

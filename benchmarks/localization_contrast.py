@@ -1,7 +1,9 @@
 """Realised contrast of every method for one, two and three quiet fingers, and of two targets."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 
@@ -20,9 +22,10 @@ from benchmarks.localization_methods import (
     reversed_pulse_contrast,
     time_reversal,
 )
-from model.drive_modes import MODES, find_drives
+from model.arrays import ComplexArray, FloatArray
+from model.drive_modes import MODES, Choice, find_drives
 from model.drive_modes.exact_search import search_exactly
-from model.drive_modes.fields import ERROR_SHARE
+from model.drive_modes.fields import ERROR_SHARE, Fields
 from model.table.robust import with_robust_contrast
 
 QUIET = (1, 2, 3)
@@ -40,9 +43,9 @@ class Section:
     columns: list[str]
     rows: list[list[str]]
     notes: list[str] = field(default_factory=list)
-    data: dict = field(default_factory=dict)
+    data: dict[Any, Any] = field(default_factory=dict)
 
-    def text(self):
+    def text(self) -> str:
         table = [self.columns, *self.rows]
         widths = [max(len(row[column]) for row in table) for column in range(len(self.columns))]
         lines = [
@@ -55,14 +58,16 @@ class Section:
         return "\n".join([self.title, *(f"  {line}" for line in lines), *self.notes])
 
 
-def shown(values):
+def shown(values: Sequence[float | None]) -> str:
     """Median, and the tenth percentile in brackets."""
-    return f"{np.median(values):.1f} ({np.percentile(values, 10):.1f})"
+    there = np.array(values, dtype=float)
+    return f"{np.median(there):.1f} ({np.percentile(there, 10):.1f})"
 
 
-def contrast_section(sets, draws, seed):
+def contrast_section(sets: int, draws: int, seed: int) -> Section:
     """Every method on the same contact sets, with and without errors."""
-    nominal, realised = {}, {}
+    nominal: dict[tuple[str, int], list[float]] = {}
+    realised: dict[tuple[str, int], list[float | None]] = {}
     for quiet in QUIET:
         rng = np.random.default_rng([seed, quiet])
         for places in contact_sets(sets, fingers=quiet + 1, rng=rng):
@@ -93,37 +98,43 @@ def contrast_section(sets, draws, seed):
     )
 
 
-def _methods(places, errors):
+def _methods(places: FloatArray, errors: Errors) -> dict[str, tuple[float, float | None]]:
     """By name, contrast of one contact set without errors and realised (None: a bound)."""
     fields = fields_of(places)
-    found = {}
+    found: dict[str, tuple[float, float | None]] = {}
 
-    def add(name, weights):
+    def add(name: str, weights: ComplexArray) -> None:
         found[name] = (
-            NO_ERRORS.contrast_db(fields, weights)[0],
-            np.median(errors.contrast_db(fields, weights)),
+            float(NO_ERRORS.contrast_db(fields, weights)[0]),
+            float(np.median(errors.contrast_db(fields, weights))),
         )
 
     add("time reversal, one frequency", time_reversal(fields))
     found["time reversal, pulse of 27"] = (
-        reversed_pulse_contrast(fields, NO_ERRORS)[0],
-        np.median(reversed_pulse_contrast(fields, errors)),
+        float(reversed_pulse_contrast(fields, NO_ERRORS)[0]),
+        float(np.median(reversed_pulse_contrast(fields, errors))),
     )
     add("inverse filter", inverse_filter(fields, quiet_centres(places)))
-    switched = MODES["switched"].find(fields, 0.0)
-    add("the paper's: switched, 1 or 2 ERAs", weights_of(switched, fields))
+    add("the paper's: switched, 1 or 2 ERAs", weights_of(_best(fields, "switched").drive, fields))
     exact = search_exactly(fields, eras_at_most=4)
+    assert exact.drive is not None
     add("switched, exact, 1 to 4 ERAs", weights_of(exact.drive, fields))
     found["  bound: any mixture of these"] = (20 * np.log10(exact.mixture), None)
     for mode in ("graded", "signed", "phased"):
-        choice = find_drives(fields, mode)
+        choice = _best(fields, mode)
         add(mode, weights_of(choice.drive, fields))
     found["  robust score of phased"] = (20 * np.log10(choice.outcome.score), None)
     found["  bound of that score"] = (20 * np.log10(robust_bound(fields)), None)
     return found
 
 
-def robust_bound(fields, *, rounds=60):
+def _best(fields: Fields, mode: str) -> Choice:
+    choice = find_drives(fields, mode)
+    assert choice is not None  # the level asked for is reached everywhere
+    return choice
+
+
+def robust_bound(fields: Fields, *, rounds: int = 60) -> float:
     """No complex weights at any one frequency have a higher robust score than this.
 
     The score's square is at most the mean square at the target by w^H R w, for R of any shares of
@@ -146,25 +157,27 @@ def robust_bound(fields, *, rounds=60):
         loud += ERROR_SHARE**2 * ((np.abs(w) ** 2)[:, None] @ power)[:, 0]
         shares *= loud ** (1.0 if number < 5 else 0.7)
         shares /= shares.sum(axis=1, keepdims=True)
-    return np.sqrt(least.max())
+    return float(np.sqrt(least.max()))
 
 
-def two_target_section(sets, draws, seed):
+def two_target_section(sets: int, draws: int, seed: int) -> Section:
     """Two targets at once: the contrast of the lesser one."""
     rows = []
     for quiet in (1, 2):
-        cells = {mode: [] for mode in MODES}
-        for_one = []
+        cells: dict[str, list[float]] = {mode: [] for mode in MODES}
+        for_one: list[float] = []
         rng = np.random.default_rng([seed, 100 + quiet])
         for places in contact_sets(sets // 4, fingers=quiet + 2, rng=rng):
             errors = Errors.draw(draws, eras=4, rng=rng)
             fields = fields_of(places, targets=2)
             for mode, values in cells.items():
-                drive = find_drives(fields, mode).drive
-                values.append(np.median(errors.contrast_db(fields, weights_of(drive, fields))))
+                drive = _best(fields, mode).drive
+                realised = errors.contrast_db(fields, weights_of(drive, fields))
+                values.append(float(np.median(realised)))
             alone = fields_of(np.delete(places, 1, axis=0))
-            drive = find_drives(alone, "phased").drive
-            for_one.append(np.median(errors.contrast_db(alone, weights_of(drive, alone))))
+            drive = _best(alone, "phased").drive
+            realised = errors.contrast_db(alone, weights_of(drive, alone))
+            for_one.append(float(np.median(realised)))
         rows.append(
             [f"2 targets, {quiet} quiet", *(shown(v) for v in cells.values()), shown(for_one)]
         )
@@ -175,7 +188,7 @@ def two_target_section(sets, draws, seed):
     )
 
 
-def ensemble_section(sets, seed):
+def ensemble_section(sets: int, seed: int) -> Section:
     """Robust contrast over the whole ensemble of plates, for patterns of 12 dB SL."""
     table = paper_table()
     rows = []
@@ -202,7 +215,7 @@ def ensemble_section(sets, seed):
     )
 
 
-def freedom_section(sets, seed):
+def freedom_section(sets: int, seed: int) -> Section:
     """How often, and by how much, a mode's answer has a lower robust score than a poorer mode's."""
     names = list(MODES)
     rows = []
@@ -212,7 +225,7 @@ def freedom_section(sets, seed):
         scores = []
         for places in contact_sets(sets, fingers=quiet + 1, rng=rng, apart=apart):
             fields = fields_of(places)
-            scores.append([find_drives(fields, mode).outcome.score for mode in names])
+            scores.append([_best(fields, mode).outcome.score for mode in names])
         ahead = 20 * np.log10(np.array(scores)[:, :-1] / np.array(scores)[:, 1:])
         rows.append(
             [f"{quiet} quiet"]

@@ -21,7 +21,7 @@ SCALE = Normalize(-15.0, 30.0)
 COLORS = "magma"
 
 
-def modes_figure():
+def modes_figure() -> Figure:
     """A map of level above threshold for each mode, fingers drawn in."""
     table = paper_table()
     x, y = (np.linspace(0, side, SIDE) for side in (table.plate.length, table.plate.width))

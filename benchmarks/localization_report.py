@@ -1,10 +1,11 @@
 """The figures as a page of the documentation, with pictures."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from matplotlib.figure import Figure
 
-from benchmarks.localization_contrast import GOALS, QUIET
+from benchmarks.localization_contrast import GOALS, QUIET, Section
 from benchmarks.localization_picture import modes_figure
 
 DOCS = Path(__file__).parent.parent / "docs"
@@ -41,9 +42,9 @@ READING = """
 """
 
 
-def write_report(sections, options):
+def write_report(sections: Sequence[Section], *, sets: int, draws: int, seed: int) -> None:
     """Write the page and its pictures."""
-    page = INTRODUCTION.format(sets=options.sets, draws=options.draws, seed=options.seed)
+    page = INTRODUCTION.format(sets=sets, draws=draws, seed=seed)
     pictures = ["localization_contrast.png", "localization_growth.png", "localization_modes.png"]
     contrast, two, ensemble, freedom, speed, growth = sections
     (DOCS / "pictures").mkdir(exist_ok=True)
@@ -57,7 +58,7 @@ def write_report(sections, options):
     print(f"wrote {DOCS / PAGE}")
 
 
-def _markdown(section):
+def _markdown(section: Section) -> str:
     lines = [f"## {section.title}", ""]
     lines.append("| " + " | ".join(section.columns) + " |")
     lines.append("|" + "---|" * len(section.columns))
@@ -68,11 +69,11 @@ def _markdown(section):
     return "\n".join(lines)
 
 
-def _save(figure, name):
+def _save(figure: Figure, name: str) -> None:
     figure.savefig(DOCS / "pictures" / name, dpi=110)
 
 
-def _contrast_figure(section):
+def _contrast_figure(section: Section) -> Figure:
     """Distribution of realised contrast, a panel for each number of quiet fingers."""
     names = [name for name in section.data["names"] if not name.startswith(" ")]
     figure = Figure(figsize=(12, 4.6), layout="constrained")
@@ -98,7 +99,7 @@ def _contrast_figure(section):
     return figure
 
 
-def _growth_figure(section):
+def _growth_figure(section: Section) -> Figure:
     """Times against size on logarithmic axes."""
     figure = Figure(figsize=(12, 4.2), layout="constrained")
     kinds = list(dict.fromkeys(what for what, _ in section.data))

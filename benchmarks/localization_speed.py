@@ -5,7 +5,10 @@ time; growth is given in the latter.
 """
 
 import time
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -17,12 +20,15 @@ from benchmarks.localization_cases import (
     question_of,
 )
 from benchmarks.localization_contrast import Section
+from model.arrays import FloatArray
 from model.drive_modes.exact_search import search_exactly
 from model.drive_modes.fields import Fields
 from model.finger.grid import Grid
 from model.rig.file import load_rig
+from model.rig.rig import Rig
 from model.table.build import build_table
 from model.table.question import Question
+from model.table.table import LocalizationTable
 
 QUESTIONS = 400
 MODES = ("switched", "phased")
@@ -30,25 +36,32 @@ MOST_ERAS = 8
 CLOSE = 0.03  # m; ten fingers 5 cm apart hardly fit
 
 
-def timed(call):
+def timed(call: Callable[[], object]) -> tuple[float, float]:
     """Seconds by the clock and of the processor."""
     started, used = time.perf_counter(), time.process_time()
     call()
     return time.perf_counter() - started, time.process_time() - used
 
 
-def live_times(table, mode, *, quiet, rng, questions=QUESTIONS):
+def live_times(
+    table: LocalizationTable,
+    mode: str,
+    *,
+    quiet: int,
+    rng: np.random.Generator,
+    questions: int = QUESTIONS,
+) -> FloatArray:
     """Seconds of every answer, (questions, 2)."""
     table.prepare(mode)
     apart = 0.05 if quiet < 6 else CLOSE
     times = []
     for places in contact_sets(questions, fingers=quiet + 1, rng=rng, apart=apart):
         question = question_of(places, mode=mode, level_db_sl=12.0)
-        times.append(timed(lambda question=question: table.ask(question)))
+        times.append(timed(partial(table.ask, question)))
     return np.array(times)
 
 
-def search_cells(table, *, loudest):
+def search_cells(table: LocalizationTable, *, loudest: bool) -> tuple[int, int]:
     """The exact search for every cell of the grid: how many patterns, how many were looked at."""
     count = looked_at = 0
     for x, y in table.cell_centres:
@@ -60,7 +73,7 @@ def search_cells(table, *, loudest):
     return count, looked_at
 
 
-def speed_section(seed):
+def speed_section(seed: int) -> Section:
     """What the requirements name: live answers, the table from nothing, the exact search."""
     table = paper_table()
     rows = []
@@ -71,13 +84,13 @@ def speed_section(seed):
             rows.append(_row(f"live answer, {mode}, {quiet} quiet", times))
     rng = np.random.default_rng([seed, 310])
     for quiet in (1, 3):
-        times = []
+        every = []
         for places in contact_sets(100, fingers=quiet + 1, rng=rng):
             question = question_of(places, eras_at_most=4, level_db_sl=12.0)
-            times.append(timed(lambda question=question: table.ask(question)))
-        rows.append(_row(f"exact search, 614 655 patterns, {quiet} quiet", times))
+            every.append(timed(partial(table.ask, question)))
+        rows.append(_row(f"exact search, 614 655 patterns, {quiet} quiet", every))
     for name, loudest in (("root mean square", False), ("loudest point", True)):
-        clock, used = timed(lambda loudest=loudest: search_cells(table, loudest=loudest))
+        clock, used = timed(partial(search_cells, table, loudest=loudest))
         label = f"the same, all {table.grid.cell_count} cells, {name} beyond 5 cm"
         rows.append([label, _readable(clock), "", _readable(used), ""])
     rig = load_rig(RIG)
@@ -90,16 +103,16 @@ def speed_section(seed):
     )
 
 
-def _row(name, times):
+def _row(name: str, times: Sequence[tuple[float, float]] | FloatArray) -> list[str]:
     """Median and 99th percentile by the clock, and of the processor."""
     clock, used = np.array(times).T
     cells = [(np.median(each), np.percentile(each, 99)) for each in (clock, used)]
     return [name, *(_readable(value) for pair in cells for value in pair)]
 
 
-def growth_section(seed):
+def growth_section(seed: int) -> Section:
     """Times against the number of ERAs, of frequencies and of cells, the others as they are."""
-    data = {}
+    data: dict[Any, dict[str, float]] = {}
     for what, values in (
         ("ERAs", range(2, MOST_ERAS + 1)),
         ("frequencies", (9, 27, 54, 93, 185)),
@@ -120,7 +133,7 @@ def growth_section(seed):
     )
 
 
-def _times_of(what, value, seed):
+def _times_of(what: str, value: int, seed: int) -> dict[str, float]:
     eras = value if what == "ERAs" else 4
     frequencies = np.linspace(40.0, 500.0, value if what == "frequencies" else 27)
     side = int(np.sqrt((value if what == "cells" else 108) / 108 * 144) + 0.5)
@@ -131,16 +144,17 @@ def _times_of(what, value, seed):
     times = {"build": time.process_time() - used}
     for mode in MODES:
         rng = np.random.default_rng([seed, 320])
-        times[mode] = np.median(live_times(table, mode, quiet=1, rng=rng, questions=60)[:, 1])
+        used_for = live_times(table, mode, quiet=1, rng=rng, questions=60)[:, 1]
+        times[mode] = float(np.median(used_for))
     rng = np.random.default_rng([seed, 321])
     exact = []
     for places in contact_sets(7, fingers=2, rng=rng):
         question = question_of(places, eras_at_most=eras, search_time=60.0, level_db_sl=12.0)
-        exact.append(timed(lambda question=question: table.ask(question))[1])
-    return times | {"exact": np.median(exact)}
+        exact.append(timed(partial(table.ask, question))[1])
+    return times | {"exact": float(np.median(exact))}
 
 
-def _rig(eras):
+def _rig(eras: int) -> Rig:
     """The paper's plate on so many ERAs: its corners first, then the middles of its sides."""
     rig = load_rig(RIG)
     length, width = rig.plate.length, rig.plate.width
@@ -153,5 +167,5 @@ def _rig(eras):
     return replace(rig, eras=several, wiring={}, amplifiers={})
 
 
-def _readable(seconds):
+def _readable(seconds: float) -> str:
     return f"{seconds:.2f} s" if seconds >= 1 else f"{1e3 * seconds:.2f} ms"

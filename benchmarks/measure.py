@@ -17,8 +17,10 @@ import json
 import resource
 import sys
 import time
+from collections.abc import Callable
 
 import numpy as np
+from numpy.typing import NDArray
 
 from benchmarks.problem import CORNERS, INSET, LENGTH, RASTER, WIDTH
 
@@ -53,7 +55,7 @@ def main() -> None:
     print(json.dumps(result | {"peak_mb": kilobytes / 1024}))
 
 
-def _time(sweep):
+def _time(sweep: Callable[[NDArray[np.float64]], object]) -> float:
     """Seconds a layout: of one where that takes long, else the mean of many, each elsewhere."""
     started = time.perf_counter()
     sweep(INSET)

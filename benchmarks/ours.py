@@ -13,6 +13,7 @@ from benchmarks.problem import (
     WIDTH,
     E,
 )  # fmt: skip
+from model.arrays import ComplexArray, FloatArray, IntArray
 from model.fem.mesh import Mesh
 from model.reduction.free_plate import solve_free_plate
 from model.structure.actuator import Era
@@ -27,30 +28,30 @@ METHOD = "Reissner-Mindlin, MITC4"
 class Plate:
     """The free plate on nx by ny elements; 0 by 0 is the automatic mesh."""
 
-    def __init__(self, nx, ny):
+    def __init__(self, nx: int, ny: int) -> None:
         plate = PlateOf(LENGTH, WIDTH, THICKNESS, Material("aluminium", E, RHO, NU), LOSS_FACTOR)
         mesh = Mesh(nx, ny, LENGTH, WIDTH) if nx else Mesh.auto(plate, frequency_max=500.0)
         self.free = solve_free_plate(plate, mesh)
         self.points = mesh.nodes
         self.dof = 3 * mesh.node_count
 
-    def sweep(self, places, observed):
+    def sweep(self, places: FloatArray, observed: FloatArray) -> ComplexArray:
         return self.free.acceleration(eras_at(places), FREQUENCIES, observed)
 
 
 class Candidates:
     """The same plate, solved for a raster of places before the first layout is asked for."""
 
-    def __init__(self, plate, places, observed):
+    def __init__(self, plate: Plate, places: FloatArray, observed: FloatArray) -> None:
         self.places = places
         between, to_points = plate.free.receptances(places, observed, FREQUENCIES)
         self.receptances = Receptances(FREQUENCIES, between, to_points)
 
-    def sweep(self, numbers):
+    def sweep(self, numbers: IntArray) -> ComplexArray:
         return self.receptances.acceleration(numbers, tuple(eras_at(self.places[numbers])))
 
 
-def eras_at(places):
+def eras_at(places: FloatArray) -> list[Era]:
     """ERAs at places (n, 2) [m]."""
     return [
         Era(f"E{number}", x, y, STIFFNESS, DAMPING, 0.0, STROKE)

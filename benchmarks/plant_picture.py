@@ -7,16 +7,20 @@ is what would be there if it only felt.
 """
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from model.arrays import FloatArray
 from model.fem.assembly import era_positions
 from model.finger.load import finger_loads
 from model.reduction.reduced_plate import reduce_plate
 from model.rig.file import load_rig
+from model.rig.rig import Rig
+from model.structure.point_load import PointLoad
 from model.transients.base_motion import fade
 from sim.plant.plant import Plant
 
@@ -49,25 +53,31 @@ def main() -> None:
     print(file)
 
 
-def vibrate(rig, points, contacts):
+def vibrate(
+    rig: Rig, points: FloatArray, contacts: Sequence[PointLoad]
+) -> tuple[FloatArray, FloatArray]:
     """Times (n,) [s] and accelerations (n, p) [m/s²] from long before the touch to its end."""
     reduced = reduce_plate(rig.plate, rig.mesh, era_positions(rig.eras))
     plant = Plant(reduced, rig.eras)
     omega = 2 * np.pi * FREQUENCY
     stroke = 0.2 * rig.eras[1].stroke
     plant.set_input(1, fade(stroke + 0j, omega=omega, start=0.0, ramp=0.02, gains=(0.0, 1.0)))
-    parts = []
+    times, felt = [], []
     for until, then in ((LANDS, contacts), (GOES, ()), (ENDS, ())):
         shapes = plant.reduced.at(points)
-        parts.append(plant.advance(until, sample_rate=RATE, shapes=shapes))
+        moments, accelerations = plant.advance(until, sample_rate=RATE, shapes=shapes)
+        times.append(moments)
+        felt.append(accelerations)
         plant.set_contacts(then)
-    return (np.concatenate(part) for part in zip(*parts, strict=True))
+    return np.concatenate(times), np.concatenate(felt)
 
 
-def draw(times, loaded, bare, x, y):
+def draw(
+    times: FloatArray, loaded: FloatArray, bare: FloatArray, x: FloatArray, y: FloatArray
+) -> Figure:
     figure = Figure(figsize=(11, 6.6), layout="constrained")
-    rows = figure.subfigures(2, 1, height_ratios=[1.8, 1])
-    panels = rows[0].subplots(2, 1, sharex=True)
+    upper, lower = figure.subfigures(2, 1, height_ratios=[1.8, 1], squeeze=False)[:, 0]
+    panels = upper.subplots(2, 1, sharex=True)
     shown = (times >= SHOWN[0]) & (times <= SHOWN[1])
     for axes, column, color, title in (
         (panels[0], 0, TARGET, "under the finger that lands, right beside the edge"),
@@ -84,7 +94,7 @@ def draw(times, loaded, bare, x, y):
         axes.set_xlim(*SHOWN)
         axes.margins(y=0.3)  # room for the legend
     panels[1].set_xlabel("time / s; grey: the finger rests on the plate")
-    maps = rows[1].subplots(1, len(MAPS), sharey=True)
+    maps = lower.subplots(1, len(MAPS), sharey=True)
     peaks = [
         np.abs(loaded[(times > since) & (times <= since + WINDOW), 2:]).max(axis=0)
         for since in MAPS.values()
@@ -103,7 +113,7 @@ def draw(times, loaded, bare, x, y):
         )
         axes.plot(*(100 * np.array(OTHER)), "o", color=QUIET, ms=7, mec="white")
     maps[0].set_ylabel("y / cm")
-    rows[1].colorbar(image, ax=maps, label="peak in 50 ms / (m/s²)", shrink=0.8)
+    lower.colorbar(image, ax=maps, label="peak in 50 ms / (m/s²)", shrink=0.8)
     return figure
 
 

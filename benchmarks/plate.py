@@ -19,7 +19,8 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.plate_report import write_report
+from benchmarks.plate_report import Result, write_report
+from model.arrays import ComplexArray
 
 ROOT = Path(__file__).parent.parent
 OURS = "ours"
@@ -42,7 +43,7 @@ def main() -> None:
     options = parser.parse_args()
 
     agreement = check_answers()
-    measured: dict[str, list[dict]] = {}
+    measured: dict[str, list[Result]] = {}
     loads = []
     for run in range(options.runs):  # one after the other, so that a slow minute hits everybody
         for program in (OURS, *PEERS):
@@ -65,17 +66,18 @@ def main() -> None:
     )
 
 
-def measure(program: str, task: str, mesh: tuple[int, int]) -> dict:
+def measure(program: str, task: str, mesh: tuple[int, int]) -> Result:
     """What one process of `benchmarks.measure` prints."""
     command = [sys.executable, "-m", "benchmarks.measure", program, task, *map(str, mesh)]
     environment = os.environ | dict.fromkeys(_THREADS, "1")
     done = subprocess.run(
         command, cwd=ROOT, env=environment, check=True, capture_output=True, text=True
     )
-    return json.loads(done.stdout.splitlines()[-1])
+    result: Result = json.loads(done.stdout.splitlines()[-1])
+    return result
 
 
-def check_answers() -> list[dict]:
+def check_answers() -> list[Result]:
     """Everybody's distance from us, ours on the automatic mesh; SystemExit where it is too large.
 
     Relative L2 over 27 frequencies, four drives and 221 points, on two layouts.
@@ -83,7 +85,7 @@ def check_answers() -> list[dict]:
     converged = _answers(measure(OURS, "answers", (0, 0)))
     rows = []
     for program in (OURS, *PEERS):
-        row: dict = {}
+        row: Result = {}
         for mesh in (MESH, FINE):
             result = measure(program, "answers", mesh)
             answers = _answers(result)
@@ -98,12 +100,12 @@ def check_answers() -> list[dict]:
     return rows
 
 
-def _answers(result: dict) -> np.ndarray:
+def _answers(result: Result) -> ComplexArray:
     real, imaginary = result["answers"]
     return np.array(real) + 1j * np.array(imaginary)
 
 
-def study() -> dict:
+def study() -> Result:
     """`era study placement` over ten thousand layouts, start of the command included."""
     with tempfile.TemporaryDirectory() as folder:
         command = [
@@ -126,7 +128,7 @@ def study() -> dict:
     return {"seconds": seconds, "peak_mb": float(done.stdout)}
 
 
-def median(runs: list[dict]) -> dict:
+def median(runs: list[Result]) -> Result:
     """One measurement that stands for several: medians, and how far the fastest and slowest lie."""
     seconds = [run["seconds"] for run in runs]
     return runs[0] | {
@@ -137,7 +139,7 @@ def median(runs: list[dict]) -> dict:
     }
 
 
-def fastest(measured: dict[str, list[dict]]) -> str:
+def fastest(measured: dict[str, list[Result]]) -> str:
     """The peer that is fastest from nothing."""
     return min(PEERS, key=lambda peer: median(measured[f"nothing {peer}"])["seconds"])
 

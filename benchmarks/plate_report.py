@@ -2,8 +2,10 @@
 
 import os
 import platform
+from collections.abc import Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
+from typing import Any, TypeAlias
 
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -11,8 +13,19 @@ from matplotlib.figure import Figure
 OURS_COLOR, PEER_COLOR = "#d62728", "#7f7f7f"
 VERSIONS = ("numpy", "scipy", "scikit-fem", "pyfe3d", "ngsolve")
 
+Result: TypeAlias = dict[Any, Any]
+"""What one measurement printed, or several come down to."""
 
-def write_report(measured, agreement, *, peers, fastest, loads, folder: Path) -> None:
+
+def write_report(
+    measured: Mapping[str, Result],
+    agreement: Sequence[Result],
+    *,
+    peers: Sequence[str],
+    fastest: str,
+    loads: Sequence[float],
+    folder: Path,
+) -> None:
     """Write measured/benchmarks.md and pictures/benchmarks.png; measured holds medians by name."""
     ours = measured["nothing ours"]
     peer_first = measured[f"nothing {fastest}"]
@@ -23,13 +36,13 @@ def write_report(measured, agreement, *, peers, fastest, loads, folder: Path) ->
     automatic = measured["nothing ours 0"]
     new = measured["layout ours"]
 
-    def row(what, each, ratio=""):
+    def row(what: str, each: Result, ratio: str = "") -> str:
         spread = f"{_time(each['least'])} to {_time(each['most'])}"
         return (
             f"| {what} | {_time(each['seconds'])} | {spread} | {each['peak_mb']:.0f} MB | {ratio} |"
         )
 
-    def times(slow, quick):
+    def times(slow: Result, quick: Result) -> str:
         return f"{slow['seconds'] / quick['seconds']:.0f}"
 
     head = [
@@ -119,7 +132,7 @@ Factoring every layout again, {name} would take {hours:.1f} hours on both cores,
     figure.savefig(folder / "pictures" / "benchmarks.png", dpi=130)
 
 
-def _picture(measured, peers) -> Figure:
+def _picture(measured: Mapping[str, Result], peers: Sequence[str]) -> Figure:
     titles = {
         "nothing": "27 frequencies x 4 drives\nfrom nothing, 48x36",
         "layout": "every further layout\non the same plate",

@@ -3,7 +3,12 @@
 Plain numbers, so that a peer needs nothing of ours.
 """
 
+from typing import TypeAlias
+
 import numpy as np
+from numpy.typing import NDArray
+
+Floats: TypeAlias = NDArray[np.float64]
 
 LENGTH, WIDTH, THICKNESS = 0.3048, 0.2286, 0.0015  # m
 E, NU, RHO = 70e9, 0.33, 2700.0  # Pa, -, kg/m³
@@ -22,6 +27,6 @@ RASTER = np.stack(
 ).reshape(-1, 2)
 
 
-def hold(omega):
+def hold(omega: float) -> complex:
     """Dynamic stiffness [N/m] of an ERA at omega [rad/s]."""
     return STIFFNESS + 1j * omega * DAMPING

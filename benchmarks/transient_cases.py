@@ -92,7 +92,7 @@ def robust_weights(target: ComplexArray, quiet: ComplexArray) -> tuple[float, Co
 def find_cases(rig: Rig, *, others: int, count: int, rng: np.random.Generator) -> list[list[Case]]:
     """For each contact set its patterns, the best first."""
     free = solve_free_plate(rig.plate, rig.mesh, frequency_max=float(FREQUENCIES[-1]))
-    cases = []
+    cases: list[list[Case]] = []
     while len(cases) < count:
         contacts = random_contacts(rng, rig, 1 + others)
         fields = [
@@ -128,7 +128,7 @@ def case_of(excitation: Excitation, patterns: list[Case], rig: Rig) -> Case:
 
 def wrong(rng: np.random.Generator, eras: int, draws: int) -> ComplexArray:
     gains = 1 + GAIN_ERROR * rng.standard_normal((draws, eras))
-    return gains * np.exp(1j * PHASE_ERROR * rng.standard_normal((draws, eras)))
+    return np.asarray(gains * np.exp(1j * PHASE_ERROR * rng.standard_normal((draws, eras))))
 
 
 def with_errors(envelopes: Envelopes, rig: Rig, errors: ComplexArray) -> Envelopes:

@@ -119,7 +119,7 @@ async def sent_apart(urls: Sequence[str], count: int) -> list[float]:
     apart = []
     for safe in make_sets(amplifiers[0].capabilities, count, channels=1):
         await asyncio.gather(*(amplifier.stage(safe) for amplifier in amplifiers))
-        commits = [(one, partial(one.commit, safe.token)) for one in amplifiers]
+        commits = [(one.wire_times.commit(), partial(one.commit, safe.token)) for one in amplifiers]
         await asyncio.gather(*at_one_moment(commits))
         sent = [amplifier.last_sent for amplifier in amplifiers]
         apart.append(max(sent) - min(sent))

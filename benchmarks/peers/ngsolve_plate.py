@@ -7,6 +7,7 @@ import netgen.meshing  # noqa: F401  # NGSolve's mesh class lives there
 import ngsolve as ng
 import numpy as np
 from ngsolve.meshes import MakeStructured2DMesh
+from numpy.typing import NDArray
 
 from benchmarks.problem import (
     LENGTH,
@@ -18,6 +19,7 @@ from benchmarks.problem import (
     THICKNESS,
     WIDTH,
     E,
+    Floats,
     hold,
 )  # fmt: skip
 
@@ -29,7 +31,7 @@ ORDER = 3
 class Plate:
     """Matrices of the free plate on nx / 3 by ny / 3 elements of order 3."""
 
-    def __init__(self, nx, ny):
+    def __init__(self, nx: int, ny: int) -> None:
         ng.SetNumThreads(1)
         self.mesh = MakeStructured2DMesh(
             quads=True, nx=nx // ORDER, ny=ny // ORDER, mapping=lambda x, y: (LENGTH * x, WIDTH * y)
@@ -55,7 +57,7 @@ class Plate:
         self.points = np.array([vertex.point for vertex in self.mesh.vertices])
         self.dof = space.ndof
 
-    def sweep(self, places, observed):
+    def sweep(self, places: Floats, observed: Floats) -> NDArray[np.complex128]:
         touch, look = self._dofs(places), self._dofs(observed)
         dynamic = self.stiffness.mat.CreateMatrix()
         force, field = (self.stiffness.mat.CreateColVector() for _ in range(2))
@@ -73,7 +75,7 @@ class Plate:
                 result[row, era] = -(omega**2) * field.FV().NumPy()[look]
         return result
 
-    def _dofs(self, places):
+    def _dofs(self, places: Floats) -> list[int]:
         """Of the deflection at vertices; vertices come first, and the deflection first of three."""
         far = np.linalg.norm(self.points[None] - places[:, None], axis=2)
         return [int(vertex) for vertex in far.argmin(axis=1)]

@@ -4,12 +4,13 @@ Its other one, Quad4, has a motion without energy that ERAs at the corners set o
 """
 
 import numpy as np
+from numpy.typing import NDArray
 from pyfe3d import DOF, DOUBLE, INT, Quad4R, Quad4RData, Quad4RProbe
 from pyfe3d.shellprop_utils import isotropic_plate
 from scipy import sparse
 
 from benchmarks.peers.scipy_sweep import sweep
-from benchmarks.problem import LENGTH, NU, RHO, THICKNESS, WIDTH, E
+from benchmarks.problem import LENGTH, NU, RHO, THICKNESS, WIDTH, E, Floats
 
 NAME = "pyfe3d"
 METHOD = "Reissner-Mindlin, Quad4R"
@@ -18,7 +19,7 @@ METHOD = "Reissner-Mindlin, Quad4R"
 class Plate:
     """Matrices of the free plate on nx by ny elements: deflection and two rotations a node."""
 
-    def __init__(self, nx, ny):
+    def __init__(self, nx: int, ny: int) -> None:
         x, y = np.meshgrid(np.linspace(0, LENGTH, nx + 1), np.linspace(0, WIDTH, ny + 1))
         self.points = np.column_stack([x.ravel(), y.ravel()])
         flat = np.column_stack([self.points, np.zeros(len(self.points))]).ravel()
@@ -50,9 +51,9 @@ class Plate:
         )
         self.dof = self.stiffness.shape[0]
 
-    def sweep(self, places, observed):
+    def sweep(self, places: Floats, observed: Floats) -> NDArray[np.complex128]:
         return sweep(self.stiffness, self.mass, self._dofs(places), self._dofs(observed))
 
-    def _dofs(self, places):
+    def _dofs(self, places: Floats) -> NDArray[np.int64]:
         far = np.linalg.norm(self.points[None] - places[:, None], axis=2)
-        return 3 * far.argmin(axis=1)
+        return np.asarray(3 * far.argmin(axis=1))

@@ -1,11 +1,14 @@
 """scikit-fem: the Kirchhoff plate with Bogner-Fox-Schmit elements, as in its example 02."""
 
+from typing import Any
+
 import numpy as np
 import skfem
+from numpy.typing import NDArray
 from skfem.helpers import dd, ddot, eye, trace
 
 from benchmarks.peers.scipy_sweep import sweep
-from benchmarks.problem import LENGTH, NU, RHO, THICKNESS, WIDTH, E
+from benchmarks.problem import LENGTH, NU, RHO, THICKNESS, WIDTH, E, Floats
 
 NAME = "scikit-fem"
 METHOD = "Kirchhoff, Bogner-Fox-Schmit"
@@ -14,7 +17,7 @@ METHOD = "Kirchhoff, Bogner-Fox-Schmit"
 class Plate:
     """Matrices of the free plate on nx by ny elements."""
 
-    def __init__(self, nx, ny):
+    def __init__(self, nx: int, ny: int) -> None:
         mesh = skfem.MeshQuad.init_tensor(
             np.linspace(0, LENGTH, nx + 1), np.linspace(0, WIDTH, ny + 1)
         )
@@ -22,13 +25,13 @@ class Plate:
         rigidity = E * THICKNESS**3 / (12 * (1 - NU**2))
 
         @skfem.BilinearForm
-        def bending(u, v, _):
+        def bending(u: Any, v: Any, _: Any) -> Any:
             curvature = dd(u)
             moment = rigidity * ((1 - NU) * curvature + NU * eye(trace(curvature), 2))
             return ddot(moment, dd(v))
 
         @skfem.BilinearForm
-        def inertia(u, v, _):
+        def inertia(u: Any, v: Any, _: Any) -> Any:
             return RHO * THICKNESS * u * v
 
         self.points = mesh.p.T
@@ -37,9 +40,9 @@ class Plate:
         self.mass = inertia.assemble(basis)
         self.dof = self.stiffness.shape[0]
 
-    def sweep(self, places, observed):
+    def sweep(self, places: Floats, observed: Floats) -> NDArray[np.complex128]:
         return sweep(self.stiffness, self.mass, self._dofs(places), self._dofs(observed))
 
-    def _dofs(self, places):
+    def _dofs(self, places: Floats) -> NDArray[np.int64]:
         far = np.linalg.norm(self.points[None] - places[:, None], axis=2)
-        return self.deflection[far.argmin(axis=1)]
+        return np.asarray(self.deflection[far.argmin(axis=1)])

@@ -1,13 +1,19 @@
 """The sweep of a peer that leaves solving to scipy: one sparse factorisation per frequency."""
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
 from benchmarks.problem import LOSS_FACTOR, OMEGA, STROKE, hold
 
 
-def sweep(stiffness, mass, touch, observe):
+def sweep(
+    stiffness: sparse.csc_array,
+    mass: sparse.csc_array,
+    touch: NDArray[np.int64],
+    observe: NDArray[np.int64],
+) -> NDArray[np.complex128]:
     """Acceleration (f, eras, p) from matrices (n, n) and the dof of ERAs and observed points.
 
     The options of SuperLU are those that make it fast here; its defaults take two to three times as

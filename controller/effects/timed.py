@@ -102,10 +102,10 @@ class Ramp(Effect):
     hold: bool = False
 
     def begin(self, contact: Contact, now: float, *, level_db_sl: float | None) -> Course:
-        """From the first level, in steps of 2 dB, or as many as fit into the duration."""
+        """From the first level, in steps of 2 dB, or of more where these were too short."""
         end = STRONG_DB_SL if level_db_sl is None else level_db_sl
         span = end - self.start_level
-        count = max(1, min(round(abs(span) / RAMP_STEP_DB), int(self.duration / SHORTEST)))
+        count = max(1, min(round(abs(span) / RAMP_STEP_DB), int(self.duration / SHORTEST) - 1))
         rise = [self.start_level + span * index / count for index in range(count)]
         levels = (*rise, level_db_sl)
         return _Rising(now, levels, self.duration / len(levels), self.hold)

@@ -343,6 +343,27 @@ async def test_close_without_proof_of_silence(caplog: pytest.LogCaptureFixture) 
 
 
 @in_virtual_time
+async def test_close_gives_an_amplifier_time_to_report_zero(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """One whose levels are two looks old is looked at a third time, and all ends in order."""
+    old = [0.3, 0.1]
+
+    def lag(request: Request) -> Reply | None:
+        if not (old and isinstance(request, GetStatus)):
+            return None
+        levels = (old.pop(0), 0.0)
+        return Status(State.OPERATION_ENABLED, Fault.NONE, 1, True, 25.0, 0.2, levels)
+
+    async with running() as bench:
+        bench.far_end.answer = lag
+        asked = len(bench.far_end.asked)
+    kinds = [type(request) for _, request in bench.far_end.asked[asked:]]
+    assert kinds == [Apply, GetStatus, GetStatus, GetStatus, Disarm]
+    assert caplog.text == ""
+
+
+@in_virtual_time
 async def test_a_rig_that_does_not_fit() -> None:
     """Amplifiers the rig does not name, and channels an amplifier has not, are refused at once."""
     bench = make_bench(channels=1)

@@ -12,6 +12,8 @@ from controller.contacts import Contact
 from controller.wishes import Target, Wish
 from controller_bench import FINGER, OTHER, make_bench, running
 from drivers.protocol.messages import Apply, LoadEnvelope, State
+from model.table.pattern import Pattern
+from model.table.question import Question
 from model.vibration.excitation import Tone
 from shaped_link import Link, Shapes
 from virtual_loop import in_virtual_time
@@ -94,6 +96,23 @@ async def test_brakes_follow_once_it_has_settled(link: Link, shapes: Shapes) -> 
         assert tone.phase == first.commands[0].phase
         assert seen[-30:] == pytest.approx([FULL] * 30, abs=1e-4)
         assert len(bench.told.applied) == 1
+
+
+@in_virtual_time
+async def test_a_brake_that_there_is_not_is_looked_for_once(link: Link, shapes: Shapes) -> None:
+    """Where no ending is found for what plays: the loop does not come back to it at each turn."""
+    looked = 0
+
+    def look(question: Question, pattern: Pattern, *, onset: bool, ending: bool) -> Pattern:
+        nonlocal looked
+        looked += ending
+        return find(question, pattern, onset=onset, ending=False)
+
+    async with running(far_ends=[link], timing=shapes) as bench:
+        find, shapes.with_envelopes = shapes.with_envelopes, look  # type: ignore[method-assign]
+        await bench.hold(FINGER, OTHER, seconds=0.4)
+        assert looked == 1
+        assert len(sets(link)) == 1
 
 
 @in_virtual_time

@@ -239,6 +239,40 @@ async def test_a_busy_amplifier_is_asked_again(
     assert not amplifier.lost
 
 
+async def test_a_stuck_amplifier_is_asked_once(
+    amplifier: Amplifier, backend: ScriptedBackend
+) -> None:
+    """Busy to the last it is not repeated to until it has taken something: others would wait."""
+    backend.script += [Nak(NakCode.BUSY)] * 3
+    for count in (3, 4, 5):
+        with pytest.raises(CommandRefused, match="busy"):
+            await amplifier.status()
+        assert len(backend.requests) == count
+        backend.script += [Nak(NakCode.BUSY)] * (count < 5)
+    backend.script.append(STATUS)
+    assert await amplifier.status() == STATUS
+    backend.script.append(Nak(NakCode.BUSY))
+    assert await amplifier.status() == STATUS
+    assert len(backend.requests) == 8
+
+
+async def test_an_apply_is_not_repeated_before_a_newer_one(
+    amplifier: Amplifier, backend: ScriptedBackend, safe: MakeSafe
+) -> None:
+    """Its answer is late while another set waits: that one is sent, and the first is given up."""
+    late: asyncio.Future[Reply] = asyncio.get_running_loop().create_future()
+    backend.script.append(late)
+    first = asyncio.create_task(amplifier.apply(safe(1)))
+    await settle()
+    newer = asyncio.create_task(amplifier.apply(safe(2)))
+    await settle()
+    late.set_exception(LinkTimeout("nothing"))
+    with pytest.raises(CommandRefused, match="superseded"):
+        await first
+    assert (await newer).token == 2
+    assert backend.requests == [Apply(safe(1)), Apply(safe(2))]
+
+
 async def test_a_reply_of_the_wrong_type_is_no_reply(
     amplifier: Amplifier, backend: ScriptedBackend, safe: MakeSafe
 ) -> None:

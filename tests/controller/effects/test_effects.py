@@ -70,6 +70,20 @@ def test_ramp_rises_in_steps() -> None:
     assert levels == [(round(0.1 * step, 6), 6.0 + 2 * step) for step in range(8)]
 
 
+def test_ramp_takes_no_steps_that_the_plate_cannot_follow() -> None:
+    """40 dB in 0.1 s would be twenty steps: five levels of 20 ms, the least that is felt."""
+    course = Ramp(start_level=6.0, duration=0.1).begin(finger(1), 0.0, level_db_sl=46.0)
+    felt = [course.feel(finger(1), 0.02 * step + 1e-9) for step in range(6)]
+    assert [getattr(one, "level_db_sl", None) for one in felt] == [
+        6.0,
+        16.0,
+        26.0,
+        36.0,
+        46.0,
+        None,
+    ]
+
+
 def test_ramp_that_holds() -> None:
     """It stays at its last level; one as strong as the neighbours allow ends with that."""
     ramp = Ramp(start_level=6.0, duration=0.8, hold=True)
@@ -185,7 +199,7 @@ def test_detents_click_once_each() -> None:
     """
     course = Detents(spacing=0.010, along="y").begin(finger(1, y=0.05), 0.0, level_db_sl=14.0)
     clicks = []
-    for index, way in enumerate((1, 4, 5.6, 5.2, 5.6, 14, 15.6, 30.6, 26, 24, 20)):
+    for index, way in enumerate((1, 4, 5.3, 5.6, 5.2, 5.6, 14, 15.6, 30.6, 26, 24, 20)):
         now = 0.1 * index
         if isinstance(course.feel(finger(1, x=0.9, y=0.05 + 1e-3 * way), now), Feeling):
             clicks.append(way)
@@ -389,6 +403,17 @@ def test_any_way_of_fingers(steps: list[tuple[float, dict[int, tuple[float, floa
             Polygon(((0, 0), (0.2, 0), (0.2, 0.1), (0.1, 0.1), (0.1, 0.2), (0, 0.2))),
             [(0.05, 0.15), (0.15, 0.05), (0.1, 0.15), (0, 0), (0.1, 0.1)],
             [(0.15, 0.15), (0.101, 0.101), (-0.001, 0.1), (0.05, 0.2001)],
+        ),
+        (
+            # A U: between its arms is outside, also on the line through their ends.
+            Polygon(
+                (
+                    *((0, 0), (0.3, 0), (0.3, 0.2), (0.2, 0.2)),
+                    *((0.2, 0.1), (0.1, 0.1), (0.1, 0.2), (0, 0.2)),
+                )
+            ),
+            [(0.25, 0.2), (0.05, 0.05)],
+            [(0.15, 0.2), (0.15, 0.15)],
         ),
     ],
 )

@@ -1,6 +1,7 @@
 """The guard's limits beyond one command: slew, power, on-time, duty, rate, envelopes."""
 
 import math
+from dataclasses import replace
 
 import pytest
 
@@ -76,8 +77,22 @@ def test_the_power_of_all_channels_is_limited() -> None:
     with pytest.raises(CommandRefused, match=r"add up to 0\.75; at most 0\.5"):
         strict.check(playing(2, 0.5, 0.5, 0.5))
     strict.check_envelope(Envelope(1, 0.01, (Knot(0.8, 0.0),)))
-    with pytest.raises(CommandRefused, match="add up"):
-        strict.check(playing(3, 0.1, onset=1))
+    for which in ("onset", "ending"):
+        with pytest.raises(CommandRefused, match="add up"):
+            strict.check(playing(3, 0.1, **{which: 1}))
+
+
+def test_an_amplifier_cannot_widen_what_the_wire_can_say() -> None:
+    """One that claims 40 channels and ramps of 5 s: at most 16, and 1 s, as the protocol has it."""
+    boasting = replace(CAPABILITIES, channels=40, ramp_max=5.0)
+    wide = Guard(GuardLimits(40.0, 500.0, 0.8), boasting, clock=Clock())
+    last = CommandSet(1, (DriveCommand(15, 110.0, 0.5),), ramp=1.0, valid_for=0.0)
+    assert wide.check(last).ramp == 1.0
+    with pytest.raises(CommandRefused, match="channels 0 to 15"):
+        wide.check(replace(last, commands=(DriveCommand(16, 110.0, 0.5),)))
+    with pytest.raises(CommandRefused, match="ramp"):
+        wide.check(replace(last, ramp=1.001))
+    assert wide.silence(2, range(40), ramp=5.0).ramp == 1.0
 
 
 def test_vibration_ends_when_its_time_is_over() -> None:
@@ -104,6 +119,33 @@ def test_a_vibration_that_goes_on_has_begun_when_it_began() -> None:
     for token, left in enumerate((2.0, 1.5, 1.0, 0.5), start=1):
         assert strict.check(playing(token, 0.5)).valid_for == pytest.approx(left)
         clock.now += 0.5
+
+
+def test_no_set_lasts_longer_than_it_can_be_told_to() -> None:
+    """With an hour of on-time it ends after the 60 s that a wire can say, and is to be renewed."""
+    assert guard(on_time=3600.0).check(playing(1, 0.5)).valid_for == 60.0
+
+
+def test_an_onset_that_leads_to_silence_vibrates_too() -> None:
+    """An ERA that helps at an onset only: its time counts, as that of a level does."""
+    clock = Clock()
+    strict = guard(clock, on_time=2.0, rate=2.0)
+    strict.check_envelope(Envelope(1, 0.01, (Knot(0.1, 0.0),)))
+    assert strict.check(playing(1, 0.0, onset=1)).valid_for == 2.0
+    clock.now += 0.5
+    assert strict.check(playing(2, 0.0, onset=1)).valid_for == 1.5
+    strict.check(playing(3, 0.5))
+    with pytest.raises(CommandRefused, match="a second"):
+        strict.check(playing(4, 0.0, onset=1))
+
+
+def test_what_has_ended_by_itself_counts_until_then() -> None:
+    """Of 2 s in ten, one second is used by a set that ended by itself, seen late."""
+    clock = Clock()
+    strict = guard(clock, duty=0.2)
+    strict.check(playing(1, 0.5, valid_for=1.0))
+    clock.now += 5.0
+    assert strict.check(playing(2, 0.5)).valid_for == pytest.approx(1.0)
 
 
 def test_a_share_of_the_time_is_silent() -> None:

@@ -41,13 +41,6 @@ class Mode:
     coherent: Coherent | None
     poorer: tuple[str, ...]
 
-    def find(self, fields: Fields, least: float) -> Drive | None:
-        """The best drive of this mode alone with more than a score; None where there is none."""
-        if self.coherent is None:
-            return find_switched(fields, least)
-        search = self.coherent.search(fields, least)
-        return search.drive() if search.score.max() > least else None
-
     def loudest(self, fields: Fields) -> float:
         """How many times above threshold the targets can be made to feel it in this mode alone.
 

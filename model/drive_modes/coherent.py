@@ -22,7 +22,6 @@ import numpy as np
 from model.arrays import IntArray
 from model.drive_modes.fields import (
     ERROR_SHARE,
-    Drive,
     Fields,
     Single,
     SingleComplex,
@@ -140,11 +139,6 @@ class Search:
     weights: SingleComplex
     bound: Single
     is_held_back: bool
-
-    def drive(self) -> Drive | None:
-        """The best of all frequencies; None where nothing reaches the level."""
-        best = int(self.score.argmax())
-        return Drive.at(best, self.weights[best]) if self.score[best] > 0 else None
 
 
 class _Best:

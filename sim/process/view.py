@@ -28,6 +28,7 @@ class PlateView:
         plate = bench.rig.plate
         x = (np.arange(_COLUMNS) + 0.5) / _COLUMNS * plate.length
         y = (np.arange(_ROWS) + 0.5) / _ROWS * plate.width
+        self.begun = bench.time  # s
         self._bench = bench
         self._points = lattice(x, y)
         self._peaks = np.zeros(len(self._points))
@@ -50,27 +51,24 @@ class PlateView:
 
 
 def draw(site: Site, plate: PlateView) -> RenderableType:
-    """The present state of a far end."""
+    """The present state of a far end; one that nobody touches fits on 24 lines of 80 columns."""
     bench = site.bench
     amplifiers = Table("amplifier", "state", "fault", "set", "level of each channel")
-    amplifiers.add_column("wire", overflow="fold")  # to be copied whole
     for name, amplifier in bench.amplifiers.items():
         status = amplifier.status(bench.time)
         levels = "  ".join(f"{level:4.0%}" for level in status.levels)
-        amplifiers.add_row(
-            *(name, status.state.name, status.fault.name, str(status.token), levels),
-            site.urls.get(name, ""),
-        )
+        amplifiers.add_row(name, status.state.name, status.fault.name, str(status.token), levels)
     fingers = Table("finger", "at", "peak acceleration")
     felt = bench.felt(bench.time - WINDOW, bench.time)
     for name, (x, y) in bench.fingers.layout.positions.items():
         peak = f"{felt[name].peak.max() / G:.2f} g" if name in felt else ""
         fingers.add_row(name, f"{x * 1000:.0f}, {y * 1000:.0f} mm", peak)
-    said = [f"{bench.time:.1f} s"]
+    said = [f"{bench.time - plate.begun:.1f} s"]
     if site.recorder is not None:
         full = ", full" if site.recorder.is_full else ""
         said.append(f"recording {site.recorder.path}: {site.recorder.seconds:.1f} s{full}")
-    return Group(amplifiers, _picture(bench, plate.take()), fingers, Text("   ".join(said)))
+    touched = [fingers] if fingers.row_count else []
+    return Group(amplifiers, _picture(bench, plate.take()), *touched, Text("   ".join(said)))
 
 
 def _picture(bench: Bench, peaks: FloatArray) -> Text:
@@ -86,5 +84,5 @@ def _picture(bench: Bench, peaks: FloatArray) -> Text:
         rows[min(int(y / size[1] * _ROWS), _ROWS - 1)][column] = mark
     bar = "+" + "-" * _COLUMNS + "+"
     lines = [bar, *(f"|{''.join(row)}|" for row in reversed(rows)), bar]
-    legend = f"peak acceleration: {_SHADES[1]} to {_SHADES[-1]} up to {_FULL:g} g; E era, O finger"
+    legend = f"peak acceleration: {_SHADES[1]} to {_SHADES[-1]} up to {_FULL:g} g; E ERA, O finger"
     return Text("\n".join([*lines, legend]))

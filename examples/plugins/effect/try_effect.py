@@ -5,9 +5,15 @@ python try_effect.py KIND
 
 import sys
 
+import era_haptics as era
 from era_haptics.plugins.effects import Contact, ContactKey, Feeling, effect_kind
 
-effect = effect_kind(sys.argv[1])()
+if len(sys.argv) != 2:
+    sys.exit(__doc__)
+try:
+    effect = effect_kind(sys.argv[1])()
+except era.InputError as error:
+    sys.exit(f"error: {error}")
 finger = Contact(ContactKey("try", 1), x=0.1, y=0.1, since=0.0)
 course = effect.begin(finger, 0.0, level_db_sl=effect.level_db_sl)
 now: float | None = 0.0

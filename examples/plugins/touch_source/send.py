@@ -8,6 +8,8 @@ import socket
 import sys
 import time
 
+if len(sys.argv) != 2:
+    sys.exit(__doc__)
 with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as line:
     place = ("127.0.0.1", int(sys.argv[1]))
     for step in range(21):

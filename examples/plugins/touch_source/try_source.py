@@ -56,6 +56,8 @@ async def main(url: str) -> None:
     print(f"{told['frames']} frames, {told['moves']} moves")
 
 
+if len(sys.argv) != 2:
+    sys.exit(__doc__)
 try:
     asyncio.run(main(sys.argv[1]))
 except era.InputError as error:

@@ -2,14 +2,13 @@
 
 import re
 from pathlib import Path
-from typing import get_args
 
 import pytest
 from typer.testing import CliRunner
 
 import model
+from key_tables import bounds_in_words, key_rows, quantities
 from model.cli import app
-from model.config.sections import Quantity
 from model.config.units import quantity
 from model.rig.file import load_rig
 from model.rig.sections import (
@@ -40,19 +39,7 @@ SECTIONS = {
 
 def rows(heading):
     """The table of keys under a heading: (unit, default, limits, meaning) by key."""
-    part = re.split(r"^## ", PAGE, flags=re.MULTILINE)
-    (text,) = [section for section in part if section.startswith(f"{heading}\n")]
-    table = text[text.index("| key |") :].split("\n\n")[0].splitlines()[2:]
-    cells = [[cell.strip() for cell in re.split(r"(?<!\\)\|", line)[1:-1]] for line in table]
-    return {key.strip("`"): rest for key, *rest in cells}
-
-
-def quantities(annotation, metadata=()):
-    """Every Quantity that a field's type carries, however deep."""
-    found = [part for part in metadata if isinstance(part, Quantity)]
-    for part in (*get_args(annotation), *getattr(annotation, "__metadata__", ())):
-        found += [part] if isinstance(part, Quantity) else quantities(part)
-    return found
+    return key_rows(PAGE, heading)
 
 
 @pytest.mark.parametrize("heading", SECTIONS)
@@ -66,17 +53,10 @@ def test_units_and_limits_are_those_that_are_checked(heading):
     """A quantity's row has its SI unit and every finite bound, in the words of the error."""
     for key, field in SECTIONS[heading].model_fields.items():
         unit, _, limits, _ = rows(heading)[key]
-        found = quantities(field.annotation, field.metadata)
+        found = quantities(field)
         assert unit == (found[0].dimension.unit if found else "")
         for asked in found:
-            bounds = {
-                "above": asked.above,
-                "at least": asked.least,
-                "at most": asked.most,
-                "below": asked.below,
-            }
-            words = [f"{word} {b:g}" for word, b in bounds.items() if abs(b) != float("inf")]
-            assert limits == ", ".join(words)
+            assert limits == bounds_in_words(asked)
 
 
 @pytest.mark.parametrize("heading", SECTIONS)
@@ -87,7 +67,7 @@ def test_defaults_are_those_that_are_taken(heading):
         if field.is_required():
             assert default == "required"
         elif isinstance(field.default, float):
-            (asked,) = quantities(field.annotation, field.metadata)
+            (asked,) = quantities(field)
             assert quantity(default, asked.dimension) == field.default
         elif isinstance(field.default, tuple):
             assert default == f"`[{', '.join(f'{bound:g}' for bound in field.default)}]`"

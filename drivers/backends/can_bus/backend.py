@@ -269,7 +269,7 @@ class CanBackend(WireBackend):
     def _fail(self, what: str) -> None:
         self._loss = self._loss or what
         if self._joined is not None:
-            self._joined.objects.abandon()
+            self._joined.objects.close()
         self._orders.fail(self._loss)
 
     def _opened(self) -> _Joined:

@@ -53,9 +53,11 @@ _T = TypeVar("_T")
 
 
 class _Client(SdoClient):
-    """`canopen`'s client, which waits as its worker does."""
+    """`canopen`'s client, which waits as its worker does, and asks nothing that nobody wants."""
 
     def __init__(self, node: int, worker: Worker) -> None:
+        self.is_given_up = False  # the transfer that is under way
+        self.is_closed = False
         self._make_queue = worker.make_queue
         super().__init__(  # type: ignore[no-untyped-call]
             cob_id("sdo_request", node), cob_id("sdo_answer", node), ObjectDictionary()
@@ -70,6 +72,12 @@ class _Client(SdoClient):
     def responses(self, empty: "queue.Queue[bytes]") -> None:
         """The client forgets what has come by taking another queue."""
         self._responses = self._make_queue()
+
+    def send_request(self, request: bytes) -> None:
+        """Send it, or end the transfer."""
+        if self.is_given_up or self.is_closed:
+            raise SdoAbortedError(_TIMED_OUT)
+        super().send_request(request)  # type: ignore[no-untyped-call]
 
 
 class ObjectClient:
@@ -95,10 +103,16 @@ class ObjectClient:
             self.foreign += 1
 
     def abandon(self) -> None:
-        """Let the transfer that is under way end soon: nobody waits for it any more."""
+        """Let the transfer that is under way end now: nobody waits for it any more."""
         if self._busy:
             self._broken = True
+            self._client.is_given_up = True  # before it is woken: it would try again
             self._client.responses.put(_ABANDON)
+
+    def close(self) -> None:
+        """Let no transfer be under way any more."""
+        self._client.is_closed = True
+        self.abandon()
 
     def identity(self, *, timeout: float) -> Identity:
         """Who it is; LinkError where two of this number answer."""
@@ -204,6 +218,7 @@ class ObjectClient:
     def _transfer(self, work: Callable[[], _T], timeout: float) -> _T:
         """Do one transfer; what `canopen` raises becomes an error of ours."""
         self._client.RESPONSE_TIMEOUT = timeout
+        self._client.is_given_up = False
         self._busy = True
         broken, self._broken = self._broken, True
         try:

@@ -1,0 +1,55 @@
+"""Who gives up opening an amplifier that does not answer waits for nothing, over every wire.
+
+In virtual time, so that it can be at any moment between two tries.
+"""
+
+import asyncio
+
+import pytest
+
+from drivers.amplifier import Amplifier
+from drivers.backends.stand_in import STAND_IN
+from drivers.registry import open_backend
+from memory_machine import MemoryMachine
+from model.rig.rig import Rig
+from sim.far_ends.wires import Wire
+from sim.faults.episodes import Episode
+from sim.transport.pseudo_terminal import TERMINAL_MAKER
+from virtual_loop import VirtualLoop, run_virtual
+from wires import far_side
+
+WIRES = {"serial": Wire("serial"), "modbus+rtu": Wire("modbus-rtu"), "can+slcan": Wire("slcan")}
+NOTHING = 0.1  # s; of the half second that one try takes
+
+
+@pytest.mark.parametrize("wire", WIRES)
+@pytest.mark.parametrize("how", ["cancelled", "closed"])
+def test_it_waits_for_no_try_that_is_left(wire: str, how: str, coarse_rig: Rig) -> None:
+    """Cancelled, as a daemon does that is told to end, or closed by somebody else meanwhile."""
+
+    async def give_up(url: str, *, after: float) -> float:
+        """How long [s] it took."""
+        amplifier = Amplifier(open_backend(url))
+        opening = asyncio.create_task(amplifier.open())
+        await asyncio.sleep(after)
+        assert not opening.done()
+        begin = asyncio.get_running_loop().time()
+        if how == "cancelled":
+            opening.cancel()
+        else:
+            await amplifier.close()
+        await asyncio.gather(opening, return_exceptions=True)
+        return asyncio.get_running_loop().time() - begin
+
+    async def run() -> None:
+        loop = asyncio.get_running_loop()
+        assert isinstance(loop, VirtualLoop)
+        machine = MemoryMachine(loop)
+        STAND_IN.set(machine)
+        TERMINAL_MAKER.set(machine.make_terminal)
+        async with far_side(WIRES[wire], coarse_rig) as far:
+            far.station.befall(Episode("hang"))
+            for after in (0.001, 0.3, 0.7, 1.2, 1.4):
+                assert await give_up(far.url, after=after) < NOTHING
+
+    run_virtual(run())

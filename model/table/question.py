@@ -1,7 +1,6 @@
 """What is asked of a localization table: who shall feel it, who must not, how strongly, and how."""
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TypeAlias
 
@@ -139,8 +138,3 @@ class Question:
                 f"ask for one of these, or build a table for them: era table build --mode"
             )
         return mode
-
-
-def as_points(points: Sequence[Sequence[float]]) -> tuple[Point, ...]:
-    """Points [m] as numbers."""
-    return tuple((float(x), float(y)) for x, y in points)

@@ -10,7 +10,7 @@ from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
-from typing import TypeAlias, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
@@ -19,6 +19,7 @@ from model.reduction.reduced_plate import ReducedPlate
 from model.structure.actuator import Era
 from model.structure.point_load import PointLoad
 from model.transients.time_response import PlateInTime, plate_in_time
+from sim.plant.finger import Position
 
 BLOCK = 256  # samples that one table of exponentials serves
 
@@ -28,7 +29,6 @@ _KEPT_AFTER = 0.2
 _LEFT_MAX = 8  # points; a finger that slides leaves many, and the older ones are still by then
 _SOLVED_MAX = 32  # sets of contacts; one takes about a megabyte
 
-_Point: TypeAlias = tuple[float, float]
 _Key = TypeVar("_Key")
 _Value = TypeVar("_Value")
 
@@ -63,9 +63,9 @@ class ContactPlates:
         self._bare = reduced
         self._eras = tuple(eras)
         self._loads = tuple(loads)
-        self._left: dict[_Point, float] = {}  # and when [s]
-        self._resting: tuple[_Point, ...] = ()
-        self._reduced: OrderedDict[tuple[_Point, ...], ReducedPlate] = OrderedDict({(): reduced})
+        self._left: dict[Position, float] = {}  # and when [s]
+        self._resting: tuple[Position, ...] = ()
+        self._reduced: OrderedDict[tuple[Position, ...], ReducedPlate] = OrderedDict({(): reduced})
         self._solved: OrderedDict[tuple[object, ...], Carried] = OrderedDict()
 
     def carrying(self, contacts: Sequence[PointLoad], *, time: float) -> Carried:
@@ -89,14 +89,14 @@ class ContactPlates:
         self._solved.move_to_end(key)
         return self._solved[key]
 
-    def _solve(self, points: tuple[_Point, ...], contacts: tuple[PointLoad, ...]) -> Carried:
+    def _solve(self, points: tuple[Position, ...], contacts: tuple[PointLoad, ...]) -> Carried:
         if not points:
             return Carried(contacts, self._bare, _bare_plate(self._bare, self._eras, self._loads))
         reduced = self._reduced_at(points)
         plate = plate_in_time(reduced, self._eras, loads=self._loads, contacts=contacts)
         return Carried(contacts, reduced, plate)
 
-    def _reduced_at(self, points: tuple[_Point, ...]) -> ReducedPlate:
+    def _reduced_at(self, points: tuple[Position, ...]) -> ReducedPlate:
         if points not in self._reduced:
             _keep(self._reduced, points, self._bare.with_forces_at(np.array(points)))
         return self._reduced[points]

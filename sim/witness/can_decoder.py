@@ -28,7 +28,6 @@ _ACTIONS = (
     *(Kind.STATUS, Kind.APPLY, Kind.STAGE, Kind.COMMIT),
     *(Kind.ARM, Kind.DISARM, Kind.STOP, Kind.CLEAR),
 )
-_TORN = 15
 _FILLING = b"\xff" * 8
 _PER_NODE = 4
 

@@ -183,4 +183,4 @@ class Outputs:
         return 0.0
 
     def _duration(self, slot: int) -> float:
-        return self._durations.get(slot, 33 * 0.1)  # the longest there is
+        return self._durations.get(slot, _LONGEST)

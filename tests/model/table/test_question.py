@@ -14,7 +14,7 @@ from model.finger.perception import detection_threshold
 from model.table.pattern import Pattern
 from model.table.question import Question
 from model.vibration.peak import tone_amplitudes
-from paper_table import contact_sets, smooth_rig, smooth_table
+from paper_table import FREQUENCIES, contact_sets, smooth_rig, smooth_table
 
 TARGET, QUIET = (0.09, 0.07), ((0.25, 0.18),)
 
@@ -99,6 +99,9 @@ def test_frequencies_are_those_that_the_amplifiers_play():
             Question((TARGET,), QUIET, mode=mode, frequencies=(150.0, 250.0))
         )
         assert all(150 <= tone.frequency <= 250 for tone in pattern.excitation.values())
+    only = float(FREQUENCIES[9])  # an amplifier's lowest and highest are among what it plays
+    pattern = smooth_table().ask(Question((TARGET,), QUIET, frequencies=(only, only)))
+    assert {tone.frequency for tone in pattern.excitation.values()} == {only}
 
 
 @pytest.mark.parametrize("mode", ["graded", "signed", "phased"])

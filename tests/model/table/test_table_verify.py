@@ -6,9 +6,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from model.fem.assembly import assemble
+from model.fem.harmonic import direct_acceleration
+from model.finger.fingertip import fingertip_points
 from model.table.build import build_in_parts
 from model.table.file import load_table, save_table
 from model.table.verify import AnswerCheck, verify_table
+from model.vibration.peak import tone_amplitudes
 from paper_plate import make_paper_rig
 from small_table import small_problem, small_table
 
@@ -56,6 +60,35 @@ def test_a_rig_whose_eras_were_measured_holds(rig, tmp_path):
         load_table(tmp_path / "t.npz", fingerprint=measured.fingerprint), measured, samples=3
     )
     assert found.misses == 0
+
+
+def test_tolerances_are_what_an_error_of_the_field_makes_of_an_answer(confirmed, rig):
+    """By hand: 20 log10(1 + error / peak), of the target for its level, of both for contrast.
+
+    The error is 2e-4 for the raster and (k s)²/8 for elements s = 25.4 mm of the first order, of
+    the root mean square over the plate.
+    """
+    rigidity = 70e9 * 0.0015**3 / (12 * (1 - 0.33**2))
+    x, y = np.meshgrid((np.arange(8) + 0.5) / 8 * 0.3048, (np.arange(6) + 0.5) / 6 * 0.2286)
+    matrices = assemble(rig.plate, rig.mesh)
+    for check in confirmed.answers:
+        contacts = (*check.question.targets, *check.question.quiet)
+        discs = [fingertip_points(*place, rig.plate) for place in contacts]
+        points = np.vstack([*discs, np.column_stack([x.ravel(), y.ravel()])])
+        frequencies, amplitudes = tone_amplitudes(
+            check.pattern.excitation,
+            rig.eras,
+            lambda f, points=points: direct_acceleration(matrices, rig.eras, f, points),
+        )
+        ends = np.cumsum([len(disc) for disc in discs])
+        target, *quiet, plate = np.split(amplitudes.sum(axis=0), ends)
+        squared = 2700 * 0.0015 * (2 * np.pi * frequencies.max()) ** 2 / rigidity  # k^4
+        error = (2e-4 + np.sqrt(squared) * 0.0254**2 / 8) * np.sqrt((plate**2).mean())
+        at_target, at_quiet = (
+            20 * np.log10(1 + error / peak) for peak in (target.mean(), np.concatenate(quiet).max())
+        )
+        assert check.level_tolerance_db == pytest.approx(0.01 + at_target, rel=1e-3)
+        assert check.contrast_tolerance_db == pytest.approx(0.01 + at_target + at_quiet, rel=1e-3)
 
 
 def test_in_time_the_contrast_is_that_of_the_direct_solve(confirmed):

@@ -25,6 +25,7 @@ from controller.api.jsonrpc import (
 )
 from controller.api.messages import METHODS
 from controller.api.parts import Message
+from drivers import clock
 from drivers.errors import CommandRefused, DriverError, LinkError
 from model.errors import InputError
 
@@ -55,7 +56,7 @@ class ApiServer:
         *,
         left: Callable[[Connection], None],
         keeps: Callable[[Connection], bool],
-        clock: Callable[[], float] = time.monotonic,
+        clock: Callable[[], float] = clock.now,
     ) -> None:
         missing = METHODS.keys() ^ handlers.keys()
         if missing:

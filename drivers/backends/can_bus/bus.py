@@ -4,7 +4,6 @@ It is fed here rather than by python-can's Notifier, which spins on an adapter t
 Callbacks run in the adapter's thread.
 """
 
-import contextlib
 import logging
 from collections.abc import Sequence
 
@@ -19,6 +18,8 @@ from drivers.codec.can_bus.frame import CanFrame
 
 # What it has to say reaches users as errors of ours.
 logging.getLogger("canopen").addHandler(logging.NullHandler())
+
+_logger = logging.getLogger(__name__)
 
 
 class _Network(canopen.Network):
@@ -51,9 +52,10 @@ class CanBus(SharedLine[Adapter]):
 
     def _take(self, frame: CanFrame) -> None:
         """Pass a frame on, in the adapter's thread."""
-        # Whatever a frame of somebody else's brings about, the next is read.
-        with contextlib.suppress(Exception):
+        try:
             self.network.notify(frame.id, bytearray(frame.data), clock.now())
+        except Exception:  # whatever a frame of somebody else's brings about, the next is read
+            _logger.debug("frame %03x of %s was not taken", frame.id, self.place, exc_info=True)
 
 
 def can_bus(url: CanBusUrl) -> CanBus:

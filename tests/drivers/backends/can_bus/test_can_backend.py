@@ -4,6 +4,7 @@ import asyncio
 import contextlib
 import gc
 import itertools
+import logging
 import threading
 import time
 from collections.abc import AsyncIterator, Callable
@@ -17,6 +18,7 @@ import serial
 
 from drivers.amplifier import Amplifier
 from drivers.backends.can_bus.backend import CanBackend
+from drivers.backends.can_bus.bus import can_bus
 from drivers.backends.can_bus.orders import PendingOrders
 from drivers.backends.urls.can_bus import CanUrl
 from drivers.codec.can_bus.frame import CanFrame
@@ -632,6 +634,24 @@ async def test_a_late_answer_is_nobody_s(virtual: Virtual) -> None:
         assert (await asking).token == token
     finally:
         await amplifier.close()
+
+
+async def test_what_takes_a_frame_may_fail_and_is_told_of_to_whoever_looks_for_it(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """A bug in it does not end the reader, and is in the log at its lowest level."""
+
+    def fail(*frame: object) -> None:
+        raise RuntimeError("a bug")
+
+    bus = can_bus(CanUrl.parse("can+virtual://any#1").bus)
+    bus.network.subscribe(0x123, fail)
+    with caplog.at_level(logging.DEBUG, "drivers"):
+        bus._take(CanFrame(0x123, b""))
+    (record,) = caplog.records
+    assert record.getMessage() == "frame 123 of can+virtual://any was not taken"
+    assert record.exc_info is not None
+    assert str(record.exc_info[1]) == "a bug"
 
 
 async def test_a_flooded_bus_is_borne(virtual: Virtual) -> None:

@@ -11,7 +11,7 @@ from model.drive_modes.sources import all_patterns
 from model.errors import InputError
 from model.finger.perception import FELT_DB_SL
 from model.table.table import LocalizationTable
-from model.table.weak_cells import LEAST_DISTANCE, WeakCells
+from model.table.weak_cells import WeakCells, are_apart
 
 CONTACT_SETS = 200
 
@@ -80,8 +80,7 @@ def contrast_distribution(
     asked = 0
     for _ in range(50 * CONTACT_SETS):
         contacts = rng.uniform(0, size, (others + 1, 2))
-        gaps = np.linalg.norm(contacts[:, None] - contacts[None], axis=-1)
-        if gaps[np.triu_indices(others + 1, 1)].min() < LEAST_DISTANCE:
+        if not are_apart(contacts):
             continue
         asked += 1
         target, *quiet = [(float(x), float(y)) for x, y in contacts]

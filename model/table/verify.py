@@ -33,7 +33,7 @@ from model.structure.point_load import load_positions
 from model.table.pattern import Pattern
 from model.table.question import Question
 from model.table.table import LocalizationTable
-from model.table.weak_cells import LEAST_DISTANCE
+from model.table.weak_cells import are_apart
 from model.transients.envelope import ramped_onset
 from model.transients.measures import SAMPLE_RATE, Transients
 from model.transients.time_response import PlateInTime, plate_in_time
@@ -281,8 +281,7 @@ def _random_answer(
     for tries in range(1000):
         count = 1 + max(1, others - tries // 200)
         contacts = rng.uniform(0, size, (count, 2))
-        apart = np.linalg.norm(contacts[:, None] - contacts, axis=-1)
-        if apart[np.triu_indices(count, 1)].min() < LEAST_DISTANCE:
+        if not are_apart(contacts):
             continue
         target, *quiet = ((float(x), float(y)) for x, y in contacts)
         question = Question((target,), tuple(quiet))

@@ -57,6 +57,12 @@ class WeakCells:
         return np.asarray(self.tenth_db < WANTED_CONTRAST_DB)
 
 
+def are_apart(contacts: FloatArray) -> bool:
+    """Whether fingers at contacts (n, 2) [m], two or more, are all that far apart."""
+    gaps = np.linalg.norm(contacts[:, None] - contacts, axis=-1)
+    return bool(gaps[np.triu_indices(len(contacts), 1)].min() >= LEAST_DISTANCE)
+
+
 def map_grid(table: LocalizationTable) -> Grid:
     """The cells that are asked about: the table's own, or fewer of a fine grid."""
     return Grid(min(table.grid.nx, _FINEST.nx), min(table.grid.ny, _FINEST.ny))

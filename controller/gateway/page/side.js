@@ -19,6 +19,11 @@ function element(name, text, className) {
   return made;
 }
 
+function ageInWords(seconds) {
+  if (seconds < OLD_REPLY_S) return `${shown(1000 * seconds)} ms`;
+  return seconds < 120 ? `${shown(seconds)} s` : `${shown(seconds / 60)} min`;
+}
+
 // eras: those of the rig, for the names of what its channels move.
 function tile(amplifier, eras) {
   const { name, state, fault, levels, temperature_c, high_voltage, high_voltage_v, reply_age_s, lost } = amplifier;
@@ -36,14 +41,14 @@ function tile(amplifier, eras) {
     meter.max = 1;
     meter.value = level;
     meter.ariaLabel = `channel ${channel}${eraOf(channel) ? `, ERA ${eraOf(channel)}` : ""}: ${percent}`;
-    channels.append(element("span", eraOf(channel) ?? `${channel}`), meter, element("span", percent));
+    channels.append(element("span", eraOf(channel) ?? `channel ${channel}`), meter, element("span", percent));
   });
   made.append(levels.length ? channels : element("p", "What its channels play is unknown.", "quiet"));
   const list = element("dl");
   const add = (key, value) => list.append(element("dt", key), element("dd", value));
   if (temperature_c !== null) add("Temperature", `${shown(temperature_c)} °C`);
   add("High voltage", high_voltage === null ? "unknown" : high_voltage_v === null ? (high_voltage ? "on" : "off") : `${shown(high_voltage_v)} V`);
-  add("Last reply", reply_age_s === null ? "none yet" : reply_age_s > OLD_REPLY_S ? `${shown(reply_age_s)} s ago` : `${shown(1000 * reply_age_s)} ms ago`);
+  add("Last reply", reply_age_s === null ? "none yet" : `${ageInWords(reply_age_s)} ago`);
   made.append(list);
   return made;
 }

@@ -1,7 +1,6 @@
 """Pictures, each a matplotlib Figure of its own, without pyplot: shown by a notebook, or saved."""
 
 import numpy as np
-from matplotlib.cm import ScalarMappable
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullLocator
 from numpy.lib.stride_tricks import sliding_window_view
@@ -12,7 +11,7 @@ from era_haptics.solved_plate import SolvedPlate
 from model.arguments import expect
 from model.arrays import FloatArray
 from model.figures.drawing import map_figure
-from model.figures.fingertips import LEVEL_COLORS, LEVEL_SCALE, draw_fingertip, draw_levels
+from model.figures.fingertips import draw_fingertip, draw_level_scale, draw_levels
 from model.table.pattern import Pattern
 from model.table.table import LocalizationTable
 from sim.plant.finger import Record
@@ -48,13 +47,7 @@ def draw_pattern(
         draw_fingertip(axes, place, felt=False)
     if pattern.contrast_db is not None:
         axes.set_title(f"contrast {pattern.contrast_db:.1f} dB predicted", fontsize=11, pad=20)
-    figure.colorbar(
-        ScalarMappable(LEVEL_SCALE, LEVEL_COLORS),
-        ax=axes,
-        label="level above detection threshold / dB SL",
-        extend="both",
-        shrink=0.8,
-    )
+    draw_level_scale(figure, [axes], shrink=0.8)
     return figure
 
 

@@ -4,11 +4,10 @@ import math
 from collections.abc import Sequence
 
 from matplotlib.axes import Axes
-from matplotlib.cm import ScalarMappable
 from matplotlib.figure import Figure
 
 from controller.demo.rows import PlayedPattern, TouchRow
-from model.figures.fingertips import LEVEL_COLORS, LEVEL_SCALE, draw_fingertip, draw_levels
+from model.figures.fingertips import draw_fingertip, draw_level_scale, draw_levels
 from model.table.table import LocalizationTable
 
 PANELS = 6
@@ -40,13 +39,7 @@ def touches_figure(table: LocalizationTable, rows: Sequence[TouchRow]) -> Figure
     for axes, row in zip(panels, rows, strict=False):
         if row.played is not None:
             _draw_touch(axes, table, row, row.played)
-    figure.colorbar(
-        ScalarMappable(LEVEL_SCALE, LEVEL_COLORS),
-        ax=list(panels),
-        label="level above detection threshold / dB SL",
-        extend="both",
-        shrink=0.7,
-    )
+    draw_level_scale(figure, panels, shrink=0.7)
     return figure
 
 

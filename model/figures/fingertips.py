@@ -1,8 +1,12 @@
 """How strongly a plate would be felt all over, and the fingertips on it."""
 
+from collections.abc import Iterable
+
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 from matplotlib.patheffects import withStroke
 
@@ -14,8 +18,8 @@ from model.table.question import Point
 from model.table.table import LocalizationTable
 from model.vibration.excitation import Excitation
 
-LEVEL_COLORS = "magma"
-LEVEL_SCALE = Normalize(-10.0, 30.0)
+_COLORS = "magma"
+_SCALE = Normalize(-10.0, 30.0)
 """From what hardly anybody feels to more than strong [dB SL]."""
 
 FELT_COLOR, QUIET_COLOR = "#6dff9c", "#9fdcff"
@@ -27,7 +31,7 @@ def draw_levels(axes: Axes, table: LocalizationTable, excitation: Excitation) ->
     """Draw the level above threshold [dB SL] over the plate, and the ERAs; axes in centimetres."""
     x, y = (np.linspace(0, side, _SIDE) for side in (table.plate.length, table.plate.width))
     level = sensation_level(*table.amplitudes(excitation, lattice(x, y))).reshape(_SIDE, _SIDE)
-    axes.pcolormesh(100 * x, 100 * y, level, cmap=LEVEL_COLORS, shading="gouraud", norm=LEVEL_SCALE)
+    axes.pcolormesh(100 * x, 100 * y, level, cmap=_COLORS, shading="gouraud", norm=_SCALE)
     axes.set_aspect("equal")
     draw_eras(axes, table.eras, active=excitation.keys())
     for era in table.eras:
@@ -40,6 +44,17 @@ def draw_levels(axes: Axes, table: LocalizationTable, excitation: Excitation) ->
                 ha="left" if era.x < table.plate.length / 2 else "right",
                 fontsize=9,
             )
+
+
+def draw_level_scale(figure: Figure, axes: Iterable[Axes], *, shrink: float) -> None:
+    """Draw beside axes what the colours of `draw_levels` say; shrink: to this share of them."""
+    figure.colorbar(
+        ScalarMappable(_SCALE, _COLORS),
+        ax=list(axes),
+        label="level above detection threshold / dB SL",
+        extend="both",
+        shrink=shrink,
+    )
 
 
 def draw_fingertip(

@@ -1,28 +1,26 @@
 """A table in pictures: where on the plate it is weak, what level it has, how much contrast."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from itertools import zip_longest
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.figure import Figure
-from matplotlib.patches import Circle, Rectangle
+from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 
-from model.arrays import FloatArray, lattice
+from model.arrays import FloatArray
 from model.errors import InputError
-from model.figures.drawing import COLORS, draw_eras, raster
-from model.finger.fingertip import FINGERTIP_RADIUS
+from model.figures.drawing import COLORS, draw_eras
+from model.figures.fingertips import draw_fingertip, draw_level_scale, draw_levels
 from model.finger.grid import Grid
-from model.finger.perception import FELT_DB_SL, sensation_level
+from model.finger.perception import FELT_DB_SL
 from model.table.pattern import Pattern
-from model.table.question import Point, Question
+from model.table.question import Question
 from model.table.summary import CONTACT_SETS, contrast_distribution
 from model.table.table import LocalizationTable
 from model.table.weak_cells import WANTED_CONTRAST_DB, WeakCells, find_weak_cells, map_grid
-
-TARGET_COLOR, QUIET_COLOR = "#2ca02c", "#1f77b4"
 
 # Where the fingers of the example are, in shares of the plate.
 _EXAMPLE = ((0.3, 0.35), (0.8, 0.6), (0.45, 0.85))
@@ -117,7 +115,7 @@ def answer_figure(table: LocalizationTable) -> Figure:
     plate = table.plate
     target, *quiet = ((u * plate.length, v * plate.width) for u, v in _EXAMPLE)
     question = Question((target,), tuple(quiet))
-    figure = Figure(figsize=(8, 6), layout="compressed")
+    figure = Figure(figsize=(6.6, 5), layout="compressed")
     axes = figure.subplots()
     try:
         pattern = table.ask(question)
@@ -125,29 +123,18 @@ def answer_figure(table: LocalizationTable) -> Figure:
         axes.set_title("The table has no answer to the three fingers of this picture")
         axes.axis("off")
         return figure
-    columns, rows = raster(plate)
-    x, y = np.linspace(0, plate.length, columns), np.linspace(0, plate.width, rows)
-    points = lattice(x, y)
-    levels = sensation_level(*table.amplitudes(pattern.excitation, points))
-    image = axes.pcolormesh(
-        100 * x,
-        100 * y,
-        levels.reshape(rows, columns),
-        cmap=COLORS,
-        shading="gouraud",
-        vmin=-10,
-        vmax=max(20.0, float(levels.max())),
-    )
-    _label(axes)
-    draw_eras(axes, table.eras, active=pattern.excitation.keys())
-    _draw_fingers(axes, [target], TARGET_COLOR)
-    _draw_fingers(axes, quiet, QUIET_COLOR)
-    figure.colorbar(image, ax=axes, label="level / dB SL")
+    axes.set_axis_off()
+    draw_levels(axes, table, pattern.excitation)
+    draw_fingertip(axes, target, felt=True, level_db_sl=pattern.level_db_sl)
+    for place in quiet:
+        draw_fingertip(axes, place, felt=False)
+    draw_level_scale(figure, [axes], shrink=0.8)
     axes.set_title(
-        f"Green: the finger to feel it, {pattern.level_db_sl:.0f} dB SL; blue: the others, "
-        f"{pattern.quiet_level_db_sl:.0f} dB SL at most; contrast {pattern.contrast_db:.1f} dB\n"
+        f"Quiet fingers: {pattern.quiet_level_db_sl:.0f} dB SL at most; "
+        f"contrast {pattern.contrast_db:.1f} dB\n"
         f"{_in_words(table, pattern)}",
         fontsize=10,
+        pad=20,
     )
     return figure
 
@@ -185,13 +172,6 @@ def _cross_out(axes: Axes, table: LocalizationTable, grid: Grid, cells: NDArray[
     """A cross on each of some cells."""
     marked = 100 * grid.centres(table.plate)[cells]
     axes.plot(*marked.T, "x", color="white", ms=6, mew=1.5)
-
-
-def _draw_fingers(axes: Axes, places: Sequence[Point], color: str) -> None:
-    for x, y in places:
-        radius = 100 * FINGERTIP_RADIUS
-        axes.add_patch(Circle((100 * x, 100 * y), radius, fill=False, ec="white", lw=4))
-        axes.add_patch(Circle((100 * x, 100 * y), radius, fill=False, ec=color, lw=2.5))
 
 
 def _label(axes: Axes) -> None:

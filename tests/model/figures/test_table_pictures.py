@@ -72,7 +72,7 @@ def test_an_answer_is_drawn_with_its_fingers(table):
     rows, columns = levels.shape
     at_target = levels[round(0.35 * (rows - 1)), round(0.3 * (columns - 1))]
     assert at_target == pytest.approx(20.0, abs=2.0)
-    assert len(axes.patches) == 6  # each with a white rim
+    assert len(axes.patches) == 3
     assert "contrast" in axes.get_title()
 
 

@@ -26,11 +26,12 @@ class DaemonKind:
         _, warnings = check_links(
             config.urls, channels=wired, frequency_max=rig.limits.frequency_max
         )
+        beyond = "" if config.table is None else f". era daemon {path} --check reads its table, too"
         line = (
             f"good: ERAs {', '.join(era.name for era in config.rig.eras)} on "
             f"{', '.join(f'{name} ({url})' for name, url in config.urls.items())}; touches from "
             f"{', '.join(source.name for source in config.touch) or 'the API only'}; "
-            f"socket {config.socket}"
+            f"socket {config.socket}{beyond}"
         )
         return Good(line, warnings)
 

@@ -230,7 +230,12 @@ def test_era_config_knows_a_daemon_file_by_its_keys(
     good = RUNNER.invoke(config_app, ["check", "d.yaml"])
     assert good.exit_code == 0, good.output
     assert "ERAs SW, SE, NE, NW on main" in good.stdout
+    assert "--check" not in good.stdout  # there is no table that it would read
     text = (folder / "d.yaml").read_text("utf-8")
+    (folder / "t.npz").touch()
+    (folder / "e.yaml").write_text(f"{text}\ntable: t.npz\n", "utf-8")
+    with_a_table = RUNNER.invoke(config_app, ["check", "e.yaml"]).stdout
+    assert with_a_table.endswith(". era daemon e.yaml --check reads its table, too\n")
     (folder / "d.yaml").write_text(text.replace("level_db_sl: 20", "level: 20"), "utf-8")
     bad = RUNNER.invoke(config_app, ["check", "d.yaml", "--json"])
     assert bad.exit_code == 1

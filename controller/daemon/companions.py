@@ -12,7 +12,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from drivers.operation.supervision import pauses
+from drivers.operation.pauses import pauses
 
 _LONGEST_PAUSE = 30.0  # s
 _END_TIMEOUT = 0.3  # s

@@ -8,7 +8,7 @@ from dataclasses import replace
 from controller.api.messages import TouchParams
 from controller.daemon.config import API_SOURCES, TouchInput
 from controller.touch import Touch, TouchFrame
-from drivers.operation.supervision import pauses
+from drivers.operation.pauses import pauses
 from model.errors import InputError
 from model.structure.plate import Plate
 

@@ -8,7 +8,7 @@ from controller.loop import Controller
 from drivers import clock
 from drivers.errors import DriverError
 from drivers.link.link import ASSUME_ENERGISED
-from drivers.operation.supervision import pauses
+from drivers.operation.pauses import pauses
 from model.errors import InputError
 
 TICK = 0.05  # s; how often it is told meanwhile that we are alive

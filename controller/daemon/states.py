@@ -17,10 +17,11 @@ from enum import Enum, StrEnum, auto
 from typing import NamedTuple
 
 from drivers.amplifier import WATCHDOG
-from drivers.operation.supervision import assume_energised
 
 ACKNOWLEDGE = "find the cause, then clear (era clear) and arm again"
 """What somebody has to do about a fault."""
+
+_MARGIN = 0.1  # s; beyond the watchdog, for the clocks and the last ramp
 
 
 class State(StrEnum):
@@ -100,9 +101,8 @@ class Machine:
 
     def assume_energised(self, now: float) -> bool:
         """Whether amplifiers that cannot be reached may still be playing at a time [s]."""
-        return self.state is State.COMM_LOST and assume_energised(
-            self.lost_at, now, watchdog=WATCHDOG
-        )
+        lost_for = self.lost_for(now)
+        return lost_for is not None and lost_for < WATCHDOG + _MARGIN
 
 
 class Rule(NamedTuple):

@@ -14,7 +14,7 @@ from controller.api.jsonrpc import ErrorCode, RpcError
 from controller.api.messages import METHODS, HelloResult
 from controller.api.parts import Message
 from controller.api.replies import Notification, Unreachable
-from drivers.operation.supervision import pauses
+from drivers.operation.pauses import pauses
 
 _FIRST_PAUSE, _LONGEST_PAUSE = 0.1, 2.0  # s; between attempts to reach the daemon
 _RATE = 10.0  # Hz; of amplifiers and latency

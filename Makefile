@@ -7,6 +7,9 @@ PYTHON ?= $(shell for python in $(PYTHONS); do \
 BIN := .venv/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet --editable
 
+# Hundreds of processes are started: what is compiled of us is kept, whatever the shell says.
+unexport PYTHONDONTWRITEBYTECODE
+
 .PHONY: demo test lint format docs fuzz kill-test fault-test soak bench bench-latency \
 	bench-localization bench-plant bench-wires dist smoke smoke-lowest sbom licences clean
 .NOTPARALLEL:

@@ -183,7 +183,7 @@ def _of_system(error: OSError) -> str:
             return "is a folder, where a file is wanted; give the name of a file"
         case errno.EACCES | errno.EPERM:
             return "you may not use this; get the right to, or give another name"
-        case errno.ENOSPC | errno.EDQUOT:
+        case number if number in _NO_ROOM:
             return "there is no room left; make some, or write elsewhere"
         case _:
             return f"{error.strerror}; check the name and who may use it"

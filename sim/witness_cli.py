@@ -3,7 +3,7 @@
 import json
 import math
 import sys
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TextIO
 
@@ -81,17 +81,16 @@ def witness(
         "times_s": {"slack": slack * 1e-3},
     }
     with ExitStack() as stack:
-        write = None
-        if record is not None:
-            file = stack.enter_context(_opened(record))
-            write = lambda line: print(line, file=file)  # noqa: E731  as short as what it does
-        seen = Witness(plan, record=write)
+        capture = None if record is None else stack.enter_context(closing(_Capture(record)))
+        seen = Witness(plan, record=None if capture is None else capture.write)
         if replay is not None:
             found = _replay(replay, seen)
         else:
             names = [wires[place.place] for place in places]
             found = _stand_in(places, names, seen, to=sys.stderr if as_json else sys.stdout)
     _tell(found, seen, as_json=as_json)
+    if capture is not None:
+        capture.check()
     if found:
         raise typer.Exit(1)
 
@@ -131,11 +130,42 @@ def _check_apart(places: list["Place"]) -> None:
                 )
 
 
-def _opened(path: Path) -> Any:
-    try:
-        return path.open("w", encoding="utf-8")
-    except OSError as problem:
-        raise InputError(f"--record {path} cannot be written: {problem.strerror}") from problem
+class _Capture:
+    """A capture that is being written. Wires do not wait for a disk: whatever befalls it is kept.
+
+    Raises InputError where it cannot be begun.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._problem: OSError | None = None
+        try:
+            self._file = path.open("w", encoding="utf-8")
+        except OSError as problem:
+            raise InputError(f"--record {path} cannot be written: {problem.strerror}") from problem
+
+    def write(self, line: str) -> None:
+        """Add a line, unless one could not be written."""
+        if self._problem is None:
+            try:
+                print(line, file=self._file)
+            except OSError as problem:
+                self._problem = problem
+
+    def close(self) -> None:
+        """Write what still waits."""
+        try:
+            self._file.close()
+        except OSError as problem:
+            self._problem = self._problem or problem
+
+    def check(self) -> None:
+        """Raise InputError if not all is in the file."""
+        if self._problem is not None:
+            raise InputError(
+                f"--record {self._path}: the capture broke off ({self._problem.strerror}), and "
+                "what came later is not in it; make room, or record elsewhere"
+            ) from self._problem
 
 
 def _replay(path: Path, seen: "Witness") -> list["Violation"]:

@@ -105,8 +105,5 @@ def calibrate(
 def _write(path: Path, text: str) -> None:
     from model.files.array_file import whole_or_nothing
 
-    try:
-        with whole_or_nothing(path) as stream:
-            stream.write(text.encode())
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written: {error.strerror}") from error
+    with whole_or_nothing(path) as stream:
+        stream.write(text.encode())

@@ -18,13 +18,15 @@ def init(
 ) -> None:
     """Write a commented rig, daemon or layout to edit. Beside it lies its schema for editors."""
     from model.config.kinds import kind_called
+    from model.files.array_file import whole_or_nothing
     from model.files.replacing import check_ending
 
     made = kind_called(kind)
     check_ending(file, ".yaml", ".yml", what=f"a {kind} file")
     schema = file.with_suffix(".schema.json")
     _write_new(file, f"# yaml-language-server: $schema={schema.name}\n{made.example()}")
-    schema.write_text(json.dumps(made.schema(), indent=2) + "\n", encoding="utf-8")
+    with whole_or_nothing(schema) as stream:
+        stream.write(json.dumps(made.schema(), indent=2).encode() + b"\n")
     typer.echo(f"Wrote {file} and {schema}")
     typer.echo(f"Next: edit it, then  era config check {file}")
 
@@ -59,11 +61,16 @@ def check(
 
 
 def _write_new(path: Path, text: str) -> None:
-    """Write a file that must not exist yet."""
+    """Write a file that must not exist yet, whole or not at all."""
     try:
-        with path.open("x", encoding="utf-8") as stream:
-            stream.write(text)
+        stream = path.open("x", encoding="utf-8")
     except FileExistsError as error:
         raise InputError(f"{path} exists and is left as it is; choose another name") from error
     except OSError as error:
+        raise InputError(f"{path} cannot be written: {error.strerror}") from error
+    try:
+        with stream:
+            stream.write(text)
+    except OSError as error:
+        path.unlink()
         raise InputError(f"{path} cannot be written: {error.strerror}") from error

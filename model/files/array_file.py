@@ -33,7 +33,7 @@ _NO_HEADER = (SyntaxError, tokenize.TokenError, TypeError, RecursionError, Memor
 def whole_or_nothing(path: Path) -> Iterator[IO[bytes]]:
     """A stream that becomes the file when the block ends well, and leaves nothing when it does not.
 
-    Raises OSError where the folder cannot be written.
+    Raises OSError, with the file's name, where it cannot be written.
     """
     temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex[:12]}")
     try:
@@ -42,8 +42,10 @@ def whole_or_nothing(path: Path) -> Iterator[IO[bytes]]:
             stream.flush()
             os.fsync(stream.fileno())
         temporary.replace(path)
-    except BaseException:
+    except BaseException as error:
         temporary.unlink(missing_ok=True)
+        if isinstance(error, OSError):
+            raise OSError(error.errno, error.strerror or str(error), str(path)) from error
         raise
 
 

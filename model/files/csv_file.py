@@ -1,12 +1,15 @@
 """Columns of numbers as a CSV file."""
 
 import csv
+import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
+
+from model.files.array_file import whole_or_nothing
 
 Column: TypeAlias = Sequence[object] | NDArray[np.generic]
 
@@ -17,12 +20,14 @@ Columns: TypeAlias = Mapping[str, Column]
 def write_columns(path: Path, columns: Columns) -> None:
     """Write columns with a line of names above them; floats with every digit that tells them apart.
 
-    Raises OSError where the file cannot be written.
+    The file is either the old one or the whole new one. Raises OSError where it cannot be written.
     """
     plain = [
         column.tolist() if isinstance(column, np.ndarray) else column for column in columns.values()
     ]
-    with path.open("w", newline="", encoding="utf-8") as stream:
-        writer = csv.writer(stream, lineterminator="\n")
+    with whole_or_nothing(path) as stream:
+        text = io.TextIOWrapper(stream, encoding="utf-8", newline="", write_through=True)
+        writer = csv.writer(text, lineterminator="\n")
         writer.writerow(columns)
         writer.writerows(zip(*plain, strict=True))
+        text.detach()

@@ -8,6 +8,7 @@ import numpy as np
 
 from model.config.document import Value
 from model.figures import save_figure
+from model.files.array_file import whole_or_nothing
 from model.files.csv_file import Column, Columns, write_columns
 from model.rig.rig import Rig
 from model.studies.cases import Cases
@@ -30,7 +31,8 @@ def write_outcome(
     """
     recommended = folder / "recommended.yaml"
     text = rig_yaml(data, rig, ranking, ranking.recommended)
-    recommended.write_text(text, encoding="utf-8")
+    with whole_or_nothing(recommended) as stream:
+        stream.write(text.encode())
     table = folder / f"{study}.csv"
     write_columns(table, all_columns(ranking.cases, ranking.results))
     for name, figure in PICTURES[study].items():

@@ -69,7 +69,7 @@ def carry_out(site: Site, line: bytes, *, now: float) -> Answer | Wait:
     except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
         return already({"error": f"not a line of JSON: {error}"})
     except (InputError, OSError) as error:
-        return already({"error": str(error)})
+        return already({"error": _in_words(error)})
     return made if isinstance(made, Wait) else lambda: _made(made)
 
 
@@ -77,7 +77,14 @@ def _made(answer: Answer) -> dict[str, Any]:
     try:
         return answer()
     except (InputError, OSError) as error:
-        return {"error": str(error)}
+        return {"error": _in_words(error)}
+
+
+def _in_words(error: InputError | OSError) -> str:
+    """What the system says of a file, without its number for it."""
+    if isinstance(error, OSError) and error.strerror:
+        return f"{error.filename or 'the file'} cannot be written: {error.strerror}"
+    return str(error)
 
 
 def _hello(site: Site, request: dict[str, Any], now: float) -> Answer:

@@ -23,7 +23,7 @@ _FORMATS = {".csv": CSV, ".wav": WAV, ".uff": UFF, ".unv": UFF}
 def write_recording(path: Path, recording: Recording) -> None:
     """Write a recording in the format that its name ends in: .csv, .wav, .uff or .unv.
 
-    Raises InputError for another ending and what a format cannot hold, OSError.
+    Raises InputError for another ending and what a format cannot hold, OSError with the name.
     """
     if not len(recording.samples) > 1:
         raise InputError(f"{path}: a recording of fewer than two samples cannot be written")
@@ -38,6 +38,8 @@ def write_recording(path: Path, recording: Recording) -> None:
         form.write(part, recording)
         for made, wanted in parts.items():
             made.replace(wanted)
+    except OSError as error:
+        raise OSError(error.errno, error.strerror or str(error), str(path)) from error
     finally:
         for made in parts:
             made.unlink(missing_ok=True)

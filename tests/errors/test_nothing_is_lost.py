@@ -3,20 +3,23 @@
 import contextlib
 import io
 import os
+import re
+import resource
 import shlex
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from importlib.metadata import entry_points
 from pathlib import Path
-from unittest.mock import patch
 
 import pytest
 
 from controller.main import run
 from error_cases import RIG, filled
 from full_disk import full_disk
+from interrupted import interrupted
 
 WRITING = {
     "table build rig.yaml -o out.npz --frequencies 60:90:30 --grid 4x3": (
@@ -26,8 +29,23 @@ WRITING = {
     "table export table.npz --format mat -o out.mat": "model.table.export.export_mat",
     "plate map rig.yaml --drive SW=110 -o out.png": "model.vibration.maps.plate_map",
     "calibrate rig.yaml measured.csv -o out.yaml": "model.calibration.calibrate.calibrate",
+    "figure 10 rig.yaml -o figures": "model.paper.catalogue.paper_figures",
+    "study placement rig.yaml -o study --layouts 2 --candidates 3x3 --frequencies 60:90:30": (
+        "model.studies.run.run_study"
+    ),
+    "report rig.yaml -o out.zip": "controller.report.collect.collect",
 }
-"""Commands that write a file, each with what takes long in it."""
+"""Commands that write a file, or several into a folder, each with what takes long in it."""
+
+LONG = {
+    "table plot table.npz -o plots": "model.figures.table_pictures.table_figures",
+    "table show table.npz": "model.table.weak_cells.find_weak_cells",
+    "table verify table.npz rig.yaml": "model.table.verify.verify_table",
+    "plate convergence rig.yaml": "model.vibration.convergence.study_convergence",
+    "rig check rig.yaml --measured measured.csv": "model.diagnosis.verdict.diagnose",
+    "demo --wire sim": "model.table.cache.cached_table",
+}
+"""Others that take long."""
 
 
 @pytest.fixture(scope="module")
@@ -38,21 +56,30 @@ def shelf(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
         yield folder
 
 
+def furnish(folder: Path, shelf: Path) -> None:
+    """A rig and what is on the shelf."""
+    (folder / "rig.yaml").write_text(RIG.replace("[40, 300]", "[40, 500]"), encoding="utf-8")
+    for name in ("table.npz", "measured.csv"):
+        (folder / name).write_bytes((shelf / name).read_bytes())
+
+
 @pytest.fixture
 def home(shelf: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder with a rig and what is on the shelf."""
-    rig = RIG.replace("[40, 300]", "[40, 500]")
-    (tmp_path / "rig.yaml").write_text(rig, encoding="utf-8")
-    for name in ("table.npz", "measured.csv"):
-        (tmp_path / name).write_bytes((shelf / name).read_bytes())
+    """A folder with a rig, a table and a measurement."""
+    furnish(tmp_path, shelf)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / ".cache"))
     return tmp_path
 
 
 def files(folder: Path) -> dict[str, bytes]:
-    """What lies in a folder."""
-    return {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()}
+    """What lies in a folder, but for the cache, and what is kept so that the command goes on."""
+    found = {str(path.relative_to(folder)): path for path in folder.rglob("*") if path.is_file()}
+    return {
+        name: path.read_bytes()
+        for name, path in found.items()
+        if not re.match(r"\.cache/|out\.npz\.parts/|study/chunks/", name)
+    }
 
 
 def said_by(command: str) -> tuple[int, str]:
@@ -63,36 +90,84 @@ def said_by(command: str) -> tuple[int, str]:
     return status, err.getvalue()
 
 
-@pytest.mark.parametrize("command", WRITING)
+@pytest.fixture(scope="module")
+def endings(
+    shelf: Path, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[dict[str, tuple[int, str]], dict[str, bytes], dict[str, bytes]]:
+    """How all these commands end that are interrupted, and what lay there before and after."""
+    folder = tmp_path_factory.mktemp("interrupted")
+    furnish(folder, shelf)
+    for command in WRITING:
+        target = folder / command.split("-o ")[1].split()[0]
+        if target.suffix:
+            target.write_bytes(b"")
+    before = files(folder)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_CACHE_HOME", str(folder / ".cache"))
+        ended = interrupted(WRITING | LONG, folder)
+    return ended, before, files(folder)
+
+
+@pytest.mark.parametrize("command", WRITING | LONG)
 def test_interrupted_a_command_says_no_more_and_leaves_all_as_it_was(
-    command: str, home: Path
+    command: str,
+    endings: tuple[dict[str, tuple[int, str]], dict[str, bytes], dict[str, bytes]],
 ) -> None:
     """130, no traceback, and the result that was there before is there still."""
-    (home / command.split("-o ")[1].split()[0]).write_bytes(b"")
-    before = files(home)
-    with patch(WRITING[command], side_effect=KeyboardInterrupt):
-        status, said = said_by(command)
-    assert status == 130
+    ended, before, after = endings
+    status, said = ended[command]
+    assert status == 130, said
     assert "Traceback" not in said
-    assert files(home) == before
+    assert "error" not in said
+    assert after == before
 
 
-@pytest.mark.parametrize("command", WRITING)
+@pytest.mark.parametrize("command", [*WRITING, "config init out.yaml"])
 def test_on_a_full_disk_the_result_of_before_stays(command: str, home: Path) -> None:
     """An error in a paragraph, and neither half a result nor the old one gone."""
-    status, said = said_by(command)
-    assert status == 0, said
+    if not command.startswith(("report", "config")):  # these replace nothing
+        status, said = said_by(command)
+        assert status == 0, said
     before = files(home)
     with full_disk():
         status, said = said_by(command)
     assert status == 2
-    assert said.startswith("era: error: ")
-    assert "Traceback" not in said
+    assert re.match(r"era: error: (.*: )?there is no room left|.*cannot be written", said), said
+    assert len(said.splitlines()) == 1
     assert files(home) == before
 
 
-@pytest.mark.parametrize("command", ["sim rig.yaml --serial", "daemon daemon.yaml"])
-def test_a_program_that_runs_ends_at_control_c(command: str, home: Path) -> None:
+def test_a_recording_whose_disk_is_full_is_told_and_leaves_nothing(home: Path) -> None:
+    """Of `era sim`, at its end: for how long there was room; the plate has vibrated on."""
+    (home / "rig.yaml").write_text(RIG, encoding="utf-8")
+    era = Path(sys.executable).with_name("era")
+    with subprocess.Popen(
+        [era, "sim", "rig.yaml", "--serial", "--finger", "0.1,0.1", "--record", "run.wav"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    ) as process:
+        assert process.stdout is not None
+        assert "serial://" in process.stdout.readline()
+        resource.prlimit(process.pid, resource.RLIMIT_FSIZE, (1024, resource.RLIM_INFINITY))
+        time.sleep(0.2)
+        process.send_signal(signal.SIGINT)
+        _, said = process.communicate(timeout=20)
+    assert process.returncode == 2
+    assert re.match(r"era: error: run\.wav: the recording broke off after .* make room\n$", said)
+    assert not list(home.glob("*run*"))
+
+
+@pytest.mark.parametrize(
+    ("command", "writes"),
+    [
+        ("sim rig.yaml --serial --finger 0.1,0.1 --record run.csv", "run.csv"),
+        ("daemon daemon.yaml", None),
+    ],
+)
+def test_a_program_that_runs_ends_at_control_c(
+    command: str, writes: str | None, home: Path
+) -> None:
     """As a terminal does it, once it serves: that is how it is ended, so it is done, in order."""
     (home / "daemon.yaml").write_text("rig: rig.yaml\ntable: table.npz\nsocket: era.sock\n")
     (home / "rig.yaml").write_text(RIG, encoding="utf-8")
@@ -116,3 +191,4 @@ def test_a_program_that_runs_ends_at_control_c(command: str, home: Path) -> None
         assert process.wait(20) == 0, said
     assert "Traceback" not in said
     assert not (home / "era.sock").exists()
+    assert writes is None or len((home / writes).read_text("utf-8").splitlines()) > 4

@@ -5,6 +5,7 @@ import json
 import signal
 import sys
 from pathlib import Path
+from resource import RLIM_INFINITY, RLIMIT_FSIZE, prlimit
 
 import pytest
 from typer.testing import CliRunner
@@ -144,8 +145,12 @@ def test_plans_that_are_none_are_refused(plan: dict[str, object], named: str) ->
     assert named in str(refused.value)
 
 
-async def test_the_command_stands_in_a_wire(coarse_rig: Rig, tmp_path: Path) -> None:
-    """A host that uses the URL it prints works as ever; told to end, it says that all was right."""
+@pytest.mark.parametrize("room", [RLIM_INFINITY, 64])
+async def test_the_command_stands_in_a_wire(coarse_rig: Rig, tmp_path: Path, room: int) -> None:
+    """A host that uses the URL it prints works as ever; told to end, it says that all was right.
+
+    On a disk with room for 64 bytes of the capture, too, but for what then is not in it.
+    """
     capture = tmp_path / "capture.txt"
     async with far_side(WIRES["serial"], coarse_rig) as far:
         options = ("--slack", "5000", "--record", str(capture))
@@ -153,17 +158,24 @@ async def test_the_command_stands_in_a_wire(coarse_rig: Rig, tmp_path: Path) -> 
         process = await asyncio.create_subprocess_exec(
             *(sys.executable, "-P", "-c", code, "witness", far.url, *options),
             stdout=asyncio.subprocess.PIPE,
+            stderr=asyncio.subprocess.PIPE,
             cwd=example_rig_path().parent.parent,
         )
         assert process.stdout is not None
         line = await asyncio.wait_for(process.stdout.readline(), PATIENCE)
+        prlimit(process.pid, RLIMIT_FSIZE, (room, RLIM_INFINITY))
         url = line.decode().split(": ")[1].strip()
         amplifier = Amplifier(open_backend(url), reply_timeout=2.0)
         await amplifier.open()
         await amplifier.status()
         await amplifier.close()
         process.send_signal(signal.SIGINT)
-        out, _ = await asyncio.wait_for(process.communicate(), PATIENCE)
-    assert process.returncode == 0
+        out, err = await asyncio.wait_for(process.communicate(), PATIENCE)
     assert out.decode().strip() == "6 frames: no rule was broken"
-    assert sum(len(piece.data) > 0 for piece in read_capture(capture)) >= 6
+    if room == RLIM_INFINITY:
+        assert process.returncode == 0
+        assert sum(len(piece.data) > 0 for piece in read_capture(capture)) >= 6
+    else:
+        assert process.returncode == 2
+        (said,) = err.decode().splitlines()
+        assert "capture.txt: the capture broke off (File too large), and what came later" in said

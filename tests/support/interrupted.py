@@ -1,0 +1,78 @@
+"""Commands that are interrupted, each a process that gets the signal while it does what takes long.
+
+They are forked off one process that has loaded what they need, since loading takes the most time.
+"""
+
+import json
+import os
+import shlex
+import signal
+import subprocess
+import sys
+import tempfile
+from collections.abc import Mapping
+from importlib import import_module
+from pathlib import Path
+from unittest.mock import patch
+
+
+def interrupted(commands: Mapping[str, str], folder: Path) -> dict[str, tuple[int, str]]:
+    """Exit status of each command, and what it says on standard error; run one after the other.
+
+    commands: with the function, by its full name, in which Ctrl-C comes.
+    """
+    done = subprocess.run(
+        [sys.executable, __file__],
+        input=json.dumps(commands),
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    answers: dict[str, tuple[int, str]] = json.loads(done.stdout)
+    return answers
+
+
+def _interrupted(command: str, inside: str) -> tuple[int, str]:
+    reading, writing = os.pipe()
+    with tempfile.TemporaryFile() as said, Path(os.devnull).open("wb") as out:
+        pid = os.fork()
+        if not pid:
+            os.close(reading)
+            os.dup2(said.fileno(), 2)
+            os.dup2(out.fileno(), 1)
+            os._exit(_waiting(command, inside, writing))
+        os.close(writing)
+        is_there = os.read(reading, 1)
+        os.close(reading)
+        if is_there:
+            os.kill(pid, signal.SIGINT)
+        _, status = os.waitpid(pid, 0)
+        said.seek(0)
+        return os.waitstatus_to_exitcode(status), said.read().decode()
+
+
+def _waiting(command: str, inside: str, writing: int) -> int:
+    """Run a command that comes to a halt in a function, and tells that it is there."""
+
+    def wait(*args: object, **kwargs: object) -> None:
+        os.write(writing, b".")
+        signal.pause()
+
+    sys.argv = ["era", *shlex.split(command)]
+    with patch(inside, wait):
+        status = main()
+    sys.stderr.flush()
+    return status
+
+
+if __name__ == "__main__":
+    from controller.main import main
+    from model.config.units import LENGTH, quantity
+
+    asked = json.loads(sys.stdin.read())
+    for module in {at.rpartition(".")[0] for at in asked.values()}:
+        import_module(module)
+    quantity("1 mm", LENGTH)  # reads all the units that there are
+    json.dump({command: _interrupted(command, at) for command, at in asked.items()}, sys.stdout)

@@ -11,6 +11,7 @@ from controller.joint_play import JointPlay
 from controller.read_backs import ReadBacks
 from controller.stops import Stops
 from controller.together import gathered, to_the_end
+from drivers import clock
 from drivers.amplifier import WATCHDOG, Amplifier
 from drivers.errors import CommandError, CommandRefused, DriverError, LinkError
 from drivers.guard import SafeCommand, SafeEnvelope
@@ -142,8 +143,7 @@ class AmplifierGroup:
             self._on_the_link(self._joint.play(commands, envelopes or {}))
         )
         if achieved is not None:
-            now = asyncio.get_running_loop().time()
-            self._read_backs.expect(commands, achieved, now=now)
+            self._read_backs.expect(commands, achieved, now=clock.now())
         return achieved
 
     async def heartbeat(self) -> bool:
@@ -162,7 +162,7 @@ class AmplifierGroup:
         Nothing more is asked for it meanwhile, but for silence, and nothing is asked again.
         """
         if self._limit is not None and not self._is_hurried:
-            self._limit.reschedule(asyncio.get_running_loop().time() + PATIENCE)
+            self._limit.reschedule(clock.now() + PATIENCE)
             for amplifier in self._all:
                 amplifier.hurry()
 
@@ -239,7 +239,7 @@ class AmplifierGroup:
                     f"amplifier {name} is in {status.state.name}, fault {status.fault.name}; "
                     "all were stopped: clear and arm again"
                 )
-            self._read_backs.check(name, status, now=asyncio.get_running_loop().time())
+            self._read_backs.check(name, status, now=clock.now())
         return True
 
     async def _or_stop(self, exchange: Coroutine[Any, Any, _T]) -> _T | None:

@@ -1,11 +1,11 @@
 """How several amplifiers play one set together: load, stage, commit at one moment, look at it."""
 
-import asyncio
 from collections.abc import Callable, Coroutine, Iterable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
 from controller.together import gathered
+from drivers import clock
 from drivers.amplifier import Amplifier
 from drivers.errors import CommandRefused
 from drivers.guard import SafeCommand, SafeEnvelope
@@ -45,9 +45,9 @@ class JointPlay:
         if not self._goes_on():
             return None  # silence came after whatever this follows
         if any(envelopes.values()):
-            begin = asyncio.get_running_loop().time()
+            begin = clock.now()
             await gathered(self._load(name, each) for name, each in envelopes.items())
-            self.loading_time = asyncio.get_running_loop().time() - begin
+            self.loading_time = clock.now() - begin
             if not self._goes_on():
                 return None  # whatever is played now would undo that silence
         if len(commands) == 1 or all(safe.is_silent for safe in commands.values()):

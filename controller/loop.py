@@ -266,8 +266,7 @@ class Controller:
                 self._decider.forget()
         if achieved is None:
             return None
-        commands = {name: several.commands for name, several in achieved.items()}
-        drive = drive_of_eras(commands, self._rig)
+        drive = drive_of_eras(achieved, self._rig)
         self._decider.confirm(drive, now=clock.now())
         if any(order.envelopes.values()):
             self._decider.loaded_in(self._group.loading_time, now=clock.now())

@@ -4,11 +4,12 @@
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 
 from controller.envelopes import ending_slots, onset_slots
 from drivers.command import CommandSet, DriveCommand
+from drivers.protocol.messages import Achieved
 from model.errors import InputError
 from model.rig.rig import Rig
 from model.transients.envelope import Envelopes
@@ -52,14 +53,12 @@ def route(
     return _sets(drive, rig, token=token, ramp=ramp)
 
 
-def drive_of_eras(
-    commands: Mapping[str, Sequence[DriveCommand]], rig: Rig
-) -> dict[str, DriveCommand]:
-    """Which ERA plays what, by its name, from commands by amplifier; silent ones are left out."""
+def drive_of_eras(played: Mapping[str, Achieved | CommandSet], rig: Rig) -> dict[str, DriveCommand]:
+    """Which ERA plays what, by its name, from what amplifiers play; silent ones are left out."""
     playing = {
         (amplifier, command.channel): command
-        for amplifier, several in commands.items()
-        for command in several
+        for amplifier, several in played.items()
+        for command in several.commands
         if command.level > 0
     }
     return {

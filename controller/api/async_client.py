@@ -143,6 +143,7 @@ class AsyncClient:
         """What the daemon tells, as it comes; ends with the connection."""
         while (told := await self._events.get()) is not None:
             yield told
+        self._events.put_nowait(None)  # it has ended for whoever listens next, too
 
     async def call(self, method: str, params: Message, result: type[_MessageT]) -> _MessageT:
         """Ask by any method of the API, and wait for the answer."""

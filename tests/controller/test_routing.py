@@ -6,6 +6,7 @@ import pytest
 
 from controller.routing import drive_of_eras, route
 from drivers.command import CommandSet, DriveCommand
+from drivers.protocol.messages import Achieved
 from model.errors import InputError
 from model.fem.mesh import Mesh
 from model.rig.rig import Channel, Limits, Rig
@@ -109,7 +110,7 @@ def test_what_may_run_on_in_time(wanted: Excitation, kept: set[str]) -> None:
     """A frequency runs on if only ERAs play it that do already; one that joins in restarts all."""
     playing = {name: DriveCommand(0, 110.0, 0.5) for name in ("SW", "SE")}
     sets = route(wanted, RIG, token=1, ramp=0, playing=playing)
-    drive = drive_of_eras({name: each.commands for name, each in sets.items()}, RIG)
+    drive = drive_of_eras(sets, RIG)
     assert {name for name, command in drive.items() if command.keep_phase} == kept
     first = route(wanted, RIG, token=1, ramp=0)
     assert not any(command.keep_phase for each in first.values() for command in each.commands)
@@ -118,8 +119,8 @@ def test_what_may_run_on_in_time(wanted: Excitation, kept: set[str]) -> None:
 def test_back_to_eras() -> None:
     """What the amplifiers play is told by ERA, without the silent ones."""
     achieved = {
-        "left": (DriveCommand(0, 40.0, 0.0), DriveCommand(1, 110.01, 0.1999)),
-        "right": (DriveCommand(0, 250.0, 0.4),),
+        "left": Achieved(7, (DriveCommand(0, 40.0, 0.0), DriveCommand(1, 110.01, 0.1999))),
+        "right": Achieved(7, (DriveCommand(0, 250.0, 0.4),)),
     }
     assert drive_of_eras(achieved, RIG) == {
         "SW": DriveCommand(1, 110.01, 0.1999),

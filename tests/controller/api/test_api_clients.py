@@ -73,13 +73,14 @@ async def test_the_asyncio_client_keeps_its_lease(tmp_path: Path) -> None:
 
 
 async def test_a_daemon_that_ends_is_told_to_whoever_waits(tmp_path: Path) -> None:
-    """Calls raise Unreachable, events come to their end."""
+    """Calls raise Unreachable, events come to their end, for whoever listens later, too."""
     async with running_daemon(tmp_path) as bench:
         era = await bench.client()
         await until_state(era, READY)
         await era.subscribe("state")
         listening = asyncio.create_task(_all_events(era))
     assert await asyncio.wait_for(listening, 20) >= 1
+    assert await asyncio.wait_for(_all_events(era), 20) == 0
     with pytest.raises(Unreachable):
         await era.status()
     await era.close()

@@ -556,5 +556,14 @@ async def test_it_comes_back_after_gateway_and_daemon(browser: Page, tmp_path: P
             with gateway_process(tmp_path, tmp_path / "era.sock", *listen):
                 await browser.until(f"{STATE} === 'READY_TO_SWITCH_ON'")
                 await browser.until(banner, lambda text: "Simulated" in text)
+                told = await browser.evaluate(
+                    "[...document.querySelectorAll('#log li')].map(e => e.innerText)"
+                    ".filter(text => /answer|connected/.test(text))"
+                )
+                kinds = ("gateway does not answer", "daemon does not answer", "connected to")
+                assert [kind in event for kind, event in zip(kinds, told, strict=True)] == [
+                    True
+                ] * 3
+                assert all(" connected again" in event for event in told[:2])
                 await browser.press(" ", "Space")  # delivered: what was complained of is over
                 await browser.until("!document.querySelector('#problem').innerText")

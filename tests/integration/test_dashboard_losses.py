@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import AsyncIterator
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -9,8 +10,8 @@ import pytest_asyncio
 
 import dashboard_pictures
 from chromium import Page, open_page
-from controller.api.events import LatencyEvent
-from controller.api.parts import LatencySummary
+from controller.api.events import LatencyEvent, StateEvent
+from controller.api.parts import LatencySummary, StateName
 from controller.effects.layout_kind import LAYOUT
 from controller.gateway.app import MOST_SESSIONS
 from daemon_bench import running_daemon, until_state
@@ -75,6 +76,24 @@ async def test_a_lost_link_is_one_event_with_what_has_come_of_it(
             assert "era clear" in back[0]
             assert "may still be energised" not in await browser.evaluate(BANNER)
             assert "%" in await browser.until(TILE, lambda text: "no link" not in text)
+
+
+async def test_a_daemon_that_ends_without_a_link_is_not_said_to_have_it_back(
+    browser: Page, tmp_path: Path
+) -> None:
+    """What was lost stays so in the events, and the end is an event of its own."""
+    states: list[tuple[StateName, str]] = [
+        ("READY_TO_SWITCH_ON", ""),
+        ("COMM_LOST", "amplifier main: cut"),
+        ("NOT_READY", "told to end"),
+    ]
+    with ScriptedDaemon(tmp_path) as daemon, gateway_process(tmp_path, daemon.socket) as gateway:
+        await open_dashboard(browser, gateway, DESKTOP)
+        for (old, _), (new, cause) in pairwise(states):
+            daemon.publish("state", StateEvent(old=old, new=new, cause=cause, remedy=None))
+            events = await browser.until(EVENTS, lambda events, cause=cause: cause in events[0])
+    assert "not ready: told to end" in events[0]
+    assert events[1].endswith("link lost: amplifier main: cut")
 
 
 async def test_why_onsets_are_plain_is_said_for_as_long_as_they_are(

@@ -4,7 +4,7 @@ import { decodeField, FieldPicture } from "./field.js";
 import { Fingers } from "./fingers.js";
 import { Link } from "./link.js";
 import { PlateOverlay, shown } from "./plate.js";
-import { addEvent, follow, showAmplifiers, showEffects, showLatency, STATES } from "./side.js";
+import { addEvent, follow, showAmplifiers, showEffects, showLatency, STATES, timeOfDay } from "./side.js";
 
 const TOPICS = ["hello", "state", "contacts", "pattern", "silence", "amplifiers", "latency", "log", "link", "field"];
 const LEASE_S = 5;
@@ -29,6 +29,7 @@ let daemon;  // undefined until it is told; null while it is away
 let shutBecause = "away";
 let since = null;  // when the gateway, the daemon or a link to an amplifier was lost
 let watchdog;  // s; how long an amplifier plays on that hears nothing
+let gap = null;  // the event of a gateway or daemon that does not answer, until one does
 let loss = null;  // the event of a lost link, and how often it was tried again
 
 const overlay = new PlateOverlay(at("plate"), at("overlay"));
@@ -93,7 +94,7 @@ function showButtons() {
 
 // What everybody should know before they look at anything else.
 function showBanner() {
-  const from = since ? ` (since ${since.toLocaleTimeString()})` : "";
+  const from = since ? ` (since ${timeOfDay(since)})` : "";
   const unseen = "Amplifiers may still be energised.";
   let text = "";
   if (!link?.isOpen) text = `${SHUT[shutBecause][0]}${shutBecause === "away" ? from : ""}. ${unseen}`;
@@ -131,6 +132,11 @@ function showStatus(status) {
   showBanner();
 }
 
+function loseContact(what) {
+  since = new Date();
+  gap ??= addEvent(log, "error", what);
+}
+
 // Nobody tells any more what is on the plate and how the amplifiers are.
 function forget(cause) {
   showState(null, cause);
@@ -163,12 +169,14 @@ function summariseSilence() {
 
 const HANDLERS = {
   hello(said) {
-    if (daemon && !said) since = new Date();
+    if (daemon && !said) loseContact("the daemon does not answer");
     daemon = said;
     if (daemon === null) {
       forget("the gateway looks for the daemon");
       return;
     }
+    if (gap) follow(gap, `${timeOfDay(new Date())} connected again`);
+    gap = null;
     showBanner();
     overlay.setUp(daemon);
     link.call("status").then(showStatus).catch(complain);
@@ -180,13 +188,15 @@ const HANDLERS = {
     summariseSilence();
     if (next === "COMM_LOST") {
       tellLoss(cause, remedy);
-    } else if (loss) {
-      follow(loss.item, `${new Date().toLocaleTimeString()} all amplifiers answer again, and are disarmed`, remedy);
-      loss = null;
+      return;
+    }
+    if (loss && next !== "NOT_READY") {
+      follow(loss.item, `${timeOfDay(new Date())} all amplifiers answer again, and are disarmed`, remedy);
     } else if (isNews) {
       const what = STATES[next] ?? next;
       addEvent(log, next === "FAULT" ? "error" : "info", cause.startsWith(what) ? cause : `${what}: ${cause}`, remedy);
     }
+    loss = null;
   },
   contacts({ contacts }) {
     overlay.show({ contacts });
@@ -231,10 +241,10 @@ function connected(isConnected) {
     since = null;
     at("door").hidden = true;
     at("main").hidden = false;
-    addEvent(log, "info", "connected to the gateway");
+    if (!gap) addEvent(log, "info", "connected to the gateway");
     return;
   }
-  if (link?.isHeard) since = new Date();
+  if (link?.isHeard) loseContact("the gateway does not answer");
   lease = null;
   daemon = undefined;
   forget(SHUT[shutBecause][1]);

@@ -19,6 +19,8 @@ function element(name, text, className) {
   return made;
 }
 
+export const timeOfDay = (date) => date.toLocaleTimeString();
+
 function ageInWords(seconds) {
   if (seconds < OLD_REPLY_S) return `${shown(1000 * seconds)} ms`;
   return seconds < 120 ? `${shown(seconds)} s` : `${shown(seconds / 60)} min`;
@@ -109,7 +111,7 @@ export function addEvent(log, level, message, remedy) {
   if (times > 1) newest.remove();
   const item = element("li");
   Object.assign(item.dataset, { message, times });
-  const time = element("time", new Date().toLocaleTimeString());
+  const time = element("time", timeOfDay(new Date()));
   item.append(time, " ", element("span", times > 1 ? `${message} (${times} times)` : message, level));
   follow(item, "", remedy);
   log.prepend(item);

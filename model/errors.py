@@ -21,4 +21,6 @@ _WORDS = {
     "List should have ": "must have ",
     "greater than or equal to": "at least",
     "less than or equal to": "at most",
+    "Choose from:\n\t": "Choose from ",
+    ",\n\t": ", ",
 }

@@ -29,8 +29,8 @@ class Unreachable(LinkError):
             return cls(f"{path} is no socket; give the one that `era daemon` says it serves at")
         if isinstance(error, FileNotFoundError | ConnectionRefusedError):
             return cls(
-                f"no daemon runs at {path}; start one with  era daemon CONFIG , or give the socket "
-                "of the one that runs (--socket PATH)"
+                f"no daemon runs at {path}; start one (era daemon CONFIG), or give the socket of "
+                "the one that runs (--socket PATH)"
             )
         if isinstance(error, PermissionError):
             return cls(f"{path} belongs to somebody else; ask whoever runs the daemon")

@@ -114,9 +114,9 @@ def _check_kind(document: Document) -> None:
     is_layout = is_layout_document(document)
     if is_layout or "plate" in document.data:
         raise InputError(
-            f"{document.source}: is a {'surface layout' if is_layout else 'rig'}, and a daemon's "
-            f"file names it with {'layout' if is_layout else 'rig'}: ; "
-            "era config init daemon.yaml --kind daemon  writes one"
+            f"{document.source}: is a {'surface layout' if is_layout else 'rig'}, which a daemon's "
+            f"file names with {'layout' if is_layout else 'rig'}: FILE; write one with  era config "
+            "init daemon.yaml --kind daemon"
         )
 
 

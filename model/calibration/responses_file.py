@@ -32,6 +32,7 @@ from model.rig.rig import Rig
 COLUMNS = ("era", "sensor", "x_m", "y_m", "frequency_hz", "real_1_s2", "imag_1_s2")
 ERA_COLUMNS = ("era_x_m", "era_y_m")  # may be left out
 _UP = 3  # +z
+_NAMED = 3  # of what no column is called, at most
 # What people call m/s² and m once signs are taken off.
 _ACCELERATION_UNITS = ("", "m/s2", "m/sec2", "m/ss", "ms-2", "ms2")
 _DISPLACEMENT_UNITS = ("", "m", "meter", "metre")
@@ -160,7 +161,9 @@ def _check_header(path: Path, header: Sequence[str]) -> None:
     foreign = [name for name in header if name not in (*COLUMNS, *ERA_COLUMNS)]
     if missing or foreign or len(set(header)) < len(header):
         said = [f"{', '.join(missing)} missing"] if missing else []
-        said += [f"{', '.join(repr(name[:30]) for name in foreign)} unknown"] if foreign else []
+        more = f" and {len(foreign) - _NAMED} more" if len(foreign) > _NAMED else ""
+        named = ", ".join(repr(name[:30]) for name in foreign[:_NAMED])
+        said += [f"{named}{more} unknown"] if foreign else []
         said += ["a column stands twice"] if not said else []
         raise InputError(
             f"{path}:1: the columns must be {', '.join(COLUMNS)}, and may be "

@@ -12,12 +12,18 @@ from by_name.nearness import did_you_mean
         ("sw", ["SW", "SE"], "did you mean SW? "),
         ("Steal", ["iron", "steel"], "did you mean steel? "),
         ("unobtainium", ["steel", "aluminium"], ""),
+        (
+            "Glass",
+            ["soda-lime-glass", "steel", "gorilla-glass"],
+            "did you mean soda-lime-glass or gorilla-glass? ",
+        ),
+        ("lass", ["soda-lime-glass"], ""),
         ("", ["steel"], ""),
         ("x", [], ""),
     ],
 )
 def test_only_what_is_nearly_the_same_is_meant(name: str, known: list[str], meant: str) -> None:
-    """One letter left out or turned round, in whatever case; what merely sounds alike is not."""
+    """A letter left out or turned round, in whatever case, or a word; not what sounds alike."""
     assert did_you_mean(name, known) == meant
 
 

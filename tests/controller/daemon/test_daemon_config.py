@@ -75,8 +75,8 @@ def test_what_is_written_later_has_a_place(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("plate: {}\neras: {}\n", "is a rig, and a daemon's file names it with rig:"),
-        ("regions: {}\n", "is a surface layout, and a daemon's file names it with layout:"),
+        ("plate: {}\neras: {}\n", "is a rig, which a daemon's file names with rig: FILE;"),
+        ("regions: {}\n", "is a surface layout, which a daemon's file names with layout: FILE;"),
     ],
 )
 def test_another_kind_of_file_is_named_as_such(folder: Path, text: str, message: str) -> None:

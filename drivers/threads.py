@@ -5,10 +5,15 @@ hangs, that is seconds, or for ever.
 """
 
 import asyncio
+import logging
 import threading
 from collections.abc import Callable
 from typing import TypeVar
 
+CLOSE_TIMEOUT = 0.7
+"""How long [s] a device may take to be closed: one far away 0.4 s; whoever ends has a second."""
+
+_logger = logging.getLogger(__name__)
 _T = TypeVar("_T")
 
 
@@ -53,6 +58,18 @@ async def in_thread(
         if not done.cancelled() and done.exception() is None:  # it came in this very moment
             _undo(done.result())
         raise
+
+
+async def close_in_thread(close: Callable[[], object], *, name: str) -> None:
+    """Close something and wait for that, but not for a device that hangs: it is left to its thread.
+
+    Raises what closing raises; name: of the thread.
+    """
+    try:
+        async with asyncio.timeout(CLOSE_TIMEOUT):
+            await in_thread(close, name=name)
+    except TimeoutError:
+        _logger.warning("%s: not done after %g s, and not waited for", name, CLOSE_TIMEOUT)
 
 
 def _post(loop: asyncio.AbstractEventLoop, callback: Callable[[_T], None], argument: _T) -> bool:

@@ -16,7 +16,7 @@ from drivers.backends.stand_in import STAND_IN, Adapter
 from drivers.backends.urls.can_bus import CanBusUrl
 from drivers.codec.can_bus.frame import CanFrame
 from drivers.errors import LinkError, LinkTimeout, said_by_system
-from drivers.threads import in_thread
+from drivers.threads import close_in_thread, in_thread
 
 _READ_TIMEOUT = 0.05  # s; how long the reader of a bus that cannot be woken notices its end
 _BUS_OFF = 0x40  # of the class of an error frame, as SocketCAN numbers them
@@ -86,8 +86,8 @@ class _ThreadedAdapter:
         wake(self._bus)
 
     async def wait_closed(self) -> None:
-        """Wait until it has."""
-        await asyncio.to_thread(self._thread.join)
+        """Wait until it has; not for an adapter that hangs."""
+        await close_in_thread(self._thread.join, name=f"era-close {self._url}")
 
     def _read(self) -> None:
         """Read until the bus is closed or lost; runs in the reader's thread, and closes it."""

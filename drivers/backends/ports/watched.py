@@ -17,6 +17,7 @@ import serial
 
 from drivers.backends.ports.writing import descriptor, write_all
 from drivers.errors import LinkError, LinkTimeout
+from drivers.threads import close_in_thread
 
 READ_TIMEOUT = 0.1  # s; how long the reader of a port that cannot be woken notices its end
 WRITE_TIMEOUT = 0.02  # s; a frame fits into any driver's buffer unless the line is stuck
@@ -74,10 +75,14 @@ class WatchedPort:
                 self._port.cancel_read()
 
     async def wait_closed(self) -> None:
-        """Wait until the reader has ended and the port is closed."""
+        """Wait until the reader has ended and the port is closed; not for a device that hangs."""
+        # Where the device takes nothing any more, the system waits half a minute for it.
+        await close_in_thread(self._give_back, name=f"era-close {self._name}")
+
+    def _give_back(self) -> None:
         if self._thread is not None:
-            await asyncio.to_thread(self._thread.join)
-        await asyncio.to_thread(close_port, self._port)
+            self._thread.join()
+        close_port(self._port)
 
     def _readable(self) -> None:
         if self._descriptor is None:

@@ -1,0 +1,79 @@
+"""A device that hangs while it is closed holds up nobody who stops, ends or opens again."""
+
+import asyncio
+import logging
+import os
+import threading
+from collections.abc import Awaitable, Callable, Iterator
+
+import pytest
+
+from drivers import threads
+from drivers.backends.can_bus import adapter
+from drivers.backends.ports import opening
+from drivers.backends.stand_in import Adapter, Port
+from drivers.backends.urls.can_bus import CanUrl
+
+
+class _Hanging:
+    """An open port or adapter that says nothing, and is closed once it may be."""
+
+    def __init__(self) -> None:
+        self.port = "/dev/ttyUSB9"
+        self.may_close, self.is_closed = threading.Event(), threading.Event()
+        self._read, self._write = os.pipe()
+
+    def fileno(self) -> int:
+        """Of a pipe into which nobody writes."""
+        return self._read
+
+    def recv(self, timeout: float) -> None:
+        """As an adapter."""
+        threading.Event().wait(timeout)
+
+    def close(self) -> None:
+        """As a port; blocks."""
+        self.may_close.wait(20)
+        os.close(self._read)
+        os.close(self._write)
+        self.is_closed.set()
+
+    shutdown = close  # as an adapter
+
+
+@pytest.fixture
+def hanging(monkeypatch: pytest.MonkeyPatch) -> Iterator[_Hanging]:
+    """What is opened; it lets go when the test is over."""
+    device = _Hanging()
+    monkeypatch.setattr(opening, "_open_port", lambda *args: device)
+    monkeypatch.setattr(adapter, "open_bus", lambda url: device)
+    monkeypatch.setattr(threads, "CLOSE_TIMEOUT", 0.05)
+    yield device
+    device.may_close.set()
+    assert device.is_closed.wait(20)
+
+
+async def _port() -> Port | Adapter:
+    return await opening.open_port(
+        "/dev/ttyUSB9", baud=9600, on_data=lambda data: None, on_loss=lambda what: None
+    )
+
+
+async def _adapter() -> Port | Adapter:
+    url = CanUrl.parse("can+socketcan://can0#1").bus
+    return await adapter.open_adapter(url, on_frame=lambda frame: None, on_loss=lambda what: None)
+
+
+@pytest.mark.parametrize("begin", [_port, _adapter])
+async def test_closing_waits_for_no_device_that_hangs(
+    begin: Callable[[], Awaitable[Port | Adapter]],
+    hanging: _Hanging,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """It goes on beside, and the log says so."""
+    opened = await begin()
+    opened.close()
+    with caplog.at_level(logging.WARNING, "drivers"):
+        await asyncio.wait_for(opened.wait_closed(), 10)
+    assert not hanging.is_closed.is_set()
+    assert "not waited for" in caplog.text

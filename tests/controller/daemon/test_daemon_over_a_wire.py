@@ -260,7 +260,6 @@ async def test_a_cut_link_is_one_line_of_the_log(
     """
     async with running_daemon(tmp_path) as bench, await bench.client() as era:
         await until_state(era, READY)
-        await era.arm("me", lease_s=30)
         await era.subscribe("link", "log")
         with caplog.at_level(logging.INFO, "controller"):
             bench.far.station.befall(Episode("hang"))
@@ -275,7 +274,7 @@ async def test_a_cut_link_is_one_line_of_the_log(
         "log",
     ]
     assert told[-1].data["message"] == "something else"
-    assert (lost.levelname, lost.getMessage()) == ("ERROR", f"{ENABLED} -> COMM_LOST")
+    assert (lost.levelname, lost.getMessage()) == ("ERROR", f"{READY} -> COMM_LOST")
     assert vars(lost)["cause"].startswith("amplifier main: no answer from ")
     assert vars(lost)["cause"].endswith("requests in a row were left unanswered)")
     assert "look at cables" in vars(lost)["remedy"]

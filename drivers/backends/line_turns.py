@@ -31,6 +31,11 @@ class LineTurns:
         self._present: int | None = None
         self._unsent: set[int] = set()
 
+    @property
+    def is_taken(self) -> bool:
+        """Whether an exchange is on the line."""
+        return self._turns.is_taken
+
     def is_unsent(self, address: int) -> bool:
         """Whether an amplifier's exchange is here and nothing of it has gone out yet."""
         return address in self._unsent

@@ -69,6 +69,11 @@ class Turns:
         self._present: _Turn | None = None
         self._awaited: list[tuple[Hashable, Kind]] = []
 
+    @property
+    def is_taken(self) -> bool:
+        """Whether somebody has the turn."""
+        return self._taken
+
     def raise_if_overtaken(self, kind: Kind) -> None:
         """Raise GaveWay where a request that has the turn must not be repeated in it.
 

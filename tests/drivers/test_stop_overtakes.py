@@ -33,6 +33,7 @@ from drivers.registry import open_backend
 from memory_machine import MemoryMachine
 from model.rig.rig import Channel, Rig
 from sim.far_ends.wires import Wire
+from sim.faults.episodes import Episode
 from sim.transport.pseudo_terminal import TERMINAL_MAKER
 from virtual_loop import VirtualLoop, run_virtual
 from wires import FarSide, far_side
@@ -315,6 +316,28 @@ def test_a_stop_goes_before_what_else_silences(line: str, what: str, coarse_rig:
                 await one.arm(2.0)
 
     on_a_line(line, coarse_rig, use)
+
+
+def test_a_stop_to_all_is_said_again_where_an_answer_may_have_run_into_it(coarse_rig: Rig) -> None:
+    """At once, and once more when the line is theirs, 8 ms later at most; on a free line once."""
+
+    async def use(chain: Chain) -> None:
+        await chain.east.stop_on_bus()
+        assert chain.frames == 1
+        chain.far.stations["west"].befall(Episode("hang"))
+        beat = asyncio.create_task(chain.west.heartbeat())
+        await asyncio.sleep(0.0005)
+        chain.forget()
+        begin = asyncio.get_running_loop().time()
+        await chain.east.stop_on_bus()
+        at_once, again = chain.sent_at[:2]
+        assert at_once == begin
+        assert 0 < again - begin <= 0.0081
+        chain.far.stations["west"].recover()
+        await beat  # it is asked again
+        assert [what for name, what in chain.kinds() if name == "east"] == ["Stop", "Stop"]
+
+    on_a_line("serial", coarse_rig, use)
 
 
 def test_on_can_a_stop_does_not_wait_for_who_listens_before_arming(coarse_rig: Rig) -> None:

@@ -18,7 +18,6 @@ from drivers.codec.serial_line.exchanges import decode_event, decode_reply, enco
 from drivers.codec.serial_line.frame import Frame, encode_frame
 from drivers.codec.serial_line.timing import SerialTimes
 from drivers.errors import DriverError, LinkError, LinkTimeout
-from drivers.link.turns import Kind
 from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.messages import Broadcast, Hello, Reply, Request, Stop
 from drivers.protocol.wire_times import NoTimes, WireTimes
@@ -118,17 +117,23 @@ class SerialBackend(WireBackend):
         )
 
     async def broadcast(self, request: Broadcast) -> None:
-        """Send a commit to every amplifier of the line in its turn, or a stop at once."""
+        """Send a commit to every amplifier of the line in its turn, or a stop at once.
+
+        A stop is sent again in its turn where an answer may have run into it: on one pair of wires
+        nobody understands either then.
+        """
         line = self._opened()
+        is_stop, was_taken = isinstance(request, Stop), line.turns.is_taken
         data = encode_frame(self._frame(request, PROTOCOL.serial.broadcast))
 
         async def send() -> None:
             self._send(line, data)
 
-        if isinstance(request, Stop):
+        if is_stop:
             await send()
-        else:
-            await line.turns.carry_out(Kind.ORDINARY, send, address=self._url.address)
+        if was_taken or not is_stop:
+            address = None if is_stop else self._url.address
+            await line.turns.carry_out(kind_on_line(request), send, address=address)
 
     async def _check_alone(self) -> None:
         """Leave a second amplifier of this address the time to answer; LinkError where one does."""

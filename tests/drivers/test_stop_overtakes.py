@@ -323,6 +323,8 @@ def test_a_stop_to_all_is_said_again_where_an_answer_may_have_run_into_it(coarse
 
     async def use(chain: Chain) -> None:
         await chain.east.stop_on_bus()
+        await asyncio.sleep(0.01)  # until it has arrived
+        assert chain.kinds() == [("east", "Stop"), ("west", "Stop")]
         assert chain.frames == 1
         chain.far.stations["west"].befall(Episode("hang"))
         beat = asyncio.create_task(chain.west.heartbeat())

@@ -27,6 +27,7 @@ async def reopen(
     that fails (retry), and of the one that does not (reopened), with a message. alive: called every
     50 ms meanwhile.
     """
+    await _attended(controller.close(), alive)  # whoever closes it still would close it again
     for pause in pauses():
         if not is_wanted():
             return False

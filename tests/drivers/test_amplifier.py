@@ -314,7 +314,7 @@ async def test_only_safe_commands_are_taken(amplifier: Amplifier) -> None:
 
 
 async def test_tokens_count_round_and_are_never_zero(amplifier: Amplifier) -> None:
-    """After 65535 comes 1."""
+    """From 1 on, and after 65535, the last that two bytes hold, comes 1: 0 names no set."""
     tokens = [amplifier.next_token() for _ in range(65536)]
     assert tokens[0] == 1
     assert tokens[-2:] == [65535, 1]

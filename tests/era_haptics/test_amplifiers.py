@@ -45,7 +45,7 @@ def test_it_is_opened_within_the_rigs_limits() -> None:
 
 
 def test_one_of_several_must_be_named() -> None:
-    """By a name of the rig."""
+    """None named, or one that the rig has not: the names that it has are told."""
     rig = replace(RIG, amplifiers={"a": "sim://", "b": "sim://"})
     for name in (None, "c"):
         with pytest.raises(era.InputError, match="the rig has the amplifiers a, b; name one"):

@@ -60,7 +60,7 @@ def test_a_place_in_every_way(places: object) -> None:
 
 
 def test_several_places_and_none() -> None:
-    """In their order."""
+    """A list of places keeps their order, and any empty one, an array too, is no place."""
     assert as_points([(0.1, 0.2), (0.3, 0.1)], what="quiet") == ((0.1, 0.2), (0.3, 0.1))
     for nothing in ((), [], np.empty((0, 2))):
         assert as_points(nothing, what="quiet") == ()

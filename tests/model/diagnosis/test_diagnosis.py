@@ -240,7 +240,7 @@ def test_what_would_explain_another_plate_is_named(
 
 
 def test_a_swap_on_another_plate_is_both(coarse_rig: Rig) -> None:
-    """Neither hides the other."""
+    """Exchanged channels on a plate with other springs: both are told, neither hides the other."""
     rng = np.random.default_rng(13)
     places = points(coarse_rig)
     values = respond(changed(coarse_rig, "eras.stiffness"), places, rng)[:, [0, 2, 1, 3]]

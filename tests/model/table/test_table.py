@@ -281,7 +281,7 @@ def test_a_wrong_byte_in_the_framing_is_refused(table, tmp_path, mark, offset, b
 
 
 def test_a_truncated_file_is_refused(table, tmp_path):
-    """Half a table is none."""
+    """The first half of a table's bytes is no table, and is told as a file that cannot be read."""
     path = tmp_path / "t.npz"
     save_table(table, path)
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])

@@ -70,5 +70,5 @@ def test_both_amplifiers_have_a_part_in_each_pattern(played: Played, truth: Trut
 
 @pytest.mark.parametrize("check", CHECKS)
 def test_what_fingers_feel_is_what_was_asked_for(played: Played, truth: Truth, check: str) -> None:
-    """Every check that holds over one wire holds where two amplifiers on two wires play together."""
+    """What holds over one wire holds where two amplifiers on two wires play together."""
     CHECKS[check](played, truth)

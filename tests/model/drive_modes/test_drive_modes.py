@@ -365,6 +365,18 @@ def test_what_is_said_to_be_the_loudest_is_had(mode):
         assert find_drives(replace(given, wanted=1.1 * most), mode) is None
 
 
+def test_two_tones_may_be_louder_than_any_drive_at_one_frequency():
+    """Each of two ERAs moves the target at a frequency of its own: both are felt sqrt(2) as much.
+
+    Richer modes have one frequency, and what `switched` can do.
+    """
+    target = np.eye(2, dtype=np.complex64)[:, :, None]
+    quiet = np.full((2, 2, 1), 0.1, dtype=np.complex64)
+    given = Fields((target,), quiet, False, np.ones(2, dtype=np.float32), 1.0)
+    for mode in MODES:
+        assert loudest(given, mode) == pytest.approx(np.sqrt(2), rel=1e-4)
+
+
 def test_phased_is_loudest_with_all_eras_in_step():
     """At one point no weights of up to full stroke give more than the sum of the magnitudes."""
     given = random_fields(2, points=1)

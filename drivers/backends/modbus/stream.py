@@ -1,6 +1,9 @@
 """The bytes of a Modbus line, both ways: a TCP connection or a serial port."""
 
 import asyncio
+import contextlib
+import ipaddress
+import socket
 from collections.abc import Callable
 from typing import cast
 
@@ -8,6 +11,7 @@ from drivers.backends.ports.opening import open_port
 from drivers.backends.stand_in import Port
 from drivers.backends.urls.modbus import ModbusUrl
 from drivers.errors import LinkError, LinkTimeout, said_by_system
+from drivers.threads import in_thread
 
 _CONNECT_TIMEOUT = 1.0  # s; an amplifier in the same building answers a hundred times faster
 _UNSENT_MAX = 4096  # bytes; sixteen frames that a peer does not take are no slow network any more
@@ -76,12 +80,9 @@ class _Connection(asyncio.Protocol):
 async def _connect(
     line: ModbusUrl, on_data: Callable[[bytes], None], on_loss: Callable[[str], None]
 ) -> Port:
-    loop = asyncio.get_running_loop()
     try:
         async with asyncio.timeout(_CONNECT_TIMEOUT):
-            _, connection = await loop.create_connection(
-                lambda: _Connection(line.place, on_data, on_loss), line.host, line.port
-            )
+            return await _first_to_answer(line, lambda: _Connection(line.place, on_data, on_loss))
     except TimeoutError:
         raise LinkError(
             f"{line.place} does not answer within {_CONNECT_TIMEOUT:g} s; check the address, the "
@@ -92,4 +93,25 @@ async def _connect(
             f"{line.place} takes no Modbus connection: check the address and the port, and that "
             f"the amplifier is switched on (the system says: {said_by_system(problem)})"
         ) from problem
-    return connection
+
+
+async def _first_to_answer(line: ModbusUrl, make: Callable[[], _Connection]) -> Port:
+    """The connection to the first of a host's addresses that takes one; raises OSError."""
+    *others, last = await _addresses(line.host)
+    loop = asyncio.get_running_loop()
+    for address in others:
+        with contextlib.suppress(OSError):
+            return (await loop.create_connection(make, address, line.port))[1]
+    return (await loop.create_connection(make, last, line.port))[1]
+
+
+async def _addresses(host: str) -> list[str]:
+    """What a host's name stands for, at least one; raises OSError."""
+    try:
+        return [str(ipaddress.ip_address(host))]
+    except ValueError:
+        # asyncio would ask for it in a thread that a program waits for before it ends.
+        found = await in_thread(
+            lambda: socket.getaddrinfo(host, None, type=socket.SOCK_STREAM), name=f"era-name {host}"
+        )
+        return [str(address[0]) for *_, address in found]

@@ -2,6 +2,8 @@
 
 import asyncio
 import socket
+import subprocess
+import sys
 
 import pytest
 
@@ -26,6 +28,46 @@ async def test_an_address_that_does_not_answer_is_told_with_what_to_check(
             await open_stream(
                 ModbusUrl.parse(f"modbus+tcp://127.0.0.1:{port}/1"), lambda _: None, lambda _: None
             )
+
+
+async def test_of_the_addresses_of_a_name_the_first_that_answers_is_taken(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The amplifier listens on the second only, as where a name has an IPv6 address, too."""
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        port = listening.getsockname()[1]
+        found = [(0, 0, 0, "", (address, 0)) for address in ("127.0.0.2", "127.0.0.1")]
+        monkeypatch.setattr(stream.socket, "getaddrinfo", lambda *args, **kwargs: found)
+        connection = await open_stream(
+            ModbusUrl.parse(f"modbus+tcp://amplifier.test:{port}/1"), lambda _: None, lambda _: None
+        )
+        taken, _ = listening.accept()
+        taken.close()
+        connection.close()
+        await connection.wait_closed()
+        await asyncio.sleep(0)
+
+
+def test_a_name_that_nobody_can_tell_holds_up_no_end() -> None:
+    """The connection is given up after a second, and the program ends though the question hangs."""
+    program = """
+import asyncio, socket, threading
+from drivers.backends.modbus import stream
+from drivers.backends.urls.modbus import ModbusUrl
+from drivers.errors import LinkError
+
+socket.getaddrinfo = lambda *args, **kwargs: threading.Event().wait()
+stream._CONNECT_TIMEOUT = 0.05
+url = ModbusUrl.parse("modbus+tcp://amplifier.test/1")
+try:
+    asyncio.run(stream.open_stream(url, lambda _: None, lambda _: None))
+except LinkError as problem:
+    print(problem)
+"""
+    ran = subprocess.run(
+        [sys.executable, "-c", program], check=True, timeout=60, capture_output=True, text=True
+    )
+    assert "amplifier.test:502 does not answer" in ran.stdout
 
 
 async def test_a_peer_that_reads_no_more_is_told_before_the_memory_is_full() -> None:

@@ -18,7 +18,6 @@ import pytest
 
 from drivers import clock
 from drivers.amplifier import Amplifier
-from drivers.backends.stand_in import STAND_IN
 from drivers.command import CommandSet, DriveCommand
 from drivers.errors import CommandRefused, DriverError, LinkError
 from drivers.guard import Guard, GuardLimits, SafeCommand
@@ -26,13 +25,12 @@ from drivers.link.link import REPLY_TIMEOUT as USUAL_TIMEOUT
 from drivers.operation.watchdog import HEARTBEAT, HEARTBEATS_BORNE, told_after
 from drivers.protocol.messages import Event, Fault, State
 from drivers.registry import open_backend
-from memory_machine import MemoryMachine
+from memory_machine import live_in_memory
 from model.rig.rig import Rig
 from reopened import reopen
 from sim.far_ends.wires import Wire
 from sim.faults.episodes import Episode, FaultKind
-from sim.transport.pseudo_terminal import TERMINAL_MAKER
-from virtual_loop import VirtualLoop, run_virtual
+from virtual_loop import run_virtual
 from wires import WIRES, FarSide, far_side, patient
 
 WATCHDOG = 0.15  # s
@@ -214,11 +212,7 @@ def in_virtual_time(
     """
 
     async def run() -> None:
-        loop = asyncio.get_running_loop()
-        assert isinstance(loop, VirtualLoop)
-        machine = MemoryMachine(loop)
-        STAND_IN.set(machine)
-        TERMINAL_MAKER.set(machine.make_terminal)
+        live_in_memory()
         async with (
             far_side({**WIRES, **SLOW_WIRES}[name], rig, seed=7) as far,
             Link(far, reply_timeout=USUAL_TIMEOUT, watched=True) as host,

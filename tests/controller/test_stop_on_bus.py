@@ -13,15 +13,13 @@ import pytest
 
 from controller.amplifiers import AmplifierGroup
 from drivers.amplifier import Amplifier
-from drivers.backends.stand_in import STAND_IN
 from drivers.protocol.messages import Reply, Request, State, Stop
 from drivers.registry import open_backend
-from memory_machine import MemoryMachine
+from memory_machine import live_in_memory
 from model.rig.rig import Channel, Rig
 from sim.far_ends.wires import Wire
 from sim.faults.episodes import Episode
-from sim.transport.pseudo_terminal import TERMINAL_MAKER
-from virtual_loop import VirtualLoop, run_virtual
+from virtual_loop import run_virtual
 from wires import FarSide, far_side
 
 BUSES = {
@@ -52,11 +50,7 @@ def on_a_bus(
         return exchange(request)
 
     async def run() -> None:
-        loop = asyncio.get_running_loop()
-        assert isinstance(loop, VirtualLoop)
-        machine = MemoryMachine(loop)
-        STAND_IN.set(machine)
-        TERMINAL_MAKER.set(machine.make_terminal)
+        live_in_memory()
         async with far_side(BUSES[bus], three) as far:
             for name, station in far.stations.items():
                 station.exchange = partial(note, name, station.exchange)  # type: ignore[method-assign]

@@ -8,14 +8,12 @@ import asyncio
 import pytest
 
 from drivers.amplifier import Amplifier
-from drivers.backends.stand_in import STAND_IN
 from drivers.registry import open_backend
-from memory_machine import MemoryMachine
+from memory_machine import live_in_memory
 from model.rig.rig import Rig
 from sim.far_ends.wires import Wire
 from sim.faults.episodes import Episode
-from sim.transport.pseudo_terminal import TERMINAL_MAKER
-from virtual_loop import VirtualLoop, run_virtual
+from virtual_loop import run_virtual
 from wires import far_side
 
 WIRES = {"serial": Wire("serial"), "modbus+rtu": Wire("modbus-rtu"), "can+slcan": Wire("slcan")}
@@ -42,11 +40,7 @@ def test_it_waits_for_no_try_that_is_left(wire: str, how: str, coarse_rig: Rig) 
         return asyncio.get_running_loop().time() - begin
 
     async def run() -> None:
-        loop = asyncio.get_running_loop()
-        assert isinstance(loop, VirtualLoop)
-        machine = MemoryMachine(loop)
-        STAND_IN.set(machine)
-        TERMINAL_MAKER.set(machine.make_terminal)
+        live_in_memory()
         async with far_side(WIRES[wire], coarse_rig) as far:
             far.station.befall(Episode("hang"))
             for after in (0.001, 0.3, 0.7, 1.2, 1.4):

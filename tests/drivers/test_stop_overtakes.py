@@ -13,7 +13,6 @@ from typing import Any
 import pytest
 
 from drivers.amplifier import Amplifier
-from drivers.backends.stand_in import STAND_IN
 from drivers.command import CommandSet, DriveCommand
 from drivers.errors import CommandRefused
 from drivers.guard import Guard, GuardLimits, SafeCommand
@@ -30,12 +29,11 @@ from drivers.protocol.messages import (
     Stop,
 )
 from drivers.registry import open_backend
-from memory_machine import MemoryMachine
+from memory_machine import live_in_memory
 from model.rig.rig import Channel, Rig
 from sim.far_ends.wires import Wire
 from sim.faults.episodes import Episode
-from sim.transport.pseudo_terminal import TERMINAL_MAKER
-from virtual_loop import VirtualLoop, run_virtual
+from virtual_loop import run_virtual
 from wires import FarSide, far_side
 
 LINES = {
@@ -100,11 +98,7 @@ def on_a_line(line: str, rig: Rig, use: Callable[[Chain], Coroutine[Any, Any, No
     chain = Chain()
 
     async def run() -> None:
-        loop = asyncio.get_running_loop()
-        assert isinstance(loop, VirtualLoop)
-        machine = MemoryMachine(loop)
-        STAND_IN.set(machine)
-        TERMINAL_MAKER.set(machine.make_terminal)
+        live_in_memory()
         async with far_side({**LINES, **BUSES}[line], two) as far:
             for name, station in far.stations.items():
                 station.exchange = partial(  # type: ignore[method-assign]

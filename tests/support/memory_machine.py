@@ -15,7 +15,7 @@ from typing import Any, TypeVar, cast
 
 from greenlet import getcurrent, greenlet
 
-from drivers.backends.stand_in import Adapter, StandIn, Worker
+from drivers.backends.stand_in import STAND_IN, Adapter, StandIn, Worker
 from drivers.backends.urls.can_bus import CanBusUrl
 from drivers.codec.can_bus.adapter_text import (
     SlcanReader,
@@ -25,7 +25,7 @@ from drivers.codec.can_bus.adapter_text import (
 )
 from drivers.codec.can_bus.frame import CanFrame
 from drivers.errors import LinkError
-from sim.transport.pseudo_terminal import Terminal
+from sim.transport.pseudo_terminal import TERMINAL_MAKER, Terminal
 from virtual_loop import VirtualLoop
 
 T = TypeVar("T")
@@ -124,6 +124,16 @@ class MemoryMachine(StandIn):
     def opened(self, name: str) -> "MemoryPort | None":
         """The host's side, where it is open."""
         return self._open.get(name)
+
+
+def live_in_memory() -> MemoryMachine:
+    """Let backends and far ends of the running virtual loop meet in memory from now on."""
+    loop = asyncio.get_running_loop()
+    assert isinstance(loop, VirtualLoop)
+    machine = MemoryMachine(loop)
+    STAND_IN.set(machine)
+    TERMINAL_MAKER.set(machine.make_terminal)
+    return machine
 
 
 class _Direction:

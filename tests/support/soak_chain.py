@@ -21,11 +21,10 @@ from controller.observer import Applied, Observer
 from controller.touch import Touch, TouchFrame
 from drivers.amplifier import Amplifier
 from drivers.backend import Backend
-from drivers.backends.stand_in import STAND_IN
 from drivers.errors import DriverError
 from drivers.protocol.messages import Reply, Request
 from drivers.registry import open_backend
-from memory_machine import MemoryMachine
+from memory_machine import live_in_memory
 from model.rig.rig import Channel, Rig
 from model.table.table import LocalizationTable
 from paper_plate import make_paper_rig
@@ -33,7 +32,6 @@ from sim.bench.bench import Bench
 from sim.bench.station import Station
 from sim.far_ends.wires import Wire, open_wires
 from sim.faults.episodes import Faults
-from sim.transport.pseudo_terminal import TERMINAL_MAKER
 from sim.witness.witness import Wish
 from small_table import small_table
 from soak_checks import RELEASE, Checks, Touched
@@ -139,9 +137,7 @@ class _Run:
         assert isinstance(loop, VirtualLoop)
         self.loop = loop
         loop.set_exception_handler(self._unhandled)
-        self.machine = MemoryMachine(loop)
-        STAND_IN.set(self.machine)
-        TERMINAL_MAKER.set(self.machine.make_terminal)
+        self.machine = live_in_memory()
         self.rig = make_soak_rig(self.plan.amplifiers)
         self.bench = Bench(self.rig, now=loop.time())
         self.touched = Touched()

@@ -19,10 +19,9 @@ from controller.loop import Controller
 from controller.touch import Touch, TouchFrame
 from drivers import clock
 from drivers.amplifier import Amplifier
-from drivers.backends.stand_in import STAND_IN
 from drivers.protocol.messages import Fault
 from drivers.registry import open_backend
-from memory_machine import MemoryMachine
+from memory_machine import MemoryMachine, live_in_memory
 from model.arrays import FloatArray
 from model.fem.mesh import Mesh
 from model.rig.rig import Channel, Limits, Rig
@@ -34,7 +33,6 @@ from model.vibration.excitation import Excitation, Tone
 from sim.bench.bench import Bench
 from sim.bench.station import Station
 from sim.far_ends.wires import Wire, open_wire
-from sim.transport.pseudo_terminal import TERMINAL_MAKER
 from sim.waveform.output import level_of
 from sim.witness.violation import Violation
 from sim.witness.witness import Witness
@@ -326,10 +324,8 @@ async def _play(
 ) -> Outcome:
     loop = asyncio.get_running_loop()
     assert isinstance(loop, VirtualLoop)
-    machine = MemoryMachine(loop)
+    machine = live_in_memory()
     between = Between(machine)
-    STAND_IN.set(machine)
-    TERMINAL_MAKER.set(machine.make_terminal)
     rig = make_rig(names, limits)
     bench = Bench(rig, now=loop.time())
     stations = [

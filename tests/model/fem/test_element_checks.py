@@ -1,6 +1,5 @@
 """The checks of plate elements: ours keep them all, and each fault is found by the check for it."""
 
-from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -9,7 +8,7 @@ from typer.testing import CliRunner
 
 from model.cli import app
 from model.fem.element_checks import CHECKS, frequency_error, rate
-from model.fem.elements import ELEMENTS, Element, element_of
+from model.fem.elements import ELEMENTS, Element
 from model.fem.elements.lagrange import Q3
 from model.fem.elements.mitc4 import MITC4, _curvature, _shear, rigidities
 
@@ -75,15 +74,12 @@ FAULTS = {
 
 
 @pytest.fixture(params=FAULTS.items(), ids=FAULTS)
-def fault(
-    request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
-) -> Iterator[tuple[str, Element]]:
+def fault(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> tuple[str, Element]:
     """An element with a fault, there by name, and which check is to find it."""
     check, element = request.param
     element = replace(element, name=f"bad-{check}")
     monkeypatch.setitem(ELEMENTS, element.name, element)
-    yield check, element
-    element_of.cache_clear()
+    return check, element
 
 
 def test_a_fault_is_found(fault: tuple[str, Element]) -> None:

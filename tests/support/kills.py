@@ -177,11 +177,15 @@ async def _once(era: AsyncClient, chance: random.Random, armed: asyncio.Event) -
 
 
 async def kill_everywhere(
-    kills: int, *, seed: int, tell: Callable[[Kill], None] | None = None
+    kills: int,
+    *,
+    seed: int,
+    serial: float = 0.5,
+    tell: Callable[[Kill], None] | None = None,
 ) -> list[Kill]:
-    """So many kills, half of them over a serial line, the others shared among the other places."""
-    others = len(PLACES) - 1
-    shares = [kills - kills // 2, *(kills // 2 // others for _ in range(others))]
+    """So many kills, a share of them over one serial line, the rest evenly at all other places."""
+    elsewhere = round(kills * (1 - serial)) // (len(PLACES) - 1)
+    shares = [elsewhere] * len(PLACES)
     shares[0] += kills - sum(shares)
     free = asyncio.Semaphore(_AT_ONCE)
 

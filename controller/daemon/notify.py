@@ -12,7 +12,7 @@ from collections.abc import Mapping
 
 
 class ServiceManager:
-    """Tells the service manager; watchdog_every [s]: how often it wants to hear, None for never."""
+    """Tells the service manager that an environment names."""
 
     def __init__(self, environment: Mapping[str, str] = os.environ) -> None:
         self._address = environment.get("NOTIFY_SOCKET", "")
@@ -20,13 +20,8 @@ class ServiceManager:
         if self._address:
             self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC)
             self._socket.setblocking(False)
-        self._every = _watchdog_every(environment)
+        self._alive_every = _alive_every(environment)  # s; None where it does not ask for it
         self._told_alive_at = float("-inf")
-
-    @property
-    def watchdog_every(self) -> float | None:
-        """How often [s] to say that one is alive: twice as often as it must be heard."""
-        return self._every
 
     def tell(self, *assignments: str) -> None:
         """Send assignments such as STATUS=..., each on its line; control characters are dropped."""
@@ -56,7 +51,7 @@ class ServiceManager:
 
     def alive(self, now: float) -> None:
         """To be called by the control loop after it has run, at a time [s], however often."""
-        if self._every is not None and now - self._told_alive_at >= self._every:
+        if self._alive_every is not None and now - self._told_alive_at >= self._alive_every:
             self._told_alive_at = now
             self.tell("WATCHDOG=1")
 
@@ -67,7 +62,7 @@ class ServiceManager:
             self._socket = None
 
 
-def _watchdog_every(environment: Mapping[str, str]) -> float | None:
+def _alive_every(environment: Mapping[str, str]) -> float | None:
     """Half of the time that WATCHDOG_USEC allows, if it is meant for this process."""
     microseconds = environment.get("WATCHDOG_USEC", "")
     meant = environment.get("WATCHDOG_PID", str(os.getpid()))

@@ -598,7 +598,7 @@ async def test_a_cancelled_stop_overtakes_nothing(
     patience: Callable[[float], None],
 ) -> None:
     """An apply whose answer is lost is repeated again once the stop that waited is withdrawn."""
-    patience(0.2)
+    patience(0.02)
     answer: asyncio.Future[Reply] = asyncio.get_running_loop().create_future()
     backend.script.append(answer)
     apply = asyncio.create_task(amplifier.apply(safe(1)))
@@ -606,7 +606,7 @@ async def test_a_cancelled_stop_overtakes_nothing(
     stop = asyncio.create_task(amplifier.stop())
     await settle()
     stop.cancel()
-    await asyncio.sleep(0.3)
+    await asyncio.sleep(0.05)
     answer.set_exception(LinkTimeout("late"))
     assert (await apply).token == 1
     assert backend.requests == [Apply(safe(1))] * 2

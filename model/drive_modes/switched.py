@@ -47,23 +47,22 @@ def find_switched(fields: Fields, least: float) -> Drive | None:
     quiet = magnitudes_of_sources(fields.quiet)
     powers = _powers(felt, fields)
     power = np.array([_mean(rows) for rows in powers])
-    loud = quiet.mean(axis=1) if fields.is_alone else quiet @ _shares(quiet)
+    shares = _even_shares(quiet) if fields.is_alone else _shares(quiet)
+    loud = quiet @ shares
 
-    def value(one: IntArray, other: IntArray) -> Single:
-        """Contrast of patterns (n,); 0 where they do not reach the level."""
-        at_quiet = quiet[one] + quiet[other]
-        sensed = np.min([np.sqrt(rows[one] + rows[other]).mean(axis=1) for rows in powers], axis=0)
-        peaks = (means[:, one] + means[:, other]).min(axis=0)
-        if fields.is_alone:
-            contrast = peaks / np.sqrt((at_quiet**2).mean(axis=1))
-        else:
-            contrast = peaks / at_quiet.max(axis=1)
-        return np.asarray(np.where(sensed >= fields.wanted, contrast, 0))
+    def value(peaks: Single, at_quiet: Single, powers: list[Single]) -> Single:
+        """Contrast of patterns (n,), 0 where they do not reach the level.
+
+        Peaks at each target (targets, n) and at the quiet points (n, q); powers: (n, p) each.
+        """
+        sensed = np.min([_mean(np.sqrt(rows)) for rows in powers], axis=0)
+        loudness = np.sqrt(_mean(at_quiet**2)) if fields.is_alone else at_quiet.max(axis=1)
+        return np.asarray(np.where(sensed >= fields.wanted, peaks.min(axis=0) / loudness, 0))
 
     nothing = len(quiet) - 1
     contrast, best = least, (nothing, nothing)
     # What one source can do is had at once, and leaves fewer pairs of them.
-    alone = value(np.arange(nothing), np.full(nothing, nothing))
+    alone = value(means[:, :-1], quiet[:-1], [rows[:-1] for rows in powers])
     if alone.max() > contrast:
         contrast, best = float(alone.max()), (int(alone.argmax()), nothing)
     one, other = _pairs(peak - contrast * loud, fields)
@@ -77,7 +76,12 @@ def find_switched(fields: Fields, least: float) -> Drive | None:
         if len(one) > AT_ONCE:
             order = np.argpartition(-bound, AT_ONCE)
             one, other, bound = one[order], other[order], bound[order]
-        found = value(one[:AT_ONCE], other[:AT_ONCE])
+        some, more = one[:AT_ONCE], other[:AT_ONCE]
+        found = value(
+            means[:, some] + means[:, more],
+            quiet[some] + quiet[more],
+            [rows[some] + rows[more] for rows in powers],
+        )
         if found.max() > contrast:
             at = int(found.argmax())
             contrast, best = float(found[at]), (int(one[at]), int(other[at]))
@@ -85,8 +89,8 @@ def find_switched(fields: Fields, least: float) -> Drive | None:
         one, other, bound = one[left], other[left], bound[left]
         if not closer and len(one) > 0:
             closer = True
-            some = quiet[:, np.argsort(-_shares(quiet))[:BOUND_POINTS]]
-            bound = (peak[one] + peak[other]) / (some[one] + some[other]).max(axis=1)
+            few = quiet[:, np.argsort(-shares)[:BOUND_POINTS]]
+            bound = (peak[one] + peak[other]) / (few[one] + few[other]).max(axis=1)
             left = np.flatnonzero(bound > contrast)
             one, other, bound = one[left], other[left], bound[left]
     return None if best[0] == nothing else _drive(best, fields)
@@ -166,7 +170,12 @@ def _powers(felt: list[Single], fields: Fields) -> list[Single]:
 
 def _mean(rows: Single) -> Single:
     """The mean over points of (n, p), as a product: a fifth of the time that `mean` takes."""
-    return np.asarray(rows @ np.full(rows.shape[1], 1 / rows.shape[1], dtype=rows.dtype))
+    return np.asarray(rows @ _even_shares(rows))
+
+
+def _even_shares(rows: Single) -> Single:
+    """For a mean over points of (n, p) that all count the same, (p,)."""
+    return np.full(rows.shape[1], 1 / rows.shape[1], dtype=rows.dtype)
 
 
 def _shares(quiet: Single) -> Single:

@@ -84,8 +84,7 @@ def demo(
         return
     if not as_json:
         print(
-            f"{rig_file.name}: {counted(table.pattern_count, 'pattern')} of "
-            f"{counted(len(rig.eras), 'ERA')} on a mesh of {table.mesh}, "
+            f"{rig_file.name}: table of {counted(len(rig.eras), 'ERA')} on a mesh of {table.mesh}, "
             f"ready in {time.perf_counter() - started:.1f} s"
         )
         print(_HEADING, end="")
@@ -118,9 +117,9 @@ def demo(
 
 
 _HEADING = """\
-                                                          contrast / dB
-                                                       steady  first 100 ms level / dB SL latency
- time  target / cm  others  ERAs                    pred.  meas.  pred.  meas.  pred.  meas.  / ms
+                                                          contrast / dB            level    latency
+                                                       steady     first 100 ms    / dB SL      / ms
+ time  target / cm  others  ERAs                    pred.  meas.  pred.  meas.  pred.  meas.
 """
 
 

@@ -221,6 +221,20 @@ def test_how_time_is_cut_does_not_matter(reduced: ReducedPlate) -> None:
     np.testing.assert_allclose(found, expected, atol=1e-8 * np.abs(expected).max())
 
 
+def test_terms_that_hold_together_move_the_base_together(reduced: ReducedPlate) -> None:
+    """As when a tone fades into one of its own frequency: two terms are one of their sum."""
+    w, a, b = 2 * np.pi * 110.0, (1 + 2j) * STROKE / 4, (-0.5 + 1j) * STROKE / 4
+    felt = []
+    for terms in (
+        [Term(0.0, 0.05, w, a, 3 * b), Term(0.0, 0.05, w, b, a)],
+        [Term(0.0, 0.05, w, a + b, 3 * b + a)],
+    ):
+        plant = Plant(reduced, eras())
+        plant.set_input(1, terms)
+        felt.append(plant.advance(0.08, sample_rate=10_000.0, shapes=reduced.shapes[:9])[1])
+    np.testing.assert_allclose(felt[0], felt[1], atol=1e-9 * np.abs(felt[1]).max())
+
+
 def test_a_plate_that_would_tip_over_is_refused(reduced: ReducedPlate) -> None:
     """Two ERAs hold no plate: the axis through them is free to turn."""
     with pytest.raises(InputError, match="tip over"):

@@ -71,6 +71,19 @@ def test_phase_counts_from_the_commit_or_runs_on() -> None:
         assert level_of(same, t) == pytest.approx(1.0)
 
 
+def test_tones_of_one_frequency_have_the_level_of_their_sum() -> None:
+    """Set at other times and in other phases: the most that the base moves within a period."""
+    first = fade_to((), 0.0, ramp=0.0, frequency=110.0, amplitude=cmath.rect(0.6, 0.4))
+    playing = fade_to(first, 0.0013, ramp=0.5, frequency=110.0, amplitude=cmath.rect(0.9, -1.1))
+    t = 0.2
+    most = 0.0
+    for share in range(1000):
+        told = [(tone.amplitude(t), t + share / 110_000 - tone.origin) for tone in playing]
+        moved = sum((a * cmath.exp(2j * math.pi * 110 * since)).imag for a, since in told)
+        most = max(most, moved)
+    assert level_of(playing, t) == pytest.approx(most, rel=1e-4)
+
+
 def test_a_change_within_a_ramp_is_continuous_and_prolongs_nothing() -> None:
     """A tone caught half faded in leaves from half; one fading out keeps its own, earlier end."""
     first = fade_to((), 0.0, ramp=0.02, frequency=100.0, amplitude=1.0)

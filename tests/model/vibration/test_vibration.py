@@ -70,6 +70,14 @@ def test_a_null_is_where_a_standing_wave_stands_still():
     assert (np.isclose(nulls, 0.5).any(axis=1)).all()
 
 
+def test_each_null_has_its_own_place():
+    """Two points that rest on a map that is no square: x by the column, y by the row."""
+    x, y = np.linspace(0, 3, 16), np.linspace(0, 2, 11)
+    rests = np.array([[0.4, 1.8], [2.2, 0.6]])
+    peak = np.min([np.hypot(x - a, y[:, None] - b) for a, b in rests], axis=0)
+    np.testing.assert_allclose(find_nulls(x, y, peak)[::-1], rests)
+
+
 @pytest.mark.parametrize(
     ("excitation", "says"),
     [

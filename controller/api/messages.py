@@ -161,7 +161,12 @@ METHODS: dict[str, Method] = {
     "arm": Method(ArmParams, ArmResult, "high voltage on; touches are felt while the lease lasts"),
     "renew": Method(RenewParams, RenewResult, "the owner of the lease is still there"),
     "disarm": Method(Nothing, Nothing, "silent along a short ramp, high voltage off; by anyone"),
-    "stop": Method(Nothing, Nothing, "quick stop, latched until clear; by anyone, at any time"),
+    "stop": Method(
+        Nothing,
+        Nothing,
+        "quick stop, latched until clear; by anyone, at any time; 1004 where an amplifier that is "
+        "lost from then on did not hear it",
+    ),
     "clear": Method(Nothing, Nothing, "acknowledge a stop, or a fault whose cause is gone"),
     "touch": Method(TouchParams, Nothing, "all fingers of this client, as a touch source"),
     "effects": Method(Nothing, EffectsResult, "which effects there are"),

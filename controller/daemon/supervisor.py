@@ -59,6 +59,7 @@ class Supervisor:
         self._controller: Controller | None = None
         self._refusal = ""
         self._tasks: set[asyncio.Task[None]] = set()
+        self._losing = asyncio.Lock()  # held until all are closed that were lost
 
     def observe(self, observer: Observer) -> Observer:
         """The observer that the controller is to be made with: this one, and ours before it."""
@@ -159,16 +160,16 @@ class Supervisor:
             case Action.DISARM:
                 await self._on_the_link(controller.disarm())
             case Action.STOP:
-                await controller.stop()
+                await self._stop()
             case Action.REACT:
-                await controller.stop()
+                await self._stop()
                 await self.handle(Event(Kind.REACTED, self.machine.cause, self.machine.remedy))
             case Action.CLEAR:
                 await self._on_the_link(self._clear())
             case Action.RECONNECT | Action.CLOSE:
                 await controller.close()
 
-    async def _on_the_link(self, work: Awaitable[None]) -> None:
+    async def _on_the_link(self, work: Awaitable[object]) -> None:
         """Do something that needs the link; its loss, or a refusal, is an event of its own."""
         try:
             await work
@@ -180,6 +181,13 @@ class Supervisor:
         except DriverError as error:
             await self.handle(Event(Kind.FAULT, str(error), ACKNOWLEDGE))
             raise
+
+    async def _stop(self) -> None:
+        """Stop all; raises LinkError where one did not hear it, which is a loss from now on."""
+        await self._the_controller.stop()
+        for amplifier in self._amplifiers.values():
+            if amplifier.lost and self.machine.state not in (State.COMM_LOST, State.NOT_READY):
+                await self._on_the_link(amplifier.status())  # raises at once why it is lost
 
     async def _arm(self) -> None:
         try:
@@ -258,12 +266,16 @@ class Supervisor:
             await asyncio.sleep(_READ_BACK_PAUSE)
 
     async def _lost(self, error: LinkError) -> None:
-        lost = [name for name, amplifier in self._amplifiers.items() if amplifier.lost]
-        if self.machine.state is not State.COMM_LOST:  # told already
-            self._link_told("lost", lost, _what(error))
-        cause = f"amplifier {', '.join(lost)}: {_what(error)}" if lost else _what(error)
-        remedy = "look at cables and supply; the daemon tries again by itself, and stays disarmed"
-        await self.handle(Event(Kind.LINK_LOST, cause, remedy))
+        """See a loss through; whoever comes with the same one waits for that, then reopens."""
+        async with self._losing:
+            lost = [name for name, amplifier in self._amplifiers.items() if amplifier.lost]
+            if self.machine.state is not State.COMM_LOST:  # told already
+                self._link_told("lost", lost, _what(error))
+            cause = f"amplifier {', '.join(lost)}: {_what(error)}" if lost else _what(error)
+            remedy = (
+                "look at cables and supply; the daemon tries again by itself, and stays disarmed"
+            )
+            await self.handle(Event(Kind.LINK_LOST, cause, remedy))
 
     async def _come_back(self) -> None:
         """Do the next thing towards leaving COMM_LOST."""

@@ -37,5 +37,5 @@ async def test_what_was_opened_and_not_disarmed_is_closed_before_it_is_tried_aga
         alive=lambda: None,
     )
     assert done
-    assert controller.asked == ["open", "disarm", "close", "open", "disarm"]
+    assert controller.asked == ["close", "open", "disarm", "close", "open", "disarm"]
     assert told == ["retry", "reopened"]

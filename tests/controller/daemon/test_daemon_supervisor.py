@@ -160,6 +160,67 @@ def unreachable(request: Request) -> Reply | None:
     raise LinkError("the wire is cut")
 
 
+@pytest.mark.parametrize("kind", [Kind.STOP, Kind.FAULT])
+def test_a_stop_that_is_not_heard_is_told_as_a_loss(kind: Kind) -> None:
+    """At once, to whoever asked for it, not with the next look half a second later; and latched."""
+
+    @in_virtual_time
+    async def run() -> None:
+        async with watched() as daemon:
+            daemon.far_end.answer = unreachable
+            with pytest.raises(LinkError, match=r"the wire is cut.*energised"):
+                await daemon.supervisor.handle(Event(kind, "somebody stopped"))
+            assert daemon.state is DaemonState.COMM_LOST
+            assert daemon.links == ["lost"]
+            daemon.far_end.answer = lambda request: None
+            await asyncio.sleep(1)
+            assert daemon.state is DaemonState.FAULT
+
+    run()
+
+
+@in_virtual_time
+async def test_a_loss_that_two_find_is_seen_through_before_anything_is_opened_again() -> None:
+    """A command finds it, and the control loop while that stops the others, which takes a while."""
+    async with watched() as daemon:
+        controller, opened = daemon.controller, list[bool]()
+        stop, close, open_again = controller.stop, controller.close, controller.open
+        step = controller.step
+
+        async def slow_stop() -> None:
+            await stop()
+            await asyncio.sleep(0.3)
+
+        async def early_close() -> None:
+            assert not opened, "what was opened again is closed"
+            await close()
+
+        async def noted_open() -> None:
+            opened.append(True)
+            await open_again()
+
+        async def lost_step() -> None:
+            controller.step = step  # type: ignore[method-assign]
+            raise LinkError("the wire is cut")
+
+        controller.stop = slow_stop  # type: ignore[method-assign]
+        controller.close = early_close  # type: ignore[method-assign]
+        controller.open = noted_open  # type: ignore[method-assign]
+        daemon.far_end.answer = unreachable
+        stopping = asyncio.create_task(daemon.supervisor.handle(Event(Kind.STOP, "somebody")))
+        await asyncio.sleep(0.4)  # it stops what else there may be once more, for it is lost
+        daemon.far_end.answer = lambda request: None
+        controller.step = lost_step  # type: ignore[method-assign]
+        controller.reconsider()
+        with pytest.raises(LinkError):
+            await stopping
+        await asyncio.sleep(1)
+        controller.close = close  # type: ignore[method-assign]
+        assert len(opened) == 1
+        assert daemon.links == ["lost", "reopened"]
+        assert daemon.state is DaemonState.FAULT
+
+
 @in_virtual_time
 async def test_a_lost_link_is_tried_again_with_growing_pauses() -> None:
     """0.1 s at first, each pause twice the one before up to 5 s; back again, nothing is armed."""

@@ -112,6 +112,24 @@ def test_a_plate_within_tolerance_is_well_and_a_swap_on_it_is_seen(
     assert min(c.confidence for c in swapped.channels) > 0.95
 
 
+def test_gain_is_told_of_the_stroke_that_a_channel_drives(
+    coarse_rig: Rig, built: tuple[np.ndarray, np.ndarray]
+) -> None:
+    """SW and SE exchanged, SE with twice the stroke: a share of it is twice what was asked of SW.
+
+    Nothing is wrong with the channels but where they are wired to.
+    """
+    places, values = built
+    sw, se, *others = coarse_rig.eras
+    rig = replace(coarse_rig, eras=(sw, replace(se, stroke=2 * sw.stroke), *others))
+    exchanged = values[:, [1, 0, 2, 3]] * np.array([2, 1 / 2, 1, 1])[:, None]
+    verdict = diagnose(rig, observe(places, exchanged))
+    assert [c.drives for c in verdict.channels][:2] == ["SE", "SW"]
+    assert states(verdict) == {"SW": ("other ERA",), "SE": ("other ERA",)}
+    for channel in verdict.channels:
+        assert channel.gain == pytest.approx(1.0, rel=0.25)
+
+
 def test_three_in_a_circle(coarse_rig: Rig, built: tuple[np.ndarray, np.ndarray]) -> None:
     """SW's channel drives SE, SE's NE, NE's SW: which permutation it is, is found."""
     places, values = built

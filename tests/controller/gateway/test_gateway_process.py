@@ -1,5 +1,6 @@
 """`era gateway` as a process: how it begins, what it refuses, TLS, and its end within a second."""
 
+import asyncio
 import os
 import signal
 import socket
@@ -11,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from controller.gateway.serving import listen
 from controller.gateway.settings import Settings, read_token
 from gateway_bench import (
     ERA,
@@ -174,6 +176,25 @@ def test_beyond_this_machine_the_url_has_a_name_that_browsers_can_call(
     options += ("--certificate", str(pair[0]), "--key", str(pair[1]))
     with gateway_process(tmp_path, daemon.socket, *options) as gateway:
         assert gateway.url.startswith("https://localhost.test:")
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "::1"])
+async def test_an_answer_waits_for_no_acknowledgement(host: str, tmp_path: Path) -> None:
+    """What is sent in pieces, head and body, leaves at once, on a connection that is kept, too.
+
+    Without TCP_NODELAY the second piece waits until the other side acknowledges the first: 40 ms.
+    """
+    accepted: asyncio.Queue[asyncio.StreamWriter] = asyncio.Queue()
+    listening = listen(Settings(socket=tmp_path / "era.sock", host=host, port=0))
+    async with await asyncio.start_server(
+        lambda _, writer: accepted.put_nowait(writer), sock=listening
+    ):
+        _, ours = await asyncio.open_connection(host, listening.getsockname()[1])
+        theirs = await accepted.get()
+        connection = theirs.get_extra_info("socket")
+        assert connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY)
+        for writer in (ours, theirs):
+            writer.close()
 
 
 def test_a_port_that_is_taken_is_told(tmp_path: Path) -> None:

@@ -48,6 +48,7 @@ class SharedLine(ABC, Generic[_OpenT]):
                 if self._opened is None:
                     self._loss = None
                     self._opened = await self._open()
+                self._told.discard(number)  # of a loss while this one waited to be on it
         except BaseException:
             await self.leave(number)
             raise

@@ -95,7 +95,8 @@ class _ThreadedAdapter:
         try:
             while not self._closing.is_set() and not problem:
                 message = self._bus.recv(timeout=_READ_TIMEOUT)
-                if message is not None:
+                # Closed meanwhile it may hang, and others have the bus open by now.
+                if message is not None and not self._closing.is_set():
                     problem = self._take(message)
         except _TROUBLE as error:
             problem = error

@@ -6,6 +6,7 @@ import os
 import threading
 from collections.abc import Awaitable, Callable, Iterator
 
+import can
 import pytest
 
 from drivers import threads
@@ -13,6 +14,7 @@ from drivers.backends.can_bus import adapter
 from drivers.backends.ports import opening
 from drivers.backends.stand_in import Adapter, Port
 from drivers.backends.urls.can_bus import CanUrl
+from drivers.codec.can_bus.frame import CanFrame
 
 
 class _Hanging:
@@ -53,6 +55,20 @@ def hanging(monkeypatch: pytest.MonkeyPatch) -> Iterator[_Hanging]:
     assert device.is_closed.wait(20)
 
 
+class _Late(_Hanging):
+    """An adapter that hangs while it is read, and then has a frame after all."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.may_read = threading.Event()
+        self.may_close.set()
+
+    def recv(self, timeout: float) -> can.Message:  # type: ignore[override]
+        """Blocks longer than it was told to."""
+        self.may_read.wait(20)
+        return can.Message(arbitration_id=0x701, is_extended_id=False, data=[5])
+
+
 async def _port() -> Port | Adapter:
     return await opening.open_port(
         "/dev/ttyUSB9", baud=9600, on_data=lambda data: None, on_loss=lambda what: None
@@ -77,3 +93,20 @@ async def test_closing_waits_for_no_device_that_hangs(
         await asyncio.wait_for(opened.wait_closed(), 10)
     assert not hanging.is_closed.is_set()
     assert "not waited for" in caplog.text
+
+
+async def test_what_an_adapter_has_once_it_was_closed_is_old(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """It hung, and the bus has been opened anew: a heartbeat of before is told to nobody."""
+    device, heard = _Late(), list[CanFrame]()
+    monkeypatch.setattr(adapter, "open_bus", lambda url: device)
+    monkeypatch.setattr(threads, "CLOSE_TIMEOUT", 0.05)
+    url = CanUrl.parse("can+socketcan://can0#1").bus
+    opened = await adapter.open_adapter(url, on_frame=heard.append, on_loss=lambda what: None)
+    opened.close()
+    await asyncio.wait_for(opened.wait_closed(), 10)
+    assert not device.is_closed.is_set()
+    device.may_read.set()
+    assert await asyncio.to_thread(device.is_closed.wait, 20)
+    assert heard == []

@@ -158,6 +158,22 @@ async def test_a_loss_is_told_once_to_each_and_over_for_who_comes_back() -> None
     await line.leave(2)
 
 
+async def test_who_was_about_to_come_when_it_was_lost_is_told_of_the_next_loss() -> None:
+    """It waited for its turn to open the line, and opens it anew: that is another line for it."""
+    line, told = the_line(), list[str]()
+    await line.join(1, lambda _: None)
+    async with line._changing:
+        coming = asyncio.create_task(line.join(2, told.append))
+        await asyncio.sleep(0)
+        line.lose("pulled out")
+    await coming
+    line.raise_if_lost(2)
+    line.lose("burnt")
+    assert told == ["pulled out", "burnt"]
+    await line.leave(1)
+    await line.leave(2)
+
+
 async def test_nothing_is_sent_while_it_is_being_opened_anew() -> None:
     """Neither as if it were open nor with an error that nobody expects; afterwards it goes out."""
     line = the_line()

@@ -150,5 +150,7 @@ async def test_a_signal_while_it_starts_is_heard_and_makes_no_noise(
         await asyncio.sleep(after)
         process.terminate()
         _, err = await asyncio.wait_for(process.communicate(), 30)
-        assert process.returncode in (0, 130, -15)
+        # By SIGINT where it came within an exec(), as dataclasses are made: CPython then ends so
+        # though the KeyboardInterrupt was caught; a shell shows that as 130, too.
+        assert process.returncode in (0, 130, -signal.SIGTERM, -signal.SIGINT)
         assert err == b""

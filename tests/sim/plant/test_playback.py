@@ -11,6 +11,7 @@ from model.fem.harmonic import direct_acceleration
 from model.finger.contrast import mean_level_db_sl
 from model.finger.fingertip import fingertip_points
 from model.finger.load import FingerLoad
+from model.finger.perception import detection_threshold
 from model.reduction.reduced_plate import ReducedPlate, reduce_plate
 from model.rig.rig import Rig
 from model.structure.point_load import PointLoad
@@ -113,3 +114,13 @@ def test_what_cannot_be_played_is_refused(
     """Times in which nothing settles or that fill the memory, and fingers beside the plate."""
     with pytest.raises(InputError, match=says):
         play(coarse_rig, reduced, EXCITATION, fingers, duration=duration)
+
+
+def test_what_is_steady_is_read_at_the_end() -> None:
+    """A finger that felt ten times as much until a quarter of a second before has the last level."""
+    times = np.arange(10_000) / 10_000.0
+    tone = np.where(times < 0.75, 10.0, 1.0) * np.sin(2 * np.pi * 100.0 * times)
+    record = Record(np.array([[0.1, 0.1]]), times, tone[:, None])
+    playback = Playback((100.0,), (record,), (), settled=0.04)
+    expected = -20 * np.log10(detection_threshold(np.array([100.0]))[0])
+    assert playback.level_db_sl == pytest.approx(expected, abs=0.01)

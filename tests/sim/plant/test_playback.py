@@ -117,7 +117,7 @@ def test_what_cannot_be_played_is_refused(
 
 
 def test_what_is_steady_is_read_at_the_end() -> None:
-    """A finger that felt ten times as much until a quarter of a second before has the last level."""
+    """Ten times as much until a quarter of a second before the end does not count."""
     times = np.arange(10_000) / 10_000.0
     tone = np.where(times < 0.75, 10.0, 1.0) * np.sin(2 * np.pi * 100.0 * times)
     record = Record(np.array([[0.1, 0.1]]), times, tone[:, None])

@@ -8,6 +8,7 @@ import typer
 
 from controller.diagnosis.cli import rig_app
 from drivers.errors import CommandError, CommandRefused, FrameError, LinkError
+from model.commands.next_line import next_line
 from model.counting import counted
 from model.errors import InputError
 
@@ -113,7 +114,7 @@ def demo(
     for file in files:
         print(f"wrote {file}")
     if table_file is not None:
-        print(f"Next: era table show {table_file}")
+        print(next_line("era", "table", "show", table_file))
 
 
 _HEADING = """\

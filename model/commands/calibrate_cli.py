@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from model.commands.next_line import next_line
 from model.counting import counted
 from model.errors import InputError
 
@@ -99,7 +100,7 @@ def calibrate(
         raise typer.Exit(NOT_THIS_PLATE)
     if not as_json:
         print(f"wrote {', '.join(files)}")
-        print(f"Next: era table build {output} -o {output.with_suffix('.npz')}")
+        print(next_line("era", "table", "build", output, "-o", output.with_suffix(".npz")))
 
 
 def _write(path: Path, text: str) -> None:

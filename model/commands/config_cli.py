@@ -6,6 +6,7 @@ from typing import Annotated
 
 import typer
 
+from model.commands.next_line import next_line
 from model.errors import InputError
 
 config_app = typer.Typer(help="Begin a configuration file, and check one.", no_args_is_help=True)
@@ -27,8 +28,8 @@ def init(
     _write_new(file, f"# yaml-language-server: $schema={schema.name}\n{made.example()}")
     with whole_or_nothing(schema) as stream:
         stream.write(json.dumps(made.schema(), indent=2).encode() + b"\n")
-    typer.echo(f"Wrote {file} and {schema}")
-    typer.echo(f"Next: edit it, then  era config check {file}")
+    typer.echo(f"Wrote {file}, which is yours to edit, and {schema}")
+    typer.echo(next_line("era", "config", "check", file))
 
 
 @config_app.command()

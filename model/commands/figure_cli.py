@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from model.commands.next_line import next_line
 from model.commands.plate_cli import JsonOption, MeshOption, RigArgument
 
 figure_app = typer.Typer()
@@ -56,7 +57,7 @@ def figure(
     print(f"{elapsed:.1f} s, mesh {rig.mesh}; wrote")
     for name in files:
         print(f"  {name}")
-    print(f"Next: era study placement {rig_file} -o study")
+    print(next_line("era", "study", "placement", rig_file, "-o", "study"))
 
 
 def _shown(value: object) -> str:

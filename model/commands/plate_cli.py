@@ -8,6 +8,8 @@ from typing import Annotated
 
 import typer
 
+from model.commands.next_line import next_line
+
 plate_app = typer.Typer(help="The plate: natural frequencies and vibration maps.")
 
 RigArgument = Annotated[Path, typer.Argument(metavar="RIG", help="Rig file, e.g. RIG.yaml.")]
@@ -140,7 +142,7 @@ def plate_map(
     print(f"nulls    {len(solved.nulls):5d}")
     if output is not None:
         print(f"wrote {output}")
-        print(f"Next: era table build {rig_file} -o table.npz")
+        print(next_line("era", "table", "build", rig_file, "-o", "table.npz"))
 
 
 @plate_app.command()

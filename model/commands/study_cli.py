@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from model.commands.next_line import next_line
 from model.commands.plate_cli import JsonOption, MeshOption, RigArgument
 from model.counting import counted
 
@@ -127,7 +128,7 @@ def study(
     print("wrote")
     for name in files:
         print(f"  {name}")
-    print(f"Next: era table build {files[0]} -o {output / 'recommended.npz'}")
+    print(next_line("era", "table", "build", files[0], "-o", output / "recommended.npz"))
 
 
 def _show(summary: dict[str, Any]) -> None:

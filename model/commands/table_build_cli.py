@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from model.commands.next_line import next_line
 from model.commands.plate_cli import JsonOption, MeshOption, RigArgument
 from model.counting import counted
 
@@ -110,4 +111,4 @@ def build(
     )
     print(f"mesh {table.mesh}: fields within {error:.3g} % of a finer one ({table.reference_mesh})")
     print(f"wrote {output} ({output.stat().st_size / 1e6:.1f} MB)")
-    print(f"Next: era table show {output}")
+    print(next_line("era", "table", "show", output))

@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from model.commands.next_line import next_line
 from model.commands.plate_cli import JsonOption
 from model.commands.table_cli import TableArgument
 
@@ -52,7 +53,7 @@ def plot(
     print("wrote")
     for file in files:
         print(f"  {file}")
-    print(f"Next: era table show {table_file} --weak")
+    print(next_line("era", "table", "show", table_file, "--weak"))
 
 
 def export(

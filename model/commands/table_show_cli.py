@@ -2,10 +2,12 @@
 
 import json
 import time
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from model.commands.next_line import next_line
 from model.commands.plate_cli import JsonOption, RigArgument
 from model.commands.table_cli import TableArgument
 
@@ -36,7 +38,7 @@ def show(
     _show_summary(summary)
     print()
     _show_map(cells, listed=weak)
-    print(f"Next: era table query {table_file} --target X,Y --quiet X,Y")
+    print(_a_question(table_file, summary["plate_m"]))
 
 
 def verify(
@@ -72,9 +74,16 @@ def verify(
         count = len(found.content) + len(found.answers)
         print(f"{count - found.misses} of {count} hold (seed {seed}), in {elapsed:.1f} s")
         if found.misses:
-            print(f"Next: era table build {rig_file} -o {table_file}")
+            print(next_line("era", "table", "build", rig_file, "-o", table_file))
     if found.misses:
         raise typer.Exit(1)
+
+
+def _a_question(table_file: Path, plate: list[float]) -> str:
+    """A first question to a table: one finger a quarter across the plate, another three."""
+    length, width, _ = plate
+    quarter, across = (f"{part * length:.3g},{part * width:.3g}" for part in (0.25, 0.75))
+    return next_line("era", "table", "query", table_file, "--target", quarter, "--quiet", across)
 
 
 def _show_summary(summary: dict[str, Any]) -> None:

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shlex
 import signal
 import subprocess
 import sys
@@ -144,7 +145,15 @@ def test_show_as_text(built: Path) -> None:
     assert [len(line.split()) for line in lines[start + 1 : start + 4]] == [4, 4, 4]
     stars = sum(line.count("*") for line in lines[start + 1 : start + 4])
     assert sum(line.startswith("(0.") for line in lines) == stars > 0
-    assert lines[-1].startswith("Next: ")
+
+
+def test_show_ends_with_a_question_that_can_be_asked(built: Path, tmp_path: Path) -> None:
+    """The next command as a shell takes it, a space in the table's name included, is answered."""
+    spaced = tmp_path / "my table.npz"
+    spaced.write_bytes(built.read_bytes())
+    era, group, *words = shlex.split(table("show", spaced).stdout.splitlines()[-1])[1:]
+    assert (era, group, words[1]) == ("era", "table", str(spaced))
+    assert as_json(*words)["contrast_db"] > 0
 
 
 def test_show_as_json(built: Path) -> None:

@@ -67,6 +67,6 @@ def excitation_of(drive: Pattern | Drives, rig: Rig) -> Excitation:
             tones[name] = told
             continue
         asked = told if isinstance(told, Drive) else Drive(told)
-        amplitude = asked.level * rig.era(name).stroke
-        tones[name] = Tone(asked.frequency, amplitude, math.radians(asked.phase_deg))
+        amplitude = float(asked.level) * rig.era(name).stroke
+        tones[name] = Tone(float(asked.frequency), amplitude, math.radians(asked.phase_deg))
     return tones

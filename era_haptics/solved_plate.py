@@ -58,9 +58,8 @@ class SolvedPlate:
         (paper Eq. 28). Raises InputError for a drive that the rig cannot play. The map of
         `era plate map`, which is solved directly, within some 1e-5 of it.
         """
-        if raster is not None:
-            _expect_raster(raster)
-        return plate_map(self.rig, self._excitation(drive), raster=raster, free=self._free)
+        points = None if raster is None else _as_raster(raster)
+        return plate_map(self.rig, self._excitation(drive), raster=points, free=self._free)
 
     def play(
         self,
@@ -116,11 +115,12 @@ class SolvedPlate:
         return reduce_free_plate(self._free, attached)
 
 
-def _expect_raster(raster: object) -> None:
-    """Raise InputError for what are no two whole numbers."""
-    pair = raster if isinstance(raster, Sequence) else ()
+def _as_raster(given: object) -> tuple[int, int]:
+    """Two whole numbers, as an array too; InputError for what are none."""
+    pair = tuple(given) if isinstance(given, Sequence | np.ndarray) else ()
     if len(pair) != 2 or not all(is_whole(count) for count in pair):
         raise InputError(
-            f"raster is {shown(raster)}, not two whole numbers; give how many points along x and "
+            f"raster is {shown(given)}, not two whole numbers; give how many points along x and "
             "y, such as raster=(61, 46)"
         )
+    return int(pair[0]), int(pair[1])

@@ -67,7 +67,7 @@ def query(
     question = Question(
         as_points(target, what="target"),
         as_points(quiet, what="quiet"),
-        level_db_sl=level_db_sl,
+        level_db_sl=float(level_db_sl),
         mode=mode,
         envelopes=envelopes,
     )

@@ -24,6 +24,14 @@ def test_a_drive_in_three_ways() -> None:
     }
 
 
+def test_numbers_of_numpy_come_out_as_plain_ones() -> None:
+    """Of single precision too, which would go on into every command; 110.5 and 0.25 are exact."""
+    drive = era.Drive(np.float32(110.5), level=np.float32(0.25), phase_deg=np.float32(0))  # type: ignore[arg-type]
+    tone = excitation_of({"SW": drive}, RIG)["SW"]
+    assert tone == era.Tone(110.5, 0.25e-4, 0.0)
+    assert {type(tone.frequency), type(tone.amplitude), type(tone.phase)} == {float}
+
+
 @pytest.mark.parametrize(
     ("drives", "says"),
     [

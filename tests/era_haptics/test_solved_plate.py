@@ -1,6 +1,7 @@
 """A plate solved once, against direct solves and other ways through the code."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -52,6 +53,12 @@ def test_a_map_is_that_of_a_direct_solve() -> None:
     direct = plate_map(rig, excitation, raster=(13, 9))
     np.testing.assert_array_equal(found.x, np.linspace(0, 0.3048, 13))
     np.testing.assert_allclose(found.peak, direct.peak, atol=1e-4 * direct.peak.max())
+
+
+@pytest.mark.parametrize("raster", [[5, 4], np.array([5, 4]), (np.int64(5), 4)])
+def test_a_raster_in_every_way(plate: era.SolvedPlate, raster: Any) -> None:
+    """Five columns, four rows: a list, an array, and a number of numpy's."""
+    assert plate.map({"SW": 110}, raster=raster).peak.shape == (4, 5)
 
 
 def test_point_masses_are_on_it() -> None:

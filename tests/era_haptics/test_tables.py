@@ -55,6 +55,14 @@ def test_a_table_is_what_was_asked_for(table: era.LocalizationTable) -> None:
     assert table.grid == era.Grid(4, 3)
 
 
+def test_a_level_of_numpy_comes_out_as_a_plain_number(table: era.LocalizationTable) -> None:
+    """Single precision would go on into amplitudes, where JSON knows none."""
+    plain, given = (era.query(table, TARGET, level_db_sl=kind(12)) for kind in (float, np.float32))
+    assert json.dumps(given.level_db_sl) == "12.0"
+    amplitudes = {type(tone.amplitude) for tone in given.excitation.values()}
+    assert (given.excitation, amplitudes) == (plain.excitation, {float})
+
+
 def test_several_targets_and_no_quiet_finger(table: era.LocalizationTable) -> None:
     """Both targets feel at least what was asked for; alone there is nobody to be told from."""
     targets = [(0.25, 0.2), TARGET]

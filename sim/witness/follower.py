@@ -85,7 +85,7 @@ class Follower:
         self._fault = 0
         self.watchdog.forget()
         self._staged = None
-        self._outputs.free(math.inf)
+        self._outputs.forget()
 
     def restarted(self, time: float) -> None:
         """It has got its supply anew: disarmed and silent."""

@@ -1,5 +1,6 @@
 """What the channels of one amplifier must play, and whether they do."""
 
+import math
 from collections.abc import Mapping, Sequence
 
 from sim.witness.fade import Fade
@@ -78,6 +79,11 @@ class Outputs:
             fade = self._fade_by(channel, begin[1])
             self._fades[channel] = fade.to(0.0, begin=begin, ramp=ramp)
         self._is_silent_after(cause)
+
+    def forget(self) -> None:
+        """Nobody knows what they play, nor whether it ends by itself."""
+        self._ends = None
+        self.free(math.inf)
 
     def free(self, until: float) -> None:
         """Nobody knows what they play until a time [s]."""

@@ -100,6 +100,17 @@ def test_a_set_that_ends_by_itself_may_fade_from_its_end_on(
     assert watched.broken == rules
 
 
+def test_who_is_lost_sight_of_may_play_on_beyond_the_end_of_a_set() -> None:
+    """What was to end at 1.4 s may have been followed by another while nobody looked."""
+    watched = Watched()
+    watched.grants(ARM, 1.0, ENABLED)
+    watched.follower.granted(BRIEF, Answered(1, 3), 1.1, 1.102)
+    watched.follower.lose_track()
+    for time in (1.35, 1.6):
+        watched.follower.said(Condition(ENABLED, 0, levels=(0.2,)), time, time + 0.001)
+    assert watched.broken == []
+
+
 @pytest.mark.parametrize(
     ("asked", "says", "late"), [(DISARM, SWITCHED_ON, "latched"), (STATUS, ENABLED, "armed")]
 )

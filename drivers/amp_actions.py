@@ -90,14 +90,16 @@ async def drive(
     async with _opened(url) as amplifier:
         guard = Guard(ceiling, amplifier.capabilities)
         wanted = DriveCommand(channel=channel, frequency=frequency, level=level)
-        safe = guard.check(
-            CommandSet(
-                token=amplifier.next_token(),
-                commands=(wanted,),
-                ramp=min(_RAMP, amplifier.capabilities.ramp_max),
-                valid_for=duration,
-            )
+        asked = CommandSet(
+            token=amplifier.next_token(),
+            commands=(wanted,),
+            ramp=min(_RAMP, amplifier.capabilities.ramp_max),
+            valid_for=duration,
         )
+        try:
+            safe = guard.check(asked)
+        except CommandRefused as refused:
+            raise CommandError(str(refused)) from refused  # what was typed is no such command
         watchdog = max(WATCHDOG, amplifier.capabilities.watchdog_min)
         check_watchdog(watchdog, amplifier.round_trip())
         try:

@@ -145,21 +145,19 @@ def test_a_drive_that_the_amplifier_ends_is_no_success(background: BackgroundFar
 
 
 @pytest.mark.parametrize(
-    ("options", "error"),
+    "options",
     [
-        (["--level", "1.1"], CommandRefused),
-        (["--frequency", "nan"], CommandRefused),
-        (["--channel", "4"], CommandRefused),
-        (["--for", "0"], CommandError),
-        (["--for", "nan"], CommandError),
+        ["--level", "1.1"],
+        ["--frequency", "nan"],
+        ["--channel", "4"],
+        ["--for", "0"],
+        ["--for", "nan"],
     ],
 )
-def test_a_bad_drive_never_arms(
-    background: BackgroundFarEnd, options: list[str], error: type[Exception]
-) -> None:
-    """What the guard refuses leaves the amplifier as it was."""
+def test_a_bad_drive_never_arms(background: BackgroundFarEnd, options: list[str]) -> None:
+    """What nobody can drive is bad input, and leaves the amplifier as it was."""
     result = CliRunner().invoke(app, ["amp", "drive", background.end.url, *options])
-    assert isinstance(result.exception, error)
+    assert isinstance(result.exception, CommandError)
     assert not any(isinstance(request, Arm) for request in background.end.requests)
 
 

@@ -1,6 +1,8 @@
 """The far end's SDO server against the client of `canopen`, and against frames by hand."""
 
+from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import canopen
 import pytest
@@ -14,11 +16,21 @@ import drivers
 from can_fuzz import Station
 from drivers.codec.can_bus.eds import eds_text
 from drivers.codec.can_bus.frame import CanFrame
+from sim.far_ends.can_bus import sdo
 from sim.far_ends.can_bus.node import CanNode
 from sim.far_ends.can_bus.sdo import NO_OBJECT, SdoAbort, SdoServer
 
 INDEX = 0x2100
 DOCS = Path(drivers.__file__).parent.parent / "docs" / "reference"
+
+
+@pytest.fixture(autouse=True, scope="module")
+def clock() -> Iterator[SimpleNamespace]:
+    """Stands still but by hand: who waits for a busy machine is no client that has given up."""
+    stopped = SimpleNamespace(time=0.0)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sdo, "clock", SimpleNamespace(now=lambda: stopped.time))
+        yield stopped
 
 
 class Memory(canopen.Network):
@@ -95,6 +107,18 @@ def test_a_lost_segment_of_a_block_is_sent_again() -> None:
     assert memory.client.responses.get()[:2] == bytes([0xA2, 2])
     memory.server.receive(bytes.fromhex("C1 0000 0000000000"))
     assert memory.value == bytes(21)
+
+
+@pytest.mark.parametrize(("pause", "answer"), [(0.99, 0xA2), (1.01, 0x80)])
+def test_who_does_not_go_on_for_a_second_has_given_up(
+    clock: SimpleNamespace, pause: float, answer: int
+) -> None:
+    """A segment of a block is taken within a second; after it nobody knows what it belongs to."""
+    memory = Memory()
+    memory.server.receive(bytes.fromhex("C2 0021 01 07000000"))
+    clock.time += pause
+    memory.server.receive(bytes.fromhex("81 01020304050607"))
+    assert [memory.client.responses.get()[0] for _ in range(2)] == [0xA4, answer]
 
 
 def test_what_is_not_there_is_an_abort() -> None:

@@ -16,6 +16,7 @@ _WORDS = {
     "Value error, ": "",
     "Field required": "is missing",
     "Extra inputs are not permitted": "is unknown",
+    "Input should be a valid string": "must be a text",
     "Input should be ": "must be ",
     "String should have ": "must have ",
     "List should have ": "must have ",

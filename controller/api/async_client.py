@@ -17,7 +17,7 @@ from controller.api import calls
 from controller.api.calls import Call, as_message
 from controller.api.conversation import ANSWER_TIMEOUT, CHUNK, MOST_EVENTS, Conversation
 from controller.api.jsonrpc import RpcError
-from controller.api.messages import ArmResult, HelloParams
+from controller.api.messages import ArmResult
 from controller.api.parts import Message
 from controller.api.replies import Answer, Greeting, Notification, Unreachable, check_version
 from controller.api.socket_path import find_socket
@@ -74,6 +74,7 @@ class AsyncClient:
         timeout: float = ANSWER_TIMEOUT,
     ) -> Self:
         """A connection that has said hello; as `Client.connect`."""
+        greeting = calls.greeting(name)
         at = find_socket(path)
         try:
             reader, writer = await asyncio.open_unix_connection(str(at))
@@ -81,7 +82,7 @@ class AsyncClient:
             raise Unreachable.at(at, error) from error
         client = cls(at, reader, writer, timeout=timeout)
         try:
-            said = await client.call("hello", HelloParams(client=name), Greeting)
+            said = await client.call("hello", greeting, Greeting)
             check_version(said, at)
         except BaseException:
             await client.close()

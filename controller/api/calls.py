@@ -47,6 +47,15 @@ def as_message(model: type[_MessageT]) -> Callable[[Mapping[str, Any]], _Message
     return lambda said: result_of(said, model)
 
 
+def greeting(name: str) -> HelloParams:
+    """What a client begins with; raises InputError for a name that cannot be sent."""
+    try:
+        return HelloParams(client=name)
+    except ValidationError as error:
+        said = in_our_words(error.errors()[0]["msg"])
+        raise InputError(f"name is {shown(name)}; it {said}") from None
+
+
 def hello(client: str) -> Call[HelloResult]:
     """Say who one is; what the daemon drives."""
     return Call("hello", HelloParams(client=client), as_message(HelloResult))

@@ -18,7 +18,7 @@ from typing import Concatenate, ParamSpec, Self, TypeVar
 from controller.api import calls
 from controller.api.calls import Call, as_message
 from controller.api.conversation import ANSWER_TIMEOUT, CHUNK, MOST_EVENTS, Conversation
-from controller.api.messages import ArmResult, HelloParams
+from controller.api.messages import ArmResult
 from controller.api.parts import Message
 from controller.api.replies import Answer, Greeting, Notification, Unreachable, check_version
 from controller.api.socket_path import find_socket
@@ -72,9 +72,10 @@ class Client:
 
         Raises Unreachable where nobody answers, or somebody of another major version.
         """
+        greeting = calls.greeting(name)
         client = cls(find_socket(path), timeout=timeout)
         try:
-            said = client.call("hello", HelloParams(client=name), Greeting)
+            said = client.call("hello", greeting, Greeting)
             check_version(said, client.path)
         except BaseException:
             client.close()

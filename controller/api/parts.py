@@ -1,8 +1,9 @@
 """What several messages of the API are made of; every number's key carries its unit."""
 
+import re
 from typing import Annotated, Any, Literal, TypeAlias
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 API_VERSION = "1.0"
 """Major and minor: another major cannot be talked to, a higher minor only has more to say."""
@@ -33,7 +34,18 @@ Topic: TypeAlias = Literal[
 
 _ONE_LINE = r"^[^\x00-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069]+$"
 
-Name: TypeAlias = Annotated[str, Field(min_length=1, max_length=80, pattern=_ONE_LINE)]
+
+def _on_one_line(text: str) -> str:
+    if not re.fullmatch(_ONE_LINE, text):
+        raise ValueError("must be one line, without characters that a terminal obeys")
+    return text
+
+
+Name: TypeAlias = Annotated[
+    str,
+    Field(min_length=1, max_length=80, json_schema_extra={"pattern": _ONE_LINE}),
+    AfterValidator(_on_one_line),
+]
 """A short text on one line, without what could garble a terminal."""
 
 Count: TypeAlias = Annotated[int, Field(ge=0)]

@@ -26,6 +26,12 @@ def _mode(text: str) -> str:
     return text
 
 
+def _file(text: str) -> str:
+    if "\0" in text:
+        raise ValueError(f"{text[:40]!r} is no file's name: it holds a zero byte; leave that out")
+    return text
+
+
 def loopback_address(text: str) -> str:
     """The text if it is HOST:PORT on the loopback interface; ValueError for anything else."""
     match = re.fullmatch(r"(127\.0\.0\.1|localhost|\[::1\]):(\d{1,5})", text)
@@ -41,7 +47,7 @@ LONGEST_WAIT = 0.1
 """How long [s] a touch may wait for its shaped onset at most: later it is no answer to it."""
 
 Port = Annotated[int, Field(ge=0, le=65535)]
-File = Annotated[str, Field(min_length=1, max_length=4096, pattern=r"^[^\x00]*$")]
+File = Annotated[str, Field(min_length=1, max_length=4096), AfterValidator(_file)]
 LevelDbSl = Annotated[float, Quantity(RATIO, least=-20, most=60)]
 
 

@@ -13,6 +13,8 @@ from pydantic_core import CoreSchema, ErrorDetails, core_schema
 from by_name.nearness import did_you_mean
 from model.config.document import ConfigError, Document, KeyPath, Problem, Value
 from model.config.units import Dimension, quantity, shown
+from model.counting import counted
+from model.errors import in_our_words
 
 
 class Section(BaseModel):
@@ -160,13 +162,16 @@ def _problem(
             message = _no_choice(details, context["expected"])
         case "string_too_short":
             message = "is empty; write something, or leave the key out"
+        case "string_too_long":
+            bound = counted(context["max_length"], "character")
+            message = f"{_shown(details)} is too long; write {bound} at most"
         case "too_short" | "too_long":
             bound = f"at least {context['min_length']}" if "min_length" in context else ""
             bound = bound or f"at most {context['max_length']}"
             count = context["actual_length"]
             message = f"has {count} {'entry' if count == 1 else 'entries'}, must have {bound}"
         case _:
-            message = f"{_shown(details)} cannot be used: {details['msg']}"
+            message = f"{in_our_words(details['msg'])}, not {_shown(details)}"
     return document.problem((*below, *path), message)
 
 

@@ -16,7 +16,7 @@ ELSEWHERE = Path(__file__).with_name("elsewhere.yaml")
 
 INNER = re.compile(
     r"Traceback|File \"|<class |object at 0x|np\.\w+\(|PosixPath\(|\[Errno|Field required|"
-    r"Input should"
+    r"(Input|String|List) should"
 )
 """What is of no use to a reader: words of Python and of the libraries below."""
 

@@ -22,6 +22,7 @@ from controller.api.parts import Message
 from controller.api.replies import Unreachable
 from controller.api.socket_path import SYSTEM_SOCKET, find_socket
 from daemon_bench import PLACE, running_daemon, until_state
+from model.errors import InputError
 
 PAGE = Path(controller.__file__).parent.parent / "docs" / "reference" / "api.md"
 READY, ENABLED = "READY_TO_SWITCH_ON", "OPERATION_ENABLED"
@@ -218,6 +219,24 @@ def test_half_a_line_is_never_gone_on_with(tmp_path: Path) -> None:
                 with pytest.raises(Unreachable):
                     era.stop()
                 assert lines.read().endswith(b"x")
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        (3, "name is 3; it must be a text"),
+        ("", "name is ''; it must have at least 1 character"),
+        ("a\nb", r"name is 'a\\nb'; it must be one line, without characters that a terminal obeys"),
+    ],
+)
+async def test_a_name_that_cannot_be_sent_is_told_before_anybody_is_called(
+    name: str, said: str, tmp_path: Path
+) -> None:
+    """In our words, and by what it is called here; no daemon is needed for that."""
+    with pytest.raises(InputError, match=f"^{said}$"):
+        Client.connect(tmp_path / "nobody", name=name)
+    with pytest.raises(InputError, match=f"^{said}$"):
+        await AsyncClient.connect(tmp_path / "nobody", name=name)
 
 
 def test_what_is_no_socket_is_named_as_such(tmp_path: Path) -> None:

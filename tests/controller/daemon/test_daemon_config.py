@@ -65,6 +65,25 @@ def test_files_count_from_the_folder_of_the_configuration(
     assert config.dump_folder == Path("/d")
 
 
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (
+            r'rig: "a\0b"',
+            r"1: rig: 'a\\x00b' is no file's name: it holds a zero byte; leave that out",
+        ),
+        (
+            f"rig: rig.yaml\nsocket: {'a' * 4097}",
+            r"2: socket: 'a{39}\.\.\. is too long; write 4096 characters at most",
+        ),
+    ],
+)
+def test_what_no_file_can_be_called(folder: Path, text: str, said: str) -> None:
+    """Told in our words, not in those of what checks the file."""
+    with pytest.raises(ConfigError, match=rf"daemon\.yaml:{said}$"):
+        load_daemon_config(written(folder, text))
+
+
 def test_what_is_written_later_has_a_place(folder: Path) -> None:
     """No folder for the log, a folder in its place, a file where the dumps' folder shall be."""
     text = "rig: rig.yaml\nlog: {file: none/log}\ndumps: {folder: rig.yaml/dumps}\n"

@@ -55,7 +55,7 @@ def test_every_problem_is_said_in_the_order_of_lines(tmp_path: Path) -> None:
         "1 rate: 20 is out of range, must be at least 10 Hz and below 20 Hz; "
         "a bare number is in Hz",
         "2 parst: unknown key; did you mean parts? known here are: parts, rate, armed",
-        "3 armed: 'yes' cannot be used: Input should be a valid boolean",
+        "3 armed: must be a valid boolean, not 'yes'",
         "5 parts.a.size: 0 is out of range, must be above 0 m and at most 1 m; "
         "a bare number is in m",
         "5 parts.a.sise: unknown key; did you mean size? known here are: size, word",

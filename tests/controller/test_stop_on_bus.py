@@ -93,3 +93,18 @@ def test_each_is_asked_as_well(bus: str, coarse_rig: Rig) -> None:
         assert sorted(name for name, _ in heard[3:]) == sorted(NAMES)
 
     on_a_bus(bus, coarse_rig, use)
+
+
+@pytest.mark.parametrize("bus", BUSES)
+def test_one_that_is_lost_keeps_the_frame_from_no_other(bus: str, coarse_rig: Rig) -> None:
+    """One that is there sends it: the others hear it at one moment, and are asked as well."""
+
+    async def use(far: FarSide, group: AmplifierGroup, heard: list[tuple[str, float]]) -> None:
+        await group._amplifiers["first"].close()  # as it is until it is opened again
+        await group.stop()
+        others = [(name, moment) for name, moment in heard if name != "first"]
+        assert sorted(name for name, _ in others[:2]) == sorted(NAMES[1:])
+        assert others[1][1] - others[0][1] < 0.001
+        assert sorted(name for name, _ in others[2:]) == sorted(NAMES[1:])
+
+    on_a_bus(bus, coarse_rig, use)

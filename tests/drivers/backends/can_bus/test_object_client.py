@@ -1,0 +1,52 @@
+"""Transfers of objects that nobody waits for any more: they end, and nothing more is sent."""
+
+from collections.abc import Callable
+
+import canopen
+import pytest
+
+from drivers.backends.can_bus.objects import ObjectClient
+from drivers.backends.stand_in import ThreadWorker
+from drivers.errors import LinkTimeout
+
+TIMEOUT = 0.01  # s; of a node that never answers
+
+
+class Network(canopen.Network):
+    """A bus on which nobody answers; `sent` counts, and `on_send` is called with each frame."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.sent = 0
+        self.on_send: Callable[[], None] = lambda: None
+
+    def send_message(self, can_id: int, data: bytes, remote: bool = False) -> None:
+        """Into the void."""
+        self.sent += 1
+        self.on_send()
+
+
+def test_a_transfer_that_waits_when_its_node_is_closed_never_begins() -> None:
+    """The job was taken before, and its turn comes afterwards: the bus may be another's by then."""
+    network = Network()
+    client = ObjectClient(network, 1, ThreadWorker("era-test"))
+    client.close()
+    with pytest.raises(LinkTimeout):
+        client.capabilities(timeout=TIMEOUT)
+    assert network.sent == 0
+
+
+def test_a_transfer_that_is_given_up_tries_nothing_again() -> None:
+    """After one that was broken off it would read an object up to five times until it is told."""
+    network = Network()
+    client = ObjectClient(network, 1, ThreadWorker("era-test"))
+    with pytest.raises(LinkTimeout):
+        client.faults(timeout=TIMEOUT)
+    network.sent, network.on_send = 0, client.abandon
+    with pytest.raises(LinkTimeout):
+        client.faults(timeout=TIMEOUT)
+    assert network.sent == 1
+    network.sent, network.on_send = 0, lambda: None
+    with pytest.raises(LinkTimeout):
+        client.faults(timeout=TIMEOUT)
+    assert network.sent >= 5

@@ -139,6 +139,8 @@ with client.armed("example"):
     now = time.monotonic()  # one clock for all processes of a machine
     felt = ask_plate(op="felt", since_s=now - 0.3, until_s=now - 0.05)["fingers"]
     client.touch([])
+if not status.drive:
+    sys.exit(f"nothing was played: {status.silent_because or status.cause}")
 
 # %%
 # Amplitudes of different frequencies add; a target counts by its mean, a quiet finger by its

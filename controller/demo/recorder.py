@@ -62,7 +62,8 @@ class _Playing:
 class TouchRecorder:
     """Collects a row per touch: hand `observer` to the controller, await `finish` at the end.
 
-    on_row is called with every row as soon as the touch was lifted and its pattern measured.
+    Times of rows count from `begin`. on_row is called with every row as soon as the touch was
+    lifted and its pattern measured.
     """
 
     def __init__(self, bench: BenchControl, *, on_row: Callable[[TouchRow], None]) -> None:
@@ -87,6 +88,10 @@ class TouchRecorder:
             link_lost=self._failed,
             source_failed=self._failed,
         )
+
+    def begin(self) -> None:
+        """Say that the recorded touches begin to come."""
+        self._start = clock.now()
 
     async def finish(self) -> None:
         """Wait until every touch that was lifted has its row.

@@ -61,8 +61,9 @@ class PlayedPattern:
 class TouchRow:
     """A touch from down to up, with the pattern that was played longest for it.
 
-    time, until [s] from the start; target: the touch itself [m]; together: the other targets [m];
-    quiet: the other fingertips [m] by id. Where nothing was played for it, reason says why.
+    time, until [s] from the recording's start; target: the touch itself [m]; together: the other
+    targets [m]; quiet: the other fingertips [m] by id. Where nothing was played for it, reason says
+    why.
     """
 
     target_id: str

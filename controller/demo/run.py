@@ -67,10 +67,15 @@ async def run_demo(
             observer=recorder.observer,
             timing=Timing(table),
         )
+
+        async def play_from_now() -> None:
+            recorder.begin()
+            await play()
+
         await controller.open()
         try:
             with no_long_collections():
-                await _drive(controller, play)
+                await _drive(controller, play_from_now)
             await recorder.finish()
         finally:
             await controller.close()

@@ -99,7 +99,7 @@ def test_every_touch_is_felt_as_predicted(wire, capture, environment, tmp_path):
 
 
 def test_a_panels_recording_is_followed_too(environment, tmp_path):
-    """An evemu recording of two fingers gives a row for each contact, from down to up."""
+    """An evemu recording of two fingers gives a row for each contact, by the recording's times."""
     recording = tmp_path / "panel.events"
     recording.write_text(
         "# EVEMU 1.3\n"
@@ -117,6 +117,7 @@ def test_a_panels_recording_is_followed_too(environment, tmp_path):
     assert done.returncode == 0, done.stderr
     first, second = json.loads(done.stdout)["touches"]
     assert first["targets_m"][0] == [pytest.approx(0.0762), pytest.approx(0.2286 * 180 / 480)]
+    assert first["time_s"] == pytest.approx(0.0, abs=0.15)
     assert first["until_s"] - first["time_s"] == pytest.approx(1.6, abs=0.15)
     assert second["until_s"] - second["time_s"] == pytest.approx(0.7, abs=0.15)
     assert second["quiet_m"] == first["targets_m"]

@@ -3,6 +3,8 @@
 import os
 import shutil
 import sys
+from collections.abc import Mapping
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -52,18 +54,29 @@ def install(
             print(f"# ---- {file.path}\n{file.text}")
         _print_next(NAME, config)
         return
-    for file in files:
-        path = root / file.path.relative_to("/")
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_text(file.text, encoding="utf-8")
-        except OSError as error:
-            raise InputError(
-                f"{path}: cannot be written ({error.strerror}); run it with sudo, give another "
-                "folder with --root, or see with --dry-run what it would write"
-            ) from error
+    texts = {root / file.path.relative_to("/"): file.text for file in files}
+    try:
+        _write(texts)
+    except PermissionError as error:
+        raise InputError(
+            f"{error.filename}: you may not write this; run it with sudo, give another folder with "
+            "--root, or see with --dry-run what it would write"
+        ) from error
+    for path in texts:
         print(f"Wrote {path}")
     _print_next(NAME, config)
+
+
+def _write(texts: Mapping[Path, str]) -> None:
+    """Write all the files or, where one cannot be written, none; raises OSError with its name."""
+    from model.files.array_file import whole_or_nothing
+
+    with ExitStack() as written:
+        for path, text in texts.items():
+            path.parent.mkdir(parents=True, exist_ok=True)
+            stream = written.enter_context(whole_or_nothing(path))
+            stream.write(text.encode())
+            stream.flush()  # before any takes its place: a full disk must show by then
 
 
 def _needs(config: Path) -> "Needs":

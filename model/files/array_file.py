@@ -33,7 +33,8 @@ _NO_HEADER = (SyntaxError, tokenize.TokenError, TypeError, RecursionError, Memor
 def whole_or_nothing(path: Path) -> Iterator[IO[bytes]]:
     """A stream that becomes the file when the block ends well, and leaves nothing when it does not.
 
-    Raises OSError, with the file's name, where it cannot be written.
+    Raises OSError, with the file's name, where it cannot be written. One that the block raises with
+    the name of another file keeps that.
     """
     temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex[:12]}")
     try:
@@ -44,7 +45,7 @@ def whole_or_nothing(path: Path) -> Iterator[IO[bytes]]:
         temporary.replace(path)
     except BaseException as error:
         temporary.unlink(missing_ok=True)
-        if isinstance(error, OSError):
+        if isinstance(error, OSError) and error.filename in (None, str(temporary), temporary):
             raise OSError(error.errno, error.strerror or str(error), str(path)) from error
         raise
 

@@ -6,12 +6,16 @@ import re
 import shutil
 import subprocess
 import sys
+from collections.abc import Callable
+from importlib.metadata import entry_points
 from pathlib import Path
 
 import pytest
 
 from controller.deploy.files import service_files
 from controller.deploy.needs import Needs, needs_of
+from controller.main import run
+from full_disk import full_disk
 from model.errors import InputError
 
 CONFIG, ERA = Path("/etc/era-haptics/daemon.yaml"), Path("/opt/era-haptics/bin/era")
@@ -102,3 +106,64 @@ def test_dry_run_writes_nothing(tmp_path: Path) -> None:
     subprocess.run([*command, "--root", str(tmp_path)], capture_output=True, check=True)
     written = {f"/{path.relative_to(tmp_path)}" for path in tmp_path.rglob("*") if path.is_file()}
     assert written == {str(file.path) for file in service_files(CONFIG, era, Needs())}
+
+
+@pytest.fixture
+def era(capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str, str]]:
+    """A command line in this process: its exit status, and what it printed."""
+
+    def call(*arguments: str | Path) -> tuple[int, str, str]:
+        group = entry_points(group="era_haptics.commands")
+        status = run([str(argument) for argument in arguments], group)
+        return (status, *capsys.readouterr())
+
+    return call
+
+
+def files(folder: Path) -> dict[str, bytes]:
+    """All that lies in a folder."""
+    return {str(path): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.mark.parametrize("before", [{}, {"systemd/system/era-haptics.service": "old\n"}])
+def test_on_a_full_disk_nothing_is_installed(
+    era: Callable[..., tuple[int, str, str]], before: dict[str, str], tmp_path: Path
+) -> None:
+    """One sentence; what was there stays, and neither of the smaller files comes alone."""
+    for name, text in before.items():
+        path = tmp_path / "etc" / name
+        path.parent.mkdir(parents=True)
+        path.write_text(text, encoding="utf-8")
+    was_there = files(tmp_path)
+    with full_disk():  # the unit is longer than that, the other two are shorter
+        status, out, said = era("systemd", "install", "--root", tmp_path)
+    unit_file = tmp_path / "etc/systemd/system/era-haptics.service"
+    told = f"era: error: {unit_file}: there is no room left; make some, or write elsewhere"
+    assert (status, out, said.splitlines()[-1:]) == (2, "", [told])
+    assert files(tmp_path) == was_there
+
+
+def test_what_cannot_be_written_last_leaves_the_first_as_it_was(
+    era: Callable[..., tuple[int, str, str]], tmp_path: Path
+) -> None:
+    """A folder stands where the rules should: it is the one that is named, and no unit is there."""
+    rules = tmp_path / "etc/udev/rules.d/70-era-haptics.rules"
+    rules.mkdir(parents=True)
+    status, out, said = era("systemd", "install", "--root", tmp_path)
+    assert (status, out) == (2, "")
+    assert f"era: error: {rules}: is a folder" in said
+    assert files(tmp_path) == {}
+
+
+def test_without_the_right_to_write_there_it_says_how(
+    era: Callable[..., tuple[int, str, str]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What the system's folders are to everybody but root, and root is who runs tests in images."""
+
+    def forbidden(path: Path, **options: bool) -> None:
+        raise PermissionError(13, "Permission denied", str(path))
+
+    monkeypatch.setattr(Path, "mkdir", forbidden)
+    status, out, said = era("systemd", "install", "--root", tmp_path)
+    assert (status, out) == (2, "")
+    assert f"{tmp_path}/etc/systemd/system: you may not write this; run it with sudo" in said

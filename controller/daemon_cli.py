@@ -246,11 +246,17 @@ def _renew(era: "Client", lease: str) -> None:
 
 def _check_places(places: "list[tuple[float, float]]", rig: "RigSummary") -> None:
     """Refuse fingers beyond the plate, which the daemon would only count."""
+    from model.config.points import in_metres
+
     for x, y in places:
         if not (0 <= x <= rig.length_m and 0 <= y <= rig.width_m):
             raise InputError(
                 f"era touch {x:g},{y:g} is beyond the plate, which is {rig.length_m:g} m by "
-                f"{rig.width_m:g} m; places count from its south-west corner"
+                f"{rig.width_m:g} m"
+                + (
+                    in_metres(x, y, length=rig.length_m, width=rig.width_m)
+                    or "; places count from its south-west corner"
+                )
             )
 
 

@@ -18,6 +18,7 @@ from model.errors import InputError
 
 SIZE_LIMIT = 1 << 20
 _DEPTH_LIMIT = 20
+_ZIP = b"PK\x03\x04"
 
 Scalar: TypeAlias = bool | int | float | str | None
 Value: TypeAlias = "Scalar | list[Value] | dict[str, Value]"
@@ -116,6 +117,12 @@ def read_document(path: Path) -> Document:
         raise _whole(source, f"cannot be read: {error.strerror}") from error
     except ValueError as error:
         raise _whole(repr(source), f"is no file name: {error}") from error
+    if content.startswith(_ZIP):
+        raise _whole(
+            source,
+            "is a .npz file, as localization tables are, or another archive; give the YAML file "
+            "that it is for, as `era config init` writes them",
+        )
     if len(content) > SIZE_LIMIT:
         raise _whole(source, "is larger than 1 MiB; a configuration has a few lines")
     try:

@@ -27,6 +27,21 @@ def parse_point(text: str, *, what: str) -> tuple[float, float]:
     return x, y
 
 
+def in_metres(x: float, y: float, *, length: float, width: float) -> str:
+    """What to give for a place off a plate of these sides [m] that smaller units put on it; or "".
+
+    From 1 on: what is less is beside a plate, not in another unit.
+    """
+    for unit, count in (("cm", 100), ("mm", 1000)):
+        sides = ((x, length), (y, width))
+        if all(at == 0 or 1 <= at <= count * side for at, side in sides):
+            return (
+                f"; places are in metres: for {x:g} {unit}, {y:g} {unit} give "
+                f"{x / count:g},{y / count:g}"
+            )
+    return ""
+
+
 def parse_pair(text: str, *, what: str) -> tuple[int, int]:
     """Two counts from `12x9`."""
     match = re.fullmatch(r"\s*(\d{1,6})\s*[x×]\s*(\d{1,6})\s*", text)

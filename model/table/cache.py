@@ -36,7 +36,8 @@ def cached_table(
     path = _cache_path(rig, frequencies, grid, mode)
     try:
         kept = load_table(path, fingerprint=rig.fingerprint)
-    except InputError as reason:
+    except InputError as error:
+        reason, _, _ = str(error).partition("; ")  # what is to be done about it is done here
         _logger.info("building the localization table: %s", reason)
     else:
         if kept.code_version == code_version():

@@ -6,6 +6,7 @@ from typing import TypeAlias
 
 import numpy as np
 
+from model.config.points import in_metres
 from model.counting import counted
 from model.drive_modes import MODES
 from model.errors import InputError
@@ -114,6 +115,7 @@ class Question:
                     raise InputError(
                         f"{what} ({x:g}, {y:g}) m is not on the plate, which reaches from (0, 0) "
                         f"to ({plate.length:g}, {plate.width:g}) m"
+                        f"{in_metres(x, y, length=plate.length, width=plate.width)}"
                     )
 
     def mode_on(self, own: str, *, era_count: int) -> str:

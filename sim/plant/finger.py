@@ -12,6 +12,7 @@ from typing import TypeAlias
 import numpy as np
 
 from model.arrays import FloatArray
+from model.config.points import in_metres
 from model.errors import InputError
 from model.finger.fingertip import fingertip_points
 from model.reduction.reduced_plate import ReducedPlate
@@ -55,6 +56,7 @@ def check_position(name: str, position: Position, *, plate: Plate) -> None:
         raise InputError(
             f"finger {name} is at ({x:g}, {y:g}) m, which is not on the plate: it reaches from "
             f"(0, 0) to ({plate.length:g}, {plate.width:g}) m"
+            f"{in_metres(x, y, length=plate.length, width=plate.width)}"
         )
 
 

@@ -97,6 +97,7 @@ def test_a_byte_order_mark_is_left_out(tmp_path: Path) -> None:
         (b"? [1, 2]\n: 3\n", 1, "", "a key must be a word"),
         (b"a: " + b"[" * 100_000, 1, "a", "nested too deeply"),
         (b"a: 1\n" + b"#" * (1 << 20), None, "", "larger than 1 MiB"),
+        (b"PK\x03\x04" + bytes(1 << 20), None, "", "is a .npz file, as localization tables"),
     ],
 )
 def test_what_is_no_plain_data_is_refused(

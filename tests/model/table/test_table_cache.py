@@ -56,6 +56,19 @@ def test_the_second_time_it_is_read(rig, builds):
     assert second.fingerprint == first.fingerprint
 
 
+def test_who_builds_a_table_asks_nobody_else_to(rig, caplog):
+    """The log says why it is built, not how to build one: first there is none, then a bad one."""
+    caplog.set_level("INFO", logger="model.table.cache")
+    _, path = cached_table(rig)
+    path.write_bytes(b"damaged")
+    cached_table(rig)
+    assert caplog.messages == [
+        f"building the localization table: there is no table {path}",
+        f"building the localization table: {path} is not a readable localization table "
+        "(it is no .npz file)",
+    ]
+
+
 def test_another_plate_or_mesh_is_another_table(rig, builds):
     """A stiffer ERA, and a finer mesh, each get a table of their own."""
     stiffer = replace(rig, eras=(replace(rig.eras[0], stiffness=18000.0), *rig.eras[1:]))

@@ -46,6 +46,22 @@ def parse_drives(texts: Sequence[str], rig: Rig) -> Excitation:
     return excitation
 
 
+def beyond_limits(excitation: Excitation, rig: Rig) -> str | None:
+    """What to be warned of where tones lie outside the rig's limits of frequency."""
+    low, high = rig.limits.frequency_min, rig.limits.frequency_max
+    beyond = [
+        f"{era} at {tone.frequency:g} Hz"
+        for era, tone in excitation.items()
+        if not low <= tone.frequency <= high
+    ]
+    if not beyond:
+        return None
+    return (
+        f"{', '.join(beyond)}: the rig's limits.frequency is {low:g} to {high:g} Hz, and no "
+        "amplifier is asked for anything else"
+    )
+
+
 _PLAIN = "hertz, a share of full stroke and degrees are plain numbers here, without a unit"
 
 

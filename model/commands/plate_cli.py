@@ -96,7 +96,7 @@ def plate_map(
     """Peak acceleration all over the plate for any drive."""
     import numpy as np
 
-    from model.commands.drive_option import parse_drives
+    from model.commands.drive_option import beyond_limits, parse_drives
     from model.config.points import parse_pair
     from model.files.picture_name import check_picture
     from model.rig.file import load_rig
@@ -110,6 +110,8 @@ def plate_map(
     started = time.perf_counter()
     solved = solve(rig, excitation, raster=parse_pair(points, what="--points") if points else None)
     elapsed = time.perf_counter() - started
+    if warning := beyond_limits(excitation, rig):
+        typer.echo(f"era: warning: {warning}", err=True)
     if output is not None:
         from model.figures import map_figure, save_figure
 

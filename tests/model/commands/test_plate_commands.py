@@ -78,6 +78,19 @@ def test_map_answers_in_numbers_and_as_a_picture(era, tmp_path):
     assert picture.read_bytes().startswith(b"\x89PNG")
 
 
+def test_a_map_beyond_the_limits_is_drawn_with_a_warning(era):
+    """40 and 500 Hz are the example's own limits; what lies outside is named in one line."""
+    asked = ("plate", "map", RIG, "--mesh", "24x18", "--json")
+    status, text, said = era(*asked, "--drive", "SW=600", "--drive", "NE=110", "--drive", "NW=39")
+    assert status == 0
+    assert json.loads(text)["max_m_s2"] > 0
+    assert said == (
+        "era: warning: SW at 600 Hz, NW at 39 Hz: the rig's limits.frequency is 40 to 500 Hz, and "
+        "no amplifier is asked for anything else\n"
+    )
+    assert era(*asked, "--drive", "SW=500", "--drive", "NE=40")[2] == ""
+
+
 def test_level_scales_a_map(era):
     """Half the level is half the acceleration everywhere: the plate is linear."""
     full, half = (

@@ -6,7 +6,10 @@ _USUAL = {"m": (1e3, "mm"), "Pa": (1e-9, "GPa"), "N/m": (1e-3, "kN/m"), "kg": (1
 def in_usual_unit(value: float, unit: str, *, digits: int = 3) -> str:
     """A value of an SI unit, none included, with the unit that plates are told in: `17 kN/m`."""
     factor, usual = _USUAL.get(unit, (1.0, unit))
-    return f"{value * factor:.{digits}g} {usual}".strip()
+    shown = f"{value * factor:.{digits}g}"
+    if "e+" in shown:  # a plate of a metre is 1000 mm
+        shown = f"{value * factor:.0f}"
+    return f"{shown} {usual}".strip()
 
 
 def percent(share: float) -> str:

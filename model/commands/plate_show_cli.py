@@ -47,6 +47,7 @@ def materials(as_json: JsonOption = False) -> None:
 
 def show(rig_file: RigArgument, as_json: JsonOption = False) -> None:
     """What the plate is made of and how it bends. Of a laminate, between which bounds."""
+    from model.quantities import in_usual_unit
     from model.rig.file import load_rig
     from model.rig.plate_summary import plate_summary
 
@@ -65,9 +66,8 @@ def show(rig_file: RigArgument, as_json: JsonOption = False) -> None:
         f"nu {summary['nu']:.3g}, loss factor {summary['loss_factor']:g}"
     )
     print(f"    flexural rigidity  {summary['flexural_rigidity_n_m']:.4g} N m")
-    print(
-        f"    mass  {1e3 * summary['mass_kg']:.4g} g ({summary['surface_density_kg_m2']:.4g} kg/m²)"
-    )
+    bare = in_usual_unit(summary["mass_kg"], "kg", digits=4)
+    print(f"    mass  {bare} ({summary['surface_density_kg_m2']:.4g} kg/m²)")
     for key, wavelength in summary["bending_wavelength_m"].items():
         print(f"    bending wavelength at {_frequency(key)}  {100 * wavelength:.3g} cm")
     for mass in summary["point_masses"]:

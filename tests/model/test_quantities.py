@@ -14,6 +14,9 @@ from model.quantities import in_usual_unit, percent
         (0.012006, "kg", 2, "12 g"),
         (4.8489, "N s/m", 3, "4.85 N s/m"),
         (0.01302, "", 2, "0.013"),
+        (1.2, "m", 3, "1200 mm"),
+        (0.9996, "m", 3, "1000 mm"),
+        (117e3, "N/m", 2, "117 kN/m"),
     ],
 )
 def test_a_quantity_is_told_in_the_unit_of_plates(

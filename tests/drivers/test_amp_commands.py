@@ -256,6 +256,18 @@ def test_discover_says_why_a_port_could_not_be_asked(monkeypatch: pytest.MonkeyP
     assert "there is no such port" in result.stdout
 
 
+def test_the_page_of_commands_names_what_is_printed(background: BackgroundFarEnd) -> None:
+    """Status, drive, stop and clear have the keys of their row, and status those of its wire."""
+    page = (Path(__file__).parents[2] / "docs" / "reference" / "commands.md").read_text("utf-8")
+    (row,) = re.findall(r"^\| `era amp status`.* \| (.*) \|$", page, re.MULTILINE)
+    everyone, of_status, of_drive = re.split(r"; of `status`|, of `drive`", row)
+    (wire,) = re.findall(r"^\| `era amp identify` .* what it allows: (.*) \|$", page, re.MULTILINE)
+    beside = {"status": of_status + wire, "drive": of_drive, "stop": "", "clear": ""}
+    for command, more in beside.items():
+        result = CliRunner().invoke(app, ["amp", command, background.end.url, "--json"])
+        assert set(json.loads(result.stdout)) == set(re.findall(r"`(\w+)`", everyone + more))
+
+
 def test_identify_says_what_the_wire_allows(background: BackgroundFarEnd) -> None:
     """At 115 200 baud: 50 and 46 bytes are 8.33 ms, 120 sets a second, a watchdog of 158 ms."""
     url = f"{background.end.url}?baud=115200"

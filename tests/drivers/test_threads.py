@@ -71,6 +71,23 @@ async def test_what_comes_in_the_moment_of_the_cancellation_is_undone() -> None:
     assert await asyncio.to_thread(closed.wait, 20)
 
 
+def test_what_comes_after_the_event_loop_has_ended_is_undone() -> None:
+    """There is nobody left to be told of it, so the thread that opened it closes it."""
+    may_open, closed = threading.Event(), threading.Event()
+
+    async def give_up() -> None:
+        opening = asyncio.create_task(
+            in_thread(lambda: may_open.wait(20), name="opening", undo=lambda _: closed.set())
+        )
+        await asyncio.sleep(0)
+        opening.cancel()
+        await asyncio.wait({opening})
+
+    asyncio.run(give_up())
+    may_open.set()
+    assert closed.wait(20)
+
+
 def test_a_program_ends_though_work_hangs() -> None:
     """Its end does not wait for a thread that waits for ever, unlike asyncio's own pool."""
     program = """

@@ -21,7 +21,9 @@ def check_replaceable(path: Path, *, is_own: bool, what: str) -> None:
 def check_ending(path: Path, *endings: str, what: str) -> None:
     """Raise InputError for a name that ends in none of what such a file may."""
     if path.suffix.lower() not in endings:
-        raise InputError(f"{path}: {what} ends in {endings[0]}; try {path.with_suffix(endings[0])}")
+        ending = endings[0]
+        better = path / f"new{ending}" if path.is_dir() else path.with_suffix(ending)
+        raise InputError(f"{path}: {what} ends in {ending}; try {better}")
 
 
 def check_place(path: Path, *, example: str) -> None:

@@ -90,7 +90,7 @@ def daemon(
 
 @app.command()
 def status(socket: Socket = None, as_json: Json = False) -> None:
-    """How the daemon, its amplifiers and the plate are."""
+    """How the daemon, amplifiers and plate are. Exit status 0 in FAULT and COMM_LOST, too."""
     with _client(socket) as era:
         told = era.status()
     typer.echo(told.model_dump_json() if as_json else show_status(told))
@@ -313,6 +313,8 @@ def show_status(told: "StatusResult") -> str:
         parts = [amplifier.state] if amplifier.state else []
         if amplifier.lost:
             parts.append("LOST")
+        if amplifier.closed_with_lost:
+            parts.append("closed with the lost one")
         if amplifier.fault not in (None, "NONE"):
             parts.append(f"fault {amplifier.fault}")
         if amplifier.temperature_c is not None:

@@ -151,13 +151,16 @@ class AmplifierStatus(Message):
     state: str | None = Field(description="its own, by the names of CiA 402")
     fault: str | None
     levels: list[float] = Field(
-        description="0 to 1 of the full stroke, by channel, as it reports; empty if lost"
+        description="0 to 1 of the full stroke, by channel, as it reports; empty if nobody knows"
     )
     temperature_c: float | None
     high_voltage: bool | None
     high_voltage_v: float | None
     reply_age_s: float | None = Field(description="since its last answer")
     lost: bool = Field(description="whether it cannot be reached: nobody knows how it is")
+    closed_with_lost: bool = Field(
+        description="whether it answered to the last, but was closed with another that is lost"
+    )
     statistics: LinkCounts
 
 

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 from drivers import clock
 from drivers.backend import Backend
+from drivers.errors import LinkError
 from drivers.protocol.messages import Broadcast, Event, Reply, Request, Status
 from drivers.protocol.wire_times import WireTimes
 from drivers.statistics import WireCounters
@@ -42,11 +43,13 @@ class RecordedBackend(Backend):
     """A backend whose messages are kept.
 
     status: the last that was read since it was opened; heard_at [s]: when the last one was read.
+    is_missing: whether it could not be opened, or did not answer, when that was tried last.
     """
 
     def __init__(self, inner: Backend, name: str, recorder: Recorder) -> None:
         self.status: Status | None = None
         self.heard_at: float | None = None
+        self.is_missing = False
         self._inner = inner
         self._name = name
         self._recorder = recorder
@@ -55,7 +58,11 @@ class RecordedBackend(Backend):
         """As the inner one."""
         self._recorder.note(self._name, "open", "")
         self.status = None  # how it was before says nothing of how it is
-        await self._inner.open()
+        try:
+            await self._inner.open()
+        except LinkError:
+            self.is_missing = True
+            raise
 
     async def close(self) -> None:
         """As the inner one."""
@@ -69,7 +76,9 @@ class RecordedBackend(Backend):
             reply = await self._inner.exchange(request, timeout=timeout)
         except BaseException as error:
             self._recorder.note(self._name, "none", f"{type(error).__name__}: {error}")
+            self.is_missing = self.is_missing or isinstance(error, LinkError)
             raise
+        self.is_missing = False
         self._recorder.note(self._name, "in", reply)
         if isinstance(reply, Status):
             self.status, self.heard_at = reply, clock.now()
@@ -94,6 +103,7 @@ class RecordedBackend(Backend):
 
         def lost(what: str) -> None:
             self._recorder.note(self._name, "lost", what)
+            self.is_missing = True
             on_loss(what)
 
         self._inner.listen(told, lost)

@@ -129,15 +129,23 @@ def amplifier_statuses(
 
     How one is that cannot be reached, nobody knows: its last answer is left out.
     """
+    is_any_missing = any(backend.is_missing for backend in backends.values())
     return [
-        _amplifier_status(name, amplifier, backends[name], urls[name])
+        _amplifier_status(
+            name,
+            amplifier,
+            backends[name],
+            urls[name],
+            closed_with_lost=is_any_missing and not backends[name].is_missing,
+        )
         for name, amplifier in amplifiers.items()
     ]
 
 
 def _amplifier_status(
-    name: str, amplifier: Amplifier, backend: RecordedBackend, url: str
+    name: str, amplifier: Amplifier, backend: RecordedBackend, url: str, *, closed_with_lost: bool
 ) -> AmplifierStatus:
+    """closed_with_lost: whether that is why nothing is known of it, where nothing is."""
     status = None if amplifier.lost else backend.status  # None as well while it is being reopened
     heard = backend.heard_at
     seen = amplifier.statistics
@@ -153,7 +161,8 @@ def _amplifier_status(
         high_voltage=status.high_voltage if status else None,
         high_voltage_v=_finite(status.voltage) if status else None,
         reply_age_s=None if heard is None else max(0.0, clock.now() - heard),
-        lost=status is None,
+        lost=status is None and not closed_with_lost,
+        closed_with_lost=status is None and closed_with_lost,
         statistics=LinkCounts(
             frames_out=seen.frames_out,
             frames_in=seen.frames_in,

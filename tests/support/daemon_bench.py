@@ -77,17 +77,21 @@ async def running_daemon(folder: Path, more: str = "") -> AsyncIterator[DaemonBe
 
 
 @asynccontextmanager
-async def far_end(folder: Path) -> AsyncIterator[FarSide]:
-    """The example's amplifier on a pseudo-terminal."""
-    rig = load_rig(write_rig(folder / "bench.yaml"))
+async def far_end(
+    folder: Path, *, changes: Sequence[tuple[str, str]] = ()
+) -> AsyncIterator[FarSide]:
+    """The example's amplifier on a pseudo-terminal; changes: of the rig's text."""
+    rig = load_rig(write_rig(folder / "bench.yaml", *changes))
     async with far_side(WIRES["serial"], rig) as far:
         yield far
 
 
 @asynccontextmanager
-async def daemon_at(far: FarSide, folder: Path, more: str = "") -> AsyncIterator[DaemonBench]:
-    """A daemon that serves, for a far end that is there."""
-    config = load_daemon_config(write_daemon(folder, {"main": far.url}, more))
+async def daemon_at(
+    far: FarSide, folder: Path, more: str = "", *, changes: Sequence[tuple[str, str]] = ()
+) -> AsyncIterator[DaemonBench]:
+    """A daemon that serves, for a far end that is there; changes: of the rig's text."""
+    config = load_daemon_config(write_daemon(folder, dict(far.urls), more, changes=changes))
     place = Place(config.socket)
     log = LogThread(folder / "log")
     handler = LogHandler(log)

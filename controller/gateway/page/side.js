@@ -28,11 +28,11 @@ function ageInWords(seconds) {
 
 // eras: those of the rig, for the names of what its channels move.
 function tile(amplifier, eras) {
-  const { name, state, fault, levels, temperature_c, high_voltage, high_voltage_v, reply_age_s, lost } = amplifier;
+  const { name, state, fault, levels, temperature_c, high_voltage, high_voltage_v, reply_age_s, lost, closed_with_lost } = amplifier;
   const isFaulty = fault && fault !== "NONE";
   const made = element("article", undefined, lost || isFaulty ? "tile bad" : "tile");
   const title = element("h3");
-  const how = lost ? "no link" : isFaulty ? `fault: ${fault.toLowerCase().replaceAll("_", " ")}` : STATES[state] ?? "unknown";
+  const how = lost ? "no link" : closed_with_lost ? "closed with the lost one" : isFaulty ? `fault: ${fault.toLowerCase().replaceAll("_", " ")}` : STATES[state] ?? "unknown";
   title.append(element("span", name), element("span", how));
   made.append(title);
   const channels = element("div", undefined, "channels");

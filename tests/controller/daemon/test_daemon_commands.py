@@ -13,7 +13,7 @@ import typer
 
 from controller.api.replies import Notification
 from controller.daemon.run import run_daemon
-from controller.daemon_cli import show_event, show_status, touch
+from controller.daemon_cli import show_event, show_status, status, touch
 from controller.metrics.__main__ import serve
 from daemon_bench import running_daemon, until_state, write_daemon
 from model.errors import InputError
@@ -74,10 +74,27 @@ async def test_a_status_says_that_touches_wait_for_somebody_to_arm(tmp_path: Pat
 async def test_a_status_says_why_touches_begin_along_plain_ramps(tmp_path: Path) -> None:
     """Where that is for a while only, and not otherwise."""
     async with running_daemon(tmp_path) as bench, await bench.client() as era:
-        status = await era.status()
-    assert "plain ramps" not in show_status(status)
-    slow = status.model_copy(update={"plain_because": "it took 50 ms"})
+        told = await era.status()
+    assert "plain ramps" not in show_status(told)
+    slow = told.model_copy(update={"plain_because": "it took 50 ms"})
     assert "  plain ramps: it took 50 ms\n" in show_status(slow)
+
+
+async def test_a_status_that_was_told_is_done_whatever_it_tells(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """In COMM_LOST and in FAULT the command ends as ever: scripts look at what it says."""
+    async with running_daemon(tmp_path) as bench, await bench.client() as era:
+        await until_state(era, "READY_TO_SWITCH_ON")
+        bench.far.station.befall(Episode("hang"))
+        await until_state(era, "COMM_LOST")
+        await asyncio.to_thread(status, socket=bench.socket)  # another status is an exception
+        await era.stop()  # latches: without it the link would come back to no fault
+        bench.far.station.recover()
+        await until_state(era, "FAULT")
+        await asyncio.to_thread(status, socket=bench.socket)
+    told = capsys.readouterr().out.splitlines()
+    assert [line.partition(":")[0] for line in told if line[0] != " "] == ["COMM_LOST", "FAULT"]
 
 
 async def test_a_status_says_what_is_known_of_a_lost_amplifier(tmp_path: Path) -> None:

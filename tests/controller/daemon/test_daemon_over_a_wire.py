@@ -5,6 +5,7 @@ import contextlib
 import json
 import logging
 import os
+import re
 import signal
 import socket
 from collections.abc import AsyncIterator
@@ -16,9 +17,11 @@ from controller.api.async_client import AsyncClient
 from controller.api.jsonrpc import ErrorCode, RpcError
 from controller.api.replies import Notification
 from controller.daemon.place import Place
+from controller.daemon_cli import show_status
 from controller.sources.tuio import tuio_datagram
 from controller.touch import Touch, TouchFrame
 from daemon_bench import (
+    PATIENCE,
     PLACE,
     DaemonBench,
     daemon_at,
@@ -32,6 +35,7 @@ from drivers.protocol.messages import Apply, LoadEnvelope, State
 from drivers.registry import open_backend
 from model.errors import InputError
 from model.rig.file import load_rig
+from rig_files import TWO_AMPLIFIERS
 from sim.faults.episodes import Episode
 
 READY = "READY_TO_SWITCH_ON"
@@ -307,6 +311,45 @@ async def test_how_a_lost_amplifier_was_is_not_told_as_how_it_is(tmp_path: Path)
         status = await era.status()
         assert status.lost_for_s is None
         assert [each.lost for each in status.amplifiers] == [False]
+
+
+async def test_who_is_lost_is_told_from_who_was_closed_with_it(tmp_path: Path) -> None:
+    """Of two amplifiers: for as long as one is away, through all attempts; and once both are."""
+
+    async def told() -> dict[str, tuple[bool, bool]]:
+        amplifiers = (await era.status()).amplifiers
+        return {each.name: (each.lost, each.closed_with_lost) for each in amplifiers}
+
+    async def until_told(**expected: tuple[bool, bool]) -> None:
+        for _ in range(int(PATIENCE / 0.01)):
+            if await told() == expected:
+                return
+            await asyncio.sleep(0.01)
+        pytest.fail(f"{await told()} in place of {expected}")
+
+    there, lost, closed = (False, False), (True, False), (False, True)
+    async with (
+        far_end(tmp_path, changes=TWO_AMPLIFIERS) as far,
+        daemon_at(far, tmp_path, changes=TWO_AMPLIFIERS) as bench,
+        await bench.client() as era,
+    ):
+        await until_state(era, READY)
+        assert await told() == {"main": there, "side": there}
+        far.stations["side"].befall(Episode("hang"))
+        await until_told(main=closed, side=lost)
+        begun = lost_for = (await era.status()).lost_for_s or 0.0
+        while lost_for < begun + 0.6:  # an attempt to reopen them
+            assert await told() == {"main": closed, "side": lost}
+            status = await era.status()
+            lost_for = status.lost_for_s or 0.0
+            await asyncio.sleep(0.01)
+        main, side = (line for line in show_status(status).splitlines() if "serial://" in line)
+        assert re.search(r"amplifier main .*\): closed with the lost one, heard", main)
+        assert re.search(r"amplifier side .*\): LOST, heard", side)
+        far.stations["main"].befall(Episode("hang"))
+        await until_told(main=lost, side=lost)
+        far.stations["side"].recover()
+        await until_told(main=lost, side=closed)
 
 
 async def test_a_pattern_that_a_cut_link_ends_is_told_to_be_over(tmp_path: Path) -> None:

@@ -158,6 +158,7 @@ def convergence(
     as_json: JsonOption = False,
 ) -> None:
     """How wrong meshes are, against a finer one. In natural frequencies and in response."""
+    from model.commands.progress import progress_bar
     from model.config.points import parse_frequencies
     from model.rig.file import load_rig
     from model.vibration.convergence import (
@@ -168,7 +169,10 @@ def convergence(
 
     rig = load_rig(rig_file, mesh=mesh)
     asked = parse_frequencies(frequencies) if frequencies else default_frequencies(rig)
-    study = study_convergence(rig, meshes_to_compare(rig), frequencies=asked)
+    started = time.perf_counter()
+    with progress_bar("meshes") as progress:
+        study = study_convergence(rig, meshes_to_compare(rig), frequencies=asked, progress=progress)
+    elapsed = time.perf_counter() - started
     if as_json:
         rows = [
             {
@@ -188,11 +192,10 @@ def convergence(
             "strip_m": study.reference.strip,
             "natural_frequencies_hz": study.natural_frequencies.tolist(),
         }
-        print(
-            json.dumps({"reference": reference, "frequencies_hz": asked.tolist(), "meshes": rows})
-        )
+        answer = {"reference": reference, "frequencies_hz": asked.tolist(), "meshes": rows}
+        print(json.dumps(answer | {"solve_time_s": elapsed}))
         return
-    print(f"{rig_file}: errors against {study.reference}")
+    print(f"{rig_file}: errors against {study.reference}, found in {elapsed:.1f} s")
     print("natural frequencies: the worst of the lowest twelve, on the ERAs; response: relative L2")
     print("of the acceleration over the plate, the worst of the ERAs driven alone")
     print()

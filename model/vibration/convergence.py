@@ -1,7 +1,7 @@
 """How far a mesh is from converged: natural frequencies and response, beside a finer mesh."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -85,12 +85,16 @@ def default_frequencies(rig: Rig) -> FloatArray:
 
 
 def study_convergence(
-    rig: Rig, meshes: Sequence[Mesh], *, frequencies: Sequence[float] | FloatArray
+    rig: Rig,
+    meshes: Sequence[Mesh],
+    *,
+    frequencies: Sequence[float] | FloatArray,
+    progress: Callable[[int, int], None] = lambda done, of: None,
 ) -> Convergence:
     """Solve a rig on each mesh and on the reference.
 
     frequencies (f,) [Hz] up to the rig's limit. Raises InputError for those that a mesh cannot
-    carry.
+    carry. progress hears how many meshes of how many are solved, the reference first.
     """
     high = rig.limits.frequency_max
     asked = np.asarray(frequencies, dtype=float)
@@ -105,7 +109,8 @@ def study_convergence(
     exact_response = _response(rig, reference, asked)
     size = np.linalg.norm(exact_response, axis=2)
     errors = []
-    for mesh in meshes:
+    for done, mesh in enumerate(meshes, start=1):
+        progress(done, 1 + len(meshes))
         difference = np.linalg.norm(_response(rig, mesh, asked) - exact_response, axis=2)
         errors.append(
             MeshError(
@@ -115,6 +120,7 @@ def study_convergence(
                 response=(difference / size).max(axis=1),
             )
         )
+    progress(1 + len(meshes), 1 + len(meshes))
     return Convergence(reference, asked, exact[held], tuple(errors))
 
 

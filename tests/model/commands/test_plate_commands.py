@@ -1,6 +1,7 @@
 """`era plate` and `era table` as a user types them."""
 
 import json
+import re
 from importlib.metadata import entry_points
 
 import numpy as np
@@ -242,13 +243,19 @@ def small_table(tmp_path_factory):
 def test_convergence_compares_meshes_as_text_and_as_json(era, monkeypatch):
     """Errors fall from mesh to mesh, and the rig's own is marked; both forms say the same.
 
-    They are forms of one study, which takes seconds.
+    They are forms of one study, which takes seconds, tells of each mesh when it is solved, and how
+    long it took.
     """
-    solve, solved = convergence.study_convergence, []
+    solve, solved, told = convergence.study_convergence, [], []
 
-    def study(rig, meshes, *, frequencies):
+    def study(rig, meshes, *, frequencies, progress):
         if not solved:
-            solved.append(solve(rig, meshes, frequencies=frequencies))
+
+            def hear(done, of):
+                told.append((done, of))
+                progress(done, of)
+
+            solved.append(solve(rig, meshes, frequencies=frequencies, progress=hear))
         return solved[0]
 
     monkeypatch.setattr(convergence, "study_convergence", study)
@@ -261,8 +268,11 @@ def test_convergence_compares_meshes_as_text_and_as_json(era, monkeypatch):
     assert [row["is_the_rigs"] for row in answer["meshes"]] == [True] + 4 * [False]
     assert answer["meshes"][0]["dof"] == 390
     assert answer["meshes"][-1]["element"] == "Q5"
+    assert answer["solve_time_s"] > 0
+    assert told == [(done, 6) for done in range(1, 7)]
     status, text, _ = era(*arguments)
     assert status == 0
+    assert re.search(r", found in \d+\.\d s$", text.splitlines()[0])
     assert [f"{error:.3f} %" in text for error in errors] == 5 * [True]
 
 

@@ -19,7 +19,7 @@ from controller.api.jsonrpc import (
     read_request,
 )
 from controller.api.messages import METHODS, SubscribeParams, TouchParams, UnsubscribeParams
-from controller.api.parts import Message
+from controller.api.parts import Message, Nothing
 from controller.gateway.outbox import Outbox
 from controller.gateway.topics import OWN
 from controller.rate import Rate
@@ -71,21 +71,31 @@ class Session:
         self._touching: set[str] = set()  # sources that have fingers down
         self._stopping = 0
         self._told: asyncio.Task[None] | None = None
+        self._has_left = False
 
     async def run(self) -> None:
-        """Serve until it leaves, or is to be left; its fingers are lifted then."""
+        """Serve until it leaves, or is to be left; its fingers are lifted then.
+
+        What it has asked for by then is seen through: no stop is taken back.
+        """
         sending = asyncio.create_task(self._send())
         receiving = asyncio.create_task(self._receive())
         try:
             await asyncio.wait({sending, receiving}, return_when=asyncio.FIRST_COMPLETED)
         finally:
-            tasks = (sending, receiving, *self._pending)
-            for task in tasks:
+            self._has_left = True
+            told = () if self._told is None else (self._told,)
+            for task in (sending, receiving, *told):
                 task.cancel()
-            for ended in await asyncio.gather(*tasks, return_exceptions=True):
-                if isinstance(ended, Exception):
-                    _logger.error("a session has failed", exc_info=ended)
+            await self._end(sending, receiving, *told)
             await self._lift()
+            await self._end(*self._pending)
+
+    async def _end(self, *tasks: "asyncio.Task[None]") -> None:
+        """Wait for the end of tasks, and tell of those that have failed."""
+        for ended in await asyncio.gather(*tasks, return_exceptions=True):
+            if isinstance(ended, Exception):
+                _logger.error("a session has failed", exc_info=ended)
 
     def tell(self, topic: str, frame: str | bytes) -> None:
         """What happened, if it wants to know."""
@@ -205,6 +215,8 @@ class Session:
     async def _pass_on(self, request: Request, params: Message) -> None:
         try:
             result = await self._daemon.call(request.method, params)
+            if request.method == "arm" and self._has_left:  # nobody knows the lease
+                await self._daemon.call("disarm", Nothing())
         except RpcError as error:
             if request.wants_answer:
                 self.outbox.answer(error_line(request.id, error).decode())

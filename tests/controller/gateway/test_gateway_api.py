@@ -303,14 +303,22 @@ def test_browsers_fingers_are_kept_apart_and_lifted_when_they_leave(
 
 def test_a_stop_overtakes_what_waits(gateway: GatewayProcess, daemon: ScriptedDaemon) -> None:
     """Sixteen requests to arm are under way, more are refused; a stop is answered all the same."""
-    with daemon.holding(), RawWebSocket(gateway) as ws:
-        for id in range(17):
-            ws.ask("arm", PARAMETERS["arm"], id=id)
-        error = ws.answer(16)["error"]
-        assert isinstance(error, dict)
-        assert error["code"] == 1005
-        ws.ask("stop", {}, id=99)
-        assert ws.answer(99)["result"] == {}
+    with RawWebSocket(gateway) as ws:
+        with daemon.holding():
+            for id in range(17):
+                ws.ask("arm", PARAMETERS["arm"], id=id)
+            error = ws.answer(16)["error"]
+            assert isinstance(error, dict)
+            assert error["code"] == 1005
+            ws.ask("stop", {}, id=99)
+            assert ws.answer(99)["result"] == {}
+        wait_for(lambda: is_taken(ws))  # after the answers to what waited, so that all are told
+
+
+def is_taken(ws: RawWebSocket) -> bool:
+    """Whether the daemon takes another request; it refuses one where many are under way."""
+    ws.ask("effects", {}, id=300)
+    return "result" in ws.answer(300)
 
 
 def test_a_request_without_id_gets_no_answer(

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from model.arrays import FloatArray
+from model.config.points import in_metres
 from model.errors import InputError
 from sim.bench.bench import Bench
 from sim.plant.finger import KEPT
@@ -42,6 +43,7 @@ class Accelerometers:
                 raise InputError(
                     f"sensor {sensor.name} is at ({sensor.x:g}, {sensor.y:g}) m, which is not on "
                     f"the plate: it reaches from (0, 0) to ({plate.length:g}, {plate.width:g}) m"
+                    f"{in_metres(sensor.x, sensor.y, length=plate.length, width=plate.width)}"
                 )
         self.sensors = tuple(sensors)
         self._pieces.clear()

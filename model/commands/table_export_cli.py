@@ -1,6 +1,7 @@
 """`era table plot` and `era table export`: a table as pictures, and for other programs."""
 
 import json
+import time
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
@@ -41,6 +42,7 @@ def plot(
 
     table = load_table(table_file)
     output.mkdir(parents=True, exist_ok=True)
+    started = time.perf_counter()
     files = []
     with progress_bar("cells and contact sets") as progress:
         for name, figure in table_figures(table, progress=progress):
@@ -50,7 +52,7 @@ def plot(
     if as_json:
         print(json.dumps({"files": files}))
         return
-    print("wrote")
+    print(f"{time.perf_counter() - started:.1f} s; wrote")
     for file in files:
         print(f"  {file}")
     print(next_line("era", "table", "show", table_file, "--weak"))

@@ -28,16 +28,19 @@ def show(
     from model.table.weak_cells import find_weak_cells
 
     table = load_table(table_file)
+    started = time.perf_counter()
     with progress_bar("cells") as progress:
         cells = find_weak_cells(table, progress=progress)
     with progress_bar("contact sets") as progress:
         summary = summarize(table, cells, progress=progress)
+    elapsed = time.perf_counter() - started
     if as_json:
         print(json.dumps(summary | {"map": _map_as_json(cells)}))
         return
     _show_summary(summary)
     print()
     _show_map(cells, listed=weak)
+    print(f"judged in {elapsed:.1f} s")
     print(_a_question(table_file, summary["plate_m"]))
 
 

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shlex
 import signal
 import subprocess
@@ -145,6 +146,7 @@ def test_show_as_text(built: Path) -> None:
     assert [len(line.split()) for line in lines[start + 1 : start + 4]] == [4, 4, 4]
     stars = sum(line.count("*") for line in lines[start + 1 : start + 4])
     assert sum(line.startswith("(0.") for line in lines) == stars > 0
+    assert re.fullmatch(r"judged in \d+\.\d s", lines[-2])
 
 
 def test_show_ends_with_a_question_that_can_be_asked(built: Path, tmp_path: Path) -> None:
@@ -232,6 +234,16 @@ def test_plot_writes_its_pictures(built: Path, tmp_path: Path) -> None:
     assert answer["files"] == [str(folder / f"{name}.png") for name in names]
     for file in answer["files"]:
         assert Path(file).read_bytes().startswith(PNG)
+
+
+def test_plot_says_how_long_it_took_what_it_wrote_and_what_is_next(
+    built: Path, tmp_path: Path
+) -> None:
+    """The time, a line for each of the four pictures, and a command."""
+    lines = table("plot", built, "-o", tmp_path).stdout.splitlines()
+    assert re.fullmatch(r"\d+\.\d s; wrote", lines[0])
+    assert {Path(line.strip()) for line in lines[1:5]} == set(tmp_path.glob("*.png"))
+    assert lines[5:] == [f"Next: era table show {built} --weak"]
 
 
 def test_export_writes_both_formats(built: Path, tmp_path: Path) -> None:

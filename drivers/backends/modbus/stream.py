@@ -114,4 +114,10 @@ async def _addresses(host: str) -> list[str]:
         found = await in_thread(
             lambda: socket.getaddrinfo(host, None, type=socket.SOCK_STREAM), name=f"era-name {host}"
         )
-        return [str(address[0]) for *_, address in found]
+        return [_with_zone(*address) for *_, address in found]
+
+
+def _with_zone(address: str | int, *numbers: str | int | bytes) -> str:
+    """An address with the number of the network that it is good on, where it is of one only."""
+    *_, zone = numbers  # of an IPv4 address the port, for which nobody has asked
+    return f"{address}%{zone!s}" if zone else str(address)

@@ -48,6 +48,16 @@ async def test_of_the_addresses_of_a_name_the_first_that_answers_is_taken(
         await asyncio.sleep(0)
 
 
+async def test_an_address_of_one_network_only_is_asked_for_there(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """As amplifiers without a router have, by RFC 4007: without the zone nobody could call it."""
+    of_name = ("fe80::1", 0, 0, 3), ("fd00::1", 0, 0, 0), ("192.0.2.1", 0)
+    found = [(0, 0, 0, "", address) for address in of_name]
+    monkeypatch.setattr(stream.socket, "getaddrinfo", lambda *args, **kwargs: found)
+    assert await stream._addresses("amplifier.test") == ["fe80::1%3", "fd00::1", "192.0.2.1"]
+
+
 def test_a_name_that_nobody_can_tell_holds_up_no_end() -> None:
     """The connection is given up after a second, and the program ends though the question hangs."""
     program = """

@@ -395,7 +395,7 @@ async def test_everything_has_a_role_and_a_name_in_a_sensible_order(page: Page) 
         ("button", "Arm"),
         ("button", "Disarm"),
         ("button", "Clear"),
-        ("checkbox", "in motion"),
+        ("checkbox", "in slow motion"),
         ("list", "Events, the newest first"),
         ("region", "Amplifiers"),
         ("region", "Touch to wire"),
@@ -479,6 +479,47 @@ async def test_no_name_of_a_region_lies_under_an_era(page: Page) -> None:
         assert await page.evaluate(hidden % width) == [4, 4, 0]
 
 
+async def test_no_text_on_the_plate_covers_another(page: Page) -> None:
+    """What fingers feel, where ERAs stand at their side or below them, and the names of regions, on
+    a plate as wide as on a phone: all of it is to be read.
+    """
+    covered = (
+        "import('./plate.js').then(({ PlateOverlay }) => {"
+        " const plate = document.body.appendChild(document.createElement('div'));"
+        " plate.append(document.createElementNS('http://www.w3.org/2000/svg', 'svg'));"
+        " plate.style.width = '%dpx';"
+        " plate.firstChild.style.width = '100%%';"
+        " const overlay = new PlateOverlay(plate, plate.firstChild);"
+        " const eras = [['SW', 0, 0], ['SE', 0.3, 0], ['NE', 0.3, 0.2], ['mid', 0.15, 0.08]]"
+        "  .map(([name, x_m, y_m]) => ({ name, x_m, y_m }));"
+        " const box = { shape: 'rectangle', width_m: 0.1, height_m: 0.08 };"
+        " const regions = [{ ...box, name: 'keypad', x_m: 0.02, y_m: 0.1 },"
+        "  { ...box, name: 'slider', x_m: 0.18, y_m: 0.1 }];"
+        " overlay.setUp({ rig: { length_m: 0.3, width_m: 0.2, eras }, layout: { regions } });"
+        " const target = { role: 'target', level_db_sl: 22, contrast_db: 40 };"
+        " const drive = { mid: { frequency_hz: 110, level: 0.5 } };"
+        " const found = [];"
+        " const places = [[0.15, 0.1], [0.02, 0.03], [0.28, 0.02], [0.29, 0.17], [0.07, 0.17]];"
+        " for (const [x_m, y_m] of places) {"
+        "  overlay.show({ drive, contacts: [{ ...target, x_m, y_m },"
+        "   { role: 'quiet', level_db_sl: null, x_m: 0.22, y_m: 0.12 }] });"
+        "  const texts = [...plate.querySelectorAll('text')].filter((each) => each.textContent);"
+        "  const boxes = texts.map((each) => each.getBoundingClientRect());"
+        "  const meet = (a, b) => a.left < b.right - 1 && b.left < a.right - 1"
+        "   && a.top < b.bottom - 3 && b.top < a.bottom - 3;"  # boxes have room above and below
+        "  boxes.forEach((a, i) => boxes.slice(i + 1).forEach((b, j) => {"
+        "   if (meet(a, b)) found.push([texts[i].textContent, texts[i + j + 1].textContent]);"
+        "  }));"
+        "  if (texts.length !== 9) found.push(texts.map((each) => each.textContent));"
+        " }"
+        " plate.remove();"
+        " return found;"
+        "})"
+    )
+    for width in (800, 360, 300):
+        assert await page.evaluate(covered % width) == []
+
+
 async def test_an_effect_plays_at_the_newest_finger(page: Page, era: Client) -> None:
     """Its button can be pressed while armed only, and needs a finger anywhere on the plate."""
     assert await page.until("document.querySelector('#effects button:disabled') !== null")
@@ -509,6 +550,27 @@ async def test_an_event_that_is_told_again_takes_one_line(page: Page) -> None:
     assert shown == ["retry", "back", "retry (3 times)", "lost"]
 
 
+async def test_only_the_lost_amplifier_is_shown_as_lost(page: Page) -> None:
+    """One that was closed with it has no red frame, and what it plays is unknown all the same."""
+    shown = await page.evaluate(
+        "import('./side.js').then(({ showAmplifiers }) => {"
+        " const unknown = { state: null, fault: null, levels: [], temperature_c: null,"
+        "  high_voltage: null, high_voltage_v: null, reply_age_s: 1 };"
+        " const tiles = document.createElement('div');"
+        " showAmplifiers(tiles, ["
+        "  { ...unknown, name: 'left', lost: true, closed_with_lost: false },"
+        "  { ...unknown, name: 'right', lost: false, closed_with_lost: true }], []);"
+        " return [...tiles.children].map((tile) => [tile.className,"
+        "  ...[...tile.querySelectorAll('h3 span, p')].map((each) => each.textContent)]);"
+        "})"
+    )
+    unknown = "What its channels play is unknown."
+    assert shown == [
+        ["tile bad", "left", "no link", unknown],
+        ["tile", "right", "closed with the lost one", unknown],
+    ]
+
+
 async def test_the_door_lets_in_with_the_token_alone(
     browser: Page, gateway: GatewayProcess, era: Client
 ) -> None:
@@ -530,6 +592,9 @@ async def test_the_door_lets_in_with_the_token_alone(
                 "document.querySelector('#door-problem')?.innerText",
                 lambda text: "refuses the token" in (text or ""),
             )
+            door = await browser.evaluate("document.querySelector('#door').innerText")
+            for command in ("era gateway", "era daemon", "era demo --dashboard"):
+                assert command in door  # one of them has printed where to look
             # It answers: whoever reads that it does not looks for the wrong thing.
             banner = await browser.evaluate("document.querySelector('#banner').innerText")
             assert "refuses the token" in banner

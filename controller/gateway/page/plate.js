@@ -63,9 +63,11 @@ export class PlateOverlay {
     this.px = this.rig.length_m / this.plate.clientWidth;  // metres of one pixel
     this.isSmall = this.plate.clientWidth < SMALL_PX;
     const [regions, eras, contacts, cursor] = this.layers;
-    regions.replaceChildren(...this.regions.flatMap((region) => this.region(region)));
+    this.taken = [];  // boxes that no text may cover; what comes first is placed first
     eras.replaceChildren(...this.rig.eras.flatMap((era) => this.era(era)));
+    this.taken.push(...this.contacts.map((contact) => this.ringBox(contact)));
     contacts.replaceChildren(...this.contacts.flatMap((contact) => this.contact(contact)));
+    regions.replaceChildren(...this.regions.flatMap((region) => this.region(region)));
     cursor.replaceChildren(...(this.cursor ? [this.circle(this.cursor, "cursor", FINGERTIP_M)] : []));
   }
 
@@ -77,12 +79,26 @@ export class PlateOverlay {
     return element("circle", { class: name, cx: x_m, cy: this.up(y_m), r: radius });
   }
 
-  label(x, y, text, name = "label") {
+  label([x, y], text, name = "label") {
     const size = SIZE * this.px;
     const room = textWidth(text) * this.px;
     const anchor = x < room / 2 ? "start" : x > this.rig.length_m - room / 2 ? "end" : "middle";
     const height = Math.min(this.rig.width_m - size / 2, Math.max(size, y));
+    const left = x - { start: 0, middle: room / 2, end: room }[anchor];
+    const top = name === "label" ? height - size : height;  // a name hangs from its line
+    if (text) this.taken.push([left, top, left + room, top + 1.2 * size]);
     return element("text", { class: name, x, y: height, "font-size": size, "text-anchor": anchor }, text);
+  }
+
+  // The first of several places for a text where it covers nothing that is there already.
+  free(places, text, isHanging = false) {
+    const [room, size] = [textWidth(text) * this.px, SIZE * this.px];
+    return places.find(([x, y]) => {
+      const left = Math.min(this.rig.length_m - room, Math.max(0, x - room / 2));
+      const top = isHanging ? y : y - size;
+      const isOn = top >= 0 && top + size <= this.rig.width_m;
+      return isOn && this.taken.every((box) => left >= box[2] || left + room <= box[0] || top >= box[3] || top + size <= box[1]);
+    });
   }
 
   region({ name, shape, x_m, y_m, width_m, height_m, radius_m, points_m }) {
@@ -103,23 +119,20 @@ export class PlateOverlay {
       outline = element("rect", { class: "region", x: x_m, y: this.up(y_m + height_m), width: width_m, height: height_m });
       bounds = [x_m, this.up(y_m + height_m), x_m + width_m, this.up(y_m)];
     }
-    if (this.isSmall && this.contacts.length) return [outline];
-    middle ??= (bounds[0] + bounds[2]) / 2;
-    return [outline, this.label(...this.freePlace(bounds, middle, name), name, "label name")];
+    const place = this.namePlace(bounds, middle ?? (bounds[0] + bounds[2]) / 2, name);
+    return place ? [outline, this.label(place, name, "label name")] : [outline];
   }
 
-  // Where a region's name hides no ERA: on the upper edge, for fingers that are put into the middle
-  // would hide it there, or on the lower one.
-  freePlace([left, top, right, bottom], middle, name) {
+  // Where a region's name covers no ERA and no finger's text: on the upper edge, for fingers that
+  // are put into the middle would hide it there, or on the lower one, anywhere in it, or just
+  // outside.
+  namePlace([left, top, right, bottom], middle, name) {
     const [width, height, gap] = [textWidth(name) * this.px, SIZE * this.px, 4 * this.px];
     const xs = [middle, left + gap + width / 2, right - gap - width / 2];
-    const places = [top + gap, bottom - gap - height].flatMap((y) => xs.map((x) => [x, y]));
-    const isFree = ([x, y]) => this.rig.eras.every((era) => {
-      const [eraX, eraY] = this.eraPlace(era);
-      const side = ERA_SIDE * this.px;
-      return Math.abs(x - eraX) > (width + side) / 2 + gap || y > eraY + side / 2 + gap || y + height < eraY - side / 2 - gap;
-    });
-    return places.find(isFree) ?? places[0];
+    const rows = [top + gap, bottom - gap - height];
+    for (let y = top + gap + height; y < bottom - gap - height; y += height / 2) rows.push(y);
+    rows.push(top - gap - height, bottom + gap);
+    return this.free(rows.flatMap((y) => xs.map((x) => [x, y])), name, true);
   }
 
   // Where an ERA's square is drawn: wholly on the plate.
@@ -137,25 +150,42 @@ export class PlateOverlay {
     const square = element("rect", {
       class: tone ? "era driven" : "era", x: x - side / 2, y: y - side / 2, width: side, height: side, "data-era": name,
     });
+    const gap = 4 * this.px;
+    this.taken.push([x - side / 2 - gap, y - side / 2 - gap, x + side / 2 + gap, y + side / 2 + gap]);
     const parts = [name];
     if (tone && !this.isSmall) parts.push(`${tone.frequency_hz.toFixed(0)} Hz`);
     if (tone) parts.push(`${(100 * tone.level).toFixed(0)} %`);
     const below = y < this.rig.width_m / 2;
-    return [square, this.label(x, below ? y + 2 * side : y - side, parts.join(" "))];
+    return [square, this.label([x, below ? y + 2 * side : y - side], parts.join(" "))];
+  }
+
+  get ringRadius() {
+    return Math.max(FINGERTIP_M, 10 * this.px);
+  }
+
+  ringBox({ x_m, y_m }) {
+    const radius = this.ringRadius;
+    return [x_m - radius, this.up(y_m) - radius, x_m + radius, this.up(y_m) + radius];
   }
 
   contact(contact) {
     const { x_m, y_m, role, level_db_sl, contrast_db } = contact;
-    const ring = this.circle(contact, `contact ${role ?? ""}`, Math.max(FINGERTIP_M, 10 * this.px));
+    const ring = this.circle(contact, `contact ${role ?? ""}`, this.ringRadius);
     ring.setAttribute("data-role", role ?? "");
     const isKnown = (value) => value !== null && value !== undefined;
-    const away = Math.max(FINGERTIP_M, 10 * this.px);
     const above = isKnown(level_db_sl) ? `${shown(level_db_sl)} dB SL` : role === "quiet" ? "quiet" : "";
     const below = role === "target" && isKnown(contrast_db) ? `${shown(contrast_db)} dB over others` : "";
-    return [
-      ring,
-      this.label(x_m, this.up(y_m) - away - 4 * this.px, above),
-      this.label(x_m, this.up(y_m) + away + 13 * this.px, below),
-    ];
+    return [ring, this.besideRing(contact, above, 0), this.besideRing(contact, below, 1)];
+  }
+
+  // A text above a finger or below it, whichever is wanted first, or else on its left or right.
+  besideRing({ x_m, y_m }, text, first) {
+    const [away, line] = [this.ringRadius + 4 * this.px, 1.25 * SIZE * this.px];
+    const [x, y, aside] = [x_m, this.up(y_m), away + (textWidth(text) * this.px) / 2];
+    const above = [0, 1, 2].map((row) => [x, y - away - row * line]);
+    const below = [0, 1, 2].map((row) => [x, y + away + 0.75 * SIZE * this.px + row * line]);
+    const besides = [0, 1, -1].flatMap((row) => [[x - aside, y + row * line], [x + aside, y + row * line]]);
+    const places = first ? [...below, ...above, ...besides] : [...above, ...below, ...besides];
+    return this.label(this.free(places, text) ?? places[0], text);
   }
 }

@@ -222,6 +222,26 @@ async def test_a_loss_that_two_find_is_seen_through_before_anything_is_opened_ag
 
 
 @in_virtual_time
+async def test_a_daemon_that_ends_while_a_loss_is_seen_through_ends() -> None:
+    """Nobody waits for the other: by then amplifiers are closed, which is no loss to be told."""
+    async with watched() as daemon:
+        stop = daemon.controller.stop
+
+        async def slow_stop() -> None:
+            await stop()
+            await asyncio.sleep(0.3)
+
+        daemon.controller.stop = slow_stop  # type: ignore[method-assign]
+        daemon.far_end.answer = unreachable
+        stopping = asyncio.create_task(daemon.supervisor.handle(Event(Kind.STOP, "somebody")))
+        await asyncio.sleep(0.4)
+        assert daemon.state is DaemonState.COMM_LOST
+    with pytest.raises(LinkError, match="the wire is cut"):
+        await asyncio.wait_for(stopping, 5)
+    assert daemon.links == ["lost"]
+
+
+@in_virtual_time
 async def test_a_lost_link_is_tried_again_with_growing_pauses() -> None:
     """0.1 s at first, each pause twice the one before up to 5 s; back again, nothing is armed."""
     async with watched() as daemon:

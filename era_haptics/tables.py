@@ -17,6 +17,7 @@ from model.table.cache import cached_table
 from model.table.pattern import Pattern
 from model.table.question import Question
 from model.table.robust import with_robust_contrast
+from model.table.spread import with_spread
 from model.table.table import PAPER_GRID, LocalizationTable
 from model.table.timing import Timing
 
@@ -76,7 +77,7 @@ def query(
     if envelopes:
         pattern = timing.with_envelopes(question, pattern)
     pattern = timing.with_transient_measures(question, pattern)
-    return with_robust_contrast(table, question, pattern)
+    return with_spread(table, question, with_robust_contrast(table, question, pattern))
 
 
 def _expect_mode(given: object) -> None:

@@ -88,6 +88,9 @@ def query(
         print(f"leaves them unaware up to{answer['usable_level_db_sl']:6.1f} dB SL")
     else:
         print(f"to the plate around it   {answer['surroundings_contrast_db']:6.1f} dB")
+        print(f"  to 95 % of that plate  {answer['surroundings_contrast_95_db']:6.1f} dB or more")
+        print(f"half as strong or more on{1e4 * answer['area_above_half_m2']:6.0f} cm²")
+        print(f"of its energy within 5 cm{100 * answer['energy_share_near']:6.0f} %")
     print(f"left after its end       {answer['left_after_db']:6.1f} dB")
     print(f"found in {1000 * answer['solve_time_s']:.1f} ms")
 

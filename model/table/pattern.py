@@ -18,6 +18,20 @@ UNAWARE_DB_SL = -10.0
 
 
 @dataclass(frozen=True)
+class Spread:
+    """How a vibration lies over the plate, relative to what its targets feel.
+
+    contrast_95_db: from the targets to what 95 % of the plate farther than 50 mm stays below, by
+    peak acceleration; area_above_half [m²]: of the plate where it is more than half as strong as
+    at the targets, these included; energy_share_near: of its kinetic energy, within 50 mm of them.
+    """
+
+    contrast_95_db: float
+    area_above_half: float
+    energy_share_near: float
+
+
+@dataclass(frozen=True)
 class Pattern:
     """An excitation with its ramp [s] and what it is predicted to do at the fingertips.
 
@@ -29,8 +43,9 @@ class Pattern:
     (`model.drive_modes.exact_search`). robust_contrast_db: tenth percentile of the contrast over
     what may differ on the real plate (`model.table.robust`); transient_contrast_db: over the first
     100 ms; left_after_db: vibration of the plate in the 100 ms after the end, relative to the
-    steady one (`model.table.timing` for both); None unless asked for. onset, ending: envelopes in
-    place of the ramp, for amplifiers that play them.
+    steady one (`model.table.timing` for both); spread: over the plate, of what is told from its
+    surroundings (`model.table.spread`); None unless asked for. onset, ending: envelopes in place of
+    the ramp, for amplifiers that play them.
     """
 
     excitation: Excitation
@@ -44,6 +59,7 @@ class Pattern:
     robust_contrast_db: float | None = None
     transient_contrast_db: float | None = None
     left_after_db: float | None = None
+    spread: Spread | None = None
     onset: Envelopes | None = None
     ending: Envelopes | None = None
 

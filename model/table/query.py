@@ -12,6 +12,7 @@ from model.errors import InputError, in_our_words
 from model.finger.perception import STRONG_DB_SL
 from model.table.question import Question
 from model.table.robust import with_robust_contrast
+from model.table.spread import with_spread
 from model.table.table import LocalizationTable
 from model.table.timing import Timing
 from model.transients.envelope import Envelopes
@@ -74,6 +75,8 @@ def answer_as_json(table: LocalizationTable, question: Question, timing: Timing)
     elapsed = time.perf_counter() - started
     pattern = timing.with_transient_measures(question, pattern)
     pattern = with_robust_contrast(table, question, pattern)
+    pattern = with_spread(table, question, pattern)
+    spread = pattern.spread
     return {
         "drive": table.drive_of(pattern.excitation),
         "mode": pattern.mode,
@@ -85,6 +88,9 @@ def answer_as_json(table: LocalizationTable, question: Question, timing: Timing)
         "transient_contrast_db": pattern.transient_contrast_db,
         "left_after_db": pattern.left_after_db,
         "surroundings_contrast_db": pattern.surroundings_contrast_db,
+        "surroundings_contrast_95_db": spread and spread.contrast_95_db,
+        "area_above_half_m2": spread and spread.area_above_half,
+        "energy_share_near": spread and spread.energy_share_near,
         "quiet_level_db_sl": pattern.quiet_level_db_sl,
         "quiet_is_unaware": pattern.quiet_is_unaware,
         "usable_level_db_sl": pattern.usable_level_db_sl,

@@ -564,7 +564,9 @@ def test_wire_time_is_arithmetic() -> None:
     slow = ModbusBackend("modbus+rtu:///dev/ttyS1?baud=9600#1").wire_times.round_trip(4)
     with pytest.raises(CommandError, match=r"round trip of 129\.5 ms need at least 279 ms"):
         check_watchdog(0.25, slow)
-    check_watchdog(0.25, ModbusBackend("modbus+rtu:///dev/ttyS1?baud=19200#1").wire_times.round_trip(4))
+    check_watchdog(
+        0.25, ModbusBackend("modbus+rtu:///dev/ttyS1?baud=19200#1").wire_times.round_trip(4)
+    )
 
 
 @pytest.mark.parametrize("framer", [FramerType.SOCKET, FramerType.RTU], ids=["TCP", "RTU"])

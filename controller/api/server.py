@@ -150,6 +150,8 @@ class ApiServer:
         request: Request | None = None
         try:
             request = read_request(line)
+            if request.method == "arm" and not request.wants_answer:
+                return  # nobody would know the lease, and so hold or end what it arms
             result = self._call(connection, request)
         except Exception as error:
             self._fail(connection, request, error)

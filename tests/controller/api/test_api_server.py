@@ -179,6 +179,15 @@ async def test_notifications_of_clients_get_no_answer(served: Served) -> None:
     assert served.asked == ["disarm"]
 
 
+async def test_nothing_is_armed_for_nobody(served: Served) -> None:
+    """Without an id the lease would be told to nobody: such a request is not even begun."""
+    wire = await served.connect()
+    wire.send(b'{"jsonrpc":"2.0","method":"arm","params":' + ARM.encode() + b"}\n")
+    wire.ask("disarm", id=5)
+    assert (await wire.line())["id"] == 5
+    assert served.asked == ["disarm"]
+
+
 async def test_a_bug_in_a_method_is_told_without_its_details(
     served: Served, caplog: pytest.LogCaptureFixture
 ) -> None:

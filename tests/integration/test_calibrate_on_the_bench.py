@@ -99,12 +99,12 @@ def test_what_a_person_reads(measured: Path, tmp_path: Path) -> None:
         "--picture", picture,
     )  # fmt: skip
     assert status == 0
-    assert "SW stiffness       17000 N/m -> 195" in said
+    assert "SW stiffness       17 kN/m -> 19.5" in said
     assert "sensor P8: dead, left out" in said
     assert "sensor P3: scale 0.8" in said
     assert "self-check: sensors P" in said
     assert f"Next: era table build {new}" in said
-    assert "SW stiffness       17000 N/m -> 195" in new.read_text()
+    assert "SW stiffness       17 kN/m -> 19.5" in new.read_text()
     assert "# The plate of the founding paper" in new.read_text()
     assert picture.read_bytes().startswith(b"\x89PNG")
 

@@ -20,8 +20,8 @@ BUGS = {
             Edit(_DRIVE, "frequency=tone.frequency,", "frequency=tone.frequency + 40,"),
             Edit(
                 "controller.routing:route",
-                "frequency=onset[name].frequency",
-                "frequency=onset[name].frequency + 40",
+                "frequency=envelope.frequency",
+                "frequency=envelope.frequency + 40",
                 also=("controller.orders",),
             ),
         ),

@@ -120,5 +120,5 @@ def _growth_figure(section: Section) -> Figure:
         axes.set_xlabel(what)
         axes.grid(alpha=0.3)
     figure.axes[0].set_ylabel("time / ms, one thread")
-    figure.axes[0].legend(fontsize=8)
+    figure.axes[-1].legend(loc="upper center", bbox_to_anchor=(0.5, 0.8), fontsize=8)
     return figure

@@ -40,7 +40,9 @@ def draw(found: Sequence[Found], file: Path, *, targets: Sequence[float]) -> Non
     for axes in (left, right):
         axes.set_xlabel("touch sent to last byte on the wire / ms")
         axes.grid(alpha=0.3)
-        axes.legend(loc="upper right", fontsize=8)  # where no curve comes
         axes.set_xticks([0.1, 1, 10, 100], ["0.1", "1", "10", "100"])
+    left.legend(fontsize=8)
+    named = right.get_legend_handles_labels()
+    figure.legend(*named, loc="outside lower right", ncols=3, fontsize=8)  # off the curves
     file.parent.mkdir(exist_ok=True)
     figure.savefig(file, dpi=110)

@@ -15,9 +15,8 @@ from model.finger.perception import STRONG_DB_SL
 from model.rig.rig import Rig
 from model.table.cache import cached_table
 from model.table.pattern import Pattern
+from model.table.query import answered, with_all_measures
 from model.table.question import Question
-from model.table.robust import with_robust_contrast
-from model.table.spread import with_spread
 from model.table.table import PAPER_GRID, LocalizationTable
 from model.table.timing import Timing
 
@@ -73,11 +72,7 @@ def query(
         envelopes=envelopes,
     )
     timing = _timing(table)
-    pattern = table.ask(question)
-    if envelopes:
-        pattern = timing.with_envelopes(question, pattern)
-    pattern = timing.with_transient_measures(question, pattern)
-    return with_spread(table, question, with_robust_contrast(table, question, pattern))
+    return with_all_measures(table, question, answered(table, question, timing), timing)
 
 
 def _expect_mode(given: object) -> None:

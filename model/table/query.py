@@ -10,6 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from model.errors import InputError, in_our_words
 from model.finger.perception import STRONG_DB_SL
+from model.table.pattern import Pattern
 from model.table.question import Question
 from model.table.robust import with_robust_contrast
 from model.table.spread import with_spread
@@ -63,19 +64,30 @@ def question_from_json(line: str) -> Question:
     )
 
 
+def answered(table: LocalizationTable, question: Question, timing: Timing) -> Pattern:
+    """The pattern for a question, with envelopes if the amplifiers play them."""
+    pattern = table.ask(question)
+    return timing.with_envelopes(question, pattern) if question.envelopes else pattern
+
+
+def with_all_measures(
+    table: LocalizationTable, question: Question, pattern: Pattern, timing: Timing
+) -> Pattern:
+    """A pattern with all that can be said of it: in time, on other plates, over the whole plate."""
+    pattern = timing.with_transient_measures(question, pattern)
+    pattern = with_robust_contrast(table, question, pattern)
+    return with_spread(table, question, pattern)
+
+
 def answer_as_json(table: LocalizationTable, question: Question, timing: Timing) -> dict[str, Any]:
     """The answer with all its measures; solve_time_s is that of the pattern, without measures.
 
     A table that has been prepared answers as it does while fingers wait.
     """
     started = time.perf_counter()
-    pattern = table.ask(question)
-    if question.envelopes:
-        pattern = timing.with_envelopes(question, pattern)
+    pattern = answered(table, question, timing)
     elapsed = time.perf_counter() - started
-    pattern = timing.with_transient_measures(question, pattern)
-    pattern = with_robust_contrast(table, question, pattern)
-    pattern = with_spread(table, question, pattern)
+    pattern = with_all_measures(table, question, pattern, timing)
     spread = pattern.spread
     return {
         "drive": table.drive_of(pattern.excitation),

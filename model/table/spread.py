@@ -5,19 +5,18 @@ mean square of the plate. That does not say whether the rest is a few loud place
 everywhere, nor how large the place is that vibrates: what is here does.
 """
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from model.arrays import FloatArray, lattice
-from model.finger.contrast import SURROUNDINGS_RADIUS
+from model.finger.contrast import is_beyond
 from model.finger.fingertip import fingertip_points
 from model.finger.perception import decibels
 from model.structure.plate import Plate
 from model.table.pattern import Pattern, Spread
-from model.table.question import Point, Question
+from model.table.question import Question
 from model.table.table import LocalizationTable
 
 SPACING = 0.0025  # m; the edge of a circle of 50 mm is met to a percent of its area
@@ -32,7 +31,7 @@ def with_spread(table: LocalizationTable, question: Question, pattern: Pattern) 
     felt = [table.amplitudes(pattern.excitation, disc)[1].sum(axis=0).mean() for disc in discs]
     points = middles(table.plate)
     frequencies, amplitudes = table.amplitudes(pattern.excitation, points)
-    near = is_near(points, question.targets)
+    near = ~is_beyond(points, question.targets)
     spread = spread_of(frequencies, amplitudes, near, felt=min(felt), plate=table.plate)
     return replace(pattern, spread=spread)
 
@@ -43,13 +42,6 @@ def middles(plate: Plate) -> FloatArray:
     x = np.linspace(0, plate.length, 2 * count_x + 1)[1::2]
     y = np.linspace(0, plate.width, 2 * count_y + 1)[1::2]
     return lattice(x, y)
-
-
-def is_near(points: FloatArray, targets: Sequence[Point]) -> NDArray[np.bool_]:
-    """Which points [m] (p, 2) are no farther than 50 mm from a target."""
-    apart = np.linalg.norm(points[:, None] - np.array(targets), axis=-1)
-    near: NDArray[np.bool_] = (apart <= SURROUNDINGS_RADIUS).any(axis=1)
-    return near
 
 
 def spread_of(

@@ -24,7 +24,7 @@ from model.drive_modes.sources import (
 )
 from model.errors import InputError
 from model.fem.mesh import Mesh
-from model.finger.contrast import SURROUNDINGS_RADIUS
+from model.finger.contrast import is_around
 from model.finger.grid import Grid
 from model.finger.perception import STRONG_DB_SL, decibels, detection_threshold
 from model.rig.rig import Limits, physics_fingerprint
@@ -151,7 +151,7 @@ class LocalizationTable:
         if question.quiet:
             quiet = found[:, :, ends[count - 1] :]
         else:
-            quiet = self._cell_fields[:, :, self._far_from(question.targets)]
+            quiet = self._cell_fields[:, :, is_around(self.cell_centres, question.targets)]
         return Fields(
             targets=tuple(
                 np.ascontiguousarray(found[:, :, start:end] * gain)
@@ -248,9 +248,3 @@ class LocalizationTable:
     def _by_frequency(self, values: NDArray[np.float32]) -> SingleComplex:
         fields = values.view(np.complex64).reshape(len(values), len(self.frequencies), -1)
         return np.ascontiguousarray(fields.transpose(1, 2, 0))
-
-    def _far_from(self, targets: Sequence[Point]) -> NDArray[np.bool_]:
-        """Which cells are not near any target; all of them where the plate is so small."""
-        apart = np.linalg.norm(self.cell_centres[:, None] - np.array(targets), axis=-1)
-        far: NDArray[np.bool_] = (apart > SURROUNDINGS_RADIUS).all(axis=1)
-        return far if far.any() else np.ones_like(far)

@@ -19,7 +19,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from model.arrays import ComplexArray, FloatArray, IntArray
-from model.finger.contrast import SURROUNDINGS_RADIUS
+from model.finger.contrast import is_around
 from model.finger.fingertip import FINGERTIP_RADIUS, fingertip_points
 from model.finger.grid import Grid
 from model.transients.envelope import Envelope, Envelopes
@@ -150,7 +150,5 @@ class Shaper:
     def _surroundings(self, targets: Sequence[Position]) -> FloatArray:
         """The same for the plate beyond 50 mm of all targets, or all of it where that is none."""
         centres = _SURROUNDINGS.centres(self._plate.reduced.plate)
-        distance = np.linalg.norm(centres[:, None] - np.array(targets), axis=-1).min(axis=1)
-        far = distance > SURROUNDINGS_RADIUS
-        shapes = self._plate.reduced.at(centres[far] if far.any() else centres)
+        shapes = self._plate.reduced.at(centres[is_around(centres, targets)])
         return np.asarray(np.linalg.qr(shapes, mode="r")) / math.sqrt(len(shapes))

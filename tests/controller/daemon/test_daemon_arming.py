@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 import logging
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,6 +23,22 @@ from sim.faults.episodes import Episode
 READY, ENABLED = "READY_TO_SWITCH_ON", "OPERATION_ENABLED"
 
 
+def arming_waits(
+    daemon: Daemon, monkeypatch: pytest.MonkeyPatch, *, then: Callable[[], None] | None = None
+) -> asyncio.Event:
+    """What the arming of a daemon waits for; then: what happens before it goes on."""
+    arm, goes_on = daemon._controller.arm, asyncio.Event()
+
+    async def slow() -> None:
+        await goes_on.wait()
+        if then is not None:
+            then()
+        await arm()
+
+    monkeypatch.setattr(daemon._controller, "arm", slow)
+    return goes_on
+
+
 async def test_arming_that_takes_longer_than_the_lease(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -32,16 +49,13 @@ async def test_arming_that_takes_longer_than_the_lease(
     async with running_daemon(tmp_path) as bench, await bench.client() as era:
         await until_state(era, READY)
         daemon = bench.daemon
-        arm, book = daemon._controller.arm, daemon._service._lease
-        goes_on = asyncio.Event()
+        book = daemon._service._lease
 
-        async def slow() -> None:
-            await goes_on.wait()
+        def pass_time() -> None:
             assert book._lease is not None
-            book._lease = replace(book._lease, ends=0.0)  # as if the time had passed
-            await arm()
+            book._lease = replace(book._lease, ends=0.0)
 
-        monkeypatch.setattr(daemon._controller, "arm", slow)
+        goes_on = arming_waits(daemon, monkeypatch, then=pass_time)
         arming = asyncio.ensure_future(era.arm("me", lease_s=1))
         await until_state(era, "SWITCHED_ON")
         async with await bench.client("other") as other:
@@ -64,13 +78,7 @@ async def test_who_hangs_up_while_arming_leaves_nothing_armed(
     """Nobody knows the lease then, which would have lasted for a minute: disarmed at once."""
     async with running_daemon(tmp_path) as bench, await bench.client() as era:
         await until_state(era, READY)
-        arm, goes_on = bench.daemon._controller.arm, asyncio.Event()
-
-        async def slow() -> None:
-            await goes_on.wait()
-            await arm()
-
-        monkeypatch.setattr(bench.daemon._controller, "arm", slow)
+        goes_on = arming_waits(bench.daemon, monkeypatch)
         other = await bench.client("other")
         arming = asyncio.ensure_future(other.arm("other", lease_s=60))
         await until_state(era, "SWITCHED_ON")
@@ -89,17 +97,12 @@ async def test_who_is_cancelled_while_arming_leaves_nothing_armed(
     """Its connection stays, and with it a lease that nobody would renew: so it disarms."""
     async with running_daemon(tmp_path) as bench, await bench.client() as era:
         await until_state(era, READY)
-        arm, goes_on = bench.daemon._controller.arm, asyncio.Event()
-
-        async def slow() -> None:
-            await goes_on.wait()
-            await arm()
+        goes_on = arming_waits(bench.daemon, monkeypatch)
 
         async def use() -> None:
             async with era.armed("me", lease_s=60):
                 raise AssertionError("it was cancelled before")
 
-        monkeypatch.setattr(bench.daemon._controller, "arm", slow)
         using = asyncio.create_task(use())
         await until_state(era, "SWITCHED_ON")
         using.cancel()

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from model.arrays import lattice
+from model.finger.contrast import is_beyond
 from model.finger.fingertip import fingertip_points
 from model.table.question import Question
-from model.table.spread import is_near, middles, spread_of, with_spread
+from model.table.spread import middles, spread_of, with_spread
 from paper_table import smooth_rig, smooth_table
 
 TARGET = (0.15, 0.12)
@@ -23,7 +24,9 @@ CIRCLE = pi * 0.05**2
 def spread(*amplitudes, frequencies=(100.0,)):
     """Of amplitudes at the plate's middles, one row for each frequency; the target feels 1 m/s²."""
     field = np.array(amplitudes, dtype=float)
-    return spread_of(np.array(frequencies), field, is_near(POINTS, [TARGET]), felt=1.0, plate=PLATE)
+    return spread_of(
+        np.array(frequencies), field, ~is_beyond(POINTS, [TARGET]), felt=1.0, plate=PLATE
+    )
 
 
 def test_a_plate_that_moves_as_one_is_nowhere_stronger():
@@ -62,7 +65,7 @@ def test_a_plate_within_five_centimetres_is_told_from_itself():
     """Where nothing is farther away, all of it is around the target."""
     small = replace(PLATE, length=0.06, width=0.06)
     points = middles(small)
-    near = is_near(points, [(0.03, 0.03)])
+    near = ~is_beyond(points, [(0.03, 0.03)])
     found = spread_of(
         np.array([100.0]), np.full((1, len(points)), 0.5), near, felt=1.0, plate=small
     )

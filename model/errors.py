@@ -1,5 +1,10 @@
 """The one error the model raises on purpose, and the words of all errors."""
 
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:  # a command that checks nothing does not wait for it
+    from pydantic import ValidationError
+
 
 class InputError(ValueError):
     """Input that cannot be used; the message says what, where and what to do about it."""
@@ -10,6 +15,12 @@ def in_our_words(message: str) -> str:
     for theirs, ours in _WORDS.items():
         message = message.replace(theirs, ours)
     return message
+
+
+def first_problem(error: "ValidationError") -> tuple[str, str]:
+    """Where the first of the values is that were refused, "" for the whole; and what is wrong."""
+    first = error.errors()[0]
+    return ".".join(str(part) for part in first["loc"]), in_our_words(first["msg"])
 
 
 _WORDS = {

@@ -24,7 +24,7 @@ from controller.api.messages import (
 from controller.api.parts import Message, Nothing, Topic, TouchPoint
 from controller.api.replies import result_of
 from model.arguments import shown
-from model.errors import InputError, in_our_words
+from model.errors import InputError, first_problem
 
 USUAL_LEASE = 10.0  # s
 
@@ -52,7 +52,7 @@ def greeting(name: str) -> HelloParams:
     try:
         return HelloParams(client=name)
     except ValidationError as error:
-        said = in_our_words(error.errors()[0]["msg"])
+        _, said = first_problem(error)
         raise InputError(f"name is {shown(name)}; it {said}") from None
 
 
@@ -131,9 +131,8 @@ def in_words(make: Callable[_P, Call[_ResultT]]) -> Callable[_P, Call[_ResultT]]
         try:
             return make(*args, **kwargs)
         except ValidationError as error:
-            first = error.errors()[0]
-            where = ".".join(str(part) for part in first["loc"])
-            raise InputError(f"{make.__name__}: {where} {in_our_words(first['msg'])}") from None
+            where, said = first_problem(error)
+            raise InputError(f"{make.__name__}: {where} {said}") from None
 
     return checked
 

@@ -14,6 +14,11 @@ from model.errors import InputError
 TICK = 0.05  # s; how often it is told meanwhile that we are alive
 
 
+def what_is_wrong(error: Exception) -> str:
+    """What an error says; what to assume of a lost amplifier the daemon's state tells."""
+    return str(error).removesuffix(ASSUME_ENERGISED)
+
+
 async def reopen(
     controller: Controller,
     *,
@@ -35,7 +40,7 @@ async def reopen(
             await _attended(controller.open(), alive)
             await controller.disarm()  # one was lost for less than its watchdog, perhaps
         except (DriverError, InputError) as error:
-            told("retry", str(error).removesuffix(ASSUME_ENERGISED))
+            told("retry", what_is_wrong(error))
             await controller.close()
         else:
             told("reopened", "every amplifier answers again, and is disarmed")

@@ -8,14 +8,13 @@ from dataclasses import replace
 from functools import partial
 
 from controller.amplifiers import Phase
-from controller.daemon.reopening import TICK, reopen
+from controller.daemon.reopening import TICK, reopen, what_is_wrong
 from controller.daemon.states import ACKNOWLEDGE, Action, Event, Kind, Machine, State, step
 from controller.loop import Controller
 from controller.observer import Observer
 from drivers import clock
 from drivers.amplifier import Amplifier
 from drivers.errors import CommandRefused, DriverError, LinkError
-from drivers.link.link import ASSUME_ENERGISED
 from drivers.link.turns import GaveWay
 from drivers.protocol.messages import Event as AmplifierEvent
 from drivers.protocol.messages import Fault, Status
@@ -269,9 +268,10 @@ class Supervisor:
         """See a loss through; whoever comes with the same one waits for that, then reopens."""
         async with self._losing:
             lost = [name for name, amplifier in self._amplifiers.items() if amplifier.lost]
+            wrong = what_is_wrong(error)
             if self.machine.state is not State.COMM_LOST:  # told already
-                self._link_told("lost", lost, _what(error))
-            cause = f"amplifier {', '.join(lost)}: {_what(error)}" if lost else _what(error)
+                self._link_told("lost", lost, wrong)
+            cause = f"amplifier {', '.join(lost)}: {wrong}" if lost else wrong
             remedy = (
                 "look at cables and supply; the daemon tries again by itself, and stays disarmed"
             )
@@ -338,11 +338,6 @@ class Supervisor:
 
 
 _quiet_logger = logging.getLogger(f"{__name__}.beside")
-
-
-def _what(error: LinkError) -> str:
-    """What is wrong with a link; what to assume of the amplifier the state tells."""
-    return str(error).removesuffix(ASSUME_ENERGISED)
 
 
 def _problem(statuses: Mapping[str, Status]) -> str | None:

@@ -21,7 +21,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from model.arguments import expect, expect_path, shown
 from model.drive_modes import MODES
-from model.errors import InputError, in_our_words
+from model.errors import InputError, first_problem
 from model.fem.mesh import Mesh
 from model.files.array_file import UNREADABLE, digest_of, read_arrays, write_arrays
 from model.finger.grid import Grid
@@ -151,11 +151,8 @@ def load_table(path: Path | str, *, fingerprint: str | None = None) -> Localizat
     try:
         header = _Header.model_validate_json(content.pop("header").tobytes())
     except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"]) or "header"
-        raise InputError(
-            f"{path}: bad header ({where}: {in_our_words(first['msg'])}); {rebuild}"
-        ) from error
+        where, said = first_problem(error)
+        raise InputError(f"{path}: bad header ({where or 'header'}: {said}); {rebuild}") from error
     if header.format != FORMAT or header.format_version != FORMAT_VERSION:
         raise InputError(
             f"{path} has format {header.format!r} version {header.format_version}; this program "

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from model.errors import InputError, in_our_words
+from model.errors import InputError, first_problem
 from model.finger.perception import STRONG_DB_SL
 from model.table.pattern import Pattern
 from model.table.question import Question
@@ -44,9 +44,7 @@ def question_from_json(line: str) -> Question:
     try:
         asked = _Line.model_validate_json(line)
     except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"])
-        said = in_our_words(first["msg"])
+        where, said = first_problem(error)
         if not where:
             raise InputError(
                 'a line is a question such as {"target": [0.08, 0.06], "quiet": [[0.22, 0.16]]}; '

@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer.core import TyperCommand
 
-from by_name.nearness import did_you_mean
 from drivers.errors import CommandError, CommandRefused, FrameError, LinkError
 from model.counting import counted
 from model.errors import InputError
+from registry.suggestions import did_you_mean
 
 if TYPE_CHECKING:
     from controller.api.client import Client

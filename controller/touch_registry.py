@@ -2,11 +2,11 @@
 
 from collections.abc import Callable
 
-from by_name.catalogue import Catalogue, Derived
 from controller.touch import TouchSource
 from model.errors import InputError
+from registry.plugins import Derived, PluginRegistry
 
-_SOURCES: Catalogue[Callable[[str], TouchSource]] = Catalogue(
+_SOURCES: PluginRegistry[Callable[[str], TouchSource]] = PluginRegistry(
     "touch source",
     "era_haptics.touch_sources",
     Derived(TouchSource),

@@ -6,11 +6,11 @@ derived from `Backend`, and made with the URL.
 
 from collections.abc import Callable
 
-from by_name.catalogue import Catalogue, Derived
 from drivers.backend import Backend
 from drivers.errors import CommandError
+from registry.plugins import Derived, PluginRegistry
 
-_BACKENDS: Catalogue[Callable[[str], Backend]] = Catalogue(
+_BACKENDS: PluginRegistry[Callable[[str], Backend]] = PluginRegistry(
     "backend",
     "era_haptics.backends",
     Derived(Backend),

@@ -58,7 +58,7 @@ def test_links_beside_the_docs_lead_somewhere(name: str) -> None:
 
 def test_pages_that_are_named_in_code_are_there() -> None:
     """Messages, docstrings and the changelog name pages by their path."""
-    code = ["by_name", "controller", "drivers", "era_haptics", "model", "sim"]
+    code = ["registry", "controller", "drivers", "era_haptics", "model", "sim"]
     files = [
         path for name in (*code, "benchmarks", "examples") for path in (ROOT / name).rglob("*.py")
     ]

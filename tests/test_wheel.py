@@ -16,7 +16,7 @@ from licences import NOTES
 from smoke import lowest, requirements
 
 ROOT = Path(__file__).parents[1]
-PACKAGES = ("by_name", "controller", "drivers", "era_haptics", "model", "sim")
+PACKAGES = ("registry", "controller", "drivers", "era_haptics", "model", "sim")
 
 # Of the sources: what is neither a program nor made by one.
 DATA = re.compile(r"\.(py|typed|yaml|csv|js|css|html|svg)$")

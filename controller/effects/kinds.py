@@ -2,11 +2,11 @@
 
 from operator import attrgetter
 
-from by_name.catalogue import Catalogue, Derived
 from controller.effects.effect import Effect
 from model.errors import InputError
+from registry.plugins import Derived, PluginRegistry
 
-_KINDS: Catalogue[type[Effect]] = Catalogue(
+_KINDS: PluginRegistry[type[Effect]] = PluginRegistry(
     "kind of effect",
     "era_haptics.effects",
     Derived(Effect),

@@ -5,7 +5,6 @@ from typing import Annotated, Any
 
 from pydantic import Field, Strict
 
-from by_name.nearness import did_you_mean
 from controller.effects.effect import Effect, Level
 from controller.effects.kinds import effect_kind
 from controller.effects.layout import BUZZ, Layout, Region, usual_effects
@@ -17,6 +16,7 @@ from model.errors import InputError
 from model.finger.perception import STRONG_DB_SL
 from model.rig.sections import Identifier
 from model.structure.plate import Plate
+from registry.suggestions import did_you_mean
 
 _MOST_REGIONS = 256
 _LENGTH = Annotated[float, Quantity(LENGTH, least=-10, most=10)]

@@ -4,10 +4,10 @@ import math
 import re
 from collections.abc import Sequence
 
-from by_name.nearness import did_you_mean
 from model.errors import InputError
 from model.rig.rig import Rig
 from model.vibration.excitation import Excitation, Tone
+from registry.suggestions import did_you_mean
 
 _FORM = re.compile(r"(?P<era>[^=]+)=(?P<frequency>[^@:]+)(?:@(?P<level>[^:]+)(?::(?P<phase>.+))?)?")
 

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
-from by_name.catalogue import Catalogue, Instance
 from model.config.document import Document
 from model.errors import InputError
+from registry.plugins import Instance, PluginRegistry
 
 USUAL = "rig"
 
@@ -41,7 +41,7 @@ class ConfigKind(Protocol):
         """Its JSON schema, for editors."""
 
 
-_KINDS: Catalogue[ConfigKind] = Catalogue(
+_KINDS: PluginRegistry[ConfigKind] = PluginRegistry(
     "kind of configuration", "era_haptics.config_kinds", Instance(ConfigKind), error=InputError
 )
 

@@ -10,11 +10,11 @@ from typing import Annotated, Any, TypeVar, Union, get_args, get_origin
 from pydantic import BaseModel, ConfigDict, GetCoreSchemaHandler, TypeAdapter, ValidationError
 from pydantic_core import CoreSchema, ErrorDetails, core_schema
 
-from by_name.nearness import did_you_mean
 from model.config.document import ConfigError, Document, KeyPath, Problem, Value
 from model.config.units import Dimension, quantity, shown
 from model.counting import counted
 from model.errors import in_our_words
+from registry.suggestions import did_you_mean
 
 
 class Section(BaseModel):

@@ -2,7 +2,6 @@
 
 import math
 
-from by_name.nearness import did_you_mean
 from model.config.document import key_name
 from model.config.sections import Validation
 from model.errors import InputError
@@ -11,6 +10,7 @@ from model.rig.parts import laminate_of, mesh_of, plate_of
 from model.rig.rig import SAME_POINT
 from model.rig.sections import EraSection, LimitsSection, MassSection, PlateSection
 from model.structure.plate import Plate
+from registry.suggestions import did_you_mean
 
 
 def check_across(validation: Validation, *, mesh_given: bool) -> None:

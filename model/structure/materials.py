@@ -6,9 +6,9 @@ a `KnownMaterial` of that name; rig files, their schema and `era plate materials
 
 from dataclasses import dataclass
 
-from by_name.catalogue import Catalogue, Instance
 from model.errors import InputError
 from model.structure.plate import Material
+from registry.plugins import Instance, PluginRegistry
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ _KNOWN = (
 KNOWN_MATERIALS = {known.material.name: known for known in _KNOWN}
 """Those that come with this package."""
 
-_MATERIALS: Catalogue[KnownMaterial] = Catalogue(
+_MATERIALS: PluginRegistry[KnownMaterial] = PluginRegistry(
     "material",
     "era_haptics.materials",
     Instance(KnownMaterial),

@@ -295,7 +295,7 @@ def test_help_loads_nothing_heavy(which: str, others: set[str]) -> None:
     )
     count, *loaded = done.stdout.split()
     assert int(count) == 1 if not which else int(count) > 40
-    ours = {"by_name", "controller", "drivers", "model", "sim"}
+    ours = {"registry", "controller", "drivers", "model", "sim"}
     typers = {"typer", "annotated_doc", "shellingham", "typing_extensions", "typing_inspection"}
     of_the_environment = {"_distutils_hack"}  # of setuptools
     assert set(loaded) - ours - typers - of_the_environment - others == set()

@@ -67,7 +67,7 @@ def test_the_commands_do_without() -> None:
 
 
 @pytest.mark.parametrize(
-    "package", ["by_name", "controller", "drivers", "era_haptics", "model", "sim"]
+    "package", ["registry", "controller", "drivers", "era_haptics", "model", "sim"]
 )
 def test_every_package_says_that_it_is_typed(package: str) -> None:
     """By the marker that type checkers look for."""

@@ -17,7 +17,7 @@ def test_a_plug_in_imports_stable_names_only(path: Path) -> None:
     """Of this project `era_haptics` alone, whose names stay while modules move."""
     brought = re.findall(r"^\s*(?:from|import) ([\w.]+)", path.read_text("utf-8"), re.MULTILINE)
     homes = {name.partition(".")[0] for name in brought}
-    assert homes & {"by_name", "controller", "drivers", "model", "sim"} == set()
+    assert homes & {"registry", "controller", "drivers", "model", "sim"} == set()
 
 
 def test_plug_ins_pass_mypy_strict(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ from functools import cached_property
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
-PACKAGES = ("by_name", "controller", "drivers", "era_haptics", "model", "sim")
+PACKAGES = ("registry", "controller", "drivers", "era_haptics", "model", "sim")
 
 ERRORS = {
     *("InputError", "ConfigError", "CommandError", "CommandRefused", "LinkError", "LinkTimeout"),

@@ -33,7 +33,7 @@ HEAD = (
     "| Python | distributions | MB installed | of it ours | era --help | a notebook's imports |\n"
     "|---|---|---|---|---|---|"
 )
-_OURS = ("by_name", "controller", "drivers", "era_haptics", "model", "sim")
+_OURS = ("registry", "controller", "drivers", "era_haptics", "model", "sim")
 _USED = "from era_haptics import SolvedPlate, load_rig, query, table"
 
 

@@ -6,18 +6,18 @@ an `Element` of that name; `model.fem.element_checks` says what it must keep.
 
 from operator import attrgetter
 
-from by_name.catalogue import Catalogue, Instance
 from model.errors import InputError
 from model.fem.elements.element import DOF_PER_NODE, Element
 from model.fem.elements.lagrange import Q3, Q4, Q5
 from model.fem.elements.mitc4 import MITC4
+from registry.plugins import Instance, PluginRegistry
 
 __all__ = ["DOF_PER_NODE", "ELEMENTS", "Element", "element_names", "element_of"]
 
 ELEMENTS = {element.name: element for element in (MITC4, Q3, Q4, Q5)}
 """Those that come with this package."""
 
-_ELEMENTS: Catalogue[Element] = Catalogue(
+_ELEMENTS: PluginRegistry[Element] = PluginRegistry(
     "element",
     "era_haptics.elements",
     Instance(Element),

@@ -2,7 +2,7 @@
 
 import pytest
 
-from by_name.nearness import did_you_mean
+from registry.suggestions import did_you_mean
 
 
 @pytest.mark.parametrize(

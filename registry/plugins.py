@@ -13,7 +13,7 @@ from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from typing import Generic, TypeVar
 
-from by_name.nearness import did_you_mean
+from registry.suggestions import did_you_mean
 
 _T = TypeVar("_T")
 _Made = TypeVar("_Made")
@@ -48,7 +48,7 @@ class Derived:
 
 
 @dataclass(frozen=True)
-class Catalogue(Generic[_T]):
+class PluginRegistry(Generic[_T]):
     """What there is of one kind, by name.
 
     what: the kind in words, for errors; group: of its entry points; wanted: what these lead to;
@@ -92,7 +92,7 @@ class Catalogue(Generic[_T]):
             )
         return self.own[name] if name in self.own else self._loaded(points[0], within)
 
-    def make(self: "Catalogue[Callable[[str], _Made]]", url: str) -> _Made:
+    def make(self: "PluginRegistry[Callable[[str], _Made]]", url: str) -> _Made:
         """What the class that the scheme of a URL names makes of it; raises as `find` does.
 
         The class may raise `error` too, for a URL that it refuses. Schemes are in small letters,

@@ -19,7 +19,7 @@ from benchmarks.latency_programs import ERA, PATIENCE, Ended, Program, Rank, mod
 from benchmarks.latency_touches import WANDERS, Work
 from controller.api.client import Client
 from controller.api.jsonrpc import RpcError
-from controller.api.parts import LatencySummary
+from controller.api.schema import LatencySummary
 from controller.means import Means, means_of
 from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.messages import Capabilities

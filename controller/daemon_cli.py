@@ -20,9 +20,9 @@ from registry.suggestions import did_you_mean
 
 if TYPE_CHECKING:
     from controller.api.client import Client
-    from controller.api.messages import StatusResult
-    from controller.api.parts import RigSummary
-    from controller.api.replies import Notification
+    from controller.api.client_protocol import Notification
+    from controller.api.methods import StatusResult
+    from controller.api.schema import RigSummary
 
 app = typer.Typer()
 
@@ -192,8 +192,8 @@ def watch(
     """Tell what happens as it happens, until Ctrl-C."""
     from typing import cast
 
-    from controller.api.events import TOPICS
-    from controller.api.parts import Topic
+    from controller.api.schema import Topic
+    from controller.api.topics import TOPICS
 
     wanted = topics or _WATCHED
     unknown = [topic for topic in wanted if topic not in TOPICS]

@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from controller.api.async_client import AsyncClient
     from controller.api.client import Client
+    from controller.api.client_protocol import Notification, Unreachable
     from controller.api.jsonrpc import RpcError
-    from controller.api.replies import Notification, Unreachable
     from drivers.blocking import BlockingAmplifier
     from drivers.command import DriveCommand
     from drivers.errors import CommandRefused, DriverError, LinkError
@@ -54,7 +54,7 @@ _HOMES = {
     "InputError": "model.errors",
     "LinkError": "drivers.errors",
     "LocalizationTable": "model.table.table",
-    "Notification": "controller.api.replies",
+    "Notification": "controller.api.client_protocol",
     "Pattern": "model.table.pattern",
     "PlateMap": "model.vibration.maps",
     "Playback": "sim.plant.playback",
@@ -63,7 +63,7 @@ _HOMES = {
     "SolvedPlate": "era_haptics.solved_plate",
     "SupportedModes": "model.reduction.supported_modes",
     "Tone": "model.vibration.excitation",
-    "Unreachable": "controller.api.replies",
+    "Unreachable": "controller.api.client_protocol",
     "commands_for": "era_haptics.amplifiers",
     "draw_map": "era_haptics.pictures",
     "draw_pattern": "era_haptics.pictures",

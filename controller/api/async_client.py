@@ -15,11 +15,17 @@ from typing import Any, Concatenate, ParamSpec, Self, TypeVar
 
 from controller.api import calls
 from controller.api.calls import Call, as_message
-from controller.api.conversation import ANSWER_TIMEOUT, CHUNK, MOST_EVENTS, Conversation
+from controller.api.client_protocol import (
+    Greeting,
+    Notification,
+    Response,
+    Unreachable,
+    check_version,
+)
+from controller.api.conversation import CHUNK, MAX_QUEUED_EVENTS, RESPONSE_TIMEOUT, Conversation
 from controller.api.jsonrpc import RpcError
-from controller.api.messages import ArmResult
-from controller.api.parts import Message
-from controller.api.replies import Answer, Greeting, Notification, Unreachable, check_version
+from controller.api.methods import ArmResult
+from controller.api.schema import Message
 from controller.api.socket_path import find_socket
 
 _P = ParamSpec("_P")
@@ -60,7 +66,7 @@ class AsyncClient:
         self._writer = writer
         self._timeout = timeout
         self._conversation = Conversation()
-        self._waiting: dict[int, asyncio.Future[Answer]] = {}
+        self._waiting: dict[int, asyncio.Future[Response]] = {}
         self._events: asyncio.Queue[Notification | None] = asyncio.Queue()
         self._gone: Unreachable | None = None
         self._reading = asyncio.create_task(self._read_all(), name="daemon's answers")
@@ -71,7 +77,7 @@ class AsyncClient:
         path: Path | str | None = None,
         *,
         name: str = "python",
-        timeout: float = ANSWER_TIMEOUT,
+        timeout: float = RESPONSE_TIMEOUT,
     ) -> Self:
         """A connection that has said hello; as `Client.connect`."""
         greeting = calls.greeting(name)
@@ -122,7 +128,9 @@ class AsyncClient:
     unsubscribe = _method(calls.unsubscribe)
 
     @contextlib.asynccontextmanager
-    async def armed(self, owner: str, *, lease_s: float = calls.USUAL_LEASE) -> AsyncIterator[None]:
+    async def armed(
+        self, owner: str, *, lease_s: float = calls.DEFAULT_LEASE
+    ) -> AsyncIterator[None]:
         """Armed within the block, disarmed after it; a task renews the lease meanwhile."""
         arming = asyncio.ensure_future(self.arm(owner, lease_s=lease_s))
         try:
@@ -191,11 +199,11 @@ class AsyncClient:
 
     def _keep(self, told: Notification) -> None:
         """Keep a notification for `events`; the oldest gives way."""
-        if self._events.qsize() >= MOST_EVENTS:
+        if self._events.qsize() >= MAX_QUEUED_EVENTS:
             self._events.get_nowait()
         self._events.put_nowait(told)
 
-    def _settle(self, answer: Answer) -> None:
+    def _settle(self, answer: Response) -> None:
         """Hand an answer to whoever waits for it; one to no request in particular to everybody."""
         for number, waiting in self._waiting.items():
             if answer.number in (number, None) and not waiting.done():

@@ -7,7 +7,8 @@ from typing import Any, Generic, ParamSpec, TypeVar, cast, get_args
 
 from pydantic import ValidationError
 
-from controller.api.messages import (
+from controller.api.client_protocol import result_of
+from controller.api.methods import (
     ArmParams,
     ArmResult,
     EffectsResult,
@@ -21,12 +22,11 @@ from controller.api.messages import (
     TouchParams,
     UnsubscribeParams,
 )
-from controller.api.parts import Message, Nothing, Topic, TouchPoint
-from controller.api.replies import result_of
+from controller.api.schema import Empty, Message, Topic, TouchPoint
 from model.arguments import shown
 from model.errors import InputError, first_problem
 
-USUAL_LEASE = 10.0  # s
+DEFAULT_LEASE = 10.0  # s
 
 _P = ParamSpec("_P")
 _MessageT = TypeVar("_MessageT", bound=Message)
@@ -63,10 +63,10 @@ def hello(client: str) -> Call[HelloResult]:
 
 def status() -> Call[StatusResult]:
     """How everything is."""
-    return Call("status", Nothing(), as_message(StatusResult))
+    return Call("status", Empty(), as_message(StatusResult))
 
 
-def arm(owner: str, *, lease_s: float = USUAL_LEASE) -> Call[ArmResult]:
+def arm(owner: str, *, lease_s: float = DEFAULT_LEASE) -> Call[ArmResult]:
     """High voltage on until the lease is over; `armed` renews it by itself."""
     return Call("arm", ArmParams(owner=owner, lease_s=lease_s), as_message(ArmResult))
 
@@ -78,17 +78,17 @@ def renew(lease: str) -> Call[RenewResult]:
 
 def disarm() -> Call[None]:
     """Silent along a short ramp, high voltage off."""
-    return Call("disarm", Nothing(), _done)
+    return Call("disarm", Empty(), _done)
 
 
 def stop() -> Call[None]:
     """Quick stop, latched until `clear`."""
-    return Call("stop", Nothing(), _done)
+    return Call("stop", Empty(), _done)
 
 
 def clear() -> Call[None]:
     """Acknowledge a stop, or a fault whose cause is gone."""
-    return Call("clear", Nothing(), _done)
+    return Call("clear", Empty(), _done)
 
 
 def touch(places: Sequence[tuple[float, float]], *, source: str = "python") -> Call[None]:
@@ -102,7 +102,7 @@ def touch(places: Sequence[tuple[float, float]], *, source: str = "python") -> C
 
 def effects() -> Call[EffectsResult]:
     """The effects that can be played."""
-    return Call("effects", Nothing(), as_message(EffectsResult))
+    return Call("effects", Empty(), as_message(EffectsResult))
 
 
 def play(
@@ -161,4 +161,4 @@ def _place(given: object) -> tuple[float, float]:
 
 
 def _done(said: Mapping[str, Any]) -> None:
-    result_of(said, Nothing)
+    result_of(said, Empty)

@@ -17,10 +17,16 @@ from typing import Concatenate, ParamSpec, Self, TypeVar
 
 from controller.api import calls
 from controller.api.calls import Call, as_message
-from controller.api.conversation import ANSWER_TIMEOUT, CHUNK, MOST_EVENTS, Conversation
-from controller.api.messages import ArmResult
-from controller.api.parts import Message
-from controller.api.replies import Answer, Greeting, Notification, Unreachable, check_version
+from controller.api.client_protocol import (
+    Greeting,
+    Notification,
+    Response,
+    Unreachable,
+    check_version,
+)
+from controller.api.conversation import CHUNK, MAX_QUEUED_EVENTS, RESPONSE_TIMEOUT, Conversation
+from controller.api.methods import ArmResult
+from controller.api.schema import Message
 from controller.api.socket_path import find_socket
 from model.arguments import expect_path
 
@@ -47,11 +53,11 @@ class Client:
     Every method raises Unreachable, a LinkError, where no answer comes.
     """
 
-    def __init__(self, path: Path | str, *, timeout: float = ANSWER_TIMEOUT) -> None:
+    def __init__(self, path: Path | str, *, timeout: float = RESPONSE_TIMEOUT) -> None:
         self.path = expect_path(path, what="path")
         self._timeout = timeout
         self._conversation = Conversation()
-        self._events: deque[Notification] = deque(maxlen=MOST_EVENTS)
+        self._events: deque[Notification] = deque(maxlen=MAX_QUEUED_EVENTS)
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_CLOEXEC)
         self._socket.settimeout(timeout)
         try:
@@ -66,7 +72,7 @@ class Client:
         path: Path | str | None = None,
         *,
         name: str = "python",
-        timeout: float = ANSWER_TIMEOUT,
+        timeout: float = RESPONSE_TIMEOUT,
     ) -> Self:
         """A connection that has said hello; path: of the socket, the usual one if None.
 
@@ -111,7 +117,7 @@ class Client:
     unsubscribe = _method(calls.unsubscribe)
 
     @contextmanager
-    def armed(self, owner: str, *, lease_s: float = calls.USUAL_LEASE) -> Iterator[None]:
+    def armed(self, owner: str, *, lease_s: float = calls.DEFAULT_LEASE) -> Iterator[None]:
         """Armed within the block, disarmed after it; a thread renews the lease meanwhile."""
         lease = self.arm(owner, lease_s=lease_s)
         over = threading.Event()
@@ -168,7 +174,7 @@ class Client:
             self.close()
             raise
 
-    def _read(self) -> list[Answer]:
+    def _read(self) -> list[Response]:
         """The answers that came next; notifications are kept for `events`. Raises OSError."""
         data = self._socket.recv(CHUNK)
         if not data:

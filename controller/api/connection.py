@@ -9,16 +9,16 @@ from collections import deque
 from collections.abc import Callable
 from typing import cast
 
-from controller.api.jsonrpc import LONGEST_LINE, ErrorCode, RpcError, error_line
-from controller.api.moot import is_moot
+from controller.api.jsonrpc import MAX_LINE_LENGTH, ErrorCode, RpcError, error_line
+from controller.api.superseded import is_superseded
 from controller.rate import Rate
 
-OUTGOING_LIMIT = 1 << 18  # bytes that a client has not read
-_NOTIFICATION_LIMIT = OUTGOING_LIMIT // 2  # the rest is for answers
+MAX_UNREAD_BYTES = 1 << 18  # bytes that a client has not read
+_NOTIFICATION_LIMIT = MAX_UNREAD_BYTES // 2  # the rest is for answers
 _INCOMING_LIMIT = 1 << 16  # bytes that are read ahead of what was served
-PATIENCE = 5.0  # s; how long a client may lose notifications before it loses the connection
+UNREAD_TIMEOUT = 5.0  # s; how long a client may lose notifications before it loses the connection
 
-REQUEST_RATE = 2000.0  # 1/s, and as many at once
+MAX_REQUEST_RATE = 2000.0  # 1/s, and as many at once
 
 
 class Connection(asyncio.Protocol):
@@ -46,7 +46,7 @@ class Connection(asyncio.Protocol):
         self._is_at_end = False
         self._lost = 0
         self._losing_since: float | None = None
-        self._rate = Rate(REQUEST_RATE, clock=clock)
+        self._rate = Rate(MAX_REQUEST_RATE, clock=clock)
 
     @property
     def is_open(self) -> bool:
@@ -62,7 +62,7 @@ class Connection(asyncio.Protocol):
         """Begin, unless there are too many already."""
         self._transport = cast(asyncio.Transport, transport)
         # Write buffers are bounded here, by what is in them.
-        self._transport.set_write_buffer_limits(high=OUTGOING_LIMIT)
+        self._transport.set_write_buffer_limits(high=MAX_UNREAD_BYTES)
         if not self._on_begin(self):
             self.refuse(RpcError(ErrorCode.BUSY, "too many connections", remedy="try again later"))
 
@@ -72,9 +72,9 @@ class Connection(asyncio.Protocol):
         *lines, self._rest = (self._rest + data).split(b"\n")
         self._lines.extend(lines)
         self._ahead += sum(map(len, lines))
-        too_long = max(map(len, lines), default=0) >= LONGEST_LINE
-        if too_long or len(self._rest) >= LONGEST_LINE:
-            self.refuse(RpcError(ErrorCode.PARSE, f"a line is longer than {LONGEST_LINE} bytes"))
+        too_long = max(map(len, lines), default=0) >= MAX_LINE_LENGTH
+        if too_long or len(self._rest) >= MAX_LINE_LENGTH:
+            self.refuse(RpcError(ErrorCode.PARSE, f"a line is longer than {MAX_LINE_LENGTH} bytes"))
             return
         if self._ahead > _INCOMING_LIMIT and self._transport is not None:
             self._transport.pause_reading()
@@ -94,9 +94,9 @@ class Connection(asyncio.Protocol):
         self._on_end(self)
 
     @property
-    def next_is_moot(self) -> bool:
+    def next_is_superseded(self) -> bool:
         """Whether the next line, of those there are, needs no serving, for the one after it."""
-        return len(self._lines) > 1 and is_moot(self._lines[0], self._lines[1])
+        return len(self._lines) > 1 and is_superseded(self._lines[0], self._lines[1])
 
     def next_line(self) -> bytes:
         """The next line to serve, of those there are."""
@@ -120,7 +120,7 @@ class Connection(asyncio.Protocol):
         if self._transport is None or self._transport.is_closing():
             return
         waiting = self._waiting(self._transport)
-        if waiting and waiting + len(line) > OUTGOING_LIMIT:
+        if waiting and waiting + len(line) > MAX_UNREAD_BYTES:
             self._transport.abort()
             return
         self._transport.write(line)
@@ -137,7 +137,7 @@ class Connection(asyncio.Protocol):
         now = self._clock()
         if self._losing_since is None:
             self._losing_since = now
-        elif now - self._losing_since > PATIENCE:
+        elif now - self._losing_since > UNREAD_TIMEOUT:
             self._transport.abort()
 
     def refuse(self, error: RpcError) -> None:

@@ -3,11 +3,11 @@
 from typing import Any
 
 from controller.api.calls import Call
+from controller.api.client_protocol import Reply, reply_of
 from controller.api.jsonrpc import request_line
-from controller.api.replies import Reply, reply_of
 
-ANSWER_TIMEOUT = 5.0  # s; arming takes the longest, some tenths of a second
-MOST_EVENTS = 1000  # that wait to be looked at; older ones are dropped
+RESPONSE_TIMEOUT = 5.0  # s; arming takes the longest, some tenths of a second
+MAX_QUEUED_EVENTS = 1000  # that wait to be looked at; older ones are dropped
 CHUNK = 1 << 16  # bytes; as many are read at a time
 
 

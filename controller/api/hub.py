@@ -10,9 +10,9 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 
 from controller.api.connection import Connection
 from controller.api.jsonrpc import event_line
-from controller.api.parts import FASTEST_RATE, Message, Topic
+from controller.api.schema import MAX_RATE, Message, Topic
 
-USUAL_RATE = 10.0  # Hz
+DEFAULT_RATE = 10.0  # Hz
 _COALESCED: frozenset[Topic] = frozenset({"contacts", "pattern", "silence"})
 _PERIODIC: frozenset[Topic] = frozenset({"amplifiers", "latency"})
 
@@ -44,7 +44,7 @@ class Hub:
             self._send([connection], topic, self._current[topic])
         if topics & _PERIODIC:
             self._cancel(connection)
-            self._repeat(connection, 1 / (rate or USUAL_RATE))
+            self._repeat(connection, 1 / (rate or DEFAULT_RATE))
 
     def unsubscribe(self, connection: Connection, topics: Iterable[Topic]) -> None:
         """Tell a client of these no more."""
@@ -60,7 +60,7 @@ class Hub:
         self._cancel(connection)
         self._topics.pop(connection, None)
 
-    def is_told(self, connection: Connection) -> bool:
+    def is_subscribed(self, connection: Connection) -> bool:
         """Whether a client has subscribed to anything."""
         return connection in self._topics
 
@@ -77,7 +77,7 @@ class Hub:
         self._newest.pop(topic, None)  # the order is that of the newest
         self._newest[topic] = make
         if self._flush is None:
-            due = max(0.0, self._flushed_at + 1 / FASTEST_RATE - self._clock())
+            due = max(0.0, self._flushed_at + 1 / MAX_RATE - self._clock())
             self._flush = asyncio.get_running_loop().call_later(due, self._flush_now)
 
     def close(self) -> None:

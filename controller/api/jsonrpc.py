@@ -13,10 +13,10 @@ from typing import Annotated, Any, Literal, TypeAlias
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic_core import from_json
 
-from controller.api.parts import Message
+from controller.api.schema import Message
 from model.errors import in_our_words
 
-LONGEST_LINE = 1 << 16  # bytes, with the line feed
+MAX_LINE_LENGTH = 1 << 16  # bytes, with the line feed
 _LONGEST_TEXT = 600  # characters of an error's message
 
 Id: TypeAlias = int | str | None
@@ -37,7 +37,7 @@ class ErrorCode(IntEnum):
     BUSY = 1005
 
 
-MEANINGS = {
+ERROR_MEANINGS = {
     ErrorCode.PARSE: "the line is no JSON, or longer than 64 KiB",
     ErrorCode.INVALID_REQUEST: "the JSON is no request",
     ErrorCode.UNKNOWN_METHOD: "there is no such method",

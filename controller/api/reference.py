@@ -10,10 +10,10 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
-from controller.api.events import TOPICS, EventParams
-from controller.api.jsonrpc import MEANINGS
-from controller.api.messages import METHODS
-from controller.api.parts import Message
+from controller.api.jsonrpc import ERROR_MEANINGS
+from controller.api.methods import METHODS
+from controller.api.schema import Message
+from controller.api.topics import TOPICS, EventParams
 from controller.written_part import insert
 
 WRITER = "controller/api/reference.py"
@@ -40,7 +40,9 @@ def reference() -> str:
             lines += [f"#### {name}", "", _summary(models[name]), ""]
             lines += [*_table("key", models[name], models), ""]
     lines += ["### Errors", "", "| code | name | meaning |", "|---|---|---|"]
-    lines += [f"| {code.value} | {code.name} | {meaning} |" for code, meaning in MEANINGS.items()]
+    lines += [
+        f"| {code.value} | {code.name} | {meaning} |" for code, meaning in ERROR_MEANINGS.items()
+    ]
     return "\n".join(lines) + "\n"
 
 

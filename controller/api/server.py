@@ -23,18 +23,18 @@ from controller.api.jsonrpc import (
     read_request,
     result_line,
 )
-from controller.api.messages import METHODS
-from controller.api.parts import Message
+from controller.api.methods import METHODS
+from controller.api.schema import Message
 from drivers import clock
 from drivers.errors import CommandRefused, DriverError, LinkError
 from model.errors import InputError
 
-MOST_CONNECTIONS = 32
-SILENCE = 1.0  # s; who has said nothing for so long gives way when all places are taken
-TURN = 0.00025  # s; so long a touch waits for clients that flood
+MAX_CONNECTIONS = 32
+IDLE_TIMEOUT = 1.0  # s; who has said nothing for so long gives way when all places are taken
+MAX_TURN_TIME = 0.00025  # s; so long a touch waits for clients that flood
 _AT_ONCE = 4  # connections that are taken in a turn
 _QUEUE = 64  # that wait for it
-MOST_PENDING = 8  # requests of one client that take long; a stop is always taken
+MAX_PENDING = 8  # requests of one client that take long; a stop is always taken
 
 Handler: TypeAlias = Callable[[Connection, Any], Message | Awaitable[Message]]
 
@@ -98,10 +98,10 @@ class ApiServer:
 
     def _begun(self, connection: Connection) -> bool:
         """Take a client in, if need be in place of one that says nothing."""
-        if len(self._connections) >= MOST_CONNECTIONS:
+        if len(self._connections) >= MAX_CONNECTIONS:
             idle = [one for one in self._connections if not self._keeps(one) and not one.pending]
             longest = min(idle, key=lambda one: one.heard_at, default=None)
-            if longest is None or self._clock() - longest.heard_at < SILENCE:
+            if longest is None or self._clock() - longest.heard_at < IDLE_TIMEOUT:
                 return False
             self._connections.discard(longest)
             longest.abort()
@@ -125,11 +125,11 @@ class ApiServer:
     def _turn(self) -> None:
         """Serve waiting clients a line each, until the turn is over."""
         self._turn_is_due = False
-        end = time.perf_counter() + TURN
+        end = time.perf_counter() + MAX_TURN_TIME
         while self._waiting:
             connection = self._waiting.popleft()
             if connection.has_lines:
-                if connection.next_is_moot:
+                if connection.next_is_superseded:
                     connection.next_line()
                 else:
                     self._serve(connection, connection.next_line())
@@ -174,7 +174,7 @@ class ApiServer:
                 f"there is no method {request.method!a}",
                 remedy=f"known are {', '.join(METHODS)}",
             )
-        if len(connection.pending) >= MOST_PENDING and request.method != "stop":
+        if len(connection.pending) >= MAX_PENDING and request.method != "stop":
             raise RpcError(ErrorCode.BUSY, "too many requests under way", remedy="wait for answers")
         return self._handlers[request.method](connection, read_params(method.params, request))
 

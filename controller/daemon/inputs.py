@@ -5,7 +5,7 @@ import logging
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 
-from controller.api.messages import TouchParams
+from controller.api.methods import TouchParams
 from controller.daemon.config import API_SOURCES, TouchInput
 from controller.touch import Touch, TouchFrame
 from drivers.operation.pauses import pauses

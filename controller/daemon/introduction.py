@@ -3,8 +3,8 @@
 from collections.abc import Mapping
 from importlib.metadata import version
 
-from controller.api.messages import HelloResult
-from controller.api.parts import API_VERSION, EraPlace, RigSummary, TableSummary
+from controller.api.methods import HelloResult
+from controller.api.schema import API_VERSION, EraPosition, RigSummary, TableSummary
 from controller.daemon.config import DaemonConfig
 from drivers.amplifier import Amplifier
 from drivers.errors import CommandError
@@ -42,7 +42,7 @@ def _rig_summary(rig: Rig, amplifiers: Mapping[str, Amplifier]) -> RigSummary:
         length_m=rig.plate.length,
         width_m=rig.plate.width,
         eras=[
-            EraPlace(
+            EraPosition(
                 name=era.name,
                 x_m=era.x,
                 y_m=era.y,

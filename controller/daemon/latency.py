@@ -4,7 +4,7 @@ from bisect import bisect_left
 
 import numpy as np
 
-from controller.api.parts import LatencySummary
+from controller.api.schema import LatencySummary
 
 EDGES_MS = (0.25, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 7.5, 10.0, 15.0, 20.0, 50.0, 100.0)
 _WINDOW = 10_000

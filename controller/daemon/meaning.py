@@ -4,8 +4,8 @@ import math
 from collections.abc import Iterable, Sequence
 
 from controller.api.jsonrpc import ErrorCode, RpcError
-from controller.api.messages import EffectsResult, PlayParams
-from controller.api.parts import EffectDescription
+from controller.api.methods import EffectsResult, PlayParams
+from controller.api.schema import EffectDescription
 from controller.contacts import Contact, ContactKey
 from controller.effects.layout import Layout
 from controller.effects.player import EffectPlayer

@@ -5,7 +5,9 @@ import contextlib
 import logging
 from collections.abc import Callable, Sequence
 
-from controller.api.events import (
+from controller.api.hub import Hub
+from controller.api.schema import AmplifierStatus
+from controller.api.topics import (
     AmplifiersEvent,
     LatencyEvent,
     LayoutEvent,
@@ -14,8 +16,6 @@ from controller.api.events import (
     SilenceEvent,
     StateEvent,
 )
-from controller.api.hub import Hub
-from controller.api.parts import AmplifierStatus
 from controller.contacts import Change, Contact, ContactKey
 from controller.daemon.latency import Latencies
 from controller.daemon.states import Machine, State

@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field, Strict
 
-from controller.api.parts import LONGEST_LEASE, SHORTEST_LEASE
+from controller.api.schema import MAX_LEASE, MIN_LEASE
 from controller.envelopes import ENVELOPE_TIME
 from model.config.sections import Quantity, Section
 from model.config.units import LENGTH, RATIO, TIME
@@ -100,9 +100,7 @@ class DaemonSection(Section):
     layout: File | None = None
     touch: Annotated[list[TouchSection], Field(max_length=16, default_factory=list)]
     serial_numbers: Annotated[dict[Identifier, str], Field(max_length=64, default_factory=dict)]
-    longest_lease: Annotated[float, Quantity(TIME, least=SHORTEST_LEASE, most=LONGEST_LEASE)] = (
-        LONGEST_LEASE
-    )
+    longest_lease: Annotated[float, Quantity(TIME, least=MIN_LEASE, most=MAX_LEASE)] = MAX_LEASE
     socket: File | None = None
     log: LogSection = LogSection()
     dumps: DumpSection | None = None

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 from controller.api.connection import Connection
 from controller.api.jsonrpc import ErrorCode, RpcError
-from controller.api.messages import (
+from controller.api.methods import (
     ArmParams,
     ArmResult,
     HelloParams,
@@ -19,8 +19,8 @@ from controller.api.messages import (
     TouchParams,
     UnsubscribeParams,
 )
-from controller.api.parts import (
-    Nothing,
+from controller.api.schema import (
+    Empty,
     PhaseName,
 )
 from controller.api.server import Handler
@@ -109,7 +109,7 @@ class Service:
 
     def keeps(self, client: Connection) -> bool:
         """Whether a client must not give way to another: it listens to something."""
-        return self._news.hub.is_told(client)
+        return self._news.hub.is_subscribed(client)
 
     def status(self) -> StatusResult:
         """How everything is."""
@@ -181,52 +181,52 @@ class Service:
         self._watch_lease()
         return RenewResult(lease_s=lease.lasts)
 
-    async def _disarm(self, client: Connection) -> Nothing:
+    async def _disarm(self, client: Connection) -> Empty:
         await self._supervisor.handle(Event(Kind.DISARM, f"disarmed by {client.name!a}"))
-        return Nothing()
+        return Empty()
 
-    async def _stop(self, client: Connection) -> Nothing:
+    async def _stop(self, client: Connection) -> Empty:
         await self._supervisor.handle(
             Event(Kind.STOP, f"stopped by {client.name!a}", "clear (era clear), then arm again")
         )
-        return Nothing()
+        return Empty()
 
-    async def _clear(self, client: Connection) -> Nothing:
+    async def _clear(self, client: Connection) -> Empty:
         machine = self._supervisor.machine
         if machine.state is State.COMM_LOST:
             raise _wrong_state(machine, ErrorCode.LINK)
         await self._supervisor.handle(Event(Kind.CLEAR, f"acknowledged by {client.name!a}"))
-        return Nothing()
+        return Empty()
 
-    def _touch(self, client: Connection, params: TouchParams) -> Nothing:
+    def _touch(self, client: Connection, params: TouchParams) -> Empty:
         if client not in self._numbers:
             self._clients += 1
             self._numbers[client] = self._clients
         self._touches.take(
             client, params, client_name=str(self._numbers[client]), now=client.heard_at
         )
-        return Nothing()
+        return Empty()
 
-    def _play(self, client: Connection, params: PlayParams) -> Nothing:
+    def _play(self, client: Connection, params: PlayParams) -> Empty:
         machine = self._supervisor.machine
         if machine.state is not State.OPERATION_ENABLED:
             raise _wrong_state(machine)
         self._meaning.play(params, self._news.scene.contacts, now=clock.now())
         self._controller.reconsider()
-        return Nothing()
+        return Empty()
 
-    def _subscribe(self, client: Connection, params: SubscribeParams) -> Nothing:
+    def _subscribe(self, client: Connection, params: SubscribeParams) -> Empty:
         # After the answer, so that nothing comes before it is known to have worked.
         asyncio.get_running_loop().call_soon(self._subscribe_now, client, params)
-        return Nothing()
+        return Empty()
 
     def _subscribe_now(self, client: Connection, params: SubscribeParams) -> None:
         if client.is_open:
             self._news.hub.subscribe(client, params.topics, rate=params.rate_hz)
 
-    def _unsubscribe(self, client: Connection, params: UnsubscribeParams) -> Nothing:
+    def _unsubscribe(self, client: Connection, params: UnsubscribeParams) -> Empty:
         self._news.hub.unsubscribe(client, params.topics)
-        return Nothing()
+        return Empty()
 
     def _end_lease(self, token: str) -> None:
         """End a lease, unless another has taken its place."""

@@ -3,8 +3,8 @@
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-from controller.api.events import ContactsEvent, PatternEvent, SilenceEvent
-from controller.api.parts import AmplifierStatus, ContactStatus, LinkCounts, Tone
+from controller.api.schema import AmplifierStatus, ContactStatus, LinkCounters, PlayedTone
+from controller.api.topics import ContactsEvent, PatternEvent, SilenceEvent
 from controller.contacts import Contact, ContactKey
 from controller.daemon.records import RecordedBackend
 from controller.observer import Applied, Silenced
@@ -65,7 +65,7 @@ class Scene:
         """For the topic `silence`; None where something is played, or nothing was decided yet."""
         return None if self.silenced is None else silence_event(self.silenced)
 
-    def drive(self) -> dict[str, Tone]:
+    def drive(self) -> dict[str, PlayedTone]:
         """What is played, by ERA."""
         return {} if self.applied is None else _drive(self.applied)
 
@@ -163,7 +163,7 @@ def _amplifier_status(
         reply_age_s=None if heard is None else max(0.0, clock.now() - heard),
         lost=status is None and not closed_with_lost,
         closed_with_lost=status is None and closed_with_lost,
-        statistics=LinkCounts(
+        statistics=LinkCounters(
             frames_out=seen.frames_out,
             frames_in=seen.frames_in,
             bad=seen.bad,
@@ -185,9 +185,9 @@ def serial_number(amplifier: Amplifier) -> str | None:
         return None
 
 
-def _drive(applied: Applied) -> dict[str, Tone]:
+def _drive(applied: Applied) -> dict[str, PlayedTone]:
     return {
-        era: Tone(frequency_hz=tone.frequency, level=tone.level, phase_deg=tone.phase)
+        era: PlayedTone(frequency_hz=tone.frequency, level=tone.level, phase_deg=tone.phase)
         for era, tone in applied.drive.items()
     }
 

@@ -17,15 +17,15 @@ from starlette.websockets import WebSocket
 
 from controller.api.jsonrpc import ErrorCode, RpcError, read_params
 from controller.api.jsonrpc import Request as RpcRequest
-from controller.api.messages import METHODS, TouchParams
+from controller.api.methods import METHODS, TouchParams
 from controller.gateway.access import LARGEST_BODY, SUBPROTOCOL, Access
+from controller.gateway.mirror import DaemonMirror
 from controller.gateway.openapi import NOT_OVER_HTTP, STATUS_OF, openapi
-from controller.gateway.picture import Picture
 from controller.gateway.session import TRY_AGAIN_LATER, Session, told_apart
 from controller.gateway.settings import Settings
 from controller.rate import Rate
 
-MOST_SESSIONS = 32
+MAX_SESSIONS = 32
 HTTP_REQUESTS_PER_SECOND = 500.0  # of everybody together; a stop is not counted
 
 _PAGE = Path(__file__).parent / "page"
@@ -36,7 +36,7 @@ class Gateway:
 
     def __init__(self, settings: Settings) -> None:
         self._sessions: set[Session] = set()
-        self._picture = Picture(settings.socket, tell=self._tell)
+        self._picture = DaemonMirror(settings.socket, tell=self._tell)
         self._rate = Rate(HTTP_REQUESTS_PER_SECOND, clock=time.monotonic)
         self._description = json.dumps(openapi()).encode()
         self.app = Starlette(
@@ -104,7 +104,7 @@ class Gateway:
         if SUBPROTOCOL not in socket.scope["subprotocols"]:
             await socket.close(1002, f"speak the subprotocol {SUBPROTOCOL}")
             return
-        if len(self._sessions) >= MOST_SESSIONS:
+        if len(self._sessions) >= MAX_SESSIONS:
             await socket.close(TRY_AGAIN_LATER, "too many clients")
             return
         session = Session(

@@ -9,11 +9,11 @@ from typing import Any
 from pydantic import ValidationError
 
 from controller.api.async_client import AsyncClient
-from controller.api.events import TOPICS
+from controller.api.client_protocol import Notification, Unreachable
 from controller.api.jsonrpc import ErrorCode, RpcError
-from controller.api.messages import METHODS, HelloResult
-from controller.api.parts import Message
-from controller.api.replies import Notification, Unreachable
+from controller.api.methods import METHODS, HelloResult
+from controller.api.schema import Message
+from controller.api.topics import TOPICS
 from drivers.operation.pauses import pauses
 
 _FIRST_PAUSE, _LONGEST_PAUSE = 0.1, 2.0  # s; between attempts to reach the daemon

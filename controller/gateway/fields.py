@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from controller.api.parts import Tone
+from controller.api.schema import PlayedTone
 from model.arrays import ComplexArray, lattice
 from model.reduction.free_plate import solve_free_plate
 from model.rig.rig import Rig
@@ -62,7 +62,7 @@ class FieldMaker:
         )
         self._responses: OrderedDict[float, ComplexArray] = OrderedDict()
 
-    def field(self, drive: Mapping[str, Tone]) -> Field:
+    def field(self, drive: Mapping[str, PlayedTone]) -> Field:
         """The plate's steady vibration under a drive by ERA; raises InputError."""
         frequencies = tuple(sorted({tone.frequency_hz for tone in drive.values()}))
         names = [era.name for era in self._rig.eras]

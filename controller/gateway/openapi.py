@@ -4,9 +4,9 @@ from typing import Any
 
 from pydantic.json_schema import models_json_schema
 
-from controller.api.jsonrpc import MEANINGS, ErrorCode, ErrorData
-from controller.api.messages import METHODS, Method
-from controller.api.parts import API_VERSION, Message, Nothing
+from controller.api.jsonrpc import ERROR_MEANINGS, ErrorCode, ErrorData
+from controller.api.methods import METHODS, Method
+from controller.api.schema import API_VERSION, Empty, Message
 
 NOT_OVER_HTTP = frozenset({"subscribe", "unsubscribe"})
 """What only makes sense where notifications arrive."""
@@ -84,14 +84,14 @@ def _operation(name: str, method: Method, references: Any) -> dict[str, Any]:
     """What one method takes and gives."""
     refusals = dict(_OF_THE_GATEWAY)
     for code, status in STATUS_OF.items():
-        refusals[status] = "; ".join(filter(None, (refusals.get(status), MEANINGS[code])))
+        refusals[status] = "; ".join(filter(None, (refusals.get(status), ERROR_MEANINGS[code])))
     failure = {"application/json": {"schema": references[ErrorAnswer, "serialization"]}}
     success = {"application/json": {"schema": references[method.result, "serialization"]}}
     return {
         "operationId": name,
         "summary": method.meaning,
         "requestBody": {
-            "required": method.params is not Nothing,
+            "required": method.params is not Empty,
             "content": {"application/json": {"schema": references[method.params, "validation"]}},
         },
         "responses": {

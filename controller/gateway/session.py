@@ -18,8 +18,8 @@ from controller.api.jsonrpc import (
     read_params,
     read_request,
 )
-from controller.api.messages import METHODS, SubscribeParams, TouchParams, UnsubscribeParams
-from controller.api.parts import Message, Nothing
+from controller.api.methods import METHODS, SubscribeParams, TouchParams, UnsubscribeParams
+from controller.api.schema import Empty, Message
 from controller.gateway.outbox import Outbox
 from controller.gateway.topics import OWN
 from controller.rate import Rate
@@ -216,7 +216,7 @@ class Session:
         try:
             result = await self._daemon.call(request.method, params)
             if request.method == "arm" and self._has_left:  # nobody knows the lease
-                await self._daemon.call("disarm", Nothing())
+                await self._daemon.call("disarm", Empty())
         except RpcError as error:
             if request.wants_answer:
                 self.outbox.answer(error_line(request.id, error).decode())

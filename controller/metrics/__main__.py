@@ -8,7 +8,7 @@ import typer
 from prometheus_client import CollectorRegistry, start_http_server
 
 from controller.api.client import Client
-from controller.api.messages import StatusResult
+from controller.api.methods import StatusResult
 from controller.api.socket_path import find_socket
 from controller.metrics.collector import DaemonCollector
 

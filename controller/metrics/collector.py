@@ -13,8 +13,8 @@ from prometheus_client.core import (
 from prometheus_client.registry import Collector
 
 from controller.api.jsonrpc import RpcError
-from controller.api.messages import StatusResult
-from controller.api.parts import AmplifierStatus, LatencySummary, StateName
+from controller.api.methods import StatusResult
+from controller.api.schema import AmplifierStatus, DaemonStateName, LatencySummary
 from drivers.errors import LinkError
 
 _LINK_COUNTS = {
@@ -50,7 +50,7 @@ class DaemonCollector(Collector):
 def metrics_of(status: StatusResult) -> Iterator[Metric]:
     """The metrics of one status."""
     state = GaugeMetricFamily("era_state", "1 for the state that it is in.", labels=["state"])
-    for name in get_args(StateName):
+    for name in get_args(DaemonStateName):
         state.add_metric([name], float(name == status.state))
     yield state
     yield _gauge("era_armed", "Whether somebody holds a lease.", float(status.armed_by is not None))

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from controller.api.client_protocol import Unreachable
 from controller.api.jsonrpc import RpcError
-from controller.api.replies import Unreachable
 from daemon_bench import PATIENCE, far_end, until
 from daemon_process import DaemonProcess, daemon_process, holding, play, plays_on
 from floods import flood

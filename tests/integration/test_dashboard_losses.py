@@ -10,9 +10,9 @@ import pytest_asyncio
 
 import dashboard_pictures
 from chromium import Page, open_page
-from controller.api.events import LatencyEvent, StateEvent
-from controller.api.parts import LatencySummary, StateName
-from controller.gateway.app import MOST_SESSIONS
+from controller.api.schema import DaemonStateName, LatencySummary
+from controller.api.topics import LatencyEvent, StateEvent
+from controller.gateway.app import MAX_SESSIONS
 from daemon_bench import running_daemon, until_state
 from dashboard_pictures import SCREENS, STATE, open_dashboard
 from gateway_bench import RawWebSocket, ScriptedDaemon, gateway_process
@@ -78,7 +78,7 @@ async def test_a_daemon_that_ends_without_a_link_is_not_said_to_have_it_back(
     browser: Page, tmp_path: Path
 ) -> None:
     """What was lost stays so in the events, and the end is an event of its own."""
-    states: list[tuple[StateName, str]] = [
+    states: list[tuple[DaemonStateName, str]] = [
         ("READY_TO_SWITCH_ON", ""),
         ("COMM_LOST", "amplifier main: cut"),
         ("NOT_READY", "told to end"),
@@ -135,7 +135,7 @@ async def test_the_banner_says_how_it_is_with_the_gateway_now(
 async def test_a_gateway_without_room_is_not_said_to_be_gone(browser: Page, tmp_path: Path) -> None:
     """It answers; whoever reads that it does not looks for the wrong thing."""
     with gateway_process(tmp_path, tmp_path / "none.sock") as gateway:
-        others = [RawWebSocket(gateway) for _ in range(MOST_SESSIONS)]
+        others = [RawWebSocket(gateway) for _ in range(MAX_SESSIONS)]
         await browser.show(f"{gateway.url}#token={gateway.token}")
         await browser.until(BANNER, lambda text: "does not let this page in" in text)
         others.pop().connection.close()

@@ -12,7 +12,7 @@ from benchmarks.latency_programs import Ended
 from benchmarks.latency_report import HEAD_CELLS, cases, report, write_report
 from benchmarks.latency_run import Case, Disturbed, Failed, Found, attempt
 from controller.api.jsonrpc import ErrorCode, RpcError
-from controller.api.parts import LatencySummary
+from controller.api.schema import LatencySummary
 
 CASES = cases(0.01, 1)
 

@@ -20,10 +20,9 @@ from pathlib import Path
 
 from controller.api.client import Client
 from controller.api.connection import Connection
-from controller.api.events import StateEvent
 from controller.api.hub import Hub
 from controller.api.jsonrpc import ErrorCode, RpcError
-from controller.api.messages import (
+from controller.api.methods import (
     METHODS,
     ArmResult,
     EffectsResult,
@@ -32,18 +31,19 @@ from controller.api.messages import (
     StatusResult,
     SubscribeParams,
 )
-from controller.api.parts import (
+from controller.api.schema import (
     API_VERSION,
     EffectDescription,
-    EraPlace,
+    Empty,
+    EraPosition,
     LatencySummary,
     Message,
-    Nothing,
     RigSummary,
     TableSummary,
     Topic,
 )
 from controller.api.server import ApiServer
+from controller.api.topics import StateEvent
 from daemon_bench import PATIENCE, daemon_table, write_daemon
 from model.rig.file import parse_rig
 from model.table.file import save_table
@@ -104,7 +104,7 @@ class ScriptedDaemon:
         server = ApiServer(
             {name: self._handler(name) for name in METHODS},
             left=self._hub.forget,
-            keeps=self._hub.is_told,
+            keeps=self._hub.is_subscribed,
         )
         bound = socket.socket(socket.AF_UNIX)
         bound.bind(str(self.socket))
@@ -143,7 +143,7 @@ class ScriptedDaemon:
             case "status":
                 return _status()
             case _:
-                return Nothing()
+                return Empty()
 
     def _hello(self) -> HelloResult:
         rig = parse_rig("rig.yaml", self._rig_text)
@@ -154,7 +154,9 @@ class ScriptedDaemon:
                 length_m=rig.plate.length,
                 width_m=rig.plate.width,
                 eras=[
-                    EraPlace(name=era.name, x_m=era.x, y_m=era.y, amplifier="main", channel=number)
+                    EraPosition(
+                        name=era.name, x_m=era.x, y_m=era.y, amplifier="main", channel=number
+                    )
                     for number, era in enumerate(rig.eras)
                 ],
                 simulated=True,

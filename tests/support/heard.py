@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from controller.api.replies import Notification
+from controller.api.client_protocol import Notification
 from model.arrays import ComplexArray, FloatArray
 from touch_stream import Place, Situation
 

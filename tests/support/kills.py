@@ -21,8 +21,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from controller.api.async_client import AsyncClient
+from controller.api.client_protocol import Unreachable
 from controller.api.jsonrpc import RpcError
-from controller.api.replies import Unreachable
 from daemon_bench import until, until_state
 from daemon_process import (
     REACTION,

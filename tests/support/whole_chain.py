@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any, TypeAlias
 from urllib.parse import quote
 
+from controller.api.client_protocol import Notification
 from controller.api.jsonrpc import RpcError
-from controller.api.replies import Notification
 from far_end_process import FarEndProcess, far_end_process
 from heard import PATIENCE, SENSORS, Control, Heard, Refused, hear
 from rig_files import write_rig

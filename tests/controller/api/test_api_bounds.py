@@ -4,12 +4,12 @@ import asyncio
 from collections.abc import Callable
 from typing import cast
 
-from controller.api.connection import OUTGOING_LIMIT, REQUEST_RATE, Connection
-from controller.api.events import ContactsEvent
+from controller.api.connection import MAX_REQUEST_RATE, MAX_UNREAD_BYTES, Connection
 from controller.api.hub import Hub
-from controller.api.messages import METHODS
-from controller.api.parts import FASTEST_RATE, Message
+from controller.api.methods import METHODS
+from controller.api.schema import MAX_RATE, Message
 from controller.api.server import ApiServer
+from controller.api.topics import ContactsEvent
 
 
 class Wire(asyncio.Transport):
@@ -63,13 +63,13 @@ def made(now: Callable[[], float]) -> tuple[Connection, Wire]:
 def test_answers_that_nobody_reads_are_bounded() -> None:
     """256 KiB of them may wait; one more byte, and the client is left. One long answer may go."""
     connection, wire = made(lambda: 0.0)
-    connection.answer(b"x" * (OUTGOING_LIMIT - 1))
+    connection.answer(b"x" * (MAX_UNREAD_BYTES - 1))
     connection.answer(b"\n")
     assert (len(wire.waiting), wire.is_aborted) == (1 << 18, False)
     connection.answer(b"\n")
     assert (len(wire.waiting), wire.is_aborted) == (1 << 18, True)
     connection, wire = made(lambda: 0.0)
-    connection.answer(b"x" * (4 * OUTGOING_LIMIT))
+    connection.answer(b"x" * (4 * MAX_UNREAD_BYTES))
     assert (len(wire.waiting), wire.is_aborted) == (1 << 20, False)
 
 
@@ -98,7 +98,7 @@ async def test_nobody_is_too_busy_to_stop() -> None:
         connection.data_received(line.encode())
         await turns()
 
-    for _ in range(int(REQUEST_RATE) + 1):
+    for _ in range(int(MAX_REQUEST_RATE) + 1):
         await ask("disarm")
     assert asked == ["disarm"] * 2000
     await ask("stop")
@@ -120,12 +120,12 @@ async def test_the_next_telling_waits_for_its_time() -> None:
         hub.publish("contacts", lambda: ContactsEvent(contacts=[]))
         return cast(asyncio.TimerHandle, hub._flush).when() - before
 
-    assert publish() < 1 / FASTEST_RATE
+    assert publish() < 1 / MAX_RATE
     await asyncio.sleep(0.01)
     assert wire.waiting
-    assert publish() >= 1 / FASTEST_RATE - 1e-6
+    assert publish() >= 1 / MAX_RATE - 1e-6
     cast(asyncio.TimerHandle, hub._flush).cancel()
     hub._flush = None
     now += 1.0
-    assert publish() < 1 / FASTEST_RATE
+    assert publish() < 1 / MAX_RATE
     hub.close()

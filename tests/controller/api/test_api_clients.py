@@ -16,10 +16,10 @@ import pytest
 import controller
 from controller.api.async_client import AsyncClient
 from controller.api.client import Client
+from controller.api.client_protocol import Unreachable
 from controller.api.jsonrpc import ErrorCode, RpcError
-from controller.api.messages import METHODS, ArmResult
-from controller.api.parts import Message
-from controller.api.replies import Unreachable
+from controller.api.methods import METHODS, ArmResult
+from controller.api.schema import Message
 from controller.api.socket_path import SYSTEM_SOCKET, find_socket
 from daemon_bench import PLACE, running_daemon, until_state
 from model.errors import InputError

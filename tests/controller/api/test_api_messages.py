@@ -8,7 +8,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import controller
-from controller.api.events import TOPICS, StateEvent
 from controller.api.jsonrpc import (
     ErrorCode,
     RpcError,
@@ -19,9 +18,10 @@ from controller.api.jsonrpc import (
     request_line,
     result_line,
 )
-from controller.api.messages import METHODS, ArmParams, ArmResult, SubscribeParams, TouchParams
-from controller.api.parts import Nothing
+from controller.api.methods import METHODS, ArmParams, ArmResult, SubscribeParams, TouchParams
 from controller.api.reference import WRITER, reference
+from controller.api.schema import Empty
+from controller.api.topics import TOPICS, StateEvent
 from controller.written_part import insert
 
 PAGE = Path(controller.__file__).parent.parent / "docs" / "reference" / "api.md"
@@ -213,11 +213,11 @@ def test_a_notification_has_a_method_and_no_id() -> None:
         ArmParams(owner="Zoë", lease_s=5.0),
         SubscribeParams(topics=["state"], rate_hz=None),
         SubscribeParams(topics=["amplifiers", "log"], rate_hz=60.0),
-        Nothing(),
+        Empty(),
     ],
 )
 def test_what_a_client_writes_is_what_the_server_reads(
-    params: ArmParams | SubscribeParams | Nothing,
+    params: ArmParams | SubscribeParams | Empty,
 ) -> None:
     """Requests of our own client keep their meaning on the way."""
     request = read_request(request_line(7, "any", params))

@@ -12,12 +12,12 @@ from pathlib import Path
 
 import pytest
 
-from controller.api.connection import OUTGOING_LIMIT, Connection
-from controller.api.events import LogEvent
+from controller.api.connection import MAX_UNREAD_BYTES, Connection
 from controller.api.hub import Hub
-from controller.api.messages import METHODS, EffectsResult, TouchParams
-from controller.api.parts import Message, Nothing
-from controller.api.server import MOST_CONNECTIONS, ApiServer
+from controller.api.methods import METHODS, EffectsResult, TouchParams
+from controller.api.schema import Empty, Message
+from controller.api.server import MAX_CONNECTIONS, ApiServer
+from controller.api.topics import LogEvent
 from daemon_bench import until
 
 
@@ -84,7 +84,7 @@ async def serving(folder: Path) -> AsyncIterator[Served]:
     def does(name: str) -> Callable[[Connection, Message], Message | Awaitable[Message]]:
         async def later() -> Message:
             await made.gate.wait()
-            return Nothing()
+            return Empty()
 
         def handle(client: Connection, params: Message) -> Message | Awaitable[Message]:
             made.asked.append(name)
@@ -105,7 +105,7 @@ async def serving(folder: Path) -> AsyncIterator[Served]:
             "effects": lambda client, params: EffectsResult(effects=[]),
         },
         left=made.left.append,
-        keeps=hub.is_told,
+        keeps=hub.is_subscribed,
     )
     bound = socket.socket(socket.AF_UNIX)
     bound.bind(str(made.path))
@@ -290,7 +290,7 @@ async def test_what_a_touch_sets_off_goes_before_the_next_turn(
     served: Served, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Between two turns there is room for what came in and for what that has woken."""
-    monkeypatch.setattr("controller.api.server.TURN", 0.0)  # a line each
+    monkeypatch.setattr("controller.api.server.MAX_TURN_TIME", 0.0)  # a line each
     loop = asyncio.get_running_loop()
     order: list[str] = []
 
@@ -314,7 +314,7 @@ async def test_what_a_touch_sets_off_goes_before_the_next_turn(
 
 async def test_thirty_two_clients_and_no_more(served: Served) -> None:
     """The next is told that it is too busy; a place that is given up is free again."""
-    wires = [await served.connect() for _ in range(MOST_CONNECTIONS)]
+    wires = [await served.connect() for _ in range(MAX_CONNECTIONS)]
     for wire in wires:
         wire.ask("effects")
         assert "result" in await wire.line()
@@ -330,7 +330,7 @@ async def test_thirty_two_clients_and_no_more(served: Served) -> None:
 
 async def test_who_says_nothing_gives_way(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Hundreds of idle clients cannot keep anybody from stopping; who listens is left alone."""
-    monkeypatch.setattr("controller.api.server.SILENCE", 0.2)
+    monkeypatch.setattr("controller.api.server.IDLE_TIMEOUT", 0.2)
     async with serving(tmp_path) as served:
         listener = await served.connect()
         listener.ask("subscribe", '{"topics":["log"]}')
@@ -353,7 +353,7 @@ async def test_who_does_not_read_loses_notifications_then_the_connection(
     served: Served, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What waits for it stays bounded, the next that arrives says how many were lost."""
-    monkeypatch.setattr("controller.api.connection.PATIENCE", 1.0)
+    monkeypatch.setattr("controller.api.connection.UNREAD_TIMEOUT", 1.0)
     deaf = socket.socket(socket.AF_UNIX)
     deaf.connect(str(served.path))
     deaf.sendall(b'{"jsonrpc":"2.0","id":1,"method":"subscribe","params":{"topics":["log"]}}\n')
@@ -362,7 +362,7 @@ async def test_who_does_not_read_loses_notifications_then_the_connection(
     for _ in range(5000):
         served.hub.publish("log", lambda: LOG)
     assert client._transport is not None
-    assert client._transport.get_write_buffer_size() < OUTGOING_LIMIT
+    assert client._transport.get_write_buffer_size() < MAX_UNREAD_BYTES
     read = b""
     deaf.setblocking(False)
     for _ in range(50):

@@ -12,13 +12,13 @@ import pytest
 
 from controller.api.async_client import AsyncClient
 from controller.api.client import Client
-from controller.api.events import TOPICS, EventParams
+from controller.api.client_protocol import Unreachable
 from controller.api.jsonrpc import ErrorCode, RpcError
-from controller.api.messages import METHODS
-from controller.api.parts import Nothing
-from controller.api.replies import Unreachable
+from controller.api.methods import METHODS
+from controller.api.schema import Empty
+from controller.api.topics import TOPICS, EventParams
 from controller.gateway.daemon_link import DaemonLink
-from controller.gateway.picture import Picture
+from controller.gateway.mirror import DaemonMirror
 from controller.gateway.topics import FIELD
 from daemon_bench import PLACE, running_daemon, until, until_state
 
@@ -84,7 +84,7 @@ async def test_keys_that_a_later_minor_version_adds_are_ignored(tmp_path: Path) 
         async with await AsyncClient.connect(later) as era:
             await until_state(era, READY)
             assert await asyncio.to_thread(ask, later) == [READY, "state"]
-            drawing = asyncio.create_task(Picture(later, tell=frames.__setitem__).run())
+            drawing = asyncio.create_task(DaemonMirror(later, tell=frames.__setitem__).run())
             await until(lambda: FIELD in frames)
             nothing = frames[FIELD]
             await era.subscribe("pattern")
@@ -164,7 +164,7 @@ async def test_a_daemon_of_another_major_version_is_named_as_such(tmp_path: Path
         said = ""
         while "version" not in said:
             with pytest.raises(RpcError) as caught:
-                await link.call("status", Nothing())
+                await link.call("status", Empty())
             said = str(caught.value)
             await asyncio.sleep(0.01)
         following.cancel()

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 import typer
 
-from controller.api.replies import Notification
+from controller.api.client_protocol import Notification
 from controller.daemon.run import run_daemon
 from controller.daemon_cli import show_event, show_status, status, touch
 from controller.metrics.__main__ import serve

@@ -6,8 +6,8 @@ from dataclasses import dataclass, field
 
 import pytest
 
-from controller.api.messages import TouchParams
-from controller.api.parts import TouchPoint
+from controller.api.methods import TouchParams
+from controller.api.schema import TouchPoint
 from controller.daemon.config import TouchInput
 from controller.daemon.inputs import MOST_SOURCES, ApiTouches, TouchInputs
 from controller.touch import Touch, TouchFrame, TouchSource

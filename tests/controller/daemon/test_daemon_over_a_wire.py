@@ -14,8 +14,8 @@ from pathlib import Path
 import pytest
 
 from controller.api.async_client import AsyncClient
+from controller.api.client_protocol import Notification
 from controller.api.jsonrpc import ErrorCode, RpcError
-from controller.api.replies import Notification
 from controller.daemon.place import Place
 from controller.daemon_cli import show_status
 from controller.sources.tuio import tuio_datagram

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from controller.api.events import LogEvent, PatternEvent
-from controller.api.messages import METHODS, TouchParams
-from controller.api.parts import Tone
+from controller.api.methods import METHODS, TouchParams
+from controller.api.schema import PlayedTone
+from controller.api.topics import LogEvent, PatternEvent
 from gateway_bench import (
     TOKEN,
     GatewayProcess,
@@ -256,7 +256,7 @@ def test_the_field_is_that_of_the_drive(gateway: GatewayProcess, daemon: Scripte
             "pattern",
             PatternEvent(
                 contacts=[],
-                drive={"SW": Tone(frequency_hz=5.0, level=0.5, phase_deg=0.0)},
+                drive={"SW": PlayedTone(frequency_hz=5.0, level=0.5, phase_deg=0.0)},
                 predicted_contrast_db=None,
                 robust_contrast_db=None,
                 predicted_level_db_sl=None,

@@ -7,11 +7,11 @@ from typing import Any
 
 import pytest
 
+from controller.api.client_protocol import Notification
 from controller.api.jsonrpc import RpcError
-from controller.api.messages import HelloResult
-from controller.api.parts import API_VERSION, Message, Nothing, RigSummary, TableSummary
-from controller.api.replies import Notification
-from controller.gateway.picture import Picture
+from controller.api.methods import HelloResult
+from controller.api.schema import API_VERSION, Empty, Message, RigSummary, TableSummary
+from controller.gateway.mirror import DaemonMirror
 from gateway_bench import PATIENCE, ScriptedDaemon
 
 
@@ -43,7 +43,7 @@ def test_another_layout_is_another_hello(tmp_path: Path) -> None:
             said = json.loads(frame)["params"]["data"]
             shown.append(None if said is None else said["layout"])
 
-    picture = Picture(tmp_path / "nowhere", tell=tell)
+    picture = DaemonMirror(tmp_path / "nowhere", tell=tell)
     one, other = {"regions": [{"name": "a"}]}, {"regions": [{"name": "b"}]}
     picture.daemon.hello = hello(one)
     picture._hello(picture.daemon.hello)
@@ -74,12 +74,12 @@ async def test_what_a_daemon_of_another_version_tells_is_said_with_what_to_updat
     daemon: ScriptedDaemon, caplog: pytest.LogCaptureFixture
 ) -> None:
     """It is asked anew, for what else it tells may be understood."""
-    picture = Picture(daemon.socket, tell=lambda topic, frame: None)
+    picture = DaemonMirror(daemon.socket, tell=lambda topic, frame: None)
 
     async def connected() -> None:
         while True:
             try:
-                await picture.daemon.call("status", Nothing())
+                await picture.daemon.call("status", Empty())
             except RpcError:
                 await asyncio.sleep(0.005)
             else:

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from controller.api.parts import Message
+from controller.api.schema import Message
 from controller.gateway.session import Session
 
 

@@ -7,8 +7,8 @@ from prometheus_client import CollectorRegistry, generate_latest
 from prometheus_client.parser import text_string_to_metric_families
 
 from controller.api.client import Client
-from controller.api.messages import StatusResult
-from controller.api.replies import Unreachable
+from controller.api.client_protocol import Unreachable
+from controller.api.methods import StatusResult
 from controller.metrics.collector import DaemonCollector
 from daemon_bench import running_daemon, until_state
 

@@ -8,11 +8,11 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 API_VERSION = "1.0"
 """Major and minor: another major cannot be talked to, a higher minor only has more to say."""
 
-SHORTEST_LEASE = 1.0  # s
-LONGEST_LEASE = 60.0  # s; whoever is gone for longer cannot say stop
-FASTEST_RATE = 60.0  # Hz; no screen shows more
+MIN_LEASE = 1.0  # s
+MAX_LEASE = 60.0  # s; whoever is gone for longer cannot say stop
+MAX_RATE = 60.0  # Hz; no screen shows more
 
-StateName: TypeAlias = Literal[
+DaemonStateName: TypeAlias = Literal[
     "NOT_READY",
     "SWITCH_ON_DISABLED",
     "READY_TO_SWITCH_ON",
@@ -57,11 +57,11 @@ class Message(BaseModel):
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
 
 
-class Nothing(Message):
+class Empty(Message):
     """An empty object: no parameters, or nothing to say but that it was done."""
 
 
-class EraPlace(Message):
+class EraPosition(Message):
     """Where an ERA stands under the plate, from its south-west corner, and how it is wired."""
 
     name: str
@@ -76,7 +76,7 @@ class RigSummary(Message):
 
     length_m: float
     width_m: float
-    eras: list[EraPlace]
+    eras: list[EraPosition]
     simulated: bool = Field(description="whether any of its amplifiers is a simulated one")
     frequency_hz: list[float] = Field(description="lowest and highest that the rig allows")
 
@@ -120,7 +120,7 @@ class ContactStatus(Message):
     effect: str | None = Field(None, description="the effect that plays for it, where one does")
 
 
-class Tone(Message):
+class PlayedTone(Message):
     """What an amplifier really plays on one ERA."""
 
     frequency_hz: float
@@ -128,7 +128,7 @@ class Tone(Message):
     phase_deg: float
 
 
-class LinkCounts(Message):
+class LinkCounters(Message):
     """How well the link to an amplifier does, since it was opened; see the wire protocol."""
 
     frames_out: Count
@@ -161,7 +161,7 @@ class AmplifierStatus(Message):
     closed_with_lost: bool = Field(
         description="whether it answered to the last, but was closed with another that is lost"
     )
-    statistics: LinkCounts
+    statistics: LinkCounters
 
 
 class LatencySummary(Message):

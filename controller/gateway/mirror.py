@@ -10,9 +10,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from controller.api.messages import HelloResult
-from controller.api.parts import Tone
-from controller.api.replies import Notification
+from controller.api.client_protocol import Notification
+from controller.api.methods import HelloResult
+from controller.api.schema import PlayedTone
 from controller.gateway.daemon_link import DaemonLink
 from controller.gateway.fields import FieldMaker
 from controller.gateway.topics import FIELD, HELLO
@@ -26,7 +26,7 @@ _logger = logging.getLogger(__name__)
 Tell: TypeAlias = Callable[[str, str | bytes], None]
 
 
-class Picture:
+class DaemonMirror:
     """Follows the daemon at a socket and tells every change, topic by topic.
 
     tell: called with a topic and its frame, text as the daemon sent it, binary for the field.
@@ -38,7 +38,7 @@ class Picture:
         self._frames: dict[str, str | bytes] = {HELLO: _event_frame(HELLO, None)}
         self._rig_text: str | None = None
         self._drawn: tuple[str, FieldMaker] | None = None  # of which rig; the thread's alone
-        self._drive: dict[str, Tone] = {}
+        self._drive: dict[str, PlayedTone] = {}
         self._wanted = asyncio.Event()
 
     async def run(self) -> None:
@@ -68,7 +68,8 @@ class Picture:
             self._frames.pop("silence" if topic == "pattern" else "pattern", None)
             drive = told.data.get("drive", {})
             self._drive = {
-                name: Tone.model_validate(tone, extra="ignore") for name, tone in drive.items()
+                name: PlayedTone.model_validate(tone, extra="ignore")
+                for name, tone in drive.items()
             }
             self._wanted.set()
         if topic == "layout":
@@ -101,7 +102,7 @@ class Picture:
             if not self._wanted.is_set():
                 self._show(FIELD, frame)
 
-    def _field(self, rig_text: str | None, drive: dict[str, Tone]) -> bytes:
+    def _field(self, rig_text: str | None, drive: dict[str, PlayedTone]) -> bytes:
         """The field under a drive."""
         if rig_text is None:
             return _NO_FIELD

@@ -13,7 +13,7 @@ from typing import Any, TypeAlias, TypeVar
 from pydantic import ValidationError
 
 from controller.api.jsonrpc import ErrorCode, RpcError
-from controller.api.parts import API_VERSION, Message
+from controller.api.schema import API_VERSION, Message
 from drivers.errors import LinkError
 
 _MessageT = TypeVar("_MessageT", bound=Message)
@@ -51,14 +51,14 @@ class Notification:
 
 
 @dataclass(frozen=True)
-class Answer:
+class Response:
     """What the daemon says to the request of a number; of None: to whatever it was."""
 
     number: int | None
     said: Mapping[str, Any]
 
 
-Reply: TypeAlias = Answer | Notification
+Reply: TypeAlias = Response | Notification
 
 
 class Greeting(Message):
@@ -72,7 +72,7 @@ def reply_of(line: bytes) -> Reply:
     try:
         said = json.loads(line)
         if said.get("method") != "event":
-            return Answer(said["id"], said)
+            return Response(said["id"], said)
         params = said["params"]
         return Notification(params["topic"], params["time_s"], params["lost"], params["data"])
     except (ValueError, AttributeError, KeyError, TypeError) as error:

@@ -8,28 +8,28 @@ from typing import Annotated, Any, NamedTuple
 
 from pydantic import Field
 
-from controller.api.parts import (
-    FASTEST_RATE,
-    LONGEST_LEASE,
-    SHORTEST_LEASE,
+from controller.api.schema import (
+    MAX_LEASE,
+    MAX_RATE,
+    MIN_LEASE,
     AmplifierStatus,
     ContactStatus,
     Count,
+    DaemonStateName,
     EffectDescription,
+    Empty,
     LatencySummary,
     Message,
     Name,
-    Nothing,
     PhaseName,
+    PlayedTone,
     RigSummary,
-    StateName,
     TableSummary,
-    Tone,
     Topic,
     TouchPoint,
 )
 
-MOST_TOUCHES = 64  # of a frame; a panel reports ten, a forearm some more
+MAX_TOUCHES = 64  # of a frame; a panel reports ten, a forearm some more
 
 
 class HelloParams(Message):
@@ -54,7 +54,7 @@ class StatusResult(Message):
 
     time_s: float = Field(description="of this answer, on the daemon's CLOCK_MONOTONIC")
     unix_time_s: float = Field(description="the same moment on the wall clock")
-    state: StateName
+    state: DaemonStateName
     cause: str = Field(description="why it is in this state")
     remedy: str | None = Field(description="what to do about it, where anything is to be done")
     phase: PhaseName
@@ -68,7 +68,7 @@ class StatusResult(Message):
     armed_by: str | None
     lease_left_s: float | None
     contacts: list[ContactStatus] = Field(description="in order of arrival, the newest last")
-    drive: dict[str, Tone] = Field(description="by ERA, silent ones left out")
+    drive: dict[str, PlayedTone] = Field(description="by ERA, silent ones left out")
     silent_because: str | None = Field(None, description="why nothing is played though armed")
     plain_because: str | None = Field(
         None, description="why touches begin along plain ramps though shaped onsets are possible"
@@ -86,7 +86,7 @@ class ArmParams(Message):
     """High voltage on, for as long as the lease is renewed."""
 
     owner: Name
-    lease_s: Annotated[float, Field(ge=SHORTEST_LEASE, le=LONGEST_LEASE)]
+    lease_s: Annotated[float, Field(ge=MIN_LEASE, le=MAX_LEASE)]
 
 
 class ArmResult(Message):
@@ -112,7 +112,7 @@ class TouchParams(Message):
     """All fingers of this client under a source name; valid for 150 ms, so repeat it."""
 
     source: Name
-    touches: Annotated[list[TouchPoint], Field(max_length=MOST_TOUCHES)]
+    touches: Annotated[list[TouchPoint], Field(max_length=MAX_TOUCHES)]
 
 
 class EffectsResult(Message):
@@ -136,7 +136,7 @@ class SubscribeParams(Message):
     """Topics to be told of; rate_hz is how often of what is measured all the time."""
 
     topics: Annotated[list[Topic], Field(min_length=1, max_length=16)]
-    rate_hz: Annotated[float, Field(ge=1, le=FASTEST_RATE)] | None = Field(
+    rate_hz: Annotated[float, Field(ge=1, le=MAX_RATE)] | None = Field(
         None, description="of amplifiers and latency; 10 if left out"
     )
 
@@ -157,21 +157,21 @@ class Method(NamedTuple):
 
 METHODS: dict[str, Method] = {
     "hello": Method(HelloParams, HelloResult, "who is there and what it drives"),
-    "status": Method(Nothing, StatusResult, "how everything is"),
+    "status": Method(Empty, StatusResult, "how everything is"),
     "arm": Method(ArmParams, ArmResult, "high voltage on; touches are felt while the lease lasts"),
     "renew": Method(RenewParams, RenewResult, "the owner of the lease is still there"),
-    "disarm": Method(Nothing, Nothing, "silent along a short ramp, high voltage off; by anyone"),
+    "disarm": Method(Empty, Empty, "silent along a short ramp, high voltage off; by anyone"),
     "stop": Method(
-        Nothing,
-        Nothing,
+        Empty,
+        Empty,
         "quick stop, latched until clear; by anyone, at any time; 1004 where an amplifier that is "
         "lost from then on did not hear it",
     ),
-    "clear": Method(Nothing, Nothing, "acknowledge a stop, or a fault whose cause is gone"),
-    "touch": Method(TouchParams, Nothing, "all fingers of this client, as a touch source"),
-    "effects": Method(Nothing, EffectsResult, "which effects there are"),
-    "play": Method(PlayParams, Nothing, "play an effect at a finger; only while armed"),
-    "subscribe": Method(SubscribeParams, Nothing, "be told of topics from now on"),
-    "unsubscribe": Method(UnsubscribeParams, Nothing, "be told of them no more"),
+    "clear": Method(Empty, Empty, "acknowledge a stop, or a fault whose cause is gone"),
+    "touch": Method(TouchParams, Empty, "all fingers of this client, as a touch source"),
+    "effects": Method(Empty, EffectsResult, "which effects there are"),
+    "play": Method(PlayParams, Empty, "play an effect at a finger; only while armed"),
+    "subscribe": Method(SubscribeParams, Empty, "be told of topics from now on"),
+    "unsubscribe": Method(UnsubscribeParams, Empty, "be told of them no more"),
 }
 """Every method of the API, by name."""

@@ -4,14 +4,14 @@ from typing import Any, Literal, NamedTuple
 
 from pydantic import Field
 
-from controller.api.parts import (
+from controller.api.schema import (
     AmplifierStatus,
     ContactStatus,
     Count,
+    DaemonStateName,
     LatencySummary,
     Message,
-    StateName,
-    Tone,
+    PlayedTone,
     Topic,
 )
 
@@ -19,8 +19,8 @@ from controller.api.parts import (
 class StateEvent(Message):
     """The daemon's state is another now."""
 
-    old: StateName
-    new: StateName
+    old: DaemonStateName
+    new: DaemonStateName
     cause: str
     remedy: str | None = Field(description="what to do about it, where anything is to be done")
 
@@ -35,7 +35,7 @@ class PatternEvent(Message):
     """A pattern that the amplifiers have confirmed."""
 
     contacts: list[ContactStatus]
-    drive: dict[str, Tone] = Field(description="by ERA, silent ones left out")
+    drive: dict[str, PlayedTone] = Field(description="by ERA, silent ones left out")
     predicted_contrast_db: float | None
     robust_contrast_db: float | None
     predicted_level_db_sl: float | None

@@ -13,10 +13,10 @@ from functools import lru_cache
 
 from pydantic_core import ValidationError, from_json
 
-from controller.api.messages import TouchParams
+from controller.api.methods import TouchParams
 
 
-def is_moot(line: bytes, following: bytes) -> bool:
+def is_superseded(line: bytes, following: bytes) -> bool:
     """Whether a line is a touch that wants no answer, and the following one takes its place."""
     source = _source(line)
     return source is not None and source == _source(following)

@@ -14,6 +14,7 @@ import numpy as np
 from examples.make_measured import FREQUENCIES, SENSOR, true_rig
 from model.calibration.calibrate import calibrate
 from model.calibration.outcome import Calibration
+from model.finger.contrast import contrast_db
 from model.finger.fingertip import fingertip_points
 from model.rig.file import load_rig
 from model.rig.rig import Rig
@@ -58,7 +59,7 @@ def reached(
         points = fingertip_points(*place, truth.plate)
         return np.asarray(truth.amplitudes(excitation, points)[1].sum(axis=0))
 
-    return float(20 * np.log10(peak(target).mean() / max(peak(place).max() for place in quiet)))
+    return float(contrast_db([peak(target)], np.concatenate([peak(place) for place in quiet])))
 
 
 def contacts(rng: np.random.Generator, count: int, rig: Rig) -> np.ndarray:

@@ -8,6 +8,7 @@ import numpy as np
 
 from model.arrays import ComplexArray, FloatArray, IntArray
 from model.drive_modes.fields import Drive, Fields, SingleComplex
+from model.finger.contrast import contrast_db
 from model.finger.fingertip import fingertip_points
 from model.finger.perception import STRONG_DB_SL
 from model.rig.file import load_rig
@@ -96,8 +97,7 @@ class Errors:
             tones = [np.abs((self.factors * weights[f]) @ field[f]) for f in active]
             return np.asarray(np.sum(tones, axis=0))
 
-        targets = np.min([peak(target).mean(axis=-1) for target in fields.targets], axis=0)
-        return np.asarray(20 * np.log10(targets / peak(fields.quiet).max(axis=-1)))
+        return contrast_db([peak(target) for target in fields.targets], peak(fields.quiet))
 
 
 def weights_of(drive: Drive, fields: Fields) -> ComplexArray:

@@ -26,6 +26,7 @@ from model.arrays import ComplexArray, FloatArray
 from model.drive_modes import MODES, Choice, find_drives
 from model.drive_modes.exact_search import search_exactly
 from model.drive_modes.fields import ERROR_SHARE, Fields
+from model.finger.perception import decibels
 from model.table.robust import with_robust_contrast
 
 QUIET = (1, 2, 3)
@@ -119,12 +120,12 @@ def _methods(places: FloatArray, errors: Errors) -> dict[str, tuple[float, float
     exact = search_exactly(fields, eras_at_most=4)
     assert exact.drive is not None
     add("switched, exact, 1 to 4 ERAs", weights_of(exact.drive, fields))
-    found["  bound: any mixture of these"] = (20 * np.log10(exact.mixture), None)
+    found["  bound: any mixture of these"] = (float(decibels(exact.mixture)), None)
     for mode in ("graded", "signed", "phased"):
         choice = _best(fields, mode)
         add(mode, weights_of(choice.drive, fields))
-    found["  robust score of phased"] = (20 * np.log10(choice.outcome.score), None)
-    found["  bound of that score"] = (20 * np.log10(robust_bound(fields)), None)
+    found["  robust score of phased"] = (float(decibels(choice.outcome.score)), None)
+    found["  bound of that score"] = (float(decibels(robust_bound(fields))), None)
     return found
 
 
@@ -226,7 +227,7 @@ def freedom_section(sets: int, seed: int) -> Section:
         for places in contact_sets(sets, fingers=quiet + 1, rng=rng, apart=apart):
             fields = fields_of(places)
             scores.append([_best(fields, mode).outcome.score for mode in names])
-        ahead = 20 * np.log10(np.array(scores)[:, :-1] / np.array(scores)[:, 1:])
+        ahead = decibels(np.array(scores)[:, :-1] / np.array(scores)[:, 1:])
         rows.append(
             [f"{quiet} quiet"]
             + [f"{int((column > 1e-6).sum())}, {max(column.max(), 0):.2f} dB" for column in ahead.T]

@@ -9,6 +9,7 @@ import numpy as np
 from benchmarks.localization_cases import LEAST, NO_ERRORS, Errors
 from model.arrays import ComplexArray, FloatArray, IntArray
 from model.drive_modes.fields import Fields, SingleComplex
+from model.finger.contrast import contrast_db
 
 
 def inverse_filter(fields: Fields, centres: IntArray) -> ComplexArray:
@@ -45,7 +46,7 @@ def reversed_pulse_contrast(fields: Fields, errors: Errors, *, samples: int = 51
 
     return np.array(
         [
-            20 * np.log10(peak(fields.targets[0], f).mean() / peak(fields.quiet, f).max())
+            float(contrast_db([peak(fields.targets[0], f)], peak(fields.quiet, f)))
             for f in errors.factors
         ]
     )

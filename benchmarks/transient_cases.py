@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from model.arrays import ComplexArray
+from model.finger.contrast import contrast_db
 from model.finger.fingertip import FINGERTIP_RADIUS, fingertip_points
 from model.finger.perception import STRONG_DB_SL, detection_threshold
 from model.reduction.free_plate import solve_free_plate
@@ -44,8 +45,8 @@ class Case:
         return float(min(1.0, felt / full))
 
     def steady_db(self, weights: ComplexArray) -> float:
-        target = np.abs(weights @ self.at_target).mean()
-        return float(20 * np.log10(target / np.abs(weights @ self.at_quiet).max()))
+        target, quiet = np.abs(weights @ self.at_target), np.abs(weights @ self.at_quiet)
+        return float(contrast_db([target], quiet))
 
     def excitation(
         self, rig: Rig, level: float = 1.0, errors: ComplexArray | None = None

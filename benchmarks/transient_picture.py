@@ -7,6 +7,7 @@ from matplotlib.figure import Figure
 
 from benchmarks.transient_cases import Case
 from model.arrays import FloatArray
+from model.finger.contrast import contrast_db
 from model.finger.fingertip import fingertip_points
 from model.rig.rig import Rig
 from model.table.pattern import ONSET_RAMP
@@ -85,7 +86,7 @@ def draw(plate: PlateInTime, rig: Rig, cases: list[list[Case]], path: Path) -> N
 def _remark(felt: FloatArray, count: int, *, start: bool) -> str:
     if start:
         peak = np.abs(felt[: round(0.1 * SAMPLE_RATE)]).max(axis=0)
-        contrast = 20 * np.log10(peak[:count].mean() / peak[count:].max())
+        contrast = contrast_db([peak[:count]], peak[count:])
         return f"contrast {contrast:.0f} dB in the first 100 ms"
     late = np.abs(felt[round(0.04 * SAMPLE_RATE) :, :count]).max()
     return f"target moves up to {late:.2g} m/s² after 40 ms"

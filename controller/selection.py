@@ -188,7 +188,7 @@ class Selector:
                 contact,
                 target.level_db_sl,
                 mean_level_db_sl(frequencies, field),
-                float(contrast_db(peak_acceleration(field), loudest)) if quiet else None,
+                float(contrast_db([peak_acceleration(field)], loudest)) if quiet else None,
             )
             for (contact, target), field in zip(targets, fields, strict=True)
         )

@@ -33,10 +33,10 @@ def measure(target: FingerFelt, quiet: Sequence[FingerFelt]) -> Measured | None:
     contrast = None
     if quiet:
         others = np.concatenate([peak_acceleration(finger.amplitudes) for finger in quiet])
-        contrast = float(contrast_db(peak_acceleration(target.amplitudes), others))
+        contrast = float(contrast_db([peak_acceleration(target.amplitudes)], others))
     return Measured(finger_level(target), contrast)
 
 
 def peak_contrast_db(target: FingerFelt, quiet: Sequence[FingerFelt]) -> float:
     """Contrast [dB] of a window's peaks, as `model.transients.measures` predicts an onset's."""
-    return float(contrast_db(target.peaks, np.concatenate([finger.peaks for finger in quiet])))
+    return float(contrast_db([target.peaks], np.concatenate([finger.peaks for finger in quiet])))

@@ -147,6 +147,11 @@ class Outcome:
     quiet_sensation: float
     score: float
 
+    @property
+    def contrast(self) -> float:
+        """Peak acceleration at the lesser target to that at the loudest quiet point, a ratio."""
+        return max(self.peak, 1e-30) / max(self.quiet_peak, 1e-30)
+
 
 def judge(fields: Fields, drive: Drive) -> Outcome:
     """What a drive does; tones of different frequencies add as magnitudes (paper Eq. 28)."""

@@ -1,4 +1,4 @@
-"""How localized a pattern is: contrast between regions of the plate, and level at the target."""
+"""How localized a vibration is: contrast between fingertips, and level at the target."""
 
 from collections.abc import Sequence
 
@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from model.arrays import FloatArray
 from model.finger.perception import decibels, sensation_level
 
-# A lone finger is told from the rest of the plate beyond this distance [m] (about two fingertips).
+# The surroundings of a lone finger begin at this distance [m], about two fingertips.
 SURROUNDINGS_RADIUS = 0.05
 
 
@@ -28,16 +28,22 @@ def is_around(points: FloatArray, targets: Sequence[tuple[float, float]]) -> NDA
     return beyond if beyond.any() else ~beyond
 
 
-def contrast_db(target: FloatArray, quiet: FloatArray) -> FloatArray:
-    """Contrast [dB] of peak accelerations: mean over the target's points to the quiet maximum.
+def contrast_ratio(targets: Sequence[FloatArray], quiet: FloatArray) -> FloatArray:
+    """Contrast of peak amplitudes as a ratio: the least target to the loudest quiet point.
 
-    target (..., p), quiet (..., q) -> (...).
+    A target counts by the mean over its points. targets (..., p) each, quiet (..., q) -> (...).
     """
-    return decibels(target.mean(axis=-1) / quiet.max(axis=-1))
+    felt = np.minimum.reduce([target.mean(axis=-1) for target in targets])
+    return np.asarray(felt / quiet.max(axis=-1))
+
+
+def contrast_db(targets: Sequence[FloatArray], quiet: FloatArray) -> FloatArray:
+    """Return `contrast_ratio` in dB."""
+    return decibels(contrast_ratio(targets, quiet))
 
 
 def mean_level_db_sl(frequencies: FloatArray, amplitudes: FloatArray) -> float:
-    """Level [dB SL] over a region: mean over its points of how far above threshold each is felt.
+    """Level [dB SL] over a region: mean over its points of amplitude to threshold.
 
     frequencies (f,) [Hz], amplitudes (f, p) [m/s²].
     """

@@ -42,7 +42,7 @@ def sensation_level(frequencies: FloatArray, amplitudes: FloatArray) -> FloatArr
     return decibels(np.sqrt(((amplitudes / threshold) ** 2).sum(axis=0)))
 
 
-def decibels(ratio: FloatArray) -> FloatArray:
+def decibels(ratio: FloatArray | float) -> FloatArray:
     """20 log10 of an amplitude ratio, of the same shape; -inf for zero."""
     with np.errstate(divide="ignore"):
         return np.asarray(20 * np.log10(ratio))

@@ -18,6 +18,7 @@ from model.drive_modes.exact_search import loudest_found, search_exactly
 from model.drive_modes.fields import Drive, Fields, Outcome, judge
 from model.drive_modes.tones import excitation_of
 from model.errors import InputError
+from model.finger.perception import decibels
 from model.structure.actuator import Era
 from model.structure.plate import Plate
 from model.table.pattern import ONSET_RAMP, Pattern
@@ -125,7 +126,7 @@ def _ask_exactly(
         raise InputError(_too_loud(question, "switched", most=most))
     outcome = judge(fields, found.drive)
     pattern = _pattern(table, question, "switched", usable, fields, found.drive, outcome)
-    return replace(pattern, contrast_bound_db=20 * math.log10(found.bound))
+    return replace(pattern, contrast_bound_db=float(decibels(found.bound)))
 
 
 def _usable(
@@ -146,7 +147,7 @@ def _usable(
 
 def _too_loud(question: Question, mode: str, *, most: float) -> str:
     where = " and ".join(f"({x:g}, {y:g})" for x, y in question.targets)
-    most = 20 * math.log10(most)
+    most = float(decibels(most))
     # Rounded down, so that it can be asked for.
     # Not all is gone through: phases of several targets, and of one that weights above zero reach,
     # are tried, and of more than two ERAs with frequencies of their own some patterns are.
@@ -169,8 +170,8 @@ def _pattern(
     outcome: Outcome,
 ) -> Pattern:
     gain = min(1.0, fields.wanted / outcome.sensation)
-    contrast = 20 * math.log10(max(outcome.peak, 1e-30) / max(outcome.quiet_peak, 1e-30))
-    quiet_level = 20 * math.log10(max(gain * outcome.quiet_sensation, 1e-30))
+    contrast = float(decibels(outcome.contrast))
+    quiet_level = float(decibels(max(gain * outcome.quiet_sensation, 1e-30)))
     return Pattern(
         excitation=excitation_of(drive, table.eras, table.frequencies[usable], gain=gain),
         ramp=ONSET_RAMP,

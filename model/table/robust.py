@@ -19,6 +19,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from model.arrays import ComplexArray, FloatArray
+from model.finger.contrast import contrast_db
 from model.finger.load import finger_loads
 from model.structure.actuator import Era
 from model.structure.point_load import PointLoad
@@ -90,13 +91,8 @@ def ensemble_contrast_db(
         ],
         axis=0,
     )
-    starts = (0, *ends)
-    of_targets = [
-        peak[:, start:end].mean(axis=1)
-        for start, end in zip(starts, ends[: len(question.targets)], strict=False)
-    ]
-    loudest = peak[:, ends[len(question.targets) - 1] :].max(axis=1)
-    return np.asarray(20 * np.log10(np.min(of_targets, axis=0) / loudest))
+    *targets, quiet = np.split(peak, ends[: len(question.targets)], axis=1)
+    return contrast_db(targets, quiet)
 
 
 def _acceleration(

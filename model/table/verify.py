@@ -27,6 +27,7 @@ from model.fem.harmonic import direct_acceleration, hold_and_drive
 from model.finger.contrast import contrast_db, mean_level_db_sl
 from model.finger.fingertip import fingertip_points
 from model.finger.grid import CELL_SAMPLES, Grid
+from model.finger.perception import decibels
 from model.reduction.reduced_plate import reduce_plate
 from model.rig.rig import Rig
 from model.structure.point_load import load_positions
@@ -236,8 +237,8 @@ class _AnswerChecker:
         peak = peak_acceleration(direct)
         wrong = field_error(self._table, float(frequencies[-1]))
         wrong *= math.sqrt(float((peak_acceleration(rest) ** 2).mean()))
-        at_target = 20 * math.log10(1 + wrong / peak[:count].mean())
-        at_quiet = 20 * math.log10(1 + wrong / peak[count:].max())
+        at_target = float(decibels(1 + wrong / peak[:count].mean()))
+        at_quiet = float(decibels(1 + wrong / peak[count:].max()))
         contrast = pattern.contrast_db
         return AnswerCheck(
             question,
@@ -270,7 +271,7 @@ def steady_in_time(
 
 def _contrast(amplitudes: FloatArray, at_target: int) -> float:
     peak = peak_acceleration(amplitudes)
-    return float(contrast_db(peak[:at_target], peak[at_target:]))
+    return float(contrast_db([peak[:at_target]], peak[at_target:]))
 
 
 def _random_answer(

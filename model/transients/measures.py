@@ -57,8 +57,7 @@ class Transients:
         felt = self.acceleration(bases, np.concatenate(discs))
         ends = np.cumsum([len(disc) for disc in discs])[:-1]
         peaks = np.split(np.abs(felt).max(axis=0), ends)
-        loudest = np.concatenate(peaks[len(targets) :])
-        return min(float(contrast_db(peak, loudest)) for peak in peaks[: len(targets)])
+        return float(contrast_db(peaks[: len(targets)], np.concatenate(peaks[len(targets) :])))
 
     def ending_contrast_db(
         self,
@@ -89,10 +88,8 @@ class Transients:
         )
         over = max((term.end for base in ending for term in base), default=0.0)
         felt = self.acceleration(ending, at_quiet, duration=over + AFTER, after=excitation)
-        loudest = np.abs(felt).max(axis=0)
         ends = np.cumsum([len(disc) for disc in discs])[:-1]
-        each = np.split(np.asarray(steady), ends)
-        return min(float(contrast_db(peak, loudest)) for peak in each)
+        return float(contrast_db(np.split(np.asarray(steady), ends), np.abs(felt).max(axis=0)))
 
     def acceleration(
         self,

@@ -8,12 +8,12 @@ decibel of what `model.transients.measures` finds sample by sample, at a hundred
 """
 
 from collections.abc import Sequence
-from itertools import accumulate, pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
 from model.arrays import ComplexArray, FloatArray, IntArray
+from model.finger.contrast import contrast_ratio
 from model.transients.measures import FIRST
 from model.transients.time_response import PlateInTime
 
@@ -53,10 +53,8 @@ class RampedOnsets:
         rows = np.concatenate([answers.real, answers.imag])
         real, imaginary = (rows @ np.concatenate([*targets, quiet]).T).reshape(2, n, MOMENTS, -1)
         peaks = np.sqrt(np.maximum.reduce(real * real + imaginary * imaginary, axis=1))
-        ends = list(accumulate(map(len, targets), initial=0))
-        felt = [peaks[:, begin:end].mean(axis=1) for begin, end in pairwise(ends)]
-        loudest = peaks[:, ends[-1] :].max(axis=1)
-        return np.asarray(np.minimum.reduce(felt) / loudest, dtype=float)
+        *felt, loudest = np.split(peaks, np.cumsum([len(shapes) for shapes in targets]), axis=1)
+        return contrast_ratio(felt, loudest).astype(float)
 
 
 def _ramp_answers(

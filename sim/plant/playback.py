@@ -88,8 +88,7 @@ class Playback:
         count = len(self.targets)
         if len(peaks) == count:
             return None
-        loudest = np.concatenate(peaks[count:])
-        return min(float(contrast_db(peak, loudest)) for peak in peaks[:count])
+        return float(contrast_db(peaks[:count], np.concatenate(peaks[count:])))
 
     @cached_property
     def _felt(self) -> tuple[Felt, ...]:

@@ -8,6 +8,7 @@ import numpy as np
 
 from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
+from model.finger.contrast import contrast_db
 from model.transients.measures import FIRST
 from sim.sensors.recording import Recording
 
@@ -113,9 +114,9 @@ def reverberation_time(recording: Recording, *, end: float) -> float:
 def _contrast(
     recording: Recording, peak: FloatArray, target: Sequence[str], quiet: Sequence[str]
 ) -> float:
-    loudest = peak[_columns(recording, quiet)].max()
-    felt = peak[_columns(recording, target)].mean()
-    return 20 * math.log10(max(felt, 1e-30) / max(loudest, 1e-30))
+    peak = np.maximum(peak, 1e-30)
+    felt, others = peak[_columns(recording, target)], peak[_columns(recording, quiet)]
+    return float(contrast_db([felt], others))
 
 
 def _columns(recording: Recording, names: Sequence[str]) -> list[int]:

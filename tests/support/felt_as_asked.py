@@ -249,4 +249,4 @@ def _apart(got: ComplexArray, wanted: ComplexArray) -> float:
 def _contrast(peaks: Mapping[str, FloatArray], situation: Situation) -> float:
     """From the target to the loudest quiet point, of peaks (p,) by place [dB]."""
     quiet = np.concatenate([peaks[place] for place in situation.quiet])
-    return float(contrast_db(peaks[situation.felt_at], quiet))
+    return float(contrast_db([peaks[situation.felt_at]], quiet))

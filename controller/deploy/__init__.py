@@ -1,1 +1,1 @@
-"""What a machine needs to run the daemon as a service of the system."""
+"""Install the daemon as a system service."""

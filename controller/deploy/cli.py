@@ -1,4 +1,4 @@
-"""`era systemd`: the daemon as a service of the system."""
+"""`era systemd`: the daemon as a system service."""
 
 import os
 import shutil
@@ -13,10 +13,10 @@ import typer
 from model.errors import InputError
 
 if TYPE_CHECKING:
-    from controller.deploy.needs import Needs
+    from controller.deploy.permissions import Permissions
 
 app = typer.Typer()
-systemd_app = typer.Typer(no_args_is_help=True, help="Run the daemon as a service of the system.")
+systemd_app = typer.Typer(no_args_is_help=True, help="Run the daemon as a system service.")
 app.add_typer(systemd_app, name="systemd")
 
 EXIT_STATUS: dict[type[BaseException], int] = {InputError: 2}
@@ -24,7 +24,7 @@ EXIT_STATUS: dict[type[BaseException], int] = {InputError: 2}
 
 @systemd_app.callback()
 def _only_commands() -> None:
-    """Run the daemon as a service of the system."""
+    """Run the daemon as a system service."""
 
 
 @systemd_app.command()
@@ -33,85 +33,75 @@ def install(
         "/etc/era-haptics/daemon.yaml"
     ),
     dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Print the files and write none.")
+        bool, typer.Option("--dry-run", help="Print the files without writing them.")
     ] = False,
     root: Annotated[
-        Path, typer.Option(help="Write below this folder, as for an image of a system.")
+        Path, typer.Option(help="Install below this folder, e.g. of a system image.")
     ] = Path("/"),
 ) -> None:
-    """Write a hardened unit, and say what to run then.
+    """Install a hardened systemd unit, its user and udev rules; print what to run next.
 
-    With it come its user and the rights to its devices.
-
-    What the unit allows follows from the daemon's file, where that is there.
+    The unit allows only the devices and networks that the daemon's file uses.
     """
-    from controller.deploy.files import NAME, service_files
+    from controller.deploy.files import SERVICE_NAME, service_files
 
     config = config.absolute()
-    files = service_files(config, _era(), _needs(config))
+    files = service_files(config, _era_command(), _permissions(config))
     if dry_run:
-        for file in files:
-            print(f"# ---- {file.path}\n{file.text}")
-        _print_next(NAME, config)
-        return
-    texts = {root / file.path.relative_to("/"): file.text for file in files}
-    try:
-        _write(texts)
-    except PermissionError as error:
-        raise InputError(
-            f"{error.filename}: you may not write this; run it with sudo, give another folder with "
-            "--root, or see with --dry-run what it would write"
-        ) from error
-    for path in texts:
-        print(f"Wrote {path}")
-    _print_next(NAME, config)
+        for path, text in files.items():
+            print(f"# ---- {path}\n{text}")
+    else:
+        installed = {root / path.relative_to("/"): text for path, text in files.items()}
+        try:
+            _write_all(installed)
+        except PermissionError as error:
+            raise InputError(
+                f"{error.filename}: no permission to write; run with sudo, install elsewhere with "
+                "--root, or print the files with --dry-run"
+            ) from error
+        for path in installed:
+            print(f"Wrote {path}")
+    print(
+        "Next, as root:\n"
+        f"  systemd-sysusers && usermod -aG {SERVICE_NAME} YOU   # may arm after logging in again\n"
+        "  udevadm control --reload && udevadm trigger\n"
+        f"  era daemon {config} --check\n"
+        f"  systemctl daemon-reload && systemctl enable --now {SERVICE_NAME}\n"
+        f"  systemctl status {SERVICE_NAME}"
+    )
 
 
-def _write(texts: Mapping[Path, str]) -> None:
-    """Write all the files or, where one cannot be written, none; raises OSError with its name."""
+def _write_all(files: Mapping[Path, str]) -> None:
+    """Write all files or none; raises OSError with the name of the file that failed."""
     from model.files.array_file import whole_or_nothing
 
     with ExitStack() as written:
-        for path, text in texts.items():
+        for path, text in files.items():
             path.parent.mkdir(parents=True, exist_ok=True)
             stream = written.enter_context(whole_or_nothing(path))
             stream.write(text.encode())
-            stream.flush()  # before any takes its place: a full disk must show by then
+            stream.flush()  # before any file is replaced, so that a full disk changes nothing
 
 
-def _needs(config: Path) -> "Needs":
-    """What a configuration needs; everything where there is none yet."""
-    from controller.deploy.needs import Needs, needs_of
+def _permissions(config: Path) -> "Permissions":
+    """Permissions that a daemon's file requires; all of them if it does not exist yet."""
+    from controller.deploy.permissions import Permissions, required_permissions
 
     if not config.exists():
-        print(
-            f"{config} is not there yet, so the unit allows every kind of device", file=sys.stderr
-        )
-        return Needs()
+        print(f"{config}: not found; the unit allows every kind of device", file=sys.stderr)
+        return Permissions()
     from controller.daemon.config import load_daemon_config
 
     loaded = load_daemon_config(config)
-    return needs_of(loaded.urls.values(), [touch.url for touch in loaded.touch])
+    return required_permissions(loaded.urls.values(), [touch.url for touch in loaded.touch])
 
 
-def _era() -> Path:
-    """The installed command; one that lies in a home folder cannot be seen by the service."""
+def _era_command() -> Path:
+    """The path of the installed `era` command."""
     beside = Path(sys.executable).with_name("era")
     found = beside if os.access(beside, os.X_OK) else Path(shutil.which("era") or "")
     if not found.is_absolute():
         raise InputError(
-            f"there is no era command for the service to run, neither beside {sys.executable} nor "
-            "in PATH; install it with  pip install era-haptics"
+            f"era: command not found beside {sys.executable} or in PATH; install it with pip"
         )
     return found
-
-
-def _print_next(name: str, config: Path) -> None:
-    print(
-        "Next, as root:\n"
-        f"  systemd-sysusers && usermod -aG {name} YOU   # who shall arm; log in again then\n"
-        "  udevadm control --reload && udevadm trigger\n"
-        f"  era daemon {config} --check\n"
-        f"  systemctl daemon-reload && systemctl enable --now {name}\n"
-        f"  systemctl status {name}"
-    )

@@ -16,11 +16,11 @@ from drivers.backends.urls.serial_line import SerialUrl
 from drivers.codec.modbus import exchanges
 from drivers.codec.serial_line.exchanges import encode_request
 from drivers.codec.serial_line.frame import encode_frame
-from drivers.guard import SafeCommand
+from drivers.guard import SafeCommandSet
 from drivers.protocol.messages import Apply, Arm, Request
 
 
-def bare_serial(url: str, sets: Sequence[SafeCommand]) -> list[float]:
+def bare_serial(url: str, sets: Sequence[SafeCommandSet]) -> list[float]:
     """pyserial: write the frame, read until the zero that ends the reply."""
     parsed = SerialUrl.parse(url)
     requests = [
@@ -47,12 +47,12 @@ def _exchange(port: serial.Serial, request: bytes) -> None:
         ends += port.read(max(1, port.in_waiting)).count(0)
 
 
-def bare_modbus(url: str, sets: Sequence[SafeCommand]) -> list[float]:
+def bare_modbus(url: str, sets: Sequence[SafeCommandSet]) -> list[float]:
     """pymodbus's own client: write the block and read what was achieved, function 23."""
     return asyncio.run(_with_pymodbus(ModbusUrl.parse(url), sets))
 
 
-async def _with_pymodbus(url: ModbusUrl, sets: Sequence[SafeCommand]) -> list[float]:
+async def _with_pymodbus(url: ModbusUrl, sets: Sequence[SafeCommandSet]) -> list[float]:
     client = (
         AsyncModbusSerialClient(url.device, baudrate=url.baud, timeout=1)
         if url.device

@@ -8,24 +8,24 @@ import can
 
 from drivers.backends.urls.can_bus import CanUrl
 from drivers.codec.can_bus.frame import CanFrame, cob_id
-from drivers.codec.can_bus.orders import encode_order
-from drivers.guard import SafeCommand
+from drivers.codec.can_bus.requests import encode_request
+from drivers.guard import SafeCommandSet
 from drivers.protocol.messages import Apply, Arm
 from sim.far_ends.can_bus.sets import Action, Order, SetBuffer
 
 CALM = 2.0  # s; the longest watchdog
 
 
-def bare_can(url: str, sets: Sequence[SafeCommand]) -> list[float]:
+def bare_can(url: str, sets: Sequence[SafeCommandSet]) -> list[float]:
     """python-can: send the frames of a set and SYNC, receive until its answer."""
     parsed = CanUrl.parse(url)
     answer = cob_id("answer", parsed.node)
     numbered = [(number % 254 + 1, safe) for number, safe in enumerate(sets)]
     requests = [
-        (number, _messages(encode_order(Apply(safe), node=parsed.node, sequence=number)))
+        (number, _messages(encode_request(Apply(safe), node=parsed.node, sequence=number)))
         for number, safe in numbered
     ]
-    arm = _messages(encode_order(Arm(CALM), node=parsed.node, sequence=255))
+    arm = _messages(encode_request(Arm(CALM), node=parsed.node, sequence=255))
     times = []
     with _open(parsed) as bus:
         bus.send(can.Message(arbitration_id=0, data=[1, parsed.node], is_extended_id=False))
@@ -37,10 +37,10 @@ def bare_can(url: str, sets: Sequence[SafeCommand]) -> list[float]:
     return times
 
 
-def can_codec(safe: SafeCommand) -> None:
+def can_codec(safe: SafeCommandSet) -> None:
     """Encode a set into its frames and read them as an amplifier does."""
     buffer = SetBuffer(16)
-    for frame in encode_order(Apply(safe), node=1, sequence=7):
+    for frame in encode_request(Apply(safe), node=1, sequence=7):
         if frame.id == cob_id("order", 1):
             token, ramp, duration, what, sequence = struct.unpack("<HHHBB", frame.data)
             action, count = Action(what & 7), what >> 3

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from drivers.amplifier import Amplifier
 from drivers.command import CommandSet, DriveCommand
-from drivers.guard import Guard, GuardLimits, SafeCommand
+from drivers.guard import Guard, GuardLimits, SafeCommandSet
 from drivers.operation.simultaneous import at_one_moment
 from drivers.protocol.messages import Capabilities
 from drivers.registry import open_backend
@@ -56,7 +56,7 @@ def far_end(rig: Path, options: Sequence[str], *, amplifiers: int = 1) -> Iterat
 
 def make_sets(
     capabilities: Capabilities, count: int, *, channels: int = CHANNELS
-) -> list[SafeCommand]:
+) -> list[SafeCommandSet]:
     """So many sets of four channels, each with a token of its own."""
     steps = iter(range(count + 1))
     # A guard lets two thousand sets a second through; here they are made long before they are sent.

@@ -24,19 +24,19 @@ from benchmarks.wire_bench import (
     sent_apart,
 )
 from drivers.codec.modbus import exchanges
-from drivers.codec.modbus.telegrams import make_telegram
+from drivers.codec.modbus.adu import build_adu
 from drivers.codec.serial_line.exchanges import decode_request, encode_request
 from drivers.codec.serial_line.frame import FrameReader, encode_frame
-from drivers.guard import SafeCommand
+from drivers.guard import SafeCommandSet
 from drivers.protocol.messages import (
     Achieved,
+    AmplifierState,
     Apply,
     Broadcast,
     Capabilities,
     Fault,
     Reply,
     Request,
-    State,
     Status,
 )
 from sim.far_ends.modbus.unit import ModbusUnit
@@ -58,15 +58,15 @@ class Measured:
     """
 
     options: Sequence[str]
-    bare: Callable[[str, Sequence[SafeCommand]], list[float]]
+    bare: Callable[[str, Sequence[SafeCommandSet]], list[float]]
     library: str
-    codec: Callable[[SafeCommand], None] | None = None
+    codec: Callable[[SafeCommandSet], None] | None = None
 
 
 _READER = FrameReader()
 
 
-def _serial_codec(safe: SafeCommand) -> None:
+def _serial_codec(safe: SafeCommandSet) -> None:
     data = encode_frame(encode_request(Apply(safe), address=1, sequence=1))
     decode_request(_READER.feed(data)[0])
 
@@ -79,7 +79,9 @@ class _Taker:
     def exchange(self, request: Request) -> Reply:
         if isinstance(request, Apply):
             return Achieved(request.command_set.token, request.command_set.commands)
-        return Status(State.OPERATION_ENABLED, Fault.NONE, 1, True, 25.0, 1.0, (0.0,) * CHANNELS)
+        return Status(
+            AmplifierState.OPERATION_ENABLED, Fault.NONE, 1, True, 25.0, 1.0, (0.0,) * CHANNELS
+        )
 
     def broadcast(self, request: Broadcast) -> None:
         pass
@@ -88,9 +90,9 @@ class _Taker:
 _UNIT = ModbusUnit(_Taker())
 
 
-def _modbus_codec(safe: SafeCommand) -> None:
+def _modbus_codec(safe: SafeCommandSet) -> None:
     exchange = exchanges.encode_request(Apply(safe), tag=1, channels=CHANNELS)
-    telegram = make_telegram(exchange.read, exchange.write, unit=1, transaction=1, is_rtu=False)
+    telegram = build_adu(exchange.read, exchange.write, unit=1, transaction=1, is_rtu=False)
     answer = _UNIT.answer(telegram.frame[7:])
     assert answer is not None
 

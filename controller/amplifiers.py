@@ -14,10 +14,10 @@ from controller.together import gathered, to_the_end
 from drivers import clock
 from drivers.amplifier import WATCHDOG, Amplifier
 from drivers.errors import CommandError, CommandRefused, DriverError, LinkError
-from drivers.guard import SafeCommand, SafeEnvelope
-from drivers.link.turns import PATIENCE, GaveWay
+from drivers.guard import SafeCommandSet, SafeEnvelope
+from drivers.link.turns import PATIENCE, Preempted
 from drivers.operation.watchdog import check_watchdog
-from drivers.protocol.messages import Achieved, State
+from drivers.protocol.messages import Achieved, AmplifierState
 
 # How often, and how far apart [s], zero is looked for after the closing ramp has ended.
 _READ_BACKS = 5
@@ -50,7 +50,7 @@ class AmplifierGroup:
         self._stops = Stops(self._amplifiers.values())
         self._joint = JointPlay(
             self._amplifiers,
-            goes_on=lambda: self.phase is Phase.ARMED and not self._is_hurried,
+            goes_on=lambda: self.phase is Phase.ARMED and not self._is_aborting_unsent,
         )
         self._closing = asyncio.Lock()  # who closes again must not hang up on who still silences
         self._silencings = 0  # how often they were disarmed, stopped or closed
@@ -75,7 +75,7 @@ class AmplifierGroup:
         return self._joint.loading_time
 
     @property
-    def _is_hurried(self) -> bool:
+    def _is_aborting_unsent(self) -> bool:
         """Whether what is under way is to be given up."""
         return self._limit is not None and self._limit.when() is not None
 
@@ -129,14 +129,14 @@ class AmplifierGroup:
 
     async def play(
         self,
-        commands: Mapping[str, SafeCommand],
+        commands: Mapping[str, SafeCommandSet],
         *,
         envelopes: Mapping[str, Sequence[SafeEnvelope]] | None = None,
     ) -> dict[str, Achieved] | None:
         """Have every amplifier play its set; what they make of it, by name.
 
         envelopes: to be loaded before. None if they were disarmed, stopped or closed meanwhile, or
-        `hurry` ended it. Raises DriverError.
+        `abort_unsent` ended it. Raises DriverError.
         """
         self._read_backs.forget()
         achieved = await self._or_stop(
@@ -156,15 +156,15 @@ class AmplifierGroup:
         """
         return await self._or_stop(self._beat()) is not None
 
-    def hurry(self) -> None:
+    def abort_unsent(self) -> None:
         """Let a `play` or `heartbeat` that is under way end within 8 ms, answered or not.
 
         Nothing more is asked for it meanwhile, but for silence, and nothing is asked again.
         """
-        if self._limit is not None and not self._is_hurried:
+        if self._limit is not None and not self._is_aborting_unsent:
             self._limit.reschedule(clock.now() + PATIENCE)
             for amplifier in self._all:
-                amplifier.hurry()
+                amplifier.abort_unsent()
 
     async def disarm(self) -> None:
         """Silent along a short ramp, then high voltage off."""
@@ -193,7 +193,7 @@ class AmplifierGroup:
             await self.stop()
             raise
 
-    async def close(self, silence: Mapping[str, SafeCommand]) -> None:
+    async def close(self, silence: Mapping[str, SafeCommandSet]) -> None:
         """Play silence, confirm it by reading back, disarm and close; safe to call twice."""
         armed = self.phase is Phase.ARMED
         self._leave_armed()
@@ -201,13 +201,13 @@ class AmplifierGroup:
         async with self._closing:
             await self._close(silence, armed=armed)
 
-    async def _close(self, silence: Mapping[str, SafeCommand], *, armed: bool) -> None:
+    async def _close(self, silence: Mapping[str, SafeCommandSet], *, armed: bool) -> None:
         """Silence what was armed, and close; one after the other."""
         try:
             if armed:
                 await self._wind_down(silence)
             elif self._may_be_armed:
-                reachable = [amplifier for amplifier in self._all if not amplifier.lost]
+                reachable = [amplifier for amplifier in self._all if not amplifier.is_lost]
                 await to_the_end(self._each(amplifier.disarm() for amplifier in reachable))
         except BaseException as error:
             await self.stop()
@@ -217,7 +217,7 @@ class AmplifierGroup:
         finally:
             await self._close_wires()
 
-    async def _wind_down(self, silence: Mapping[str, SafeCommand]) -> None:
+    async def _wind_down(self, silence: Mapping[str, SafeCommandSet]) -> None:
         """Silence, proof of it, and high voltage off."""
         await gathered(self._amplifiers[name].apply(safe) for name, safe in silence.items())
         await asyncio.sleep(max(safe.ramp for safe in silence.values()))
@@ -234,7 +234,7 @@ class AmplifierGroup:
         """A heartbeat to every amplifier; True, or CommandRefused from one that is not enabled."""
         replies = await self._together(amplifier.heartbeat() for amplifier in self._all)
         for name, status in zip(self._amplifiers, replies, strict=True):
-            if status.state is not State.OPERATION_ENABLED:
+            if status.state is not AmplifierState.OPERATION_ENABLED:
                 raise CommandRefused(
                     f"amplifier {name} is in {status.state.name}, fault {status.fault.name}; "
                     "all were stopped: clear and arm again"
@@ -245,22 +245,22 @@ class AmplifierGroup:
     async def _or_stop(self, exchange: Coroutine[Any, Any, _T]) -> _T | None:
         """What the control loop wants of the amplifiers; if anything goes wrong, stop all of them.
 
-        None if `hurry` ended it, or if it failed for they were disarmed, stopped or closed.
+        None if `abort_unsent` ended it, or if it failed for they were disarmed, stopped or closed.
         """
         try:
-            return await self._unless_hurried(exchange)
+            return await self._unless_aborted(exchange)
         except Exception as error:
             if isinstance(error, DriverError) and self.phase not in (Phase.ARMED, Phase.LOST):
                 return None
             await self.stop()
             raise
 
-    async def _unless_hurried(self, exchange: Coroutine[Any, Any, _T]) -> _T | None:
+    async def _unless_aborted(self, exchange: Coroutine[Any, Any, _T]) -> _T | None:
         limit = asyncio.timeout(None)
         try:
             async with limit as self._limit:
                 return await exchange
-        except GaveWay:
+        except Preempted:
             if limit.when() is None:
                 raise
             return None

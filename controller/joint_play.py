@@ -8,7 +8,7 @@ from controller.together import gathered
 from drivers import clock
 from drivers.amplifier import Amplifier
 from drivers.errors import CommandRefused
-from drivers.guard import SafeCommand, SafeEnvelope
+from drivers.guard import SafeCommandSet, SafeEnvelope
 from drivers.operation.simultaneous import at_one_moment
 from drivers.protocol.messages import Achieved, Status
 
@@ -35,7 +35,7 @@ class JointPlay:
 
     async def play(
         self,
-        commands: Mapping[str, SafeCommand],
+        commands: Mapping[str, SafeCommandSet],
         envelopes: Mapping[str, Sequence[SafeEnvelope]],
     ) -> dict[str, Achieved] | None:
         """What they make of their sets, by name; None where silence came in between.
@@ -95,7 +95,7 @@ class JointPlay:
         if self._goes_on():
             await (amplifier.commit_on_bus(token) if for_all else amplifier.commit(token))
 
-    def _commits(self, sets: Mapping[str, SafeCommand]) -> Iterable[Coroutine[Any, Any, object]]:
+    def _commits(self, sets: Mapping[str, SafeCommandSet]) -> Iterable[Coroutine[Any, Any, object]]:
         """Commit everything that is staged, to arrive at one moment; once where a bus is shared."""
         together: dict[tuple[str, int], list[Amplifier]] = {}
         for name, safe in sets.items():

@@ -226,7 +226,7 @@ class Controller:
         if change:
             self._wake.set()
         if self._decider.owes_silence:
-            self._group.hurry()
+            self._group.abort_unsent()
         self._watch_leases()
 
     def _watch_leases(self) -> None:

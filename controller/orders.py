@@ -9,7 +9,7 @@ from controller.envelopes import wire_envelopes
 from controller.routing import goes_on, route, route_again, route_end
 from drivers.command import DriveCommand
 from drivers.errors import CommandRefused
-from drivers.guard import Guard, SafeCommand, SafeEnvelope
+from drivers.guard import Guard, SafeCommandSet, SafeEnvelope
 from drivers.protocol.definition import token_after
 from model.rig.rig import Rig
 from model.table.pattern import Pattern
@@ -46,7 +46,7 @@ class Order:
     never.
     """
 
-    commands: Mapping[str, SafeCommand]
+    commands: Mapping[str, SafeCommandSet]
     envelopes: Mapping[str, tuple[SafeEnvelope, ...]] = field(default_factory=dict)
     pattern: Pattern | None = None
     is_brake: bool = False
@@ -205,7 +205,7 @@ class OrderMaker:
         return self._token
 
 
-def _as_played(pattern: Pattern, commands: Mapping[str, SafeCommand]) -> Pattern:
+def _as_played(pattern: Pattern, commands: Mapping[str, SafeCommandSet]) -> Pattern:
     """The pattern with the ramp that its sets have, which a limit of slew may have lengthened."""
     ramp = max(safe.ramp for safe in commands.values())
     return pattern if ramp == pattern.ramp else replace(pattern, ramp=ramp)

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 
 from drivers.errors import CommandRefused
-from drivers.guard import SafeCommand
+from drivers.guard import SafeCommandSet
 from drivers.operation.read_back import BORNE, Expectation, is_fault, read_back
 from drivers.protocol.messages import Achieved, Status
 
@@ -19,7 +19,7 @@ class ReadBacks:
         self._expected.clear()
 
     def expect(
-        self, played: Mapping[str, SafeCommand], achieved: Mapping[str, Achieved], *, now: float
+        self, played: Mapping[str, SafeCommandSet], achieved: Mapping[str, Achieved], *, now: float
     ) -> None:
         """From a time [s] on they play this; of a set that ends by itself nothing is expected."""
         self._expected = {

@@ -25,7 +25,7 @@ class Stops:
 
     def wish(self) -> "list[asyncio.Task[None]]":
         """What stops all that can be reached, to be waited for; raises what that raises."""
-        reachable = [stop for amplifier, stop in self._of_each if not amplifier.lost]
+        reachable = [stop for amplifier, stop in self._of_each if not amplifier.is_lost]
         return [stop.wish() for stop in (*self._on_buses, *reachable)]
 
 
@@ -41,4 +41,4 @@ def _sharing_a_bus(amplifiers: Collection[Amplifier]) -> list[list[Amplifier]]:
 async def _tell(several: Sequence[Amplifier]) -> None:
     """Stop all on a bus, by the link of one that is not lost if there is one; nobody answers."""
     with suppress(LinkError):  # whoever can be reached is asked as well, and tells
-        await next((each for each in several if not each.lost), several[0]).stop_on_bus()
+        await next((each for each in several if not each.is_lost), several[0]).stop_on_bus()

@@ -9,12 +9,12 @@ from typing import Any
 
 from drivers.amplifier import WATCHDOG, Amplifier
 from drivers.command import CommandSet, DriveCommand
-from drivers.conformance import Check, Outcome, run_check
+from drivers.conformance import Check, CheckResult, run_check
 from drivers.errors import CommandError, CommandRefused, DriverError
 from drivers.guard import FREQUENCY_CEILING, FREQUENCY_FLOOR, LEVEL_CEILING, Guard, GuardLimits
 from drivers.operation.watchdog import check_watchdog, shortest_watchdog
 from drivers.protocol.definition import PROTOCOL
-from drivers.protocol.messages import Achieved, State, Status
+from drivers.protocol.messages import Achieved, AmplifierState, Status
 from drivers.registry import open_backend
 
 _RAMP = 0.05  # s; neither start nor end of a drive clicks
@@ -115,7 +115,7 @@ async def drive(
     return {"url": url, **_achieved_rows(achieved), "duration_s": duration, **_status_rows(after)}
 
 
-async def conform(url: str, checks: tuple[Check, ...]) -> AsyncIterator[Outcome]:
+async def conform(url: str, checks: tuple[Check, ...]) -> AsyncIterator[CheckResult]:
     """What comes of each check in turn."""
     async with _opened(url) as amplifier:
         for check in checks:
@@ -138,7 +138,11 @@ async def _arm(amplifier: Amplifier, watchdog: float, url: str) -> None:
         await amplifier.arm(watchdog)
     except CommandRefused as refused:
         now = await amplifier.status()
-        if now.state not in (State.QUICK_STOP_ACTIVE, State.FAULT_REACTION_ACTIVE, State.FAULT):
+        if now.state not in (
+            AmplifierState.QUICK_STOP_ACTIVE,
+            AmplifierState.FAULT_REACTION_ACTIVE,
+            AmplifierState.FAULT,
+        ):
             raise
         raise CommandRefused(
             f"the amplifier does not arm: it is in {now.state.name}, fault {now.fault.name}, until "
@@ -156,7 +160,7 @@ async def _keep_alive(amplifier: Amplifier, duration: float, *, beat: float, url
     while (left := end - loop.time()) > 0:
         await asyncio.sleep(min(beat, left))
         status = await amplifier.heartbeat()
-        if status.state is not State.OPERATION_ENABLED:
+        if status.state is not AmplifierState.OPERATION_ENABLED:
             raise CommandRefused(
                 f"the amplifier ended the drive by itself: it is in {status.state.name}, fault "
                 f"{status.fault.name}; see era amp status {shlex.quote(url)}, and "

@@ -5,20 +5,20 @@ from typing import final
 
 from drivers.backend import Backend
 from drivers.errors import CommandError, FrameError, LinkError
-from drivers.guard import SafeCommand, SafeEnvelope
+from drivers.guard import SafeCommandSet, SafeEnvelope
 from drivers.link.link import REPLY_TIMEOUT, Link
 from drivers.link.refusals import NO_PROTOCOL
-from drivers.link.turns import Kind
+from drivers.link.turns import RequestPriority
 from drivers.protocol.definition import PROTOCOL, token_after
 from drivers.protocol.messages import (
     Achieved,
+    AmplifierEvent,
     Apply,
     Arm,
     Capabilities,
     Clear,
     Commit,
     Disarm,
-    Event,
     FaultList,
     FaultRecord,
     GetCaps,
@@ -62,7 +62,7 @@ class Amplifier:
     ) -> None:
         self._link = Link(backend, reply_timeout=reply_timeout, on_event=self._told)
         self._serial_number = serial_number
-        self._listeners: list[Callable[[Event], None]] = []
+        self._listeners: list[Callable[[AmplifierEvent], None]] = []
         self._token = 0
         self._identity: Identity | None = None
         self._capabilities: Capabilities | None = None
@@ -87,9 +87,9 @@ class Amplifier:
         return self._link.backend.last_sent
 
     @property
-    def lost(self) -> bool:
+    def is_lost(self) -> bool:
         """Whether every further call raises LinkError."""
-        return self._link.lost
+        return self._link.is_lost
 
     @property
     def bus(self) -> str | None:
@@ -110,7 +110,7 @@ class Amplifier:
         """Time [s] on the wire of its longest exchange, an apply of all channels; 0 if unknown."""
         return self.wire_times.round_trip(self.capabilities.channels)
 
-    def listen(self, on_event: Callable[[Event], None]) -> None:
+    def listen(self, on_event: Callable[[AmplifierEvent], None]) -> None:
         """Be told, in the event loop, what the amplifier says unasked; a hint that may be lost."""
         self._listeners.append(on_event)
 
@@ -161,11 +161,15 @@ class Amplifier:
                 f"a watchdog of {watchdog:g} s is out of the amplifier's range of {low:g} to "
                 f"{high:g} s"
             )
-        return await self._link.ask(Arm(watchdog=watchdog), expect=Status, kind=Kind.APPLY)
+        return await self._link.ask(
+            Arm(watchdog=watchdog), expect=Status, kind=RequestPriority.APPLY
+        )
 
     async def disarm(self, ramp: float = DISARM_RAMP) -> Status:
         """Silent along a ramp [s], then high voltage off; overtakes all that waits."""
-        return await self._link.ask(Disarm(ramp=self._ramp(ramp)), expect=Status, kind=Kind.SILENCE)
+        return await self._link.ask(
+            Disarm(ramp=self._ramp(ramp)), expect=Status, kind=RequestPriority.SILENCE
+        )
 
     async def stop(self, ramp: float = STOP_RAMP) -> Status:
         """Quick stop along a ramp [s], latched until clear; overtakes all that waits.
@@ -174,7 +178,9 @@ class Amplifier:
         and raises CommandRefused, or follows where it silences. What is not on the wire yet gives
         way at once.
         """
-        return await self._link.ask(Stop(ramp=self._ramp(ramp)), expect=Status, kind=Kind.STOP)
+        return await self._link.ask(
+            Stop(ramp=self._ramp(ramp)), expect=Status, kind=RequestPriority.STOP
+        )
 
     async def load_envelope(self, safe: SafeEnvelope) -> None:
         """Keep an envelope under its slot, for sets that come after it; at any time, armed or not.
@@ -193,13 +199,13 @@ class Amplifier:
                 f"{len(safe.knots)} into slot {safe.slot}; {NO_PROTOCOL}"
             )
 
-    async def stage(self, safe: SafeCommand) -> Achieved:
+    async def stage(self, safe: SafeCommandSet) -> Achieved:
         """Keep a set ready under its token; returns what commit would play.
 
         Raises CommandRefused where a newer set, a stop or a disarm came before its turn.
         """
         request = Stage(_safe(safe))
-        achieved = await self._link.ask(request, expect=Achieved, kind=Kind.APPLY)
+        achieved = await self._link.ask(request, expect=Achieved, kind=RequestPriority.APPLY)
         return _of_token(achieved, safe.token)
 
     async def commit(self, token: int) -> Achieved:
@@ -207,17 +213,19 @@ class Amplifier:
 
         Raises CommandRefused where a newer set, a stop or a disarm came before its turn.
         """
-        achieved = await self._link.ask(Commit(token=token), expect=Achieved, kind=Kind.APPLY)
+        achieved = await self._link.ask(
+            Commit(token=token), expect=Achieved, kind=RequestPriority.APPLY
+        )
         return _of_token(achieved, token)
 
-    async def apply(self, safe: SafeCommand) -> Achieved:
+    async def apply(self, safe: SafeCommandSet) -> Achieved:
         """Play a set now; returns what the amplifier makes of it.
 
         A silent set overtakes as a stop does. Raises CommandRefused where a newer set or a stop
         took its place.
         """
         request = Apply(_safe(safe))
-        kind = Kind.SILENCE if safe.is_silent else Kind.APPLY
+        kind = RequestPriority.SILENCE if safe.is_silent else RequestPriority.APPLY
         return _of_token(await self._link.ask(request, expect=Achieved, kind=kind), safe.token)
 
     async def status(self) -> Status:
@@ -233,21 +241,20 @@ class Amplifier:
 
         Raises CommandRefused where another stop came before its turn: that is not acknowledged.
         """
-        return await self._link.ask(Clear(), expect=Status, kind=Kind.CLEAR)
+        return await self._link.ask(Clear(), expect=Status, kind=RequestPriority.CLEAR)
 
     async def heartbeat(self) -> Status:
         """Feed the watchdog; to be called by the control loop itself, after it has run."""
         status = await self._link.ask(Ping(), expect=Status)
-        self._link.beaten()
+        self._link.heartbeat_acknowledged()
         return status
 
-    def hurry(self) -> None:
-        """Neither send what still waits for the wire nor ask again: whoever asks gives it up soon.
+    def abort_unsent(self) -> None:
+        """Do not send what still waits for the wire, and repeat nothing.
 
-        Where it is not sent, or no answer comes, or the amplifier is busy, GaveWay is raised; what
-        silences is sent and repeated as ever.
+        Such requests raise Preempted; requests with stop priority are sent and repeated as usual.
         """
-        self._link.hurry()
+        self._link.abort_unsent()
 
     async def commit_on_bus(self, token: int) -> None:
         """Have every amplifier of the bus play what it has staged under this token, at one moment.
@@ -255,13 +262,13 @@ class Amplifier:
         Nobody answers: `status` of each tells whether it followed. Raises CommandError where the
         bus knows no broadcast.
         """
-        await self._link.broadcast(Commit(token=token), Kind.APPLY)
+        await self._link.broadcast(Commit(token=token), RequestPriority.APPLY)
 
     async def stop_on_bus(self, ramp: float = STOP_RAMP) -> None:
         """Quick stop of every amplifier of the bus, before all that waits there; nobody answers."""
         await self._link.backend.broadcast(Stop(ramp=self._ramp(ramp)))
 
-    def _told(self, event: Event) -> None:
+    def _told(self, event: AmplifierEvent) -> None:
         for listener in self._listeners:
             listener(event)
 
@@ -273,10 +280,10 @@ class Amplifier:
         return min(ramp, longest) if ramp > 0 else 0.0
 
 
-def _safe(safe: SafeCommand) -> SafeCommand:
-    if type(safe) is not SafeCommand:
+def _safe(safe: SafeCommandSet) -> SafeCommandSet:
+    if type(safe) is not SafeCommandSet:
         raise TypeError(
-            f"an amplifier takes a SafeCommand, not a {type(safe).__name__}: "
+            f"an amplifier takes a SafeCommandSet, not a {type(safe).__name__}: "
             "let Guard.check make one"
         )
     return safe

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 
 from drivers.errors import CommandError
-from drivers.protocol.messages import Broadcast, Event, Reply, Request
+from drivers.protocol.messages import AmplifierEvent, Broadcast, Reply, Request
 from drivers.protocol.wire_times import NoTimes, WireTimes
 from drivers.statistics import WireCounters
 
@@ -53,7 +53,9 @@ class Backend(ABC):
         """What was seen on the wire; all zero where nothing is counted."""
         return WireCounters()
 
-    def listen(self, on_event: Callable[[Event], None], on_loss: Callable[[str], None]) -> None:
+    def listen(
+        self, on_event: Callable[[AmplifierEvent], None], on_loss: Callable[[str], None]
+    ) -> None:
         """Whom to tell, in the event loop, what comes unasked.
 
         on_event: the amplifier's own events; on_loss: once after each opening, when the wire or the

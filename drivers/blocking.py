@@ -19,7 +19,14 @@ from drivers.command import CommandSet, DriveCommand, Envelope
 from drivers.errors import CommandError, CommandRefused
 from drivers.guard import Guard, GuardLimits
 from drivers.operation.watchdog import HEARTBEAT
-from drivers.protocol.messages import Achieved, Capabilities, FaultRecord, Identity, State, Status
+from drivers.protocol.messages import (
+    Achieved,
+    AmplifierState,
+    Capabilities,
+    FaultRecord,
+    Identity,
+    Status,
+)
 from drivers.registry import open_backend
 
 _RAMP = 0.02  # s; neither start nor end of a vibration clicks
@@ -66,7 +73,7 @@ class BlockingAmplifier:
         where: TracebackType | None,
     ) -> None:
         try:
-            if not self._amplifier.lost:
+            if not self._amplifier.is_lost:
                 self._wait(self._amplifier.disarm())
         finally:
             try:
@@ -143,7 +150,7 @@ class BlockingAmplifier:
         while (left := end - time.monotonic()) > 0:
             time.sleep(min(left, HEARTBEAT))
             status = self.heartbeat()
-            if status.state is not State.OPERATION_ENABLED:
+            if status.state is not AmplifierState.OPERATION_ENABLED:
                 raise CommandRefused(
                     f"the amplifier stopped by itself: it is in {status.state.name}, fault "
                     f"{status.fault.name}; once the cause is gone, clear() it and arm() again"

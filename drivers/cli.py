@@ -11,7 +11,7 @@ import typer
 from drivers.errors import CommandError, CommandRefused, FrameError, LinkError
 
 if TYPE_CHECKING:
-    from drivers.conformance import Check, Outcome
+    from drivers.conformance import Check, CheckResult
 
 EXIT_STATUS: dict[type[BaseException], int] = {
     CommandError: 2,
@@ -224,7 +224,7 @@ def conformance(
         raise typer.Exit(1)
 
 
-async def _conform(url: str, checks: "tuple[Check, ...]", *, quiet: bool) -> "list[Outcome]":
+async def _conform(url: str, checks: "tuple[Check, ...]", *, quiet: bool) -> "list[CheckResult]":
     from drivers.amp_actions import conform
 
     outcomes = []

@@ -9,7 +9,12 @@ from collections.abc import Mapping, Sequence
 from drivers.amplifier import WATCHDOG
 from drivers.backend import Backend
 from drivers.errors import CommandError
-from drivers.operation.watchdog import HEARTBEAT, HEARTBEATS_BORNE, check_watchdog, told_after
+from drivers.operation.watchdog import (
+    HEARTBEAT,
+    MAX_MISSED_HEARTBEATS,
+    check_watchdog,
+    loss_detection_time,
+)
 from drivers.registry import open_backend
 
 # s; how far apart commits on two links may arrive although they are sent together: USB adapters
@@ -71,17 +76,18 @@ def _told_late(backends: Mapping[str, Backend], channels: Mapping[str, int]) -> 
     lines: dict[str, list[str]] = {}
     for name, backend in backends.items():
         lines.setdefault((backend.takes_turns and backend.bus) or name, []).append(name)
-    bound = HEARTBEATS_BORNE * HEARTBEAT
+    bound = MAX_MISSED_HEARTBEATS * HEARTBEAT
     warnings = []
     for names in lines.values():
-        took = told_after(backends[name].wire_times.round_trip(channels[name]) for name in names)
+        took = loss_detection_time(
+            backends[name].wire_times.round_trip(channels[name]) for name in names
+        )
         if took > bound:
-            who = f"amplifier {names[0]} falls" if len(names) == 1 else f"{', '.join(names)} fall"
             warnings.append(
-                f"where {who} silent without the port being lost, that is told after up to "
-                f"{took * 1e3:.0f} ms instead of {HEARTBEATS_BORNE} heartbeats, {bound * 1e3:.0f} "
-                "ms, for so long the wire may take to ask again; the watchdog silences all the "
-                "same: use a faster line, or one for each amplifier, if that is too late"
+                f"{', '.join(names)}: loss of the amplifiers may be detected only after "
+                f"{took * 1e3:.0f} ms, got a limit of {MAX_MISSED_HEARTBEATS} heartbeats, "
+                f"{bound * 1e3:.0f} ms; the watchdog stops them regardless: use a faster line, or "
+                "one line per amplifier, if that is too late"
             )
     return warnings
 

@@ -1,36 +1,36 @@
-"""How well a link does: what was counted on it, and how long its answers take."""
+"""Counters and timing of a link."""
 
 from dataclasses import dataclass
 
 
 @dataclass
 class WireCounters:
-    """What a backend has seen on its wire since it was opened, in frames (or telegrams).
+    """Frames counted by a backend since its wire was opened.
 
-    bad: damaged ones, by checksum, length or form; foreign: good ones that nobody waited for, late
-    or of somebody else; events: what came unasked.
+    crc_errors: damaged frames, by checksum, length or form; unexpected_frames: valid frames that no
+    request was waiting for, such as late replies; events: unsolicited messages.
     """
 
     frames_out: int = 0
     frames_in: int = 0
-    bad: int = 0
-    foreign: int = 0
+    crc_errors: int = 0
+    unexpected_frames: int = 0
     events: int = 0
 
 
 @dataclass(frozen=True, slots=True)
 class LinkStatistics:
-    """The state of a link, as one moment sees it.
+    """Statistics of a link at one moment.
 
-    Frames as in `WireCounters`. retries: requests that were repeated; timeouts: requests that got
-    no answer in time; refusals: Naks. last_round_trip [s], heartbeat_age [s] since the last
-    heartbeat was answered: None before the first.
+    Frames as in `WireCounters`. retries: repeated requests; timeouts: requests without a reply in
+    time; refusals: Naks. last_round_trip [s]; heartbeat_age [s] since the last acknowledged
+    heartbeat: None before the first.
     """
 
     frames_out: int
     frames_in: int
-    bad: int
-    foreign: int
+    crc_errors: int
+    unexpected_frames: int
     events: int
     retries: int
     timeouts: int

@@ -14,7 +14,7 @@ from drivers import clock
 from drivers.backend import Backend
 from drivers.errors import CommandError, LinkError
 from drivers.guard import require_safe
-from drivers.protocol.messages import Event, Reply, Request
+from drivers.protocol.messages import AmplifierEvent, Reply, Request
 from drivers.statistics import WireCounters
 from model.errors import InputError
 from model.rig.file import load_rig
@@ -48,14 +48,16 @@ class SimulatedBackend(Backend):
         self._name = ""
         self._last_sent = 0.0
         self._counters = WireCounters()
-        self._on_event: Callable[[Event], None] = lambda event: None
+        self._on_event: Callable[[AmplifierEvent], None] = lambda event: None
 
     @property
     def counters(self) -> WireCounters:
         """Requests and replies; nothing is ever damaged here."""
         return self._counters
 
-    def listen(self, on_event: Callable[[Event], None], on_loss: Callable[[str], None]) -> None:
+    def listen(
+        self, on_event: Callable[[AmplifierEvent], None], on_loss: Callable[[str], None]
+    ) -> None:
         """Whom to tell of events; nothing is ever lost here."""
         self._on_event = on_event
 
@@ -100,7 +102,7 @@ class SimulatedBackend(Backend):
         self._counters.frames_in += 1
         return self._bench.exchange(self._name, request, now=self._last_sent)
 
-    def _tell(self, event: Event, moment: float) -> None:
+    def _tell(self, event: AmplifierEvent, moment: float) -> None:
         self._counters.events += 1
         self._on_event(event)
 

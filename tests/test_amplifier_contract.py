@@ -12,7 +12,7 @@ from drivers.amplifier import Amplifier
 from drivers.backend import Backend
 from drivers.command import CommandSet, DriveCommand, Envelope, Knot
 from drivers.conformance import CHECKS, Check, run_check
-from drivers.protocol.messages import Apply, LoadEnvelope, Stage, State
+from drivers.protocol.messages import AmplifierState, Apply, LoadEnvelope, Stage
 from drivers.registry import open_backend
 from wires import PROCESS_WIRES, patient
 
@@ -74,7 +74,7 @@ async def test_a_lost_host_may_come_back(backend: Backend) -> None:
     for _ in range(2):
         amplifier = Amplifier(backend, reply_timeout=REPLY_TIMEOUT)
         await amplifier.open()
-        assert (await amplifier.arm(2.0)).state is State.OPERATION_ENABLED
+        assert (await amplifier.arm(2.0)).state is AmplifierState.OPERATION_ENABLED
         await amplifier.disarm(0.0)
         await amplifier.close()
 
@@ -100,7 +100,7 @@ async def test_the_backend_says_what_it_counts(amplifier: Amplifier, backend: Ba
     after = amplifier.statistics
     assert after.frames_out - before.frames_out >= 5
     assert after.frames_in - before.frames_in >= 5
-    assert (after.bad, after.retries) == (before.bad, before.retries)
+    assert (after.crc_errors, after.retries) == (before.crc_errors, before.retries)
     assert after.last_round_trip is not None
     assert after.heartbeat_age is not None
     assert backend.wire_times.round_trip(4) >= 0

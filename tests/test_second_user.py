@@ -10,7 +10,7 @@ import pytest
 from drivers.amplifier import Amplifier
 from drivers.backends.sole_host import SoleHost
 from drivers.errors import LinkError
-from drivers.protocol.messages import State
+from drivers.protocol.messages import AmplifierState
 from drivers.registry import open_backend
 from model.rig.rig import Rig
 from wires import WIRES, FarSide, far_side
@@ -35,10 +35,10 @@ async def test_the_second_user_of_an_address_is_refused_and_the_first_undisturbe
     await first.arm(2.0)
     with pytest.raises(LinkError, match="this program has it open already; give every amplifier"):
         await second.open()
-    assert (await first.heartbeat()).state is State.OPERATION_ENABLED
+    assert (await first.heartbeat()).state is AmplifierState.OPERATION_ENABLED
     await first.close()
     await second.open()
-    assert (await second.disarm()).state is State.SWITCH_ON_DISABLED
+    assert (await second.disarm()).state is AmplifierState.SWITCH_ON_DISABLED
     await second.close()
 
 
@@ -66,14 +66,14 @@ async def test_over_tcp_only_one_program_arms_and_any_may_stop(coarse_rig: Rig) 
         amplifier = Amplifier(open_backend(far.url), reply_timeout=PATIENT)
         with held_by_another_program(far.url.removeprefix("modbus+tcp://")):
             await amplifier.open()
-            assert (await amplifier.status()).state is State.SWITCH_ON_DISABLED
-            assert (await amplifier.stop()).state is not State.OPERATION_ENABLED
+            assert (await amplifier.status()).state is AmplifierState.SWITCH_ON_DISABLED
+            assert (await amplifier.stop()).state is not AmplifierState.OPERATION_ENABLED
             await amplifier.clear()
             with pytest.raises(LinkError, match="another program on this machine drives"):
                 await amplifier.arm(2.0)
         await amplifier.close()
         await amplifier.open()
-        assert (await amplifier.arm(2.0)).state is State.OPERATION_ENABLED
+        assert (await amplifier.arm(2.0)).state is AmplifierState.OPERATION_ENABLED
         await amplifier.close()
 
 

@@ -12,8 +12,8 @@ import serial
 from drivers.amplifier import Amplifier
 from drivers.command import CommandSet, DriveCommand
 from drivers.errors import LinkError
-from drivers.guard import Guard, GuardLimits, SafeCommand
-from drivers.protocol.messages import State, Status
+from drivers.guard import Guard, GuardLimits, SafeCommandSet
+from drivers.protocol.messages import AmplifierState, Status
 from drivers.registry import open_backend
 from model.rig.rig import Channel, Rig
 from reopened import reopen
@@ -62,7 +62,7 @@ async def amplifiers(far: FarSide) -> AsyncIterator[dict[str, Amplifier]]:
         await amplifier.close()
 
 
-def tone(amplifier: Amplifier, level: float, token: int) -> SafeCommand:
+def tone(amplifier: Amplifier, level: float, token: int) -> SafeCommandSet:
     """A set on channel 0 under a token."""
     guard = Guard(GuardLimits(40.0, 500.0, 1.0), amplifier.capabilities)
     wanted = CommandSet(token, (DriveCommand(0, 110.0, level),), ramp=0.0, valid_for=0.0)
@@ -146,7 +146,7 @@ async def test_one_comes_back_while_the_other_is_left_lost(wire: Wire, two_ampli
             station.befall(Episode("unplug"))
         for one in (east, west):
             async with asyncio.timeout(10):
-                while not one.lost:
+                while not one.is_lost:
                     with contextlib.suppress(LinkError):
                         await one.status()
         for station in far.stations.values():
@@ -156,7 +156,9 @@ async def test_one_comes_back_while_the_other_is_left_lost(wire: Wire, two_ampli
             await west.status()
         await reopen(west, tries=200)
         assert (
-            (await east.status()).state is (await west.status()).state is State.SWITCH_ON_DISABLED
+            (await east.status()).state
+            is (await west.status()).state
+            is AmplifierState.SWITCH_ON_DISABLED
         )
         await east.close()
         await west.close()
@@ -214,5 +216,5 @@ async def test_one_stop_silences_all(amplifiers: dict[str, Amplifier]) -> None:
     await amplifiers["west"].stop_on_bus(0.0)
     for amplifier in amplifiers.values():
         status = await amplifier.status()
-        assert status.state is State.QUICK_STOP_ACTIVE
+        assert status.state is AmplifierState.QUICK_STOP_ACTIVE
         assert not any(status.levels)

@@ -8,7 +8,7 @@ from typing import NamedTuple
 from drivers import clock
 from drivers.backend import Backend
 from drivers.errors import LinkError
-from drivers.protocol.messages import Broadcast, Event, Reply, Request, Status
+from drivers.protocol.messages import AmplifierEvent, Broadcast, Reply, Request, Status
 from drivers.protocol.wire_times import WireTimes
 from drivers.statistics import WireCounters
 
@@ -94,10 +94,12 @@ class RecordedBackend(Backend):
         """Of the inner one."""
         return self._inner.counters
 
-    def listen(self, on_event: Callable[[Event], None], on_loss: Callable[[str], None]) -> None:
+    def listen(
+        self, on_event: Callable[[AmplifierEvent], None], on_loss: Callable[[str], None]
+    ) -> None:
         """As the inner one; events and the loss are kept."""
 
-        def told(event: Event) -> None:
+        def told(event: AmplifierEvent) -> None:
             self._recorder.note(self._name, "event", event)
             on_event(event)
 

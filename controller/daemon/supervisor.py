@@ -15,10 +15,8 @@ from controller.observer import Observer
 from drivers import clock
 from drivers.amplifier import Amplifier
 from drivers.errors import CommandRefused, DriverError, LinkError
-from drivers.link.turns import GaveWay
-from drivers.protocol.messages import Event as AmplifierEvent
-from drivers.protocol.messages import Fault, Status
-from drivers.protocol.messages import State as AmplifierState
+from drivers.link.turns import Preempted
+from drivers.protocol.messages import AmplifierEvent, AmplifierState, Fault, Status
 
 LOOK_EVERY = 0.5  # s; how often a disarmed amplifier is asked how it is
 _READ_BACKS = 15
@@ -175,7 +173,7 @@ class Supervisor:
         except LinkError as error:
             await self._lost(error)
             raise
-        except GaveWay:
+        except Preempted:
             raise  # no fault of the amplifiers': what it gave way to is an event of its own
         except DriverError as error:
             await self.handle(Event(Kind.FAULT, str(error), ACKNOWLEDGE))
@@ -185,7 +183,7 @@ class Supervisor:
         """Stop all; raises LinkError where one did not hear it, which is a loss from now on."""
         await self._the_controller.stop()
         for amplifier in self._amplifiers.values():
-            if amplifier.lost and self.machine.state not in (State.COMM_LOST, State.NOT_READY):
+            if amplifier.is_lost and self.machine.state not in (State.COMM_LOST, State.NOT_READY):
                 await self._on_the_link(amplifier.status())  # raises at once why it is lost
 
     async def _arm(self) -> None:
@@ -225,17 +223,17 @@ class Supervisor:
         raise CommandRefused(f"{problem}; the cause is not gone, so nothing was cleared")
 
     async def _acknowledge(self) -> None:
-        """Clear what was acknowledged; raises GaveWay where there is something since."""
+        """Clear what was acknowledged; raises Preempted where there is something since."""
         self._check_acknowledged()
         try:
             await self._the_controller.clear()
-        except GaveWay:
+        except Preempted:
             self._check_acknowledged()
             raise
 
     def _check_acknowledged(self) -> None:
         if not self.machine.acknowledged:
-            raise GaveWay(
+            raise Preempted(
                 "somebody has stopped the amplifiers since, or there is a fault since: that is not "
                 "cleared; find the cause, then clear again"
             )
@@ -260,14 +258,14 @@ class Supervisor:
     async def _statuses(self) -> dict[str, Status]:
         """How each amplifier is; asked again where a stop or disarm went before it."""
         while True:
-            with contextlib.suppress(GaveWay):
+            with contextlib.suppress(Preempted):
                 return {name: await each.status() for name, each in self._amplifiers.items()}
             await asyncio.sleep(_READ_BACK_PAUSE)
 
     async def _lost(self, error: LinkError) -> None:
         """See a loss through; whoever comes with the same one waits for that, then reopens."""
         async with self._losing:
-            lost = [name for name, amplifier in self._amplifiers.items() if amplifier.lost]
+            lost = [name for name, amplifier in self._amplifiers.items() if amplifier.is_lost]
             wrong = what_is_wrong(error)
             if self.machine.state is not State.COMM_LOST:  # told already
                 self._link_told("lost", lost, wrong)

@@ -146,7 +146,9 @@ def _amplifier_status(
     name: str, amplifier: Amplifier, backend: RecordedBackend, url: str, *, closed_with_lost: bool
 ) -> AmplifierStatus:
     """closed_with_lost: whether that is why nothing is known of it, where nothing is."""
-    status = None if amplifier.lost else backend.status  # None as well while it is being reopened
+    status = (
+        None if amplifier.is_lost else backend.status
+    )  # None as well while it is being reopened
     heard = backend.heard_at
     seen = amplifier.statistics
     round_trip = seen.last_round_trip
@@ -166,8 +168,8 @@ def _amplifier_status(
         statistics=LinkCounters(
             frames_out=seen.frames_out,
             frames_in=seen.frames_in,
-            bad=seen.bad,
-            foreign=seen.foreign,
+            bad=seen.crc_errors,
+            foreign=seen.unexpected_frames,
             events=seen.events,
             retries=seen.retries,
             timeouts=seen.timeouts,

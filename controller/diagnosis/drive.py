@@ -15,7 +15,7 @@ from controller.guards import make_guards
 from controller.routing import route
 from drivers.amplifier import Amplifier
 from drivers.errors import CommandRefused
-from drivers.guard import Guard, SafeCommand
+from drivers.guard import Guard, SafeCommandSet
 from drivers.protocol.definition import token_after
 from model.arrays import ComplexArray, FloatArray
 from model.diagnosis.observation import Observation, Pair
@@ -155,7 +155,7 @@ class Drive:
                 played = found.frequency
         return played
 
-    def _silence(self) -> dict[str, SafeCommand]:
+    def _silence(self) -> dict[str, SafeCommandSet]:
         """Silence for every amplifier that has a guard yet."""
         channels: dict[str, list[int]] = {name: [] for name in self._guards}
         for wired in self._rig.wiring.values():

@@ -8,18 +8,22 @@ from collections.abc import Awaitable, Callable, Iterator
 from contextlib import contextmanager
 from typing import TypeVar, final
 
-from drivers.link.turns import SUPERSEDED, GaveWay, Kind, Turns
+from drivers.link.turns import SUPERSEDED, Preempted, RequestPriority, Turns
 from drivers.protocol.messages import Apply, Disarm, Request, Stop
 
 _T = TypeVar("_T")
 
 
-def kind_on_line(request: Request) -> Kind:
+def kind_on_line(request: Request) -> RequestPriority:
     """How a request stands to those for others; no set takes the place of another's."""
     if isinstance(request, Stop):
-        return Kind.STOP
+        return RequestPriority.STOP
     is_silent_set = isinstance(request, Apply) and request.command_set.is_silent
-    return Kind.SILENCE if is_silent_set or isinstance(request, Disarm) else Kind.ORDINARY
+    return (
+        RequestPriority.SILENCE
+        if is_silent_set or isinstance(request, Disarm)
+        else RequestPriority.ORDINARY
+    )
 
 
 @final
@@ -56,25 +60,25 @@ class LineTurns:
             self._turns.release(address, kind)
 
     async def carry_out(
-        self, kind: Kind, exchange: Callable[[], Awaitable[_T]], *, address: int | None
+        self, kind: RequestPriority, exchange: Callable[[], Awaitable[_T]], *, address: int | None
     ) -> _T:
         """Do an exchange when it has its turn, and again where it had to give way.
 
         Repeating is safe: a token is played once, and the other requests may be repeated anyway.
-        address: whose it is; None for one to all. Raises GaveWay instead of beginning where this
+        address: whose it is; None for one to all. Raises Preempted instead of beginning where this
         amplifier itself is being silenced: what silences it waits for this to end, so that this
         must not wait for the line.
         """
         while True:
             if self._turns.is_kept_from_own(address, kind):
-                raise GaveWay(SUPERSEDED)
+                raise Preempted(SUPERSEDED)
             if address is not None:
                 self._unsent.add(address)
             try:
                 async with self._turns.take(kind):
                     self._present = address
                     return await exchange()
-            except GaveWay:
+            except Preempted:
                 continue
             finally:
                 if address is not None:

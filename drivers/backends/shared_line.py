@@ -6,7 +6,7 @@ from collections.abc import Callable, Hashable
 from typing import Any, ClassVar, Generic, TypeVar
 from weakref import WeakKeyDictionary
 
-from drivers.backends.stand_in import Adapter, Port
+from drivers.backends.hardware import Adapter, Port
 from drivers.errors import LinkError
 
 _OpenT = TypeVar("_OpenT", bound=Port | Adapter)

@@ -8,7 +8,7 @@ import contextlib
 import socket
 import sys
 
-from drivers.backends.stand_in import STAND_IN
+from drivers.backends.hardware import HARDWARE_PROVIDER
 from drivers.errors import LinkError
 
 
@@ -24,7 +24,7 @@ class SoleHost:
 
     def claim(self) -> None:
         """Have it from now on; LinkError where another on this machine has it."""
-        if self._held is not None or sys.platform != "linux" or STAND_IN.get() is not None:
+        if self._held is not None or sys.platform != "linux" or HARDWARE_PROVIDER.get() is not None:
             return
         claim = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
         try:

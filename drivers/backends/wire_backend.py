@@ -3,7 +3,7 @@
 from collections.abc import Callable
 
 from drivers.backend import Backend
-from drivers.protocol.messages import Event
+from drivers.protocol.messages import AmplifierEvent
 from drivers.statistics import WireCounters
 
 
@@ -17,7 +17,7 @@ class WireBackend(Backend):
     def __init__(self) -> None:
         self._counters = WireCounters()
         self._last_sent = 0.0
-        self._on_event: Callable[[Event], None] = _ignore
+        self._on_event: Callable[[AmplifierEvent], None] = _ignore
         self._on_loss: Callable[[str], None] = _ignore
 
     @property
@@ -30,7 +30,9 @@ class WireBackend(Backend):
         """When system or adapter took the last request's last byte, by the loop's clock [s]."""
         return self._last_sent
 
-    def listen(self, on_event: Callable[[Event], None], on_loss: Callable[[str], None]) -> None:
+    def listen(
+        self, on_event: Callable[[AmplifierEvent], None], on_loss: Callable[[str], None]
+    ) -> None:
         """See `Backend.listen`."""
         self._on_event, self._on_loss = on_event, on_loss
 

@@ -7,9 +7,9 @@ and ends disarmed.
 
 from drivers.conformance import ending, looking, playing, shaping
 from drivers.conformance.bench import LEVEL
-from drivers.conformance.check import Check, Outcome, Steps, run_check
+from drivers.conformance.check import Check, CheckResult, Steps, run_check
 
-__all__ = ["CHECKS", "LEVEL", "Check", "Outcome", "run_check"]
+__all__ = ["CHECKS", "LEVEL", "Check", "CheckResult", "run_check"]
 
 _LOOKING: tuple[Steps, ...] = (
     looking.identity,

@@ -6,7 +6,7 @@ from collections.abc import Awaitable, Callable
 from drivers.amplifier import Amplifier
 from drivers.command import CommandSet, DriveCommand
 from drivers.errors import CommandRefused
-from drivers.guard import Guard, GuardLimits, SafeCommand
+from drivers.guard import Guard, GuardLimits, SafeCommandSet
 from drivers.protocol.messages import Capabilities, Status
 
 LEVEL = 0.2
@@ -43,7 +43,7 @@ class Bench:
         valid_for: float = 0.0,
         guard: Guard | None = None,
         first: int = 0,
-    ) -> SafeCommand:
+    ) -> SafeCommandSet:
         """A set that drives channels from `first` on at these shares of the test level."""
         commands = tuple(
             DriveCommand(first + number, self.frequency, share * self.level)

@@ -22,14 +22,14 @@ class Check:
 
 
 @dataclass(frozen=True)
-class Outcome:
+class CheckResult:
     """What came of a check: problem is None where it is kept, else what happened instead."""
 
     check: Check
     problem: str | None
 
 
-async def run_check(check: Check, amplifier: Amplifier) -> Outcome:
+async def run_check(check: Check, amplifier: Amplifier) -> CheckResult:
     """Run one check on an open amplifier that is disarmed, and leave it so."""
     bench = Bench(amplifier)
     try:
@@ -39,5 +39,5 @@ async def run_check(check: Check, amplifier: Amplifier) -> Outcome:
             if check.drives:
                 await bench.rest()
     except (ContractBroken, DriverError) as problem:
-        return Outcome(check, str(problem))
-    return Outcome(check, None)
+        return CheckResult(check, str(problem))
+    return CheckResult(check, None)

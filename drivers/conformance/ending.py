@@ -1,7 +1,7 @@
 """How a vibration ends: by a stop, by itself, by the watchdog."""
 
 from drivers.conformance.bench import CALM, Bench, expect
-from drivers.protocol.messages import Fault, State
+from drivers.protocol.messages import AmplifierState, Fault
 
 
 async def quick_stop(bench: Bench) -> None:
@@ -9,12 +9,16 @@ async def quick_stop(bench: Bench) -> None:
     await bench.arm()
     await bench.amplifier.apply(bench.tones(1.0))
     status = await bench.amplifier.stop(0.0)
-    expect(status.state is State.QUICK_STOP_ACTIVE, f"stopped it is in {status.state.name}")
+    expect(
+        status.state is AmplifierState.QUICK_STOP_ACTIVE, f"stopped it is in {status.state.name}"
+    )
     expect(not any(status.levels), f"stopped its levels are {status.levels}")
     await bench.refused(bench.amplifier.apply(bench.tones(1.0)), what="an apply while stopped")
     await bench.refused(bench.arm(), what="arming while stopped")
     status = await bench.amplifier.clear()
-    expect(status.state is State.SWITCH_ON_DISABLED, f"cleared it is in {status.state.name}")
+    expect(
+        status.state is AmplifierState.SWITCH_ON_DISABLED, f"cleared it is in {status.state.name}"
+    )
 
 
 async def disarm(bench: Bench) -> None:
@@ -23,7 +27,9 @@ async def disarm(bench: Bench) -> None:
     await bench.amplifier.apply(bench.tones(1.0))
     await bench.amplifier.disarm(0.01)
     status = await bench.until(
-        lambda status: status.state is State.SWITCH_ON_DISABLED, what="disarming", feed=False
+        lambda status: status.state is AmplifierState.SWITCH_ON_DISABLED,
+        what="disarming",
+        feed=False,
     )
     expect(not any(status.levels), f"disarmed its levels are {status.levels}")
     expect(not status.high_voltage, "disarmed its high voltage is on")
@@ -35,7 +41,7 @@ async def watchdog(bench: Bench) -> None:
     await bench.amplifier.arm(bench.can.watchdog_min)
     await bench.amplifier.apply(bench.tones(1.0))
     status = await bench.until(
-        lambda status: status.state is State.FAULT, what="the watchdog's fault", feed=False
+        lambda status: status.state is AmplifierState.FAULT, what="the watchdog's fault", feed=False
     )
     expect(status.fault is Fault.WATCHDOG, f"the fault is {status.fault.name}")
     # Some wires tell levels and state apart: those of a moment later are the levels in FAULT.
@@ -48,7 +54,9 @@ async def watchdog(bench: Bench) -> None:
     await bench.refused(bench.arm(), what="arming in FAULT")
     await bench.refused(bench.amplifier.apply(bench.tones(1.0)), what="an apply in FAULT")
     status = await bench.amplifier.clear()
-    expect(status.state is State.SWITCH_ON_DISABLED, f"cleared it is in {status.state.name}")
+    expect(
+        status.state is AmplifierState.SWITCH_ON_DISABLED, f"cleared it is in {status.state.name}"
+    )
 
 
 async def heartbeats(bench: Bench) -> None:
@@ -77,7 +85,7 @@ async def valid_for(bench: Bench) -> None:
     status = await bench.until(
         lambda status: not any(status.levels), what="the end of a vibration", feed=True
     )
-    expect(status.state is State.OPERATION_ENABLED, f"then it is in {status.state.name}")
+    expect(status.state is AmplifierState.OPERATION_ENABLED, f"then it is in {status.state.name}")
     await bench.amplifier.apply(ending)
     await bench.expect_levels(why="a set that has ended was applied again")
     await bench.amplifier.commit(staged.token)

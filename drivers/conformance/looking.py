@@ -2,7 +2,7 @@
 
 from drivers.amplifier import WATCHDOG
 from drivers.conformance.bench import Bench, expect
-from drivers.protocol.messages import State
+from drivers.protocol.messages import AmplifierState
 
 
 async def identity(bench: Bench) -> None:
@@ -24,7 +24,7 @@ async def capabilities(bench: Bench) -> None:
 async def starts_disarmed(bench: Bench) -> None:
     """It is disarmed while nobody has armed it: high voltage off, silent."""
     status = await bench.amplifier.status()
-    expect(status.state is State.SWITCH_ON_DISABLED, f"its state is {status.state.name}")
+    expect(status.state is AmplifierState.SWITCH_ON_DISABLED, f"its state is {status.state.name}")
     expect(not status.high_voltage, "its high voltage is on")
     expect(status.levels == (0.0,) * bench.can.channels, f"its levels are {status.levels}")
 

@@ -5,14 +5,14 @@ from dataclasses import replace
 
 from drivers.command import CommandSet, DriveCommand
 from drivers.conformance.bench import LEVEL_ERROR, Bench, expect
-from drivers.protocol.messages import State
+from drivers.protocol.messages import AmplifierState
 
 
 async def plays_nothing_disarmed(bench: Bench) -> None:
     """It plays nothing before it is armed, and nothing of it afterwards."""
     await bench.refused(bench.amplifier.apply(bench.tones(1.0)), what="an apply while disarmed")
     status = await bench.arm()
-    expect(status.state is State.OPERATION_ENABLED, f"armed it is in {status.state.name}")
+    expect(status.state is AmplifierState.OPERATION_ENABLED, f"armed it is in {status.state.name}")
     expect(status.high_voltage, "armed its high voltage is off")
     expect(status.token == 0, f"armed it plays token {status.token}")
     expect(not any(status.levels), f"armed its levels are {status.levels}")
@@ -123,4 +123,6 @@ async def patience(bench: Bench) -> None:
         asking.cancel()
         await asyncio.gather(asking, return_exceptions=True)
         status = await bench.arm()
-        expect(status.state is State.OPERATION_ENABLED, f"armed it is in {status.state.name}")
+        expect(
+            status.state is AmplifierState.OPERATION_ENABLED, f"armed it is in {status.state.name}"
+        )

@@ -1,6 +1,6 @@
 """The guard: nothing is played that it has not let through."""
 
-from drivers.guard.guard import Guard, SafeCommand, SafeEnvelope
+from drivers.guard.guard import Guard, SafeCommandSet, SafeEnvelope
 from drivers.guard.limits import FREQUENCY_CEILING, FREQUENCY_FLOOR, LEVEL_CEILING, GuardLimits
 from drivers.guard.required import require_safe
 
@@ -10,7 +10,7 @@ __all__ = [
     "LEVEL_CEILING",
     "Guard",
     "GuardLimits",
-    "SafeCommand",
+    "SafeCommandSet",
     "SafeEnvelope",
     "require_safe",
 ]

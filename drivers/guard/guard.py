@@ -20,7 +20,7 @@ _KEY = object()
 
 
 @final
-class SafeCommand(CommandSet):
+class SafeCommandSet(CommandSet):
     """A command set that a guard has let through; only a `Guard` can make one.
 
     settled_after [s]: how long after its commit at the latest nothing fades any more.
@@ -39,12 +39,14 @@ class SafeCommand(CommandSet):
         key: object = None,
     ) -> None:
         if key is not _KEY:
-            raise TypeError("a SafeCommand is made by Guard.check or Guard.silence, by nobody else")
+            raise TypeError(
+                "a SafeCommandSet is made by Guard.check or Guard.silence, by nobody else"
+            )
         super().__init__(token=token, commands=commands, ramp=ramp, valid_for=valid_for)
         object.__setattr__(self, "settled_after", settled_after)
 
     def __init_subclass__(cls) -> None:
-        raise TypeError("SafeCommand cannot be subclassed")
+        raise TypeError("SafeCommandSet cannot be subclassed")
 
 
 @final
@@ -99,7 +101,7 @@ class Guard:
             rate=bounds.rate,
         )
 
-    def check(self, command_set: CommandSet) -> SafeCommand:
+    def check(self, command_set: CommandSet) -> SafeCommandSet:
         """The set as a command that may be sent; CommandRefused says which channel and why.
 
         Where on-time or duty are limited, valid_for is made short enough for them.
@@ -147,7 +149,7 @@ class Guard:
             self._loaded.pop(safe.slot, None)
         return safe
 
-    def silence(self, token: int, channels: Collection[int], *, ramp: float) -> SafeCommand:
+    def silence(self, token: int, channels: Collection[int], *, ramp: float) -> SafeCommandSet:
         """Level zero on these channels (and on all others, as ever); never fails.
 
         A channel that does not exist is left out, a ramp [s] out of range becomes the nearest in
@@ -168,7 +170,7 @@ class Guard:
 
     def check_or_silence(
         self, command_set: CommandSet, *, ramp: float
-    ) -> tuple[SafeCommand, CommandRefused | None]:
+    ) -> tuple[SafeCommandSet, CommandRefused | None]:
         """The checked set and None, or silence along a ramp [s] and why.
 
         For the control loop: whatever goes wrong in checking, and of whatever kind, the result can
@@ -191,7 +193,7 @@ class Guard:
 
     def _let_through(
         self, token: int, commands: tuple[DriveCommand, ...], *, ramp: float, valid_for: float
-    ) -> SafeCommand:
+    ) -> SafeCommandSet:
         self._last_token = token
         fades = [ramp]
         if not all(command.skip_ending for command in commands):  # an earlier ending may play
@@ -199,7 +201,7 @@ class Guard:
         vibrates = any(command.level > 0 or command.onset for command in commands)
         self._budget.note(self._clock(), lasts=(valid_for or _FOREVER) if vibrates else 0.0)
         self._playing = {command.channel: command for command in commands if command.level > 0}
-        return SafeCommand(
+        return SafeCommandSet(
             token,
             commands,
             ramp=ramp,

@@ -12,13 +12,13 @@ from drivers import clock
 from drivers.backend import Backend
 from drivers.errors import FrameError, LinkError, LinkTimeout
 from drivers.link.refusals import NO_PROTOCOL, is_busy, refusal
-from drivers.link.turns import SUPERSEDED, GaveWay, Kind, Turns
+from drivers.link.turns import SUPERSEDED, Preempted, RequestPriority, Turns
 from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.messages import (
     Achieved,
+    AmplifierEvent,
     Broadcast,
     Capabilities,
-    Event,
     FaultList,
     Identity,
     Loaded,
@@ -61,7 +61,7 @@ class Link:
     """
 
     def __init__(
-        self, backend: Backend, *, reply_timeout: float, on_event: Callable[[Event], None]
+        self, backend: Backend, *, reply_timeout: float, on_event: Callable[[AmplifierEvent], None]
     ) -> None:
         self.backend = backend
         self._reply_timeout = reply_timeout
@@ -69,7 +69,7 @@ class Link:
         self._turns = Turns(lambda: backend.is_unsent)
         self._loss: str | None = "the amplifier is not open yet; call open() first"
         self._unanswered = 0
-        self._is_hurried = False  # whoever waits for an answer soon gives it up
+        self._is_aborting_unsent = False  # whoever waits for an answer soon gives it up
         self._is_stuck = False  # it was busy to the last: until it is not, nothing is repeated
         self._retries = self._timeouts = self._refusals = 0
         self._last_round_trip: float | None = None
@@ -77,7 +77,7 @@ class Link:
         backend.listen(on_event, self._found_lost)
 
     @property
-    def lost(self) -> bool:
+    def is_lost(self) -> bool:
         """Whether every further request raises LinkError."""
         return self._loss is not None
 
@@ -88,8 +88,8 @@ class Link:
         return LinkStatistics(
             frames_out=seen.frames_out,
             frames_in=seen.frames_in,
-            bad=seen.bad,
-            foreign=seen.foreign,
+            crc_errors=seen.crc_errors,
+            unexpected_frames=seen.unexpected_frames,
             events=seen.events,
             retries=self._retries,
             timeouts=self._timeouts,
@@ -114,7 +114,7 @@ class Link:
         """Repeat once less on a wire whose longest exchange [s] takes more than the timeout."""
         self._retries_allowed = retries_on(round_trip, reply_timeout=self._reply_timeout)
 
-    def beaten(self) -> None:
+    def heartbeat_acknowledged(self) -> None:
         """A heartbeat was answered."""
         self._last_heartbeat = clock.now()
 
@@ -123,7 +123,7 @@ class Link:
         request: Request,
         *,
         expect: type[_ReplyT],
-        kind: Kind = Kind.ORDINARY,
+        kind: RequestPriority = RequestPriority.ORDINARY,
         timeout: float | None = None,
     ) -> _ReplyT:
         """The reply to a request in its turn; timeout [s] in place of the usual one.
@@ -151,33 +151,33 @@ class Link:
             )
         return reply
 
-    def hurry(self) -> None:
+    def abort_unsent(self) -> None:
         """Neither send what still waits for the wire nor repeat what is on its way.
 
-        It raises GaveWay instead, unless it silences.
+        It raises Preempted instead, unless it silences.
         """
-        self._is_hurried = True
-        self._turns.give_way_unsent()
+        self._is_aborting_unsent = True
+        self._turns.preempt_unsent()
 
-    async def broadcast(self, request: Broadcast, kind: Kind) -> None:
+    async def broadcast(self, request: Broadcast, kind: RequestPriority) -> None:
         """Say something to all of the bus in its turn; raises LinkError, CommandError."""
         self._raise_if_lost()
         async with self._turns.take(kind):
             await self.backend.broadcast(request)
 
-    async def _in_turn(self, request: Request, kind: Kind, timeout: float) -> Reply:
+    async def _in_turn(self, request: Request, kind: RequestPriority, timeout: float) -> Reply:
         while True:
             try:
                 async with self._turns.take(kind):
                     self._raise_if_lost()
                     return await self._exchange(request, kind, timeout)
-            except GaveWay:
+            except Preempted:
                 if not kind.silences:  # what silences is still wanted after the stop before it
                     raise
 
-    async def _exchange(self, request: Request, kind: Kind, timeout: float) -> Reply:
+    async def _exchange(self, request: Request, kind: RequestPriority, timeout: float) -> Reply:
         busy = 0
-        self._is_hurried = False
+        self._is_aborting_unsent = False
         while True:
             begin = clock.now()
             try:
@@ -203,8 +203,8 @@ class Link:
                 busy += 1
                 await asyncio.sleep(BUSY_PAUSE)
             self._turns.raise_if_overtaken(kind)
-            if self._is_hurried and not kind.silences:
-                raise GaveWay(SUPERSEDED)
+            if self._is_aborting_unsent and not kind.silences:
+                raise Preempted(SUPERSEDED)
             self._retries += 1
 
     def _found_lost(self, what: str) -> None:

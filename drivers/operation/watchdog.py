@@ -10,12 +10,12 @@ from drivers.link.link import REPLY_TIMEOUT, retries_on
 from drivers.protocol.definition import PROTOCOL
 
 HEARTBEAT = 0.05  # s; the control loop's own
-HEARTBEATS_BORNE = 3  # two may be lost or late before the amplifier falls silent
+MAX_MISSED_HEARTBEATS = 3  # two may be lost or late before the amplifier falls silent
 
 
 def shortest_watchdog(round_trip: float) -> float:
     """The shortest watchdog [s] that a wire with this round trip [s] allows."""
-    return HEARTBEATS_BORNE * HEARTBEAT + round_trip
+    return MAX_MISSED_HEARTBEATS * HEARTBEAT + round_trip
 
 
 def check_watchdog(watchdog: float, round_trip: float) -> None:
@@ -27,13 +27,13 @@ def check_watchdog(watchdog: float, round_trip: float) -> None:
     shortest = shortest_watchdog(round_trip)
     if not watchdog >= shortest - 1e-9:  # sums of floats
         raise CommandError(
-            f"a watchdog of {watchdog * 1e3:g} ms is too short: {HEARTBEATS_BORNE} heartbeats of "
-            f"{HEARTBEAT * 1e3:g} ms and a round trip of {round_trip * 1e3:.1f} ms need at least "
-            f"{shortest * 1e3:.0f} ms; lengthen it, or use a faster line"
+            f"watchdog must be at least {shortest * 1e3:.0f} ms ({MAX_MISSED_HEARTBEATS} "
+            f"heartbeats of {HEARTBEAT * 1e3:g} ms and a round trip of {round_trip * 1e3:.1f} ms), "
+            f"got {watchdog * 1e3:g} ms; lengthen it, or use a faster line"
         )
 
 
-def told_after(round_trips: Iterable[float]) -> float:
+def loss_detection_time(round_trips: Iterable[float]) -> float:
     """How long [s] it takes at most until amplifiers on one line that fall silent count as lost.
 
     All of them at once, right after an answer, and each is asked for a set next: one after the

@@ -1,8 +1,8 @@
 """What host and amplifier say to each other, whatever the wire.
 
 A request is answered by exactly one reply: the one named beside it here, or a `Nak`.
-An `Event` comes unasked, on wires on which an amplifier may speak first. Codecs turn these into
-bytes and back; nothing here knows of bytes.
+An `AmplifierEvent` comes unsolicited, on wires on which an amplifier may speak first. Codecs turn
+these into bytes and back; nothing here deals with bytes.
 
     Hello       Identity            who is there
     GetCaps     Capabilities        what it can play
@@ -28,7 +28,7 @@ from typing import TypeAlias
 from drivers.command import CommandSet, DriveCommand, Envelope
 
 
-class State(IntEnum):
+class AmplifierState(IntEnum):
     """Amplifier states by their CiA 402 names; the numbers are those on the wire."""
 
     NOT_READY = 0
@@ -190,7 +190,7 @@ class Status:
     [V] of the high-voltage supply, 0 where it is not measured.
     """
 
-    state: State
+    state: AmplifierState
     fault: Fault
     token: int
     high_voltage: bool
@@ -233,10 +233,10 @@ class Loaded:
 
 
 @dataclass(frozen=True, slots=True)
-class Event:
+class AmplifierEvent:
     """The state has changed, or there is a fault; channel: the one to blame, where one is."""
 
-    state: State
+    state: AmplifierState
     fault: Fault
     channel: int | None = None
 

@@ -8,6 +8,8 @@ from drivers.errors import CommandError, LinkError, LinkTimeout
 from drivers.guard import require_safe
 from drivers.protocol.messages import (
     Achieved,
+    AmplifierEvent,
+    AmplifierState,
     Apply,
     Arm,
     Broadcast,
@@ -15,7 +17,6 @@ from drivers.protocol.messages import (
     Clear,
     Commit,
     Disarm,
-    Event,
     Fault,
     FaultList,
     FaultRecord,
@@ -32,7 +33,6 @@ from drivers.protocol.messages import (
     Reply,
     Request,
     Stage,
-    State,
     Status,
     Stop,
 )
@@ -41,6 +41,8 @@ from drivers.statistics import WireCounters
 
 __all__ = [
     "Achieved",
+    "AmplifierEvent",
+    "AmplifierState",
     "Apply",
     "Arm",
     "Backend",
@@ -53,7 +55,6 @@ __all__ = [
     "Disarm",
     "DriveCommand",
     "Envelope",
-    "Event",
     "Fault",
     "FaultList",
     "FaultRecord",
@@ -73,7 +74,6 @@ __all__ = [
     "Reply",
     "Request",
     "Stage",
-    "State",
     "Status",
     "Stop",
     "WireBackend",

@@ -15,13 +15,14 @@ from collections.abc import Callable, Sequence
 from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.messages import (
     Achieved,
+    AmplifierEvent,
+    AmplifierState,
     Apply,
     Arm,
     Capabilities,
     Clear,
     Commit,
     Disarm,
-    Event,
     Fault,
     FaultList,
     FaultRecord,
@@ -36,7 +37,6 @@ from drivers.protocol.messages import (
     Reply,
     Request,
     Stage,
-    State,
     Status,
     Stop,
 )
@@ -92,9 +92,9 @@ class SimulatedAmplifier:
             protocol_version=PROTOCOL.version,
         )
         self.capabilities = capabilities(channels)
-        self.state = State.SWITCH_ON_DISABLED
+        self.state = AmplifierState.SWITCH_ON_DISABLED
         self.fault = Fault.NONE
-        self.listeners: list[Callable[[Event, float], None]] = []
+        self.listeners: list[Callable[[AmplifierEvent, float], None]] = []
         self._heat = Heat(since=-math.inf)
         self._faults: deque[tuple[Fault, int | None, float]] = deque(maxlen=_FAULTS_KEPT)
         self._start()
@@ -131,8 +131,10 @@ class SimulatedAmplifier:
             elif moment == self._watchdog_end:
                 self.trip(Fault.WATCHDOG, moment)
             elif moment == self._silence_reached:
-                silent = self.state is State.FAULT_REACTION_ACTIVE
-                self._enter(State.FAULT if silent else State.SWITCH_ON_DISABLED, moment)
+                silent = self.state is AmplifierState.FAULT_REACTION_ACTIVE
+                self._enter(
+                    AmplifierState.FAULT if silent else AmplifierState.SWITCH_ON_DISABLED, moment
+                )
             else:
                 self._too_warm(moment)
         if self._is_derated and self._heat.at(now) < GOOD_BELOW:
@@ -157,7 +159,7 @@ class SimulatedAmplifier:
         """How the amplifier is at a time [s] up to which it has been ticked."""
         levels = self._channels.levels(now)
         left = self._fed + self._watchdog - now if self.state in ENABLED else 0.0
-        is_on = self.state in (State.SWITCHED_ON, *ENABLED) or any(levels)
+        is_on = self.state in (AmplifierState.SWITCHED_ON, *ENABLED) or any(levels)
         decayed = math.exp(min(0.0, (self._silent_from - now) / _DISCHARGE))
         return Status(
             state=self.state,
@@ -176,10 +178,10 @@ class SimulatedAmplifier:
         Where nothing can play it is only noted among the faults.
         """
         self._faults.appendleft((fault, channel, moment))
-        if self.state in (*ENABLED, State.SWITCHED_ON, State.QUICK_STOP_ACTIVE):
+        if self.state in (*ENABLED, AmplifierState.SWITCHED_ON, AmplifierState.QUICK_STOP_ACTIVE):
             self._silence(moment, ramp=SILENCING_RAMP)
             self.fault = fault
-            self._enter(State.FAULT_REACTION_ACTIVE, moment, channel=channel)
+            self._enter(AmplifierState.FAULT_REACTION_ACTIVE, moment, channel=channel)
 
     def set_temperature(self, temperature: float, moment: float) -> None:
         """Bring it to a temperature [°C] from outside; what follows from that follows."""
@@ -194,9 +196,9 @@ class SimulatedAmplifier:
         self._heat = Heat(moment, self._heat.at(moment))
         self.fault = Fault.NONE
         self._start()
-        self._enter(State.SWITCH_ON_DISABLED, moment)
+        self._enter(AmplifierState.SWITCH_ON_DISABLED, moment)
 
-    def _carry_out(self, request: Request, following: State, now: float) -> Reply | None:
+    def _carry_out(self, request: Request, following: AmplifierState, now: float) -> Reply | None:
         """Do what is asked in a state that allows it; None where the reply is the status."""
         match request:
             case Hello():
@@ -242,7 +244,7 @@ class SimulatedAmplifier:
         self._watchdog = watchdog
         self._fed = now
         self._sets.forget()
-        self._enter(State.OPERATION_ENABLED, now)
+        self._enter(AmplifierState.OPERATION_ENABLED, now)
         return None
 
     def _commit(self, token: int, now: float) -> Achieved:
@@ -275,9 +277,9 @@ class SimulatedAmplifier:
         self._sets.staged = None
         self._warm(moment)
 
-    def _enter(self, state: State, moment: float, *, channel: int | None = None) -> None:
+    def _enter(self, state: AmplifierState, moment: float, *, channel: int | None = None) -> None:
         """Go to a state and tell who listens, where it is another or a fault was cleared."""
-        told = Event(state, self.fault, channel)
+        told = AmplifierEvent(state, self.fault, channel)
         if state is not self.state:
             self.state = state
             for listener in self.listeners:
@@ -289,7 +291,7 @@ class SimulatedAmplifier:
 
     @property
     def _silence_reached(self) -> float:
-        ending = (State.SWITCHED_ON, State.FAULT_REACTION_ACTIVE)
+        ending = (AmplifierState.SWITCHED_ON, AmplifierState.FAULT_REACTION_ACTIVE)
         return self._silent_from if self.state in ending else math.inf
 
     @property

@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from typing import TypeAlias
 
 from drivers.protocol.messages import (
+    AmplifierState,
     Apply,
     Arm,
     Clear,
@@ -23,41 +24,54 @@ from drivers.protocol.messages import (
     Ping,
     Request,
     Stage,
-    State,
     Stop,
 )
 
-ENABLED = frozenset({State.OPERATION_ENABLED})
+ENABLED = frozenset({AmplifierState.OPERATION_ENABLED})
 """States in which the amplifier may play and its watchdog runs."""
 
-Table: TypeAlias = Mapping[tuple[State, type[Request]], State]
+Table: TypeAlias = Mapping[tuple[AmplifierState, type[Request]], AmplifierState]
 
 _ASKING: tuple[type[Request], ...] = (Hello, GetCaps, GetStatus, GetFaults, Ping, LoadEnvelope)
 _PLAYING: tuple[type[Request], ...] = (Stage, Commit, Apply)
-_OFF = (State.SWITCH_ON_DISABLED, State.READY_TO_SWITCH_ON)
-_STOPPED = (State.QUICK_STOP_ACTIVE, State.FAULT_REACTION_ACTIVE, State.FAULT)
+_OFF = (AmplifierState.SWITCH_ON_DISABLED, AmplifierState.READY_TO_SWITCH_ON)
+_STOPPED = (
+    AmplifierState.QUICK_STOP_ACTIVE,
+    AmplifierState.FAULT_REACTION_ACTIVE,
+    AmplifierState.FAULT,
+)
 
 TRANSITIONS: Table = {
-    **{(state, request): state for state in State for request in _ASKING},
+    **{(state, request): state for state in AmplifierState for request in _ASKING},
     # Whatever the state, a wish for silence is granted and never undoes a latched stop or fault.
-    **{(state, Disarm): state for state in (State.NOT_READY, *_OFF, *_STOPPED)},
-    (State.SWITCHED_ON, Disarm): State.SWITCHED_ON,
-    (State.OPERATION_ENABLED, Disarm): State.SWITCHED_ON,
-    **{(state, Stop): State.QUICK_STOP_ACTIVE for state in State},
+    **{(state, Disarm): state for state in (AmplifierState.NOT_READY, *_OFF, *_STOPPED)},
+    (AmplifierState.SWITCHED_ON, Disarm): AmplifierState.SWITCHED_ON,
+    (AmplifierState.OPERATION_ENABLED, Disarm): AmplifierState.SWITCHED_ON,
+    **{(state, Stop): AmplifierState.QUICK_STOP_ACTIVE for state in AmplifierState},
     **{
         (state, Stop): state
-        for state in (State.NOT_READY, State.FAULT_REACTION_ACTIVE, State.FAULT)
+        for state in (
+            AmplifierState.NOT_READY,
+            AmplifierState.FAULT_REACTION_ACTIVE,
+            AmplifierState.FAULT,
+        )
     },
-    **{(state, Clear): state for state in State},
-    (State.QUICK_STOP_ACTIVE, Clear): State.SWITCH_ON_DISABLED,
-    (State.FAULT, Clear): State.SWITCH_ON_DISABLED,
+    **{(state, Clear): state for state in AmplifierState},
+    (AmplifierState.QUICK_STOP_ACTIVE, Clear): AmplifierState.SWITCH_ON_DISABLED,
+    (AmplifierState.FAULT, Clear): AmplifierState.SWITCH_ON_DISABLED,
     # READY_TO_SWITCH_ON and SWITCHED_ON are passed through at once: Arm goes all the way.
-    **{(state, Arm): State.OPERATION_ENABLED for state in (*_OFF, State.SWITCHED_ON)},
-    (State.OPERATION_ENABLED, Arm): State.OPERATION_ENABLED,
-    **{(State.OPERATION_ENABLED, request): State.OPERATION_ENABLED for request in _PLAYING},
+    **{
+        (state, Arm): AmplifierState.OPERATION_ENABLED
+        for state in (*_OFF, AmplifierState.SWITCHED_ON)
+    },
+    (AmplifierState.OPERATION_ENABLED, Arm): AmplifierState.OPERATION_ENABLED,
+    **{
+        (AmplifierState.OPERATION_ENABLED, request): AmplifierState.OPERATION_ENABLED
+        for request in _PLAYING
+    },
 }
 
 
-def next_state(state: State, request: type[Request]) -> State | None:
+def next_state(state: AmplifierState, request: type[Request]) -> AmplifierState | None:
     """The state that a request leads to, or None where it is refused."""
     return TRANSITIONS.get((state, request))

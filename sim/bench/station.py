@@ -12,9 +12,9 @@ from typing import Literal, TypeAlias
 
 from drivers import clock
 from drivers.protocol.messages import (
+    AmplifierEvent,
     Broadcast,
     Capabilities,
-    Event,
     Fault,
     Identity,
     Nak,
@@ -73,7 +73,7 @@ class Station:
         """Be told False when the wire is pulled out and True when it is back."""
         self._on_plug.append(on_plug)
 
-    def listen(self, on_event: Callable[[Event], None]) -> None:
+    def listen(self, on_event: Callable[[AmplifierEvent], None]) -> None:
         """Be told when state or fault changes."""
         self._amplifier.listeners.append(lambda event, _: on_event(event))
 

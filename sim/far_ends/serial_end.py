@@ -13,7 +13,7 @@ from drivers.codec.payload import Malformed
 from drivers.codec.serial_line.exchanges import decode_request, encode_event, encode_reply
 from drivers.codec.serial_line.frame import Frame, FrameCounters, FrameReader, encode_frame
 from drivers.protocol.definition import PROTOCOL
-from drivers.protocol.messages import Commit, Event, Nak, Reply, Stop
+from drivers.protocol.messages import AmplifierEvent, Commit, Nak, Reply, Stop
 from sim.bench.station import Station
 from sim.transport.line import TwoWayLine
 from sim.transport.pseudo_terminal import make_terminal
@@ -114,7 +114,7 @@ class SerialEnd:
                 for station in self._stations.values():
                     station.broadcast(request)
 
-    def _tell(self, event: Event) -> None:
+    def _tell(self, event: AmplifierEvent) -> None:
         if self._first.is_answering:
             self._events = (self._events + 1) & 0xFFFF
             frame = encode_event(event, address=PROTOCOL.serial.address, sequence=self._events)

@@ -13,7 +13,7 @@ from controller_bench import make_bench
 from drivers.amplifier import Amplifier
 from drivers.backend import Backend
 from drivers.errors import DriverError, LinkTimeout
-from drivers.protocol.messages import Reply, Request, State
+from drivers.protocol.messages import AmplifierState, Reply, Request
 from model.vibration.excitation import Tone
 from shaped_link import Shapes
 from sim.amplifier.amplifier import SimulatedAmplifier
@@ -122,7 +122,7 @@ async def test_nothing_stays_vibrating(seed: int, loss: float) -> None:
     if dice.random() < 0.5:
         await controller.close()
         states = {link.amplifier.state for link in links.values()}
-        assert loss or State.OPERATION_ENABLED not in states
+        assert loss or AmplifierState.OPERATION_ENABLED not in states
     tasks[0].cancel()
     await asyncio.sleep(WATCHDOG + 0.15)
     assert max(link.level() for link in links.values()) == 0

@@ -10,6 +10,7 @@ from controller_bench import FINGER, OTHER, make_bench, running
 from drivers.amplifier import Amplifier
 from drivers.errors import CommandError, CommandRefused, LinkError
 from drivers.protocol.messages import (
+    AmplifierState,
     Apply,
     Arm,
     Commit,
@@ -22,7 +23,6 @@ from drivers.protocol.messages import (
     Reply,
     Request,
     Stage,
-    State,
     Status,
     Stop,
 )
@@ -109,9 +109,9 @@ async def test_together_or_not_at_all() -> None:
         (Commit, Nak(NakCode.BAD_TOKEN)),
         (
             GetStatus,
-            Status(State.OPERATION_ENABLED, Fault.NONE, 9999, True, 25.0, 0.2, (0.0, 0.0)),
+            Status(AmplifierState.OPERATION_ENABLED, Fault.NONE, 9999, True, 25.0, 0.2, (0.0, 0.0)),
         ),
-        (Ping, Status(State.FAULT, Fault.ARC, 1, False, 25.0, 0.0, (0.0, 0.0))),
+        (Ping, Status(AmplifierState.FAULT, Fault.ARC, 1, False, 25.0, 0.0, (0.0, 0.0))),
     ],
 )
 @in_virtual_time
@@ -188,18 +188,18 @@ async def test_silence_asked_for_while_arming(silencing: str) -> None:
     assert bench.controller.phase is (Phase.CLOSED if silencing == "close" else Phase.DISARMED)
     if silencing != "close":
         states = {far_end.state for far_end in bench.far_ends}
-        assert State.OPERATION_ENABLED not in states
+        assert AmplifierState.OPERATION_ENABLED not in states
 
 
 @in_virtual_time
 async def test_arming_again_that_is_refused() -> None:
     """Amplifiers that were armed and cannot be armed anew are disarmed, and nothing is played."""
     async with running("a", "b") as bench:
-        bench.far_ends[0].state = State.SWITCH_ON_DISABLED  # the other one refuses
+        bench.far_ends[0].state = AmplifierState.SWITCH_ON_DISABLED  # the other one refuses
         with pytest.raises(CommandRefused):
             await bench.controller.arm()
         assert bench.controller.phase is Phase.DISARMED
-        assert {far_end.state for far_end in bench.far_ends} == {State.SWITCH_ON_DISABLED}
+        assert {far_end.state for far_end in bench.far_ends} == {AmplifierState.SWITCH_ON_DISABLED}
 
 
 @in_virtual_time
@@ -211,7 +211,7 @@ async def test_a_disarm_that_fails() -> None:
         )
         with pytest.raises(CommandRefused, match="busy"):
             await bench.controller.disarm()
-        assert {far_end.state for far_end in bench.far_ends} == {State.QUICK_STOP_ACTIVE}
+        assert {far_end.state for far_end in bench.far_ends} == {AmplifierState.QUICK_STOP_ACTIVE}
 
 
 @in_virtual_time
@@ -229,11 +229,11 @@ async def test_a_stop_is_seen_through() -> None:
     )
     await asyncio.sleep(0.065)  # the next heartbeat goes out after 50 ms
     assert [len(far_end.requests(Stop)) for far_end in bench.far_ends] == [1, 1]
-    assert {far_end.state for far_end in bench.far_ends} == {State.OPERATION_ENABLED}
+    assert {far_end.state for far_end in bench.far_ends} == {AmplifierState.OPERATION_ENABLED}
     task.cancel()
     with pytest.raises(asyncio.CancelledError):
         await task
-    assert {far_end.state for far_end in bench.far_ends} == {State.QUICK_STOP_ACTIVE}
+    assert {far_end.state for far_end in bench.far_ends} == {AmplifierState.QUICK_STOP_ACTIVE}
     await bench.controller.close()
 
 
@@ -255,7 +255,7 @@ async def test_a_finger_lifted_while_all_are_stopped() -> None:
     assert len(bench.far_end.requests(Stop)) == 1
     bench.touch()
     await asyncio.sleep(0.03)
-    assert bench.far_end.state is State.QUICK_STOP_ACTIVE
+    assert bench.far_end.state is AmplifierState.QUICK_STOP_ACTIVE
     assert bench.told.contacts == [1, 1, 0]
     assert len(bench.told.refused) == 1
     await bench.controller.close()
@@ -281,7 +281,7 @@ async def test_a_bug_stops_all(kind: type[Request]) -> None:
     await bench.hold(FINGER, seconds=0.1)
     with pytest.raises(ZeroDivisionError):
         await task
-    assert {far_end.state for far_end in bench.far_ends} == {State.QUICK_STOP_ACTIVE}
+    assert {far_end.state for far_end in bench.far_ends} == {AmplifierState.QUICK_STOP_ACTIVE}
     assert bench.controller.phase is Phase.DISARMED
     await bench.controller.close()
 
@@ -333,7 +333,7 @@ async def test_close_without_proof_of_silence(caplog: pytest.LogCaptureFixture) 
     """An amplifier that goes on reporting a level is stopped, and that is logged."""
     async with running() as bench:
         bench.far_end.answer = lambda request: (
-            Status(State.OPERATION_ENABLED, Fault.NONE, 1, True, 25.0, 0.2, (0.3, 0.0))
+            Status(AmplifierState.OPERATION_ENABLED, Fault.NONE, 1, True, 25.0, 0.2, (0.3, 0.0))
             if isinstance(request, GetStatus)
             else None
         )
@@ -353,7 +353,7 @@ async def test_close_gives_an_amplifier_time_to_report_zero(
         if not (old and isinstance(request, GetStatus)):
             return None
         levels = (old.pop(0), 0.0)
-        return Status(State.OPERATION_ENABLED, Fault.NONE, 1, True, 25.0, 0.2, levels)
+        return Status(AmplifierState.OPERATION_ENABLED, Fault.NONE, 1, True, 25.0, 0.2, levels)
 
     async with running() as bench:
         bench.far_end.answer = lag
@@ -440,7 +440,7 @@ async def test_a_stop_is_seen_through_however_often_its_caller_is_cancelled() ->
             stopping.cancel()
         with pytest.raises(asyncio.CancelledError):
             await stopping
-        assert {far_end.state for far_end in bench.far_ends} == {State.QUICK_STOP_ACTIVE}
+        assert {far_end.state for far_end in bench.far_ends} == {AmplifierState.QUICK_STOP_ACTIVE}
 
 
 @in_virtual_time
@@ -462,7 +462,7 @@ async def test_all_who_stop_what_is_being_stopped_have_one_stop_together() -> No
         assert all(far_end.times(Stop)[-1] > wished for far_end in bench.far_ends)
         await asyncio.gather(clearing, return_exceptions=True)
         assert [len(far_end.requests(Stop)) for far_end in bench.far_ends] == [2, 2]
-        assert {far_end.state for far_end in bench.far_ends} == {State.QUICK_STOP_ACTIVE}
+        assert {far_end.state for far_end in bench.far_ends} == {AmplifierState.QUICK_STOP_ACTIVE}
         await bench.controller.stop()
         assert [len(far_end.requests(Stop)) for far_end in bench.far_ends] == [3, 3]
 

@@ -16,6 +16,7 @@ from controller_bench import FINGER, OTHER, make_bench, running
 from drivers.errors import LinkTimeout
 from drivers.operation.watchdog import HEARTBEAT
 from drivers.protocol.messages import (
+    AmplifierState,
     Apply,
     Arm,
     Commit,
@@ -24,7 +25,6 @@ from drivers.protocol.messages import (
     Ping,
     Reply,
     Request,
-    State,
 )
 from model.errors import InputError
 from model.vibration.excitation import Excitation, Tone
@@ -511,7 +511,9 @@ async def test_arming_again_gives_no_heartbeat_up() -> None:
         last = max(time for time, request in bench.far_end.asked if isinstance(request, Ping))
         await asyncio.sleep(last + 0.9 * HEARTBEAT - asyncio.get_running_loop().time())
         bench.far_end.delay = 0.02
-        bench.far_end.state = State.SWITCH_ON_DISABLED  # from where this one lets itself be armed
+        bench.far_end.state = (
+            AmplifierState.SWITCH_ON_DISABLED
+        )  # from where this one lets itself be armed
         begin = len(bench.far_end.asked)
         await bench.controller.arm()
         await asyncio.sleep(0.1)

@@ -5,13 +5,13 @@ import pytest
 from controller.read_backs import ReadBacks
 from drivers.command import CommandSet, DriveCommand
 from drivers.errors import CommandRefused
-from drivers.guard import Guard, GuardLimits, SafeCommand
-from drivers.protocol.messages import Achieved, Capabilities, Fault, State, Status
+from drivers.guard import Guard, GuardLimits, SafeCommandSet
+from drivers.protocol.messages import Achieved, AmplifierState, Capabilities, Fault, Status
 
 CAPABILITIES = Capabilities(2, 20.0, 600.0, 0.01, 1.0, 0.0001, 0.01, 1.0, 0.1, 2.0, 0)
 
 
-def tone(*, ramp: float = 0.0, valid_for: float = 0.0) -> SafeCommand:
+def tone(*, ramp: float = 0.0, valid_for: float = 0.0) -> SafeCommandSet:
     """Channel 0 at half of full stroke."""
     wanted = CommandSet(1, (DriveCommand(0, 110.0, 0.5),), ramp=ramp, valid_for=valid_for)
     return Guard(GuardLimits(20.0, 600.0, 1.0), CAPABILITIES).check(wanted)
@@ -19,10 +19,10 @@ def tone(*, ramp: float = 0.0, valid_for: float = 0.0) -> SafeCommand:
 
 def reported(*levels: float) -> Status:
     """An enabled amplifier with these levels."""
-    return Status(State.OPERATION_ENABLED, Fault.NONE, 1, True, 25.0, 0.25, levels)
+    return Status(AmplifierState.OPERATION_ENABLED, Fault.NONE, 1, True, 25.0, 0.25, levels)
 
 
-def expecting(safe: SafeCommand) -> ReadBacks:
+def expecting(safe: SafeCommandSet) -> ReadBacks:
     """Played at 10 s, as asked."""
     read_backs = ReadBacks()
     read_backs.expect({"main": safe}, {"main": Achieved(1, safe.commands)}, now=10.0)

@@ -11,7 +11,7 @@ import pytest
 from controller.contacts import Contact
 from controller.wishes import Target, Wish
 from controller_bench import FINGER, OTHER, make_bench, running
-from drivers.protocol.messages import Apply, LoadEnvelope, State
+from drivers.protocol.messages import AmplifierState, Apply, LoadEnvelope
 from model.table.pattern import Pattern
 from model.table.question import Question
 from model.vibration.excitation import Tone
@@ -185,7 +185,7 @@ async def test_silence_does_not_wait_for_envelopes(link: Link, shapes: Shapes) -
         assert silent.is_silent
         _, sent = [time for time, request in link.asked if isinstance(request, Apply)]
         assert sent - lifted < 0.020
-        assert link.amplifier.state is State.OPERATION_ENABLED
+        assert link.amplifier.state is AmplifierState.OPERATION_ENABLED
 
 
 @in_virtual_time
@@ -408,7 +408,7 @@ async def test_wishes_that_fail_silence_all_and_recover(
             await bench.hold(FINGER, OTHER, seconds=0.3)
         assert link.levels() == (0.0, 0.0)
         assert bench.told.silenced[-1].reason.startswith("ZeroDivisionError")
-        assert link.amplifier.state is State.OPERATION_ENABLED
+        assert link.amplifier.state is AmplifierState.OPERATION_ENABLED
         bench.touch((3, 0.2, 0.2))
         await asyncio.sleep(0.030)
         assert link.levels()[0] > 0

@@ -13,7 +13,7 @@ import pytest
 
 from controller.amplifiers import AmplifierGroup
 from drivers.amplifier import Amplifier
-from drivers.protocol.messages import Reply, Request, State, Stop
+from drivers.protocol.messages import AmplifierState, Reply, Request, Stop
 from drivers.registry import open_backend
 from memory_machine import live_in_memory
 from model.rig.rig import Channel, Rig
@@ -77,7 +77,7 @@ def test_one_that_does_not_answer_holds_up_no_other_stop(bus: str, coarse_rig: R
         await group.stop()
         for name in NAMES[1:]:
             assert min(moment for who, moment in heard if who == name) - begin < FRAME
-            assert far.stations[name].status().state is State.QUICK_STOP_ACTIVE
+            assert far.stations[name].status().state is AmplifierState.QUICK_STOP_ACTIVE
 
     on_a_bus(bus, coarse_rig, use)
 

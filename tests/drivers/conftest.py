@@ -5,7 +5,7 @@ from collections.abc import AsyncIterator, Callable
 import pytest
 
 from drivers.command import CommandSet, DriveCommand
-from drivers.guard import Guard, GuardLimits, SafeCommand
+from drivers.guard import Guard, GuardLimits, SafeCommandSet
 from drivers.protocol.messages import Capabilities
 from scripted_amplifier import CAPABILITIES, FarEnd
 
@@ -31,10 +31,10 @@ def guard() -> Guard:
 
 
 @pytest.fixture
-def safe(guard: Guard) -> Callable[..., SafeCommand]:
+def safe(guard: Guard) -> Callable[..., SafeCommandSet]:
     """A guarded set of one channel under a token."""
 
-    def make(token: int, level: float = 0.2) -> SafeCommand:
+    def make(token: int, level: float = 0.2) -> SafeCommandSet:
         command = DriveCommand(channel=0, frequency=110.0, level=level)
         return guard.check(CommandSet(token=token, commands=(command,), ramp=0.01, valid_for=0.0))
 

@@ -19,6 +19,7 @@ from drivers.cli import EXIT_STATUS, app
 from drivers.discovery.search import candidates
 from drivers.errors import CommandError, CommandRefused, FrameError, LinkError, LinkTimeout
 from drivers.protocol.messages import (
+    AmplifierState,
     Apply,
     Arm,
     Clear,
@@ -30,7 +31,6 @@ from drivers.protocol.messages import (
     Nak,
     NakCode,
     Ping,
-    State,
     Stop,
 )
 from drivers.registry import known_schemes
@@ -134,7 +134,7 @@ def test_a_refused_drive_is_disarmed(background: BackgroundFarEnd) -> None:
 def test_a_drive_that_the_amplifier_ends_is_no_success(background: BackgroundFarEnd) -> None:
     """A fault in the middle of a drive is told, and the amplifier is disarmed all the same."""
     usual = background.end.answer
-    arc = replace(STATUS, state=State.FAULT, fault=Fault.ARC)
+    arc = replace(STATUS, state=AmplifierState.FAULT, fault=Fault.ARC)
     background.end.answer = lambda request, frame: (
         arc if isinstance(request, Ping) else usual(request, frame)
     )
@@ -288,7 +288,7 @@ def test_a_drive_over_too_slow_a_line_never_arms(background: BackgroundFarEnd) -
 def test_a_drive_after_a_stop_says_how_to_clear(background: BackgroundFarEnd) -> None:
     """The state, the fault and the command that acknowledges it, as a shell takes the URL."""
     usual = background.end.answer
-    stopped = replace(STATUS, state=State.QUICK_STOP_ACTIVE)
+    stopped = replace(STATUS, state=AmplifierState.QUICK_STOP_ACTIVE)
     background.end.answer = lambda request, frame: (
         Nak(NakCode.WRONG_STATE)
         if isinstance(request, Arm)

@@ -9,11 +9,12 @@ from drivers.amplifier import Amplifier
 from drivers.backend import Backend
 from drivers.command import CommandSet, Envelope, Knot
 from drivers.errors import CommandError, CommandRefused, FrameError, LinkError, LinkTimeout
-from drivers.guard import Guard, GuardLimits, SafeCommand
+from drivers.guard import Guard, GuardLimits, SafeCommandSet
 from drivers.link import turns
 from drivers.operation.watchdog import check_watchdog
 from drivers.protocol.messages import (
     Achieved,
+    AmplifierState,
     Apply,
     Arm,
     Capabilities,
@@ -31,7 +32,6 @@ from drivers.protocol.messages import (
     Ping,
     Reply,
     Request,
-    State,
     Status,
     Stop,
 )
@@ -39,9 +39,9 @@ from drivers.registry import open_backend
 from scripted_amplifier import CAPABILITIES
 
 IDENTITY = Identity("Acme", "Quad", "A-17", "1.2", 1)
-STATUS = Status(State.OPERATION_ENABLED, Fault.NONE, 0, True, 25.0, 0.25, (0.0,) * 4)
+STATUS = Status(AmplifierState.OPERATION_ENABLED, Fault.NONE, 0, True, 25.0, 0.25, (0.0,) * 4)
 WITH_ENVELOPES = replace(CAPABILITIES, envelope_knots=8, envelope_slots=4, envelope_step_max=0.1)
-MakeSafe = Callable[..., SafeCommand]
+MakeSafe = Callable[..., SafeCommandSet]
 
 
 class ScriptedBackend(Backend):
@@ -173,7 +173,7 @@ async def test_three_lost_replies_lose_the_amplifier(
     backend.script += [LinkTimeout("no answer")] * 3
     with pytest.raises(LinkTimeout, match="3 requests in a row"):
         await amplifier.heartbeat()
-    assert amplifier.lost
+    assert amplifier.is_lost
     for call in (amplifier.arm, amplifier.stop, amplifier.status, amplifier.heartbeat):
         with pytest.raises(LinkError, match=r"no answer.*opened again it is disarmed"):
             await call()
@@ -210,7 +210,7 @@ async def test_timeouts_are_counted_in_a_row(
     for _ in range(3):
         backend.script += [LinkTimeout("noise"), LinkTimeout("noise"), STATUS]
         await amplifier.heartbeat()
-    assert not amplifier.lost
+    assert not amplifier.is_lost
 
 
 @pytest.mark.parametrize("code", NakCode)
@@ -222,7 +222,7 @@ async def test_a_refusal_is_readable(
     with pytest.raises(CommandRefused, match=r"refused Arm \(channel 2\): \w+ \w+") as caught:
         await amplifier.arm()
     assert caught.value.channel == 2
-    assert not amplifier.lost
+    assert not amplifier.is_lost
 
 
 async def test_a_busy_amplifier_is_asked_again(
@@ -236,7 +236,7 @@ async def test_a_busy_amplifier_is_asked_again(
     with pytest.raises(CommandRefused, match="busy"):
         await amplifier.apply(safe(6))
     assert len(backend.requests) == 6
-    assert not amplifier.lost
+    assert not amplifier.is_lost
 
 
 async def test_a_stuck_amplifier_is_asked_once(
@@ -309,7 +309,7 @@ async def test_only_safe_commands_are_taken(amplifier: Amplifier) -> None:
     """A set that no guard has seen does not reach the backend."""
     plain = CommandSet(token=1, commands=(), ramp=0.0, valid_for=0.0)
     for call in (amplifier.apply, amplifier.stage):
-        with pytest.raises(TypeError, match="SafeCommand"):
+        with pytest.raises(TypeError, match="SafeCommandSet"):
             await call(plain)
 
 
@@ -521,7 +521,7 @@ async def test_a_stop_waits_for_no_answer_that_does_not_come(
     with pytest.raises(CommandRefused, match="superseded"):
         await apply
     assert backend.requests == [Apply(safe(1)), Stop(0.005)]
-    assert not amplifier.lost
+    assert not amplifier.is_lost
     assert (await amplifier.status()) == STATUS
 
 

@@ -15,8 +15,9 @@ import pytest
 from drivers.amplifier import Amplifier
 from drivers.command import CommandSet, DriveCommand
 from drivers.errors import CommandRefused
-from drivers.guard import Guard, GuardLimits, SafeCommand
+from drivers.guard import Guard, GuardLimits, SafeCommandSet
 from drivers.protocol.messages import (
+    AmplifierState,
     Apply,
     Disarm,
     GetStatus,
@@ -25,7 +26,6 @@ from drivers.protocol.messages import (
     Reply,
     Request,
     Stage,
-    State,
     Stop,
 )
 from drivers.registry import open_backend
@@ -80,7 +80,7 @@ class Chain:
         """Whom, and what, by its name."""
         return [(name, type(request).__name__) for name, request in self.asked]
 
-    def tone(self, amplifier: Amplifier, token: int, level: float = 0.3) -> SafeCommand:
+    def tone(self, amplifier: Amplifier, token: int, level: float = 0.3) -> SafeCommandSet:
         """A set on channel 0."""
         guard = Guard(GuardLimits(40.0, 500.0, 1.0), amplifier.capabilities)
         commands = (DriveCommand(0, 110.0, level),)
@@ -161,9 +161,9 @@ def test_what_waits_for_the_line_is_not_sent_before_a_stop(
         await refused(waiting)
         await beat
         assert chain.kinds() == [("west", "Ping"), ("east", "Stop")]
-        assert status.state is State.QUICK_STOP_ACTIVE
+        assert status.state is AmplifierState.QUICK_STOP_ACTIVE
         assert chain.east.statistics.retries == chain.east.statistics.timeouts == 0
-        assert (await chain.east.heartbeat()).state is State.QUICK_STOP_ACTIVE
+        assert (await chain.east.heartbeat()).state is AmplifierState.QUICK_STOP_ACTIVE
 
     on_a_line(line, coarse_rig, use)
 
@@ -181,7 +181,7 @@ def test_what_is_hurried_while_it_waits_for_the_line_is_not_sent(
         await asyncio.sleep(0.0005)
         waiting = asyncio.create_task(SENDING[what](chain))
         await asyncio.sleep(0.0005)
-        chain.east.hurry()
+        chain.east.abort_unsent()
         await refused(waiting)
         assert not beat.done()
         await chain.east.disarm()
@@ -427,7 +427,7 @@ def test_a_stop_goes_before_the_repetition_of_what_else_silences(
         async with asyncio.timeout(1):
             status = await chain.east.stop()
             await asyncio.gather(waiting, return_exceptions=True)
-        assert status.state is State.QUICK_STOP_ACTIVE
+        assert status.state is AmplifierState.QUICK_STOP_ACTIVE
         assert [kind for _, kind in chain.kinds()] == [
             silencing.__name__,
             "Stop",

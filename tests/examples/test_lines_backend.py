@@ -13,7 +13,7 @@ import pytest
 from drivers.backend import Backend
 from drivers.command import CommandSet, DriveCommand
 from drivers.errors import CommandError, LinkError, LinkTimeout
-from drivers.protocol.messages import Apply, Nak, NakCode, Ping, State, Status
+from drivers.protocol.messages import AmplifierState, Apply, Nak, NakCode, Ping, Status
 
 MODULE = Path(__file__).parents[2] / "examples" / "plugins" / "backend" / "lines_backend.py"
 STATUS = {"state": 1, "fault": 0, "token": 0, "high_voltage": False} | {
@@ -99,8 +99,8 @@ async def test_a_late_reply_is_no_answer_to_the_next_request(
         await backend.exchange(Ping(), timeout=SOON)
     status = await backend.exchange(Ping(), timeout=LONG)
     assert isinstance(status, Status)
-    assert status.state is State.SWITCH_ON_DISABLED
-    assert backend.counters.foreign == 1
+    assert status.state is AmplifierState.SWITCH_ON_DISABLED
+    assert backend.counters.unexpected_frames == 1
 
 
 @pytest.mark.parametrize(
@@ -122,7 +122,7 @@ async def test_damaged_lines_are_counted_and_dropped(
     """Whatever they hold; the good one after them is understood."""
     far_end.answers = lambda number: damaged + line(number, STATUS)
     assert isinstance(await backend.exchange(Ping(), timeout=LONG), Status)
-    assert backend.counters.bad >= 1
+    assert backend.counters.crc_errors >= 1
 
 
 async def test_a_refusal_is_returned(backend: Backend, far_end: FarEnd) -> None:
@@ -145,7 +145,7 @@ async def test_a_line_that_is_cut_is_told_of(backend: Backend, far_end: FarEnd) 
 async def test_what_no_guard_has_seen_is_not_sent(backend: Backend) -> None:
     """A TypeError, before anything is on the wire."""
     plain = CommandSet(1, (DriveCommand(0, 110.0, 0.5),), ramp=0.0, valid_for=0.0)
-    with pytest.raises(TypeError, match="SafeCommand"):
+    with pytest.raises(TypeError, match="SafeCommandSet"):
         await backend.exchange(Apply(plain), timeout=LONG)
     assert backend.counters.frames_out == 0
 

@@ -37,7 +37,7 @@ from daemon_process import (
     plays_on,
     ready,
 )
-from drivers.protocol.messages import Apply, Disarm, Fault, GetStatus, State
+from drivers.protocol.messages import AmplifierState, Apply, Disarm, Fault, GetStatus
 from journal import Journal, energised, loudness, silent_from
 from model.rig.file import load_rig
 from rig_files import TWO_AMPLIFIERS, write_rig
@@ -115,7 +115,7 @@ async def test_paused_for_longer_than_the_watchdog_nothing_old_is_replayed(tmp_p
             async with holding(era):
                 await play(era, far)
                 os.kill(daemon.process.pid, signal.SIGSTOP)
-                await until(lambda: far.station.status().state is State.FAULT)
+                await until(lambda: far.station.status().state is AmplifierState.FAULT)
                 assert far.amplifier.fault is Fault.WATCHDOG
                 fed = journal.last_fed("main")
                 assert silent_from(far) - fed <= WATCHDOG + REACTION + 1e-9
@@ -344,7 +344,7 @@ async def test_told_to_end_it_ramps_down_reads_back_and_disarms(
                 silent = next(entry for entry in after if not any(entry.levels))
                 assert isinstance(silent.request, GetStatus)  # it was read back before disarming
                 assert isinstance(after[-1].request, Disarm)
-                assert far.stations[name].status().state is State.SWITCH_ON_DISABLED
+                assert far.stations[name].status().state is AmplifierState.SWITCH_ON_DISABLED
             return took
 
     await best_of(f"from {number.name} to the exit", attempt, 1.0)

@@ -21,7 +21,7 @@ from daemon_process import (
     playing,
     run_era,
 )
-from drivers.protocol.messages import State
+from drivers.protocol.messages import AmplifierState
 from model.table.file import save_table
 
 
@@ -75,7 +75,7 @@ async def test_the_commands_do_what_they_say(tmp_path: Path) -> None:
         assert (status, json.loads(out)["state"]) == (0, "QUICK_STOP_ACTIVE")
         status, out, _ = await run_era("clear", *where)
         assert (status, out.partition(":")[0]) == (0, "READY_TO_SWITCH_ON")
-        assert far.station.status().state is State.SWITCH_ON_DISABLED
+        assert far.station.status().state is AmplifierState.SWITCH_ON_DISABLED
         arming = await asyncio.create_subprocess_exec(
             *(ERA, "arm", "--lease", "1", *map(str, where)),
             stdout=asyncio.subprocess.PIPE,

@@ -61,7 +61,7 @@ async def test_sets_that_no_guard_has_seen_are_refused() -> None:
     """A plain CommandSet is a mistake of the program, not of the user."""
     backend = SimulatedBackend(URL)
     for request in (Apply(SET), Stage(SET)):
-        with pytest.raises(TypeError, match="SafeCommand"):
+        with pytest.raises(TypeError, match="SafeCommandSet"):
             await backend.exchange(request, timeout=1)
 
 

@@ -9,7 +9,7 @@ import pytest
 from drivers.amplifier import Amplifier
 from drivers.command import CommandSet, DriveCommand
 from drivers.guard import Guard, GuardLimits
-from drivers.protocol.messages import State
+from drivers.protocol.messages import AmplifierState
 from drivers.registry import open_backend
 from model.errors import InputError
 from model.rig.rig import Rig
@@ -43,13 +43,13 @@ async def _drive(url: str) -> None:
     try:
         guard = Guard(GuardLimits(40.0, 500.0, 1.0), amplifier.capabilities)
         wanted = CommandSet(1, (DriveCommand(0, 110.0, 0.4, 90.0),), ramp=0.01, valid_for=0.0)
-        assert (await amplifier.arm()).state is State.OPERATION_ENABLED
+        assert (await amplifier.arm()).state is AmplifierState.OPERATION_ENABLED
         assert (await amplifier.apply(guard.check(wanted))).commands[0].level == 0.4
         await asyncio.sleep(0.02)
         await amplifier.heartbeat()
-        assert (await amplifier.stop()).state is State.QUICK_STOP_ACTIVE
+        assert (await amplifier.stop()).state is AmplifierState.QUICK_STOP_ACTIVE
         await asyncio.sleep(0.02)  # its ramp, after which it can be cleared
-        assert (await amplifier.clear()).state is State.SWITCH_ON_DISABLED
+        assert (await amplifier.clear()).state is AmplifierState.SWITCH_ON_DISABLED
     finally:
         await amplifier.close()
 

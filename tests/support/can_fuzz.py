@@ -16,15 +16,16 @@ from drivers.codec.can_bus.adapter_text import (
     slcan_line,
     socketcand_element,
 )
-from drivers.codec.can_bus.answers import AnswerReader, decode_emergency
 from drivers.codec.can_bus.frame import CanFrame
 from drivers.codec.can_bus.objects import pack_envelope, unpack_achieved, unpack_faults
-from drivers.codec.can_bus.orders import encode_order
+from drivers.codec.can_bus.replies import CanReplyReader, decode_emergency
+from drivers.codec.can_bus.requests import encode_request
 from drivers.errors import DriverError
 from drivers.protocol.messages import (
+    AmplifierEvent,
+    AmplifierState,
     Arm,
     Clear,
-    Event,
     GetCaps,
     GetFaults,
     Hello,
@@ -32,7 +33,6 @@ from drivers.protocol.messages import (
     LoadEnvelope,
     Reply,
     Request,
-    State,
     Status,
 )
 from sim.amplifier.amplifier import SimulatedAmplifier
@@ -101,7 +101,7 @@ class Station:
         self.amplifier.tick(self.now)
         assert all(0 <= level <= 1 + 1e-9 for level in self.status().levels)
         playing = any(tone.lasts for output in self.amplifier.outputs for tone in output)
-        assert not playing or self.amplifier.state is State.OPERATION_ENABLED
+        assert not playing or self.amplifier.state is AmplifierState.OPERATION_ENABLED
 
 
 class CanEnds:
@@ -113,9 +113,9 @@ class CanEnds:
         self._node = CanNode(self._station, 1, send=self._said.append)  # type: ignore[arg-type]
         self._node.start(lambda delay, callback: _NEVER)
         self._revive()
-        self._answers = AnswerReader(1)
+        self._answers = CanReplyReader(1)
         self._taken = 0
-        self.events: list[Event] = []
+        self.events: list[AmplifierEvent] = []
         self.telegrams = [self._telegram(request) for request in requests]
         self.telegrams += [_pack(self._answer_to(telegram)) for telegram in self.telegrams]
 
@@ -158,7 +158,7 @@ class CanEnds:
         for data in (b"\x01\x01",):
             self._node.receive(CanFrame(0x000, data))
         for order in (Clear(), Arm(2.0)):
-            for frame in encode_order(order, node=1, sequence=9):
+            for frame in encode_request(order, node=1, sequence=9):
                 self._node.receive(frame)
 
     def _telegram(self, request: Request) -> bytes:
@@ -170,7 +170,7 @@ class CanEnds:
             case LoadEnvelope() as load:
                 return _pack(_write_object(0x2100, _ENVELOPE_SLOT, pack_envelope(load)))
             case _:
-                return _pack(list(encode_order(request, node=1, sequence=7)))
+                return _pack(list(encode_request(request, node=1, sequence=7)))
 
     def _answer_to(self, telegram: bytes) -> list[CanFrame]:
         self._said.clear()

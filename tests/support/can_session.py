@@ -12,9 +12,9 @@ from typing import cast
 from can_fuzz import Station
 from drivers.codec.can_bus.frame import CanFrame
 from drivers.codec.can_bus.objects import pack_envelope
-from drivers.codec.can_bus.orders import Order, encode_broadcast, encode_order
+from drivers.codec.can_bus.requests import PdoRequest, encode_broadcast, encode_request
 from drivers.command import CommandSet, DriveCommand, Envelope, Knot
-from drivers.guard import Guard, GuardLimits, SafeCommand
+from drivers.guard import Guard, GuardLimits, SafeCommandSet
 from drivers.protocol.messages import (
     Apply,
     Arm,
@@ -117,7 +117,7 @@ class Session:
         yield self._asked(
             "Commit token 515, to every amplifier of the bus", *encode_broadcast(Commit(515))
         )
-        torn = encode_order(
+        torn = encode_request(
             Apply(self.guard.check(CommandSet(516, _COMMANDS, ramp=0.0, valid_for=0.0))),
             node=NODE,
             sequence=8,
@@ -143,11 +143,11 @@ class Session:
         yield self._ordered("Disarm, ramp 50 ms", Disarm(0.05), 16)
         yield self._asked("NMT: reset node", CanFrame(0x000, bytes([129, NODE])))
 
-    def _next(self, token: int) -> SafeCommand:
+    def _next(self, token: int) -> SafeCommandSet:
         return self.guard.check(CommandSet(token, _COMMANDS, ramp=0.0, valid_for=0.0))
 
-    def _ordered(self, title: str, order: Order, sequence: int, *, fd: bool = False) -> Step:
-        frames = encode_order(order, node=NODE, sequence=sequence, fd=fd)
+    def _ordered(self, title: str, order: PdoRequest, sequence: int, *, fd: bool = False) -> Step:
+        frames = encode_request(order, node=NODE, sequence=sequence, fd=fd)
         return self._asked(title, *frames)
 
     def _asked(self, title: str, *frames: CanFrame) -> Step:

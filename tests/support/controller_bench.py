@@ -18,6 +18,7 @@ from drivers.command import CommandSet
 from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.messages import (
     Achieved,
+    AmplifierState,
     Apply,
     Arm,
     Capabilities,
@@ -33,7 +34,6 @@ from drivers.protocol.messages import (
     Reply,
     Request,
     Stage,
-    State,
     Status,
     Stop,
 )
@@ -62,7 +62,7 @@ class FarEnd(Backend):
         self.asked: list[tuple[float, Request]] = []
         self.delay = self.commit_takes = 0.0
         self.channels = channels
-        self.state = State.SWITCH_ON_DISABLED
+        self.state = AmplifierState.SWITCH_ON_DISABLED
         self.levels = (0.0,) * channels
         self.token = 0
         self.staged: CommandSet | None = None
@@ -114,17 +114,17 @@ class FarEnd(Backend):
                     watchdog_max=1.0,
                     envelope_knots=0,
                 )
-            case Arm() if self.state is State.SWITCH_ON_DISABLED:
-                self.state = State.OPERATION_ENABLED
+            case Arm() if self.state is AmplifierState.SWITCH_ON_DISABLED:
+                self.state = AmplifierState.OPERATION_ENABLED
             case Arm():
                 return Nak(NakCode.WRONG_STATE)
-            case Disarm() if self.state is State.QUICK_STOP_ACTIVE:
+            case Disarm() if self.state is AmplifierState.QUICK_STOP_ACTIVE:
                 self.levels = (0.0,) * self.channels  # silence undoes no latched stop
             case Disarm() | Clear():
-                self.state = State.SWITCH_ON_DISABLED
+                self.state = AmplifierState.SWITCH_ON_DISABLED
                 self.levels = (0.0,) * self.channels
             case Stop():
-                self.state = State.QUICK_STOP_ACTIVE
+                self.state = AmplifierState.QUICK_STOP_ACTIVE
                 self.levels = (0.0,) * self.channels
             case Stage(command_set=staged):
                 self.staged = staged

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 from drivers.protocol.messages import (
+    AmplifierState,
     Apply,
     Arm,
     Commit,
@@ -15,7 +16,6 @@ from drivers.protocol.messages import (
     Reply,
     Request,
     Stage,
-    State,
     Stop,
 )
 from wires import FarSide
@@ -86,7 +86,11 @@ class Journal:
 def energised(far: FarSide) -> list[str]:
     """The amplifiers that are enabled now, or on their way out of it, or still audible."""
     statuses = {name: station.status() for name, station in far.stations.items()}
-    alive = (State.OPERATION_ENABLED, State.SWITCHED_ON, State.FAULT_REACTION_ACTIVE)
+    alive = (
+        AmplifierState.OPERATION_ENABLED,
+        AmplifierState.SWITCHED_ON,
+        AmplifierState.FAULT_REACTION_ACTIVE,
+    )
     return [name for name, one in statuses.items() if one.state in alive or any(one.levels)]
 
 

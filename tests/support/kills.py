@@ -32,7 +32,7 @@ from daemon_process import (
     NotServing,
     daemon_process,
 )
-from drivers.protocol.messages import State
+from drivers.protocol.messages import AmplifierState
 from journal import Journal, energised, loudness
 from model.rig.file import load_rig
 from rig_files import TWO_AMPLIFIERS, write_rig
@@ -141,7 +141,7 @@ async def _kill(wire: str, daemon: DaemonProcess, journal: Journal) -> Kill:
         max((end - fed for end, fed in ends), default=None),
         max((end - dead for end, _ in ends), default=None),
         len(journal.since(dead)),
-        sum(far.stations[name].status().state is State.FAULT for name in alive),
+        sum(far.stations[name].status().state is AmplifierState.FAULT for name in alive),
         loudness(far),
     )
 

@@ -15,7 +15,7 @@ from typing import Any, TypeVar, cast
 
 from greenlet import getcurrent, greenlet
 
-from drivers.backends.stand_in import STAND_IN, Adapter, StandIn, Worker
+from drivers.backends.hardware import HARDWARE_PROVIDER, Adapter, HardwareProvider, Worker
 from drivers.backends.urls.can_bus import CanBusUrl
 from drivers.codec.can_bus.adapter_text import (
     SlcanReader,
@@ -35,7 +35,7 @@ _SPLIT = 0.1  # how many pieces arrive in two
 _NOTICED = 0.002  # s; until a hang-up is
 
 
-class MemoryMachine(StandIn):
+class MemoryMachine(HardwareProvider):
     """Ports by their names; `make_terminal` is for far ends, the rest for backends."""
 
     def __init__(self, loop: VirtualLoop) -> None:
@@ -131,7 +131,7 @@ def live_in_memory() -> MemoryMachine:
     loop = asyncio.get_running_loop()
     assert isinstance(loop, VirtualLoop)
     machine = MemoryMachine(loop)
-    STAND_IN.set(machine)
+    HARDWARE_PROVIDER.set(machine)
     TERMINAL_MAKER.set(machine.make_terminal)
     return machine
 

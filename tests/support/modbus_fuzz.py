@@ -4,9 +4,9 @@ import random
 from collections.abc import Iterator, Sequence
 
 from drivers.codec.modbus import exchanges
-from drivers.codec.modbus.telegrams import AnswerReader, make_telegram
+from drivers.codec.modbus.adu import ResponseReader, build_adu
 from drivers.errors import FrameError
-from drivers.protocol.messages import Arm, Clear, Reply, Request, State
+from drivers.protocol.messages import AmplifierState, Arm, Clear, Reply, Request
 from drivers.statistics import WireCounters
 from sim.amplifier.amplifier import SimulatedAmplifier
 from sim.far_ends.modbus.frames import PAUSE, RtuReader, TcpReader, rtu_frame, tcp_frame
@@ -49,7 +49,7 @@ class Station:
         for tone in (tone for output in self.amplifier.outputs for tone in output):
             assert can.frequency_min <= tone.frequency <= can.frequency_max
             assert isinstance(tone, ShapedTone) or abs(tone.full) <= can.level_max + 1e-9
-            is_armed = self.amplifier.state is State.OPERATION_ENABLED
+            is_armed = self.amplifier.state is AmplifierState.OPERATION_ENABLED
             assert is_armed or tone.silent_from <= self.now + can.ramp_max
 
 
@@ -66,15 +66,13 @@ class ModbusEnds:
         self._station = Station()
         self._unit = ModbusUnit(self._station)
         self._far = RtuReader() if is_rtu else TcpReader()
-        self._host = AnswerReader(is_rtu=is_rtu, counters=WireCounters())
+        self._host = ResponseReader(is_rtu=is_rtu, counters=WireCounters())
         self._taken = 0
         self._requests_by_size: dict[int, Request] = {}  # in bytes that are read
         self.telegrams: list[bytes] = []
         for request in requests:
             exchange = exchanges.encode_request(request, tag=_TAG, channels=4)
-            telegram = make_telegram(
-                exchange.read, exchange.write, unit=1, transaction=0, is_rtu=True
-            )
+            telegram = build_adu(exchange.read, exchange.write, unit=1, transaction=0, is_rtu=True)
             pdu = telegram.frame[1:-2]
             answer = self._unit.answer(pdu)
             assert answer is not None
@@ -132,7 +130,7 @@ class ModbusEnds:
         size = data[2] if self._is_rtu else data[8] if len(data) > 8 else 0
         request = self._requests_by_size.get(size, self._requests[0])
         exchange = exchanges.encode_request(request, tag=_TAG, channels=4)
-        telegram = make_telegram(
+        telegram = build_adu(
             exchange.read,
             exchange.write,
             unit=1,

@@ -7,6 +7,8 @@ from drivers.command import CommandSet, DriveCommand, Envelope, Knot
 from drivers.guard import Guard, GuardLimits
 from drivers.protocol.messages import (
     Achieved,
+    AmplifierEvent,
+    AmplifierState,
     Apply,
     Arm,
     Broadcast,
@@ -14,7 +16,6 @@ from drivers.protocol.messages import (
     Clear,
     Commit,
     Disarm,
-    Event,
     Fault,
     FaultList,
     FaultRecord,
@@ -31,7 +32,6 @@ from drivers.protocol.messages import (
     Reply,
     Request,
     Stage,
-    State,
     Status,
     Stop,
 )
@@ -51,7 +51,7 @@ SHAPE = GUARD.check_envelope(Envelope(slot=5, step=0.005, knots=(Knot(0.1, 90), 
 GUARD.check_envelope(Envelope(slot=6, step=0.005, knots=(Knot(0.1, 0),)))
 SHAPED_COMMANDS = (DriveCommand(0, 110.0, 0.2, onset=5, ending=6),)
 SHAPED = GUARD.check(CommandSet(514, SHAPED_COMMANDS, ramp=0.0, valid_for=0.0))
-S = State
+S = AmplifierState
 OFF = Status(S.SWITCH_ON_DISABLED, Fault.NONE, 0, False, 25.0, 0.0, (0.0,) * 4)
 ARMED = Status(S.OPERATION_ENABLED, Fault.NONE, 0, True, 25.0, 0.25, (0.0,) * 4, 1800.0)
 LEVELS = (0.2, 0.0, 0.0, 1.0)
@@ -149,5 +149,5 @@ class ScriptedStation:
     def on_plug(self, on_plug: Callable[[bool], None]) -> None:
         """Its wire stays where it is."""
 
-    def listen(self, on_event: Callable[[Event], None]) -> None:
+    def listen(self, on_event: Callable[[AmplifierEvent], None]) -> None:
         """It never speaks unasked."""

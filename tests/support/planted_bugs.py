@@ -294,7 +294,7 @@ DRIVERS: dict[str, Bug] = {
     "sets are sent without their SYNC": _bug(
         "answer",
         Edit(
-            "drivers.codec.can_bus.orders:encode_order",
+            "drivers.codec.can_bus.requests:encode_request",
             "head, wanted.commands, node, sequence), SYNC)",
             "head, wanted.commands, node, sequence))",
             also=("drivers.backends.can_bus.backend",),
@@ -304,7 +304,7 @@ DRIVERS: dict[str, Bug] = {
     "a command has the sequence number before": _bug(
         "commit",
         Edit(
-            "drivers.codec.can_bus.orders:_in_classic_frames",
+            "drivers.codec.can_bus.requests:_in_classic_frames",
             "_command(command, sequence))",
             "_command(command, sequence - (command.channel == 1)))",
         ),
@@ -313,7 +313,7 @@ DRIVERS: dict[str, Bug] = {
     "the frame of a channel has its neighbour's identifier": _bug(
         "garbage",
         Edit(
-            "drivers.codec.can_bus.orders:_in_classic_frames",
+            "drivers.codec.can_bus.requests:_in_classic_frames",
             "command_id(node, command.channel)",
             "command_id(node, (1, 0, 2)[command.channel])",
         ),

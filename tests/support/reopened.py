@@ -4,7 +4,7 @@ import asyncio
 
 from drivers.amplifier import Amplifier
 from drivers.errors import LinkError
-from drivers.protocol.messages import State
+from drivers.protocol.messages import AmplifierState
 
 
 async def reopen(amplifier: Amplifier, *, tries: int = 100, pause: float = 0.01) -> None:
@@ -16,7 +16,7 @@ async def reopen(amplifier: Amplifier, *, tries: int = 100, pause: float = 0.01)
         try:
             await amplifier.close()
             await amplifier.open()
-            if (await amplifier.status()).state is State.OPERATION_ENABLED:
+            if (await amplifier.status()).state is AmplifierState.OPERATION_ENABLED:
                 await amplifier.disarm()  # it was lost for less than its watchdog
         except LinkError:
             if not left:

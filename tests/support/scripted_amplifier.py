@@ -11,6 +11,7 @@ from drivers.codec.serial_line.exchanges import decode_request, encode_reply
 from drivers.codec.serial_line.frame import Frame, FrameReader, encode_frame
 from drivers.protocol.messages import (
     Achieved,
+    AmplifierState,
     Apply,
     Capabilities,
     Commit,
@@ -23,13 +24,12 @@ from drivers.protocol.messages import (
     Reply,
     Request,
     Stage,
-    State,
     Status,
 )
 
 IDENTITY = Identity("Acme", "Quad", "A-17", "1.2", 1)
 CAPABILITIES = Capabilities(4, 20.0, 600.0, 0.01, 1.0, 0.0001, 0.01, 1.0, 0.1, 2.0, 0)
-STATUS = Status(State.OPERATION_ENABLED, Fault.NONE, 0, True, 25.0, 0.25, (0.0,) * 4)
+STATUS = Status(AmplifierState.OPERATION_ENABLED, Fault.NONE, 0, True, 25.0, 0.25, (0.0,) * 4)
 
 
 def usual_answer(request: Request) -> Reply:

@@ -9,8 +9,9 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 
 from drivers.protocol.messages import (
+    AmplifierEvent,
+    AmplifierState,
     Arm,
-    Event,
     GetCaps,
     GetFaults,
     GetStatus,
@@ -18,7 +19,6 @@ from drivers.protocol.messages import (
     Nak,
     Reply,
     Request,
-    State,
 )
 from sim.amplifier.amplifier import SimulatedAmplifier
 from sim.bench.bench import Bench
@@ -35,12 +35,12 @@ TOGETHER = 0.6  # s; until all are silent after one of them has a fault
 STEP = 0.020  # s; how often is looked while something vibrates
 IDLE_STEP = 1.0
 _NOT_FEEDING = (Hello, GetCaps, GetStatus, GetFaults)
-_FAULTED = (State.FAULT, State.FAULT_REACTION_ACTIVE)
+_FAULTED = (AmplifierState.FAULT, AmplifierState.FAULT_REACTION_ACTIVE)
 _PLAYING = (
-    State.OPERATION_ENABLED,
-    State.FAULT_REACTION_ACTIVE,
-    State.QUICK_STOP_ACTIVE,
-    State.SWITCHED_ON,
+    AmplifierState.OPERATION_ENABLED,
+    AmplifierState.FAULT_REACTION_ACTIVE,
+    AmplifierState.QUICK_STOP_ACTIVE,
+    AmplifierState.SWITCHED_ON,
 )
 
 
@@ -195,7 +195,7 @@ class Checks:
         elif not self._is_closed:
             self._starving[name] = self._loop.call_at(due, self._expect_silence, name)
 
-    def _told(self, name: str, event: Event, at: float) -> None:
+    def _told(self, name: str, event: AmplifierEvent, at: float) -> None:
         if event.state in _FAULTED:
             self._faulted.setdefault(name, at)
         else:

@@ -12,7 +12,7 @@ import can
 import serial
 
 from drivers.backends.can_bus.interfaces import open_bus, send_all, wake
-from drivers.backends.stand_in import STAND_IN, Adapter
+from drivers.backends.hardware import HARDWARE_PROVIDER, Adapter
 from drivers.backends.urls.can_bus import CanBusUrl
 from drivers.codec.can_bus.frame import CanFrame
 from drivers.errors import LinkError, LinkTimeout, said_by_system
@@ -34,7 +34,7 @@ async def open_adapter(
     on_frame is called with each frame, in the reader's thread, on_loss once, in the event loop,
     with why the bus was lost.
     """
-    stand_in = STAND_IN.get()
+    stand_in = HARDWARE_PROVIDER.get()
     if stand_in is not None:
         return await stand_in.open_adapter(url, on_frame=on_frame, on_loss=on_loss)
     try:

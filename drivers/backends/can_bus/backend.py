@@ -14,16 +14,16 @@ from drivers import clock
 from drivers.backends.can_bus.bus import CanBus, can_bus
 from drivers.backends.can_bus.node import NodeWatch
 from drivers.backends.can_bus.objects import ObjectClient
-from drivers.backends.can_bus.orders import PendingOrders
-from drivers.backends.stand_in import Worker, make_worker
+from drivers.backends.can_bus.pending import PendingRequests
+from drivers.backends.hardware import Worker, make_worker
 from drivers.backends.urls.can_bus import CanUrl
 from drivers.backends.wire_backend import WireBackend
-from drivers.codec.can_bus.answers import UNASKED, Answer, plain_reply
 from drivers.codec.can_bus.frame import CANOPEN, CanFrame, cob_id
-from drivers.codec.can_bus.orders import (
-    Order,
+from drivers.codec.can_bus.replies import UNASKED, CanReply, plain_reply
+from drivers.codec.can_bus.requests import (
+    PdoRequest,
     encode_broadcast,
-    encode_order,
+    encode_request,
     wanted_commands,
 )
 from drivers.codec.can_bus.timing import CanTimes
@@ -31,11 +31,11 @@ from drivers.errors import LinkError, LinkTimeout
 from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.messages import (
     Achieved,
+    AmplifierEvent,
     Apply,
     Arm,
     Broadcast,
     Commit,
-    Event,
     GetCaps,
     GetFaults,
     Hello,
@@ -70,7 +70,7 @@ class CanBackend(WireBackend):
         self._url = CanUrl.parse(url)
         self._joined: _Joined | None = None
         self._node = NodeWatch(self._url, answered=self._answered, told=self._told, lost=self._lose)
-        self._orders = PendingOrders()
+        self._orders = PendingRequests()
         self._staged: Achieved | None = None  # as it was asked for
         self._channels = PROTOCOL.quantities.channel_count.maximum
         self._loss: str | None = None
@@ -162,7 +162,7 @@ class CanBackend(WireBackend):
         self._node.start()
         return identity
 
-    async def _order(self, order: Order, timeout: float) -> Reply:
+    async def _order(self, order: PdoRequest, timeout: float) -> Reply:
         if isinstance(order, Arm):
             self._is_listening = True
             try:
@@ -170,7 +170,7 @@ class CanBackend(WireBackend):
             finally:
                 self._is_listening = False
         sequence = self._orders.next_sequence()
-        frames = encode_order(
+        frames = encode_request(
             order, node=self._url.node, sequence=sequence, fd=bool(self._url.bus.fd)
         )
         if isinstance(order, Apply | Stage):
@@ -198,7 +198,7 @@ class CanBackend(WireBackend):
             return reply  # always, where the order is about no set
         return await self._achieved(order, answer, timeout)
 
-    async def _achieved(self, order: Order, answer: Answer, timeout: float) -> Achieved:
+    async def _achieved(self, order: PdoRequest, answer: CanReply, timeout: float) -> Achieved:
         """What a set plays: what was asked for if the answer says so, else it is read."""
         wanted = None
         if isinstance(order, Apply | Stage):
@@ -248,16 +248,16 @@ class CanBackend(WireBackend):
         self._last_sent = clock.now()
         self._counters.frames_out += len(frames)
 
-    def _told(self, event: Event) -> None:
+    def _told(self, event: AmplifierEvent) -> None:
         self._counters.events += 1
         self._on_event(event)
 
-    def _answered(self, answer: Answer) -> None:
+    def _answered(self, answer: CanReply) -> None:
         if answer.sequence == UNASKED:
             self._told(answer.event)
             return
         if not self._orders.take(answer):
-            self._counters.foreign += 1
+            self._counters.unexpected_frames += 1
 
     def _lose(self, what: str) -> None:
         if self._loss is not None or self._joined is None:

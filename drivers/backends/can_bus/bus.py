@@ -11,8 +11,8 @@ import canopen
 
 from drivers import clock
 from drivers.backends.can_bus.adapter import open_adapter
+from drivers.backends.hardware import Adapter
 from drivers.backends.shared_line import SharedLine, shared_line
-from drivers.backends.stand_in import Adapter
 from drivers.backends.urls.can_bus import CanBusUrl
 from drivers.codec.can_bus.frame import CanFrame
 

@@ -13,14 +13,14 @@ from drivers import clock
 from drivers.backends.can_bus.bus import CanBus
 from drivers.backends.can_bus.objects import ObjectClient
 from drivers.backends.urls.can_bus import CanUrl
-from drivers.codec.can_bus.answers import Answer, AnswerReader, decode_emergency
 from drivers.codec.can_bus.frame import CANOPEN, CanFrame, cob_id
-from drivers.codec.can_bus.orders import host_number
+from drivers.codec.can_bus.replies import CanReply, CanReplyReader, decode_emergency
+from drivers.codec.can_bus.requests import host_number
 from drivers.errors import FrameError, LinkError
-from drivers.protocol.messages import Event
+from drivers.protocol.messages import AmplifierEvent
 from drivers.statistics import WireCounters
 
-HEARTBEATS_BORNE = 3  # of the amplifier's that may be missing before it counts as lost
+MAX_MISSED_HEARTBEATS = 3  # of the amplifier's that may be missing before it counts as lost
 _LATE = 0.005  # s; by so much a timer is late, and a loss is to be told by the third heartbeat
 _SHORTEST = 1e-4  # s; of a pause
 _HOST_HEARTBEAT = CANOPEN["heartbeat_ms"] / 1000  # s; as every host sends it while it is armed
@@ -39,15 +39,15 @@ class NodeWatch:
         self,
         url: CanUrl,
         *,
-        answered: Callable[[Answer], None],
-        told: Callable[[Event], None],
+        answered: Callable[[CanReply], None],
+        told: Callable[[AmplifierEvent], None],
         lost: Callable[[str], None],
     ) -> None:
         self._url = url
         self._on_answer, self._on_event, self._on_loss = answered, told, lost
         self._loop: asyncio.AbstractEventLoop | None = None
         self._counters = WireCounters()
-        self._answers = AnswerReader(url.node)
+        self._answers = CanReplyReader(url.node)
         self._emergencies = EmcyConsumer()
         self._subscribed: list[tuple[int, Callable[..., None]]] = []
         self._is_watched = False
@@ -62,7 +62,7 @@ class NodeWatch:
         """Listen on a bus from now on, in the running event loop."""
         self._loop = asyncio.get_running_loop()
         self._counters = counters
-        self._answers = AnswerReader(self._url.node)
+        self._answers = CanReplyReader(self._url.node)
         self._joined = clock.now()
         self._host_heard = -math.inf
         node, nmt = self._url.node, NmtMaster(self._url.node)
@@ -105,7 +105,7 @@ class NodeWatch:
     async def check_no_other_host(self) -> None:
         """Listen for the heartbeat of another host before arming; LinkError where there is one."""
         await asyncio.sleep(max(0.0, self._joined + 1.2 * _HOST_HEARTBEAT - clock.now()))
-        if clock.now() - self._host_heard < HEARTBEATS_BORNE * _HOST_HEARTBEAT:
+        if clock.now() - self._host_heard < MAX_MISSED_HEARTBEATS * _HOST_HEARTBEAT:
             raise LinkError(
                 f"another program drives node {self._url.node} on {self._url.bus}; end that one"
             )
@@ -115,7 +115,7 @@ class NodeWatch:
         try:
             answer = self._answers.feed(CanFrame(can_id, bytes(data)))
         except FrameError:
-            self._counters.bad += 1
+            self._counters.crc_errors += 1
             return
         if answer is not None:
             self._post(self._on_answer, answer)
@@ -126,7 +126,7 @@ class NodeWatch:
         try:
             self._post(self._on_event, decode_emergency(data))
         except FrameError:
-            self._counters.bad += 1
+            self._counters.crc_errors += 1
 
     def _heartbeat(self, state: int) -> None:
         self._heard = clock.now()
@@ -146,7 +146,7 @@ class NodeWatch:
 
     def _other_host(self, can_id: int, data: bytearray, timestamp: float) -> None:
         self._host_heard = clock.now()
-        self._counters.foreign += 1
+        self._counters.unexpected_frames += 1
 
     def _post(self, callback: Callable[[_T], None], argument: _T) -> None:
         """Call back in the event loop."""
@@ -161,7 +161,7 @@ class NodeWatch:
         """
         now = clock.now()
         silent = now - self._heard
-        limit = HEARTBEATS_BORNE * self._url.heartbeat - _LATE
+        limit = MAX_MISSED_HEARTBEATS * self._url.heartbeat - _LATE
         was_held_up = now - self._look_due > self._url.heartbeat / 2
         if silent < limit or was_held_up:
             # A rest that rounding leaves must not be looked at again in this very moment.

@@ -14,7 +14,7 @@ from canopen.objectdictionary import ObjectDictionary
 from canopen.sdo.client import SdoClient
 from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
-from drivers.backends.stand_in import Worker
+from drivers.backends.hardware import Worker
 from drivers.backends.waiting import SETTLE
 from drivers.codec.can_bus.frame import cob_id
 from drivers.codec.can_bus.objects import (
@@ -84,7 +84,7 @@ class ObjectClient:
     """The SDO client of one node, for jobs of a worker; `feed` takes its answers as they come."""
 
     def __init__(self, network: canopen.Network, node: int, worker: Worker) -> None:
-        self.foreign = 0
+        self.unexpected_frames = 0
         self._network = network
         self._node = node
         self._worker = worker
@@ -100,7 +100,7 @@ class ObjectClient:
         if is_wanted and len(data) == _LENGTH:
             self._client.on_response(can_id, data, timestamp)
         else:
-            self.foreign += 1
+            self.unexpected_frames += 1
 
     def abandon(self) -> None:
         """Let the transfer that is under way end now: nobody waits for it any more."""

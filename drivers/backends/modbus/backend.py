@@ -12,25 +12,26 @@ import asyncio
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 
+from drivers.backends.hardware import number_below
 from drivers.backends.line_turns import kind_on_line
 from drivers.backends.modbus.line import ModbusLine, modbus_line
 from drivers.backends.sole_host import SoleHost
-from drivers.backends.stand_in import number_below
 from drivers.backends.urls.modbus import ModbusUrl
 from drivers.backends.waiting import SETTLE
 from drivers.backends.wire_backend import WireBackend
 from drivers.codec.modbus import exchanges
+from drivers.codec.modbus.adu import ModbusResponse
 from drivers.codec.modbus.blocks import unpack_fault_count
 from drivers.codec.modbus.exchanges import Exchange, Read, Write
-from drivers.codec.modbus.telegrams import Answer
 from drivers.codec.modbus.timing import ModbusTimes
 from drivers.errors import LinkError, LinkTimeout
-from drivers.link.turns import Kind
+from drivers.link.turns import RequestPriority
 from drivers.protocol.messages import (
+    AmplifierEvent,
+    AmplifierState,
     Arm,
     Broadcast,
     Capabilities,
-    Event,
     Fault,
     FaultList,
     Hello,
@@ -38,7 +39,6 @@ from drivers.protocol.messages import (
     NakCode,
     Reply,
     Request,
-    State,
 )
 from drivers.protocol.wire_times import NoTimes, WireTimes
 
@@ -51,7 +51,7 @@ _TAGS = (1 << 16) - 1
 class _Asked:
     """How a request stands to others on the line, and how long each transaction may take [s]."""
 
-    kind: Kind
+    kind: RequestPriority
     timeout: float
 
 
@@ -67,7 +67,7 @@ class ModbusBackend(WireBackend):
         self._tag = number_below(_TAGS)
         self._can_read_back = True
         self._channels = exchanges.CHANNELS_MAX
-        self._condition: tuple[State, Fault] | None = None
+        self._condition: tuple[AmplifierState, Fault] | None = None
         self._loss: str | None = None  # until it is opened anew, even if others have the line back
         self._is_asking = False
 
@@ -179,7 +179,7 @@ class ModbusBackend(WireBackend):
             await self._check_alone()
         return exchanges.decode_reply(request, answer.registers), answer.registers
 
-    async def _carry_out(self, exchange: Exchange, tag: int, asked: "_Asked") -> Answer:
+    async def _carry_out(self, exchange: Exchange, tag: int, asked: "_Asked") -> ModbusResponse:
         read, write = exchange.read, exchange.write
         if write is None:
             return await self._transact(read, None, asked, tag=None)
@@ -193,8 +193,8 @@ class ModbusBackend(WireBackend):
 
     async def _transact(
         self, read: Read | None, write: Write | None, asked: "_Asked", *, tag: int | None
-    ) -> Answer:
-        def accept(answer: Answer) -> bool:
+    ) -> ModbusResponse:
+        def accept(answer: ModbusResponse) -> bool:
             if answer.exception or read is None:
                 return True
             return exchanges.is_of(answer.registers, tag=tag)
@@ -218,7 +218,7 @@ class ModbusBackend(WireBackend):
             )
         return answer
 
-    async def _refusal(self, answer: Answer, tag: int, asked: "_Asked") -> Nak:
+    async def _refusal(self, answer: ModbusResponse, tag: int, asked: "_Asked") -> Nak:
         """Why a write was refused; exceptions that only one refusal leads to need no asking."""
         if answer.exception == _ILLEGAL_FUNCTION:
             return Nak(NakCode.UNKNOWN_TYPE)
@@ -235,14 +235,14 @@ class ModbusBackend(WireBackend):
             f"{answer.exception} and names no reason for it"
         )
 
-    def _look_at(self, request: Request, answer: Answer) -> None:
+    def _look_at(self, request: Request, answer: ModbusResponse) -> None:
         """Tell who listens what an answer shows to have changed."""
         condition = exchanges.condition(request, answer.registers)
         if condition is None or condition == self._condition:
             return
         before, self._condition = self._condition, condition
         if before is not None:
-            self._on_event(Event(*condition))
+            self._on_event(AmplifierEvent(*condition))
 
     def _opened(self) -> ModbusLine:
         if self._line is None or self._loss is not None:

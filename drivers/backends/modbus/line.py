@@ -10,17 +10,17 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager
 
 from drivers import clock
+from drivers.backends.hardware import Port
 from drivers.backends.line_turns import LineTurns
 from drivers.backends.modbus.stream import open_stream
 from drivers.backends.shared_line import SharedLine, shared_line
-from drivers.backends.stand_in import Port
 from drivers.backends.urls.modbus import ModbusUrl
 from drivers.backends.waiting import reply_within
+from drivers.codec.modbus.adu import ModbusResponse, RequestAdu, ResponseReader, build_adu
 from drivers.codec.modbus.exchanges import Read, Write
-from drivers.codec.modbus.telegrams import Answer, AnswerReader, Telegram, make_telegram
 from drivers.codec.modbus.timing import ModbusTimes
 from drivers.errors import LinkError, LinkTimeout
-from drivers.link.turns import Kind
+from drivers.link.turns import RequestPriority
 from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.messages import Request
 from drivers.statistics import WireCounters
@@ -42,13 +42,13 @@ class ModbusLine(SharedLine[Port]):
         self.counters = WireCounters()
         self.last_sent = 0.0
         self._turns = LineTurns()
-        self._reader = AnswerReader(is_rtu=url.is_rtu, counters=self.counters)
+        self._reader = ResponseReader(is_rtu=url.is_rtu, counters=self.counters)
         self.is_contradicted = False  # whether the last answer was followed by another
-        self._given: Answer | None = None
+        self._given: ModbusResponse | None = None
         self._transaction = 0
-        self._telegram: Telegram | None = None
-        self._accept: Callable[[Answer], bool] = _any
-        self._answer: asyncio.Future[Answer] | None = None
+        self._telegram: RequestAdu | None = None
+        self._accept: Callable[[ModbusResponse], bool] = _any
+        self._answer: asyncio.Future[ModbusResponse] | None = None
         # Of a serial line: when it is free again, at the latest where an answer is owed.
         self._free_from = 0.0
         self._is_owed = False
@@ -58,7 +58,7 @@ class ModbusLine(SharedLine[Port]):
 
     async def _open(self) -> Port:
         self.counters = WireCounters()
-        self._reader = AnswerReader(is_rtu=self.url.is_rtu, counters=self.counters)
+        self._reader = ResponseReader(is_rtu=self.url.is_rtu, counters=self.counters)
         self._telegram = self._given = None
         self._is_owed, self._free_from = False, 0.0
         return await open_stream(self.url, self._received, self._lose)
@@ -69,10 +69,10 @@ class ModbusLine(SharedLine[Port]):
         write: Write | None,
         *,
         unit: int,
-        kind: Kind = Kind.ORDINARY,
+        kind: RequestPriority = RequestPriority.ORDINARY,
         timeout: float,
-        accept: Callable[[Answer], bool],
-    ) -> Answer:
+        accept: Callable[[ModbusResponse], bool],
+    ) -> ModbusResponse:
         """Write, read, or both in one transaction, and wait for the answer.
 
         kind: how this stands to what others ask on the line (see `kind_on_line`); accept: whether
@@ -80,7 +80,7 @@ class ModbusLine(SharedLine[Port]):
         slow line and an amplifier that reacts in time need longer. Raises LinkTimeout, LinkError.
         """
 
-        async def exchange() -> Answer:
+        async def exchange() -> ModbusResponse:
             await self._await_silence()
             self.raise_if_lost(unit)
             telegram = self._make(read, write, unit=unit)
@@ -106,7 +106,7 @@ class ModbusLine(SharedLine[Port]):
 
         return await self._turns.carry_out(kind, exchange, address=unit)
 
-    async def broadcast(self, write: Write, kind: Kind, *, unit: int | None) -> None:
+    async def broadcast(self, write: Write, kind: RequestPriority, *, unit: int | None) -> None:
         """Write to all units, in the turn of this kind and unit; nobody answers.
 
         unit: whose stop this gives way to, and which may be one that others ask meanwhile; or None.
@@ -129,10 +129,10 @@ class ModbusLine(SharedLine[Port]):
         """See `Backend.silencing`."""
         return self._turns.silencing(request, unit)
 
-    def _make(self, read: Read | None, write: Write | None, *, unit: int) -> Telegram:
+    def _make(self, read: Read | None, write: Write | None, *, unit: int) -> RequestAdu:
         self._transaction = (self._transaction + 1) % _TRANSACTIONS
         number = 0 if self.url.is_rtu else self._transaction
-        return make_telegram(read, write, unit=unit, transaction=number, is_rtu=self.url.is_rtu)
+        return build_adu(read, write, unit=unit, transaction=number, is_rtu=self.url.is_rtu)
 
     def _send(self, frame: bytes) -> None:
         stream = self._ready()
@@ -164,12 +164,12 @@ class ModbusLine(SharedLine[Port]):
     def _received(self, data: bytes) -> None:
         for answer in self._reader.feed(data, self._telegram):
             if not self._accept(answer):
-                self.counters.foreign += 1
+                self.counters.unexpected_frames += 1
                 continue
             self._is_owed = False
             self._came.set()
             if self._answer is None or self._answer.done():
-                self.counters.foreign += 1
+                self.counters.unexpected_frames += 1
                 self.is_contradicted = self.is_contradicted or answer != self._given
             else:
                 self._given = answer
@@ -187,5 +187,5 @@ def modbus_line(url: ModbusUrl) -> ModbusLine:
     return shared_line(ModbusLine, url.line, lambda: ModbusLine(url.line))
 
 
-def _any(answer: Answer) -> bool:
+def _any(answer: ModbusResponse) -> bool:
     return True

@@ -7,8 +7,8 @@ import socket
 from collections.abc import Callable
 from typing import cast
 
+from drivers.backends.hardware import Port
 from drivers.backends.ports.opening import open_port
-from drivers.backends.stand_in import Port
 from drivers.backends.urls.modbus import ModbusUrl
 from drivers.errors import LinkError, LinkTimeout, said_by_system
 from drivers.threads import in_thread

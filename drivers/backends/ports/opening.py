@@ -8,6 +8,7 @@ from collections.abc import Callable
 
 import serial
 
+from drivers.backends.hardware import HARDWARE_PROVIDER, Port
 from drivers.backends.ports.watched import (
     READ_TIMEOUT,
     WRITE_TIMEOUT,
@@ -16,7 +17,6 @@ from drivers.backends.ports.watched import (
     connection_of,
     remedy_of,
 )
-from drivers.backends.stand_in import STAND_IN, Port
 from drivers.errors import LinkError, said_by_system
 from drivers.threads import in_thread
 
@@ -41,7 +41,7 @@ async def open_port(
     parity, stop bits: as pyserial names them. on_data is called with what comes in, on_loss once
     with why the port was lost.
     """
-    stand_in = STAND_IN.get()
+    stand_in = HARDWARE_PROVIDER.get()
     if stand_in is not None:
         return await stand_in.open_port(name, on_data=on_data, on_loss=on_loss)
     try:

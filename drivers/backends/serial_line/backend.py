@@ -8,9 +8,9 @@ import asyncio
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 
+from drivers.backends.hardware import number_below
 from drivers.backends.line_turns import kind_on_line
 from drivers.backends.serial_line.line import SerialLine, serial_line
-from drivers.backends.stand_in import number_below
 from drivers.backends.urls.serial_line import SerialUrl
 from drivers.backends.waiting import SETTLE, reply_within
 from drivers.backends.wire_backend import WireBackend
@@ -51,8 +51,8 @@ class SerialBackend(WireBackend):
     @property
     def counters(self) -> WireCounters:
         """What was seen for this amplifier; damaged frames are those of the whole line."""
-        bad = self._counters.bad if self._line is None else self._line.bad
-        return replace(self._counters, bad=bad)
+        crc_errors = self._counters.crc_errors if self._line is None else self._line.crc_errors
+        return replace(self._counters, crc_errors=crc_errors)
 
     @property
     def bus(self) -> str:
@@ -96,7 +96,7 @@ class SerialBackend(WireBackend):
         line, self._line = self._line, None
         if line is None:
             return
-        self._counters.bad = line.bad
+        self._counters.crc_errors = line.crc_errors
         self._why_closed = f"{self._url.port} was closed"
         self._fail(LinkError(self._why_closed))
         line.listen(self._url.address, None)
@@ -200,7 +200,7 @@ class SerialBackend(WireBackend):
             or not frame.is_reply
             or frame.address != self._url.address
         ):
-            self._counters.foreign += 1
+            self._counters.unexpected_frames += 1
             return
         self._answered = frame
         try:
@@ -212,7 +212,7 @@ class SerialBackend(WireBackend):
         try:
             event = decode_event(frame)
         except DriverError:
-            self._counters.bad += 1
+            self._counters.crc_errors += 1
             return
         self._counters.events += 1
         self._on_event(event)

@@ -3,10 +3,10 @@
 from collections.abc import Callable
 
 from drivers import clock
+from drivers.backends.hardware import Port
 from drivers.backends.line_turns import LineTurns
 from drivers.backends.ports.opening import open_port
 from drivers.backends.shared_line import SharedLine, shared_line
-from drivers.backends.stand_in import Port
 from drivers.codec.serial_line.frame import Frame, FrameReader
 from drivers.errors import LinkError
 
@@ -28,9 +28,9 @@ class SerialLine(SharedLine[Port]):
         self._listeners: dict[int, Callable[[Frame], None]] = {}
 
     @property
-    def bad(self) -> int:
+    def crc_errors(self) -> int:
         """How many damaged frames came in."""
-        return self._reader.counters.bad
+        return self._reader.counters.crc_errors
 
     def listen(self, address: int, on_frame: Callable[[Frame], None] | None) -> None:
         """Whom to tell of frames from an address; None for nobody any more."""

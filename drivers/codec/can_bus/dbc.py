@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 from drivers.codec.can_bus.frame import CANOPEN, LAYOUTS, Field, cob_id, command_id
-from drivers.codec.can_bus.orders import host_number
+from drivers.codec.can_bus.requests import host_number
 from drivers.protocol.definition import PROTOCOL, Quantity
 
 _HOST, _AMPLIFIER, _BYTES = "Host", "Amplifier", 8

@@ -15,6 +15,7 @@ from drivers.errors import FrameError
 from drivers.protocol.definition import PROTOCOL, Quantity
 from drivers.protocol.messages import (
     Achieved,
+    AmplifierState,
     Capabilities,
     Fault,
     FaultList,
@@ -23,7 +24,6 @@ from drivers.protocol.messages import (
     Loaded,
     Nak,
     NakCode,
-    State,
     Status,
 )
 
@@ -119,7 +119,7 @@ def unpack_status(registers: Sequence[int]) -> Status:
     if found["high_voltage"] > 1:
         raise FrameError(f"high_voltage is {found['high_voltage']}, neither 0 nor 1")
     return Status(
-        state=_one_of(State, found["state"]),
+        state=_one_of(AmplifierState, found["state"]),
         fault=_one_of(Fault, found["fault"]),
         token=_integer("active_token", found["active_token"]),
         high_voltage=bool(found["high_voltage"]),
@@ -204,7 +204,7 @@ def unpack_refusal(registers: Sequence[int]) -> tuple[Nak, int] | None:
     return Nak(_one_of(NakCode, found["nak"]), _channel(found["channel"])), found["refused_tag"]
 
 
-def unpack_condition(registers: Sequence[int]) -> tuple[State, Fault]:
+def unpack_condition(registers: Sequence[int]) -> tuple[AmplifierState, Fault]:
     """With which a status and what was achieved begin."""
     found, _ = _fields(("state", "fault"), registers)
-    return _one_of(State, found["state"]), _one_of(Fault, found["fault"])
+    return _one_of(AmplifierState, found["state"]), _one_of(Fault, found["fault"])

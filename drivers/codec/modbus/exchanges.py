@@ -17,6 +17,7 @@ from drivers.command import CommandSet, DriveCommand, Envelope
 from drivers.guard import require_safe
 from drivers.protocol.definition import PROTOCOL, Quantity
 from drivers.protocol.messages import (
+    AmplifierState,
     Apply,
     Arm,
     Broadcast,
@@ -35,7 +36,6 @@ from drivers.protocol.messages import (
     Reply,
     Request,
     Stage,
-    State,
     Stop,
 )
 
@@ -158,7 +158,7 @@ def decode_reply(request: Request, registers: Sequence[int]) -> Reply:
             return blocks.unpack_status(registers)
 
 
-def condition(request: Request, registers: Sequence[int]) -> tuple[State, Fault] | None:
+def condition(request: Request, registers: Sequence[int]) -> tuple[AmplifierState, Fault] | None:
     """State and fault where the block that was read tells them; raises FrameError."""
     if isinstance(request, Hello | GetCaps | GetFaults | LoadEnvelope):
         return None

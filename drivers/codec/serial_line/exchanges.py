@@ -34,13 +34,14 @@ from drivers.guard import require_safe
 from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.messages import (
     Achieved,
+    AmplifierEvent,
+    AmplifierState,
     Apply,
     Arm,
     Capabilities,
     Clear,
     Commit,
     Disarm,
-    Event,
     Fault,
     FaultList,
     GetCaps,
@@ -56,7 +57,6 @@ from drivers.protocol.messages import (
     Reply,
     Request,
     Stage,
-    State,
     Status,
     Stop,
 )
@@ -128,10 +128,12 @@ _LOADED = _Layout(
     ),
 )
 _EVENT_LAYOUT = _Layout(
-    Event,
+    AmplifierEvent,
     lambda event: bytes([event.state, event.fault]) + pack_optional_channel(event.channel),
-    lambda cursor: Event(
-        state=cursor.one_of(State), fault=cursor.one_of(Fault), channel=cursor.optional_channel()
+    lambda cursor: AmplifierEvent(
+        state=cursor.one_of(AmplifierState),
+        fault=cursor.one_of(Fault),
+        channel=cursor.optional_channel(),
     ),
 )
 
@@ -205,15 +207,15 @@ def is_event(frame: Frame) -> bool:
     return frame.kind == REPLY | _EVENT
 
 
-def encode_event(event: Event, *, address: int, sequence: int) -> Frame:
+def encode_event(event: AmplifierEvent, *, address: int, sequence: int) -> Frame:
     """The frame in which an amplifier speaks unasked."""
     payload = _EVENT_LAYOUT.pack(event)
     return Frame(kind=REPLY | _EVENT, address=address, sequence=sequence, payload=payload)
 
 
-def decode_event(frame: Frame) -> Event:
+def decode_event(frame: Frame) -> AmplifierEvent:
     """The event in a frame for which `is_event` holds; raises Malformed."""
-    event: Event = _decode(_EVENT_LAYOUT, frame.payload)
+    event: AmplifierEvent = _decode(_EVENT_LAYOUT, frame.payload)
     return event
 
 

@@ -61,7 +61,7 @@ class FrameCounters:
     bad_version: int = 0
 
     @property
-    def bad(self) -> int:
+    def crc_errors(self) -> int:
         """Everything that was dropped."""
         return self.bad_crc + self.too_long + self.truncated + self.bad_version
 

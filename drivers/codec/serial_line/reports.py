@@ -6,12 +6,12 @@ Unpacking gives values that are in range, or raises Malformed.
 from drivers.codec.payload import Cursor, pack, pack_optional_channel, pack_text
 from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.messages import (
+    AmplifierState,
     Capabilities,
     Fault,
     FaultList,
     FaultRecord,
     Identity,
-    State,
     Status,
 )
 
@@ -95,7 +95,7 @@ def pack_status(status: Status) -> bytes:
 
 def unpack_status(cursor: Cursor) -> Status:
     """How it is."""
-    state = cursor.one_of(State)
+    state = cursor.one_of(AmplifierState)
     fault = cursor.one_of(Fault)
     token = cursor.integer(_Q.active_token)
     flags = cursor.flags(_HIGH_VOLTAGE)

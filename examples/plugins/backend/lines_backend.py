@@ -12,6 +12,7 @@ from urllib.parse import urlsplit
 
 from era_haptics.plugins.backends import (
     Achieved,
+    AmplifierState,
     Apply,
     Arm,
     Capabilities,
@@ -36,7 +37,6 @@ from era_haptics.plugins.backends import (
     Reply,
     Request,
     Stage,
-    State,
     Status,
     Stop,
     WireBackend,
@@ -124,7 +124,7 @@ class LinesBackend(WireBackend):
         try:
             line = await reader.readline()
         except ValueError:  # longer than any answer
-            self._counters.bad += 1
+            self._counters.crc_errors += 1
             return None
         if not line.endswith(b"\n"):
             raise ConnectionResetError("the amplifier has hung up")
@@ -133,9 +133,9 @@ class LinesBackend(WireBackend):
             told = json.loads(line, parse_constant=refuse)
             if told["id"] == self._number:
                 return read(request, told)
-            self._counters.foreign += 1
+            self._counters.unexpected_frames += 1
         except (ValueError, TypeError, LookupError, AttributeError, RecursionError):
-            self._counters.bad += 1
+            self._counters.crc_errors += 1
         return None
 
 
@@ -217,7 +217,7 @@ def read(request: Request, told: dict[str, Any]) -> Reply:
                 ),
             )
     return Status(
-        state=State(told["state"]),
+        state=AmplifierState(told["state"]),
         fault=Fault(told["fault"]),
         token=told["token"],
         high_voltage=told["high_voltage"],

@@ -12,7 +12,7 @@ from typing import TypeAlias
 
 from drivers import clock
 from drivers.codec.can_bus.frame import CanFrame
-from drivers.protocol.messages import Event, Fault, Ping, State, Stop
+from drivers.protocol.messages import AmplifierEvent, AmplifierState, Fault, Ping, Stop
 from sim.bench.station import Station
 from sim.far_ends.can_bus.objects import CANOPEN, IDS, ObjectDictionary
 from sim.far_ends.can_bus.orders import Orders
@@ -98,7 +98,7 @@ class CanNode:
 
     def _leave_operation(self, state: int) -> None:
         """Nothing is heard of the host then, so nothing may play."""
-        if self._station.status().state is State.OPERATION_ENABLED:
+        if self._station.status().state is AmplifierState.OPERATION_ENABLED:
             self._station.exchange(Stop(_QUICK))
         self._state = state
         self._orders.forget()
@@ -142,7 +142,7 @@ class CanNode:
         if self._state == _OPERATIONAL:
             self._orders.take(cob_id, data, fd=fd)
 
-    def _tell(self, event: Event) -> None:
+    def _tell(self, event: AmplifierEvent) -> None:
         """A change of state or fault: an emergency for faults, an answer to nobody for others."""
         concerns_fault = event.fault is not Fault.NONE or self._fault is not Fault.NONE
         self._fault = event.fault

@@ -17,7 +17,7 @@ from controller.daemon.notify import ServiceManager
 from controller.daemon.place import Place
 from daemon_bench import daemon_table, far_end, running_daemon, until, until_state, write_daemon
 from drivers.errors import LinkError
-from drivers.protocol.messages import State
+from drivers.protocol.messages import AmplifierState
 from sim.faults.episodes import Episode
 
 READY, ENABLED = "READY_TO_SWITCH_ON", "OPERATION_ENABLED"
@@ -69,7 +69,7 @@ async def test_arming_that_takes_longer_than_the_lease(
         assert 0.5 < (status.lease_left_s or 0) <= 1
         await era.renew(lease.lease)
         await until_state(era, READY)
-        assert bench.far.station.status().state is State.SWITCH_ON_DISABLED
+        assert bench.far.station.status().state is AmplifierState.SWITCH_ON_DISABLED
 
 
 async def test_who_hangs_up_while_arming_leaves_nothing_armed(
@@ -88,7 +88,7 @@ async def test_who_hangs_up_while_arming_leaves_nothing_armed(
         goes_on.set()
         await until_state(era, READY)
         assert (await era.status()).armed_by is None
-        assert bench.far.station.status().state is State.SWITCH_ON_DISABLED
+        assert bench.far.station.status().state is AmplifierState.SWITCH_ON_DISABLED
 
 
 async def test_who_is_cancelled_while_arming_leaves_nothing_armed(

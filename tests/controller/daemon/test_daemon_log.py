@@ -20,7 +20,7 @@ from controller.daemon.notify import ServiceManager
 from controller.daemon.records import KEPT, Record, RecordedBackend, Recorder
 from controller.daemon_cli import app
 from drivers.backend import Backend
-from drivers.protocol.messages import Arm, Fault, State, Status
+from drivers.protocol.messages import AmplifierState, Arm, Fault, Status
 
 
 def record(message: str, line: int = 1, **extra: object) -> logging.LogRecord:
@@ -210,7 +210,7 @@ def test_the_last_messages_are_kept_and_no_more() -> None:
 
 def test_a_dump_is_lines_of_json_for_its_owner_alone(tmp_path: Path) -> None:
     """The cause first, then each message with its content in words; only the newest files stay."""
-    status = Status(State.FAULT, Fault.ARC, 7, False, 25.0, 0.0, (0.5, 0.0), 0.0)
+    status = Status(AmplifierState.FAULT, Fault.ARC, 7, False, 25.0, 0.0, (0.5, 0.0), 0.0)
     records = [
         Record(1.5, "main", "out", Arm(watchdog=0.25)),
         Record(1.6, "main", "in", status),

@@ -31,7 +31,7 @@ from daemon_bench import (
     until_state,
 )
 from drivers.amplifier import Amplifier
-from drivers.protocol.messages import Apply, LoadEnvelope, State
+from drivers.protocol.messages import AmplifierState, Apply, LoadEnvelope
 from drivers.registry import open_backend
 from model.errors import InputError
 from model.rig.file import load_rig
@@ -89,7 +89,7 @@ async def test_touches_are_felt_while_armed_and_only_then(tmp_path: Path) -> Non
         assert (contact["x_m"], contact["y_m"]) == pytest.approx(PLACE)
         assert contact["role"] is None
         assert not any(bench.far.station.status().levels)
-        assert bench.far.station.status().state is State.SWITCH_ON_DISABLED
+        assert bench.far.station.status().state is AmplifierState.SWITCH_ON_DISABLED
         await era.arm("me", lease_s=30)
         async with holding(era, bench, PLACE, (0.25, 0.2)):
             told = (await told_of(era, "pattern")).data
@@ -160,7 +160,7 @@ async def test_a_lease_that_is_not_renewed_disarms(tmp_path: Path) -> None:
         assert await until_state(era, READY, "SWITCH_ON_DISABLED") is not None
         assert loop.time() - begin >= 0.9
         await until_state(era, READY)
-        assert bench.far.station.status().state is State.SWITCH_ON_DISABLED
+        assert bench.far.station.status().state is AmplifierState.SWITCH_ON_DISABLED
         assert await refusal(era.renew(lease.lease)) is ErrorCode.LEASE
 
 
@@ -177,7 +177,7 @@ async def test_one_arms_and_anybody_stops(tmp_path: Path) -> None:
         assert status.state == "QUICK_STOP_ACTIVE"
         assert "bystander" in status.cause
         assert status.armed_by is None
-        assert bench.far.station.status().state is State.QUICK_STOP_ACTIVE
+        assert bench.far.station.status().state is AmplifierState.QUICK_STOP_ACTIVE
         assert await refusal(era.arm("me")) is ErrorCode.WRONG_STATE
         await era.clear()
         await until_state(era, READY)
@@ -197,7 +197,7 @@ async def test_a_stop_overtakes_the_arming_it_stops(tmp_path: Path) -> None:
         status = await era.status()
         assert status.state in ("QUICK_STOP_ACTIVE", "FAULT_REACTION_ACTIVE", "FAULT")
         assert status.armed_by is None
-        assert bench.far.station.status().state is not State.OPERATION_ENABLED
+        assert bench.far.station.status().state is not AmplifierState.OPERATION_ENABLED
 
 
 async def test_touches_over_tuio_are_felt(tmp_path: Path) -> None:
@@ -249,7 +249,7 @@ async def test_a_cut_link_is_told_and_comes_back_disarmed(tmp_path: Path) -> Non
         bench.far.station.recover()
         await until_state(era, "FAULT")
         assert not (await era.status()).assume_energised
-        assert bench.far.station.status().state is not State.OPERATION_ENABLED
+        assert bench.far.station.status().state is not AmplifierState.OPERATION_ENABLED
         await era.clear()
         await until_state(era, READY)
         await era.arm("me")
@@ -423,11 +423,11 @@ async def test_an_amplifier_that_was_left_armed_is_disarmed_at_the_start(tmp_pat
         amplifier = Amplifier(open_backend(far.url), reply_timeout=1.0)
         await amplifier.open()
         await amplifier.arm(2.0)
-        assert far.station.status().state is State.OPERATION_ENABLED
+        assert far.station.status().state is AmplifierState.OPERATION_ENABLED
         await amplifier.close()
         async with daemon_at(far, tmp_path) as bench, await bench.client() as era:
             await until_state(era, READY)
-            assert far.station.status().state is State.SWITCH_ON_DISABLED
+            assert far.station.status().state is AmplifierState.SWITCH_ON_DISABLED
 
 
 async def test_an_amplifier_in_a_fault_is_told_at_the_start(tmp_path: Path) -> None:
@@ -437,7 +437,7 @@ async def test_an_amplifier_in_a_fault_is_told_at_the_start(tmp_path: Path) -> N
         await amplifier.open()
         await amplifier.arm(0.15)
         await amplifier.close()
-        await until(lambda: far.station.status().state is State.FAULT)
+        await until(lambda: far.station.status().state is AmplifierState.FAULT)
         async with daemon_at(far, tmp_path) as bench, await bench.client() as era:
             await until_state(era, "FAULT")
             assert "WATCHDOG" in (await era.status()).cause

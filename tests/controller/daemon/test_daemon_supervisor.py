@@ -20,6 +20,7 @@ from drivers.amplifier import Amplifier
 from drivers.errors import CommandRefused, LinkError
 from drivers.operation.watchdog import HEARTBEAT
 from drivers.protocol.messages import (
+    AmplifierState,
     Apply,
     Arm,
     Clear,
@@ -31,7 +32,6 @@ from drivers.protocol.messages import (
     Ping,
     Reply,
     Request,
-    State,
     Status,
     Stop,
 )
@@ -62,7 +62,9 @@ class Watched:
         now = asyncio.get_running_loop().time()
         self.controller.deliver(TouchFrame("test", now, (Touch(1, 0.5, 0.5),)))
 
-    def status(self, state: State, fault: Fault = Fault.NONE, level: float = 0.0) -> Status:
+    def status(
+        self, state: AmplifierState, fault: Fault = Fault.NONE, level: float = 0.0
+    ) -> Status:
         """What the amplifier could say."""
         return Status(state, fault, 0, False, 25.0, 0.0, (level, 0.0))
 
@@ -288,13 +290,13 @@ async def test_an_amplifier_that_comes_back_armed_is_disarmed() -> None:
         daemon.far_end.answer = unreachable
         await asyncio.sleep(0.2)
         assert daemon.state is DaemonState.COMM_LOST
-        daemon.far_end.state = State.OPERATION_ENABLED
+        daemon.far_end.state = AmplifierState.OPERATION_ENABLED
         daemon.far_end.asked.clear()
         daemon.far_end.answer = lambda request: None
         await asyncio.sleep(1)
         assert daemon.state is DaemonState.FAULT
         assert daemon.far_end.requests(Disarm)
-        assert daemon.far_end.state is State.SWITCH_ON_DISABLED
+        assert daemon.far_end.state is AmplifierState.SWITCH_ON_DISABLED
 
 
 @in_virtual_time
@@ -302,7 +304,7 @@ async def test_clear_is_refused_while_the_cause_is_there() -> None:
     """An amplifier that stays in its fault keeps the daemon in it; then clear works."""
     async with watched() as daemon:
         await daemon.supervisor.handle(ARM)
-        hot = daemon.status(State.FAULT, Fault.OVER_TEMPERATURE)
+        hot = daemon.status(AmplifierState.FAULT, Fault.OVER_TEMPERATURE)
         daemon.far_end.answer = lambda request: hot if isinstance(request, Ping) else None
         await asyncio.sleep(0.2)
         assert daemon.state is DaemonState.FAULT
@@ -327,7 +329,7 @@ async def test_clear_waits_for_level_zero() -> None:
     """A level that is still reported is no silence, whatever state the amplifier is in."""
     async with watched() as daemon:
         await daemon.supervisor.handle(Event(Kind.STOP, "stop"))
-        loud = daemon.status(State.SWITCH_ON_DISABLED, level=0.01)
+        loud = daemon.status(AmplifierState.SWITCH_ON_DISABLED, level=0.01)
         daemon.far_end.answer = lambda request: loud if isinstance(request, GetStatus) else None
         with pytest.raises(CommandRefused, match="level"):
             await daemon.supervisor.handle(Event(Kind.CLEAR))
@@ -342,7 +344,7 @@ async def test_clear_right_after_a_stop_waits_for_the_ramp() -> None:
         await daemon.supervisor.handle(ARM)
         await daemon.supervisor.handle(Event(Kind.STOP, "stop"))
         silent = loop.time() + 0.05
-        stopping = daemon.status(State.QUICK_STOP_ACTIVE)
+        stopping = daemon.status(AmplifierState.QUICK_STOP_ACTIVE)
         daemon.far_end.answer = lambda request: stopping if loop.time() < silent else None
         await daemon.supervisor.handle(Event(Kind.CLEAR))
         assert daemon.state is DaemonState.READY_TO_SWITCH_ON
@@ -355,7 +357,7 @@ async def test_a_stop_is_not_acknowledged_by_who_asked_before_it(later: float) -
     more is said to the amplifier, and the state is that of the stop."""
     async with watched() as daemon:
         await daemon.supervisor.handle(Event(Kind.STOP, "the first"))
-        stopping = daemon.status(State.QUICK_STOP_ACTIVE)
+        stopping = daemon.status(AmplifierState.QUICK_STOP_ACTIVE)
         daemon.far_end.answer = lambda request: stopping
         daemon.far_end.delay = 0.004
         clearing = asyncio.create_task(daemon.supervisor.handle(Event(Kind.CLEAR)))
@@ -386,7 +388,7 @@ async def test_a_stop_while_disarming_is_a_stop_and_no_fault(later: float) -> No
         await asyncio.gather(disarming, return_exceptions=True)
         assert daemon.state is DaemonState.QUICK_STOP_ACTIVE
         assert DaemonState.FAULT not in daemon.states
-        assert daemon.far_end.state is State.QUICK_STOP_ACTIVE
+        assert daemon.far_end.state is AmplifierState.QUICK_STOP_ACTIVE
 
 
 @in_virtual_time
@@ -414,14 +416,14 @@ async def test_a_stop_while_arming_is_a_stop_and_no_fault() -> None:
             await arming
         assert daemon.state is DaemonState.QUICK_STOP_ACTIVE
         assert DaemonState.OPERATION_ENABLED not in daemon.states
-        assert daemon.far_end.state is not State.OPERATION_ENABLED
+        assert daemon.far_end.state is not AmplifierState.OPERATION_ENABLED
 
 
 @in_virtual_time
 async def test_a_fault_of_a_disarmed_amplifier_is_seen() -> None:
     """Within a second, though nobody asks for anything."""
     async with watched() as daemon:
-        sick = daemon.status(State.FAULT, Fault.INTERNAL)
+        sick = daemon.status(AmplifierState.FAULT, Fault.INTERNAL)
         daemon.far_end.answer = lambda request: sick if isinstance(request, GetStatus) else None
         await asyncio.sleep(1)
         assert daemon.state is DaemonState.FAULT

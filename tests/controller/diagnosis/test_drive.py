@@ -10,7 +10,7 @@ from controller.diagnosis.sensors import Sensors
 from controller_bench import make_bench
 from drivers.amplifier import Amplifier
 from drivers.errors import CommandRefused
-from drivers.protocol.messages import Achieved, Apply, Reply, Request, State
+from drivers.protocol.messages import Achieved, AmplifierState, Apply, Reply, Request
 from virtual_loop import in_virtual_time
 
 
@@ -58,5 +58,5 @@ async def test_a_level_that_is_not_played_ends_the_check() -> None:
         match=r"amplifier main plays level 0.05 on channel 0 in place of 0.1: let it cool down, or",
     ):
         await drive.run([110.0])
-    assert far_end.state is not State.OPERATION_ENABLED
+    assert far_end.state is not AmplifierState.OPERATION_ENABLED
     assert not far_end.is_open

@@ -11,8 +11,8 @@ import pytest
 
 from drivers import threads
 from drivers.backends.can_bus import adapter
+from drivers.backends.hardware import Adapter, Port
 from drivers.backends.ports import opening
-from drivers.backends.stand_in import Adapter, Port
 from drivers.backends.urls.can_bus import CanUrl
 from drivers.codec.can_bus.frame import CanFrame
 

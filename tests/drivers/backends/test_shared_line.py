@@ -6,10 +6,17 @@ from collections.abc import Callable
 import pytest
 
 from drivers.backends.can_bus.backend import CanBackend
+from drivers.backends.hardware import (
+    HARDWARE_PROVIDER,
+    Adapter,
+    HardwareProvider,
+    Port,
+    ThreadWorker,
+    Worker,
+)
 from drivers.backends.modbus.backend import ModbusBackend
 from drivers.backends.serial_line.backend import SerialBackend
 from drivers.backends.shared_line import SharedLine, shared_line
-from drivers.backends.stand_in import STAND_IN, Adapter, Port, StandIn, ThreadWorker, Worker
 from drivers.backends.wire_backend import WireBackend
 from drivers.errors import LinkError
 from drivers.protocol.messages import Arm, Ping
@@ -195,7 +202,7 @@ async def test_nothing_is_sent_while_it_is_being_opened_anew() -> None:
     await line.leave(2)
 
 
-class _Machine(StandIn):
+class _Machine(HardwareProvider):
     """A machine with a line that takes everything and says nothing, until it is lost."""
 
     def __init__(self) -> None:
@@ -252,7 +259,7 @@ async def test_what_waited_while_the_line_was_lost_is_not_sent_when_others_open_
     """An amplifier that was lost is armed by nobody before it was opened anew."""
     url, requests = WAITING[kind]
     machine = _Machine()
-    STAND_IN.set(machine)
+    HARDWARE_PROVIDER.set(machine)
     east, west = (kind(url.format(number)) for number in (1, 2))
     await east.open()
     await west.open()

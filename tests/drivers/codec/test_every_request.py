@@ -6,7 +6,8 @@ from typing import get_args
 import pytest
 
 from drivers.codec.can_bus.objects import pack_envelope
-from drivers.codec.can_bus.orders import Order, action_of, encode_order
+from drivers.codec.can_bus.requests import PdoRequest, action_of
+from drivers.codec.can_bus.requests import encode_request as encode_can_request
 from drivers.codec.modbus import exchanges
 from drivers.codec.serial_line.exchanges import decode_request, encode_request
 from drivers.codec.serial_line.frame import FrameReader, encode_frame
@@ -111,11 +112,11 @@ def test_on_can_it_is_an_order_or_an_object(request_of_each_kind: Request) -> No
     asked = request_of_each_kind
     if isinstance(asked, LoadEnvelope):
         assert len(pack_envelope(asked)) == 3 + 4
-    elif not isinstance(asked, get_args(Order)):
+    elif not isinstance(asked, get_args(PdoRequest)):
         assert type(asked) in READ_AS_OBJECTS
     else:
         for fd in (False, True):
-            frames = encode_order(asked, node=1, sequence=9, fd=fd)
+            frames = encode_can_request(asked, node=1, sequence=9, fd=fd)
             (order,) = (frame for frame in frames if frame.id == 0x481)
             assert order.data[7] == 9
             assert order.fd is fd
@@ -123,6 +124,6 @@ def test_on_can_it_is_an_order_or_an_object(request_of_each_kind: Request) -> No
 
 def test_no_two_orders_ask_for_the_same_but_a_heartbeat_and_a_look() -> None:
     """A Ping asks how it is, as GetStatus does, after the host's heartbeat."""
-    orders = [each for each in EXAMPLES.values() if isinstance(each, get_args(Order))]
+    orders = [each for each in EXAMPLES.values() if isinstance(each, get_args(PdoRequest))]
     assert len({action_of(each) for each in orders}) == len(orders) - 1
     assert action_of(Ping()) == action_of(GetStatus())

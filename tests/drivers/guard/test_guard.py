@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from drivers.codec.serial_line.exchanges import decode_request, encode_request
 from drivers.command import CommandSet, DriveCommand
 from drivers.errors import CommandError, CommandRefused
-from drivers.guard import Guard, GuardLimits, SafeCommand
+from drivers.guard import Guard, GuardLimits, SafeCommandSet
 from drivers.protocol.messages import Apply, Capabilities
 
 CAPABILITIES = Capabilities(4, 20.0, 600.0, 0.01, 1.0, 0.0001, 0.01, 0.5, 0.1, 2.0, 0)
@@ -25,7 +25,7 @@ def with_command(**changes: object) -> CommandSet:
 def test_a_good_set_passes_unchanged() -> None:
     """What is within the limits comes through as it is."""
     safe = GUARD.check(GOOD)
-    assert type(safe) is SafeCommand
+    assert type(safe) is SafeCommandSet
     assert (safe.token, safe.commands) == (GOOD.token, GOOD.commands)
     assert (safe.ramp, safe.valid_for) == (GOOD.ramp, GOOD.valid_for)
 
@@ -167,11 +167,11 @@ def test_nobody_else_makes_a_safe_command() -> None:
     """Neither the constructor nor a changed copy nor a subclass gets past the guard."""
     safe = GUARD.check(GOOD)
     with pytest.raises(TypeError):
-        SafeCommand(1, (), ramp=0.0, valid_for=0.0)
+        SafeCommandSet(1, (), ramp=0.0, valid_for=0.0)
     with pytest.raises(TypeError):
         replace(safe, token=8)
     with pytest.raises(TypeError):
-        type("Forged", (SafeCommand,), {})
+        type("Forged", (SafeCommandSet,), {})
     with pytest.raises(AttributeError):
         safe.token = 8
     assert copy.copy(safe) == safe

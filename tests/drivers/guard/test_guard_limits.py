@@ -7,7 +7,7 @@ import pytest
 
 from drivers.command import CommandSet, DriveCommand, Envelope, Knot
 from drivers.errors import CommandError, CommandRefused
-from drivers.guard import Guard, GuardLimits, SafeCommand, SafeEnvelope
+from drivers.guard import Guard, GuardLimits, SafeCommandSet, SafeEnvelope
 from drivers.protocol.messages import Capabilities
 
 CAPABILITIES = Capabilities(
@@ -237,6 +237,6 @@ def test_only_a_guard_makes_what_is_safe() -> None:
     """Neither can be made by hand, nor be derived from."""
     with pytest.raises(TypeError):
         SafeEnvelope(1, 0.005, ())
-    for kind in (SafeCommand, SafeEnvelope):
+    for kind in (SafeCommandSet, SafeEnvelope):
         with pytest.raises(TypeError):
             type("Sly", (kind,), {})

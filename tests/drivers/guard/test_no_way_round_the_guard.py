@@ -64,13 +64,13 @@ def test_there_is_something_to_walk() -> None:
     """The walk sees the guard, the amplifier and the control loop."""
     seen = {file.name for file in FILES}
     assert {"guard.py", "amplifier.py", "exchanges.py", "loop.py"} <= seen
-    assert any(name == "SafeCommand" for name, _ in calls(GUARD))
+    assert any(name == "SafeCommandSet" for name, _ in calls(GUARD))
 
 
 @pytest.mark.parametrize("file", [file for file in FILES if file != GUARD], ids=str)
 def test_nobody_else_makes_a_safe_command(file: Path) -> None:
-    """No call of SafeCommand or SafeEnvelope, no key, no forging around a constructor."""
-    made = [name for name, _ in calls(file) if name in ("SafeCommand", "SafeEnvelope")]
+    """No call of SafeCommandSet or SafeEnvelope, no key, no forging around a constructor."""
+    made = [name for name, _ in calls(file) if name in ("SafeCommandSet", "SafeEnvelope")]
     assert made == []
     assert names(file).isdisjoint({"_KEY", "__new__", "__class__", "__setattr__", "pickle", "copy"})
 

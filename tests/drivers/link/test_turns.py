@@ -6,7 +6,7 @@ import pytest
 
 from drivers.backends.line_turns import LineTurns
 from drivers.errors import CommandRefused
-from drivers.link.turns import Kind, Turns
+from drivers.link.turns import RequestPriority, Turns
 from drivers.protocol.messages import Disarm, Stop
 
 
@@ -24,7 +24,9 @@ class Users:
         self.order: list[str] = []
         self.ends: dict[str, asyncio.Event] = {}
 
-    def take(self, name: str, kind: Kind = Kind.ORDINARY) -> "asyncio.Task[None]":
+    def take(
+        self, name: str, kind: RequestPriority = RequestPriority.ORDINARY
+    ) -> "asyncio.Task[None]":
         """Somebody who keeps the turn until told to end."""
         self.ends[name] = asyncio.Event()
 
@@ -48,7 +50,9 @@ async def test_silence_goes_before_what_was_just_handed_the_turn(users: Users) -
     tasks = [users.take(name) for name in ("first", "second", "third")]
     await settle()
     users.ends["first"].set()
-    tasks.append(users.take("stop", Kind.SILENCE))  # runs after the first and before the second
+    tasks.append(
+        users.take("stop", RequestPriority.SILENCE)
+    )  # runs after the first and before the second
     await settle()
     for end in users.ends.values():
         end.set()
@@ -60,9 +64,9 @@ async def test_a_stop_goes_before_what_else_silences(users: Users) -> None:
     """Silent sets and disarms that wait, with their longer ramps, come after it, in their order."""
     tasks = [users.take("first")]
     await settle()
-    tasks += [users.take(name, Kind.SILENCE) for name in ("zero", "disarm")]
+    tasks += [users.take(name, RequestPriority.SILENCE) for name in ("zero", "disarm")]
     await settle()
-    tasks.append(users.take("stop", Kind.STOP))
+    tasks.append(users.take("stop", RequestPriority.STOP))
     await settle()
     for end in users.ends.values():
         end.set()
@@ -73,12 +77,12 @@ async def test_a_stop_goes_before_what_else_silences(users: Users) -> None:
 async def test_an_apply_that_was_just_handed_the_turn_gives_way_for_good() -> None:
     """It was superseded before any of it was sent; the silence comes, and what was behind it."""
     users = Users(Turns())
-    first, apply = users.take("first"), users.take("apply", Kind.APPLY)
+    first, apply = users.take("first"), users.take("apply", RequestPriority.APPLY)
     await settle()
     behind = users.take("behind")
     await settle()
     users.ends["first"].set()
-    stop = users.take("stop", Kind.SILENCE)
+    stop = users.take("stop", RequestPriority.SILENCE)
     await settle()
     for end in users.ends.values():
         end.set()
@@ -90,11 +94,11 @@ async def test_an_apply_that_was_just_handed_the_turn_gives_way_for_good() -> No
 
 async def test_a_link_that_was_kept_free_for_nothing_is_handed_on(users: Users) -> None:
     """Where what silences was given up, those who have waited meanwhile come; also the new."""
-    users.turns.keep_free("west", Kind.SILENCE)
+    users.turns.keep_free("west", RequestPriority.SILENCE)
     early = users.take("early")
     await settle()
     assert users.order == []
-    users.turns.release("west", Kind.SILENCE)
+    users.turns.release("west", RequestPriority.SILENCE)
     await settle()
     late = users.take("late")
     for end in users.ends.values():
@@ -115,11 +119,11 @@ async def test_of_two_stops_the_one_that_is_given_up_keeps_the_line_no_less_free
     with line.silencing(Stop(0.005), 1):
         with line.silencing(Stop(0.005), 1):
             other = asyncio.create_task(
-                line.carry_out(Kind.ORDINARY, lambda: say("other"), address=2)
+                line.carry_out(RequestPriority.ORDINARY, lambda: say("other"), address=2)
             )
             await settle()
         await settle()
-        await line.carry_out(Kind.STOP, lambda: say("stop"), address=1)
+        await line.carry_out(RequestPriority.STOP, lambda: say("stop"), address=1)
     await other
     assert said == ["stop", "other"]
 
@@ -136,12 +140,14 @@ async def test_what_an_amplifier_still_has_to_say_ends_with_its_own_stop() -> No
     with line.silencing(Disarm(0.05), 1):
         with pytest.raises(CommandRefused, match="superseded"):
             async with asyncio.timeout(5):
-                await line.carry_out(Kind.ORDINARY, lambda: say("own"), address=1)
-        other = asyncio.create_task(line.carry_out(Kind.ORDINARY, lambda: say("other"), address=2))
+                await line.carry_out(RequestPriority.ORDINARY, lambda: say("own"), address=1)
+        other = asyncio.create_task(
+            line.carry_out(RequestPriority.ORDINARY, lambda: say("other"), address=2)
+        )
         await settle()
         assert line.is_unsent(2)
         assert not line.is_unsent(1)
-        await line.carry_out(Kind.SILENCE, lambda: say("stop"), address=1)
+        await line.carry_out(RequestPriority.SILENCE, lambda: say("stop"), address=1)
     await other
     assert said == ["stop", "other"]
     assert not line.is_unsent(2)

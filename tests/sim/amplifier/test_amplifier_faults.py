@@ -7,11 +7,12 @@ import pytest
 from drivers.command import CommandSet, DriveCommand, Envelope, Knot
 from drivers.protocol.messages import (
     Achieved,
+    AmplifierEvent,
+    AmplifierState,
     Apply,
     Arm,
     Clear,
     Disarm,
-    Event,
     Fault,
     FaultList,
     FaultRecord,
@@ -19,7 +20,6 @@ from drivers.protocol.messages import (
     LoadEnvelope,
     Nak,
     NakCode,
-    State,
 )
 from sim.amplifier.amplifier import SimulatedAmplifier
 from sim.amplifier.heat import Heat
@@ -64,7 +64,7 @@ def test_over_70_degrees_it_derates_and_over_85_it_trips() -> None:
     amplifier.handle(Apply(playing(1, 0.8)), 0.0)
     amplifier.set_temperature(71.0, 1.0)
     assert amplifier.status(1.02).levels == pytest.approx((0.4,) * 4)
-    assert amplifier.state is State.OPERATION_ENABLED
+    assert amplifier.state is AmplifierState.OPERATION_ENABLED
     reply = amplifier.handle(Apply(playing(2, 0.6)), 1.1)
     assert isinstance(reply, Achieved)
     assert reply.commands[0].level == pytest.approx(0.3)
@@ -72,13 +72,17 @@ def test_over_70_degrees_it_derates_and_over_85_it_trips() -> None:
     amplifier.set_temperature(86.0, 1.2)
     amplifier.tick(1.2051)
     now = amplifier.status(1.2051)
-    assert (now.state, now.fault, now.high_voltage) == (State.FAULT, Fault.OVER_TEMPERATURE, False)
+    assert (now.state, now.fault, now.high_voltage) == (
+        AmplifierState.FAULT,
+        Fault.OVER_TEMPERATURE,
+        False,
+    )
     assert now.levels == (0.0,) * 4
     amplifier.handle(Clear(), 1.3)
-    assert amplifier.state is State.FAULT
+    assert amplifier.state is AmplifierState.FAULT
     amplifier.set_temperature(25.0, 1.4)
     amplifier.handle(Clear(), 1.4)
-    assert amplifier.state is State.SWITCH_ON_DISABLED
+    assert amplifier.state is AmplifierState.SWITCH_ON_DISABLED
     amplifier.handle(Arm(2.0), 1.5)
     reply = amplifier.handle(Apply(playing(3, 0.6)), 1.5)
     assert isinstance(reply, Achieved)
@@ -108,17 +112,20 @@ def test_high_voltage_is_there_while_armed_and_discharges_afterwards() -> None:
 def test_a_fault_silences_and_latches(fault: Fault) -> None:
     """Silent within 5 ms, high voltage off, listed with its channel, told to listeners in order."""
     amplifier = armed()
-    events: list[tuple[Event, float]] = []
+    events: list[tuple[AmplifierEvent, float]] = []
     amplifier.listeners.append(lambda event, time: events.append((event, time)))
     amplifier.handle(Apply(playing(1, 0.8)), 0.0)
     amplifier.trip(fault, 1.0, channel=2)
     amplifier.tick(1.0051)
     now = amplifier.status(1.0051)
-    assert (now.state, now.fault, now.levels) == (State.FAULT, fault, (0.0,) * 4)
+    assert (now.state, now.fault, now.levels) == (AmplifierState.FAULT, fault, (0.0,) * 4)
     listed = amplifier.handle(GetFaults(), 2.0)
     assert listed == FaultList((FaultRecord(fault, 2, 1.0),))
     told = [event for event, _ in events]
-    assert told == [Event(State.FAULT_REACTION_ACTIVE, fault, 2), Event(State.FAULT, fault)]
+    assert told == [
+        AmplifierEvent(AmplifierState.FAULT_REACTION_ACTIVE, fault, 2),
+        AmplifierEvent(AmplifierState.FAULT, fault),
+    ]
     assert [time for _, time in events] == pytest.approx([1.0, 1.005])
     assert amplifier.handle(Arm(2.0), 2.0) == Nak(NakCode.WRONG_STATE)
 
@@ -127,7 +134,7 @@ def test_a_fault_while_disarmed_is_only_noted() -> None:
     """There is nothing to silence; the list of faults tells of it."""
     amplifier = SimulatedAmplifier("main", channels=4)
     amplifier.trip(Fault.ARC, 1.0)
-    assert amplifier.state is State.SWITCH_ON_DISABLED
+    assert amplifier.state is AmplifierState.SWITCH_ON_DISABLED
     listed = amplifier.handle(GetFaults(), 1.5)
     assert listed == FaultList((FaultRecord(Fault.ARC, None, 0.5),))
 
@@ -139,7 +146,7 @@ def test_a_restart_forgets_everything_but_is_silent_at_once() -> None:
     amplifier.handle(Apply(playing(1, 0.8)), 0.5)
     amplifier.restart(1.0)
     now = amplifier.status(1.0)
-    assert (now.state, now.token, now.levels) == (State.SWITCH_ON_DISABLED, 0, (0.0,) * 4)
+    assert (now.state, now.token, now.levels) == (AmplifierState.SWITCH_ON_DISABLED, 0, (0.0,) * 4)
     amplifier.handle(Arm(2.0), 1.1)
     shaped = CommandSet(1, (DriveCommand(0, 110.0, 0.5, onset=1),), ramp=0.0, valid_for=0.0)
     assert amplifier.handle(Apply(shaped), 1.2) == Nak(NakCode.NO_ENVELOPE, 0)

@@ -8,6 +8,7 @@ import pytest
 from drivers.command import CommandSet, DriveCommand
 from drivers.protocol.messages import (
     Achieved,
+    AmplifierState,
     Apply,
     Arm,
     Capabilities,
@@ -27,7 +28,6 @@ from drivers.protocol.messages import (
     Reply,
     Request,
     Stage,
-    State,
     Status,
     Stop,
 )
@@ -61,7 +61,7 @@ def refused(reply: Reply, code: NakCode, channel: int | None = None) -> None:
     assert reply == Nak(code, channel)
 
 
-S = State
+S = AmplifierState
 # One row per state, one column per request; "!" is refused, "." stays as it is.
 REQUESTS: list[Request] = [
     *(Hello(), GetCaps(), GetStatus(), GetFaults(), Ping()),
@@ -85,24 +85,26 @@ REPLIES = {
 }
 
 
-def brought_to(state: State, request: Request) -> SimulatedAmplifier:
+def brought_to(state: AmplifierState, request: Request) -> SimulatedAmplifier:
     """An amplifier in a state, reached by the protocol where the protocol leads there."""
     amplifier = armed()
     amplifier.handle(Apply(playing(5, 0.5)), 0.0)
     if isinstance(request, Commit):
         amplifier.handle(Stage(playing(7, 0.5)), 0.0)
     match state:
-        case State.SWITCH_ON_DISABLED:
+        case AmplifierState.SWITCH_ON_DISABLED:
             amplifier.handle(Disarm(0.0), 0.01)
-        case State.SWITCHED_ON:
+        case AmplifierState.SWITCHED_ON:
             amplifier.handle(Disarm(0.5), 0.01)
-        case State.QUICK_STOP_ACTIVE:
+        case AmplifierState.QUICK_STOP_ACTIVE:
             amplifier.handle(Stop(0.0), 0.01)
-        case State.FAULT_REACTION_ACTIVE:
+        case AmplifierState.FAULT_REACTION_ACTIVE:
             amplifier.tick(0.251)
-        case State.FAULT:
+        case AmplifierState.FAULT:
             amplifier.tick(0.256)
-        case State.NOT_READY | State.READY_TO_SWITCH_ON:  # never entered: passed through at once
+        case (
+            AmplifierState.NOT_READY | AmplifierState.READY_TO_SWITCH_ON
+        ):  # never entered: passed through at once
             amplifier = SimulatedAmplifier("main", channels=4)
             amplifier.state = state
         case _:
@@ -111,13 +113,13 @@ def brought_to(state: State, request: Request) -> SimulatedAmplifier:
     return amplifier
 
 
-@pytest.mark.parametrize("state", list(State), ids=lambda state: state.name)
+@pytest.mark.parametrize("state", list(AmplifierState), ids=lambda state: state.name)
 @pytest.mark.parametrize("column", range(12), ids=[type(r).__name__ for r in REQUESTS])
-def test_every_request_in_every_state(state: State, column: int) -> None:
+def test_every_request_in_every_state(state: AmplifierState, column: int) -> None:
     """Each pair leads where the protocol says, or is refused and changes nothing."""
     request, expected = REQUESTS[column], EXPECTED[state][column]
     amplifier = brought_to(state, request)
-    now = 0.252 if state is State.FAULT_REACTION_ACTIVE else 0.26
+    now = 0.252 if state is AmplifierState.FAULT_REACTION_ACTIVE else 0.26
     now = 0.02 if state in (S.OPERATION_ENABLED, S.SWITCHED_ON) else now
     before = status(amplifier, now)
     reply = amplifier.handle(request, now)
@@ -171,7 +173,7 @@ def test_what_feeds_the_watchdog(request_: Request) -> None:
     amplifier.handle(request_, 0.2)
     amplifier.tick(0.3)
     asking = isinstance(request_, Hello | GetCaps | GetStatus | GetFaults)
-    assert (amplifier.state is State.FAULT) == asking
+    assert (amplifier.state is AmplifierState.FAULT) == asking
 
 
 def test_refused_requests_do_not_feed_the_watchdog() -> None:
@@ -322,14 +324,14 @@ def test_quick_stop_is_latched() -> None:
     amplifier.handle(Stop(0.05), 0.1)
     assert status(amplifier, 0.125).levels[0] == pytest.approx(0.5)
     amplifier.handle(Clear(), 0.125)
-    assert amplifier.state is State.QUICK_STOP_ACTIVE
+    assert amplifier.state is AmplifierState.QUICK_STOP_ACTIVE
     refused(amplifier.handle(Apply(playing(2, 1.0)), 0.13), NakCode.WRONG_STATE)
     stopped = status(amplifier, 10.0)
     assert (stopped.state, stopped.levels[0]) == (S.QUICK_STOP_ACTIVE, 0)
     assert stopped.fault is Fault.NONE
     assert not stopped.high_voltage
     amplifier.handle(Clear(), 10.0)
-    assert amplifier.state is State.SWITCH_ON_DISABLED
+    assert amplifier.state is AmplifierState.SWITCH_ON_DISABLED
 
 
 @pytest.mark.parametrize("ramp", [math.nan, -1.0, 1e9])

@@ -15,6 +15,7 @@ from drivers.codec.serial_line.frame import Frame, FrameReader, encode_frame
 from drivers.errors import LinkError
 from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.messages import (
+    AmplifierState,
     GetStatus,
     Hello,
     Identity,
@@ -22,7 +23,6 @@ from drivers.protocol.messages import (
     NakCode,
     Reply,
     Request,
-    State,
     Status,
     Stop,
 )
@@ -99,7 +99,7 @@ async def test_noise_before_a_frame_is_skipped(end: SerialEnd, host: Host) -> No
     os.write(host.fd, b"\x00\x17garbage\x00" + bytes(flipped) + good[:6])
     status = await host.ask(GetStatus())
     assert isinstance(status, Status)
-    assert status.state is State.SWITCH_ON_DISABLED
+    assert status.state is AmplifierState.SWITCH_ON_DISABLED
     assert end.counters.good == 1
     assert end.counters.bad_crc + end.counters.truncated >= 2
 
@@ -134,7 +134,7 @@ async def test_a_stop_is_carried_out_whatever_its_ramp(host: Host, address: int)
     assert all(frame.kind != 0x9F for frame in frames)  # neither of the event and the reply refuses
     status = await host.ask(GetStatus(), sequence=10)
     assert isinstance(status, Status)
-    assert status.state is State.QUICK_STOP_ACTIVE
+    assert status.state is AmplifierState.QUICK_STOP_ACTIVE
 
 
 async def test_frames_for_others_and_echoes_are_not_answered(host: Host) -> None:

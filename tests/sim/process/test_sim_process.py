@@ -13,7 +13,7 @@ from drivers.amplifier import Amplifier
 from drivers.backends.serial_line.backend import SerialBackend
 from drivers.command import CommandSet, DriveCommand
 from drivers.guard import Guard, GuardLimits
-from drivers.protocol.messages import State
+from drivers.protocol.messages import AmplifierState
 from model.rig.file import example_rig_path
 
 ROOT = example_rig_path().parent.parent
@@ -59,7 +59,7 @@ async def test_serves_until_it_is_told_to_end(number: signal.Signals) -> None:
             wanted = CommandSet(1, (DriveCommand(2, 110.0, 0.25),), ramp=0.0, valid_for=0.0)
             await amplifier.apply(guard.check(wanted))
             status = await amplifier.status()
-            assert (status.state, status.token) == (State.OPERATION_ENABLED, 1)
+            assert (status.state, status.token) == (AmplifierState.OPERATION_ENABLED, 1)
             assert status.levels == (0, 0, 0.25, 0)
             await amplifier.close()
         finally:

@@ -19,14 +19,14 @@ import serial
 from drivers.amplifier import Amplifier
 from drivers.backends.can_bus.backend import CanBackend
 from drivers.backends.can_bus.bus import can_bus
-from drivers.backends.can_bus.orders import PendingOrders
+from drivers.backends.can_bus.pending import PendingRequests
 from drivers.backends.urls.can_bus import CanUrl
 from drivers.codec.can_bus.frame import CanFrame
 from drivers.codec.can_bus.objects import index_of
 from drivers.command import CommandSet, DriveCommand, Envelope, Knot
 from drivers.errors import CommandError, CommandRefused, FrameError, LinkError, LinkTimeout
-from drivers.guard import Guard, GuardLimits, SafeCommand
-from drivers.protocol.messages import Apply, Event, Fault, Hello, Ping, State
+from drivers.guard import Guard, GuardLimits, SafeCommandSet
+from drivers.protocol.messages import AmplifierEvent, AmplifierState, Apply, Fault, Hello, Ping
 from model.rig.rig import Rig
 from sim.bench.bench import Bench
 from sim.bench.station import Station
@@ -136,7 +136,7 @@ async def opened(url: str) -> AsyncIterator[Amplifier]:
         await amplifier.close()
 
 
-def tones(amplifier: Amplifier, *levels: float, onset: int = 0) -> SafeCommand:
+def tones(amplifier: Amplifier, *levels: float, onset: int = 0) -> SafeCommandSet:
     """A set at 110 Hz, a level for each channel from 0 on."""
     guard = Guard(LIMITS, amplifier.capabilities)
     if onset:
@@ -222,8 +222,8 @@ async def test_on_a_virtual_bus_the_whole_session_works(virtual: Virtual) -> Non
         status = await amplifier.heartbeat()
         assert status.levels == pytest.approx((0.1, 0.2, 0.3, 0.4))
         assert await amplifier.faults() == ()
-        assert (await amplifier.stop(0.0)).state is State.QUICK_STOP_ACTIVE
-        assert (await amplifier.clear()).state is State.SWITCH_ON_DISABLED
+        assert (await amplifier.stop(0.0)).state is AmplifierState.QUICK_STOP_ACTIVE
+        assert (await amplifier.clear()).state is AmplifierState.SWITCH_ON_DISABLED
 
 
 async def test_the_heartbeat_is_sent_by_the_call_and_by_nothing_else(virtual: Virtual) -> None:
@@ -386,7 +386,9 @@ class Telling(CanBackend):
         super().__init__(url)
         self._told_losses = told
 
-    def listen(self, on_event: Callable[[Event], None], on_loss: Callable[[str], None]) -> None:
+    def listen(
+        self, on_event: Callable[[AmplifierEvent], None], on_loss: Callable[[str], None]
+    ) -> None:
         """Note and pass on."""
 
         def note(what: str) -> None:
@@ -434,7 +436,7 @@ async def test_a_boot_up_is_noticed_before_the_first_heartbeat(virtual: Virtual)
     await amplifier.open()
     try:
         virtual.gateway.say(CanFrame(0x701, b"\x00"))
-        await eventually(lambda: amplifier.lost)
+        await eventually(lambda: amplifier.is_lost)
     finally:
         await amplifier.close()
 
@@ -515,7 +517,7 @@ async def test_a_server_that_hangs_up_is_noticed_at_once(coarse_rig: Rig) -> Non
         await amplifier.open()
         try:
             far.station.befall(Episode("unplug"))
-            await eventually(lambda: amplifier.lost)
+            await eventually(lambda: amplifier.is_lost)
         finally:
             await amplifier.close()
 
@@ -559,7 +561,7 @@ async def test_a_late_answer_is_no_second_amplifier(virtual: Virtual) -> None:
 
 def test_orders_are_numbered_from_1_to_255() -> None:
     """255 numbers and then the first again: 0 is nobody's."""
-    orders = PendingOrders()
+    orders = PendingRequests()
     numbers = [orders.next_sequence() for _ in range(3 * 255)]
     assert sorted(numbers) == sorted([*range(1, 256)] * 3)
     assert numbers[:255] == numbers[255:510]
@@ -588,21 +590,23 @@ async def test_a_second_host_does_not_arm(virtual: Virtual) -> None:
 
 async def test_events_are_told(virtual: Virtual) -> None:
     """Emergencies and changes of state without a fault, each once."""
-    events: list[Event] = []
+    events: list[AmplifierEvent] = []
     amplifier = Amplifier(CanBackend(virtual.url()), reply_timeout=0.5)
     amplifier.listen(events.append)
     await amplifier.open()
     try:
         await amplifier.arm(2.0)
         virtual.far.station.befall(Episode("arc"))
-        await eventually(lambda: virtual.far.station.status().state is State.FAULT)
+        await eventually(lambda: virtual.far.station.status().state is AmplifierState.FAULT)
         await amplifier.clear()
-        await eventually(lambda: Event(State.SWITCH_ON_DISABLED, Fault.NONE) in events)
+        await eventually(
+            lambda: AmplifierEvent(AmplifierState.SWITCH_ON_DISABLED, Fault.NONE) in events
+        )
         assert events == [
-            Event(State.OPERATION_ENABLED, Fault.NONE),
-            Event(State.FAULT_REACTION_ACTIVE, Fault.ARC),
-            Event(State.FAULT, Fault.ARC),
-            Event(State.SWITCH_ON_DISABLED, Fault.NONE),
+            AmplifierEvent(AmplifierState.OPERATION_ENABLED, Fault.NONE),
+            AmplifierEvent(AmplifierState.FAULT_REACTION_ACTIVE, Fault.ARC),
+            AmplifierEvent(AmplifierState.FAULT, Fault.ARC),
+            AmplifierEvent(AmplifierState.SWITCH_ON_DISABLED, Fault.NONE),
         ]
     finally:
         await amplifier.close()
@@ -615,7 +619,7 @@ async def test_a_late_answer_is_nobody_s(virtual: Virtual) -> None:
     await amplifier.open()
     try:
         await amplifier.arm(2.0)
-        before = backend.counters.foreign
+        before = backend.counters.unexpected_frames
         virtual.gateway.listening = False  # the amplifier hears nothing, so no answer is its own
         safe = tones(amplifier, 0.3)
         asking = asyncio.create_task(backend.exchange(Apply(safe), timeout=PATIENCE))
@@ -628,7 +632,7 @@ async def test_a_late_answer_is_nobody_s(virtual: Virtual) -> None:
         ):
             answer = bytes([number, action | 8, 4, 255, named, 0, 0, 0])
             virtual.gateway.say(CanFrame(0x181, answer))
-        await eventually(lambda: backend.counters.foreign == before + 3)
+        await eventually(lambda: backend.counters.unexpected_frames == before + 3)
         assert not asking.done()
         virtual.gateway.say(CanFrame(0x181, bytes([sequence, 1 | 8, 4, 255, token, 0, 0, 0])))
         assert (await asking).token == token
@@ -667,7 +671,7 @@ async def test_a_flooded_bus_is_borne(virtual: Virtual) -> None:
             virtual.gateway.say(CanFrame(0x581, bytes(8)))
         safe = tones(amplifier, 0.3)
         assert (await amplifier.apply(safe)).token == safe.token
-        assert backend.counters.bad >= 3000
+        assert backend.counters.crc_errors >= 3000
         assert await amplifier.faults() == ()
     finally:
         await amplifier.close()
@@ -689,7 +693,7 @@ async def test_a_ping_is_two_frames_and_an_unarmed_one_is_answered(virtual: Virt
         sent = backend.counters.frames_out
         reply = await backend.exchange(Ping(), timeout=1.0)
         assert backend.counters.frames_out == sent + 2
-        assert reply.state is State.SWITCH_ON_DISABLED  # type: ignore[union-attr]
+        assert reply.state is AmplifierState.SWITCH_ON_DISABLED  # type: ignore[union-attr]
 
 
 @pytest.mark.parametrize("kind", ["socketcand", "slcan", "virtual"])
@@ -741,4 +745,4 @@ async def test_an_adapter_that_takes_no_more_for_a_moment_is_not_lost(
         safe = tones(amplifier, 0.3)
         assert (await amplifier.apply(safe)).token == safe.token
         assert amplifier.statistics.retries >= 1
-        assert not amplifier.lost
+        assert not amplifier.is_lost

@@ -6,7 +6,7 @@ import canopen
 import pytest
 
 from drivers.backends.can_bus.objects import ObjectClient
-from drivers.backends.stand_in import ThreadWorker
+from drivers.backends.hardware import ThreadWorker
 from drivers.errors import LinkTimeout
 
 TIMEOUT = 0.01  # s; of a node that never answers

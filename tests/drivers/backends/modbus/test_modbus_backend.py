@@ -10,24 +10,25 @@ from pymodbus.server import ModbusTcpServer
 from pymodbus.simulator import DataType, SimData, SimDevice
 
 from drivers.amplifier import Amplifier
+from drivers.backends.hardware import HARDWARE_PROVIDER, Adapter, HardwareProvider, Port, Worker
 from drivers.backends.modbus import line as line_of_modbus
 from drivers.backends.modbus.backend import ModbusBackend
 from drivers.backends.modbus.line import modbus_line
-from drivers.backends.stand_in import STAND_IN, Adapter, Port, StandIn, Worker
 from drivers.backends.urls.modbus import ModbusUrl
 from drivers.codec.modbus.exchanges import Read, Write
 from drivers.codec.modbus.timing import ModbusTimes
 from drivers.command import CommandSet
 from drivers.errors import CommandError, FrameError, LinkError, LinkTimeout
-from drivers.guard import SafeCommand
+from drivers.guard import SafeCommandSet
 from drivers.operation.watchdog import check_watchdog
 from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.messages import (
     Achieved,
+    AmplifierEvent,
+    AmplifierState,
     Apply,
     Arm,
     Commit,
-    Event,
     Fault,
     FaultList,
     FaultRecord,
@@ -43,7 +44,6 @@ from drivers.protocol.messages import (
     Reply,
     Request,
     Stage,
-    State,
     Stop,
 )
 from modbus_peer import Peer, peer
@@ -260,7 +260,7 @@ async def test_a_late_answer_is_not_credited_to_the_next_request(
     for _ in range(3):  # and copies of it later
         status = await backend.exchange(GetStatus(), timeout=PATIENCE)
         assert status == replace(ARMED, token=2)
-    assert backend.counters.foreign == 3
+    assert backend.counters.unexpected_frames == 3
 
 
 async def test_a_late_refusal_is_not_credited_to_the_next_request(
@@ -347,7 +347,7 @@ async def test_an_answer_that_is_none_is_dropped(
         assert not far.is_rtu
         assert place == 5  # a length that is longer swallows the beginning of the next frame
     counters = backend.counters
-    assert counters.bad + counters.foreign >= 1
+    assert counters.crc_errors + counters.unexpected_frames >= 1
     far.answer = lambda request: far.unit.answer(request.pdu)
     assert await backend.exchange(Ping(), timeout=PATIENCE) == ARMED
 
@@ -370,7 +370,7 @@ async def test_an_echo_of_another_write_is_dropped(place: int) -> None:
             await link.transact(None, write, unit=1, timeout=SHORT, accept=lambda _: True)
         with pytest.raises(LinkTimeout):
             await link.transact(None, Write(8, (99,)), unit=1, timeout=SHORT, accept=lambda _: True)
-        assert link.counters.foreign == 2
+        assert link.counters.unexpected_frames == 2
         await link.leave(1)
 
 
@@ -516,24 +516,27 @@ async def test_events_are_what_answers_show_to_have_changed(
     far: Peer, backend: ModbusBackend
 ) -> None:
     """One a change of state or fault, none for the first answer, and none for looking on."""
-    told: list[Event] = []
+    told: list[AmplifierEvent] = []
     backend.listen(told.append, lambda _: None)
     for status in (ARMED, ARMED, TRIPPED, TRIPPED, ARMED):
         far.station.answer = lambda _, status=status: status
         await backend.exchange(GetStatus(), timeout=PATIENCE)
-    assert told == [Event(State.FAULT, Fault.WATCHDOG), Event(State.OPERATION_ENABLED, Fault.NONE)]
+    assert told == [
+        AmplifierEvent(AmplifierState.FAULT, Fault.WATCHDOG),
+        AmplifierEvent(AmplifierState.OPERATION_ENABLED, Fault.NONE),
+    ]
 
 
 async def test_only_what_a_guard_has_seen_is_sent(far: Peer, backend: ModbusBackend) -> None:
     """A plain set is a TypeError, and nothing of it is on the wire."""
     plain = CommandSet(1, SET.commands, 0.0, 0.0)
     for request in (Apply(plain), Stage(plain)):
-        with pytest.raises(TypeError, match="SafeCommand"):
+        with pytest.raises(TypeError, match="SafeCommandSet"):
             await backend.exchange(request, timeout=PATIENCE)
     assert far.requests == []
 
 
-async def test_an_amplifier_stands_on_it(far: Peer, safe: Callable[..., SafeCommand]) -> None:
+async def test_an_amplifier_stands_on_it(far: Peer, safe: Callable[..., SafeCommandSet]) -> None:
     """Open, arm, play, and no answer three times: lost, by the one implementation of all wires."""
     amplifier = Amplifier(ModbusBackend(far.url), reply_timeout=SHORT)
     await amplifier.open()
@@ -543,7 +546,7 @@ async def test_an_amplifier_stands_on_it(far: Peer, safe: Callable[..., SafeComm
     far.answer = lambda _: None
     with pytest.raises(LinkTimeout, match="3 requests in a row"):
         await amplifier.heartbeat()
-    assert amplifier.lost
+    assert amplifier.is_lost
     await amplifier.close()
 
 
@@ -593,7 +596,7 @@ async def test_a_server_that_is_not_ours_understands_the_frames(framer: FramerTy
     assert both.registers == (500, 600, 700, 800)
     assert (await ask(Read(99, 5))).exception == 2
     assert (await ask(Read(0, 100))).registers[9] == 900
-    assert link.counters.bad == link.counters.foreign == 0
+    assert link.counters.crc_errors == link.counters.unexpected_frames == 0
     await link.leave(1)
     await server.shutdown()
 
@@ -627,7 +630,7 @@ async def test_two_amplifiers_of_one_unit_are_refused() -> None:
         await amplifier.close()
 
 
-class _Ports(StandIn):
+class _Ports(HardwareProvider):
     """Ports that only remember how they were opened and closed."""
 
     def __init__(self) -> None:
@@ -668,7 +671,7 @@ class _NotedPort:
 async def test_a_lost_port_is_given_back_before_it_is_opened_again() -> None:
     """Also where only one of two amplifiers on it comes back: the system gives it out once."""
     ports = _Ports()
-    STAND_IN.set(ports)
+    HARDWARE_PROVIDER.set(ports)
     east, west = (ModbusBackend(f"modbus+rtu:///dev/none?baud=115200#{unit}") for unit in (1, 2))
     await east.open()
     await west.open()

@@ -19,7 +19,7 @@ from drivers.backends.urls.serial_line import SerialUrl
 from drivers.codec.serial_line.exchanges import decode_request, encode_reply
 from drivers.codec.serial_line.frame import Frame, FrameReader, encode_frame
 from drivers.errors import CommandError, FrameError, LinkError, LinkTimeout
-from drivers.guard import SafeCommand
+from drivers.guard import SafeCommandSet
 from drivers.protocol.messages import Achieved, GetStatus, Hello, Nak, NakCode, Ping
 from scripted_amplifier import IDENTITY, STATUS, FarEnd, usual_answer
 
@@ -109,7 +109,7 @@ async def test_late_and_foreign_replies_are_dropped(
     assert await backend.exchange(Hello(), timeout=PATIENCE) == IDENTITY
     far_end.answer = lambda request, frame: usual_answer(request)
     assert await backend.exchange(Ping(), timeout=PATIENCE) == STATUS
-    assert backend.counters.foreign == 4
+    assert backend.counters.unexpected_frames == 4
 
 
 async def test_noise_before_a_reply_is_skipped(backend: SerialBackend, far_end: FarEnd) -> None:
@@ -123,7 +123,7 @@ async def test_noise_before_a_reply_is_skipped(backend: SerialBackend, far_end: 
 
     far_end.answer = answer
     assert await backend.exchange(Ping(), timeout=PATIENCE) == STATUS
-    assert backend.counters.bad == 2
+    assert backend.counters.crc_errors == 2
 
 
 async def test_a_wrong_answer_is_the_far_ends_fault(
@@ -158,7 +158,7 @@ async def test_an_unplugged_line_fails_what_waits_and_what_comes(far_end: FarEnd
 
 
 async def test_the_amplifier_over_an_unplugged_line_stays_lost(
-    far_end: FarEnd, safe: Callable[[int], SafeCommand]
+    far_end: FarEnd, safe: Callable[[int], SafeCommandSet]
 ) -> None:
     """An unplugged line is one clear paragraph from every later call."""
     amplifier = Amplifier(SerialBackend(far_end.url), reply_timeout=PATIENCE)
@@ -223,11 +223,11 @@ async def test_cancelling_leaves_the_link_usable(backend: SerialBackend, far_end
     far_end.send(STATUS, far_end.frames[0])
     far_end.answer = lambda request, frame: usual_answer(request)
     assert await backend.exchange(Hello(), timeout=PATIENCE) == IDENTITY
-    assert backend.counters.foreign == 1
+    assert backend.counters.unexpected_frames == 1
 
 
 async def test_a_lost_reply_is_asked_for_again_over_the_wire(
-    far_end: FarEnd, safe: Callable[[int], SafeCommand]
+    far_end: FarEnd, safe: Callable[[int], SafeCommandSet]
 ) -> None:
     """The amplifier repeats an apply with the same token under a new sequence number."""
     amplifier = Amplifier(SerialBackend(far_end.url), reply_timeout=0.2)

@@ -125,7 +125,7 @@ async def test_a_server_that_hangs_up_is_a_lost_line(
     redirector.hang_up()
     async with asyncio.timeout(10):
         while True:
-            if amplifier.lost:
+            if amplifier.is_lost:
                 break
             await asyncio.sleep(0.01)
     with pytest.raises(LinkError, match="was lost"):

@@ -11,8 +11,8 @@ from drivers.amplifier import Amplifier
 from drivers.command import CommandSet, DriveCommand
 from drivers.conformance import CHECKS, Check, run_check
 from drivers.errors import CommandRefused
-from drivers.guard import Guard, GuardLimits, SafeCommand
-from drivers.protocol.messages import Event, Fault, State
+from drivers.guard import Guard, GuardLimits, SafeCommandSet
+from drivers.protocol.messages import AmplifierEvent, AmplifierState, Fault
 from drivers.registry import open_backend
 from vendor_can import VendorAmplifier
 
@@ -36,7 +36,7 @@ async def amplifier(vendor: str) -> AsyncIterator[Amplifier]:
     await amplifier.close()
 
 
-def tones(amplifier: Amplifier, token: int, level: float, *, ramp: float = 0.0) -> SafeCommand:
+def tones(amplifier: Amplifier, token: int, level: float, *, ramp: float = 0.0) -> SafeCommandSet:
     """A set on two channels."""
     guard = Guard(GuardLimits(40.0, 500.0, 1.0), amplifier.capabilities)
     commands = (DriveCommand(0, 110.0, level), DriveCommand(3, 250.5, level / 2, 90.0))
@@ -50,7 +50,7 @@ async def test_it_is_identified(amplifier: Amplifier) -> None:
     assert (identity.serial_number, identity.firmware) == ("EL-0042", "0.1")
     assert (capabilities.channels, capabilities.frequency_min) == (4, 20.0)
     assert (capabilities.frequency_max, capabilities.envelope_knots) == (600.0, 0)
-    assert (await amplifier.status()).state is State.SWITCH_ON_DISABLED
+    assert (await amplifier.status()).state is AmplifierState.SWITCH_ON_DISABLED
 
 
 async def test_it_plays_and_stops(amplifier: Amplifier) -> None:
@@ -58,7 +58,7 @@ async def test_it_plays_and_stops(amplifier: Amplifier) -> None:
     after each; what was asked in the wrong state is refused."""
     with pytest.raises(CommandRefused, match="not armed"):
         await amplifier.apply(tones(amplifier, 1, 0.5))
-    assert (await amplifier.arm(2.0)).state is State.OPERATION_ENABLED
+    assert (await amplifier.arm(2.0)).state is AmplifierState.OPERATION_ENABLED
     achieved = await amplifier.stage(tones(amplifier, 7, 0.5))
     assert [command.phase for command in achieved.commands] == [0.0, 90.0]
     assert not any((await amplifier.heartbeat()).levels)
@@ -70,27 +70,29 @@ async def test_it_plays_and_stops(amplifier: Amplifier) -> None:
     await amplifier.stage(tones(amplifier, 9, 0.4))
     await amplifier.commit_on_bus(9)
     assert (await amplifier.status()).token == 9
-    assert (await amplifier.stop(0.0)).state is State.QUICK_STOP_ACTIVE
+    assert (await amplifier.stop(0.0)).state is AmplifierState.QUICK_STOP_ACTIVE
     assert not any((await amplifier.status()).levels)
     with pytest.raises(CommandRefused, match="stopped"):
         await amplifier.arm(2.0)
-    assert (await amplifier.clear()).state is State.SWITCH_ON_DISABLED
+    assert (await amplifier.clear()).state is AmplifierState.SWITCH_ON_DISABLED
 
 
 async def test_its_watchdog_is_told_by_an_emergency(amplifier: Amplifier) -> None:
     """Nobody beats: a latched fault, which the host hears of unasked."""
     came = asyncio.Event()
     amplifier.listen(
-        lambda told: came.set() if told == Event(State.FAULT, Fault.WATCHDOG) else None
+        lambda told: (
+            came.set() if told == AmplifierEvent(AmplifierState.FAULT, Fault.WATCHDOG) else None
+        )
     )
     await amplifier.arm(0.1)
     await amplifier.apply(tones(amplifier, 1, 0.5))
     async with asyncio.timeout(10):
         await came.wait()
     status = await amplifier.status()
-    assert (status.state, status.fault) == (State.FAULT, Fault.WATCHDOG)
+    assert (status.state, status.fault) == (AmplifierState.FAULT, Fault.WATCHDOG)
     assert [record.fault for record in await amplifier.faults()] == [Fault.WATCHDOG]
-    assert (await amplifier.clear()).state is State.SWITCH_ON_DISABLED
+    assert (await amplifier.clear()).state is AmplifierState.SWITCH_ON_DISABLED
 
 
 @pytest.mark.parametrize("check", CHECKS, ids=lambda check: check.name)

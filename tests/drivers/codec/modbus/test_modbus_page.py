@@ -6,8 +6,8 @@ import pytest
 
 import drivers
 from drivers.codec.modbus import exchanges
+from drivers.codec.modbus.adu import RequestAdu, ResponseReader, build_adu
 from drivers.codec.modbus.exchanges import Exchange, Read, Write
-from drivers.codec.modbus.telegrams import AnswerReader, Telegram, make_telegram
 from drivers.command import CommandSet, Envelope
 from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.messages import Apply, Commit, LoadEnvelope, Nak, Ping, Request, Stage, Stop
@@ -49,10 +49,10 @@ def exchange_of(name: str, number: int) -> Exchange:
 
 def telegram(
     read: Read | None, write: Write | None, number: int, wire: str, unit: int = 1
-) -> Telegram:
+) -> RequestAdu:
     """What the host sends; number: of the transaction, where there is one."""
     is_rtu = wire == "RTU"
-    return make_telegram(read, write, unit=unit, transaction=0 if is_rtu else number, is_rtu=is_rtu)
+    return build_adu(read, write, unit=unit, transaction=0 if is_rtu else number, is_rtu=is_rtu)
 
 
 def answered(station: ScriptedStation, name: str, wire: str) -> bytes:
@@ -99,7 +99,7 @@ def test_the_host_understands_the_reply(name: str, number: int, wire: str) -> No
     """The frame, coming byte by byte, becomes the message that the page speaks of."""
     exchange, example = exchange_of(name, number), EXAMPLES[name]
     sent = telegram(exchange.read, exchange.write, number, wire)
-    reader = AnswerReader(is_rtu=wire == "RTU", counters=WireCounters())
+    reader = ResponseReader(is_rtu=wire == "RTU", counters=WireCounters())
     data = FRAMES[f"{name} reply, {wire}"]
     (answer,) = [one for byte in data for one in reader.feed(bytes([byte]), sent)]
     if isinstance(example.reply, Nak):
@@ -132,7 +132,7 @@ def test_the_reason_of_a_refusal_can_be_read(wire: str) -> None:
     assert sent.frame == FRAMES[f"Refusal request, {wire}"]
     pdu = unit.answer(pdu_of(sent.frame, wire))
     assert pdu == pdu_of(FRAMES[f"Refusal reply, {wire}"], wire)
-    reader = AnswerReader(is_rtu=wire == "RTU", counters=WireCounters())
+    reader = ResponseReader(is_rtu=wire == "RTU", counters=WireCounters())
     (answer,) = reader.feed(FRAMES[f"Refusal reply, {wire}"], sent)
     assert exchanges.decode_refusal(answer.registers, tag=number) == EXAMPLES[name].reply
     assert exchanges.decode_refusal(answer.registers, tag=number - 1) is None
@@ -151,7 +151,7 @@ def test_without_function_23_it_takes_two(wire: str) -> None:
         assert sent.frame == FRAMES[f"{name} request, {wire}"]
         pdu = unit.answer(pdu_of(sent.frame, wire))
         assert pdu == pdu_of(FRAMES[f"{name} reply, {wire}"], wire)
-        reader = AnswerReader(is_rtu=wire == "RTU", counters=WireCounters())
+        reader = ResponseReader(is_rtu=wire == "RTU", counters=WireCounters())
         (answer,) = reader.feed(FRAMES[f"{name} reply, {wire}"], sent)
     assert exchanges.is_of(answer.registers, tag=20)
     assert exchanges.decode_reply(example.request, answer.registers) == example.reply

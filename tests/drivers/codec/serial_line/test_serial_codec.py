@@ -21,17 +21,18 @@ from drivers.codec.serial_line.exchanges import (
 from drivers.codec.serial_line.frame import REPLY, Frame
 from drivers.command import CommandSet, DriveCommand, Envelope, Knot
 from drivers.errors import CommandError
-from drivers.guard import Guard, GuardLimits, SafeCommand
+from drivers.guard import Guard, GuardLimits, SafeCommandSet
 from drivers.protocol.definition import PROTOCOL, Quantity
 from drivers.protocol.messages import (
     Achieved,
+    AmplifierEvent,
+    AmplifierState,
     Apply,
     Arm,
     Capabilities,
     Clear,
     Commit,
     Disarm,
-    Event,
     Fault,
     FaultList,
     FaultRecord,
@@ -48,7 +49,6 @@ from drivers.protocol.messages import (
     Reply,
     Request,
     Stage,
-    State,
     Status,
     Stop,
 )
@@ -111,7 +111,7 @@ REQUESTS = st.one_of(
 ACHIEVED = st.builds(Achieved, token=st.integers(1, 65535), commands=COMMANDS)
 STATUSES = st.builds(
     Status,
-    state=st.sampled_from(State),
+    state=st.sampled_from(AmplifierState),
     fault=st.sampled_from(Fault),
     token=st.integers(0, 65535),
     high_voltage=st.booleans(),
@@ -209,7 +209,7 @@ GOLDEN_REPLIES: list[tuple[Reply, int, int, str]] = [
         "04 d007 60ea 0100 1027 0100 0100 e803 6400 d007 20 10 0a00 e803 01",
     ),
     (
-        Status(State.FAULT, Fault.WATCHDOG, 513, True, -2.5, 0.1, (0.0, 0.5), 1800.0),
+        Status(AmplifierState.FAULT, Fault.WATCHDOG, 513, True, -2.5, 0.1, (0.0, 0.5), 1800.0),
         9,
         0x89,
         "07 01 0102 01 e7ff 6400 0807 02 0000 8813",
@@ -273,7 +273,7 @@ def test_an_envelope_is_these_bytes() -> None:
 
 def test_an_event_is_these_bytes() -> None:
     """State, fault and channel under type 30 with the reply bit; no request has that type."""
-    event = Event(State.FAULT, Fault.ARC, 2)
+    event = AmplifierEvent(AmplifierState.FAULT, Fault.ARC, 2)
     frame = Frame(kind=0x9E, address=1, sequence=4, payload=bytes.fromhex("07 04 02"))
     assert encode_event(event, address=1, sequence=4) == frame
     assert is_event(frame)
@@ -404,9 +404,9 @@ def test_a_channel_named_twice_is_malformed() -> None:
 @pytest.mark.parametrize("wrap", [Stage, Apply])
 def test_only_guarded_sets_are_encoded(wrap: Callable[[CommandSet], Request]) -> None:
     """A plain CommandSet is refused by the encoder, whatever it holds."""
-    with pytest.raises(TypeError, match="SafeCommand"):
+    with pytest.raises(TypeError, match="SafeCommandSet"):
         encode_request(wrap(SET), address=1, sequence=1)
-    assert type(GUARD.check(SET)) is SafeCommand
+    assert type(GUARD.check(SET)) is SafeCommandSet
 
 
 @pytest.mark.parametrize(
@@ -442,7 +442,7 @@ def test_malformed_replies_say_what_is_wrong(asked: Request, payload: str, probl
 def test_a_reply_to_another_type_is_malformed() -> None:
     """A Status in answer to a Commit is no answer, and neither is a refusal of a Ping."""
     request = Frame(kind=6, address=1, sequence=1, payload=b"\1\0")
-    status = Status(State.FAULT, Fault.ARC, 0, False, 25.0, 0.0, ())
+    status = Status(AmplifierState.FAULT, Fault.ARC, 0, False, 25.0, 0.0, ())
     ping = Frame(kind=12, address=1, sequence=1, payload=b"")
     for reply in (status, Nak(NakCode.BUSY)):
         with pytest.raises(Malformed, match="answered"):
@@ -482,10 +482,10 @@ def test_quantities_round_and_wrap() -> None:
 
 @pytest.mark.parametrize(
     ("enum", "listed"),
-    [(State, PROTOCOL.states), (Fault, PROTOCOL.faults), (NakCode, PROTOCOL.naks)],
+    [(AmplifierState, PROTOCOL.states), (Fault, PROTOCOL.faults), (NakCode, PROTOCOL.naks)],
 )
 def test_numbers_are_those_of_the_definition(
-    enum: type[State] | type[Fault] | type[NakCode], listed: dict[str, int]
+    enum: type[AmplifierState] | type[Fault] | type[NakCode], listed: dict[str, int]
 ) -> None:
     """States, faults and refusals have the numbers of protocol.yaml, none more and none less."""
     assert {member.name: member.value for member in enum} == listed

@@ -11,13 +11,14 @@ from drivers.guard import Guard, GuardLimits
 from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.messages import (
     Achieved,
+    AmplifierEvent,
+    AmplifierState,
     Apply,
     Arm,
     Capabilities,
     Clear,
     Commit,
     Disarm,
-    Event,
     Fault,
     FaultList,
     FaultRecord,
@@ -34,7 +35,6 @@ from drivers.protocol.messages import (
     Reply,
     Request,
     Stage,
-    State,
     Status,
     Stop,
 )
@@ -57,16 +57,27 @@ SHAPE = GUARD.check_envelope(Envelope(slot=5, step=0.005, knots=(Knot(0.1, 90), 
 GUARD.check_envelope(Envelope(slot=6, step=0.005, knots=(Knot(0.1, 0.0),)))
 SHAPED_COMMANDS = (DriveCommand(0, 110.0, 0.2, onset=5, ending=6),)
 SHAPED = GUARD.check(CommandSet(514, SHAPED_COMMANDS, ramp=0.0, valid_for=0.0))
-OFF = Status(State.SWITCH_ON_DISABLED, Fault.NONE, 0, False, 25.0, 0.0, (0.0,) * 4)
-ARMED = Status(State.OPERATION_ENABLED, Fault.NONE, 0, True, 25.0, 0.25, (0.0,) * 4, 1800.0)
+OFF = Status(AmplifierState.SWITCH_ON_DISABLED, Fault.NONE, 0, False, 25.0, 0.0, (0.0,) * 4)
+ARMED = Status(
+    AmplifierState.OPERATION_ENABLED, Fault.NONE, 0, True, 25.0, 0.25, (0.0,) * 4, 1800.0
+)
 PLAYING = Status(
-    State.OPERATION_ENABLED, Fault.NONE, 513, True, 25.0, 0.25, (0.2, 0.0, 0.0, 1.0), 1800.0
+    AmplifierState.OPERATION_ENABLED,
+    Fault.NONE,
+    513,
+    True,
+    25.0,
+    0.25,
+    (0.2, 0.0, 0.0, 1.0),
+    1800.0,
 )
-FADING = Status(State.SWITCHED_ON, Fault.NONE, 513, True, 25.0, 0.0, (0.2, 0.0, 0.0, 1.0), 1800.0)
+FADING = Status(
+    AmplifierState.SWITCHED_ON, Fault.NONE, 513, True, 25.0, 0.0, (0.2, 0.0, 0.0, 1.0), 1800.0
+)
 STOPPED = Status(
-    State.QUICK_STOP_ACTIVE, Fault.NONE, 513, True, 25.0, 0.0, (0.2, 0.0, 0.0, 1.0), 1800.0
+    AmplifierState.QUICK_STOP_ACTIVE, Fault.NONE, 513, True, 25.0, 0.0, (0.2, 0.0, 0.0, 1.0), 1800.0
 )
-TRIPPED = Status(State.FAULT, Fault.WATCHDOG, 513, False, 25.0, 0.0, (0.0,) * 4)
+TRIPPED = Status(AmplifierState.FAULT, Fault.WATCHDOG, 513, False, 25.0, 0.0, (0.0,) * 4)
 
 EXCHANGES: dict[str, tuple[Request, Reply]] = {
     "Hello": (Hello(), Identity("Acme", "Quad", "A-17", "1.2", 1)),
@@ -103,7 +114,7 @@ def made(name: str) -> tuple[str, str]:
 def test_every_message_has_an_example() -> None:
     """The page shows a request and a reply for every message, and nothing else."""
     names = {f"{name} {part}" for name in EXCHANGES for part in ("request", "reply")}
-    assert set(EXAMPLES) == names | {"Event"}
+    assert set(EXAMPLES) == names | {"AmplifierEvent"}
     assert {type(request) for request, _ in EXCHANGES.values()} == set(Request.__args__)
 
 
@@ -115,9 +126,9 @@ def test_examples_are_what_the_codec_makes(name: str) -> None:
 
 def test_the_example_of_an_event_is_what_the_codec_makes() -> None:
     """The one frame that answers nothing: address 1, the fourth event."""
-    event = Event(State.FAULT_REACTION_ACTIVE, Fault.ARC, 2)
+    event = AmplifierEvent(AmplifierState.FAULT_REACTION_ACTIVE, Fault.ARC, 2)
     frame = encode_event(event, address=1, sequence=4)
-    assert EXAMPLES["Event"] == encode_frame(frame).hex(" ").upper()
+    assert EXAMPLES["AmplifierEvent"] == encode_frame(frame).hex(" ").upper()
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ import pytest
 
 import drivers
 from drivers.backends.urls.can_bus import CanUrl
-from drivers.protocol.messages import Fault, State
+from drivers.protocol.messages import AmplifierState, Fault
 from model.rig.rig import Rig
 from sim.far_ends.wires import Wire
 from wires import far_side
@@ -83,6 +83,9 @@ async def test_a_master_of_others_drives_it(coarse_rig: Rig) -> None:
                 ):
                     await asyncio.sleep(0.01)
             assert await waiting == (0x8130, 0x11)
-            assert far.amplifier.state in (State.FAULT_REACTION_ACTIVE, State.FAULT)
+            assert far.amplifier.state in (
+                AmplifierState.FAULT_REACTION_ACTIVE,
+                AmplifierState.FAULT,
+            )
         finally:
             await asyncio.to_thread(master.close)

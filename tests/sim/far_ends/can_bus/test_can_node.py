@@ -8,7 +8,7 @@ import pytest
 from can_fuzz import Station
 from can_session import Timers
 from drivers.codec.can_bus.frame import CanFrame
-from drivers.protocol.messages import Fault, Ping, State
+from drivers.protocol.messages import AmplifierState, Fault, Ping
 from sim.far_ends.can_bus.node import CanNode
 
 ORDER, ANSWER, SYNC = 0x481, 0x181, CanFrame(0x080, b"")
@@ -42,7 +42,7 @@ class Bench:
         return self.sync().data[1] >> 4
 
     @property
-    def state(self) -> State:
+    def state(self) -> AmplifierState:
         """Of the amplifier."""
         return self.station.amplifier.state
 
@@ -58,7 +58,7 @@ def bench() -> Bench:
     bench = Bench()
     bench.tell(0x000, "01 01")
     bench.tell(ORDER, "7F00 0000 FA00 04 01")
-    assert bench.state is State.OPERATION_ENABLED
+    assert bench.state is AmplifierState.OPERATION_ENABLED
     return bench
 
 
@@ -77,7 +77,7 @@ def test_before_it_is_started_it_takes_no_orders() -> None:
     bench = Bench()
     assert bench.said == [CanFrame(0x701, b"\x00")]
     assert bench.tell(ORDER, "7F00 0000 FA00 04 01") == []
-    assert bench.state is State.SWITCH_ON_DISABLED
+    assert bench.state is AmplifierState.SWITCH_ON_DISABLED
     assert len(bench.tell(0x601, "40 00 10 00 00000000")) == 1
     bench.tell(0x000, "01 02")  # somebody else
     assert bench.tell(ORDER, "7F00 0000 FA00 04 01") == []
@@ -180,19 +180,19 @@ def test_a_broadcast_plays_what_its_token_names(bench: Bench) -> None:
         assert bench.tell(SYNC.id, "") == []
         assert bench.levels[0] == pytest.approx(level)
     bench.tell(0x480, "0000 0000 0000 06 00")
-    assert bench.state is State.QUICK_STOP_ACTIVE
+    assert bench.state is AmplifierState.QUICK_STOP_ACTIVE
 
 
 @pytest.mark.parametrize(
     ("id", "order", "state"),
     [
-        (ORDER, "0000 FFFF 0000 06 02", State.QUICK_STOP_ACTIVE),
-        (ORDER, "0000 FFFF 0000 05 02", State.SWITCHED_ON),
-        (0x480, "0000 FFFF 0000 06 00", State.QUICK_STOP_ACTIVE),
+        (ORDER, "0000 FFFF 0000 06 02", AmplifierState.QUICK_STOP_ACTIVE),
+        (ORDER, "0000 FFFF 0000 05 02", AmplifierState.SWITCHED_ON),
+        (0x480, "0000 FFFF 0000 06 00", AmplifierState.QUICK_STOP_ACTIVE),
     ],
 )
 def test_silence_is_never_refused_for_its_ramp(
-    bench: Bench, id: int, order: str, state: State
+    bench: Bench, id: int, order: str, state: AmplifierState
 ) -> None:
     """A stop, a disarm and a broadcast stop along 65.5 s are carried out along the longest ramp."""
     bench.tell(0x201, command(0, 1))
@@ -212,7 +212,7 @@ def test_the_host_s_heartbeat_feeds_and_no_other_does(bench: Bench) -> None:
     bench.station.pass_time(0.2)
     bench.tell(0x77F, "05")
     bench.station.pass_time(0.2)
-    assert bench.state is State.OPERATION_ENABLED
+    assert bench.state is AmplifierState.OPERATION_ENABLED
     bench.tell(ORDER, "0000 0000 0000 00 05")
     bench.station.pass_time(0.051)
     assert bench.station.amplifier.fault is Fault.WATCHDOG
@@ -225,7 +225,7 @@ def test_out_of_operation_it_is_stopped(bench: Bench, nmt: str) -> None:
     bench.tell(ORDER, apply(9, 1, 2))
     bench.sync()
     bench.tell(0x000, nmt)
-    assert bench.state is State.QUICK_STOP_ACTIVE
+    assert bench.state is AmplifierState.QUICK_STOP_ACTIVE
     bench.station.pass_time(0.005)
     assert not any(bench.levels)
     assert bench.tell(ORDER, "0000 0000 0000 00 05") == []
@@ -246,7 +246,7 @@ def test_a_reset_node_has_lost_everything(bench: Bench) -> None:
     bench.tell(ORDER, apply(9, 1, 2))
     bench.sync()
     assert bench.tell(0x000, "81 01")[-1] == CanFrame(0x701, b"\x00")
-    assert bench.state is State.SWITCH_ON_DISABLED
+    assert bench.state is AmplifierState.SWITCH_ON_DISABLED
     assert not any(bench.levels)
     assert bench.tell(0x601, "40 16 10 01 00000000")[0].data[4:] == bytes(4)
 

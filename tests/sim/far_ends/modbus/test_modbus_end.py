@@ -16,7 +16,7 @@ from pymodbus.client import AsyncModbusTcpClient
 
 from drivers.errors import LinkError
 from drivers.protocol.definition import PROTOCOL
-from drivers.protocol.messages import Commit, Fault, NakCode, Ping, State, Stop
+from drivers.protocol.messages import AmplifierState, Commit, Fault, NakCode, Ping, Stop
 from modbus_session import EXAMPLES, ScriptedStation
 from model.rig.file import example_rig_path
 from model.rig.rig import Rig
@@ -300,7 +300,7 @@ async def test_what_cannot_be_read_back_is_not_written(tcp: FarSide, read: str) 
     pdu = bytes.fromhex(f"17 {read} 00 02 00 03 06 00 0F 00 FA 00 00")  # and ARM
     master.send(struct.pack(">HHHB", 5, 0, len(pdu) + 1, 1) + pdu)
     assert (await master.receive(9))[7] == 0x97
-    assert tcp.amplifier.state is State.SWITCH_ON_DISABLED
+    assert tcp.amplifier.state is AmplifierState.SWITCH_ON_DISABLED
     await master.close()
 
 
@@ -324,7 +324,7 @@ async def test_an_exception_does_not_feed_the_watchdog(tcp: FarSide) -> None:
     await client.write_registers(2, [MAP["controlwords"]["ARM"], 100, 0], device_id=1)
     armed = time.monotonic()
     refused = 0
-    while tcp.amplifier.state is State.OPERATION_ENABLED and time.monotonic() < armed + 5:
+    while tcp.amplifier.state is AmplifierState.OPERATION_ENABLED and time.monotonic() < armed + 5:
         for address, words in ((16, [999]), (2, [7]), (1002, [4])):
             refused += (await client.write_registers(address, words, device_id=1)).isError()
         await client.read_input_registers(STATUS, count=26, device_id=1)
@@ -378,7 +378,7 @@ async def test_pymodbus_plays_a_set(tcp: FarSide) -> None:
     assert both.registers == [513, 4, *channels]
     status = await client.read_input_registers(STATUS, count=14, device_id=1)
     assert status.registers[0] == 4711
-    assert status.registers[2:5] == [State.OPERATION_ENABLED, Fault.NONE, 513]
+    assert status.registers[2:5] == [AmplifierState.OPERATION_ENABLED, Fault.NONE, 513]
     assert status.registers[10:] == [2000, 0, 0, 10000]
     played = tcp.amplifier.outputs[3][0]
     assert (played.frequency, played.start) == (250.5, tcp.amplifier.outputs[0][0].start)
@@ -387,7 +387,7 @@ async def test_pymodbus_plays_a_set(tcp: FarSide) -> None:
     await client.write_register(2, MAP["controlwords"]["STOP"], device_id=1)
     await asyncio.sleep(0.01)
     status = await client.read_input_registers(STATUS, count=14, device_id=1)
-    assert status.registers[2] == State.QUICK_STOP_ACTIVE
+    assert status.registers[2] == AmplifierState.QUICK_STOP_ACTIVE
     assert status.registers[10:] == [0, 0, 0, 0]
     client.close()
 
@@ -407,7 +407,7 @@ async def test_pymodbus_is_told_why(tcp: FarSide) -> None:
 async def test_minimalmodbus_plays_a_set(rtu: FarSide) -> None:
     """A master that is not ours drives the amplifier over the serial line, register by register."""
     await asyncio.to_thread(play_with_minimalmodbus, rtu.url)
-    assert rtu.amplifier.state is State.SWITCH_ON_DISABLED
+    assert rtu.amplifier.state is AmplifierState.SWITCH_ON_DISABLED
     assert rtu.amplifier.fault is Fault.NONE
 
 
@@ -432,7 +432,7 @@ def play_with_minimalmodbus(url: str) -> None:
         assert master.read_register(1034, functioncode=4) == NakCode.BAD_TOKEN
         master.write_register(2, MAP["controlwords"]["DISARM"], functioncode=6)
         time.sleep(0.02)
-        assert master.read_register(1002, functioncode=4) == State.SWITCH_ON_DISABLED
+        assert master.read_register(1002, functioncode=4) == AmplifierState.SWITCH_ON_DISABLED
     finally:
         master.serial.close()
 

@@ -2,7 +2,7 @@
 
 Its frames and messages are used, its client is not: over RTU that gives a late answer to the next
 request, a damaged answer makes it close a TCP connection, and what has half arrived is thrown away
-when the next request goes out. So what comes in is taken apart here; see `AnswerReader`.
+when the next request goes out. So what comes in is taken apart here; see `ResponseReader`.
 """
 
 from dataclasses import dataclass
@@ -32,7 +32,7 @@ _WRITES = (5, 6, 15, 16)
 
 
 @dataclass(frozen=True)
-class Telegram:
+class RequestAdu:
     """A request for one unit: its frame, and by what its answer is known.
 
     transaction: of a TCP frame, 0 for RTU; answer_size: of the PDU, in bytes.
@@ -48,23 +48,23 @@ class Telegram:
 
 
 @dataclass(frozen=True)
-class Answer:
+class ModbusResponse:
     """What came back: the registers that were read, or the code of an exception."""
 
     registers: tuple[int, ...] = ()
     exception: int = 0
 
 
-def make_telegram(
+def build_adu(
     read: Read | None, write: Write | None, *, unit: int, transaction: int, is_rtu: bool
-) -> Telegram:
+) -> RequestAdu:
     """The frame that writes, reads, or does both in one transaction; one of the two is given."""
     pdu = _pdu(read, write)
     pdu.dev_id = unit
     pdu.transaction_id = transaction
     frame = (_RTU if is_rtu else _TCP).buildFrame(pdu)
     size = 5 if read is None else 2 + 2 * read.count
-    return Telegram(unit, transaction, pdu.function_code, frame, size, read, write)
+    return RequestAdu(unit, transaction, pdu.function_code, frame, size, read, write)
 
 
 def _pdu(read: Read | None, write: Write | None) -> ModbusPDU:
@@ -84,7 +84,7 @@ def _pdu(read: Read | None, write: Write | None) -> ModbusPDU:
     return WriteMultipleRegistersRequest(address=write.address, registers=registers)
 
 
-class AnswerReader:
+class ResponseReader:
     """Finds the answer to a telegram in whatever arrives, and counts what is something else.
 
     An answer has the unit, the function and the length that were asked for, over TCP the
@@ -99,10 +99,10 @@ class AnswerReader:
     def clear(self) -> None:
         """Forget what has half arrived."""
         if self._buffer:
-            self._counters.bad += 1
+            self._counters.crc_errors += 1
             self._buffer.clear()
 
-    def feed(self, data: bytes, to: Telegram | None) -> list[Answer]:
+    def feed(self, data: bytes, to: RequestAdu | None) -> list[ModbusResponse]:
         """The answers to a telegram in these bytes; to: None where nothing was asked."""
         self._buffer += data
         split = self._next_rtu if self._is_rtu else self._next_tcp
@@ -114,12 +114,12 @@ class AnswerReader:
             if to is not None and (transaction, unit) == (to.transaction, to.unit):
                 answer = _answer(pdu, to)
             if answer is None:
-                self._counters.foreign += 1
+                self._counters.unexpected_frames += 1
             else:
                 answers.append(answer)
         return answers
 
-    def _next_tcp(self, to: Telegram | None) -> tuple[int, int, bytes] | None:
+    def _next_tcp(self, to: RequestAdu | None) -> tuple[int, int, bytes] | None:
         if len(self._buffer) < _MBAP:
             return None
         transaction, protocol, length = (
@@ -135,20 +135,20 @@ class AnswerReader:
         del self._buffer[:end]
         return transaction, unit, pdu
 
-    def _next_rtu(self, to: Telegram | None) -> tuple[int, int, bytes] | None:
+    def _next_rtu(self, to: RequestAdu | None) -> tuple[int, int, bytes] | None:
         for start in range(len(self._buffer) - 4):
             size = self._rtu_size(start, to)
             if size and start + size <= len(self._buffer):
                 frame = bytes(self._buffer[start : start + size])
                 if FramerRTU.check_CRC(frame[:-2], int.from_bytes(frame[-2:], "big")):
-                    self._counters.bad += start > 0
+                    self._counters.crc_errors += start > 0
                     del self._buffer[: start + size]
                     return 0, frame[0], frame[1:-2]
         if len(self._buffer) > 2 * _RTU_MAX:
             self.clear()
         return None
 
-    def _rtu_size(self, start: int, to: Telegram | None) -> int:
+    def _rtu_size(self, start: int, to: RequestAdu | None) -> int:
         """How long a frame would be that begins here; 0 where none can.
 
         After bytes that are none of a frame only the answer itself is looked for: anything may look
@@ -165,7 +165,7 @@ class AnswerReader:
         return 8 if function in _WRITES else 0
 
 
-def _answer(pdu: bytes, to: Telegram) -> Answer | None:
+def _answer(pdu: bytes, to: RequestAdu) -> ModbusResponse | None:
     """What a PDU answers to a telegram, if it does."""
     if not _has_form(pdu, to):
         return None
@@ -176,17 +176,17 @@ def _answer(pdu: bytes, to: Telegram) -> Answer | None:
     if message is None:
         return None
     if isinstance(message, ExceptionResponse):
-        return Answer(exception=message.exception_code)
+        return ModbusResponse(exception=message.exception_code)
     if to.read is not None:
-        return Answer(tuple(message.registers))
+        return ModbusResponse(tuple(message.registers))
     assert to.write is not None  # noqa: S101  one of the two
     wanted = to.write.registers
     echo = tuple(message.registers) if len(wanted) == 1 else message.count
     is_echo = echo == (wanted if len(wanted) == 1 else len(wanted))
-    return Answer() if is_echo and message.address == to.write.address else None
+    return ModbusResponse() if is_echo and message.address == to.write.address else None
 
 
-def _has_form(pdu: bytes, to: Telegram) -> bool:
+def _has_form(pdu: bytes, to: RequestAdu) -> bool:
     """Whether function and lengths are those of an answer, or of an exception."""
     if pdu[0] == to.function | _EXCEPTION:
         return len(pdu) == 2

@@ -4,10 +4,10 @@ import asyncio
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from drivers.backends.stand_in import number_below
+from drivers.backends.hardware import number_below
 from drivers.backends.waiting import reply_within
-from drivers.codec.can_bus.answers import Answer
-from drivers.codec.can_bus.orders import SEQUENCE_MAX, Order, action_of
+from drivers.codec.can_bus.replies import CanReply
+from drivers.codec.can_bus.requests import SEQUENCE_MAX, PdoRequest, action_of
 from drivers.errors import LinkError
 from drivers.protocol.messages import Apply, Commit
 
@@ -18,10 +18,10 @@ class _Pending:
 
     action: int
     token: int | None
-    answer: asyncio.Future[Answer]
+    answer: asyncio.Future[CanReply]
 
 
-class PendingOrders:
+class PendingRequests:
     """By their sequence numbers; an answer must also name the action and the token."""
 
     def __init__(self) -> None:
@@ -35,15 +35,15 @@ class PendingOrders:
         return self._sequence
 
     async def answer_to(
-        self, order: Order, *, sequence: int, send: Callable[[], None], timeout: float
-    ) -> Answer:
+        self, order: PdoRequest, *, sequence: int, send: Callable[[], None], timeout: float
+    ) -> CanReply:
         """Send an order under its number and wait so long [s]; LinkError, TimeoutError."""
         token = None
         if isinstance(order, Apply):
             token = order.command_set.token
         elif isinstance(order, Commit):
             token = order.token
-        answer: asyncio.Future[Answer] = asyncio.get_running_loop().create_future()
+        answer: asyncio.Future[CanReply] = asyncio.get_running_loop().create_future()
         self._pending[sequence] = pending = _Pending(action_of(order), token, answer)
         try:
             send()
@@ -52,7 +52,7 @@ class PendingOrders:
             if self._pending.get(sequence) is pending:
                 del self._pending[sequence]
 
-    def take(self, answer: Answer) -> bool:
+    def take(self, answer: CanReply) -> bool:
         """Whether somebody waited for this answer; it is handed over then."""
         pending = self._pending.get(answer.sequence)
         if pending is None or pending.answer.done() or pending.action != answer.action:

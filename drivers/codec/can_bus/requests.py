@@ -27,7 +27,7 @@ from drivers.protocol.messages import (
     Stop,
 )
 
-Order = Apply | Stage | Commit | Arm | Disarm | Stop | Clear | GetStatus | Ping
+PdoRequest = Apply | Stage | Commit | Arm | Disarm | Stop | Clear | GetStatus | Ping
 
 SEQUENCE_MAX = 255
 _Q = PROTOCOL.quantities
@@ -40,7 +40,7 @@ _FILLING = b"\xff"  # a block of these is no command: its level would be out of 
 SYNC = CanFrame(cob_id("sync"), b"")
 
 
-def action_of(order: Order) -> int:
+def action_of(order: PdoRequest) -> int:
     """Which action an order asks for; a Ping asks for the status, its heartbeat goes before it."""
     name = type(order).__name__.lower()
     return _ACTIONS.get(name, _ACTIONS["status"])
@@ -51,8 +51,8 @@ def host_number(node: int) -> int:
     return int(CANOPEN["host_base"]) - node
 
 
-def encode_order(
-    order: Order, *, node: int, sequence: int, fd: bool = False
+def encode_request(
+    order: PdoRequest, *, node: int, sequence: int, fd: bool = False
 ) -> tuple[CanFrame, ...]:
     """The frames of an order to a node; TypeError for a set that has not passed a guard.
 
@@ -111,7 +111,7 @@ def wanted_commands(wanted: CommandSet) -> tuple[DriveCommand, ...]:
 
 
 def _order(
-    order: Order,
+    order: PdoRequest,
     node: int,
     sequence: int,
     *,

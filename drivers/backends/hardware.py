@@ -94,7 +94,7 @@ class ThreadWorker(Worker):
         time.sleep(seconds)
 
 
-class StandIn(ABC):
+class HardwareProvider(ABC):
     """What stands in for the machine."""
 
     @abstractmethod
@@ -122,17 +122,19 @@ class StandIn(ABC):
         """A number from 0 to limit - 1, by chance."""
 
 
-STAND_IN: ContextVar[StandIn | None] = ContextVar("STAND_IN", default=None)
+HARDWARE_PROVIDER: ContextVar[HardwareProvider | None] = ContextVar(
+    "HARDWARE_PROVIDER", default=None
+)
 """Who stands in for the machine in this context; nobody as a rule."""
 
 
 def make_worker(name: str) -> Worker:
     """Somebody for jobs that block; name: of the thread."""
-    stand_in = STAND_IN.get()
+    stand_in = HARDWARE_PROVIDER.get()
     return ThreadWorker(name) if stand_in is None else stand_in.make_worker()
 
 
 def number_below(limit: int) -> int:
     """A number from 0 to limit - 1 that nobody can guess, or that the stand-in has chosen."""
-    stand_in = STAND_IN.get()
+    stand_in = HARDWARE_PROVIDER.get()
     return secrets.randbelow(limit) if stand_in is None else stand_in.below(limit)

@@ -6,20 +6,28 @@ from dataclasses import dataclass, field
 from drivers.codec.can_bus.frame import BLOCK, CANOPEN, LAYOUTS, CanFrame, cob_id
 from drivers.errors import FrameError
 from drivers.protocol.definition import PROTOCOL
-from drivers.protocol.messages import Event, Fault, Nak, NakCode, Reply, State, Status
+from drivers.protocol.messages import (
+    AmplifierEvent,
+    AmplifierState,
+    Fault,
+    Nak,
+    NakCode,
+    Reply,
+    Status,
+)
 
 UNASKED = 0  # the sequence number of what an amplifier says by itself
 _Q = PROTOCOL.quantities
 _ACTIONS: Mapping[str, int] = CANOPEN["actions"]
 _TORN: int = CANOPEN["torn"]
 _NO_CHANNEL: int = CANOPEN["no_channel"]
-_STATES = {state.value: state for state in State}
+_STATES = {state.value: state for state in AmplifierState}
 _FAULTS = {fault.value: fault for fault in Fault}
 _NAKS = {code.value: code for code in NakCode}
 
 
 @dataclass(frozen=True, slots=True)
-class Answer:
+class CanReply:
     """What an amplifier says to an order, or, with sequence 0, by itself.
 
     refusal: None where it was carried out; exact: a set plays to the last step as it was asked for.
@@ -28,7 +36,7 @@ class Answer:
 
     sequence: int
     action: int
-    state: State
+    state: AmplifierState
     fault: Fault
     token: int
     exact: bool
@@ -37,13 +45,13 @@ class Answer:
     status: Status | None
 
     @property
-    def event(self) -> Event:
+    def event(self) -> AmplifierEvent:
         """What it tells where nobody asked."""
-        return Event(self.state, self.fault, self.channel)
+        return AmplifierEvent(self.state, self.fault, self.channel)
 
 
 @dataclass
-class AnswerReader:
+class CanReplyReader:
     """Puts the frames of one amplifier's answers together.
 
     An answer in several frames is whole when the last, the answer itself, has come with the
@@ -65,7 +73,7 @@ class AnswerReader:
             *(cob_id("levels", self.node + group) for group in groups),
         )
 
-    def feed(self, frame: CanFrame) -> Answer | None:
+    def feed(self, frame: CanFrame) -> CanReply | None:
         """Take a frame with one of `ids`; an Answer once it is whole, else None.
 
         Raises FrameError for a frame that makes no sense.
@@ -79,7 +87,7 @@ class AnswerReader:
             self._levels[group] = _unpack("levels", frame.data)
         return None
 
-    def _answer(self, data: bytes) -> Answer | None:
+    def _answer(self, data: bytes) -> CanReply | None:
         if len(data) > BLOCK:  # CAN FD: condition and levels follow in the same frame
             self._condition = _unpack("condition", data[BLOCK : 2 * BLOCK])
             count = min(self._condition["channel_count"], _Q.channel_count.maximum)
@@ -102,7 +110,7 @@ class AnswerReader:
             if status is None:
                 return None
         blamed = None if channel == _NO_CHANNEL else channel
-        return Answer(
+        return CanReply(
             sequence=sequence,
             action=action,
             state=_STATES[values["state"]],
@@ -144,7 +152,7 @@ class AnswerReader:
         )
 
 
-def decode_emergency(data: bytes) -> Event:
+def decode_emergency(data: bytes) -> AmplifierEvent:
     """The event in an EMCY message; raises FrameError."""
     values = _unpack("emergency", data)
     channel = values["channel"]
@@ -154,26 +162,26 @@ def decode_emergency(data: bytes) -> Event:
         or not (channel == _NO_CHANNEL or _Q.channel.holds(channel))
     ):
         raise FrameError(f"an emergency that makes no sense: {data.hex(' ')}")
-    return Event(
+    return AmplifierEvent(
         _STATES[values["state"]],
         _FAULTS[values["fault"]],
         None if channel == _NO_CHANNEL else channel,
     )
 
 
-def plain_reply(answer: Answer) -> Reply | None:
+def plain_reply(answer: CanReply) -> Reply | None:
     """The reply that an answer holds by itself; None where it is about a set that was taken."""
     return answer.refusal or answer.status
 
 
-def _refusal(result: int, state: State, channel: int | None) -> Nak | None:
+def _refusal(result: int, state: AmplifierState, channel: int | None) -> Nak | None:
     if result == 0:
         return None
     if result != _TORN:
         return Nak(_NAKS[result], channel)
     # A frame of the set was lost: the amplifier has done nothing, and can be asked again, unless it
     # says at once that it would refuse the whole set as well.
-    is_armed = state is State.OPERATION_ENABLED
+    is_armed = state is AmplifierState.OPERATION_ENABLED
     return Nak(NakCode.BUSY if is_armed else NakCode.WRONG_STATE, channel)
 
 

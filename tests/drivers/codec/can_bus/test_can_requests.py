@@ -8,7 +8,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.codec.can_bus.answers import AnswerReader, decode_emergency
 from drivers.codec.can_bus.dbc import dbc_text
 from drivers.codec.can_bus.frame import LAYOUTS, CanFrame
 from drivers.codec.can_bus.objects import (
@@ -20,17 +19,19 @@ from drivers.codec.can_bus.objects import (
     unpack_faults,
     unpack_identity,
 )
-from drivers.codec.can_bus.orders import SYNC, encode_broadcast, encode_order, wanted_commands
+from drivers.codec.can_bus.replies import CanReplyReader, decode_emergency
+from drivers.codec.can_bus.requests import SYNC, encode_broadcast, encode_request, wanted_commands
 from drivers.command import CommandSet, DriveCommand, Envelope
 from drivers.errors import FrameError
-from drivers.guard import Guard, GuardLimits, SafeCommand
+from drivers.guard import Guard, GuardLimits, SafeCommandSet
 from drivers.protocol.messages import (
+    AmplifierEvent,
+    AmplifierState,
     Apply,
     Arm,
     Capabilities,
     Commit,
     Disarm,
-    Event,
     Fault,
     FaultRecord,
     LoadEnvelope,
@@ -38,7 +39,6 @@ from drivers.protocol.messages import (
     NakCode,
     Ping,
     Stage,
-    State,
     Status,
     Stop,
 )
@@ -48,7 +48,7 @@ WIDE = Capabilities(
 )
 
 
-def make(channels: int) -> SafeCommand:
+def make(channels: int) -> SafeCommandSet:
     """A set of so many channels, each at its own frequency."""
     commands = tuple(
         DriveCommand(channel, 100.0 + channel, 0.01 * channel) for channel in range(channels)
@@ -60,11 +60,11 @@ def make(channels: int) -> SafeCommand:
 def test_orders_are_these_bytes() -> None:
     """Token, ramp, time, action and count, sequence: each where it belongs."""
     frames = {
-        "arm": encode_order(Arm(0.25), node=3, sequence=1),
-        "disarm": encode_order(Disarm(0.05), node=3, sequence=2),
-        "stop": encode_order(Stop(0.005), node=3, sequence=255),
-        "commit": encode_order(Commit(0x1234), node=3, sequence=4),
-        "ping": encode_order(Ping(), node=3, sequence=5),
+        "arm": encode_request(Arm(0.25), node=3, sequence=1),
+        "disarm": encode_request(Disarm(0.05), node=3, sequence=2),
+        "stop": encode_request(Stop(0.005), node=3, sequence=255),
+        "commit": encode_request(Commit(0x1234), node=3, sequence=4),
+        "ping": encode_request(Ping(), node=3, sequence=5),
     }
     order = 0x483
     assert frames == {
@@ -81,7 +81,7 @@ def test_orders_are_these_bytes() -> None:
 
 def test_a_set_is_a_frame_a_channel_its_order_and_a_sync() -> None:
     """Channels 4 and on have the identifiers of the next node; the count stands in the order."""
-    frames = encode_order(Apply(make(6)), node=2, sequence=9)
+    frames = encode_request(Apply(make(6)), node=2, sequence=9)
     assert [frame.id for frame in frames] == [
         *(0x202, 0x302, 0x402, 0x502, 0x203, 0x303),
         *(0x482, 0x080),
@@ -92,14 +92,14 @@ def test_a_set_is_a_frame_a_channel_its_order_and_a_sync() -> None:
 
 def test_over_can_fd_a_set_of_seven_is_one_frame() -> None:
     """Eight bytes of order, seven commands; of sixteen channels the rest goes before it."""
-    (one, sync) = encode_order(Apply(make(7)), node=1, sequence=2, fd=True)
+    (one, sync) = encode_request(Apply(make(7)), node=1, sequence=2, fd=True)
     assert (one.id, len(one.data), one.fd, sync) == (0x481, 64, True, SYNC)
-    frames = encode_order(Apply(make(16)), node=1, sequence=2, fd=True)
+    frames = encode_request(Apply(make(16)), node=1, sequence=2, fd=True)
     assert [(frame.id, len(frame.data)) for frame in frames] == [
         *((0x201, 64), (0x201, 8)),
         *((0x481, 64), (0x080, 0)),
     ]
-    five = encode_order(Stage(make(4)), node=1, sequence=2, fd=True)[0]
+    five = encode_request(Stage(make(4)), node=1, sequence=2, fd=True)[0]
     assert len(five.data) == 48
     assert five.data[40:] == b"\xff" * 8
 
@@ -113,12 +113,12 @@ def test_broadcasts_are_for_node_zero() -> None:
     assert encode_broadcast(Stop(0.01)) == (CanFrame(0x480, bytes.fromhex("0000 0A00 0000 06 00")),)
 
 
-def test_only_what_a_guard_let_through_is_encoded(safe: Callable[..., SafeCommand]) -> None:
+def test_only_what_a_guard_let_through_is_encoded(safe: Callable[..., SafeCommandSet]) -> None:
     """A plain command set raises TypeError, as does a plain envelope."""
     plain = CommandSet(token=1, commands=safe(1).commands, ramp=0.0, valid_for=0.0)
     for wrap in (Apply, Stage):
-        with pytest.raises(TypeError, match="SafeCommand"):
-            encode_order(wrap(plain), node=1, sequence=1)
+        with pytest.raises(TypeError, match="SafeCommandSet"):
+            encode_request(wrap(plain), node=1, sequence=1)
     with pytest.raises(TypeError, match="SafeEnvelope"):
         pack_envelope(LoadEnvelope(Envelope(1, 0.005, ())))
 
@@ -136,7 +136,7 @@ def test_cantools_reads_from_the_dbc_what_was_asked(
     wanted = DriveCommand(2, frequency, level, phase, keep_phase=keep)
     guard = Guard(GuardLimits(20.0, 600.0, 1.0), WIDE)
     safe = guard.check(CommandSet(token=77, commands=(wanted,), ramp=0.25, valid_for=1.5))
-    frames = encode_order(Apply(safe), node=1, sequence=5)
+    frames = encode_request(Apply(safe), node=1, sequence=5)
     command, order = (DATABASE.decode_message(frame.id, frame.data) for frame in frames[:2])
     achieved = wanted_commands(safe)[0]
     assert command["frequency"] == pytest.approx(achieved.frequency, abs=1e-9)
@@ -154,13 +154,20 @@ LEVELS = bytes.fromhex("D007 0000 0040 9C 04")  # 0.2, 0, 0, 1 in 14 bits each
 CONDITION = bytes.fromhex("04 01 FA00 0807 04 00")
 ANSWER = bytes.fromhex("04 00 04 FF 0102 FA00")
 STATUS = Status(
-    State.OPERATION_ENABLED, Fault.NONE, 513, True, 25.0, 0.25, (0.2, 0.0, 0.0, 1.0), 1800.0
+    AmplifierState.OPERATION_ENABLED,
+    Fault.NONE,
+    513,
+    True,
+    25.0,
+    0.25,
+    (0.2, 0.0, 0.0, 1.0),
+    1800.0,
 )
 
 
 def feed(*frames: tuple[int, bytes]) -> list[object]:
     """What a reader of node 1 makes of frames."""
-    reader = AnswerReader(1)
+    reader = CanReplyReader(1)
     answers = [reader.feed(CanFrame(id, data)) for id, data in frames]
     return [answer for answer in answers if answer is not None]
 
@@ -208,9 +215,9 @@ def test_a_torn_set_is_not_asked_again_where_no_set_is_taken(both: int) -> None:
 def test_what_nobody_asked_for_is_an_event() -> None:
     """An answer with sequence 0, and an emergency."""
     (answer,) = feed((0x181, bytes([0, 0, 5, 0xFF, 0, 0, 0, 0])))
-    assert answer.event == Event(State.QUICK_STOP_ACTIVE, Fault.NONE)
+    assert answer.event == AmplifierEvent(AmplifierState.QUICK_STOP_ACTIVE, Fault.NONE)
     told = decode_emergency(bytes.fromhex("4023 03 46 02 000000"))
-    assert told == Event(State.FAULT_REACTION_ACTIVE, Fault.ARC, 2)
+    assert told == AmplifierEvent(AmplifierState.FAULT_REACTION_ACTIVE, Fault.ARC, 2)
 
 
 @pytest.mark.parametrize(
@@ -235,7 +242,7 @@ def test_frames_that_make_no_sense_are_told(id: int, data: bytes) -> None:
 @given(data=st.binary(max_size=64), at=st.integers(0, 6))
 def test_any_bytes_are_an_answer_or_a_frame_error(data: bytes, at: int) -> None:
     """Nothing that comes raises anything else, whatever identifier it has."""
-    reader = AnswerReader(1)
+    reader = CanReplyReader(1)
     for id in (reader.ids[at % len(reader.ids)], 0x181):
         try:
             reader.feed(CanFrame(id, data))

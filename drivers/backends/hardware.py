@@ -130,11 +130,11 @@ HARDWARE_PROVIDER: ContextVar[HardwareProvider | None] = ContextVar(
 
 def make_worker(name: str) -> Worker:
     """Somebody for jobs that block; name: of the thread."""
-    stand_in = HARDWARE_PROVIDER.get()
-    return ThreadWorker(name) if stand_in is None else stand_in.make_worker()
+    hardware = HARDWARE_PROVIDER.get()
+    return ThreadWorker(name) if hardware is None else hardware.make_worker()
 
 
 def number_below(limit: int) -> int:
     """A number from 0 to limit - 1 that nobody can guess, or that the stand-in has chosen."""
-    stand_in = HARDWARE_PROVIDER.get()
-    return secrets.randbelow(limit) if stand_in is None else stand_in.below(limit)
+    hardware = HARDWARE_PROVIDER.get()
+    return secrets.randbelow(limit) if hardware is None else hardware.below(limit)

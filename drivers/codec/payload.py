@@ -84,7 +84,7 @@ class Cursor:
             return kind(value)
         except ValueError:
             raise Malformed(
-                f"{value} is no {kind.__name__.lower()}", code=NakCode.BAD_VALUE
+                f"unknown {kind.__name__} {value}", code=NakCode.BAD_VALUE
             ) from None
 
     def flags(self, known: int) -> int:

@@ -648,7 +648,7 @@ def test_watchdog_bears_three_heartbeats(watchdog: float, round_trip: float, fit
     if fits:
         check_watchdog(watchdog, round_trip)
         return
-    with pytest.raises(CommandError, match="need at least"):
+    with pytest.raises(CommandError, match=r"at least \d+ ms"):
         check_watchdog(watchdog, round_trip)
 
 

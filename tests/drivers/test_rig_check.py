@@ -26,7 +26,7 @@ def checked(*urls: str, channels: int = 2) -> tuple[dict[str, str], list[str]]:
         ("serial:///dev/ttyUSB0?baud=fast", "baud is 'fast'"),
         ("modbus+tcp://host/999", "unit is '999'"),
         (f"{BUS}#300", "node after # is '300'"),
-        ("modbus+rtu:///dev/ttyS1?baud=9600#1", "watchdog of 250 ms is too short"),
+        ("modbus+rtu:///dev/ttyS1?baud=9600#1", "got 250 ms"),
     ],
 )
 def test_what_cannot_be_used_is_named(url: str, message: str) -> None:
@@ -82,7 +82,7 @@ def test_what_cannot_be_told_within_three_heartbeats_is_warned_of(
     late = [warning for warning in warnings if "3 heartbeats, 150 ms" in warning]
     assert len(late) == len(told)
     for warning, time in zip(late, told, strict=True):
-        assert f"told after up to {time}" in warning
+        assert time in warning
         assert "\n" not in warning
 
 

@@ -34,9 +34,9 @@ async def open_adapter(
     on_frame is called with each frame, in the reader's thread, on_loss once, in the event loop,
     with why the bus was lost.
     """
-    stand_in = HARDWARE_PROVIDER.get()
-    if stand_in is not None:
-        return await stand_in.open_adapter(url, on_frame=on_frame, on_loss=on_loss)
+    hardware = HARDWARE_PROVIDER.get()
+    if hardware is not None:
+        return await hardware.open_adapter(url, on_frame=on_frame, on_loss=on_loss)
     try:
         bus = await in_thread(lambda: open_bus(url), name=f"era-open {url}", undo=_shut)
     except _TROUBLE as problem:

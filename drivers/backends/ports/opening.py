@@ -41,9 +41,9 @@ async def open_port(
     parity, stop bits: as pyserial names them. on_data is called with what comes in, on_loss once
     with why the port was lost.
     """
-    stand_in = HARDWARE_PROVIDER.get()
-    if stand_in is not None:
-        return await stand_in.open_port(name, on_data=on_data, on_loss=on_loss)
+    hardware = HARDWARE_PROVIDER.get()
+    if hardware is not None:
+        return await hardware.open_port(name, on_data=on_data, on_loss=on_loss)
     try:
         port = await in_thread(
             lambda: _open_port(name, baud, parity, stop), name=f"era-open {name}", undo=close_port

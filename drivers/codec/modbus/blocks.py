@@ -77,7 +77,7 @@ def _one_of(kind: type[_EnumT], register: int) -> _EnumT:
     try:
         return kind(register)
     except ValueError:
-        raise FrameError(f"{register} is no {kind.__name__.lower()}") from None
+        raise FrameError(f"unknown {kind.__name__} {register}") from None
 
 
 def _channel(register: int) -> int | None:

@@ -378,7 +378,7 @@ async def test_an_answer_out_of_range_is_refused(far: Peer, backend: ModbusBacke
     """A state that does not exist, with a good check, is the amplifier's mistake: FrameError."""
     await backend.exchange(GetCaps(), timeout=PATIENCE)
     far.station.answer = lambda _: replace(ARMED, state=9)  # type: ignore[arg-type]
-    with pytest.raises(FrameError, match="9 is no state"):
+    with pytest.raises(FrameError, match="AmplifierState 9"):
         await backend.exchange(Ping(), timeout=PATIENCE)
     far.station.answer = lambda _: replace(ARMED, levels=(0.0,) * 5)
     with pytest.raises(FrameError, match="5 channels where 4 were read"):
@@ -565,7 +565,7 @@ def test_wire_time_is_arithmetic() -> None:
     assert ModbusBackend("modbus+tcp://h/1").wire_times.round_trip(4) == 0
     assert ModbusBackend("modbus+tcp://h/1").wire_times.loading(20) == 0
     slow = ModbusBackend("modbus+rtu:///dev/ttyS1?baud=9600#1").wire_times.round_trip(4)
-    with pytest.raises(CommandError, match=r"round trip of 129\.5 ms need at least 279 ms"):
+    with pytest.raises(CommandError, match=r"279 ms.*129\.5 ms"):
         check_watchdog(0.25, slow)
     check_watchdog(
         0.25, ModbusBackend("modbus+rtu:///dev/ttyS1?baud=19200#1").wire_times.round_trip(4)

@@ -12,11 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from benchmarks.latency_touches import FLOODING, HELD, Work, places
-from controller.contacts import Contact, ContactKey
-from controller.means import Means
-from controller.routing import route
-from controller.selection import MOVE_TOLERANCE, Selector
-from controller.wishes import NewestBuzzes
+from controller.loop.capabilities import PlaybackCapabilities
+from controller.loop.intent import NewestBuzzes
+from controller.loop.routing import route
+from controller.loop.selection import MOVE_TOLERANCE, Selector
+from controller.sources.contacts import Contact, ContactKey
 from drivers.codec.serial_line.exchanges import decode_request
 from drivers.codec.serial_line.frame import Frame
 from drivers.command import DriveCommand
@@ -116,11 +116,11 @@ class Expected:
         work: Work,
         rig: Rig,
         table: LocalizationTable,
-        means: Means,
+        capabilities: PlaybackCapabilities,
         *,
         flooded: float | None,
     ) -> None:
-        self._rig, self._table, self._means = rig, table, means
+        self._rig, self._table, self._capabilities = rig, table, capabilities
         self._places = [self._on_plate(x, y) for _, x, y in places(work, rig.plate)]
         self._work = work
         self._others = [self._on_plate(*HELD)]
@@ -160,8 +160,8 @@ class Expected:
                 Contact(ContactKey("bench", number), x, y, since=float(number))
                 for number, (x, y) in enumerate([*self._others, self._places[touch]])
             ]
-            wish = NewestBuzzes().wish(contacts, 0.0)
-            pattern = Selector(self._table).select(contacts, wish, self._means).pattern
+            intent = NewestBuzzes().intent(contacts, 0.0)
+            pattern = Selector(self._table).select(contacts, intent, self._capabilities).pattern
             commands: Sequence[DriveCommand] = ()
             if pattern is not None:
                 sets = route(pattern.excitation, self._rig, token=1, ramp=pattern.ramp)

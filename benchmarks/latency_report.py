@@ -11,7 +11,7 @@ from benchmarks.latency_programs import DEVICE_NICE
 from benchmarks.latency_run import FLOOD_RATE, WORKERS, Case, Failed, Found
 from benchmarks.latency_touches import SLIDE, Work
 from controller.deploy.files import NICE
-from controller.selection import MOVE_TOLERANCE
+from controller.loop.selection import MOVE_TOLERANCE
 
 DOCS = Path(__file__).parent.parent / "docs"
 PICTURE = "pictures/latency.png"

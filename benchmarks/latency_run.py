@@ -20,7 +20,7 @@ from benchmarks.latency_touches import WANDERS, Work
 from controller.api.client import Client
 from controller.api.jsonrpc import RpcError
 from controller.api.schema import LatencySummary
-from controller.means import Means, means_of
+from controller.loop.capabilities import PlaybackCapabilities, playback_capabilities
 from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.messages import Capabilities
 from drivers.protocol.wire_times import NoTimes, WireTimes
@@ -183,11 +183,11 @@ def _matched(
             lambda touch, command: abs((touch + 1 & 0xFFFF) - command.sequence),
             first=lambda before, touch: touch,
         )
-    means = _means(rig, case.touch_wait)
+    capabilities = _capabilities(rig, case.touch_wait)
     # Of two patterns that are as good a hundredth of a millimetre may decide; and the flood's
     # finger is lifted where the flood itself gets no processor for 150 ms.
     floods = (0.0, WANDERS, None) if case.is_loaded else (None,)
-    expected = [Expected(case.work, rig, table, means, flooded=each) for each in floods]
+    expected = [Expected(case.work, rig, table, capabilities, flooded=each) for each in floods]
     # A set whose answer was late is sent once more, under its token.
     repeated = {id(each) for one, each in pairwise(since) if each.token == one.token}
     vibrating = [
@@ -201,9 +201,9 @@ def _matched(
 LAST = 0.03  # s; after the last touch fingers expire, and silence answers none
 
 
-def _means(rig: Rig, touch_wait: float) -> Means:
+def _capabilities(rig: Rig, touch_wait: float) -> PlaybackCapabilities:
     opened = {name: _Open(capabilities(4)) for name in rig.amplifiers}
-    return means_of(rig, opened, envelope_time=touch_wait * 1e-3)
+    return playback_capabilities(rig, opened, envelope_time=touch_wait * 1e-3)
 
 
 def _daemon_file(folder: Path, url: str, table: Path, port: int, touch_wait: float) -> Path:

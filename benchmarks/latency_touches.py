@@ -5,8 +5,8 @@ import random
 from collections.abc import Iterator
 from dataclasses import dataclass
 
+from controller.sources.touch import Touch, TouchFrame
 from controller.sources.tuio import tuio_datagram
-from controller.touch import Touch, TouchFrame
 from model.structure.plate import Plate
 
 APART = 0.050  # m; between a finger that is to feel it and those that are not

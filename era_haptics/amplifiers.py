@@ -1,7 +1,7 @@
 """The amplifiers of a rig from a script: opened by the rig's URLs and limits, told patterns."""
 
-from controller.guards import guard_limits
-from controller.routing import route
+from controller.group.guards import guard_limits
+from controller.loop.routing import route
 from drivers.blocking import BlockingAmplifier
 from drivers.command import DriveCommand
 from era_haptics.arguments import expect_rig

@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from controller.sources.capture import Datagram, write_capture
+from controller.sources.touch import Touch, TouchFrame
 from controller.sources.tuio import tuio_datagram
-from controller.touch import Touch, TouchFrame
 
 LENGTH, WIDTH = 0.3048, 0.2286
 MARGIN = 0.015

@@ -10,8 +10,8 @@ import pytest
 
 from controller.effects.kinds import effect_kind, effect_kinds
 from controller.effects.timed import Buzz
+from controller.sources.registry import open_source
 from controller.sources.tuio import TuioSource
-from controller.touch_registry import open_source
 from drivers.backends.serial_line.backend import SerialBackend
 from drivers.errors import CommandError
 from drivers.registry import known_schemes, open_backend

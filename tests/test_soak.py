@@ -10,9 +10,9 @@ from typing import Any
 
 import pytest
 
-from controller.loop import Controller
-from controller.selection import Selector
-from controller.touch import TouchFrame
+from controller.loop.loop import Controller
+from controller.loop.selection import Selector
+from controller.sources.touch import TouchFrame
 from drivers.backends.modbus.line import ModbusLine
 from planted_bugs import BUGS as BUGS_OF_THE_WITNESS
 from planted_bugs import plant

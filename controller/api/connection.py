@@ -10,8 +10,8 @@ from collections.abc import Callable
 from typing import cast
 
 from controller.api.jsonrpc import MAX_LINE_LENGTH, ErrorCode, RpcError, error_line
+from controller.api.rate_limit import RateLimiter
 from controller.api.superseded import is_superseded
-from controller.rate import Rate
 
 MAX_UNREAD_BYTES = 1 << 18  # bytes that a client has not read
 _NOTIFICATION_LIMIT = MAX_UNREAD_BYTES // 2  # the rest is for answers
@@ -46,7 +46,7 @@ class Connection(asyncio.Protocol):
         self._is_at_end = False
         self._lost = 0
         self._losing_since: float | None = None
-        self._rate = Rate(MAX_REQUEST_RATE, clock=clock)
+        self._rate = RateLimiter(MAX_REQUEST_RATE, clock=clock)
 
     @property
     def is_open(self) -> bool:

@@ -9,9 +9,9 @@ from controller.api.socket_path import default_socket
 from controller.daemon.sections import CalibrationSection, DaemonSection, TouchSection
 from controller.effects.layout import Layout, usual_effects
 from controller.effects.layout_file import is_layout_document, load_layout
-from controller.touch import TouchSource
-from controller.touch_calibration import CalibratedSource, TouchCalibration, fitted, turned
-from controller.touch_registry import open_source
+from controller.sources.calibration import CalibratedSource, TouchCalibration, fitted, turned
+from controller.sources.registry import open_source
+from controller.sources.touch import TouchSource
 from drivers.errors import CommandError
 from drivers.registry import open_backend
 from model.config.document import ConfigError, Document, read_document

@@ -14,15 +14,15 @@ from controller.daemon.log import LogThread
 from controller.daemon.meaning import Meaning
 from controller.daemon.news import News
 from controller.daemon.notify import ServiceManager
-from controller.daemon.place import Place
 from controller.daemon.records import RecordedBackend, Recorder
 from controller.daemon.reload import plan_reload
 from controller.daemon.service import Service
+from controller.daemon.socket_lock import SocketLock
 from controller.daemon.states import Machine, State
 from controller.daemon.supervisor import Supervisor
 from controller.daemon.view import amplifier_statuses
-from controller.loop import Controller
-from controller.touch import TouchFrame
+from controller.loop.loop import Controller
+from controller.sources.touch import TouchFrame
 from drivers import clock
 from drivers.amplifier import Amplifier
 from drivers.errors import DriverError
@@ -90,7 +90,7 @@ class Daemon:
             table,
             amplifiers=amplifiers,
             observer=self._supervisor.observe(self._news.observer()),
-            wishes=self._meaning,
+            intent_source=self._meaning,
             timing=Timing(table),
             mode=config.section.mode,
             envelope_time=config.section.touch_wait,
@@ -115,7 +115,7 @@ class Daemon:
         )
         self._companions = Companions()
 
-    async def run(self, place: Place) -> None:
+    async def run(self, place: SocketLock) -> None:
         """Open, serve until told to end, fall silent and close.
 
         Raises LinkError, CommandError and InputError where it cannot begin.
@@ -231,7 +231,10 @@ class Daemon:
         socket = str(self._config.socket)
         if self._dashboard is not None:
             self._companions.start(
-                Companion("controller.gateway", ("--socket", socket, "--listen", self._dashboard))
+                Companion(
+                    "controller.cli",
+                    ("gateway", "--socket", socket, "--listen", self._dashboard),
+                )
             )
         if self._config.section.metrics is not None:
             port = str(self._config.section.metrics)

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from controller.api.methods import TouchParams
 from controller.daemon.config import API_SOURCES, TouchInput
-from controller.touch import Touch, TouchFrame
+from controller.sources.touch import Touch, TouchFrame
 from drivers.operation.pauses import pauses
 from model.errors import InputError
 from model.structure.plate import Plate

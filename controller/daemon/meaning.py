@@ -6,11 +6,11 @@ from collections.abc import Iterable, Sequence
 from controller.api.jsonrpc import ErrorCode, RpcError
 from controller.api.methods import EffectsResult, PlayParams
 from controller.api.schema import EffectDescription
-from controller.contacts import Contact, ContactKey
 from controller.effects.layout import Layout
 from controller.effects.player import EffectPlayer
-from controller.selection import MOST_DB_SL
-from controller.wishes import Wish
+from controller.loop.intent import HapticIntent
+from controller.loop.selection import MOST_DB_SL
+from controller.sources.contacts import Contact, ContactKey
 
 REACH = 0.020
 """An effect that is asked for at a place is felt by a finger within this distance [m]."""
@@ -22,9 +22,9 @@ class Meaning:
     def __init__(self, layout: Layout) -> None:
         self._player = EffectPlayer(layout)
 
-    def wish(self, contacts: Sequence[Contact], now: float) -> Wish:
-        """As `Wishes`."""
-        return self._player.wish(contacts, now)
+    def intent(self, contacts: Sequence[Contact], now: float) -> HapticIntent:
+        """As `IntentSource`."""
+        return self._player.intent(contacts, now)
 
     def exchange(self, layout: Layout) -> None:
         """From now on touches mean this; nothing that is over in a moment is felt again."""

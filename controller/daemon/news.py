@@ -16,12 +16,12 @@ from controller.api.topics import (
     SilenceEvent,
     StateEvent,
 )
-from controller.contacts import Change, Contact, ContactKey
 from controller.daemon.latency import Latencies
 from controller.daemon.states import Machine, State
 from controller.daemon.view import Scene
 from controller.effects.layout import Layout
-from controller.observer import Applied, Observer, Silenced
+from controller.loop.observer import Applied, Observer, Silenced
+from controller.sources.contacts import Change, Contact, ContactKey
 from drivers import clock
 
 _logger = logging.getLogger(__name__)

@@ -4,7 +4,7 @@ import asyncio
 from collections.abc import Callable, Coroutine
 from typing import Any
 
-from controller.loop import Controller
+from controller.loop.loop import Controller
 from drivers import clock
 from drivers.errors import DriverError
 from drivers.link.link import ASSUME_ENERGISED

@@ -9,8 +9,8 @@ from controller.daemon.config import DaemonConfig, load_daemon_config
 from controller.daemon.daemon import Daemon
 from controller.daemon.log import LogThread, start_log
 from controller.daemon.notify import ServiceManager
-from controller.daemon.place import Place
 from controller.daemon.sections import loopback_address
+from controller.daemon.socket_lock import SocketLock
 from drivers.errors import DriverError
 from model.config.document import ConfigError, read_document
 from model.counting import counted
@@ -48,7 +48,7 @@ def run_daemon(path: Path, *, dashboard: str | None) -> None:
         raise InputError(f"--dashboard {error}") from error
     config = load_daemon_config(path)
     _try_log(config)
-    place = Place(config.socket)
+    place = SocketLock(config.socket)
     try:
         log = start_log(config.log_file, level=config.section.log.level)
         try:
@@ -72,7 +72,7 @@ def _try_log(config: DaemonConfig) -> None:
         ) from error
 
 
-def _run(config: DaemonConfig, place: Place, *, log: LogThread, dashboard: str | None) -> None:
+def _run(config: DaemonConfig, place: SocketLock, *, log: LogThread, dashboard: str | None) -> None:
     manager = ServiceManager()
     manager.status("the localization table is made ready")
     table = _table(config)

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, Field, Strict
 
 from controller.api.schema import MAX_LEASE, MIN_LEASE
-from controller.envelopes import ENVELOPE_TIME
+from controller.loop.envelopes import ENVELOPE_TIME
 from model.config.sections import Quantity, Section
 from model.config.units import LENGTH, RATIO, TIME
 from model.drive_modes import MODES

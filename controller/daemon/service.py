@@ -32,7 +32,7 @@ from controller.daemon.meaning import Meaning
 from controller.daemon.news import News
 from controller.daemon.states import Event, Kind, Machine, State
 from controller.daemon.supervisor import Supervisor
-from controller.loop import Controller
+from controller.loop.loop import Controller
 from drivers import clock
 from drivers.amplifier import WATCHDOG, Amplifier
 from model.table.table import LocalizationTable
@@ -147,7 +147,7 @@ class Service:
             self._config,
             self._table,
             self._amplifiers,
-            mode=self._controller.means.mode,
+            mode=self._controller.capabilities.mode,
             layout=self._news.layout_event().layout,
         )
 

@@ -7,11 +7,11 @@ from collections.abc import Awaitable, Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 
-from controller.amplifiers import Phase
 from controller.daemon.reopening import TICK, reopen, what_is_wrong
 from controller.daemon.states import ACKNOWLEDGE, Action, Event, Kind, Machine, State, step
-from controller.loop import Controller
-from controller.observer import Observer
+from controller.group.amplifier_group import Phase
+from controller.loop.loop import Controller
+from controller.loop.observer import Observer
 from drivers import clock
 from drivers.amplifier import Amplifier
 from drivers.errors import CommandRefused, DriverError, LinkError

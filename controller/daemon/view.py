@@ -5,9 +5,9 @@ from dataclasses import dataclass
 
 from controller.api.schema import AmplifierStatus, ContactStatus, LinkCounters, PlayedTone
 from controller.api.topics import ContactsEvent, PatternEvent, SilenceEvent
-from controller.contacts import Contact, ContactKey
 from controller.daemon.records import RecordedBackend
-from controller.observer import Applied, Silenced
+from controller.loop.observer import Applied, Silenced
+from controller.sources.contacts import Contact, ContactKey
 from drivers import clock
 from drivers.amplifier import Amplifier
 from drivers.errors import CommandError

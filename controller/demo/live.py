@@ -8,7 +8,7 @@ from controller.daemon.config import load_daemon_config
 from controller.daemon.daemon import Daemon
 from controller.daemon.log import start_log
 from controller.daemon.notify import ServiceManager
-from controller.daemon.place import Place
+from controller.daemon.socket_lock import SocketLock
 from controller.demo.far_end import open_far_end
 from controller.gateway.installed import require_gateway
 from model.rig.file import load_rig
@@ -28,7 +28,7 @@ async def run_live(rig_file: Path, table: LocalizationTable, *, wire: str, dashb
         file = Path(folder) / "daemon.yaml"
         file.write_text(f"rig: {rig_file}\nlog: {{level: warning}}\n", encoding="utf-8")
         config = load_daemon_config(file)
-        place = Place(config.socket)
+        place = SocketLock(config.socket)
         try:
             log = start_log(None, level=config.section.log.level)
             try:

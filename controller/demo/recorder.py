@@ -6,12 +6,12 @@ from collections.abc import Callable, Coroutine, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from controller.contacts import Change, Contact, ContactKey
 from controller.demo.far_end import BenchControl, FingerFelt
 from controller.demo.measure import finger_level, measure, peak_contrast_db
 from controller.demo.rows import Onset, Place, PlayedPattern, TouchRow
-from controller.observer import Applied, Observer, Silenced
-from controller.selection import Felt
+from controller.loop.observer import Applied, Observer, Silenced
+from controller.loop.selection import Felt
+from controller.sources.contacts import Change, Contact, ContactKey
 from drivers import clock
 from drivers.errors import LinkError
 from model.transients.measures import FIRST

@@ -5,16 +5,16 @@ from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import TypeAlias
 
-from controller.contacts import LEASE
 from controller.demo.far_end import OPTIONS, open_far_end
 from controller.demo.picture import choose_rows, touches_figure
 from controller.demo.recorder import TouchRecorder
 from controller.demo.rows import TouchRow
-from controller.loop import Controller
+from controller.loop.loop import Controller
 from controller.sources.capture import read_capture, replay_capture
+from controller.sources.contacts import CONTACT_TIMEOUT
 from controller.sources.evemu import EvemuSource
+from controller.sources.touch import TouchSource
 from controller.sources.tuio import TuioSource
-from controller.touch import TouchSource
 from drivers.amplifier import Amplifier
 from drivers.operation.steady import no_long_collections
 from drivers.registry import open_backend
@@ -132,4 +132,4 @@ async def _drive(controller: Controller, play: Play) -> None:
 
 async def _play_out(play: Play) -> None:
     await play()
-    await asyncio.sleep(LEASE + AFTERGLOW)
+    await asyncio.sleep(CONTACT_TIMEOUT + AFTERGLOW)

@@ -9,10 +9,10 @@ from itertools import pairwise
 
 import numpy as np
 
-from controller.amplifiers import AmplifierGroup
 from controller.diagnosis.sensors import Sensors
-from controller.guards import make_guards
-from controller.routing import route
+from controller.group.amplifier_group import AmplifierGroup
+from controller.group.guards import make_guards
+from controller.loop.routing import route
 from drivers.amplifier import Amplifier
 from drivers.errors import CommandRefused
 from drivers.guard import Guard, SafeCommandSet

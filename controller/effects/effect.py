@@ -7,7 +7,7 @@ from typing import Annotated, ClassVar, Literal, TypeAlias
 
 from pydantic import BeforeValidator
 
-from controller.contacts import Contact
+from controller.sources.contacts import Contact
 from model.config.sections import Quantity, Section
 from model.config.units import RATIO
 from model.finger.perception import STRONG_DB_SL

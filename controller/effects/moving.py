@@ -7,9 +7,9 @@ from typing import Annotated, ClassVar, Literal, Self
 
 from pydantic import model_validator
 
-from controller.contacts import Contact
 from controller.effects.effect import Course, Effect, Feeling, Nothing
 from controller.effects.timed import SHORTEST
+from controller.sources.contacts import Contact
 from model.config.sections import Quantity
 from model.config.units import LENGTH, RATIO, SPEED, TIME
 

@@ -1,13 +1,13 @@
-"""From contacts to wishes by a surface layout: who feels which effect, and who gives way."""
+"""From contacts to intents by a surface layout: who feels which effect, and who gives way."""
 
 import math
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field
 
-from controller.contacts import Contact, ContactKey
 from controller.effects.effect import Course, Effect, Feeling
 from controller.effects.layout import Layout, Region
-from controller.wishes import NOBODY_TOUCHES, Target, Wish
+from controller.loop.intent import NO_CONTACTS, HapticIntent, Target
+from controller.sources.contacts import Contact, ContactKey
 
 # A finger that rests on an edge must not go in and out with the noise of its sensor, so it stays in
 # the region that it came into until it is this far [m] from where it did.
@@ -37,7 +37,7 @@ class _Finger:
 
 
 class EffectPlayer:
-    """Plays the effects of a layout; `wish` is a pure function of what it was told, in order.
+    """Plays the effects of a layout; `intent` is a pure function of what it was told, in order.
 
     Every play asks for its finger. Of one finger the play that began last is felt; when it is over,
     the one before goes on. Of several fingers those of the highest priority are felt, among equals
@@ -55,11 +55,11 @@ class EffectPlayer:
         self._fingers: dict[ContactKey, _Finger] = {}
         self._number = 0
 
-    def wish(self, contacts: Sequence[Contact], now: float) -> Wish:
+    def intent(self, contacts: Sequence[Contact], now: float) -> HapticIntent:
         """Who shall feel what at a time [s]."""
         self._follow(contacts, now)
         if not contacts:
-            return Wish((), NOBODY_TOUCHES)
+            return HapticIntent((), NO_CONTACTS)
         asking: list[tuple[int, int, Contact, Feeling]] = []
         ends: list[float] = []
         for contact in contacts:
@@ -68,7 +68,7 @@ class EffectPlayer:
                 asking.append((play.priority, play.number, contact, feeling))
         asking.sort(key=lambda one: one[:2], reverse=True)
         chosen = [one for one in asking if one[0] == asking[0][0]][: self.layout.most_at_once]
-        return Wish(
+        return HapticIntent(
             tuple(
                 Target(contact.key, feeling.level_db_sl, or_less=feeling.or_less)
                 for _, _, contact, feeling in chosen

@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 from typing import Annotated, ClassVar
 
-from controller.contacts import Contact
 from controller.effects.effect import (
     HIGHEST_LEVEL,
     LOWEST_LEVEL,
@@ -12,6 +11,7 @@ from controller.effects.effect import (
     Feeling,
     Nothing,
 )
+from controller.sources.contacts import Contact
 from model.config.sections import Quantity
 from model.config.units import RATIO, TIME
 from model.finger.perception import STRONG_DB_SL

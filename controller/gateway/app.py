@@ -18,12 +18,12 @@ from starlette.websockets import WebSocket
 from controller.api.jsonrpc import ErrorCode, RpcError, read_params
 from controller.api.jsonrpc import Request as RpcRequest
 from controller.api.methods import METHODS, TouchParams
+from controller.api.rate_limit import RateLimiter
 from controller.gateway.access import LARGEST_BODY, SUBPROTOCOL, Access
 from controller.gateway.mirror import DaemonMirror
 from controller.gateway.openapi import NOT_OVER_HTTP, STATUS_OF, openapi
 from controller.gateway.session import TRY_AGAIN_LATER, Session, told_apart
 from controller.gateway.settings import Settings
-from controller.rate import Rate
 
 MAX_SESSIONS = 32
 HTTP_REQUESTS_PER_SECOND = 500.0  # of everybody together; a stop is not counted
@@ -37,7 +37,7 @@ class Gateway:
     def __init__(self, settings: Settings) -> None:
         self._sessions: set[Session] = set()
         self._picture = DaemonMirror(settings.socket, tell=self._tell)
-        self._rate = Rate(HTTP_REQUESTS_PER_SECOND, clock=time.monotonic)
+        self._rate = RateLimiter(HTTP_REQUESTS_PER_SECOND, clock=time.monotonic)
         self._description = json.dumps(openapi()).encode()
         self.app = Starlette(
             routes=[

@@ -11,7 +11,7 @@ from uvicorn.protocols.http.h11_impl import H11Protocol, RequestResponseCycle
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 from websockets.frames import CloseCode, Frame
 
-from controller.rate import Rate
+from controller.api.rate_limit import RateLimiter
 
 MOST_WAITING = 128  # connections that have not sent a whole request yet
 REQUEST_PATIENCE = 5.0  # s; a connection without a whole request by then is closed
@@ -100,7 +100,7 @@ class HttpConnection(H11Protocol):
 class WebSocketConnection(WebSocketsSansIOProtocol):
     """A WebSocket whose every buffer has an end, and which ends when the gateway leaves it."""
 
-    _controls: Rate | None = None
+    _controls: RateLimiter | None = None
 
     def data_received(self, data: bytes) -> None:
         """Take what was sent, unless what it was sent before lies unread."""
@@ -144,7 +144,7 @@ class WebSocketConnection(WebSocketsSansIOProtocol):
     def _may_go_on(self) -> bool:
         """Whether it keeps within the rate of control frames; otherwise it is left."""
         if self._controls is None:
-            self._controls = Rate(CONTROLS_PER_SECOND, clock=self.loop.time)
+            self._controls = RateLimiter(CONTROLS_PER_SECOND, clock=self.loop.time)
         is_fine = self._controls.take()
         if not is_fine:
             self.transport.abort()

@@ -19,10 +19,10 @@ from controller.api.jsonrpc import (
     read_request,
 )
 from controller.api.methods import METHODS, SubscribeParams, TouchParams, UnsubscribeParams
+from controller.api.rate_limit import RateLimiter
 from controller.api.schema import Empty, Message
 from controller.gateway.outbox import Outbox
 from controller.gateway.topics import OWN
-from controller.rate import Rate
 
 REQUESTS_PER_SECOND = 200.0  # touches and stop are not counted
 MOST_PENDING = 16
@@ -64,7 +64,7 @@ class Session:
         self._socket = socket
         self._daemon = daemon
         self._current = current
-        self._rate = Rate(REQUESTS_PER_SECOND, clock=clock)
+        self._rate = RateLimiter(REQUESTS_PER_SECOND, clock=clock)
         self._topics: set[str] = set()
         self._pending: set[asyncio.Task[None]] = set()
         self._touches: dict[str, TouchParams] = {}  # the newest of each source, not yet told

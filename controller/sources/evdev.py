@@ -10,7 +10,7 @@ from urllib.parse import parse_qsl
 from controller.sources.input_device import InputDevice, InputEvent
 from controller.sources.playing import REPEAT
 from controller.sources.slots import Range, SlotReader, SlotState
-from controller.touch import Touch, TouchFrame, TouchSource
+from controller.sources.touch import Touch, TouchFrame, TouchSource
 from model.errors import InputError
 
 # How long [s] a panel that was pulled out is waited for, longer each time.

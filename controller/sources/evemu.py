@@ -17,7 +17,7 @@ from controller.sources.slots import (
     EventError,
     SlotReader,
 )
-from controller.touch import TouchFrame, TouchSource
+from controller.sources.touch import TouchFrame, TouchSource
 from model.errors import InputError
 
 _EVENT = re.compile(

@@ -4,7 +4,7 @@ import asyncio
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
-from controller.touch import TouchFrame
+from controller.sources.touch import TouchFrame
 
 # A panel at rest says nothing, but a contact without news counts as lifted.
 REPEAT = 0.05

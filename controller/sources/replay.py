@@ -8,9 +8,9 @@ from urllib.parse import parse_qsl
 
 from controller.sources.capture import read_capture
 from controller.sources.playing import play
+from controller.sources.reject_counter import RejectCounter
+from controller.sources.touch import TouchFrame, TouchSource
 from controller.sources.tuio import TuioReader
-from controller.tally import Tally
-from controller.touch import TouchFrame, TouchSource
 from model.errors import InputError
 
 _logger = logging.getLogger(__name__)
@@ -28,7 +28,7 @@ class ReplaySource(TouchSource):
         if not url.startswith("replay:") or not path:
             raise InputError(f"touch source {url}: expected replay:PATH of a TUIO capture")
         self._speed = _speed(url, options)
-        reader = TuioReader(Tally(_logger))
+        reader = TuioReader(RejectCounter(_logger))
         frames = [
             reader.read(datagram.payload, (Path(path).name, 0), now=datagram.time)
             for datagram in read_capture(path)

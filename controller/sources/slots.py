@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TypeAlias
 
-from controller.touch import Touch
+from controller.sources.touch import Touch
 
 EV_SYN, EV_ABS = 0x00, 0x03
 SYN_REPORT, SYN_MT_REPORT, SYN_DROPPED = 0, 2, 3

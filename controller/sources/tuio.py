@@ -16,8 +16,8 @@ from pythonosc.osc_message_builder import OscMessageBuilder
 
 from controller.sources.datagrams import Datagram, Datagrams, Peer, listen
 from controller.sources.osc import OscError, osc_messages
-from controller.tally import Tally
-from controller.touch import Touch, TouchFrame, TouchSource
+from controller.sources.reject_counter import RejectCounter
+from controller.sources.touch import Touch, TouchFrame, TouchSource
 from model.errors import InputError
 
 ADDRESS = "/tuio/2Dcur"
@@ -65,7 +65,7 @@ class TuioReader:
     one by host and port. Nothing is ever raised: what cannot be used is counted in `tally`.
     """
 
-    def __init__(self, tally: Tally) -> None:
+    def __init__(self, tally: RejectCounter) -> None:
         self.tally = tally
         self._senders: dict[str, _Sender] = {}
 
@@ -213,7 +213,7 @@ class TuioSource(TouchSource):
 
     def __init__(self, url: str) -> None:
         self.host, self._port = _host_and_port(url)
-        self.tally = Tally(_logger)
+        self.tally = RejectCounter(_logger)
         self._url = url
         self._line: Datagrams | None = None
         self._reader = TuioReader(self.tally)

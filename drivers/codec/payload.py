@@ -83,9 +83,7 @@ class Cursor:
         try:
             return kind(value)
         except ValueError:
-            raise Malformed(
-                f"unknown {kind.__name__} {value}", code=NakCode.BAD_VALUE
-            ) from None
+            raise Malformed(f"unknown {kind.__name__} {value}", code=NakCode.BAD_VALUE) from None
 
     def flags(self, known: int) -> int:
         """A byte in which only the known bits may be set."""

@@ -3,11 +3,11 @@
 `open_source`, `ContactTracker` and what it tells are for trying one, as contacts on a plate.
 """
 
-from controller.contacts import Change, Contact, ContactKey, ContactTracker
+from controller.sources.contacts import Change, Contact, ContactKey, ContactTracker
 from controller.sources.datagrams import Datagram, Datagrams, listen
-from controller.tally import Tally
-from controller.touch import Touch, TouchFrame, TouchSource
-from controller.touch_registry import open_source
+from controller.sources.registry import open_source
+from controller.sources.reject_counter import RejectCounter
+from controller.sources.touch import Touch, TouchFrame, TouchSource
 from drivers.clock import now
 from model.errors import InputError
 
@@ -19,7 +19,7 @@ __all__ = [
     "Datagram",
     "Datagrams",
     "InputError",
-    "Tally",
+    "RejectCounter",
     "Touch",
     "TouchFrame",
     "TouchSource",

@@ -9,9 +9,9 @@ import typer
 from typer.core import TyperGroup
 from typer.testing import CliRunner
 
-from controller.command_page import WRITER, command_reference, own_commands
-from controller.written_part import insert
+from command_page import WRITER, command_reference, own_commands
 from model.cli import app
+from page_part import insert
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "reference" / "commands.md").read_text("utf-8")
@@ -21,7 +21,7 @@ COARSE = ["--frequencies", "100:200:50", "--grid", "4x3", "--mesh", "12x9"]
 
 def test_every_command_stands_on_the_page() -> None:
     """As the commands themselves say it; after a change write it anew."""
-    remedy = "python -m controller.command_page docs/reference/commands.md"
+    remedy = "python docs/generators/command_page.py docs/reference/commands.md"
     assert insert(PAGE, command_reference(), writer=WRITER) == PAGE, remedy
 
 

@@ -164,7 +164,7 @@ def test_a_bad_drive_never_arms(background: BackgroundFarEnd, options: list[str]
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_ctrl_c_ends_silent(background: BackgroundFarEnd, number: signal.Signals) -> None:
     """An interrupt or an order to end in the middle of a drive disarms before the process ends."""
-    command = [sys.executable, "-P", "-c", "from controller.main import main; exit(main())"]
+    command = [sys.executable, "-P", "-c", "from controller.cli.main import main; exit(main())"]
     process = subprocess.Popen(
         [*command, "amp", "drive", background.end.url, "--for", "30"],
         stdout=subprocess.DEVNULL,

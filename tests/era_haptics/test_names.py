@@ -57,7 +57,8 @@ def test_a_name_brings_nothing_that_it_does_not_need(name: str, never: tuple[str
 def test_the_commands_do_without() -> None:
     """`era --help` does not load it."""
     program = (
-        "import sys, contextlib\nsys.argv = ['era', '--help']\nfrom controller.main import main\n"
+        "import sys, contextlib\nsys.argv = ['era', '--help']\n"
+        "from controller.cli.main import main\n"
         "with contextlib.suppress(SystemExit):\n    main()\nprint('era_haptics' in sys.modules)"
     )
     said = subprocess.run(

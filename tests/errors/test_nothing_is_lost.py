@@ -16,7 +16,7 @@ from pathlib import Path
 
 import pytest
 
-from controller.main import run
+from controller.cli.main import run
 from error_cases import RIG, filled
 from full_disk import full_disk
 from interrupted import interrupted

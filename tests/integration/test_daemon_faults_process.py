@@ -22,8 +22,8 @@ import pytest
 import jumping_clock
 from best_of import best_of
 from controller.api.async_client import AsyncClient
+from controller.sources.touch import Touch, TouchFrame
 from controller.sources.tuio import tuio_datagram
-from controller.touch import Touch, TouchFrame
 from daemon_bench import PATIENCE, far_end, until, until_state
 from daemon_process import (
     REACTION,

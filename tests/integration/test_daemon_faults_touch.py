@@ -13,8 +13,8 @@ import pytest
 
 from best_of import best_of
 from controller.api.async_client import AsyncClient
+from controller.sources.touch import Touch, TouchFrame
 from controller.sources.tuio import tuio_datagram
-from controller.touch import Touch, TouchFrame
 from daemon_bench import PATIENCE, far_end, until
 from daemon_process import DaemonProcess, armed, daemon_process, disarmed, play
 from floods import flood

@@ -11,10 +11,10 @@ from pathlib import Path
 
 import pytest
 
-from controller.main import run
+from controller.cli.main import run
 from controller.sources.capture import Datagram, write_capture
+from controller.sources.touch import Touch, TouchFrame
 from controller.sources.tuio import tuio_datagram
-from controller.touch import Touch, TouchFrame
 
 ERA = Path(sys.executable).with_name("era")
 FRAME = 1 / 50

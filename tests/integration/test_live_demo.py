@@ -9,7 +9,7 @@ from pathlib import Path
 from typer.testing import CliRunner
 
 from controller.api.client import Client
-from controller.cli import app
+from controller.cli.demo import app
 from model.errors import InputError
 
 LIVE = """\

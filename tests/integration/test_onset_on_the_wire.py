@@ -7,8 +7,8 @@ import pytest
 
 from controller.demo.run import read_touches, run_demo
 from controller.sources.capture import Datagram, write_capture
+from controller.sources.touch import Touch, TouchFrame
 from controller.sources.tuio import tuio_datagram
-from controller.touch import Touch, TouchFrame
 from model.rig.file import example_rig_path, load_rig
 from model.table.build import build_table
 from model.table.question import Question

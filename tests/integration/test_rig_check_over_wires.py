@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from controller.cli import app
+from controller.cli.demo import app
 from drivers.errors import LinkError
 from far_end_process import far_end_process
 from model.calibration.responses_file import write_responses_csv, write_responses_uff

@@ -154,7 +154,7 @@ async def test_the_command_stands_in_a_wire(coarse_rig: Rig, tmp_path: Path, roo
     capture = tmp_path / "capture.txt"
     async with far_side(WIRES["serial"], coarse_rig) as far:
         options = ("--slack", "5000", "--record", str(capture))
-        code = "import sys; from controller.main import main; sys.exit(main())"
+        code = "import sys; from controller.cli.main import main; sys.exit(main())"
         process = await asyncio.create_subprocess_exec(
             *(sys.executable, "-P", "-c", code, "witness", far.url, *options),
             stdout=asyncio.subprocess.PIPE,

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from controller.loop import Controller
-from controller.observer import Applied, Observer, Silenced
-from controller.touch import Touch, TouchFrame, TouchSource
+from controller.loop.loop import Controller
+from controller.loop.observer import Applied, Observer, Silenced
+from controller.sources.touch import Touch, TouchFrame, TouchSource
 from drivers.amplifier import Amplifier
 from drivers.backend import Backend
 from drivers.command import CommandSet

@@ -14,7 +14,7 @@ from controller.daemon.config import load_daemon_config
 from controller.daemon.daemon import Daemon
 from controller.daemon.log import LogHandler, LogThread
 from controller.daemon.notify import ServiceManager
-from controller.daemon.place import Place
+from controller.daemon.socket_lock import SocketLock
 from model.rig.file import load_rig
 from model.table.table import LocalizationTable
 from rig_files import write_rig
@@ -92,7 +92,7 @@ async def daemon_at(
 ) -> AsyncIterator[DaemonBench]:
     """A daemon that serves, for a far end that is there; changes: of the rig's text."""
     config = load_daemon_config(write_daemon(folder, dict(far.urls), more, changes=changes))
-    place = Place(config.socket)
+    place = SocketLock(config.socket)
     log = LogThread(folder / "log")
     handler = LogHandler(log)
     daemon = Daemon(config, daemon_table(), log=log, manager=ServiceManager({}), dashboard=None)

@@ -25,7 +25,7 @@ from typing import Any
 import yaml
 
 from controller.api.jsonrpc import RpcError
-from controller.main import run
+from controller.cli.main import run
 from drivers.errors import DriverError
 from gateway_bench import real_daemon
 from model.errors import InputError

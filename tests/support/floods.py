@@ -21,8 +21,8 @@ import time
 from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import asynccontextmanager
 
+from controller.sources.touch import Touch, TouchFrame
 from controller.sources.tuio import tuio_datagram
-from controller.touch import Touch, TouchFrame
 
 _SUBSCRIBE = {
     "topics": ["state", "contacts", "pattern", "silence", "amplifiers", "latency", "log", "link"],

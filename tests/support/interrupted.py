@@ -68,7 +68,7 @@ def _waiting(command: str, inside: str, writing: int) -> int:
 
 
 if __name__ == "__main__":
-    from controller.main import main
+    from controller.cli.main import main
     from model.config.units import LENGTH, quantity
 
     asked = json.loads(sys.stdin.read())

@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from controller.main import main
+from controller.cli.main import main
 
 JUMPS = (86_400.0, -86_400.0, 0.4, -0.4, 3e8, -1.7e9, 0.0)
 """How far [s] it is from the real one: days, less than a lease, another decade, near 1970."""

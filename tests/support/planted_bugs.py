@@ -80,36 +80,38 @@ CONTROLLER: dict[str, Bug] = {
     "an up is dropped": _bug(
         "lift",
         Edit(
-            "controller.contacts:ContactTracker._lift",
+            "controller.sources.contacts:ContactTracker._lift",
             "self._contacts.pop(key) for key in tuple(keys)",
             "self._contacts[key] for key in tuple(keys)",
         ),
     ),
     "the lease of a source never ends": _bug(
         "lift",
-        Edit("controller.contacts:LEASE", "", "2.0"),
+        Edit("controller.sources.contacts:CONTACT_TIMEOUT", "", "2.0"),
         scenario=scenarios.source_dies,
     ),
     "channels are swapped in routing": _bug(
         "pattern",
         Edit(
-            "controller.routing:_drive",
+            "controller.loop.routing:_drive",
             "number = rig.wiring[name].number",
             "number = (1, 0, 2)[rig.wiring[name].number]",
         ),
     ),
     "phases are sent in radians": _bug(
         "pattern",
-        Edit("controller.routing:_wrapped_degrees", "math.degrees(", "float("),
+        Edit("controller.loop.routing:_wrapped_degrees", "math.degrees(", "float("),
     ),
     "levels are of twice the stroke": _bug(
         "pattern",
-        Edit("controller.routing:_drive", "rig.era(name).stroke", "(2 * rig.era(name).stroke)"),
+        Edit(
+            "controller.loop.routing:_drive", "rig.era(name).stroke", "(2 * rig.era(name).stroke)"
+        ),
     ),
     "the pattern of the first finger stays": _bug(
         "touch",
         Edit(
-            "controller.selection:Selector._holds",
+            "controller.loop.selection:Selector._holds",
             "if not targets or not current.targets:",
             "if targets and current.targets:\n        return True\n    if not targets:",
         ),
@@ -117,7 +119,7 @@ CONTROLLER: dict[str, Bug] = {
     "fingers beside the plate count": _bug(
         "justified",
         Edit(
-            "controller.contacts:ContactTracker._places",
+            "controller.sources.contacts:ContactTracker._places",
             "elif not (0 <= touch.x <= 1 and 0 <= touch.y <= 1):",
             "elif False:",
         ),
@@ -126,7 +128,7 @@ CONTROLLER: dict[str, Bug] = {
     "the heartbeat comes from a timer": _bug(
         "heartbeat",
         Edit(
-            "controller.loop:Controller.step",
+            "controller.loop.loop:Controller.step",
             "self._wake.clear()",
             """self._wake.clear()
     async def beat():
@@ -138,17 +140,19 @@ CONTROLLER: dict[str, Bug] = {
         ),
         scenario=scenarios.hung,
     ),
-    "heartbeats are too rare": _bug("heartbeat", Edit("controller.loop:HEARTBEAT", "", "0.2")),
+    "heartbeats are too rare": _bug("heartbeat", Edit("controller.loop.loop:HEARTBEAT", "", "0.2")),
     "heartbeats wait for touches": _bug(
         "heartbeat",
         Edit(
-            "controller.loop:Controller._next_cause", "moments.append(self._heartbeat_due)", "pass"
+            "controller.loop.loop:Controller._next_cause",
+            "moments.append(self._heartbeat_due)",
+            "pass",
         ),
     ),
     "a stop reaches one amplifier only": _bug(
         "stop",
         Edit(
-            "controller.stops:Stops.wish",
+            "controller.group.quick_stops:QuickStops.request",
             "(*self._on_buses, *reachable)",
             "reachable[:1]",
         ),
@@ -157,12 +161,12 @@ CONTROLLER: dict[str, Bug] = {
     "a set is committed by one amplifier only": _bug(
         "commit",
         Edit(
-            "controller.joint_play:JointPlay._commits",
+            "controller.group.synchronized_play:SynchronizedPlay._commits",
             "in together.items()",
             "in list(together.items())[:1]",
         ),
         Edit(
-            "controller.joint_play:JointPlay.play",
+            "controller.group.synchronized_play:SynchronizedPlay.play",
             "if status.token != commands[name].token:",
             "if False:",
         ),
@@ -171,7 +175,7 @@ CONTROLLER: dict[str, Bug] = {
     "it arms again once it is cleared": _bug(
         "armed",
         Edit(
-            "controller.loop:Controller.clear",
+            "controller.loop.loop:Controller.clear",
             "await self._group.clear()",
             "await self._group.clear(); await self._group.arm()",
         ),
@@ -180,21 +184,21 @@ CONTROLLER: dict[str, Bug] = {
     "fingers that are alone are not answered": _bug(
         "touch",
         Edit(
-            "controller.loop:Controller.step",
+            "controller.loop.loop:Controller.step",
             "if self.phase is Phase.ARMED and (",
             "if self.phase is Phase.ARMED and len(decision.contacts) != 1 and (",
         ),
     ),
     "a touch does not wake the loop": _bug(
-        "lift", Edit("controller.loop:Controller._follow", "self._wake.set()", "pass")
+        "lift", Edit("controller.loop.loop:Controller._follow", "self._wake.set()", "pass")
     ),
     "the release takes half a second": _bug(
-        "lift", Edit("controller.decision:RELEASE_RAMP", "", "0.5")
+        "lift", Edit("controller.loop.decision:RELEASE_RAMP", "", "0.5")
     ),
     "what was played is not taken back": _bug(
         "lift",
-        Edit("controller.decision:Decider._ending", "if not contacts:", "if False:"),
-        Edit("controller.decision:FADE_RAMP", "", "0.3"),
+        Edit("controller.loop.decision:Decider._ending", "if not contacts:", "if False:"),
+        Edit("controller.loop.decision:FADE_RAMP", "", "0.3"),
     ),
 }
 
@@ -222,7 +226,10 @@ DRIVERS: dict[str, Bug] = {
     "every set has the same token": _bug(
         "token",
         Edit(
-            "drivers.protocol.definition:token_after", "token %", "0 *", also=("controller.orders",)
+            "drivers.protocol.definition:token_after",
+            "token %",
+            "0 *",
+            also=("controller.loop.orders",),
         ),
     ),
     "levels have 1000 steps": _bug(
@@ -272,7 +279,7 @@ DRIVERS: dict[str, Bug] = {
     "silence waits its turn": _bug(
         "lift",
         Edit("drivers.link.turns:PATIENCE", "", "10.0"),
-        Edit("controller.amplifiers:PATIENCE", "", "10.0"),
+        Edit("controller.group.amplifier_group:PATIENCE", "", "10.0"),
         scenario=scenarios.slow_lift,
     ),
     "a stop is sent as a disarm": _bug(

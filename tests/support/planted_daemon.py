@@ -6,7 +6,7 @@ import pytest
 
 from planted_bugs import Bug, Edit, plant
 
-_DRIVE = "controller.routing:_drive"
+_DRIVE = "controller.loop.routing:_drive"
 BUGS = {
     "levels are of three quarters of the stroke": Bug(
         "level", (Edit(_DRIVE, "rig.era(name).stroke", "(0.75 * rig.era(name).stroke)"),)
@@ -19,10 +19,10 @@ BUGS = {
         (
             Edit(_DRIVE, "frequency=tone.frequency,", "frequency=tone.frequency + 40,"),
             Edit(
-                "controller.routing:route",
+                "controller.loop.routing:route",
                 "frequency=envelope.frequency",
                 "frequency=envelope.frequency + 40",
-                also=("controller.orders",),
+                also=("controller.loop.orders",),
             ),
         ),
     ),
@@ -30,7 +30,7 @@ BUGS = {
         "lift",
         (
             Edit(
-                "controller.contacts:ContactTracker._lift",
+                "controller.sources.contacts:ContactTracker._lift",
                 "self._contacts.pop(key) for key in tuple(keys)",
                 "self._contacts[key] for key in tuple(keys)",
             ),
@@ -41,7 +41,7 @@ BUGS = {
 
 
 if __name__ == "__main__":
-    from controller.main import main
+    from controller.cli.main import main
 
     plant(BUGS[sys.argv.pop(1)], pytest.MonkeyPatch())
     sys.exit(main())

@@ -12,5 +12,5 @@ def era_program() -> str:
     return (
         "import sys; from model import version; "
         f"version.code_version = lambda: {code_version()!r}; "
-        "from controller.main import main; sys.exit(main())"
+        "from controller.cli.main import main; sys.exit(main())"
     )

@@ -15,10 +15,10 @@ from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import Any, TextIO
 
-from controller.amplifiers import Phase
-from controller.loop import Controller
-from controller.observer import Applied, Observer
-from controller.touch import Touch, TouchFrame
+from controller.group.amplifier_group import Phase
+from controller.loop.loop import Controller
+from controller.loop.observer import Applied, Observer
+from controller.sources.touch import Touch, TouchFrame
 from drivers.amplifier import Amplifier
 from drivers.backend import Backend
 from drivers.errors import DriverError

@@ -8,8 +8,8 @@ from itertools import pairwise
 from pathlib import Path
 
 from controller.sources.capture import Datagram, read_capture, write_capture
+from controller.sources.touch import Touch, TouchFrame
 from controller.sources.tuio import tuio_datagram
-from controller.touch import Touch, TouchFrame
 
 LENGTH, WIDTH = 12 * 0.0254, 9 * 0.0254  # m; the example's plate
 FRAME = 1 / 60  # s; as touch tables send

@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from controller.loop import Controller
-from controller.touch import Touch, TouchFrame
+from controller.loop.loop import Controller
+from controller.sources.touch import Touch, TouchFrame
 from drivers import clock
 from drivers.amplifier import Amplifier
 from drivers.protocol.messages import Fault

@@ -11,7 +11,7 @@ from collections.abc import Callable
 
 from era_haptics.plugins.touch_sources import (
     InputError,
-    Tally,
+    RejectCounter,
     Touch,
     TouchFrame,
     TouchSource,
@@ -29,7 +29,7 @@ class JsonTouch(TouchSource):
         if not host or not (port.isascii() and port.isdecimal() and 0 < int(port) < 65536):
             raise InputError(f"touch source {url}: write jsontouch:HOST:PORT")
         self._host, self._port = host, int(port)
-        self.tally = Tally(logging.getLogger(__name__))  # counts, and logs once a second at most
+        self.tally = RejectCounter(logging.getLogger(__name__))  # and log once a second
 
     async def run(self, deliver: Callable[[TouchFrame], None]) -> None:
         """Deliver a frame a datagram until cancelled; malformed ones are counted, never raised."""

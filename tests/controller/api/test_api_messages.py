@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import controller
+from api_page import WRITER, reference
 from controller.api.jsonrpc import (
     ErrorCode,
     RpcError,
@@ -19,10 +20,9 @@ from controller.api.jsonrpc import (
     result_line,
 )
 from controller.api.methods import METHODS, ArmParams, ArmResult, SubscribeParams, TouchParams
-from controller.api.reference import WRITER, reference
 from controller.api.schema import Empty
 from controller.api.topics import TOPICS, StateEvent
-from controller.written_part import insert
+from page_part import insert
 
 PAGE = Path(controller.__file__).parent.parent / "docs" / "reference" / "api.md"
 
@@ -263,7 +263,7 @@ def test_the_page_names_every_method_topic_key_and_code() -> None:
     """The API's page holds the reference that the models give; after a change write it anew."""
     page = PAGE.read_text("utf-8")
     assert insert(page, reference(), writer=WRITER) == page, (
-        "python -m controller.api.reference docs/reference/api.md"
+        "python docs/generators/api_page.py docs/reference/api.md"
     )
     for name in [*METHODS, *(f"topic {topic}" for topic in TOPICS)]:
         assert re.search(rf"^#### {name}$", page, re.MULTILINE)

@@ -14,7 +14,7 @@ from controller.daemon.config import load_daemon_config
 from controller.daemon.daemon import Daemon
 from controller.daemon.log import LogThread
 from controller.daemon.notify import ServiceManager
-from controller.daemon.place import Place
+from controller.daemon.socket_lock import SocketLock
 from daemon_bench import daemon_table, far_end, running_daemon, until, until_state, write_daemon
 from drivers.errors import LinkError
 from drivers.protocol.messages import AmplifierState
@@ -164,7 +164,7 @@ async def test_an_end_while_an_amplifier_is_waited_for(tmp_path: Path) -> None:
     async with far_end(tmp_path) as far:
         far.station.befall(Episode("hang"))
         config = load_daemon_config(write_daemon(tmp_path, {"main": far.url}))
-        place, log = Place(config.socket), LogThread(tmp_path / "log")
+        place, log = SocketLock(config.socket), LogThread(tmp_path / "log")
         daemon = Daemon(config, daemon_table(), log=log, manager=ServiceManager({}), dashboard=None)
         running = asyncio.create_task(daemon.run(place))
         try:

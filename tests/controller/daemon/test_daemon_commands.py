@@ -12,8 +12,8 @@ import pytest
 import typer
 
 from controller.api.client_protocol import Notification
+from controller.cli.daemon import show_event, show_status, status, touch
 from controller.daemon.run import run_daemon
-from controller.daemon_cli import show_event, show_status, status, touch
 from controller.metrics.__main__ import serve
 from daemon_bench import running_daemon, until_state, write_daemon
 from model.errors import InputError

@@ -6,7 +6,7 @@ from typer.testing import CliRunner
 
 from controller.api.socket_path import default_socket
 from controller.daemon.config import load_daemon_config
-from controller.touch import Touch
+from controller.sources.touch import Touch
 from model.commands.config_cli import config_app
 from model.config.document import ConfigError
 from model.errors import InputError

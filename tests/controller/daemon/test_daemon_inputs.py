@@ -10,8 +10,8 @@ from controller.api.methods import TouchParams
 from controller.api.schema import TouchPoint
 from controller.daemon.config import TouchInput
 from controller.daemon.inputs import MOST_SOURCES, ApiTouches, TouchInputs
-from controller.touch import Touch, TouchFrame, TouchSource
-from controller.touch_calibration import TouchCalibration
+from controller.sources.calibration import TouchCalibration
+from controller.sources.touch import Touch, TouchFrame, TouchSource
 from model.errors import InputError
 from model.structure.plate import Material, Plate
 

@@ -13,12 +13,12 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
+from controller.cli.daemon import app
 from controller.daemon.dumps import write_dump
 from controller.daemon.latency import Latencies
 from controller.daemon.log import JsonFormatter, LogHandler, LogThread, RateLimit
 from controller.daemon.notify import ServiceManager
 from controller.daemon.records import KEPT, Record, RecordedBackend, Recorder
-from controller.daemon_cli import app
 from drivers.backend import Backend
 from drivers.protocol.messages import AmplifierState, Arm, Fault, Status
 

@@ -16,10 +16,10 @@ import pytest
 from controller.api.async_client import AsyncClient
 from controller.api.client_protocol import Notification
 from controller.api.jsonrpc import ErrorCode, RpcError
-from controller.daemon.place import Place
-from controller.daemon_cli import show_status
+from controller.cli.daemon import show_status
+from controller.daemon.socket_lock import SocketLock
+from controller.sources.touch import Touch, TouchFrame
 from controller.sources.tuio import tuio_datagram
-from controller.touch import Touch, TouchFrame
 from daemon_bench import (
     PATIENCE,
     PLACE,
@@ -133,7 +133,7 @@ async def test_a_client_that_is_gone_leaves_no_finger(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Its contacts are lifted with its connection; others stay, for two clients are two sources."""
-    monkeypatch.setattr("controller.contacts.LEASE", 60.0)  # so that nothing else lifts them
+    monkeypatch.setattr("controller.sources.contacts.CONTACT_TIMEOUT", 60.0)  # nothing else lifts
     async with running_daemon(tmp_path) as bench, await bench.client() as era:
         await until_state(era, READY)
         other = await bench.client()
@@ -518,7 +518,7 @@ async def test_a_second_daemon_at_the_same_socket_is_refused(tmp_path: Path) -> 
     """By the lock, with the number of the process that runs; the first goes on."""
     async with running_daemon(tmp_path) as bench, await bench.client() as era:
         with pytest.raises(InputError, match=rf"runs already at .* \(process {os.getpid()}\)"):
-            Place(bench.socket)
+            SocketLock(bench.socket)
         await until_state(era, READY)
 
 

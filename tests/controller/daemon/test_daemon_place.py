@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from controller.daemon.place import Place
+from controller.daemon.socket_lock import SocketLock
 from model.errors import InputError
 
 
@@ -14,7 +14,7 @@ def test_the_socket_is_its_users_alone(tmp_path: Path) -> None:
     """Mode 0600 in a folder of mode 0700, whatever the umask; gone in the end."""
     before = os.umask(0)
     try:
-        place = Place(tmp_path / "new" / "era.sock")
+        place = SocketLock(tmp_path / "new" / "era.sock")
         with place.bound():
             assert place.path.stat().st_mode & 0o777 == 0o600
             assert place.path.parent.stat().st_mode & 0o777 == 0o700
@@ -29,7 +29,7 @@ def test_the_socket_is_its_users_alone(tmp_path: Path) -> None:
 def test_a_folder_that_is_a_groups(tmp_path: Path, folder: int, socket: int) -> None:
     """Where the folder is for a group and nobody else, so is the socket; never for everybody."""
     tmp_path.chmod(folder)
-    place = Place(tmp_path / "era.sock")
+    place = SocketLock(tmp_path / "era.sock")
     with place.bound():
         assert place.path.stat().st_mode & 0o777 == socket
     place.leave()
@@ -39,13 +39,14 @@ def test_a_socket_that_a_killed_daemon_left_is_no_obstacle(tmp_path: Path) -> No
     """The lock goes with its process; the file that stays says nothing."""
     path = tmp_path / "era.sock"
     script = (
-        "import os, sys; from pathlib import Path; from controller.daemon.place import Place; "
-        "place = Place(Path(sys.argv[1])); place.bound(); os.kill(os.getpid(), 9)"
+        "import os, sys; from pathlib import Path; "
+        "from controller.daemon.socket_lock import SocketLock; "
+        "place = SocketLock(Path(sys.argv[1])); place.bound(); os.kill(os.getpid(), 9)"
     )
     done = subprocess.run([sys.executable, "-c", script, str(path)], check=False)
     assert done.returncode == -9
     assert path.is_socket()
-    place = Place(path)
+    place = SocketLock(path)
     place.bound().close()
     place.leave()
 
@@ -56,7 +57,7 @@ def test_a_folder_where_others_may_write_is_refused(tmp_path: Path) -> None:
     folder.mkdir()
     folder.chmod(0o777)
     with pytest.raises(InputError, match="others may write here"):
-        Place(folder / "era.sock")
+        SocketLock(folder / "era.sock")
 
 
 def test_a_link_of_somebody_elses_is_refused(
@@ -66,22 +67,22 @@ def test_a_link_of_somebody_elses_is_refused(
     (tmp_path / "ours").mkdir()
     link = tmp_path / "link"
     link.symlink_to("ours")
-    Place(link / "era.sock").leave()
+    SocketLock(link / "era.sock").leave()
     theirs = os.stat_result((0o120777, *link.lstat()[1:4], os.getuid() + 1, *link.lstat()[5:10]))
     monkeypatch.setattr(Path, "lstat", lambda path: theirs)
     with pytest.raises(InputError, match="or it is theirs"):
-        Place(link / "era.sock")
+        SocketLock(link / "era.sock")
 
 
 def test_a_path_that_is_too_long_is_said_to_be(tmp_path: Path) -> None:
     """The system's own error would name no length."""
     with pytest.raises(InputError, match="at most 107 bytes"):
-        Place(tmp_path / ("x" * 120))
+        SocketLock(tmp_path / ("x" * 120))
 
 
 def test_two_places_in_one_folder_are_two(tmp_path: Path) -> None:
     """Each socket has its own lock."""
-    places = [Place(tmp_path / name) for name in ("a.sock", "b.sock")]
+    places = [SocketLock(tmp_path / name) for name in ("a.sock", "b.sock")]
     for place in places:
         bound = place.bound()
         assert isinstance(bound, socket.socket)
@@ -101,5 +102,5 @@ def test_what_is_no_socket_is_left_alone(tmp_path: Path, what: str) -> None:
         case _:
             path.symlink_to(tmp_path / "nowhere")
     with pytest.raises(InputError, match="something else than a socket is there; move it away"):
-        Place(path)
+        SocketLock(path)
     assert [each.name for each in tmp_path.iterdir()] == ["there"]

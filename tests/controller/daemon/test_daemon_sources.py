@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from controller.sources.touch import Touch, TouchFrame
 from controller.sources.tuio import tuio_datagram
-from controller.touch import Touch, TouchFrame
 from daemon_bench import running_daemon, until_state
 from sim.faults.episodes import Episode
 

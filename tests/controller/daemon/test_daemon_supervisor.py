@@ -12,9 +12,9 @@ import pytest
 from controller.daemon.states import Event, Kind, Machine
 from controller.daemon.states import State as DaemonState
 from controller.daemon.supervisor import Supervisor
-from controller.loop import Controller
-from controller.observer import Observer
-from controller.touch import Touch, TouchFrame
+from controller.loop.loop import Controller
+from controller.loop.observer import Observer
+from controller.sources.touch import Touch, TouchFrame
 from controller_bench import make_bench
 from drivers.amplifier import Amplifier
 from drivers.errors import CommandRefused, LinkError

@@ -12,9 +12,9 @@ from pathlib import Path
 
 import pytest
 
+from controller.cli.main import run
 from controller.deploy.files import service_files
 from controller.deploy.permissions import Permissions, required_permissions
-from controller.main import run
 from full_disk import full_disk
 from model.errors import InputError
 

@@ -6,7 +6,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from controller.contacts import Contact, ContactKey
 from controller.daemon.meaning import Meaning
 from controller.effects.effect import Course, Effect, Feeling, Nothing
 from controller.effects.kinds import effect_kind, effect_kinds
@@ -15,6 +14,7 @@ from controller.effects.moving import Detents, Texture
 from controller.effects.player import EffectPlayer
 from controller.effects.shapes import Circle, Polygon, Rectangle
 from controller.effects.timed import Buzz, Click, Ramp
+from controller.sources.contacts import Contact, ContactKey
 
 
 def finger(id: int, x: float = 0.05, y: float = 0.05, *, since: float = 0.0) -> Contact:
@@ -30,27 +30,27 @@ def wanted(
     player: EffectPlayer, contacts: Sequence[Contact], now: float
 ) -> dict[int, float | None]:
     """Levels that are wished, by the finger's id."""
-    wish = player.wish(contacts, now)
-    return {target.key.id: target.level_db_sl for target in wish.targets}
+    intent = player.intent(contacts, now)
+    return {target.key.id: target.level_db_sl for target in intent.targets}
 
 
 def test_click_is_over_after_its_duration() -> None:
-    """A click of 40 ms is felt until then; the wish says when to look again, and ends."""
+    """A click of 40 ms is felt until then; the intent says when to look again, and ends."""
     player = EffectPlayer(Layout(effects={"click": Click(level=18.0)}, elsewhere="click"))
     here = [finger(1)]
-    wish = player.wish(here, 10.0)
-    assert [target.level_db_sl for target in wish.targets] == [18.0]
-    assert wish.until == pytest.approx(10.04)
+    intent = player.intent(here, 10.0)
+    assert [target.level_db_sl for target in intent.targets] == [18.0]
+    assert intent.until == pytest.approx(10.04)
     assert wanted(player, here, 10.039) == {1: 18.0}
     assert wanted(player, here, 10.04) == {}
-    assert player.wish(here, 10.05).until is None
+    assert player.intent(here, 10.05).until is None
 
 
 def test_buzz_lasts_as_long_as_the_finger() -> None:
     """Without a duration it asks for nothing but its finger; a new finger begins anew."""
     player = EffectPlayer(Layout())
     assert wanted(player, [finger(1)], 0.0) == {1: 20.0}
-    assert player.wish([finger(1)], 100.0).until is None
+    assert player.intent([finger(1)], 100.0).until is None
     assert wanted(player, [], 101.0) == {}
     assert wanted(player, [finger(1)], 102.0) == {1: 20.0}
 
@@ -247,11 +247,11 @@ def test_the_first_end_is_when_to_look_again() -> None:
     slider = Region("slider", LEFT, on_move="dots")
     effects: dict[str, Effect] = {"dots": Detents(duration=0.03), "click": Click(duration=0.04)}
     player = EffectPlayer(Layout((slider,), effects, elsewhere="click"))
-    player.wish([finger(1, 0.05)], 0.0)
+    player.intent([finger(1, 0.05)], 0.0)
     fingers = [finger(1, 0.056), finger(2, 0.15)]
-    assert player.wish(fingers, 1.0).until == pytest.approx(1.03)
-    assert player.wish(fingers, 1.03).until == pytest.approx(1.04)
-    assert player.wish(fingers, 1.04).until is None
+    assert player.intent(fingers, 1.0).until == pytest.approx(1.03)
+    assert player.intent(fingers, 1.03).until == pytest.approx(1.04)
+    assert player.intent(fingers, 1.04).until is None
 
 
 def test_several_at_once() -> None:
@@ -366,9 +366,9 @@ def test_another_layout_is_no_other_press() -> None:
     )
 )
 def test_any_way_of_fingers(steps: list[tuple[float, dict[int, tuple[float, float]]]]) -> None:
-    """Only fingers that are there are targets, no more than allowed, and no wish ran out before.
+    """Only fingers that are there are targets, no more than allowed, and no intent ran out before.
 
-    The same sequence gives the same wishes.
+    The same sequence gives the same intents.
     """
     regions = (
         Region("left", LEFT, on_press="click", on_move="texture", on_release="click"),
@@ -386,7 +386,7 @@ def test_any_way_of_fingers(steps: list[tuple[float, dict[int, tuple[float, floa
     for pause, places in steps:
         now += pause
         contacts = [finger(id, x, y) for id, (x, y) in places.items()]
-        first, again = (player.wish(contacts, now) for player in players)
+        first, again = (player.intent(contacts, now) for player in players)
         assert first == again
         assert {target.key for target in first.targets} <= {each.key for each in contacts}
         assert len(first.targets) <= 2

@@ -4,11 +4,11 @@ import asyncio
 
 import pytest
 
-from controller.contacts import Contact
 from controller.effects.effect import Course, Effect, Feeling, Nothing
 from controller.effects.layout import Layout
 from controller.effects.player import EffectPlayer
 from controller.effects.timed import Buzz, Click
+from controller.sources.contacts import Contact
 from controller_bench import FINGER, running
 from virtual_loop import in_virtual_time
 
@@ -18,7 +18,7 @@ from virtual_loop import in_virtual_time
 async def test_a_click_ends_on_time_while_nothing_moves(duration: float) -> None:
     """Told to fall silent within a millisecond of its end, not with the next heartbeat."""
     layout = Layout(effects={"click": Click(duration=duration)}, elsewhere="click")
-    async with running(wishes=EffectPlayer(layout)) as bench:
+    async with running(intent_source=EffectPlayer(layout)) as bench:
         loop = asyncio.get_running_loop()
         bench.touch(FINGER)
         begin = loop.time()
@@ -55,7 +55,7 @@ async def test_an_effect_that_fails_is_silence_and_no_more() -> None:
 
     layout = Layout(effects={"broken": Broken(), "buzz": Buzz()}, elsewhere="broken")
     player = EffectPlayer(layout)
-    async with running(wishes=player) as bench:
+    async with running(intent_source=player) as bench:
         await bench.hold(FINGER, seconds=0.2)
         _, played, silent = bench.far_end.sets()
         assert any(command.level for command in played.commands)

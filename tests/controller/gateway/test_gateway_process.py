@@ -210,7 +210,7 @@ def test_without_the_extra_it_says_what_to_install(tmp_path: Path) -> None:
     """The command is there, and tells; so does nothing else of `era` need the libraries."""
     code = (
         "import sys; sys.modules['starlette'] = None; sys.argv = ['era', 'gateway'];"
-        "from controller.main import main; sys.exit(main())"
+        "from controller.cli.main import main; sys.exit(main())"
     )
     done = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False

@@ -20,9 +20,9 @@ from controller.sources.input_device import (
     get_slots,
     parse_events,
 )
+from controller.sources.registry import open_source
 from controller.sources.slots import SlotState
-from controller.touch import TouchFrame
-from controller.touch_registry import open_source
+from controller.sources.touch import TouchFrame
 from model.errors import InputError
 from virtual_sockets import run_virtual_on_sockets
 

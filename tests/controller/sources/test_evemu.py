@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from controller.sources.evemu import EvemuSource, read_evemu
-from controller.touch import TouchFrame
+from controller.sources.touch import TouchFrame
 from model.errors import InputError
 from virtual_loop import in_virtual_time
 

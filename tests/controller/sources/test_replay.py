@@ -6,9 +6,9 @@ from pathlib import Path
 import pytest
 
 from controller.sources.capture import Datagram, write_capture
+from controller.sources.registry import open_source
+from controller.sources.touch import Touch, TouchFrame
 from controller.sources.tuio import tuio_datagram
-from controller.touch import Touch, TouchFrame
-from controller.touch_registry import open_source
 from model.errors import InputError
 from virtual_loop import run_virtual
 

@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 from pythonosc.osc_bundle_builder import IMMEDIATELY, OscBundleBuilder
 from pythonosc.osc_message_builder import OscMessageBuilder
 
+from controller.sources.reject_counter import RejectCounter
+from controller.sources.touch import Touch, TouchFrame
 from controller.sources.tuio import TuioReader, TuioSource, tuio_datagram
-from controller.tally import Tally
-from controller.touch import Touch, TouchFrame
 from model.errors import InputError
 from virtual_sockets import in_virtual_time_on_sockets
 
@@ -56,7 +56,7 @@ def frame(*touches: tuple[int, float, float], fseq: int = -1, source: str = "tab
 @pytest.fixture
 def reader() -> TuioReader:
     """A reader whose log line does not matter."""
-    return TuioReader(Tally(logging.getLogger("test")))
+    return TuioReader(RejectCounter(logging.getLogger("test")))
 
 
 def touches(frame: TouchFrame | None) -> list[tuple[int, float, float]]:
@@ -248,7 +248,7 @@ def test_huge_bundles_are_not_read(reader: TuioReader) -> None:
 @given(st.binary(max_size=200), st.integers(0, 300))
 def test_any_bytes(noise: bytes, cut: int) -> None:
     """Whatever bytes come, alone or in the middle of a good bundle, nothing is raised."""
-    reader = TuioReader(Tally(logging.getLogger("test")))
+    reader = TuioReader(RejectCounter(logging.getLogger("test")))
     good = frame((1, 0.25, 0.5), fseq=1)
     for datagram in (noise, good[:cut], good[:cut] + noise, good[:cut] + noise + good[cut:]):
         reader.read(datagram, PEER, now=0)
@@ -265,7 +265,7 @@ def test_tuio_datagram_is_the_inverse(places: dict[int, tuple[float, float]]) ->
     """What tuio_datagram writes, the reader reads: ids and positions of single precision."""
     wanted = tuple(Touch(id, x, y) for id, (x, y) in places.items())
     datagram = tuio_datagram(TouchFrame("table@a", 0.0, wanted), 7)
-    result = TuioReader(Tally(logging.getLogger("test"))).read(datagram, PEER, now=2.0)
+    result = TuioReader(RejectCounter(logging.getLogger("test"))).read(datagram, PEER, now=2.0)
     assert result == TouchFrame("tuio:192.0.2.7/table@a", 2.0, wanted)
 
 

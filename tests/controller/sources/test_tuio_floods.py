@@ -10,9 +10,9 @@ from pythonosc.osc_bundle_builder import IMMEDIATELY, OscBundleBuilder
 from pythonosc.osc_message_builder import OscMessageBuilder
 
 from controller.sources.datagrams import MANY, Datagram, Peer, listen
+from controller.sources.reject_counter import RejectCounter
+from controller.sources.touch import Touch, TouchFrame
 from controller.sources.tuio import TuioReader, tuio_datagram, without_moot
-from controller.tally import Tally
-from controller.touch import Touch, TouchFrame
 
 HERE, THERE = ("127.0.0.1", 5001), ("127.0.0.1", 5002)
 
@@ -82,7 +82,7 @@ def test_who_reads_the_rest_knows_the_same(said: list[tuple[bytes, Peer]]) -> No
     said = [(data, peer) for data, peer in said if (peer == HERE) == (b"a\0\0\0" in data)]
     frames: list[dict[str, tuple[Touch, ...]]] = []
     for each in (waiting(*said), without_moot(waiting(*said))):
-        reader = TuioReader(Tally(logging.getLogger(__name__)))
+        reader = TuioReader(RejectCounter(logging.getLogger(__name__)))
         frames.append({})
         for data, peer, arrived in each:
             frame = reader.read(data, peer, now=arrived)

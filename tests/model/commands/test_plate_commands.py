@@ -7,7 +7,7 @@ from importlib.metadata import entry_points
 import numpy as np
 import pytest
 
-from controller.main import run
+from controller.cli.main import run
 from model.rig.file import example_rig_path
 from model.vibration import convergence
 

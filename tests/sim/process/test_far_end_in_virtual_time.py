@@ -141,7 +141,7 @@ async def test_a_signal_while_it_starts_is_heard_and_makes_no_noise(
     import asyncio
     import sys
 
-    for command in (["-m", "sim"], ["-c", "from controller.main import main; main()", "sim"]):
+    for command in (["-m", "sim"], ["-c", "from controller.cli.main import main; main()", "sim"]):
         process = await asyncio.create_subprocess_exec(
             *(sys.executable, "-P", *command, str(write_rig(tmp_path / "rig.yaml")), "--serial"),
             stdout=asyncio.subprocess.PIPE,

@@ -1,0 +1,1 @@
+"""The `era` command and the controller's share of it."""

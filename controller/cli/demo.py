@@ -1,0 +1,169 @@
+"""The controller's share of the `era` command: demo, rig check."""
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from controller.cli.rig import rig_app
+from drivers.errors import CommandError, CommandRefused, FrameError, LinkError
+from model.commands.next_line import next_line
+from model.counting import counted
+from model.errors import InputError
+
+if TYPE_CHECKING:
+    from controller.demo.rows import TouchRow
+
+app = typer.Typer()
+app.add_typer(rig_app, name="rig")
+
+EXIT_STATUS: dict[type[BaseException], int] = {
+    InputError: 2,
+    CommandError: 2,
+    CommandRefused: 1,
+    LinkError: 3,
+    FrameError: 3,
+}
+"""Exit status of the errors that these commands raise on purpose."""
+
+
+@app.callback()
+def _controller() -> None:
+    """Keep `demo` a command of its own while it is the only one."""
+
+
+@app.command()
+def demo(
+    wire: Annotated[
+        str,
+        typer.Option(
+            help="serial (a pseudo-terminal), modbus (TCP), can (socketcand) or sim (no wire)."
+        ),
+    ] = "serial",
+    touches: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="A TUIO capture, or an evemu recording (.events)."),
+    ] = None,
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for the picture.")] = Path("out"),
+    as_json: Annotated[bool, typer.Option("--json", help="One JSON object, nothing else.")] = False,
+    dashboard: Annotated[
+        bool, typer.Option("--dashboard", help="Touch it yourself, on a page in the browser.")
+    ] = False,
+) -> None:
+    """Recorded touches in, felt vibrations out. The whole chain over a simulated plate."""
+    import asyncio
+    import time
+
+    from controller.demo.run import (
+        WIRES,
+        example_touches_path,
+        read_touches,
+        run_demo,
+        write_picture,
+    )
+    from model.rig.file import example_rig_path, load_rig
+    from model.table.cache import cached_table
+
+    if wire not in WIRES:
+        raise InputError(f"--wire {wire}: there is no such wire; choose one of {', '.join(WIRES)}")
+    if dashboard and (touches is not None or as_json):
+        raise InputError(
+            "--dashboard takes its touches from the page; leave --touches and --json out"
+        )
+    recorded = read_touches(touches or example_touches_path())
+    rig_file = example_rig_path()
+    rig = load_rig(rig_file)
+    started = time.perf_counter()
+    table, table_file = cached_table(rig)
+    if dashboard:
+        from controller.cli.daemon import DASHBOARD
+        from controller.demo.live import run_live
+
+        print("Open the URL below, press Arm, and touch the plate; Ctrl-C ends it.", flush=True)
+        asyncio.run(run_live(rig_file, table, wire=wire, dashboard=DASHBOARD))
+        return
+    if not as_json:
+        print(
+            f"{rig_file.name}: table of {counted(len(rig.eras), 'ERA')} on a mesh of {table.mesh}, "
+            f"ready in {time.perf_counter() - started:.1f} s"
+        )
+        print(_HEADING, end="")
+    rows = asyncio.run(
+        run_demo(
+            rig_file,
+            table,
+            wire=wire,
+            touches=recorded,
+            on_row=lambda row: None if as_json else print(_line(row), flush=True),
+        )
+    )
+    files = write_picture(table, rows, out)
+    if as_json:
+        print(
+            json.dumps(
+                {
+                    "wire": wire,
+                    "touches": [row.as_json() for row in rows],
+                    "files": [str(file) for file in files],
+                }
+            )
+        )
+        return
+    print(_summary(rows))
+    for file in files:
+        print(f"wrote {file}")
+    if table_file is not None:
+        print(next_line("era", "table", "show", table_file))
+
+
+_HEADING = """\
+                                                          contrast / dB            level    latency
+                                                       steady     first 100 ms    / dB SL      / ms
+ time  target / cm  others  ERAs                    pred.  meas.  pred.  meas.  pred.  meas.
+"""
+
+
+def _line(row: "TouchRow") -> str:
+    x, y = (100 * value for value in row.target)
+    start = f"{row.time:5.1f}  {x:5.1f},{y:5.1f}  {len(row.quiet):6d}  "
+    played = row.played
+    if played is None:
+        return f"{start}silent: {row.reason}"
+    by_frequency: dict[float, list[str]] = {}
+    for era, tone in played.drive.items():
+        by_frequency.setdefault(tone["frequency_hz"], []).append(era)
+    eras = ", ".join(f"{' '.join(some)} {hertz:g} Hz" for hertz, some in by_frequency.items())
+    numbers = (
+        *(played.predicted_contrast_db, played.measured_contrast_db),
+        *(played.onset.predicted_contrast_db, played.onset.measured_contrast_db),
+        played.predicted_level_db_sl,
+        played.measured.level_db_sl if played.measured else None,
+    )
+    return (
+        f"{start}{eras:22s} {' '.join(f'{_number(number):>6s}' for number in numbers)} "
+        f"{_number(1000 * played.latency):>6s}{'' if played.is_steady else '  still ringing'}"
+    )
+
+
+def _number(value: float | None) -> str:
+    return "-" if value is None else f"{value:.1f}"
+
+
+def _summary(rows: "list[TouchRow]") -> str:
+    """How well prediction and measurement agree over the touches that reached the steady state."""
+    differences = [
+        abs(row.played.predicted_contrast_db - row.played.measured_contrast_db)
+        for row in rows
+        if row.played is not None
+        and row.played.is_steady
+        and row.played.predicted_contrast_db is not None
+        and row.played.measured_contrast_db is not None
+    ]
+    touches = counted(len(rows), "touch", plural="touches")
+    if not differences:
+        return touches
+    return (
+        f"{touches}; predicted and measured contrast differ by at most {max(differences):.1f} dB "
+        f"over the {len(differences)} with other fingers on the plate"
+    )

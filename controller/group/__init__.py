@@ -1,0 +1,1 @@
+"""The amplifiers of a rig as one: armed, played, stopped and closed together."""

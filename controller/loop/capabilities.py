@@ -1,0 +1,62 @@
+"""What the opened amplifiers of a rig can play together, in the table's words."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from controller.loop.envelopes import ENVELOPE_TIME, Loading, Shaping, shaping_of
+from model.drive_modes import MODES, playable_modes
+from model.errors import InputError
+from model.rig.rig import Rig
+
+
+@dataclass(frozen=True)
+class PlaybackCapabilities:
+    """What patterns may be made of.
+
+    mode: in which the table is asked; playable: the modes that every amplifier can play;
+    frequencies: the lowest and highest [Hz]; largest: amplitude [m] by ERA; shaping: which
+    envelopes all of them play.
+    """
+
+    mode: str
+    playable: tuple[str, ...]
+    frequencies: tuple[float, float]
+    largest: Mapping[str, float]
+    shaping: Shaping
+
+
+def playback_capabilities(
+    rig: Rig,
+    amplifiers: Mapping[str, Loading],
+    *,
+    mode: str | None = None,
+    envelope_time: float = ENVELOPE_TIME,
+) -> PlaybackCapabilities:
+    """What the open amplifiers of a rig, by name, can play.
+
+    mode: None for the best that all can; envelope_time [s]: how long loading envelopes may hold up
+    a touch, 0 for ramps only. Raises InputError for a mode that one of them cannot play.
+    """
+    capabilities = {name: amplifier.capabilities for name, amplifier in amplifiers.items()}
+    each = [
+        playable_modes(level_step=caps.level_step, phase_step=caps.phase_step)
+        for caps in capabilities.values()
+    ]
+    playable = tuple(name for name in MODES if all(name in modes for modes in each))
+    if mode is not None and mode not in playable:
+        raise InputError(
+            f"these amplifiers cannot play mode {mode}, only {', '.join(playable)}; choose one of "
+            "these, or none for the best"
+        )
+    limits = rig.limits
+    level = {name: min(limits.level, caps.level_max) for name, caps in capabilities.items()}
+    return PlaybackCapabilities(
+        mode=mode or playable[-1],
+        playable=playable,
+        frequencies=(
+            max([limits.frequency_min, *(caps.frequency_min for caps in capabilities.values())]),
+            min([limits.frequency_max, *(caps.frequency_max for caps in capabilities.values())]),
+        ),
+        largest={era.name: era.stroke * level[rig.wiring[era.name].amplifier] for era in rig.eras},
+        shaping=shaping_of(rig, amplifiers, within=envelope_time),
+    )

@@ -1,0 +1,24 @@
+"""Touch sources by the scheme of their URL, our own and those of installed plug-ins alike."""
+
+from collections.abc import Callable
+
+from controller.sources.touch import TouchSource
+from model.errors import InputError
+from registry.plugins import Derived, PluginRegistry
+
+_SOURCES: PluginRegistry[Callable[[str], TouchSource]] = PluginRegistry(
+    "touch source",
+    "era_haptics.touch_sources",
+    Derived(TouchSource),
+    error=InputError,
+    ending=":",
+    example="tuio:127.0.0.1:3333",
+)
+
+
+def open_source(url: str) -> TouchSource:
+    """Make the touch source of a URL such as `tuio:127.0.0.1:3333` or `evemu:taps.events`.
+
+    Raises InputError on an unknown scheme, a plug-in that does not work or a URL that it refuses.
+    """
+    return _SOURCES.make(url)

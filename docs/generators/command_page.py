@@ -1,0 +1,66 @@
+"""The reference in docs/reference/commands.md: every command with its arguments and options.
+
+`python docs/generators/command_page.py docs/reference/commands.md` writes it anew between the
+page's two marks, from the commands themselves. Commands of other installed packages are left out.
+"""
+
+import sys
+from collections.abc import Iterator
+from importlib.metadata import entry_points
+from pathlib import Path
+
+import typer
+from typer.core import TyperGroup
+
+from controller.cli.main import put_together
+from page_part import insert
+
+WRITER = "docs/generators/command_page.py"
+_DISTRIBUTION = "era-haptics"
+
+
+def own_commands() -> TyperGroup:
+    """Those that come with era-haptics."""
+    entries = entry_points(group="era_haptics.commands")
+    own = [entry for entry in entries if entry.dist and entry.dist.name == _DISTRIBUTION]
+    return put_together(own, debug=False)[0]
+
+
+def command_reference() -> str:
+    """All commands by name, groups after the single ones, as Markdown."""
+    group = own_commands()
+    context = typer.Context(group, info_name="era")
+    return "\n".join(_group(group, context))
+
+
+def _group(group: TyperGroup, context: typer.Context) -> Iterator[str]:
+    commands = sorted(
+        group.commands.items(), key=lambda item: (isinstance(item[1], TyperGroup), item[0])
+    )
+    for name, command in commands:
+        inner = typer.Context(command, info_name=name, parent=context)
+        if isinstance(command, TyperGroup):
+            yield from _group(command, inner)
+            continue
+        yield from (f"### {inner.command_path}", "")
+        yield from (" ".join((command.help or "").split()), "")
+        usage = " ".join(command.collect_usage_pieces(inner))
+        yield from ("```text", f"{inner.command_path} {usage}", "```", "")
+        records = [parameter.get_help_record(inner) for parameter in command.params]
+        yield from ("| | |", "|---|---|")
+        for record in records:
+            if record is not None:
+                yield f"| `{_cell(record[0])}` | {_cell(record[1])} |"
+        yield ""
+
+
+def _cell(text: str) -> str:
+    """Without what a table of Markdown would take for its own."""
+    return " ".join(text.split()).replace("|", "\\|")
+
+
+if __name__ == "__main__":
+    path = Path(sys.argv[1])
+    path.write_text(
+        insert(path.read_text("utf-8"), command_reference(), writer=WRITER), encoding="utf-8"
+    )

@@ -1,0 +1,110 @@
+"""Amplifiers that share a bus are stopped by one frame, whoever of them answers.
+
+In virtual time over real far ends; what is told is what the amplifiers heard, and when.
+"""
+
+import asyncio
+from collections.abc import Callable, Coroutine
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import pytest
+
+from controller.group.amplifier_group import AmplifierGroup
+from drivers.amplifier import Amplifier
+from drivers.protocol.messages import AmplifierState, Reply, Request, Stop
+from drivers.registry import open_backend
+from memory_machine import live_in_memory
+from model.rig.rig import Channel, Rig
+from sim.far_ends.wires import Wire
+from sim.faults.episodes import Episode
+from virtual_loop import run_virtual
+from wires import FarSide, far_side
+
+BUSES = {
+    "serial": Wire("serial", speed=115_200, shared=True),
+    "modbus+rtu": Wire("modbus-rtu", speed=115_200, shared=True),
+    "can+slcan": Wire("slcan", shared=True),
+}
+FRAME = 0.004  # s; a broadcast stop on the slowest of these, with the silence before it
+NAMES = ("first", "second", "third")
+
+
+def on_a_bus(
+    bus: str,
+    rig: Rig,
+    use: Callable[[FarSide, AmplifierGroup, list[tuple[str, float]]], Coroutine[Any, Any, None]],
+) -> None:
+    """Use three armed amplifiers in virtual time; the last of use's arguments is who heard a Stop,
+    and when [s]."""
+    wiring = {era: Channel(NAMES[number % 3], number // 3) for number, era in enumerate(rig.wiring)}
+    three = replace(rig, wiring=wiring, amplifiers=dict.fromkeys(NAMES, "sim://"))
+    heard: list[tuple[str, float]] = []
+
+    def note(
+        name: str, exchange: Callable[[Request], Reply | None], request: Request
+    ) -> Reply | None:
+        if isinstance(request, Stop):
+            heard.append((name, asyncio.get_running_loop().time()))
+        return exchange(request)
+
+    async def run() -> None:
+        live_in_memory()
+        async with far_side(BUSES[bus], three) as far:
+            for name, station in far.stations.items():
+                station.exchange = partial(note, name, station.exchange)  # type: ignore[method-assign]
+            group = AmplifierGroup(
+                {name: Amplifier(open_backend(url)) for name, url in far.urls.items()}
+            )
+            await group.open()
+            await group.arm()
+            await asyncio.sleep(0.02)  # the line has been silent for long
+            await use(far, group, heard)
+            await group.close({})
+
+    run_virtual(run())
+
+
+@pytest.mark.parametrize("bus", BUSES)
+def test_one_that_does_not_answer_holds_up_no_other_stop(bus: str, coarse_rig: Rig) -> None:
+    """The first is asked for its status 30 ms and more; the others are silent a frame after the
+    stop was wished all the same, and latched."""
+
+    async def use(far: FarSide, group: AmplifierGroup, heard: list[tuple[str, float]]) -> None:
+        far.stations["first"].befall(Episode("hang"))
+        begin = asyncio.get_running_loop().time()
+        await group.stop()
+        for name in NAMES[1:]:
+            assert min(moment for who, moment in heard if who == name) - begin < FRAME
+            assert far.stations[name].status().state is AmplifierState.QUICK_STOP_ACTIVE
+
+    on_a_bus(bus, coarse_rig, use)
+
+
+@pytest.mark.parametrize("bus", BUSES)
+def test_each_is_asked_as_well(bus: str, coarse_rig: Rig) -> None:
+    """One frame tells all at a moment, and then each is asked for its answer."""
+
+    async def use(far: FarSide, group: AmplifierGroup, heard: list[tuple[str, float]]) -> None:
+        await group.stop()
+        assert sorted(name for name, _ in heard[:3]) == sorted(NAMES)
+        assert heard[2][1] - heard[0][1] < 0.001
+        assert sorted(name for name, _ in heard[3:]) == sorted(NAMES)
+
+    on_a_bus(bus, coarse_rig, use)
+
+
+@pytest.mark.parametrize("bus", BUSES)
+def test_one_that_is_lost_keeps_the_frame_from_no_other(bus: str, coarse_rig: Rig) -> None:
+    """One that is there sends it: the others hear it at one moment, and are asked as well."""
+
+    async def use(far: FarSide, group: AmplifierGroup, heard: list[tuple[str, float]]) -> None:
+        await group._amplifiers["first"].close()  # as it is until it is opened again
+        await group.stop()
+        others = [(name, moment) for name, moment in heard if name != "first"]
+        assert sorted(name for name, _ in others[:2]) == sorted(NAMES[1:])
+        assert others[1][1] - others[0][1] < 0.001
+        assert sorted(name for name, _ in others[2:]) == sorted(NAMES[1:])
+
+    on_a_bus(bus, coarse_rig, use)

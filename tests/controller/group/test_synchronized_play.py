@@ -1,0 +1,55 @@
+"""What several amplifiers are asked for a set where silence comes before it, or amid it."""
+
+import pytest
+
+from controller.group.synchronized_play import SynchronizedPlay
+from controller_bench import FarEnd
+from drivers.amplifier import Amplifier
+from drivers.command import CommandSet, DriveCommand
+from drivers.guard import Guard, GuardLimits
+from drivers.protocol.messages import Commit, Request, Stage
+from virtual_loop import in_virtual_time
+
+NAMES = ("a", "b")
+
+
+@pytest.mark.parametrize(("steps", "asked"), [(0, []), (1, [Stage])])
+async def test_what_is_silenced_goes_no_further(steps: int, asked: list[type[Request]]) -> None:
+    """Before it nothing is asked; once all have it staged nobody commits, and none is torn."""
+    far_ends = {name: FarEnd() for name in NAMES}
+    amplifiers = {name: Amplifier(far_end) for name, far_end in far_ends.items()}
+    for amplifier in amplifiers.values():
+        await amplifier.open()
+    before = len(far_ends["a"].asked)
+    guard = Guard(GuardLimits(40.0, 500.0, 1.0), amplifiers["a"].capabilities)
+    wanted = CommandSet(1, (DriveCommand(0, 110.0, 0.2),), ramp=0.01, valid_for=0.0)
+    joint = SynchronizedPlay(amplifiers, goes_on=lambda: len(far_ends["b"].asked) < before + steps)
+    assert await joint.play(dict.fromkeys(NAMES, guard.check(wanted)), {}) is None
+    assert not joint.is_set_incomplete
+    for far_end in far_ends.values():
+        assert [type(request) for _, request in far_end.asked[before:]] == asked
+
+
+@in_virtual_time
+async def test_a_set_is_sent_when_the_last_has_what_it_needs() -> None:
+    """The wire of one takes 10 ms longer, so the other is told 10 ms later; both are asked then."""
+    far_ends = {name: FarEnd() for name in NAMES}
+    far_ends["a"].commit_takes = 0.010
+    amplifiers = {name: Amplifier(far_end) for name, far_end in far_ends.items()}
+    for amplifier in amplifiers.values():
+        await amplifier.open()
+        await amplifier.arm()
+    for far_end in far_ends.values():
+        far_end.delay = 0.003
+    guard = Guard(GuardLimits(40.0, 500.0, 1.0), amplifiers["a"].capabilities)
+    wanted = CommandSet(1, (DriveCommand(0, 110.0, 0.2),), ramp=0.01, valid_for=0.0)
+    joint = SynchronizedPlay(amplifiers, goes_on=lambda: True)
+    assert await joint.play(dict.fromkeys(NAMES, guard.check(wanted)), {}) is not None
+    first, last = sorted(
+        time
+        for far_end in far_ends.values()
+        for time, request in far_end.asked
+        if isinstance(request, Commit)
+    )
+    assert last - first == pytest.approx(0.010)
+    assert joint.last_sent == last

@@ -1,0 +1,132 @@
+"""Touches, arming, stopping, cancelling and slow answers in any order: nothing stays vibrating."""
+
+import asyncio
+import random
+from typing import Any
+
+import pytest
+
+from controller.group.amplifier_group import Phase
+from controller.loop.loop import Controller
+from controller.sources.touch import Touch, TouchFrame
+from controller_bench import make_bench
+from drivers.amplifier import Amplifier
+from drivers.backend import Backend
+from drivers.errors import DriverError, LinkTimeout
+from drivers.protocol.messages import AmplifierState, Reply, Request
+from model.vibration.excitation import Tone
+from shaped_link import Shapes
+from sim.amplifier.amplifier import SimulatedAmplifier
+from virtual_loop import in_virtual_time
+
+PAUSES = (0.0, 0.001, 0.004, 0.02, 0.06)
+WATCHDOG = 0.25 + 0.005  # s; what an amplifier needs to fall silent by itself
+
+
+class Link(Backend):
+    """A simulated amplifier on the loop's clock whose answers take a while; some may be lost."""
+
+    def __init__(self, dice: random.Random, *, loss: float) -> None:
+        self.amplifier = SimulatedAmplifier("any", channels=2)
+        self._dice = dice
+        self._loss = loss
+        self._last_sent = 0.0
+
+    async def open(self) -> None:
+        """Always succeeds."""
+
+    async def close(self) -> None:
+        """Nothing is to be given back."""
+
+    @property
+    def last_sent(self) -> float:
+        """On the loop's clock [s]."""
+        return self._last_sent
+
+    async def exchange(self, request: Request, *, timeout: float) -> Reply:
+        """Obey at once, answer later."""
+        self._last_sent = asyncio.get_running_loop().time()
+        reply = self.amplifier.handle(request, self._last_sent)
+        if self._dice.random() < self._loss:
+            await asyncio.sleep(timeout)
+            raise LinkTimeout("the answer was lost")
+        await asyncio.sleep(self._dice.choice((0.0, 0.001, 0.005, 0.009)))
+        return reply
+
+    def level(self) -> float:
+        """The loudest channel now."""
+        now = asyncio.get_running_loop().time()
+        self.amplifier.tick(now)
+        return max(self.amplifier.status(now).levels)
+
+
+async def step_at_random(
+    controller: Controller, table: Any, dice: random.Random, tasks: list[asyncio.Task[None]]
+) -> bool | None:
+    """Do one thing; whether a finger is down now, or None where that has not changed."""
+    now = asyncio.get_running_loop().time()
+    match dice.choices(["touch", "lift", "ask", "withdraw", "wait"], [9, 5, 4, 1, 2])[0]:
+        case "touch":
+            era, frequency = dice.choice(("SW", "NE")), dice.choice((110.0, 250.0))
+            table.excitation = {era: Tone(frequency, dice.choice((20e-6, 40e-6)))}
+            finger = Touch(1, dice.random(), dice.random())
+            controller.deliver(TouchFrame("any", now, (finger,)))
+            return True
+        case "lift":
+            controller.deliver(TouchFrame("any", now, ()))
+            return False
+        case "ask":
+            call = getattr(
+                controller, dice.choice(("arm", "arm", "arm", "disarm", "stop", "clear"))
+            )
+            tasks.append(asyncio.create_task(call()))
+        case "withdraw":  # the loop itself is the first; another one takes over from it
+            number = dice.randrange(len(tasks))
+            tasks[number].cancel()
+            if number == 0:
+                await asyncio.gather(tasks[0], return_exceptions=True)
+                tasks[0] = asyncio.create_task(controller.run())
+    return None
+
+
+@pytest.mark.parametrize("loss", [0.0, 0.1])
+@pytest.mark.parametrize("seed", range(40))
+@in_virtual_time
+async def test_nothing_stays_vibrating(seed: int, loss: float) -> None:
+    """While answers come, zero is reached 20 ms after the last finger; in the end in any case.
+
+    The end is a close, or a loop that is no more: then the watchdogs do it. No task is left.
+    """
+    dice = random.Random(seed)
+    loop = asyncio.get_running_loop()
+    bench = make_bench(*("a", "b")[: dice.choice((1, 2))])
+    links = {name: Link(dice, loss=loss) for name in bench.rig.amplifiers}
+    controller = Controller(
+        bench.rig,
+        bench.table,
+        amplifiers={name: Amplifier(link) for name, link in links.items()},
+        timing=dice.choice((None, Shapes())),
+    )
+    await controller.open()
+    tasks = [asyncio.create_task(controller.run())]
+    down, lifted = False, loop.time()
+    for _ in range(40):
+        was, change = down, await step_at_random(controller, bench.table, dice, tasks)
+        down = was if change is None else change
+        if was and not down:
+            lifted = loop.time()
+        await asyncio.sleep(dice.choice(PAUSES))
+        if down or loop.time() - lifted < 0.0205 or controller.phase is not Phase.ARMED:
+            continue
+        assert loss or max(link.level() for link in links.values()) < 1e-3
+    if dice.random() < 0.5:
+        await controller.close()
+        states = {link.amplifier.state for link in links.values()}
+        assert loss or AmplifierState.OPERATION_ENABLED not in states
+    tasks[0].cancel()
+    await asyncio.sleep(WATCHDOG + 0.15)
+    assert max(link.level() for link in links.values()) == 0
+    await controller.close()
+    for ended in await asyncio.gather(*tasks, return_exceptions=True):
+        assert ended is None or isinstance(ended, DriverError | asyncio.CancelledError)
+    assert asyncio.all_tasks() == {asyncio.current_task()}

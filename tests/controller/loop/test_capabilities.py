@@ -1,0 +1,157 @@
+"""What the opened amplifiers can play, and which envelopes their wires have the time for."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import pytest
+
+from controller.loop.capabilities import playback_capabilities
+from controller.loop.envelopes import Shaping, ending_slots, onset_slots, shaping_of, wire_envelopes
+from drivers.command import Envelope as WireEnvelope
+from drivers.command import Knot
+from drivers.protocol.messages import Capabilities
+from drivers.protocol.wire_times import WireTimes
+from model.errors import InputError
+from model.fem.mesh import Mesh
+from model.rig.rig import Channel, Limits, Rig
+from model.structure.actuator import Era
+from model.structure.plate import Material, Plate
+from model.table.pattern import Pattern
+from model.transients.envelope import Envelope
+from model.vibration.excitation import Tone
+from sim.amplifier.amplifier import capabilities
+from told_times import ToldTimes
+
+FINE = capabilities(4)
+BOTH, ONSETS, ENDINGS = Shaping(True, True), Shaping(True, False), Shaping(False, True)
+
+
+@dataclass
+class Opened:
+    """An amplifier that takes a time [s] for each knot."""
+
+    capabilities: Capabilities = FINE
+    bus: str | None = None
+    knot_time: float = 0.0
+
+    @property
+    def wire_times(self) -> WireTimes:
+        """In proportion to the knots."""
+        return ToldTimes(knot_takes=self.knot_time)
+
+
+def rig() -> Rig:
+    """Two ERAs on the left amplifier, one on the right."""
+    return Rig(
+        plate=Plate(0.3, 0.2, 0.0015, Material("aluminium", 70e9, 2700.0, 0.33)),
+        mesh=Mesh(4, 4, 0.3, 0.2),
+        eras=tuple(
+            Era(name, x, 0.0, 17_000.0, 1.0, 0.0, stroke)
+            for name, x, stroke in (("A", 0.0, 1e-4), ("B", 0.15, 2e-4), ("C", 0.3, 1e-4))
+        ),
+        wiring={"A": Channel("left", 3), "C": Channel("right", 0), "B": Channel("left", 1)},
+        amplifiers={"left": "fake://", "right": "fake://"},
+        limits=Limits(40.0, 500.0, 0.8),
+    )
+
+
+@pytest.mark.parametrize(
+    ("steps", "mode"),
+    [
+        ([(1e-4, 0.01), (1e-4, 0.01)], "phased"),
+        ([(1e-4, 0.01), (1e-4, 180.0)], "signed"),
+        ([(1e-4, 360.0), (1e-4, 0.01)], "graded"),
+        ([(1e-4, 0.01), (1.0, 0.01)], "switched"),
+    ],
+)
+def test_the_richest_mode_that_all_can_play(steps: list[tuple[float, float]], mode: str) -> None:
+    """By the steps of level and phase [degrees] of each amplifier."""
+    left, right = (
+        Opened(replace(FINE, level_step=level, phase_step=phase)) for level, phase in steps
+    )
+    capabilities = playback_capabilities(rig(), {"left": left, "right": right})
+    assert capabilities.mode == mode
+    assert capabilities.playable[-1] == mode
+
+
+def test_a_poorer_mode_may_be_asked_for_but_no_richer_one() -> None:
+    """The choice holds, or is refused with what there is."""
+    plain = {name: Opened(replace(FINE, phase_step=360.0)) for name in ("left", "right")}
+    assert playback_capabilities(rig(), plain, mode="switched").mode == "switched"
+    with pytest.raises(InputError, match="cannot play mode phased, only switched, graded"):
+        playback_capabilities(rig(), plain, mode="phased")
+
+
+def test_frequencies_and_amplitudes_are_the_least_of_all() -> None:
+    """Of the rig's limits and every amplifier."""
+    left = Opened(replace(FINE, frequency_min=50.0, level_max=0.5))
+    right = Opened(replace(FINE, frequency_max=300.0))
+    capabilities = playback_capabilities(rig(), {"left": left, "right": right})
+    assert capabilities.frequencies == (50.0, 300.0)
+    assert capabilities.largest == pytest.approx({"A": 5e-5, "B": 1e-4, "C": 8e-5})
+
+
+@pytest.mark.parametrize(
+    ("left", "right", "shaping"),
+    [
+        (Opened(), Opened(), BOTH),
+        # An onset has 20 knots on the wire, an ending 7; the left amplifier has two of each.
+        (Opened(knot_time=0.020 / 40), Opened(), BOTH),
+        (Opened(knot_time=0.021 / 40), Opened(), ENDINGS),
+        (Opened(knot_time=0.021 / 14), Opened(), Shaping(False, False)),
+        # Two amplifiers on one wire wait for each other, on two they do not.
+        (Opened(knot_time=0.4e-3), Opened(knot_time=0.4e-3), BOTH),
+        (Opened(FINE, "bus", 0.4e-3), Opened(FINE, "bus", 0.4e-3), ENDINGS),
+        (Opened(replace(FINE, envelope_knots=19)), Opened(), ENDINGS),
+        (Opened(), Opened(replace(FINE, envelope_knots=6)), Shaping(False, False)),
+        (Opened(replace(FINE, envelope_slots=3)), Opened(), ONSETS),
+        (Opened(replace(FINE, envelope_slots=1)), Opened(), Shaping(False, False)),
+        (Opened(replace(FINE, envelope_step_min=0.01)), Opened(), Shaping(False, False)),
+    ],
+)
+def test_envelopes_that_all_play_and_that_are_loaded_in_time(
+    left: Opened, right: Opened, shaping: Shaping
+) -> None:
+    """Knots, slots and steps of every amplifier, and 20 ms for every wire."""
+    assert shaping_of(rig(), {"left": left, "right": right}, within=0.020) == shaping
+
+
+def test_no_time_is_no_envelopes() -> None:
+    """Where a touch may not wait at all, ramps serve, however fast the wire is."""
+    assert not shaping_of(rig(), {"left": Opened(), "right": Opened()}, within=0.0)
+
+
+def test_envelopes_on_the_wire_by_hand() -> None:
+    """Levels in strokes, phases in degrees, without the last knot; a slot each, onsets first."""
+    pattern = Pattern(
+        {"A": Tone(110.0, 5e-5)},
+        0.02,
+        20.0,
+        None,
+        None,
+        onset={
+            "B": Envelope(110.0, 0, (1e-4j, -2e-4, 0)),
+            "A": Envelope(110.0, 0, (2e-5, 5e-5)),
+        },
+        ending={"A": Envelope(110.0, 5e-5, (-1e-5j, 0))},
+    )
+    assert onset_slots(rig()) == {"A": 1, "B": 2, "C": 1}
+    assert ending_slots(rig()) == {"A": 3, "B": 4, "C": 2}
+    loads = wire_envelopes(pattern, rig())
+    assert loads["right"] == ()
+    close: Callable[[float], Any] = pytest.approx
+    assert loads["left"] == (
+        WireEnvelope(2, 0.005, (Knot(close(0.5), close(90.0)), Knot(close(1.0), close(180.0)))),
+        WireEnvelope(1, 0.005, (Knot(close(0.2), 0.0),)),
+        WireEnvelope(3, 0.005, (Knot(close(0.1), close(-90.0)),)),
+    )
+
+
+def test_a_knot_at_full_stroke_is_not_beyond_it() -> None:
+    """What rounding adds in the search for knots would be refused by every guard."""
+    full = complex(1e-4 * math.cos(1.0), 1e-4 * math.sin(1.0)) * (1 + 1e-12)
+    pattern = Pattern({}, 0.02, 20.0, None, None, onset={"A": Envelope(110.0, 0, (full, 0))})
+    ((envelope,), _) = wire_envelopes(pattern, rig()).values()
+    assert envelope.knots[0].level == 1.0

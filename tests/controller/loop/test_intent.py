@@ -1,0 +1,61 @@
+"""Who is the target where nobody gave touches another meaning."""
+
+import math
+
+import pytest
+
+from controller.loop.intent import HapticIntent, NewestBuzzes, Target
+from controller.sources.contacts import Contact, ContactKey
+
+
+def at(id: int) -> Contact:
+    """A contact; where it is does not matter here."""
+    return Contact(ContactKey("a", id), 0.1, 0.1, since=0.0)
+
+
+def wanted(source: NewestBuzzes, *ids: int) -> list[int]:
+    """Which of these contacts shall feel something."""
+    intent = source.intent(tuple(at(id) for id in ids), 0.0)
+    return [target.key.id for target in intent.targets]
+
+
+@pytest.mark.parametrize(
+    ("steps", "targets"),
+    [
+        ([(1,), (1, 2, 3)], [[1], [3]]),  # the newest
+        ([(1, 2), (1,), (1,), (1, 3)], [[2], [], [], [3]]),  # silent until the next contact comes
+        ([(1, 2), (1,), (1, 2)], [[2], [], [2]]),  # one that comes back under its id is new
+        ([(1, 2), (2,), ()], [[2], [2], []]),  # another one's lift changes nothing
+    ],
+)
+def test_the_newest_contact_is_the_target(
+    steps: list[tuple[int, ...]], targets: list[list[int]]
+) -> None:
+    """From contacts to target, step by step."""
+    source = NewestBuzzes()
+    assert [wanted(source, *ids) for ids in steps] == targets
+
+
+def test_it_is_wanted_at_the_given_level_for_as_long_as_it_is_down() -> None:
+    """None is for as strongly as the neighbours allow; nothing is to be asked again for."""
+    for level in (17.0, None):
+        intent = NewestBuzzes(level).intent((at(1),), 0.0)
+        assert intent.targets == (Target(ContactKey("a", 1), level),)
+        assert intent.until is None
+
+
+def test_it_says_why_nobody_is_to_feel_anything() -> None:
+    """After a lift another reason than on an empty plate."""
+    source = NewestBuzzes()
+    assert source.intent((), 0.0).reason == "nobody touches the plate"
+    source.intent((at(1), at(2)), 0.0)
+    assert source.intent((at(1),), 0.0).reason == "the target was lifted"
+    assert source.intent((), 0.0).reason == "nobody touches the plate"
+
+
+@pytest.mark.parametrize(
+    ("until", "due"), [(None, None), (7.0, 7.0), (3.0, 5.001), (math.nan, 5.001)]
+)
+def test_a_wish_runs_out(until: float | None, due: float | None) -> None:
+    """The loop comes back when it does; one that has run out does not keep it busy."""
+    assert HapticIntent((), until=until).due(5.0) == due

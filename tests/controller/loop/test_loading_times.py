@@ -1,0 +1,56 @@
+"""When envelopes are loaded no more, and when that is tried again."""
+
+from controller.loop.loading_times import FIRST_PAUSE, LONGEST_PAUSE, LoadingTimes
+
+SLOW, FAST = 0.031, 0.030
+
+
+def pause_after(times: LoadingTimes, now: float) -> float:
+    """How long [s] from a time on nothing is loaded, to half a second."""
+    return next(half / 2 for half in range(10_000) if times.problem(now + half / 2) is None)
+
+
+def test_three_slow_ones_in_a_row_are_too_many() -> None:
+    """One in time between them, and it is counted anew; just as long as allowed is in time."""
+    times = LoadingTimes(FAST)
+    for duration in (SLOW, SLOW, FAST, SLOW, SLOW):
+        times.took(duration, now=5.0)
+        assert times.problem(5.0) is None
+    times.took(SLOW, now=5.0)
+    assert times.problem(5.0) is not None
+    assert "took 31 ms" in str(times.problem(5.0))
+    assert pause_after(times, 5.0) == FIRST_PAUSE
+
+
+def test_pauses_grow_to_a_bound_while_it_stays_slow() -> None:
+    """Each attempt costs one slow loading only: 30, 60, 120, 240, 480, 480 s."""
+    times, now, pauses = LoadingTimes(FAST), 0.0, []
+    times.took(SLOW, now=now)
+    times.took(SLOW, now=now)
+    for _ in range(6):
+        times.took(SLOW, now=now)
+        pauses.append(pause_after(times, now))
+        now += pauses[-1]
+    assert pauses == [30.0, 60.0, 120.0, 240.0, LONGEST_PAUSE, LONGEST_PAUSE]
+
+
+def test_a_wire_that_is_fast_again_is_as_it_was() -> None:
+    """After three in time a slow one is a hiccup again, and the pause is the first one."""
+    times = LoadingTimes(FAST)
+    for _ in range(3):
+        times.took(SLOW, now=0.0)
+    for duration in (FAST, FAST, FAST, SLOW, SLOW):
+        times.took(duration, now=FIRST_PAUSE)
+        assert times.problem(FIRST_PAUSE) is None
+    times.took(SLOW, now=FIRST_PAUSE)
+    assert pause_after(times, FIRST_PAUSE) == FIRST_PAUSE
+
+
+def test_two_in_time_are_not_yet_trusted() -> None:
+    """A wire that is fast for a moment is left at its first slow loading, for twice as long."""
+    times = LoadingTimes(FAST)
+    for _ in range(3):
+        times.took(SLOW, now=0.0)
+    for duration in (FAST, FAST, SLOW):
+        times.took(duration, now=FIRST_PAUSE)
+    assert pause_after(times, FIRST_PAUSE) == 2 * FIRST_PAUSE

@@ -1,0 +1,271 @@
+"""What the table is asked for intents, and when a pattern is chosen anew."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from controller.loop.capabilities import PlaybackCapabilities
+from controller.loop.envelopes import PLAIN
+from controller.loop.intent import HapticIntent, Target
+from controller.loop.selection import Selector, strongest
+from controller.sources.contacts import Contact, ContactKey
+from model.arrays import FloatArray
+from model.errors import InputError
+from model.finger.perception import detection_threshold
+from model.structure.plate import Material, Plate
+from model.table.pattern import Pattern
+from model.table.question import Question
+from model.vibration.excitation import Excitation, Tone
+from small_table import small_table
+
+CAPABILITIES = PlaybackCapabilities(
+    "phased", ("switched", "phased"), (45.0, 300.0), {"SW": 1e-4}, PLAIN
+)
+
+
+class Table:
+    """A table that remembers what it was asked, and refuses targets left of `refuse_below`."""
+
+    plate = Plate(0.3, 0.2, 0.0015, Material("aluminium", 70e9, 2700.0, 0.33))
+    frequencies = np.array([100.0])
+
+    def __init__(self) -> None:
+        self.asked: list[Question] = []
+        self.refuse_below = 0.0
+        self.most = math.inf
+        self.error: Exception | None = None
+        self.quiet_level: float | None = None
+
+    def prepare(self, mode: str) -> None:
+        """Not asked for here."""
+
+    def ask(self, question: Question) -> Pattern:
+        """A pattern that names its question."""
+        self.asked.append(question)
+        if self.error is not None:
+            raise self.error
+        if question.targets[0][0] < self.refuse_below:
+            raise InputError("nothing is felt there")
+        if question.level_db_sl > self.most:
+            raise InputError("too loud")
+        tone = Tone(100.0 + len(self.asked), 1e-6)
+        return Pattern({"SW": tone}, 0.02, question.level_db_sl, None, self.quiet_level)
+
+    def amplitudes(
+        self, excitation: Excitation, points: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Ten times above threshold at x = 0.1 m, and in proportion to x."""
+        frequencies = np.array([100.0])
+        return frequencies, detection_threshold(frequencies)[:, None] * 100 * points[None, :, 0]
+
+
+def wanting(**levels: float | None) -> HapticIntent:
+    """An intent for contacts c1, c2 and so on, at their levels, be they on the plate or not."""
+    targets = (Target(ContactKey("a", int(name[1:])), each) for name, each in levels.items())
+    return HapticIntent(tuple(targets), "nothing is wanted")
+
+
+def at(id: int, x: float, y: float = 0.1) -> Contact:
+    """A contact."""
+    return Contact(ContactKey("a", id), x, y, since=0.0)
+
+
+@pytest.fixture
+def table() -> Table:
+    """A table that refuses nothing."""
+    return Table()
+
+
+def test_all_others_are_quiet(table: Table) -> None:
+    """The table is asked for the target at its level, in the mode and band of the amplifiers."""
+    selection = Selector(table).select(
+        (at(1, 0.1), at(2, 0.2), at(3, 0.25)), wanting(c3=17.0), CAPABILITIES
+    )
+    (question,) = table.asked
+    assert (question.targets, question.quiet) == (((0.25, 0.1),), ((0.1, 0.1), (0.2, 0.1)))
+    assert (question.level_db_sl, question.mode) == (17.0, "phased")
+    assert (question.playable, question.frequencies) == (("switched", "phased"), (45.0, 300.0))
+    assert not question.envelopes
+    (felt,) = selection.felt
+    assert (felt.contact.key.id, felt.wanted_db_sl, felt.level_db_sl) == (3, 17.0, 17.0)
+
+
+def test_several_targets_are_told_one_by_one(table: Table) -> None:
+    """The strongest gives the level, the others are softer; each is told what it will feel.
+
+    By hand: amplitudes go with x, so the mean over a fingertip is that at its centre, 20 dB SL at
+    0.1 m and 26 at 0.2; the loudest point of the quiet one, on a rim of 13 mm, lies at 0.063 m.
+    """
+    selection = Selector(table).select(
+        (at(1, 0.1), at(2, 0.2), at(3, 0.05)), wanting(c1=12.0, c2=20.0), CAPABILITIES
+    )
+    (question,) = table.asked
+    assert question.targets == ((0.1, 0.1), (0.2, 0.1))
+    assert (question.level_db_sl, question.softer_db) == (20.0, (8.0, 0.0))
+    assert [felt.wanted_db_sl for felt in selection.felt] == [12.0, 20.0]
+    levels = [felt.level_db_sl for felt in selection.felt]
+    assert levels == pytest.approx([20.0, 20 + 20 * math.log10(2)], abs=0.01)
+    rim = 0.05 + 0.013 * math.cos(math.pi / 12)
+    contrasts = [felt.contrast_db for felt in selection.felt]
+    assert contrasts == pytest.approx([20 * math.log10(x / rim) for x in (0.1, 0.2)], abs=0.01)
+
+
+def test_beside_a_level_no_level_means_the_strongest_of_them(table: Table) -> None:
+    """One that takes what the neighbours allow does not turn the others up or down."""
+    selector, intent = Selector(table), wanting(c1=None, c2=15.0, c3=9.0)
+    selector.select((at(1, 0.1), at(2, 0.2), at(3, 0.25)), intent, CAPABILITIES)
+    assert table.asked[0].level_db_sl == 15.0
+    assert table.asked[0].softer_db == (0.0, 0.0, 6.0)
+
+
+def test_as_strong_as_the_neighbours_allow(table: Table) -> None:
+    """Asked for at 12 dB SL; with 14 dB less at the quiet finger, -10 dB there leave 4 here."""
+    table.quiet_level = -2.0
+    selection = Selector(table).select((at(1, 0.1), at(2, 0.2)), wanting(c1=None), CAPABILITIES)
+    assert table.asked[0].level_db_sl == 12.0
+    assert selection.pattern is not None
+    assert selection.felt[0].level_db_sl == pytest.approx(4.0)
+    assert selection.pattern.quiet_level_db_sl == pytest.approx(-10.0)
+    assert selection.pattern.excitation["SW"].amplitude == pytest.approx(1e-6 * 10 ** (-8 / 20))
+
+
+@pytest.mark.parametrize(
+    ("quiet", "largest", "level"),
+    [
+        (-40.0, 1.0, 26.0),  # nobody is to be numbed
+        (None, 1.0, 26.0),
+        (-40.0, 2e-6, 12 + 20 * math.log10(2)),  # the ERA's stroke ends it
+    ],
+)
+def test_where_strength_ends(quiet: float | None, largest: float, level: float) -> None:
+    """At twice what is strong, or at the stroke; without neighbours too."""
+    pattern = Pattern({"SW": Tone(100.0, 1e-6)}, 0.02, 12.0, None, quiet)
+    found = strongest(pattern, {"SW": largest})
+    assert found.level_db_sl == pytest.approx(level)
+    gain = 10 ** ((level - 12.0) / 20)
+    assert found.excitation["SW"].amplitude == pytest.approx(1e-6 * gain)
+
+
+def test_what_cannot_be_felt_alone_is_not_played() -> None:
+    """Less than 10 dB between target and neighbour leave nothing to be felt."""
+    pattern = Pattern({"SW": Tone(100.0, 1e-6)}, 0.02, 12.0, None, 3.0)
+    with pytest.raises(InputError, match="felt by another finger too"):
+        strongest(pattern, {"SW": 1.0})
+
+
+def or_less(level: float) -> HapticIntent:
+    """One level at contact 1, or less where that cannot be had."""
+    return HapticIntent((Target(ContactKey("a", 1), level, or_less=True),))
+
+
+def test_a_level_or_less(table: Table) -> None:
+    """Beyond what can be had: as strong as neighbours and stroke allow, and never above the level.
+
+    12 dB SL at 1 um, a stroke of 2 um: 6 dB more; at the quiet finger there are -17 dB, 7 dB less
+    than it may have.
+    """
+    table.most, table.quiet_level = 15.0, -17.0
+    capabilities = replace(CAPABILITIES, largest={"SW": 2e-6})
+    contacts = (at(1, 0.1), at(2, 0.2))
+    for wanted, level in ((14.0, 14.0), (30.0, 12 + 20 * math.log10(2)), (17.0, 17.0)):
+        selection = Selector(table).select(contacts, or_less(wanted), capabilities)
+        assert selection.pattern is not None
+        assert selection.felt[0].level_db_sl == pytest.approx(level)
+        assert selection.question is table.asked[-1]
+    table.most = 11.0
+    selection = Selector(table).select(contacts, or_less(30.0), capabilities)
+    assert (selection.pattern, selection.reason) == (None, "too loud")
+
+
+def test_a_level_or_less_on_a_plate() -> None:
+    """60 dB SL is more than the paper's ERAs can do: what they can is played, at full stroke."""
+    table, full = small_table(), dict.fromkeys(("SW", "SE", "NE", "NW"), 0.0001)
+    capabilities = PlaybackCapabilities("switched", ("switched",), (40.0, 500.0), full, PLAIN)
+    selection = Selector(table).select((at(1, 0.1),), or_less(60.0), capabilities)
+    assert selection.pattern is not None
+    assert 12 < selection.felt[0].level_db_sl < 60
+    loudest = max(tone.amplitude for tone in selection.pattern.excitation.values())
+    assert loudest == pytest.approx(1e-4)
+
+
+def test_nothing_wanted(table: Table) -> None:
+    """No target, or none that is on the plate: nothing is asked, and the reason is the intent's."""
+    for intent in (wanting(), wanting(c9=20.0)):
+        selector = Selector(table)
+        for contacts in [(), (at(1, 0.1),), (at(1, 0.29),)]:
+            selection = selector.select(contacts, intent, CAPABILITIES)
+            assert (selection.targets, selection.pattern) == ((), None)
+            assert selection.reason == "nothing is wanted"
+    assert table.asked == []
+
+
+@pytest.mark.parametrize("mover", [0, 1])
+def test_moves(table: Table, mover: int) -> None:
+    """Up to 8 mm from where the pattern was chosen it stays, beyond it is chosen anew.
+
+    It is the way from there that counts, not from the frame before, and of any contact.
+    """
+    selector, intent = Selector(table), wanting(c2=20.0)
+
+    def contacts(distance: float) -> tuple[Contact, ...]:
+        moved = [0.0, 0.0]
+        moved[mover] = distance
+        return (at(1, 0.1, 0.1 + moved[0]), at(2, 0.2, 0.1 - moved[1]))
+
+    first = selector.select(contacts(0.0), intent, CAPABILITIES)
+    assert selector.select(contacts(0.004), intent, CAPABILITIES) is first
+    assert selector.select(contacts(0.0079), intent, CAPABILITIES) is first
+    second = selector.select(contacts(0.0081), intent, CAPABILITIES)
+    assert second.pattern != first.pattern
+    assert selector.select(contacts(0.0), intent, CAPABILITIES) is not second
+
+
+def test_other_wishes_are_another_pattern(table: Table) -> None:
+    """Another level, one more target, one fewer."""
+    selector, contacts = Selector(table), (at(1, 0.1), at(2, 0.2))
+    for levels in ({"c1": 20.0}, {"c1": 14.0}, {"c1": 14.0, "c2": 14.0}, {"c2": 14.0}):
+        chosen = selector.select(contacts, wanting(**levels), CAPABILITIES)
+        assert selector.select(contacts, wanting(**levels), CAPABILITIES) is chosen
+    assert len(table.asked) == 4
+
+
+def test_a_quiet_contact_that_lifts_changes_nothing(table: Table) -> None:
+    """The target goes on feeling the same."""
+    selector, intent = Selector(table), wanting(c2=20.0)
+    first = selector.select((at(1, 0.1), at(2, 0.2)), intent, CAPABILITIES)
+    assert selector.select((at(2, 0.2),), intent, CAPABILITIES) is first
+
+
+def test_refused_by_the_table(table: Table) -> None:
+    """A table's refusal is silence with its words, asked again when it may have changed."""
+    table.refuse_below = 0.2
+    selector, intent = Selector(table), wanting(c2=20.0)
+    refused = selector.select((at(1, 0.25), at(2, 0.1)), intent, CAPABILITIES)
+    assert [contact.key.id for contact, _ in refused.targets] == [2]
+    assert (refused.pattern, refused.reason) == (None, "nothing is felt there")
+    assert selector.select((at(1, 0.25), at(2, 0.1)), intent, CAPABILITIES) is refused
+    assert len(table.asked) == 1
+    assert selector.select((at(2, 0.1),), intent, CAPABILITIES).reason == "nothing is felt there"
+    assert len(table.asked) == 2  # without the quiet contact it might have been possible
+    assert selector.select((at(2, 0.21),), intent, CAPABILITIES).pattern is not None
+
+
+def test_a_table_that_fails_is_not_asked_again_for_the_same(table: Table) -> None:
+    """Whatever it raises is silence with its words until something else is wanted."""
+    table.error = ZeroDivisionError("by no ERA")
+    selector, intent = Selector(table), wanting(c1=20.0)
+    failed = selector.select((at(1, 0.1),), intent, CAPABILITIES)
+    assert (failed.pattern, failed.reason) == (None, "ZeroDivisionError: by no ERA")
+    assert selector.select((at(1, 0.1),), intent, CAPABILITIES) is failed
+    assert len(table.asked) == 1
+    table.error = None
+    assert selector.select((at(1, 0.2),), intent, CAPABILITIES).pattern is not None
+
+
+def test_with_envelopes_the_table_is_told_so(table: Table) -> None:
+    """It may choose by steady contrast then."""
+    capabilities = replace(CAPABILITIES, shaping=replace(PLAIN, onsets=True))
+    Selector(table).select((at(1, 0.1),), wanting(c1=20.0), capabilities)
+    assert table.asked[0].envelopes

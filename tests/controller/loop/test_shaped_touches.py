@@ -1,0 +1,430 @@
+"""Envelopes from the table to the amplifier, on a virtual clock."""
+
+import asyncio
+import logging
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from controller.loop.intent import HapticIntent, Target
+from controller.sources.contacts import Contact
+from controller_bench import FINGER, OTHER, make_bench, running
+from drivers.protocol.messages import AmplifierState, Apply, LoadEnvelope
+from model.table.pattern import Pattern
+from model.table.question import Question
+from model.vibration.excitation import Tone
+from shaped_link import Link, Shapes
+from virtual_loop import in_virtual_time
+
+ONSET = 0.105  # s; 21 steps
+FULL = 0.2  # the level that the table's pattern has
+
+
+@pytest.fixture
+def link() -> Link:
+    """The amplifier."""
+    return Link()
+
+
+@pytest.fixture
+def shapes() -> Shapes:
+    """What shapes."""
+    return Shapes()
+
+
+def sets(link: Link) -> list[Any]:
+    """Every set that was applied since the silence that follows arming."""
+    return [apply.command_set for apply in link.requests(Apply)][1:]
+
+
+def loaded(link: Link) -> list[Any]:
+    """Every envelope that was loaded."""
+    return [load.envelope for load in link.requests(LoadEnvelope)]
+
+
+@in_virtual_time
+async def test_a_touch_brings_its_onset(link: Link, shapes: Shapes) -> None:
+    """Knots of the driven ERA as the table found them, in strokes; the last is the command's own.
+
+    By hand: lines from 0 to level 0.2 at 90 degrees, 105 ms long.
+    """
+    async with running(far_ends=[link], timing=shapes) as bench:
+        begin = asyncio.get_running_loop().time()
+        bench.touch(FINGER, OTHER)
+        await asyncio.sleep(ONSET / 2)
+        (onset,) = loaded(link)
+        assert onset.step == 0.005
+        assert [knot.level for knot in onset.knots] == pytest.approx(
+            [FULL * number / 21 for number in range(1, 21)]
+        )
+        assert {knot.phase for knot in onset.knots} == {90.0}
+        (played,) = sets(link)
+        assert [(each.onset, each.level) for each in played.commands] == [
+            (onset.slot, pytest.approx(FULL)),
+            (0, 0.0),
+        ]
+        assert link.levels()[0] == pytest.approx(FULL / 2, abs=1e-4)
+        (applied,) = bench.told.applied
+        assert applied.pattern.onset is not None
+        assert (applied.time, applied.from_rest) == (pytest.approx(begin), True)
+        assert applied.transient_contrast_db == 30.0
+
+
+@in_virtual_time
+async def test_brakes_follow_once_it_has_settled(link: Link, shapes: Shapes) -> None:
+    """The same tone goes on undisturbed, now with an ending; nobody is told of another pattern."""
+    async with running(far_ends=[link], timing=shapes) as bench:
+        await bench.hold(FINGER, OTHER, seconds=0.1)
+        assert len(loaded(link)) == 1
+        seen = []
+        for _ in range(40):
+            bench.touch(FINGER, OTHER)
+            await asyncio.sleep(0.002)
+            seen.append(link.levels()[0])
+        onset, ending = loaded(link)
+        assert ending.slot != onset.slot
+        loadings = [t for t, each in link.asked if isinstance(each, LoadEnvelope)]
+        assert loadings[1] - loadings[0] == pytest.approx(ONSET)
+        assert [knot.level for knot in ending.knots] == pytest.approx(
+            [FULL * (1 - number / 8) for number in range(1, 8)]
+        )
+        first, again = sets(link)
+        (tone,) = [each for each in again.commands if each.level]
+        assert (tone.ending, tone.onset, tone.keep_phase) == (ending.slot, 0, True)
+        assert tone.phase == first.commands[0].phase
+        assert seen[-30:] == pytest.approx([FULL] * 30, abs=1e-4)
+        assert len(bench.told.applied) == 1
+
+
+@in_virtual_time
+async def test_a_brake_that_there_is_not_is_looked_for_once(link: Link, shapes: Shapes) -> None:
+    """Where no ending is found for what plays: the loop does not come back to it at each turn."""
+    looked = 0
+
+    def look(question: Question, pattern: Pattern, *, onset: bool, ending: bool) -> Pattern:
+        nonlocal looked
+        looked += ending
+        return find(question, pattern, onset=onset, ending=False)
+
+    async with running(far_ends=[link], timing=shapes) as bench:
+        find, shapes.with_envelopes = shapes.with_envelopes, look  # type: ignore[method-assign]
+        await bench.hold(FINGER, OTHER, seconds=0.4)
+        assert looked == 1
+        assert len(sets(link)) == 1
+
+
+@in_virtual_time
+async def test_a_lifted_target_ends_by_its_brake(link: Link, shapes: Shapes) -> None:
+    """Along the knots while another finger stays; it is silence for whoever watches."""
+    async with running(far_ends=[link], timing=shapes) as bench:
+        await bench.hold(OTHER, FINGER, seconds=0.3)
+        bench.touch(OTHER)
+        await asyncio.sleep(0.020)
+        assert link.levels()[0] == pytest.approx(FULL / 2, abs=1e-3)
+        await asyncio.sleep(0.0205)
+        assert link.levels() == (0.0, 0.0)
+        assert bench.told.silenced[-1].reason == "the target was lifted"
+        bench.touch()
+        await asyncio.sleep(0.001)
+        assert [each.skip_ending for each in sets(link)[-1].commands] == [True, True]
+
+
+@pytest.mark.parametrize("held", [0.05, 0.3])
+@in_virtual_time
+async def test_the_last_finger_up_needs_no_brake(link: Link, shapes: Shapes, held: float) -> None:
+    """Zero at once and within 20 ms, whether the onset is over or not."""
+    async with running(far_ends=[link], timing=shapes) as bench:
+        await bench.hold(FINGER, seconds=held)
+        bench.touch()
+        await asyncio.sleep(0)
+        await asyncio.sleep(0.020)
+        assert link.levels() == (0.0, 0.0)
+
+
+@in_virtual_time
+async def test_the_last_finger_up_ends_a_brake_too(link: Link, shapes: Shapes) -> None:
+    """The target lifts, 5 ms later the other finger: silent 20 ms after that, not 35."""
+    async with running(far_ends=[link], timing=shapes) as bench:
+        await bench.hold(OTHER, FINGER, seconds=0.3)
+        bench.touch(OTHER)
+        await asyncio.sleep(0.005)
+        assert link.levels()[0] > 0.15
+        bench.touch()
+        await asyncio.sleep(0.020)
+        assert link.levels() == (0.0, 0.0)
+
+
+@in_virtual_time
+async def test_no_brake_before_it_has_settled(link: Link, shapes: Shapes) -> None:
+    """A brake leads from the full level; lifted half way up the target fades along 20 ms."""
+    async with running(far_ends=[link], timing=shapes) as bench:
+        await bench.hold(OTHER, FINGER, seconds=0.05)
+        bench.touch(OTHER)
+        highest = 0.0
+        for _ in range(21):
+            highest = max(highest, link.levels()[0])
+            await asyncio.sleep(0.001)
+        assert highest <= FULL / 2 + 1e-3
+        assert link.levels() == (0.0, 0.0)
+        assert len(loaded(link)) == 1
+
+
+@in_virtual_time
+async def test_silence_does_not_wait_for_envelopes(link: Link, shapes: Shapes) -> None:
+    """The finger lifts while its onset is loaded slowly: zero is on the wire within 20 ms."""
+    link.delay = lambda request: 0.020 if isinstance(request, LoadEnvelope) else 0.0
+    async with running(far_ends=[link], timing=shapes) as bench:
+        bench.touch(FINGER)
+        await asyncio.sleep(0.005)
+        lifted = asyncio.get_running_loop().time()
+        bench.touch()
+        await asyncio.sleep(0.1)
+        (silent,) = sets(link)
+        assert silent.is_silent
+        _, sent = [time for time, request in link.asked if isinstance(request, Apply)]
+        assert sent - lifted < 0.020
+        assert link.amplifier.state is AmplifierState.OPERATION_ENABLED
+
+
+@in_virtual_time
+async def test_what_runs_on_has_no_new_onset(link: Link, shapes: Shapes) -> None:
+    """A finger that slides on feels the same frequency without a gap, and gets its brake anew."""
+    async with running(far_ends=[link], timing=shapes) as bench:
+        await bench.hold(FINGER, OTHER, seconds=0.2)
+        await bench.hold((1, 0.6, 0.5), OTHER, seconds=0.2)
+        lengths = [len(envelope.knots) for envelope in loaded(link)]
+        assert lengths == [20, 7, 7]
+        assert [command_set.commands[0].keep_phase for command_set in sets(link)] == [
+            *(False, True),
+            *(True, True),
+        ]
+        _, moved = bench.told.applied
+        assert moved.pattern.onset is None
+        assert moved.transient_contrast_db is None
+
+
+@in_virtual_time
+async def test_a_brake_is_not_another_patterns(link: Link, shapes: Shapes) -> None:
+    """Lifted right after it slid on: what plays now has no brake yet, and fades."""
+    async with running(far_ends=[link], timing=shapes) as bench:
+        await bench.hold(OTHER, FINGER, seconds=0.2)
+        bench.touch(OTHER, (1, 0.6, 0.5))
+        await asyncio.sleep(0.005)
+        bench.touch(OTHER)
+        await asyncio.sleep(0.005)
+        assert sets(link)[-1].is_silent
+        assert [each.skip_ending for each in sets(link)[-1].commands] == [True, True]
+
+
+@in_virtual_time
+async def test_a_fault_knows_no_brake(
+    link: Link, shapes: Shapes, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whatever goes wrong in a decision, all fall silent along the ramp."""
+    async with running(far_ends=[link], timing=shapes, intent_source=Always()) as bench:
+        await bench.hold(FINGER, seconds=0.2)
+        monkeypatch.setattr(Always, "intent", lambda self, contacts, now: 1 / 0)
+        bench.touch((1, 0.51, 0.5))
+        await asyncio.sleep(0.005)
+        assert sets(link)[-1].is_silent
+        assert [each.skip_ending for each in sets(link)[-1].commands] == [True, True]
+        monkeypatch.undo()
+
+
+class Always:
+    """Every finger feels it for as long as it is there."""
+
+    def intent(self, contacts: Sequence[Contact], now: float) -> HapticIntent:
+        """All of them."""
+        return HapticIntent(tuple(Target(each.key, 20.0) for each in contacts))
+
+
+@in_virtual_time
+async def test_nothing_is_loaded_or_played_after_a_disarm(link: Link, shapes: Shapes) -> None:
+    """Disarmed while the first of two onsets is loaded: it is the last that the amplifier hears."""
+    link.delay = lambda request: 0.005 if isinstance(request, LoadEnvelope) else 0.0
+    async with running(far_ends=[link], timing=shapes) as bench:
+        bench.table.excitation = {"SW": Tone(110.0, 2e-5), "NE": Tone(110.0, 4e-5)}
+        bench.touch(FINGER)
+        await asyncio.sleep(0.002)
+        await bench.controller.disarm()
+        await asyncio.sleep(0.05)
+        assert len(loaded(link)) == 1
+        assert sets(link) == []
+
+
+def without_envelopes(link: Link) -> None:
+    """An amplifier that plays none."""
+    capabilities = link.amplifier.capabilities
+    link.amplifier.capabilities = replace(capabilities, envelope_knots=0, envelope_slots=0)
+
+
+def with_few_knots(link: Link) -> None:
+    """An amplifier whose envelopes are one knot too short."""
+    link.amplifier.capabilities = replace(link.amplifier.capabilities, envelope_knots=6)
+
+
+def on_a_slow_wire(link: Link) -> None:
+    """Two ERAs on one wire: 32 ms, and a touch may wait for 30."""
+    link.loading = 0.016
+
+
+@pytest.mark.parametrize("poorer", [without_envelopes, with_few_knots, on_a_slow_wire])
+@in_virtual_time
+async def test_where_envelopes_are_not_possible_ramps_serve(
+    link: Link, shapes: Shapes, poorer: Callable[[Link], None]
+) -> None:
+    """None is loaded, and who watches is told of the ramp and its contrast."""
+    poorer(link)
+    async with running(far_ends=[link], timing=shapes) as bench:
+        assert not bench.controller.capabilities.shaping
+        await bench.hold(FINGER, OTHER, seconds=0.3)
+        assert loaded(link) == []
+        (applied,) = bench.told.applied
+        assert applied.pattern.onset is None
+        assert applied.pattern.ramp == sets(link)[0].ramp == 0.015
+        assert applied.transient_contrast_db == 10.0
+
+
+@in_virtual_time
+async def test_a_wire_that_turns_out_slow_gets_ramps(
+    link: Link, shapes: Shapes, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Three slow loadings in a row; a single one is a hiccup. After 30 s it is tried again."""
+    slow = 0.0
+    link.delay = lambda request: slow if isinstance(request, LoadEnvelope) else 0.0
+    caplog.set_level(logging.WARNING)
+    async with running(far_ends=[link], timing=shapes, envelope_time=0.020) as bench:
+
+        async def is_shaped(duration: float) -> bool:
+            nonlocal slow
+            slow = duration
+            await bench.hold(FINGER, seconds=0.1)
+            await bench.hold(seconds=0.05)
+            return bench.told.applied[-1].pattern.onset is not None
+
+        shaped = []
+        for duration in (0.021, 0.021, 0.001, 0.021, 0.021):
+            shaped.append(await is_shaped(duration))
+            assert bench.controller.plain_because is None
+        for duration in (0.021, 0.001):
+            shaped.append(await is_shaped(duration))
+        assert shaped == [True] * 6 + [False]
+        assert "again in 30 s" in bench.controller.plain_because
+        await asyncio.sleep(30)
+        assert bench.controller.plain_because is None
+        assert await is_shaped(0.001)
+    assert "loading envelopes took 21 ms" in caplog.text
+
+
+@in_virtual_time
+async def test_an_onset_that_the_guard_refuses_is_a_ramp(link: Link, shapes: Shapes) -> None:
+    """A knot beyond full stroke is never on the wire; the pattern itself is played."""
+    shapes.largest = 6.0
+    async with running(far_ends=[link], timing=shapes) as bench:
+        await bench.hold(FINGER, OTHER, seconds=0.05)
+        assert [len(envelope.knots) for envelope in loaded(link)] == [7]  # its brake
+        (applied,) = bench.told.applied
+        assert applied.pattern.onset is None
+        assert applied.transient_contrast_db == 10.0
+        assert bench.told.refused == []
+
+
+@in_virtual_time
+async def test_everything_is_prepared_before_the_first_touch(link: Link, shapes: Shapes) -> None:
+    """Mode and frequencies, when the controller is opened."""
+    bench = make_bench(far_ends=[link], timing=shapes)
+    await bench.controller.open()
+    assert bench.table.prepared == ["phased"]
+    assert shapes.prepared == [110.0, 250.0]
+    await bench.controller.close()
+
+
+@in_virtual_time
+async def test_several_amplifiers_start_together(shapes: Shapes) -> None:
+    """Each has its ERA's envelope before any is committed."""
+    links = [Link(), Link()]
+    for link in links:
+        link.delay = lambda request: 0.002
+    async with running("left", "right", far_ends=links, timing=shapes) as bench:
+        bench.table.excitation = {"SW": Tone(110.0, 2e-5), "NE": Tone(110.0, 4e-5)}
+        bench.touch(FINGER)
+        await asyncio.sleep(0.012 + ONSET / 2)
+        for link, channel, level in ((links[0], 0, 0.2), (links[1], 1, 0.4)):
+            (onset,) = loaded(link)
+            assert onset.slot == 1
+            assert link.levels()[channel] == pytest.approx(level / 2, rel=0.1)
+
+
+class Click:
+    """Every finger feels it for 80 ms, from when it came down."""
+
+    def intent(self, contacts: Sequence[Contact], now: float) -> HapticIntent:
+        """Those that came less than 80 ms ago."""
+        fresh = [contact for contact in contacts if now < contact.since + 0.08]
+        until = min((contact.since + 0.08 for contact in fresh), default=None)
+        return HapticIntent(tuple(Target(each.key, 20.0) for each in fresh), "it is over", until)
+
+
+@in_virtual_time
+async def test_a_wish_that_runs_out_ends_by_itself(link: Link) -> None:
+    """The loop wakes at its time, though nobody moves and no heartbeat is due then."""
+    async with running(far_ends=[link], intent_source=Click()) as bench:
+        begin = asyncio.get_running_loop().time()
+        await bench.hold(FINGER, seconds=0.2)
+        (_, over), times = sets(link), [t for t, each in link.asked if isinstance(each, Apply)]
+        _, start, end = times
+        assert (start, end) == pytest.approx((begin, begin + 0.08))
+        assert over.is_silent
+        assert bench.told.silenced[-1].reason == "it is over"
+
+
+@in_virtual_time
+async def test_several_targets_are_told_with_what_each_feels(link: Link) -> None:
+    """Two fingers at once ask, both get it."""
+    async with running(far_ends=[link], intent_source=Click()) as bench:
+        bench.touch(FINGER, OTHER)
+        await asyncio.sleep(0.001)
+        (applied,) = bench.told.applied
+        assert [felt.contact.key.id for felt in applied.targets] == [1, 2]
+        assert applied.quiet == ()
+        assert len(bench.table.asked[-1].targets) == 2
+
+
+@in_virtual_time
+async def test_wishes_that_fail_silence_all_and_recover(
+    link: Link, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What plays ends along the ramp at once, heartbeats go on; then it is as if nothing was."""
+    source = Click()
+    async with running(far_ends=[link], intent_source=source) as bench:
+        bench.touch(FINGER)
+        await asyncio.sleep(0.030)
+        assert link.levels()[0] > 0
+        with monkeypatch.context() as patch:
+            patch.setattr(Click, "intent", lambda self, contacts, now: 1 / 0)
+            await bench.hold(FINGER, OTHER, seconds=0.3)
+        assert link.levels() == (0.0, 0.0)
+        assert bench.told.silenced[-1].reason.startswith("ZeroDivisionError")
+        assert link.amplifier.state is AmplifierState.OPERATION_ENABLED
+        bench.touch((3, 0.2, 0.2))
+        await asyncio.sleep(0.030)
+        assert link.levels()[0] > 0
+
+
+@in_virtual_time
+async def test_a_contact_is_new_only_once_whatever_the_table_does(link: Link) -> None:
+    """The table fails for a second finger; when that one lifts nobody is the newest any more."""
+    async with running(far_ends=[link]) as bench:
+        bench.touch(FINGER)
+        await asyncio.sleep(0.01)
+        good, bench.table.excitation = bench.table.excitation, ZeroDivisionError()
+        bench.touch(FINGER, OTHER)
+        await asyncio.sleep(0.01)
+        bench.table.excitation = good
+        bench.touch(FINGER)
+        await asyncio.sleep(0.05)
+        assert bench.told.silenced[-1].reason == "the target was lifted"
+        assert link.levels() == (0.0, 0.0)

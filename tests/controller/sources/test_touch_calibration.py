@@ -1,0 +1,119 @@
+"""From a sensor's coordinates to the plate's."""
+
+import asyncio
+import math
+from collections.abc import Callable
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from controller.sources.calibration import CalibratedSource, TouchCalibration, fitted, turned
+from controller.sources.touch import Touch, TouchFrame, TouchSource
+from model.errors import InputError
+from model.structure.plate import Material, Plate
+
+ALUMINIUM = Material("aluminium", E=70e9, rho=2700, nu=0.33)
+PLATE = Plate(length=0.4, width=0.2, thickness=1e-3, material=ALUMINIUM)
+
+
+@pytest.mark.parametrize(
+    ("degrees", "mirror", "top_left", "top_right"),
+    [
+        (0, None, (0, 0), (1, 0)),
+        (90, None, (1, 0), (1, 1)),
+        (180, None, (1, 1), (0, 1)),
+        (270, None, (0, 1), (0, 0)),
+        (0, "x", (1, 0), (0, 0)),
+        (0, "y", (0, 1), (1, 1)),
+        (90, "y", (1, 1), (1, 0)),
+    ],
+)
+def test_turned_and_mirrored(
+    degrees: int, mirror: str | None, top_left: tuple[int, int], top_right: tuple[int, int]
+) -> None:
+    """Where the sensor's upper corners come to lie on the plate, by turning a sheet of paper."""
+    calibration = turned(degrees, mirror=mirror)
+    for corner, place in (((0, 0), top_left), ((1, 0), top_right)):
+        placed = calibration.place(Touch(1, *corner))
+        assert (placed.x, placed.y) == pytest.approx(place)
+
+
+def test_fit_of_a_panel_larger_than_the_plate() -> None:
+    """A sensor 5 cm wider than the plate on each side, touched at three corners of the plate.
+
+    The plate's middle is the sensor's middle, and its north-west corner is where it was touched.
+    """
+    touched = [(0.1, 0.1), (0.9, 0.1), (0.1, 0.9)]
+    calibration = fitted(touched, [(0, 0.2), (0.4, 0.2), (0, 0)], PLATE)
+    middle = calibration.place(Touch(1, 0.5, 0.5))
+    corner = calibration.place(Touch(1, 0.1, 0.1))
+    assert (middle.x, middle.y) == pytest.approx((0.5, 0.5))
+    assert (corner.x, corner.y) == pytest.approx((0, 0), abs=1e-12)
+
+
+@given(
+    matrix=st.tuples(*[st.floats(-2, 2) for _ in range(6)]).filter(
+        lambda m: abs(m[0] * m[4] - m[1] * m[3]) > 0.1
+    )
+)
+def test_fit_finds_the_matrix(matrix: tuple[float, ...]) -> None:
+    """Four points placed by any matrix give that matrix back."""
+    a, b, c, d, e, f = matrix
+    truth = TouchCalibration(((a, b, c), (d, e, f)))
+    touched = [(0.0, 0.0), (1.0, 0.0), (0.0, 1.0), (1.0, 1.0)]
+    placed = [truth.place(Touch(1, *point)) for point in touched]
+    places = [(0.4 * touch.x, 0.2 * (1 - touch.y)) for touch in placed]
+    found = fitted(touched, places, PLATE)
+    assert [*found.matrix[0], *found.matrix[1]] == pytest.approx(matrix, abs=1e-9)
+
+
+def test_point_touched_elsewhere() -> None:
+    """Of four corners one was touched 4 cm off: no fit, and the distance is told."""
+    touched = [(0.0, 0.0), (1.0, 0.0), (0.0, 1.0), (1.0, 1.0)]
+    with pytest.raises(InputError, match=r"only to 10\.0 mm"):
+        # A quarter of the error stays at every corner of a parallelogram.
+        fitted(touched, [(0, 0.2), (0.4, 0.2), (0, 0), (0.36, 0)], PLATE)
+
+
+@pytest.mark.parametrize(
+    ("touched", "places", "words"),
+    [
+        ([(0, 0), (1, 0)], [(0, 0), (0.4, 0)], "at least three"),
+        ([(0, 0), (1, 0), (0, 1)], [(0, 0), (0.4, 0)], "at least three"),
+        ([(0, 0), (0.5, 0.5), (1, 1)], [(0, 0), (0.2, 0.1), (0.4, 0.2)], "on a line"),
+        ([(0, 0), (math.nan, 0), (0, 1)], [(0, 0), (0.2, 0.1), (0.4, 0.2)], "not finite"),
+        ([(0, 0), (1, 0), (0, 1)], [(0, 0), (0, 0), (0, 0)], "folds"),
+    ],
+)
+def test_points_that_say_too_little(
+    touched: list[tuple[float, float]], places: list[tuple[float, float]], words: str
+) -> None:
+    """They are refused, each with its reason."""
+    with pytest.raises(InputError, match=words):
+        fitted(touched, places, PLATE)
+
+
+def test_matrices_that_fold() -> None:
+    """A sensor folded onto a line would put every finger in the same place."""
+    for matrix in (((1, 0, 0), (1, 0, 0)), ((math.inf, 0, 0), (0, 1, 0))):
+        with pytest.raises(InputError, match="folds"):
+            TouchCalibration(matrix)
+    with pytest.raises(InputError, match="turned by 45"):
+        turned(45)
+
+
+async def test_calibrated_source() -> None:
+    """Frames keep their source, time and ids; not finite stays so, for contacts to refuse."""
+
+    class Once(TouchSource):
+        async def run(self, deliver: Callable[[TouchFrame], None]) -> None:
+            deliver(TouchFrame("panel", 1.5, (Touch(4, 0.25, 0.5), Touch(5, math.nan, 0))))
+
+    seen: list[TouchFrame] = []
+    await asyncio.wait_for(CalibratedSource(Once(), turned(180)).run(seen.append), 1)
+    (frame,) = seen
+    assert (frame.source, frame.time) == ("panel", 1.5)
+    assert frame.touches[0] == Touch(4, 0.75, 0.5)
+    assert frame.touches[1].id == 5
+    assert math.isnan(frame.touches[1].x)

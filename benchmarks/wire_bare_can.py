@@ -11,7 +11,7 @@ from drivers.codec.can_bus.frame import CanFrame, cob_id
 from drivers.codec.can_bus.requests import encode_request
 from drivers.guard import SafeCommandSet
 from drivers.protocol.messages import Apply, Arm
-from sim.far_ends.can_bus.sets import Action, Order, SetBuffer
+from sim.far_ends.can_bus.sets import Action, RequestFrame, SetBuffer
 
 CALM = 2.0  # s; the longest watchdog
 
@@ -44,7 +44,7 @@ def can_codec(safe: SafeCommandSet) -> None:
         if frame.id == cob_id("order", 1):
             token, ramp, duration, what, sequence = struct.unpack("<HHHBB", frame.data)
             action, count = Action(what & 7), what >> 3
-            order = Order(token, ramp, duration, action, count, sequence, True, False)
+            order = RequestFrame(token, ramp, duration, action, count, sequence, True, False)
         elif frame.data:
             buffer.take(frame.data[6] >> 4, frame.data)
     buffer.command_set(order)

@@ -20,8 +20,8 @@ from model.errors import InputError
 from model.rig.file import load_rig
 from sim.bench.bench import Bench
 from sim.bench.real_time import keep_time
+from sim.control.context import SimulationContext
 from sim.control.server import control_socket
-from sim.control.site import Site
 
 _FORM = "sim://RIG.yaml, with ?control=PATH and &amplifier=NAME where they are wanted"
 
@@ -78,7 +78,9 @@ class SimulatedBackend(Backend):
             raise CommandError(f"{self._url}: {error}") from error
         async with contextlib.AsyncExitStack() as stack:
             if self._control is not None:
-                await stack.enter_async_context(control_socket(Site(bench), self._control))
+                await stack.enter_async_context(
+                    control_socket(SimulationContext(bench), self._control)
+                )
             task = asyncio.create_task(keep_time(bench), name=f"simulated plate of {self._url}")
             stack.push_async_callback(_cancel, task)
             bench.amplifiers[name].listeners.append(self._tell)

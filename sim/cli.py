@@ -12,7 +12,7 @@ from model.errors import InputError
 from sim.witness_cli import witness
 
 if TYPE_CHECKING:
-    from sim.control.site import Site
+    from sim.control.context import SimulationContext
     from sim.far_ends.wires import Wire
     from sim.process.far_end import FarEnd
     from sim.process.view import PlateView
@@ -116,7 +116,7 @@ def sim(
         from model.rig.file import load_rig
         from sim.far_ends.wire_choice import choose_wires
         from sim.far_ends.wires import Wire
-        from sim.faults.file import FaultFile, load_faults
+        from sim.faults.fault_file import FaultFile, load_faults
         from sim.process.far_end import FarEnd
 
         plain = Wire("serial", speed=speed, shared=shared, unpluggable=faults is not None)
@@ -220,14 +220,14 @@ class _LiveView:
         self._live = Live(auto_refresh=False)
         self._plate: PlateView | None = None
 
-    def __call__(self, site: "Site") -> None:
+    def __call__(self, context: "SimulationContext") -> None:
         from sim.process.view import PlateView, draw
 
         if self._plate is None:
-            self._plate = PlateView(site.bench)
-            site.bench.taps.append(self._plate)
+            self._plate = PlateView(context.bench)
+            context.bench.taps.append(self._plate)
             self._live.start()
-        self._live.update(draw(site, self._plate), refresh=True)
+        self._live.update(draw(context, self._plate), refresh=True)
 
     def close(self) -> None:
         self._live.stop()

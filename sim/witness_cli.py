@@ -13,7 +13,7 @@ from model.counting import counted
 from model.errors import InputError
 
 if TYPE_CHECKING:
-    from sim.witness.place import Place
+    from sim.witness.endpoint import WireEndpoint
     from sim.witness.violation import Violation
     from sim.witness.witness import Witness
 
@@ -50,7 +50,7 @@ def witness(
 
     Prints a URL for each: use it in place of the amplifier's. Ends with Ctrl-C.
     """
-    from sim.witness.place import place_of
+    from sim.witness.endpoint import parse_endpoint
     from sim.witness.witness import Witness
 
     limits: dict[str, Any] = {
@@ -65,7 +65,7 @@ def witness(
             "--record writes what passes a wire, and with --replay nothing passes one: leave out "
             "one of the two"
         )
-    places = [place_of(url) for url in urls]
+    places = [parse_endpoint(url) for url in urls]
     _check_apart(places)
     wires = {place: f"wire{n}" for n, place in enumerate(dict.fromkeys(p.place for p in places), 1)}
     plan = {
@@ -112,7 +112,7 @@ def _in_range(option: str, given: float, *, most: float = math.inf, unit: str) -
     return given
 
 
-def _check_apart(places: list["Place"]) -> None:
+def _check_apart(places: list["WireEndpoint"]) -> None:
     """That no two URLs mean one amplifier, or one wire in two ways."""
     for number, place in enumerate(places):
         for other in places[:number]:
@@ -190,7 +190,7 @@ def _replay(path: Path, seen: "Witness") -> list["Violation"]:
 
 
 def _stand_in(
-    places: list["Place"], names: list[str], seen: "Witness", *, to: TextIO
+    places: list["WireEndpoint"], names: list[str], seen: "Witness", *, to: TextIO
 ) -> list["Violation"]:
     import asyncio
     import signal

@@ -18,7 +18,7 @@ import serial
 
 from drivers.errors import LinkError
 from sim.transport.pseudo_terminal import PseudoTerminal
-from sim.witness.place import Place
+from sim.witness.endpoint import WireEndpoint
 from sim.witness.seen import Toward
 from sim.witness.witness import Witness
 
@@ -29,7 +29,7 @@ _logger = logging.getLogger(__name__)
 
 @asynccontextmanager
 async def relays(
-    places: Sequence[Place],
+    places: Sequence[WireEndpoint],
     names: Sequence[str],
     witness: Witness,
 ) -> AsyncIterator[list[str]]:
@@ -48,7 +48,7 @@ async def relays(
 
 
 @asynccontextmanager
-async def _line(place: Place, name: str, witness: Witness) -> AsyncIterator[str]:
+async def _line(place: WireEndpoint, name: str, witness: Witness) -> AsyncIterator[str]:
     """A pseudo-terminal in front of a serial port."""
     try:
         port = serial.Serial(place.place, baudrate=place.baud, timeout=0, exclusive=True)
@@ -92,7 +92,7 @@ async def _line(place: Place, name: str, witness: Witness) -> AsyncIterator[str]
 
 
 @asynccontextmanager
-async def _network(place: Place, name: str, witness: Witness) -> AsyncIterator[str]:
+async def _network(place: WireEndpoint, name: str, witness: Witness) -> AsyncIterator[str]:
     """A port of the loopback interface in front of a server."""
     loop = asyncio.get_running_loop()
     host, _, number = place.place.rpartition(":")

@@ -29,7 +29,7 @@ from memory_machine import live_in_memory
 from model.rig.rig import Rig
 from reopened import reopen
 from sim.far_ends.wires import Wire
-from sim.faults.episodes import Episode, FaultKind
+from sim.faults.fault_window import FaultKind, FaultWindow
 from virtual_loop import run_virtual
 from wires import WIRES, FarSide, far_side, patient
 
@@ -68,7 +68,7 @@ class Link:
 
     async def again(self) -> None:
         """After a loss, with all faults over: open, cleared, armed, however busy the machine is."""
-        self.far.station.recover()
+        self.far.device.recover()
         async with asyncio.timeout(60):
             while True:
                 with contextlib.suppress(LinkError, CommandRefused):  # not yet silent
@@ -120,7 +120,7 @@ async def test_a_host_that_is_gone_leaves_silence(far: FarSide) -> None:
     await eventually(lambda: far.silent_from() < math.inf)
     measured = far.silent_from() - fed
     assert WATCHDOG <= measured <= WATCHDOG + REACTION + 1e-9
-    await eventually(lambda: far.station.status().state is AmplifierState.FAULT)
+    await eventually(lambda: far.device.status().state is AmplifierState.FAULT)
     assert far.amplifier.fault is Fault.WATCHDOG
 
 
@@ -132,7 +132,7 @@ async def test_a_link_that_is_cut_leaves_silence_and_is_told(far: FarSide, kind:
         await link.amplifier.apply(link.tone())
         cut = time.monotonic()
         fed = fed_at(far)
-        far.station.befall(Episode(kind))
+        far.device.inject_fault(FaultWindow(kind))
         with pytest.raises(LinkError):
             await beat(link.amplifier, MAX_MISSED_HEARTBEATS)
         asked = link.amplifier.statistics
@@ -144,8 +144,8 @@ async def test_a_link_that_is_cut_leaves_silence_and_is_told(far: FarSide, kind:
             await link.amplifier.apply(link.tone())
         await eventually(lambda: far.silent_from() < math.inf)
         assert far.silent_from() - max(fed, fed_at(far)) <= WATCHDOG + REACTION + 1e-9
-        await eventually(lambda: far.station.status().state is AmplifierState.FAULT)
-        far.station.recover()
+        await eventually(lambda: far.device.status().state is AmplifierState.FAULT)
+        far.device.recover()
         await reopen(link.amplifier, tries=200)
         status = await link.amplifier.status()  # that it was opened again has armed nothing
         assert (status.state, status.levels) == (AmplifierState.FAULT, (0.0,) * 4)
@@ -158,12 +158,12 @@ async def test_a_wire_that_is_pulled_out_is_told_within_60_ms(far: FarSide) -> N
     async with Link(far) as host:
         for _ in range(10):
             pulled = now()
-            far.station.befall(Episode("unplug"))
+            far.device.inject_fault(FaultWindow("unplug"))
             await eventually(lambda: host.amplifier.is_lost)
             took.append(now() - pulled)
             if took[-1] <= 0.060:
                 return
-            far.station.recover()
+            far.device.recover()
             await reopen(host.amplifier, tries=200)
     raise AssertionError(f"told after {', '.join(f'{1e3 * one:.0f} ms' for one in took)}")
 
@@ -184,9 +184,9 @@ def test_a_wire_comes_back_once_nothing_holds_it_out(name: str, coarse_rig: Rig)
 
     async def use(host: Link) -> None:
         await host.amplifier.close()
-        host.far.station.befall(Episode("unplug", lasts=0.2))
+        host.far.device.inject_fault(FaultWindow("unplug", lasts=0.2))
         await asyncio.sleep(0.1)
-        host.far.station.befall(Episode("unplug", lasts=0.3))
+        host.far.device.inject_fault(FaultWindow("unplug", lasts=0.3))
         await asyncio.sleep(0.2)
         assert not await is_there(host)
         await asyncio.sleep(0.2)
@@ -235,7 +235,7 @@ def test_an_amplifier_that_is_silent_is_told_within_three_heartbeats(
     async def use(host: Link) -> None:
         for _ in range(10):
             await host.again()
-            host.far.station.befall(Episode(kind))
+            host.far.device.inject_fault(FaultWindow(kind))
             hung = clock.now()
             with pytest.raises(LinkError):
                 await beat_on(host.amplifier)
@@ -257,7 +257,7 @@ def test_a_loss_in_the_middle_of_a_set_is_told_as_soon_as_the_rig_check_says(
         assert (bound > MAX_MISSED_HEARTBEATS * HEARTBEAT) == is_late
         for _ in range(5):
             await host.again()
-            host.far.station.befall(Episode("hang"))
+            host.far.device.inject_fault(FaultWindow("hang"))
             hung = clock.now()
             await asyncio.sleep(HEARTBEAT)
             commands = tuple(DriveCommand(channel, 110.0, 0.2) for channel in range(4))
@@ -302,14 +302,14 @@ async def test_each_token_is_applied_once_under_loss(far: FarSide) -> None:
     confirmed = []
     async with Link(far, reply_timeout=0.03) as link:
         await link.amplifier.arm(2.0)
-        far.station.befall(Episode("drop", share=0.2))
+        far.device.inject_fault(FaultWindow("drop", share=0.2))
         for number in range(40):
             safe = link.tone(0.1 + 0.01 * (number % 10))
             try:
                 achieved = await link.amplifier.apply(safe)
             except LinkError:
                 await link.again()
-                far.station.befall(Episode("drop", share=0.2))
+                far.device.inject_fault(FaultWindow("drop", share=0.2))
                 continue
             except CommandRefused:  # a wire on which a set takes several telegrams
                 continue
@@ -317,7 +317,7 @@ async def test_each_token_is_applied_once_under_loss(far: FarSide) -> None:
             assert achieved.commands[0].level == pytest.approx(safe.commands[0].level)
             confirmed.append(achieved.token)
         lost = link.amplifier.statistics.timeouts
-        far.station.recover()
+        far.device.recover()
     assert lost >= 3
     assert len(confirmed) >= 15
     assert len(played) == len(set(played))
@@ -331,7 +331,7 @@ async def test_nothing_is_credited_to_another_request(far: FarSide, kind: FaultK
     patience = 0.5 if kind == "duplicate" else 0.03
     async with Link(far, reply_timeout=patience) as link:
         await link.amplifier.arm(2.0)
-        far.station.befall(Episode(kind, share=0.3, delay=0.05))
+        far.device.inject_fault(FaultWindow(kind, share=0.3, delay=0.05))
         right = 0
         for _ in range(15):
             safe = link.tone(0.3)
@@ -339,7 +339,7 @@ async def test_nothing_is_credited_to_another_request(far: FarSide, kind: FaultK
                 achieved = await link.amplifier.apply(safe)
             except LinkError:
                 await link.again()
-                far.station.befall(Episode(kind, share=0.3, delay=0.05))
+                far.device.inject_fault(FaultWindow(kind, share=0.3, delay=0.05))
                 continue
             except DriverError:  # a copy that came late, or twice, or only half; or nonsense
                 continue
@@ -356,14 +356,14 @@ async def test_a_damaged_set_is_counted_and_changes_nothing(far: FarSide) -> Non
         await host.amplifier.arm(2.0)
         first = host.tone(0.4)
         await host.amplifier.apply(first)
-        far.station.befall(Episode("corrupt", toward="amplifier"))
+        far.device.inject_fault(FaultWindow("corrupt", toward="amplifier"))
         with pytest.raises(DriverError):
             await host.amplifier.apply(host.tone(0.9))
         far.bench.advance(clock.now())
-        assert far.station.status().token == first.token
-        assert far.station.status().levels[0] == pytest.approx(0.4)
+        assert far.device.status().token == first.token
+        assert far.device.status().levels[0] == pytest.approx(0.4)
         await host.again()
-        far.station.befall(Episode("corrupt", toward="host"))
+        far.device.inject_fault(FaultWindow("corrupt", toward="host"))
         with pytest.raises(DriverError):
             await host.amplifier.heartbeat()
         seen = host.amplifier.statistics
@@ -375,11 +375,11 @@ async def test_one_good_telegram_resynchronises(far: FarSide) -> None:
     """After a damaged one the very next is understood."""
     async with Link(far, reply_timeout=2.0) as link:
         for _ in range(5):
-            far.station.befall(Episode("corrupt", toward="amplifier"))
+            far.device.inject_fault(FaultWindow("corrupt", toward="amplifier"))
             with pytest.raises(TimeoutError):
                 async with asyncio.timeout(0.03):
                     await link.amplifier.heartbeat()
-            far.station.recover()
+            far.device.recover()
             before = link.amplifier.statistics.timeouts
             await link.amplifier.heartbeat()
             assert link.amplifier.statistics.timeouts == before
@@ -391,14 +391,14 @@ async def test_a_torn_set_changes_nothing(far: FarSide) -> None:
         await link.amplifier.arm(2.0)
         first = link.tone(0.4)
         await link.amplifier.apply(first)
-        far.station.befall(Episode("torn_commit"))
+        far.device.inject_fault(FaultWindow("incomplete_set"))
         both = tuple(DriveCommand(channel, 150.0, 0.2) for channel in range(4))
         token = link.amplifier.next_token()
         safe = link.guard.check(CommandSet(token, both, ramp=0.0, valid_for=0.0))
         with pytest.raises(DriverError):
             await link.amplifier.apply(safe)
         far.bench.advance(time.monotonic())
-        status = far.station.status()
+        status = far.device.status()
         assert status.token == first.token
         assert status.levels == pytest.approx((0.4, 0.0, 0.0, 0.0), abs=1e-4)
 
@@ -407,7 +407,7 @@ async def test_a_storm_of_refusals_is_not_answered_with_one(far: FarSide) -> Non
     """A host that beats 20 times a second sends at most 50 frames in it."""
     async with Link(far) as link:
         await link.amplifier.arm(2.0)
-        far.station.befall(Episode("nak_storm"))
+        far.device.inject_fault(FaultWindow("nak_storm"))
         before = link.amplifier.statistics
         for _ in range(20):  # as many heartbeats as there are in a second
             with pytest.raises(CommandRefused, match="busy"):
@@ -415,7 +415,7 @@ async def test_a_storm_of_refusals_is_not_answered_with_one(far: FarSide) -> Non
         after = link.amplifier.statistics
         assert after.refusals - before.refusals == 20
         assert after.frames_out - before.frames_out <= 50
-        far.station.recover()
+        far.device.recover()
         assert (await link.amplifier.heartbeat()).state is AmplifierState.OPERATION_ENABLED
 
 
@@ -425,7 +425,7 @@ async def test_a_reboot_is_noticed_and_nothing_is_armed(far: FarSide) -> None:
         await link.amplifier.arm(2.0)
         await link.amplifier.apply(link.tone())
         begin = time.monotonic()
-        far.station.befall(Episode("reboot", lasts=0.05))
+        far.device.inject_fault(FaultWindow("reboot", lasts=0.05))
         assert far.silent_from() - begin <= 0.01
         try:
             status = await link.amplifier.heartbeat()
@@ -455,9 +455,9 @@ async def test_a_fault_of_the_amplifier_silences_and_latches(far: FarSide, kind:
         await link.amplifier.arm(2.0)
         await link.amplifier.apply(link.tone())
         begin = time.monotonic()
-        far.station.befall(Episode(kind))
+        far.device.inject_fault(FaultWindow(kind))
         assert far.silent_from() - begin <= REACTION + 0.01  # and what the test itself took
-        await eventually(lambda: far.station.status().state is AmplifierState.FAULT)
+        await eventually(lambda: far.device.status().state is AmplifierState.FAULT)
         status = await link.amplifier.status()
         assert status.fault.name == kind.upper()
         assert not status.high_voltage
@@ -474,7 +474,7 @@ async def test_warmth_derates_and_then_trips(far: FarSide) -> None:
     async with Link(far) as link:
         await link.amplifier.arm(2.0)
         await link.amplifier.apply(link.tone(0.6))
-        far.station.befall(Episode("over_temperature", lasts=0.3))
+        far.device.inject_fault(FaultWindow("over_temperature", lasts=0.3))
         async with asyncio.timeout(10):
             while (
                 status := await link.amplifier.heartbeat()
@@ -492,7 +492,7 @@ async def test_a_hung_host_that_goes_on_replays_nothing(far: FarSide) -> None:
         await link.amplifier.arm(WATCHDOG)
         await link.amplifier.apply(link.tone())
         pending = link.tone(0.9)
-        await eventually(lambda: far.station.status().state is AmplifierState.FAULT)
+        await eventually(lambda: far.device.status().state is AmplifierState.FAULT)
         with pytest.raises(CommandRefused):
             await link.amplifier.apply(pending)
         assert (await link.amplifier.status()).levels == (0.0,) * 4
@@ -510,10 +510,10 @@ async def test_a_hundred_replugs_leak_nothing(far: FarSide) -> None:
     async with Link(far) as link:
         before: tuple[int, int, int] | None = None
         for number in range(105):
-            far.station.befall(Episode("unplug"))
+            far.device.inject_fault(FaultWindow("unplug"))
             with pytest.raises(LinkError):
                 await beat(link.amplifier, MAX_MISSED_HEARTBEATS)
-            far.station.recover()
+            far.device.recover()
             await reopen(link.amplifier, tries=200)
             if number == 4:
                 before = in_use()

@@ -18,7 +18,7 @@ from drivers.registry import open_backend
 from model.rig.rig import Channel, Rig
 from reopened import reopen
 from sim.far_ends.wires import Wire
-from sim.faults.episodes import Episode
+from sim.faults.fault_window import FaultWindow
 from wires import SHARED_WIRES, FarSide, far_side, patient
 
 
@@ -142,15 +142,15 @@ async def test_one_comes_back_while_the_other_is_left_lost(wire: Wire, two_ampli
         )
         await east.open()
         await west.open()
-        for station in far.stations.values():
-            station.befall(Episode("unplug"))
+        for device in far.devices.values():
+            device.inject_fault(FaultWindow("unplug"))
         for one in (east, west):
             async with asyncio.timeout(10):
                 while not one.is_lost:
                     with contextlib.suppress(LinkError):
                         await one.status()
-        for station in far.stations.values():
-            station.recover()
+        for device in far.devices.values():
+            device.recover()
         await reopen(east, tries=200)
         with pytest.raises(LinkError):
             await west.status()
@@ -195,13 +195,13 @@ async def test_a_stop_waits_for_no_other_that_is_stuck(
     now = asyncio.get_running_loop().time
     took = []
     for _ in range(10):
-        far.stations["west"].befall(Episode("hang"))
+        far.devices["west"].inject_fault(FaultWindow("hang"))
         stuck = [asyncio.create_task(west.heartbeat()) for _ in range(3)]
         await asyncio.sleep(0.005)  # the first is on the line
         begin = now()
         await silence(east, 0.0)
         took.append(now() - begin)
-        far.stations["west"].recover()
+        far.devices["west"].recover()
         assert all(isinstance(status, Status) for status in await asyncio.gather(*stuck))
         if took[-1] < 0.050:
             return

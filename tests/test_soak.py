@@ -18,7 +18,7 @@ from planted_bugs import BUGS as BUGS_OF_THE_WITNESS
 from planted_bugs import plant
 from sim.amplifier.amplifier import SimulatedAmplifier
 from sim.far_ends.serial_end import SerialEnd
-from sim.faults.episodes import Episode
+from sim.faults.fault_window import FaultWindow
 from soak import outcomes, shrink
 from soak_chain import run_plan
 from soak_plan import (
@@ -119,7 +119,7 @@ BUGS: dict[str, tuple[Any, str, Any, Plan, str]] = {
         SimulatedAmplifier,
         "_watchdog_end",
         property(_never),
-        held(Trouble(2.0, 0, Episode("unplug", lasts=1.5))),
+        held(Trouble(2.0, 0, FaultWindow("unplug", lasts=1.5))),
         "after it was fed",
     ),
     "lifts that get lost": (
@@ -140,7 +140,7 @@ BUGS: dict[str, tuple[Any, str, Any, Plan, str]] = {
     "a far end that stumbles": (
         SerialEnd,
         "_answer",
-        lambda end, frame, station: 1 / 0,
+        lambda end, frame, device: 1 / 0,
         held(),
         "unhandled",
     ),
@@ -190,7 +190,7 @@ def test_the_witness_finds_planted_bugs_in_the_soak(
 def test_what_is_not_needed_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of a plan that fails, shrinking leaves what makes it fail: to arm, and the finger."""
     plan = held(
-        Trouble(3.7, 0, Episode("delay", lasts=0.1, delay=0.002)),
+        Trouble(3.7, 0, FaultWindow("delay", lasts=0.1, delay=0.002)),
         asks=(Ask(3.8, "disarm"), Ask(3.9, "clear")),
     )
     monkeypatch.setattr(Controller, "deliver", _deaf_to_lifts(Controller.deliver))

@@ -4,7 +4,7 @@ from collections.abc import Callable, Coroutine
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
-from sim.control.site import Site
+from sim.control.context import SimulationContext
 
 Answer: TypeAlias = Callable[[], dict[str, Any]]
 """Makes an answer, or raises InputError; touches nothing of the bench: any thread may do it."""
@@ -18,7 +18,7 @@ class Wait:
     then: Answer
 
 
-Operation: TypeAlias = Callable[[Site, dict[str, Any], float], Answer | Wait]
+Operation: TypeAlias = Callable[[SimulationContext, dict[str, Any], float], Answer | Wait]
 """Does what a request asks now [s], or raises InputError and changes nothing."""
 
 

@@ -5,42 +5,42 @@ from collections.abc import Mapping
 from typing import Any
 
 from sim.control.answers import Answer, Operation, already
-from sim.control.site import Site
-from sim.faults.file import episode_of
+from sim.control.context import SimulationContext
+from sim.faults.fault_file import parse_fault
 
 
-def _befall(site: Site, request: dict[str, Any], now: float) -> Answer:
+def _inject_fault(context: SimulationContext, request: dict[str, Any], now: float) -> Answer:
     told = {key: value for key, value in request.items() if key != "op"}
-    episode = episode_of(told)
-    for station in site.stations_of(episode.amplifier):
-        station.befall(episode)
+    window = parse_fault(told)
+    for device in context.devices_of(window.amplifier):
+        device.inject_fault(window)
     return already({"ok": True, "time_s": now})
 
 
-def _faults(site: Site, request: dict[str, Any], now: float) -> Answer:
+def _faults(context: SimulationContext, request: dict[str, Any], now: float) -> Answer:
     listed = {}
-    for name, station in site.stations.items():
-        begin = station.faults.begin
+    for name, device in context.devices.items():
+        begin = device.faults.begin
         listed[name] = [
             {
-                "fault": episode.fault,
-                "begin_s": begin + episode.at,
-                "end_s": begin + episode.end if math.isfinite(episode.end) else None,
-                "is_on": episode.at <= now - begin < episode.end,
+                "fault": window.fault,
+                "begin_s": begin + window.at,
+                "end_s": begin + window.end if math.isfinite(window.end) else None,
+                "is_on": window.at <= now - begin < window.end,
             }
-            for episode in station.faults.episodes
+            for window in device.faults.windows
         ]
     return already({"faults": listed})
 
 
-def _recover(site: Site, request: dict[str, Any], now: float) -> Answer:
-    for station in site.stations_of(request.get("amplifier")):
-        station.recover()
+def _recover(context: SimulationContext, request: dict[str, Any], now: float) -> Answer:
+    for device in context.devices_of(request.get("amplifier")):
+        device.recover()
     return already({"ok": True, "time_s": now})
 
 
 OPERATIONS: Mapping[str, Operation] = {
-    "befall": _befall,
+    "inject_fault": _inject_fault,
     "faults": _faults,
     "recover": _recover,
 }

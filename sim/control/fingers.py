@@ -5,47 +5,47 @@ from typing import Any
 
 from model.errors import InputError
 from sim.control.answers import Answer, Operation, already
-from sim.control.site import Site
+from sim.control.context import SimulationContext
 from sim.control.values import finger_of, place_of, window_of
 from sim.plant.felt import feel
 from sim.plant.finger import Position, Record
 
 
-def _fingers(site: Site, request: dict[str, Any], now: float) -> Answer:
+def _fingers(context: SimulationContext, request: dict[str, Any], now: float) -> Answer:
     fingers = request.get("fingers")
     if not isinstance(fingers, dict):
         raise InputError('fingers must be an object of positions, as in {"1": [0.10, 0.08]}')
     places = {
         name: place_of(place, what=f"finger {name[:40]!r}") for name, place in fingers.items()
     }
-    return _placed(site, places, now)
+    return _placed(context, places, now)
 
 
-def _come(site: Site, request: dict[str, Any], now: float) -> Answer:
-    name, present = finger_of(request), site.bench.fingers.layout.positions
+def _come(context: SimulationContext, request: dict[str, Any], now: float) -> Answer:
+    name, present = finger_of(request), context.bench.fingers.layout.positions
     if (name in present) != (request["op"] == "move"):
         there = "is on the plate already" if name in present else "is not on the plate"
         raise InputError(f"finger {name!r} {there}")
     at = place_of(request.get("at_m"), what=f"finger {name!r}")
-    return _placed(site, {**present, name: at}, now)
+    return _placed(context, {**present, name: at}, now)
 
 
-def _go(site: Site, request: dict[str, Any], now: float) -> Answer:
-    name, present = finger_of(request), site.bench.fingers.layout.positions
+def _go(context: SimulationContext, request: dict[str, Any], now: float) -> Answer:
+    name, present = finger_of(request), context.bench.fingers.layout.positions
     if name not in present:
         raise InputError(f"finger {name!r} is not on the plate")
-    return _placed(site, {id: at for id, at in present.items() if id != name}, now)
+    return _placed(context, {id: at for id, at in present.items() if id != name}, now)
 
 
-def _placed(site: Site, places: Mapping[str, Position], now: float) -> Answer:
-    site.bench.place_fingers(places, now=now)
-    return already({"ok": True, "time_s": site.bench.time})
+def _placed(context: SimulationContext, places: Mapping[str, Position], now: float) -> Answer:
+    context.bench.place_fingers(places, now=now)
+    return already({"ok": True, "time_s": context.bench.time})
 
 
-def _felt(site: Site, request: dict[str, Any], now: float) -> Answer:
+def _felt(context: SimulationContext, request: dict[str, Any], now: float) -> Answer:
     since, until = window_of(request)
-    site.bench.advance(now)
-    records, frequencies = site.bench.records(since, until)
+    context.bench.advance(now)
+    records, frequencies = context.bench.records(since, until)
     return lambda: {"fingers": {id: _as_felt(rec, frequencies) for id, rec in records.items()}}
 
 

@@ -26,7 +26,7 @@
         {"sensors": {NAME: {"at_m", "real_m_s2": [one per frequency], "imag_m_s2": [...]}}}
         by least squares over the signals; Im[a exp(i omega t)], t the far end's time
 
-    {"op": "befall", "fault": ..., "lasts": ..., ...}  a fault as in a fault file, from now on
+    {"op": "inject_fault", "fault": ..., "lasts": ..., ...}  a fault as in a fault file, from now on
     {"op": "faults"}                                   {"faults": {NAME: [{"fault", "begin_s",
                                                            "end_s" or null, "is_on"}]}}
     {"op": "recover", "amplifier": NAME}               every fault ends; without a name, of all
@@ -46,14 +46,14 @@ from typing import Any
 from model.errors import InputError
 from sim.control import faults, fingers, sensors
 from sim.control.answers import Answer, Operation, Wait, already
-from sim.control.site import Site
+from sim.control.context import SimulationContext
 from sim.control.values import number_of
 
 VERSION = 2
 _STEP_MAX = 3600.0  # s of virtual time in one request
 
 
-def carry_out(site: Site, line: bytes, *, now: float) -> Answer | Wait:
+def carry_out(context: SimulationContext, line: bytes, *, now: float) -> Answer | Wait:
     """Do what one line of control asks now [s]; returns what makes the answer to it.
 
     Making it may take long and touches nothing of the bench any more: any thread may do it.
@@ -65,7 +65,7 @@ def carry_out(site: Site, line: bytes, *, now: float) -> Answer | Wait:
         op = request.get("op")
         if not isinstance(op, str) or op not in _OPS:
             raise InputError(f"op is {str(op)[:40]!r}; it must be one of {', '.join(_OPS)}")
-        made = _OPS[op](site, request, now)
+        made = _OPS[op](context, request, now)
     except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
         return already({"error": f"not a line of JSON: {error}"})
     except (InputError, OSError) as error:
@@ -87,20 +87,20 @@ def _in_words(error: InputError | OSError) -> str:
     return str(error)
 
 
-def _hello(site: Site, request: dict[str, Any], now: float) -> Answer:
+def _hello(context: SimulationContext, request: dict[str, Any], now: float) -> Answer:
     return already(
         {
             "protocol": "era-sim-control",
             "version": VERSION,
-            "clock": "wall" if site.step is None else "virtual",
+            "clock": "wall" if context.step is None else "virtual",
             "ops": list(_OPS),
-            "urls": dict(site.urls),
+            "urls": dict(context.urls),
         }
     )
 
 
-def _state(site: Site, request: dict[str, Any], now: float) -> Answer:
-    bench = site.bench
+def _state(context: SimulationContext, request: dict[str, Any], now: float) -> Answer:
+    bench = context.bench
     bench.advance(now)
     amplifiers = {}
     for name, amplifier in bench.amplifiers.items():
@@ -116,8 +116,8 @@ def _state(site: Site, request: dict[str, Any], now: float) -> Answer:
     return already({"time_s": bench.time, "fingers": resting, "amplifiers": amplifiers})
 
 
-def _step(site: Site, request: dict[str, Any], now: float) -> Wait:
-    seconds, step = number_of(request, "seconds", "seconds"), site.step
+def _step(context: SimulationContext, request: dict[str, Any], now: float) -> Wait:
+    seconds, step = number_of(request, "seconds", "seconds"), context.step
     if step is None:
         raise InputError("time is the clock's here; start the far end with --virtual-time")
     if not 0 < seconds <= _STEP_MAX:
@@ -125,9 +125,9 @@ def _step(site: Site, request: dict[str, Any], now: float) -> Wait:
 
     async def passes() -> None:
         await step(seconds)
-        site.bench.advance(now + seconds)
+        context.bench.advance(now + seconds)
 
-    return Wait(passes, lambda: {"ok": True, "time_s": site.bench.time})
+    return Wait(passes, lambda: {"ok": True, "time_s": context.bench.time})
 
 
 _OPS: Mapping[str, Operation] = {

@@ -7,7 +7,7 @@ from typing import Any
 
 from model.errors import InputError
 from sim.control.answers import Answer, Operation, already
-from sim.control.site import Site
+from sim.control.context import SimulationContext
 from sim.control.values import is_number, number_of, place_of, window_of
 from sim.sensors.accelerometer import Accelerometer
 from sim.sensors.recorder import Recorder
@@ -17,14 +17,14 @@ from sim.sensors.signal_measures import tone_phasors
 _TONES_MAX = 64
 
 
-def _sensors(site: Site, request: dict[str, Any], now: float) -> Answer:
+def _sensors(context: SimulationContext, request: dict[str, Any], now: float) -> Answer:
     asked = request.get("sensors")
     if not isinstance(asked, dict):
         raise InputError('sensors must be an object, as in {"P1": {"at_m": [0.10, 0.08]}}')
     sensors = [_sensor(name, told) for name, told in asked.items()]
-    site.bench.advance(now)
-    site.accelerometers.place(sensors)
-    return already({"ok": True, "time_s": site.bench.time})
+    context.bench.advance(now)
+    context.accelerometers.place(sensors)
+    return already({"ok": True, "time_s": context.bench.time})
 
 
 def _sensor(name: str, told: object) -> Accelerometer:
@@ -54,8 +54,8 @@ _SENSOR_KEYS = {
 }
 
 
-def _signals(site: Site, request: dict[str, Any], now: float) -> Answer:
-    recording = _recorded(site, request, now)
+def _signals(context: SimulationContext, request: dict[str, Any], now: float) -> Answer:
+    recording = _recorded(context, request, now)
     return lambda: {
         "sample_rate_hz": recording.sample_rate,
         "start_s": recording.start,
@@ -71,19 +71,19 @@ def _signals(site: Site, request: dict[str, Any], now: float) -> Answer:
     }
 
 
-def _tones(site: Site, request: dict[str, Any], now: float) -> Answer:
+def _tones(context: SimulationContext, request: dict[str, Any], now: float) -> Answer:
     frequencies = request.get("frequencies_hz")
     if not (
         isinstance(frequencies, list)
         and 0 < len(frequencies) <= _TONES_MAX
-        and all(is_number(f) and 0 < f < site.bench.sample_rate / 2 for f in frequencies)
+        and all(is_number(f) and 0 < f < context.bench.sample_rate / 2 for f in frequencies)
         and len(set(frequencies)) == len(frequencies)
     ):
         raise InputError(
             f"frequencies_hz must be 1 to {_TONES_MAX} different frequencies below "
-            f"{site.bench.sample_rate / 2:g} Hz"
+            f"{context.bench.sample_rate / 2:g} Hz"
         )
-    recording = _recorded(site, request, now)
+    recording = _recorded(context, request, now)
 
     def answer() -> dict[str, Any]:
         found = tone_phasors(recording, frequencies)
@@ -103,24 +103,24 @@ def _tones(site: Site, request: dict[str, Any], now: float) -> Answer:
     return answer
 
 
-def _recorded(site: Site, request: dict[str, Any], now: float) -> Recording:
+def _recorded(context: SimulationContext, request: dict[str, Any], now: float) -> Recording:
     since, until = window_of(request)
-    site.bench.advance(now)
-    return site.accelerometers.read(since, until)
+    context.bench.advance(now)
+    return context.accelerometers.read(since, until)
 
 
-def _record(site: Site, request: dict[str, Any], now: float) -> Answer:
+def _record(context: SimulationContext, request: dict[str, Any], now: float) -> Answer:
     file = request.get("file")
     if not isinstance(file, str) or not file:
         raise InputError("file must be the name of a recording, as in run.csv")
-    site.bench.advance(now)
-    site.record(Path(file))
-    return already({"ok": True, "time_s": site.bench.time})
+    context.bench.advance(now)
+    context.record(Path(file))
+    return already({"ok": True, "time_s": context.bench.time})
 
 
-def _finish(site: Site, request: dict[str, Any], now: float) -> Answer:
-    site.bench.advance(now)
-    recorder = site.stop_recording()
+def _finish(context: SimulationContext, request: dict[str, Any], now: float) -> Answer:
+    context.bench.advance(now)
+    recorder = context.stop_recording()
     return lambda: _finished(recorder)
 
 

@@ -16,14 +16,14 @@ from typing import Any
 from drivers import clock
 from drivers.errors import LinkError
 from sim.control.answers import Answer, Wait
+from sim.control.context import SimulationContext
 from sim.control.operations import carry_out
-from sim.control.site import Site
 
 LINE_MAX = 64 * 1024  # bytes; thirty fingers take a tenth of it
 
 
 @asynccontextmanager
-async def control_socket(site: Site, path: Path) -> AsyncIterator[None]:
+async def control_socket(context: SimulationContext, path: Path) -> AsyncIterator[None]:
     """Serve control of a far end at a path; raises LinkError where no socket can be made."""
     sock = _bind(path)
     loop = asyncio.get_running_loop()
@@ -38,7 +38,7 @@ async def control_socket(site: Site, path: Path) -> AsyncIterator[None]:
         except OSError:  # the client has left again already
             return
         connection.setblocking(False)
-        client = loop.create_task(_converse(site, connection), name=f"control at {path}")
+        client = loop.create_task(_converse(context, connection), name=f"control at {path}")
         clients[client] = connection
         client.add_done_callback(forget)
 
@@ -54,7 +54,7 @@ async def control_socket(site: Site, path: Path) -> AsyncIterator[None]:
         await asyncio.gather(*clients, return_exceptions=True)
 
 
-async def _converse(site: Site, connection: socket.socket) -> None:
+async def _converse(context: SimulationContext, connection: socket.socket) -> None:
     """Answer a client line by line until it leaves. Plain sockets: no transport to outlive us."""
     loop = asyncio.get_running_loop()
     rest = b""
@@ -62,7 +62,7 @@ async def _converse(site: Site, connection: socket.socket) -> None:
         while data := await loop.sock_recv(connection, LINE_MAX):
             *lines, rest = (rest + data).split(b"\n")
             for line in lines:
-                make_answer = carry_out(site, line, now=clock.now())
+                make_answer = carry_out(context, line, now=clock.now())
                 if isinstance(make_answer, Wait):
                     await make_answer.passes()
                     make_answer = make_answer.then

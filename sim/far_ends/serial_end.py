@@ -14,26 +14,30 @@ from drivers.codec.serial_line.exchanges import decode_request, encode_event, en
 from drivers.codec.serial_line.frame import Frame, FrameCounters, FrameReader, encode_frame
 from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.messages import AmplifierEvent, Commit, Nak, Reply, Stop
-from sim.bench.station import Station
+from sim.bench.simulated_device import SimulatedDevice
 from sim.transport.line import TwoWayLine
 from sim.transport.pseudo_terminal import make_terminal
 
 
 class SerialEnd:
-    """A pseudo-terminal on which stations answer, each at the address that is its number.
+    """A pseudo-terminal on which devices answer, each at the address that is its number.
 
     baud: bytes take as long as at this speed; None for no time at all. unpluggable: the port is
     named by a link that outlives the pseudo-terminal.
     """
 
     def __init__(
-        self, stations: Sequence[Station], *, baud: int | None = None, unpluggable: bool = False
+        self,
+        devices: Sequence[SimulatedDevice],
+        *,
+        baud: int | None = None,
+        unpluggable: bool = False,
     ) -> None:
-        alone = len(stations) == 1
-        self._stations = {
-            PROTOCOL.serial.address if alone else station.number: station for station in stations
+        alone = len(devices) == 1
+        self._devices = {
+            PROTOCOL.serial.address if alone else device.number: device for device in devices
         }
-        self._first = stations[0]
+        self._first = devices[0]
         self._baud = baud or PROTOCOL.serial.baud
         self._line = TwoWayLine(
             to_amplifier=self._arrived,
@@ -61,9 +65,9 @@ class SerialEnd:
         """The URL of each amplifier, by its name."""
         first = PROTOCOL.serial.address
         return {
-            station.name: f"serial://{self.port}?baud={self._baud}"
+            device.name: f"serial://{self.port}?baud={self._baud}"
             + (f"&address={number}" if number != first else "")
-            for number, station in self._stations.items()
+            for number, device in self._devices.items()
         }
 
     @property
@@ -76,7 +80,7 @@ class SerialEnd:
         self._terminal.listen()
         if self._is_unpluggable:
             self._first.on_plug(self._plug)
-        if len(self._stations) == 1:
+        if len(self._devices) == 1:
             self._first.listen(self._tell)
 
     def close(self) -> None:
@@ -95,24 +99,24 @@ class SerialEnd:
                 continue
             if frame.address == PROTOCOL.serial.broadcast:
                 self._broadcast(frame)
-            elif frame.address in self._stations:
-                reply = self._answer(frame, self._stations[frame.address])
+            elif frame.address in self._devices:
+                reply = self._answer(frame, self._devices[frame.address])
                 if reply is not None:
                     self._line.outward.send(encode_frame(encode_reply(reply, frame)))
 
-    def _answer(self, frame: Frame, station: Station) -> Reply | None:
+    def _answer(self, frame: Frame, device: SimulatedDevice) -> Reply | None:
         try:
             request = decode_request(frame)
         except Malformed as problem:
-            return Nak(problem.code, problem.channel) if station.is_answering else None
-        return station.exchange(request)
+            return Nak(problem.code, problem.channel) if device.is_answering else None
+        return device.exchange(request)
 
     def _broadcast(self, frame: Frame) -> None:
         with contextlib.suppress(Malformed):
             request = decode_request(frame)
             if isinstance(request, Commit | Stop):
-                for station in self._stations.values():
-                    station.broadcast(request)
+                for device in self._devices.values():
+                    device.broadcast(request)
 
     def _tell(self, event: AmplifierEvent) -> None:
         if self._first.is_answering:

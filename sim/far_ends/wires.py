@@ -1,6 +1,6 @@
 """Which far end stands behind which wire.
 
-A far end is an asynchronous context in which stations answer on a real wire; it gives the URL of
+A far end is an asynchronous context in which devices answer on a real wire; it gives the URL of
 each amplifier by its name. A new one is a file of its own and one line in `_OPENERS`.
 """
 
@@ -9,7 +9,7 @@ from contextlib import AbstractAsyncContextManager, AsyncExitStack, asynccontext
 from dataclasses import dataclass
 from typing import TypeAlias
 
-from sim.bench.station import Station
+from sim.bench.simulated_device import SimulatedDevice
 
 
 @dataclass(frozen=True)
@@ -34,34 +34,36 @@ class Wire:
 FarEnd: TypeAlias = AbstractAsyncContextManager[Mapping[str, str]]
 
 
-def open_wire(wire: Wire, stations: Sequence[Station]) -> FarEnd:
-    """The far end of this wire with these stations on it; entering it may raise LinkError."""
-    return _OPENERS[wire.kind](wire, stations)
+def open_wire(wire: Wire, devices: Sequence[SimulatedDevice]) -> FarEnd:
+    """The far end of this wire with these devices on it; entering it may raise LinkError."""
+    return _OPENERS[wire.kind](wire, devices)
 
 
 @asynccontextmanager
 async def open_wires(
-    wires: Mapping[str, Wire], stations: Sequence[Station]
+    wires: Mapping[str, Wire], devices: Sequence[SimulatedDevice]
 ) -> AsyncIterator[Mapping[str, str]]:
-    """The far ends of stations on several wires, by their names: those with equal ones on one.
+    """The far ends of devices on several wires, by their names: those with equal ones on one.
 
-    Gives the URL of each by its name, in the stations' order. Raises LinkError.
+    Gives the URL of each by its name, in the devices' order. Raises LinkError.
     """
-    lines: dict[Wire, list[Station]] = {}
-    for station in stations:
-        lines.setdefault(wires[station.name], []).append(station)
+    lines: dict[Wire, list[SimulatedDevice]] = {}
+    for device in devices:
+        lines.setdefault(wires[device.name], []).append(device)
     urls: dict[str, str] = {}
     async with AsyncExitStack() as stack:
         for wire, together in lines.items():
             urls.update(await stack.enter_async_context(open_wire(wire, together)))
-        yield {station.name: urls[station.name] for station in stations}
+        yield {device.name: urls[device.name] for device in devices}
 
 
 @asynccontextmanager
-async def _serial(wire: Wire, stations: Sequence[Station]) -> AsyncIterator[Mapping[str, str]]:
+async def _serial(
+    wire: Wire, devices: Sequence[SimulatedDevice]
+) -> AsyncIterator[Mapping[str, str]]:
     from sim.far_ends.serial_end import SerialEnd
 
-    lines = [list(stations)] if wire.shared else [[station] for station in stations]
+    lines = [list(devices)] if wire.shared else [[device] for device in devices]
     urls = {}
     async with AsyncExitStack() as stack:
         for line in lines:
@@ -73,10 +75,12 @@ async def _serial(wire: Wire, stations: Sequence[Station]) -> AsyncIterator[Mapp
 
 
 @asynccontextmanager
-async def _modbus_tcp(wire: Wire, stations: Sequence[Station]) -> AsyncIterator[Mapping[str, str]]:
+async def _modbus_tcp(
+    wire: Wire, devices: Sequence[SimulatedDevice]
+) -> AsyncIterator[Mapping[str, str]]:
     from sim.far_ends.modbus.end import ModbusTcpEnd
 
-    end = ModbusTcpEnd(stations, port=wire.port)
+    end = ModbusTcpEnd(devices, port=wire.port)
     try:
         await end.start()
         yield end.urls
@@ -85,10 +89,12 @@ async def _modbus_tcp(wire: Wire, stations: Sequence[Station]) -> AsyncIterator[
 
 
 @asynccontextmanager
-async def _modbus_rtu(wire: Wire, stations: Sequence[Station]) -> AsyncIterator[Mapping[str, str]]:
+async def _modbus_rtu(
+    wire: Wire, devices: Sequence[SimulatedDevice]
+) -> AsyncIterator[Mapping[str, str]]:
     from sim.far_ends.modbus.end import ModbusRtuEnd
 
-    end = ModbusRtuEnd(stations, speed=wire.speed, unpluggable=wire.unpluggable)
+    end = ModbusRtuEnd(devices, speed=wire.speed, unpluggable=wire.unpluggable)
     try:
         end.start()
         yield end.urls
@@ -96,19 +102,19 @@ async def _modbus_rtu(wire: Wire, stations: Sequence[Station]) -> AsyncIterator[
         end.close()
 
 
-def _socketcand(wire: Wire, stations: Sequence[Station]) -> FarEnd:
+def _socketcand(wire: Wire, devices: Sequence[SimulatedDevice]) -> FarEnd:
     from sim.far_ends.can_bus.ends import socketcand
 
-    return socketcand(stations, port=wire.port, bitrate=wire.speed)
+    return socketcand(devices, port=wire.port, bitrate=wire.speed)
 
 
-def _slcan(wire: Wire, stations: Sequence[Station]) -> FarEnd:
+def _slcan(wire: Wire, devices: Sequence[SimulatedDevice]) -> FarEnd:
     from sim.far_ends.can_bus.ends import slcan
 
-    return slcan(stations, bitrate=wire.speed, unpluggable=wire.unpluggable)
+    return slcan(devices, bitrate=wire.speed, unpluggable=wire.unpluggable)
 
 
-_OPENERS: Mapping[str, Callable[[Wire, Sequence[Station]], FarEnd]] = {
+_OPENERS: Mapping[str, Callable[[Wire, Sequence[SimulatedDevice]], FarEnd]] = {
     "serial": _serial,
     "modbus-tcp": _modbus_tcp,
     "modbus-rtu": _modbus_rtu,

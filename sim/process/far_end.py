@@ -16,12 +16,12 @@ from model.finger.load import FingerLoad
 from model.rig.rig import Rig
 from sim.bench.bench import Bench
 from sim.bench.real_time import keep_time
-from sim.bench.station import Station
+from sim.bench.simulated_device import SimulatedDevice
+from sim.control.context import SimulationContext, finish_recording
 from sim.control.server import control_socket
-from sim.control.site import Site, finish_recording
 from sim.far_ends.wire_choice import Choice
 from sim.far_ends.wires import open_wires
-from sim.faults.file import FaultFile
+from sim.faults.fault_file import FaultFile
 from sim.plant.finger import Position
 from sim.plant.plant import SAMPLE_RATE
 from sim.process.virtual_time import SteppedLoop
@@ -57,7 +57,7 @@ async def run_far_end(
     far_end: FarEnd,
     *,
     ready: Callable[[Mapping[str, str]], None],
-    view: Callable[[Site], None] | None,
+    view: Callable[[SimulationContext], None] | None,
 ) -> str | None:
     """Simulate until SIGTERM, SIGINT or SIGHUP, or the end of standard input where that counts.
 
@@ -82,30 +82,30 @@ async def run_far_end(
     if ended.is_set():
         return None
     bench.place_fingers(far_end.fingers, now=clock.now())
-    site = Site(bench, step=loop.step if isinstance(loop, SteppedLoop) else None)
-    site.accelerometers.place(far_end.sensors)
+    context = SimulationContext(bench, step=loop.step if isinstance(loop, SteppedLoop) else None)
+    context.accelerometers.place(far_end.sensors)
     if far_end.record is not None:
-        site.record(far_end.record)
+        context.record(far_end.record)
     try:
-        await _serve(far_end, site, ended=ended, ready=ready, view=view)
+        await _serve(far_end, context, ended=ended, ready=ready, view=view)
     finally:
-        said = await finish_recording(site)
+        said = await finish_recording(context)
     return said
 
 
 async def _serve(
     far_end: FarEnd,
-    site: Site,
+    context: SimulationContext,
     *,
     ended: asyncio.Event,
     ready: Callable[[Mapping[str, str]], None],
-    view: Callable[[Site], None] | None,
+    view: Callable[[SimulationContext], None] | None,
 ) -> None:
     """Put the amplifiers on their wires, and let time pass until the end."""
-    bench = site.bench
+    bench = context.bench
     async with contextlib.AsyncExitStack() as stack:
-        stations = [
-            Station(
+        devices = [
+            SimulatedDevice(
                 bench,
                 name,
                 number=far_end.wires[name].number or number,
@@ -114,18 +114,18 @@ async def _serve(
             for number, name in enumerate(bench.amplifiers, start=1)
         ]
         wires = {name: choice.wire for name, choice in far_end.wires.items()}
-        site.urls = await stack.enter_async_context(open_wires(wires, stations))
-        site.stations = {station.name: station for station in stations}
+        context.urls = await stack.enter_async_context(open_wires(wires, devices))
+        context.devices = {device.name: device for device in devices}
         if far_end.control is not None:
-            await stack.enter_async_context(control_socket(site, far_end.control))
-        for station in stations:
-            stack.callback(station.close)
-            station.start()
+            await stack.enter_async_context(control_socket(context, far_end.control))
+        for device in devices:
+            stack.callback(device.close)
+            device.start()
         await stack.enter_async_context(_in_background(keep_time(bench), ended))
         if view is not None:
-            await stack.enter_async_context(_in_background(_keep_viewing(site, view), ended))
+            await stack.enter_async_context(_in_background(_keep_viewing(context, view), ended))
         stack.enter_context(no_long_collections())
-        ready(site.urls)
+        ready(context.urls)
         await ended.wait()
 
 
@@ -138,9 +138,11 @@ def _await_eof(loop: asyncio.AbstractEventLoop, ended: asyncio.Event) -> None:
         loop.call_soon_threadsafe(ended.set)
 
 
-async def _keep_viewing(site: Site, view: Callable[[Site], None]) -> None:
+async def _keep_viewing(
+    context: SimulationContext, view: Callable[[SimulationContext], None]
+) -> None:
     while True:
-        view(site)
+        view(context)
         await asyncio.sleep(_VIEW_EVERY)
 
 

@@ -11,7 +11,7 @@ from rich.text import Text
 from model.arrays import FloatArray, lattice
 from model.vibration.peak import G
 from sim.bench.bench import Bench
-from sim.control.site import Site
+from sim.control.context import SimulationContext
 
 WINDOW = 0.2  # s; as long as a picture stays
 _SHADES = " ·-+*#@"
@@ -50,9 +50,9 @@ class PlateView:
         return peaks.reshape(_ROWS, _COLUMNS)
 
 
-def draw(site: Site, plate: PlateView) -> RenderableType:
+def draw(context: SimulationContext, plate: PlateView) -> RenderableType:
     """The present state of a far end; one that nobody touches fits on 24 lines of 80 columns."""
-    bench = site.bench
+    bench = context.bench
     amplifiers = Table("amplifier", "state", "fault", "set", "level of each channel")
     for name, amplifier in bench.amplifiers.items():
         status = amplifier.status(bench.time)
@@ -64,9 +64,9 @@ def draw(site: Site, plate: PlateView) -> RenderableType:
         peak = f"{felt[name].peak.max() / G:.2f} g" if name in felt else ""
         fingers.add_row(name, f"{x * 1000:.0f}, {y * 1000:.0f} mm", peak)
     said = [f"{bench.time - plate.begun:.1f} s"]
-    if site.recorder is not None:
-        full = ", full" if site.recorder.is_full else ""
-        said.append(f"recording {site.recorder.path}: {site.recorder.seconds:.1f} s{full}")
+    if context.recorder is not None:
+        full = ", full" if context.recorder.is_full else ""
+        said.append(f"recording {context.recorder.path}: {context.recorder.seconds:.1f} s{full}")
     touched = [fingers] if fingers.row_count else []
     return Group(amplifiers, _picture(bench, plate.take()), *touched, Text("   ".join(said)))
 

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from functools import partial
 
 from drivers import clock
-from sim.faults.episodes import Faults, Toward
+from sim.faults.fault_window import Faults, Toward
 
 
 class Line:

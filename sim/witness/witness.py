@@ -14,7 +14,7 @@ from sim.witness.side import Side
 from sim.witness.violation import Report, Violation
 from sim.witness.wire import Wire
 
-Wish = Literal["arm", "disarm", "stop", "clear"]
+OperatorCommand = Literal["arm", "disarm", "stop", "clear"]
 
 
 class Witness:
@@ -124,7 +124,7 @@ class Witness:
         """What every pattern must be from now on, by amplifier and channel; None: any."""
         self._host.expect(expected)
 
-    def wish(self, time: float, what: Wish) -> None:
+    def wish(self, time: float, what: OperatorCommand) -> None:
         """Somebody wants the controller to do this, now."""
         self._pass_to(time)
         self._host.wish(time, what)

@@ -12,7 +12,7 @@ from drivers.registry import open_backend
 from memory_machine import live_in_memory
 from model.rig.rig import Rig
 from sim.far_ends.wires import Wire
-from sim.faults.episodes import Episode
+from sim.faults.fault_window import FaultWindow
 from virtual_loop import run_virtual
 from wires import far_side
 
@@ -42,7 +42,7 @@ def test_it_waits_for_no_try_that_is_left(wire: str, how: str, coarse_rig: Rig) 
     async def run() -> None:
         live_in_memory()
         async with far_side(WIRES[wire], coarse_rig) as far:
-            far.station.befall(Episode("hang"))
+            far.device.inject_fault(FaultWindow("hang"))
             for after in (0.001, 0.3, 0.7, 1.2, 1.4):
                 assert await give_up(far.url, after=after) < NOTHING
 

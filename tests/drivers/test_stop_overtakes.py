@@ -32,7 +32,7 @@ from drivers.registry import open_backend
 from memory_machine import live_in_memory
 from model.rig.rig import Channel, Rig
 from sim.far_ends.wires import Wire
-from sim.faults.episodes import Episode
+from sim.faults.fault_window import FaultWindow
 from virtual_loop import run_virtual
 from wires import FarSide, far_side
 
@@ -100,9 +100,9 @@ def on_a_line(line: str, rig: Rig, use: Callable[[Chain], Coroutine[Any, Any, No
     async def run() -> None:
         live_in_memory()
         async with far_side({**LINES, **BUSES}[line], two) as far:
-            for name, station in far.stations.items():
-                station.exchange = partial(  # type: ignore[method-assign]
-                    note, chain.asked, name, station.exchange
+            for name, device in far.devices.items():
+                device.exchange = partial(  # type: ignore[method-assign]
+                    note, chain.asked, name, device.exchange
                 )
             both = {name: Amplifier(open_backend(url)) for name, url in far.urls.items()}
             for amplifier in both.values():
@@ -320,7 +320,7 @@ def test_a_stop_to_all_is_said_again_where_an_answer_may_have_run_into_it(coarse
         await asyncio.sleep(0.01)  # until it has arrived
         assert chain.kinds() == [("east", "Stop"), ("west", "Stop")]
         assert chain.frames == 1
-        chain.far.stations["west"].befall(Episode("hang"))
+        chain.far.devices["west"].inject_fault(FaultWindow("hang"))
         beat = asyncio.create_task(chain.west.heartbeat())
         await asyncio.sleep(0.0005)
         chain.forget()
@@ -329,7 +329,7 @@ def test_a_stop_to_all_is_said_again_where_an_answer_may_have_run_into_it(coarse
         at_once, again = chain.sent_at[:2]
         assert at_once == begin
         assert 0 < again - begin <= 0.0081
-        chain.far.stations["west"].recover()
+        chain.far.devices["west"].recover()
         await beat  # it is asked again
         assert [what for name, what in chain.kinds() if name == "east"] == ["Stop", "Stop"]
 
@@ -405,7 +405,7 @@ def test_a_stop_goes_before_the_repetition_of_what_else_silences(
     8 ms later at the latest, and 10 ms where an answer is owed; the repetition follows it."""
 
     async def use(chain: Chain) -> None:
-        east = chain.far.stations["east"]
+        east = chain.far.devices["east"]
         usual: Callable[[Request], Reply | None] = east.exchange
         given = [first]
 

@@ -42,7 +42,7 @@ from journal import Journal, energised, loudness, silent_from
 from model.rig.file import load_rig
 from rig_files import TWO_AMPLIFIERS, write_rig
 from sim.far_ends.wires import Wire
-from sim.faults.episodes import Episode
+from sim.faults.fault_window import FaultWindow
 from tuio_panel import free_port, panel
 from wires import WIRES, far_side
 
@@ -115,7 +115,7 @@ async def test_paused_for_longer_than_the_watchdog_nothing_old_is_replayed(tmp_p
             async with holding(era):
                 await play(era, far)
                 os.kill(daemon.process.pid, signal.SIGSTOP)
-                await until(lambda: far.station.status().state is AmplifierState.FAULT)
+                await until(lambda: far.device.status().state is AmplifierState.FAULT)
                 assert far.amplifier.fault is Fault.WATCHDOG
                 fed = journal.last_fed("main")
                 assert silent_from(far) - fed <= WATCHDOG + REACTION + 1e-9
@@ -197,10 +197,10 @@ async def test_a_full_disk_costs_log_lines_and_nothing_else(tmp_path: Path) -> N
             size = (tmp_path / "era.log").stat().st_size
             assert size > 0
             await plays_on("disk full", daemon, era, journal)
-            far.station.befall(Episode("arc"))
+            far.device.inject_fault(FaultWindow("arc"))
             await until_state(era, "FAULT")
             assert loudness(far) == 0
-            far.station.recover()
+            far.device.recover()
             os.kill(pid, signal.SIGHUP)
             await plays_on("disk full, after a fault", daemon, era, journal)
             assert (tmp_path / "era.log").stat().st_size == size
@@ -333,7 +333,7 @@ async def test_told_to_end_it_ramps_down_reads_back_and_disarms(
                 assert not daemon.socket.exists()
                 assert daemon.said("OPERATION_ENABLED -> NOT_READY")
                 assert not daemon.said("no json")
-            for name in far.stations:
+            for name in far.devices:
                 asked = [entry for entry in journal.since(begin) if entry.amplifier == name]
                 ends = [entry for entry in asked if isinstance(entry.request, Apply)]
                 end = ends[-1]
@@ -344,7 +344,7 @@ async def test_told_to_end_it_ramps_down_reads_back_and_disarms(
                 silent = next(entry for entry in after if not any(entry.levels))
                 assert isinstance(silent.request, GetStatus)  # it was read back before disarming
                 assert isinstance(after[-1].request, Disarm)
-                assert far.stations[name].status().state is AmplifierState.SWITCH_ON_DISABLED
+                assert far.devices[name].status().state is AmplifierState.SWITCH_ON_DISABLED
             return took
 
     await best_of(f"from {number.name} to the exit", attempt, 1.0)
@@ -355,7 +355,7 @@ async def test_told_to_end_over_a_dead_link_it_ends_all_the_same(tmp_path: Path)
 
     async def attempt() -> float:
         async with held(tmp_path) as test:
-            test.far.station.befall(Episode("hang"))
+            test.far.device.inject_fault(FaultWindow("hang"))
             begin = time.monotonic()
             test.daemon.process.send_signal(signal.SIGTERM)
             await test.daemon.status()
@@ -382,7 +382,7 @@ async def test_a_cut_cable_is_told_in_time(tmp_path: Path, wire: str) -> None:
                 await play(era, far)
                 await era.subscribe("state")
                 cut = time.monotonic()
-                far.station.befall(Episode("unplug"))
+                far.device.inject_fault(FaultWindow("unplug"))
                 async with asyncio.timeout(20):
                     async for told in era.events():
                         if told.topic == "state" and told.data["new"] == "COMM_LOST":
@@ -390,7 +390,7 @@ async def test_a_cut_cable_is_told_in_time(tmp_path: Path, wire: str) -> None:
                 await era.unsubscribe("state")
                 await until(lambda: not energised(far))
                 assert silent_from(far) - journal.last_fed("main") <= WATCHDOG + REACTION + 1e-9
-                far.station.recover()
+                far.device.recover()
                 await until_state(era, "FAULT")
                 assert loudness(far) == 0
                 return told.time - cut

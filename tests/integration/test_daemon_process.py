@@ -43,7 +43,7 @@ async def test_a_second_daemon_is_refused_and_disturbs_nothing(tmp_path: Path) -
         assert "the daemon ends: " in err
         assert "Traceback" not in err
         assert (await era.status()).state == "OPERATION_ENABLED"
-        await until(lambda: any(far.station.status().levels))
+        await until(lambda: any(far.device.status().levels))
 
 
 async def test_the_commands_do_what_they_say(tmp_path: Path) -> None:
@@ -75,7 +75,7 @@ async def test_the_commands_do_what_they_say(tmp_path: Path) -> None:
         assert (status, json.loads(out)["state"]) == (0, "QUICK_STOP_ACTIVE")
         status, out, _ = await run_era("clear", *where)
         assert (status, out.partition(":")[0]) == (0, "READY_TO_SWITCH_ON")
-        assert far.station.status().state is AmplifierState.SWITCH_ON_DISABLED
+        assert far.device.status().state is AmplifierState.SWITCH_ON_DISABLED
         arming = await asyncio.create_subprocess_exec(
             *(ERA, "arm", "--lease", "1", *map(str, where)),
             stdout=asyncio.subprocess.PIPE,
@@ -181,7 +181,7 @@ async def test_check_touches_no_amplifier(tmp_path: Path) -> None:
         save_table(daemon_table(), tmp_path / "table.npz")
         path = write_daemon(tmp_path, {"main": far.url}, "table: table.npz\n")
         status, out, _ = await run_era("daemon", path, "--check")
-        assert (status, far.station.status().token) == (0, 0)
+        assert (status, far.device.status().token) == (0, 0)
         assert "good" in out
         (tmp_path / "table.npz").write_bytes(b"no table")
         status, _, err = await run_era("daemon", path, "--check")

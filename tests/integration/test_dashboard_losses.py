@@ -16,7 +16,7 @@ from controller.gateway.app import MAX_SESSIONS
 from daemon_bench import running_daemon, until_state
 from dashboard_pictures import SCREENS, STATE, open_dashboard
 from gateway_bench import RawWebSocket, ScriptedDaemon, gateway_process
-from sim.faults.episodes import Episode
+from sim.faults.fault_window import FaultWindow
 
 pytestmark = pytest.mark.asyncio(loop_scope="module")
 
@@ -47,7 +47,7 @@ async def test_a_lost_link_is_one_event_with_what_has_come_of_it(
             # Disarmed: no watchdog can make it another fault on a busy machine.
             assert "%" in await browser.until(TILE)
             before = await browser.evaluate(EVENTS)
-            bench.far.station.befall(Episode("hang"))
+            bench.far.device.inject_fault(FaultWindow("hang"))
             await browser.until(f"{STATE} === 'COMM_LOST'")
             told = await browser.until(BANNER, lambda text: "watchdog" in text)
             assert "Its watchdog silences it after 0.25\u00a0s, which nothing confirms" in told
@@ -64,7 +64,7 @@ async def test_a_lost_link_is_one_event_with_what_has_come_of_it(
             assert retried[1:] == before
             assert "link lost: amplifier main: no answer" in retried[0]
             assert "look at cables and supply" in retried[0]
-            bench.far.station.recover()
+            bench.far.device.recover()
             await browser.until(f"{STATE} === 'READY_TO_SWITCH_ON'")
             back = await browser.until(EVENTS, lambda events: "answer again" in events[0])
             assert back[1:] == before

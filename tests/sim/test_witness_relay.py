@@ -13,14 +13,14 @@ from drivers.protocol.messages import AmplifierState
 from drivers.registry import open_backend
 from model.errors import InputError
 from model.rig.rig import Rig
-from sim.witness.place import place_of
+from sim.witness.endpoint import parse_endpoint
 from sim.witness.witness import Witness
 from sim.witness_relay import relays
 from wires import WIRES, far_side
 
 
 def _witness(url: str, *, level: float) -> Witness:
-    place = place_of(url)
+    place = parse_endpoint(url)
     limits = {"frequency_hz": [40, 500], "level": level}
     plan: dict[str, Any] = {
         "wires": {"line": place.kind},
@@ -60,7 +60,7 @@ async def test_what_passes_a_relay_is_seen(wire: str, coarse_rig: Rig) -> None:
     async with far_side(WIRES[wire], coarse_rig) as far:
         for level, broken in ((0.5, set()), (0.3, {"limits"})):
             witness = _witness(far.url, level=level)
-            async with relays([place_of(far.url)], ["line"], witness) as (url,):
+            async with relays([parse_endpoint(far.url)], ["line"], witness) as (url,):
                 assert url != far.url
                 await _drive(url)
             found = witness.finish()
@@ -80,7 +80,7 @@ async def test_what_passes_a_relay_is_seen(wire: str, coarse_rig: Rig) -> None:
 )
 def test_urls_are_taken_apart(url: str, place: str, address: int) -> None:
     """Device or server and number are those of the URL, and all else stays in the new one."""
-    taken = place_of(url)
+    taken = parse_endpoint(url)
     assert (taken.place, taken.address) == (place, address)
     assert taken.through("X").replace("X", place) == url
 
@@ -89,7 +89,7 @@ def test_urls_are_taken_apart(url: str, place: str, address: int) -> None:
 def test_urls_that_lead_to_no_wire_are_refused(url: str) -> None:
     """What a relay cannot stand in is said in one sentence."""
     with pytest.raises(InputError, match=r"URL|HOST:PORT"):
-        place_of(url)
+        parse_endpoint(url)
 
 
 @pytest.mark.parametrize(
@@ -106,7 +106,7 @@ def test_urls_that_lead_to_no_wire_are_refused(url: str) -> None:
 def test_numbers_that_none_can_have_are_refused(url: str, named: str) -> None:
     """Who watches for an amplifier that cannot be there would find nothing wrong with it."""
     with pytest.raises(InputError) as refused:
-        place_of(url)
+        parse_endpoint(url)
     assert url in str(refused.value)
     assert named in str(refused.value)
 
@@ -116,10 +116,10 @@ async def test_a_relay_before_nobody_says_so(caplog: pytest.LogCaptureFixture) -
     with socket.socket() as bound:  # and nobody listens there
         bound.bind(("127.0.0.1", 0))
         url = f"modbus+tcp://127.0.0.1:{bound.getsockname()[1]}/1"
-        async with relays([place_of(url)], ["line"], _witness(url, level=0.5)) as (end,):
-            host, _, port = place_of(end).place.rpartition(":")
+        async with relays([parse_endpoint(url)], ["line"], _witness(url, level=0.5)) as (end,):
+            host, _, port = parse_endpoint(end).place.rpartition(":")
             reader, writer = await asyncio.open_connection(host, int(port))
             assert await reader.read() == b""
             writer.close()
     (record,) = caplog.records
-    assert place_of(url).place in record.getMessage()
+    assert parse_endpoint(url).place in record.getMessage()

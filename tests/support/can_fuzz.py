@@ -40,7 +40,7 @@ from sim.far_ends.can_bus.bus import CanBus
 from sim.far_ends.can_bus.node import CanNode
 from sim.far_ends.can_bus.slcan_adapter import SlcanAdapter
 from sim.far_ends.can_bus.socketcand_server import SocketcandEnd, _Client
-from sim.faults.episodes import Faults
+from sim.faults.fault_window import Faults
 
 _FD = 0x8000
 _FD_LENGTHS = (8, 12, 16, 20, 24, 32, 48, 64)
@@ -58,7 +58,7 @@ class _Never:
 _NEVER = cast(asyncio.TimerHandle, _Never())
 
 
-class Station:
+class FakeDevice:
     """A simulated amplifier whose clock stands where it is put; `asked` is what came lately."""
 
     is_answering = True
@@ -108,9 +108,9 @@ class CanEnds:
     """A node and what the host reads with; telegrams: the frames of good requests and answers."""
 
     def __init__(self, requests: Sequence[Request]) -> None:
-        self._station = Station()
+        self._device = FakeDevice()
         self._said: list[CanFrame] = []
-        self._node = CanNode(self._station, 1, send=self._said.append)  # type: ignore[arg-type]
+        self._node = CanNode(self._device, 1, send=self._said.append)  # type: ignore[arg-type]
         self._node.start(lambda delay, callback: _NEVER)
         self._revive()
         self._answers = CanReplyReader(1)
@@ -124,15 +124,15 @@ class CanEnds:
         self._taken += 1
         if self._taken % _REVIVAL == 0:
             self._revive()
-        self._station.asked.clear()
+        self._device.asked.clear()
         self._said.clear()
         for frame in _unpack(data):
             self._node.receive(frame)
             self._hear(frame)
         for frame in self._said:
             self._hear(frame)
-        self._station.pass_time(0.01)
-        return list(self._station.asked)
+        self._device.pass_time(0.01)
+        return list(self._device.asked)
 
     def mend(self, data: bytes) -> bytes:
         """A SYNC behind it, so that what came of a set takes effect."""

@@ -9,7 +9,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import cast
 
-from can_fuzz import Station
+from can_fuzz import FakeDevice
 from drivers.codec.can_bus.frame import CanFrame
 from drivers.codec.can_bus.objects import pack_envelope
 from drivers.codec.can_bus.requests import PdoRequest, encode_broadcast, encode_request
@@ -70,12 +70,12 @@ class Timers:
 
 
 class Session:
-    """Plays it; `station` and `node` are there for a test to look into."""
+    """Plays it; `device` and `node` are there for a test to look into."""
 
     def __init__(self) -> None:
-        self.station = Station()
-        self.station.amplifier.identity = replace(
-            self.station.amplifier.identity,
+        self.device = FakeDevice()
+        self.device.amplifier.identity = replace(
+            self.device.amplifier.identity,
             vendor="Acme",
             product="Quad 1800 V",
             serial_number="A-17",
@@ -83,8 +83,8 @@ class Session:
         )
         self._said: list[CanFrame] = []
         self.timers = Timers()
-        self.node = CanNode(self.station, NODE, send=self._said.append)  # type: ignore[arg-type]
-        self.guard = Guard(GuardLimits(20.0, 600.0, 1.0), self.station.capabilities)
+        self.node = CanNode(self.device, NODE, send=self._said.append)  # type: ignore[arg-type]
+        self.guard = Guard(GuardLimits(20.0, 600.0, 1.0), self.device.capabilities)
 
     def steps(self) -> Iterator[Step]:
         """All of them, in order."""
@@ -107,7 +107,7 @@ class Session:
         safe = self.guard.check(CommandSet(513, _COMMANDS, ramp=0.02, valid_for=0.5))
         yield self._ordered("Apply token 513", Apply(safe), 2)
         yield self._ordered("The same again, for its answer was lost", Apply(safe), 3)
-        self.station.pass_time(0.05)
+        self.device.pass_time(0.05)
         yield self._ordered("Ping: the host's heartbeat, and how are you?", Ping(), 4)
         staged = self.guard.check(CommandSet(514, _COMMANDS[:1], ramp=0.0, valid_for=0.0))
         yield self._ordered("Stage token 514", Stage(staged), 5)
@@ -133,12 +133,12 @@ class Session:
         yield self._ordered("Apply token 517 with this onset", Apply(shaped), 9)
         yield self._ordered("Apply token 518, as CAN FD", Apply(self._next(518)), 10, fd=True)
         yield self._ordered("Status, as CAN FD", GetStatus(), 11, fd=True)
-        self.station.pass_time(0.3)
+        self.device.pass_time(0.3)
         yield self._heard("Nobody is heard for 250 ms: an emergency, and one more once silent")
         yield self._ordered("Arm, but it has to be cleared first", Arm(0.25), 12)
         yield self._ordered("Clear", Clear(), 13)
         yield self._ordered("Stop, ramp 5 ms", Stop(0.005), 14)
-        self.station.pass_time(0.01)
+        self.device.pass_time(0.01)
         yield self._ordered("Clear", Clear(), 15)
         yield self._ordered("Disarm, ramp 50 ms", Disarm(0.05), 16)
         yield self._asked("NMT: reset node", CanFrame(0x000, bytes([129, NODE])))

@@ -132,7 +132,7 @@ async def playing(daemon: DaemonProcess) -> AsyncIterator[AsyncClient]:
         await until_state(era, "READY_TO_SWITCH_ON")
         await era.arm("test", lease_s=60)
         async with holding(era):
-            await until(lambda: any(daemon.far.station.status().levels))
+            await until(lambda: any(daemon.far.device.status().levels))
             yield era
 
 

@@ -85,7 +85,7 @@ class Journal:
 
 def energised(far: FarSide) -> list[str]:
     """The amplifiers that are enabled now, or on their way out of it, or still audible."""
-    statuses = {name: station.status() for name, station in far.stations.items()}
+    statuses = {name: device.status() for name, device in far.devices.items()}
     alive = (
         AmplifierState.OPERATION_ENABLED,
         AmplifierState.SWITCHED_ON,
@@ -96,12 +96,12 @@ def energised(far: FarSide) -> list[str]:
 
 def silent_from(far: FarSide) -> float:
     """When [s] every channel of every amplifier is silent, or was; -inf where none ever played."""
-    for station in far.stations.values():
-        station.status()
+    for device in far.devices.values():
+        device.status()
     outputs = (output for one in far.bench.amplifiers.values() for output in one.outputs)
     return max((tone.silent_from for output in outputs for tone in output), default=-math.inf)
 
 
 def loudness(far: FarSide) -> float:
     """The highest level of any channel now."""
-    return max(max(station.status().levels) for station in far.stations.values())
+    return max(max(device.status().levels) for device in far.devices.values())

@@ -141,7 +141,7 @@ async def _kill(wire: str, daemon: DaemonProcess, journal: Journal) -> Kill:
         max((end - fed for end, fed in ends), default=None),
         max((end - dead for end, _ in ends), default=None),
         len(journal.since(dead)),
-        sum(far.stations[name].status().state is AmplifierState.FAULT for name in alive),
+        sum(far.devices[name].status().state is AmplifierState.FAULT for name in alive),
         loudness(far),
     )
 

@@ -22,7 +22,7 @@ _READ_WRITE = 23
 _BLOCK = 10  # where the block begins that a request of function 23 writes; its check is second
 
 
-class Station:
+class FakeDevice:
     """A simulated amplifier whose clock stands where it is put; `asked` is what came lately."""
 
     is_answering = True
@@ -63,8 +63,8 @@ class ModbusEnds:
         self._is_rtu = is_rtu
         self._requests = requests
         self._chance = random.Random(1)
-        self._station = Station()
-        self._unit = ModbusUnit(self._station)
+        self._device = FakeDevice()
+        self._unit = ModbusUnit(self._device)
         self._far = RtuReader() if is_rtu else TcpReader()
         self._host = ResponseReader(is_rtu=is_rtu, counters=WireCounters())
         self._taken = 0
@@ -99,13 +99,13 @@ class ModbusEnds:
         self._taken += 1
         if self._taken % _REVIVAL == 0:
             for request in (Clear(), Arm(2.0)):
-                self._station.exchange(request)
-        self._station.asked.clear()
+                self._device.exchange(request)
+        self._device.asked.clear()
         for piece in self._pieces(data):
-            for request in self._far.feed(piece, self._station.now):
+            for request in self._far.feed(piece, self._device.now):
                 self._serve(request)
-        understood = [*self._station.asked, *self._read(data)]
-        self._station.pass_time(self._chance.choice((0.0, 0.0, 0.001, 0.02, 2 * PAUSE)))
+        understood = [*self._device.asked, *self._read(data)]
+        self._device.pass_time(self._chance.choice((0.0, 0.0, 0.001, 0.02, 2 * PAUSE)))
         return understood
 
     def _pieces(self, data: bytes) -> Iterator[bytes]:

@@ -6,7 +6,7 @@ from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import asynccontextmanager
 from typing import TypeAlias, cast
 
-from modbus_session import ScriptedStation
+from modbus_session import ScriptedDevice
 from sim.far_ends.modbus.frames import Request, RtuReader, TcpReader, rtu_frame, tcp_frame
 from sim.far_ends.modbus.unit import ModbusUnit
 
@@ -18,13 +18,13 @@ class Peer(asyncio.Protocol):
     """The far side of a line; its connection is one at a time.
 
     answer(request) gives the PDU that answers at once, None is silence; by default that of the
-    `station`'s registers, a unit for each number that is asked for.
+    `device`'s registers, a unit for each number that is asked for.
     """
 
     def __init__(self, *, is_rtu: bool) -> None:
         self.is_rtu = is_rtu
-        self.station = ScriptedStation()
-        self.unit = ModbusUnit(self.station)
+        self.device = ScriptedDevice()
+        self.unit = ModbusUnit(self.device)
         self.requests: list[Request] = []
         self.connections = 0
         self.answer: Callable[[Request], Answer] = lambda request: self.unit.answer(request.pdu)

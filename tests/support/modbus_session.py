@@ -35,7 +35,7 @@ from drivers.protocol.messages import (
     Status,
     Stop,
 )
-from sim.faults.episodes import Faults
+from sim.faults.fault_window import Faults
 
 CAPABILITIES = Capabilities(
     *(4, 20.0, 600.0, 0.01, 1.0, 0.0001, 0.01, 1.0, 0.1, 2.0, 32, 16, 0.001, 0.1, False)
@@ -94,7 +94,7 @@ EXAMPLES: dict[str, Example] = {
 }
 
 
-class ScriptedStation:
+class ScriptedDevice:
     """An amplifier that says what it is told to say, and remembers what it was asked."""
 
     name = "main"

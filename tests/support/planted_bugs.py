@@ -498,7 +498,9 @@ FAR_ENDS: dict[str, Bug] = {
     ),
     "a torn set is played": _bug(
         "commit",
-        Edit("sim.far_ends.can_bus.sets:SetBuffer.command_set", "len(own) != order.count", "False"),
+        Edit(
+            "sim.far_ends.can_bus.sets:SetBuffer.command_set", "len(own) != request.count", "False"
+        ),
         scenario=scenarios.torn,
         wire="slcan",
     ),
@@ -518,7 +520,7 @@ FAR_ENDS: dict[str, Bug] = {
     "an answer comes without its levels": _bug(
         "answer",
         Edit(
-            "sim.far_ends.can_bus.orders:Orders._answer",
+            "sim.far_ends.can_bus.requests:RequestHandler._answer",
             "reversed(sent.items())",
             "reversed(list(sent.items())[:2])",
         ),

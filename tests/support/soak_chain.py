@@ -29,10 +29,10 @@ from model.rig.rig import Channel, Rig
 from model.table.table import LocalizationTable
 from paper_plate import make_paper_rig
 from sim.bench.bench import Bench
-from sim.bench.station import Station
+from sim.bench.simulated_device import SimulatedDevice
 from sim.far_ends.wires import Wire, open_wires
-from sim.faults.episodes import Faults
-from sim.witness.witness import Wish
+from sim.faults.fault_window import Faults
+from sim.witness.witness import OperatorCommand
 from small_table import small_table
 from soak_checks import RELEASE, Checks, Touched
 from soak_plan import Ask, Hand, Plan, Trouble
@@ -157,32 +157,32 @@ class _Run:
             arming=lambda: self.asking > 0,
         )
         self.checks.violations = self.violations
-        stations = self._stations()
+        devices = self._devices()
         lines = self.plan.lines
         wires = {
             name: Wire(
                 lines[number % len(lines)].kind,
                 speed=lines[number % len(lines)].speed,
-                shared=len(lines) < len(stations),
+                shared=len(lines) < len(devices),
                 unpluggable=True,
                 line=str(number % len(lines)),
             )
-            for number, name in enumerate(stations)
+            for number, name in enumerate(devices)
         }
-        async with open_wires(wires, [*stations.values()]) as urls:
+        async with open_wires(wires, [*devices.values()]) as urls:
             self.urls = urls
             self.witness = SoakWitness(
                 loop, urls, channels=_channels(self.rig), release=self._release()
             )
             self.checks.sense = self.witness.sense
             self.serving = asyncio.create_task(self._serve())
-            await self._play(stations)
+            await self._play(devices)
             await self._end()
             self.checks.look()
             self.violations += self.witness.found()
             self.counts["frames seen by the witness"] = self.witness.frames
-            for station in stations.values():
-                station.close()
+            for device in devices.values():
+                device.close()
         self.checks.close()
         await asyncio.sleep(2.0)  # what was still on its way has come
         left = [task for task in asyncio.all_tasks() if task is not asyncio.current_task()]
@@ -197,17 +197,17 @@ class _Run:
         ]
         return RELEASE + max(on_wire) + _ON_THE_WIRE
 
-    def _stations(self) -> dict[str, Station]:
-        stations = {}
+    def _devices(self) -> dict[str, SimulatedDevice]:
+        devices = {}
         for number, name in enumerate(self.bench.amplifiers, start=1):
             faults = Faults(begin=self.loop.time(), seed=self.plan.seed)
-            station = Station(self.bench, name, number=number, faults=faults)
-            station.exchange = self._exchanging(name, station.exchange)  # type: ignore[method-assign]
-            station.listen(
+            device = SimulatedDevice(self.bench, name, number=number, faults=faults)
+            device.exchange = self._exchanging(name, device.exchange)  # type: ignore[method-assign]
+            device.listen(
                 lambda event, name=name: self.note("amplifier", name, event.state, event.fault)  # type: ignore[misc]
             )
-            stations[name] = station
-        return stations
+            devices[name] = device
+        return devices
 
     def _exchanging(
         self, name: str, exchange: Callable[[Request], Reply | None]
@@ -220,21 +220,21 @@ class _Run:
 
         return exchanging
 
-    async def _play(self, stations: dict[str, Station]) -> None:
+    async def _play(self, devices: dict[str, SimulatedDevice]) -> None:
         """Let the plan happen."""
-        by_number = [*stations.values()]
+        by_number = [*devices.values()]
         for action in self.plan.actions:
             await self._until(action.at)
             match action:
                 case Hand():
                     self.counts["gestures"] += 1
                     self._spawn(self._touch(action))
-                case Trouble(number=number, episode=episode):
-                    self.counts[f"fault {episode.fault}"] += 1
-                    self.note("fault", by_number[number].name, episode)
-                    self.witness.befalls(episode)
-                    by_number[number].befall(episode)
-                    if episode.fault == "unplug":
+                case Trouble(number=number, window=window):
+                    self.counts[f"fault {window.fault}"] += 1
+                    self.note("fault", by_number[number].name, window)
+                    self.witness.inject_fault(window)
+                    by_number[number].inject_fault(window)
+                    if window.fault == "unplug":
                         self._expect_loss(number)
                 case Ask():
                     self.counts[f"operator {action.what}"] += 1
@@ -328,7 +328,9 @@ class _Run:
         else:
             await self._call(ask.what, getattr(controller, ask.what))
 
-    async def _call(self, name: Wish, call: Callable[[], Coroutine[Any, Any, None]]) -> None:
+    async def _call(
+        self, name: OperatorCommand, call: Callable[[], Coroutine[Any, Any, None]]
+    ) -> None:
         """What an operator asks; a refusal is an answer, too."""
         self.witness.wish(name)
         self.asking += name == "arm"

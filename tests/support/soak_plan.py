@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import TypeAlias
 
-from sim.faults.episodes import Episode, FaultKind
+from sim.faults.fault_window import FaultKind, FaultWindow
 
 KINDS: Mapping[str, Sequence[int | None]] = {
     "serial": (115_200, 921_600),
@@ -33,7 +33,7 @@ TELEGRAM_FAULTS: Sequence[FaultKind] = (
     "duplicate",
     "corrupt",
     "truncate",
-    "torn_commit",
+    "incomplete_set",
 )
 AMPLIFIER_FAULTS: Sequence[FaultKind] = (
     "unplug",
@@ -88,7 +88,7 @@ class Trouble:
 
     at: float
     number: int
-    episode: Episode
+    window: FaultWindow
 
 
 Action: TypeAlias = Hand | Ask | Trouble
@@ -119,7 +119,7 @@ class Plan:
         spans = []
         for action in self.actions:
             if isinstance(action, Trouble):
-                spans.append((action.at, action.at + action.episode.lasts + SETTLED))
+                spans.append((action.at, action.at + action.window.lasts + SETTLED))
             elif isinstance(action, Ask) and action.what != "ready":
                 spans.append((action.at, action.at + action.lasts + SETTLED))
         return spans
@@ -160,7 +160,7 @@ def _rough(dice: random.Random, begin: float, length: float, amplifiers: int) ->
     actions: list[Action] = [*_hands(dice, begin, length)]
     for _ in range(dice.randint(1, 6)):
         at = begin + dice.uniform(0, length)
-        actions.append(Trouble(at, dice.randrange(amplifiers), _episode(dice)))
+        actions.append(Trouble(at, dice.randrange(amplifiers), _fault_window(dice)))
     if dice.random() < 0.3:
         what, lasts = dice.choice((("kill", 0.0), ("stall", dice.uniform(0.05, 1.0))))
         actions.append(Ask(begin + dice.uniform(0, length), what, lasts))
@@ -186,9 +186,9 @@ def _minder(dice: random.Random, begin: float, length: float) -> list[Action]:
     return [*moments]
 
 
-def _episode(dice: random.Random) -> Episode:
+def _fault_window(dice: random.Random) -> FaultWindow:
     if dice.random() < 0.6:
-        return Episode(
+        return FaultWindow(
             dice.choice(TELEGRAM_FAULTS),
             lasts=dice.choice((0.02, 0.1, 0.5, 2.0)) * dice.uniform(0.5, 1.5),
             share=dice.choice((0.05, 0.2, 0.5, 1.0)),
@@ -197,7 +197,7 @@ def _episode(dice: random.Random) -> Episode:
         )
     fault = dice.choice(AMPLIFIER_FAULTS)
     scale = {"over_temperature": 2.0, "unplug": 0.6}.get(fault, 0.3)
-    return Episode(fault, lasts=scale * dice.uniform(0.05, 1.5))
+    return FaultWindow(fault, lasts=scale * dice.uniform(0.05, 1.5))
 
 
 def _hands(dice: random.Random, begin: float, length: float) -> list[Hand]:

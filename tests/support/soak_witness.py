@@ -9,9 +9,9 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from sim.amplifier.amplifier import SimulatedAmplifier
-from sim.faults.episodes import Episode
-from sim.witness.place import place_of
-from sim.witness.witness import Wish, Witness
+from sim.faults.fault_window import FaultWindow
+from sim.witness.endpoint import parse_endpoint
+from sim.witness.witness import OperatorCommand, Witness
 from soak_contacts import FrameTouches, SourceContacts
 from virtual_loop import START, VirtualLoop
 
@@ -33,7 +33,7 @@ class SoakWitness:
     def __init__(
         self, loop: VirtualLoop, urls: Mapping[str, str], *, channels: int, release: float
     ) -> None:
-        places = {name: place_of(url) for name, url in urls.items()}
+        places = {name: parse_endpoint(url) for name, url in urls.items()}
         plan: dict[str, Any] = {
             "wires": {place.place: place.kind for place in places.values()},
             "amplifiers": {
@@ -77,7 +77,7 @@ class SoakWitness:
             self._open.discard(link)
             self._witness.closed(link, self._loop.time())
 
-    def wish(self, what: Wish) -> None:
+    def wish(self, what: OperatorCommand) -> None:
         """An operator wants this."""
         self._witness.wish(self._loop.time(), what)
 
@@ -95,11 +95,11 @@ class SoakWitness:
         if (end := self._contacts.next_end(now)) < math.inf:
             self._loop.call_at(end + _ENDED, self._look_at_leases)
 
-    def befalls(self, episode: Episode) -> None:
+    def inject_fault(self, window: FaultWindow) -> None:
         """A fault begins. What it does to one wire, a controller of all may show on each."""
         self._troubles += 1
         self._tell_trouble()
-        lasts = episode.lasts + (episode.delay if episode.fault == "delay" else 0.0)
+        lasts = window.lasts + (window.delay if window.fault == "delay" else 0.0)
         self._loop.call_later(lasts, self._over)
 
     def sense(self, name: str, amplifier: SimulatedAmplifier, levels: Sequence[float]) -> None:

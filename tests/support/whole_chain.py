@@ -18,7 +18,7 @@ from controller.api.jsonrpc import RpcError
 from far_end_process import FarEndProcess, far_end_process
 from heard import PATIENCE, SENSORS, Control, Heard, Refused, hear
 from rig_files import write_rig
-from sim.witness.place import place_of
+from sim.witness.endpoint import parse_endpoint
 from sim.witness.violation import Violation
 from sim.witness.witness import Witness
 from sim.witness_relay import relays
@@ -230,7 +230,7 @@ async def _witnessed(
     stack: contextlib.AsyncExitStack, far_end: FarEndProcess
 ) -> tuple[dict[str, str], Witness]:
     """A witness in every wire of a far end, and the URLs that lead through it."""
-    places = {name: place_of(url) for name, url in far_end.urls.items()}
+    places = {name: parse_endpoint(url) for name, url in far_end.urls.items()}
     limits = {"frequency_hz": list(FREQUENCY_LIMITS), "level": LEVEL_LIMIT}
     plan = {
         "wires": {name: place.kind for name, place in places.items()},

@@ -11,9 +11,9 @@ from drivers import clock
 from model.rig.rig import Rig
 from sim.amplifier.amplifier import SimulatedAmplifier
 from sim.bench.bench import Bench
-from sim.bench.station import Station
+from sim.bench.simulated_device import SimulatedDevice
 from sim.far_ends.wires import Wire, open_wire
-from sim.faults.episodes import Faults
+from sim.faults.fault_window import Faults
 
 WIRES: Mapping[str, Wire] = {
     "serial": Wire("serial", unpluggable=True),
@@ -46,10 +46,10 @@ def patient(url: str) -> str:
 
 @dataclass(frozen=True)
 class FarSide:
-    """The far side of a wire: URLs and stations by the amplifiers' names, and the bench behind."""
+    """The far side of a wire: URLs and devices by the amplifiers' names, and the bench behind."""
 
     urls: Mapping[str, str]
-    stations: Mapping[str, Station]
+    devices: Mapping[str, SimulatedDevice]
     bench: Bench
 
     @property
@@ -58,14 +58,14 @@ class FarSide:
         return next(iter(self.urls.values()))
 
     @property
-    def station(self) -> Station:
+    def device(self) -> SimulatedDevice:
         """The only one, or the first."""
-        return next(iter(self.stations.values()))
+        return next(iter(self.devices.values()))
 
     @property
     def amplifier(self) -> SimulatedAmplifier:
         """What stands behind it."""
-        return self.bench.amplifiers[self.station.name]
+        return self.bench.amplifiers[self.device.name]
 
     def silent_from(self) -> float:
         """When the amplifier is silent for good [s], or infinity, by its own clock."""
@@ -78,16 +78,16 @@ class FarSide:
 async def far_side(wire: Wire, rig: Rig, *, seed: int = 0) -> AsyncIterator[FarSide]:
     """The amplifiers of a rig behind a wire, without faults until a test lets them befall."""
     bench = Bench(rig, now=clock.now())
-    stations: Sequence[Station] = [
-        Station(bench, name, number=number, faults=Faults(begin=clock.now(), seed=seed))
+    devices: Sequence[SimulatedDevice] = [
+        SimulatedDevice(bench, name, number=number, faults=Faults(begin=clock.now(), seed=seed))
         for number, name in enumerate(bench.amplifiers, start=1)
     ]
-    async with open_wire(wire, stations) as urls:
+    async with open_wire(wire, devices) as urls:
         try:
-            yield FarSide(urls, {station.name: station for station in stations}, bench)
+            yield FarSide(urls, {device.name: device for device in devices}, bench)
         finally:
-            for station in stations:
-                station.close()
+            for device in devices:
+                device.close()
 
 
 PROCESS_WIRES: Mapping[str, Sequence[str]] = {

@@ -31,7 +31,7 @@ from model.table.pattern import Pattern
 from model.table.question import Question
 from model.vibration.excitation import Excitation, Tone
 from sim.bench.bench import Bench
-from sim.bench.station import Station
+from sim.bench.simulated_device import SimulatedDevice
 from sim.far_ends.wires import Wire, open_wire
 from sim.waveform.output import level_of
 from sim.witness.violation import Violation
@@ -328,10 +328,11 @@ async def _play(
     between = Between(machine)
     rig = make_rig(names, limits)
     bench = Bench(rig, now=loop.time())
-    stations = [
-        Station(bench, name, number=number) for number, name in enumerate(bench.amplifiers, 1)
+    devices = [
+        SimulatedDevice(bench, name, number=number)
+        for number, name in enumerate(bench.amplifiers, 1)
     ]
-    async with open_wire(WITNESSED[wire], stations) as urls:
+    async with open_wire(WITNESSED[wire], devices) as urls:
         links = {name: _link(wire, url) for name, url in urls.items()}
         tap.witness = witness = Witness(plan_for(wire, urls, links))
         for link in {*links.values()}:
@@ -348,8 +349,8 @@ async def _play(
                 async with asyncio.timeout(_LONGEST):
                     await chain._try(scenario(chain))
             await _end(chain)
-        for station in stations:
-            station.close()
+        for device in devices:
+            device.close()
     return Outcome(witness.finish(loop.time()), witness.frames, chain.errors)
 
 

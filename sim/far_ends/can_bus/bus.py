@@ -10,7 +10,7 @@ import zlib
 from collections.abc import Callable
 
 from drivers.codec.can_bus.frame import CanFrame
-from sim.faults.episodes import Faults
+from sim.faults.fault_window import Faults
 from sim.transport.line import TwoWayLine
 
 LENGTHS = (0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64)

@@ -6,7 +6,7 @@ from collections.abc import AsyncIterator, Mapping, Sequence
 from contextlib import AsyncExitStack, asynccontextmanager
 
 from drivers.protocol.definition import PROTOCOL
-from sim.bench.station import Station
+from sim.bench.simulated_device import SimulatedDevice
 from sim.far_ends.can_bus.bus import CanBus, Stub
 from sim.far_ends.can_bus.node import CanNode
 from sim.far_ends.can_bus.slcan_adapter import SlcanEnd
@@ -18,7 +18,7 @@ _PER_NODE: int = PROTOCOL.canopen["channels_per_node"]
 
 @asynccontextmanager
 async def nodes_on(
-    bus: CanBus, stations: Sequence[Station], *, bitrate: int | None = None
+    bus: CanBus, devices: Sequence[SimulatedDevice], *, bitrate: int | None = None
 ) -> AsyncIterator[dict[str, int]]:
     """Amplifiers as nodes of a bus; the node of each by its name.
 
@@ -27,17 +27,17 @@ async def nodes_on(
     with contextlib.ExitStack() as stack:
         numbers = {}
         number = 1
-        for station in stations:
-            node = _join(bus, station, number, bitrate=bitrate, stack=stack)
-            numbers[station.name] = number
+        for device in devices:
+            node = _join(bus, device, number, bitrate=bitrate, stack=stack)
+            numbers[device.name] = number
             node.start()
-            number += -(-station.capabilities.channels // _PER_NODE)
+            number += -(-device.capabilities.channels // _PER_NODE)
         yield numbers
 
 
 @asynccontextmanager
 async def socketcand(
-    stations: Sequence[Station], *, port: int = 0, bitrate: int | None = None
+    devices: Sequence[SimulatedDevice], *, port: int = 0, bitrate: int | None = None
 ) -> AsyncIterator[Mapping[str, str]]:
     """All amplifiers on one bus behind a socketcand server; their URLs by their names."""
     bus = CanBus()
@@ -55,8 +55,8 @@ async def socketcand(
     async with AsyncExitStack() as stack:
         await end.open()
         stack.push_async_callback(end.close)
-        nodes = await stack.enter_async_context(nodes_on(bus, stations, bitrate=bitrate))
-        stations[0].on_plug(plug)
+        nodes = await stack.enter_async_context(nodes_on(bus, devices, bitrate=bitrate))
+        devices[0].on_plug(plug)
         speed = f"?bitrate={bitrate}" if bitrate not in (None, _BITRATE) else ""
         yield {
             name: f"can+socketcand://127.0.0.1:{end.port}/{BUS_NAME}{speed}#{node}"
@@ -67,15 +67,15 @@ async def socketcand(
 
 @asynccontextmanager
 async def slcan(
-    stations: Sequence[Station], *, bitrate: int | None = None, unpluggable: bool = False
+    devices: Sequence[SimulatedDevice], *, bitrate: int | None = None, unpluggable: bool = False
 ) -> AsyncIterator[Mapping[str, str]]:
     """All amplifiers on one bus behind a serial adapter; their URLs by their names."""
     bus = CanBus()
     end = SlcanEnd(bus, unpluggable=unpluggable)
     async with AsyncExitStack() as stack:
         stack.callback(end.close)
-        nodes = await stack.enter_async_context(nodes_on(bus, stations, bitrate=bitrate))
-        stations[0].on_plug(end.plug)
+        nodes = await stack.enter_async_context(nodes_on(bus, devices, bitrate=bitrate))
+        devices[0].on_plug(end.plug)
         yield {
             name: f"can+slcan://{end.path}?bitrate={bitrate or _BITRATE}#{node}"
             for name, node in nodes.items()
@@ -84,14 +84,14 @@ async def slcan(
 
 def _join(
     bus: CanBus,
-    station: Station,
+    device: SimulatedDevice,
     number: int,
     *,
     bitrate: int | None,
     stack: contextlib.ExitStack,
 ) -> CanNode:
-    stub = Stub(bus, lambda frame: node.receive(frame), faults=station.faults, bitrate=bitrate)
-    node = CanNode(station, number, send=stub.send)
+    stub = Stub(bus, lambda frame: node.receive(frame), faults=device.faults, bitrate=bitrate)
+    node = CanNode(device, number, send=stub.send)
     stack.callback(stub.close)
     stack.callback(node.close)
     return node

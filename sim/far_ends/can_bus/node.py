@@ -13,9 +13,9 @@ from typing import TypeAlias
 from drivers import clock
 from drivers.codec.can_bus.frame import CanFrame
 from drivers.protocol.messages import AmplifierEvent, AmplifierState, Fault, Ping, Stop
-from sim.bench.station import Station
+from sim.bench.simulated_device import SimulatedDevice
 from sim.far_ends.can_bus.objects import CANOPEN, IDS, ObjectDictionary
-from sim.far_ends.can_bus.orders import Orders
+from sim.far_ends.can_bus.requests import RequestHandler
 from sim.far_ends.can_bus.sdo import SdoServer
 from sim.far_ends.can_bus.sets import NO_CHANNEL, Action
 
@@ -33,18 +33,20 @@ CallLater: TypeAlias = Callable[[float, Callable[[], None]], asyncio.TimerHandle
 class CanNode:
     """An amplifier as node `node` of a bus; send puts a frame of its own on the bus."""
 
-    def __init__(self, station: Station, node: int, *, send: Callable[[CanFrame], None]) -> None:
-        self._station = station
+    def __init__(
+        self, device: SimulatedDevice, node: int, *, send: Callable[[CanFrame], None]
+    ) -> None:
+        self._device = device
         self._node = node
         self._send = send
         self._state = _PRE_OPERATIONAL
-        self._objects = ObjectDictionary(station, node, pdo_written=self._pdo)
+        self._objects = ObjectDictionary(device, node, pdo_written=self._pdo)
         self._sdo = SdoServer(
             read=self._objects.read,
             write=self._objects.write,
             send=lambda data: send(CanFrame(IDS["sdo_answer"] + node, data)),
         )
-        self._orders = Orders(station, node, objects=self._objects, send=send)
+        self._requests = RequestHandler(device, node, objects=self._objects, send=send)
         self._fault = Fault.NONE
         self._was_off = False
         self._look_again: asyncio.TimerHandle | None = None
@@ -53,7 +55,7 @@ class CanNode:
     def start(self, call_later: CallLater | None = None) -> None:
         """Boot; what comes later is left to the running event loop, unless to somebody else."""
         self._call_later = call_later or asyncio.get_running_loop().call_later
-        self._station.listen(self._tell)
+        self._device.listen(self._tell)
         self._boot()
         self._look()
 
@@ -72,9 +74,9 @@ class CanNode:
         elif frame.id == IDS["sdo_request"] + self._node and self._state != _STOPPED:
             self._sdo.receive(frame.data)
         elif frame.id == IDS["heartbeat"] + self._objects.host and self._objects.host:
-            self._station.exchange(Ping())
+            self._device.exchange(Ping())
         elif frame.id == IDS["sync"] and len(frame.data) <= 1:
-            self._orders.sync()
+            self._requests.sync()
         else:
             self._pdo(frame.id, frame.data, fd=frame.fd)
 
@@ -93,20 +95,20 @@ class CanNode:
             self._leave_operation(_PRE_OPERATIONAL)
             self._boot()
         elif data[0] == _NMT["reset_node"]:
-            self._station.restart()
+            self._device.restart()
             self._boot()
 
     def _leave_operation(self, state: int) -> None:
         """Nothing is heard of the host then, so nothing may play."""
-        if self._station.status().state is AmplifierState.OPERATION_ENABLED:
-            self._station.exchange(Stop(_QUICK))
+        if self._device.status().state is AmplifierState.OPERATION_ENABLED:
+            self._device.exchange(Stop(_QUICK))
         self._state = state
-        self._orders.forget()
+        self._requests.forget()
 
     def _boot(self) -> None:
         self._objects.reset()
         self._sdo.reset()
-        self._orders.forget()
+        self._requests.forget()
         self._state = _PRE_OPERATIONAL
         self._send(CanFrame(IDS["heartbeat"] + self._node, b"\x00"))
         if self._beat is not None:
@@ -129,24 +131,24 @@ class CanNode:
         self._look_again = self._call_later(_LOOK, self._look)
 
     def _is_awake(self) -> bool:
-        is_off = self._station.faults.now("reboot", clock.now())
+        is_off = self._device.faults.now("reboot", clock.now())
         if self._was_off and not is_off:
             self._was_off = False
             self._boot()
         self._was_off = is_off
-        return self._station.is_answering
+        return self._device.is_answering
 
     # what is for the amplifier, and from it
 
     def _pdo(self, cob_id: int, data: bytes, *, fd: bool = False) -> None:
         if self._state == _OPERATIONAL:
-            self._orders.take(cob_id, data, fd=fd)
+            self._requests.take(cob_id, data, fd=fd)
 
     def _tell(self, event: AmplifierEvent) -> None:
         """A change of state or fault: an emergency for faults, an answer to nobody for others."""
         concerns_fault = event.fault is not Fault.NONE or self._fault is not Fault.NONE
         self._fault = event.fault
-        if not self._station.is_answering or self._state == _STOPPED:
+        if not self._device.is_answering or self._state == _STOPPED:
             return
         channel = NO_CHANNEL if event.channel is None else event.channel
         if concerns_fault:

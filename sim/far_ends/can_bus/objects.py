@@ -12,7 +12,7 @@ from typing import Any
 
 from drivers.protocol.definition import PROTOCOL, Quantity
 from drivers.protocol.messages import FaultList, GetFaults, LoadEnvelope, Nak
-from sim.bench.station import Station
+from sim.bench.simulated_device import SimulatedDevice
 from sim.far_ends.can_bus.domains import ABORTS, envelope_of, faults_domain
 from sim.far_ends.can_bus.sdo import (
     BAD_LENGTH,
@@ -57,12 +57,12 @@ class ObjectDictionary:
     """
 
     def __init__(
-        self, station: Station, node: int, *, pdo_written: Callable[[int, bytes], None]
+        self, device: SimulatedDevice, node: int, *, pdo_written: Callable[[int, bytes], None]
     ) -> None:
-        self._station = station
+        self._device = device
         self._node = node
         self._pdo_written = pdo_written
-        self._channels = station.capabilities.channels
+        self._channels = device.capabilities.channels
         self.achieved = b""
         self.blocks: dict[int, bytes] = {}  # the last of each PDO, by its identifier
         self.reset()
@@ -133,16 +133,16 @@ class ObjectDictionary:
         self._count(_INDEX["texts"], len(texts))
         for subindex, text in enumerate(texts, start=1):
             self._reads[_INDEX["texts"], subindex] = partial(self._text, text)
-        able = self._station.capabilities
+        able = self._device.capabilities
         kinds = CANOPEN["objects"]["capabilities"]["types"]
-        values = {**_fields(able), "protocol_version": self._station.identity.protocol_version}
+        values = {**_fields(able), "protocol_version": self._device.identity.protocol_version}
         self._record(
             "capabilities",
             [_scaled(_quantity(kind), values[name]) for name, kind in kinds.items()],
         )
 
     def _how_it_is(self) -> None:
-        status, index = self._station.status, _INDEX["status"]
+        status, index = self._device.status, _INDEX["status"]
         self._count(index, 7)
         self._reads[index, 1] = lambda: bytes([status().state])
         self._reads[index, 2] = lambda: bytes([status().fault])
@@ -207,17 +207,17 @@ class ObjectDictionary:
 
     def _serial_number(self) -> bytes:
         """A number that the text of it makes, and no other is likely to."""
-        return _pack("u32", zlib.crc32(self._station.identity.serial_number.encode()))
+        return _pack("u32", zlib.crc32(self._device.identity.serial_number.encode()))
 
     def _text(self, name: str) -> bytes:
-        text: str = getattr(self._station.identity, name)
+        text: str = getattr(self._device.identity, name)
         return text.encode()
 
     def _block(self, cob_id: int) -> bytes:
         return self.blocks.get(cob_id, bytes(8))
 
     def _level(self, channel: int) -> bytes:
-        return _scaled(_Q.level, self._station.status().levels[channel])
+        return _scaled(_Q.level, self._device.status().levels[channel])
 
     def _set_consumer(self, data: bytes) -> None:
         value = _unpack("u32", data)
@@ -227,15 +227,15 @@ class ObjectDictionary:
         self.heartbeat = _unpack("u16", data)
 
     def _error_register(self) -> bytes:
-        fault = self._station.status().fault
+        fault = self._device.status().fault
         return bytes([CANOPEN["emergencies"][fault.name]["error_register"]])
 
     def _faults(self) -> bytes:
-        reply = self._station.exchange(GetFaults())
+        reply = self._device.exchange(GetFaults())
         return faults_domain(reply.faults if isinstance(reply, FaultList) else ())
 
     def _load(self, slot: int, data: bytes) -> None:
-        reply = self._station.exchange(LoadEnvelope(envelope_of(slot, data)))
+        reply = self._device.exchange(LoadEnvelope(envelope_of(slot, data)))
         if isinstance(reply, Nak):
             raise SdoAbort(ABORTS[reply.code])
 

@@ -1,7 +1,7 @@
-"""The sets that come over CAN: an order, and the commands under its sequence number.
+"""Command sets over CAN: a request frame and the command frames with its sequence number.
 
-A set is whole when as many commands as its order says have come under its number, and the envelope
-slots with those that refer to some; anything less is torn.
+A set is complete when the announced number of commands, and the envelope slots that they refer to,
+carry the sequence number of the request.
 """
 
 import struct
@@ -13,13 +13,13 @@ from drivers.command import CommandSet, DriveCommand
 from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.messages import NakCode
 
-TORN = 15  # the result of a set with a frame missing; others are those of refusals
+INCOMPLETE_SET = 15  # result code; the others are those of refusals
 NO_CHANNEL = 255
 _Q = PROTOCOL.quantities
 
 
 class Action(IntEnum):
-    """What an order is for."""
+    """What a request is for."""
 
     STATUS = 0
     APPLY = 1
@@ -39,8 +39,8 @@ TO_ALL = (Action.COMMIT, Action.STOP)
 
 
 @dataclass(frozen=True, slots=True)
-class Order:
-    """An order frame as it came; own: not said to all."""
+class RequestFrame:
+    """A request frame as it came; own: not said to all."""
 
     token: int
     ramp: int
@@ -63,7 +63,7 @@ class _Command(NamedTuple):
 
 
 class Refused(Exception):
-    """An order that says nonsense, or a set with a frame missing."""
+    """A request that says nonsense, or a set with a frame missing."""
 
     def __init__(self, code: int, channel: int = NO_CHANNEL) -> None:
         super().__init__(code, channel)
@@ -90,7 +90,7 @@ class SetBuffer:
         self._slots.clear()
 
     def clear_others(self, sequence: int) -> None:
-        """An order has come: what is under another number than its own belongs to none any more."""
+        """Discard commands and slots that carry another sequence number than a new request."""
         own = {channel: one for channel, one in self._commands.items() if one.sequence == sequence}
         self._commands = own
         self._slots = {channel: one for channel, one in self._slots.items() if one[1] == sequence}
@@ -112,21 +112,21 @@ class SetBuffer:
         for place in range(4):
             self._slots[4 * (data[6] & 3) + place] = (word >> 12 * place & 0xFFF, data[7])
 
-    def command_set(self, order: Order) -> CommandSet:
-        """The set of an order; raises Refused."""
-        if not (_Q.ramp.holds(order.ramp) and _Q.valid_for.holds(order.time)):
+    def command_set(self, request: RequestFrame) -> CommandSet:
+        """The set of a request; raises Refused."""
+        if not (_Q.ramp.holds(request.ramp) and _Q.valid_for.holds(request.time)):
             raise Refused(NakCode.BAD_VALUE)
         own = {
             channel: command
             for channel, command in self._commands.items()
-            if command.sequence == order.sequence
+            if command.sequence == request.sequence
         }
-        if len(own) != order.count:
-            raise Refused(TORN)
+        if len(own) != request.count:
+            raise Refused(INCOMPLETE_SET)
         commands = tuple(
             self._drive_command(channel, command) for channel, command in sorted(own.items())
         )
-        return CommandSet(order.token, commands, order.ramp / 1000, order.time / 1000)
+        return CommandSet(request.token, commands, request.ramp / 1000, request.time / 1000)
 
     def _drive_command(self, channel: int, command: _Command) -> DriveCommand:
         if command.flags >> 4 != channel or channel >= self._channels:
@@ -139,7 +139,7 @@ class SetBuffer:
         if command.flags & 4:
             slots, of = self._slots.get(channel, (0, -1))
             if of != command.sequence:
-                raise Refused(TORN)
+                raise Refused(INCOMPLETE_SET)
         return DriveCommand(
             channel=channel,
             frequency=command.frequency / 100,

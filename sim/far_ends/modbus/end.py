@@ -16,7 +16,7 @@ from typing import cast
 from drivers import clock
 from drivers.errors import LinkError
 from drivers.protocol.definition import PROTOCOL
-from sim.bench.station import Station
+from sim.bench.simulated_device import SimulatedDevice
 from sim.far_ends.modbus.frames import (
     PAUSE,
     Reader,
@@ -41,9 +41,9 @@ _BITS_PER_BYTE = 11  # start, eight data, parity, stop
 class _Units:
     """The units behind one port or line."""
 
-    def __init__(self, stations: Sequence[Station]) -> None:
-        self.stations = stations
-        self.units = {station.number: ModbusUnit(station) for station in stations}
+    def __init__(self, devices: Sequence[SimulatedDevice]) -> None:
+        self.devices = devices
+        self.units = {device.number: ModbusUnit(device) for device in devices}
 
     def answer(self, request: Request, *, over_tcp: bool) -> bytes | None:
         """The PDU that answers a request, if one does."""
@@ -68,7 +68,7 @@ class _Wire(ABC):
         self.line = TwoWayLine(
             to_amplifier=self._arrived,
             to_host=self.send,
-            faults=units.stations[0].faults,
+            faults=units.devices[0].faults,
             bits_per_second=speed,
             bits_per_byte=_BITS_PER_BYTE,
         )
@@ -108,16 +108,20 @@ class _Wire(ABC):
 
 
 class ModbusRtuEnd(_Wire):
-    """A pseudo-terminal on which stations answer, each as the unit of its number.
+    """A pseudo-terminal on which devices answer, each as the unit of its number.
 
     speed [bit/s]: bytes take as long as at this speed; None for no time at all. unpluggable: the
     port is named by a link that outlives the pseudo-terminal.
     """
 
     def __init__(
-        self, stations: Sequence[Station], *, speed: int | None = None, unpluggable: bool = False
+        self,
+        devices: Sequence[SimulatedDevice],
+        *,
+        speed: int | None = None,
+        unpluggable: bool = False,
     ) -> None:
-        super().__init__(_Units(stations), RtuReader(), speed=speed)
+        super().__init__(_Units(devices), RtuReader(), speed=speed)
         self._baud = speed or _MAP["baud"]
         self._is_unpluggable = unpluggable
         self._terminal = make_terminal(self.line.inward.send, unpluggable=unpluggable)
@@ -126,13 +130,13 @@ class ModbusRtuEnd(_Wire):
     def urls(self) -> dict[str, str]:
         """The URL of each amplifier, by its name."""
         line = f"modbus+rtu://{self._terminal.port}?baud={self._baud}"
-        return {station.name: f"{line}#{station.number}" for station in self.units.stations}
+        return {device.name: f"{line}#{device.number}" for device in self.units.devices}
 
     def start(self) -> None:
         """Answer from now on, in the running event loop."""
         self._terminal.listen()
         if self._is_unpluggable:
-            self.units.stations[0].on_plug(self._plug)
+            self.units.devices[0].on_plug(self._plug)
 
     def close(self) -> None:
         """Hang up; to be called in the event loop that it was started in."""
@@ -196,8 +200,8 @@ class _Connection(_Wire, asyncio.Protocol):
 class ModbusTcpEnd:
     """A TCP port on the loopback interface; port 0 is any that is free."""
 
-    def __init__(self, stations: Sequence[Station], *, port: int = 0) -> None:
-        self._units = _Units(stations)
+    def __init__(self, devices: Sequence[SimulatedDevice], *, port: int = 0) -> None:
+        self._units = _Units(devices)
         self._is_plugged = True
         self.connections: set[_Connection] = set()
         self._server: asyncio.Server | None = None
@@ -207,8 +211,8 @@ class ModbusTcpEnd:
     def urls(self) -> dict[str, str]:
         """The URL of each amplifier, by its name; once it has started."""
         return {
-            station.name: f"modbus+tcp://{_HOST}:{self._port}/{station.number}"
-            for station in self._units.stations
+            device.name: f"modbus+tcp://{_HOST}:{self._port}/{device.number}"
+            for device in self._units.devices
         }
 
     async def start(self) -> None:
@@ -223,7 +227,7 @@ class ModbusTcpEnd:
                 "another, or 0 for any"
             ) from error
         self._port = self._server.sockets[0].getsockname()[1]
-        self._units.stations[0].on_plug(self._plug)
+        self._units.devices[0].on_plug(self._plug)
 
     async def close(self) -> None:
         """Hang up and listen no more."""

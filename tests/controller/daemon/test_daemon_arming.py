@@ -18,7 +18,7 @@ from controller.daemon.socket_lock import SocketLock
 from daemon_bench import daemon_table, far_end, running_daemon, until, until_state, write_daemon
 from drivers.errors import LinkError
 from drivers.protocol.messages import AmplifierState
-from sim.faults.episodes import Episode
+from sim.faults.fault_window import FaultWindow
 
 READY, ENABLED = "READY_TO_SWITCH_ON", "OPERATION_ENABLED"
 
@@ -69,7 +69,7 @@ async def test_arming_that_takes_longer_than_the_lease(
         assert 0.5 < (status.lease_left_s or 0) <= 1
         await era.renew(lease.lease)
         await until_state(era, READY)
-        assert bench.far.station.status().state is AmplifierState.SWITCH_ON_DISABLED
+        assert bench.far.device.status().state is AmplifierState.SWITCH_ON_DISABLED
 
 
 async def test_who_hangs_up_while_arming_leaves_nothing_armed(
@@ -88,7 +88,7 @@ async def test_who_hangs_up_while_arming_leaves_nothing_armed(
         goes_on.set()
         await until_state(era, READY)
         assert (await era.status()).armed_by is None
-        assert bench.far.station.status().state is AmplifierState.SWITCH_ON_DISABLED
+        assert bench.far.device.status().state is AmplifierState.SWITCH_ON_DISABLED
 
 
 async def test_who_is_cancelled_while_arming_leaves_nothing_armed(
@@ -162,7 +162,7 @@ async def test_an_end_during_a_reload_starts_nothing(
 async def test_an_end_while_an_amplifier_is_waited_for(tmp_path: Path) -> None:
     """It does not answer when the daemon starts: being told to end ends that at once."""
     async with far_end(tmp_path) as far:
-        far.station.befall(Episode("hang"))
+        far.device.inject_fault(FaultWindow("hang"))
         config = load_daemon_config(write_daemon(tmp_path, {"main": far.url}))
         place, log = SocketLock(config.socket), LogThread(tmp_path / "log")
         daemon = Daemon(config, daemon_table(), log=log, manager=ServiceManager({}), dashboard=None)
@@ -191,7 +191,7 @@ async def test_an_end_while_a_lost_amplifier_is_tried_again(
             await asyncio.Event().wait()
 
         monkeypatch.setattr(bench.daemon._controller, "open", endless)
-        bench.far.station.befall(Episode("hang"))
+        bench.far.device.inject_fault(FaultWindow("hang"))
         await asyncio.wait_for(tries.wait(), 20)
 
 
@@ -212,7 +212,7 @@ async def test_the_service_manager_hears_of_a_daemon_that_waits_for_an_amplifier
             alive += 1
 
         monkeypatch.setattr(bench.daemon._controller, "open", endless)
-        bench.far.station.befall(Episode("hang"))
+        bench.far.device.inject_fault(FaultWindow("hang"))
         await asyncio.wait_for(tries.wait(), 20)
         monkeypatch.setattr(bench.daemon._manager, "alive", count)
         await until(lambda: alive >= 3)

@@ -17,7 +17,7 @@ from controller.daemon.run import run_daemon
 from controller.metrics.__main__ import serve
 from daemon_bench import running_daemon, until_state, write_daemon
 from model.errors import InputError
-from sim.faults.episodes import Episode
+from sim.faults.fault_window import FaultWindow
 
 
 def test_an_event_is_told_by_the_clock_on_the_wall_and_without_what_is_not_known() -> None:
@@ -86,11 +86,11 @@ async def test_a_status_that_was_told_is_done_whatever_it_tells(
     """In COMM_LOST and in FAULT the command ends as ever: scripts look at what it says."""
     async with running_daemon(tmp_path) as bench, await bench.client() as era:
         await until_state(era, "READY_TO_SWITCH_ON")
-        bench.far.station.befall(Episode("hang"))
+        bench.far.device.inject_fault(FaultWindow("hang"))
         await until_state(era, "COMM_LOST")
         await asyncio.to_thread(status, socket=bench.socket)  # another status is an exception
         await era.stop()  # latches: without it the link would come back to no fault
-        bench.far.station.recover()
+        bench.far.device.recover()
         await until_state(era, "FAULT")
         await asyncio.to_thread(status, socket=bench.socket)
     told = capsys.readouterr().out.splitlines()
@@ -102,7 +102,7 @@ async def test_a_status_says_what_is_known_of_a_lost_amplifier(tmp_path: Path) -
     async with running_daemon(tmp_path) as bench, await bench.client() as era:
         await until_state(era, "READY_TO_SWITCH_ON")
         before = show_status(await era.status())
-        bench.far.station.befall(Episode("hang"))
+        bench.far.device.inject_fault(FaultWindow("hang"))
         await until_state(era, "COMM_LOST")
         lost = await era.status()
     assert "READY_TO_SWITCH_ON" in before

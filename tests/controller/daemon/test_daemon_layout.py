@@ -69,7 +69,7 @@ async def test_regions_and_effects_by_name(tmp_path: Path, monkeypatch: pytest.M
         touching.cancel()
         touching = asyncio.create_task(keep_touching(era, ON_QUIET))
         assert await contacts_as(era, None) == [None]
-        await until(lambda: not any(bench.far.station.status().levels))
+        await until(lambda: not any(bench.far.device.status().levels))
         assert "no effect plays" in ((await era.status()).silent_because or "")
 
         for effect, place, level in (
@@ -104,8 +104,8 @@ async def test_a_click_is_over_on_the_wire_while_its_finger_rests(tmp_path: Path
         await until_state(era, READY)
         await era.arm("me", lease_s=60)
         touching = asyncio.create_task(keep_touching(era, ON_PAD))
-        await until(lambda: any(bench.far.station.status().levels))
-        await until(lambda: not any(bench.far.station.status().levels))
+        await until(lambda: any(bench.far.device.status().levels))
+        await until(lambda: not any(bench.far.device.status().levels))
         status = await era.status()
         assert (status.state, len(status.contacts), status.drive) == (ENABLED, 1, {})
         touching.cancel()

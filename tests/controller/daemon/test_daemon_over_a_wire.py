@@ -36,7 +36,7 @@ from drivers.registry import open_backend
 from model.errors import InputError
 from model.rig.file import load_rig
 from rig_files import TWO_AMPLIFIERS
-from sim.faults.episodes import Episode
+from sim.faults.fault_window import FaultWindow
 
 READY = "READY_TO_SWITCH_ON"
 ENABLED = "OPERATION_ENABLED"
@@ -55,7 +55,7 @@ async def holding(
 
     task = asyncio.create_task(repeat())
     try:
-        await until(lambda: any(bench.far.station.status().levels))
+        await until(lambda: any(bench.far.device.status().levels))
         yield
     finally:
         task.cancel()
@@ -88,8 +88,8 @@ async def test_touches_are_felt_while_armed_and_only_then(tmp_path: Path) -> Non
         (contact,) = (await told_of(era, "contacts")).data["contacts"]
         assert (contact["x_m"], contact["y_m"]) == pytest.approx(PLACE)
         assert contact["role"] is None
-        assert not any(bench.far.station.status().levels)
-        assert bench.far.station.status().state is AmplifierState.SWITCH_ON_DISABLED
+        assert not any(bench.far.device.status().levels)
+        assert bench.far.device.status().state is AmplifierState.SWITCH_ON_DISABLED
         await era.arm("me", lease_s=30)
         async with holding(era, bench, PLACE, (0.25, 0.2)):
             told = (await told_of(era, "pattern")).data
@@ -103,11 +103,11 @@ async def test_touches_are_felt_while_armed_and_only_then(tmp_path: Path) -> Non
             assert 0 < (status.lease_left_s or 0) <= 30
             commanded = [told["drive"][era]["level"] for era in ("SW", "SE", "NE", "NW")]
             await until(
-                lambda: bench.far.station.status().levels == pytest.approx(commanded, abs=1e-4)
+                lambda: bench.far.device.status().levels == pytest.approx(commanded, abs=1e-4)
             )
             assert (await era.status()).drive.keys() == told["drive"].keys()
         await era.touch([])
-        await until(lambda: not any(bench.far.station.status().levels))
+        await until(lambda: not any(bench.far.device.status().levels))
         assert (await told_of(era, "silence")).data["reason"]
         assert (await era.status()).drive == {}
 
@@ -160,7 +160,7 @@ async def test_a_lease_that_is_not_renewed_disarms(tmp_path: Path) -> None:
         assert await until_state(era, READY, "SWITCH_ON_DISABLED") is not None
         assert loop.time() - begin >= 0.9
         await until_state(era, READY)
-        assert bench.far.station.status().state is AmplifierState.SWITCH_ON_DISABLED
+        assert bench.far.device.status().state is AmplifierState.SWITCH_ON_DISABLED
         assert await refusal(era.renew(lease.lease)) is ErrorCode.LEASE
 
 
@@ -172,12 +172,12 @@ async def test_one_arms_and_anybody_stops(tmp_path: Path) -> None:
         async with await bench.client("bystander") as bystander, holding(era, bench):
             assert await refusal(bystander.arm("you")) is ErrorCode.LEASE
             await bystander.stop()
-            await until(lambda: not any(bench.far.station.status().levels))
+            await until(lambda: not any(bench.far.device.status().levels))
             status = await bystander.status()
         assert status.state == "QUICK_STOP_ACTIVE"
         assert "bystander" in status.cause
         assert status.armed_by is None
-        assert bench.far.station.status().state is AmplifierState.QUICK_STOP_ACTIVE
+        assert bench.far.device.status().state is AmplifierState.QUICK_STOP_ACTIVE
         assert await refusal(era.arm("me")) is ErrorCode.WRONG_STATE
         await era.clear()
         await until_state(era, READY)
@@ -197,7 +197,7 @@ async def test_a_stop_overtakes_the_arming_it_stops(tmp_path: Path) -> None:
         status = await era.status()
         assert status.state in ("QUICK_STOP_ACTIVE", "FAULT_REACTION_ACTIVE", "FAULT")
         assert status.armed_by is None
-        assert bench.far.station.status().state is not AmplifierState.OPERATION_ENABLED
+        assert bench.far.device.status().state is not AmplifierState.OPERATION_ENABLED
 
 
 async def test_touches_over_tuio_are_felt(tmp_path: Path) -> None:
@@ -231,7 +231,7 @@ async def test_a_cut_link_is_told_and_comes_back_disarmed(tmp_path: Path) -> Non
         await until_state(era, READY)
         await era.subscribe("link", "state")
         await era.arm("me", lease_s=30)
-        bench.far.station.befall(Episode("hang"))
+        bench.far.device.inject_fault(FaultWindow("hang"))
         await until_state(era, "COMM_LOST")
         status = await era.status()
         assert status.assume_energised
@@ -246,10 +246,10 @@ async def test_a_cut_link_is_told_and_comes_back_disarmed(tmp_path: Path) -> Non
             await era.clear()
         assert caught.value.code is ErrorCode.LINK
         await era.stop()
-        bench.far.station.recover()
+        bench.far.device.recover()
         await until_state(era, "FAULT")
         assert not (await era.status()).assume_energised
-        assert bench.far.station.status().state is not AmplifierState.OPERATION_ENABLED
+        assert bench.far.device.status().state is not AmplifierState.OPERATION_ENABLED
         await era.clear()
         await until_state(era, READY)
         await era.arm("me")
@@ -266,7 +266,7 @@ async def test_a_cut_link_is_one_line_of_the_log(
         await until_state(era, READY)
         await era.subscribe("link", "log")
         with caplog.at_level(logging.INFO, "controller"):
-            bench.far.station.befall(Episode("hang"))
+            bench.far.device.inject_fault(FaultWindow("hang"))
             told = [await told_of(era, "link", "log") for _ in range(3)]
             lost, *retried = caplog.records
             logging.getLogger("controller").info("something else")
@@ -292,7 +292,7 @@ async def test_how_a_lost_amplifier_was_is_not_told_as_how_it_is(tmp_path: Path)
         await until_state(era, READY)
         (known,) = (await era.status()).amplifiers
         assert (known.lost, known.levels, known.high_voltage) == (False, [0.0] * 4, False)
-        bench.far.station.befall(Episode("hang"))
+        bench.far.device.inject_fault(FaultWindow("hang"))
         await until_state(era, "COMM_LOST")
         begun = lost_for = (await era.status()).lost_for_s or 0.0
         while lost_for < begun + 1.0:  # two attempts to reopen it
@@ -306,7 +306,7 @@ async def test_how_a_lost_amplifier_was_is_not_told_as_how_it_is(tmp_path: Path)
             assert lost.reply_age_s >= status.lost_for_s
             lost_for = status.lost_for_s
             await asyncio.sleep(0.01)
-        bench.far.station.recover()
+        bench.far.device.recover()
         await until_state(era, READY)
         status = await era.status()
         assert status.lost_for_s is None
@@ -335,7 +335,7 @@ async def test_who_is_lost_is_told_from_who_was_closed_with_it(tmp_path: Path) -
     ):
         await until_state(era, READY)
         assert await told() == {"main": there, "side": there}
-        far.stations["side"].befall(Episode("hang"))
+        far.devices["side"].inject_fault(FaultWindow("hang"))
         await until_told(main=closed, side=lost)
         begun = lost_for = (await era.status()).lost_for_s or 0.0
         while lost_for < begun + 0.6:  # an attempt to reopen them
@@ -346,9 +346,9 @@ async def test_who_is_lost_is_told_from_who_was_closed_with_it(tmp_path: Path) -
         main, side = (line for line in show_status(status).splitlines() if "serial://" in line)
         assert re.search(r"amplifier main .*\): closed with the lost one, heard", main)
         assert re.search(r"amplifier side .*\): LOST, heard", side)
-        far.stations["main"].befall(Episode("hang"))
+        far.devices["main"].inject_fault(FaultWindow("hang"))
         await until_told(main=lost, side=lost)
-        far.stations["side"].recover()
+        far.devices["side"].recover()
         await until_told(main=lost, side=closed)
 
 
@@ -360,7 +360,7 @@ async def test_a_pattern_that_a_cut_link_ends_is_told_to_be_over(tmp_path: Path)
         async with holding(era, bench):
             await era.subscribe("pattern", "silence")
             assert (await told_of(era, "pattern")).data["drive"]
-            bench.far.station.befall(Episode("hang"))
+            bench.far.device.inject_fault(FaultWindow("hang"))
             await until_state(era, "COMM_LOST")
             reason = (await told_of(era, "silence")).data["reason"]
             # On a busy machine the finger, said too seldom, may be taken for lifted first.
@@ -373,10 +373,10 @@ async def test_a_cut_link_is_noticed_while_disarmed(tmp_path: Path) -> None:
     async with running_daemon(tmp_path) as bench, await bench.client() as era:
         await until_state(era, READY)
         await era.subscribe("link")
-        bench.far.station.befall(Episode("hang"))
+        bench.far.device.inject_fault(FaultWindow("hang"))
         await until_state(era, "COMM_LOST")
         assert (await told_of(era, "link")).data["event"] == "lost"
-        bench.far.station.recover()
+        bench.far.device.recover()
         await until_state(era, READY)
 
 
@@ -387,9 +387,9 @@ async def test_a_fault_stops_is_dumped_and_needs_to_be_cleared(tmp_path: Path) -
         await until_state(era, READY)
         await era.arm("me", lease_s=30)
         async with holding(era, bench):
-            bench.far.station.befall(Episode("over_voltage"))
+            bench.far.device.inject_fault(FaultWindow("over_voltage"))
             await until_state(era, "FAULT")
-        assert not any(bench.far.station.status().levels)
+        assert not any(bench.far.device.status().levels)
         assert "OVER_VOLTAGE" in (await era.status()).cause
         assert await refusal(era.arm("me")) is ErrorCode.WRONG_STATE
         await era.clear()
@@ -411,7 +411,7 @@ async def test_a_dump_that_cannot_be_written_changes_nothing(tmp_path: Path) -> 
         await until_state(era, READY)
         await era.arm("me", lease_s=30)
         (tmp_path / "dumps").write_text("in the way", "utf-8")
-        bench.far.station.befall(Episode("arc"))
+        bench.far.device.inject_fault(FaultWindow("arc"))
         await until_state(era, "FAULT")
         await era.clear()
         await until_state(era, READY)
@@ -423,11 +423,11 @@ async def test_an_amplifier_that_was_left_armed_is_disarmed_at_the_start(tmp_pat
         amplifier = Amplifier(open_backend(far.url), reply_timeout=1.0)
         await amplifier.open()
         await amplifier.arm(2.0)
-        assert far.station.status().state is AmplifierState.OPERATION_ENABLED
+        assert far.device.status().state is AmplifierState.OPERATION_ENABLED
         await amplifier.close()
         async with daemon_at(far, tmp_path) as bench, await bench.client() as era:
             await until_state(era, READY)
-            assert far.station.status().state is AmplifierState.SWITCH_ON_DISABLED
+            assert far.device.status().state is AmplifierState.SWITCH_ON_DISABLED
 
 
 async def test_an_amplifier_in_a_fault_is_told_at_the_start(tmp_path: Path) -> None:
@@ -437,7 +437,7 @@ async def test_an_amplifier_in_a_fault_is_told_at_the_start(tmp_path: Path) -> N
         await amplifier.open()
         await amplifier.arm(0.15)
         await amplifier.close()
-        await until(lambda: far.station.status().state is AmplifierState.FAULT)
+        await until(lambda: far.device.status().state is AmplifierState.FAULT)
         async with daemon_at(far, tmp_path) as bench, await bench.client() as era:
             await until_state(era, "FAULT")
             assert "WATCHDOG" in (await era.status()).cause

@@ -9,7 +9,7 @@ import pytest
 from controller.sources.touch import Touch, TouchFrame
 from controller.sources.tuio import tuio_datagram
 from daemon_bench import running_daemon, until_state
-from sim.faults.episodes import Episode
+from sim.faults.fault_window import FaultWindow
 
 
 def free_port() -> int:
@@ -64,12 +64,12 @@ async def test_a_finger_that_lifts_while_the_link_is_lost(tmp_path: Path) -> Non
         await asyncio.sleep(0.05)
         assert len((await era.status()).contacts) == 1
         await era.touch([(0.1, 0.1)])
-        bench.far.station.befall(Episode("hang"))
+        bench.far.device.inject_fault(FaultWindow("hang"))
         while (await era.status()).state != "COMM_LOST":
             await era.touch([(0.1, 0.1)])
             await asyncio.sleep(0.03)
         await era.touch([])
         assert (await era.status()).contacts == []
-        bench.far.station.recover()
+        bench.far.device.recover()
         await until_state(era, "READY_TO_SWITCH_ON")
         assert (await era.status()).contacts == []

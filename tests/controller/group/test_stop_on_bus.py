@@ -18,7 +18,7 @@ from drivers.registry import open_backend
 from memory_machine import live_in_memory
 from model.rig.rig import Channel, Rig
 from sim.far_ends.wires import Wire
-from sim.faults.episodes import Episode
+from sim.faults.fault_window import FaultWindow
 from virtual_loop import run_virtual
 from wires import FarSide, far_side
 
@@ -52,8 +52,8 @@ def on_a_bus(
     async def run() -> None:
         live_in_memory()
         async with far_side(BUSES[bus], three) as far:
-            for name, station in far.stations.items():
-                station.exchange = partial(note, name, station.exchange)  # type: ignore[method-assign]
+            for name, device in far.devices.items():
+                device.exchange = partial(note, name, device.exchange)  # type: ignore[method-assign]
             group = AmplifierGroup(
                 {name: Amplifier(open_backend(url)) for name, url in far.urls.items()}
             )
@@ -72,12 +72,12 @@ def test_one_that_does_not_answer_holds_up_no_other_stop(bus: str, coarse_rig: R
     stop was wished all the same, and latched."""
 
     async def use(far: FarSide, group: AmplifierGroup, heard: list[tuple[str, float]]) -> None:
-        far.stations["first"].befall(Episode("hang"))
+        far.devices["first"].inject_fault(FaultWindow("hang"))
         begin = asyncio.get_running_loop().time()
         await group.stop()
         for name in NAMES[1:]:
             assert min(moment for who, moment in heard if who == name) - begin < FRAME
-            assert far.stations[name].status().state is AmplifierState.QUICK_STOP_ACTIVE
+            assert far.devices[name].status().state is AmplifierState.QUICK_STOP_ACTIVE
 
     on_a_bus(bus, coarse_rig, use)
 

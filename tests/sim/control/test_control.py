@@ -17,9 +17,9 @@ from drivers.errors import LinkError
 from drivers.protocol.messages import Apply, Arm
 from model.rig.rig import Rig
 from sim.bench.bench import Bench
+from sim.control.context import SimulationContext
 from sim.control.operations import carry_out
 from sim.control.server import LINE_MAX, control_socket
-from sim.control.site import Site
 
 
 @pytest.fixture
@@ -36,7 +36,7 @@ def mode(path: Path) -> int | None:
 
 def ask(bench: Bench, now: float, **request: Any) -> dict[str, Any]:
     """One line of control."""
-    made = carry_out(Site(bench), json.dumps(request).encode(), now=now)
+    made = carry_out(SimulationContext(bench), json.dumps(request).encode(), now=now)
     assert callable(made)
     return made()
 
@@ -100,7 +100,7 @@ def test_malformed_lines_get_an_error_and_change_nothing(coarse_rig: Rig, line: 
     """Whatever the line, there is an answer, it says what is wrong, and no finger moves."""
     bench = Bench(coarse_rig, now=1.0)
     ask(bench, 1.0, op="fingers", fingers={"a": [0.1, 0.1]})
-    made = carry_out(Site(bench), line, now=1.0)
+    made = carry_out(SimulationContext(bench), line, now=1.0)
     assert callable(made)
     reply = made()
     assert reply.keys() == {"error"}
@@ -113,14 +113,14 @@ async def test_the_socket_is_its_owners_and_goes_with_the_bench(
 ) -> None:
     """Mode 0600; several lines on one connection; no file is left behind."""
     bench = Bench(coarse_rig, now=0.0)
-    async with control_socket(Site(bench), socket_path):
+    async with control_socket(SimulationContext(bench), socket_path):
         assert mode(socket_path) == 0o600
         reader, writer = await asyncio.open_unix_connection(socket_path)
         writer.write(b'{"op": "state"}\nnonsense\n{"op": "state"}\n')
         replies = [json.loads(await reader.readline()) for _ in range(3)]
         assert ["error" in reply for reply in replies] == [False, True, False]
         with pytest.raises(LinkError, match="no other program"):
-            async with control_socket(Site(bench), socket_path):
+            async with control_socket(SimulationContext(bench), socket_path):
                 pass
         writer.close()
         await writer.wait_closed()
@@ -130,7 +130,7 @@ async def test_the_socket_is_its_owners_and_goes_with_the_bench(
 async def test_an_endless_line_is_cut_off(coarse_rig: Rig, socket_path: Path) -> None:
     """A line beyond the bound gets an error and the connection ends; others go on."""
     bench = Bench(coarse_rig, now=0.0)
-    async with control_socket(Site(bench), socket_path):
+    async with control_socket(SimulationContext(bench), socket_path):
         reader, writer = await asyncio.open_unix_connection(socket_path)
         writer.write(b" " * (2 * LINE_MAX))
         assert "longer than" in json.loads(await reader.readline())["error"]
@@ -148,7 +148,7 @@ async def test_a_dead_socket_is_replaced(coarse_rig: Rig, socket_path: Path) -> 
     """A far end that was killed leaves a socket that nobody serves; the next one takes over."""
     with socket.socket(socket.AF_UNIX) as dead:
         dead.bind(str(socket_path))
-    async with control_socket(Site(Bench(coarse_rig, now=0.0)), socket_path):
+    async with control_socket(SimulationContext(Bench(coarse_rig, now=0.0)), socket_path):
         _, writer = await asyncio.open_unix_connection(socket_path)
         writer.close()
         await writer.wait_closed()
@@ -161,6 +161,6 @@ async def test_a_place_for_no_socket_is_an_error(coarse_rig: Rig, socket_path: P
     plain.write_text("kept")
     for path in (socket_path / "deeper", socket_path.parent / ("x" * 200), plain):
         with pytest.raises(LinkError, match="control socket"):
-            async with control_socket(Site(bench), path):
+            async with control_socket(SimulationContext(bench), path):
                 pass
     assert plain.read_text() == "kept"

@@ -28,7 +28,7 @@ from drivers.protocol.messages import (
 )
 from model.rig.rig import Rig
 from sim.bench.bench import Bench
-from sim.bench.station import Station
+from sim.bench.simulated_device import SimulatedDevice
 from sim.far_ends.serial_end import SerialEnd
 from sim.transport.pseudo_terminal import PseudoTerminal
 
@@ -69,7 +69,7 @@ class Host:
 @pytest.fixture
 async def end(coarse_rig: Rig) -> AsyncIterator[SerialEnd]:
     """An amplifier on a line."""
-    end = SerialEnd([Station(Bench(coarse_rig, now=time.monotonic()), "main")])
+    end = SerialEnd([SimulatedDevice(Bench(coarse_rig, now=time.monotonic()), "main")])
     end.start()
     yield end
     end.close()

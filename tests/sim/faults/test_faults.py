@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 from model.errors import InputError
-from sim.faults.episodes import Episode, FaultKind, Faults
-from sim.faults.file import load_faults
+from sim.faults.fault_file import load_faults
+from sim.faults.fault_window import FaultKind, Faults, FaultWindow
 from sim.transport.line import Line
 
 TELEGRAM = bytes(range(40))
@@ -31,8 +31,8 @@ def test_a_file_says_what_goes_wrong_and_when(tmp_path: Path) -> None:
     )
     file = load_faults(path, amplifiers=["east", "west"])
     east = file.of("east", begin=100.0)
-    assert east.episodes == [Episode("drop", 2.0, 1.5, share=0.2, toward="host")]
-    assert len(file.of("west", begin=100.0).episodes) == 2
+    assert east.windows == [FaultWindow("drop", 2.0, 1.5, share=0.2, toward="host")]
+    assert len(file.of("west", begin=100.0).windows) == 2
     assert [east.now("drop", time) for time in (101.9, 102.0, 103.4, 103.5)] == [
         *(False, True, True, False)
     ]
@@ -64,14 +64,14 @@ def test_every_mistake_is_told_with_its_line(tmp_path: Path) -> None:
             "truncate",
             lambda arrived: TELEGRAM.startswith(arrived[0][1]) and len(arrived[0][1]) < 40,
         ),
-        ("torn_commit", lambda arrived: len(arrived[0][1]) < 40),
+        ("incomplete_set", lambda arrived: len(arrived[0][1]) < 40),
         ("delay", lambda arrived: 0 < arrived[0][0] <= 0.1 and arrived[0][1] == TELEGRAM),
         ("corrupt", lambda arrived: 1 <= flipped_bits(arrived[0][1]) <= 3),
     ],
 )
 def test_what_befalls_a_telegram(kind: str, is_so: "object") -> None:
     """Each fault does what its name says, and only while it is on."""
-    faults = Faults([Episode(kind, at=1.0, lasts=1.0)], begin=10.0, seed=3)
+    faults = Faults([FaultWindow(kind, at=1.0, lasts=1.0)], begin=10.0, seed=3)
     assert is_so(faults.pass_on(TELEGRAM, toward="amplifier", time=11.5))
     for time in (10.5, 12.0):
         assert faults.pass_on(TELEGRAM, toward="amplifier", time=time) == [(0.0, TELEGRAM)]
@@ -86,7 +86,7 @@ def test_a_share_of_telegrams_in_one_direction() -> None:
     """A fifth of many, those towards the host only; the same seed, the same ones."""
     runs = []
     for _ in range(2):
-        faults = Faults([Episode("drop", share=0.2, toward="host")], seed=5)
+        faults = Faults([FaultWindow("drop", share=0.2, toward="host")], seed=5)
         runs.append([bool(faults.pass_on(TELEGRAM, toward="host", time=1.0)) for _ in range(2000)])
     assert runs[0] == runs[1]
     assert 0.17 < runs[0].count(False) / 2000 < 0.23
@@ -128,8 +128,8 @@ async def test_a_closed_line_delivers_nothing_more() -> None:
 
 def test_a_telegram_may_be_cut_and_flipped_by_several_faults_at_once() -> None:
     """What is cut to nothing does not arrive, and nothing stumbles over it."""
-    kinds: tuple[FaultKind, ...] = ("truncate", "truncate", "corrupt", "torn_commit")
-    faults = Faults([Episode(kind) for kind in kinds])
+    kinds: tuple[FaultKind, ...] = ("truncate", "truncate", "corrupt", "incomplete_set")
+    faults = Faults([FaultWindow(kind) for kind in kinds])
     arrived = [faults.pass_on(b"ab", toward="amplifier", time=1.0) for _ in range(200)]
     assert {len(data) for telegrams in arrived for _, data in telegrams} <= {1}
     assert [] in arrived

@@ -63,7 +63,7 @@ async def test_stepped_recorded_touched_and_broken(tmp_path: Path) -> None:
             assert (await far_end.ask("state"))["amplifiers"]["main"]["fault"] == "WATCHDOG"
             await amplifier.clear()
             await amplifier.arm(0.5)
-            assert (await far_end.ask("befall", fault="arc", amplifier="main"))["ok"]
+            assert (await far_end.ask("inject_fault", fault="arc", amplifier="main"))["ok"]
             assert (await far_end.ask("state"))["amplifiers"]["main"]["fault"] == "ARC"
             befallen = (await far_end.ask("state"))["time_s"]
             assert (await far_end.ask("faults"))["faults"]["main"] == [
@@ -73,9 +73,9 @@ async def test_stepped_recorded_touched_and_broken(tmp_path: Path) -> None:
             assert (await far_end.ask("faults")) == {"faults": {"main": []}}
             assert (
                 "none of the far end's"
-                in (await far_end.ask("befall", fault="arc", amplifier="x"))["error"]
+                in (await far_end.ask("inject_fault", fault="arc", amplifier="x"))["error"]
             )
-            assert "share" in (await far_end.ask("befall", fault="drop", share=2))["error"]
+            assert "share" in (await far_end.ask("inject_fault", fault="drop", share=2))["error"]
             assert "seconds" in (await far_end.ask("step", seconds=-1))["error"]
         finally:
             await amplifier.close()
@@ -101,7 +101,7 @@ async def test_what_is_due_within_a_step_happens_at_its_time(tmp_path: Path) -> 
             guard = Guard(GuardLimits(40, 500, 1), amplifier.capabilities)
             wanted = CommandSet(1, (DriveCommand(0, 110.0, 0.5),), ramp=0.0, valid_for=0.0)
             await amplifier.apply(guard.check(wanted))
-            await far_end.ask("befall", fault="over_temperature", lasts=1.0)
+            await far_end.ask("inject_fault", fault="over_temperature", lasts=1.0)
             await far_end.ask("step", seconds=0.8)
             assert (await far_end.ask("state"))["amplifiers"]["main"]["fault"] == "OVER_TEMPERATURE"
             signals = await far_end.ask("signals", since_s=0.3, until_s=0.8)

@@ -7,15 +7,15 @@ from drivers.command import CommandSet, DriveCommand
 from drivers.protocol.messages import Apply, Arm
 from model.rig.rig import Rig
 from sim.bench.bench import Bench
-from sim.control.site import Site
+from sim.control.context import SimulationContext
 from sim.process.view import PlateView, draw
 
 
-def shown(site: Site, plate: PlateView) -> str:
+def shown(context: SimulationContext, plate: PlateView) -> str:
     """The view as text on a usual terminal."""
     console = Console(width=80, force_terminal=False)
     with console.capture() as capture:
-        console.print(draw(site, plate))
+        console.print(draw(context, plate))
     return capture.get()
 
 
@@ -27,14 +27,14 @@ def rows_of(text: str) -> list[str]:
 def test_the_plate_is_drawn_the_right_way_up_and_as_it_shakes(coarse_rig: Rig) -> None:
     """ERAs in the corners, the finger where it is, nothing at rest, and the most where most is."""
     bench = Bench(coarse_rig, now=0.0)
-    site = Site(bench, urls={"main": "serial:///dev/pts/7?baud=921600"})
+    context = SimulationContext(bench, urls={"main": "serial:///dev/pts/7?baud=921600"})
     plate = PlateView(bench)
     bench.taps.append(plate)
-    untouched = shown(site, plate).splitlines()
+    untouched = shown(context, plate).splitlines()
     assert len(untouched) < 24
     assert max(map(len, untouched)) <= 80
     bench.place_fingers({"1": (0.25, 0.05)}, now=0.0)
-    still = shown(site, plate)
+    still = shown(context, plate)
     rows = rows_of(still)
     assert [row[0] + row[-1] for row in (rows[0], rows[-1])] == ["EE", "EE"]
     # 0.25 of 0.3048 m from the left, 0.05 of 0.2286 m from below.
@@ -45,7 +45,7 @@ def test_the_plate_is_drawn_the_right_way_up_and_as_it_shakes(coarse_rig: Rig) -
     bench.exchange("main", Apply(wanted), now=0.1)
     bench.advance(1.0)
     bench.advance(1.3)
-    moving = shown(site, plate)
+    moving = shown(context, plate)
     assert "OPERATION_ENABLED" in moving
     assert " 50%    0%    0%    0%" in moving
     assert "1.3 s" in moving

@@ -29,12 +29,12 @@ from drivers.guard import Guard, GuardLimits, SafeCommandSet
 from drivers.protocol.messages import AmplifierEvent, AmplifierState, Apply, Fault, Hello, Ping
 from model.rig.rig import Rig
 from sim.bench.bench import Bench
-from sim.bench.station import Station
+from sim.bench.simulated_device import SimulatedDevice
 from sim.far_ends.can_bus.bus import CanBus
 from sim.far_ends.can_bus.ends import nodes_on
 from sim.far_ends.can_bus.node import CanNode
 from sim.far_ends.wires import Wire
-from sim.faults.episodes import Episode
+from sim.faults.fault_window import FaultWindow
 from wires import FarSide, far_side
 
 PATIENCE = 5.0  # s; for a loaded machine, not an expectation
@@ -106,16 +106,16 @@ class Virtual:
 async def virtual_side(rig: Rig) -> AsyncIterator[Virtual]:
     """The amplifiers of a rig on a virtual bus."""
     bench = Bench(rig, now=time.monotonic())
-    stations = {name: Station(bench, name) for name in bench.amplifiers}
+    devices = {name: SimulatedDevice(bench, name) for name in bench.amplifiers}
     bus = CanBus()
-    async with nodes_on(bus, list(stations.values())):
+    async with nodes_on(bus, list(devices.values())):
         gateway = Gateway(bus)
         try:
-            yield Virtual(gateway, FarSide({}, stations, bench))
+            yield Virtual(gateway, FarSide({}, devices, bench))
         finally:
             await gateway.close()
-            for station in stations.values():
-                station.close()
+            for device in devices.values():
+                device.close()
 
 
 @pytest.fixture
@@ -260,7 +260,7 @@ async def test_what_is_not_played_as_asked_is_read_back(virtual: Virtual) -> Non
     """An amplifier that is warm plays half, and says so in the answer and the achieved levels."""
     async with opened(virtual.url()) as amplifier:
         await amplifier.arm(2.0)
-        virtual.far.station.befall(Episode("over_temperature", lasts=60.0))
+        virtual.far.device.inject_fault(FaultWindow("over_temperature", lasts=60.0))
         wanted = tones(amplifier, 0.4, 0.2)
         achieved = await amplifier.apply(wanted)
         assert achieved.token == wanted.token
@@ -516,7 +516,7 @@ async def test_a_server_that_hangs_up_is_noticed_at_once(coarse_rig: Rig) -> Non
         amplifier = Amplifier(CanBackend(url), reply_timeout=0.5)
         await amplifier.open()
         try:
-            far.station.befall(Episode("unplug"))
+            far.device.inject_fault(FaultWindow("unplug"))
             await eventually(lambda: amplifier.is_lost)
         finally:
             await amplifier.close()
@@ -525,12 +525,12 @@ async def test_a_server_that_hangs_up_is_noticed_at_once(coarse_rig: Rig) -> Non
 async def test_two_amplifiers_of_one_number_are_refused(virtual: Virtual) -> None:
     """A second, different answer to who is there: neither is talked to."""
     other = replace(virtual.far.amplifier.identity, serial_number="TWIN")
-    station = type("Twin", (), {})()
+    device = type("Twin", (), {})()
     for name in ("capabilities", "faults", "is_answering", "listen", "status", "exchange"):
-        setattr(station, name, getattr(virtual.far.station, name))
-    station.identity = other
+        setattr(device, name, getattr(virtual.far.device, name))
+    device.identity = other
     bus = virtual.gateway.bus
-    twin = CanNode(station, 1, send=lambda frame: bus.send(frame, sender=hear))
+    twin = CanNode(device, 1, send=lambda frame: bus.send(frame, sender=hear))
 
     def hear(frame: CanFrame) -> None:
         twin.receive(frame)
@@ -596,8 +596,8 @@ async def test_events_are_told(virtual: Virtual) -> None:
     await amplifier.open()
     try:
         await amplifier.arm(2.0)
-        virtual.far.station.befall(Episode("arc"))
-        await eventually(lambda: virtual.far.station.status().state is AmplifierState.FAULT)
+        virtual.far.device.inject_fault(FaultWindow("arc"))
+        await eventually(lambda: virtual.far.device.status().state is AmplifierState.FAULT)
         await amplifier.clear()
         await eventually(
             lambda: AmplifierEvent(AmplifierState.SWITCH_ON_DISABLED, Fault.NONE) in events

@@ -55,7 +55,7 @@ from modbus_session import (
     SET,
     SHAPE,
     TRIPPED,
-    ScriptedStation,
+    ScriptedDevice,
 )
 from sim.far_ends.modbus.frames import Request as Telegram
 from sim.far_ends.modbus.unit import ModbusUnit
@@ -181,10 +181,10 @@ async def test_more_faults_than_usual_are_read_in_two_steps(
     records = tuple(FaultRecord(Fault.ARC, number % 4, float(number)) for number in range(32))
     for count, reads in ((4, 1), (5, 2), (30, 2)):
         far.requests.clear()
-        far.station.answer = lambda _, count=count: FaultList(records[:count])
+        far.device.answer = lambda _, count=count: FaultList(records[:count])
         assert await backend.exchange(GetFaults(), timeout=PATIENCE) == FaultList(records[:count])
         assert len(far.requests) == reads
-    far.station.answer = lambda _: FaultList(records)
+    far.device.answer = lambda _: FaultList(records)
     answer = await backend.exchange(GetFaults(), timeout=PATIENCE)
     assert answer == FaultList(records[:30])
 
@@ -197,7 +197,7 @@ async def test_without_function_23_it_goes_on_with_two(far: Peer, backend: Modbu
     assert await backend.exchange(Apply(SET), timeout=PATIENCE) == Achieved(513, COMMANDS)
     assert await backend.exchange(Ping(), timeout=PATIENCE) == ARMED
     assert far.functions == [23, 16, 4, 6, 4]
-    carried_out = [one for one in far.station.asked if not isinstance(one, GetStatus)]
+    carried_out = [one for one in far.device.asked if not isinstance(one, GetStatus)]
     assert [type(request) for request in carried_out] == [Apply, Ping]
 
 
@@ -211,7 +211,7 @@ async def test_every_refusal_is_told_with_its_reason(
 ) -> None:
     """Whatever exception it came as; busy is taken at its word, the others are read."""
     backend._can_read_back = combined
-    far.station.answer = lambda _: Nak(code, 2)
+    far.device.answer = lambda _: Nak(code, 2)
     nak = await backend.exchange(Apply(SET), timeout=PATIENCE)
     is_busy = code is NakCode.BUSY
     assert nak == Nak(code, None if is_busy else 2)
@@ -253,10 +253,10 @@ async def test_a_late_answer_is_not_credited_to_the_next_request(
         return pdu
 
     far.answer = answer
-    far.station.answer = lambda _: replace(ARMED, token=1)
+    far.device.answer = lambda _: replace(ARMED, token=1)
     with pytest.raises(LinkTimeout):
         await backend.exchange(GetStatus(), timeout=SHORT)
-    far.station.answer = lambda _: replace(ARMED, token=2)
+    far.device.answer = lambda _: replace(ARMED, token=2)
     for _ in range(3):  # and copies of it later
         status = await backend.exchange(GetStatus(), timeout=PATIENCE)
         assert status == replace(ARMED, token=2)
@@ -281,10 +281,10 @@ async def test_a_late_refusal_is_not_credited_to_the_next_request(
         return pdu
 
     far.answer = answer
-    far.station.answer = lambda _: Nak(NakCode.WRONG_STATE)
+    far.device.answer = lambda _: Nak(NakCode.WRONG_STATE)
     with pytest.raises(LinkTimeout):
         await backend.exchange(Apply(SET), timeout=SHORT)
-    far.station.answer = far.station.usual_answer
+    far.device.answer = far.device.usual_answer
     if far.is_rtu:
         with pytest.raises(LinkTimeout, match="names no reason"):
             await backend.exchange(Arm(0.25), timeout=PATIENCE)
@@ -377,13 +377,13 @@ async def test_an_echo_of_another_write_is_dropped(place: int) -> None:
 async def test_an_answer_out_of_range_is_refused(far: Peer, backend: ModbusBackend) -> None:
     """A state that does not exist, with a good check, is the amplifier's mistake: FrameError."""
     await backend.exchange(GetCaps(), timeout=PATIENCE)
-    far.station.answer = lambda _: replace(ARMED, state=9)  # type: ignore[arg-type]
+    far.device.answer = lambda _: replace(ARMED, state=9)  # type: ignore[arg-type]
     with pytest.raises(FrameError, match="AmplifierState 9"):
         await backend.exchange(Ping(), timeout=PATIENCE)
-    far.station.answer = lambda _: replace(ARMED, levels=(0.0,) * 5)
+    far.device.answer = lambda _: replace(ARMED, levels=(0.0,) * 5)
     with pytest.raises(FrameError, match="5 channels where 4 were read"):
         await backend.exchange(Ping(), timeout=PATIENCE)
-    far.station.answer = lambda request: (
+    far.device.answer = lambda request: (
         replace(ARMED, levels=(0.0,) * 5)
         if isinstance(request, GetStatus)
         else Achieved(513, COMMANDS)
@@ -484,7 +484,7 @@ async def test_a_broadcast_goes_to_unit_0_and_waits_for_nobody(
     assert far.requests[0].pdu == bytes.fromhex("06 00 10 02 01")  # as on the vendor page
     far.unit.hear(far.requests[0].pdu)
     far.unit.hear(far.requests[1].pdu)
-    assert far.station.heard == [Commit(513), Stop(0.005)]
+    assert far.device.heard == [Commit(513), Stop(0.005)]
 
 
 async def test_what_is_cancelled_leaves_its_answer_the_time_to_come(
@@ -519,7 +519,7 @@ async def test_events_are_what_answers_show_to_have_changed(
     told: list[AmplifierEvent] = []
     backend.listen(told.append, lambda _: None)
     for status in (ARMED, ARMED, TRIPPED, TRIPPED, ARMED):
-        far.station.answer = lambda _, status=status: status
+        far.device.answer = lambda _, status=status: status
         await backend.exchange(GetStatus(), timeout=PATIENCE)
     assert told == [
         AmplifierEvent(AmplifierState.FAULT, Fault.WATCHDOG),
@@ -604,7 +604,7 @@ async def test_a_server_that_is_not_ours_understands_the_frames(framer: FramerTy
 async def test_two_amplifiers_of_one_unit_are_refused() -> None:
     """Over RTU two different answers to one Hello; one that came twice is no second amplifier."""
     async with peer(is_rtu=True) as far:
-        second = ScriptedStation()
+        second = ScriptedDevice()
         second.answer = lambda request: (
             replace(IDENTITY, serial_number="B-18")
             if isinstance(request, Hello)

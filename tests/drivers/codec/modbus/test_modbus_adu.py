@@ -11,7 +11,7 @@ from drivers.codec.modbus.adu import ModbusResponse, RequestAdu, ResponseReader,
 from drivers.errors import FrameError
 from drivers.protocol.messages import Apply, Ping, Status
 from drivers.statistics import WireCounters
-from modbus_session import ARMED, SET, ScriptedStation
+from modbus_session import ARMED, SET, ScriptedDevice
 from sim.far_ends.modbus.frames import PAUSE, Request, RtuReader, TcpReader, rtu_frame, tcp_frame
 from sim.far_ends.modbus.unit import ModbusUnit
 
@@ -22,7 +22,7 @@ def asked_and_answered(is_rtu: bool) -> tuple[RequestAdu, bytes]:
     telegram = build_adu(
         exchange.read, exchange.write, unit=1, transaction=0 if is_rtu else 300, is_rtu=is_rtu
     )
-    unit = ModbusUnit(ScriptedStation())
+    unit = ModbusUnit(ScriptedDevice())
     pdu = unit.answer(telegram.frame[1:-2] if is_rtu else telegram.frame[7:])
     assert pdu is not None
     return telegram, rtu_frame(1, pdu) if is_rtu else tcp_frame(Request(1, b"", 300), pdu)

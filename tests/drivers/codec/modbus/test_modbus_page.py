@@ -12,7 +12,7 @@ from drivers.command import CommandSet, Envelope
 from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.messages import Apply, Commit, LoadEnvelope, Nak, Ping, Request, Stage, Stop
 from drivers.statistics import WireCounters
-from modbus_session import EXAMPLES, ScriptedStation
+from modbus_session import EXAMPLES, ScriptedDevice
 from sim.far_ends.modbus.frames import Request as Asked
 from sim.far_ends.modbus.frames import rtu_frame, tcp_frame
 from sim.far_ends.modbus.unit import ModbusUnit
@@ -55,10 +55,10 @@ def telegram(
     return build_adu(read, write, unit=unit, transaction=0 if is_rtu else number, is_rtu=is_rtu)
 
 
-def answered(station: ScriptedStation, name: str, wire: str) -> bytes:
+def answered(device: ScriptedDevice, name: str, wire: str) -> bytes:
     """What the far end answers to a request of the page, as a frame."""
     request = FRAMES[f"{name} request, {wire}"]
-    pdu = ModbusUnit(station).answer(pdu_of(request, wire))
+    pdu = ModbusUnit(device).answer(pdu_of(request, wire))
     assert pdu is not None
     if wire == "RTU":
         return rtu_frame(1, pdu)
@@ -114,19 +114,19 @@ def test_the_host_understands_the_reply(name: str, number: int, wire: str) -> No
 @every_example
 def test_the_far_end_understands_and_answers(name: str, number: int, wire: str) -> None:
     """The far end, which shares no code with the host, reads the message and says the reply."""
-    station = ScriptedStation()
-    station.tell(EXAMPLES[name])
-    assert answered(station, name, wire) == FRAMES[f"{name} reply, {wire}"]
-    assert station.asked[0] == plain(EXAMPLES[name].request)
+    device = ScriptedDevice()
+    device.tell(EXAMPLES[name])
+    assert answered(device, name, wire) == FRAMES[f"{name} reply, {wire}"]
+    assert device.asked[0] == plain(EXAMPLES[name].request)
 
 
 @every_wire
 def test_the_reason_of_a_refusal_can_be_read(wire: str) -> None:
     """The far end names it with the tag of the refused write, and the host takes it for its own."""
-    station, name = ScriptedStation(), "Refused Apply"
+    device, name = ScriptedDevice(), "Refused Apply"
     number = dict(NUMBERED)[name]
-    station.tell(EXAMPLES[name])
-    unit = ModbusUnit(station)
+    device.tell(EXAMPLES[name])
+    unit = ModbusUnit(device)
     unit.answer(pdu_of(FRAMES[f"{name} request, {wire}"], wire))
     sent = telegram(exchanges.refusal_read(), None, number, wire)
     assert sent.frame == FRAMES[f"Refusal request, {wire}"]
@@ -142,9 +142,9 @@ def test_the_reason_of_a_refusal_can_be_read(wire: str) -> None:
 def test_without_function_23_it_takes_two(wire: str) -> None:
     """The same block by function 16, whose echo is checked, and its outcome by function 4."""
     exchange, example = exchange_of("Apply", 20), EXAMPLES["Apply"]
-    station = ScriptedStation()
-    station.tell(example)
-    unit = ModbusUnit(station)
+    device = ScriptedDevice()
+    device.tell(example)
+    unit = ModbusUnit(device)
     steps = {"FC16 Apply": (None, exchange.write), "FC4 Apply": (exchange.read, None)}
     for number, (name, (read, write)) in enumerate(steps.items(), start=20):
         sent = telegram(read, write, number, wire)
@@ -164,9 +164,9 @@ def test_broadcasts_are_heard(name: str, wire: str) -> None:
     number, request = BROADCASTS[name]
     sent = telegram(None, exchanges.encode_broadcast(request), number, wire, unit=0)
     assert sent.frame == FRAMES[f"{name} request, {wire}"]
-    station = ScriptedStation()
-    ModbusUnit(station).hear(pdu_of(sent.frame, wire))
-    assert station.heard == [request]
+    device = ScriptedDevice()
+    ModbusUnit(device).hear(pdu_of(sent.frame, wire))
+    assert device.heard == [request]
 
 
 @every_wire
@@ -175,15 +175,15 @@ def test_other_masters_are_served(wire: str) -> None:
 
     The objects are those of the standard: 0, 1 and 2, and 128 as the first of the vendor's own.
     """
-    station = ScriptedStation()
-    station.tell(EXAMPLES["Hello"])
+    device = ScriptedDevice()
+    device.tell(EXAMPLES["Hello"])
     reply = FRAMES[f"FC43 Identification reply, {wire}"]
-    assert answered(station, "FC43 Identification", wire) == reply
+    assert answered(device, "FC43 Identification", wire) == reply
     for number, text in ((0, b"Acme"), (1, b"Quad"), (2, b"1.2"), (0x80, b"A-17")):
         assert bytes([number, len(text)]) + text in reply
-    station = ScriptedStation()
-    assert answered(station, "FC6 Ping", wire) == FRAMES[f"FC6 Ping reply, {wire}"]
-    assert station.asked == [Ping()]
+    device = ScriptedDevice()
+    assert answered(device, "FC6 Ping", wire) == FRAMES[f"FC6 Ping reply, {wire}"]
+    assert device.asked == [Ping()]
 
 
 def addresses() -> dict[int, str]:

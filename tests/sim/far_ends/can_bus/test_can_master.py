@@ -79,7 +79,7 @@ async def test_a_master_of_others_drives_it(coarse_rig: Rig) -> None:
             waiting = asyncio.create_task(asyncio.to_thread(master.wait_for_emergency))
             async with asyncio.timeout(PATIENCE):
                 while (  # noqa: ASYNC110  time passes only for who asks
-                    far.station.status().fault is not Fault.WATCHDOG
+                    far.device.status().fault is not Fault.WATCHDOG
                 ):
                     await asyncio.sleep(0.01)
             assert await waiting == (0x8130, 0x11)

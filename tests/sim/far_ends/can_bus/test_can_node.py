@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 import pytest
 
-from can_fuzz import Station
+from can_fuzz import FakeDevice
 from can_session import Timers
 from drivers.codec.can_bus.frame import CanFrame
 from drivers.protocol.messages import AmplifierState, Fault, Ping
@@ -19,10 +19,10 @@ class Bench:
     """A node 1 with four channels, in operation and armed; `said` since it was last asked."""
 
     def __init__(self) -> None:
-        self.station = Station()
+        self.device = FakeDevice()
         self.said: list[CanFrame] = []
         self.timers = Timers()
-        self.node = CanNode(self.station, 1, send=self.said.append)  # type: ignore[arg-type]
+        self.node = CanNode(self.device, 1, send=self.said.append)  # type: ignore[arg-type]
         self.node.start(self.timers.call_later)
 
     def tell(self, id: int, data: str) -> list[CanFrame]:
@@ -44,12 +44,12 @@ class Bench:
     @property
     def state(self) -> AmplifierState:
         """Of the amplifier."""
-        return self.station.amplifier.state
+        return self.device.amplifier.state
 
     @property
     def levels(self) -> tuple[float, ...]:
         """What it plays."""
-        return self.station.status().levels
+        return self.device.status().levels
 
 
 @pytest.fixture
@@ -206,16 +206,16 @@ def test_silence_is_never_refused_for_its_ramp(
 def test_the_host_s_heartbeat_feeds_and_no_other_does(bench: Bench) -> None:
     """127 armed it: its heartbeat is a sign of life, that of 126 and a status are none."""
     for feeding, id in ((False, 0x77E), (True, 0x77F)):
-        bench.station.asked.clear()
+        bench.device.asked.clear()
         bench.tell(id, "05")
-        assert (Ping() in bench.station.asked) is feeding
-    bench.station.pass_time(0.2)
+        assert (Ping() in bench.device.asked) is feeding
+    bench.device.pass_time(0.2)
     bench.tell(0x77F, "05")
-    bench.station.pass_time(0.2)
+    bench.device.pass_time(0.2)
     assert bench.state is AmplifierState.OPERATION_ENABLED
     bench.tell(ORDER, "0000 0000 0000 00 05")
-    bench.station.pass_time(0.051)
-    assert bench.station.amplifier.fault is Fault.WATCHDOG
+    bench.device.pass_time(0.051)
+    assert bench.device.amplifier.fault is Fault.WATCHDOG
 
 
 @pytest.mark.parametrize("nmt", ["02 01", "80 01", "82 01", "02 00"])
@@ -226,7 +226,7 @@ def test_out_of_operation_it_is_stopped(bench: Bench, nmt: str) -> None:
     bench.sync()
     bench.tell(0x000, nmt)
     assert bench.state is AmplifierState.QUICK_STOP_ACTIVE
-    bench.station.pass_time(0.005)
+    bench.device.pass_time(0.005)
     assert not any(bench.levels)
     assert bench.tell(ORDER, "0000 0000 0000 00 05") == []
 
@@ -254,8 +254,8 @@ def test_a_reset_node_has_lost_everything(bench: Bench) -> None:
 def test_a_fault_is_an_emergency_until_it_is_cleared(bench: Bench) -> None:
     """Code and register by the table of CiA 301, state, fault, channel; code 0 in the end."""
     bench.said.clear()
-    bench.station.amplifier.trip(Fault.ARC, bench.station.now, channel=2)
-    bench.station.pass_time(0.01)
+    bench.device.amplifier.trip(Fault.ARC, bench.device.now, channel=2)
+    bench.device.pass_time(0.01)
     assert bench.said == [
         CanFrame(0x081, bytes.fromhex("4023 03 46 02 000000")),
         CanFrame(0x081, bytes.fromhex("4023 03 47 FF 000000")),

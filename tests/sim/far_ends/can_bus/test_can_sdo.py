@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import drivers
-from can_fuzz import Station
+from can_fuzz import FakeDevice
 from drivers.codec.can_bus.eds import eds_text
 from drivers.codec.can_bus.frame import CanFrame
 from sim.far_ends.can_bus import sdo
@@ -147,7 +147,7 @@ def test_any_frames_are_answered_or_not_but_never_more(frames: list[bytes]) -> N
 @pytest.fixture
 def node() -> canopen.RemoteNode:
     """A far end as `canopen` sees it with the data sheet."""
-    station = Station()
+    device = FakeDevice()
 
     class Wire(canopen.Network):
         def send_message(self, can_id: int, data: bytes, remote: bool = False) -> None:
@@ -156,7 +156,7 @@ def node() -> canopen.RemoteNode:
 
     network = Wire()
     far = CanNode(
-        station,  # type: ignore[arg-type]
+        device,  # type: ignore[arg-type]
         5,
         send=lambda frame: network.notify(frame.id, bytearray(frame.data), 0.0),
     )

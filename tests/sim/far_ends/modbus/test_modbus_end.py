@@ -17,7 +17,7 @@ from pymodbus.client import AsyncModbusTcpClient
 from drivers.errors import LinkError
 from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.messages import AmplifierState, Commit, Fault, NakCode, Ping, Stop
-from modbus_session import EXAMPLES, ScriptedStation
+from modbus_session import EXAMPLES, ScriptedDevice
 from model.rig.file import example_rig_path
 from model.rig.rig import Rig
 from sim.far_ends.modbus.end import ModbusRtuEnd, ModbusTcpEnd
@@ -102,9 +102,9 @@ class Master:
 
 
 @contextlib.asynccontextmanager
-async def scripted(wire: str, *stations: ScriptedStation) -> AsyncIterator[Master]:
+async def scripted(wire: str, *devices: ScriptedDevice) -> AsyncIterator[Master]:
     """A raw master at a far end with scripted amplifiers."""
-    end = ModbusTcpEnd(stations) if wire == "TCP" else ModbusRtuEnd(stations)
+    end = ModbusTcpEnd(devices) if wire == "TCP" else ModbusRtuEnd(devices)
     if isinstance(end, ModbusTcpEnd):
         await end.start()
     else:
@@ -139,12 +139,12 @@ every_wire = pytest.mark.parametrize("wire", ["RTU", "TCP"])
 @every_wire
 async def test_the_session_of_the_vendor_page(wire: str) -> None:
     """Its request bytes, sent over a real wire, bring its reply bytes, one after the other."""
-    station = ScriptedStation()
-    async with scripted(wire, station) as master:
+    device = ScriptedDevice()
+    async with scripted(wire, device) as master:
         for name, example in EXAMPLES.items():
             if name == "GetCaps":  # its tag is the one before it, and before it there is none
                 assert master.received == b""
-            station.tell(example)
+            device.tell(example)
             master.send(FRAMES[f"{name} request, {wire}"])
             reply = FRAMES[f"{name} reply, {wire}"]
             assert await master.receive(len(reply)) == reply, name
@@ -159,9 +159,9 @@ async def test_two_requests_in_one_piece_and_one_in_many(wire: str) -> None:
     """Both are answered in their order; slow bytes make one request all the same."""
     arm, ping = (FRAMES[f"{name} request, {wire}"] for name in ("Arm", "Ping"))
     expected = FRAMES[f"Arm reply, {wire}"]
-    station = ScriptedStation()
-    async with scripted(wire, station) as master:
-        station.tell(EXAMPLES["Arm"])
+    device = ScriptedDevice()
+    async with scripted(wire, device) as master:
+        device.tell(EXAMPLES["Arm"])
         master.send(ping + arm)
         replies = await master.receive(2 * len(expected))
         assert replies[len(expected) :] == expected
@@ -183,47 +183,47 @@ async def test_the_next_good_frame_is_understood(wire: str, damage: str) -> None
         "garbage before": b"\x17\x55\xaa\x00\xff\x31",
         "length": stop[:5] + bytes([0xFF]) + stop[6:],
     }[damage]
-    station = ScriptedStation()
-    async with scripted(wire, station) as master:
+    device = ScriptedDevice()
+    async with scripted(wire, device) as master:
         master.send(damaged)
         await asyncio.sleep(PAUSE + 0.02)
-        station.tell(EXAMPLES["Ping"])
+        device.tell(EXAMPLES["Ping"])
         master.received.clear()
         master.send(ping)
         reply = FRAMES[f"Ping reply, {wire}"]
         assert await master.receive(len(reply)) == reply
-        assert not any(isinstance(request, Stop) for request in station.asked)
+        assert not any(isinstance(request, Stop) for request in device.asked)
 
 
 @every_wire
 async def test_frames_for_others_are_not_answered(wire: str) -> None:
     """Another unit is silent: the first answer is that of the frame after it."""
     ping = FRAMES[f"Ping request, {wire}"]
-    station = ScriptedStation()
-    async with scripted(wire, station) as master:
+    device = ScriptedDevice()
+    async with scripted(wire, device) as master:
         other = bytearray(ping)
         other[0 if wire == "RTU" else 6] = 9
         if wire == "RTU":
             other[-2:] = struct.pack("<H", crc(bytes(other[:-2])))
         master.send(bytes(other))
-        station.tell(EXAMPLES["Ping"])
+        device.tell(EXAMPLES["Ping"])
         master.send(ping)
         reply = FRAMES[f"Ping reply, {wire}"]
         assert await master.receive(len(reply)) == reply
-        assert station.asked.count(Ping()) == 1
+        assert device.asked.count(Ping()) == 1
 
 
 async def test_over_tcp_the_only_one_is_also_unit_255() -> None:
     """As masters have it that know no units; where there are several, nobody is."""
     ping = bytearray(FRAMES["Ping request, TCP"])
     ping[6] = 255
-    station = ScriptedStation()
-    station.tell(EXAMPLES["Ping"])
-    async with scripted("TCP", station) as master:
+    device = ScriptedDevice()
+    device.tell(EXAMPLES["Ping"])
+    async with scripted("TCP", device) as master:
         master.send(bytes(ping))
         reply = FRAMES["Ping reply, TCP"]
         assert (await master.receive(len(reply)))[7:] == reply[7:]
-    pair = ScriptedStation(), ScriptedStation(number=2)
+    pair = ScriptedDevice(), ScriptedDevice(number=2)
     async with scripted("TCP", *pair) as master:
         master.send(bytes(ping))
         await asyncio.sleep(0.02)
@@ -234,7 +234,7 @@ async def test_over_tcp_the_only_one_is_also_unit_255() -> None:
 @every_wire
 async def test_a_broadcast_reaches_every_unit_and_nobody_answers(wire: str) -> None:
     """Commit and stop to unit 0 are heard by all; a set to unit 0 by nobody."""
-    pair = ScriptedStation(), ScriptedStation(number=2)
+    pair = ScriptedDevice(), ScriptedDevice(number=2)
     async with scripted(wire, *pair) as master:
         apply = bytearray(FRAMES[f"FC16 Apply request, {wire}"])
         apply[0 if wire == "RTU" else 6] = 0
@@ -246,20 +246,20 @@ async def test_a_broadcast_reaches_every_unit_and_nobody_answers(wire: str) -> N
         master.send(FRAMES[f"Ping request, {wire}"])
         await master.receive(len(FRAMES[f"Ping reply, {wire}"]))
         assert master.received == b""
-    for station in pair:
-        assert station.heard == [Commit(513), Stop(0.005)]
+    for device in pair:
+        assert device.heard == [Commit(513), Stop(0.005)]
 
 
 async def test_an_amplifier_that_hangs_says_nothing() -> None:
     """Neither to requests nor to broadcasts."""
-    station = ScriptedStation()
-    station.is_answering = False
-    async with scripted("TCP", station) as master:
+    device = ScriptedDevice()
+    device.is_answering = False
+    async with scripted("TCP", device) as master:
         for name in ("Hello", "Arm", "Apply", "FC43 Identification"):
             master.send(FRAMES[f"{name} request, TCP"])
         await asyncio.sleep(0.02)
         assert master.received == b""
-    assert station.asked == []
+    assert device.asked == []
 
 
 EXCEPTIONS = {
@@ -309,11 +309,11 @@ async def test_what_cannot_be_is_an_exception(tcp: FarSide, request_: str, answe
     """The PDU gets the exception of the standard, and nothing has changed."""
     master = Master(tcp.url)
     await master.open()
-    before = tcp.station.status()
+    before = tcp.device.status()
     pdu, expected = bytes.fromhex(request_), bytes.fromhex(answer)
     master.send(struct.pack(">HHHB", 77, 0, len(pdu) + 1, 1) + pdu)
     assert await master.receive(9) == struct.pack(">HHHB", 77, 0, 3, 1) + expected
-    after = tcp.station.status()
+    after = tcp.device.status()
     assert (after.state, after.token, after.levels) == (before.state, before.token, before.levels)
     await master.close()
 
@@ -439,8 +439,8 @@ def play_with_minimalmodbus(url: str) -> None:
 
 async def test_a_function_that_is_unknown_ends_with_the_silence_after_it() -> None:
     """Over RTU its length is not known: exception 1 comes once the line is silent."""
-    station = ScriptedStation()
-    async with scripted("RTU", station) as master:
+    device = ScriptedDevice()
+    async with scripted("RTU", device) as master:
         body = bytes([1, 0x41, 1, 2, 3])
         master.send(body + struct.pack("<H", crc(body)))
         expected = bytes([1, 0xC1, 1])
@@ -454,8 +454,8 @@ def test_the_crc_is_that_of_modbus() -> None:
 
 async def test_a_master_that_never_reads_is_hung_up_on() -> None:
     """Its answers fill no memory, and others are served meanwhile."""
-    station = ScriptedStation()
-    end = ModbusTcpEnd([station])
+    device = ScriptedDevice()
+    end = ModbusTcpEnd([device])
     await end.start()
     host, _, port = end.urls["main"].removeprefix("modbus+tcp://").partition("/")[0].partition(":")
     hello = FRAMES["Hello request, TCP"]
@@ -483,7 +483,7 @@ async def test_a_master_that_never_reads_is_hung_up_on() -> None:
 
 async def test_a_crowd_of_masters_is_bounded() -> None:
     """The seventeenth connection is hung up on at once; the first ones go on."""
-    end = ModbusTcpEnd([ScriptedStation()])
+    end = ModbusTcpEnd([ScriptedDevice()])
     await end.start()
     masters = [Master(end.urls["main"]) for _ in range(20)]
     for master in masters:
@@ -499,9 +499,9 @@ async def test_a_crowd_of_masters_is_bounded() -> None:
 
 async def test_a_port_that_is_taken_is_named() -> None:
     """LinkError with the port and what to do."""
-    end = ModbusTcpEnd([ScriptedStation()])
+    end = ModbusTcpEnd([ScriptedDevice()])
     await end.start()
     port = int(re.findall(r":(\d+)/", end.urls["main"])[0])
     with pytest.raises(LinkError, match=f"port {port} cannot be listened on.*0 for any"):
-        await ModbusTcpEnd([ScriptedStation()], port=port).start()
+        await ModbusTcpEnd([ScriptedDevice()], port=port).start()
     await end.close()

@@ -1,8 +1,7 @@
-"""Orders and sets that come to a node in operation, and how it answers them.
+"""Requests and sets sent to an operational CANopen node, and its replies.
 
-An order is carried out as it comes, a set when the SYNC after it has come; whatever still waits for
-a SYNC when another order comes is forgotten. Written, as all of the node, from protocol.yaml's
-description, with nothing of the host's code in it.
+A request is executed on arrival, a set at the SYNC that follows it; a new request discards whatever
+still waits for a SYNC. Written from protocol.yaml, without code of the host's side.
 """
 
 import struct
@@ -26,18 +25,18 @@ from drivers.protocol.messages import (
     Status,
     Stop,
 )
-from sim.bench.station import Station
+from sim.bench.simulated_device import SimulatedDevice
 from sim.far_ends.can_bus.bus import LENGTHS
 from sim.far_ends.can_bus.domains import achieved_domain
 from sim.far_ends.can_bus.objects import IDS, ObjectDictionary, channel_ids, sent_ids
 from sim.far_ends.can_bus.sets import (
+    INCOMPLETE_SET,
     NO_CHANNEL,
     SETS,
     TO_ALL,
-    TORN,
     Action,
-    Order,
     Refused,
+    RequestFrame,
     SetBuffer,
     integers_of,
 )
@@ -45,26 +44,26 @@ from sim.far_ends.can_bus.sets import (
 _Q = PROTOCOL.quantities
 
 
-class Orders:
+class RequestHandler:
     """What a node is told to do; send puts an answer on the bus."""
 
     def __init__(
         self,
-        station: Station,
+        device: SimulatedDevice,
         node: int,
         *,
         objects: ObjectDictionary,
         send: Callable[[CanFrame], None],
     ) -> None:
-        self._station = station
+        self._device = device
         self._node = node
         self._objects = objects
         self._send = send
-        channels = station.capabilities.channels
+        channels = device.capabilities.channels
         self._channel_of = channel_ids(node, channels)
         self._sent_ids = sent_ids(node, channels)
         self._buffer = SetBuffer(channels)
-        self._waiting: Order | None = None  # for its SYNC
+        self._waiting: RequestFrame | None = None  # for its SYNC
         self._asked: tuple[int, list[tuple[object, ...]]] = (0, [])  # token, what was asked
 
     def take(self, cob_id: int, data: bytes, *, fd: bool = False) -> None:
@@ -72,9 +71,9 @@ class Orders:
         if len(data) < 8:
             return
         if cob_id == IDS["order"] + self._node:
-            self._order(data, own=True, fd=fd)
+            self._request(data, own=True, fd=fd)
         elif cob_id == IDS["order"]:
-            self._order(data, own=False, fd=False)
+            self._request(data, own=False, fd=False)
         elif cob_id == IDS["slots"] + self._node and len(data) == 8:
             self._buffer.take_slots(data)
         elif fd and cob_id == IDS["command"] + self._node:
@@ -84,15 +83,15 @@ class Orders:
 
     def sync(self) -> None:
         """Carry out the set that has come, if one has."""
-        order, self._waiting = self._waiting, None
-        if order is not None and order.own:
-            self._carry_out(order, lambda: self._set_request(order))
-        elif order is not None and _Q.token.holds(order.token):
-            self._station.broadcast(Commit(order.token))
-        elif order is None and self._buffer.sequence is not None:
-            # Commands without their order: it was lost, and whoever sent it waits.
-            lost = Order(0, 0, 0, Action.APPLY, 0, self._buffer.sequence, own=True, fd=False)
-            self._answer(lost, result=TORN)
+        request, self._waiting = self._waiting, None
+        if request is not None and request.own:
+            self._carry_out(request, lambda: self._set_request(request))
+        elif request is not None and _Q.token.holds(request.token):
+            self._device.broadcast(Commit(request.token))
+        elif request is None and self._buffer.sequence is not None:
+            # Commands without their request: it was lost, and whoever sent it waits.
+            lost = RequestFrame(0, 0, 0, Action.APPLY, 0, self._buffer.sequence, own=True, fd=False)
+            self._answer(lost, result=INCOMPLETE_SET)
         self.forget()
 
     def forget(self) -> None:
@@ -100,48 +99,50 @@ class Orders:
         self._buffer.clear()
         self._waiting = None
 
-    def _order(self, data: bytes, *, own: bool, fd: bool) -> None:
+    def _request(self, data: bytes, *, own: bool, fd: bool) -> None:
         token, ramp, duration, what, sequence = struct.unpack_from("<HHHBB", data)
-        order = Order(token, ramp, duration, Action(what & 7), what >> 3, sequence, own, fd)
-        is_dropped = sequence == 0 if own else order.action not in TO_ALL
+        request = RequestFrame(
+            token, ramp, duration, Action(what & 7), what >> 3, sequence, own, fd
+        )
+        is_dropped = sequence == 0 if own else request.action not in TO_ALL
         if is_dropped:
             return
         self._waiting = None
         self._buffer.clear_others(sequence)
         if fd:
             self._buffer.take_blocks(data[8:])
-        if order.action in SETS:
-            self._waiting = order
+        if request.action in SETS:
+            self._waiting = request
         elif own:
-            self._carry_out(order, lambda: self._plain_request(order))
+            self._carry_out(request, lambda: self._plain_request(request))
         else:
-            self._station.broadcast(Stop(_nearest_ramp(ramp)))
+            self._device.broadcast(Stop(_nearest_ramp(ramp)))
 
-    def _carry_out(self, order: Order, make: Callable[[], Request]) -> None:
+    def _carry_out(self, request: RequestFrame, make: Callable[[], Request]) -> None:
         try:
-            reply = self._station.exchange(make())
+            reply = self._device.exchange(make())
         except Refused as refused:
-            self._answer(order, result=refused.code, channel=refused.channel)
+            self._answer(request, result=refused.code, channel=refused.channel)
             return
         if reply is None:
             return
         if isinstance(reply, Nak):
             channel = NO_CHANNEL if reply.channel is None else reply.channel
-            self._answer(order, result=reply.code, channel=channel)
+            self._answer(request, result=reply.code, channel=channel)
         elif isinstance(reply, Achieved):
-            self._answer(order, exact=self._is_exact(reply))
+            self._answer(request, exact=self._is_exact(reply))
         else:
-            if order.action is Action.ARM:
-                self._objects.host, self._objects.watchdog = order.token, order.time
-            self._answer(order, condition=self._condition(order, reply))
+            if request.action is Action.ARM:
+                self._objects.host, self._objects.watchdog = request.token, request.time
+            self._answer(request, condition=self._condition(request, reply))
 
-    def _plain_request(self, order: Order) -> Request:
-        ramp = _nearest_ramp(order.ramp)
-        match order.action:
+    def _plain_request(self, request: RequestFrame) -> Request:
+        ramp = _nearest_ramp(request.ramp)
+        match request.action:
             case Action.ARM:  # arm; its token is the number of the host
-                if not _Q.watchdog.holds(order.time) or not 1 <= order.token <= 127:
+                if not _Q.watchdog.holds(request.time) or not 1 <= request.token <= 127:
                     raise Refused(NakCode.BAD_VALUE)
-                return Arm(order.time / 1000)
+                return Arm(request.time / 1000)
             case Action.DISARM:
                 return Disarm(ramp)
             case Action.STOP:
@@ -151,14 +152,14 @@ class Orders:
             case _:
                 return GetStatus()
 
-    def _set_request(self, order: Order) -> Request:
-        if not _Q.token.holds(order.token):
+    def _set_request(self, request: RequestFrame) -> Request:
+        if not _Q.token.holds(request.token):
             raise Refused(NakCode.BAD_TOKEN)
-        if order.action is Action.COMMIT:
-            return Commit(order.token)
-        wanted = self._buffer.command_set(order)
-        self._asked = order.token, [integers_of(command) for command in wanted.commands]
-        return Apply(wanted) if order.action is Action.APPLY else Stage(wanted)
+        if request.action is Action.COMMIT:
+            return Commit(request.token)
+        wanted = self._buffer.command_set(request)
+        self._asked = request.token, [integers_of(command) for command in wanted.commands]
+        return Apply(wanted) if request.action is Action.APPLY else Stage(wanted)
 
     def _is_exact(self, achieved: Achieved) -> bool:
         """Whether a set plays as it was asked for; if not, the host reads what it does."""
@@ -167,14 +168,14 @@ class Orders:
         played = sorted(integers_of(command) for command in achieved.commands)
         return token == achieved.token and played == asked
 
-    def _condition(self, order: Order, reply: Reply) -> list[bytes]:
+    def _condition(self, request: RequestFrame, reply: Reply) -> list[bytes]:
         """How it is: the condition, and the levels of four channels at a time."""
-        status = reply if isinstance(reply, Status) else self._station.status()
+        status = reply if isinstance(reply, Status) else self._device.status()
         levels = [_Q.level.to_wire(min(level, 1.0)) for level in status.levels]
         blocks = [
             struct.pack(
                 "<BBhHBx",
-                order.sequence,
+                request.sequence,
                 status.high_voltage,
                 _Q.temperature.to_wire(min(max(status.temperature, -100), 200)),
                 _Q.voltage.to_wire(status.voltage),
@@ -183,12 +184,12 @@ class Orders:
         ]
         for begin in range(0, len(levels), 4):
             word = sum(level << 14 * place for place, level in enumerate(levels[begin : begin + 4]))
-            blocks.append(word.to_bytes(7, "little") + bytes([order.sequence]))
+            blocks.append(word.to_bytes(7, "little") + bytes([request.sequence]))
         return blocks
 
     def _answer(
         self,
-        order: Order,
+        request: RequestFrame,
         *,
         result: int = 0,
         channel: int = NO_CHANNEL,
@@ -196,11 +197,11 @@ class Orders:
         condition: Sequence[bytes] = (),
     ) -> None:
         """Answer in the kind of frame in which it was asked; the answer itself comes last."""
-        status = self._station.status()
+        status = self._device.status()
         answer = struct.pack(
             "<BBBBHH",
-            order.sequence,
-            order.action | exact << 3 | result << 4,
+            request.sequence,
+            request.action | exact << 3 | result << 4,
             status.state | status.fault << 4,
             channel,
             status.token,
@@ -209,7 +210,7 @@ class Orders:
         blocks = [answer, *condition]
         sent = dict(zip(self._sent_ids, blocks, strict=False))  # the condition may be left out
         self._objects.blocks.update(sent)
-        if order.fd:
+        if request.fd:
             data = b"".join(blocks)
             length = next(length for length in LENGTHS if length >= len(data))
             frame = CanFrame(IDS["answer"] + self._node, data.ljust(length, b"\xff"), fd=True)

@@ -8,21 +8,21 @@ from typing import Any
 
 from model.errors import InputError
 from sim.bench.bench import Bench
-from sim.bench.station import Station
+from sim.bench.simulated_device import SimulatedDevice
 from sim.sensors.on_bench import Accelerometers
 from sim.sensors.recorder import Recorder
 
 
 @dataclass
-class Site:
+class SimulationContext:
     """A bench, and what else there is.
 
-    stations: amplifiers on wires, urls: where, both by name; step: lets virtual time [s] pass, None
+    devices: amplifiers on wires, urls: where, both by name; step: lets virtual time [s] pass, None
     where time is the clock's; recorder: the recording that is being made, if there is one.
     """
 
     bench: Bench
-    stations: Mapping[str, Station] = field(default_factory=dict)
+    devices: Mapping[str, SimulatedDevice] = field(default_factory=dict)
     urls: Mapping[str, str] = field(default_factory=dict)
     step: Callable[[float], Coroutine[Any, Any, None]] | None = None
     recorder: Recorder | None = None
@@ -51,21 +51,21 @@ class Site:
         recorder.stop()
         return recorder
 
-    def stations_of(self, amplifier: str | None) -> Sequence[Station]:
+    def devices_of(self, amplifier: str | None) -> Sequence[SimulatedDevice]:
         """One amplifier's, or those of all; InputError for none."""
         if amplifier is None:
-            return tuple(self.stations.values())
-        if amplifier not in self.stations:
-            known = ", ".join(self.stations) or "no amplifier on a wire"
+            return tuple(self.devices.values())
+        if amplifier not in self.devices:
+            known = ", ".join(self.devices) or "no amplifier on a wire"
             raise InputError(f"{str(amplifier)[:40]!r} is none of the far end's: {known}")
-        return (self.stations[amplifier],)
+        return (self.devices[amplifier],)
 
 
-async def finish_recording(site: Site) -> str | None:
+async def finish_recording(context: SimulationContext) -> str | None:
     """Write the recording that is being made; what to say of it, None where there is none."""
-    if site.recorder is None:
+    if context.recorder is None:
         return None
-    recorder = site.stop_recording()
+    recorder = context.stop_recording()
     await asyncio.to_thread(recorder.finish)
     full = " (as long as it may become; the rest is not in it)" if recorder.is_full else ""
     return f"wrote {recorder.path}: {recorder.seconds:.1f} s{full}"

@@ -25,7 +25,7 @@ from drivers.protocol.messages import (
 )
 from sim.amplifier.heat import AMBIENT, DERATE_ABOVE, FAULT_ABOVE
 from sim.bench.bench import Bench
-from sim.faults.episodes import Episode, Faults
+from sim.faults.fault_window import Faults, FaultWindow
 
 _FAILS = {
     "over_voltage": Fault.OVER_VOLTAGE,
@@ -34,7 +34,7 @@ _FAILS = {
 }
 
 
-class Station:
+class SimulatedDevice:
     """An amplifier of a bench by its name; number: its address on a wire, 1 or more.
 
     Simulated time is the event loop's, by default time.monotonic(), the same in all processes of a
@@ -104,24 +104,24 @@ class Station:
 
     def start(self) -> None:
         """Let the faults that are due later come, in the running event loop."""
-        for episode in self.faults.episodes:
-            self._expect(episode)
+        for window in self.faults.windows:
+            self._expect(window)
 
-    def befall(self, episode: Episode) -> None:
+    def inject_fault(self, window: FaultWindow) -> None:
         """One more fault, from now on: its `at` is not looked at."""
         now = clock.now()
-        episode = replace(episode, at=now - self.faults.begin)
-        self.faults.episodes = (*self.faults.episodes, episode)
-        self._expect(episode)
+        window = replace(window, at=now - self.faults.begin)
+        self.faults.windows = (*self.faults.windows, window)
+        self._expect(window)
 
     def recover(self) -> None:
         """Every fault that is on ends now, and none comes any more."""
         self.close()
         over = clock.now() - self.faults.begin
-        for episode in self.faults.episodes:
-            if episode.at <= over < episode.end:
-                self._pass(replace(episode, lasts=over - episode.at), "end")
-        self.faults.episodes = ()
+        for window in self.faults.windows:
+            if window.at <= over < window.end:
+                self._pass(replace(window, lasts=over - window.at), "end")
+        self.faults.windows = ()
 
     def close(self) -> None:
         """No more faults come."""
@@ -129,26 +129,26 @@ class Station:
             timer.cancel()
         self._expected.clear()
 
-    def _expect(self, episode: Episode) -> None:
+    def _expect(self, window: FaultWindow) -> None:
         """Bring about, when they are due, those faults that nobody needs to ask for."""
-        begin = self.faults.begin + episode.at - clock.now()
+        begin = self.faults.begin + window.at - clock.now()
         edges: dict[_Edge, float] = {
             "begin": begin,
-            "half": begin + episode.lasts / 2,
-            "end": begin + episode.lasts,
+            "half": begin + window.lasts / 2,
+            "end": begin + window.lasts,
         }
         loop = asyncio.get_running_loop()
         for edge, delay in edges.items():
             if edge == "begin" and delay <= 0:
-                self._pass(episode, edge)
+                self._pass(window, edge)
             elif delay < math.inf:
-                self._expected.append(loop.call_later(delay, self._pass, episode, edge))
+                self._expected.append(loop.call_later(delay, self._pass, window, edge))
 
-    def _pass(self, episode: Episode, edge: "_Edge") -> None:
-        """An episode begins, is half over or ends."""
+    def _pass(self, window: FaultWindow, edge: "_Edge") -> None:
+        """An window begins, is half over or ends."""
         now = clock.now()
         self._bench.advance(now)
-        match episode.fault, edge:
+        match window.fault, edge:
             case "unplug", "begin":
                 self._pulled_out += 1
                 if self._pulled_out == 1:

@@ -29,7 +29,7 @@ _URL = re.compile(
 
 
 @dataclass(frozen=True)
-class Place:
+class WireEndpoint:
     """A URL taken apart. kind: of wire; place: a device or HOST:PORT; address: on the wire."""
 
     url: str
@@ -48,7 +48,7 @@ class Place:
         return self.url.replace(self.place, other, 1)
 
 
-def place_of(url: str) -> Place:
+def parse_endpoint(url: str) -> WireEndpoint:
     """Take a URL apart; raises InputError for one that no relay can stand in."""
     found = _URL.fullmatch(url)
     kind = _KINDS.get(found["scheme"]) if found else None
@@ -79,4 +79,4 @@ def place_of(url: str) -> Place:
             f"{url}: {place} is neither a device, as in /dev/ttyUSB0, nor HOST:PORT with a port of "
             f"{_PORTS[0]} to {_PORTS[-1]}"
         )
-    return Place(url, kind, place, int(number), int(speed))
+    return WireEndpoint(url, kind, place, int(number), int(speed))

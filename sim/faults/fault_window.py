@@ -19,7 +19,7 @@ FaultKind: TypeAlias = Literal[
     "duplicate",
     "corrupt",
     "truncate",
-    "torn_commit",  # of a set in several frames some are lost, of one in one frame the end
+    "incomplete_set",  # of a set in several frames some are lost, of one in one frame the end
     # of the wire
     "unplug",
     # of the amplifier
@@ -35,7 +35,7 @@ Toward: TypeAlias = Literal["amplifier", "host"]
 
 
 @dataclass(frozen=True)
-class Episode:
+class FaultWindow:
     """One fault from `at` [s after the begin] on, for `lasts` [s].
 
     amplifier: whose; None for all. Of telegrams: share, how many of them, 0..1; toward: in which
@@ -60,10 +60,10 @@ class Episode:
 class Faults:
     """What goes wrong with one amplifier and its wire, by a clock that is handed in.
 
-    begin [s] of that clock: from when the episodes count. The same seed gives the same faults.
+    begin [s] of that clock: from when the windows count. The same seed gives the same faults.
     """
 
-    episodes: Sequence[Episode] = ()
+    windows: Sequence[FaultWindow] = ()
     begin: float = 0.0
     seed: int = 0
     _random: random.Random = field(init=False)
@@ -73,35 +73,33 @@ class Faults:
 
     def now(self, fault: FaultKind, time: float) -> bool:
         """Whether a fault is on at a time [s]."""
-        return any(
-            self._is_on(episode, time) for episode in self.episodes if episode.fault == fault
-        )
+        return any(self._is_on(window, time) for window in self.windows if window.fault == fault)
 
     def pass_on(self, telegram: bytes, *, toward: Toward, time: float) -> list[tuple[float, bytes]]:
         """What arrives of a telegram that is sent at a time [s], and how much later [s]."""
         arriving = [(0.0, telegram)]
-        for episode in self.episodes:
-            hit = self._is_on(episode, time) and episode.toward in (None, toward)
-            if hit and self._random.random() < episode.share:
-                arriving = self._befallen(episode, arriving, toward)
+        for window in self.windows:
+            hit = self._is_on(window, time) and window.toward in (None, toward)
+            if hit and self._random.random() < window.share:
+                arriving = self._apply(window, arriving, toward)
                 arriving = [(delay, data) for delay, data in arriving if data]  # cut to nothing
         return arriving
 
-    def _befallen(
-        self, episode: Episode, arriving: list[tuple[float, bytes]], toward: Toward
+    def _apply(
+        self, window: FaultWindow, arriving: list[tuple[float, bytes]], toward: Toward
     ) -> list[tuple[float, bytes]]:
-        match episode.fault:
+        match window.fault:
             case "drop":
                 return []
             case "delay":
-                return [(d + self._random.uniform(0, episode.delay), data) for d, data in arriving]
+                return [(d + self._random.uniform(0, window.delay), data) for d, data in arriving]
             case "duplicate":
                 return arriving * 2
             case "corrupt":
                 return [(delay, self._corrupt(data)) for delay, data in arriving]
             case "truncate":
                 return [(delay, self._cut(data)) for delay, data in arriving]
-            case "torn_commit" if toward == "amplifier":
+            case "incomplete_set" if toward == "amplifier":
                 return [(delay, self._cut(data)) for delay, data in arriving]
             case _:
                 return arriving
@@ -117,5 +115,5 @@ class Faults:
     def _cut(self, data: bytes) -> bytes:
         return data[: self._random.randrange(len(data))]
 
-    def _is_on(self, episode: Episode, time: float) -> bool:
-        return episode.at <= time - self.begin < episode.end
+    def _is_on(self, window: FaultWindow, time: float) -> bool:
+        return window.at <= time - self.begin < window.end

@@ -18,10 +18,10 @@ from model.config.document import read_document
 from model.config.sections import Quantity, Section, Validation
 from model.config.units import RATIO, TIME
 from model.errors import InputError, in_our_words
-from sim.faults.episodes import Episode, FaultKind, Faults, Toward
+from sim.faults.fault_window import FaultKind, Faults, FaultWindow, Toward
 
 
-class _EpisodeSection(Section):
+class _FaultSection(Section):
     fault: FaultKind
     at: Annotated[float, Quantity(TIME, least=0)] = 0.0
     lasts: Annotated[float, Quantity(TIME, above=0)] = math.inf
@@ -31,28 +31,28 @@ class _EpisodeSection(Section):
     delay: Annotated[float, Quantity(TIME, above=0, most=10)] = 0.1
 
 
-class _FaultSection(Section):
+class _FaultFileSection(Section):
     seed: int = 0
-    faults: list[_EpisodeSection]
+    faults: list[_FaultSection]
 
 
 @dataclass(frozen=True)
 class FaultFile:
     """What shall go wrong with the amplifiers of a rig."""
 
-    episodes: tuple[Episode, ...]
+    windows: tuple[FaultWindow, ...]
     seed: int = 0
 
     def of(self, amplifier: str, *, begin: float) -> Faults:
         """What concerns one of them, counted from a time [s]."""
-        own = [episode for episode in self.episodes if episode.amplifier in (None, amplifier)]
+        own = [window for window in self.windows if window.amplifier in (None, amplifier)]
         return Faults(own, begin=begin, seed=self.seed)
 
 
 def load_faults(path: Path, *, amplifiers: Collection[str]) -> FaultFile:
     """Read a fault file; raises ConfigError with every problem, by file, line and key."""
     document = read_document(path)
-    validation = Validation(document, _FaultSection)
+    validation = Validation(document, _FaultFileSection)
     listed = document.data.get("faults")
     for number, entry in enumerate(listed if isinstance(listed, list) else []):
         name = entry.get("amplifier") if isinstance(entry, dict) else None
@@ -62,15 +62,15 @@ def load_faults(path: Path, *, amplifiers: Collection[str]) -> FaultFile:
                 ("faults", number, "amplifier"), f"{name!r} is none of the rig's: {known}"
             )
     validation.finish()
-    section = _FaultSection.model_validate(document.data)
-    episodes = tuple(Episode(**episode.model_dump()) for episode in section.faults)
-    return FaultFile(episodes, seed=section.seed)
+    section = _FaultFileSection.model_validate(document.data)
+    windows = tuple(FaultWindow(**window.model_dump()) for window in section.faults)
+    return FaultFile(windows, seed=section.seed)
 
 
-def episode_of(told: Mapping[str, Any]) -> Episode:
+def parse_fault(told: Mapping[str, Any]) -> FaultWindow:
     """One fault from its keys, which are those of a file; InputError says what is wrong."""
     try:
-        return Episode(**_EpisodeSection.model_validate(dict(told)).model_dump())
+        return FaultWindow(**_FaultSection.model_validate(dict(told)).model_dump())
     except ValidationError as error:
         problems = (
             f"{'.'.join(map(str, details['loc']))}: {in_our_words(details['msg'])}"

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.codec.can_bus.dbc import dbc_text
+from can_dbc import dbc_text
 from drivers.codec.can_bus.frame import LAYOUTS, CanFrame
 from drivers.codec.can_bus.objects import (
     capability_entries,

@@ -4,9 +4,9 @@ from pathlib import Path
 import pytest
 
 import drivers
+from can_files import FILES
 from can_session import session
 from drivers.codec.can_bus.frame import CANOPEN, LAYOUTS
-from drivers.codec.can_bus.generate import FILES, main
 from drivers.codec.can_bus.objects import entries
 from drivers.protocol.definition import PROTOCOL
 
@@ -95,20 +95,5 @@ def test_every_fault_and_nak_has_a_code() -> None:
 
 @pytest.mark.parametrize("name", FILES)
 def test_the_files_are_up_to_date(name: str) -> None:
-    """EDS and DBC are what `python -m drivers.codec.can_bus.generate docs/reference` writes."""
+    """EDS and DBC are what `python docs/generators/can_files.py docs/reference` writes."""
     assert (DOCS / name).read_text("utf-8") == FILES[name]()
-
-
-def test_the_files_are_written_where_they_are_wanted(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """Into the folder; help ends well, and a folder that is none is bad usage without a trace."""
-    monkeypatch.setattr("sys.argv", ["generate", str(tmp_path)])
-    assert main() == 0
-    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(FILES)
-    for argument, status in (("--help", 0), (str(tmp_path / "none"), 2)):
-        monkeypatch.setattr("sys.argv", ["generate", argument])
-        with pytest.raises(SystemExit) as ended:
-            main()
-        assert ended.value.code == status
-    assert "there is no folder" in capsys.readouterr().err

@@ -13,8 +13,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import drivers
+from can_eds import eds_text
 from can_fuzz import FakeDevice
-from drivers.codec.can_bus.eds import eds_text
 from drivers.codec.can_bus.frame import CanFrame
 from sim.far_ends.can_bus import sdo
 from sim.far_ends.can_bus.node import CanNode

@@ -10,9 +10,11 @@ import numpy as np
 
 from model.arrays import ComplexArray, FloatArray
 from model.fem.assembly import era_positions
-from model.fem.harmonic import check_frequencies, hold_and_drive
+from model.fem.harmonic import check_frequencies
+from model.reduction.low_rank import coupled_forces, on_diagonal
 from model.reduction.reduced_plate import reduce_plate
 from model.rig.rig import Rig
+from model.structure.dynamic_stiffness import attached_stiffness, base_stiffness
 from model.structure.point_load import load_positions
 
 
@@ -20,11 +22,11 @@ from model.structure.point_load import load_positions
 class FastPlate:
     """The reduced plate of a rig at its ERAs and loads (h, r) and at points (p, r).
 
-    squared: omega² of the modes (r,) [rad²/s²] at the rig's own modulus; omega (f,) [rad/s].
+    eigenvalues: omega² of the modes (r,) [rad²/s²] at the rig's own modulus; omega (f,) [rad/s].
     """
 
     modulus: float
-    squared: FloatArray
+    eigenvalues: FloatArray
     held: FloatArray
     shapes: FloatArray
     omega: FloatArray
@@ -35,17 +37,15 @@ class FastPlate:
         rig: the same plate on the same places, with other values.
         """
         plate = rig.plate
-        elastic = (1 + 1j * plate.loss_factor) * (plate.material.E / self.modulus) * self.squared
-        answer = 1 / (elastic - (self.omega**2)[:, None])
-        hold, _ = hold_and_drive((), rig.loads, self.omega)
-        spring, bolts = _springs(rig, self.omega)
-        hold = np.hstack([spring - (self.omega**2)[:, None] * bolts, hold])
-        forward = answer[:, :, None] * self.held.T
-        between = self.held @ forward
-        count = hold.shape[1]
-        inverse = np.linalg.inv(np.eye(count) + hold[:, :, None] * between)
-        force = inverse[:, :, : len(rig.eras)] * spring[:, None, :]
-        moved = self.shapes @ forward @ force
+        elastic = (
+            (1 + 1j * plate.loss_factor) * (plate.material.E / self.modulus) * self.eigenvalues
+        )
+        modal_receptance = 1 / (elastic - (self.omega**2)[:, None])
+        forward = modal_receptance[:, :, None] * self.held.T
+        stiffness = attached_stiffness(rig.eras, rig.loads, self.omega)
+        applied = on_diagonal(base_stiffness(rig.eras, self.omega), rows=stiffness.shape[1])
+        forces = coupled_forces(self.held @ forward, stiffness, applied)
+        moved = self.shapes @ forward @ forces
         return np.asarray(-(self.omega**2)[:, None, None] * moved.transpose(0, 2, 1))
 
 
@@ -66,11 +66,3 @@ def fast_plate(rig: Rig, points: FloatArray, frequencies: FloatArray) -> FastPla
         reduced.at(points),
         2 * np.pi * frequencies,
     )
-
-
-def _springs(rig: Rig, omega: FloatArray) -> tuple[ComplexArray, FloatArray]:
-    """k + i omega c of each ERA (f, eras) [N/m], and bolt masses (eras,) [kg]."""
-    stiffness = np.array([era.stiffness for era in rig.eras])
-    damping = np.array([era.damping for era in rig.eras])
-    bolts = np.array([era.bolt_mass for era in rig.eras])
-    return stiffness + 1j * omega[:, None] * damping, bolts

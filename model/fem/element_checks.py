@@ -202,10 +202,10 @@ def frequency_error(element: Element, count: int) -> float:
     held = np.concatenate([3 * sides, 3 * sides + 2, 3 * ends, 3 * ends + 1])
     free = np.setdiff1d(np.arange(assembled.dof), held)
     exact = _exact_omega_squared(THIN)
-    squared, _, _ = shift_invert_modes(
+    eigenvalues, _ = shift_invert_modes(
         assembled.stiffness[free][:, free], assembled.mass[free][:, free], 1, shift=exact
     )
-    return float(np.sqrt(max(squared[0], 0.0) / exact) - 1)
+    return float(np.sqrt(max(eigenvalues[0], 0.0) / exact) - 1)
 
 
 def rate(coarse: float, fine: float) -> float:

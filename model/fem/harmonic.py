@@ -17,6 +17,7 @@ from model.fem.assembly import PlateMatrices, era_positions
 from model.fem.factorisation import factorise
 from model.fem.mesh import LEAST_NODES_PER_WAVELENGTH, Mesh
 from model.structure.actuator import Era
+from model.structure.dynamic_stiffness import attached_stiffness, drive_forces
 from model.structure.plate import Plate
 from model.structure.point_load import PointLoad, load_positions
 
@@ -41,26 +42,6 @@ def check_frequencies(plate: Plate, mesh: Mesh, frequencies: FloatArray) -> None
         )
 
 
-def hold_and_drive(
-    eras: Sequence[Era], loads: Sequence[PointLoad], omega: FloatArray
-) -> tuple[ComplexArray, ComplexArray]:
-    """Dynamic stiffness (f, eras + loads) [N/m], and each ERA's force at full stroke (f, eras) [N].
-
-    omega: (f,) [rad/s]. The force is that of the base as it moves with the ERA's own gain.
-    """
-    held = np.array(
-        [(era.stiffness, era.damping, era.bolt_mass) for era in eras]
-        + [(load.stiffness, load.damping, load.mass) for load in loads],
-        dtype=float,
-    ).reshape(-1, 3)
-    spring = held[:, 0] + 1j * omega[:, None] * held[:, 1]
-    stroke = np.array([era.stroke for era in eras])
-    drive = spring[:, : len(eras)] * stroke
-    for number, era in enumerate(eras):
-        drive[:, number] *= era.gain(omega / (2 * np.pi))
-    return spring - (omega**2)[:, None] * held[:, 2], drive
-
-
 def direct_acceleration(
     matrices: PlateMatrices,
     eras: Sequence[Era],
@@ -81,14 +62,14 @@ def direct_acceleration(
     observe = matrices.deflection_at(points)
     result = np.empty((len(frequencies), len(eras), observe.shape[0]), dtype=complex)
     omegas = 2 * np.pi * np.asarray(frequencies, dtype=float)
-    holds, drives = hold_and_drive(eras, loads, omegas)
-    for row, (omega, hold, drive) in enumerate(zip(omegas, holds, drives, strict=True)):
-        dynamic = (
+    attached, forces = attached_stiffness(eras, loads, omegas), drive_forces(eras, omegas)
+    for row, omega in enumerate(omegas):
+        dynamic_stiffness = (
             (1 + 1j * matrices.plate.loss_factor) * matrices.stiffness
             - omega**2 * matrices.mass
-            + touch.T @ sparse.diags_array(hold) @ touch
+            + touch.T @ sparse.diags_array(attached[row]) @ touch
         )
-        factor = factorise(dynamic)
-        displacement = factor.solve((touch[: len(eras)].T @ sparse.diags_array(drive)).toarray())
+        load = touch[: len(eras)].T @ sparse.diags_array(forces[row])
+        displacement = factorise(dynamic_stiffness).solve(load.toarray())
         result[row] = -(omega**2) * (observe @ displacement).T
     return result

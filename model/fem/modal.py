@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy import sparse
-from scipy.sparse.linalg import LinearOperator, SuperLU, eigsh
+from scipy.sparse.linalg import LinearOperator, eigsh
 
 from model.arrays import FloatArray, IntArray
 from model.errors import InputError
@@ -30,12 +30,12 @@ class Modes:
 
 def shift_invert_modes(
     stiffness: sparse.csc_array, mass: sparse.csc_array, count: int, *, shift: float
-) -> tuple[FloatArray, FloatArray, SuperLU]:
+) -> tuple[FloatArray, FloatArray]:
     """The lowest eigenpairs: omega² ascending (count,) and mass-normalised vectors (dof, count).
 
     shift [rad²/s²]: above zero, of the order of the lowest omega² wanted; stiffness + shift * mass
     is then positive definite even where the free plate's rigid-body modes leave stiffness alone
-    singular. Its factors come with the answer, for whoever needs them next.
+    singular.
     """
     size = stiffness.shape[0]
     if count >= size:
@@ -44,7 +44,7 @@ def shift_invert_modes(
             "ask for fewer modes or use a finer mesh"
         )
     factor = factorise(stiffness + shift * mass)
-    squared, vectors = eigsh(
+    eigenvalues, vectors = eigsh(
         stiffness,
         count,
         M=mass,
@@ -53,8 +53,8 @@ def shift_invert_modes(
         OPinv=LinearOperator(stiffness.shape, matvec=factor.solve, dtype=float),
         v0=np.random.default_rng(0).standard_normal(size),  # ARPACK's own start is random
     )
-    order = np.argsort(squared)
-    return squared[order], vectors[:, order], factor
+    order = np.argsort(eigenvalues)
+    return eigenvalues[order], vectors[:, order]
 
 
 def _nothing_held(matrices: PlateMatrices) -> IntArray:
@@ -105,7 +105,7 @@ def modes(
     held = SUPPORTS[support](matrices)
     free = np.setdiff1d(np.arange(matrices.dof), held)
     rigid = RIGID_BODY_MODES if support == "free" else 0
-    squared, vectors, _ = shift_invert_modes(
+    eigenvalues, vectors = shift_invert_modes(
         sparse.csc_array(stiffness[free][:, free]),
         sparse.csc_array(mass[free][:, free]),
         count + rigid,
@@ -113,5 +113,5 @@ def modes(
     )
     whole = np.zeros((matrices.dof, count))
     whole[free] = vectors[:, rigid:]
-    frequencies = np.sqrt(np.maximum(squared[rigid:], 0)) / (2 * np.pi)
+    frequencies = np.sqrt(np.maximum(eigenvalues[rigid:], 0)) / (2 * np.pi)
     return Modes(frequencies, whole[0::3])

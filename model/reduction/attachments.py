@@ -39,12 +39,12 @@ class Attachments:
 class _Solved:
     """One point in one class: its force (size,), and sums of phi (u / u_c)^j, (TERMS, size).
 
-    momenta: the same sums times the mass.
+    mass_weighted: the same sums times the mass.
     """
 
     force: FloatArray
     residual: FloatArray
-    momenta: FloatArray
+    mass_weighted: FloatArray
 
 
 class AttachmentSolver:
@@ -98,10 +98,12 @@ class AttachmentSolver:
             size = part.symmetry.size
             force = np.array([each[number].force for each in points]).reshape(rows, size)
             residual = np.array([each[number].residual for each in points]).reshape(-1, size)
-            momenta = np.array([each[number].momenta for each in others]).reshape(-1, size)
+            mass_weighted = np.array([each[number].mass_weighted for each in others]).reshape(
+                -1, size
+            )
             first = np.array([each[number].residual[0] for each in others]).reshape(columns, size)
             moments[0] += force @ first.T
-            inner = (residual @ momenta.T).reshape(rows, TERMS, columns, TERMS)
+            inner = (residual @ mass_weighted.T).reshape(rows, TERMS, columns, TERMS)
             for power in range(2, 2 * TERMS + 1):
                 moments[power - 1] += inner[:, power // 2 - 1, :, (power + 1) // 2 - 1]
         return moments

@@ -17,20 +17,20 @@ from model.fem.symmetry import SymmetryClass
 class ClassModes:
     """One symmetry class: its factors, and its modes up to the cut-off.
 
-    factor: of stiffness + shift * mass; mass (n, n); squared (r,) [rad²/s²], vectors (n, r) of unit
-    modal mass; next_squared: of the lowest mode left out.
+    factor: of K + shift M; mass M (n, n); eigenvalues omega² (r,) [rad²/s²] and vectors Phi (n, r)
+    with Phi^T M Phi = I; next_eigenvalue: of the lowest truncated mode.
     """
 
     symmetry: SymmetryClass
     factor: Factor
     mass: sparse.csr_array
-    squared: FloatArray
+    eigenvalues: FloatArray
     vectors: FloatArray
-    next_squared: float
+    next_eigenvalue: float
 
     @cached_property
-    def _momenta(self) -> FloatArray:
-        """Mass times the modes, (n, r)."""
+    def _mass_weighted_modes(self) -> FloatArray:
+        """M Phi, (n, r)."""
         return np.asarray(self.mass @ self.vectors)
 
     def residuals(self, forces: FloatArray, *, terms: int, scale: float) -> FloatArray:
@@ -45,7 +45,7 @@ class ClassModes:
             deflection = self.factor.solve(force) / scale
             # The kept modes' share is taken out; once leaves rounding behind, twice is enough.
             for _ in range(2):
-                deflection -= self.vectors @ (self._momenta.T @ deflection)
+                deflection -= self.vectors @ (self._mass_weighted_modes.T @ deflection)
             force = self.mass @ deflection
             result[0, :, term], result[1, :, term] = deflection.T, force.T
         return result
@@ -61,19 +61,19 @@ def solve_class(
     shifted, unsummed = symmetry.assemble(elements, shift)
     factor, mass = factorise_definite(shifted), sparse.csr_array(unsummed)
     while True:
-        squared, vectors = _lowest(factor, mass, count, shift=shift)
-        if squared[-1] >= cut or len(squared) == symmetry.size:
+        eigenvalues, vectors = _lowest(factor, mass, count, shift=shift)
+        if eigenvalues[-1] >= cut or len(eigenvalues) == symmetry.size:
             break
         count += count // 3 + 1
-    kept = int(np.searchsorted(squared, cut))
-    squared[np.abs(squared) < 1e-6 * shift] = 0.0
+    kept = int(np.searchsorted(eigenvalues, cut))
+    eigenvalues[np.abs(eigenvalues) < 1e-6 * shift] = 0.0
     return ClassModes(
         symmetry,
         factor,
         mass,
-        squared[:kept],
+        eigenvalues[:kept],
         vectors[:, :kept],
-        float(squared[min(kept, len(squared) - 1)]),
+        float(eigenvalues[min(kept, len(eigenvalues) - 1)]),
     )
 
 
@@ -89,7 +89,7 @@ def _lowest(
         u, vectors = linalg.eigh(root.T @ inverse @ root)
         vectors = linalg.solve_triangular(root.T, vectors)
     else:
-        squared, vectors = eigsh(
+        eigenvalues, vectors = eigsh(
             mass,  # only its shape is used
             count,
             M=mass,
@@ -97,6 +97,6 @@ def _lowest(
             OPinv=LinearOperator(mass.shape, matvec=factor.solve, dtype=float),
             v0=np.random.default_rng(0).standard_normal(size),  # ARPACK's own start is random
         )
-        u = 1 / (squared + shift)
+        u = 1 / (eigenvalues + shift)
     order = np.argsort(-u)
     return 1 / u[order] - shift, vectors[:, order]

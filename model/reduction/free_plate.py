@@ -17,30 +17,20 @@ import numpy as np
 from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
 from model.fem.assembly import element_matrices, era_positions
-from model.fem.harmonic import check_frequencies, hold_and_drive
+from model.fem.harmonic import check_frequencies
 from model.fem.mesh import Mesh
 from model.fem.symmetry import CLASSES, symmetry_class
 from model.reduction.attachments import TERMS, Attachments, AttachmentSolver
 from model.reduction.class_modes import ClassModes, solve_class
-from model.reduction.truncation import truncation_error, truncation_weights
+from model.reduction.low_rank import coupled_forces, on_diagonal
+from model.reduction.truncation import truncation_weights
 from model.structure.actuator import Era
+from model.structure.dynamic_stiffness import attached_stiffness, drive_forces
 from model.structure.plate import Plate
 from model.structure.point_load import PointLoad, load_positions
 
 # Modes are kept up to this multiple of the highest frequency asked for.
 FREQUENCY_MARGIN = 2.0
-
-
-@dataclass(frozen=True)
-class Response:
-    """Acceleration [m/s²] per frequency, driven ERA and point (f, eras, p), and how wrong it is.
-
-    error: (f, eras), an upper estimate of the error relative to the response, both root mean
-    square over the plate; against the exact answer of the same mesh, not of a finer one.
-    """
-
-    acceleration: ComplexArray
-    error: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,9 +47,9 @@ class FreePlate:
     classes: tuple[ClassModes, ...]
 
     @property
-    def squared(self) -> FloatArray:
+    def eigenvalues(self) -> FloatArray:
         """omega² of the modes (r,) [rad²/s²], class by class; the first of a class may be 0."""
-        return np.concatenate([part.squared for part in self.classes])
+        return np.concatenate([part.eigenvalues for part in self.classes])
 
     @cached_property
     def attachments(self) -> AttachmentSolver:
@@ -69,7 +59,7 @@ class FreePlate:
     @property
     def largest_truncated(self) -> float:
         """1 / (lambda + shift) of the lowest mode left out [s²/rad²]."""
-        return 1 / (min(part.next_squared for part in self.classes) + self.shift)
+        return 1 / (min(part.next_eigenvalue for part in self.classes) + self.shift)
 
     def acceleration(
         self,
@@ -79,49 +69,23 @@ class FreePlate:
         *,
         loads: Sequence[PointLoad] = (),
     ) -> ComplexArray:
-        """Acceleration [m/s²] at points (p, 2) per frequency [Hz] (f,) and ERA: (f, eras, p).
+        """Acceleration [m/s²] at points [m] (p, 2) per frequency [Hz] (f,) and ERA: (f, eras, p).
 
-        As `direct_acceleration`: each ERA alone at full stroke, the others holding.
-        """
-        return self.respond(eras, frequencies, points, loads=loads).acceleration
-
-    def respond(
-        self,
-        eras: Sequence[Era],
-        frequencies: FloatArray,
-        points: FloatArray,
-        *,
-        loads: Sequence[PointLoad] = (),
-    ) -> Response:
-        """The same with its error, per frequency (f,) [Hz], at any points [m] (p, 2) of the plate.
-
-        Raises InputError for a frequency that is none, above frequency_max or above what the mesh
-        carries, and for points off the plate.
+        As `direct_acceleration`: each ERA alone at full stroke, the others at rest. Raises
+        InputError for a frequency that is not above zero, above frequency_max or above what the
+        mesh carries, and for points off the plate.
         """
         omega = self._omega(frequencies)
-        hold, drive = hold_and_drive(eras, loads, omega)
         attached = self.attachments.solve(np.vstack([era_positions(eras), load_positions(loads)]))
-        count = len(hold[0])
-        answers, weights = self._answers(omega, TERMS)
-
-        # Forces on the plate for a unit force put in at each attachment, all of them holding back.
-        receptance = self._between(attached, omega)
-        unit = np.linalg.inv(np.eye(count) + hold[:, :, None] * receptance)
-        modal = np.asarray(answers[:, :, None] * (attached.shapes.T @ unit), dtype=complex)
-        residual = np.asarray(weights[:, :, None, None] * unit[:, None], dtype=complex)
-        coordinates = np.concatenate([modal, residual.reshape(len(omega), -1, count)], axis=1)
-        driven = coordinates[:, :, : len(eras)] * drive[:, None, :]
-        displacement = _apply(self.attachments.basis(attached, points), driven)
-        acceleration = -(omega**2)[:, None, None] * displacement
-
-        size = _field_size(modal, residual, attached.moments)
-        off_receptance, off_field = (self._truncation_error(omega, n) for n in (2 * TERMS, TERMS))
-        strength, spread = (np.sqrt(np.diagonal(attached.moments[power])) for power in (0, 1))
-        force = np.abs(unit)
-        wrong_force = np.abs(hold) * off_receptance[:, None] * strength * size
-        error = wrong_force.sum(axis=1)[:, None] * (strength[:, None] * force).sum(axis=1)
-        error += off_field[:, None] * (spread[:, None] * force).sum(axis=1)
-        return Response(acceleration, (error / size)[:, : len(eras)])
+        stiffness = attached_stiffness(eras, loads, omega)
+        applied = on_diagonal(drive_forces(eras, omega), rows=stiffness.shape[1])
+        forces = coupled_forces(self._between(attached, omega), stiffness, applied)
+        modal_receptance, weights = self._modal_receptance(omega, TERMS)
+        modal = modal_receptance[:, :, None] * (attached.shapes.T @ forces)
+        residual = (weights[:, :, None, None] * forces[:, None]).reshape(len(omega), -1, len(eras))
+        coordinates = np.concatenate([modal, residual], axis=1)
+        displacement = _apply(self.attachments.basis(attached, points), coordinates)
+        return np.asarray(-(omega**2)[:, None, None] * displacement)
 
     def receptances(
         self,
@@ -140,44 +104,38 @@ class FreePlate:
         omega = self._omega(frequencies)
         attached = self.attachments.solve(np.vstack([places, load_positions(loads)]))
         count = len(attached.shapes)
-        answers, weights = self._answers(omega, TERMS)
+        modal_receptance, weights = self._modal_receptance(omega, TERMS)
         basis = self.attachments.basis(attached, points)
-        shapes, residual = np.split(basis, [len(self.squared)], axis=1)
-        to_points = _apply(shapes, answers[:, :, None] * attached.shapes.T)
+        shapes, residual = np.split(basis, [len(self.eigenvalues)], axis=1)
+        to_points = _apply(shapes, modal_receptance[:, :, None] * attached.shapes.T)
         to_points += np.tensordot(weights, residual.reshape(-1, TERMS, count).T, axes=(1, 1))
         between = self._between(attached, omega)
         if loads:
-            hold, _ = hold_and_drive((), loads, omega)
-            at_loads = between[:, len(places) :, len(places) :]
-            back = np.linalg.inv(np.eye(len(loads)) + hold[:, :, None] * at_loads)
-            back = between[:, : len(places), len(places) :] @ (back * hold[:, None, :])
-            to_points = to_points[:, : len(places)] - back @ to_points[:, len(places) :]
-            between = between[:, : len(places)] - back @ between[:, len(places) :]
-            between = between[:, :, : len(places)]
+            # R - R_pl D (I + R_ll D)^-1 R_lp; places p, loads l, all receptances symmetric.
+            n = len(places)
+            stiffness = attached_stiffness((), loads, omega)
+            reaction = stiffness[:, :, None] * between[:, n:, :n]
+            forces = coupled_forces(between[:, n:, n:], stiffness, reaction).swapaxes(1, 2)
+            to_points = to_points[:, :n] - forces @ to_points[:, n:]
+            between = between[:, :n, :n] - forces @ between[:, n:, :n]
         return between, to_points
 
-    def _answers(self, omega: FloatArray, terms: int) -> tuple[ComplexArray, ComplexArray]:
-        """How each mode answers (f, r), and the weights of what the truncated ones add, (f, n)."""
+    def _modal_receptance(self, omega: FloatArray, terms: int) -> tuple[ComplexArray, ComplexArray]:
+        """Receptance of each mode (f, r) [m/N kg], and weights of the truncated ones, (f, terms).
+
+        1 / ((1 + i eta) lambda - omega²) for an eigenvalue lambda at modal mass 1.
+        """
         loss = 1 + 1j * self.plate.loss_factor
-        zeta = np.asarray(omega**2 / loss + self.shift, dtype=complex)
-        weights = truncation_weights(zeta, self.largest_truncated, terms)
-        answers = 1 / (loss * self.squared - (omega**2)[:, None])
-        return np.asarray(answers, dtype=complex), np.asarray(weights / loss, dtype=complex)
+        shifted = np.asarray(omega**2 / loss + self.shift, dtype=complex)
+        weights = truncation_weights(shifted, self.largest_truncated, terms)
+        receptance = 1 / (loss * self.eigenvalues - (omega**2)[:, None])
+        return np.asarray(receptance, dtype=complex), np.asarray(weights / loss, dtype=complex)
 
     def _between(self, attached: Attachments, omega: FloatArray) -> ComplexArray:
         """Receptance between attachments, (f, n, n)."""
-        answers, weights = self._answers(omega, 2 * TERMS)
-        modal = (answers[:, None, :] * attached.shapes) @ attached.shapes.T
+        modal_receptance, weights = self._modal_receptance(omega, 2 * TERMS)
+        modal = (modal_receptance[:, None, :] * attached.shapes) @ attached.shapes.T
         return np.asarray(modal + np.tensordot(weights, attached.moments, axes=1))
-
-    def _truncation_error(self, omega: FloatArray, terms: int) -> FloatArray:
-        """The most by which the answer of any truncated mode can be wrong, (f,) [s²/rad²]."""
-        largest = self.largest_truncated
-        loss = 1 + 1j * self.plate.loss_factor
-        zeta = np.asarray(omega**2 / loss + self.shift, dtype=complex)
-        # None of them answers more strongly than the lowest would at full reach.
-        most = largest / (1 - np.abs(zeta) * largest)
-        return np.asarray(truncation_error(zeta, largest, terms) * most)
 
     def _omega(self, frequencies: FloatArray) -> FloatArray:
         """omega [rad/s] of frequencies [Hz] that can be answered; InputError for others."""
@@ -200,16 +158,6 @@ def _apply(basis: FloatArray, coordinates: ComplexArray) -> ComplexArray:
     result = np.empty((f, n, len(basis)), dtype=complex)
     result.real, result.imag = product[:, :, 0], product[:, :, 1]
     return result
-
-
-def _field_size(modal: ComplexArray, residual: ComplexArray, moments: FloatArray) -> FloatArray:
-    """Root of the plate's mass times its mean square deflection, for each column: (f, n)."""
-    square = (np.abs(modal) ** 2).sum(axis=1)
-    for a in range(residual.shape[1]):
-        for b in range(residual.shape[1]):
-            share = residual[:, a].conj() * (moments[a + b + 1] @ residual[:, b])
-            square += share.sum(axis=1).real
-    return np.asarray(np.sqrt(square))
 
 
 def solve_free_plate(plate: Plate, mesh: Mesh, *, frequency_max: float = 500.0) -> FreePlate:

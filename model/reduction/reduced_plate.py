@@ -18,7 +18,7 @@ from model.structure.plate import Plate
 
 STATIC_VECTORS = 3  # for each attachment
 
-# Static vectors of less than this share (squared) of their own size are another's to rounding.
+# Static vectors below this share of their squared norm are linear combinations of the others.
 _SAME = 1e-9
 
 
@@ -83,7 +83,7 @@ class ReducedPlate:
         """
         if self.origin is None or other.origin is None:
             return np.eye(len(self.omega))
-        modes = len(self.origin.free.squared)
+        modes = len(self.origin.free.eigenvalues)
         carried = np.zeros((len(self.omega), len(other.omega)))
         carried[:modes, :modes] = np.eye(modes)
         mass = _products(self.origin.moments_with(other.origin), power=1)
@@ -107,7 +107,7 @@ def reduce_free_plate(free: FreePlate, attachments: FloatArray) -> ReducedPlate:
     """Reduce a free plate that has been solved, for forces at the attachments [m] (n, 2)."""
     attached = free.attachments.solve(attachments)
     basis = free.attachments.basis(attached, free.mesh.nodes)
-    modes = len(free.squared)
+    modes = len(free.eigenvalues)
     mass = _products(attached.moments, power=1)
     shifted = _products(attached.moments, power=0)
 
@@ -121,7 +121,7 @@ def reduce_free_plate(free: FreePlate, attachments: FloatArray) -> ReducedPlate:
     return ReducedPlate(
         free.plate,
         free.mesh,
-        np.concatenate([np.sqrt(free.squared), omega]),
+        np.concatenate([np.sqrt(free.eigenvalues), omega]),
         np.hstack([basis[:, :modes], basis[:, modes : modes + len(mass)] @ mixture]),
         Origin(free, np.asarray(attachments, dtype=float), attached.moments, mixture),
     )

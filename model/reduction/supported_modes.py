@@ -65,8 +65,8 @@ def supported_modes(
     Raises InputError for ERAs that do not hold the plate.
     """
     M, C, K = modal_matrices(reduced, eras, loads=loads)
-    squared, psi = linalg.eigh(K, M)
-    omega = np.sqrt(squared)
+    eigenvalues, psi = linalg.eigh(K, M)
+    omega = np.sqrt(eigenvalues)
     low = omega <= 2 * np.pi * frequency_max
     omega, psi = omega[low], psi[:, low]
     ratios = np.einsum("rn,rs,sn->n", psi, C, psi) / (2 * omega)

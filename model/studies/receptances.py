@@ -10,10 +10,11 @@ import numpy as np
 
 from model.arrays import ComplexArray, FloatArray, IntArray
 from model.errors import InputError
-from model.fem.harmonic import hold_and_drive
 from model.reduction.free_plate import solve_free_plate
+from model.reduction.low_rank import coupled_forces, on_diagonal
 from model.rig.rig import Rig
 from model.structure.actuator import Era
+from model.structure.dynamic_stiffness import attached_stiffness, drive_forces
 
 # More than this [bytes] and the machine is likely to run out of memory.
 _MOST_BYTES = 2 << 30
@@ -47,12 +48,10 @@ class Receptances:
         if room is None:
             room = self.room(len(eras))
         omega = 2 * np.pi * self.frequencies
-        hold, drive = hold_and_drive(eras, (), omega)
         at_eras = self.between[:, places[:, None], places]
-        one = np.eye(len(eras))
-        # Force on the plate by ERA driven: what its base pushes less what all ERAs hold back.
-        force = np.linalg.solve(one + hold[:, :, None] * at_eras, drive[:, :, None] * one)
-        scaled = -(omega**2)[:, None, None] * force.transpose(0, 2, 1)
+        applied = on_diagonal(drive_forces(eras, omega), rows=len(eras))
+        forces = coupled_forces(at_eras, attached_stiffness(eras, (), omega), applied)
+        scaled = -(omega**2)[:, None, None] * forces.transpose(0, 2, 1)
         np.take(self.to_points, places, axis=1, out=room[0], mode="clip")  # else it is buffered
         acceleration: ComplexArray = np.matmul(scaled, room[0], out=room[1])
         return acceleration

@@ -21,7 +21,9 @@ import numpy as np
 from model.arrays import ComplexArray, FloatArray
 from model.finger.contrast import contrast_db
 from model.finger.load import finger_loads
+from model.reduction.low_rank import coupled_forces
 from model.structure.actuator import Era
+from model.structure.dynamic_stiffness import attached_stiffness, dynamic_stiffness
 from model.structure.point_load import PointLoad
 from model.table.pattern import Pattern
 from model.table.question import Point, Question
@@ -101,36 +103,36 @@ def _acceleration(
     ensemble: Ensemble,
     shapes: FloatArray,
     frequency: float,
-    base: ComplexArray,
+    motion: ComplexArray,
 ) -> ComplexArray:
     """Acceleration (m, p) [m/s²] at points of shapes (p, r) for a base motion (eras,) [m]."""
     touch = np.vstack([table.held, table.shapes_at(contacts)])
     omega = 2 * np.pi * frequency
-    hold, push = _attached(table, finger_loads(contacts), ensemble, omega)
+    stiffness, base = _attached(table, finger_loads(contacts), ensemble, omega)
     scale = ensemble.thickness[:, None]
     loss = 1 + 1j * table.plate.loss_factor * ensemble.damping[:, None]
-    answer = 1 / ((loss * (table.omega * scale) ** 2 - omega**2) * scale)
-    receptance = (answer[:, None, :] * touch) @ touch.T
-    pushed = np.zeros(hold.shape, dtype=complex)
+    modal_receptance = 1 / ((loss * (table.omega * scale) ** 2 - omega**2) * scale)
+    receptance = np.asarray((modal_receptance[:, None, :] * touch) @ touch.T, dtype=complex)
+    applied = np.zeros((*stiffness.shape, 1), dtype=complex)
     gains = [complex(era.gain(np.array(frequency))) for era in table.eras]
-    pushed[:, : len(table.eras)] = push * ensemble.drive * gains * base
-    system = np.eye(hold.shape[1]) + hold[:, :, None] * receptance
-    force = np.linalg.solve(system, pushed[:, :, None])[:, :, 0]
-    return np.asarray(-(omega**2) * ((answer * (force @ touch)) @ shapes.T))
+    applied[:, : len(table.eras), 0] = base * ensemble.drive * gains * motion
+    forces = coupled_forces(receptance, stiffness, applied)[:, :, 0]
+    return np.asarray(-(omega**2) * ((modal_receptance * (forces @ touch)) @ shapes.T))
 
 
 def _attached(
     table: LocalizationTable, loads: Sequence[PointLoad], ensemble: Ensemble, omega: float
 ) -> tuple[ComplexArray, ComplexArray]:
-    """Dynamic stiffness of ERAs, masses, fingers (m, n); force of an ERA per base motion (m, e)."""
+    """Dynamic stiffness of ERAs, masses, fingers (m, n), and of the ERAs' bases (m, eras) [N/m]."""
     eras: Sequence[Era] = table.eras
-    stiffness = ensemble.stiffness * [era.stiffness for era in eras]
-    damping = ensemble.damping[:, None] * [era.damping for era in eras]
-    push = stiffness + 1j * omega * damping
-    bolts = omega**2 * np.array([era.bolt_mass for era in eras])
-    rest = np.array(
-        [-(omega**2) * mass.mass + 0j for mass in table.masses]
-        + [load.stiffness + 1j * omega * load.damping - omega**2 * load.mass for load in loads]
+    bases = dynamic_stiffness(
+        ensemble.stiffness * [era.stiffness for era in eras],
+        ensemble.damping[:, None] * [era.damping for era in eras],
+        0.0,
+        omega,
     )
-    hold = np.hstack([push - bolts, np.broadcast_to(rest, (len(push), len(rest)))])
-    return hold, push
+    bolts = dynamic_stiffness(0.0, 0.0, np.array([era.bolt_mass for era in eras]), omega)
+    masses = [PointLoad(mass.x, mass.y, mass=mass.mass) for mass in table.masses]
+    (rest,) = attached_stiffness((), [*masses, *loads], np.array([omega]))
+    stiffness = np.hstack([bases + bolts, np.broadcast_to(rest, (len(bases), len(rest)))])
+    return stiffness, bases

@@ -23,13 +23,15 @@ from model.arrays import ComplexArray, FloatArray
 from model.drive_modes.sources import magnitudes_of_sources
 from model.errors import InputError
 from model.fem.assembly import PlateMatrices, assemble, era_positions
-from model.fem.harmonic import direct_acceleration, hold_and_drive
+from model.fem.harmonic import direct_acceleration
 from model.finger.contrast import contrast_db, mean_level_db_sl
 from model.finger.fingertip import fingertip_points
 from model.finger.grid import CELL_SAMPLES, Grid
 from model.finger.perception import decibels
+from model.reduction.low_rank import coupled_forces, on_diagonal
 from model.reduction.reduced_plate import reduce_plate
 from model.rig.rig import Rig
+from model.structure.dynamic_stiffness import attached_stiffness, drive_forces
 from model.structure.point_load import load_positions
 from model.table.pattern import Pattern
 from model.table.question import Question
@@ -200,13 +202,13 @@ def _modal_response(table: LocalizationTable, rig: Rig, index: int) -> ComplexAr
     """Fields (eras, points) at one frequency from the modes that the table holds."""
     omega = 2 * np.pi * table.frequencies[index]
     loss = 1 + 1j * rig.plate.loss_factor
-    answer = 1 / (loss * table.omega**2 - omega**2)
-    receptance = (table.held * answer) @ table.held.T
-    (hold,), (drive,) = hold_and_drive(rig.eras, rig.loads, np.array([omega]))
-    push = np.zeros((len(hold), len(drive)), dtype=complex)
-    np.fill_diagonal(push, drive)
-    force = np.linalg.solve(np.eye(len(hold)) + hold[:, None] * receptance, push)
-    return np.asarray(-(omega**2) * (table.shapes @ ((answer * table.held).T @ force)).T)
+    modal_receptance = 1 / (loss * table.omega**2 - omega**2)
+    receptance = (table.held * modal_receptance) @ table.held.T
+    at = np.array([omega])
+    (stiffness,) = attached_stiffness(rig.eras, rig.loads, at)
+    (applied,) = on_diagonal(drive_forces(rig.eras, at), rows=len(stiffness))
+    forces = coupled_forces(receptance, stiffness, applied)
+    return np.asarray(-(omega**2) * (table.shapes @ ((modal_receptance * table.held).T @ forces)).T)
 
 
 class _AnswerChecker:

@@ -58,11 +58,10 @@ def random_loads(rng: np.random.Generator) -> tuple[PointLoad, ...]:
 
 
 def test_any_layout_at_any_frequency_agrees_with_the_direct_solve(free):
-    """One solved plate is within 1e-4 (relative L2) of a direct solve; its error covers the miss.
+    """One solved plate is within 1e-4 (relative L2) of a direct solve.
 
     One to six ERAs of any stiffness, bolts, fingers, a mass; frequencies anywhere up to 500 Hz and
-    at a resonance of each layout. What rounding leaves in the direct solve grows as the inertia of
-    the plate gets lost beside the stiffness, with 1 / frequency².
+    at a resonance of each layout.
     """
     rng = np.random.default_rng(7)
     matrices = assemble(free.plate, free.mesh)
@@ -73,39 +72,9 @@ def test_any_layout_at_any_frequency_agrees_with_the_direct_solve(free):
         resonance = rng.choice(natural[(natural > 5) & (natural < 500)])
         frequencies = np.array([*rng.uniform(5, 500, 3), resonance, 500.0])
         direct = direct_acceleration(matrices, eras, frequencies, points, loads=loads)
-        quick = free.respond(eras, frequencies, points, loads=loads)
-        error = np.linalg.norm(quick.acceleration - direct, axis=2)
-        error /= np.linalg.norm(direct, axis=2)
+        quick = free.acceleration(eras, frequencies, points, loads=loads)
+        error = np.linalg.norm(quick - direct, axis=2) / np.linalg.norm(direct, axis=2)
         assert error.max() < 1e-4
-        rounding = 1e-8 * (100 / frequencies[:, None]) ** 2
-        assert (error < np.maximum(1.5 * quick.error, rounding)).all()
-        assert quick.error.max() < 1e-4
-
-
-def test_the_estimate_covers_poor_answers_at_resonances_too(monkeypatch):
-    """One solve a point: what couples stiff ERAs is then poor, and resonances amplify that."""
-    monkeypatch.setattr("model.reduction.free_plate.TERMS", 1)
-    monkeypatch.setattr("model.reduction.attachments.TERMS", 1)
-    plate = Plate(LENGTH, WIDTH, 0.0015, ALUMINIUM, loss_factor=1e-3)
-    mesh = MESHES["24x18"]
-    free = solve_free_plate(plate, mesh)
-    matrices = assemble(plate, mesh)
-    places = [(0.051, 0.017), (0.29, 0.08), (0.12, 0.1), (0.2, 0.15)]
-    eras = [Era(f"E{n}", x, y, 1e6, 1.0, 0.0, 1e-4) for n, (x, y) in enumerate(places)]
-    natural = modes(matrices, 12, support="eras", eras=eras).natural_frequencies
-    frequencies = natural[natural < 500]
-    direct = direct_acceleration(matrices, eras, frequencies, mesh.nodes)
-    quick = free.respond(eras, frequencies, mesh.nodes)
-    error = np.linalg.norm(quick.acceleration - direct, axis=2) / np.linalg.norm(direct, axis=2)
-    assert error.max() > 0.01
-    assert (error < 1.5 * quick.error).all()
-
-
-def test_the_error_estimate_is_not_the_same_for_all(free):
-    """It falls by decades from 500 Hz to 50 Hz: it says where an answer is good, not only that."""
-    eras = random_eras(np.random.default_rng(1), 4)
-    error = free.respond(eras, np.array([50.0, 500.0]), free.mesh.nodes[:5]).error
-    assert (error[0] < 0.01 * error[1]).all()
 
 
 def test_below_all_bending_modes_it_agrees_too():
@@ -157,7 +126,7 @@ def test_bars_and_the_smallest_meshes_agree_too(length, width, mesh):
 def test_the_classes_hold_every_mode_of_the_plate(free):
     """The four quarters' modes are those of the whole plate, found without its symmetry."""
     whole = modes(assemble(free.plate, free.mesh), 15, support="free").natural_frequencies
-    quarters = np.sort(np.sqrt(free.squared)) / (2 * np.pi)
+    quarters = np.sort(np.sqrt(free.eigenvalues)) / (2 * np.pi)
     assert (quarters[:3] == 0).all()
     np.testing.assert_allclose(quarters[3:18], whole, rtol=1e-8)
 

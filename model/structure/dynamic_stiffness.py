@@ -1,0 +1,45 @@
+"""Dynamic stiffness of what is attached to the plate at points: ERAs, fingers and point masses."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from model.arrays import ComplexArray, FloatArray
+from model.structure.actuator import Era
+from model.structure.point_load import PointLoad
+
+
+def dynamic_stiffness(
+    stiffness: FloatArray | float,
+    damping: FloatArray | float,
+    mass: FloatArray | float,
+    omega: FloatArray | float,
+) -> ComplexArray:
+    """D = k + i omega c - omega² m [N/m]; the arguments broadcast against each other."""
+    k, c, m, w = (np.asarray(value, dtype=float) for value in (stiffness, damping, mass, omega))
+    return np.asarray(k + 1j * w * c - w**2 * m)
+
+
+def attached_stiffness(
+    eras: Sequence[Era], loads: Sequence[PointLoad], omega: FloatArray
+) -> ComplexArray:
+    """Dynamic stiffness [N/m] of ERAs and loads at omega (f,) [rad/s], (f, eras + loads)."""
+    parameters = [(era.stiffness, era.damping, era.bolt_mass) for era in eras]
+    parameters += [(load.stiffness, load.damping, load.mass) for load in loads]
+    stiffness, damping, mass = np.array(parameters, dtype=float).reshape(-1, 3).T
+    return dynamic_stiffness(stiffness, damping, mass, omega[:, None])
+
+
+def base_stiffness(eras: Sequence[Era], omega: FloatArray) -> ComplexArray:
+    """Force on the plate per displacement of an ERA's base, k_b + i omega c [N/m], (f, eras)."""
+    stiffness = np.array([era.stiffness for era in eras], dtype=float)
+    damping = np.array([era.damping for era in eras], dtype=float)
+    return dynamic_stiffness(stiffness, damping, 0.0, omega[:, None])
+
+
+def drive_forces(eras: Sequence[Era], omega: FloatArray) -> ComplexArray:
+    """Force of each ERA at full stroke, its own gain included [N], (f, eras) (paper Eq. 25)."""
+    strokes = np.array([era.stroke for era in eras])
+    gains = np.array([era.gain(omega / (2 * np.pi)) for era in eras])
+    gains = gains.reshape(len(eras), len(omega)).T
+    return np.asarray(base_stiffness(eras, omega) * strokes * gains)

@@ -7,7 +7,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import yaml
+from ruamel.yaml import YAML
 
 from drivers.errors import CommandError
 
@@ -146,7 +146,7 @@ class Protocol:
 
 def _load() -> Protocol:
     text = Path(__file__).with_name("protocol.yaml").read_text(encoding="utf-8")
-    raw: dict[str, Any] = yaml.safe_load(text)
+    raw: dict[str, Any] = YAML(typ="safe", pure=True).load(text)
     listed = raw["quantities"]
     return Protocol(
         version=raw["version"],

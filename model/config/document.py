@@ -1,40 +1,34 @@
-"""Reading a YAML file strictly: plain data, and the line that every key stands on.
+"""YAML files read strictly, with the line of every key.
 
-The rules it lives by: UTF-8, at most 1 MiB, one document, a mapping at the top. No anchors,
-aliases or tags, so that nothing unfolds or gets constructed. No key twice. Words are text: only
-true, false and null are more (YAML 1.1 takes NO for false and 1:30 for 90). All of it comes from
-the parser's events; no object is ever built by the YAML library.
+A file is UTF-8, at most 1 MiB, one document with a mapping at the top, without anchors, aliases
+or tags, so that nothing expands or gets constructed. No key is given twice. Words are text unless
+they are decimal numbers, true, false or null (core schema of YAML 1.2).
 """
 
 import re
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeAlias
+from typing import Any, Literal, TypeAlias
 
-import yaml
+from ruamel.yaml import YAML
+from ruamel.yaml.composer import Composer
+from ruamel.yaml.error import MarkedYAMLError
+from ruamel.yaml.events import Event, MappingStartEvent, ScalarEvent
+from ruamel.yaml.nodes import MappingNode, Node, ScalarNode
+from ruamel.yaml.reader import ReaderError
+from ruamel.yaml.resolver import BaseResolver, VersionedResolver
 
 from model.errors import InputError
 
-SIZE_LIMIT = 1 << 20
-_DEPTH_LIMIT = 20
+MAX_SIZE = 1 << 20  # bytes
+_MAX_DEPTH = 20
 _ZIP = b"PK\x03\x04"
 
 Scalar: TypeAlias = bool | int | float | str | None
 Value: TypeAlias = "Scalar | list[Value] | dict[str, Value]"
 KeyPath: TypeAlias = tuple[str | int, ...]
-
-# Longer numbers stay text, which says of itself that it is no number.
-_INTEGER = re.compile(r"[-+]?[0-9]{1,18}")
-_NUMBER = re.compile(r"[-+]?(\.[0-9]{1,30}|[0-9]{1,30}(\.[0-9]{0,30})?)([eE][-+]?[0-9]{1,3})?")
-_WORDS: dict[str, Scalar] = {
-    **dict.fromkeys(("", "~", "null", "Null", "NULL")),
-    **dict.fromkeys(("true", "True", "TRUE"), True),
-    **dict.fromkeys(("false", "False", "FALSE"), False),
-    **dict.fromkeys((".nan", ".NaN", ".NAN"), float("nan")),
-    **dict.fromkeys((".inf", ".Inf", ".INF", "+.inf", "+.Inf", "+.INF"), float("inf")),
-    **dict.fromkeys(("-.inf", "-.Inf", "-.INF"), float("-inf")),
-}
 
 
 @dataclass(frozen=True)
@@ -65,9 +59,10 @@ class ConfigError(InputError):
 
 @dataclass(frozen=True)
 class Document:
-    """What a file says. lines: the line of every key and list entry, by its path."""
+    """The content of a file, its text, and the line of every key and list entry by its path."""
 
     source: str
+    text: str
     data: dict[str, Value]
     lines: dict[KeyPath, int]
 
@@ -81,10 +76,10 @@ class Document:
         return value
 
     def line_of(self, path: KeyPath) -> int:
-        """The line of a key, or of the nearest one above it for a key that is missing."""
-        while path not in self.lines:
+        """The line of a key or list entry, or of the nearest one above it if it is missing."""
+        while path and path not in self.lines:
             path = path[:-1]
-        return self.lines[path]
+        return self.lines.get(path, 1)
 
     def problem(self, path: KeyPath, message: str) -> Problem:
         """A problem at a key."""
@@ -108,7 +103,7 @@ def read_document(path: Path) -> Document:
     source = str(path)
     try:
         with path.open("rb") as stream:
-            content = stream.read(SIZE_LIMIT + 1)
+            content = stream.read(MAX_SIZE + 1)
     except FileNotFoundError as error:
         raise _whole(source, "no such file; check its name and folder") from error
     except IsADirectoryError as error:
@@ -123,7 +118,7 @@ def read_document(path: Path) -> Document:
             "is a .npz file, as localization tables are, or another archive; give the YAML file "
             "that it is for, as `era config init` writes them",
         )
-    if len(content) > SIZE_LIMIT:
+    if len(content) > MAX_SIZE:
         raise _whole(source, "is larger than 1 MiB; a configuration has a few lines")
     try:
         text = content.decode("utf-8")
@@ -136,122 +131,138 @@ def read_document(path: Path) -> Document:
 
 def parse_document(source: str, text: str) -> Document:
     """Read the text of a YAML file that came from a source; raises ConfigError."""
-    return _Builder(source, text).document()
+    yaml = plain_yaml("safe")
+    with _errors_at(source, text):
+        data = yaml.load(text)
+    if yaml.composer.repeated:
+        raise ConfigError(source, yaml.composer.repeated)
+    if data is None:
+        raise _whole(source, "is empty; `era config init` writes one to begin with")
+    return Document(source, text, data, yaml.composer.lines)
+
+
+def plain_yaml(kind: Literal["safe", "rt"]) -> YAML:
+    """A YAML parser that accepts plain data only; "rt" keeps comments, and is far less robust."""
+    yaml = YAML(typ=kind, pure=True)
+    yaml.Composer = _PlainComposer
+    yaml.Resolver = _PlainResolver
+    yaml.allow_duplicate_keys = True  # the composer reports all of them
+    return yaml
 
 
 def _whole(source: str, message: str) -> ConfigError:
     return ConfigError(source, [Problem(None, "", message)])
 
 
-class _Builder:
-    """Builds a document from parser events, one pass, nothing kept that the file did not say."""
+@contextmanager
+def _errors_at(source: str, text: str) -> Iterator[None]:
+    """Raise what the parser raises as ConfigError, with the line."""
+    try:
+        yield
+    except _Refused as error:
+        raise ConfigError(source, [error.problem]) from None
+    except MarkedYAMLError as error:
+        mark = error.problem_mark or error.context_mark
+        line = None if mark is None else mark.line + 1
+        said = " ".join(part for part in (error.context, error.problem) if part)
+        raise ConfigError(source, [Problem(line, "", f"is not valid YAML: {said}")]) from error
+    except ReaderError as error:
+        line = text.count("\n", 0, error.position) + 1
+        message = f"character U+{error.character:04X} is not allowed in YAML; remove it"
+        raise ConfigError(source, [Problem(line, "", message)]) from error
 
-    def __init__(self, source: str, text: str) -> None:
-        self._source = source
-        self._events = self._parse(text)
-        self._lines: dict[KeyPath, int] = {(): 1}
-        self._repeated: list[Problem] = []
 
-    def document(self) -> Document:
-        """The one document of the text."""
-        event = self._next()
-        while isinstance(event, yaml.StreamStartEvent | yaml.DocumentStartEvent):
-            event = self._next()
-        if isinstance(event, yaml.StreamEndEvent):
-            raise _whole(self._source, "is empty; `era config init` writes one to begin with")
-        if not isinstance(event, yaml.MappingStartEvent):
-            raise self._error(
-                event, (), "expected `key: value` lines, as `era config init` writes them"
-            )
-        self._check(event, ())
-        data = self._mapping(())
-        self._next()  # the document's end
-        event = self._next()
-        if not isinstance(event, yaml.StreamEndEvent):
-            raise self._error(event, (), "a second document starts here; keep one in the file")
-        if self._repeated:
-            raise ConfigError(self._source, self._repeated)
-        return Document(self._source, data, self._lines)
+class _Refused(Exception):
+    """Something in a file that is more than plain data."""
 
-    def _parse(self, text: str) -> Iterator[yaml.Event]:
-        """The parser's events; its errors as ConfigError."""
-        try:
-            yield from yaml.parse(text, Loader=yaml.SafeLoader)
-        except yaml.MarkedYAMLError as error:
-            mark = error.problem_mark or error.context_mark
-            line = None if mark is None else mark.line + 1
-            said = " ".join(part for part in (error.context, error.problem) if part)
-            message = f"is not valid YAML: {said}"
-            raise ConfigError(self._source, [Problem(line, "", message)]) from error
-        except yaml.reader.ReaderError as error:
-            line = text.count("\n", 0, error.position) + 1
-            message = f"character U+{error.character:04X} is not allowed in YAML; remove it"
-            raise ConfigError(self._source, [Problem(line, "", message)]) from error
+    def __init__(self, problem: Problem) -> None:
+        self.problem = problem
 
-    def _next(self) -> yaml.Event:
-        return next(self._events)
 
-    def _error(self, event: yaml.Event, path: KeyPath, message: str) -> ConfigError:
-        line = _line(event)
-        return ConfigError(self._source, [Problem(line, key_name(path), message)])
+class _PlainComposer(Composer):
+    """Composes nodes of plain data; anything else is refused before it becomes a node.
 
-    def _check(self, event: yaml.Event, path: KeyPath) -> None:
-        """Refuse what makes YAML more than plain data."""
+    lines: of every key and list entry by its path; repeated: keys that are given twice.
+    """
+
+    def __init__(self, loader: Any = None) -> None:
+        super().__init__(loader)
+        self.lines: dict[KeyPath, int] = {}
+        self.repeated: list[Problem] = []
+        self._path: KeyPath = ()
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        """Compose the next node: a list entry by its number, a value by the node of its key."""
+        above = self._path
+        is_key = parent is not None and index is None
+        event = self.parser.peek_event()
+        if isinstance(index, ScalarNode):
+            self._path = (*above, index.value)
+            self.lines.setdefault(self._path, _line(index))
+        elif index is not None:
+            self._path = (*above, index)
+            self.lines[self._path] = _line(event)
+        self._check(event, is_key=is_key, is_root=parent is None)
+        node = super().compose_node(parent, index)
+        if is_key:
+            node.ctag = BaseResolver.DEFAULT_SCALAR_TAG  # NO is a word
+        elif isinstance(node, MappingNode):
+            self._note_repeated(node)
+        self._path = above
+        return node
+
+    def _check(self, event: Event, *, is_key: bool, is_root: bool) -> None:
         if getattr(event, "anchor", None) is not None:  # an alias names its anchor too
-            raise self._error(event, path, "anchors and aliases are not used; write the value out")
-        tag = getattr(event, "tag", None)
-        if tag is not None:
-            raise self._error(event, path, "tags are not used; remove what begins with !")
-        if len(path) > _DEPTH_LIMIT:
-            raise self._error(event, path[:3], "is nested too deeply")
+            raise self._refused(event, "anchors and aliases are not used; write the value out")
+        if getattr(event, "ctag", None) is not None:
+            raise self._refused(event, "tags are not used; remove what begins with !")
+        if len(self._path) > _MAX_DEPTH:
+            self._path = self._path[:3]
+            raise self._refused(event, f"is nested more than {_MAX_DEPTH} levels deep")
+        if is_key and not isinstance(event, ScalarEvent):
+            raise self._refused(event, "a key must be a word")
+        if is_root and not isinstance(event, MappingStartEvent) and not _is_empty(event):
+            raise self._refused(
+                event, "expected `key: value` lines, as `era config init` writes them"
+            )
 
-    def _value(self, event: yaml.Event, path: KeyPath) -> Value:
-        self._check(event, path)
-        if isinstance(event, yaml.MappingStartEvent):
-            return self._mapping(path)
-        if isinstance(event, yaml.SequenceStartEvent):
-            return self._sequence(path)
-        assert isinstance(event, yaml.ScalarEvent)  # noqa: S101 - no other event can stand here
-        return _scalar(event.value) if event.style is None else event.value
+    def _refused(self, event: Event, message: str) -> _Refused:
+        return _Refused(Problem(_line(event), key_name(self._path), message))
 
-    def _mapping(self, path: KeyPath) -> dict[str, Value]:
-        mapping: dict[str, Value] = {}
-        while not isinstance(event := self._next(), yaml.MappingEndEvent):
-            self._check(event, path)
-            if not isinstance(event, yaml.ScalarEvent):
-                raise self._error(event, path, "a key must be a word")
-            key = event.value
-            here = (*path, key)
-            line = _line(event)
-            value = self._value(self._next(), here)
-            if key in mapping:
-                first = self._lines[here]
-                message = f"stands twice, first on line {first}; remove one"
-                self._repeated.append(Problem(line, key_name(here), message))
-                continue
-            mapping[key] = value
-            self._lines[here] = line
-        return mapping
-
-    def _sequence(self, path: KeyPath) -> list[Value]:
-        sequence: list[Value] = []
-        while not isinstance(event := self._next(), yaml.SequenceEndEvent):
-            here = (*path, len(sequence))
-            self._lines[here] = _line(event)
-            sequence.append(self._value(event, here))
-        return sequence
+    def _note_repeated(self, mapping: MappingNode) -> None:
+        seen: set[str] = set()
+        for key, _ in mapping.value:
+            if key.value in seen:
+                path = (*self._path, key.value)
+                message = f"is given twice, first on line {self.lines[path]}; remove one"
+                self.repeated.append(Problem(_line(key), key_name(path), message))
+            seen.add(key.value)
 
 
-def _line(event: yaml.Event) -> int:
-    return event.start_mark.line + 1 if event.start_mark else 1
+class _PlainResolver(VersionedResolver):
+    """Takes words for text unless they are decimal numbers, true, false or null."""
+
+    processing_version = (1, 2)  # whatever a %YAML directive says
+
+    def resolve(self, kind: Any, value: Any, implicit: Any) -> Any:
+        """The tag of a node by its kind and text."""
+        tag = super().resolve(kind, value, implicit)
+        name = str(tag).rpartition(":")[2]
+        is_number = name in ("int", "float") and _NUMBER.fullmatch(value)
+        return tag if is_number or name in _PLAIN else BaseResolver.DEFAULT_SCALAR_TAG
 
 
-def _scalar(text: str) -> Scalar:
-    """What a word without quotes means, by the core schema of YAML 1.2 in decimal."""
-    if text in _WORDS:
-        return _WORDS[text]
-    if _INTEGER.fullmatch(text):
-        return int(text)
-    if _NUMBER.fullmatch(text):
-        return float(text)
-    return text
+_PLAIN = ("str", "map", "seq", "bool", "null")
+# A longer number stays text, and is refused as such.
+_NUMBER = re.compile(
+    r"[-+]?(?:[0-9]{1,18}|(?:\.[0-9]{1,30}|[0-9]{1,30}(?:\.[0-9]{0,30})?)(?:[eE][-+]?[0-9]{1,3})?)"
+    r"|[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN)"
+)
+
+
+def _is_empty(event: Event) -> bool:
+    return isinstance(event, ScalarEvent) and event.value == "" and event.style is None
+
+
+def _line(at: Event | Node) -> int:
+    return at.start_mark.line + 1 if at.start_mark else 1

@@ -3,9 +3,8 @@
 from collections.abc import Mapping
 from copy import deepcopy
 
-import yaml
-
 from model.config.document import Value
+from model.config.editing import data_text
 from model.rig.rig import Rig
 from model.structure.plate import Plate
 from model.studies.ranking import Ranking
@@ -62,6 +61,4 @@ def rig_yaml(data: Mapping[str, Value], rig: Rig, ranking: Ranking, case: int) -
             "channel": channel.number if channel else free + number - len(wiring),
         }
     comment = f"# Recommended by a study. {in_words(rig, ranking, case)}\n"
-    return comment + yaml.safe_dump(
-        {**data, "eras": eras}, sort_keys=False, allow_unicode=True, default_flow_style=None
-    )
+    return comment + data_text({**data, "eras": eras})

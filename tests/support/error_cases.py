@@ -22,7 +22,7 @@ from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
-import yaml
+from ruamel.yaml import YAML
 
 from controller.api.jsonrpc import RpcError
 from controller.cli.main import run
@@ -106,7 +106,7 @@ def subjects() -> tuple[Subject, ...]:
 
 
 def _subject(path: Path) -> Subject:
-    given: dict[str, Any] = yaml.safe_load(path.read_text("utf-8"))
+    given: dict[str, Any] = YAML(typ="safe", pure=True).load(path.read_text("utf-8"))
     stem = path.stem.split("-", 1)[1]
     cases = []
     for number, entry in enumerate(given["cases"], start=1):

@@ -12,10 +12,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import yaml
 from typer.testing import CliRunner
 
 from model.commands.study_cli import study_app
+from model.config.document import read_document
+from model.config.editing import data_text
 from model.errors import InputError
 from model.rig.file import example_rig_path, load_rig
 from model.studies.run import CHUNK
@@ -54,7 +55,7 @@ def test_a_study_recommends_a_rig_that_loads(tmp_path: Path, what: str) -> None:
 
 def test_what_no_study_changes_is_kept(tmp_path: Path) -> None:
     """Bolt mass, measured gains and what else a rig says of its ERAs is in the recommended one."""
-    data = yaml.safe_load(Path(RIG).read_text(encoding="utf-8"))
+    data = read_document(Path(RIG)).data
     for era in data["eras"].values():
         era |= {
             "bolt_mass": "4 g",
@@ -62,7 +63,7 @@ def test_what_no_study_changes_is_kept(tmp_path: Path) -> None:
             "gains": [[60, 0.9, -2], [320, 1, 3]],
         }
     path = tmp_path / "rig.yaml"
-    path.write_text(yaml.safe_dump(data, sort_keys=False), encoding="utf-8")
+    path.write_text(data_text(data), encoding="utf-8")
     study("placement", tmp_path / "out", "--layouts", "12", rig=str(path))
     rig = load_rig(tmp_path / "out" / "recommended.yaml")
     before = load_rig(path).eras[0]
@@ -148,10 +149,10 @@ def test_why_the_best_is_not_recommended_is_said(tmp_path: Path) -> None:
 
 def one_era_rig(folder: Path) -> str:
     """The example's rig with its first ERA alone."""
-    data = yaml.safe_load(Path(RIG).read_text(encoding="utf-8"))
+    data = read_document(Path(RIG)).data
     data["eras"] = dict([next(iter(data["eras"].items()))])
     path = folder / "one.yaml"
-    path.write_text(yaml.safe_dump(data, sort_keys=False), encoding="utf-8")
+    path.write_text(data_text(data), encoding="utf-8")
     return str(path)
 
 

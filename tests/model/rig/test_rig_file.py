@@ -4,9 +4,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import yaml
 
-from model.config.document import ConfigError
+from model.config.document import ConfigError, read_document
 from model.errors import InputError
 from model.rig.file import example_rig_path, load_rig, parse_rig, rig_schema
 from model.rig.parts import parse_mesh
@@ -454,7 +453,7 @@ def test_the_same_plate_has_the_same_fingerprint_however_it_is_written(tmp_path:
 def test_the_schema_for_editors_knows_what_the_example_says() -> None:
     """Every key of the example stands in the schema's section for it, and all required ones do."""
     schema = rig_schema()
-    example = yaml.safe_load(example_rig_path().read_text(encoding="utf-8"))
+    example = read_document(example_rig_path()).data
     sections = schema["$defs"]
     assert example.keys() <= schema["properties"].keys()
     assert set(schema["required"]) <= example.keys()

@@ -13,12 +13,13 @@ import numpy as np
 
 from examples.make_measured import FREQUENCIES, SENSOR, true_rig
 from model.calibration.calibrate import calibrate
-from model.calibration.outcome import Calibration
+from model.calibration.calibration_result import Calibration
 from model.finger.contrast import contrast_db
 from model.finger.fingertip import fingertip_points
 from model.rig.file import load_rig
 from model.rig.rig import Rig
 from model.table.build import build_table
+from model.table.question import Question
 from model.table.table import LocalizationTable
 from sim.sensors.accelerometer import scanning_grid
 from sim.sensors.stepped_sine import record_responses
@@ -53,7 +54,8 @@ def reached(
 ) -> float:
     """Contrast [dB] on the true plate of the pattern that a table gives."""
     target, *quiet = [(float(x), float(y)) for x, y in places]
-    excitation = asked.answer(target, quiet=quiet, level_db_sl=12.0, mode=mode).excitation
+    question = Question((target,), tuple(quiet), level_db_sl=12.0, mode=mode)
+    excitation = asked.query(question).excitation
 
     def peak(place: tuple[float, float]) -> np.ndarray:
         points = fingertip_points(*place, truth.plate)

@@ -37,8 +37,8 @@ def main() -> None:
     from benchmarks.latency_report import as_json, cases, check_case, lines, write_report
     from benchmarks.latency_run import Failed, Found, attempt, measure
     from model.rig.file import example_rig_path, load_rig
-    from model.table.cache import cached_table
     from model.table.file import save_table
+    from model.table.table_cache import cached_table
 
     table, _ = cached_table(load_rig(example_rig_path()))
     found: list[Found | Failed] = []

@@ -200,7 +200,7 @@ def ensemble_section(sets: int, seed: int) -> Section:
             values = []
             for places in contact_sets(sets, fingers=quiet + 1, rng=rng):
                 question = question_of(places, mode=mode, level_db_sl=12.0)
-                pattern = with_robust_contrast(table, question, table.ask(question))
+                pattern = with_robust_contrast(table, question, table.query(question))
                 values.append(pattern.robust_contrast_db)
             row.append(shown(values))
         rows.append(row)

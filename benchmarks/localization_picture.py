@@ -30,7 +30,7 @@ def modes_figure() -> Figure:
     panels = figure.subplots(1, len(MODES))
     for axes, mode in zip(panels, MODES, strict=True):
         question = question_of(PLACES, mode=mode)
-        pattern = with_robust_contrast(table, question, table.ask(question))
+        pattern = with_robust_contrast(table, question, table.query(question))
         level = sensation_level(*table.amplitudes(pattern.excitation, points))
         axes.pcolormesh(
             100 * x, 100 * y, level.reshape(SIDE, SIDE), cmap=COLORS, norm=SCALE, shading="gouraud"

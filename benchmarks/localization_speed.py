@@ -57,7 +57,7 @@ def live_times(
     times = []
     for places in contact_sets(questions, fingers=quiet + 1, rng=rng, apart=apart):
         question = question_of(places, mode=mode, level_db_sl=12.0)
-        times.append(timed(partial(table.ask, question)))
+        times.append(timed(partial(table.query, question)))
     return np.array(times)
 
 
@@ -87,7 +87,7 @@ def speed_section(seed: int) -> Section:
         every = []
         for places in contact_sets(100, fingers=quiet + 1, rng=rng):
             question = question_of(places, eras_at_most=4, level_db_sl=12.0)
-            every.append(timed(partial(table.ask, question)))
+            every.append(timed(partial(table.query, question)))
         rows.append(_row(f"exact search, 614 655 patterns, {quiet} quiet", every))
     for name, loudest in (("root mean square", False), ("loudest point", True)):
         clock, used = timed(partial(search_cells, table, loudest=loudest))
@@ -150,7 +150,7 @@ def _times_of(what: str, value: int, seed: int) -> dict[str, float]:
     exact = []
     for places in contact_sets(7, fingers=2, rng=rng):
         question = question_of(places, eras_at_most=eras, search_time=60.0, level_db_sl=12.0)
-        exact.append(timed(partial(table.ask, question))[1])
+        exact.append(timed(partial(table.query, question))[1])
     return times | {"exact": float(np.median(exact))}
 
 

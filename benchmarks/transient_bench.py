@@ -76,7 +76,7 @@ class Bench:
             for name, ramp in (("abrupt", 0.0), ("20 ms ramp", 0.02), ("40 ms ramp", 0.04)):
                 bases = ramped_onset(excitation, self.rig.eras, ramp=ramp)
                 columns[name].append(self._contrast(case, bases))
-            chosen = self.table.ask(
+            chosen = self.table.query(
                 Question(tuple(case.targets), tuple(case.quiet), mode="phased", level_db_sl=12.0)
             )
             bases = ramped_onset(chosen.excitation, self.rig.eras, ramp=chosen.ramp)

@@ -13,11 +13,11 @@ from model.errors import InputError
 from model.finger.grid import Grid
 from model.finger.perception import STRONG_DB_SL
 from model.rig.rig import Rig
-from model.table.cache import cached_table
 from model.table.pattern import Pattern
-from model.table.query import answered, with_all_measures
+from model.table.query import query_table
 from model.table.question import Question
 from model.table.table import PAPER_GRID, LocalizationTable
+from model.table.table_cache import cached_table
 from model.table.timing import Timing
 
 
@@ -51,14 +51,16 @@ def query(
     level_db_sl: float = STRONG_DB_SL,
     mode: str | None = None,
     envelopes: bool = False,
+    measures: bool = True,
 ) -> Pattern:
-    """The best pattern for fingers at these places [m], with all that is predicted of it.
+    """Find the best pattern for fingers at these places [m], with its predicted measures.
 
-    target: who shall feel it, quiet: who must not, each one place or several; level_db_sl: how
-    strongly, 20 dB above the detection threshold is strong; mode: the table's own if None;
-    envelopes: for amplifiers that play shaped onsets and endings. Raises InputError for places off
-    the plate or on top of each other, and a level that cannot be reached. The same as
-    `era table query`; `table.answer` is the quicker one, which predicts less.
+    target: fingers to feel it; quiet: fingers not to feel it; each one place or several.
+    level_db_sl: level at the target above its detection threshold, 20 dB is strong; mode: drive
+    mode, the table's own if None; envelopes: for amplifiers that play shaped onsets and endings;
+    measures: compute transient and robust contrast and concentration, too, some ten milliseconds.
+    Raises InputError for places off the plate or on top of each other, and a level that cannot be
+    reached. The same as `era table query`.
     """
     expect(table, LocalizationTable, what="table", made_by="era.table(rig)")
     expect_number(level_db_sl, what="level_db_sl", unit="decibels above the threshold")
@@ -71,8 +73,8 @@ def query(
         mode=mode,
         envelopes=envelopes,
     )
-    timing = _timing(table)
-    return with_all_measures(table, question, answered(table, question, timing), timing)
+    pattern, _ = query_table(table, question, _timing(table), measures=measures)
+    return pattern
 
 
 def _expect_mode(given: object) -> None:

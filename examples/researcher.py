@@ -152,7 +152,9 @@ distances = np.array([0.02, 0.03, 0.05, 0.08, 0.12])
 study = {
     mode: np.array(
         [
-            table.answer(target, quiet=[(target[0] + distance, target[1])], mode=mode).contrast_db
+            era.query(
+                table, target, quiet=(target[0] + distance, target[1]), mode=mode, measures=False
+            ).contrast_db
             for distance in distances
         ]
     )

@@ -63,7 +63,7 @@ def demo(
         write_picture,
     )
     from model.rig.file import example_rig_path, load_rig
-    from model.table.cache import cached_table
+    from model.table.table_cache import cached_table
 
     if wire not in WIRES:
         raise InputError(f"--wire {wire}: there is no such wire; choose one of {', '.join(WIRES)}")

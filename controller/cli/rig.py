@@ -65,7 +65,7 @@ def check(
     """
     import time
 
-    from model.diagnosis import wording
+    from model.diagnosis import diagnosis_report
     from model.diagnosis.verdict import diagnose
     from model.rig.file import load_rig
 
@@ -95,7 +95,7 @@ def check(
     verdict = diagnose(rig, observation)
     elapsed = time.perf_counter() - started
     if as_json:
-        print(json.dumps({**wording.as_json(verdict), "elapsed_s": elapsed}))
+        print(json.dumps({**diagnosis_report.as_json(verdict), "elapsed_s": elapsed}))
     else:
         low, high = verdict.frequencies.min(), verdict.frequencies.max()
         print(
@@ -104,7 +104,15 @@ def check(
             f"from {low:g} to {high:g} Hz, {elapsed:.1f} s"
         )
         print()
-        print("\n".join([*wording.channel_table(verdict), "", *wording.verdict_rows(verdict)]))
+        print(
+            "\n".join(
+                [
+                    *diagnosis_report.channel_table(verdict),
+                    "",
+                    *diagnosis_report.verdict_rows(verdict),
+                ]
+            )
+        )
     if not verdict.is_well:
         raise typer.Exit(NOT_WELL)
 

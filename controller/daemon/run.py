@@ -15,9 +15,9 @@ from drivers.errors import DriverError
 from model.config.document import ConfigError, read_document
 from model.counting import counted
 from model.errors import InputError
-from model.table.cache import cached_table
 from model.table.file import load_table
 from model.table.table import LocalizationTable
+from model.table.table_cache import cached_table
 
 _SWITCH_INTERVAL = 0.001  # s; another thread keeps the control loop waiting no longer
 

@@ -125,7 +125,7 @@ class Decider:
             envelopes=shaping.onsets,
         )
         pattern = self._timing.with_envelopes(
-            anybody, self._table.ask(anybody), onset=shaping.onsets, ending=shaping.endings
+            anybody, self._table.query(anybody), onset=shaping.onsets, ending=shaping.endings
         )
         self._timing.with_transient_measures(anybody, pattern)
 

@@ -47,7 +47,7 @@ class PatternTable(Protocol):
     def prepare(self, mode: str) -> None:
         """Work out what the first question in a mode would have to wait for."""
 
-    def ask(self, question: Question) -> Pattern:
+    def query(self, question: Question) -> Pattern:
         """The best pattern; raises InputError where there is none."""
 
     def amplitudes(
@@ -159,15 +159,15 @@ class Selector:
     ) -> tuple[Question, Pattern]:
         """The pattern, and what the table was asked in the end; raises InputError."""
         if all(target.level_db_sl is None for target in targets):
-            return question, strongest(self._table.ask(question), largest)
+            return question, strongest(self._table.query(question), largest)
         try:
-            return question, self._table.ask(question)
+            return question, self._table.query(question)
         except InputError:
             if not all(target.or_less for target in targets):
                 raise
         wanted = question.level_db_sl
         question = replace(question, level_db_sl=min(wanted, FELT_DB_SL))
-        return question, strongest(self._table.ask(question), largest, at_most=wanted)
+        return question, strongest(self._table.query(question), largest, at_most=wanted)
 
     def _felt(
         self,

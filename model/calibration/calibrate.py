@@ -7,13 +7,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.arrays import ComplexArray, FloatArray
+from model.calibration.calibration_result import (
+    FITS,
+    Calibration,
+    FittedParameter,
+    HeldOut,
+    SensorScale,
+)
+from model.calibration.calibration_screening import silent_eras, silent_sensors, unlike_the_plate
 from model.calibration.fast_plate import FastPlate, fast_plate
 from model.calibration.fit import Fit, Problem, misfit, row_size, solve
 from model.calibration.held_out import as_it_was, hold_out, relative_error
-from model.calibration.outcome import FITS, Calibration, FittedParameter, HeldOut, SensorScale
 from model.calibration.parameters import Parameter, parameters_of, rig_with, starts
 from model.calibration.responses import Responses
-from model.calibration.screening import silent_eras, silent_sensors, unlike_the_plate
 from model.errors import InputError
 from model.rig.rig import Rig
 from model.structure.actuator import Gain

@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.arrays import ComplexArray, FloatArray
+from model.calibration.calibration_result import HeldOut
 from model.calibration.fit import Fit, Problem, row_size, solve
-from model.calibration.outcome import HeldOut
 from model.calibration.parameters import rig_with
 
 _HELD_OUT_SHARE = 0.2  # of the sensors

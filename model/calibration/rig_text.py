@@ -8,7 +8,7 @@ import numpy as np
 import yaml
 from scipy.optimize import brentq
 
-from model.calibration.outcome import Calibration
+from model.calibration.calibration_result import Calibration
 from model.config.document import KeyPath
 from model.errors import InputError
 from model.rig.rig import Rig

@@ -34,7 +34,7 @@ def calibrate(
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object, nothing else.")] = False,
 ) -> None:
     """Fit a rig to measured frequency responses. Values with their uncertainty, and a new rig."""
-    from model.calibration import wording
+    from model.calibration import calibration_report
     from model.calibration.calibrate import calibrate as fit
     from model.calibration.responses import responses_of
     from model.calibration.responses_file import read_functions
@@ -54,8 +54,11 @@ def calibrate(
     started = time.perf_counter()
     calibration = fit(rig, responses, all_scales=all_scales)
     elapsed = time.perf_counter() - started
-    rows = wording.change_rows(calibration)
-    notes = [*wording.finding_rows(calibration), wording.check_row(calibration)]
+    rows = calibration_report.change_rows(calibration)
+    notes = [
+        *calibration_report.finding_rows(calibration),
+        calibration_report.check_row(calibration),
+    ]
     files = []
     if calibration.is_good:
         from model.calibration.rig_text import calibrated_text, check_reads_back
@@ -72,12 +75,12 @@ def calibrate(
         files.append(str(output))
     if picture is not None:
         from model.figures import save_figure
-        from model.figures.calibration import calibration_figure
+        from model.figures.calibration_figure import calibration_figure
 
         save_figure(calibration_figure(calibration), picture)
         files.append(str(picture))
     if as_json:
-        told = wording.as_json(calibration, rig, files)
+        told = calibration_report.as_json(calibration, rig, files)
         print(json.dumps({**told, "solve_time_s": elapsed}))
     else:
         print(
@@ -87,7 +90,7 @@ def calibrate(
             f"{counted(responses.count, 'value')}; fitted in {elapsed:.1f} s"
         )
         print()
-        print("\n".join([*rows, *wording.gain_rows(calibration)]))
+        print("\n".join([*rows, *calibration_report.gain_rows(calibration)]))
         print()
         print("\n".join(notes))
     if not calibration.is_good:

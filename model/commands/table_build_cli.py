@@ -46,8 +46,8 @@ def build(
     from model.table.build import build_in_parts
     from model.table.file import ZIP, save_table
     from model.table.kept_parts import KeptParts
-    from model.table.parts import TableProblem
-    from model.table.table import usual_frequencies
+    from model.table.table import default_drive_frequencies
+    from model.table.table_parts import TableProblem
 
     if mode not in MODES:
         raise InputError(f"unknown drive mode --mode {mode!r}; known: {', '.join(MODES)}")
@@ -57,7 +57,11 @@ def build(
     rig = load_rig(rig_file, mesh=mesh)
     started = time.perf_counter()
     cells = Grid(*parse_pair(grid, what="--grid"))
-    asked = usual_frequencies(rig.limits) if frequencies is None else parse_frequencies(frequencies)
+    asked = (
+        default_drive_frequencies(rig.limits)
+        if frequencies is None
+        else parse_frequencies(frequencies)
+    )
     problem = TableProblem(rig, asked, cells)
     kept = KeptParts.beside(output, problem.digest)
     with progress_bar("parts") as progress:

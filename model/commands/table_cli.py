@@ -46,7 +46,7 @@ def query(
     from model.config.points import parse_point
     from model.errors import InputError
     from model.table.file import load_table
-    from model.table.query import answer_as_json, prepared_timing
+    from model.table.query import prepared_timing, query_as_json
     from model.table.question import Question
 
     if batch is not None:
@@ -69,7 +69,7 @@ def query(
     )
     table = load_table(table_file)
     table.prepare(mode)
-    answer = answer_as_json(table, question, prepared_timing(table))
+    answer = query_as_json(table, question, prepared_timing(table))
     if as_json:
         print(json.dumps(answer))
         return
@@ -99,13 +99,13 @@ def _answer_batch(table_file: Path, batch: Path) -> None:
     """Answer line by line as they are read; status 1 at the end if any had no answer."""
     from model.errors import InputError
     from model.table.file import load_table
-    from model.table.query import answer_lines
+    from model.table.query import query_batch
 
     table = load_table(table_file)
     failed = False
     try:
         with batch.open(encoding="utf-8") as lines:
-            for answer in answer_lines(table, lines):
+            for answer in query_batch(table, lines):
                 failed = failed or "error" in answer
                 print(json.dumps(answer))
     except OSError as error:

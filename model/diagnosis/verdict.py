@@ -11,10 +11,7 @@ from model.arrays import ComplexArray, FloatArray
 from model.calibration.fast_plate import FastPlate, fast_plate
 from model.diagnosis.assignment import Likeness, likeness, likeness_to
 from model.diagnosis.causes import Explanation, explain
-from model.diagnosis.observation import Observation
-from model.diagnosis.plate_match import FITS, MODEL_ERROR, Match, match_plate
-from model.diagnosis.polarity import Phase, phases_of_drive, signs_of_pairs
-from model.diagnosis.screening import (
+from model.diagnosis.diagnosis_screening import (
     LEAST_SENSORS,
     check_enough,
     dead_channels,
@@ -22,6 +19,9 @@ from model.diagnosis.screening import (
     shapeless_channels,
     usable_sensors,
 )
+from model.diagnosis.observation import Observation
+from model.diagnosis.plate_match import FITS, MODEL_ERROR, Match, match_plate
+from model.diagnosis.polarity import Phase, phases_of_drive, signs_of_pairs
 from model.errors import InputError
 from model.rig.rig import Channel, Rig
 

@@ -118,7 +118,7 @@ def answer_figure(table: LocalizationTable) -> Figure:
     figure = Figure(figsize=(6.6, 5), layout="compressed")
     axes = figure.subplots()
     try:
-        pattern = table.ask(question)
+        pattern = table.query(question)
     except InputError:  # too weak a rig, or too small a plate for three fingers
         axes.set_title("The table has no answer to the three fingers of this picture")
         axes.axis("off")

@@ -19,8 +19,8 @@ from model.finger.grid import Grid
 from model.processes import on_processes
 from model.rig.rig import Rig
 from model.table.kept_parts import KeptParts
-from model.table.parts import Part, TableProblem, solve_part
 from model.table.table import PAPER_FREQUENCIES, PAPER_GRID, LocalizationTable
+from model.table.table_parts import Part, TableProblem, solve_part
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from model.files.array_file import Arrays
 from model.files.kept_arrays import keep_arrays, kept_arrays
-from model.table.parts import PART_TYPES, Part
+from model.table.table_parts import PART_TYPES, Part
 
 _SUFFIX = ".part.npz"
 

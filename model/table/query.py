@@ -1,4 +1,4 @@
-"""Questions to a table as JSON, and its answers."""
+"""Queries of a table with all measures, and their JSON."""
 
 import cmath
 import math
@@ -10,10 +10,10 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from model.errors import InputError, first_problem
 from model.finger.perception import STRONG_DB_SL
+from model.table.concentration import with_concentration
 from model.table.pattern import Pattern
 from model.table.question import Question
 from model.table.robust import with_robust_contrast
-from model.table.spread import with_spread
 from model.table.table import LocalizationTable
 from model.table.timing import Timing
 from model.transients.envelope import Envelopes
@@ -22,7 +22,7 @@ _Place = Annotated[list[float], Field(min_length=2, max_length=2)]
 
 
 class _Line(BaseModel):
-    """What a line of a batch may hold."""
+    """Schema of a line of a batch."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -36,7 +36,7 @@ class _Line(BaseModel):
 
 
 def question_from_json(line: str) -> Question:
-    """The question of one line, `{"target": [x, y], "quiet": [[x, y], ...], "mode": ...}`.
+    """Parse the question of one line, `{"target": [x, y], "quiet": [[x, y], ...], "mode": ...}`.
 
     Several targets: `"targets": [[x, y], ...]`; also `"level_db_sl"`, `"eras_at_most"` and
     `"envelopes"`. Raises InputError.
@@ -44,13 +44,13 @@ def question_from_json(line: str) -> Question:
     try:
         asked = _Line.model_validate_json(line)
     except ValidationError as error:
-        where, said = first_problem(error)
-        if not where:
-            raise InputError(
-                'a line is a question such as {"target": [0.08, 0.06], "quiet": [[0.22, 0.16]]}; '
-                f"{said}"
-            ) from None
-        raise InputError(f"{where}: {said}") from None
+        key, rule = first_problem(error)
+        raise InputError(
+            f"{key}: {rule}"
+            if key
+            else 'line must be a JSON object such as {"target": [0.08, 0.06], "quiet": '
+            f"[[0.22, 0.16]]}}; {rule}"
+        ) from None
     targets = [*([] if asked.target is None else [asked.target]), *asked.targets]
     return Question(
         targets=tuple((x, y) for x, y in targets),
@@ -62,31 +62,30 @@ def question_from_json(line: str) -> Question:
     )
 
 
-def answered(table: LocalizationTable, question: Question, timing: Timing) -> Pattern:
-    """The pattern for a question, with envelopes if the amplifiers play them."""
-    pattern = table.ask(question)
-    return timing.with_envelopes(question, pattern) if question.envelopes else pattern
+def query_table(
+    table: LocalizationTable, question: Question, timing: Timing, *, measures: bool = True
+) -> tuple[Pattern, float]:
+    """Query a table; also return the time [s] that the pattern took without its measures.
 
-
-def with_all_measures(
-    table: LocalizationTable, question: Question, pattern: Pattern, timing: Timing
-) -> Pattern:
-    """A pattern with all that can be said of it: in time, on other plates, over the whole plate."""
-    pattern = timing.with_transient_measures(question, pattern)
-    pattern = with_robust_contrast(table, question, pattern)
-    return with_spread(table, question, pattern)
-
-
-def answer_as_json(table: LocalizationTable, question: Question, timing: Timing) -> dict[str, Any]:
-    """The answer with all its measures; solve_time_s is that of the pattern, without measures.
-
-    A table that has been prepared answers as it does while fingers wait.
+    The pattern has envelopes if the question wants them; measures: compute those in time, on
+    plates within tolerance and over the whole plate.
     """
     started = time.perf_counter()
-    pattern = answered(table, question, timing)
+    pattern = table.query(question)
+    if question.envelopes:
+        pattern = timing.with_envelopes(question, pattern)
     elapsed = time.perf_counter() - started
-    pattern = with_all_measures(table, question, pattern, timing)
-    spread = pattern.spread
+    if not measures:
+        return pattern, elapsed
+    pattern = timing.with_transient_measures(question, pattern)
+    pattern = with_robust_contrast(table, question, pattern)
+    return with_concentration(table, question, pattern), elapsed
+
+
+def query_as_json(table: LocalizationTable, question: Question, timing: Timing) -> dict[str, Any]:
+    """Query a table with all measures; the JSON object of `era table query`."""
+    pattern, elapsed = query_table(table, question, timing)
+    concentration = pattern.concentration
     return {
         "drive": table.drive_of(pattern.excitation),
         "mode": pattern.mode,
@@ -98,9 +97,9 @@ def answer_as_json(table: LocalizationTable, question: Question, timing: Timing)
         "transient_contrast_db": pattern.transient_contrast_db,
         "left_after_db": pattern.left_after_db,
         "surroundings_contrast_db": pattern.surroundings_contrast_db,
-        "surroundings_contrast_95_db": spread and spread.contrast_95_db,
-        "area_above_half_m2": spread and spread.area_above_half,
-        "energy_share_near": spread and spread.energy_share_near,
+        "surroundings_contrast_95_db": concentration and concentration.contrast_95_db,
+        "area_above_half_m2": concentration and concentration.area_above_half,
+        "energy_share_near": concentration and concentration.energy_share_near,
         "quiet_level_db_sl": pattern.quiet_level_db_sl,
         "quiet_is_unaware": pattern.quiet_is_unaware,
         "usable_level_db_sl": pattern.usable_level_db_sl,
@@ -112,7 +111,7 @@ def answer_as_json(table: LocalizationTable, question: Question, timing: Timing)
 
 
 def prepared_timing(table: LocalizationTable) -> Timing:
-    """What shapes the table's patterns, with all that does not depend on fingers worked out."""
+    """Solve what the timing of patterns needs at every frequency of a table."""
     timing = Timing(table)
     timing.prepare(table.frequencies.tolist())
     return timing
@@ -121,7 +120,7 @@ def prepared_timing(table: LocalizationTable) -> Timing:
 def envelopes_as_json(
     envelopes: Envelopes | None, table: LocalizationTable
 ) -> dict[str, Any] | None:
-    """By ERA: level 0..1 of the stroke and phase at the start and at every knot, and their step."""
+    """Level 0..1 of the stroke and phase at the start and at every knot, by ERA."""
     if envelopes is None:
         return None
     strokes = {era.name: era.stroke for era in table.eras}
@@ -140,14 +139,14 @@ def _as_level_and_phase(amplitude: complex, *, stroke: float) -> dict[str, float
     return {"level": abs(amplitude) / stroke, "phase_deg": math.degrees(cmath.phase(amplitude))}
 
 
-def answer_lines(table: LocalizationTable, lines: Iterable[str]) -> Iterator[dict[str, Any]]:
-    """An answer for every line that is not empty; `{"error": ..., "line": n}` where it has none."""
+def query_batch(table: LocalizationTable, lines: Iterable[str]) -> Iterator[dict[str, Any]]:
+    """Answer every line that is not empty; `{"error": ..., "line": n}` for one without answer."""
     table.prepare()
     timing = prepared_timing(table)
     for number, line in enumerate(lines, start=1):
         if not line.strip():
             continue
         try:
-            yield answer_as_json(table, question_from_json(line), timing)
+            yield query_as_json(table, question_from_json(line), timing)
         except InputError as error:
             yield {"error": str(error), "line": number}

@@ -17,9 +17,9 @@ from model.structure.plate import Plate
 Point: TypeAlias = tuple[float, float]
 """x, y [m]."""
 
-MOST_CONTACTS = 10
+MAX_CONTACTS = 10
 
-LEAST_LEVEL_DB_SL, MOST_LEVEL_DB_SL = -100.0, 200.0
+MIN_LEVEL_DB_SL, MAX_LEVEL_DB_SL = -100.0, 200.0
 """Below lies nothing that a channel can play, above nothing that a plate survives."""
 
 
@@ -54,12 +54,12 @@ class Question:
         """Refuse what has no answer on any plate."""
         if not self.targets:
             raise InputError("nobody is to feel anything: name at least one target")
-        if len(self.targets) + len(self.quiet) > MOST_CONTACTS:
+        if len(self.targets) + len(self.quiet) > MAX_CONTACTS:
             raise InputError(
                 f"{len(self.targets) + len(self.quiet)} contacts are more than ten fingers; "
-                f"leave out all but {MOST_CONTACTS}"
+                f"leave out all but {MAX_CONTACTS}"
             )
-        low, high = LEAST_LEVEL_DB_SL, MOST_LEVEL_DB_SL
+        low, high = MIN_LEVEL_DB_SL, MAX_LEVEL_DB_SL
         if not low <= self.level_db_sl <= high:  # not true of NaN either
             raise InputError(
                 f"a level of {self.level_db_sl:g} dB SL is none that can be asked for; 20 is "
@@ -71,7 +71,7 @@ class Question:
                 f"{counted(len(self.targets), 'target')}; give each its own, or none"
             )
         for softer in self.softer_db:
-            if not 0 <= softer <= MOST_LEVEL_DB_SL:  # not true of NaN either
+            if not 0 <= softer <= MAX_LEVEL_DB_SL:  # not true of NaN either
                 raise InputError(
                     f"a target cannot be softer than the level asked for by {softer} dB; take the "
                     "highest for the level, and say by how much the others are below it"

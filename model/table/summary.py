@@ -10,6 +10,7 @@ from model.arrays import FloatArray, IntArray
 from model.drive_modes.sources import all_patterns
 from model.errors import InputError
 from model.finger.perception import FELT_DB_SL
+from model.table.question import Question
 from model.table.table import LocalizationTable
 from model.table.weak_cells import WeakCells, are_apart
 
@@ -85,7 +86,7 @@ def contrast_distribution(
         asked += 1
         target, *quiet = [(float(x), float(y)) for x, y in contacts]
         with contextlib.suppress(InputError):
-            contrast = table.answer(target, quiet=quiet).contrast_db
+            contrast = table.query(Question((target,), tuple(quiet))).contrast_db
             contrasts.append(np.nan if contrast is None else contrast)
         progress((others - 1) * CONTACT_SETS + len(contrasts), 3 * CONTACT_SETS)
         # Where hardly a target is reached, the few that are must do.

@@ -14,7 +14,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from model.arrays import FloatArray
+from model.arrays import FloatArray, IntArray
 from model.drive_modes.exact_search import pattern_count
 from model.drive_modes.fields import Fields, SingleComplex
 from model.drive_modes.sources import (
@@ -26,15 +26,15 @@ from model.errors import InputError
 from model.fem.mesh import Mesh
 from model.finger.contrast import is_around
 from model.finger.grid import Grid
-from model.finger.perception import STRONG_DB_SL, decibels, detection_threshold
+from model.finger.perception import decibels, detection_threshold
 from model.rig.rig import Limits, physics_fingerprint
 from model.structure.actuator import Era
 from model.structure.plate import Plate
 from model.structure.point_load import PointLoad
 from model.structure.point_mass import PointMass
-from model.table.answer import answer_to
 from model.table.pattern import ONSET_RAMP, Pattern
-from model.table.question import LEAST_LEVEL_DB_SL, Point, Question
+from model.table.pattern_choice import Candidates, OnsetContrast, choose_pattern
+from model.table.question import MIN_LEVEL_DB_SL, Point, Question
 from model.table.raster import Fingertips, Raster
 from model.table.reduced_on_raster import ReducedOnRaster
 from model.transients.onset import RampedOnsets
@@ -48,10 +48,10 @@ PAPER_FREQUENCIES = np.arange(60.0, 321.0, 10.0)
 PAPER_GRID = Grid(12, 9)
 
 
-def usual_frequencies(limits: Limits) -> FloatArray:
-    """What a table of a rig is built for unless somebody says: the paper's within its limits.
+def default_drive_frequencies(limits: Limits) -> FloatArray:
+    """Drive frequencies of a table by default: the paper's within the rig's limits, (f,) [Hz].
 
-    Steps of 10 Hz from its lowest where it may play none of those; (f,) [Hz], never empty.
+    Steps of 10 Hz from the lowest limit where that leaves none.
     """
     low, high = limits.frequency_min, limits.frequency_max
     first, past = np.searchsorted(PAPER_FREQUENCIES, [low, np.nextafter(high, np.inf)])
@@ -111,41 +111,45 @@ class LocalizationTable:
         """Mean peak acceleration over each cell of every `switched` pattern, (n, cells) [m/s²]."""
         return sums_of_sources(self.cell_sources.T, len(self.eras)).T
 
-    def answer(
-        self,
-        target: Point,
-        *,
-        quiet: Sequence[Point] = (),
-        level_db_sl: float = STRONG_DB_SL,
-        mode: str | None = None,
-    ) -> Pattern:
-        """The pattern for one target; see `ask`."""
-        return self.ask(Question((target,), tuple(quiet), level_db_sl=level_db_sl, mode=mode))
+    def query(self, question: Question) -> Pattern:
+        """Find the best pattern in a drive mode among those that reach a level at the targets.
 
-    def ask(self, question: Question) -> Pattern:
-        """The best pattern in a mode among those that reach a level at the targets.
-
-        `switched` goes by contrast, the other modes by their robust score (`model.drive_modes`); a
-        lone finger is told from the plate beyond 50 mm, root mean square. The pattern is then
-        turned down to the level asked for; contrast does not depend on that. Raises InputError for
-        contacts off the plate or on top of each other and a level that cannot be reached.
+        `switched` maximizes contrast, the other modes their robust score (`model.drive_modes`);
+        with no quiet finger contrast is to the plate beyond 50 mm, root mean square. The pattern
+        is then scaled to the level, which leaves contrast as it is. Raises InputError for contacts
+        off the plate and for a level that cannot be reached.
         """
-        return answer_to(self, question)
+        question.check_on(self.plate)
+        drive_mode = question.mode_on(self.mode, era_count=len(self.eras))
+        low, high = question.frequencies
+        playable = np.flatnonzero((self.frequencies >= low) & (self.frequencies <= high))
+        if len(playable) == 0:
+            raise InputError(
+                f"frequencies of the table must include some from {low:g} to {high:g} Hz, which "
+                f"these amplifiers play, got {self.frequencies[0]:g} to {self.frequencies[-1]:g} "
+                "Hz; build a table with others: era table build --frequencies"
+            )
+        fingertips = self._fingertips(question)
+        fields = self._fields(question, fingertips)
+        if len(playable) < len(self.frequencies):
+            fields = fields.at(playable)
+        onset_contrast = self._onset_contrast(question, fingertips, playable)
+        candidates = Candidates(self.eras, self.frequencies[playable], fields, onset_contrast)
+        return choose_pattern(question, drive_mode, candidates)
 
     def prepare(self, mode: str | None = None) -> None:
         """Work out what the first question in a mode would have to wait for."""
         centre = (self.plate.length / 2, self.plate.width / 2)
         for quiet in ((), ((0.0, 0.0),)):
-            self.ask(Question((centre,), quiet, level_db_sl=LEAST_LEVEL_DB_SL, mode=mode))
+            self.query(Question((centre,), quiet, level_db_sl=MIN_LEVEL_DB_SL, mode=mode))
         if (mode or self.mode) != "switched":
             _ = self.onsets  # not every question has patterns to choose among
 
     def fields(self, question: Question) -> Fields:
-        """What a drive mode needs to know about a question, at all frequencies of the table."""
-        return self.fields_at(question, self.fingertips(question))
+        """Fields of the ERAs at the fingertips of a question, at all frequencies of the table."""
+        return self._fields(question, self._fingertips(question))
 
-    def fields_at(self, question: Question, fingertips: Fingertips) -> Fields:
-        """The same, with the question's fingertips as `fingertips` has them."""
+    def _fields(self, question: Question, fingertips: Fingertips) -> Fields:
         found, ends = self._by_frequency(fingertips.read(self._values)), fingertips.ends
         count = len(question.targets)
         if question.quiet:
@@ -241,9 +245,30 @@ class LocalizationTable:
         """Fields at the centres of the cells, (f, eras, cells)."""
         return self._by_frequency(self.raster.at(self._values, self.cell_centres))
 
-    def fingertips(self, question: Question) -> Fingertips:
-        """Where the question's fingers are on the raster, targets first."""
+    def _fingertips(self, question: Question) -> Fingertips:
+        """Fingertips of a question on the raster, targets first."""
         return self.raster.fingertips(np.array([*question.targets, *question.quiet]))
+
+    def _onset_contrast(
+        self, question: Question, fingertips: Fingertips, playable: IntArray
+    ) -> OnsetContrast:
+        """Contrast of plain ramps at the fingertips, by index among the playable frequencies."""
+
+        def contrast(rows: IntArray, weights: SingleComplex) -> FloatArray | None:
+            if self.onsets is None:
+                return None
+            shapes, ends = fingertips.read(self.shapes), fingertips.ends
+            return self.onsets.contrast(
+                playable[rows],
+                weights,
+                targets=[
+                    shapes[start:end] * gain
+                    for start, end, gain in zip((0, *ends), ends, question.gains, strict=False)
+                ],
+                quiet=shapes[ends[len(question.targets) - 1] :],
+            )
+
+        return contrast
 
     def _by_frequency(self, values: NDArray[np.float32]) -> SingleComplex:
         fields = values.view(np.complex64).reshape(len(values), len(self.frequencies), -1)

@@ -289,7 +289,7 @@ def _random_answer(
         target, *quiet = ((float(x), float(y)) for x, y in contacts)
         question = Question((target,), tuple(quiet))
         with contextlib.suppress(InputError):
-            return question, table.ask(question)
+            return question, table.query(question)
     raise InputError(
         f"no random contacts on this plate of {size[0]:g} x {size[1]:g} m have an answer at 20 dB "
         "SL to verify; is it smaller than two fingers, or its stroke too small?"

@@ -17,6 +17,7 @@ from model.arrays import FloatArray
 from model.errors import InputError
 from model.finger.grid import Grid
 from model.finger.perception import FELT_DB_SL, STRONG_DB_SL
+from model.table.question import Question
 from model.table.table import LocalizationTable
 
 LEAST_DISTANCE = 0.05
@@ -110,8 +111,9 @@ def text_map(weak: WeakCells) -> Iterator[str]:
 def _contrast(table: LocalizationTable, target: FloatArray, other: FloatArray) -> float:
     """Contrast [dB] at the wanted level; -inf where that is not reached."""
     at, quiet = ((float(x), float(y)) for x, y in (target, other))
+    question = Question((at,), (quiet,), level_db_sl=WANTED_LEVEL_DB_SL)
     try:
-        contrast = table.answer(at, quiet=[quiet], level_db_sl=WANTED_LEVEL_DB_SL).contrast_db
+        contrast = table.query(question).contrast_db
     except InputError:
         return -np.inf
     return -np.inf if contrast is None else contrast

@@ -42,7 +42,7 @@ GOOD: dict[Callable[..., Any], dict[str, Any]] = {
 }  # fmt: skip
 """Arguments that can be used, by function; None: a small table, or what was played before."""
 
-TAKES_ANYTHING = {"title", "envelopes"}
+TAKES_ANYTHING = {"title", "envelopes", "measures"}
 
 
 STRAYS = (object(), "here", 3.5, [object()])

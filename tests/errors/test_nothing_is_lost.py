@@ -43,7 +43,7 @@ LONG = {
     "table verify table.npz rig.yaml": "model.table.verify.verify_table",
     "plate convergence rig.yaml": "model.vibration.convergence.study_convergence",
     "rig check rig.yaml --measured measured.csv": "model.diagnosis.verdict.diagnose",
-    "demo --wire sim": "model.table.cache.cached_table",
+    "demo --wire sim": "model.table.table_cache.cached_table",
 }
 """Others that take long."""
 

@@ -45,5 +45,5 @@ def test_contrast_of_the_onset_is_the_predicted_one(touches):
     assert onset.is_shaped
     assert onset.measured_contrast_db == pytest.approx(onset.predicted_contrast_db, abs=2)
     question = Question((row.target,), tuple(row.quiet.values()), mode="phased")
-    ramped = Timing(table).with_transient_measures(question, table.ask(question))
+    ramped = Timing(table).with_transient_measures(question, table.query(question))
     assert onset.measured_contrast_db > ramped.transient_contrast_db + 6

@@ -175,7 +175,7 @@ class Table:
         """Remember it."""
         self.prepared.append(mode)
 
-    def ask(self, question: Question) -> Pattern:
+    def query(self, question: Question) -> Pattern:
         """The same for every target."""
         self.asked.append(question)
         if isinstance(self.excitation, Exception):

@@ -78,7 +78,7 @@ def patterns_are_the_tables(played: Played, truth: Truth) -> None:
     for heard in _touched(played):
         assert len(heard.told) == 1, heard.situation
         (told,) = heard.told
-        wanted = truth.table.ask(truth.asked(heard.situation)).excitation
+        wanted = truth.table.query(truth.asked(heard.situation)).excitation
         assert told["drive"].keys() == wanted.keys()
         for name, tone in wanted.items():
             got = told["drive"][name]
@@ -133,7 +133,7 @@ def onset_is_the_predicted_one(played: Played, truth: Truth) -> None:
     timing = Timing(truth.table)
     first, *_ = _touched(played)
     question = truth.asked(first.situation)
-    pattern = truth.table.ask(question)
+    pattern = truth.table.query(question)
     if truth.is_shaped:
         pattern = timing.with_envelopes(question, pattern, ending=False)
     predicted = timing.with_transient_measures(question, pattern).transient_contrast_db

@@ -4,8 +4,8 @@ import numpy as np
 
 from model.finger.grid import Grid
 from model.table.build import build_in_parts
-from model.table.parts import TableProblem
 from model.table.table import LocalizationTable
+from model.table.table_parts import TableProblem
 from paper_plate import make_paper_rig
 
 FREQUENCIES = np.array([60.0, 110.0, 250.0])

@@ -71,7 +71,7 @@ class OneTable:
     def prepare(self, mode: str) -> None:
         """There is nothing to work out."""
 
-    def ask(self, question: Question) -> Pattern:
+    def query(self, question: Question) -> Pattern:
         """By the number of fingers alone."""
         excitation = self.shared if question.quiet else self.alone
         contrast = 12.0 if question.quiet else None

@@ -41,7 +41,7 @@ class Table:
     def prepare(self, mode: str) -> None:
         """Not asked for here."""
 
-    def ask(self, question: Question) -> Pattern:
+    def query(self, question: Question) -> Pattern:
         """A pattern that names its question."""
         self.asked.append(question)
         if self.error is not None:

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from model.calibration.outcome import Calibration
+from model.calibration.calibration_result import Calibration
 from model.calibration.rig_text import calibrated_text, check_reads_back
 from model.errors import InputError
 from model.rig.file import load_rig

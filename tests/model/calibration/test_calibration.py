@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from model.calibration.calibrate import calibrate
+from model.calibration.calibration_result import Calibration
 from model.calibration.fast_plate import fast_plate
-from model.calibration.outcome import Calibration
 from model.calibration.responses import Responses
 from model.errors import InputError
 from model.fem.assembly import assemble
@@ -17,6 +17,7 @@ from model.finger.fingertip import fingertip_points
 from model.rig.rig import Rig
 from model.structure.point_mass import PointMass
 from model.table.build import build_table
+from model.table.question import Question
 from paper_plate import make_paper_rig
 from perturbed_plate import FREQUENCIES, NAMES, POINTS, measured, perturbed
 
@@ -119,7 +120,8 @@ def test_contrast_is_regained(rig: Rig, truth: Rig, fitted: Calibration) -> None
             continue
         row = []
         for table in tables:
-            pattern = table.answer(target, quiet=[quiet], level_db_sl=12.0, mode="phased")
+            question = Question((target,), (quiet,), level_db_sl=12.0, mode="phased")
+            pattern = table.query(question)
             felt, disturbed = (
                 tables[0]
                 .amplitudes(pattern.excitation, fingertip_points(*place, truth.plate))[1]

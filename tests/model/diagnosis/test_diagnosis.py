@@ -12,9 +12,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from model.diagnosis.diagnosis_report import as_json, channel_table, verdict_rows
 from model.diagnosis.observation import Observation, Pair
 from model.diagnosis.verdict import Verdict, diagnose
-from model.diagnosis.wording import as_json, channel_table, verdict_rows
 from model.errors import InputError
 from model.fem.assembly import assemble
 from model.fem.harmonic import direct_acceleration

@@ -67,7 +67,7 @@ def directly(rig, pattern, member, *, targets=1):
 def test_each_plate_is_what_the_direct_solver_says(mode):
     """Thicker, softer, damped otherwise, misdriven, with fingers on it: within 0.1 dB."""
     question = Question((TARGET,), QUIET, mode=mode)
-    pattern = smooth_table().ask(question)
+    pattern = smooth_table().query(question)
     found = ensemble_contrast_db(smooth_table(), question, pattern.excitation, MEMBERS)
     solved = [directly(smooth_rig(), pattern, member) for member in range(3)]
     np.testing.assert_allclose(found, solved, atol=0.1)
@@ -77,7 +77,7 @@ def test_each_plate_is_what_the_direct_solver_says(mode):
 def test_of_two_targets_the_lesser_one_counts():
     """The second of them is a target too and no quiet finger, on each plate as solved directly."""
     question = Question((TARGET, QUIET[0]), QUIET[1:], mode="switched")
-    pattern = smooth_table().ask(question)
+    pattern = smooth_table().query(question)
     found = ensemble_contrast_db(smooth_table(), question, pattern.excitation, MEMBERS)
     solved = [directly(smooth_rig(), pattern, member, targets=2) for member in range(3)]
     np.testing.assert_allclose(found, solved, atol=0.1)
@@ -94,7 +94,7 @@ def test_what_was_measured_of_a_rig_counts_on_each_plate():
     rig = replace(rig, eras=eras, masses=(PointMass(0.2, 0.05, 0.03),))
     table = build_table(rig, frequencies=np.array([110.0, 250.0]))
     question = Question((TARGET,), QUIET, mode="phased")
-    pattern = table.ask(question)
+    pattern = table.query(question)
     found = ensemble_contrast_db(table, question, pattern.excitation, MEMBERS)
     solved = [directly(rig, pattern, member) for member in range(3)]
     np.testing.assert_allclose(found, solved, atol=0.1)
@@ -104,7 +104,7 @@ def test_it_is_the_tenth_percentile_of_the_same_plates_every_time():
     """Nine of ten plates of the drawn ensemble have more; asked again it is the same number."""
     question = Question((TARGET,), QUIET, mode="phased")
     table = smooth_table()
-    pattern = with_robust_contrast(table, question, table.ask(question))
+    pattern = with_robust_contrast(table, question, table.query(question))
     contrasts = ensemble_contrast_db(table, question, pattern.excitation, draw_ensemble(4))
     assert (contrasts > pattern.robust_contrast_db).mean() == pytest.approx(0.9, abs=0.006)
     assert with_robust_contrast(table, question, pattern) == pattern
@@ -127,5 +127,5 @@ def test_the_ensemble_is_as_wide_as_is_said():
 def test_a_lone_finger_has_no_robust_contrast():
     """There is nobody to be told from."""
     question = Question((TARGET,))
-    pattern = with_robust_contrast(smooth_table(), question, smooth_table().ask(question))
+    pattern = with_robust_contrast(smooth_table(), question, smooth_table().query(question))
     assert pattern.robust_contrast_db is None

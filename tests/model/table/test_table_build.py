@@ -8,11 +8,11 @@ import pytest
 
 from model.errors import InputError
 from model.finger.grid import Grid
-from model.table import parts
+from model.table import table_parts
 from model.table.build import build_in_parts
 from model.table.file import save_table
 from model.table.kept_parts import KeptParts
-from model.table.parts import TableProblem
+from model.table.table_parts import TableProblem
 from model.vibration.convergence import study_convergence
 from paper_plate import make_paper_rig
 from small_table import FREQUENCIES, small_problem
@@ -83,7 +83,7 @@ def test_an_interrupted_build_goes_on(problem, whole, tmp_path):
 
 def test_whichever_part_is_missing_comes_where_it_belongs(problem, tmp_path, monkeypatch):
     """Twelve cells in shares of five: one share lost, the table is that of a build in one go."""
-    monkeypatch.setattr(parts, "CELLS_AT_ONCE", 5)
+    monkeypatch.setattr(table_parts, "CELLS_AT_ONCE", 5)
     whole = file_of(build_in_parts(problem, mode="switched"), tmp_path)
     kept = KeptParts.beside(tmp_path / "t.npz", problem.digest)
     build_in_parts(problem, mode="switched", kept=kept)
@@ -121,7 +121,7 @@ def test_parts_of_another_table_are_not_used(problem, tmp_path, caplog, what):
     digest = other.digest
     if what == "code":
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(parts, "code_version", lambda: "another")
+            patch.setattr(table_parts, "code_version", lambda: "another")
             digest = replace(problem).digest
     kept = KeptParts.beside(tmp_path / "t.npz", digest)
     with caplog.at_level(logging.WARNING):

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from model.finger.grid import Grid
-from model.table import cache as table_cache
-from model.table import parts
-from model.table.cache import cached_table
+from model.table import table_cache, table_parts
+from model.table.table_cache import cached_table
 from paper_plate import make_paper_rig
 
 
@@ -58,7 +57,7 @@ def test_the_second_time_it_is_read(rig, builds):
 
 def test_who_builds_a_table_asks_nobody_else_to(rig, caplog):
     """The log says why it is built, not how to build one: first there is none, then a bad one."""
-    caplog.set_level("INFO", logger="model.table.cache")
+    caplog.set_level("INFO", logger="model.table.table_cache")
     _, path = cached_table(rig)
     path.write_bytes(b"damaged")
     cached_table(rig)
@@ -102,7 +101,7 @@ def test_another_rigs_table_under_its_name_is_built_anew(rig, builds):
 def test_what_other_code_made_is_built_anew(rig, builds, monkeypatch):
     """A table that an older model left behind is not what this one would say, so it is replaced."""
     with monkeypatch.context() as older:
-        older.setattr(parts, "code_version", lambda: "0.0.1+000000000000")
+        older.setattr(table_parts, "code_version", lambda: "0.0.1+000000000000")
         table, path = cached_table(rig)
         assert table.code_version == "0.0.1+000000000000"
     table, again = cached_table(rig)

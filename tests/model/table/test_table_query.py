@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 from model.cli import app
 from model.errors import InputError
 from model.table.file import save_table
-from model.table.query import answer_lines, question_from_json
+from model.table.query import query_batch, question_from_json
 from paper_table import smooth_table
 
 RUNNER = CliRunner()
@@ -64,7 +64,7 @@ def test_the_questions_on_the_page_are_questions():
 def test_a_bad_line_does_not_end_the_run():
     """Each line has its answer; one without says its number; empty lines are passed over."""
     lines = ['{"target": [0.1, 0.1]}\n', "\n", "oops\n", '{"target": [9, 9]}\n']
-    first, bad, off = answer_lines(smooth_table(), lines)
+    first, bad, off = query_batch(smooth_table(), lines)
     assert first["level_db_sl"] == 20.0
     assert (bad["line"], off["line"]) == (3, 4)
     assert "not on the plate" in off["error"]

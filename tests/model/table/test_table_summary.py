@@ -156,17 +156,17 @@ def test_contrast_is_asked_of_fingers_apart(table, others):
     """Two hundred sets at least 5 cm apart; where no target is reached it ends at four hundred."""
     asked = []
 
-    def answer(target, *, quiet):
-        asked.append(np.array([target, *quiet]))
+    def answer(question):
+        asked.append(np.array([*question.targets, *question.quiet]))
         return SimpleNamespace(contrast_db=float(len(asked)))
 
-    def refuse(target, *, quiet):
-        answer(target, quiet=quiet)
+    def refuse(question):
+        answer(question)
         raise InputError("out of reach")
 
     found, none = (
         contrast_distribution(
-            SimpleNamespace(plate=table.plate, answer=each),
+            SimpleNamespace(plate=table.plate, query=each),
             others=others,
             rng=np.random.default_rng(1),
         )

@@ -8,7 +8,7 @@ import pytest
 from model.fem.assembly import era_positions
 from model.reduction.reduced_plate import reduce_plate
 from model.table.build import build_table
-from model.table.query import answer_lines
+from model.table.query import query_batch
 from model.table.question import Question
 from model.table.timing import Timing
 from model.transients.envelope import ramped_ending, ramped_onset, shaped
@@ -40,7 +40,7 @@ def solved(rig):
 
 def test_without_envelopes_the_measures_are_those_of_the_ramp(rig, table, solved):
     """Nothing but a plain ramp is played, and that is what is predicted, whoever solves it."""
-    pattern = Timing(table).with_transient_measures(QUESTION, table.ask(QUESTION))
+    pattern = Timing(table).with_transient_measures(QUESTION, table.query(QUESTION))
     assert pattern.onset is None
     assert pattern.ending is None
     onset = ramped_onset(pattern.excitation, rig.eras, ramp=0.040)
@@ -54,9 +54,9 @@ def test_without_envelopes_the_measures_are_those_of_the_ramp(rig, table, solved
 def test_envelopes_are_part_of_the_pattern_and_measured_with_it(rig, table, solved):
     """Shaped onset and ending do better than the ramp, as another solution of the plate finds."""
     timing = Timing(table)
-    plain = timing.with_transient_measures(QUESTION, table.ask(QUESTION))
+    plain = timing.with_transient_measures(QUESTION, table.query(QUESTION))
     pattern = timing.with_transient_measures(
-        QUESTION, timing.with_envelopes(QUESTION, table.ask(QUESTION))
+        QUESTION, timing.with_envelopes(QUESTION, table.query(QUESTION))
     )
     contrast = solved.contrast_db(
         shaped(pattern.onset, rig.eras), targets=QUESTION.targets, quiet=QUESTION.quiet
@@ -73,7 +73,9 @@ def test_a_lone_finger_has_an_ending_but_no_contrast(table):
     """There is nobody to tell it from; what is left after the end can be said all the same."""
     alone = Question(((0.09, 0.07),), mode="phased")
     timing = Timing(table)
-    pattern = timing.with_transient_measures(alone, timing.with_envelopes(alone, table.ask(alone)))
+    pattern = timing.with_transient_measures(
+        alone, timing.with_envelopes(alone, table.query(alone))
+    )
     assert pattern.transient_contrast_db is None
     assert pattern.left_after_db < -20
 
@@ -81,7 +83,7 @@ def test_a_lone_finger_has_an_ending_but_no_contrast(table):
 def test_answers_in_json_carry_knots_only_where_asked_for(table):
     """A line that says envelopes gets 21 and 8 knots for every ERA, another one null."""
     line = {"target": [0.09, 0.07], "quiet": [[0.25, 0.18]]}
-    plain, with_knots = answer_lines(
+    plain, with_knots = query_batch(
         table, [json.dumps(line), json.dumps(line | {"envelopes": True})]
     )
     assert plain["onset"] is plain["ending"] is None

@@ -61,7 +61,7 @@ def test_a_plain_ramp_takes_the_pattern_of_the_better_onset(mode):
         question = Question((places[0],), (places[1],), mode=mode)
         fields = table.fields(question)
         best = find_drives(fields, mode)
-        plain = table.ask(question)
+        plain = table.query(question)
         frequency = max(tone.frequency for tone in plain.excitation.values())
         weights = np.zeros(4, dtype=np.complex64)
         for number, era in enumerate(table.eras):
@@ -134,7 +134,7 @@ def test_a_decibel_of_the_score_counts_as_much_as_three_of_the_onset(softer, fre
         if len(values) < 2:
             continue
         chosen_among += 1
-        answered = table.ask(question).excitation
+        answered = table.query(question).excitation
         at = phases.index({name: (tone.frequency, tone.phase) for name, tone in answered.items()})
         assert values[at] >= max(values) - 0.2
     assert chosen_among >= 6
@@ -148,7 +148,7 @@ def test_amplifiers_with_envelopes_get_the_best_steady_pattern(mode):
         question = Question((places[0],), tuple(places[1:]), mode=mode, envelopes=True)
         best = find_drives(table.fields(question), mode)
         tones = excitation_of(best.drive, table.eras, FREQUENCIES, gain=1.0)
-        answered = table.ask(question).excitation
+        answered = table.query(question).excitation
         assert {name: tone.frequency for name, tone in answered.items()} == {
             name: tone.frequency for name, tone in tones.items()
         }
@@ -163,4 +163,4 @@ def test_a_plate_on_one_or_two_eras_has_answers_all_the_same(count):
     table = build_table(replace(rig, eras=rig.eras[:count]), frequencies=FREQUENCIES[::3])
     for mode in ("switched", "phased"):
         question = Question(((0.09, 0.07),), ((0.25, 0.18),), mode=mode)
-        assert table.ask(question).contrast_db > 0
+        assert table.query(question).contrast_db > 0

@@ -6,9 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.arrays import ComplexArray
+from model.calibration.calibration_screening import silent_sensors
 from model.calibration.fast_plate import FastPlate, fast_plate
 from model.calibration.responses import Responses
-from model.calibration.screening import silent_sensors
 from model.diagnosis.assignment import likeness
 from model.diagnosis.observation import Observation
 from model.diagnosis.plate_match import FITS, Match

@@ -3,7 +3,7 @@
 import numpy as np
 from matplotlib.figure import Figure
 
-from model.calibration.outcome import Calibration
+from model.calibration.calibration_result import Calibration
 
 _ROWS = 2  # of sensors
 

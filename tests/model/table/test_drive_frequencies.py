@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from model.rig.rig import Limits
-from model.table.table import usual_frequencies
+from model.table.table import default_drive_frequencies
 
 
 @pytest.mark.parametrize(
@@ -21,5 +21,5 @@ def test_they_are_those_of_the_paper_that_the_rig_may_play(
     low: float, high: float, expected: list[float]
 ) -> None:
     """60 to 320 Hz in steps of 10 (the paper's section 4) within the limits; never none at all."""
-    found = usual_frequencies(Limits(frequency_min=low, frequency_max=high, level=1.0))
+    found = default_drive_frequencies(Limits(frequency_min=low, frequency_max=high, level=1.0))
     np.testing.assert_array_equal(found, list(expected))

@@ -12,7 +12,7 @@ from model.finger.grid import Grid
 from model.rig.rig import Rig
 from model.table.build import build_table
 from model.table.file import FORMAT_VERSION, load_table, save_table
-from model.table.table import PAPER_GRID, LocalizationTable, usual_frequencies
+from model.table.table import PAPER_GRID, LocalizationTable, default_drive_frequencies
 from model.version import code_version
 
 _logger = logging.getLogger(__name__)
@@ -27,12 +27,12 @@ def cached_table(
 ) -> tuple[LocalizationTable, Path | None]:
     """The table of a rig, from the user's cache folder or built and kept there; and its file.
 
-    frequencies (f,) [Hz]: `usual_frequencies` where none are given. A damaged cache file, and one
+    frequencies (f,) [Hz]: `default_drive_frequencies` if None. A damaged cache file, and one
     that other code has made, is built anew. Where nothing can be written the table is built all the
     same and the file is None.
     """
     if frequencies is None:
-        frequencies = usual_frequencies(rig.limits)
+        frequencies = default_drive_frequencies(rig.limits)
     path = _cache_path(rig, frequencies, grid, mode)
     try:
         kept = load_table(path, fingerprint=rig.fingerprint)

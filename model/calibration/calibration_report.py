@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from model.calibration.outcome import Calibration, FittedParameter
+from model.calibration.calibration_result import Calibration, FittedParameter
 from model.counting import counted
 from model.quantities import in_usual_unit, percent
 from model.rig.rig import Rig

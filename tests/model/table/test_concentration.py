@@ -9,29 +9,29 @@ import pytest
 from model.arrays import lattice
 from model.finger.contrast import is_beyond
 from model.finger.fingertip import fingertip_points
+from model.table.concentration import cell_centres, concentration_of, with_concentration
 from model.table.question import Question
-from model.table.spread import middles, spread_of, with_spread
 from paper_table import smooth_rig, smooth_table
 
 TARGET = (0.15, 0.12)
 PLATE = smooth_rig().plate
 AREA = PLATE.length * PLATE.width
-POINTS = middles(PLATE)
+POINTS = cell_centres(PLATE)
 NEAR = np.hypot(*(POINTS - TARGET).T) <= 0.05
 CIRCLE = pi * 0.05**2
 
 
-def spread(*amplitudes, frequencies=(100.0,)):
-    """Of amplitudes at the plate's middles, one row for each frequency; the target feels 1 m/s²."""
+def concentration(*amplitudes, frequencies=(100.0,)):
+    """Concentration of amplitudes (f, p) at the centres of cells, 1 m/s² at the target."""
     field = np.array(amplitudes, dtype=float)
-    return spread_of(
+    return concentration_of(
         np.array(frequencies), field, ~is_beyond(POINTS, [TARGET]), felt=1.0, plate=PLATE
     )
 
 
 def test_a_plate_that_moves_as_one_is_nowhere_stronger():
     """All of it is above half of the target, none is told from it, and energy goes with area."""
-    found = spread(np.ones(len(POINTS)))
+    found = concentration(np.ones(len(POINTS)))
     assert found.contrast_95_db == pytest.approx(0.0)
     assert found.area_above_half == pytest.approx(AREA)
     assert found.energy_share_near == pytest.approx(CIRCLE / AREA, rel=0.01)
@@ -41,22 +41,22 @@ def test_a_plate_that_moves_as_one_is_nowhere_stronger():
 def test_a_twentieth_of_the_plate_around_is_left_out(share, contrast):
     """A strip a tenth as strong as the target counts if it is more than that, else what is left."""
     strip = POINTS[:, 0] < share * (AREA - CIRCLE) / PLATE.width
-    found = spread(np.where(NEAR, 1.0, np.where(strip, 0.1, 0.001)))
+    found = concentration(np.where(NEAR, 1.0, np.where(strip, 0.1, 0.001)))
     assert found.contrast_95_db == pytest.approx(contrast)
     assert found.area_above_half == pytest.approx(CIRCLE, rel=0.01)
 
 
 def test_energy_counts_slow_vibrations_for_more():
     """Equal accelerations at half the frequency are twice the velocity, four times the energy."""
-    found = spread(NEAR, ~NEAR, frequencies=(100.0, 200.0))
+    found = concentration(NEAR, ~NEAR, frequencies=(100.0, 200.0))
     assert found.energy_share_near == pytest.approx(4 / (4 + (AREA / CIRCLE - 1)), rel=0.01)
 
 
 def test_several_frequencies_are_felt_as_their_sum():
     """Half the plate at a quarter of the target, twice: half as strong there, so not above half."""
     left = POINTS[:, 0] < PLATE.length / 2
-    below = spread(0.249 * left, 0.249 * left, frequencies=(100.0, 200.0))
-    above = spread(0.251 * left, 0.251 * left, frequencies=(100.0, 200.0))
+    below = concentration(0.249 * left, 0.249 * left, frequencies=(100.0, 200.0))
+    above = concentration(0.251 * left, 0.251 * left, frequencies=(100.0, 200.0))
     assert below.area_above_half == 0
     assert above.area_above_half == pytest.approx(AREA / 2, rel=0.01)
 
@@ -64,9 +64,9 @@ def test_several_frequencies_are_felt_as_their_sum():
 def test_a_plate_within_five_centimetres_is_told_from_itself():
     """Where nothing is farther away, all of it is around the target."""
     small = replace(PLATE, length=0.06, width=0.06)
-    points = middles(small)
+    points = cell_centres(small)
     near = ~is_beyond(points, [(0.03, 0.03)])
-    found = spread_of(
+    found = concentration_of(
         np.array([100.0]), np.full((1, len(points)), 0.5), near, felt=1.0, plate=small
     )
     assert found.contrast_95_db == pytest.approx(20 * np.log10(2))
@@ -79,7 +79,7 @@ def test_a_table_tells_the_spread_of_its_field(mode):
     table = smooth_table()
     places = ((0.09, 0.08), (0.24, 0.14))
     question = Question(places, mode=mode)
-    pattern = with_spread(table, question, table.ask(question))
+    pattern = with_concentration(table, question, table.query(question))
     steps = (np.arange(0.0008, side, 0.0017) for side in (PLATE.length, PLATE.width))
     points = lattice(*steps)
     frequencies, amplitudes = table.amplitudes(pattern.excitation, points)
@@ -95,14 +95,16 @@ def test_a_table_tells_the_spread_of_its_field(mode):
         else:
             near_energy += velocity @ velocity
     level_of_rest = 20 * np.log10(felt / sorted(far)[int(0.95 * len(far))])
-    assert pattern.spread is not None
-    assert pattern.spread.contrast_95_db == pytest.approx(level_of_rest, abs=0.1)
-    assert pattern.spread.area_above_half == pytest.approx(loud / len(points) * AREA, rel=0.02)
-    assert pattern.spread.energy_share_near == pytest.approx(near_energy / energy, abs=0.01)
+    assert pattern.concentration is not None
+    assert pattern.concentration.contrast_95_db == pytest.approx(level_of_rest, abs=0.1)
+    assert pattern.concentration.area_above_half == pytest.approx(
+        loud / len(points) * AREA, rel=0.02
+    )
+    assert pattern.concentration.energy_share_near == pytest.approx(near_energy / energy, abs=0.01)
 
 
 def test_fingers_to_be_kept_quiet_are_what_counts():
     """With others on the plate the spread is not told."""
     table = smooth_table()
     question = Question(((0.09, 0.08),), ((0.24, 0.14),))
-    assert with_spread(table, question, table.ask(question)).spread is None
+    assert with_concentration(table, question, table.query(question)).concentration is None

@@ -1,6 +1,7 @@
 """A guard for every amplifier of a rig, by the limits that its file sets."""
 
 from collections.abc import Mapping
+from dataclasses import asdict
 
 from drivers.amplifier import Amplifier
 from drivers.guard import Guard, GuardLimits
@@ -27,13 +28,4 @@ def make_guards(rig: Rig, amplifiers: Mapping[str, Amplifier]) -> dict[str, Guar
 
 def guard_limits(limits: Limits) -> GuardLimits:
     """The rig's limits as a guard takes them."""
-    return GuardLimits(
-        frequency_min=limits.frequency_min,
-        frequency_max=limits.frequency_max,
-        level=limits.level,
-        slew=limits.slew,
-        power=limits.power,
-        on_time=limits.on_time,
-        duty=limits.duty,
-        rate=limits.rate,
-    )
+    return GuardLimits(**asdict(limits))

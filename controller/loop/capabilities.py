@@ -3,7 +3,9 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from controller.group.guards import guard_limits
 from controller.loop.envelopes import ENVELOPE_TIME, Loading, Shaping, shaping_of
+from drivers.guard import limits_in_force
 from model.drive_modes import MODES, playable_modes
 from model.errors import InputError
 from model.rig.rig import Rig
@@ -48,15 +50,17 @@ def playback_capabilities(
             f"these amplifiers cannot play mode {mode}, only {', '.join(playable)}; choose one of "
             "these, or none for the best"
         )
-    limits = rig.limits
-    level = {name: min(limits.level, caps.level_max) for name, caps in capabilities.items()}
+    configured = guard_limits(rig.limits)
+    limits = {name: limits_in_force(configured, caps) for name, caps in capabilities.items()}
     return PlaybackCapabilities(
         mode=mode or playable[-1],
         playable=playable,
         frequencies=(
-            max([limits.frequency_min, *(caps.frequency_min for caps in capabilities.values())]),
-            min([limits.frequency_max, *(caps.frequency_max for caps in capabilities.values())]),
+            max(one.frequency_min for one in limits.values()),
+            min(one.frequency_max for one in limits.values()),
         ),
-        largest={era.name: era.stroke * level[rig.wiring[era.name].amplifier] for era in rig.eras},
+        largest={
+            era.name: era.stroke * limits[rig.wiring[era.name].amplifier].level for era in rig.eras
+        },
         shaping=shaping_of(rig, amplifiers, within=envelope_time),
     )

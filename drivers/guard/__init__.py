@@ -1,7 +1,13 @@
-"""The guard: nothing is played that it has not let through."""
+"""The guard: only what it has checked can be encoded and played."""
 
 from drivers.guard.guard import Guard, SafeCommandSet, SafeEnvelope
-from drivers.guard.limits import FREQUENCY_CEILING, FREQUENCY_FLOOR, LEVEL_CEILING, GuardLimits
+from drivers.guard.limits import (
+    FREQUENCY_CEILING,
+    FREQUENCY_FLOOR,
+    LEVEL_CEILING,
+    GuardLimits,
+    limits_in_force,
+)
 from drivers.guard.required import require_safe
 
 __all__ = [
@@ -12,5 +18,6 @@ __all__ = [
     "GuardLimits",
     "SafeCommandSet",
     "SafeEnvelope",
+    "limits_in_force",
     "require_safe",
 ]

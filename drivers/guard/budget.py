@@ -1,40 +1,40 @@
-"""What a guard allows over time: how many sets a second, and how long there may be vibration."""
+"""Limits over time: command sets per second, on-time and duty."""
 
 from collections import deque
 
 from drivers.errors import CommandRefused
-from drivers.guard.limits import Bounds
+from drivers.guard.limits import GuardLimits
 
 DUTY_WINDOW = 10.0
-"""Over which the duty is counted [s]; short against the time in which an amplifier warms up."""
+"""Window of the duty limit [s]; short against the thermal time constant of an amplifier."""
 
-_BURST = 1.0  # s; what was not used of the rate may be made up for within it
-_ROUNDING = 1e-6  # of a set; whoever waits for one must not be sent away at its moment
+_BURST = 1.0  # s; unused rate can be caught up within it
+_ROUNDING = 1e-6  # of a set; a caller that waits until the given moment must pass
 
 
 class Budget:
-    """Counts what was let through, by times [s] that are handed in and never go back."""
+    """Counts checked sets and vibration time; times [s] are arguments and never decrease."""
 
-    def __init__(self, bounds: Bounds) -> None:
-        self._rate = bounds.rate
-        self._on_time = bounds.on_time
-        self._duty_time = bounds.duty * DUTY_WINDOW if bounds.duty < 1 else None
-        self._sets = bounds.rate * _BURST
+    def __init__(self, limits: GuardLimits) -> None:
+        self._rate = limits.rate
+        self._on_time = limits.on_time
+        self._duty_time = limits.duty * DUTY_WINDOW if limits.duty < 1 else None
+        self._sets = limits.rate * _BURST
         self._counted = 0.0
-        self._vibrations: deque[tuple[float, float]] = deque()  # that are over: begin, end
-        self._since: float | None = None  # when the present one began
-        self._until = 0.0  # when it ends by itself
+        self._vibrations: deque[tuple[float, float]] = deque()  # ended ones: begin, end
+        self._since: float | None = None  # begin of the present one
+        self._until = 0.0  # end of the present one by valid_for
 
     def remaining(self, now: float) -> float | None:
-        """How long a vibration that is asked for now may last [s]; None for no limit.
+        """Longest vibration [s] that may start now; None if unlimited.
 
-        Raises CommandRefused where there is nothing left, or sets come too fast.
+        Raises CommandRefused if no time is left or the rate is exceeded.
         """
         self._settle(now)
         if self._sets < 1 - _ROUNDING:
             raise CommandRefused(
-                f"more than {self._rate:g} command sets a second; send fewer, for the limit is "
-                "there to stop a loop that runs wild",
+                f"rate must be at most {self._rate:g} command sets a second; send fewer, the limit "
+                "stops runaway loops",
                 until=now + (1 - self._sets) / self._rate,
             )
         left = [self._on_time - (0.0 if self._since is None else now - self._since)]
@@ -43,13 +43,13 @@ class Budget:
         shortest = min(left)
         if shortest <= 0:
             raise CommandRefused(
-                "the vibration has lasted for as long as the limits of on-time and duty allow; "
-                "let it rest"
+                "vibration time must stay within the on-time and duty limits, none is left; pause "
+                "the vibration"
             )
         return None if shortest == float("inf") else shortest
 
     def note(self, now: float, *, lasts: float) -> None:
-        """A set was let through: vibration for so long [s], 0 for silence."""
+        """Count a checked set: vibration for a time [s], 0 for silence."""
         self._settle(now)
         if lasts > 0:
             self._sets -= 1
@@ -59,7 +59,7 @@ class Budget:
             self._end(now)
 
     def _settle(self, now: float) -> None:
-        """What happened by itself until now."""
+        """Account for what happened by itself until now."""
         if self._since is not None and self._until <= now:
             self._end(self._until)
         while self._vibrations and self._vibrations[0][1] < now - DUTY_WINDOW:
@@ -73,7 +73,7 @@ class Budget:
         self._since = None
 
     def _used(self, now: float) -> float:
-        """Time with vibration within the window before now [s]."""
+        """Vibration time within the window before now [s]."""
         opened = now - DUTY_WINDOW
         present = () if self._since is None else ((self._since, now),)
         spans = [end - max(begin, opened) for begin, end in (*self._vibrations, *present)]

@@ -1,7 +1,6 @@
-"""The guard: the only maker of commands that an encoder will take.
+"""The guard: the only maker of command sets that encoders accept.
 
-Its limits are the least of the configuration, what the amplifier reports and built-in ceilings;
-nothing sets them at run time.
+Its limits are fixed at construction, see `drivers.guard.limits`.
 """
 
 from collections.abc import Callable, Collection
@@ -11,8 +10,8 @@ from drivers.clock import now
 from drivers.command import CommandSet, DriveCommand, Envelope, Knot
 from drivers.errors import CommandRefused
 from drivers.guard.budget import Budget
-from drivers.guard.limits import GuardLimits, tightest
-from drivers.guard.rules import Known, check_envelope, check_set, is_number, is_token
+from drivers.guard.limits import GuardLimits, capabilities_in_force, limits_in_force
+from drivers.guard.rules import GuardContext, check_envelope, check_set, is_finite, is_token
 from drivers.protocol.definition import PROTOCOL, token_after
 from drivers.protocol.messages import Capabilities
 
@@ -21,9 +20,9 @@ _KEY = object()
 
 @final
 class SafeCommandSet(CommandSet):
-    """A command set that a guard has let through; only a `Guard` can make one.
+    """A command set that has passed a guard; only a `Guard` can make one.
 
-    settled_after [s]: how long after its commit at the latest nothing fades any more.
+    settled_after [s]: time from its commit until all ramps and envelopes have ended.
     """
 
     settled_after: float
@@ -39,9 +38,7 @@ class SafeCommandSet(CommandSet):
         key: object = None,
     ) -> None:
         if key is not _KEY:
-            raise TypeError(
-                "a SafeCommandSet is made by Guard.check or Guard.silence, by nobody else"
-            )
+            raise TypeError("SafeCommandSet must be made by Guard.check or Guard.silence")
         super().__init__(token=token, commands=commands, ramp=ramp, valid_for=valid_for)
         object.__setattr__(self, "settled_after", settled_after)
 
@@ -51,13 +48,13 @@ class SafeCommandSet(CommandSet):
 
 @final
 class SafeEnvelope(Envelope):
-    """An envelope that a guard has let through; only a `Guard` can make one."""
+    """An envelope that has passed a guard; only a `Guard` can make one."""
 
     def __init__(
         self, slot: int, step: float, knots: tuple[Knot, ...], *, key: object = None
     ) -> None:
         if key is not _KEY:
-            raise TypeError("a SafeEnvelope is made by Guard.check_envelope, by nobody else")
+            raise TypeError("SafeEnvelope must be made by Guard.check_envelope")
         super().__init__(slot=slot, step=step, knots=knots)
 
     def __init_subclass__(cls) -> None:
@@ -66,10 +63,11 @@ class SafeEnvelope(Envelope):
 
 @final
 class Guard:
-    """Lets the command sets of one amplifier through or refuses them.
+    """Checks the command sets of one amplifier.
 
-    clock [s]: by which rate, on-time and duty are counted, the event loop's unless given. Raises
-    CommandError for limits that leave nothing to play.
+    limits: the configured ones. clock [s]: for rate,
+    on-time and duty, the event loop's by default. Raises CommandError for limits that leave nothing
+    to play.
     """
 
     def __init__(
@@ -79,9 +77,10 @@ class Guard:
         *,
         clock: Callable[[], float] = now,
     ) -> None:
-        self._bounds = tightest(limits, capabilities)
+        self._limits = limits_in_force(limits, capabilities)
+        self._capabilities = capabilities_in_force(capabilities)
         self._clock = clock
-        self._budget = Budget(self._bounds)
+        self._budget = Budget(self._limits)
         self._last_token = 0
         self._playing: dict[int, DriveCommand] = {}
         self._loaded: dict[int, SafeEnvelope] = {}
@@ -89,31 +88,21 @@ class Guard:
     @property
     def limits(self) -> GuardLimits:
         """The limits in force: the least of configuration, amplifier and ceilings."""
-        bounds = self._bounds
-        return GuardLimits(
-            frequency_min=bounds.frequency_min,
-            frequency_max=bounds.frequency_max,
-            level=bounds.level,
-            slew=bounds.slew,
-            power=bounds.power,
-            on_time=bounds.on_time,
-            duty=bounds.duty,
-            rate=bounds.rate,
-        )
+        return self._limits
 
     def check(self, command_set: CommandSet) -> SafeCommandSet:
-        """The set as a command that may be sent; CommandRefused says which channel and why.
+        """Check a set; CommandRefused names channel and reason.
 
-        Where on-time or duty are limited, valid_for is made short enough for them.
+        valid_for is shortened to the on-time and duty that are left.
         """
-        check_set(command_set, self._bounds, Known(self._playing, self._loaded))
+        check_set(command_set, self._context)
         valid_for = float(command_set.valid_for)
         shaped = any(command.onset for command in command_set.commands)
         if shaped or not command_set.is_silent:
             remaining = self._budget.remaining(self._clock())
             if remaining is not None:
                 valid_for = min(valid_for or remaining, remaining, _LONGEST)
-        # A silent channel keeps no frequency that an amplifier could stumble over.
+        # A silent channel gets a frequency that the amplifier accepts.
         commands = tuple(
             DriveCommand(
                 channel=int(command.channel),
@@ -131,16 +120,16 @@ class Guard:
             )
             for command in command_set.commands
         )
-        return self._let_through(
+        return self._make_safe(
             int(command_set.token), commands, ramp=float(command_set.ramp), valid_for=valid_for
         )
 
     def check_envelope(self, envelope: Envelope) -> SafeEnvelope:
-        """The envelope as one that may be loaded; CommandRefused says which knot and why.
+        """Check an envelope; CommandRefused names knot and reason.
 
-        Sets that refer to its slot are checked with it from now on: it must be loaded before.
+        Sets that refer to its slot are checked with it from now on: load it before them.
         """
-        check_envelope(envelope, self._bounds)
+        check_envelope(envelope, self._context)
         knots = tuple(Knot(float(knot.level), float(knot.phase)) for knot in envelope.knots)
         safe = SafeEnvelope(int(envelope.slot), float(envelope.step), knots, key=_KEY)
         if knots:
@@ -150,11 +139,10 @@ class Guard:
         return safe
 
     def silence(self, token: int, channels: Collection[int], *, ramp: float) -> SafeCommandSet:
-        """Level zero on these channels (and on all others, as ever); never fails.
+        """Make a set with level zero on these channels (unnamed ones fall silent too); never fails.
 
-        A channel that does not exist is left out, a ramp [s] out of range becomes the nearest in
-        range, and a token that cannot be sent becomes the one after the last. Along the ramp, no
-        endings.
+        Unknown channels are skipped, a ramp [s] is clipped into range, and an invalid token becomes
+        the one after the last. Channels fall silent along the ramp, without endings.
         """
         if not is_token(token):
             token = token_after(self._last_token)
@@ -162,36 +150,39 @@ class Guard:
             DriveCommand(
                 channel=channel, frequency=self._idle_frequency, level=0.0, skip_ending=True
             )
-            for channel in range(self._bounds.channels)
+            for channel in range(self._capabilities.channels)
             if channel in channels
         )
-        ramp = min(max(float(ramp), 0.0), self._bounds.ramp) if is_number(ramp) else 0.0
-        return self._let_through(int(token), commands, ramp=ramp, valid_for=0.0)
+        ramp = min(max(float(ramp), 0.0), self._capabilities.ramp_max) if is_finite(ramp) else 0.0
+        return self._make_safe(int(token), commands, ramp=ramp, valid_for=0.0)
 
     def check_or_silence(
         self, command_set: CommandSet, *, ramp: float
     ) -> tuple[SafeCommandSet, CommandRefused | None]:
-        """The checked set and None, or silence along a ramp [s] and why.
+        """Return the checked set and None, or silence along a ramp [s] and the reason.
 
-        For the control loop: whatever goes wrong in checking, and of whatever kind, the result can
-        be sent and is silent.
+        For the control loop: any exception in checking becomes a silent set that can be sent.
         """
         try:
             return self.check(command_set), None
-        except Exception as problem:  # silence is right for every kind of failure
+        except Exception as problem:  # every failure means silence
             reason = (
                 problem
                 if isinstance(problem, CommandRefused)
                 else CommandRefused(f"{type(problem).__name__}: {problem}")
             )
             token = getattr(command_set, "token", 0)
-            return self.silence(token, range(self._bounds.channels), ramp=ramp), reason
+            return self.silence(token, range(self._capabilities.channels), ramp=ramp), reason
 
     @property
     def _idle_frequency(self) -> float:
-        return self._bounds.frequency_min
+        return self._limits.frequency_min
 
-    def _let_through(
+    @property
+    def _context(self) -> GuardContext:
+        return GuardContext(self._limits, self._capabilities, self._playing, self._loaded)
+
+    def _make_safe(
         self, token: int, commands: tuple[DriveCommand, ...], *, ramp: float, valid_for: float
     ) -> SafeCommandSet:
         self._last_token = token

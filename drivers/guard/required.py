@@ -1,20 +1,20 @@
-"""What an encoder asks of every request before it makes anything of it."""
+"""Refusal of requests that have not passed a guard, for encoders."""
 
 from drivers.guard.guard import SafeCommandSet, SafeEnvelope
 from drivers.protocol.messages import Apply, LoadEnvelope, Request, Stage
 
 
 def require_safe(request: Request) -> None:
-    """Raise TypeError for a request with a set or an envelope that no guard has let through."""
+    """Raise TypeError for a request whose set or envelope has not passed a guard."""
     match request:
-        case Stage(command_set=asked) | Apply(command_set=asked):
-            is_safe = type(asked) is SafeCommandSet
-        case LoadEnvelope(envelope=asked):
-            is_safe = type(asked) is SafeEnvelope
+        case Stage(command_set=content) | Apply(command_set=content):
+            is_safe = type(content) is SafeCommandSet
+        case LoadEnvelope(envelope=content):
+            is_safe = type(content) is SafeEnvelope
         case _:
             return
     if not is_safe:
         raise TypeError(
-            f"only a SafeCommandSet or a SafeEnvelope is played, not a {type(asked).__name__}: "
-            "let a Guard make one"
+            "request must carry a SafeCommandSet or a SafeEnvelope made by a Guard, got "
+            f"{type(content).__name__}"
         )

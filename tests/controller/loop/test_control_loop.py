@@ -344,9 +344,9 @@ async def test_a_table_that_fails(
 @pytest.mark.parametrize(
     ("excitation", "complaint"),
     [
-        ({"SW": Tone(110.0, 101e-6)}, r"main: level of channel 0 is 1\.01"),
-        ({"SW": Tone(39.0, 10e-6)}, "main: frequency of channel 0 is 39 Hz"),
-        ({"SW": Tone(110.0, math.nan)}, "main: level of channel 0 is nan"),
+        ({"SW": Tone(110.0, 101e-6)}, r"main: level of channel 0 .*1\.01"),
+        ({"SW": Tone(39.0, 10e-6)}, "main: frequency of channel 0 .*39 Hz"),
+        ({"SW": Tone(110.0, math.nan)}, "main: level of channel 0 .*nan"),
     ],
 )
 @in_virtual_time
@@ -382,7 +382,7 @@ async def test_what_came_too_fast_is_felt_as_soon_as_it_may(amplifiers: list[str
         asked = len(bench.table.asked)
         await bench.hold(FINGER, seconds=0.4)
         (refusal,) = bench.told.refused
-        assert "more than 2 command sets a second" in refusal
+        assert "2 command sets" in refusal
         assert bench.told.silenced[-1].reason == refusal
         assert not any(bench.far_end.levels)
         await bench.hold(FINGER, seconds=0.2)

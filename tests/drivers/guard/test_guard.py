@@ -1,5 +1,6 @@
 import copy
 import math
+import re
 from dataclasses import replace
 
 import pytest
@@ -38,32 +39,32 @@ def test_a_good_set_passes_unchanged() -> None:
             for name in ("frequency", "level", "phase")
             for value in (math.nan, math.inf, -math.inf, "1", None)
         ],
-        (with_command(frequency=39.99), "frequency of channel 1 is 39.99 Hz"),
-        (with_command(frequency=500.01), "between 40 and 500 Hz"),
+        (with_command(frequency=39.99), "frequency of channel 1.*39.99 Hz"),
+        (with_command(frequency=500.01), "40 to 500 Hz"),
         (with_command(level=-0.01), "level of channel 1"),
-        (with_command(level=0.81), "between 0 and 0.8"),
+        (with_command(level=0.81), "0 to 0.8"),
         (with_command(channel=4), "channel 4 does not exist"),
         (with_command(channel=-1), "channel -1"),
         (with_command(channel=1.5), "channel 1.5"),
-        (replace(GOOD, commands=GOOD.commands * 2), "channel 1 is named twice"),
+        (replace(GOOD, commands=GOOD.commands * 2), "channel 1.*twice"),
         *[(replace(GOOD, token=token), "token") for token in (0, -1, 65536, 1.0, None)],
         *[(replace(GOOD, ramp=ramp), "ramp") for ramp in (-0.001, 0.501, math.nan, math.inf)],
         *[(replace(GOOD, valid_for=value), "valid_for") for value in (-1, 60.1, math.nan)],
     ],
 )
-def test_bad_sets_are_refused(bad: CommandSet, reason: str) -> None:
+def test_guard_refuses_an_invalid_set(bad: CommandSet, reason: str) -> None:
     """Each bad value is refused with its channel and reason, and is silence for the loop."""
     with pytest.raises(CommandRefused, match=reason):
         GUARD.check(bad)
     safe, why = GUARD.check_or_silence(bad, ramp=0.01)
     assert why is not None
-    assert reason in str(why)
+    assert re.search(reason, str(why))
     assert safe.is_silent
     assert [command.channel for command in safe.commands] == [0, 1, 2, 3]
 
 
 def test_the_channel_to_blame_is_named() -> None:
-    """CommandRefused carries the channel for whoever wants to stop just that."""
+    """CommandRefused carries the channel to blame."""
     with pytest.raises(CommandRefused) as caught:
         GUARD.check(with_command(level=2.0))
     assert caught.value.channel == 1

@@ -45,7 +45,7 @@ def test_a_level_rises_no_faster_than_allowed() -> None:
     """At 10 a second, 0.5 takes 50 ms; falling and staying cost nothing; a new tone starts anew."""
     strict = guard(slew=10.0)
     for ramp in (0.0, 0.049):
-        with pytest.raises(CommandRefused, match=r"rise by 0\.5 .* longer ramp"):
+        with pytest.raises(CommandRefused, match=r"0\.5 .*longer ramp"):
             strict.check(playing(1, 0.5, ramp=ramp))
     strict.check(playing(2, 0.5, ramp=0.05))
     strict.check(playing(3, 0.6, ramp=0.01))
@@ -59,7 +59,7 @@ def test_a_level_rises_no_faster_than_allowed() -> None:
 def test_knots_rise_no_faster_than_allowed() -> None:
     """Within an envelope, from its begin, and from its last knot to the command's level."""
     strict = guard(slew=10.0)
-    with pytest.raises(CommandRefused, match=r"slot 1 would rise by 0\.2"):
+    with pytest.raises(CommandRefused, match=r"slot 1: .*0\.2"):
         strict.check_envelope(Envelope(1, 0.01, (Knot(0.1, 0.0), Knot(0.3, 0.0))))
     strict.check_envelope(Envelope(1, 0.01, (Knot(0.1, 0.0), Knot(0.2, 0.0))))
     strict.check(playing(1, 0.3, onset=1))
@@ -74,11 +74,11 @@ def test_the_power_of_all_channels_is_limited() -> None:
     """Squares of the levels add up; those of envelopes count where they are higher."""
     strict = guard(power=0.5)
     strict.check(playing(1, 0.5, 0.5))
-    with pytest.raises(CommandRefused, match=r"add up to 0\.75; at most 0\.5"):
+    with pytest.raises(CommandRefused, match=r"0\.5, got 0\.75"):
         strict.check(playing(2, 0.5, 0.5, 0.5))
     strict.check_envelope(Envelope(1, 0.01, (Knot(0.8, 0.0),)))
     for which in ("onset", "ending"):
-        with pytest.raises(CommandRefused, match="add up"):
+        with pytest.raises(CommandRefused, match="squared levels"):
             strict.check(playing(3, 0.1, **{which: 1}))
 
 
@@ -88,7 +88,7 @@ def test_an_amplifier_cannot_widen_what_the_wire_can_say() -> None:
     wide = Guard(GuardLimits(40.0, 500.0, 0.8), boasting, clock=Clock())
     last = CommandSet(1, (DriveCommand(15, 110.0, 0.5),), ramp=1.0, valid_for=0.0)
     assert wide.check(last).ramp == 1.0
-    with pytest.raises(CommandRefused, match="channels 0 to 15"):
+    with pytest.raises(CommandRefused, match="0 to 15"):
         wide.check(replace(last, commands=(DriveCommand(16, 110.0, 0.5),)))
     with pytest.raises(CommandRefused, match="ramp"):
         wide.check(replace(last, ramp=1.001))
@@ -154,7 +154,7 @@ def test_a_share_of_the_time_is_silent() -> None:
     strict = guard(clock, duty=0.1)
     assert strict.check(playing(1, 0.5)).valid_for == pytest.approx(1.0)
     clock.now += 1.0
-    with pytest.raises(CommandRefused, match="let it rest"):
+    with pytest.raises(CommandRefused, match="duty"):
         strict.check(playing(2, 0.5))
     assert strict.check(playing(3, 0.0)).is_silent
     clock.now += 9.5
@@ -167,7 +167,7 @@ def test_sets_come_no_faster_than_allowed() -> None:
     strict = guard(clock, rate=10.0)
     for token in range(1, 11):
         strict.check(playing(token, 0.5))
-    with pytest.raises(CommandRefused, match="10 command sets a second") as caught:
+    with pytest.raises(CommandRefused, match="10 command sets") as caught:
         strict.check(playing(11, 0.5))
     assert caught.value.until == pytest.approx(clock.now + 0.1)
     assert strict.check(playing(12, 0.0)).is_silent
@@ -196,8 +196,8 @@ def test_limits_that_leave_nothing_are_refused(name: str, value: float) -> None:
 @pytest.mark.parametrize(
     ("envelope", "problem"),
     [
-        (Envelope(0, 0.005, (Knot(0.1, 0.0),)), "slots 1 to 16"),
-        (Envelope(17, 0.005, (Knot(0.1, 0.0),)), "slots 1 to 16"),
+        (Envelope(0, 0.005, (Knot(0.1, 0.0),)), "slot .*1 to 16"),
+        (Envelope(17, 0.005, (Knot(0.1, 0.0),)), "slot .*1 to 16"),
         (Envelope(1, 0.0, (Knot(0.1, 0.0),)), "step"),
         (Envelope(1, math.nan, (Knot(0.1, 0.0),)), "step"),
         (Envelope(1, 0.005, (Knot(0.1, 0.0),) * 33), "33 knots"),
@@ -215,12 +215,12 @@ def test_envelopes_out_of_range_are_refused(envelope: Envelope, problem: str) ->
 def test_a_set_may_only_refer_to_what_the_guard_has_seen() -> None:
     """What is in a slot decides about slew and power, so it must be known; until it is emptied."""
     known = guard()
-    with pytest.raises(CommandRefused, match="no envelope"):
+    with pytest.raises(CommandRefused, match="empty slot 3"):
         known.check(playing(1, 0.5, ending=3))
     known.check_envelope(Envelope(3, 0.005, (Knot(0.1, 0.0),)))
     known.check(playing(2, 0.5, ending=3))
     known.check_envelope(Envelope(3, 0.005, ()))
-    with pytest.raises(CommandRefused, match="no envelope"):
+    with pytest.raises(CommandRefused, match="empty slot 3"):
         known.check(playing(3, 0.5, ending=3))
 
 

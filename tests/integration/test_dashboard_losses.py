@@ -9,7 +9,7 @@ import pytest
 import pytest_asyncio
 
 import dashboard_pictures
-from chromium import Page, open_page
+from chromium import Browser, Page, open_browser
 from controller.api.schema import DaemonStateName, LatencySummary
 from controller.api.topics import LatencyEvent, StateEvent
 from controller.gateway.app import MAX_SESSIONS
@@ -28,54 +28,59 @@ PROBES = (Path(dashboard_pictures.__file__).with_name("page_probes.js")).read_te
 
 
 @pytest_asyncio.fixture(scope="module", loop_scope="module")
-async def browser(tmp_path_factory: pytest.TempPathFactory) -> AsyncIterator[Page]:
-    """A browser's tab."""
-    async with open_page(tmp_path_factory.mktemp("profile")) as page:
+async def browser(tmp_path_factory: pytest.TempPathFactory) -> AsyncIterator[Browser]:
+    """A browser for all tests."""
+    async with open_browser(tmp_path_factory.mktemp("profile")) as browser:
+        yield browser
+
+
+@pytest_asyncio.fixture(loop_scope="module")
+async def tab(browser: Browser) -> AsyncIterator[Page]:
+    """A fresh tab."""
+    async with browser.open_page() as page:
         yield page
 
 
-async def test_a_lost_link_is_one_event_with_what_has_come_of_it(
-    browser: Page, tmp_path: Path
-) -> None:
+async def test_a_lost_link_is_one_event_with_what_has_come_of_it(tab: Page, tmp_path: Path) -> None:
     """The banner says since when and for how long at most the amplifier plays; how it was before is
     not shown as how it is; attempts and the return stand below the loss.
     """
     async with running_daemon(tmp_path) as bench, await bench.client() as era:
         await until_state(era, "READY_TO_SWITCH_ON")
         with gateway_process(tmp_path, bench.socket) as gateway:
-            await open_dashboard(browser, gateway, DESKTOP)
+            await open_dashboard(tab, gateway, DESKTOP)
             # Disarmed: no watchdog can make it another fault on a busy machine.
-            assert "%" in await browser.until(TILE)
-            before = await browser.evaluate(EVENTS)
+            assert "%" in await tab.until(TILE)
+            before = await tab.evaluate(EVENTS)
             bench.far.device.inject_fault(FaultWindow("hang"))
-            await browser.until(f"{STATE} === 'COMM_LOST'")
-            told = await browser.until(BANNER, lambda text: "watchdog" in text)
+            await tab.until(f"{STATE} === 'COMM_LOST'")
+            told = await tab.until(BANNER, lambda text: "watchdog" in text)
             assert "Its watchdog silences it after 0.25\u00a0s, which nothing confirms" in told
             assert "(since " in told
             assert "may still be energised" in told
-            tile = await browser.until(TILE, lambda text: "no link" in text)
+            tile = await tab.until(TILE, lambda text: "no link" in text)
             assert "What its channels play is unknown." in tile
             assert "%" not in tile
             assert "°C" not in tile
-            assert await browser.evaluate("document.querySelector('.plate.unknown') !== null")
-            ratios = await browser.evaluate(f"({PROBES}).contrasts()")
+            assert await tab.evaluate("document.querySelector('.plate.unknown') !== null")
+            ratios = await tab.evaluate(f"({PROBES}).contrasts()")
             assert [each for each in ratios if each[0] < 4.5] == []
-            retried = await browser.until(EVENTS, lambda events: "tried again 2" in events[0])
+            retried = await tab.until(EVENTS, lambda events: "tried again 2" in events[0])
             assert retried[1:] == before
             assert "link lost: amplifier main: no answer" in retried[0]
             assert "look at cables and supply" in retried[0]
             bench.far.device.recover()
-            await browser.until(f"{STATE} === 'READY_TO_SWITCH_ON'")
-            back = await browser.until(EVENTS, lambda events: "answer again" in events[0])
+            await tab.until(f"{STATE} === 'READY_TO_SWITCH_ON'")
+            back = await tab.until(EVENTS, lambda events: "answer again" in events[0])
             assert back[1:] == before
             assert "tried again" not in back[0]
             assert "look at cables" not in back[0]
-            assert "may still be energised" not in await browser.evaluate(BANNER)
-            assert "%" in await browser.until(TILE, lambda text: "no link" not in text)
+            assert "may still be energised" not in await tab.evaluate(BANNER)
+            assert "%" in await tab.until(TILE, lambda text: "no link" not in text)
 
 
 async def test_a_daemon_that_ends_without_a_link_is_not_said_to_have_it_back(
-    browser: Page, tmp_path: Path
+    tab: Page, tmp_path: Path
 ) -> None:
     """What was lost stays so in the events, and the end is an event of its own."""
     states: list[tuple[DaemonStateName, str]] = [
@@ -84,61 +89,59 @@ async def test_a_daemon_that_ends_without_a_link_is_not_said_to_have_it_back(
         ("NOT_READY", "told to end"),
     ]
     with ScriptedDaemon(tmp_path) as daemon, gateway_process(tmp_path, daemon.socket) as gateway:
-        await open_dashboard(browser, gateway, DESKTOP)
+        await open_dashboard(tab, gateway, DESKTOP)
         for (old, _), (new, cause) in pairwise(states):
             daemon.publish("state", StateEvent(old=old, new=new, cause=cause, remedy=None))
-            events = await browser.until(EVENTS, lambda events, cause=cause: cause in events[0])
+            events = await tab.until(EVENTS, lambda events, cause=cause: cause in events[0])
     assert "not ready: told to end" in events[0]
     assert events[1].endswith("link lost: amplifier main: cut")
 
 
 async def test_why_onsets_are_plain_is_said_for_as_long_as_they_are(
-    browser: Page, tmp_path: Path
+    tab: Page, tmp_path: Path
 ) -> None:
     """Beside the latencies that it is about, in the daemon's words."""
     summary = LatencySummary(count=0, median=None, p99=None, p999=None, histogram=[])
     plain = "document.querySelector('#plain').innerText"
     with ScriptedDaemon(tmp_path) as daemon, gateway_process(tmp_path, daemon.socket) as gateway:
-        await open_dashboard(browser, gateway, DESKTOP)
+        await open_dashboard(tab, gateway, DESKTOP)
         for because, shown in (
             ("loading took 50 ms", "Plain ramps in place of shaped onsets: loading took 50 ms"),
             (None, ""),
         ):
             daemon.publish("latency", LatencyEvent(latency_ms=summary, plain_because=because))
-            await browser.until(f"{plain} === {json.dumps(shown)}")
+            await tab.until(f"{plain} === {json.dumps(shown)}")
 
 
-async def test_the_banner_says_how_it_is_with_the_gateway_now(
-    browser: Page, tmp_path: Path
-) -> None:
+async def test_the_banner_says_how_it_is_with_the_gateway_now(tab: Page, tmp_path: Path) -> None:
     """Refused for the token, gone, there with the right token again: whatever was before."""
 
     async def until_said(words: str) -> None:
-        await browser.until(BANNER, lambda text: words in text)
+        await tab.until(BANNER, lambda text: words in text)
 
     daemon = tmp_path / "none.sock"
     with gateway_process(tmp_path, daemon) as first:
-        await browser.show(f"{first.url}#token={first.token}")
+        await tab.show(f"{first.url}#token={first.token}")
         await until_said("The daemon does not answer")
         listen = ("--listen", f"127.0.0.1:{first.port}")
         first.end()
     with gateway_process(tmp_path, daemon, *listen, token="another-token-than-before"):
         await until_said("The gateway refuses the token")
-        assert await browser.evaluate("!document.querySelector('#door').hidden")
+        assert await tab.evaluate("!document.querySelector('#door').hidden")
     await until_said("The gateway does not answer (since ")
-    assert await browser.evaluate("document.querySelector('#door').hidden")
+    assert await tab.evaluate("document.querySelector('#door').hidden")
     with gateway_process(tmp_path, daemon, *listen):
         await until_said("The daemon does not answer")
     await until_said("The gateway does not answer")
 
 
-async def test_a_gateway_without_room_is_not_said_to_be_gone(browser: Page, tmp_path: Path) -> None:
+async def test_a_gateway_without_room_is_not_said_to_be_gone(tab: Page, tmp_path: Path) -> None:
     """It answers; whoever reads that it does not looks for the wrong thing."""
     with gateway_process(tmp_path, tmp_path / "none.sock") as gateway:
         others = [RawWebSocket(gateway) for _ in range(MAX_SESSIONS)]
-        await browser.show(f"{gateway.url}#token={gateway.token}")
-        await browser.until(BANNER, lambda text: "does not let this page in" in text)
+        await tab.show(f"{gateway.url}#token={gateway.token}")
+        await tab.until(BANNER, lambda text: "does not let this page in" in text)
         others.pop().connection.close()
-        await browser.until(BANNER, lambda text: "daemon does not answer" in text)
+        await tab.until(BANNER, lambda text: "daemon does not answer" in text)
         for other in others:
             other.connection.close()

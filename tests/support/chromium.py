@@ -11,6 +11,7 @@ from collections.abc import AsyncIterator, Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+import httpx
 import pytest
 import websockets
 
@@ -169,9 +170,34 @@ class Page:
                     self.complaints.append(str(said["params"]["exceptionDetails"]))
 
 
+class Browser:
+    """A running Chromium that opens tabs."""
+
+    def __init__(self, port: int) -> None:
+        self._port = port
+
+    @contextlib.asynccontextmanager
+    async def open_page(self) -> AsyncIterator[Page]:
+        """Open a tab of its own, closed at the end.
+
+        Chromium 156 delivers no emulated touch to a tab that was navigated after two fingers had
+        touched it, so each test gets a fresh one.
+        """
+        async with httpx.AsyncClient(base_url=f"http://127.0.0.1:{self._port}/json") as client:
+            tab = (await client.put("/new?about:blank")).json()
+            url = tab["webSocketDebuggerUrl"]
+            async with websockets.connect(url, max_size=None, compression=None) as socket:
+                page = Page(socket)
+                try:
+                    yield page
+                finally:
+                    await page.close()
+            await client.get(f"/close/{tab['id']}")
+
+
 @contextlib.asynccontextmanager
-async def open_page(profile: Path) -> AsyncIterator[Page]:
-    """A browser of its own with one tab; profile: an empty folder."""
+async def open_browser(profile: Path) -> AsyncIterator[Browser]:
+    """Start a browser; profile: an empty folder."""
     process = await asyncio.create_subprocess_exec(
         *(chromium(), f"--user-data-dir={profile}", *FLAGS),
         stdout=asyncio.subprocess.DEVNULL,
@@ -179,32 +205,12 @@ async def open_page(profile: Path) -> AsyncIterator[Page]:
     )
     try:
         async with asyncio.timeout(STARTING):
-            told = profile / "DevToolsActivePort"
+            port_file = profile / "DevToolsActivePort"
             # A file that another process writes sets no event.
-            while not (told.exists() and len(told.read_text().splitlines()) == 2):  # noqa: ASYNC110
+            while not (port_file.exists() and len(port_file.read_text().splitlines()) == 2):  # noqa: ASYNC110
                 await asyncio.sleep(0.05)
-            port = told.read_text().splitlines()[0]
-            url = await _tab(int(port))
-        async with websockets.connect(url, max_size=None, compression=None) as socket:
-            page = Page(socket)
-            try:
-                yield page
-            finally:
-                await page.close()
+        yield Browser(int(port_file.read_text().splitlines()[0]))
     finally:
         with contextlib.suppress(ProcessLookupError):
             process.kill()
         await process.wait()
-
-
-async def _tab(port: int) -> str:
-    """Where the browser's first tab listens."""
-    import httpx
-
-    async with httpx.AsyncClient() as client:
-        while True:
-            tabs = (await client.get(f"http://127.0.0.1:{port}/json/list")).json()
-            for tab in tabs:
-                if tab["type"] == "page":
-                    return str(tab["webSocketDebuggerUrl"])
-            await asyncio.sleep(0.05)

@@ -13,7 +13,7 @@ from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from chromium import Page, open_page
+from chromium import Page, open_browser
 from controller.effects.layout_kind import LAYOUT
 from gateway_bench import GatewayProcess, gateway_process, real_daemon
 
@@ -81,11 +81,12 @@ async def _take(folder: Path) -> None:
             real_daemon(work, "layout: layout.yaml\n") as daemon,
             gateway_process(work, daemon) as gateway,
         ):
-            async with open_page(work / "profile") as page:
+            async with open_browser(work / "profile") as browser:
                 for screen in SCREENS:
                     for is_dark in (False, True):
-                        await page.dark(is_dark)
-                        await _take_one(page, gateway, screen, folder, is_dark=is_dark)
+                        async with browser.open_page() as page:
+                            await page.dark(is_dark)
+                            await _take_one(page, gateway, screen, folder, is_dark=is_dark)
 
 
 async def _take_one(

@@ -239,7 +239,7 @@ async def test_touches_that_the_browser_takes_away_are_lifted(page: Page, era: C
 
 
 async def test_a_reload_lifts_resting_fingers_and_takes_new_ones(page: Page, era: Client) -> None:
-    """Fingers that rest on the glass while the page is reloaded are gone; the next touch is felt."""
+    """Fingers that rest on the glass during a reload are gone; the next touch is felt."""
     await page.touch("touchStart", await on_plate(page, *PLACES))
     await contacts(era, 2)
     await page.call("Page.reload")

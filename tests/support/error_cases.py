@@ -1,11 +1,12 @@
-"""Cases that provoke errors, what each says, and the page that all of them make.
+"""Cases that provoke errors: what is typed, the exit status, and the place that the error names.
 
-A case is an entry of a file in tests/errors/cases: what is typed (`run`, a command line of `era`,
-or `python`, code of the library), with files of its own (`files`, `edit` of the prepared ones) and
-code that comes before a command (`before`). Code has an ExitStack, `until_over`, and raises, or
-names what was `told` to it. A case that names era.sock finds a daemon there.
-What it says stands in docs/reference/errors.md alone, which
-`python tests/support/error_cases.py` writes anew; read every changed line of it.
+A case is an entry of a file in tests/errors/cases: `run`, a command line of `era`; `files` of its
+own, or an `edit` of the prepared ones; what happens `before`; the exit `status`, 2 unless given;
+`at`, the file with its line, the key or the option that the message names. Entries under `variants`
+share their command line. A case that names era.sock finds a daemon there.
+
+Those `shown` are quoted in docs/reference/errors.md. After a message was reworded,
+`python tests/support/error_cases.py` writes these quotations anew.
 """
 
 import contextlib
@@ -15,23 +16,24 @@ import re
 import shlex
 import sys
 import tempfile
-from collections.abc import Iterator
+import threading
+import time
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import cache
+from importlib import import_module
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
-from ruamel.yaml import YAML
+import yaml
 
-from controller.api.jsonrpc import RpcError
-from controller.cli.main import run
-from drivers.errors import DriverError
+from controller.api.client import Client
+from controller.main import run
 from gateway_bench import real_daemon
-from model.errors import InputError
 
-HERE = Path(__file__).parents[1] / "errors"
-PAGE = HERE.parents[1] / "docs" / "reference" / "errors.md"
+ROOT = Path(__file__).parents[2]
+PAGE = ROOT / "docs" / "reference" / "errors.md"
 HOME = "/home/you"
 """Stands on the page for the folder of a case, which is its home, too."""
 
@@ -55,114 +57,110 @@ _PREPARED = {
     "layout.yaml": "effects:\n  tick: {kind: click}\n"
     "regions:\n  ok: {circle: {at: [0.1, 0.1], radius: 0.02}, on_press: tick}\n",
 }
-
-
-SOCKET, _DAEMON = "era.sock", "running"
+_SOCKET, _DAEMON = "era.sock", "running"
 
 
 @dataclass(frozen=True)
 class Case:
-    """One way to get an error. status: None for code, which raises; said: begins what came first.
-
-    blur: a pattern of what is another at each run.
-    """
+    """One way to get an error; blur: a pattern of what differs in each run."""
 
     name: str
-    subject: str
-    run: str | None = None
-    python: str | None = None
-    status: int | None = None
+    run: str
+    status: int = 2
+    at: list[str] = field(default_factory=list)
     files: dict[str, str | bytes] = field(default_factory=dict)
     edit: dict[str, list[str]] = field(default_factory=dict)
-    blur: str | None = None
-    before: str = ""
+    before: str | None = None
     said: str = ""
-    prelude: str = ""
+    blur: str | None = None
+    shown: bool = False
+
+    @property
+    def typed(self) -> list[str]:
+        """The lines that provoke it, as the page quotes them."""
+        lines = [f"# {name}: {old} -> {new}" for name, (old, new) in self.edit.items()]
+        for name, content in self.files.items():
+            content = content if isinstance(content, str) else repr(content)
+            lines += [f"# {name}: {line}" for line in content.splitlines()]
+        return [line.replace("\n", " / ") for line in lines] + [f"$ {self.run}"]
 
 
 @dataclass(frozen=True)
-class Subject:
-    """A part of the page: a title, what to know, and its cases."""
-
-    title: str
-    about: str
-    cases: tuple[Case, ...]
-
-
-@dataclass(frozen=True)
-class Told:
+class Outcome:
     """How a case ended; changed: files that it wrote, altered or removed."""
 
     text: str
-    status: int | None
+    status: int
     out: str
-    changed: frozenset[str] = frozenset()
+    changed: frozenset[str]
 
 
 @cache
-def subjects() -> tuple[Subject, ...]:
+def cases() -> tuple[Case, ...]:
     """All cases, in the order of their files."""
-    return tuple(_subject(path) for path in sorted((HERE / "cases").glob("*.yaml")))
+    found: list[Case] = []
+    for path in sorted((ROOT / "tests" / "errors" / "cases").glob("*.yaml")):
+        entries: list[dict[str, Any]] = yaml.safe_load(path.read_text("utf-8"))
+        flat = [
+            {"run": entry["run"], **variant}
+            for entry in entries
+            for variant in entry.get("variants", [entry])
+        ]
+        for number, case in enumerate(flat, start=1):
+            at = case.pop("at", [])
+            places = at if isinstance(at, list) else [at]
+            found.append(Case(name=f"{path.stem}-{number}", at=places, **case))
+    return tuple(found)
 
 
-def _subject(path: Path) -> Subject:
-    given: dict[str, Any] = YAML(typ="safe", pure=True).load(path.read_text("utf-8"))
-    stem = path.stem.split("-", 1)[1]
-    cases = []
-    for number, entry in enumerate(given["cases"], start=1):
-        status = entry.pop("status", 2) if "run" in entry else None
-        prelude = given.get("python", "")
-        cases.append(
-            Case(name=f"{stem}-{number}", subject=stem, status=status, prelude=prelude, **entry)
-        )
-    return Subject(given["title"], given.get("about", ""), tuple(cases))
-
-
-def provoke(case: Case, folder: Path, shelf: Path) -> Told:
-    """Run a case in a folder of its own; shelf: where files lie that are dear to make."""
+def provoke(case: Case, folder: Path, shelf: Path) -> Outcome:
+    """Run a case in a folder of its own; shelf: holds what is slow to make."""
     _lay_out(case, folder, shelf)
     before = _files(folder)
-    with _at_home(folder):
-        told = _run(case) if case.run is not None else _call(case)
-    text = told.text.replace(str(folder), HOME)
+    out, err = io.StringIO(), io.StringIO()
+    with _at_home(folder), contextlib.ExitStack() as stack:
+        if case.before:
+            _BEFORE[case.before](stack)
+        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+            program, *arguments = shlex.split(case.run)
+            assert program == "era"
+            status = run(arguments, entry_points(group="era_haptics.commands"))
+    text = err.getvalue().replace(str(folder), HOME)
     if case.blur:
         text = re.sub(case.blur, "...", text)
     changed = frozenset(str(path) for path, _ in before ^ _files(folder))
-    return Told(text, told.status, told.out, changed)
+    return Outcome(text, status, out.getvalue(), changed)
 
 
 def _files(folder: Path) -> set[tuple[Path, bytes]]:
-    """What lies in a folder, but for the cache."""
+    """The files in a folder but for the cache."""
     found = (path for path in folder.rglob("*") if path.is_file())
     within = ((path.relative_to(folder), path) for path in found)
     return {(name, path.read_bytes()) for name, path in within if name.parts[0] != ".cache"}
 
 
 def _lay_out(case: Case, folder: Path, shelf: Path) -> None:
-    typed = (case.prelude, case.before, case.run, case.python, *case.files.values())
-    asked = " ".join(map(str, typed))
+    mentioned = " ".join(map(str, (case.run, case.edit, *case.files.values())))
     for name, text in _PREPARED.items():
-        if name in asked or name in case.edit or name == "rig.yaml":
+        if name in mentioned or name == "rig.yaml":
             (folder / name).write_text(text, encoding="utf-8")
     for path in shelf.iterdir():
-        if path.name in asked and path.is_file():
+        if path.name in mentioned and path.is_file():
             (folder / path.name).write_bytes(path.read_bytes())
-    if SOCKET in asked:
-        (folder / SOCKET).symlink_to(shelf / _DAEMON / SOCKET)
+    if _SOCKET in mentioned:
+        (folder / _SOCKET).symlink_to(shelf / _DAEMON / _SOCKET)
     for name, (old, new) in case.edit.items():
         text = (folder / name).read_text("utf-8")
         assert old in text, f"{case.name}: {name} has no {old!r} to be changed"
         (folder / name).write_text(text.replace(old, new, 1), encoding="utf-8")
     for name, content in case.files.items():
-        path = folder / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(content if isinstance(content, bytes) else content.encode())
+        (folder / name).write_bytes(content if isinstance(content, bytes) else content.encode())
 
 
 @contextlib.contextmanager
 def _at_home(folder: Path) -> Iterator[None]:
-    """Everything that a command looks for or leaves behind lies in this folder."""
-    before, kept = Path.cwd(), dict(os.environ)
+    """Make this folder the current one, the home, and that of caches and sockets."""
+    before, environment = Path.cwd(), dict(os.environ)
     os.chdir(folder)
     os.environ.update(
         HOME=str(folder),
@@ -176,121 +174,98 @@ def _at_home(folder: Path) -> Iterator[None]:
     finally:
         os.chdir(before)
         os.environ.clear()
-        os.environ.update(kept)
+        os.environ.update(environment)
 
 
-def _run(case: Case) -> Told:
-    assert case.run is not None
-    program, *arguments = shlex.split(case.run)
-    assert program == "era"
-    out, err = io.StringIO(), io.StringIO()
-    with contextlib.ExitStack() as until_over:
-        if case.before:
-            names: dict[str, Any] = {"until_over": until_over}
-            exec(case.prelude, names)
-            exec(case.before, names)
-        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-            status = run(arguments, entry_points(group="era_haptics.commands"))
-    return Told(err.getvalue(), status, out.getvalue())
+def _without_uvicorn(stack: contextlib.ExitStack) -> None:
+    stack.callback(sys.modules.__setitem__, "uvicorn", import_module("uvicorn"))
+    sys.modules["uvicorn"] = None  # type: ignore[assignment]  # as where it is not installed
 
 
-def _call(case: Case) -> Told:
-    assert case.python is not None
-    with contextlib.ExitStack() as until_over:
-        names: dict[str, Any] = {"until_over": until_over}
-        try:
-            exec(case.prelude, names)
-            exec(case.python, names)
-        except (InputError, DriverError, RpcError) as error:
-            return Told(f"{type(error).__name__}: {error}\n", None, "")
-    if "told" in names:
-        return Told(f"{names['told']}\n", None, "")
-    raise AssertionError(f"{case.name}: nothing was wrong")
+def _disarmed(stack: contextlib.ExitStack) -> Client:
+    """A client of the running daemon, which is disarmed first."""
+    client = stack.enter_context(Client.connect(Path(_SOCKET), name="another"))
+    client.disarm()
+    client.clear()
+    while client.status().state != "READY_TO_SWITCH_ON":
+        time.sleep(0.005)
+    return client
+
+
+def _armed_by_another(stack: contextlib.ExitStack) -> None:
+    _disarmed(stack).arm("another")
+
+
+def _stopped_once_armed(stack: contextlib.ExitStack) -> None:
+    client = _disarmed(stack)
+
+    def stop() -> None:
+        while client.status().state != "OPERATION_ENABLED":
+            time.sleep(0.005)
+        client.stop()
+
+    thread = threading.Thread(target=stop)
+    thread.start()
+    stack.callback(thread.join)
+
+
+_BEFORE: dict[str, Callable[[contextlib.ExitStack], None]] = {
+    "without_uvicorn": _without_uvicorn,
+    "armed_by_another": _armed_by_another,
+    "stopped_once_armed": _stopped_once_armed,
+}
 
 
 @contextlib.contextmanager
 def filled(shelf: Path) -> Iterator[None]:
-    """What is dear to make: a small table, copies of examples, and a daemon that runs meanwhile."""
+    """Put a small table and copies of examples on a shelf, and run a daemon meanwhile."""
     (shelf / "rig.yaml").write_text(RIG, encoding="utf-8")
     table = f"table build {shelf}/rig.yaml -o {shelf}/table.npz --frequencies 60:120:30 --grid 4x3"
     with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
         assert run(shlex.split(table), entry_points(group="era_haptics.commands")) == 0
     (shelf / "rig.yaml").unlink()
     for name in ("measured.csv", "measured.uff", "touches.tuio"):
-        (shelf / name).write_bytes((HERE.parents[1] / "examples" / name).read_bytes())
+        (shelf / name).write_bytes((ROOT / "examples" / name).read_bytes())
     (shelf / _DAEMON).mkdir()
     with real_daemon(shelf / _DAEMON):
         yield
 
 
-def page(told: dict[str, Told]) -> str:
-    """The page of all cases with what they say."""
-    lines = [
-        "# What went wrong, and what to do",
-        "",
-        "Errors as they are printed; search this page for words of yours. Each was provoked by",
-        "what stands above it, mostly with the rig `rig.yaml` at the end of the page and a change.",
-        "Exit status 2 is bad usage or input, 1 that the answer is no, 3 hardware or link.",
-        "Written by `python tests/support/error_cases.py`.",
-        "",
-    ]
-    for subject in subjects():
-        lines += [f"## {subject.title}", ""]
-        if subject.about:
-            lines += [subject.about.strip(), ""]
-        for case in subject.cases:
-            lines += ["```text", *_typed(case), told[case.name].text.rstrip("\n"), "```", ""]
-    lines += ["## The rig of these examples", "", "```yaml", RIG.rstrip("\n"), "```"]
-    return "\n".join(lines) + "\n"
+@dataclass(frozen=True)
+class Quotation:
+    """A box of the page: the lines that are typed, the message, and the status that is promised."""
+
+    typed: list[str]
+    text: str
+    status: int
 
 
-def _typed(case: Case) -> list[str]:
-    lines = [f"# {name}: {old} -> {_short(new)}" for name, (old, new) in case.edit.items()]
-    for name, content in case.files.items():
-        shown = content.decode(errors="backslashreplace") if isinstance(content, bytes) else content
-        lines += [f"# {name}:", *(f"#     {_short(line)}" for line in shown.splitlines()[:12])]
-    if case.run is not None:
-        return [*lines, *_code(case.before), f"$ {case.run}"]
-    assert case.python is not None
-    return [*lines, *_code(case.python)]
+def quotations() -> list[Quotation]:
+    """The boxes of the page in their order, each with the exit status of its section."""
+    found, status = [], -1
+    for section in PAGE.read_text("utf-8").split("\n## ")[1:]:
+        if promised := re.search(r"Exit status (\d)", section):
+            status = int(promised[1])
+        for box in section.split("```text\n")[1:]:
+            lines = box.split("\n```")[0].splitlines()
+            typed = [line for line in lines if line.startswith(("# ", "$ "))]
+            found.append(Quotation(typed, "\n".join(lines[len(typed) :]), status))
+    return found
 
 
-def _code(text: str) -> list[str]:
-    return [
-        f"{'...' if number else '>>>'} {line}"
-        for number, line in enumerate(text.rstrip("\n").splitlines())
-    ]
-
-
-def _short(line: str) -> str:
-    line = line.replace("\n", " / ")
-    return line if len(line) <= 100 else f"{line[:100]}..."
-
-
-def _main(wanted: list[str]) -> None:
-    """Write the page; with names of subjects say what their cases say, and write nothing."""
-    told: dict[str, Told] = {}
+def _write_page() -> None:
+    """Quote all messages anew."""
+    shown = {tuple(case.typed): case for case in cases() if case.shown}
+    page = PAGE.read_text("utf-8")
     with tempfile.TemporaryDirectory() as shelf, filled(Path(shelf)):
-        for subject in subjects():
-            for case in subject.cases:
-                if wanted and case.subject not in wanted:
-                    continue
-                with tempfile.TemporaryDirectory() as folder:
-                    try:
-                        told[case.name] = provoke(case, Path(folder), Path(shelf))
-                    except BaseException as error:
-                        if not wanted:
-                            raise
-                        sys.stdout.write(f"!! {case.name} {type(error).__name__}: {error}\n")
-                        continue
-                if wanted:
-                    said = told[case.name]
-                    odd = f"  !! STATUS {said.status}" if said.status != case.status else ""
-                    odd += f"  !! OUT {said.out[:300]}" if said.out else ""
-                    sys.stdout.write("\n".join([*_typed(case), said.text + odd, ""]))
-    if not wanted:
-        PAGE.write_text(page(told), encoding="utf-8")
+        for quoted in quotations():
+            case = shown[tuple(quoted.typed)]
+            with tempfile.TemporaryDirectory() as folder:
+                text = provoke(case, Path(folder), Path(shelf)).text.rstrip("\n")
+            typed = "\n".join(quoted.typed)
+            page = page.replace(f"{typed}\n{quoted.text}\n```", f"{typed}\n{text}\n```")
+    PAGE.write_text(page, encoding="utf-8")
 
 
 if __name__ == "__main__":
-    _main(sys.argv[1:])
+    _write_page()

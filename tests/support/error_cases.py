@@ -26,10 +26,10 @@ from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
-import yaml
+from ruamel.yaml import YAML
 
 from controller.api.client import Client
-from controller.main import run
+from controller.cli.main import run
 from gateway_bench import real_daemon
 
 ROOT = Path(__file__).parents[2]
@@ -100,7 +100,7 @@ def cases() -> tuple[Case, ...]:
     """All cases, in the order of their files."""
     found: list[Case] = []
     for path in sorted((ROOT / "tests" / "errors" / "cases").glob("*.yaml")):
-        entries: list[dict[str, Any]] = yaml.safe_load(path.read_text("utf-8"))
+        entries: list[dict[str, Any]] = YAML(typ="safe", pure=True).load(path.read_text("utf-8"))
         flat = [
             {"run": entry["run"], **variant}
             for entry in entries

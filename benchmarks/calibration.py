@@ -50,11 +50,11 @@ def errors(found: Calibration, truth: Rig) -> dict[str, float]:
 
 
 def reached(
-    truth: LocalizationTable, asked: LocalizationTable, places: np.ndarray, *, mode: str
+    truth: LocalizationTable, asked: LocalizationTable, places: np.ndarray, *, drive_mode: str
 ) -> float:
     """Contrast [dB] on the true plate of the pattern that a table gives."""
     target, *quiet = [(float(x), float(y)) for x, y in places]
-    question = Question((target,), tuple(quiet), level_db_sl=12.0, mode=mode)
+    question = Question((target,), tuple(quiet), level_db_sl=12.0, drive_mode=drive_mode)
     excitation = asked.query(question).excitation
 
     def peak(place: tuple[float, float]) -> np.ndarray:
@@ -77,14 +77,17 @@ def show_contrast(rig: Rig, truth: Rig, found: Calibration) -> None:
     tables = [build_table(each) for each in (truth, found.rig, rig)]
     print(f"contrast on the true plate, dB, median of {CONTACTS} random contact sets")
     print("     mode quiet  true rig  calibrated  before  most lost")
-    for mode in ("switched", "signed", "phased"):
+    for drive_mode in ("switched", "signed", "phased"):
         for quiet in (1, 2):
             rng = np.random.default_rng(1)
             sets = [contacts(rng, 1 + quiet, rig) for _ in range(CONTACTS)]
-            rows = [[reached(tables[0], each, s, mode=mode) for each in tables] for s in sets]
+            rows = [
+                [reached(tables[0], each, s, drive_mode=drive_mode) for each in tables]
+                for s in sets
+            ]
             best, regained, before = np.array(rows).T
             print(
-                f"{mode:>9} {quiet:5d} {np.median(best):9.1f} {np.median(regained):11.1f} "
+                f"{drive_mode:>9} {quiet:5d} {np.median(best):9.1f} {np.median(regained):11.1f} "
                 f"{np.median(before):7.1f} {(best - regained).max():10.2f}"
             )
 

@@ -48,7 +48,7 @@ def question_of(
     *,
     targets: int = 1,
     level_db_sl: float = STRONG_DB_SL,
-    mode: str | None = None,
+    drive_mode: str | None = None,
     eras_at_most: int = 2,
     search_time: float = 10.0,
 ) -> Question:
@@ -58,7 +58,7 @@ def question_of(
         tuple(points[:targets]),
         tuple(points[targets:]),
         level_db_sl=level_db_sl,
-        mode=mode,
+        drive_mode=drive_mode,
         eras_at_most=eras_at_most,
         search_time=search_time,
     )

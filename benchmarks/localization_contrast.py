@@ -23,7 +23,7 @@ from benchmarks.localization_methods import (
     time_reversal,
 )
 from model.arrays import ComplexArray, FloatArray
-from model.drive_modes import MODES, Choice, find_drives
+from model.drive_modes import DRIVE_MODES, Choice, find_drives
 from model.drive_modes.exact_search import search_exactly
 from model.drive_modes.fields import ERROR_SHARE, Fields
 from model.finger.perception import decibels
@@ -84,8 +84,10 @@ def contrast_section(sets: int, draws: int, seed: int) -> Section:
             values = realised[name, quiet]
             row += [shown(nominal[name, quiet]), "" if values[0] is None else shown(values)]
         rows.append(row)
-    for mode, goals in GOALS.items():
-        rows.append([f"goal, {mode}", *(cell for quiet in QUIET for cell in ("", goals[quiet]))])
+    for drive_mode, goals in GOALS.items():
+        rows.append(
+            [f"goal, {drive_mode}", *(cell for quiet in QUIET for cell in ("", goals[quiet]))]
+        )
     return Section(
         "Contrast [dB], median (10th percentile): without errors, realised",
         ["", *(cell for quiet in QUIET for cell in (f"{quiet} quiet", "realised"))],
@@ -121,16 +123,16 @@ def _methods(places: FloatArray, errors: Errors) -> dict[str, tuple[float, float
     assert exact.drive is not None
     add("switched, exact, 1 to 4 ERAs", weights_of(exact.drive, fields))
     found["  bound: any mixture of these"] = (float(decibels(exact.mixture)), None)
-    for mode in ("graded", "signed", "phased"):
-        choice = _best(fields, mode)
-        add(mode, weights_of(choice.drive, fields))
+    for drive_mode in ("graded", "signed", "phased"):
+        choice = _best(fields, drive_mode)
+        add(drive_mode, weights_of(choice.drive, fields))
     found["  robust score of phased"] = (float(decibels(choice.outcome.score)), None)
     found["  bound of that score"] = (float(decibels(robust_bound(fields))), None)
     return found
 
 
-def _best(fields: Fields, mode: str) -> Choice:
-    choice = find_drives(fields, mode)
+def _best(fields: Fields, drive_mode: str) -> Choice:
+    choice = find_drives(fields, drive_mode)
     assert choice is not None  # the level asked for is reached everywhere
     return choice
 
@@ -165,14 +167,14 @@ def two_target_section(sets: int, draws: int, seed: int) -> Section:
     """Two targets at once: the contrast of the lesser one."""
     rows = []
     for quiet in (1, 2):
-        cells: dict[str, list[float]] = {mode: [] for mode in MODES}
+        cells: dict[str, list[float]] = {drive_mode: [] for drive_mode in DRIVE_MODES}
         for_one: list[float] = []
         rng = np.random.default_rng([seed, 100 + quiet])
         for places in contact_sets(sets // 4, fingers=quiet + 2, rng=rng):
             errors = Errors.draw(draws, eras=4, rng=rng)
             fields = fields_of(places, targets=2)
-            for mode, values in cells.items():
-                drive = _best(fields, mode).drive
+            for drive_mode, values in cells.items():
+                drive = _best(fields, drive_mode).drive
                 realised = errors.contrast_db(fields, weights_of(drive, fields))
                 values.append(float(np.median(realised)))
             alone = fields_of(np.delete(places, 1, axis=0))
@@ -184,7 +186,7 @@ def two_target_section(sets: int, draws: int, seed: int) -> Section:
         )
     return Section(
         "Two targets: realised contrast [dB] of the lesser one, median (10th percentile)",
-        ["", *MODES, "phased, only one of them"],
+        ["", *DRIVE_MODES, "phased, only one of them"],
         rows,
     )
 
@@ -193,13 +195,13 @@ def ensemble_section(sets: int, seed: int) -> Section:
     """Robust contrast over the whole ensemble of plates, for patterns of 12 dB SL."""
     table = paper_table()
     rows = []
-    for mode in MODES:
-        row = [mode]
+    for drive_mode in DRIVE_MODES:
+        row = [drive_mode]
         for quiet in QUIET:
             rng = np.random.default_rng([seed, 200 + quiet])
             values = []
             for places in contact_sets(sets, fingers=quiet + 1, rng=rng):
-                question = question_of(places, mode=mode, level_db_sl=12.0)
+                question = question_of(places, drive_mode=drive_mode, level_db_sl=12.0)
                 pattern = with_robust_contrast(table, question, table.query(question))
                 values.append(pattern.robust_contrast_db)
             row.append(shown(values))
@@ -218,7 +220,7 @@ def ensemble_section(sets: int, seed: int) -> Section:
 
 def freedom_section(sets: int, seed: int) -> Section:
     """How often, and by how much, a mode's answer has a lower robust score than a poorer mode's."""
-    names = list(MODES)
+    names = list(DRIVE_MODES)
     rows = []
     for quiet in (1, 2, 3, 9):
         rng = np.random.default_rng([seed, 400 + quiet])
@@ -226,7 +228,7 @@ def freedom_section(sets: int, seed: int) -> Section:
         scores = []
         for places in contact_sets(sets, fingers=quiet + 1, rng=rng, apart=apart):
             fields = fields_of(places)
-            scores.append([_best(fields, mode).outcome.score for mode in names])
+            scores.append([_best(fields, drive_mode).outcome.score for drive_mode in names])
         ahead = decibels(np.array(scores)[:, :-1] / np.array(scores)[:, 1:])
         rows.append(
             [f"{quiet} quiet"]

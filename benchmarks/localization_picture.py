@@ -9,7 +9,7 @@ from matplotlib.patheffects import withStroke
 
 from benchmarks.localization_cases import paper_table, question_of
 from model.arrays import lattice
-from model.drive_modes import MODES
+from model.drive_modes import DRIVE_MODES
 from model.figures.drawing import draw_eras
 from model.finger.fingertip import FINGERTIP_RADIUS
 from model.finger.perception import sensation_level
@@ -27,9 +27,9 @@ def modes_figure() -> Figure:
     x, y = (np.linspace(0, side, SIDE) for side in (table.plate.length, table.plate.width))
     points = lattice(x, y)
     figure = Figure(figsize=(13, 3.4), layout="constrained")
-    panels = figure.subplots(1, len(MODES))
-    for axes, mode in zip(panels, MODES, strict=True):
-        question = question_of(PLACES, mode=mode)
+    panels = figure.subplots(1, len(DRIVE_MODES))
+    for axes, drive_mode in zip(panels, DRIVE_MODES, strict=True):
+        question = question_of(PLACES, drive_mode=drive_mode)
         pattern = with_robust_contrast(table, question, table.query(question))
         level = sensation_level(*table.amplitudes(pattern.excitation, points))
         axes.pcolormesh(
@@ -59,7 +59,7 @@ def modes_figure() -> Figure:
             )
         tones = sorted({f"{tone.frequency:.0f}" for tone in pattern.excitation.values()})
         axes.set_title(
-            f"{mode}, {' and '.join(tones)} Hz\n{pattern.contrast_db:.0f} dB, "
+            f"{drive_mode}, {' and '.join(tones)} Hz\n{pattern.contrast_db:.0f} dB, "
             f"{pattern.robust_contrast_db:.0f} dB robust",
             fontsize=10,
         )

@@ -87,9 +87,11 @@ def _contrast_figure(section: Section) -> Figure:
             widths=0.6,
             medianprops={"color": "#c0392b", "linewidth": 2},
         )
-        for mode, color in (("switched", "#2980b9"), ("phased", "#27ae60")):
-            goal = float(GOALS[mode][quiet].split()[0])
-            axes.axvline(goal, color=color, linestyle="--", linewidth=1, label=f"goal, {mode}")
+        for drive_mode, color in (("switched", "#2980b9"), ("phased", "#27ae60")):
+            goal = float(GOALS[drive_mode][quiet].split()[0])
+            axes.axvline(
+                goal, color=color, linestyle="--", linewidth=1, label=f"goal, {drive_mode}"
+            )
         axes.set_yticks(range(1, len(names) + 1), names)
         axes.invert_yaxis()
         axes.set_xlabel("realised contrast / dB")

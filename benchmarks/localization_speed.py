@@ -31,7 +31,7 @@ from model.table.question import Question
 from model.table.table import LocalizationTable
 
 QUESTIONS = 400
-MODES = ("switched", "phased")
+DRIVE_MODES = ("switched", "phased")
 MOST_ERAS = 8
 CLOSE = 0.03  # m; ten fingers 5 cm apart hardly fit
 
@@ -45,18 +45,18 @@ def timed(call: Callable[[], object]) -> tuple[float, float]:
 
 def live_times(
     table: LocalizationTable,
-    mode: str,
+    drive_mode: str,
     *,
     quiet: int,
     rng: np.random.Generator,
     questions: int = QUESTIONS,
 ) -> FloatArray:
     """Seconds of every answer, (questions, 2)."""
-    table.prepare(mode)
+    table.prepare(drive_mode)
     apart = 0.05 if quiet < 6 else CLOSE
     times = []
     for places in contact_sets(questions, fingers=quiet + 1, rng=rng, apart=apart):
-        question = question_of(places, mode=mode, level_db_sl=12.0)
+        question = question_of(places, drive_mode=drive_mode, level_db_sl=12.0)
         times.append(timed(partial(table.query, question)))
     return np.array(times)
 
@@ -77,11 +77,11 @@ def speed_section(seed: int) -> Section:
     """What the requirements name: live answers, the table from nothing, the exact search."""
     table = paper_table()
     rows = []
-    for mode in MODES:
+    for drive_mode in DRIVE_MODES:
         for quiet in (1, 3, 9):
             rng = np.random.default_rng([seed, 300 + quiet])
-            times = live_times(table, mode, quiet=quiet, rng=rng)
-            rows.append(_row(f"live answer, {mode}, {quiet} quiet", times))
+            times = live_times(table, drive_mode, quiet=quiet, rng=rng)
+            rows.append(_row(f"live answer, {drive_mode}, {quiet} quiet", times))
     rng = np.random.default_rng([seed, 310])
     for quiet in (1, 3):
         every = []
@@ -142,10 +142,10 @@ def _times_of(what: str, value: int, seed: int) -> dict[str, float]:
     used = time.process_time()
     table = build_table(rig, frequencies=frequencies, grid=grid)
     times = {"build": time.process_time() - used}
-    for mode in MODES:
+    for drive_mode in DRIVE_MODES:
         rng = np.random.default_rng([seed, 320])
-        used_for = live_times(table, mode, quiet=1, rng=rng, questions=60)[:, 1]
-        times[mode] = float(np.median(used_for))
+        used_for = live_times(table, drive_mode, quiet=1, rng=rng, questions=60)[:, 1]
+        times[drive_mode] = float(np.median(used_for))
     rng = np.random.default_rng([seed, 321])
     exact = []
     for places in contact_sets(7, fingers=2, rng=rng):

@@ -77,7 +77,9 @@ class Bench:
                 bases = ramped_onset(excitation, self.rig.eras, ramp=ramp)
                 columns[name].append(self._contrast(case, bases))
             chosen = self.table.query(
-                Question(tuple(case.targets), tuple(case.quiet), mode="phased", level_db_sl=12.0)
+                Question(
+                    tuple(case.targets), tuple(case.quiet), drive_mode="phased", level_db_sl=12.0
+                )
             )
             bases = ramped_onset(chosen.excitation, self.rig.eras, ramp=chosen.ramp)
             columns["the table's pattern and ramp"].append(self._contrast(case, bases))

@@ -24,22 +24,22 @@ from model.table.timing import Timing
 def table(
     rig: Rig,
     *,
-    mode: str = "switched",
+    drive_mode: str = "switched",
     frequencies: Sequence[float] | FloatArray | None = None,
     grid: Grid = PAPER_GRID,
 ) -> LocalizationTable:
     """The rig's localization table, from the user's cache, or built in a second or two and kept.
 
-    mode: what it answers in unless asked otherwise, `switched`, `graded`, `signed` or `phased`;
+    drive_mode: its default, `switched`, `graded`, `signed` or `phased`;
     frequencies (f,) [Hz], ascending, within the rig's limits, unless given
     60 to 320 in steps of 10 as far as these allow; grid: target cells. It is what
     `era table build` writes; `load_table` and `save_table` are for such files. Raises InputError.
     """
     expect_rig(rig)
     expect(grid, Grid, what="grid", made_by="era.Grid(12, 9)")
-    _expect_mode(mode)
+    _expect_mode(drive_mode)
     wanted = None if frequencies is None else _as_frequencies(frequencies)
-    found, _ = cached_table(rig, frequencies=wanted, grid=grid, mode=mode)
+    found, _ = cached_table(rig, frequencies=wanted, grid=grid, drive_mode=drive_mode)
     return found
 
 
@@ -49,28 +49,28 @@ def query(
     *,
     quiet: Places = (),
     level_db_sl: float = STRONG_DB_SL,
-    mode: str | None = None,
+    drive_mode: str | None = None,
     envelopes: bool = False,
     measures: bool = True,
 ) -> Pattern:
     """Find the best pattern for fingers at these places [m], with its predicted measures.
 
     target: fingers to feel it; quiet: fingers not to feel it; each one place or several.
-    level_db_sl: level at the target above its detection threshold, 20 dB is strong; mode: drive
-    mode, the table's own if None; envelopes: for amplifiers that play shaped onsets and endings;
+    level_db_sl: level at the target above its detection threshold, 20 dB is strong; drive_mode:
+    the table's own if None; envelopes: for amplifiers that play shaped onsets and endings;
     measures: compute transient and robust contrast and concentration, too, some ten milliseconds.
     Raises InputError for places off the plate or on top of each other, and a level that cannot be
     reached. The same as `era table query`.
     """
     expect(table, LocalizationTable, what="table", made_by="era.table(rig)")
     expect_number(level_db_sl, what="level_db_sl", unit="decibels above the threshold")
-    if mode is not None:
-        _expect_mode(mode)
+    if drive_mode is not None:
+        _expect_mode(drive_mode)
     question = Question(
         as_points(target, what="target"),
         as_points(quiet, what="quiet"),
         level_db_sl=float(level_db_sl),
-        mode=mode,
+        drive_mode=drive_mode,
         envelopes=envelopes,
     )
     pattern, _ = query_table(table, question, _timing(table), measures=measures)
@@ -80,7 +80,7 @@ def query(
 def _expect_mode(given: object) -> None:
     """Raise InputError for what is no name."""
     if not isinstance(given, str):
-        raise InputError(f"mode is {shown(given)}; give the name of one, such as mode='phased'")
+        raise InputError(f"drive_mode must be a name such as 'phased', got {shown(given)}")
 
 
 def _as_frequencies(given: object) -> FloatArray:

@@ -102,7 +102,7 @@ frequency, and picks amplitudes and phases for these fingers.
 """
 
 # %%
-table = era.table(rig, mode="phased")
+table = era.table(rig, drive_mode="phased")
 target, quiet = (0.08, 0.06), [(0.22, 0.16)]
 pattern = era.query(table, target, quiet=quiet)
 for name, tone in table.drive_of(pattern.excitation).items():
@@ -150,16 +150,20 @@ off) and with free amplitudes and phases (`phased`), which any one table answers
 # %%
 distances = np.array([0.02, 0.03, 0.05, 0.08, 0.12])
 study = {
-    mode: np.array(
+    drive_mode: np.array(
         [
             era.query(
-                table, target, quiet=(target[0] + distance, target[1]), mode=mode, measures=False
+                table,
+                target,
+                quiet=(target[0] + distance, target[1]),
+                drive_mode=drive_mode,
+                measures=False,
             ).contrast_db
             for distance in distances
         ]
     )
-    for mode in ("switched", "phased")
+    for drive_mode in ("switched", "phased")
 }
-print("distance / cm  " + "".join(f"{mode:>10} / dB" for mode in study))
+print("distance / cm  " + "".join(f"{drive_mode:>10} / dB" for drive_mode in study))
 for number, distance in enumerate(distances):
     print(f"{100 * distance:13.0f}  " + "".join(f"{each[number]:15.1f}" for each in study.values()))

@@ -92,7 +92,7 @@ class Daemon:
             observer=self._supervisor.observe(self._news.observer()),
             intent_source=self._meaning,
             timing=Timing(table),
-            mode=config.section.mode,
+            drive_mode=config.section.mode,
             envelope_time=config.section.touch_wait,
         )
         self._touches = ApiTouches(config.rig.plate, self._deliver)

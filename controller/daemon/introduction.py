@@ -17,7 +17,7 @@ def introduction(
     table: LocalizationTable,
     amplifiers: Mapping[str, Amplifier],
     *,
-    mode: str,
+    drive_mode: str,
     layout: dict[str, object] | None,
 ) -> HelloResult:
     """What the daemon drives, in which mode, by which surface layout."""
@@ -27,7 +27,7 @@ def introduction(
         rig=_rig_summary(config.rig, amplifiers),
         table=TableSummary(
             fingerprint=table.fingerprint,
-            mode=mode,
+            mode=drive_mode,
             frequencies_hz=[float(each) for each in table.frequencies],
             cells_x=table.grid.nx,
             cells_y=table.grid.ny,

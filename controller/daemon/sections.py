@@ -9,7 +9,7 @@ from controller.api.schema import MAX_LEASE, MIN_LEASE
 from controller.loop.envelopes import ENVELOPE_TIME
 from model.config.sections import Quantity, Section
 from model.config.units import LENGTH, RATIO, TIME
-from model.drive_modes import MODES
+from model.drive_modes import DRIVE_MODES
 from model.finger.perception import STRONG_DB_SL
 from model.rig.sections import Identifier
 
@@ -21,8 +21,8 @@ _POINT = Annotated[tuple[_LENGTH, _LENGTH], Strict(strict=False)]
 
 
 def _mode(text: str) -> str:
-    if text not in MODES:
-        raise ValueError(f"{text[:40]!r} is no drive mode; choose {', '.join(MODES)}")
+    if text not in DRIVE_MODES:
+        raise ValueError(f"{text[:40]!r} is no drive mode; choose {', '.join(DRIVE_MODES)}")
     return text
 
 

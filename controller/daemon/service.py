@@ -147,7 +147,7 @@ class Service:
             self._config,
             self._table,
             self._amplifiers,
-            mode=self._controller.capabilities.mode,
+            drive_mode=self._controller.capabilities.drive_mode,
             layout=self._news.layout_event().layout,
         )
 

@@ -85,7 +85,7 @@ class TouchRow:
             "targets_m": [list(place) for place in (self.target, *self.together)],
             "quiet_m": [list(place) for place in self.quiet.values()],
             "drive": {era: dict(tone) for era, tone in played.drive.items()} if played else {},
-            "mode": played.pattern.mode if played else None,
+            "mode": played.pattern.drive_mode if played else None,
             "shaped_onset": played is not None and played.onset.is_shaped,
             "predicted_contrast_db": played.predicted_contrast_db if played else None,
             "measured_contrast_db": measured.contrast_db if measured else None,

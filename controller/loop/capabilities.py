@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from controller.group.guards import guard_limits
 from controller.loop.envelopes import ENVELOPE_TIME, Loading, Shaping, shaping_of
 from drivers.guard import limits_in_force
-from model.drive_modes import MODES, playable_modes
+from model.drive_modes import DRIVE_MODES, playable_drive_modes
 from model.errors import InputError
 from model.rig.rig import Rig
 
@@ -15,12 +15,12 @@ from model.rig.rig import Rig
 class PlaybackCapabilities:
     """What patterns may be made of.
 
-    mode: in which the table is asked; playable: the modes that every amplifier can play;
+    drive_mode: in which the table is asked; playable: the modes that every amplifier can play;
     frequencies: the lowest and highest [Hz]; largest: amplitude [m] by ERA; shaping: which
     envelopes all of them play.
     """
 
-    mode: str
+    drive_mode: str
     playable: tuple[str, ...]
     frequencies: tuple[float, float]
     largest: Mapping[str, float]
@@ -31,29 +31,29 @@ def playback_capabilities(
     rig: Rig,
     amplifiers: Mapping[str, Loading],
     *,
-    mode: str | None = None,
+    drive_mode: str | None = None,
     envelope_time: float = ENVELOPE_TIME,
 ) -> PlaybackCapabilities:
     """What the open amplifiers of a rig, by name, can play.
 
-    mode: None for the best that all can; envelope_time [s]: how long loading envelopes may hold up
-    a touch, 0 for ramps only. Raises InputError for a mode that one of them cannot play.
+    drive_mode: None for the best that all can play; envelope_time [s]: how long loading envelopes
+    may delay a touch, 0 for ramps only. Raises InputError for a mode that one cannot play.
     """
     capabilities = {name: amplifier.capabilities for name, amplifier in amplifiers.items()}
     each = [
-        playable_modes(level_step=caps.level_step, phase_step=caps.phase_step)
+        playable_drive_modes(level_step=caps.level_step, phase_step=caps.phase_step)
         for caps in capabilities.values()
     ]
-    playable = tuple(name for name in MODES if all(name in modes for modes in each))
-    if mode is not None and mode not in playable:
+    playable = tuple(name for name in DRIVE_MODES if all(name in modes for modes in each))
+    if drive_mode is not None and drive_mode not in playable:
         raise InputError(
-            f"these amplifiers cannot play mode {mode}, only {', '.join(playable)}; choose one of "
-            "these, or none for the best"
+            f"drive mode {drive_mode} is not playable, only {', '.join(playable)}; "
+            "choose one of these, or none for the best"
         )
     configured = guard_limits(rig.limits)
     limits = {name: limits_in_force(configured, caps) for name, caps in capabilities.items()}
     return PlaybackCapabilities(
-        mode=mode or playable[-1],
+        drive_mode=drive_mode or playable[-1],
         playable=playable,
         frequencies=(
             max(one.frequency_min for one in limits.values()),

@@ -110,7 +110,7 @@ class Decider:
 
         Raises InputError for a table that has no answer which these amplifiers play.
         """
-        self._table.prepare(self._capabilities.mode)
+        self._table.prepare(self._capabilities.drive_mode)
         if self._timing is None:
             return
         self._timing.prepare(self._table.frequencies.tolist())
@@ -119,7 +119,7 @@ class Decider:
             ((plate.length / 2, plate.width / 2),),
             ((0.0, 0.0),),
             level_db_sl=-100.0,
-            mode=self._capabilities.mode,
+            drive_mode=self._capabilities.drive_mode,
             playable=self._capabilities.playable,
             frequencies=self._capabilities.frequencies,
             envelopes=shaping.onsets,

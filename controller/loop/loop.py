@@ -45,7 +45,7 @@ class Controller:
     run, so that a loop that hangs lets the amplifiers' watchdogs trip.
 
     intent_source: who feels what; by default the newest contact buzzes where it is. timing: what
-    shapes the table's patterns; ramps only without it. mode: drive mode of the patterns, None for
+    shapes the table's patterns; ramps only without it. drive_mode: that of the patterns, None for
     the best that the amplifiers can play. envelope_time [s]: how long loading envelopes may hold up
     a touch, 0 for ramps only.
     """
@@ -60,7 +60,7 @@ class Controller:
         observer: Observer | None = None,
         intent_source: IntentSource | None = None,
         timing: PatternTiming | None = None,
-        mode: str | None = None,
+        drive_mode: str | None = None,
         envelope_time: float = ENVELOPE_TIME,
     ) -> None:
         if amplifiers.keys() != rig.amplifiers.keys():
@@ -76,7 +76,7 @@ class Controller:
         self._observer = observer or Observer()
         self._intent_source = intent_source or NewestBuzzes()
         self._timing = timing
-        self._mode = mode
+        self._drive_mode = drive_mode
         self._envelope_time = envelope_time if timing is not None else 0.0
         self._tally = RejectCounter(_logger)
         self._opened_decider: Decider | None = None
@@ -119,7 +119,7 @@ class Controller:
                 capabilities=playback_capabilities(
                     self._rig,
                     self._amplifiers,
-                    mode=self._mode,
+                    drive_mode=self._drive_mode,
                     envelope_time=self._envelope_time,
                 ),
                 intent_source=self._intent_source,

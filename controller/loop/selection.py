@@ -44,7 +44,7 @@ class PatternTable(Protocol):
     def frequencies(self) -> FloatArray:
         """What its patterns may use [Hz]."""
 
-    def prepare(self, mode: str) -> None:
+    def prepare(self, drive_mode: str) -> None:
         """Work out what the first question in a mode would have to wait for."""
 
     def query(self, question: Question) -> Pattern:
@@ -210,7 +210,7 @@ def _question(
         quiet=tuple((contact.x, contact.y) for contact in quiet),
         level_db_sl=level,
         softer_db=tuple(level - each for each in levels),
-        mode=capabilities.mode,
+        drive_mode=capabilities.drive_mode,
         playable=capabilities.playable,
         frequencies=capabilities.frequencies,
         envelopes=capabilities.shaping.onsets,

@@ -23,8 +23,8 @@ def build(
             "of the rig.",
         ),
     ] = None,
-    mode: Annotated[
-        str, typer.Option(help="Drive mode to answer in: switched, graded, signed or phased.")
+    drive_mode: Annotated[
+        str, typer.Option("--mode", help="Drive mode: switched, graded, signed or phased.")
     ] = "switched",
     grid: Annotated[
         str, typer.Option(metavar="NXxNY", help="Target cells along x and y.")
@@ -38,7 +38,7 @@ def build(
     """Solve the plate and write its table. Goes on where an interrupted build stopped."""
     from model.commands.progress import progress_bar
     from model.config.points import parse_frequencies, parse_pair
-    from model.drive_modes import MODES
+    from model.drive_modes import DRIVE_MODES
     from model.errors import InputError
     from model.files.replacing import begins_with, check_ending, check_place, check_replaceable
     from model.finger.grid import Grid
@@ -49,8 +49,10 @@ def build(
     from model.table.table import default_drive_frequencies
     from model.table.table_parts import TableProblem
 
-    if mode not in MODES:
-        raise InputError(f"unknown drive mode --mode {mode!r}; known: {', '.join(MODES)}")
+    if drive_mode not in DRIVE_MODES:
+        raise InputError(
+            f"unknown drive mode --mode {drive_mode!r}; known: {', '.join(DRIVE_MODES)}"
+        )
     check_place(output, example="table.npz")
     check_ending(output, ".npz", what="a localization table")
     check_replaceable(output, is_own=begins_with(output, ZIP), what="localization table")
@@ -67,7 +69,7 @@ def build(
     with progress_bar("parts") as progress:
         try:
             built = build_in_parts(
-                problem, mode=mode, workers=workers, kept=kept, progress=progress
+                problem, drive_mode=drive_mode, workers=workers, kept=kept, progress=progress
             )
         except KeyboardInterrupt:
             done = (
@@ -92,7 +94,7 @@ def build(
                     "mesh": [table.mesh.nx, table.mesh.ny],
                     "element": table.mesh.element,
                     "discretisation_error_percent": error,
-                    "mode": table.mode,
+                    "mode": table.drive_mode,
                     "fingerprint": table.fingerprint,
                     "code_version": table.code_version,
                     "parts": built.part_count,

@@ -22,9 +22,11 @@ def query(
     quiet: Annotated[
         list[str] | None, typer.Option(metavar="X,Y", help="A finger not to feel it; repeatable.")
     ] = None,
-    mode: Annotated[
+    drive_mode: Annotated[
         str | None,
-        typer.Option(help="switched, graded, signed or phased; the table's own if not given."),
+        typer.Option(
+            "--mode", help="Drive mode: switched, graded, signed or phased; default: the table's."
+        ),
     ] = None,
     level: Annotated[
         float, typer.Option(metavar="DB_SL", help="Wanted level at the target, dB SL.")
@@ -63,12 +65,12 @@ def query(
         targets=tuple(parse_point(text, what="--target") for text in target),
         quiet=tuple(parse_point(text, what="--quiet") for text in quiet or []),
         level_db_sl=level,
-        mode=mode,
+        drive_mode=drive_mode,
         eras_at_most=eras,
         envelopes=envelopes,
     )
     table = load_table(table_file)
-    table.prepare(mode)
+    table.prepare(drive_mode)
     answer = query_as_json(table, question, prepared_timing(table))
     if as_json:
         print(json.dumps(answer))

@@ -31,7 +31,7 @@ __all__ = ["MODES", "Choice", "Mode", "find_drives", "loudest", "playable_modes"
 
 
 @dataclass(frozen=True)
-class Mode:
+class DriveMode:
     """A drive mode.
 
     coherent: how it finds weights of all ERAs at one frequency, None for `switched`; poorer: the
@@ -49,11 +49,11 @@ class Mode:
         return (self.coherent.loudest if self.coherent else loudest_switched)(fields)
 
 
-MODES: dict[str, Mode] = {
-    "switched": Mode(None, ()),
-    "graded": Mode(GRADED, ("switched",)),
-    "signed": Mode(SIGNED, ("graded", "switched")),
-    "phased": Mode(PHASED, ("signed", "graded", "switched")),
+DRIVE_MODES: dict[str, DriveMode] = {
+    "switched": DriveMode(None, ()),
+    "graded": DriveMode(GRADED, ("switched",)),
+    "signed": DriveMode(SIGNED, ("graded", "switched")),
+    "phased": DriveMode(PHASED, ("signed", "graded", "switched")),
 }
 """By name, from the least freedom to the most."""
 
@@ -90,7 +90,7 @@ class Choice:
         )
 
 
-def find_drives(fields: Fields, mode: str) -> Choice | None:
+def find_drives(fields: Fields, drive_mode: str) -> Choice | None:
     """The drive of the best robust score in a mode and the poorer ones, with those near it.
 
     None where none reaches the wanted level.
@@ -99,9 +99,9 @@ def find_drives(fields: Fields, mode: str) -> Choice | None:
     open_ = np.arange(fields.frequency_count)
     score = np.zeros(len(open_), dtype=np.float32)
     weights = np.zeros((len(open_), fields.era_count), dtype=np.complex64)
-    for name in (mode, *MODES[mode].poorer):
+    for name in (drive_mode, *DRIVE_MODES[drive_mode].poorer):
         least = best[1].score if best else 0.0
-        coherent = MODES[name].coherent
+        coherent = DRIVE_MODES[name].coherent
         if coherent is None:
             # What is there already lets most of the search for something better be left out.
             drive = find_switched(fields, least)
@@ -130,12 +130,14 @@ def find_drives(fields: Fields, mode: str) -> Choice | None:
     return Choice(*best, reached, weights[reached], score[reached])
 
 
-def loudest(fields: Fields, mode: str) -> float:
+def loudest(fields: Fields, drive_mode: str) -> float:
     """How many times above threshold the targets can be made to feel it in a mode."""
-    return max(MODES[name].loudest(fields) for name in (*MODES[mode].poorer, mode))
+    return max(
+        DRIVE_MODES[name].loudest(fields) for name in (*DRIVE_MODES[drive_mode].poorer, drive_mode)
+    )
 
 
-def playable_modes(*, level_step: float, phase_step: float) -> tuple[str, ...]:
+def playable_drive_modes(*, level_step: float, phase_step: float) -> tuple[str, ...]:
     """The modes that an amplifier can play whose levels and phases [degrees] have such steps.
 
     A level step of 1 is on or off; phase steps above 180 degrees are no phase, 180 a sign.

@@ -62,7 +62,7 @@ def weak_cells_figure(table: LocalizationTable, weak: WeakCells) -> Figure:
         axes.label_outer()
     figure.colorbar(image, ax=grid, label="contrast / dB")
     figure.suptitle(
-        f"Mode {table.mode}: contrast from each cell to one other finger\n"
+        f"Mode {table.drive_mode}: contrast from each cell to one other finger\n"
         f"(crosses: below {WANTED_CONTRAST_DB:g} dB; dots: ERAs)"
     )
     return figure
@@ -106,7 +106,7 @@ def contrast_figure(
     axes.set_ylabel("contact sets with at least this contrast / %")
     axes.grid(color="0.9")
     figure.legend(loc="outside lower center", ncols=3, fontsize=9, frameon=False)
-    axes.set_title(f"Mode {table.mode}: random contact sets at least 5 cm apart")
+    axes.set_title(f"Mode {table.drive_mode}: random contact sets at least 5 cm apart")
     return figure
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.arrays import FloatArray
-from model.drive_modes import MODES
+from model.drive_modes import DRIVE_MODES
 from model.errors import InputError
 from model.files.array_file import Arrays
 from model.finger.grid import Grid
@@ -37,20 +37,20 @@ def build_table(
     *,
     frequencies: FloatArray = PAPER_FREQUENCIES,
     grid: Grid = PAPER_GRID,
-    mode: str = "switched",
+    drive_mode: str = "switched",
 ) -> LocalizationTable:
     """Solve the rig's plate on its mesh and keep what localization needs.
 
-    frequencies (f,) [Hz], ascending, within the rig's limits; mode: one of MODES. Raises
-    InputError.
+    frequencies (f,) [Hz], ascending, within the rig's limits; drive_mode: one of DRIVE_MODES.
+    Raises InputError.
     """
-    return build_in_parts(TableProblem(rig, frequencies, grid), mode=mode).table
+    return build_in_parts(TableProblem(rig, frequencies, grid), drive_mode=drive_mode).table
 
 
 def build_in_parts(
     problem: TableProblem,
     *,
-    mode: str,
+    drive_mode: str,
     workers: int = 1,
     kept: KeptParts | None = None,
     progress: Callable[[int, int], None] = lambda done, of: None,
@@ -60,8 +60,8 @@ def build_in_parts(
     progress: called with how many parts are done, of how many. An exception, Ctrl-C among them,
     leaves what is done where it is kept.
     """
-    if mode not in MODES:
-        raise InputError(f"unknown drive mode {mode!r}; known: {', '.join(MODES)}")
+    if drive_mode not in DRIVE_MODES:
+        raise InputError(f"unknown drive mode {drive_mode!r}; known: {', '.join(DRIVE_MODES)}")
     parts = dict(enumerate(problem.parts()))
     done: dict[int, Arrays] = {}
     for number, part in parts.items():
@@ -76,7 +76,7 @@ def build_in_parts(
             kept.store(parts[number], arrays)
         done[number] = arrays
         progress(len(done), len(parts))
-    table = _put_together(problem, mode, {parts[number]: done[number] for number in parts})
+    table = _put_together(problem, drive_mode, {parts[number]: done[number] for number in parts})
     return Build(table, len(parts), reused_count)
 
 
@@ -95,7 +95,7 @@ def _solve(
 
 
 def _put_together(
-    problem: TableProblem, mode: str, solved: Mapping[Part, Arrays]
+    problem: TableProblem, drive_mode: str, solved: Mapping[Part, Arrays]
 ) -> LocalizationTable:
     def joined(name: str, *, axis: int) -> NDArray[Any]:
         pieces = [arrays[name] for arrays in solved.values() if name in arrays]
@@ -110,7 +110,7 @@ def _put_together(
         mesh=rig.mesh,
         raster=problem.raster,
         grid=problem.grid,
-        mode=mode,
+        drive_mode=drive_mode,
         code_version=problem.code_version,
         frequencies=problem.frequencies,
         reference_mesh=problem.reference_mesh,

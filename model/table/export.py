@@ -44,7 +44,7 @@ def export_mat(table: LocalizationTable, path: Path) -> None:
         "format_version": float(FORMAT_VERSION),
         "code_version": table.code_version,
         "fingerprint": table.fingerprint,
-        "mode": table.mode,
+        "mode": table.drive_mode,
         "plate": _plate(table),
         "eras": _structs([asdict(era) for era in table.eras]),
         "masses": _structs([asdict(mass) for mass in table.masses]),

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from model.arguments import expect, expect_path, shown
-from model.drive_modes import MODES
+from model.drive_modes import DRIVE_MODES
 from model.errors import InputError, first_problem
 from model.fem.mesh import Mesh
 from model.files.array_file import UNREADABLE, digest_of, read_arrays, write_arrays
@@ -110,7 +110,7 @@ def save_table(table: LocalizationTable, path: Path | str) -> None:
         "format_version": FORMAT_VERSION,
         "code_version": table.code_version,
         "fingerprint": table.fingerprint,
-        "mode": table.mode,
+        "mode": table.drive_mode,
         "plate": asdict(table.plate),
         "eras": [asdict(era) for era in table.eras],
         "masses": [asdict(mass) for mass in table.masses],
@@ -200,14 +200,14 @@ def _assemble(header: _Header, arrays: dict[str, NDArray[Any]], path: Path) -> L
             discretisation_error=np.array(header.discretisation_error, dtype=float),
             raster=Raster(**header.raster.model_dump()),
             grid=Grid(**header.grid),
-            mode=header.mode,
+            drive_mode=header.mode,
             code_version=header.code_version,
             **arrays,
         )
     except (TypeError, KeyError, ValueError) as error:
         raise InputError(f"{path}: the header does not describe a plate ({error})") from error
-    if table.mode not in MODES:
-        raise InputError(f"{path}: unknown drive mode {table.mode!r}")
+    if table.drive_mode not in DRIVE_MODES:
+        raise InputError(f"{path}: unknown drive mode {table.drive_mode!r}")
     count, era_count, coordinates = len(table.frequencies), len(table.eras), len(table.omega)
     sources = era_count * (era_count + 1) // 2 * count + 1
     expected = {

@@ -49,7 +49,7 @@ class Pattern:
     level_db_sl: float
     contrast_db: float | None
     quiet_level_db_sl: float | None
-    mode: str = "switched"
+    drive_mode: str = "switched"
     surroundings_contrast_db: float | None = None
     contrast_bound_db: float | None = None
     robust_contrast_db: float | None = None

@@ -130,6 +130,6 @@ def _pattern(
         level_db_sl=question.level_db_sl,
         contrast_db=contrast if question.quiet else None,
         quiet_level_db_sl=quiet_level if question.quiet else None,
-        mode=drive_mode,
+        drive_mode=drive_mode,
         surroundings_contrast_db=None if question.quiet else contrast,
     )

@@ -56,7 +56,7 @@ def question_from_json(line: str) -> Question:
         targets=tuple((x, y) for x, y in targets),
         quiet=tuple((x, y) for x, y in asked.quiet),
         level_db_sl=asked.level_db_sl,
-        mode=asked.mode,
+        drive_mode=asked.mode,
         eras_at_most=asked.eras_at_most,
         envelopes=asked.envelopes,
     )
@@ -88,7 +88,7 @@ def query_as_json(table: LocalizationTable, question: Question, timing: Timing) 
     concentration = pattern.concentration
     return {
         "drive": table.drive_of(pattern.excitation),
-        "mode": pattern.mode,
+        "mode": pattern.drive_mode,
         "level_db_sl": pattern.level_db_sl,
         "contrast_db": pattern.contrast_db,
         "contrast_db_sl": pattern.contrast_db_sl,

@@ -8,7 +8,7 @@ import numpy as np
 
 from model.config.points import in_metres
 from model.counting import counted
-from model.drive_modes import MODES
+from model.drive_modes import DRIVE_MODES
 from model.errors import InputError
 from model.finger.fingertip import FINGERTIP_RADIUS
 from model.finger.perception import STRONG_DB_SL
@@ -29,10 +29,10 @@ class Question:
 
     targets: where fingers shall feel it, one or more; quiet: where fingers must not; level_db_sl:
     wanted at every target; softer_db: by how much less each of them wants than that, empty for
-    nothing; mode: a name in MODES, None for the table's own; playable: the modes that the
-    amplifiers can play; frequencies: the lowest and highest they can [Hz]; eras_at_most: how many
-    ERAs `switched` may drive, beyond two by exact search, which is not for live use and ends after
-    search_time [s] at the latest, with a bound in place of a proof; envelopes: whether the
+    nothing; drive_mode: a name in DRIVE_MODES, None for the table's own; playable: the modes that
+    the amplifiers can play; frequencies: the lowest and highest they can [Hz]; eras_at_most: how
+    many ERAs `switched` may drive, beyond two by exact search, which is not for live use and ends
+    after search_time [s] at the latest, with a bound in place of a proof; envelopes: whether the
     amplifiers play any (`model.table.timing`).
 
     Where targets are not wanted alike, contrast and level of the answer are those of the target
@@ -43,8 +43,8 @@ class Question:
     quiet: tuple[Point, ...] = ()
     level_db_sl: float = STRONG_DB_SL
     softer_db: tuple[float, ...] = ()
-    mode: str | None = None
-    playable: tuple[str, ...] = tuple(MODES)
+    drive_mode: str | None = None
+    playable: tuple[str, ...] = tuple(DRIVE_MODES)
     frequencies: tuple[float, float] = (0.0, math.inf)
     eras_at_most: int = 2
     search_time: float = 10.0
@@ -87,8 +87,10 @@ class Question:
                         f"the {what} ({contact[0]:g}, {contact[1]:g}) m is given twice; two "
                         "fingers are at two places, so give each once"
                     )
-        if self.mode is not None and self.mode not in MODES:
-            raise InputError(f"unknown drive mode {self.mode!r}; known: {', '.join(MODES)}")
+        if self.drive_mode is not None and self.drive_mode not in DRIVE_MODES:
+            raise InputError(
+                f"unknown drive mode {self.drive_mode!r}; known: {', '.join(DRIVE_MODES)}"
+            )
         for target in self.targets:
             for position in self.quiet:
                 if math.dist(position, target) < FINGERTIP_RADIUS:
@@ -118,25 +120,25 @@ class Question:
                         f"{in_metres(x, y, length=plate.length, width=plate.width)}"
                     )
 
-    def mode_on(self, own: str, *, era_count: int) -> str:
+    def drive_mode_on(self, own: str, *, era_count: int) -> str:
         """The mode to answer in on a table of so many ERAs, whose own mode is given.
 
         Raises InputError if it is not playable, and for a number of ERAs that it cannot keep to.
         """
-        mode = self.mode or own
+        drive_mode = self.drive_mode or own
         if self.eras_at_most > max(2, era_count):
             raise InputError(
                 f"the table has {counted(era_count, 'ERA')}, of which up to {self.eras_at_most} "
                 f"cannot be driven; allow {era_count} at the most"
             )
-        if self.eras_at_most != 2 and mode != "switched":
+        if self.eras_at_most != 2 and drive_mode != "switched":
             raise InputError(
-                f"how many ERAs are driven is a matter of mode switched; mode {mode} drives all of "
-                "them: ask for mode switched, or leave the number of ERAs out"
+                f"how many ERAs are driven is a matter of mode switched; mode {drive_mode} drives "
+                "all of them: ask for mode switched, or leave the number of ERAs out"
             )
-        if mode not in self.playable:
+        if drive_mode not in self.playable:
             raise InputError(
-                f"these amplifiers cannot play mode {mode}, only {', '.join(self.playable)}; "
+                f"these amplifiers cannot play mode {drive_mode}, only {', '.join(self.playable)}; "
                 f"ask for one of these, or build a table for them: era table build --mode"
             )
-        return mode
+        return drive_mode

@@ -35,7 +35,7 @@ def summarize(
     available = table.available_level_db_sl
     known = np.isfinite(weak.tenth_db) | np.isneginf(weak.tenth_db)
     summary: dict[str, Any] = {
-        "mode": table.mode,
+        "mode": table.drive_mode,
         "plate_m": [table.plate.length, table.plate.width, table.plate.thickness],
         "eras": [era.name for era in table.eras],
         "frequencies_hz": [float(table.frequencies[0]), float(table.frequencies[-1])],

@@ -63,7 +63,7 @@ def default_drive_frequencies(limits: Limits) -> FloatArray:
 class LocalizationTable:
     """Fields of one plate on its ERAs, with all that is needed to choose among patterns.
 
-    mode: what questions are answered in unless they say; frequencies (f,) [Hz]; acceleration
+    drive_mode: what questions are answered in unless they say; frequencies (f,) [Hz]; acceleration
     (points, f, eras) complex [m/s²] on the raster, each ERA alone at full stroke; omega (r,)
     [rad/s], held (eras + masses, r) and shapes (points, r) [1/sqrt(kg)]: the reduced free plate, at
     what holds it and on the raster (`model.reduction.reduced_plate`); cell_sources (sources, cells)
@@ -78,7 +78,7 @@ class LocalizationTable:
     mesh: Mesh
     raster: Raster
     grid: Grid
-    mode: str
+    drive_mode: str
     code_version: str
     frequencies: FloatArray
     acceleration: SingleComplex
@@ -93,7 +93,8 @@ class LocalizationTable:
         low, high = self.frequencies[[0, -1]]
         return (
             f"<LocalizationTable of {self.plate.length:g} x {self.plate.width:g} m on ERAs "
-            f"{', '.join(era.name for era in self.eras)}, {low:g} to {high:g} Hz, mode {self.mode}>"
+            f"{', '.join(era.name for era in self.eras)}, {low:g} to {high:g} Hz, "
+            f"mode {self.drive_mode}>"
         )
 
     @property
@@ -120,7 +121,7 @@ class LocalizationTable:
         off the plate and for a level that cannot be reached.
         """
         question.check_on(self.plate)
-        drive_mode = question.mode_on(self.mode, era_count=len(self.eras))
+        drive_mode = question.drive_mode_on(self.drive_mode, era_count=len(self.eras))
         low, high = question.frequencies
         playable = np.flatnonzero((self.frequencies >= low) & (self.frequencies <= high))
         if len(playable) == 0:
@@ -137,12 +138,14 @@ class LocalizationTable:
         candidates = Candidates(self.eras, self.frequencies[playable], fields, onset_contrast)
         return choose_pattern(question, drive_mode, candidates)
 
-    def prepare(self, mode: str | None = None) -> None:
+    def prepare(self, drive_mode: str | None = None) -> None:
         """Work out what the first question in a mode would have to wait for."""
         centre = (self.plate.length / 2, self.plate.width / 2)
         for quiet in ((), ((0.0, 0.0),)):
-            self.query(Question((centre,), quiet, level_db_sl=MIN_LEVEL_DB_SL, mode=mode))
-        if (mode or self.mode) != "switched":
+            self.query(
+                Question((centre,), quiet, level_db_sl=MIN_LEVEL_DB_SL, drive_mode=drive_mode)
+            )
+        if (drive_mode or self.drive_mode) != "switched":
             _ = self.onsets  # not every question has patterns to choose among
 
     def fields(self, question: Question) -> Fields:

@@ -23,7 +23,7 @@ def cached_table(
     *,
     frequencies: FloatArray | None = None,
     grid: Grid = PAPER_GRID,
-    mode: str = "switched",
+    drive_mode: str = "switched",
 ) -> tuple[LocalizationTable, Path | None]:
     """The table of a rig, from the user's cache folder or built and kept there; and its file.
 
@@ -33,7 +33,7 @@ def cached_table(
     """
     if frequencies is None:
         frequencies = default_drive_frequencies(rig.limits)
-    path = _cache_path(rig, frequencies, grid, mode)
+    path = _cache_path(rig, frequencies, grid, drive_mode)
     try:
         kept = load_table(path, fingerprint=rig.fingerprint)
     except InputError as error:
@@ -43,7 +43,7 @@ def cached_table(
         if kept.code_version == code_version():
             return kept, path
         _logger.info("building the localization table: %s made the one kept", kept.code_version)
-    table = build_table(rig, frequencies=frequencies, grid=grid, mode=mode)
+    table = build_table(rig, frequencies=frequencies, grid=grid, drive_mode=drive_mode)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         save_table(table, path)
@@ -53,7 +53,7 @@ def cached_table(
     return table, path
 
 
-def _cache_path(rig: Rig, frequencies: FloatArray, grid: Grid, mode: str) -> Path:
-    name = f"{FORMAT_VERSION} {rig.mesh} {grid} {mode} {frequencies.tolist()}"
+def _cache_path(rig: Rig, frequencies: FloatArray, grid: Grid, drive_mode: str) -> Path:
+    name = f"{FORMAT_VERSION} {rig.mesh} {grid} {drive_mode} {frequencies.tolist()}"
     digest = hashlib.sha256(f"{rig.fingerprint} {name}".encode()).hexdigest()[:16]
     return platformdirs.user_cache_path("era-haptics", appauthor=False) / f"table-{digest}.npz"

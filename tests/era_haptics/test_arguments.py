@@ -21,9 +21,9 @@ GOOD: dict[Callable[..., Any], dict[str, Any]] = {
     era.example_rig_path: {},
     era.load_table: {"path": "t.npz", "fingerprint": RIG.fingerprint},
     era.save_table: {"table": None, "path": "t.npz"},
-    era.table: {"rig": RIG, "mode": "switched", "frequencies": [60], "grid": era.Grid(4, 3)},
+    era.table: {"rig": RIG, "drive_mode": "switched", "frequencies": [60], "grid": era.Grid(4, 3)},
     era.query: {
-        "table": None, "target": TARGET, "quiet": (), "level_db_sl": 20.0, "mode": "signed",
+        "table": None, "target": TARGET, "quiet": (), "level_db_sl": 20.0, "drive_mode": "signed",
     },
     era.SolvedPlate: {"rig": RIG},
     PLATE.map: {"drive": DRIVE, "raster": (3, 3)},

@@ -42,7 +42,10 @@ def test_a_map_marks_who_is_driven() -> None:
 def test_a_pattern_is_drawn_with_its_fingers() -> None:
     """Circles of 13 mm where fingers are, the contrast in the title, the plate in decibels."""
     table = build_table(
-        PLATE.rig, frequencies=np.array([60.0, 110.0, 250.0]), grid=era.Grid(4, 3), mode="phased"
+        PLATE.rig,
+        frequencies=np.array([60.0, 110.0, 250.0]),
+        grid=era.Grid(4, 3),
+        drive_mode="phased",
     )
     pattern = era.query(table, TARGET, quiet=QUIET)
     figure = era.draw_pattern(table, pattern, TARGET, quiet=QUIET)

@@ -31,7 +31,7 @@ def table(plate: era.SolvedPlate) -> era.LocalizationTable:
     from model.table.build import build_table
 
     frequencies = np.array([60.0, 110.0, 180.0, 250.0])
-    return build_table(plate.rig, frequencies=frequencies, grid=era.Grid(4, 3), mode="phased")
+    return build_table(plate.rig, frequencies=frequencies, grid=era.Grid(4, 3), drive_mode="phased")
 
 
 def test_modes_are_converged(plate: era.SolvedPlate) -> None:

@@ -44,6 +44,6 @@ def test_contrast_of_the_onset_is_the_predicted_one(touches):
     onset = row.played.onset
     assert onset.is_shaped
     assert onset.measured_contrast_db == pytest.approx(onset.predicted_contrast_db, abs=2)
-    question = Question((row.target,), tuple(row.quiet.values()), mode="phased")
+    question = Question((row.target,), tuple(row.quiet.values()), drive_mode="phased")
     ramped = Timing(table).with_transient_measures(question, table.query(question))
     assert onset.measured_contrast_db > ramped.transient_contrast_db + 6

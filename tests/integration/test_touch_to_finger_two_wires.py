@@ -39,7 +39,7 @@ def truth(tmp_path_factory: pytest.TempPathFactory) -> Truth:
     """The rig as it is meant, and its table, asked without any of the chain."""
     rig = load_rig(write_rig(tmp_path_factory.mktemp("truth") / "rig.yaml", *TWO_AMPLIFIERS))
     table = build_table(rig, frequencies=np.arange(80.0, 321.0, 40.0), grid=Grid(4, 3))
-    return Truth(rig, table, STREAM, mode="switched")
+    return Truth(rig, table, STREAM, drive_mode="switched")
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +53,7 @@ def played(truth: Truth, tmp_path_factory: pytest.TempPathFactory) -> Played:
 async def play(folder: Path) -> Played:
     """Through a daemon, over both wires."""
     chain = running_chain(
-        folder, WIRES, table=folder / "table.npz", rig_changes=TWO_AMPLIFIERS, mode="switched"
+        folder, WIRES, table=folder / "table.npz", rig_changes=TWO_AMPLIFIERS, drive_mode="switched"
     )
     async with chain as running:
         return await running.play(STREAM)

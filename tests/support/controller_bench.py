@@ -171,9 +171,9 @@ class Table:
         """Those of the tests' tones [Hz]."""
         return np.array([110.0, 250.0])
 
-    def prepare(self, mode: str) -> None:
+    def prepare(self, drive_mode: str) -> None:
         """Remember it."""
-        self.prepared.append(mode)
+        self.prepared.append(drive_mode)
 
     def query(self, question: Question) -> Pattern:
         """The same for every target."""
@@ -186,7 +186,7 @@ class Table:
             20.0,
             12.0 if question.quiet else None,
             None,
-            question.mode or "",
+            question.drive_mode or "",
         )
 
     def amplitudes(

@@ -39,7 +39,7 @@ class Truth:
     rig: Rig
     table: LocalizationTable
     stream: Stream
-    mode: str = "phased"
+    drive_mode: str = "phased"
     is_shaped: bool = True
 
     def asked(self, situation: Situation) -> Question:
@@ -48,7 +48,7 @@ class Truth:
             (self.stream.places[situation.felt_at],),
             tuple(self.stream.places[place] for place in situation.quiet),
             level_db_sl=LEVEL_DB_SL,
-            mode=self.mode,
+            drive_mode=self.drive_mode,
             frequencies=(40.0, 500.0),
             envelopes=self.is_shaped,
         )

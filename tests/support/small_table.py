@@ -16,6 +16,6 @@ def small_problem(*, nx: int = 12, ny: int = 9) -> TableProblem:
     return TableProblem(make_paper_rig(nx, ny), FREQUENCIES, Grid(4, 3))
 
 
-def small_table(*, mode: str = "switched") -> LocalizationTable:
+def small_table(*, drive_mode: str = "switched") -> LocalizationTable:
     """On the paper's own mesh."""
-    return build_in_parts(small_problem(), mode=mode).table
+    return build_in_parts(small_problem(), drive_mode=drive_mode).table

@@ -47,7 +47,7 @@ async def running_daemon(
     rig_changes: Sequence[tuple[str, str]],
     *,
     table: Path,
-    mode: str | None,
+    drive_mode: str | None,
     bug: str | None,
 ) -> AsyncIterator[RunningDaemon]:
     """`era daemon` over these URLs; killed with the context at the latest.
@@ -65,7 +65,7 @@ async def running_daemon(
     config.write_text(
         f"rig: rig.yaml\ntable: {table}\nsocket: era.sock\nlevel_db_sl: {LEVEL_DB_SL}\n"
         f'touch:\n  - {{name: panel, url: "tuio:127.0.0.1:{port}"}}\n'
-        + (f"mode: {mode}\n" if mode else ""),
+        + (f"mode: {drive_mode}\n" if drive_mode else ""),
         encoding="utf-8",
     )
     command = (ERA,) if bug is None else (sys.executable, planted_daemon.__file__, bug)

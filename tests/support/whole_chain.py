@@ -176,7 +176,7 @@ async def running_chain(
     options: Sequence[str] = (),
     rig_changes: Sequence[tuple[str, str]] = (),
     truth_changes: Sequence[tuple[str, str]] | None = None,
-    mode: str | None = None,
+    drive_mode: str | None = None,
     bug: str | None = None,
 ) -> AsyncIterator[Chain]:
     """A daemon over these wires, by amplifier, and the far end; None: sim:// in the daemon.
@@ -199,7 +199,9 @@ async def running_chain(
             )
             path = far_end.control
             urls, witness = await _witnessed(stack, far_end)
-        daemon = await _started(stack, folder, urls, rig_changes, table=table, mode=mode, bug=bug)
+        daemon = await _started(
+            stack, folder, urls, rig_changes, table=table, drive_mode=drive_mode, bug=bug
+        )
         await stack.enter_async_context(daemon.client)
         control = await stack.enter_async_context(Control.at(path))
         yield Chain(folder, daemon, control, witness)
@@ -212,12 +214,14 @@ async def _started(
     rig_changes: Sequence[tuple[str, str]],
     *,
     table: Path,
-    mode: str | None,
+    drive_mode: str | None,
     bug: str | None,
 ) -> RunningDaemon:
     """A daemon that serves; a machine that is too busy for the wire may keep it from starting."""
     for left in reversed(range(ATTEMPTS)):
-        daemon = running_daemon(folder, urls, rig_changes, table=table, mode=mode, bug=bug)
+        daemon = running_daemon(
+            folder, urls, rig_changes, table=table, drive_mode=drive_mode, bug=bug
+        )
         try:
             return await stack.enter_async_context(daemon)
         except DidNotStart as problem:

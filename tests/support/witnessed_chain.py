@@ -68,14 +68,14 @@ class OneTable:
         """Those of its tones [Hz]."""
         return np.array([90.0, 110.0, 150.0])
 
-    def prepare(self, mode: str) -> None:
+    def prepare(self, drive_mode: str) -> None:
         """There is nothing to work out."""
 
     def query(self, question: Question) -> Pattern:
         """By the number of fingers alone."""
         excitation = self.shared if question.quiet else self.alone
         contrast = 12.0 if question.quiet else None
-        return Pattern(excitation, 0.015, 20.0, contrast, None, question.mode)
+        return Pattern(excitation, 0.015, 20.0, contrast, None, question.drive_mode)
 
     def amplitudes(
         self, excitation: Excitation, points: FloatArray

@@ -72,16 +72,16 @@ def test_the_richest_mode_that_all_can_play(steps: list[tuple[float, float]], mo
         Opened(replace(FINE, level_step=level, phase_step=phase)) for level, phase in steps
     )
     capabilities = playback_capabilities(rig(), {"left": left, "right": right})
-    assert capabilities.mode == mode
+    assert capabilities.drive_mode == mode
     assert capabilities.playable[-1] == mode
 
 
 def test_a_poorer_mode_may_be_asked_for_but_no_richer_one() -> None:
     """The choice holds, or is refused with what there is."""
     plain = {name: Opened(replace(FINE, phase_step=360.0)) for name in ("left", "right")}
-    assert playback_capabilities(rig(), plain, mode="switched").mode == "switched"
-    with pytest.raises(InputError, match="cannot play mode phased, only switched, graded"):
-        playback_capabilities(rig(), plain, mode="phased")
+    assert playback_capabilities(rig(), plain, drive_mode="switched").drive_mode == "switched"
+    with pytest.raises(InputError, match=r"phased.*switched, graded"):
+        playback_capabilities(rig(), plain, drive_mode="phased")
 
 
 def test_frequencies_and_amplitudes_are_the_least_of_all() -> None:

@@ -85,7 +85,7 @@ def test_all_others_are_quiet(table: Table) -> None:
     )
     (question,) = table.asked
     assert (question.targets, question.quiet) == (((0.25, 0.1),), ((0.1, 0.1), (0.2, 0.1)))
-    assert (question.level_db_sl, question.mode) == (17.0, "phased")
+    assert (question.level_db_sl, question.drive_mode) == (17.0, "phased")
     assert (question.playable, question.frequencies) == (("switched", "phased"), (45.0, 300.0))
     assert not question.envelopes
     (felt,) = selection.felt

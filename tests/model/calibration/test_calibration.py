@@ -120,7 +120,7 @@ def test_contrast_is_regained(rig: Rig, truth: Rig, fitted: Calibration) -> None
             continue
         row = []
         for table in tables:
-            question = Question((target,), (quiet,), level_db_sl=12.0, mode="phased")
+            question = Question((target,), (quiet,), level_db_sl=12.0, drive_mode="phased")
             pattern = table.query(question)
             felt, disturbed = (
                 tables[0]

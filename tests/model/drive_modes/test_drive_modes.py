@@ -9,13 +9,13 @@ from scipy.linalg import eigh
 from scipy.optimize import minimize
 
 from model.drive_modes import (
-    MODES,
+    DRIVE_MODES,
     Choice,
     coherent,
     fields,
     find_drives,
     loudest,
-    playable_modes,
+    playable_drive_modes,
 )
 from model.drive_modes import switched as switched_mode
 from model.drive_modes.fields import ERROR_SHARE, SILENT, Drive, Fields, Outcome, judge
@@ -50,7 +50,7 @@ def fields_on_plate(places, *, targets=1, level=12.0):
 
 def found_alone(mode, given, least):
     """The drive that a mode finds by itself, without what the poorer ones have found."""
-    coherent = MODES[mode].coherent
+    coherent = DRIVE_MODES[mode].coherent
     if coherent is None:
         return switched_mode.find_switched(given, least)
     search = coherent.search(given, least)
@@ -276,7 +276,7 @@ def test_a_general_optimiser_finds_nothing_better(mode, count, free):
 def test_modes_keep_to_what_they_may(seed):
     """Switched: full stroke; graded: real and not below zero; signed: real; none above 1."""
     given = random_fields(seed)
-    switched, graded, signed, phased = (found_alone(mode, given, 0.0) for mode in MODES)
+    switched, graded, signed, phased = (found_alone(mode, given, 0.0) for mode in DRIVE_MODES)
     assert set(np.abs(switched.weight).tolist()) <= {0.0, 1.0}
     assert (graded.weight.imag == 0).all()
     assert (graded.weight.real >= 0).all()
@@ -296,7 +296,7 @@ def test_more_freedom_is_never_worse(level):
     for quiet, targets in ((1, 1), (3, 1), (7, 1), (2, 2), (3, 2)):
         for places in contact_sets(10, fingers=quiet + targets, seed=quiet):
             given = fields_on_plate(places, targets=targets, level=level)
-            found = [find_drives(given, mode) for mode in MODES]
+            found = [find_drives(given, mode) for mode in DRIVE_MODES]
             scores = [one.outcome.score if one else 1e-3 for one in found]
             switched, graded, signed, phased = 20 * np.log10(scores)
             assert graded >= switched
@@ -353,7 +353,7 @@ def test_the_phased_optimum_does_not_depend_on_what_holds_the_plate(monkeypatch)
         assert scores[0] == pytest.approx(scores[1], abs=0.1)
 
 
-@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("mode", DRIVE_MODES)
 def test_what_is_said_to_be_the_loudest_is_had(mode):
     """A hair below the loudest level there is a drive; a tenth above there is none."""
     for places in contact_sets(5, fingers=2, seed=5):
@@ -373,7 +373,7 @@ def test_two_tones_may_be_louder_than_any_drive_at_one_frequency():
     target = np.eye(2, dtype=np.complex64)[:, :, None]
     quiet = np.full((2, 2, 1), 0.1, dtype=np.complex64)
     given = Fields((target,), quiet, False, np.ones(2, dtype=np.float32), 1.0)
-    for mode in MODES:
+    for mode in DRIVE_MODES:
         assert loudest(given, mode) == pytest.approx(np.sqrt(2), rel=1e-4)
 
 
@@ -381,7 +381,7 @@ def test_phased_is_loudest_with_all_eras_in_step():
     """At one point no weights of up to full stroke give more than the sum of the magnitudes."""
     given = random_fields(2, points=1)
     sums = np.abs(given.targets[0][:, :, 0]).sum(axis=1) / given.threshold
-    assert MODES["phased"].loudest(given) == pytest.approx(sums.max(), rel=1e-4)
+    assert DRIVE_MODES["phased"].loudest(given) == pytest.approx(sums.max(), rel=1e-4)
 
 
 def test_two_targets_and_a_quiet_point_are_all_served():
@@ -420,5 +420,5 @@ def test_two_targets_and_a_quiet_point_are_all_served():
 )
 def test_what_an_amplifier_can_play_follows_from_its_steps(level_step, phase_step, richest):
     """On and off only; levels; signs; phases; phases too coarse to cancel with."""
-    modes = playable_modes(level_step=level_step, phase_step=phase_step)
-    assert modes == tuple(MODES)[: list(MODES).index(richest) + 1]
+    modes = playable_drive_modes(level_step=level_step, phase_step=phase_step)
+    assert modes == tuple(DRIVE_MODES)[: list(DRIVE_MODES).index(richest) + 1]

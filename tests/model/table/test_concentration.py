@@ -78,7 +78,7 @@ def test_a_table_tells_the_spread_of_its_field(mode):
     """Two fingers, both targets: the same from points 1.7 mm apart, counted one by one."""
     table = smooth_table()
     places = ((0.09, 0.08), (0.24, 0.14))
-    question = Question(places, mode=mode)
+    question = Question(places, drive_mode=mode)
     pattern = with_concentration(table, question, table.query(question))
     steps = (np.arange(0.0008, side, 0.0017) for side in (PLATE.length, PLATE.width))
     points = lattice(*steps)

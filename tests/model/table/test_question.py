@@ -32,7 +32,10 @@ TARGET, QUIET = (0.09, 0.07), ((0.25, 0.18),)
         (lambda: Question((TARGET,), QUIET * 2), "quiet finger .* is given twice"),
         (lambda: Question((TARGET,), (TARGET,)), "within the quiet fingertip"),
         (lambda: Question((TARGET,), search_time=math.nan), "cannot end after nan s"),
-        (lambda: Question((TARGET,), mode="loud"), "unknown drive mode 'loud'; known: switched"),
+        (
+            lambda: Question((TARGET,), drive_mode="loud"),
+            "unknown drive mode 'loud'; known: switched",
+        ),
         (lambda: Question((TARGET,), eras_at_most=0), "at least one"),
         (lambda: Question((TARGET,), softer_db=(0.0, 3.0)), "2 levels for 1 target; give"),
         (lambda: Question((TARGET,), softer_db=(-1.0,)), "cannot be softer"),
@@ -51,11 +54,11 @@ def test_questions_that_nobody_can_answer_are_refused(question, says):
     [
         Question(((0.1, math.inf),)),
         Question((TARGET,), ((math.nan, 0.1),)),
-        Question((TARGET,), mode="phased", playable=("switched",)),
+        Question((TARGET,), drive_mode="phased", playable=("switched",)),
         Question((TARGET,), playable=("graded",)),
         Question((TARGET,), frequencies=(600.0, 800.0)),
         Question((TARGET,), eras_at_most=9),
-        Question((TARGET,), eras_at_most=3, mode="graded"),
+        Question((TARGET,), eras_at_most=3, drive_mode="graded"),
     ],
 )
 def test_query_refuses_what_table_or_amplifiers_lack(question):
@@ -67,9 +70,9 @@ def test_query_refuses_what_table_or_amplifiers_lack(question):
 @pytest.mark.parametrize(
     ("question", "is_exhaustive"),
     [
-        (Question((TARGET,), QUIET, mode="phased"), True),
-        (Question((TARGET, (0.2, 0.1)), mode="phased"), False),
-        (Question((TARGET,), QUIET, mode="graded"), False),
+        (Question((TARGET,), QUIET, drive_mode="phased"), True),
+        (Question((TARGET, (0.2, 0.1)), drive_mode="phased"), False),
+        (Question((TARGET,), QUIET, drive_mode="graded"), False),
         (Question((TARGET, (0.2, 0.1))), True),
         (Question((TARGET,), QUIET, eras_at_most=4), False),
     ],
@@ -107,7 +110,7 @@ def test_frequencies_are_those_that_the_amplifiers_play():
     """With amplifiers from 150 to 250 Hz no tone lies outside, in any mode."""
     for mode in ("switched", "graded", "signed", "phased"):
         pattern = smooth_table().query(
-            Question((TARGET,), QUIET, mode=mode, frequencies=(150.0, 250.0))
+            Question((TARGET,), QUIET, drive_mode=mode, frequencies=(150.0, 250.0))
         )
         assert all(150 <= tone.frequency <= 250 for tone in pattern.excitation.values())
     only = float(FREQUENCIES[9])  # an amplifier's lowest and highest are among what it plays
@@ -120,7 +123,7 @@ def test_an_answer_is_what_the_direct_solver_says(mode):
     """Level, contrast and the loudest quiet level of a pattern, by the sparse direct solve."""
     rig, table = smooth_rig(), smooth_table()
     target, *quiet = contact_sets(1, fingers=4, seed=2)[0]
-    pattern = table.query(Question((target,), tuple(quiet), level_db_sl=17.0, mode=mode))
+    pattern = table.query(Question((target,), tuple(quiet), level_db_sl=17.0, drive_mode=mode))
     discs = [fingertip_points(*place, rig.plate) for place in (target, *quiet)]
     matrices = assemble(rig.plate, rig.mesh)
     frequencies, amplitudes = tone_amplitudes(
@@ -154,10 +157,10 @@ def test_measures_follow_from_levels():
 def test_the_usable_level_leaves_quiet_fingers_unaware():
     """Asked again for what is usable, the quiet finger is unaware."""
     table = smooth_table()
-    loud = table.query(Question((TARGET,), QUIET, mode="phased", level_db_sl=40.0))
+    loud = table.query(Question((TARGET,), QUIET, drive_mode="phased", level_db_sl=40.0))
     assert loud.quiet_is_unaware is False
     soft = table.query(
-        Question((TARGET,), QUIET, mode="phased", level_db_sl=loud.usable_level_db_sl - 1e-3)
+        Question((TARGET,), QUIET, drive_mode="phased", level_db_sl=loud.usable_level_db_sl - 1e-3)
     )
     assert soft.quiet_is_unaware is True
 
@@ -166,8 +169,10 @@ def test_mirrored_contacts_get_mirrored_phased_patterns():
     """West and east swap: the same contrast, and each ERA's level at its mirror image."""
     table = smooth_table()
     length = table.plate.length
-    west = table.query(Question((TARGET,), QUIET, mode="phased"))
-    east = table.query(Question(((length - 0.09, 0.07),), ((length - 0.25, 0.18),), mode="phased"))
+    west = table.query(Question((TARGET,), QUIET, drive_mode="phased"))
+    east = table.query(
+        Question(((length - 0.09, 0.07),), ((length - 0.25, 0.18),), drive_mode="phased")
+    )
     assert east.contrast_db == pytest.approx(west.contrast_db, abs=0.05)
     for name, mirrored in {"SW": "SE", "SE": "SW", "NE": "NW", "NW": "NE"}.items():
         assert east.excitation[mirrored].frequency == west.excitation[name].frequency
@@ -179,7 +184,7 @@ def test_mirrored_contacts_get_mirrored_phased_patterns():
 def test_the_strongest_era_of_a_frequency_has_phase_zero():
     """No phase is absolute; the others are told from the strongest."""
     for place, *quiet in contact_sets(4, fingers=3, seed=12):
-        pattern = smooth_table().query(Question((place,), tuple(quiet), mode="phased"))
+        pattern = smooth_table().query(Question((place,), tuple(quiet), drive_mode="phased"))
         strongest = max(pattern.excitation.values(), key=lambda tone: tone.amplitude)
         assert strongest.phase == 0.0
         assert sum(tone.phase == 0.0 for tone in pattern.excitation.values()) == 1
@@ -191,7 +196,7 @@ def test_two_targets_both_feel_it(softer):
     table = smooth_table()
     first, second, quiet = contact_sets(1, fingers=3, seed=9)[0]
     question = Question(
-        (first, second), (quiet,), mode="phased", level_db_sl=15.0, softer_db=softer
+        (first, second), (quiet,), drive_mode="phased", level_db_sl=15.0, softer_db=softer
     )
     pattern = table.query(question)
     levels = []
@@ -207,7 +212,7 @@ def test_two_targets_both_feel_it(softer):
 def test_a_lone_finger_is_told_from_the_plate_around_it(mode):
     """The pattern's ratio to the rms of cell centres beyond 5 cm is what the answer says."""
     table = smooth_table()
-    pattern = table.query(Question((TARGET,), mode=mode))
+    pattern = table.query(Question((TARGET,), drive_mode=mode))
     centres = table.cell_centres
     far = centres[np.hypot(*(centres - TARGET).T) > 0.05]
     points = np.concatenate([fingertip_points(*TARGET, table.plate), far])
@@ -222,7 +227,7 @@ def test_two_fingers_alone_are_told_from_what_is_near_neither():
     """Both are targets; only cells beyond 5 cm of the one and of the other are around them."""
     table = smooth_table()
     places = (TARGET, QUIET[0])
-    pattern = table.query(Question(places, mode="phased"))
+    pattern = table.query(Question(places, drive_mode="phased"))
     centres = table.cell_centres
     far = centres[[min(math.dist(centre, each) for each in places) > 0.05 for centre in centres]]
     discs = [fingertip_points(*each, table.plate) for each in places]

@@ -66,7 +66,7 @@ def directly(rig, pattern, member, *, targets=1):
 @pytest.mark.parametrize("mode", ["switched", "phased"])
 def test_each_plate_is_what_the_direct_solver_says(mode):
     """Thicker, softer, damped otherwise, misdriven, with fingers on it: within 0.1 dB."""
-    question = Question((TARGET,), QUIET, mode=mode)
+    question = Question((TARGET,), QUIET, drive_mode=mode)
     pattern = smooth_table().query(question)
     found = ensemble_contrast_db(smooth_table(), question, pattern.excitation, MEMBERS)
     solved = [directly(smooth_rig(), pattern, member) for member in range(3)]
@@ -76,7 +76,7 @@ def test_each_plate_is_what_the_direct_solver_says(mode):
 
 def test_of_two_targets_the_lesser_one_counts():
     """The second of them is a target too and no quiet finger, on each plate as solved directly."""
-    question = Question((TARGET, QUIET[0]), QUIET[1:], mode="switched")
+    question = Question((TARGET, QUIET[0]), QUIET[1:], drive_mode="switched")
     pattern = smooth_table().query(question)
     found = ensemble_contrast_db(smooth_table(), question, pattern.excitation, MEMBERS)
     solved = [directly(smooth_rig(), pattern, member, targets=2) for member in range(3)]
@@ -93,7 +93,7 @@ def test_what_was_measured_of_a_rig_counts_on_each_plate():
     )
     rig = replace(rig, eras=eras, masses=(PointMass(0.2, 0.05, 0.03),))
     table = build_table(rig, frequencies=np.array([110.0, 250.0]))
-    question = Question((TARGET,), QUIET, mode="phased")
+    question = Question((TARGET,), QUIET, drive_mode="phased")
     pattern = table.query(question)
     found = ensemble_contrast_db(table, question, pattern.excitation, MEMBERS)
     solved = [directly(rig, pattern, member) for member in range(3)]
@@ -102,7 +102,7 @@ def test_what_was_measured_of_a_rig_counts_on_each_plate():
 
 def test_it_is_the_tenth_percentile_of_the_same_plates_every_time():
     """Nine of ten plates of the drawn ensemble have more; asked again it is the same number."""
-    question = Question((TARGET,), QUIET, mode="phased")
+    question = Question((TARGET,), QUIET, drive_mode="phased")
     table = smooth_table()
     pattern = with_robust_contrast(table, question, table.query(question))
     contrasts = ensemble_contrast_db(table, question, pattern.excitation, draw_ensemble(4))

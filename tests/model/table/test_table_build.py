@@ -30,7 +30,7 @@ def problem():
 def whole(problem, tmp_path_factory):
     """The file of an uninterrupted build by one process."""
     path = tmp_path_factory.mktemp("whole") / "t.npz"
-    save_table(build_in_parts(problem, mode="switched").table, path)
+    save_table(build_in_parts(problem, drive_mode="switched").table, path)
     return path.read_bytes()
 
 
@@ -55,14 +55,14 @@ def interrupted(problem, folder, *, after):
     """Parts left by a build that was interrupted."""
     kept = KeptParts.beside(folder / "t.npz", problem.digest)
     with pytest.raises(KeyboardInterrupt):
-        build_in_parts(problem, mode="switched", kept=kept, progress=interrupt_after(after))
+        build_in_parts(problem, drive_mode="switched", kept=kept, progress=interrupt_after(after))
     assert len(list(kept.folder.iterdir())) == after
     return kept
 
 
 def test_two_processes_make_the_same_file(problem, whole, tmp_path):
     """To the bit, whoever solves which part."""
-    build = build_in_parts(problem, mode="switched", workers=2)
+    build = build_in_parts(problem, drive_mode="switched", workers=2)
     assert build.part_count == PARTS
     assert file_of(build, tmp_path) == whole
 
@@ -72,7 +72,7 @@ def test_an_interrupted_build_goes_on(problem, whole, tmp_path):
     kept = interrupted(problem, tmp_path, after=3)
     told: list[int] = []
     build = build_in_parts(
-        problem, mode="switched", kept=kept, progress=lambda done, of: told.append(done)
+        problem, drive_mode="switched", kept=kept, progress=lambda done, of: told.append(done)
     )
     assert build.reused_count == 3
     assert told == [3, PARTS]
@@ -84,14 +84,14 @@ def test_an_interrupted_build_goes_on(problem, whole, tmp_path):
 def test_whichever_part_is_missing_comes_where_it_belongs(problem, tmp_path, monkeypatch):
     """Twelve cells in shares of five: one share lost, the table is that of a build in one go."""
     monkeypatch.setattr(table_parts, "CELLS_AT_ONCE", 5)
-    whole = file_of(build_in_parts(problem, mode="switched"), tmp_path)
+    whole = file_of(build_in_parts(problem, drive_mode="switched"), tmp_path)
     kept = KeptParts.beside(tmp_path / "t.npz", problem.digest)
-    build_in_parts(problem, mode="switched", kept=kept)
+    build_in_parts(problem, drive_mode="switched", kept=kept)
     shares = sorted(kept.folder.glob("cells-*"))
     assert len(shares) == 3
     for share in shares:
         share.unlink()
-        build = build_in_parts(problem, mode="switched", kept=kept)
+        build = build_in_parts(problem, drive_mode="switched", kept=kept)
         assert (build.reused_count, build.part_count) == (5, 6)
         assert file_of(build, tmp_path) == whole
 
@@ -99,9 +99,9 @@ def test_whichever_part_is_missing_comes_where_it_belongs(problem, tmp_path, mon
 def test_kept_parts_are_for_any_mode(problem, tmp_path):
     """The mode is no part of what is solved."""
     kept = interrupted(problem, tmp_path, after=2)
-    build = build_in_parts(problem, mode="phased", kept=kept)
+    build = build_in_parts(problem, drive_mode="phased", kept=kept)
     assert build.reused_count == 2
-    assert build.table.mode == "phased"
+    assert build.table.drive_mode == "phased"
 
 
 @pytest.mark.parametrize("what", ["frequencies", "plate", "grid", "mesh", "code"])
@@ -155,7 +155,7 @@ def test_a_damaged_part_is_told_and_solved_again(problem, whole, tmp_path, caplo
         data = bytearray(other.read_bytes())
     path.write_bytes(data)
     with caplog.at_level(logging.WARNING):
-        build = build_in_parts(problem, mode="switched", kept=kept)
+        build = build_in_parts(problem, drive_mode="switched", kept=kept)
     assert path.name in caplog.text
     assert "computed again" in caplog.text
     assert build.reused_count == 2
@@ -180,7 +180,7 @@ def test_a_table_says_how_wrong_its_mesh_is():
     rig = make_paper_rig(24, 18)
     rig = replace(rig, eras=(replace(rig.eras[0], x=0.11, y=0.09), *rig.eras[1:]))
     frequencies = np.array([110.0, 165.0, 250.0])
-    table = build_in_parts(TableProblem(rig, frequencies, Grid(2, 2)), mode="switched").table
+    table = build_in_parts(TableProblem(rig, frequencies, Grid(2, 2)), drive_mode="switched").table
     study = study_convergence(rig, [rig.mesh], frequencies=frequencies.tolist())
     assert table.reference_mesh == study.reference
     np.testing.assert_allclose(table.discretisation_error, study.errors[0].response, rtol=0.1)
@@ -195,4 +195,4 @@ def test_a_table_too_large_to_be_read_is_refused_before_it_is_solved():
 def test_an_unknown_mode_is_refused(problem):
     """The error lists those there are."""
     with pytest.raises(InputError, match="switched, graded, signed, phased"):
-        build_in_parts(problem, mode="loud")
+        build_in_parts(problem, drive_mode="loud")

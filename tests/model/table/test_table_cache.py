@@ -117,7 +117,7 @@ def test_every_choice_has_a_table_of_its_own(rig, builds):
     cached_table(rig, frequencies=low)
     assert cached_table(rig, frequencies=high)[0].frequencies.tolist() == [70.0, 90.0]
     assert cached_table(rig, frequencies=low, grid=Grid(3, 2))[0].grid == Grid(3, 2)
-    assert cached_table(rig, frequencies=low, mode="phased")[0].mode == "phased"
+    assert cached_table(rig, frequencies=low, drive_mode="phased")[0].drive_mode == "phased"
     assert len(builds) == 4
 
 

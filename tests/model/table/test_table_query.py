@@ -31,7 +31,7 @@ def test_a_line_is_a_question():
     )
     assert question.targets == ((0.1, 0.1), (0.2, 0.2))
     assert question.quiet == ((0.05, 0.02),)
-    assert (question.mode, question.level_db_sl, question.eras_at_most) == ("phased", 15.0, 3)
+    assert (question.drive_mode, question.level_db_sl, question.eras_at_most) == ("phased", 15.0, 3)
     assert question_from_json('{"target": [0.1, 0.1]}').targets == ((0.1, 0.1),)
 
 
@@ -58,7 +58,7 @@ def test_the_questions_on_the_page_are_questions():
     block = page.split("```json\n")[1].split("```")[0]
     first, second = [question_from_json(line) for line in block.splitlines()]
     assert (first.targets, first.quiet) == (((0.08, 0.06),), ((0.22, 0.16),))
-    assert (len(second.targets), second.level_db_sl, second.mode) == (2, 15.0, "signed")
+    assert (len(second.targets), second.level_db_sl, second.drive_mode) == (2, 15.0, "signed")
 
 
 def test_a_bad_line_does_not_end_the_run():

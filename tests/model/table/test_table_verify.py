@@ -26,7 +26,7 @@ def rig():
 @pytest.fixture(scope="module")
 def table():
     """Phased, where contrast is highest and most easily lost."""
-    return small_table(mode="phased")
+    return small_table(drive_mode="phased")
 
 
 @pytest.fixture(scope="module")
@@ -55,7 +55,7 @@ def test_a_rig_whose_eras_were_measured_holds(rig, tmp_path):
     gains = ((60.0, 0.8, 0.3), (250.0, 1.2, -0.5))
     measured = replace(rig, eras=(replace(rig.eras[0], gains=gains), *rig.eras[1:]))
     problem = replace(small_problem(), rig=measured)
-    save_table(build_in_parts(problem, mode="phased").table, tmp_path / "t.npz")
+    save_table(build_in_parts(problem, drive_mode="phased").table, tmp_path / "t.npz")
     found = verify_table(
         load_table(tmp_path / "t.npz", fingerprint=measured.fingerprint), measured, samples=3
     )

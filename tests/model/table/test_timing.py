@@ -16,7 +16,7 @@ from model.transients.measures import Transients
 from model.transients.time_response import plate_in_time
 from paper_plate import make_paper_rig
 
-QUESTION = Question(((0.09, 0.07),), ((0.25, 0.18), (0.05, 0.19)), mode="phased")
+QUESTION = Question(((0.09, 0.07),), ((0.25, 0.18), (0.05, 0.19)), drive_mode="phased")
 
 
 @pytest.fixture(scope="module")
@@ -28,7 +28,7 @@ def rig():
 @pytest.fixture(scope="module")
 def table(rig):
     """A few frequencies are enough to choose among."""
-    return build_table(rig, frequencies=np.array([90.0, 130.0, 220.0, 300.0]), mode="phased")
+    return build_table(rig, frequencies=np.array([90.0, 130.0, 220.0, 300.0]), drive_mode="phased")
 
 
 @pytest.fixture(scope="module")
@@ -71,7 +71,7 @@ def test_envelopes_are_part_of_the_pattern_and_measured_with_it(rig, table, solv
 
 def test_a_lone_finger_has_an_ending_but_no_contrast(table):
     """There is nobody to tell it from; what is left after the end can be said all the same."""
-    alone = Question(((0.09, 0.07),), mode="phased")
+    alone = Question(((0.09, 0.07),), drive_mode="phased")
     timing = Timing(table)
     pattern = timing.with_transient_measures(
         alone, timing.with_envelopes(alone, table.query(alone))

@@ -58,7 +58,7 @@ def test_a_plain_ramp_takes_the_pattern_of_the_better_onset(mode):
     timing = Timing(table)
     gained = []
     for places in contact_sets(12, fingers=2, seed=21):
-        question = Question((places[0],), (places[1],), mode=mode)
+        question = Question((places[0],), (places[1],), drive_mode=mode)
         fields = table.fields(question)
         best = find_drives(fields, mode)
         plain = table.query(question)
@@ -112,7 +112,7 @@ def test_a_decibel_of_the_score_counts_as_much_as_three_of_the_onset(softer, fre
         question = Question(
             tuple(places[:count]),
             tuple(places[count:]),
-            mode="phased",
+            drive_mode="phased",
             softer_db=softer,
             frequencies=frequencies,
         )
@@ -145,7 +145,7 @@ def test_amplifiers_with_envelopes_get_the_best_steady_pattern(mode):
     """A shaped onset needs no choice: what is answered is the drive of the best robust score."""
     table = smooth_table()
     for places in contact_sets(6, fingers=3, seed=22):
-        question = Question((places[0],), tuple(places[1:]), mode=mode, envelopes=True)
+        question = Question((places[0],), tuple(places[1:]), drive_mode=mode, envelopes=True)
         best = find_drives(table.fields(question), mode)
         tones = excitation_of(best.drive, table.eras, FREQUENCIES, gain=1.0)
         answered = table.query(question).excitation
@@ -162,5 +162,5 @@ def test_a_plate_on_one_or_two_eras_has_answers_all_the_same(count):
     rig = smooth_rig()
     table = build_table(replace(rig, eras=rig.eras[:count]), frequencies=FREQUENCIES[::3])
     for mode in ("switched", "phased"):
-        question = Question(((0.09, 0.07),), ((0.25, 0.18),), mode=mode)
+        question = Question(((0.09, 0.07),), ((0.25, 0.18),), drive_mode=mode)
         assert table.query(question).contrast_db > 0

@@ -1,8 +1,8 @@
-"""Things that go by a name: those that come with this project, and those of installed packages.
+"""Things found by name: those that come with this project, and those of installed packages.
 
 A plug-in is an entry point: its group says what it adds, its name which one. It is imported when
-that name is asked for and never before, so one that is broken harms nobody else. Where several
-packages claim a name none gets it: which would win depended on the order of files in a folder.
+that name is looked up and never before, so that a broken one affects nothing else. A name that
+several packages claim is refused: which of them won would depend on the order of files in a folder.
 """
 
 import sys
@@ -18,10 +18,14 @@ from registry.suggestions import did_you_mean
 _T = TypeVar("_T")
 _Made = TypeVar("_Made")
 
+_OURS = "era-haptics"
+_GROUPS = "era_haptics."  # what the names of our groups begin with
+_REMEDY = "repair or remove that package"
+
 
 @dataclass(frozen=True)
 class Instance:
-    """What an entry point leads to: an object of this class."""
+    """An entry point leads to an object of this class."""
 
     of: type
 
@@ -35,7 +39,7 @@ class Instance:
 
 @dataclass(frozen=True)
 class Derived:
-    """What an entry point leads to: a class derived from this one."""
+    """An entry point leads to a class derived from this one."""
 
     of: type
 
@@ -49,13 +53,13 @@ class Derived:
 
 @dataclass(frozen=True)
 class PluginRegistry(Generic[_T]):
-    """What there is of one kind, by name.
+    """The things of one kind by name.
 
-    what: the kind in words, for errors; group: of its entry points; wanted: what these lead to;
-    error: what is raised, in words for people; own: what comes with this project and is no entry
-    point; called: the name that such a thing has itself, if it has one; otherwise: what is said
-    last to whoever asked for a name that nobody knows. Of a kind that is made of URLs, ending: what
-    stands behind its name there; example: such a URL.
+    what: the kind, for error messages; group: of its entry points; wanted: what these lead to;
+    error: the class of errors raised; own: what comes with this project and is not an entry point;
+    called: the name that such a thing has itself, if it has one; problem: what is wrong with one,
+    None if nothing; hint: the end of the message for an unknown name. If the name is the scheme of
+    a URL, ending: what follows the scheme; example: such a URL.
     """
 
     what: str
@@ -65,21 +69,22 @@ class PluginRegistry(Generic[_T]):
     error: type[Exception]
     own: Mapping[str, _T] = field(default_factory=dict)
     called: Callable[[_T], str] | None = None
-    otherwise: str = ""
+    problem: Callable[[_T], str | None] | None = None
+    hint: str = ""
     ending: str = ""
     example: str = ""
 
     def names(self) -> tuple[str, ...]:
-        """All of them, our own first; no plug-in is loaded."""
+        """All names, our own first; no plug-in is loaded."""
         return (*self.own, *sorted(_installed(self.group).keys() - self.own.keys()))
 
     def find(self, name: str, *, within: str = "") -> _T:
-        """The one of this name; raises `error` for none, several, or a broken plug-in.
+        """Look up a name; raises `error` for an unknown or ambiguous one, or a broken plug-in.
 
-        within: the whole of what was written, where the name is a part of it.
+        within: the whole text that the name is a part of.
         """
         points = _installed(self.group).get(name, ())
-        packages = [*(["era-haptics"] if name in self.own else []), *map(_package, points)]
+        packages = [*([_OURS] if name in self.own else []), *map(_package, points)]
         if not packages:
             raise self.error(
                 f"{_quoted(within)}unknown {self.what} {name[:40] + self.ending!r}; "
@@ -88,69 +93,104 @@ class PluginRegistry(Generic[_T]):
         if len(packages) > 1:
             raise self.error(
                 f"{_quoted(within)}{self.what} {name}{self.ending} is claimed by several packages "
-                f"({', '.join(packages)}); uninstall all but one, or give theirs another name"
+                f"({', '.join(packages)}); uninstall all but one, or rename theirs"
             )
         return self.own[name] if name in self.own else self._loaded(points[0], within)
 
     def make(self: "PluginRegistry[Callable[[str], _Made]]", url: str) -> _Made:
-        """What the class that the scheme of a URL names makes of it; raises as `find` does.
+        """Call the class that the scheme of a URL names with the URL; raises as `find` does.
 
-        The class may raise `error` too, for a URL that it refuses. Schemes are in small letters,
-        however people write them.
+        The class may raise `error` for a URL that it refuses. Schemes are case-insensitive.
         """
         scheme, ending, _ = url.partition(self.ending)
         if not ending:
             raise self.error(
-                f"{url!r} does not begin with the scheme of a {self.what} and {self.ending}, "
-                f"as {self.example} does; {self._known()}"
+                f"{url!r} must begin with the scheme of a {self.what} and {self.ending}, "
+                f"for example {self.example}; {self._known()}"
             )
         name = scheme.lower()
         maker = self.find(name, within=url)
         (point,) = _installed(self.group)[name]
-        with self._blamed(point, url, but=(self.error,)):
+        with self._attributed(point, url, but=(self.error,)):
             return maker(url)
 
     def _known(self) -> str:
         spelled = ", ".join(name + self.ending for name in self.names())
-        return f"known are {spelled}{self.otherwise}"
+        return f"known are {spelled}{self.hint}"
 
     def _loaded(self, point: EntryPoint, within: str) -> _T:
-        with self._blamed(point, within):
+        with self._attributed(point, within):
             loaded: _T = point.load()
         if not self.wanted.is_met_by(loaded):
             leads = loaded.__name__ if isinstance(loaded, type) else type(loaded).__name__
-            raise self.error(
-                f"{self._plug_in(point, within)} leads to {leads}, not to {self.wanted}; "
-                "repair or remove that package"
-            )
-        with self._blamed(point, within):
+            self._refuse(point, within, f"leads to {leads}, not to {self.wanted}")
+        with self._attributed(point, within):
             called = point.name if self.called is None else self.called(loaded)
+            problem = None if self.problem is None else self.problem(loaded)
         if called != point.name:
-            raise self.error(
-                f"{self._plug_in(point, within)} gives one that is called {called!r}; "
-                "what it gives and its entry point need the same name"
-            )
+            self._refuse(point, within, f"is called {called!r}, unlike its entry point")
+        if problem is not None:
+            self._refuse(point, within, f"breaks its contract: {problem}")
         return loaded
 
     @contextmanager
-    def _blamed(
+    def _attributed(
         self, point: EntryPoint, within: str, *, but: tuple[type[Exception], ...] = ()
     ) -> Iterator[None]:
-        """Tell of whatever a plug-in raises by its package; but: what it may raise."""
+        """Raise whatever a plug-in raises as `error`, with its package; but: what it may raise."""
         try:
             yield
         except but:
             raise
         except Exception as error:  # a plug-in may fail in any way
-            raise self.error(
-                f"{self._plug_in(point, within)} does not work ({type(error).__name__}: {error}); "
-                "repair or remove that package"
-            ) from error
+            where = f"{_quoted(within)}{self.what} {point.name}{self.ending}: "
+            raise self.error(where + _failed(point, error)) from error
 
-    def _plug_in(self, point: EntryPoint, within: str) -> str:
-        """Who needs which one of which package."""
-        asked = f"{_quoted(within)}{self.what} {point.name}{self.ending}"
-        return f"{asked}: the plug-in {point.value} of {_package(point)}"
+    def _refuse(self, point: EntryPoint, within: str, problem: str) -> None:
+        where = f"{_quoted(within)}{self.what} {point.name}{self.ending}: "
+        raise self.error(f"{where}{_plugin(point)} {problem}; {_REMEDY}")
+
+
+class WrongResultError(TypeError):
+    """A plug-in's function that returned a value of the wrong type."""
+
+    def __init__(self, plugin: object, result: object, wanted: type) -> None:
+        """plugin: the object whose method returned the result."""
+        self.module = type(plugin).__module__
+        returned = type(result).__name__
+        super().__init__(f"{type(plugin).__name__} returned {returned}, must be {wanted.__name__}")
+
+
+def failure_text(error: BaseException) -> str:
+    """An unexpected error in words; attributed to a plug-in's package if its code was running."""
+    point = failed_plugin(error)
+    return f"{type(error).__name__}: {error}" if point is None else _failed(point, error)
+
+
+def failed_plugin(error: BaseException) -> EntryPoint | None:
+    """The plug-in of another package in whose code an error arose; None if it is ours."""
+    modules = [error.module] if isinstance(error, WrongResultError) else []
+    trace = error.__traceback__
+    while trace is not None:
+        modules.append(trace.tb_frame.f_globals.get("__name__", ""))
+        trace = trace.tb_next
+    plugins = _of_others(tuple(sys.path))
+    tops = [module.partition(".")[0] for module in reversed(modules)]
+    return next((plugins[top] for top in tops if top in plugins), None)
+
+
+def package_remedy(point: EntryPoint) -> str:
+    """What to do about a plug-in that cannot be used."""
+    package = _package(point)
+    return f"reinstall {package}" if package == _OURS else f"repair or remove {package}"
+
+
+def _failed(point: EntryPoint, error: BaseException) -> str:
+    return f"{_plugin(point)} failed ({type(error).__name__}: {error}); {_REMEDY}"
+
+
+def _plugin(point: EntryPoint) -> str:
+    return f"plug-in {point.value} of package {_package(point)}"
 
 
 def _quoted(within: str) -> str:
@@ -158,18 +198,31 @@ def _quoted(within: str) -> str:
 
 
 def _installed(group: str) -> dict[str, tuple[EntryPoint, ...]]:
-    """The entry points of a group by name, on the path of now: a notebook may add to it."""
+    """The entry points of a group by name, on the current path: a notebook may add to it."""
     return _found(group, tuple(sys.path))
 
 
 @cache
 def _found(group: str, path: tuple[str, ...]) -> dict[str, tuple[EntryPoint, ...]]:
-    """What leads to the same is found once, for one installation may lie on the path twice."""
+    """Those of the same value count once, for one installation may lie on the path twice."""
     found: dict[str, dict[str, EntryPoint]] = {}
     for point in entry_points(group=group):
         found.setdefault(point.name, {}).setdefault(point.value, point)
     return {name: tuple(points.values()) for name, points in found.items()}
 
 
+@cache
+def _of_others(path: tuple[str, ...]) -> dict[str, EntryPoint]:
+    """A plug-in of every other package, by the name of its top-level module."""
+    points = [
+        point
+        for group in entry_points().groups
+        if group.startswith(_GROUPS)
+        for point in entry_points(group=group)
+    ]
+    ours = {point.module.partition(".")[0] for point in points if _package(point) == _OURS}
+    return {top: point for point in points if (top := point.module.partition(".")[0]) not in ours}
+
+
 def _package(point: EntryPoint) -> str:
-    return (point.dist and point.dist.name) or "an unknown package"
+    return (point.dist and point.dist.name) or "unknown"

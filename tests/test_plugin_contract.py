@@ -1,15 +1,23 @@
-"""What installed packages add, of every kind alike: found by name, blamed alone, never chosen."""
+"""Plug-ins of every kind: found by name, and attributed to their package when they fail."""
 
+import asyncio
 import re
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from importlib.metadata import entry_points
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from controller.cli.main import run
+from controller.effects.effect import Effect
 from controller.effects.kinds import effect_kind, effect_kinds
+from controller.effects.layout import Layout
+from controller.effects.player import EffectPlayer
 from controller.effects.timed import Buzz
+from controller.sources.contacts import Contact, ContactKey
 from controller.sources.registry import open_source
 from controller.sources.tuio import TuioSource
 from drivers.backends.serial_line.backend import SerialBackend
@@ -20,24 +28,25 @@ from model.errors import InputError
 from model.fem.elements import ELEMENTS, element_names, element_of
 from model.rig.kind import RIG
 from model.structure.materials import KNOWN_MATERIALS, known_material, material_names
+from registry.plugins import failure_text
 
-INIT = """\
+URL_CLASS = """\
     def __init__(self, url):
-        if url.endswith("nowhere"):
-            raise Refused("there is no such place")
-        if url.endswith("badly"):
-            raise KeyError("thought of all but this")
+        if url.endswith("refused"):
+            raise Refused("refused")
+        if url.endswith("broken"):
+            raise KeyError("missing")
 """
 
 
 @dataclass(frozen=True)
 class Kind:
-    """What can be added.
+    """A kind of plug-in.
 
-    what: in words; works: the source of a module with THING, what an entry point named `fine` leads
-    to; wanted: that in words; find: how it is asked for, by its name or by a URL of its name, its
-    ending and a rest; own: the name of one of this project's, and what it is; names: of all, where
-    these are told; error: what is raised.
+    what: its name in messages; works: the source of a module with THING, the value of an entry
+    point named `fine`; fails: that of one that works until `use` uses it; wanted: the class in
+    messages; find: looks one up by its name, or by a URL of its name, ending and rest; own: the
+    name of one of this project's, and its value; names: lists all; error: the class raised.
     """
 
     group: str
@@ -47,13 +56,21 @@ class Kind:
     find: Callable[[str], object]
     own: tuple[str, object]
     names: Callable[[], tuple[str, ...]] | None = None
+    fails: str = ""
+    use: Callable[[Any], object] = lambda found: None
     ending: str = ""
     rest: str = ""
     error: type[Exception] = InputError
 
-    def ask(self, name: str) -> object:
+    def look_up(self, name: str) -> object:
         """The one of a name."""
         return self.find(name + self.ending + self.rest)
+
+
+def play_effect(kind: type[Effect]) -> None:
+    """Touch a plate whose layout has this effect everywhere."""
+    layout = Layout((), effects={"it": kind()}, elsewhere="it")
+    EffectPlayer(layout).intent([Contact(ContactKey("s", 1), 0.1, 0.1, 0.0)], 0.0)
 
 
 KINDS = [
@@ -66,16 +83,22 @@ KINDS = [
         known_material,
         ("steel", KNOWN_MATERIALS["steel"]),
         material_names,
+        fails="from era_haptics.plugins.materials import KnownMaterial, Material\n"
+        "THING = KnownMaterial(Material('fine', '1e9', 900.0, 0.3), '', '', '')\n",
     ),
     Kind(
         "elements",
         "element",
         "from era_haptics.plugins.elements import Element\n"
-        "THING = Element('fine', (-1.0, 1.0), lambda *_: None, lambda *_: None)\n",
+        "from numpy import eye\n"
+        "THING = Element('fine', (-1.0, 1.0), lambda *_: eye(12), lambda *_: eye(12))\n",
         "an instance of Element",
         element_of,
         ("Q4", ELEMENTS["Q4"]),
         element_names,
+        fails="from era_haptics.plugins.elements import Element\n"
+        "from numpy import eye\n"
+        "THING = Element('fine', (-1.0, 1.0), lambda *_: eye(3), lambda *_: eye(3))\n",
     ),
     Kind(
         "effects",
@@ -89,13 +112,20 @@ KINDS = [
         effect_kind,
         ("buzz", Buzz),
         effect_kinds,
+        fails="from era_haptics.plugins.effects import Effect\n"
+        "class THING(Effect):\n"
+        "    kind = 'fine'\n"
+        "    moves = False\n"
+        "    def begin(self, contact, now, *, level_db_sl):\n"
+        "        return 7\n",
+        use=play_effect,
     ),
     Kind(
         "backends",
         "backend",
         "from era_haptics.plugins.backends import CommandError as Refused, WireBackend\n"
         "class THING(WireBackend):\n"
-        f"{INIT}"
+        f"{URL_CLASS}"
         "    async def open(self): pass\n"
         "    async def close(self): pass\n"
         "    async def exchange(self, request, *, timeout): pass\n",
@@ -103,6 +133,13 @@ KINDS = [
         open_backend,
         ("rfc2217", SerialBackend),
         known_schemes,
+        fails="from era_haptics.plugins.backends import WireBackend\n"
+        "class THING(WireBackend):\n"
+        "    def __init__(self, url): pass\n"
+        "    async def open(self): raise KeyError('open')\n"
+        "    async def close(self): pass\n"
+        "    async def exchange(self, request, *, timeout): pass\n",
+        use=lambda found: asyncio.run(found.open()),
         ending="://",
         rest="a:1",
         error=CommandError,
@@ -112,11 +149,16 @@ KINDS = [
         "touch source",
         "from era_haptics.plugins.touch_sources import InputError as Refused, TouchSource\n"
         "class THING(TouchSource):\n"
-        f"{INIT}"
+        f"{URL_CLASS}"
         "    async def run(self, deliver): pass\n",
         "a class derived from TouchSource",
         open_source,
         ("tuio", TuioSource),
+        fails="from era_haptics.plugins.touch_sources import TouchSource\n"
+        "class THING(TouchSource):\n"
+        "    def __init__(self, url): pass\n"
+        "    async def run(self, deliver): deliver()\n",
+        use=lambda found: asyncio.run(found.run(lambda frame: None)),
         ending=":",
         rest="a:1",
     ),
@@ -127,6 +169,10 @@ KINDS = [
         "an instance of ConfigKind",
         kind_called,
         ("rig", RIG),
+        fails="class Fine:\n    check = example = schema = print\n"
+        "    def recognises(self, document): return document.missing\n"
+        "THING = Fine()\n",
+        use=lambda found: found.recognises({}),
     ),
 ]
 
@@ -141,7 +187,7 @@ with_names_of_their_own = pytest.mark.parametrize(
 )
 
 Install = Callable[..., str]
-"""install(package, kind, name, source): an installed package; gives the module of its plug-in."""
+"""install(package, kind, name, source) -> the name of the plug-in's module."""
 
 
 @pytest.fixture
@@ -177,112 +223,148 @@ def is_made_by(found: object, thing: object) -> bool:
 
 
 @of_every_kind
-def test_one_is_imported_when_its_name_is_asked_for_and_never_before(
-    kind: Kind, install: Install
-) -> None:
-    """Neither for the names of all nor for another one, and then no other with it."""
+def test_plugin_is_imported_only_when_looked_up(kind: Kind, install: Install) -> None:
+    """Listing names and looking up another one import nothing."""
     ours, what_it_is = kind.own
     fine = install("good", kind, "fine", kind.works)
-    other = install("other", kind, "unasked", "raise RuntimeError('nobody asked')\n")
+    other = install("other", kind, "unused", "raise RuntimeError('imported')\n")
     if kind.names is not None:
-        assert {"fine", "unasked", ours} <= set(kind.names())
-    assert is_made_by(kind.ask(ours), what_it_is)
+        assert {"fine", "unused", ours} <= set(kind.names())
+    assert is_made_by(kind.look_up(ours), what_it_is)
     assert not {fine, other} & sys.modules.keys()
-    assert is_made_by(kind.ask("fine"), sys.modules[fine].THING)
+    assert is_made_by(kind.look_up("fine"), sys.modules[fine].THING)
     assert other not in sys.modules
 
 
 @of_every_kind
 @pytest.mark.parametrize(
-    ("source", "what"),
+    "source",
     [
-        ("raise RuntimeError('half installed')\n", "does not work (RuntimeError: half installed)"),
-        ("THINGS = None\n", "does not work (AttributeError: "),
-        (None, "does not work (ModuleNotFoundError: "),
-        ("THING = 7\n", "leads to int, not to {wanted}"),
-        ("class THING:\n    pass\n", "leads to THING, not to {wanted}"),
-        ("def THING(*_):\n    return None\n", "leads to function, not to {wanted}"),
+        "raise RuntimeError('half installed')\n",
+        "THINGS = None\n",
+        None,
+        "THING = 7\n",
+        "class THING:\n    pass\n",
+        "def THING(*_):\n    return None\n",
     ],
 )
-def test_one_that_is_broken_is_blamed_and_harms_no_other(
-    kind: Kind, source: str | None, what: str, install: Install
+def test_broken_plugin_is_attributed_to_its_package(
+    kind: Kind, source: str | None, install: Install
 ) -> None:
-    """Whatever it does when it is imported, or gives; its package is named, others work."""
+    """Whether it fails on import or has the wrong type; others work, and there is a remedy."""
     module = install("bad", kind, "broken", source)
     install("good", kind, "fine", kind.works)
-    with pytest.raises(kind.error) as told:
-        kind.ask("broken")
-    said = str(told.value)
-    assert f"{kind.what} broken{kind.ending}: the plug-in {module}:THING of bad " in said
-    assert what.format(wanted=kind.wanted) in said
-    assert said.endswith("; repair or remove that package")
-    assert kind.ask("fine")
-    assert kind.ask(kind.own[0])
+    with pytest.raises(kind.error) as caught:
+        kind.look_up("broken")
+    message = str(caught.value)
+    assert f"{kind.what} broken{kind.ending}: plug-in {module}:THING of package bad " in message
+    assert message.endswith("; repair or remove that package")
+    assert kind.look_up("fine")
+    assert kind.look_up(kind.own[0])
+
+
+@pytest.mark.parametrize(
+    "kind", [kind for kind in KINDS if kind.fails], ids=lambda kind: kind.group
+)
+def test_plugin_that_fails_in_use_is_attributed_to_its_package(
+    kind: Kind, install: Install
+) -> None:
+    """The error that its code raised, or that its result led to, names the package."""
+    module = install("bad", kind, "fine", kind.fails)
+    try:
+        kind.use(kind.look_up("fine"))
+    except kind.error as error:
+        text = str(error)
+    except Exception as error:
+        text = failure_text(error)
+    assert f"plug-in {module}:THING of package bad" in text
+    assert text.endswith("; repair or remove that package")
+
+
+def test_own_error_is_not_attributed_to_a_plugin(install: Install) -> None:
+    """An error with no plug-in's code in its traceback."""
+    install("bad", KINDS[0], "fine", "raise RuntimeError\n")
+    with pytest.raises(ZeroDivisionError) as caught:
+        1 / 0  # noqa: B018
+    assert failure_text(caught.value) == "ZeroDivisionError: division by zero"
+
+
+def test_command_attributes_the_failure_of_a_plugin(
+    install: Install, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Bad input (2), not a bug of this project (70)."""
+    kind = next(kind for kind in KINDS if kind.group == "config_kinds")
+    module = install("bad", kind, "fine", kind.fails)
+    path = tmp_path / "rig.yaml"
+    path.write_text("a: 1\n", "utf-8")
+    assert run(["config", "check", str(path)], entry_points(group="era_haptics.commands")) == 2
+    error = capsys.readouterr().err
+    assert f"plug-in {module}:THING of package bad" in error
+    assert "bug" not in error
 
 
 @of_every_kind
-def test_a_name_that_several_packages_claim_is_given_to_none(kind: Kind, install: Install) -> None:
-    """Nor to us, if ours is claimed: the error names who claims it, and other names work."""
+def test_name_claimed_by_several_packages_is_refused(kind: Kind, install: Install) -> None:
+    """Ours included; the error names the packages, and other names work."""
     install("one", kind, "fine", kind.works)
     install("two", kind, "fine", kind.works)
     ours, _ = kind.own
     install("three", kind, ours, kind.works)
     for name, claimants in (("fine", {"one", "two"}), (ours, {"era-haptics", "three"})):
-        with pytest.raises(kind.error, match="is claimed by several packages") as told:
-            kind.ask(name)
-        named = str(told.value).split("packages (")[1].split(");")[0]
-        assert f"{kind.what} {name}{kind.ending} is claimed" in str(told.value)
+        with pytest.raises(kind.error) as caught:
+            kind.look_up(name)
+        named = str(caught.value).split("packages (")[1].split(");")[0]
         assert set(named.split(", ")) == claimants
     install("four", kind, "other", kind.works.replace("'fine'", "'other'"))
-    assert kind.ask("other")
+    assert kind.look_up("other")
 
 
 @of_every_kind
-def test_one_that_is_found_twice_is_one(kind: Kind, install: Install) -> None:
-    """The same place in the same module, as where an old folder has been left on the path."""
+def test_plugin_on_the_path_twice_is_one(kind: Kind, install: Install) -> None:
+    """The same object of the same module, as where an old folder has been left on the path."""
     module = install("good", kind, "fine", kind.works)
     install("left", kind, "fine", kind.works, module=module)
-    assert is_made_by(kind.ask("fine"), sys.modules[module].THING)
+    assert is_made_by(kind.look_up("fine"), sys.modules[module].THING)
 
 
 @of_every_kind
-def test_an_unknown_name_is_told_with_what_may_be_meant(kind: Kind, install: Install) -> None:
-    """A package's name is meant as well as one of ours, and all that are known are told."""
+def test_unknown_name_suggests_a_known_one(kind: Kind, install: Install) -> None:
+    """A package's name as well as one of ours; all known names are listed."""
     install("good", kind, "pigeonry", kind.works)
-    with pytest.raises(kind.error) as told:
-        kind.ask("pigeonri")
-    unknown, _, known = str(told.value).partition("? known are ")
+    with pytest.raises(kind.error) as caught:
+        kind.look_up("pigeonri")
+    unknown, _, known = str(caught.value).partition("? known are ")
     ending = kind.ending
-    meant = f"unknown {kind.what} 'pigeonri{ending}'; did you mean pigeonry{ending}"
-    assert unknown.endswith(meant)
+    assert f"'pigeonri{ending}'" in unknown
+    assert unknown.endswith(f"did you mean pigeonry{ending}")
     assert {f"pigeonry{ending}", f"{kind.own[0]}{ending}"} <= set(re.split("[,;] ", known))
-    with pytest.raises(kind.error, match=f"unknown {kind.what} 'x{{40}}{ending}'; known are "):
-        kind.ask("x" * 500)
+    with pytest.raises(kind.error, match=f"'x{{40}}{ending}'; known are "):
+        kind.look_up("x" * 500)
 
 
 @with_names_of_their_own
-def test_a_thing_with_a_name_has_that_of_its_entry_point(kind: Kind, install: Install) -> None:
-    """Or a table would say another one than the rig, and a client another one than the layout."""
+def test_plugin_has_the_name_of_its_entry_point(kind: Kind, install: Install) -> None:
+    """Otherwise a table would have another name than the rig."""
     install("good", kind, "finer", kind.works)
-    with pytest.raises(kind.error, match=r"of good gives one that is called 'fine'; what it gives"):
-        kind.ask("finer")
+    with pytest.raises(kind.error, match=r"of package good .*'fine'"):
+        kind.look_up("finer")
 
 
 @made_of_urls
-def test_what_a_class_makes_of_a_url_is_its_own(kind: Kind, install: Install) -> None:
-    """It may refuse one in its own words; whatever else it raises is blamed on its package."""
+def test_plugin_made_of_a_url_may_refuse_it(kind: Kind, install: Install) -> None:
+    """By the kind's own class of errors; anything else is attributed to its package."""
     install("good", kind, "fine", kind.works)
-    with pytest.raises(kind.error, match=r"^there is no such place$"):
-        kind.find(f"fine{kind.ending}nowhere")
-    with pytest.raises(kind.error, match=r"fine:.* of good does not work \(KeyError"):
-        kind.find(f"fine{kind.ending}badly")
+    with pytest.raises(kind.error, match=r"^refused$"):
+        kind.find(f"fine{kind.ending}refused")
+    with pytest.raises(kind.error, match=r"of package good .*KeyError"):
+        kind.find(f"fine{kind.ending}broken")
 
 
 @made_of_urls
-def test_a_scheme_may_be_in_capitals_and_must_be_there(kind: Kind, install: Install) -> None:
-    """A bare name of a device or a file is answered with how to write it."""
+def test_scheme_is_case_insensitive_and_required(kind: Kind, install: Install) -> None:
+    """A bare device or file name is refused with an example of a URL."""
     module = install("good", kind, "fine", kind.works)
-    assert is_made_by(kind.ask("FINE"), sys.modules[module].THING)
+    assert is_made_by(kind.look_up("FINE"), sys.modules[module].THING)
     for url in ("", "fine", "/dev/fine"):
-        with pytest.raises(kind.error, match=rf"{kind.ending}, as \w+:.* does; known are .*fine:"):
+        with pytest.raises(kind.error, match=rf"{kind.ending}.*known are .*fine:"):
             kind.find(url)

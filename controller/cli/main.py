@@ -20,6 +20,7 @@ from typer.core import TyperGroup
 from typer.main import get_group
 
 from model.errors import in_our_words
+from registry.plugins import failed_plugin, failure_text, package_remedy
 
 BAD_INPUT = 2
 BUG = 70  # EX_SOFTWARE of sysexits.h
@@ -104,8 +105,8 @@ def put_together(modules: Iterable[EntryPoint], *, debug: bool) -> tuple[TyperGr
             if debug:
                 traceback.print_exc()
             _say(
-                f"warning: the commands of {entry.value} are left out, for it cannot be loaded "
-                f"({type(error).__name__}: {error}); the others work. Install era-haptics again"
+                f"warning: skipped the commands of {entry.value}, which cannot be loaded "
+                f"({type(error).__name__}: {error}); {package_remedy(entry)}"
             )
     return group, statuses
 
@@ -157,6 +158,9 @@ def _report(error: Exception, statuses: ExitStatus) -> int:
         return BAD_INPUT
     if isinstance(error, OSError) and error.errno in _NO_ROOM:
         _say("error: there is no room left for what is written; make some, or write elsewhere")
+        return BAD_INPUT
+    if failed_plugin(error) is not None:
+        _say(f"error: {failure_text(error)}")
         return BAD_INPUT
     _say(
         f"error: this is a bug in era-haptics, please report it ({type(error).__name__}: {error}). "

@@ -32,6 +32,7 @@ from drivers.threads import in_thread
 from model.errors import InputError
 from model.table.table import LocalizationTable
 from model.table.timing import Timing
+from registry.plugins import failure_text
 
 _END_PATIENCE = 0.2  # s; by then whoever can be silenced has been
 
@@ -248,7 +249,9 @@ class Daemon:
             self._controller.deliver(frame)
 
     def _input_failed(self, name: str, error: Exception) -> None:
-        _logger.error("touch source %s has failed, and is tried again: %s", name, error)
+        expected = isinstance(error, InputError | OSError)
+        said = str(error) if expected else failure_text(error)
+        _logger.error("touch source %s: failed, retrying: %s", name, said)
 
     def _state_changed(self, old: Machine, new: Machine) -> None:
         self._news.state_changed(old, new)

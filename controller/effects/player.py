@@ -4,10 +4,11 @@ import math
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field
 
-from controller.effects.effect import Course, Effect, Feeling
+from controller.effects.effect import Course, Effect, Feeling, Nothing
 from controller.effects.layout import Layout, Region
 from controller.loop.intent import NO_CONTACTS, HapticIntent, Target
 from controller.sources.contacts import Contact, ContactKey
+from registry.plugins import WrongResultError
 
 # A finger that rests on an edge must not go in and out with the noise of its sensor, so it stays in
 # the region that it came into until it is this far [m] from where it did.
@@ -172,7 +173,10 @@ class EffectPlayer:
         priority: int,
     ) -> None:
         self._number += 1
-        course = self.layout.effects[name].begin(contact, now, level_db_sl=level)
+        effect = self.layout.effects[name]
+        course = effect.begin(contact, now, level_db_sl=level)
+        if not isinstance(course, Course):
+            raise WrongResultError(effect, course, Course)
         finger.plays.append(_Play(name, course, self._number, priority))
 
     def _felt(
@@ -189,6 +193,8 @@ class EffectPlayer:
             answer = play.course.feel(contact, now)
             if answer is None:
                 continue
+            if not isinstance(answer, Feeling | Nothing):
+                raise WrongResultError(play.course, answer, Feeling)
             lasting.append(play)
             if answer.until is not None:
                 ends.append(answer.until)

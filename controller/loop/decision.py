@@ -20,6 +20,7 @@ from drivers.command import DriveCommand
 from drivers.guard import Guard
 from model.rig.rig import Rig
 from model.table.question import Question
+from registry.plugins import failure_text
 
 # With nobody on the plate the end may be short, so that zero is reached within 20 ms of the lift.
 RELEASE_RAMP = 0.010
@@ -200,7 +201,7 @@ class Decider:
             order = self._order_for(selection, now, is_new=is_new)
         except Exception as error:
             is_calm = False
-            selection = Selection((), contacts, None, f"{type(error).__name__}: {error}")
+            selection = Selection((), contacts, None, failure_text(error))
             is_new, order = selection != self._decided, None
             if is_new:
                 _logger.exception("the decision failed, all channels fall silent")

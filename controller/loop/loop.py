@@ -26,6 +26,7 @@ from drivers.errors import CommandError, DriverError, LinkError
 from drivers.operation.watchdog import HEARTBEAT
 from model.errors import InputError
 from model.rig.rig import Rig
+from registry.plugins import failure_text
 
 # On an orderly end nobody waits, so the end is soft.
 CLOSING_RAMP = 0.050
@@ -297,7 +298,7 @@ class Controller:
             await source.run(self.deliver)
         except Exception as error:
             _logger.exception("a touch source failed")
-            self._tell(self._observer.source_failed, f"{type(error).__name__}: {error}")
+            self._tell(self._observer.source_failed, failure_text(error))
 
     async def _next_cause(self) -> None:
         """Wait until there is a reason to run: news, a heartbeat, an overdue source or intent."""

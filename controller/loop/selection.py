@@ -21,6 +21,7 @@ from model.table.pattern import UNAWARE_DB_SL, Pattern
 from model.table.question import Question
 from model.vibration.excitation import Excitation
 from model.vibration.peak import peak_acceleration
+from registry.plugins import failure_text
 
 # Fields vary over a good part of a bending wavelength, 17 cm and more below 500 Hz; a fingertip
 # that moved by less than its own radius is still within the disc it was chosen for.
@@ -151,7 +152,7 @@ class Selector:
             return Selection(targets, quiet, None, str(error))
         except Exception as error:
             _logger.exception("the table failed, all channels fall silent")
-            return Selection(targets, quiet, None, f"{type(error).__name__}: {error}")
+            return Selection(targets, quiet, None, failure_text(error))
         return Selection(targets, quiet, pattern, None, question, felt)
 
     def _ask(

@@ -6,17 +6,17 @@ as `RigCheck`.
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from importlib.metadata import entry_points
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 from urllib.parse import quote
 
 from model.config.document import Document, Problem
+from model.errors import InputError
 from model.rig.rig import Rig
 from model.rig.sections import LimitsSection
+from registry.plugins import Instance, PluginRegistry
 
-GROUP = "era_haptics.rig_checks"
 
-
+@runtime_checkable
 class RigCheck(Protocol):
     """Looks at URLs and opens nothing."""
 
@@ -29,6 +29,11 @@ class RigCheck(Protocol):
         """
 
 
+_CHECKS: PluginRegistry[RigCheck] = PluginRegistry(
+    "rig check", "era_haptics.rig_checks", Instance(RigCheck), error=InputError
+)
+
+
 def check_amplifiers(document: Document, rig: Rig | None) -> tuple[list[Problem], list[str]]:
     """Problems and warnings; rig: what the document became, if it did."""
     urls = _urls(document)
@@ -36,11 +41,11 @@ def check_amplifiers(document: Document, rig: Rig | None) -> tuple[list[Problem]
     highest = rig.limits.frequency_max if rig else LimitsSection().frequency[1]
     problems: list[Problem] = []
     warnings: list[str] = []
-    for point in entry_points(group=GROUP):
-        check: RigCheck = point.load()
-        wrong, told = check(urls, channels=wired, frequency_max=highest)
+    for name in _CHECKS.names():
+        wrong, told = _CHECKS.find(name)(urls, channels=wired, frequency_max=highest)
         problems += [
-            document.problem(("amplifiers", name, "url"), what) for name, what in wrong.items()
+            document.problem(("amplifiers", amplifier, "url"), what)
+            for amplifier, what in wrong.items()
         ]
         warnings += told
     return problems, warnings

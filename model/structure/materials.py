@@ -79,7 +79,7 @@ _MATERIALS: PluginRegistry[KnownMaterial] = PluginRegistry(
     error=InputError,
     own=KNOWN_MATERIALS,
     called=lambda known: known.material.name,
-    otherwise="; any other can be given by its numbers, {E: 70 GPa, rho: 2700, nu: 0.33}",
+    hint="; any other can be given by its numbers, {E: 70 GPa, rho: 2700, nu: 0.33}",
 )
 
 

@@ -4,6 +4,7 @@ An installed package adds one by an entry point of the group `era_haptics.elemen
 an `Element` of that name; `model.fem.element_checks` says what it must keep.
 """
 
+from functools import cache
 from operator import attrgetter
 
 from model.errors import InputError
@@ -17,6 +18,15 @@ __all__ = ["DOF_PER_NODE", "ELEMENTS", "Element", "element_names", "element_of"]
 ELEMENTS = {element.name: element for element in (MITC4, Q3, Q4, Q5)}
 """Those that come with this package."""
 
+
+@cache
+def _matrix_problem(element: Element) -> str | None:
+    """What is wrong with the nodes or the matrices of a plug-in's element."""
+    from model.fem.element_checks import matrices, nodes  # they use meshes, and these elements
+
+    return nodes(element) or matrices(element)
+
+
 _ELEMENTS: PluginRegistry[Element] = PluginRegistry(
     "element",
     "era_haptics.elements",
@@ -24,6 +34,7 @@ _ELEMENTS: PluginRegistry[Element] = PluginRegistry(
     error=InputError,
     own=ELEMENTS,
     called=attrgetter("name"),
+    problem=_matrix_problem,
 )
 
 

@@ -1,4 +1,4 @@
-"""What `era amp` does with one amplifier; each gives the rows that are shown."""
+"""Actions of `era amp` on one amplifier; each returns the rows of its result."""
 
 import asyncio
 import contextlib
@@ -12,6 +12,7 @@ from drivers.command import CommandSet, DriveCommand
 from drivers.conformance import Check, CheckResult, run_check
 from drivers.errors import CommandError, CommandRefused, DriverError
 from drivers.guard import FREQUENCY_CEILING, FREQUENCY_FLOOR, LEVEL_CEILING, Guard, GuardLimits
+from drivers.operation.keep_alive import keep_alive
 from drivers.operation.watchdog import check_watchdog, shortest_watchdog
 from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.messages import Achieved, AmplifierState, Status
@@ -21,7 +22,7 @@ _RAMP = 0.05  # s; neither start nor end of a drive clicks
 
 
 async def identify(url: str) -> dict[str, Any]:
-    """Who it is, what it can play, and what its wire allows."""
+    """Read identity, capabilities and wire times."""
     async with _opened(url) as amplifier:
         who, what = amplifier.identity, amplifier.capabilities
         return {
@@ -51,7 +52,7 @@ async def identify(url: str) -> dict[str, Any]:
 
 
 async def status(url: str) -> dict[str, Any]:
-    """How it is, what went wrong with it, and how its link does."""
+    """Read status, faults and link timing."""
     async with _opened(url) as amplifier:
         now = await amplifier.status()
         faults = await amplifier.faults()
@@ -68,7 +69,7 @@ async def status(url: str) -> dict[str, Any]:
 
 
 async def stop(url: str) -> dict[str, Any]:
-    """Quick stop."""
+    """Stop all channels."""
     async with _opened(url) as amplifier:
         return {"url": url, **_status_rows(await amplifier.stop())}
 
@@ -82,10 +83,10 @@ async def clear(url: str) -> dict[str, Any]:
 async def drive(
     url: str, *, channel: int, frequency: float, level: float, duration: float
 ) -> dict[str, Any]:
-    """Let one channel vibrate for a while [s]; ends silent and disarmed."""
+    """Drive one channel for a time [s]; ends silent and disarmed."""
     longest = PROTOCOL.quantities.valid_for.high
     if not 0 < duration <= longest:
-        raise CommandError(f"--for is {duration:g} s; it must be above 0 and at most {longest:g} s")
+        raise CommandError(f"--for must be above 0 and at most {longest:g} s, got {duration:g} s")
     ceiling = GuardLimits(FREQUENCY_FLOOR, FREQUENCY_CEILING, LEVEL_CEILING)
     async with _opened(url) as amplifier:
         guard = Guard(ceiling, amplifier.capabilities)
@@ -99,15 +100,15 @@ async def drive(
         try:
             safe = guard.check(asked)
         except CommandRefused as refused:
-            raise CommandError(str(refused)) from refused  # what was typed is no such command
+            raise CommandError(str(refused)) from refused  # bad input, not a refusal
         watchdog = max(WATCHDOG, amplifier.capabilities.watchdog_min)
         check_watchdog(watchdog, amplifier.round_trip())
         try:
             await _arm(amplifier, watchdog, url)
             achieved = await amplifier.apply(safe)
-            await _keep_alive(amplifier, duration, beat=watchdog / 5, url=url)
+            await keep_alive(amplifier, duration, interval=watchdog / 5)
         finally:
-            # What cannot be told to the amplifier any more is left to its watchdog.
+            # An amplifier that cannot be reached is stopped by its watchdog.
             with contextlib.suppress(DriverError):
                 await amplifier.disarm(_RAMP)
         await asyncio.sleep(_RAMP)
@@ -116,7 +117,7 @@ async def drive(
 
 
 async def conform(url: str, checks: tuple[Check, ...]) -> AsyncIterator[CheckResult]:
-    """What comes of each check in turn."""
+    """Run checks in turn on one open amplifier."""
     async with _opened(url) as amplifier:
         for check in checks:
             yield await run_check(check, amplifier)
@@ -133,7 +134,7 @@ async def _opened(url: str) -> AsyncIterator[Amplifier]:
 
 
 async def _arm(amplifier: Amplifier, watchdog: float, url: str) -> None:
-    """Arm, or say how to get out of a stop or fault; watchdog [s]."""
+    """Arm with a watchdog [s]; a refusal after a stop or fault names the remedy."""
     try:
         await amplifier.arm(watchdog)
     except CommandRefused as refused:
@@ -145,31 +146,13 @@ async def _arm(amplifier: Amplifier, watchdog: float, url: str) -> None:
         ):
             raise
         raise CommandRefused(
-            f"the amplifier does not arm: it is in {now.state.name}, fault {now.fault.name}, until "
-            "that is acknowledged; once its cause is gone: era amp clear " + shlex.quote(url)
+            f"the amplifier does not arm: state {now.state.name}, fault {now.fault.name}; once the "
+            f"cause is gone: era amp clear {shlex.quote(url)}"
         ) from refused
 
 
-async def _keep_alive(amplifier: Amplifier, duration: float, *, beat: float, url: str) -> None:
-    """Feed the watchdog for a while [s], a heartbeat every `beat` [s]; raises CommandRefused.
-
-    That is where the amplifier has stopped by itself meanwhile.
-    """
-    loop = asyncio.get_running_loop()
-    end = loop.time() + duration
-    while (left := end - loop.time()) > 0:
-        await asyncio.sleep(min(beat, left))
-        status = await amplifier.heartbeat()
-        if status.state is not AmplifierState.OPERATION_ENABLED:
-            raise CommandRefused(
-                f"the amplifier ended the drive by itself: it is in {status.state.name}, fault "
-                f"{status.fault.name}; see era amp status {shlex.quote(url)}, and "
-                f"era amp clear {shlex.quote(url)} once the cause is gone"
-            )
-
-
 def _wire_rows(amplifier: Amplifier) -> dict[str, Any]:
-    """What the wire allows, by arithmetic; nothing where its speed is not known."""
+    """Limits by the wire's speed; empty where that is unknown."""
     round_trip = amplifier.round_trip()
     if not round_trip:
         return {}

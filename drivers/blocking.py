@@ -1,41 +1,34 @@
-"""An amplifier for scripts that are not asynchronous: the same calls, each waiting for its end.
+"""A synchronous amplifier for scripts.
 
     with BlockingAmplifier("serial:///dev/ttyUSB0", limits=GuardLimits(40, 500, 0.5)) as amplifier:
         amplifier.arm()
         amplifier.play([DriveCommand(channel=0, frequency=110, level=0.2)], duration=0.5)
 
-The watchdog is fed by `play` while it waits, and by nothing else: a script that hangs is silent.
+Only `play`, while it waits, and `heartbeat` feed the watchdog: a script that hangs falls silent.
 """
 
 import asyncio
 import threading
-import time
 from collections.abc import Coroutine, Sequence
 from types import TracebackType
 from typing import Any, TypeVar
 
 from drivers.amplifier import WATCHDOG, Amplifier
 from drivers.command import CommandSet, DriveCommand, Envelope
-from drivers.errors import CommandError, CommandRefused
+from drivers.errors import CommandError
 from drivers.guard import Guard, GuardLimits
+from drivers.operation.keep_alive import keep_alive
 from drivers.operation.watchdog import HEARTBEAT
-from drivers.protocol.messages import (
-    Achieved,
-    AmplifierState,
-    Capabilities,
-    FaultRecord,
-    Identity,
-    Status,
-)
+from drivers.protocol.messages import Achieved, Capabilities, FaultRecord, Identity, Status
 from drivers.registry import open_backend
 
-_RAMP = 0.02  # s; neither start nor end of a vibration clicks
+_RAMP = 0.02  # s; long enough that neither start nor end of a vibration clicks
 
 _T = TypeVar("_T")
 
 
 class BlockingAmplifier:
-    """The amplifier of a URL within these limits, open as long as the context lasts.
+    """The amplifier at a URL within limits, open while the context lasts.
 
     Leaving the context disarms it. Raises what `Amplifier` raises.
     """
@@ -43,13 +36,13 @@ class BlockingAmplifier:
     def __init__(self, url: str, *, limits: GuardLimits) -> None:
         if not isinstance(url, str):
             raise CommandError(
-                "the URL of an amplifier is text, such as serial:///dev/ttyUSB0, not a "
+                "URL of an amplifier must be a string such as serial:///dev/ttyUSB0, got "
                 f"{type(url).__name__}"
             )
         if not isinstance(limits, GuardLimits):
             raise CommandError(
-                f"limits is a {type(limits).__name__}; give GuardLimits with the lowest and the "
-                "highest frequency [Hz] and the highest level, such as GuardLimits(40, 500, 0.5)"
+                "limits must be GuardLimits of lowest and highest frequency [Hz] and highest "
+                f"level, such as GuardLimits(40, 500, 0.5), got {type(limits).__name__}"
             )
         self._url = url
         self._limits = limits
@@ -59,7 +52,8 @@ class BlockingAmplifier:
     def __enter__(self) -> "BlockingAmplifier":
         self._thread.start()
         try:
-            self._amplifier = self._wait(self._open())
+            self._amplifier = Amplifier(open_backend(self._url))
+            self._wait(self._amplifier.open())
             self._guard = Guard(self._limits, self._amplifier.capabilities)
         except BaseException:
             self._end()
@@ -83,7 +77,7 @@ class BlockingAmplifier:
 
     @property
     def identity(self) -> Identity:
-        """Who it is."""
+        """Vendor, product, serial number and firmware."""
         return self._amplifier.identity
 
     @property
@@ -92,11 +86,11 @@ class BlockingAmplifier:
         return self._amplifier.capabilities
 
     def arm(self, watchdog: float = WATCHDOG) -> Status:
-        """High voltage on, level zero; watchdog [s]."""
+        """Switch the high voltage on, level zero; watchdog [s]."""
         return self._wait(self._amplifier.arm(watchdog))
 
     def disarm(self) -> Status:
-        """Silent, then high voltage off."""
+        """Fall silent, then switch the high voltage off."""
         return self._wait(self._amplifier.disarm())
 
     def stop(self) -> Status:
@@ -108,11 +102,11 @@ class BlockingAmplifier:
         return self._wait(self._amplifier.clear())
 
     def status(self) -> Status:
-        """How it is."""
+        """Read state, fault and levels."""
         return self._wait(self._amplifier.status())
 
     def faults(self) -> tuple[FaultRecord, ...]:
-        """Latched and past faults, newest first."""
+        """Read latched and past faults, newest first."""
         return self._wait(self._amplifier.faults())
 
     def heartbeat(self) -> Status:
@@ -120,50 +114,40 @@ class BlockingAmplifier:
         return self._wait(self._amplifier.heartbeat())
 
     def load_envelope(self, envelope: Envelope) -> None:
-        """Keep an envelope for the sets to come."""
+        """Load an envelope for later sets."""
         self._wait(self._amplifier.load_envelope(self._guard.check_envelope(envelope)))
 
     def apply(
         self, commands: Sequence[DriveCommand], *, ramp: float = _RAMP, valid_for: float = 0.0
     ) -> Achieved:
-        """Play these commands from now on, all others silent; returns what is achieved."""
-        _expect_commands(commands)
-        safe = self._guard.check(
-            CommandSet(
-                token=self._amplifier.next_token(),
-                commands=tuple(commands),
-                ramp=ramp,
-                valid_for=valid_for,
-            )
+        """Play these commands from now on, all other channels silent."""
+        _require_commands(commands)
+        command_set = CommandSet(
+            token=self._amplifier.next_token(),
+            commands=tuple(commands),
+            ramp=ramp,
+            valid_for=valid_for,
         )
-        return self._wait(self._amplifier.apply(safe))
+        return self._wait(self._amplifier.apply(self._guard.check(command_set)))
 
     def play(
         self, commands: Sequence[DriveCommand], *, duration: float, ramp: float = _RAMP
     ) -> Achieved:
-        """Play these commands for a while [s] and wait for the end; feeds the watchdog.
+        """Play these commands for a time [s], feed the watchdog and wait for the end.
 
-        Raises CommandRefused where the amplifier has stopped by itself.
+        Raises CommandRefused if the amplifier stops by itself.
         """
         achieved = self.apply(commands, ramp=ramp, valid_for=duration)
-        end = time.monotonic() + duration
-        while (left := end - time.monotonic()) > 0:
-            time.sleep(min(left, HEARTBEAT))
-            status = self.heartbeat()
-            if status.state is not AmplifierState.OPERATION_ENABLED:
-                raise CommandRefused(
-                    f"the amplifier stopped by itself: it is in {status.state.name}, fault "
-                    f"{status.fault.name}; once the cause is gone, clear() it and arm() again"
-                )
+        self._wait(keep_alive(self._amplifier, duration, interval=HEARTBEAT))
         return achieved
 
-    async def _open(self) -> Amplifier:
-        amplifier = Amplifier(open_backend(self._url))
-        await amplifier.open()
-        return amplifier
-
     def _wait(self, work: Coroutine[Any, Any, _T]) -> _T:
-        return asyncio.run_coroutine_threadsafe(work, self._loop).result()
+        future = asyncio.run_coroutine_threadsafe(work, self._loop)
+        try:
+            return future.result()
+        except BaseException:  # also KeyboardInterrupt: nothing goes on feeding the watchdog
+            future.cancel()
+            raise
 
     def _end(self) -> None:
         self._loop.call_soon_threadsafe(self._loop.stop)
@@ -171,10 +155,12 @@ class BlockingAmplifier:
         self._loop.close()
 
 
-def _expect_commands(given: object) -> None:
-    """Raise CommandError for what are no drive commands, those of all amplifiers by name say."""
-    if not isinstance(given, Sequence) or not all(isinstance(one, DriveCommand) for one in given):
+def _require_commands(commands: object) -> None:
+    """Raise CommandError for anything but a sequence of drive commands."""
+    if not (
+        isinstance(commands, Sequence) and all(isinstance(one, DriveCommand) for one in commands)
+    ):
         raise CommandError(
-            f"what shall be played is a {type(given).__name__}, not a list of DriveCommand; give "
-            'those of one amplifier, as in commands_for(rig, pattern)["main"]'
+            f"commands must be a list of DriveCommand, got {type(commands).__name__}; pass those "
+            'of one amplifier, as in commands_for(rig, pattern)["main"]'
         )

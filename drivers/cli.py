@@ -1,4 +1,4 @@
-"""The `era amp` commands: talk to one amplifier by hand."""
+"""The `era amp` commands: control one amplifier by hand."""
 
 import json
 import shlex
@@ -26,59 +26,58 @@ URLs:
   serial:///dev/ttyUSB0?baud=921600&address=1   a serial port, on Windows serial:///COM3
   serial://HOST:PORT  rfc2217://HOST:PORT       a serial server
   hwgrep://VENDOR:PRODUCT                       the serial port of a USB adapter
-  modbus+tcp://HOST:PORT/UNIT                   Modbus over TCP, behind a gateway ?baud=19200
+  modbus+tcp://HOST:PORT/UNIT                   Modbus over TCP; ?baud=19200 for a gateway
   modbus+rtu:///dev/ttyS1?baud=115200#UNIT      Modbus on a serial port
-  can+socketcan://can0#NODE                     CAN on an interface of the system
+  can+socketcan://can0#NODE                     CAN on a network interface
   can+slcan:///dev/ttyACM0?bitrate=500000#NODE  CAN on a serial adapter
-  can+socketcand://HOST:PORT/can0#NODE          CAN by a server
+  can+socketcand://HOST:PORT/can0#NODE          CAN through a socketcand server
   sim://RIG.yaml                                a simulated amplifier of a rig
-Put one with ?, # or & into quotes, or the shell makes something else of these.
+Quote URLs that contain ?, # or &.
 """
 
 app = typer.Typer(no_args_is_help=True)
 amp = typer.Typer(
-    no_args_is_help=True, help="Talk to one amplifier by hand.", epilog=_URLS, rich_markup_mode=None
+    no_args_is_help=True, help="Control one amplifier by hand.", epilog=_URLS, rich_markup_mode=None
 )
 app.add_typer(amp, name="amp")
 
 
 @app.callback()
 def _group() -> None:
-    """Keeps `amp` a group of its own, also where this app stands alone."""
+    """Keep `amp` a command group even if the app has no other."""
 
 
 Url = Annotated[
     str,
     typer.Argument(
         metavar="URL",
-        help="serial:///dev/ttyUSB0?baud=921600, or another as era amp --help lists them.",
+        help="Address of the amplifier, such as serial:///dev/ttyUSB0?baud=921600.",
         show_default=False,
     ),
 ]
-Json = Annotated[bool, typer.Option("--json", help="One JSON object on standard output.")]
+Json = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 
 
 @amp.command()
 def discover(
     url: Annotated[
-        list[str] | None, typer.Argument(help="Ask here as well.", show_default=False)
+        list[str] | None, typer.Argument(help="Identify at these URLs too.", show_default=False)
     ] = None,
     probe: Annotated[
         bool,
-        typer.Option(help="Ask at every port who is there; nothing else is sent."),
+        typer.Option(help="Send an identify request to every port."),
     ] = True,
     slcan: Annotated[
         bool,
         typer.Option(
             "--slcan",
-            help="Ask first whether a serial port is a CAN adapter, by the characters V and CR, "
-            "which a device of another kind may take for a command of its own; then listen to its "
-            "bus at 500 kbit/s, onto which nothing is written.",
+            help="Detect CAN adapters on serial ports by sending V and CR, which other devices may "
+            "take for a command; then listen to their bus at 500 kbit/s.",
         ),
     ] = False,
     json_: Json = False,
 ) -> None:
-    """List serial ports, CAN interfaces and who answers on them."""
+    """List serial ports, CAN interfaces and the amplifiers on them."""
     import asyncio
 
     from drivers.discovery.search import ask, candidates, with_slcan
@@ -118,7 +117,7 @@ def discover(
         if row["remedy"]:
             print(f"  {row['remedy']}")
     if not rows:
-        print("no serial port and no CAN interface: plug an adapter in, and look again")
+        print("no serial port and no CAN interface found; plug in an adapter and try again")
     for one in found:
         if one.identity is None and one.url in (url or []):
             print(f"{one.url}: {one.problem}")
@@ -128,14 +127,14 @@ def discover(
     if not amplifiers and heard:
         print(f"Next: era amp identify {shlex.quote(heard[0])}")
     elif not amplifiers:
-        print("no amplifier answered")
+        print("no amplifier found")
     else:
         print(f"Next: era amp identify {shlex.quote(amplifiers[0]['url'])}")
 
 
 @amp.command()
 def identify(url: Url, json_: Json = False) -> None:
-    """Who the amplifier is and what it can play. Also what its wire allows."""
+    """Show identity, capabilities and wire times."""
     from drivers import amp_actions
 
     _show(_run(amp_actions.identify(url)), as_json=json_)
@@ -143,7 +142,7 @@ def identify(url: Url, json_: Json = False) -> None:
 
 @amp.command()
 def status(url: Url, json_: Json = False) -> None:
-    """How the amplifier is, and what went wrong with it."""
+    """Show state, levels and faults."""
     from drivers import amp_actions
 
     _show(_run(amp_actions.status(url)), as_json=json_)
@@ -152,13 +151,13 @@ def status(url: Url, json_: Json = False) -> None:
 @amp.command()
 def drive(
     url: Url,
-    channel: Annotated[int, typer.Option(help="Output of the amplifier, from 0.")] = 0,
-    frequency: Annotated[float, typer.Option(help="Mechanical frequency in Hz.")] = 110.0,
-    level: Annotated[float, typer.Option(help="0 to 1 of full stroke.")] = 0.2,
-    duration: Annotated[float, typer.Option("--for", help="How long, in s.")] = 0.5,
+    channel: Annotated[int, typer.Option(help="Output channel, from 0.")] = 0,
+    frequency: Annotated[float, typer.Option(help="Mechanical frequency [Hz].")] = 110.0,
+    level: Annotated[float, typer.Option(help="Level, 0 to 1 of full stroke.")] = 0.2,
+    duration: Annotated[float, typer.Option("--for", help="Duration [s].")] = 0.5,
     json_: Json = False,
 ) -> None:
-    """Let one channel vibrate for a while. Ends silent and disarmed, whatever happens."""
+    """Drive one channel, then disarm."""
     from drivers import amp_actions
 
     driven = amp_actions.drive(
@@ -169,7 +168,7 @@ def drive(
 
 @amp.command()
 def stop(url: Url, json_: Json = False) -> None:
-    """Quick stop: silent at once. Refuses to play until it is cleared."""
+    """Stop all channels at once. Latched until cleared."""
     from drivers import amp_actions
 
     _show(_run(amp_actions.stop(url)), as_json=json_)
@@ -179,7 +178,7 @@ def stop(url: Url, json_: Json = False) -> None:
 
 @amp.command()
 def clear(url: Url, json_: Json = False) -> None:
-    """Acknowledge a stop, or a fault whose cause is gone. The amplifier stays disarmed."""
+    """Acknowledge a stop or fault. Leaves the amplifier disarmed."""
     from drivers import amp_actions
 
     _show(_run(amp_actions.clear(url)), as_json=json_)
@@ -189,38 +188,38 @@ def clear(url: Url, json_: Json = False) -> None:
 def conformance(
     url: Url,
     write: Annotated[
-        bool, typer.Option("--write", help="Drive the outputs too, without asking first.")
+        bool, typer.Option("--write", help="Drive the outputs too, without confirmation.")
     ] = False,
     json_: Json = False,
 ) -> None:
-    """Check that an amplifier keeps the contract. Looks only, unless told to drive its channels."""
+    """Check that an amplifier fulfils the contract. Reads only, unless --write is given."""
     import asyncio
 
     from drivers.conformance import CHECKS, LEVEL
 
-    looking = tuple(check for check in CHECKS if not check.drives)
+    reading = tuple(check for check in CHECKS if not check.drives)
     driving = tuple(check for check in CHECKS if check.drives)
-    outcomes = asyncio.run(_conform(url, looking, quiet=json_))
+    outcomes = asyncio.run(_conform(url, reading, quiet=json_))
     if not write and not json_ and sys.stdin.isatty():
         write = typer.confirm(
-            f"{len(driving)} more checks arm it and let its channels vibrate at {LEVEL:.0%} of "
-            "full stroke. Go on?"
+            f"{len(driving)} more checks arm the amplifier and drive its channels at {LEVEL:.0%} "
+            "of full stroke. Continue?"
         )
     if write and all(outcome.problem is None for outcome in outcomes):
         outcomes += asyncio.run(_conform(url, driving, quiet=json_))
-    broken = [outcome for outcome in outcomes if outcome.problem is not None]
-    left_out = len(CHECKS) - len(outcomes)
+    failed = [outcome for outcome in outcomes if outcome.problem is not None]
+    skipped = len(CHECKS) - len(outcomes)
     if json_:
         rows = [
             {"check": one.check.name, "proves": one.check.proves, "problem": one.problem}
             for one in outcomes
         ]
-        print(json.dumps({"url": url, "kept": not broken, "left_out": left_out, "checks": rows}))
+        print(json.dumps({"url": url, "kept": not failed, "left_out": skipped, "checks": rows}))
     else:
-        print(f"{len(outcomes) - len(broken)} kept, {len(broken)} broken, {left_out} left out")
-        if left_out:
+        print(f"{len(outcomes) - len(failed)} passed, {len(failed)} failed, {skipped} skipped")
+        if skipped:
             print(f"Next: era amp conformance {shlex.quote(url)} --write")
-    if broken:
+    if failed:
         raise typer.Exit(1)
 
 
@@ -231,7 +230,7 @@ async def _conform(url: str, checks: "tuple[Check, ...]", *, quiet: bool) -> "li
     async for outcome in conform(url, checks):
         outcomes.append(outcome)
         if not quiet:
-            mark = "kept  " if outcome.problem is None else "BROKEN"
+            mark = "passed" if outcome.problem is None else "FAILED"
             print(f"{mark}  It {outcome.check.proves}.")
             if outcome.problem is not None:
                 print(f"        {outcome.problem}")
@@ -254,7 +253,7 @@ def _show(result: dict[str, Any], *, as_json: bool) -> None:
 
 
 def in_words(value: Any) -> str:
-    """A value of JSON as people read it: of a number what counts, of an object what it has."""
+    """Format a JSON value for reading: numbers to five digits, objects as `key value`."""
     match value:
         case bool():
             return "yes" if value else "no"
@@ -266,8 +265,8 @@ def in_words(value: Any) -> str:
         case dict():
             words = {key: in_words(one) for key, one in value.items() if one is not None}
             return ", ".join(
-                f"{key} ({told})" if isinstance(value[key], dict) else f"{key} {told}"
-                for key, told in words.items()
+                f"{key} ({text})" if isinstance(value[key], dict) else f"{key} {text}"
+                for key, text in words.items()
             )
         case _:
             return str(value)

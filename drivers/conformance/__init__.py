@@ -1,21 +1,21 @@
-"""The contract that any amplifier must keep, whatever its wire, as checks that say what they prove.
+"""The contract of every amplifier, whatever its wire, as checks.
 
 Run against hardware by `era amp conformance URL`, and by the project's tests over every backend.
-The first checks only read. The others arm the amplifier and let its channels vibrate; each begins
-and ends disarmed.
+The first checks only read. The others arm the amplifier and drive its channels; each begins and
+ends disarmed.
 """
 
-from drivers.conformance import ending, looking, playing, shaping
+from drivers.conformance import ending, envelopes, playing, reading
 from drivers.conformance.bench import LEVEL
 from drivers.conformance.check import Check, CheckResult, Steps, run_check
 
 __all__ = ["CHECKS", "LEVEL", "Check", "CheckResult", "run_check"]
 
-_LOOKING: tuple[Steps, ...] = (
-    looking.identity,
-    looking.capabilities,
-    looking.starts_disarmed,
-    looking.looking_on,
+_READING: tuple[Steps, ...] = (
+    reading.identity,
+    reading.capabilities,
+    reading.starts_disarmed,
+    reading.reading_changes_nothing,
 )
 _DRIVING: tuple[Steps, ...] = (
     playing.plays_nothing_disarmed,
@@ -25,14 +25,14 @@ _DRIVING: tuple[Steps, ...] = (
     playing.stage_and_commit,
     playing.tokens,
     playing.ramps,
-    playing.patience,
+    playing.cancelled_requests,
     ending.quick_stop,
     ending.disarm,
     ending.watchdog,
     ending.heartbeats,
     ending.valid_for,
-    shaping.envelopes,
-    shaping.missing_envelopes,
+    envelopes.envelopes,
+    envelopes.missing_envelopes,
 )
 
 
@@ -48,5 +48,5 @@ def _checks(*several: Steps, drives: bool) -> tuple[Check, ...]:
     )
 
 
-CHECKS = (*_checks(*_LOOKING, drives=False), *_checks(*_DRIVING, drives=True))
-"""In the order in which they are run."""
+CHECKS = (*_checks(*_READING, drives=False), *_checks(*_DRIVING, drives=True))
+"""All checks, in their order of execution."""

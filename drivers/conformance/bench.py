@@ -1,4 +1,4 @@
-"""An amplifier under test, what it is asked to play, and what must be the case then."""
+"""An amplifier under test: sets for it, and expectations on its status."""
 
 import asyncio
 from collections.abc import Awaitable, Callable
@@ -10,15 +10,15 @@ from drivers.guard import Guard, GuardLimits, SafeCommandSet
 from drivers.protocol.messages import Capabilities, Status
 
 LEVEL = 0.2
-"""At which channels vibrate: felt by a finger, and far from any limit."""
+"""Level of driven channels: perceptible, and far from any limit."""
 
-CALM = 2.0  # s; a watchdog that does not trip while a check goes on, where there is one so long
-PATIENCE = 5.0  # s; for what comes by itself
-LEVEL_ERROR = 0.002  # of full stroke; of an amplifier that measures
+LONG_WATCHDOG = 2.0  # s; does not trip during a check, on amplifiers that support it
+EVENT_TIMEOUT = 5.0  # s; for changes without a request
+LEVEL_TOLERANCE = 0.002  # of full stroke; for amplifiers that measure their levels
 
 
-class ContractBroken(Exception):
-    """The amplifier does something else than the contract says."""
+class ContractViolation(Exception):
+    """The amplifier does not behave as the contract says."""
 
 
 class Bench:
@@ -32,7 +32,7 @@ class Bench:
         self.guard = self.guard_as(self.can)
 
     def guard_as(self, capabilities: Capabilities) -> Guard:
-        """A guard for an amplifier that can do this."""
+        """Make a guard for an amplifier with these capabilities."""
         return Guard(GuardLimits(0.0, 1e6, 1.0), capabilities)
 
     def tones(
@@ -44,7 +44,7 @@ class Bench:
         guard: Guard | None = None,
         first: int = 0,
     ) -> SafeCommandSet:
-        """A set that drives channels from `first` on at these shares of the test level."""
+        """Make a set that drives channels from `first` on at these shares of the test level."""
         commands = tuple(
             DriveCommand(first + number, self.frequency, share * self.level)
             for number, share in enumerate(shares)
@@ -59,43 +59,43 @@ class Bench:
         )
 
     async def arm(self) -> Status:
-        """Armed, with a watchdog that leaves time."""
-        return await self.amplifier.arm(min(CALM, self.can.watchdog_max))
+        """Arm with a long watchdog."""
+        return await self.amplifier.arm(min(LONG_WATCHDOG, self.can.watchdog_max))
 
     async def levels(self) -> tuple[float, ...]:
-        """As read back."""
+        """Read the levels back."""
         return (await self.amplifier.status()).levels
 
     async def expect_levels(self, *shares: float, why: str) -> None:
-        """The first channels are at these shares of the test level, all others silent."""
+        """Require the first channels at these shares of the test level, all others silent."""
         levels = await self.levels()
         wanted = [share * self.level for share in shares] + [0.0] * (len(levels) - len(shares))
-        met = all(abs(a - b) <= LEVEL_ERROR for a, b in zip(levels, wanted, strict=True))
-        expect(met, f"{why}: levels are {levels} instead of {tuple(wanted)}")
+        is_met = all(abs(a - b) <= LEVEL_TOLERANCE for a, b in zip(levels, wanted, strict=True))
+        expect(is_met, f"{why}: levels must be {tuple(wanted)}, got {levels}")
 
     async def until(self, reached: Callable[[Status], bool], *, what: str, feed: bool) -> Status:
-        """Ask until the status is as wanted; feed: whether asking feeds the watchdog."""
+        """Poll until a status is reached; feed: whether polling feeds the watchdog."""
         ask = self.amplifier.heartbeat if feed else self.amplifier.status
         try:
-            async with asyncio.timeout(PATIENCE):
+            async with asyncio.timeout(EVENT_TIMEOUT):
                 while True:
                     status = await ask()
                     if reached(status):
                         return status
                     await asyncio.sleep(0.005)
         except TimeoutError:
-            raise ContractBroken(f"{what} did not happen within {PATIENCE:g} s") from None
+            raise ContractViolation(f"{what} must happen within {EVENT_TIMEOUT:g} s") from None
 
     async def refused(self, call: Awaitable[object], *, what: str) -> None:
-        """The amplifier must say no."""
+        """Require a refusal."""
         try:
             await call
         except CommandRefused:
             return
-        raise ContractBroken(f"{what} was not refused")
+        raise ContractViolation(f"{what} must be refused, got a reply")
 
     async def rest(self) -> None:
-        """Silent, disarmed, nothing latched."""
+        """Bring it to silence, disarmed, nothing latched."""
         await self.amplifier.stop(0.0)
         await self.until(
             lambda status: not any(status.levels), what="silence after a stop", feed=False
@@ -103,7 +103,7 @@ class Bench:
         await self.amplifier.clear()
 
 
-def expect(condition: bool, otherwise: str) -> None:
-    """Raise ContractBroken with what is the case instead."""
+def expect(condition: bool, problem: str) -> None:
+    """Raise ContractViolation with the problem unless the condition holds."""
     if not condition:
-        raise ContractBroken(otherwise)
+        raise ContractViolation(problem)

@@ -1,11 +1,11 @@
-"""One thing that every amplifier must do, and what came of trying it."""
+"""One check of the contract, and its result."""
 
 from collections.abc import Callable, Coroutine
 from dataclasses import dataclass
 from typing import TypeAlias
 
 from drivers.amplifier import Amplifier
-from drivers.conformance.bench import Bench, ContractBroken
+from drivers.conformance.bench import Bench, ContractViolation
 from drivers.errors import DriverError
 
 Steps: TypeAlias = Callable[[Bench], Coroutine[None, None, None]]
@@ -13,7 +13,7 @@ Steps: TypeAlias = Callable[[Bench], Coroutine[None, None, None]]
 
 @dataclass(frozen=True)
 class Check:
-    """One thing that must hold: a name, what it proves, and whether outputs are driven for it."""
+    """A requirement: its name, what it proves, and whether outputs are driven for it."""
 
     name: str
     proves: str
@@ -23,14 +23,14 @@ class Check:
 
 @dataclass(frozen=True)
 class CheckResult:
-    """What came of a check: problem is None where it is kept, else what happened instead."""
+    """Result of a check; problem: what happened instead, None if it passed."""
 
     check: Check
     problem: str | None
 
 
 async def run_check(check: Check, amplifier: Amplifier) -> CheckResult:
-    """Run one check on an open amplifier that is disarmed, and leave it so."""
+    """Run one check on an open, disarmed amplifier, and leave it disarmed."""
     bench = Bench(amplifier)
     try:
         try:
@@ -38,6 +38,6 @@ async def run_check(check: Check, amplifier: Amplifier) -> CheckResult:
         finally:
             if check.drives:
                 await bench.rest()
-    except (ContractBroken, DriverError) as problem:
+    except (ContractViolation, DriverError) as problem:
         return CheckResult(check, str(problem))
     return CheckResult(check, None)

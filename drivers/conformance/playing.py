@@ -1,32 +1,37 @@
-"""What is played, and what is not: sets, tokens, ramps."""
+"""Checks of sets, tokens and ramps."""
 
 import asyncio
 from dataclasses import replace
 
 from drivers.command import CommandSet, DriveCommand
-from drivers.conformance.bench import LEVEL_ERROR, Bench, expect
+from drivers.conformance.bench import LEVEL_TOLERANCE, Bench, expect
 from drivers.protocol.messages import AmplifierState
 
 
 async def plays_nothing_disarmed(bench: Bench) -> None:
-    """It plays nothing before it is armed, and nothing of it afterwards."""
+    """It plays nothing before it is armed, and plays no earlier set once armed."""
     await bench.refused(bench.amplifier.apply(bench.tones(1.0)), what="an apply while disarmed")
     status = await bench.arm()
-    expect(status.state is AmplifierState.OPERATION_ENABLED, f"armed it is in {status.state.name}")
-    expect(status.high_voltage, "armed its high voltage is off")
-    expect(status.token == 0, f"armed it plays token {status.token}")
-    expect(not any(status.levels), f"armed its levels are {status.levels}")
+    expect(
+        status.state is AmplifierState.OPERATION_ENABLED, f"state after Arm is {status.state.name}"
+    )
+    expect(status.high_voltage, "high voltage after Arm is off")
+    expect(status.token == 0, f"token after Arm must be 0, got {status.token}")
+    expect(not any(status.levels), f"levels after Arm are {status.levels}")
 
 
 async def achieved(bench: Bench) -> None:
-    """It says what it really plays: the nearest steps; token and levels read back."""
+    """It reports what it really plays: the nearest steps; token and levels read back."""
     await bench.arm()
     asked = DriveCommand(0, bench.frequency + 0.0049, bench.level * 0.987654, 12.3456)
     token = bench.amplifier.next_token()
     achieved = await bench.amplifier.apply(
         bench.guard.check(CommandSet(token, (asked,), ramp=0.0, valid_for=0.0))
     )
-    expect([one.channel for one in achieved.commands] == [0], "not the channels that were asked")
+    expect(
+        [one.channel for one in achieved.commands] == [0],
+        "achieved channels differ from the requested ones",
+    )
     (played,) = achieved.commands
     can = bench.can
     for what, error, step in (
@@ -34,23 +39,26 @@ async def achieved(bench: Bench) -> None:
         ("level", played.level - asked.level, can.level_step),
         ("phase", (played.phase - asked.phase + 180) % 360 - 180, can.phase_step),
     ):
-        expect(abs(error) <= step / 2 + 1e-9, f"{what} is off by {error:g}, its step is {step:g}")
+        expect(
+            abs(error) <= step / 2 + 1e-9,
+            f"{what} must be within half a step of {step:g}, got an error of {error:g}",
+        )
     status = await bench.amplifier.status()
-    expect(status.token == token, f"token {status.token} is read back instead of {token}")
-    await bench.expect_levels(played.level / bench.level, why="what is achieved is read back")
+    expect(status.token == token, f"token must be {token}, got {status.token}")
+    await bench.expect_levels(played.level / bench.level, why="achieved level")
 
 
 async def unnamed_channels(bench: Bench) -> None:
-    """It silences the channels that a set does not name."""
+    """It silences the channels that a set does not contain."""
     await bench.arm()
     await bench.amplifier.apply(bench.tones(1.0))
-    await bench.expect_levels(1.0, why="a set plays")
+    await bench.expect_levels(1.0, why="applied set")
     await bench.amplifier.apply(bench.tones())
-    await bench.expect_levels(why="a set without channels silences all")
+    await bench.expect_levels(why="set without channels")
 
 
 async def all_or_nothing(bench: Bench) -> None:
-    """It takes a set whole or not at all; what plays and what is staged stays."""
+    """It accepts a set whole or not at all; the playing and the staged set stay."""
     await bench.arm()
     before = bench.tones(1.0)
     await bench.amplifier.apply(before)
@@ -61,62 +69,62 @@ async def all_or_nothing(bench: Bench) -> None:
         beyond = bench.tones(0.5, guard=larger, first=bench.can.channels)
         await bench.refused(bench.amplifier.apply(beyond), what="a channel that does not exist")
         status = await bench.amplifier.status()
-        expect(status.token == before.token, "a refused set changed the token")
-        await bench.expect_levels(1.0, why="after a refused set the one before plays on")
+        expect(status.token == before.token, "token must not change by a refused set")
+        await bench.expect_levels(1.0, why="after a refused set")
     await bench.amplifier.commit(staged.token)
-    await bench.expect_levels(0.25, why="what was staged before a refused set is committed")
+    await bench.expect_levels(0.25, why="commit of a set staged before a refused one")
 
 
 async def stage_and_commit(bench: Bench) -> None:
-    """It moves nothing on Stage, and plays what is staged on Commit of its token only."""
+    """It changes nothing on Stage, and plays the staged set on Commit of its token only."""
     await bench.arm()
     staged = bench.tones(1.0)
     await bench.amplifier.stage(staged)
-    await bench.expect_levels(why="Stage changes nothing")
+    await bench.expect_levels(why="after Stage")
     other = bench.amplifier.next_token()
     await bench.refused(bench.amplifier.commit(other), what="a token that is not staged")
-    await bench.expect_levels(why="a refused Commit changes nothing")
+    await bench.expect_levels(why="after a refused Commit")
     await bench.amplifier.commit(staged.token)
-    await bench.expect_levels(1.0, why="Commit plays what is staged")
+    await bench.expect_levels(1.0, why="after Commit")
 
 
 async def tokens(bench: Bench) -> None:
-    """It applies a token once: repeated it is confirmed, late it is refused."""
+    """It applies a token once: a repetition is confirmed, a late copy refused."""
     await bench.arm()
     first = bench.tones(1.0)
     achieved = await bench.amplifier.apply(first)
     again = bench.tones(0.5, token=first.token)
     expect(
         (await bench.amplifier.apply(again)).commands == achieved.commands,
-        "a repeated token is not answered as the first time",
+        "reply to a repeated token must equal the first one",
     )
     await bench.amplifier.commit(first.token)
-    await bench.expect_levels(1.0, why="a repeated token changes nothing")
+    await bench.expect_levels(1.0, why="after a repeated token")
     await bench.amplifier.apply(bench.tones(0.25))
     staged = bench.tones(0.5)
     await bench.amplifier.stage(staged)
     await bench.refused(bench.amplifier.apply(first), what="a late copy of an earlier set")
-    await bench.expect_levels(0.25, why="a late copy changes nothing")
+    await bench.expect_levels(0.25, why="after a late copy")
     await bench.amplifier.commit(staged.token)
-    await bench.expect_levels(0.5, why="a late copy does not oust what is staged")
+    await bench.expect_levels(0.5, why="commit of a set staged before a late copy")
 
 
 async def ramps(bench: Bench) -> None:
-    """It fades along the ramp of the set."""
+    """It follows the ramp of a set."""
     await bench.arm()
     ramp = min(0.5, bench.can.ramp_max)
     await bench.amplifier.apply(bench.tones(1.0, ramp=ramp))
     level = (await bench.levels())[0]
-    expect(level < bench.level * 0.9, "after a moment of a long ramp the level is there already")
+    expect(level < bench.level * 0.9, f"level must rise along the ramp, got {level:g} at its begin")
     await bench.until(
-        lambda status: abs(status.levels[0] - bench.level) <= LEVEL_ERROR,
-        what="the end of a ramp",
+        lambda status: abs(status.levels[0] - bench.level) <= LEVEL_TOLERANCE,
+        what="end of a ramp",
         feed=True,
     )
 
 
-async def patience(bench: Bench) -> None:
-    """It gives the next request its own reply after one that was cancelled."""
+async def cancelled_requests(bench: Bench) -> None:
+    """It gives a request its own reply after one that was cancelled."""
     for _ in range(3):
         asking = asyncio.create_task(bench.amplifier.faults())
         await asyncio.sleep(0)
@@ -124,5 +132,6 @@ async def patience(bench: Bench) -> None:
         await asyncio.gather(asking, return_exceptions=True)
         status = await bench.arm()
         expect(
-            status.state is AmplifierState.OPERATION_ENABLED, f"armed it is in {status.state.name}"
+            status.state is AmplifierState.OPERATION_ENABLED,
+            f"state after Arm is {status.state.name}",
         )

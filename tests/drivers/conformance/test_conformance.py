@@ -223,7 +223,7 @@ async def test_a_mistake_is_found(
     answer: Answer, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The check it is for says what happened instead; an honest amplifier passes that check."""
-    monkeypatch.setattr("drivers.conformance.bench.PATIENCE", 1.0)
+    monkeypatch.setattr("drivers.conformance.bench.EVENT_TIMEOUT", 1.0)
     (check,) = [check for check in CHECKS if check.name == name]
     outcomes = []
     for behaviour in (answer, honest):

@@ -1,11 +1,11 @@
-"""Envelopes, where the amplifier has them."""
+"""Checks of envelopes, on amplifiers that support them."""
 
 from drivers.command import CommandSet, DriveCommand, Envelope, Knot
-from drivers.conformance.bench import LEVEL_ERROR, Bench, expect
+from drivers.conformance.bench import LEVEL_TOLERANCE, Bench, expect
 
 
 async def envelopes(bench: Bench) -> None:
-    """It plays envelopes through their knots, endings too, where it says that it can."""
+    """It plays onset and ending envelopes through their knots, if it reports any."""
     if not bench.can.envelope_knots:
         return
     await bench.arm()
@@ -19,23 +19,25 @@ async def envelopes(bench: Bench) -> None:
     achieved = await bench.amplifier.apply(safe)
     expect(
         (achieved.commands[0].onset, achieved.commands[0].ending) == (1, 2),
-        "the slots are not those that were asked",
+        "achieved slots must be those requested",
     )
     status = await bench.amplifier.status()
-    expect(status.levels[0] < bench.level * 0.9, "it does not begin at zero")
+    expect(
+        status.levels[0] < bench.level * 0.9, f"level must begin at zero, got {status.levels[0]:g}"
+    )
     await bench.until(
-        lambda status: abs(status.levels[0] - bench.level) <= LEVEL_ERROR,
-        what="the end of an onset",
+        lambda status: abs(status.levels[0] - bench.level) <= LEVEL_TOLERANCE,
+        what="end of an onset",
         feed=True,
     )
     await bench.amplifier.apply(bench.tones())
     level = (await bench.levels())[0]
-    expect(level > 0, "it is silent at once although it has an ending")
-    await bench.until(lambda status: not any(status.levels), what="the end of an ending", feed=True)
+    expect(level > 0, "level must follow the ending, got silence at once")
+    await bench.until(lambda status: not any(status.levels), what="end of an ending", feed=True)
 
 
 async def missing_envelopes(bench: Bench) -> None:
-    """It refuses a set that refers to an envelope it has not; what plays plays on."""
+    """It refuses a set that refers to an empty slot; the playing set stays."""
     if not bench.can.envelope_slots:
         return
     slot = bench.can.envelope_slots
@@ -49,4 +51,4 @@ async def missing_envelopes(bench: Bench) -> None:
     safe = bench.guard.check(CommandSet(token, (shaped,), ramp=0.0, valid_for=0.0))
     await bench.amplifier.load_envelope(bench.guard.check_envelope(Envelope(slot, step, ())))
     await bench.refused(bench.amplifier.apply(safe), what="a set with an empty slot")
-    await bench.expect_levels(1.0, why="after a refused set the one before plays on")
+    await bench.expect_levels(1.0, why="after a refused set")

@@ -4,7 +4,6 @@ The table is asked again, offline, what it answers for a touch; a command that p
 it. So nothing that the daemon says of itself takes part.
 """
 
-import cmath
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -139,7 +138,7 @@ class Expected:
             frequency, amplitude = expected.get(played.channel, (played.frequency, 0j))
             if played.level > 0 and abs(played.frequency - frequency) > 0.01:
                 return math.inf
-            difference = abs(cmath.rect(played.level, math.radians(played.phase)) - amplitude)
+            difference = abs(played.phasor - amplitude)
             most = max(most, difference / (absolute + relative * loudest))
         return most
 
@@ -170,7 +169,7 @@ class Expected:
             self._known[touch] = {
                 each.channel: (
                     each.frequency,
-                    cmath.rect(each.level, math.radians(each.phase)),
+                    each.phasor,
                 )
                 for each in commands
                 if each.level > 0

@@ -53,7 +53,7 @@ class Case:
     ) -> Excitation:
         weights = level * self.weights * (1 if errors is None else errors)
         return {
-            era.name: Tone(self.frequency, float(era.stroke * abs(w)), float(np.angle(w)))
+            era.name: Tone.from_phasor(self.frequency, era.stroke * complex(w))
             for era, w in zip(rig.eras, weights, strict=True)
         }
 
@@ -121,7 +121,7 @@ def case_of(excitation: Excitation, patterns: list[Case], rig: Rig) -> Case:
     for number, era in enumerate(rig.eras):
         tone = excitation.get(era.name)
         if tone is not None:
-            weights[number] = tone.amplitude / era.stroke * np.exp(1j * tone.phase)
+            weights[number] = tone.phasor / era.stroke
     (frequency,) = {tone.frequency for tone in excitation.values()}
     same = min(patterns, key=lambda each: abs(each.frequency - frequency))
     return replace(same, weights=weights)

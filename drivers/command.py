@@ -5,6 +5,8 @@ amplitude, level and phase, goes along straight lines from where it is through t
 step, and reaches what the command says one step after the last knot. So nothing can jump.
 """
 
+import cmath
+import math
 from dataclasses import dataclass
 
 
@@ -29,6 +31,11 @@ class DriveCommand:
     ending: int = 0
     skip_ending: bool = False
 
+    @property
+    def phasor(self) -> complex:
+        """Complex amplitude in full strokes, level exp(i phase)."""
+        return cmath.rect(self.level, math.radians(self.phase))
+
 
 @dataclass(frozen=True, slots=True)
 class Knot:
@@ -36,6 +43,11 @@ class Knot:
 
     level: float
     phase: float
+
+    @property
+    def phasor(self) -> complex:
+        """Complex amplitude in full strokes, level exp(i phase)."""
+        return cmath.rect(self.level, math.radians(self.phase))
 
 
 @dataclass(frozen=True)

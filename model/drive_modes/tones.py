@@ -1,6 +1,5 @@
 """From what a drive mode finds to physics: a tone for each ERA."""
 
-import cmath
 from collections.abc import Sequence
 
 import numpy as np
@@ -23,15 +22,14 @@ def excitation_of(
     tones = {}
     for index, weight in drive.tones():
         strongest = weight[np.argmax(np.abs(weight))]
-        turned = weight * (np.conj(strongest) / np.abs(strongest))
+        in_phase = weight * (np.conj(strongest) / np.abs(strongest))
         frequency = float(frequencies[index])
-        # Numbers of Python's own: those of numpy take ten times as long, one by one.
-        for era, w in zip(eras, turned.tolist(), strict=True):
+        # Python's own numbers: those of numpy take ten times as long, one by one.
+        for era, w in zip(eras, in_phase.tolist(), strict=True):
             if w != 0:
-                in_phase = w.real > 0 and abs(w.imag) < ROUNDING * w.real
-                tones[era.name] = Tone(
-                    frequency=frequency,
-                    amplitude=gain * min(abs(w), 1.0) * era.stroke,
-                    phase=0.0 if in_phase else cmath.phase(w),
-                )
+                if w.real > 0 and abs(w.imag) < ROUNDING * w.real:
+                    w = w.real
+                unit = Tone.from_phasor(frequency, w)
+                amplitude = gain * min(unit.amplitude, 1.0) * era.stroke
+                tones[era.name] = Tone(frequency, amplitude, unit.phase)
     return tones

@@ -112,7 +112,7 @@ def _faded(
 ) -> Bases:
     return tuple(
         fade(
-            cmath.rect(tone.amplitude, tone.phase),
+            tone.phasor,
             omega=2 * math.pi * tone.frequency,
             start=0.0,
             ramp=ramp,

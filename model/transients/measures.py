@@ -163,7 +163,7 @@ class Transients:
             tone = excitation.get(era.name)
             if tone is not None:
                 unit = steady_states(self._plate, 2 * math.pi * tone.frequency)[number]
-                states[era.name] = unit * (tone.amplitude / era.stroke * np.exp(1j * tone.phase))
+                states[era.name] = unit * (tone.phasor / era.stroke)
         return states
 
 

@@ -28,6 +28,7 @@ from model.transients.knots import Carrier, ending_knots, onset_knots, solve_car
 from model.transients.measures import AFTER
 from model.transients.time_response import PlateInTime
 from model.vibration.excitation import Excitation
+from model.vibration.peak import base_amplitudes
 
 RISE = 0.040
 """How long [s] a target takes to full vibration along its raised cosine."""
@@ -119,18 +120,14 @@ class Shaper:
         helped: whether those that the excitation leaves silent do where there is one frequency.
         """
         eras = self._plate.eras
-        frequencies = sorted({tone.frequency for tone in excitation.values()})
-        groups = []
-        for frequency in frequencies:
-            amplitudes = np.zeros(len(eras), dtype=complex)
-            plays = np.full(len(eras), helped and len(frequencies) == 1)
-            for number, era in enumerate(eras):
-                tone = excitation.get(era.name)
-                if tone is not None and tone.frequency == frequency:
-                    amplitudes[number] = tone.amplitude / era.stroke * np.exp(1j * tone.phase)
-                    plays[number] = True
-            groups.append((frequency, amplitudes, np.flatnonzero(plays)))
-        return groups
+        frequencies, phasors = base_amplitudes(excitation, eras)
+        helped = helped and len(frequencies) == 1
+        return [
+            (frequency, amplitudes, np.flatnonzero((amplitudes != 0) | helped))
+            for frequency, amplitudes in zip(
+                frequencies.tolist(), phasors / [era.stroke for era in eras], strict=True
+            )
+        ]
 
     def _fingertips(self, positions: Sequence[Position]) -> FloatArray:
         """Few rows (d, r) that a vibration under fingertips comes down to.

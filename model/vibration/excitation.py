@@ -1,15 +1,16 @@
 """What drives the plate, in physics: a tone per active ERA."""
 
+import cmath
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import Self, TypeAlias
 
 GAIN_ERROR = 0.05
-"""Standard deviation of what an ERA does against what it was told, relative."""
+"""Standard deviation of the relative error of an ERA's amplitude."""
 
 PHASE_ERROR = math.radians(5)
-"""The same for its phase [rad]."""
+"""Standard deviation of the error of an ERA's phase [rad]."""
 
 
 @dataclass(frozen=True)
@@ -19,6 +20,16 @@ class Tone:
     frequency: float
     amplitude: float
     phase: float = 0.0
+
+    @classmethod
+    def from_phasor(cls, frequency: float, phasor: complex) -> Self:
+        """Make the tone of a phasor [m] at a frequency [Hz]."""
+        return cls(frequency, abs(phasor), cmath.phase(phasor))
+
+    @property
+    def phasor(self) -> complex:
+        """Complex amplitude a exp(i phase) [m]: y(t) = Im[phasor exp(2 pi i f t)]."""
+        return cmath.rect(self.amplitude, self.phase)
 
 
 Excitation: TypeAlias = Mapping[str, Tone]

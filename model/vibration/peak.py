@@ -35,7 +35,7 @@ def base_amplitudes(excitation: Excitation, eras: Sequence[Era]) -> tuple[FloatA
     amplitudes = np.zeros((len(frequencies), len(eras)), dtype=complex)
     for name, tone in excitation.items():
         row = np.searchsorted(frequencies, tone.frequency)
-        amplitudes[row, names.index(name)] = tone.amplitude * np.exp(1j * tone.phase)
+        amplitudes[row, names.index(name)] = tone.phasor
     return frequencies, amplitudes
 
 

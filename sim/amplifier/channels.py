@@ -1,11 +1,9 @@
 """What the channels of a simulated amplifier play, and how one set gives way to the next."""
 
-import cmath
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
-from drivers.command import CommandSet, DriveCommand, Envelope, Knot
+from drivers.command import CommandSet, DriveCommand, Envelope
 from drivers.protocol.messages import Achieved
 from sim.waveform.output import Output, end_along, fade_to, level_of, shape_to
 
@@ -97,7 +95,7 @@ class Channels:
                     time,
                     ramp=ramp,
                     frequency=command.frequency,
-                    amplitude=_amplitude(command),
+                    amplitude=command.phasor,
                     keep_phase=command.keep_phase,
                 )
             self._outputs[channel] = output
@@ -155,7 +153,7 @@ def _shaped(
         step=onset.step,
         knots=_amplitudes(onset),
         frequency=command.frequency,
-        amplitude=_amplitude(command),
+        amplitude=command.phasor,
         keep_phase=command.keep_phase,
     )
 
@@ -165,9 +163,4 @@ def _ended(playing: Output, time: float, ending: Envelope, ramp: float) -> Outpu
 
 
 def _amplitudes(envelope: Envelope) -> tuple[complex, ...]:
-    return tuple(_amplitude(knot) for knot in envelope.knots)
-
-
-def _amplitude(told: DriveCommand | Knot) -> complex:
-    """In full strokes, of a level and a phase in degrees."""
-    return cmath.rect(told.level, math.radians(told.phase))
+    return tuple(knot.phasor for knot in envelope.knots)

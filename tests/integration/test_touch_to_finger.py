@@ -84,10 +84,10 @@ PLANTED = {
     "phases have the other sign": Planted(
         {"patterns_are_the_tables", "localization_is_the_predicted_one"}
     ),
-    "frequencies are a step too high": Planted(
+    "frequencies are too high": Planted(
         {"patterns_are_the_tables", "localization_is_the_predicted_one"}
     ),
-    "the last up is dropped": Planted(
+    "lifts are dropped": Planted(
         {
             "silence_comes_in_time",
             "plate_follows",

@@ -1,535 +1,556 @@
 """Bugs to plant into the running chain, each with the rule that the witness must find broken.
 
-A bug is a change of the text of one function: what stands in the source is replaced and the
-function made anew. Where the text is not there any more, planting it fails.
+A bug replaces an attribute of a module or class by a fake, or wraps it.
 """
 
-import importlib
-import inspect
-import textwrap
-from collections.abc import Awaitable, Callable
-from dataclasses import dataclass
+import asyncio
+import functools
+import math
+import struct
+import zlib
+from collections import deque
+from collections.abc import Awaitable, Callable, Iterable, Mapping
+from dataclasses import dataclass, replace
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import pytest
 
+import drivers.backends.can_bus.backend as can_backend
 import witness_scenarios as scenarios
+from controller.group import amplifier_group
+from controller.group.quick_stops import QuickStops
+from controller.group.synchronized_play import SynchronizedPlay
+from controller.loop import decision, loop, orders
+from controller.loop.decision import Decider
+from controller.loop.loop import Controller
+from controller.loop.selection import Selector
+from controller.sources import contacts
+from controller.sources.contacts import ContactTracker
+from drivers.amplifier import Amplifier
+from drivers.backends.serial_line.backend import SerialBackend
+from drivers.codec import payload
+from drivers.codec.can_bus import requests
+from drivers.codec.modbus import exchanges
+from drivers.codec.serial_line import frame as serial_frame
+from drivers.codec.serial_line import sets as serial_sets
+from drivers.command import CommandSet, DriveCommand
+from drivers.guard import rules
+from drivers.link import turns
+from drivers.link.link import Link
+from drivers.link.turns import Turns
+from drivers.protocol.definition import PROTOCOL, Quantity
+from drivers.protocol.messages import AmplifierState, Apply, Disarm, Hello, Identity, Stage, Status
+from sim.amplifier import amplifier as simulated
+from sim.amplifier.amplifier import SimulatedAmplifier
+from sim.amplifier.channels import Channels, PlayableSet
+from sim.amplifier.sets import Sets
+from sim.far_ends.can_bus.requests import RequestHandler
+from sim.far_ends.can_bus.sets import SetBuffer
+from sim.far_ends.serial_end import SerialEnd
 from witnessed_chain import Chain
 
-
-@dataclass(frozen=True)
-class Edit:
-    """In a function (module:name or module:Class.name), this text becomes that.
-
-    also: modules that have imported the function by its name.
-    """
-
-    where: str
-    old: str
-    new: str
-    also: tuple[str, ...] = ()
+Plant = Callable[[pytest.MonkeyPatch], None]
 
 
 @dataclass(frozen=True)
 class Bug:
-    """What is changed, the rule that it breaks, and where it is seen."""
+    """What is changed, the rule that it breaks, and where that is seen."""
 
     breaks: str
-    edits: tuple[Edit, ...]
+    plant: Plant
     scenario: Callable[[Chain], Awaitable[None]] = scenarios.day
     wire: str = "serial"
     amplifiers: tuple[str, ...] = ("main",)
 
 
-def plant(bug: Bug, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Change the code as the bug says, for as long as the monkeypatch lasts."""
-    for edit in bug.edits:
-        module_name, _, path = edit.where.partition(":")
-        module = importlib.import_module(module_name)
-        *owners, name = path.split(".")
-        owner: Any = getattr(module, owners[0]) if owners else module
-        if not hasattr(owner, name):
-            raise LookupError(f"{edit.where} is not there any more")
-        if edit.old == "":
-            monkeypatch.setattr(owner, name, eval(edit.new, vars(module)))
-            continue
-        found = inspect.unwrap(
-            getattr(inspect.getattr_static(owner, name), "fget", None) or getattr(owner, name)
-        )
-        source = textwrap.dedent(inspect.getsource(found))
-        if edit.old not in source:
-            raise LookupError(f"{edit.where} does not say {edit.old!r} any more")
-        made: dict[str, Any] = {}
-        code = compile(source.replace(edit.old, edit.new), f"<planted in {edit.where}>", "exec")
-        exec(code, vars(module), made)
-        monkeypatch.setattr(owner, name, made[name])
-        for other in edit.also:
-            monkeypatch.setattr(importlib.import_module(other), name, made[name])
+def replaced(owner: type | ModuleType, name: str, fake: Any) -> Plant:
+    """Put something else in an attribute's place."""
+    return lambda patch: patch.setattr(owner, name, fake)
 
 
-def _bug(breaks: str, *edits: Edit, **where: Any) -> Bug:
-    return Bug(breaks, edits, **where)
+def wrapped(owner: type | ModuleType, name: str, around: Callable[..., Any]) -> Plant:
+    """Call `around` with the original and its arguments in the place of a function."""
+
+    def plant(patch: pytest.MonkeyPatch) -> None:
+        original = getattr(owner, name)
+
+        @functools.wraps(original)
+        def fake(*args: Any, **kwargs: Any) -> Any:
+            return around(original, *args, **kwargs)
+
+        patch.setattr(owner, name, fake)
+
+    return plant
+
+
+def both(first: Plant, second: Plant) -> Plant:
+    """Plant two changes that make one bug."""
+
+    def plant(patch: pytest.MonkeyPatch) -> None:
+        first(patch)
+        second(patch)
+
+    return plant
+
+
+def _swapped(channel: int) -> int:
+    return (1, 0, 2)[channel]
+
+
+def _with_commands(
+    command_set: CommandSet, change: Callable[[DriveCommand], DriveCommand]
+) -> CommandSet:
+    changed = (change(command) for command in command_set.commands)
+    return replace(command_set, commands=tuple(sorted(changed, key=lambda one: one.channel)))
+
+
+def routed(change: Callable[[DriveCommand], DriveCommand]) -> Plant:
+    """Change every command that routing makes of a pattern."""
+
+    def around(route: Callable[..., Mapping[str, CommandSet]], *args: Any, **kwargs: Any) -> Any:
+        sets = route(*args, **kwargs)
+        return {name: _with_commands(wanted, change) for name, wanted in sets.items()}
+
+    return wrapped(orders, "route", around)
+
+
+def _kept(tracker: ContactTracker, keys: Iterable[Any]) -> tuple[Any, ...]:
+    return tuple(tracker._contacts[key] for key in tuple(keys))
+
+
+lifts_are_dropped = replaced(ContactTracker, "_lift", _kept)
+
+
+def _keeps_targets(holds: Any, selector: Selector, intent: Any, targets: Any, quiet: Any) -> bool:
+    is_going_on = bool(targets and selector._current.targets)
+    return is_going_on or holds(selector, intent, targets, quiet)
+
+
+def _on_the_plate(update: Any, tracker: ContactTracker, frame: Any) -> Any:
+    def clip(share: float) -> float:
+        return min(max(share, 0.0), 1.0)
+
+    touches = (replace(each, x=clip(each.x), y=clip(each.y)) for each in frame.touches)
+    return update(tracker, replace(frame, touches=tuple(touches)))
+
+
+async def _beats_apart(step: Any, controller: Any) -> None:
+    async def beat() -> None:
+        while True:
+            await asyncio.sleep(loop.HEARTBEAT)
+            await controller._group.heartbeat()
+
+    if not hasattr(controller, "beating"):
+        controller.beating = asyncio.create_task(beat())
+    await step(controller)
+
+
+async def _sleeps_past_heartbeats(next_cause: Any, controller: Any) -> None:
+    due, controller._heartbeat_due = controller._heartbeat_due, math.inf
+    try:
+        await next_cause(controller)
+    finally:
+        if controller._heartbeat_due == math.inf:
+            controller._heartbeat_due = due
+
+
+async def _remembers_sets(play: Any, group: Any, commands: Any, envelopes: Any) -> Any:
+    group.wanted = commands
+    return await play(group, commands, envelopes)
+
+
+async def _reports_wanted_tokens(statuses: Any, group: Any) -> Any:
+    return {
+        name: replace(status, token=group.wanted[name].token)
+        for name, status in (await statuses(group)).items()
+    }
+
+
+async def _arms_again(clear: Any, controller: Any) -> None:
+    await clear(controller)
+    await controller._group.arm()
+
+
+def _deaf_to_one(decide: Any, decider: Decider, now: float) -> Any:
+    made = decide(decider, now)
+    return replace(made, is_new=False, order=None) if len(made.contacts) == 1 else made
+
+
+def _wakes_nothing(follow: Any, controller: Any, change: Any) -> None:
+    wake, controller._wake = controller._wake, asyncio.Event()
+    try:
+        follow(controller, change)
+    finally:
+        controller._wake = wake
 
 
 _TWO = ("a", "b")
 
-_WITHOUT = "tuple(rule for rule in _RULES if rule is not {})"
-_FAR = "sim.amplifier.amplifier:SimulatedAmplifier"
-
 CONTROLLER: dict[str, Bug] = {
-    "an up is dropped": _bug(
-        "lift",
-        Edit(
-            "controller.sources.contacts:ContactTracker._lift",
-            "self._contacts.pop(key) for key in tuple(keys)",
-            "self._contacts[key] for key in tuple(keys)",
-        ),
+    "lifts are dropped": Bug("lift", lifts_are_dropped),
+    "the contacts of a dead source stay": Bug(
+        "lift", replaced(contacts, "CONTACT_TIMEOUT", 2.0), scenarios.source_dies
     ),
-    "the lease of a source never ends": _bug(
-        "lift",
-        Edit("controller.sources.contacts:CONTACT_TIMEOUT", "", "2.0"),
-        scenario=scenarios.source_dies,
+    "channels are swapped in routing": Bug(
+        "pattern", routed(lambda one: replace(one, channel=_swapped(one.channel)))
     ),
-    "channels are swapped in routing": _bug(
-        "pattern",
-        Edit(
-            "controller.loop.routing:_drive",
-            "number = rig.wiring[name].number",
-            "number = (1, 0, 2)[rig.wiring[name].number]",
-        ),
+    "phases are sent in radians": Bug(
+        "pattern", routed(lambda one: replace(one, phase=math.radians(one.phase)))
     ),
-    "phases are sent in radians": _bug(
-        "pattern",
-        Edit("controller.loop.routing:_wrapped_degrees", "math.degrees(", "float("),
+    "levels are of twice the stroke": Bug(
+        "pattern", routed(lambda one: replace(one, level=one.level / 2))
     ),
-    "levels are of twice the stroke": _bug(
-        "pattern",
-        Edit(
-            "controller.loop.routing:_drive", "rig.era(name).stroke", "(2 * rig.era(name).stroke)"
-        ),
+    "the pattern of the first finger stays": Bug(
+        "touch", wrapped(Selector, "_holds", _keeps_targets)
     ),
-    "the pattern of the first finger stays": _bug(
-        "touch",
-        Edit(
-            "controller.loop.selection:Selector._holds",
-            "if not targets or not current.targets:",
-            "if targets and current.targets:\n        return True\n    if not targets:",
-        ),
+    "fingers beside the plate count": Bug(
+        "justified", wrapped(ContactTracker, "update", _on_the_plate), scenarios.touched_beside
     ),
-    "fingers beside the plate count": _bug(
-        "justified",
-        Edit(
-            "controller.sources.contacts:ContactTracker._places",
-            "elif not (0 <= touch.x <= 1 and 0 <= touch.y <= 1):",
-            "elif False:",
-        ),
-        scenario=scenarios.touched_beside,
+    "the heartbeat comes from a timer": Bug(
+        "heartbeat", wrapped(Controller, "step", _beats_apart), scenarios.hung
     ),
-    "the heartbeat comes from a timer": _bug(
-        "heartbeat",
-        Edit(
-            "controller.loop.loop:Controller.step",
-            "self._wake.clear()",
-            """self._wake.clear()
-    async def beat():
-        while True:
-            await asyncio.sleep(HEARTBEAT)
-            await self._group.heartbeat()
-    if not hasattr(self, "beating"):
-        self.beating = asyncio.create_task(beat())""",
-        ),
-        scenario=scenarios.hung,
+    "heartbeats are too rare": Bug("heartbeat", replaced(loop, "HEARTBEAT", 0.2)),
+    "heartbeats wait for touches": Bug(
+        "heartbeat", wrapped(Controller, "_next_cause", _sleeps_past_heartbeats)
     ),
-    "heartbeats are too rare": _bug("heartbeat", Edit("controller.loop.loop:HEARTBEAT", "", "0.2")),
-    "heartbeats wait for touches": _bug(
-        "heartbeat",
-        Edit(
-            "controller.loop.loop:Controller._next_cause",
-            "moments.append(self._heartbeat_due)",
-            "pass",
-        ),
-    ),
-    "a stop reaches one amplifier only": _bug(
+    "a stop reaches one amplifier only": Bug(
         "stop",
-        Edit(
-            "controller.group.quick_stops:QuickStops.request",
-            "(*self._on_buses, *reachable)",
-            "reachable[:1]",
-        ),
+        wrapped(QuickStops, "__init__", lambda init, self, all_: init(self, list(all_)[:1])),
         amplifiers=_TWO,
     ),
-    "a set is committed by one amplifier only": _bug(
+    "a set is committed by one amplifier only": Bug(
         "commit",
-        Edit(
-            "controller.group.synchronized_play:SynchronizedPlay._commits",
-            "in together.items()",
-            "in list(together.items())[:1]",
-        ),
-        Edit(
-            "controller.group.synchronized_play:SynchronizedPlay.play",
-            "if status.token != commands[name].token:",
-            "if False:",
+        both(
+            both(
+                wrapped(SynchronizedPlay, "play", _remembers_sets),
+                wrapped(SynchronizedPlay, "statuses", _reports_wanted_tokens),
+            ),
+            wrapped(
+                SynchronizedPlay,
+                "_commits",
+                lambda commits, group, sets: commits(group, dict(list(sets.items())[:1])),
+            ),
         ),
         amplifiers=_TWO,
     ),
-    "it arms again once it is cleared": _bug(
-        "armed",
-        Edit(
-            "controller.loop.loop:Controller.clear",
-            "await self._group.clear()",
-            "await self._group.clear(); await self._group.arm()",
-        ),
-        scenario=scenarios.arc,
+    "it arms again once it is cleared": Bug(
+        "armed", wrapped(Controller, "clear", _arms_again), scenarios.arc
     ),
-    "fingers that are alone are not answered": _bug(
-        "touch",
-        Edit(
-            "controller.loop.loop:Controller.step",
-            "if self.phase is Phase.ARMED and (",
-            "if self.phase is Phase.ARMED and len(decision.contacts) != 1 and (",
-        ),
-    ),
-    "a touch does not wake the loop": _bug(
-        "lift", Edit("controller.loop.loop:Controller._follow", "self._wake.set()", "pass")
-    ),
-    "the release takes half a second": _bug(
-        "lift", Edit("controller.loop.decision:RELEASE_RAMP", "", "0.5")
-    ),
-    "what was played is not taken back": _bug(
+    "a single finger is not answered": Bug("touch", wrapped(Decider, "decide", _deaf_to_one)),
+    "a touch does not wake the loop": Bug("lift", wrapped(Controller, "_follow", _wakes_nothing)),
+    "the release takes half a second": Bug("lift", replaced(decision, "RELEASE_RAMP", 0.5)),
+    "a lift ends like a fade": Bug(
         "lift",
-        Edit("controller.loop.decision:Decider._ending", "if not contacts:", "if False:"),
-        Edit("controller.loop.decision:FADE_RAMP", "", "0.3"),
+        both(
+            replaced(decision, "FADE_RAMP", 0.3),
+            wrapped(
+                Decider,
+                "_ending",
+                lambda ending, decider, left, **how: ending(decider, left or ("one",), **how),
+            ),
+        ),
     ),
 }
+
+
+def _without(rule: Any) -> Plant:
+    return lambda patch: patch.setattr(
+        rules, "_RULES", tuple(each for each in rules._RULES if each is not rule)
+    )
+
+
+def _nan_as_integer(to_wire: Any, quantity: Quantity, value: float) -> int:
+    return -0x8000 if math.isnan(value) else to_wire(quantity, value)
+
+
+class _AnyChecksum(int):
+    """A checksum that equals every other."""
+
+    def __eq__(self, other: object) -> bool:
+        return True
+
+    __hash__ = int.__hash__
+
+
+_unchecked = replaced(
+    serial_frame, "zlib", SimpleNamespace(crc32=lambda body: _AnyChecksum(zlib.crc32(body)))
+)
+
+
+def _credited_to_first(received: Any, backend: Any, frame: Any) -> None:
+    waiting = next(iter(backend._pending), frame.sequence) if frame.is_reply else frame.sequence
+    received(backend, replace(frame, sequence=waiting))
+
+
+async def _takes_at_once(_come: Any, line: Any, _kind: Any) -> None:
+    line._taken = True
+
+
+async def _knows_already(ask: Any, link: Link, request: Any, **how: Any) -> Any:
+    if isinstance(request, Hello):
+        return Identity("", "", "", "", PROTOCOL.version)
+    return await ask(link, request, **how)
+
+
+def _without_sync(encode: Any, request: Any, **how: Any) -> Any:
+    frames = encode(request, **how)
+    is_set = isinstance(request, Apply | Stage)
+    return tuple(one for one in frames if one != requests.SYNC) if is_set else frames
+
+
+def _with_wrong_checksum(block: Any, *args: Any) -> Any:
+    write = block(*args)
+    tag, crc, *rest = write.registers
+    return replace(write, registers=(tag, crc ^ 1, *rest))
+
+
+def _level_first(pack: Any, command: DriveCommand) -> list[int]:
+    frequency, level, *rest = pack(command)
+    return [level, frequency, *rest]
+
 
 DRIVERS: dict[str, Bug] = {
-    "the frequency clamp is removed": _bug(
-        "limits",
-        Edit("drivers.guard.rules:_RULES", "", _WITHOUT.format("_check_frequencies")),
-        scenario=scenarios.too_high,
+    "the frequency limit is removed": Bug(
+        "limits", _without(rules._check_frequencies), scenarios.too_high
     ),
-    "the level clamp is removed": _bug(
-        "limits",
-        Edit("drivers.guard.rules:_RULES", "", _WITHOUT.format("_check_levels")),
-        scenario=scenarios.too_loud,
-    ),
-    "the check for NaN is skipped": _bug(
+    "the level limit is removed": Bug("limits", _without(rules._check_levels), scenarios.too_loud),
+    "the check for NaN is skipped": Bug(
         "garbage",
-        Edit("drivers.guard.rules:_RULES", "", _WITHOUT.format("_check_finite")),
-        Edit(
-            "drivers.protocol.definition:Quantity.to_wire",
-            "if not math.isfinite(value):",
-            "if math.isnan(value):\n        return -0x8000\n    if False:",
-        ),
-        scenario=scenarios.not_a_number,
+        both(_without(rules._check_finite), wrapped(Quantity, "to_wire", _nan_as_integer)),
+        scenarios.not_a_number,
     ),
-    "every set has the same token": _bug(
-        "token",
-        Edit(
-            "drivers.protocol.definition:token_after",
-            "token %",
-            "0 *",
-            also=("controller.loop.orders",),
-        ),
-    ),
-    "levels have 1000 steps": _bug(
+    "every set has the same token": Bug("token", replaced(orders, "token_after", lambda _: 1)),
+    "levels have 1000 steps": Bug(
         "pattern",
-        Edit(
-            "drivers.codec.serial_line.sets:_pack_commands",
-            "command.frequency, command.level,",
-            "command.frequency, command.level / 10,",
+        wrapped(
+            serial_sets,
+            "_pack_commands",
+            lambda pack, commands: pack(
+                tuple(replace(one, level=one.level / 10) for one in commands)
+            ),
         ),
     ),
-    "integers are sent with the high byte first": _bug(
+    "integers are sent with the high byte first": Bug(
         "garbage",
-        Edit(
-            "drivers.codec.payload:_LAYOUTS",
-            "",
-            "{code: struct.Struct('>' + code) for code in 'BHIh'}",
-        ),
+        replaced(payload, "_LAYOUTS", {code: struct.Struct(">" + code) for code in "BHIh"}),
     ),
-    "the host does not check the CRC": _bug(
-        "credit",
-        Edit(
-            "drivers.codec.serial_line.frame:FrameReader._finish",
-            "if _CRC.unpack(crc) != (zlib.crc32(body),):",
-            "if False:",
-        ),
-        scenario=scenarios.damaged_answer,
+    "the host does not check the CRC": Bug("credit", _unchecked, scenarios.damaged_answer),
+    "a reply is credited to the first that waits": Bug(
+        "credit", wrapped(SerialBackend, "_received", _credited_to_first), scenarios.foreign_answer
     ),
-    "a reply is credited to whoever waits": _bug(
-        "credit",
-        Edit(
-            "drivers.backends.serial_line.backend:SerialBackend._received",
-            "self._pending.get(frame.sequence)",
-            "next(iter(self._pending.values()), None)",
-        ),
-        scenario=scenarios.foreign_answer,
+    "two requests are on the line at once": Bug(
+        "credit", wrapped(Turns, "come", _takes_at_once), scenarios.slow_touch
     ),
-    "two requests are on the line at once": _bug(
-        "credit",
-        Edit("drivers.link.turns:Turns.come", "if self._taken or", "if False and"),
-        scenario=scenarios.slow_touch,
-    ),
-    "a stop is queued behind": _bug(
-        "stop",
-        Edit("drivers.link.turns:PATIENCE", "", "10.0"),
-        scenario=scenarios.slow_stop,
-    ),
-    "silence waits its turn": _bug(
+    "a stop is queued behind": Bug("stop", replaced(turns, "PATIENCE", 10.0), scenarios.slow_stop),
+    "silence waits its turn": Bug(
         "lift",
-        Edit("drivers.link.turns:PATIENCE", "", "10.0"),
-        Edit("controller.group.amplifier_group:PATIENCE", "", "10.0"),
-        scenario=scenarios.slow_lift,
+        both(replaced(turns, "PATIENCE", 10.0), replaced(amplifier_group, "PATIENCE", 10.0)),
+        scenarios.slow_lift,
     ),
-    "a stop is sent as a disarm": _bug(
-        "stop",
-        Edit(
-            "drivers.amplifier:Amplifier.stop",
-            "Stop(ramp=self._ramp(ramp))",
-            "Disarm(ramp=self._ramp(ramp))",
-        ),
+    "a stop is sent as a disarm": Bug("stop", replaced(Amplifier, "stop", Amplifier.disarm)),
+    "no amplifier is identified": Bug("identified", wrapped(Link, "ask", _knows_already)),
+    "sets are sent without their SYNC": Bug(
+        "answer", wrapped(can_backend, "encode_request", _without_sync), wire="slcan"
     ),
-    "nobody is identified": _bug(
-        "identified",
-        Edit(
-            "drivers.amplifier:Amplifier.open",
-            "await self._link.ask(Hello(), expect=Identity, timeout=OPEN_TIMEOUT)",
-            "Identity('', '', '', '', PROTOCOL.version)",
-        ),
-    ),
-    "sets are sent without their SYNC": _bug(
-        "answer",
-        Edit(
-            "drivers.codec.can_bus.requests:encode_request",
-            "head, wanted.commands, node, sequence), SYNC)",
-            "head, wanted.commands, node, sequence))",
-            also=("drivers.backends.can_bus.backend",),
-        ),
-        wire="slcan",
-    ),
-    "a command has the sequence number before": _bug(
+    "a command has the sequence number before": Bug(
         "commit",
-        Edit(
-            "drivers.codec.can_bus.requests:_in_classic_frames",
-            "_command(command, sequence))",
-            "_command(command, sequence - (command.channel == 1)))",
+        wrapped(
+            requests,
+            "_command",
+            lambda encode, one, sequence: encode(one, sequence - (one.channel == 1)),
         ),
         wire="socketcand",
     ),
-    "the frame of a channel has its neighbour's identifier": _bug(
+    "the frame of a channel has its neighbour's identifier": Bug(
         "garbage",
-        Edit(
-            "drivers.codec.can_bus.requests:_in_classic_frames",
-            "command_id(node, command.channel)",
-            "command_id(node, (1, 0, 2)[command.channel])",
+        wrapped(
+            requests, "command_id", lambda id_of, node, channel: id_of(node, _swapped(channel))
         ),
         wire="slcan",
     ),
-    "a block carries a wrong check": _bug(
-        "garbage",
-        Edit(
-            "drivers.codec.modbus.exchanges:_block",
-            "check_of(registers)",
-            "check_of(registers[1:])",
-        ),
-        wire="modbus-tcp",
+    "a block carries a wrong checksum": Bug(
+        "garbage", wrapped(exchanges, "_block", _with_wrong_checksum), wire="modbus-tcp"
     ),
-    "registers of channels begin with the level": _bug(
-        "limits",
-        Edit(
-            "drivers.codec.modbus.exchanges:_pack_channel",
-            "*_unsigned(\n            (_Q.frequency, command.frequency),\n"
-            "            (_Q.level, command.level),",
-            "*_unsigned(\n            (_Q.level, command.level),\n"
-            "            (_Q.frequency, command.frequency),",
-        ),
-        wire="modbus-rtu",
+    "registers of channels begin with the level": Bug(
+        "limits", wrapped(exchanges, "_pack_channel", _level_first), wire="modbus-rtu"
     ),
 }
 
+_watchdog_end: Any = SimulatedAmplifier._watchdog_end
+
+
+def _watchdog_ends(change: Callable[[float], float]) -> Plant:
+    changed = property(lambda amplifier: change(_watchdog_end.fget(amplifier)))
+    return replaced(SimulatedAmplifier, "_watchdog_end", changed)
+
+
+def _reports(change: Callable[[Status], Status]) -> Plant:
+    return wrapped(
+        SimulatedAmplifier, "status", lambda status, amplifier, now: change(status(amplifier, now))
+    )
+
+
+def _enters(wrong: AmplifierState, *, instead_of: AmplifierState) -> Plant:
+    def around(
+        enter: Any, amplifier: Any, state: AmplifierState, moment: float, **how: Any
+    ) -> None:
+        enter(amplifier, wrong if state is instead_of else state, moment, **how)
+
+    return wrapped(SimulatedAmplifier, "_enter", around)
+
+
+def _plays(change: Callable[[CommandSet], CommandSet]) -> Plant:
+    def around(play: Any, channels: Channels, playable: PlayableSet, time: float) -> None:
+        play(channels, replace(playable, command_set=change(playable.command_set)), time)
+
+    return wrapped(Channels, "play", around)
+
+
+def _plays_each(change: Callable[[DriveCommand], DriveCommand]) -> Plant:
+    return _plays(lambda wanted: _with_commands(wanted, change))
+
+
+def _on_first_channel(act: Any, channels: Channels, *args: Any, **kwargs: Any) -> None:
+    others = channels.outputs[1:]
+    act(channels, *args, **kwargs)
+    channels._outputs[1:] = others
+
+
+def _plays_on(carry_out: Any, amplifier: Any, request: Any, *args: Any) -> Any:
+    if not isinstance(request, Disarm):
+        return carry_out(amplifier, request, *args)
+    amplifier._silence = lambda moment, **_: setattr(amplifier, "_silent_from", moment)
+    try:
+        return carry_out(amplifier, request, *args)
+    finally:
+        del amplifier._silence
+
+
+def _forgetful(stage: Any, sets: Sets, *args: Any, **kwargs: Any) -> Any:
+    tokens, sets.tokens = sets.tokens, deque()
+    try:
+        return stage(sets, *args, **kwargs)
+    finally:
+        sets.tokens = tokens
+
+
+def _twice(write: Any, end: SerialEnd, data: bytes) -> None:
+    write(end, data)
+    write(end, data)
+
+
+def _all_but_the_ninth(write: Any, end: Any, data: bytes) -> None:
+    end.writes = getattr(end, "writes", 0) + 1
+    if end.writes != 9:
+        write(end, data)
+
+
+def _incomplete(make: Any, buffer: SetBuffer, request: Any) -> CommandSet:
+    own = [one for one in buffer._commands.values() if one.sequence == request.sequence]
+    made: CommandSet = make(buffer, replace(request, count=len(own)))
+    return made
+
+
+def _without_levels(answer: Any, handler: Any, request: Any, **how: Any) -> None:
+    answer(handler, request, **{**how, "condition": how.get("condition", ())[:1]})
+
+
 FAR_ENDS: dict[str, Bug] = {
-    "the watchdog is 20 ms late": _bug(
-        "watchdog",
-        Edit(
-            f"{_FAR}._watchdog_end",
-            "self._fed + self._watchdog",
-            "0.02 + self._fed + self._watchdog",
-        ),
-        scenario=scenarios.hung,
+    "the watchdog is 20 ms late": Bug(
+        "watchdog", _watchdog_ends(lambda end: end + 0.02), scenarios.hung
     ),
-    "the watchdog is 20 ms early": _bug(
-        "watchdog",
-        Edit(
-            f"{_FAR}._watchdog_end",
-            "self._fed + self._watchdog",
-            "self._fed + self._watchdog - 0.02",
-        ),
-        scenario=scenarios.hung,
+    "the watchdog is 20 ms early": Bug(
+        "watchdog", _watchdog_ends(lambda end: end - 0.02), scenarios.hung
     ),
-    "there is no watchdog": _bug(
-        "watchdog",
-        Edit(f"{_FAR}._watchdog_end", "if self.state in ENABLED", "if False"),
-        scenario=scenarios.hung,
+    "there is no watchdog": Bug("watchdog", _watchdog_ends(lambda _: math.inf), scenarios.hung),
+    "a status request feeds the watchdog": Bug(
+        "watchdog", replaced(simulated, "_NOT_FEEDING", ()), scenarios.hung
     ),
-    "looking on feeds the watchdog": _bug(
-        "watchdog", Edit("sim.amplifier.amplifier:_NOT_FEEDING", "", "()"), scenario=scenarios.hung
+    "the time left is reported in hundredths": Bug(
+        "watchdog", _reports(lambda one: replace(one, watchdog_left=one.watchdog_left / 10))
     ),
-    "the time left is told in hundredths": _bug(
-        "watchdog",
-        Edit(
-            f"{_FAR}.status",
-            "self._fed + self._watchdog - now",
-            "0.1 * (self._fed + self._watchdog - now)",
-        ),
-    ),
-    "a fault is not latched": _bug(
+    "a fault is not latched": Bug(
         "latched",
-        Edit(f"{_FAR}.tick", "State.FAULT if silent", "State.SWITCH_ON_DISABLED if silent"),
-        scenario=scenarios.arc,
+        _enters(AmplifierState.SWITCH_ON_DISABLED, instead_of=AmplifierState.FAULT),
+        scenarios.arc,
     ),
-    "a stop is not latched": _bug(
+    "a stop is not latched": Bug(
         "latched",
-        Edit(
-            f"{_FAR}._carry_out",
-            "self._enter(following, now)\n            self.tick(now)",
-            "self._enter(State.SWITCH_ON_DISABLED, now)\n            self.tick(now)",
-        ),
+        _enters(AmplifierState.SWITCH_ON_DISABLED, instead_of=AmplifierState.QUICK_STOP_ACTIVE),
     ),
-    "it arms itself after a fault": _bug(
+    "it arms itself after a fault": Bug(
         "armed",
-        Edit(f"{_FAR}.tick", "State.FAULT if silent", "State.OPERATION_ENABLED if silent"),
-        scenario=scenarios.arc,
+        _enters(AmplifierState.OPERATION_ENABLED, instead_of=AmplifierState.FAULT),
+        scenarios.arc,
     ),
-    "a commit is torn": _bug(
-        "commit",
-        Edit(
-            "sim.amplifier.channels:Channels.play",
-            "for channel, playing in enumerate(self._outputs):",
-            "for channel, playing in list(enumerate(self._outputs))[:1]:",
+    "a commit reaches one channel only": Bug(
+        "commit", wrapped(Channels, "play", _on_first_channel)
+    ),
+    "channels are swapped in the amplifier": Bug(
+        "plays", _plays_each(lambda one: replace(one, channel=_swapped(one.channel)))
+    ),
+    "a ramp is ignored": Bug("ramp", _plays(lambda wanted: replace(wanted, ramp=0.0))),
+    "a stop is abrupt": Bug(
+        "ramp",
+        wrapped(
+            Channels,
+            "silence",
+            lambda silence, channels, time, ramp: silence(channels, time, ramp=0),
         ),
     ),
-    "channels are swapped in the amplifier": _bug(
-        "plays",
-        Edit(
-            "sim.amplifier.channels:Channels.play",
-            "commands.get(channel,",
-            "commands.get((1, 0, 2)[channel],",
-        ),
+    "a disarmed amplifier plays on": Bug(
+        "silent", wrapped(SimulatedAmplifier, "_carry_out", _plays_on), scenarios.disarmed_amid
     ),
-    "a ramp is ignored": _bug(
-        "ramp", Edit("sim.amplifier.channels:Channels.play", "ramp=ramp,", "ramp=0.0,")
+    "a fault silences one channel only": Bug(
+        "silent", wrapped(Channels, "silence", _on_first_channel), scenarios.arc
     ),
-    "a stop is abrupt": _bug(
-        "ramp", Edit("sim.amplifier.channels:Channels.silence", "ramp=ramp", "ramp=0.0")
-    ),
-    "a disarmed amplifier plays on": _bug(
-        "silent",
-        Edit(
-            f"{_FAR}._carry_out",
-            "self._silence(now, ramp=self._stopping_ramp(ramp))",
-            "self._silent_from = now",
-        ),
-        scenario=scenarios.disarmed_amid,
-    ),
-    "a fault lets one channel play on": _bug(
-        "silent",
-        Edit(
-            "sim.amplifier.channels:Channels.silence",
-            "for output in self._outputs]",
-            "for output in self._outputs[:1]] + self._outputs[1:]",
-        ),
-        scenario=scenarios.arc,
-    ),
-    "a stale set is played": _bug(
-        "token",
-        Edit("sim.amplifier.sets:Sets.stage", "if wanted.token in self.tokens:", "if False:"),
-        scenario=scenarios.late_copy,
-    ),
-    "a damaged frame is carried out": _bug(
-        "damage",
-        Edit(
-            "drivers.codec.serial_line.frame:FrameReader._finish",
-            "if _CRC.unpack(crc) != (zlib.crc32(body),):",
-            "if False:",
-        ),
-        scenario=scenarios.noise,
-    ),
-    "the high voltage stays on": _bug(
+    "a stale set is played": Bug("token", wrapped(Sets, "stage", _forgetful), scenarios.late_copy),
+    "a damaged frame is carried out": Bug("damage", _unchecked, scenarios.noise),
+    "the high voltage stays on": Bug(
         "high_voltage",
-        Edit(f"{_FAR}.status", "is_on = ", "is_on = self.state is State.FAULT or "),
-        scenario=scenarios.arc,
-    ),
-    "every answer is sent twice": _bug(
-        "credit",
-        Edit(
-            "sim.far_ends.serial_end:SerialEnd._to_host",
-            "self._terminal.write(data)",
-            "self._terminal.write(data); self._terminal.write(data)",
+        _reports(
+            lambda one: replace(
+                one, high_voltage=one.high_voltage or one.state is AmplifierState.FAULT
+            )
         ),
+        scenarios.arc,
     ),
-    "a request is left unanswered": _bug(
-        "answer",
-        Edit(
-            "sim.far_ends.serial_end:SerialEnd._to_host",
-            "self._terminal.write(data)",
-            "self._n = getattr(self, '_n', 0) + 1\n    if self._n != 9: self._terminal.write(data)",
-        ),
+    "every answer is sent twice": Bug("credit", wrapped(SerialEnd, "_to_host", _twice)),
+    "a request is left unanswered": Bug(
+        "answer", wrapped(SerialEnd, "_to_host", _all_but_the_ninth)
     ),
-    "its channels vibrate at half the frequency": _bug(
-        "plays",
-        Edit(
-            "sim.amplifier.channels:Channels.play",
-            "frequency=command.frequency",
-            "frequency=command.frequency / 2",
-        ),
+    "its channels vibrate at half the frequency": Bug(
+        "plays", _plays_each(lambda one: replace(one, frequency=one.frequency / 2))
     ),
-    "it plays a tenth of the level": _bug(
-        "plays",
-        Edit(
-            "sim.amplifier.channels:Channels.play",
-            "amplitude=_amplitude(command),",
-            "amplitude=_amplitude(command) / 10,",
-        ),
+    "it plays a tenth of the level": Bug(
+        "plays", _plays_each(lambda one: replace(one, level=one.level / 10))
     ),
-    "it says that nothing plays": _bug(
-        "plays",
-        Edit(f"{_FAR}.status", "levels=levels", "levels=(0.0,) * len(levels)"),
+    "it reports that nothing plays": Bug(
+        "plays", _reports(lambda one: replace(one, levels=(0.0,) * len(one.levels)))
     ),
-    "a torn set is played": _bug(
-        "commit",
-        Edit(
-            "sim.far_ends.can_bus.sets:SetBuffer.command_set", "len(own) != request.count", "False"
-        ),
-        scenario=scenarios.torn,
-        wire="slcan",
+    "an incomplete set is played": Bug(
+        "commit", wrapped(SetBuffer, "command_set", _incomplete), scenarios.torn, wire="slcan"
     ),
-    "it takes sets while it is disarmed": _bug(
+    "it takes sets while it is disarmed": Bug(
         "enabled",
-        Edit("sim.amplifier.amplifier:next_state", "", "lambda state, request: state"),
-        scenario=scenarios.strangers_set,
+        replaced(simulated, "next_state", lambda state, request: state),
+        scenarios.strangers_set,
     ),
-    "it says that it is only switched on": _bug(
+    "it reports that it is only switched on": Bug(
         "state",
-        Edit(
-            f"{_FAR}.status",
-            "state=self.state,",
-            "state=State.SWITCHED_ON if self.state is State.OPERATION_ENABLED else self.state,",
+        _reports(
+            lambda one: (
+                replace(one, state=AmplifierState.SWITCHED_ON)
+                if one.state is AmplifierState.OPERATION_ENABLED
+                else one
+            )
         ),
     ),
-    "an answer comes without its levels": _bug(
-        "answer",
-        Edit(
-            "sim.far_ends.can_bus.requests:RequestHandler._answer",
-            "reversed(sent.items())",
-            "reversed(list(sent.items())[:2])",
-        ),
-        wire="socketcand",
+    "an answer comes without its levels": Bug(
+        "answer", wrapped(RequestHandler, "_answer", _without_levels), wire="socketcand"
     ),
-    "it forgets which set plays": _bug(
-        "token",
-        Edit(f"{_FAR}.status", "self._sets.token", "0"),
-    ),
+    "it forgets which set plays": Bug("token", _reports(lambda one: replace(one, token=0))),
 }
 
 BUGS = {**CONTROLLER, **DRIVERS, **FAR_ENDS}

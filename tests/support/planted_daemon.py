@@ -1,47 +1,27 @@
 """`era` with a bug planted in it: python planted_daemon.py BUG daemon daemon.yaml."""
 
 import sys
+from dataclasses import replace
 
 import pytest
 
-from planted_bugs import Bug, Edit, plant
+from planted_bugs import Bug, lifts_are_dropped, routed
 
-_DRIVE = "controller.loop.routing:_drive"
 BUGS = {
     "levels are of three quarters of the stroke": Bug(
-        "level", (Edit(_DRIVE, "rig.era(name).stroke", "(0.75 * rig.era(name).stroke)"),)
+        "level", routed(lambda one: replace(one, level=one.level / 0.75))
     ),
-    "phases have the other sign": Bug(
-        "phase", (Edit(_DRIVE, "_wrapped_degrees(tone.phase)", "_wrapped_degrees(-tone.phase)"),)
+    "phases have the other sign": Bug("phase", routed(lambda one: replace(one, phase=-one.phase))),
+    "frequencies are too high": Bug(
+        "frequency", routed(lambda one: replace(one, frequency=one.frequency + 40))
     ),
-    "frequencies are a step too high": Bug(
-        "frequency",
-        (
-            Edit(_DRIVE, "frequency=tone.frequency,", "frequency=tone.frequency + 40,"),
-            Edit(
-                "controller.loop.routing:route",
-                "frequency=envelope.frequency",
-                "frequency=envelope.frequency + 40",
-                also=("controller.loop.orders",),
-            ),
-        ),
-    ),
-    "the last up is dropped": Bug(
-        "lift",
-        (
-            Edit(
-                "controller.sources.contacts:ContactTracker._lift",
-                "self._contacts.pop(key) for key in tuple(keys)",
-                "self._contacts[key] for key in tuple(keys)",
-            ),
-        ),
-    ),
+    "lifts are dropped": Bug("lift", lifts_are_dropped),
 }
-"""By name. The daemon believes in what it does: only who felt it can tell."""
+"""By name. The daemon's own reports show none of them; what a finger feels does."""
 
 
 if __name__ == "__main__":
     from controller.cli.main import main
 
-    plant(BUGS[sys.argv.pop(1)], pytest.MonkeyPatch())
+    BUGS[sys.argv.pop(1)].plant(pytest.MonkeyPatch())
     sys.exit(main())

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 import witness_scenarios
-from planted_bugs import BUGS, CONTROLLER, DRIVERS, FAR_ENDS, plant
+from planted_bugs import BUGS, CONTROLLER, DRIVERS, FAR_ENDS
 from witnessed_chain import WITNESSED, Chain, play
 
 SCENARIOS: dict[str, Callable[[Chain], Awaitable[None]]] = {
@@ -79,7 +79,7 @@ def test_a_node_that_is_hardly_heard_is_not_looked_at_for_ever(seed: int) -> Non
 def test_a_planted_bug_is_found(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """The rule that this bug breaks is found broken."""
     bug = BUGS[name]
-    plant(bug, monkeypatch)
+    bug.plant(monkeypatch)
     found = play(bug.wire, bug.scenario, amplifiers=bug.amplifiers).found
     broken = [one for one in found if one.invariant == bug.breaks]
     assert broken, [str(one) for one in found[:5]]

@@ -58,7 +58,7 @@ def test_play_raises_when_the_watchdog_has_tripped(
     monkeypatch.setattr("drivers.blocking.HEARTBEAT", 0.15)
     with BlockingAmplifier(URL, limits=LIMITS) as amplifier:
         amplifier.arm(0.1)
-        with pytest.raises(CommandRefused, match="FAULT.* WATCHDOG.*clear"):
+        with pytest.raises(CommandRefused, match=r"FAULT.* WATCHDOG.*clear"):
             amplifier.play([DriveCommand(0, 110.0, 0.2)], duration=1.0)
 
 

@@ -1,0 +1,114 @@
+"""Words that identifiers no longer use, each with its replacement: `python vocabulary.py` lists them.
+
+The glossary of CONTRIBUTING.md defines the words that are used instead.
+"""
+
+import ast
+import re
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+PACKAGES = ("controller", "drivers", "era_haptics", "model", "registry", "sim")
+
+RETIRED = {
+    "squared": "eigenvalues",
+    "hold": "dynamic_stiffness",
+    "answers": "modal_receptance",
+    "turn": "phase_factor",
+    "zeta": "shifted_eigenvalue, or damping_ratio",
+    "CLOSE": "PRUNE_MARGIN",
+    "MOVES": "LAWSON_STEPS",
+    "Order|OrderMaker": "CommandSet and its envelopes",
+    "Means": "PlaybackCapabilities",
+    "Station|Site": "SimulatedDevice, SimulationContext",
+}
+"""Whole identifiers."""
+
+RETIRED_WORDS = {
+    "momenta": "mass_weighted_modes",
+    "spread": "std, bandwidth or radius",
+    "promising": "MAX_CANDIDATES",
+    "move_shares": "lawson_iterations",
+    "likely": "expected",
+    "gave_way|gives?_way|given_way": "Preempted, preempt",
+    "hurry|hurried": "abort_unsent",
+    "beaten|borne": "heartbeat_acknowledged, MAX_MISSED_HEARTBEATS",
+    "keep_free": "reserve",
+    "told|told_after": "reported, notified, loss_detection_time",
+    "left_out": "skipped",
+    "torn": "incomplete",
+    "is_contradicted": "duplicate_responder",
+    "stand_in": "HardwareProvider",
+    "befalls?|episodes?": "inject_fault, FaultWindow",
+    "stations?": "SimulatedDevice",
+    "sites?": "SimulationContext",
+    "moot": "superseded",
+    "wish|wishes|wished": "intent",
+    "telegrams?": "ADU",
+    "dearest|dear": "SLOWEST",
+    "nearness": "suggestions",
+    "nobody|somebody|anybody|everybody|whoever": "the component's name",
+    "patience": "_TIMEOUT",
+    "(?<!at_)most|longest|usual": "MAX_, DEFAULT_",
+}
+"""Words within identifiers; they are split at underscores and capitals."""
+
+CONTACT_PACKAGES = ("controller/sources/", "controller/loop/", "sim/")
+"""Where `lease`, the word of arming, would mean the timeout of a contact."""
+
+ALLOWED_FILES = (
+    "drivers/link/",
+    "drivers/backends/line_turns.py",
+)
+"""Their names follow the next version of the protocol."""
+
+ALLOWED = {"most_at_once", "longest_lease"}
+"""Keys of files."""
+
+
+def retired_identifiers() -> Iterator[str]:
+    """Yield `path:line: identifier, use ...` for each definition that has a retired word."""
+    for package in PACKAGES:
+        for path in sorted((ROOT / package).rglob("*.py")):
+            file = path.relative_to(ROOT).as_posix()
+            if file.startswith(ALLOWED_FILES):
+                continue
+            names = {(path.stem, 1), *_definitions(ast.parse(path.read_text("utf-8")))}
+            for name, line in sorted(names, key=lambda each: each[1]):
+                instead = _replacement(name, file)
+                if instead is not None:
+                    yield f"{file}:{line}: {name}, use {instead}"
+
+
+def _definitions(tree: ast.Module) -> Iterator[tuple[str, int]]:
+    """Names of functions, classes, arguments, variables and attributes where they are assigned."""
+    for node in ast.walk(tree):
+        match node:
+            case ast.FunctionDef(name=name) | ast.AsyncFunctionDef(name=name):
+                yield name, node.lineno
+            case ast.ClassDef(name=name) | ast.arg(arg=name):
+                yield name, node.lineno
+            case ast.Name(id=name, ctx=ast.Store()) | ast.Attribute(attr=name, ctx=ast.Store()):
+                yield name, node.lineno
+
+
+def _replacement(name: str, file: str) -> str | None:
+    plain = name.strip("_")
+    if plain in ALLOWED:
+        return None
+    for pattern, instead in RETIRED.items():
+        if re.fullmatch(pattern, plain):
+            return instead
+    words = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", plain).lower()
+    for pattern, instead in RETIRED_WORDS.items():
+        if re.search(rf"(?:^|_)(?:{pattern})(?:_|$)", words):
+            return instead
+    if file.startswith(CONTACT_PACKAGES) and re.search(r"(?:^|_)leases?(?:_|$)", words):
+        return "contact_timeout"
+    return None
+
+
+if __name__ == "__main__":
+    sys.stdout.writelines(f"{line}\n" for line in retired_identifiers())

@@ -58,13 +58,13 @@ def modes(
                     "support": support.value,
                     "mesh": [rig.mesh.nx, rig.mesh.ny],
                     "dof": matrices.dof,
-                    "element": rig.mesh.element,
+                    "element": rig.mesh.element.name,
                     "solve_time_s": elapsed,
                 }
             )
         )
         return
-    element = "" if rig.mesh.element in str(rig.mesh) else f" {rig.mesh.element}"
+    element = "" if rig.mesh.element.name in str(rig.mesh) else f" {rig.mesh.element.name}"
     print(f"{rig_file}: {rig.mesh}{element}, {matrices.dof} dof, support: {support.value}")
     for number, frequency in enumerate(solved.natural_frequencies, start=1):
         beyond = "  beyond what the mesh carries" if frequency > carried else ""
@@ -177,7 +177,7 @@ def convergence(
         rows = [
             {
                 "mesh": [error.mesh.nx, error.mesh.ny],
-                "element": error.mesh.element,
+                "element": error.mesh.element.name,
                 "strip_m": error.mesh.strip,
                 "dof": error.dof,
                 "is_the_rigs": error.mesh == rig.mesh,
@@ -188,7 +188,7 @@ def convergence(
         ]
         reference = {
             "mesh": [study.reference.nx, study.reference.ny],
-            "element": study.reference.element,
+            "element": study.reference.element.name,
             "strip_m": study.reference.strip,
             "natural_frequencies_hz": study.natural_frequencies.tolist(),
         }
@@ -207,4 +207,4 @@ def convergence(
         errors = [100 * abs(error.frequency).max(), *(100 * error.response)]
         columns = "".join(f"{value:10.3f} %" for value in errors)
         mine = "  <- the rig's" if error.mesh == rig.mesh else ""
-        print(f"{mesh_text:>9}{error.mesh.element:>9}{strip:>8}{error.dof:>8}{columns}{mine}")
+        print(f"{mesh_text:>9}{error.mesh.element.name:>9}{strip:>8}{error.dof:>8}{columns}{mine}")

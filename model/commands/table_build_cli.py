@@ -92,7 +92,7 @@ def build(
                     "cells": table.grid.cell_count,
                     "frequencies_hz": table.frequencies.tolist(),
                     "mesh": [table.mesh.nx, table.mesh.ny],
-                    "element": table.mesh.element,
+                    "element": table.mesh.element.name,
                     "discretisation_error_percent": error,
                     "mode": table.drive_mode,
                     "fingerprint": table.fingerprint,

@@ -65,8 +65,8 @@ def element_matrices(plate: Plate, mesh: Mesh) -> ElementMatrices:
     sizes = [(dx, dy) for dy in widths[1] for dx in widths[0]]
     side_x, side_y = mesh.element_sides
     return ElementMatrices(
-        stiffness=np.array([mesh.kind.stiffness(plate, dx, dy) for dx, dy in sizes]),
-        mass=np.array([mesh.kind.mass(plate, dx, dy) for dx, dy in sizes]),
+        stiffness=np.array([mesh.element.stiffness(plate, dx, dy) for dx, dy in sizes]),
+        mass=np.array([mesh.element.mass(plate, dx, dy) for dx, dy in sizes]),
         size=(len(widths[0]) * side_y[:, None] + side_x).ravel(),
     )
 

@@ -191,11 +191,11 @@ CHECKS = tuple(
 def frequency_error(element: Element, count: int) -> float:
     """Relative error of a thin plate's lowest natural frequency with count by count elements.
 
-    A mesh finds the element by its name. On hard simple supports, w and the rotation along the
+    On hard simple supports, w and the rotation along the
     edge held, w = sin(pi x / L) sin(pi y / W) with rotations alike solves the Reissner-Mindlin
     plate exactly.
     """
-    mesh = Mesh(count, count, THIN.length, THIN.width, element.name)
+    mesh = Mesh(count, count, THIN.length, THIN.width, element)
     assembled = assemble(THIN, mesh)
     node = np.arange(mesh.node_count).reshape(mesh.rows, mesh.columns)
     sides, ends = node[:, [0, -1]].ravel(), node[[0, -1]].ravel()

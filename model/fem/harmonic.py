@@ -1,9 +1,9 @@
 """Complex steady-state response of the plate to its ERAs, one frequency at a time.
 
 An ERA is a spring k_b and a damper c between the plate and a base that moves y exp(i omega t), with
-a bolt of mass m_b on the plate. It drives the plate with (k_b + i omega c) y and, driven or not,
-holds it with k_b + i omega c - omega² m_b (paper Eq. 21 and 25). The plate's own damping is
-hysteretic: (1 + i eta) K.
+a bolt of mass m_b on the plate. Its force on the plate is (k_b + i omega c) y minus its dynamic
+stiffness k_b + i omega c - omega² m_b times the deflection (paper Eq. 21 and 25). The plate's own
+damping is hysteretic: ((1 + i eta) K - omega² M) u = F.
 """
 
 from collections.abc import Sequence
@@ -15,7 +15,7 @@ from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
 from model.fem.assembly import PlateMatrices, era_positions
 from model.fem.factorisation import factorise
-from model.fem.mesh import LEAST_NODES_PER_WAVELENGTH, Mesh
+from model.fem.mesh import MIN_NODES_PER_WAVELENGTH, Mesh
 from model.structure.actuator import Era
 from model.structure.dynamic_stiffness import attached_stiffness, drive_forces
 from model.structure.plate import Plate
@@ -23,22 +23,24 @@ from model.structure.point_load import PointLoad, load_positions
 
 
 def check_frequencies(plate: Plate, mesh: Mesh, frequencies: FloatArray) -> None:
-    """Raise InputError if one of frequencies (f,) [Hz] is none or the mesh cannot carry it."""
+    """Raise InputError for frequencies (f,) [Hz] not above zero or too high for the mesh."""
     for frequency in frequencies:
         if not (np.isfinite(frequency) and frequency > 0):
-            raise InputError(f"frequency is {frequency} Hz, must be above zero")
+            raise InputError(f"frequency must be above zero, got {frequency} Hz")
     highest = max(frequencies, default=0.0)
     if highest > mesh.highest_frequency(plate):
-        wavelength = plate.bending_wavelength(highest)
+        elements = plate.bending_wavelength(highest) / max(mesh.element_size)
+        least = MIN_NODES_PER_WAVELENGTH / mesh.element.order
+        coarsest = Mesh.coarsest(plate, frequency=highest, element=mesh.element)
+        remedy = (
+            f"raise the upper limits.frequency to {highest:g} Hz, which mesh: auto follows"
+            if mesh.strip
+            else f"use {coarsest} or finer"
+        )
         raise InputError(
-            f"the mesh {mesh} has {wavelength / max(mesh.element_size):.1f} elements in a bending "
-            f"wavelength at {highest:g} Hz, too few to answer: "
-            f"{LEAST_NODES_PER_WAVELENGTH / mesh.kind.order:g} of {mesh.element} are the least; "
-            + (
-                f"raise the upper limits.frequency to {highest:g} Hz, which mesh: auto follows"
-                if mesh.strip
-                else f"use {Mesh.coarsest(plate, frequency=highest, element=mesh.element)} or finer"
-            )
+            f"mesh {mesh}: must have at least {least:g} elements of {mesh.element.name} in a "
+            f"bending wavelength, got {elements:.1f} elements in a bending wavelength at "
+            f"{highest:g} Hz; {remedy}"
         )
 
 
@@ -52,10 +54,9 @@ def direct_acceleration(
 ) -> ComplexArray:
     """Acceleration [m/s²] at points (p, 2) per frequency [Hz] (f,) and driven ERA: (f, eras, p).
 
-    Each ERA alone at full stroke and phase zero, the others and the loads holding. One sparse
-    factorisation per frequency: the reference that the free plate's answer is compared with. Raises
-    InputError for a frequency that is none or that the mesh cannot carry, and for points off the
-    plate.
+    Each ERA alone at full stroke and phase zero, the others at rest. One sparse factorisation per
+    frequency: the reference that `FreePlate.acceleration` is compared with. Raises InputError as
+    `check_frequencies`, and for points off the plate.
     """
     check_frequencies(matrices.plate, matrices.mesh, frequencies)
     touch = matrices.deflection_at(np.vstack([era_positions(eras), load_positions(loads)]))

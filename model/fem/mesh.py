@@ -1,95 +1,100 @@
 """A structured mesh of rectangles over the plate."""
 
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
 from functools import cached_property
+from typing import Any, Self
 
 import numpy as np
 from scipy import sparse
 
 from model.arrays import FloatArray, IntArray, lattice
 from model.errors import InputError
-from model.fem.elements import Element, element_of
+from model.fem.elements import MITC4, Q5, Element, element_of
 from model.structure.plate import Plate
 
-PAPER_ELEMENT = "MITC4"
-"""What a mesh is made of where nothing else is said."""
+PAPER_ELEMENT = MITC4
+"""The default element of a mesh."""
 
-# What the automatic mesh is made of. The lowest twelve natural frequencies of the paper's plate are
-# then within 0.01 % of converged, and its accelerations (relative L2) within 0.1 % on ERAs at the
-# corners, 0.2 % on ERAs elsewhere and 0.6 % there at a resonance: a force at a point bends the
-# plate more sharply than an element does.
-AUTO_ELEMENT = "Q5"
+# The automatic mesh. The lowest twelve natural frequencies of the paper's plate are then within
+# 0.01 % of converged, and its accelerations (relative L2) within 0.1 % with ERAs at the corners,
+# 0.2 % with ERAs elsewhere and 0.6 % there at a resonance: a point force bends the plate more
+# sharply than an element does.
+AUTO_ELEMENT = Q5
 AUTO_ELEMENTS_PER_WAVELENGTH = 5.5
-AUTO_LEAST_ELEMENTS = 3
-AUTO_STRIP_THICKNESSES = 2.0  # the layer along a free edge is about as wide as the plate is thick
+AUTO_MIN_ELEMENTS = 3
+AUTO_STRIP_THICKNESSES = 2.0  # the boundary layer of a free edge is about as wide as the thickness
 
-# Fewer nodes to a wavelength than this and an answer is not worth having.
-LEAST_NODES_PER_WAVELENGTH = 6
+MIN_NODES_PER_WAVELENGTH = 6
+"""With fewer nodes to a bending wavelength a mesh is refused."""
 
 
 @dataclass(frozen=True)
 class Mesh:
-    """nx by ny equal rectangles over length by width [m], and if wanted a strip along every edge.
+    """nx by ny equal rectangles over length by width [m], optionally with strips along the edges.
 
-    element: the name of one that `element_of` finds. strip [m]: the width of one more row of
-    elements along every edge, for the layer at a free edge; the nx by ny elements then share what
-    is left. The nodes form a lattice: node j * columns + i lies at (node_x[i], node_y[j]).
+    strip [m]: width of one more row of elements along every edge, for the boundary layer of a free
+    edge; the nx by ny elements then share the rest. The nodes form a lattice: node j * columns + i
+    lies at (node_x[i], node_y[j]).
     """
 
     nx: int
     ny: int
     length: float
     width: float
-    element: str = PAPER_ELEMENT
+    element: Element = PAPER_ELEMENT
     strip: float = 0.0
 
     def __post_init__(self) -> None:
-        """Refuse a mesh without elements, of unknown ones, or with strips that fill the plate."""
+        """Refuse a mesh without elements, or with strips that fill the plate."""
         if self.nx < 1 or self.ny < 1:
-            raise InputError(f"mesh: {self.nx}x{self.ny} has no elements; at least 1x1 is needed")
-        element_of(self.element)
+            raise InputError(f"mesh: elements must be 1x1 or more, got {self.nx}x{self.ny}")
         if not 0 <= 2 * self.strip < min(self.length, self.width):
             raise InputError(
-                f"mesh: strips of {self.strip:g} m along the edges leave nothing of a plate of "
-                f"{self.length:g} x {self.width:g} m; make them narrower, or 0 for none"
+                f"mesh: strips must be narrower than half the plate of {self.length:g} x "
+                f"{self.width:g} m, got {self.strip:g} m; 0 for none"
             )
 
     @classmethod
-    def auto(cls, plate: Plate, *, frequency_max: float) -> "Mesh":
-        """The cheapest mesh that is accurate for bending waves up to a frequency [Hz]."""
+    def auto(cls, plate: Plate, *, frequency_max: float) -> Self:
+        """Make the cheapest mesh that is accurate for bending waves up to a frequency [Hz]."""
         size = plate.bending_wavelength(frequency_max) / AUTO_ELEMENTS_PER_WAVELENGTH
         nx, ny = (
-            max(AUTO_LEAST_ELEMENTS, math.ceil(side / size)) for side in (plate.length, plate.width)
+            max(AUTO_MIN_ELEMENTS, math.ceil(side / size)) for side in (plate.length, plate.width)
         )
-        # A plate so thick that the layer is no smaller than an element needs no strip for it.
+        # On a thick plate the boundary layer is no narrower than an element: no strip needed.
         strip = AUTO_STRIP_THICKNESSES * plate.thickness
         if strip > min(plate.length / nx, plate.width / ny) / 2:
             strip = 0.0
         return cls(nx, ny, plate.length, plate.width, AUTO_ELEMENT, strip)
 
     @classmethod
-    def coarsest(cls, plate: Plate, *, frequency: float, element: str = PAPER_ELEMENT) -> "Mesh":
-        """The coarsest mesh of an element that carries a frequency [Hz]."""
-        order = element_of(element).order
-        size = plate.bending_wavelength(frequency) * order / LEAST_NODES_PER_WAVELENGTH
-        # Rounding shall not put a mesh that fits exactly just beyond what it carries.
+    def coarsest(cls, plate: Plate, *, frequency: float, element: Element = PAPER_ELEMENT) -> Self:
+        """Make the coarsest mesh of an element that resolves a frequency [Hz]."""
+        size = plate.bending_wavelength(frequency) * element.order / MIN_NODES_PER_WAVELENGTH
+        # Rounding must not turn a mesh that fits exactly into one too coarse.
         size *= 1 - 1e-9
         nx, ny = (math.ceil(side / size) for side in (plate.length, plate.width))
         return cls(nx, ny, plate.length, plate.width, element)
 
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> Self:
+        """Make the mesh of `to_dict`; raises InputError for an unknown element."""
+        return cls(**{**values, "element": element_of(values["element"])})
+
+    def to_dict(self) -> dict[str, Any]:
+        """Its fields for a file, the element by its name."""
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        return values | {"element": self.element.name}
+
     def __str__(self) -> str:
         text = f"{self.nx}x{self.ny}"
         if self.element != PAPER_ELEMENT:
-            text += f" {self.element}"
+            text += f" {self.element.name}"
         if self.strip:
             text += f" with strips of {1000 * self.strip:.3g} mm"
         return text
-
-    @property
-    def kind(self) -> Element:
-        """The element that the mesh is made of."""
-        return element_of(self.element)
 
     @property
     def element_size(self) -> tuple[float, float]:
@@ -98,13 +103,13 @@ class Mesh:
 
     @property
     def element_counts(self) -> tuple[int, int]:
-        """How many elements lie along x and y, strips included."""
+        """Number of elements along x and y, strips included."""
         strips = 2 if self.strip else 0
         return self.nx + strips, self.ny + strips
 
     @cached_property
     def element_sides(self) -> tuple[IntArray, IntArray]:
-        """Which elements along x and y are as wide as a strip (1) and which are not (0)."""
+        """1 for elements along x and y that are as wide as a strip, 0 for the others."""
         sides = tuple(np.zeros(count, dtype=int) for count in self.element_counts)
         if self.strip:
             for side in sides:
@@ -114,12 +119,12 @@ class Mesh:
     @property
     def columns(self) -> int:
         """Number of nodes along x."""
-        return self.kind.order * self.element_counts[0] + 1
+        return self.element.order * self.element_counts[0] + 1
 
     @property
     def rows(self) -> int:
         """Number of nodes along y."""
-        return self.kind.order * self.element_counts[1] + 1
+        return self.element.order * self.element_counts[1] + 1
 
     @property
     def node_count(self) -> int:
@@ -128,7 +133,7 @@ class Mesh:
 
     @cached_property
     def lines(self) -> tuple[FloatArray, FloatArray]:
-        """Where elements meet along x (n,) and along y (m,) [m], the plate's edges included."""
+        """Element boundaries along x (n,) and y (m,) [m], the plate's edges included."""
         lines = []
         for length, count in ((self.length, self.nx), (self.width, self.ny)):
             inner = np.linspace(self.strip, length - self.strip, count + 1)
@@ -146,7 +151,7 @@ class Mesh:
         return self._along(self.lines[1])
 
     def _along(self, lines: FloatArray) -> FloatArray:
-        share = (1 + np.array(self.kind.side[:-1])) / 2
+        share = (1 + np.array(self.element.side[:-1])) / 2
         inner = lines[:-1, None] + share * np.diff(lines)[:, None]
         return np.append(inner.ravel(), lines[-1])
 
@@ -161,7 +166,7 @@ class Mesh:
 
         Elements are numbered row by row as well, x running first.
         """
-        order = self.kind.order
+        order = self.element.order
         along_x, along_y = (order * np.arange(count) for count in self.element_counts)
         corner = (along_y[:, None] * self.columns + along_x).ravel()
         step = np.arange(order + 1)
@@ -169,27 +174,27 @@ class Mesh:
 
     @property
     def raster(self) -> tuple[int, int]:
-        """How many evenly spaced points along x and y show what the mesh can carry.
+        """Numbers of evenly spaced points along x and y that show what the mesh resolves.
 
-        The nodes themselves where elements are of the first order and without strips.
+        The nodes themselves for elements of the first order without strips.
         """
-        per_element = 1 if self.kind.order == 1 else 2 * self.kind.order
+        per_element = 1 if self.element.order == 1 else 2 * self.element.order
         return per_element * self.nx + 1, per_element * self.ny + 1
 
     @property
     def shortest_wavelength(self) -> float:
-        """The shortest bending wave [m] that it can carry: six elements of the first order."""
-        return LEAST_NODES_PER_WAVELENGTH * max(self.element_size) / self.kind.order
+        """The shortest bending wavelength [m] that it resolves: six elements of the first order."""
+        return MIN_NODES_PER_WAVELENGTH * max(self.element_size) / self.element.order
 
     def highest_frequency(self, plate: Plate) -> float:
-        """The highest frequency [Hz] whose bending waves in a plate it can carry."""
+        """The highest frequency [Hz] whose bending waves in a plate it resolves."""
         return plate.bending_frequency(self.shortest_wavelength)
 
     def interpolation(self, points: FloatArray) -> sparse.csr_array:
         """Shape functions at points [m] (n, 2): sparse (n, node_count), rows sum to 1.
 
-        These are the element's own shape functions for the deflection, so nothing is lost.
-        Points must lie on the plate; raises InputError for one that does not.
+        The element's own shape functions for the deflection. Raises InputError for a point off the
+        plate.
         """
         points = np.atleast_2d(np.asarray(points, dtype=float))
         tolerance = 1e-9 * max(self.length, self.width)
@@ -198,7 +203,7 @@ class Mesh:
         if off.any():
             x, y = points[np.argmax(off)]
             raise InputError(
-                f"point ({x:g}, {y:g}) m is not on the plate, which reaches from (0, 0) to "
+                f"point ({x:g}, {y:g}) m is not on the plate, (0, 0) to "
                 f"({self.length:g}, {self.width:g}) m"
             )
         cell_x, weight_x = self._locate(points[:, 0], self.lines[0])
@@ -210,7 +215,7 @@ class Mesh:
         return sparse.csr_array((weights.ravel(), (rows, columns.ravel())), shape=shape)
 
     def _locate(self, position: FloatArray, lines: FloatArray) -> tuple[IntArray, FloatArray]:
-        """In which element along one direction each position [m] lies, and its shape functions."""
+        """Element along one direction and shape functions there of each position [m]."""
         cell = np.clip(np.searchsorted(lines, position, side="right") - 1, 0, len(lines) - 2)
         start, end = lines[cell], lines[cell + 1]
-        return cell, self.kind.shape((2 * position - start - end) / (end - start))
+        return cell, self.element.shape((2 * position - start - end) / (end - start))

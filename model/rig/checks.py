@@ -5,7 +5,7 @@ import math
 from model.config.document import key_name
 from model.config.sections import Validation
 from model.errors import InputError
-from model.fem.mesh import LEAST_NODES_PER_WAVELENGTH, Mesh
+from model.fem.mesh import MIN_NODES_PER_WAVELENGTH, Mesh
 from model.rig.parts import laminate_of, mesh_of, plate_of
 from model.rig.rig import SAME_POINT
 from model.rig.sections import EraSection, LimitsSection, MassSection, PlateSection
@@ -78,7 +78,7 @@ def _check_mesh(validation: Validation, plate: Plate, *, frequency_max: float) -
         validation.add(
             ("mesh",),
             f"{mesh} is too coarse for bending waves at {frequency_max:g} Hz (limits.frequency): "
-            f"at least {coarsest} is needed, {LEAST_NODES_PER_WAVELENGTH / mesh.kind.order:g} "
+            f"at least {coarsest} is needed, {MIN_NODES_PER_WAVELENGTH / mesh.element.order:g} "
             "elements a wavelength; auto takes a mesh that is accurate",
         )
 

@@ -4,6 +4,7 @@ import math
 import re
 
 from model.errors import InputError
+from model.fem.elements import element_of
 from model.fem.mesh import PAPER_ELEMENT, Mesh
 from model.rig.rig import Limits
 from model.rig.sections import EraSection, LimitsSection, MassSection, MaterialSection, PlateSection
@@ -108,7 +109,7 @@ def parse_mesh(text: str, plate: Plate) -> Mesh:
             f"mesh {nx}x{ny} cannot be used; each side takes 1 to {_MOST_ELEMENTS_PER_SIDE}"
             " elements"
         )
-    element = match[3] or PAPER_ELEMENT
+    element = element_of(match[3]) if match[3] else PAPER_ELEMENT
     return Mesh(nx=nx, ny=ny, length=plate.length, width=plate.width, element=element)
 
 

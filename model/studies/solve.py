@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,7 +54,7 @@ class StudyProblem:
     def digest(self) -> str:
         """SHA-256 over everything in it but the positions, of which a case names its own."""
         digest = hashlib.sha256()
-        mesh = json.dumps(asdict(self.rig.mesh), sort_keys=True)
+        mesh = json.dumps(self.rig.mesh.to_dict(), sort_keys=True)
         for text in (self.rig.fingerprint, mesh, self.code_version):
             digest.update(f"{text}\n".encode())
         digest.update(self.frequencies.tobytes())

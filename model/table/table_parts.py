@@ -3,7 +3,7 @@
 import hashlib
 import json
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -86,7 +86,7 @@ class TableProblem:
     @cached_property
     def digest(self) -> str:
         """SHA-256 over everything in it and the code that solves it."""
-        mesh, reference = asdict(self.rig.mesh), asdict(self.reference_mesh)
+        mesh, reference = self.rig.mesh.to_dict(), self.reference_mesh.to_dict()
         text = json.dumps([self.rig.fingerprint, mesh, reference, str(self.grid)], sort_keys=True)
         digest = hashlib.sha256(f"{self.code_version}\n{text}\n".encode())
         digest.update(self.frequencies.tobytes())

@@ -135,7 +135,7 @@ def field_error(table: LocalizationTable, frequency: float) -> float:
     polynomial of order p within (k s)^(p + 1) / 4 (p + 1): next to nothing of elements of high
     order; those of the first order make straight lines of it, the raster does not.
     """
-    order = table.mesh.kind.order
+    order = table.mesh.element.order
     step = max(table.mesh.element_size) / order
     phase = 2 * math.pi / table.plate.bending_wavelength(frequency) * step
     return float(RASTER_ERROR + phase ** (order + 1) / (4 * (order + 1)))

@@ -5,6 +5,7 @@ from functools import cache
 
 import numpy as np
 
+from model.fem.elements import ELEMENTS
 from model.fem.mesh import Mesh
 from model.rig.rig import Rig
 from model.table.build import build_table
@@ -17,7 +18,7 @@ FREQUENCIES = np.linspace(40.0, 500.0, 27)
 def smooth_rig() -> Rig:
     """The paper's rig on 6x5 elements of the fifth order."""
     rig = make_paper_rig(6, 5)
-    return replace(rig, mesh=Mesh(6, 5, rig.plate.length, rig.plate.width, "Q5"))
+    return replace(rig, mesh=Mesh(6, 5, rig.plate.length, rig.plate.width, ELEMENTS["Q5"]))
 
 
 @cache

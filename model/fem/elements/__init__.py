@@ -4,7 +4,6 @@ An installed package adds one by an entry point of the group `era_haptics.elemen
 an `Element` of that name; `model.fem.element_checks` says what it must keep.
 """
 
-from functools import cache
 from operator import attrgetter
 
 from model.errors import InputError
@@ -13,13 +12,12 @@ from model.fem.elements.lagrange import Q3, Q4, Q5
 from model.fem.elements.mitc4 import MITC4
 from registry.plugins import Instance, PluginRegistry
 
-__all__ = ["DOF_PER_NODE", "ELEMENTS", "Element", "element_names", "element_of"]
+__all__ = ["DOF_PER_NODE", "ELEMENTS", "MITC4", "Q5", "Element", "element_names", "element_of"]
 
 ELEMENTS = {element.name: element for element in (MITC4, Q3, Q4, Q5)}
 """Those that come with this package."""
 
 
-@cache
 def _matrix_problem(element: Element) -> str | None:
     """What is wrong with the nodes or the matrices of a plug-in's element."""
     from model.fem.element_checks import matrices, nodes  # they use meshes, and these elements

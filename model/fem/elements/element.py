@@ -1,7 +1,7 @@
 """What a plate element is: where its nodes lie and what its matrices are."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -28,8 +28,8 @@ class Element:
 
     name: str
     side: tuple[float, ...]
-    stiffness: ElementMatrix
-    mass: ElementMatrix
+    stiffness: ElementMatrix = field(compare=False)
+    mass: ElementMatrix = field(compare=False)
 
     @property
     def order(self) -> int:

@@ -5,6 +5,7 @@ import pytest
 
 from model.errors import InputError
 from model.fem.assembly import assemble
+from model.fem.elements import ELEMENTS
 from model.fem.mesh import Mesh
 from model.fem.modal import modes
 from model.structure.actuator import Era
@@ -80,7 +81,7 @@ def test_high_order_does_not_lock_on_thin_plates(thickness):
     m, n = np.meshgrid(np.arange(1, 9), np.arange(1, 9))
     # Paper Eq. 29.
     thin = np.sort((scale * ((m * np.pi / LENGTH) ** 2 + (n * np.pi / WIDTH) ** 2)).ravel())[:8]
-    matrices = assemble(plate, Mesh(6, 5, LENGTH, WIDTH, "Q5"))
+    matrices = assemble(plate, Mesh(6, 5, LENGTH, WIDTH, ELEMENTS["Q5"]))
     solved = modes(matrices, 8, support="simply-supported").natural_frequencies
     np.testing.assert_allclose(solved, thin, rtol=1e-3)
 

@@ -9,6 +9,7 @@ from scipy.sparse.linalg import splu
 
 from model.errors import InputError
 from model.fem.assembly import assemble
+from model.fem.elements import ELEMENTS
 from model.fem.harmonic import direct_acceleration
 from model.fem.mesh import Mesh
 from model.fem.modal import modes
@@ -22,7 +23,7 @@ from paper_plate import ALUMINIUM, LENGTH, WIDTH
 MESHES = {
     "24x18": Mesh(24, 18, LENGTH, WIDTH),
     "19x15": Mesh(19, 15, LENGTH, WIDTH),
-    "5x4 Q4": Mesh(5, 4, LENGTH, WIDTH, "Q4", 0.003),
+    "5x4 Q4": Mesh(5, 4, LENGTH, WIDTH, ELEMENTS["Q4"], 0.003),
 }
 
 
@@ -80,7 +81,7 @@ def test_any_layout_at_any_frequency_agrees_with_the_direct_solve(free):
 def test_below_all_bending_modes_it_agrees_too():
     """A block 20 mm thick only rocks on its ERAs up to 500 Hz: rigid modes alone are kept."""
     plate = Plate(0.3, 0.2, 0.02, ALUMINIUM)
-    mesh = Mesh(3, 3, 0.3, 0.2, "Q4")
+    mesh = Mesh(3, 3, 0.3, 0.2, ELEMENTS["Q4"])
     eras = random_eras(np.random.default_rng(3), 4)
     eras = tuple(replace(era, x=era.x * 0.9, y=era.y * 0.8) for era in eras)
     frequencies = np.array([40.0, 210.0, 500.0])

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from model.fem.assembly import assemble, era_positions
+from model.fem.elements import ELEMENTS
 from model.fem.harmonic import direct_acceleration
 from model.fem.mesh import Mesh
 from model.reduction.reduced_plate import reduce_plate
@@ -12,7 +13,7 @@ from model.structure.plate import Plate
 from paper_plate import ALUMINIUM, LENGTH, WIDTH
 
 PLATE = Plate(LENGTH, WIDTH, 0.0015, ALUMINIUM)
-MESH = Mesh(6, 5, LENGTH, WIDTH, "Q4", 0.003)
+MESH = Mesh(6, 5, LENGTH, WIDTH, ELEMENTS["Q4"], 0.003)
 CORNERS = [(0.0, 0.0), (LENGTH, 0.0), (LENGTH, WIDTH), (0.0, WIDTH)]
 INSIDE = [(0.051, 0.017), (0.29, 0.08), (0.12, WIDTH)]
 

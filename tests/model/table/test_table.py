@@ -10,6 +10,7 @@ import pytest
 from model.drive_modes.sources import all_patterns, magnitudes_of_sources, sums_of_sources
 from model.errors import InputError
 from model.fem.assembly import assemble
+from model.fem.elements import ELEMENTS
 from model.fem.harmonic import direct_acceleration
 from model.fem.mesh import Mesh
 from model.files.array_file import digest_of
@@ -31,7 +32,7 @@ from paper_plate import make_paper_rig
 def rig():
     """A mesh that is quick to solve directly, of elements as smooth as fields are."""
     paper = make_paper_rig(24, 18)
-    return replace(paper, mesh=Mesh(6, 5, paper.plate.length, paper.plate.width, "Q5"))
+    return replace(paper, mesh=Mesh(6, 5, paper.plate.length, paper.plate.width, ELEMENTS["Q5"]))
 
 
 @pytest.fixture(scope="module")

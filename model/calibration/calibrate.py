@@ -16,10 +16,11 @@ from model.calibration.calibration_result import (
 )
 from model.calibration.calibration_screening import silent_eras, silent_sensors, unlike_the_plate
 from model.calibration.fast_plate import FastPlate, fast_plate
-from model.calibration.fit import Fit, Problem, misfit, row_size, solve
+from model.calibration.fit import Fit, Problem, misfit, solve
 from model.calibration.held_out import as_it_was, hold_out, relative_error
 from model.calibration.parameters import Parameter, parameters_of, rig_with, starts
 from model.calibration.responses import Responses
+from model.calibration.variable_projection import row_rms
 from model.errors import InputError
 from model.rig.rig import Rig
 from model.structure.actuator import Gain
@@ -123,12 +124,12 @@ def _best_fit(problem: Problem) -> Fit:
 
 
 def _identified(problem: Problem, fit: Fit) -> tuple[Problem, Fit]:
-    """Hold what the data leave open at the rig's own value, the worst first, and fit the rest."""
-    known = np.array([parameter.known for parameter in problem.parameters])
+    """Hold parameters that the data tell less of than their prior at the rig's value, and refit."""
+    prior = np.array([parameter.prior_std for parameter in problem.parameters])
     own = np.array([parameter.start for parameter in problem.parameters])
     while True:
-        excess = np.where(problem.free, fit.x_error / known, 0)
-        # Of a plate that does not fit, no value means anything, known or not.
+        excess = np.where(problem.free, fit.x_error / prior, 0)
+        # No value of a plate that does not fit means anything.
         if not excess.max() > 1 or _fit_error(problem, fit) > FITS:
             return problem, fit
         free = problem.free.copy()
@@ -140,7 +141,7 @@ def _identified(problem: Problem, fit: Fit) -> tuple[Problem, Fit]:
 def _fit_error(problem: Problem, fit: Fit) -> float:
     rig = rig_with(problem.rig, problem.parameters, fit.x)
     predicted = fit.gains[:, :, None] * problem.plate.responses(rig) * fit.scales
-    return relative_error(problem.values, predicted, row_size(problem.values, fit.used), fit.used)
+    return relative_error(problem.values, predicted, row_rms(problem.values, fit.used), fit.used)
 
 
 def _with_median_scale_one(fit: Fit) -> Fit:

@@ -1,15 +1,13 @@
-"""Nonlinear least squares for a rig's numbers, gains and sensor scales.
+"""Nonlinear least squares for the parameters of a rig, gains and sensor scales.
 
     d_fes = g_fe s_s a_fes(x) + noise
 
-d measured, a the model's, g a complex gain for every frequency and ERA, s a real scale for every
-sensor. Gains enter linearly and are taken out (variable projection): for any x and s the best ones
-are known at once, so only x and s are searched, and what is left of the data is how shapes over the
-sensors change with frequency. The standard errors then contain what the gains leave open.
+d measured, a of the model, g a complex gain of every frequency and ERA, s a real scale of every
+sensor. Gains are projected out (`model.calibration.variable_projection`); x and s are searched.
+The standard errors include what the gains leave undetermined.
 
-Noise has a part of its own size and a part in proportion to the response, both estimated from the
-residuals; values that do not fit either are left out, the worst of a row first, for one wrong value
-pulls the gain of its whole row.
+Noise has a constant part and a part in proportion to the response, both estimated from the
+residuals. Outliers are left out, the worst of a row first, since one pulls the gain of its row.
 """
 
 from collections.abc import Sequence
@@ -23,6 +21,7 @@ from scipy.optimize import least_squares, nnls
 from model.arrays import ComplexArray, FloatArray, IntArray
 from model.calibration.fast_plate import FastPlate
 from model.calibration.parameters import Parameter, rig_with
+from model.calibration.variable_projection import best_gains, modal_assurance, row_rms
 from model.rig.rig import Rig
 
 _Loss: TypeAlias = Literal["linear", "soft_l1"]
@@ -74,7 +73,7 @@ def solve(problem: Problem, x: FloatArray, scales: FloatArray) -> Fit:
     used = np.isfinite(problem.values)
     # Until residuals tell more: nothing is believed that stands out of its row.
     first = replace(problem, values=_without_peaks(problem.values, used))
-    noise = 0.05 * row_size(first.values, used)
+    noise = 0.05 * row_rms(first.values, used)
     x, scales, _ = _search(first, x, scales, used / noise[:, :, None], loss="soft_l1")
     for number in range(_ROUNDS):
         left = _residual(problem, x, scales, used / noise[:, :, None])
@@ -89,7 +88,7 @@ def solve(problem: Problem, x: FloatArray, scales: FloatArray) -> Fit:
         if is_settled:
             break
     model = problem.plate.responses(rig_with(problem.rig, problem.parameters, x)) * scales
-    gains = _gains(model, problem.values, weight)
+    gains = best_gains(model, problem.values, weight)
     power = (np.abs(weight * model) ** 2).sum(axis=2)
     with np.errstate(divide="ignore"):
         gains_error = np.where(power > 0, 1 / np.sqrt(power), np.nan)
@@ -102,18 +101,9 @@ def solve(problem: Problem, x: FloatArray, scales: FloatArray) -> Fit:
 
 
 def misfit(problem: Problem, x: FloatArray) -> float:
-    """How badly shapes over the sensors fit, 0 to 1, whatever gains: median of 1 - MAC.
-
-    x (n,): of every parameter, free or not. MAC: modal assurance criterion of each row of values,
-    for one frequency and ERA.
-    """
+    """Median over rows of 1 - MAC, 0 to 1, for all parameters x (n,), free or not."""
     model = problem.plate.responses(rig_with(problem.rig, problem.parameters, x))
-    used = np.isfinite(problem.values)
-    values = np.where(used, problem.values, 0)
-    model = np.where(used, model, 0)
-    inner = np.abs((model.conj() * values).sum(axis=2)) ** 2
-    size = (np.abs(model) ** 2).sum(axis=2) * (np.abs(values) ** 2).sum(axis=2)
-    return float(np.median(1 - inner[size > 0] / size[size > 0]))
+    return float(np.nanmedian(1 - modal_assurance(problem.values, model)))
 
 
 def _search(
@@ -197,17 +187,9 @@ def _residual(
 ) -> ComplexArray:
     """Weighted residual (f, e, s) with the best gains; zero where nothing was measured."""
     model = problem.plate.responses(rig_with(problem.rig, problem.parameters, x)) * scales
-    gains = _gains(model, problem.values, weight)
+    gains = best_gains(model, problem.values, weight)
     left = np.where(weight > 0, problem.values - np.nan_to_num(gains)[:, :, None] * model, 0)
     return np.asarray(weight * left)
-
-
-def _gains(model: ComplexArray, values: ComplexArray, weight: FloatArray) -> ComplexArray:
-    """The best complex gain of each row (f, e); NaN where nothing was measured."""
-    values = np.where(weight > 0, values, 0)
-    inner = (weight**2 * model.conj() * values).sum(axis=2)
-    power = (np.abs(weight * model) ** 2).sum(axis=2)
-    return np.where(power > 0, inner / np.where(power > 0, power, 1), np.nan)
 
 
 def _without_peaks(values: ComplexArray, used: NDArray[np.bool_]) -> ComplexArray:
@@ -219,19 +201,12 @@ def _without_peaks(values: ComplexArray, used: NDArray[np.bool_]) -> ComplexArra
     return np.asarray(values * np.minimum(1, limit[:, :, None] / np.maximum(size, 1e-300)))
 
 
-def row_size(values: ComplexArray, used: NDArray[np.bool_]) -> FloatArray:
-    """Root mean square of each row over its sensors (f, e); 1 for an empty row."""
-    power = np.where(used, np.abs(np.where(used, values, 0)) ** 2, 0).sum(axis=2)
-    size = np.sqrt(power / np.maximum(used.sum(axis=2), 1))
-    return np.where(size > 0, size, 1.0)
-
-
 def _noise(values: ComplexArray, raw: FloatArray, used: NDArray[np.bool_]) -> FloatArray:
     """Standard deviation (f, e) of a value's real or imaginary part: sqrt(a² + b² size²).
 
     From the medians of residuals raw (f, e, s), over rows from weak to strong.
     """
-    size = row_size(values, used)
+    size = row_rms(values, used)
     sensors = used.sum(axis=2)
     rows = np.flatnonzero((sensors >= 2).ravel())
     floor = _SMALLEST_NOISE * size

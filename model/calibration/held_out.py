@@ -7,8 +7,9 @@ from numpy.typing import NDArray
 
 from model.arrays import ComplexArray, FloatArray
 from model.calibration.calibration_result import HeldOut
-from model.calibration.fit import Fit, Problem, row_size, solve
+from model.calibration.fit import Fit, Problem, solve
 from model.calibration.parameters import rig_with
+from model.calibration.variable_projection import row_rms
 
 _HELD_OUT_SHARE = 0.2  # of the sensors
 _LEAST_TO_HOLD_OUT = 5  # sensors
@@ -33,7 +34,7 @@ def hold_out(problem: Problem, fit: Fit, names: tuple[str, ...]) -> HeldOut | No
         free_scales=problem.free_scales[~unseen],
     )
     seen = solve(part, fit.x, fit.scales[~unseen])
-    size = row_size(problem.values, np.isfinite(problem.values))
+    size = row_rms(problem.values)
     rig = rig_with(problem.rig, problem.parameters, seen.x)
     predicted = seen.gains[:, :, None] * problem.plate.responses(rig) * fit.scales
     return HeldOut(

@@ -10,21 +10,21 @@ from model.arrays import FloatArray
 from model.rig.rig import Rig
 from model.structure.actuator import Era, damping_from_ratio
 
-# The order of what the rig's author cannot know: a fit that leaves more than this open has not
-# found the parameter, and its value stays what it was.
-_MODULUS_KNOWN = 0.1  # of itself
-_STIFFNESS_KNOWN = 0.25  # of itself
-_LOSS_KNOWN = 0.005
-_DAMPING_RATIO_KNOWN = 0.02
-_BOLT_KNOWN = 0.05  # of the plate's mass that an ERA carries
+# Standard deviations of what the author of a rig knows: an alloy's modulus and a sheet's thickness,
+# a maker's spring, and hardly anything about losses.
+_MODULUS_STD = 0.07  # of its logarithm
+_STIFFNESS_STD = 0.10  # of its logarithm
+_LOSS_STD, _MIN_LOSS_STD = 0.7, 0.003  # of itself, and at least
+_DAMPING_STD, _MIN_DAMPING_RATIO_STD = 0.7, 0.015
+_BOLT_STD = 0.05  # of the plate's mass that an ERA carries
 
 
 @dataclass(frozen=True)
 class Parameter:
-    """One number: what it is, of which ERA ("" for the plate), its value in the rig, and its unit.
+    """A number of a rig: its kind, its ERA ("" for the plate), its value in the rig, its unit.
 
-    A fit moves x, value = prior * exp(x) where is_factor, else step * x, both in that unit; known:
-    the largest standard error of x at which it counts as identified; lower, upper: of x.
+    A fit varies x: value = prior * exp(x) if is_factor, else step * x, both in that unit.
+    prior_std: standard deviation of x beforehand; lower, upper: bounds of x.
     """
 
     kind: str
@@ -33,7 +33,7 @@ class Parameter:
     unit: str
     is_factor: bool
     step: float
-    known: float
+    prior_std: float
     lower: float
     upper: float
 
@@ -61,25 +61,31 @@ def parameters_of(rig: Rig) -> tuple[Parameter, ...]:
     plate = rig.plate
     share = plate.mass / len(rig.eras)
     found = [
-        _factor("modulus", "", plate.material.E, "Pa", known=_MODULUS_KNOWN, reach=3.0),
-        _offset("loss_factor", "", plate.loss_factor, "", step=0.01, known=_LOSS_KNOWN, most=0.5),
+        _factor("modulus", "", plate.material.E, "Pa", std=_MODULUS_STD, reach=3.0),
+        _offset(
+            "loss_factor",
+            "",
+            plate.loss_factor,
+            "",
+            step=0.01,
+            std=max(_LOSS_STD * plate.loss_factor, _MIN_LOSS_STD),
+            most=0.5,
+        ),
     ]
     for era in rig.eras:
-        # Damping is told by its ratio to what the ERA carries, so that one bound fits all.
+        # Bounds and steps go by the ratio to the mass that the ERA carries, and fit every ERA.
         unit_damping = damping_from_ratio(
             1.0, stiffness=era.stiffness, plate_mass=plate.mass, era_count=len(rig.eras)
         )
         found += [
-            _factor(
-                "stiffness", era.name, era.stiffness, "N/m", known=_STIFFNESS_KNOWN, reach=10.0
-            ),
+            _factor("stiffness", era.name, era.stiffness, "N/m", std=_STIFFNESS_STD, reach=10.0),
             _offset(
                 "damping",
                 era.name,
                 era.damping,
                 "N s/m",
                 step=0.05 * unit_damping,
-                known=_DAMPING_RATIO_KNOWN * unit_damping,
+                std=max(_DAMPING_STD * era.damping, _MIN_DAMPING_RATIO_STD * unit_damping),
                 most=2 * unit_damping,
             ),
             _offset(
@@ -88,7 +94,7 @@ def parameters_of(rig: Rig) -> tuple[Parameter, ...]:
                 era.bolt_mass,
                 "kg",
                 step=0.05 * share,
-                known=_BOLT_KNOWN * share,
+                std=_BOLT_STD * share,
                 most=5 * share,
             ),
         ]
@@ -127,15 +133,13 @@ def _era_with(era: Era, values: dict[tuple[str, str], float]) -> Era:
     )
 
 
-def _factor(
-    kind: str, era: str, prior: float, unit: str, *, known: float, reach: float
-) -> Parameter:
+def _factor(kind: str, era: str, prior: float, unit: str, *, std: float, reach: float) -> Parameter:
     bound = math.log(reach)
-    return Parameter(kind, era, prior, unit, True, prior, known, -bound, bound)
+    return Parameter(kind, era, prior, unit, True, prior, std, -bound, bound)
 
 
 def _offset(
-    kind: str, era: str, prior: float, unit: str, *, step: float, known: float, most: float
+    kind: str, era: str, prior: float, unit: str, *, step: float, std: float, most: float
 ) -> Parameter:
     upper = max(most, 2 * prior) / step
-    return Parameter(kind, era, prior, unit, False, step, known / step, 0.0, upper)
+    return Parameter(kind, era, prior, unit, False, step, std / step, 0.0, upper)

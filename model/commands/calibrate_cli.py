@@ -61,15 +61,14 @@ def calibrate(
     ]
     files = []
     if calibration.is_good:
-        from model.calibration.rig_text import calibrated_text, check_reads_back
+        from model.calibration.calibrated_rig import calibrated_text, check_reads_back
+        from model.config.document import read_document
 
         comment = "\n".join(
             [f"{rig_file.name} calibrated with {measured_file.name} by `era calibrate`:"]
             + [f"  {row}" for row in [*rows, *notes]]
         )
-        text = calibrated_text(
-            rig_file.read_text(encoding="utf-8"), rig, calibration, comment=comment
-        )
+        text = calibrated_text(read_document(rig_file), rig, calibration, comment=comment)
         _write(output, text)
         check_reads_back(load_rig(output, mesh=mesh), calibration, output)
         files.append(str(output))

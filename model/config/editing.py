@@ -28,7 +28,8 @@ def edited_text(document: Document, change: Callable[[CommentedMap], None]) -> s
     """
     yaml = plain_yaml("rt")
     yaml.preserve_quotes = True
-    yaml.width = max(100, *map(len, document.text.splitlines()))
+    # Room for new keys on the longest line, which would break elsewhere otherwise.
+    yaml.width = max(map(len, document.text.splitlines())) + 100
     yaml.indent(**_indentation(document.text))
     stream = StringIO()
     with _refused_if_lossy(document):

@@ -12,6 +12,7 @@ from scipy.stats import ttest_1samp
 from model.arrays import ComplexArray, FloatArray
 from model.calibration.fast_plate import FastPlate
 from model.calibration.parameters import parameters_of, rig_with, starts
+from model.calibration.variable_projection import modal_assurance
 from model.rig.rig import Rig
 
 _LEAST_MISFIT = 0.02  # below it sensors' errors decide and not shapes
@@ -79,21 +80,9 @@ def likeness_to(model: ComplexArray, values: ComplexArray) -> Likeness:
     return Likeness(_mac(values, model), (0.0, 0.0))
 
 
-def mac_of(values: ComplexArray, model: ComplexArray) -> float:
-    """MAC of two shapes (s,), 0..1."""
-    there = np.isfinite(values)
-    power = (np.abs(values[there]) ** 2).sum() * (np.abs(model[there]) ** 2).sum()
-    return float(abs(np.vdot(model[there], values[there])) ** 2 / power) if power > 0 else 0.0
-
-
 def _mac(values: ComplexArray, model: ComplexArray) -> FloatArray:
-    there = np.isfinite(values)
-    filled = np.where(there, values, 0)
-    inner = np.abs(np.einsum("fis,fjs->fij", filled, model.conj())) ** 2
-    power = (np.abs(filled) ** 2).sum(axis=2)[:, :, None]
-    model_power = np.einsum("fis,fjs->fij", there.astype(float), np.abs(model) ** 2)
-    size = power * model_power
-    return np.where(size > 0, inner / np.where(size > 0, size, 1), np.nan)
+    """MAC (f, e, e) of each channel with each ERA."""
+    return modal_assurance(values[:, :, None], model[:, None])
 
 
 def _driven(mac: FloatArray, channel: int) -> bool:

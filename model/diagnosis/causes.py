@@ -17,7 +17,7 @@ from scipy.optimize import minimize_scalar
 
 from model.arrays import ComplexArray, FloatArray
 from model.calibration.fast_plate import FastPlate, fast_plate
-from model.diagnosis.assignment import mac_of
+from model.calibration.variable_projection import modal_assurance
 from model.diagnosis.plate_match import Match, match_plate
 from model.errors import InputError
 from model.rig.rig import Rig
@@ -186,19 +186,15 @@ def _finely(
 
 
 def _misfit(values: ComplexArray, model: ComplexArray) -> float:
-    """How badly shapes and, up to a gain for each channel, sizes agree: 0 for wholly."""
-    shapes, sizes = [], []
-    for channel in range(values.shape[1]):
-        ratios = []
-        for row in range(values.shape[0]):
-            there = np.isfinite(values[row, channel])
-            if there.any():
-                shapes.append(1 - mac_of(values[row, channel], model[row, channel]))
-                size = np.linalg.norm(values[row, channel][there])
-                ratios.append(math.log(size / np.linalg.norm(model[row, channel][there])))
-        if ratios:
-            sizes += list(np.minimum(np.abs(np.array(ratios) - np.median(ratios)), 1.0))
-    return float(np.mean(shapes) + 0.5 * np.mean(sizes))
+    """Disagreement of shapes and, up to a gain of each channel, of sizes; 0 for none."""
+    mac = modal_assurance(values, model)
+    measured = np.isfinite(values)
+    norms = (np.linalg.norm(np.where(measured, each, 0), axis=2) for each in (values, model))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = np.log(np.divide(*norms))
+    ratio = ratio[:, measured.any(axis=(0, 2))]
+    deviation = np.minimum(np.abs(ratio - np.nanmedian(ratio, axis=0)), 1.0)
+    return float(np.nanmean(1 - mac) + 0.5 * np.nanmean(deviation))
 
 
 def _rig(cause: Cause, rig: Rig, factor: float) -> Rig | None:

@@ -132,10 +132,10 @@ def as_json(verdict: Verdict) -> dict[str, Any]:
                     "parameter": parameter.name,
                     "unit": parameter.unit,
                     "expected": parameter.prior,
-                    "found": parameter.value(parameter.start + z * known),
+                    "found": parameter.value(parameter.start + z * parameter.prior_std),
                     "standard_deviations": float(z),
                 }
-                for parameter, z, known in zip(match.parameters, match.z, match.known, strict=True)
+                for parameter, z in zip(match.parameters, match.z, strict=True)
             ],
             "explanations": [
                 {

@@ -21,17 +21,11 @@ from scipy.optimize import least_squares
 from model.arrays import ComplexArray, FloatArray
 from model.calibration.fast_plate import FastPlate
 from model.calibration.parameters import Parameter, parameters_of, rig_with
+from model.calibration.variable_projection import best_gains, row_rms
 from model.rig.rig import Rig
 
-# One standard deviation of what a rig's author knows: an alloy's modulus and a sheet's thickness, a
-# maker's spring, and hardly anything about losses.
-_MODULUS_KNOWN = 0.07
-_STIFFNESS_KNOWN = 0.10
-_LOSS_KNOWN = 0.7  # of itself
-_DAMPING_KNOWN = 0.7  # of itself
-_BOLT_KNOWN = 1.0  # twentieths of what an ERA carries
-_GAIN_KNOWN = 1.0  # of a logarithm: a factor of 2.7
-_GAIN_WANDERS = 0.08  # over frequency, of itself
+_GAIN_STD = 1.0  # of the logarithm of a channel's gain
+_GAIN_TOLERANCE = 0.08  # standard deviation over frequency, of itself
 FITS = 0.2  # rms error, relative to the response, of a plate to believe
 MODEL_ERROR = 0.05  # of a row's rms: sensors' scales and places, what is not modelled
 _ROBUST = 2.0  # standard deviations
@@ -55,7 +49,6 @@ class Match:
     rig: Rig
     parameters: tuple[Parameter, ...]
     z: FloatArray
-    known: FloatArray
     gains: FloatArray
     cost: float
     error: float
@@ -88,10 +81,10 @@ def match_plate(
     """
     parameters = parameters_of(rig)
     center = np.array([parameter.start for parameter in parameters])
-    spread = np.array([_known(parameter) for parameter in parameters])
+    std = np.array([parameter.prior_std for parameter in parameters])
     rows: NDArray[np.bool_] = np.asarray(np.isfinite(values).any(axis=2))
     used = np.flatnonzero(rows.any(axis=0))
-    size = _size(values)
+    size = row_rms(values)
     noise = model_error * size[:, :, None] * np.ones(values.shape[2])
     if floor is not None:
         noise = np.hypot(noise, floor)
@@ -104,26 +97,26 @@ def match_plate(
         return np.asarray(plate.responses(rig)[:, driven])
 
     def residuals(z: FloatArray) -> FloatArray:
-        x = center + spread * z[:count]
+        x = center + std * z[:count]
         model = responses(rig_with(rig, parameters, x))
         gains = np.ones(values.shape[1])
-        gains[used] = np.exp(_GAIN_KNOWN * z[count:])
-        best, magnitude = _project(model, measured, weight, gains)
-        left = weight * (measured - best)
-        wander = ((magnitude - gains) / (_GAIN_WANDERS * gains))[rows]
+        gains[used] = np.exp(_GAIN_STD * z[count:])
+        projected = best_gains(model, measured, weight, expected=gains, tolerance=_GAIN_TOLERANCE)
+        left = weight * (measured - projected[:, :, None] * model)
+        wander = ((np.abs(projected) - gains) / (_GAIN_TOLERANCE * gains))[rows]
         left = _robust(left[weight > 0])
         return np.concatenate([left.real, left.imag, _robust(wander), z])
 
     bounds = np.array([[p.lower, p.upper] for p in parameters])
-    bounds = (bounds - center[:, None]) / spread[:, None]
+    bounds = (bounds - center[:, None]) / std[:, None]
     lower, upper = np.vstack([bounds, np.tile([-8.0, 8.0], (len(used), 1))]).T
     begins = []
     for modulus, stiffness in starts:
         moves = {"modulus": modulus, "stiffness": stiffness}
         shift = np.array([moves.get(parameter.kind, 0.0) for parameter in parameters])
         model = responses(rig_with(rig, parameters, center + shift))
-        ratio = np.log(np.maximum(size / _size(np.where(rows[:, :, None], model, np.nan)), 1e-6))
-        first = np.concatenate([shift / spread, [np.median(ratio[rows[:, e], e]) for e in used]])
+        ratio = np.log(np.maximum(size / row_rms(np.where(rows[:, :, None], model, np.nan)), 1e-6))
+        first = np.concatenate([shift / std, [np.median(ratio[rows[:, e], e]) for e in used]])
         begins.append(np.clip(first, lower + 1e-6, upper - 1e-6))
     found = [
         least_squares(
@@ -138,18 +131,19 @@ def match_plate(
         for begin in begins
     ]
     best = min(found, key=lambda each: float(each.cost))
-    x = center + spread * best.x[:count]
+    x = center + std * best.x[:count]
     gains = np.full(values.shape[1], np.nan)
-    gains[used] = np.exp(_GAIN_KNOWN * best.x[count:])
+    gains[used] = np.exp(_GAIN_STD * best.x[count:])
     fitted = rig_with(rig, parameters, x)
     model = responses(fitted)
-    shown, _ = _project(model, measured, weight, np.nan_to_num(gains, nan=1.0))
-    share = (np.abs(shown - measured) / size[:, :, None])[weight > 0]
+    projected = best_gains(
+        model, measured, weight, expected=np.nan_to_num(gains, nan=1.0), tolerance=_GAIN_TOLERANCE
+    )
+    share = (np.abs(projected[:, :, None] * model - measured) / size[:, :, None])[weight > 0]
     return Match(
         fitted,
         parameters,
         best.x[:count],
-        spread,
         gains,
         float(best.cost),
         math.sqrt(float((share**2).mean())) if len(share) else math.inf,
@@ -167,38 +161,3 @@ def _robust(left: NDArray[_Number]) -> NDArray[_Number]:
     share = np.abs(left) / _ROBUST
     half = 2 * (np.sqrt(1 + share**2) - 1)
     return np.asarray(left * np.sqrt(half) / np.maximum(share, 1e-12))
-
-
-def _project(
-    model: ComplexArray, measured: ComplexArray, weight: FloatArray, gains: FloatArray
-) -> tuple[ComplexArray, FloatArray]:
-    """The model (f, e, s) with the best magnitude and phase of every row, and these magnitudes."""
-    inner = (weight**2 * model.conj() * measured).sum(axis=2)
-    power = (np.abs(weight * model) ** 2).sum(axis=2)
-    prior = 1 / (_GAIN_WANDERS * gains) ** 2
-    magnitude = (np.abs(inner) + prior * gains) / (power + prior)
-    turn = np.exp(1j * np.angle(inner))
-    return np.asarray((magnitude * turn)[:, :, None] * model), magnitude
-
-
-def _size(values: ComplexArray) -> FloatArray:
-    """Root mean square of each row (f, e); 1 where there is none."""
-    there = np.isfinite(values)
-    power = np.where(there, np.abs(np.where(there, values, 0)) ** 2, 0).sum(axis=2)
-    size = np.sqrt(power / np.maximum(there.sum(axis=2), 1))
-    return np.where(size > 0, size, 1.0)
-
-
-def _known(parameter: Parameter) -> float:
-    """One standard deviation of x beforehand."""
-    match parameter.kind:
-        case "modulus":
-            return _MODULUS_KNOWN
-        case "stiffness":
-            return _STIFFNESS_KNOWN
-        case "loss_factor":
-            return max(_LOSS_KNOWN * parameter.start, 0.3)
-        case "damping":
-            return max(_DAMPING_KNOWN * parameter.start, 0.3)
-        case _:
-            return _BOLT_KNOWN

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from model.arrays import ComplexArray, FloatArray
-from model.diagnosis.assignment import mac_of
+from model.calibration.variable_projection import modal_assurance
 from model.diagnosis.observation import Observation
 
 _LEAST_MISFIT = 0.02
@@ -66,10 +66,9 @@ def signs_of_pairs(
         first, second = (_row(observation, predicted, pair.frequency, era) for era in pair.eras)
         if first is None or second is None:
             continue
-        plus, minus = (
-            math.log(max(1 - mac_of(pair.values, first + sign * second), _LEAST_MISFIT))
-            for sign in (1, -1)
-        )
+        shapes = np.array([first + second, first - second])
+        mac = np.nan_to_num(modal_assurance(pair.values, shapes))
+        plus, minus = np.log(np.maximum(1 - mac, _LEAST_MISFIT))
         evidence[pair.eras] += minus - plus
         evidence[pair.eras[::-1]] += minus - plus
     signs: dict[int, tuple[int, float]] = {}

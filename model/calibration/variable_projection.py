@@ -1,0 +1,60 @@
+"""Variable projection of gains, and measures of rows of responses over sensors.
+
+    d_fes = g_fe a_fes + noise
+
+d measured, a of the model, g the gain of a row, at one frequency f and of one ERA e. Gains enter
+linearly: the best ones follow at once from any model, so that only its parameters are searched
+(Golub and Pereyra, SIAM J. Numer. Anal. 10, 1973).
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model.arrays import ComplexArray, FloatArray
+
+
+def best_gains(
+    model: ComplexArray,
+    values: ComplexArray,
+    weight: FloatArray,
+    *,
+    expected: FloatArray | None = None,
+    tolerance: float = 0.0,
+) -> ComplexArray:
+    """Return the gain of every row (f, e) that minimizes sum |weight (values - gain model)|².
+
+    model, values, weight (f, e, s), weight zero where nothing was measured. expected (e,):
+    magnitudes known beforehand to a relative standard deviation `tolerance`; they add
+    ((|gain| - expected) / (tolerance expected))² to each row. Without them the gain of a row
+    without values is NaN.
+    """
+    values = np.where(weight > 0, values, 0)
+    inner = (weight**2 * model.conj() * values).sum(axis=2)
+    power = (np.abs(weight * model) ** 2).sum(axis=2)
+    if expected is None:
+        return np.where(power > 0, inner / np.where(power > 0, power, 1), np.nan)
+    precision = 1 / (tolerance * expected) ** 2
+    magnitude = (np.abs(inner) + precision * expected) / (power + precision)
+    return np.asarray(magnitude * np.exp(1j * np.angle(inner)))
+
+
+def row_rms(values: ComplexArray, used: NDArray[np.bool_] | None = None) -> FloatArray:
+    """Root mean square of each row of values (f, e, s) over its sensors; 1 for an empty row."""
+    used = np.isfinite(values) if used is None else used
+    power = np.where(used, np.abs(np.where(used, values, 0)) ** 2, 0).sum(axis=2)
+    rms = np.sqrt(power / np.maximum(used.sum(axis=2), 1))
+    return np.where(rms > 0, rms, 1.0)
+
+
+def modal_assurance(values: ComplexArray, model: ComplexArray) -> FloatArray:
+    """Modal assurance criterion |a^H d|² / (|a|² |d|²) of shapes (..., s); NaN of empty ones.
+
+    1 for the same shape whatever its gain, about 1/s for noise. Values that are not finite are
+    left out.
+    """
+    measured = np.isfinite(values)
+    values = np.where(measured, values, 0)
+    model = np.where(measured, model, 0)
+    inner = np.abs((model.conj() * values).sum(axis=-1)) ** 2
+    power = (np.abs(values) ** 2).sum(axis=-1) * (np.abs(model) ** 2).sum(axis=-1)
+    return np.where(power > 0, inner / np.where(power > 0, power, 1), np.nan)

@@ -1,4 +1,4 @@
-"""Latencies drawn: how often each is, and how rarely one is longer."""
+"""LatencyStatistics drawn: how often each is, and how rarely one is longer."""
 
 from collections.abc import Sequence
 from pathlib import Path

@@ -57,7 +57,7 @@ class AmplifiersEvent(Message):
 
 
 class LatencyEvent(Message):
-    """Latencies, at the rate that was subscribed to."""
+    """LatencyStatistics, at the rate that was subscribed to."""
 
     latency_ms: LatencySummary
     plain_because: str | None = Field(

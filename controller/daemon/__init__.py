@@ -1,1 +1,1 @@
-"""The daemon: one process with the control loop and the drivers, told what to do over its API."""
+"""The daemon: drives a plate continuously and serves the API."""

@@ -1,4 +1,4 @@
-"""Reading a daemon's configuration, and everything that it names, before anything is touched."""
+"""Loads and validates a daemon's configuration and the files that it names."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -6,7 +6,7 @@ from pathlib import Path
 from urllib.parse import quote
 
 from controller.api.socket_path import default_socket
-from controller.daemon.sections import CalibrationSection, DaemonSection, TouchSection
+from controller.daemon.config_sections import CalibrationSection, DaemonSection, TouchSection
 from controller.effects.layout import Layout, usual_effects
 from controller.effects.layout_file import is_layout_document, load_layout
 from controller.sources.calibration import CalibratedSource, TouchCalibration, fitted, turned
@@ -22,28 +22,28 @@ from model.rig.file import load_rig
 from model.rig.rig import Rig
 
 API_SOURCES = "api"
-"""What the sources of clients of the API are called, before the colon; nothing else is."""
+"""Prefix of the touch sources of API clients, reserved for them."""
 
 
 @dataclass(frozen=True)
 class TouchInput:
-    """A touch source by its name in the configuration, not yet made."""
+    """A configured touch source, not yet created."""
 
     name: str
     url: str
     calibration: TouchCalibration
 
     def make(self) -> TouchSource:
-        """The source in the plate's coordinates; raises InputError."""
+        """Create the source, in plate coordinates; raises InputError."""
         return CalibratedSource(open_source(self.url), self.calibration)
 
 
 @dataclass(frozen=True)
 class DaemonConfig:
-    """All that a daemon runs by; rig_text: the rig's file as it stands there.
+    """A validated configuration.
 
-    urls: by amplifier; table: its file, or None to build it or take it from the cache; layout: None
-    for one effect everywhere.
+    rig_text: content of the rig's file; urls: by amplifier name; table: its file, or None to build
+    it or take it from the cache; layout: None for the same effect everywhere.
     """
 
     source: Path
@@ -60,13 +60,13 @@ class DaemonConfig:
     dump_folder: Path | None
 
     @property
-    def meaning(self) -> Layout:
-        """What touches mean: the layout, or without one that every touch buzzes where it is."""
+    def effective_layout(self) -> Layout:
+        """The layout, or one that buzzes at every touch if none is configured."""
         return self.layout or Layout(effects=usual_effects(self.section.level_db_sl))
 
 
 def load_daemon_config(path: Path) -> DaemonConfig:
-    """Read a daemon's file and the rig that it names; raises ConfigError with every problem."""
+    """Load a daemon's file with its rig and layout; raises ConfigError with all problems."""
     document = read_document(path)
     _check_kind(document)
     validation = Validation(document, DaemonSection)
@@ -76,15 +76,15 @@ def load_daemon_config(path: Path) -> DaemonConfig:
     touch = _touch(validation, document, rig)
     table = _file(document, "table")
     if table is not None and not table.is_file():
-        validation.add(("table",), f"there is no file {table}; check its name and folder")
+        validation.add(("table",), f"file not found: {table}; check name and folder")
     layout = _layout(validation, document, rig)
     _check_serial_numbers(validation, rig)
     log_file = _beside(document, _named(document, "log", "file"))
     dump_folder = _beside(document, _named(document, "dumps", "folder"))
-    _check_places(validation, log_file, dump_folder)
+    _check_folders(validation, log_file, dump_folder)
     validation.finish()
-    assert rig is not None  # noqa: S101  else there was a problem
-    assert rig_file is not None  # noqa: S101  or there is no rig
+    assert rig is not None  # noqa: S101  else a problem was reported
+    assert rig_file is not None  # noqa: S101  else there is no rig
     section = DaemonSection.model_validate(document.data)
     return DaemonConfig(
         source=path,
@@ -103,30 +103,30 @@ def load_daemon_config(path: Path) -> DaemonConfig:
 
 
 def is_daemon_document(document: Document) -> bool:
-    """Whether a configuration file is a daemon's: it names a rig and is none."""
+    """Whether a document is a daemon's: it names a rig and does not describe a plate."""
     return "rig" in document.data and "plate" not in document.data
 
 
 def _check_kind(document: Document) -> None:
-    """Refuse another kind of file as a whole, in place of all the keys that it does not know."""
+    """Refuse another kind of file as a whole instead of reporting each unknown key."""
     if "rig" in document.data:
         return
     is_layout = is_layout_document(document)
     if is_layout or "plate" in document.data:
         raise InputError(
-            f"{document.source}: is a {'surface layout' if is_layout else 'rig'}, which a daemon's "
-            f"file names with {'layout' if is_layout else 'rig'}: FILE; write one with  era config "
-            "init daemon.yaml --kind daemon"
+            f"{document.source}: must be a daemon's file, got a "
+            f"{'surface layout' if is_layout else 'rig'}; name it in one with "
+            f"{'layout' if is_layout else 'rig'}: FILE (era config init daemon.yaml --kind daemon)"
         )
 
 
 def _file(document: Document, key: str) -> Path | None:
-    """A file that a key names, from the folder of the configuration; None for none."""
+    """The path named by a key, relative to the configuration's folder; None if absent."""
     return _beside(document, _named(document, key))
 
 
 def _named(document: Document, *keys: str) -> str | None:
-    """What keys name, section by section; None where it is no file's name."""
+    """The text at nested keys; None if it is absent or not a file name."""
     value: object = document.data
     for key in keys:
         value = value.get(key) if isinstance(value, dict) else None
@@ -138,20 +138,20 @@ def _beside(document: Document, name: str | None) -> Path | None:
 
 
 def _rig(validation: Validation, file: Path | None) -> tuple[Rig | None, str]:
-    """The rig and its text; what is wrong with it stands at the key that names it."""
+    """Load the rig and its text; problems are reported at the key that names it."""
     if file is None:
         return None, ""
     try:
         return load_rig(file), file.read_text("utf-8")
     except ConfigError as error:
-        validation.add(("rig",), "the rig cannot be used:\n    " + str(error).replace("\n", "\n  "))
+        validation.add(("rig",), "invalid rig:\n    " + str(error).replace("\n", "\n  "))
     except (InputError, OSError) as error:
-        validation.add(("rig",), f"the rig cannot be used: {error}")
+        validation.add(("rig",), f"invalid rig: {error}")
     return None, ""
 
 
 def _layout(validation: Validation, document: Document, rig: Rig | None) -> Layout | None:
-    """The surface layout; what is wrong with it stands at the key that names it."""
+    """Load the surface layout; problems are reported at the key that names it."""
     file = _file(document, "layout")
     if file is None:
         return None
@@ -163,13 +163,13 @@ def _layout(validation: Validation, document: Document, rig: Rig | None) -> Layo
             level_db_sl=STRONG_DB_SL if level is None else level,
         )
     except InputError as error:
-        told = str(error).replace("\n", "\n  ")
-        validation.add(("layout",), f"the layout cannot be used:\n    {told}")
+        indented = str(error).replace("\n", "\n  ")
+        validation.add(("layout",), f"invalid layout:\n    {indented}")
     return None
 
 
 def _urls(validation: Validation, rig: Rig | None, rig_file: Path | None) -> dict[str, str]:
-    """How to reach each amplifier; `sim://` is one over the rig itself."""
+    """The URL of each amplifier; `sim://` becomes a simulated one over this rig."""
     if rig is None or rig_file is None:
         return {}
     here = quote(str(rig_file.resolve()))
@@ -181,52 +181,55 @@ def _urls(validation: Validation, rig: Rig | None, rig_file: Path | None) -> dic
         try:
             open_backend(url)
         except CommandError as error:
-            validation.add(("rig",), f"amplifiers.{name}.url of the rig cannot be used: {error}")
+            validation.add(("rig",), f"invalid amplifiers.{name}.url of the rig: {error}")
     if len(urls) > 1 and any(url.startswith("sim://") for url in urls.values()):
         validation.add(
             ("rig",),
-            "the rig has several amplifiers, which are simulated over one plate by a process of "
-            "their own only: run era sim RIG --serial and put the URLs that it prints into the rig",
+            "sim:// supports one amplifier only; run era sim RIG --serial and put the URLs that it "
+            "prints into the rig",
         )
     return urls
 
 
 def _touch(validation: Validation, document: Document, rig: Rig | None) -> tuple[TouchInput, ...]:
-    """The touch sources that are in order; a source is made once, to know that it can be."""
+    """The valid touch sources; each is created once to check its URL."""
     listed = document.data.get("touch")
     inputs: list[TouchInput] = []
     for number, entry in enumerate(listed if isinstance(listed, list) else []):
         try:
             section = TouchSection.model_validate(entry)
         except ValueError:
-            continue  # the validation has said so
-        here = ("touch", number)
+            continue  # reported by the validation
+        location = ("touch", number)
         if any(section.name == other.name for other in inputs):
-            validation.add((*here, "name"), f"two sources are called {section.name}; rename one")
+            validation.add((*location, "name"), f"name must be unique, got {section.name} twice")
             continue
         if section.name == API_SOURCES:
-            validation.add((*here, "name"), f"{API_SOURCES} is what programs are called; rename it")
+            validation.add(
+                (*location, "name"),
+                f"name must not be {API_SOURCES}, which is reserved for API clients",
+            )
         try:
             calibration = _calibration(section.calibration, rig)
-            made = TouchInput(section.name, section.url, calibration)
+            touch_input = TouchInput(section.name, section.url, calibration)
         except InputError as error:
-            validation.add((*here, "calibration"), str(error))
+            validation.add((*location, "calibration"), str(error))
             continue
         try:
-            made.make()
+            touch_input.make()
         except InputError as error:
-            validation.add((*here, "url"), str(error))
-        inputs.append(made)
+            validation.add((*location, "url"), str(error))
+        inputs.append(touch_input)
     return tuple(inputs)
 
 
 def _calibration(section: CalibrationSection, rig: Rig | None) -> TouchCalibration:
     is_turned = bool(section.turned or section.mirror)
     if is_turned + (section.matrix is not None) + (section.points is not None) > 1:
-        raise InputError("give turned and mirror, or a matrix, or points, and no two of them")
+        raise InputError("must have only one of turned and mirror, matrix, points")
     if section.matrix is not None:
         return TouchCalibration(section.matrix)
-    if section.points is None or rig is None:  # without its plate a rig is refused anyway
+    if section.points is None or rig is None:  # an invalid rig is reported already
         return turned(section.turned, mirror=section.mirror)
     plate = rig.plate
     return fitted(
@@ -239,19 +242,19 @@ def _calibration(section: CalibrationSection, rig: Rig | None) -> TouchCalibrati
     )
 
 
-def _check_places(validation: Validation, log: Path | None, dumps: Path | None) -> None:
-    """What is written only later must have a place; who may write there is seen at the start.
+def _check_folders(validation: Validation, log: Path | None, dumps: Path | None) -> None:
+    """Check the places of files that are written later.
 
-    The log's folder must be there, that of the dumps is made when it is needed.
+    The folder of the log must exist; that of the dumps is created when needed.
     """
     if log is not None and log.is_dir():
-        validation.add(("log", "file"), f"{log} is a folder; name a file in it")
+        validation.add(("log", "file"), f"must be a file, got the folder {log}")
     elif log is not None and not log.parent.is_dir():
-        validation.add(("log", "file"), f"there is no folder {log.parent}; make it")
+        validation.add(("log", "file"), f"folder not found: {log.parent}; create it")
     if dumps is not None:
-        there = next(each for each in (dumps, *dumps.absolute().parents) if each.exists())
-        if not there.is_dir():
-            validation.add(("dumps", "folder"), f"{there} is no folder; name another")
+        existing = next(each for each in (dumps, *dumps.absolute().parents) if each.exists())
+        if not existing.is_dir():
+            validation.add(("dumps", "folder"), f"must be a folder, got the file {existing}")
 
 
 def _check_serial_numbers(validation: Validation, rig: Rig | None) -> None:
@@ -259,5 +262,5 @@ def _check_serial_numbers(validation: Validation, rig: Rig | None) -> None:
         if rig is not None and name not in rig.amplifiers:
             validation.add(
                 ("serial_numbers", name),
-                f"the rig has no such amplifier; it has {', '.join(rig.amplifiers)}",
+                f"unknown amplifier; the rig has {', '.join(rig.amplifiers)}",
             )

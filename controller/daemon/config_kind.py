@@ -1,46 +1,46 @@
-"""Daemon files, as `era config` deals with them."""
+"""Daemon files as a kind of configuration for `era config`."""
 
 from collections import Counter
 from pathlib import Path
 from typing import Any
 
 from controller.daemon.config import is_daemon_document, load_daemon_config
-from controller.daemon.sections import DaemonSection
+from controller.daemon.config_sections import DaemonSection
 from drivers.rig_check import check_links
 from model.config.document import Document
 from model.config.kinds import Good
 
 
 class DaemonKind:
-    """A daemon's configuration file."""
+    """The daemon's configuration file."""
 
     def recognises(self, document: Document) -> bool:
-        """It names a rig, and is none."""
+        """Whether a document is a daemon's file."""
         return is_daemon_document(document)
 
     def check(self, path: Path) -> Good:
-        """Read it with the rig that it names; a good one in a line."""
+        """Check a file and the files that it names; return a one-line summary."""
         config = load_daemon_config(path)
         rig = config.rig
         wired = Counter(channel.amplifier for channel in rig.wiring.values())
         _, warnings = check_links(
             config.urls, channels=wired, frequency_max=rig.limits.frequency_max
         )
-        beyond = "" if config.table is None else f". era daemon {path} --check reads its table, too"
+        hint = "" if config.table is None else f". era daemon {path} --check reads its table, too"
         line = (
             f"good: ERAs {', '.join(era.name for era in config.rig.eras)} on "
             f"{', '.join(f'{name} ({url})' for name, url in config.urls.items())}; touches from "
             f"{', '.join(source.name for source in config.touch) or 'the API only'}; "
-            f"socket {config.socket}{beyond}"
+            f"socket {config.socket}{hint}"
         )
         return Good(line, warnings)
 
     def example(self) -> str:
-        """Every key, with what it is for."""
+        """A commented example with every key."""
         return Path(__file__).with_name("example.yaml").read_text(encoding="utf-8")
 
     def schema(self) -> dict[str, Any]:
-        """For editors."""
+        """The JSON schema for editors."""
         schema = {"$schema": "https://json-schema.org/draft/2020-12/schema"}
         return schema | DaemonSection.model_json_schema() | {"title": "A daemon of era-haptics"}
 

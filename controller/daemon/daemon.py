@@ -1,4 +1,4 @@
-"""The daemon put together: control loop, drivers, API; from its configuration to its end."""
+"""The daemon: control loop, drivers and API assembled from a configuration."""
 
 import asyncio
 import contextlib
@@ -6,21 +6,21 @@ import logging
 import signal
 
 from controller.api.server import ApiServer
-from controller.daemon.companions import Companion, Companions
+from controller.daemon.active_layout import ActiveLayout
+from controller.daemon.api_service import ApiService
+from controller.daemon.api_views import amplifier_statuses
+from controller.daemon.child_processes import ChildProcess, ChildProcesses
 from controller.daemon.config import DaemonConfig, load_daemon_config
-from controller.daemon.dumps import Dumps
-from controller.daemon.inputs import ApiTouches, TouchInputs
+from controller.daemon.fault_dumps import FaultDumps
 from controller.daemon.log import LogThread
-from controller.daemon.meaning import Meaning
-from controller.daemon.news import News
-from controller.daemon.notify import ServiceManager
-from controller.daemon.records import RecordedBackend, Recorder
+from controller.daemon.message_recorder import RecordedBackend, Recorder
+from controller.daemon.publisher import EventPublisher
 from controller.daemon.reload import plan_reload
-from controller.daemon.service import Service
+from controller.daemon.service_manager import ServiceManager
 from controller.daemon.socket_lock import SocketLock
-from controller.daemon.states import Machine, State
+from controller.daemon.states import DaemonState, StateMachine
 from controller.daemon.supervisor import Supervisor
-from controller.daemon.view import amplifier_statuses
+from controller.daemon.touch_inputs import ApiTouches, TouchInputs
 from controller.loop.loop import Controller
 from controller.sources.touch import TouchFrame
 from drivers import clock
@@ -34,15 +34,15 @@ from model.table.table import LocalizationTable
 from model.table.timing import Timing
 from registry.plugins import failure_text
 
-_END_PATIENCE = 0.2  # s; by then whoever can be silenced has been
+_CLOSE_TIMEOUT = 0.2  # s; for the control loop to end after all reachable amplifiers are silent
 
 _logger = logging.getLogger(__name__)
 
 
 class Daemon:
-    """One daemon; `run` is its whole life. Must be made within the event loop that runs it.
+    """A daemon; create it within the event loop that runs it.
 
-    dashboard: HOST:PORT where the gateway shall serve the page, None for nowhere.
+    dashboard: HOST:PORT at which the gateway serves the page, or None.
     """
 
     def __init__(
@@ -55,18 +55,18 @@ class Daemon:
         dashboard: str | None,
     ) -> None:
         self._config = config
-        self._begun_with = config
+        self._initial_config = config
         self._log = log
         self._manager = manager
         self._dashboard = dashboard
         self._loop = asyncio.get_running_loop()
         self._reloads: set[asyncio.Task[None]] = set()
-        self._reloading = asyncio.Lock()
-        self._reload_is_due = False
-        self._ended = asyncio.Event()
-        self._end_cause = "the daemon ends"
+        self._reload_lock = asyncio.Lock()
+        self._is_reload_pending = False
+        self._shutdown = asyncio.Event()
+        self._shutdown_cause = "the daemon is shutting down"
         self._recorder = Recorder()
-        self._dumps = Dumps(self._recorder)
+        self._dumps = FaultDumps(self._recorder)
         backends = self._make_backends(config)
         amplifiers = {
             name: Amplifier(backend, serial_number=config.section.serial_numbers.get(name))
@@ -75,14 +75,14 @@ class Daemon:
         self._supervisor = Supervisor(
             amplifiers,
             state_changed=self._state_changed,
-            link_told=lambda *told: self._news.link_told(*told),
+            link_changed=lambda *change: self._publisher.link_changed(*change),
             alive=lambda: manager.alive(clock.now()),
         )
-        self._meaning = Meaning(config.meaning)
-        self._news = News(
+        self._layout = ActiveLayout(config.effective_layout)
+        self._publisher = EventPublisher(
             machine=lambda: self._supervisor.machine,
             amplifiers=lambda: amplifier_statuses(amplifiers, backends, config.urls),
-            effect_of=self._meaning.effect_of,
+            effect_of=self._layout.effect_of,
             layout=config.layout,
             plain_because=lambda: self._controller.plain_because,
         )
@@ -90,67 +90,67 @@ class Daemon:
             config.rig,
             table,
             amplifiers=amplifiers,
-            observer=self._supervisor.observe(self._news.observer()),
-            intent_source=self._meaning,
+            observer=self._supervisor.observe(self._publisher.observer()),
+            intent_source=self._layout,
             timing=Timing(table),
             drive_mode=config.section.mode,
             envelope_time=config.section.touch_wait,
         )
         self._touches = ApiTouches(config.rig.plate, self._deliver)
         self._inputs = TouchInputs(self._deliver, failed=self._input_failed)
-        self._service = Service(
+        self._api = ApiService(
             config,
             table,
             self._controller,
             self._supervisor,
             amplifiers=amplifiers,
-            news=self._news,
+            publisher=self._publisher,
             touches=self._touches,
-            meaning=self._meaning,
+            layout=self._layout,
         )
         self._server = ApiServer(
-            self._service.handlers(),
-            left=self._service.left,
-            keeps=self._service.keeps,
+            self._api.handlers(),
+            left=self._api.client_left,
+            keeps=self._api.keeps,
             clock=clock.now,
         )
-        self._companions = Companions()
+        self._children = ChildProcesses()
 
-    async def run(self, place: SocketLock) -> None:
-        """Open, serve until told to end, fall silent and close.
+    async def run(self, lock: SocketLock) -> None:
+        """Open, serve until terminated, silence the amplifiers and close.
 
-        Raises LinkError, CommandError and InputError where it cannot begin.
+        Raises LinkError, CommandError and InputError if the start fails.
         """
         loop = asyncio.get_running_loop()
         for number in (signal.SIGTERM, signal.SIGINT):
-            loop.add_signal_handler(number, self.end, f"told to end by {signal.strsignal(number)}")
-        loop.add_signal_handler(signal.SIGHUP, self._reload_soon)
+            loop.add_signal_handler(number, self.shut_down, f"{signal.strsignal(number)} received")
+        loop.add_signal_handler(signal.SIGHUP, self._request_reload)
         running: asyncio.Task[None] | None = None
         try:
-            if not await self._opened():
+            if not await self._open():
                 return
-            await self._server.open(place.bound())
-            await self._inputs.exchange(self._config.touch)
-            self._log.listener = self._news.logged
+            await self._server.open(lock.bind())
+            await self._inputs.replace(self._config.touch)
+            self._log.listener = self._publisher.logged
             running = asyncio.create_task(self._supervisor.run(), name="control loop")
-            self._start_companions()
-            ended = asyncio.create_task(self._ended.wait())
+            self._start_children()
+            shutdown = asyncio.create_task(self._shutdown.wait())
             with no_long_collections():
                 self._manager.ready(self._status_line())
-                _logger.info("serving at %s", place.path)
-                await asyncio.wait({running, ended}, return_when=asyncio.FIRST_COMPLETED)
-            ended.cancel()
+                _logger.info("serving at %s", lock.path)
+                await asyncio.wait({running, shutdown}, return_when=asyncio.FIRST_COMPLETED)
+            shutdown.cancel()
         finally:
             await self._close(running)
         if not running.cancelled():
             running.result()
 
-    async def _opened(self) -> bool:
-        """Open the amplifiers; False where the daemon is told to end before they all answered."""
+    async def _open(self) -> bool:
+        """Open the amplifiers; return False if terminated before all have replied."""
         opening = asyncio.create_task(self._supervisor.open(self._controller))
-        ended = asyncio.create_task(self._ended.wait())
-        await asyncio.wait({opening, ended}, return_when=asyncio.FIRST_COMPLETED)
-        ended.cancel()
+        shutdown = asyncio.create_task(self._shutdown.wait())
+        await asyncio.wait({opening, shutdown}, return_when=asyncio.FIRST_COMPLETED)
+        shutdown.cancel()
         if opening.done():
             opening.result()
             return True
@@ -158,69 +158,72 @@ class Daemon:
         await asyncio.wait({opening})
         return False
 
-    def end(self, cause: str) -> None:
-        """End in order; from a signal, or from whoever runs the daemon."""
-        self._end_cause = cause
-        self._ended.set()
+    def shut_down(self, cause: str) -> None:
+        """Request an orderly shutdown."""
+        self._shutdown_cause = cause
+        self._shutdown.set()
 
     async def reload(self) -> None:
-        """Read the configuration again, and take over what can be taken over."""
-        async with self._reloading:
-            self._reload_is_due = False  # whoever asks from here on means what is there then
+        """Read the configuration again and apply what can change while running."""
+        async with self._reload_lock:
+            self._is_reload_pending = False  # a later request needs another read
             self._manager.reloading()
             try:
                 source = self._config.source
                 new = await in_thread(lambda: load_daemon_config(source), name="reload")
-                await self._take_over(new)
+                await self._apply(new)
             except InputError as error:
-                _logger.error("the configuration is left as it was: %s", error)
-            except Exception:  # whoever waits for the reload must hear of its end
-                _logger.exception("the configuration could not be taken over")
+                _logger.error("config: reload rejected, keeping previous: %s", error)
+            except Exception:  # systemd waits for the end of the reload
+                _logger.exception("config: reload failed")
             self._manager.ready(self._status_line())
 
-    async def _take_over(self, new: DaemonConfig) -> None:
-        is_armed = self._supervisor.machine.state in (State.SWITCHED_ON, State.OPERATION_ENABLED)
+    async def _apply(self, new: DaemonConfig) -> None:
+        is_armed = self._supervisor.machine.state in (
+            DaemonState.SWITCHED_ON,
+            DaemonState.OPERATION_ENABLED,
+        )
         plan = plan_reload(self._config, new, is_armed=is_armed)
         if plan.refused is not None:
-            _logger.error("the configuration is left as it was: %s", plan.refused)
+            _logger.error("config: reload rejected, keeping previous: %s", plan.refused)
             return
-        for key in plan_reload(self._begun_with, new, is_armed=False).restart:
-            _logger.warning("%s has changed: restart the daemon to take it over", key)
+        for key in plan_reload(self._initial_config, new, is_armed=False).restart:
+            _logger.warning("config: %s changed, which needs a restart", key)
         for key in plan.apply:
             match key:
                 case "touch":
-                    await self._inputs.exchange(new.touch)
+                    await self._inputs.replace(new.touch)
                 case "layout":
-                    self._meaning.exchange(new.meaning)
-                    self._news.layout_changed(new.layout)
+                    self._layout.replace(new.effective_layout)
+                    self._publisher.layout_changed(new.layout)
                     self._controller.reconsider()
                 case "longest_lease":
-                    self._service.longest_lease = new.section.longest_lease
+                    self._api.longest_lease = new.section.longest_lease
                 case "log.level":
                     logging.getLogger().setLevel(new.section.log.level.upper())
                 case _:
-                    pass  # is read when it is needed
+                    pass  # read when needed
         self._config = new
-        _logger.info("took over %s", ", ".join(plan.apply) or "nothing: all is as it was")
+        _logger.info("config: reloaded, applied %s", ", ".join(plan.apply) or "no change")
 
     async def _close(self, running: "asyncio.Task[None] | None") -> None:
-        """Silence first; then everything else, as far as it comes."""
+        """Silence the amplifiers first, then close everything else."""
         self._manager.stopping()
-        for reload in self._reloads:  # or it would start what is to end
+        for reload in self._reloads:  # it would start inputs again
             reload.cancel()
         try:
-            await self._supervisor.close(self._end_cause)
+            await self._supervisor.close(self._shutdown_cause)
         finally:
             if running is not None:
-                _, late = await asyncio.wait({running}, timeout=_END_PATIENCE)
-                for task in late:  # it waits for an amplifier that does not answer
+                _, late = await asyncio.wait({running}, timeout=_CLOSE_TIMEOUT)
+                for task in late:  # waiting for an amplifier that does not reply
                     task.cancel()
                     await asyncio.wait({task})
             self._log.listener = None
-            for step in (self._inputs.close(), self._companions.close(), self._server.close()):
+            for step in (self._inputs.close(), self._children.close(), self._server.close()):
                 with contextlib.suppress(OSError):
                     await step
-            self._news.hub.close()
+            self._publisher.hub.close()
 
     def _make_backends(self, config: DaemonConfig) -> dict[str, RecordedBackend]:
         return {
@@ -228,36 +231,36 @@ class Daemon:
             for name, url in config.urls.items()
         }
 
-    def _start_companions(self) -> None:
+    def _start_children(self) -> None:
         socket = str(self._config.socket)
         if self._dashboard is not None:
-            self._companions.start(
-                Companion(
+            self._children.start(
+                ChildProcess(
                     "controller.cli",
                     ("gateway", "--socket", socket, "--listen", self._dashboard),
                 )
             )
         if self._config.section.metrics is not None:
             port = str(self._config.section.metrics)
-            self._companions.start(
-                Companion("controller.metrics", ("--socket", socket, "--port", port))
+            self._children.start(
+                ChildProcess("controller.metrics", ("--socket", socket, "--port", port))
             )
 
     def _deliver(self, frame: TouchFrame) -> None:
-        """Hand touches to the control loop; where there is none just now, they are not felt."""
+        """Pass touches to the control loop; ignore them while it is not running."""
         with contextlib.suppress(DriverError):
             self._controller.deliver(frame)
 
     def _input_failed(self, name: str, error: Exception) -> None:
-        expected = isinstance(error, InputError | OSError)
-        said = str(error) if expected else failure_text(error)
-        _logger.error("touch source %s: failed, retrying: %s", name, said)
+        is_expected = isinstance(error, InputError | OSError)
+        text = str(error) if is_expected else failure_text(error)
+        _logger.error("touch source %s: failed, restarting: %s", name, text)
 
-    def _state_changed(self, old: Machine, new: Machine) -> None:
-        self._news.state_changed(old, new)
-        self._service.state_changed(new)
+    def _state_changed(self, old: StateMachine, new: StateMachine) -> None:
+        self._publisher.state_changed(old, new)
+        self._api.state_changed(new)
         self._manager.status(f"{new.state.value}: {new.cause}")
-        if new.state in (State.FAULT_REACTION_ACTIVE, State.COMM_LOST):
+        if new.state in (DaemonState.FAULT_REACTION_ACTIVE, DaemonState.COMM_LOST):
             self._dump(new.cause)
 
     def _dump(self, cause: str) -> None:
@@ -265,11 +268,11 @@ class Daemon:
         if folder is not None and dumps is not None:
             self._dumps.write(folder, cause=cause, keep=dumps.keep)
 
-    def _reload_soon(self) -> None:
-        """Reload; while another one goes on, once after it, however often that is asked for."""
-        if self._reload_is_due:
+    def _request_reload(self) -> None:
+        """Start a reload; requests during a reload are combined into one after it."""
+        if self._is_reload_pending:
             return
-        self._reload_is_due = True
+        self._is_reload_pending = True
         task = asyncio.ensure_future(self.reload())
         self._reloads.add(task)
         task.add_done_callback(self._reloads.discard)

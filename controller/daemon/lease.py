@@ -1,4 +1,4 @@
-"""Who has armed, and for how long: one lease at a time, renewed by its owner or over."""
+"""The arming lease: one at a time, renewed by its owner or expired."""
 
 import secrets
 from dataclasses import dataclass, replace
@@ -8,66 +8,61 @@ from controller.api.jsonrpc import ErrorCode, RpcError
 
 @dataclass(frozen=True)
 class Lease:
-    """token: what its owner proves it with; lasts [s] from every renewal; ends [s]."""
+    """A lease; token: proves ownership; duration [s]: from each renewal; expires_at [s]."""
 
     owner: str
     token: str
-    lasts: float
-    ends: float
+    duration: float
+    expires_at: float
 
 
-class LeaseBook:
-    """Keeps the lease; reads no clock, so every question says what time [s] it is."""
+class LeaseHolder:
+    """Holds the current lease; reads no clock, so every method takes the time [s]."""
 
     def __init__(self) -> None:
         self._lease: Lease | None = None
 
-    def held(self, now: float) -> Lease | None:
-        """The lease that runs."""
-        return self._lease if self._lease and now < self._lease.ends else None
+    def current(self, now: float) -> Lease | None:
+        """The lease that has not expired, or None."""
+        return self._lease if self._lease and now < self._lease.expires_at else None
 
     @property
-    def ends(self) -> float | None:
-        """When [s] the lease is over unless it is renewed; None where there is none."""
-        return self._lease.ends if self._lease else None
+    def expires_at(self) -> float | None:
+        """When the lease expires unless renewed [s]; None without a lease."""
+        return self._lease.expires_at if self._lease else None
 
-    def grant(self, owner: str, *, lasts: float, now: float) -> Lease:
-        """A new lease; raises RpcError while another runs."""
-        held = self.held(now)
-        if held is not None:
+    def grant(self, owner: str, *, duration: float, now: float) -> Lease:
+        """Grant a new lease; raises RpcError while another is current."""
+        current = self.current(now)
+        if current is not None:
             raise RpcError(
                 ErrorCode.LEASE,
-                f"armed by {held.owner!a} for {held.ends - now:.1f} s more",
-                remedy="wait, or disarm first: anyone may",
+                f"armed by {current.owner!a} for {current.expires_at - now:.1f} s more",
+                remedy="wait, or disarm first: every client may",
             )
-        self._lease = Lease(owner, secrets.token_hex(16), lasts, now + lasts)
+        self._lease = Lease(owner, secrets.token_hex(16), duration, now + duration)
         return self._lease
 
-    def begin(self, token: str, *, now: float) -> Lease:
-        """The lease that was granted, as long as it lasts from now on, also if it was over by then.
-
-        Raises RpcError where it was ended.
-        """
+    def restart(self, token: str, *, now: float) -> Lease:
+        """Restart the granted lease, even if it has expired; raises RpcError if it was ended."""
         if self._lease is None or self._lease.token != token:
-            raise RpcError(ErrorCode.LEASE, "the lease was ended meanwhile", remedy="arm again")
-        self._lease = replace(self._lease, ends=now + self._lease.lasts)
+            raise RpcError(ErrorCode.LEASE, "lease was ended meanwhile", remedy="arm again")
+        self._lease = replace(self._lease, expires_at=now + self._lease.duration)
         return self._lease
 
     def renew(self, token: str, *, now: float) -> Lease:
-        """The same lease from now on; raises RpcError where it is over, or another's."""
-        held = self.held(now)
-        if held is None:
-            raise RpcError(
-                ErrorCode.LEASE, "the lease is over: nothing is armed by it", remedy="arm again"
-            )
-        if not secrets.compare_digest(held.token.encode(), token.encode()):
+        """Renew the current lease; raises RpcError if it has expired or is not the caller's."""
+        current = self.current(now)
+        if current is None:
+            raise RpcError(ErrorCode.LEASE, "lease has expired", remedy="arm again")
+        if not secrets.compare_digest(current.token.encode(), token.encode()):
             raise RpcError(
                 ErrorCode.LEASE,
-                f"the lease that runs belongs to {held.owner!a}, not to you",
-                remedy="wait until it is over, or disarm first: anyone may",
+                f"lease belongs to {current.owner!a}",
+                remedy="wait until it expires, or disarm first: every client may",
             )
-        return self.begin(held.token, now=now)
+        return self.restart(current.token, now=now)
 
     def end(self) -> None:
-        """No lease runs any more."""
+        """End the lease."""
         self._lease = None

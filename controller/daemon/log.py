@@ -1,8 +1,8 @@
-"""The daemon's log: JSON, one object a line, written by a thread of its own.
+"""The daemon's log: JSON lines, written by a thread.
 
-Whoever logs never waits: lines go into a bounded queue, and what does not fit, or cannot be
-written, is counted. Of lines from one place in the code a few a second are written, the next then
-says how many were left out. Texts from outside are escaped by JSON, so that no line can be forged.
+Logging never blocks: lines go into a bounded queue; lines that do not fit or cannot be written are
+counted. Each logging call in the code is limited to a few lines a second; the next line says how
+many were skipped. JSON escapes control characters, so that messages cannot forge lines.
 """
 
 import contextlib
@@ -16,92 +16,96 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TextIO
 
-_QUEUE = 2000  # lines that wait to be written
-_BURST = 5  # lines from one place at once
-_RATE = 1.0  # 1/s from then on
-_LONGEST = 2000  # characters of a message
-_END_TIMEOUT = 0.3  # s; a disk that hangs must not hold up the end
+_MAX_QUEUED = 2000  # lines
+_BURST = 5  # lines of one logging call at once
+_RATE = 1.0  # 1/s after a burst
+_MAX_MESSAGE = 2000  # characters
+_CLOSE_TIMEOUT = 0.3  # s; a hanging disk must not delay the exit
 
-_STANDARD = frozenset(logging.makeLogRecord({}).__dict__) | {"message", "asctime", "taskName"}
+_STANDARD_FIELDS = frozenset(logging.makeLogRecord({}).__dict__) | {
+    "message",
+    "asctime",
+    "taskName",
+}
 
 
 class JsonFormatter(logging.Formatter):
-    """A record as JSON: time, level, logger, message, what `extra` gave, and a traceback."""
+    """Formats a record as JSON: time, level, logger, message, extra fields, traceback."""
 
     def format(self, record: logging.LogRecord) -> str:
-        """One line without control characters; everything beyond ASCII is escaped."""
+        """Return one line of ASCII without control characters."""
         seconds = time.strftime("%Y-%m-%dT%H:%M:%S", time.gmtime(record.created))
-        said: dict[str, object] = {
+        fields: dict[str, object] = {
             "time": f"{seconds}.{int(record.msecs):03d}Z",
             "level": record.levelname.lower(),
             "logger": record.name,
-            "message": record.getMessage()[:_LONGEST],
+            "message": record.getMessage()[:_MAX_MESSAGE],
         }
         for name, value in record.__dict__.items():
-            if name not in _STANDARD:
-                said[name] = value if isinstance(value, int | float | str | None) else str(value)
+            if name not in _STANDARD_FIELDS:
+                fields[name] = value if isinstance(value, int | float | str | None) else str(value)
         if record.exc_info:
-            said["traceback"] = self.formatException(record.exc_info)[-4 * _LONGEST :]
-        return json.dumps(said)
+            fields["traceback"] = self.formatException(record.exc_info)[-4 * _MAX_MESSAGE :]
+        return json.dumps(fields)
 
 
 UNLIMITED = frozenset({"controller.daemon.supervisor"})
-"""Loggers of which every line is written: changes of state, which the wire itself makes rare."""
+"""Loggers without a rate limit: state transitions, which are rare by nature."""
 
 
-class RateLimit(logging.Filter):
-    """Lets a few records a second through for every place in the code; clock [s]."""
+class RateLimitFilter(logging.Filter):
+    """Limits the rate of records per logging call; clock [s]."""
 
     def __init__(self, *, clock: Callable[[], float] = time.monotonic) -> None:
         super().__init__()
         self._clock = clock
-        self._places: dict[tuple[str, int], tuple[float, float, int]] = {}
+        self._buckets: dict[tuple[str, int], tuple[float, float, int]] = {}
 
     def filter(self, record: logging.LogRecord) -> bool:
-        """Whether a record is written; one that is says how many before it were not."""
+        """Whether to write a record; its field `skipped` counts the records not written before."""
         if record.name in UNLIMITED:
             return True
-        place, now = (record.pathname, record.lineno), self._clock()
-        allowance, seen_at, left_out = self._places.get(place, (float(_BURST), now, 0))
-        allowance = min(float(_BURST), allowance + _RATE * (now - seen_at))
-        if allowance < 1:
-            self._places[place] = (allowance, now, left_out + 1)
+        call, now = (record.pathname, record.lineno), self._clock()
+        tokens, updated_at, skipped = self._buckets.get(call, (float(_BURST), now, 0))
+        tokens = min(float(_BURST), tokens + _RATE * (now - updated_at))
+        if tokens < 1:
+            self._buckets[call] = (tokens, now, skipped + 1)
             return False
-        self._places[place] = (allowance - 1, now, 0)
-        if left_out:
-            record.__dict__["left_out"] = left_out
+        self._buckets[call] = (tokens - 1, now, 0)
+        if skipped:
+            record.__dict__["skipped"] = skipped
         return True
 
 
 class LogThread:
     """Writes the log until it is closed; `lost` counts lines that could not be written.
 
-    file: appended to; None for standard error. A file that fails is tried again with every line.
-    listener: told of every record, in whatever thread it arose.
+    file: appended to; None for standard error. A failing file is reopened for every line. listener:
+    called with every record in the thread that logs it.
     """
 
     def __init__(self, file: Path | None) -> None:
         self.lost = 0
         self.listener: Callable[[logging.LogRecord], None] | None = None
         self._file = file
-        self._lines: queue.Queue[str | None] = queue.Queue(_QUEUE)
+        self._lines: queue.Queue[str | None] = queue.Queue(_MAX_QUEUED)
         self._thread = threading.Thread(target=self._write_all, name="log", daemon=True)
         self._thread.start()
 
     def put(self, line: str) -> None:
-        """Have a line written; never waits."""
+        """Queue a line; never blocks."""
         try:
             self._lines.put_nowait(line)
         except queue.Full:
             self.lost += 1
 
     def close(self) -> None:
-        """Write what waits, but not for long."""
+        """Write the queued lines, within a time limit."""
         try:
-            self._lines.put(None, timeout=_END_TIMEOUT)
+            self._lines.put(None, timeout=_CLOSE_TIMEOUT)
         except queue.Full:
             return
-        self._thread.join(_END_TIMEOUT)
+        self._thread.join(_CLOSE_TIMEOUT)
 
     def _write_all(self) -> None:
         stream: TextIO | None = None
@@ -113,23 +117,23 @@ class LogThread:
                 stream.flush()
             except (OSError, ValueError):
                 self.lost += 1
-                self._leave(stream)
-                stream = None  # a full disk may have room again
-        self._leave(stream)
+                self._close_file(stream)
+                stream = None  # the disk may have space again
+        self._close_file(stream)
 
     def _open(self) -> TextIO:
         if self._file is None:
             return sys.stderr
         return self._file.open("a", encoding="utf-8")
 
-    def _leave(self, stream: TextIO | None) -> None:
+    def _close_file(self, stream: TextIO | None) -> None:
         if stream is not None and self._file is not None:
             with contextlib.suppress(OSError, ValueError):
                 stream.close()
 
 
 class LogHandler(logging.Handler):
-    """Formats records and hands them to the thread."""
+    """Formats records and queues them for the thread."""
 
     def __init__(self, thread: LogThread) -> None:
         super().__init__()
@@ -142,15 +146,15 @@ class LogHandler(logging.Handler):
             self._thread.put(self.format(record))
             if self._thread.listener is not None and record.levelno >= logging.INFO:
                 self._thread.listener(record)
-        except Exception:  # a log that fails must not end what it tells of
+        except Exception:  # a failing log must not stop the program
             self._thread.lost += 1
 
 
 def start_log(file: Path | None, *, level: str) -> LogThread:
-    """Send everything that is logged in this process there, from a level on; nowhere else."""
+    """Send all records of this process from a level on to a file, or to standard error."""
     thread = LogThread(file)
     handler = LogHandler(thread)
-    handler.addFilter(RateLimit())
+    handler.addFilter(RateLimitFilter())
     root = logging.getLogger()
     root.handlers[:] = [handler]
     root.setLevel(level.upper())

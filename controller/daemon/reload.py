@@ -1,21 +1,21 @@
-"""What a running daemon can take over from a changed configuration, and what it cannot."""
+"""What a running daemon can apply of a changed configuration."""
 
 from dataclasses import dataclass
 
 from controller.daemon.config import DaemonConfig
 
-RESTART = ("touch_wait", "socket", "log.file", "metrics", "dashboard")
-"""Keys that hold from the start to the end of a daemon."""
+NEED_RESTART = ("touch_wait", "socket", "log.file", "metrics", "dashboard")
+"""Keys that are applied at the start only."""
 
-BASIS = ("rig", "table", "mode", "serial_numbers")
-"""Keys on which all others depend: where one of them changes, nothing is taken over."""
+REFUSED = ("rig", "table", "mode", "serial_numbers")
+"""Keys on which all others depend: a change of one of them refuses the reload."""
 
 
 @dataclass(frozen=True)
 class ReloadPlan:
-    """apply: keys to take over now; restart: keys that have changed but wait for a restart.
+    """apply: keys to apply now; restart: changed keys that need a restart.
 
-    refused: why nothing is taken over at all, or None.
+    refused: why nothing is applied at all, or None.
     """
 
     apply: tuple[str, ...]
@@ -24,36 +24,31 @@ class ReloadPlan:
 
 
 def plan_reload(old: DaemonConfig, new: DaemonConfig, *, is_armed: bool) -> ReloadPlan:
-    """What follows from a new configuration that is in order by itself."""
-    changed = _changed(old, new)
-    basis = tuple(key for key in BASIS if key in changed)
-    if basis:
-        return ReloadPlan(
-            (),
-            basis,
-            f"{', '.join(basis)} changed, which only a restart can take over; nothing was changed",
-        )
-    before, after = old.meaning.strongest_db_sl, new.meaning.strongest_db_sl
+    """Plan the change from one valid configuration to another."""
+    changed = _changed_keys(old, new)
+    refused = tuple(key for key in REFUSED if key in changed)
+    if refused:
+        return ReloadPlan((), refused, f"{', '.join(refused)} changed, which needs a restart")
+    before, after = old.effective_layout.strongest_db_sl, new.effective_layout.strongest_db_sl
     if is_armed and after > before:
         return ReloadPlan(
             (),
             (),
-            f"the strongest effect would rise from {before:g} to {after:g} dB SL while armed; "
-            "nothing was changed: disarm, then reload",
+            f"strongest effect must not rise while armed, got {after:g} instead of {before:g} "
+            "dB SL; disarm, then reload",
         )
-    restart = tuple(key for key in RESTART if key in changed)
+    restart = tuple(key for key in NEED_RESTART if key in changed)
     return ReloadPlan(tuple(key for key in changed if key not in restart), restart)
 
 
-def _changed(old: DaemonConfig, new: DaemonConfig) -> list[str]:
-    """Keys whose meaning is another."""
+def _changed_keys(old: DaemonConfig, new: DaemonConfig) -> list[str]:
     differs = {
         "rig": (old.rig_text, old.urls) != (new.rig_text, new.urls),
         "table": old.table != new.table,
         "mode": old.section.mode != new.section.mode,
         "serial_numbers": old.section.serial_numbers != new.section.serial_numbers,
         "touch_wait": old.section.touch_wait != new.section.touch_wait,
-        "layout": old.meaning != new.meaning,
+        "layout": old.effective_layout != new.effective_layout,
         "touch": old.touch != new.touch,
         "longest_lease": old.section.longest_lease != new.section.longest_lease,
         "log.level": old.section.log.level != new.section.log.level,
@@ -63,4 +58,4 @@ def _changed(old: DaemonConfig, new: DaemonConfig) -> list[str]:
         "metrics": old.section.metrics != new.section.metrics,
         "dashboard": old.section.dashboard != new.section.dashboard,
     }
-    return [key for key, is_other in differs.items() if is_other]
+    return [key for key, is_changed in differs.items() if is_changed]

@@ -1,14 +1,14 @@
-"""What state the daemon is in, and what may follow: a table, and `step`, which goes by it.
+"""The daemon's state machine: a transition table and `step`, a pure function that applies it.
 
-The names are those of CiA 402. In words:
+State names follow CiA 402.
 
-- Nothing but ARM, in READY_TO_SWITCH_ON, leads to SWITCHED_ON, and from there ARMED to
+- Only ARM in READY_TO_SWITCH_ON leads to SWITCHED_ON, and only ARMED from there to
   OPERATION_ENABLED.
-- QUICK_STOP_ACTIVE and FAULT are left for SWITCH_ON_DISABLED only, and only once somebody has
-  acknowledged (CLEAR) and all amplifiers have then been read back as sound: no fault, level zero.
-- COMM_LOST is left once the amplifiers are open again *and* the time has passed for which a lost
-  one may go on playing; for FAULT, if anything was latched or energised before.
-- What the table does not name leaves everything as it is.
+- QUICK_STOP_ACTIVE and FAULT lead only to SWITCH_ON_DISABLED, after an acknowledgement (CLEAR) and
+  a read-back of all amplifiers without a fault and at level zero.
+- COMM_LOST is left once the amplifiers are reconnected *and* the watchdog of a lost amplifier must
+  have expired; to FAULT if anything was latched or energised before.
+- An event without an entry in the table changes nothing.
 """
 
 from collections.abc import Callable, Mapping
@@ -19,12 +19,12 @@ from typing import NamedTuple
 from drivers.amplifier import WATCHDOG
 
 ACKNOWLEDGE = "find the cause, then clear (era clear) and arm again"
-"""What somebody has to do about a fault."""
+"""Remedy of every fault."""
 
-_MARGIN = 0.1  # s; beyond the watchdog, for the clocks and the last ramp
+_WATCHDOG_MARGIN = 0.1  # s; for clock deviations and the last ramp
 
 
-class State(StrEnum):
+class DaemonState(StrEnum):
     """States by their CiA 402 names, and COMM_LOST."""
 
     NOT_READY = "NOT_READY"
@@ -38,192 +38,224 @@ class State(StrEnum):
     COMM_LOST = "COMM_LOST"
 
 
-class Kind(Enum):
-    """What can happen."""
+class Trigger(Enum):
+    """Kinds of events."""
 
-    OPENED = auto()  # every amplifier answered and is the expected one
-    SOUND = auto()  # every amplifier was read back: disarmed, no fault, level zero
-    ARM = auto()  # somebody asks for it
-    ARMED = auto()  # every amplifier confirmed it
-    DISARM = auto()  # somebody asks for it
-    LEASE_LOST = auto()  # whoever armed has not renewed
-    STOP = auto()  # somebody asks for it
-    CLEAR = auto()  # somebody acknowledges
-    FAULT = auto()  # an amplifier or the loop reports one
-    REACTED = auto()  # what a fault asks for was done
+    OPENED = auto()  # every amplifier has replied with the expected identity
+    VERIFIED = auto()  # every amplifier was read back: disarmed, no fault, level zero
+    ARM = auto()  # requested
+    ARMED = auto()  # every amplifier has confirmed
+    DISARM = auto()  # requested
+    LEASE_LOST = auto()  # the arming lease was not renewed
+    STOP = auto()  # requested
+    CLEAR = auto()  # acknowledgement requested
+    FAULT = auto()  # reported by an amplifier or the control loop
+    REACTION_DONE = auto()  # the fault reaction is complete
     LINK_LOST = auto()  # an amplifier cannot be reached
-    REOPENED = auto()  # after that: all answer again, and are disarmed
-    TICK = auto()  # time passes
-    CLOSE = auto()  # the daemon ends
+    RECONNECTED = auto()  # all amplifiers reply again and are disarmed
+    TICK = auto()  # time has passed
+    CLOSE = auto()  # the daemon shuts down
 
 
 class Action(Enum):
-    """What is to be done; what comes of it is the next event."""
+    """Actions of a transition; the outcome of each is the next event."""
 
-    VERIFY = auto()  # disarm what still plays, read all back: SOUND or FAULT
+    VERIFY = auto()  # disarm what still plays, read all back: VERIFIED or FAULT
     ARM = auto()  # ARMED or FAULT
     DISARM = auto()
-    STOP = auto()  # quick stop of all that can be reached
-    REACT = auto()  # quick stop, then REACTED
-    CLEAR = auto()  # acknowledge at the amplifiers, read all back: SOUND or FAULT
-    RECONNECT = auto()  # with growing pauses: REOPENED
-    CLOSE = auto()  # silent along a ramp, read back, disarmed, closed
+    STOP = auto()  # quick stop of all reachable amplifiers
+    REACT = auto()  # quick stop, then REACTION_DONE
+    CLEAR = auto()  # acknowledge at the amplifiers, read all back: VERIFIED or FAULT
+    RECONNECT = auto()  # with growing pauses: RECONNECTED
+    CLOSE = auto()  # ramp down, read back, disarm, close
 
 
 @dataclass(frozen=True)
-class Event:
-    """Something that happened: why, and what one can do about it."""
+class DaemonEvent:
+    """An event with its cause and a remedy for the user."""
 
-    kind: Kind
+    trigger: Trigger
     cause: str = ""
     remedy: str | None = None
 
 
 @dataclass(frozen=True)
-class Machine:
-    """The daemon's state and all that its next step depends on.
+class StateMachine:
+    """The daemon's state and everything that its next transition depends on.
 
-    latched: somebody must acknowledge before anything is armed; acknowledged: somebody has, and the
-    amplifiers are being read back; lost_at [s]: when the link was lost; reopened: since then.
+    is_latched: an acknowledgement is required before arming; is_acknowledged: it was given, and the
+    amplifiers are being read back; lost_at [s]: when the link was lost; is_reconnected: since then.
     """
 
-    state: State = State.NOT_READY
-    cause: str = "the daemon starts"
+    state: DaemonState = DaemonState.NOT_READY
+    cause: str = "the daemon is starting"
     remedy: str | None = None
-    latched: bool = False
-    acknowledged: bool = False
+    is_latched: bool = False
+    is_acknowledged: bool = False
     lost_at: float = 0.0
-    reopened: bool = False
+    is_reconnected: bool = False
 
     def lost_for(self, now: float) -> float | None:
-        """How long [s] a link has been lost at a time [s]; None where none is."""
-        return now - self.lost_at if self.state is State.COMM_LOST else None
+        """Time since the link was lost [s]; None while it is up."""
+        return now - self.lost_at if self.state is DaemonState.COMM_LOST else None
 
     def assume_energised(self, now: float) -> bool:
-        """Whether amplifiers that cannot be reached may still be playing at a time [s]."""
+        """Whether a lost amplifier may still be playing: its watchdog need not have expired."""
         lost_for = self.lost_for(now)
-        return lost_for is not None and lost_for < WATCHDOG + _MARGIN
+        return lost_for is not None and lost_for < WATCHDOG + _WATCHDOG_MARGIN
 
 
-class Rule(NamedTuple):
-    """Where an event leads to, what is to be done, and when the rule holds."""
+class Transition(NamedTuple):
+    """Next state, actions, and the condition under which the transition applies."""
 
-    to: State
+    to: DaemonState
     actions: tuple[Action, ...] = ()
-    when: Callable[[Machine, float], bool] = lambda machine, now: True
+    when: Callable[[StateMachine, float], bool] = lambda machine, now: True
 
 
-_SILENT = (State.SWITCH_ON_DISABLED, State.READY_TO_SWITCH_ON)
-_ENERGISED = (State.SWITCHED_ON, State.OPERATION_ENABLED)
-_LATCHING = (State.QUICK_STOP_ACTIVE, State.FAULT_REACTION_ACTIVE, State.FAULT)
+_SILENT = (DaemonState.SWITCH_ON_DISABLED, DaemonState.READY_TO_SWITCH_ON)
+_ENERGISED = (DaemonState.SWITCHED_ON, DaemonState.OPERATION_ENABLED)
+_LATCHING = (DaemonState.QUICK_STOP_ACTIVE, DaemonState.FAULT_REACTION_ACTIVE, DaemonState.FAULT)
 _OPEN = (*_SILENT, *_ENERGISED, *_LATCHING)
 
 
-def _acknowledged(machine: Machine, now: float) -> bool:
-    return machine.acknowledged
+def _is_acknowledged(machine: StateMachine, now: float) -> bool:
+    return machine.is_acknowledged
 
 
-def _safe_to_go_on(machine: Machine, now: float) -> bool:
-    return machine.reopened and not machine.assume_energised(now)
+def _may_leave_comm_lost(machine: StateMachine, now: float) -> bool:
+    return machine.is_reconnected and not machine.assume_energised(now)
 
 
-def _safe_but_latched(machine: Machine, now: float) -> bool:
-    return machine.latched and _safe_to_go_on(machine, now)
+def _must_leave_latched(machine: StateMachine, now: float) -> bool:
+    return machine.is_latched and _may_leave_comm_lost(machine, now)
 
 
-_BACK = (
-    Rule(State.FAULT, when=_safe_but_latched),
-    Rule(State.SWITCH_ON_DISABLED, (Action.VERIFY,), _safe_to_go_on),
-    Rule(State.COMM_LOST),
+_LEAVE_COMM_LOST = (
+    Transition(DaemonState.FAULT, when=_must_leave_latched),
+    Transition(DaemonState.SWITCH_ON_DISABLED, (Action.VERIFY,), _may_leave_comm_lost),
+    Transition(DaemonState.COMM_LOST),
 )
 
-TABLE: Mapping[tuple[State, Kind], tuple[Rule, ...]] = {
-    (State.NOT_READY, Kind.OPENED): (Rule(State.SWITCH_ON_DISABLED, (Action.VERIFY,)),),
-    (State.SWITCH_ON_DISABLED, Kind.SOUND): (Rule(State.READY_TO_SWITCH_ON),),
-    (State.READY_TO_SWITCH_ON, Kind.ARM): (Rule(State.SWITCHED_ON, (Action.ARM,)),),
-    (State.SWITCHED_ON, Kind.ARMED): (Rule(State.OPERATION_ENABLED),),
+TRANSITIONS: Mapping[tuple[DaemonState, Trigger], tuple[Transition, ...]] = {
+    (DaemonState.NOT_READY, Trigger.OPENED): (
+        Transition(DaemonState.SWITCH_ON_DISABLED, (Action.VERIFY,)),
+    ),
+    (DaemonState.SWITCH_ON_DISABLED, Trigger.VERIFIED): (
+        Transition(DaemonState.READY_TO_SWITCH_ON),
+    ),
+    (DaemonState.READY_TO_SWITCH_ON, Trigger.ARM): (
+        Transition(DaemonState.SWITCHED_ON, (Action.ARM,)),
+    ),
+    (DaemonState.SWITCHED_ON, Trigger.ARMED): (Transition(DaemonState.OPERATION_ENABLED),),
     **{
-        (state, kind): (Rule(State.SWITCH_ON_DISABLED, (Action.DISARM, Action.VERIFY)),)
+        (state, trigger): (
+            Transition(DaemonState.SWITCH_ON_DISABLED, (Action.DISARM, Action.VERIFY)),
+        )
         for state in _ENERGISED
-        for kind in (Kind.DISARM, Kind.LEASE_LOST)
+        for trigger in (Trigger.DISARM, Trigger.LEASE_LOST)
     },
     **{
-        (state, Kind.STOP): (Rule(State.QUICK_STOP_ACTIVE, (Action.STOP,)),)
-        for state in (*_SILENT, *_ENERGISED, State.QUICK_STOP_ACTIVE)
+        (state, Trigger.STOP): (Transition(DaemonState.QUICK_STOP_ACTIVE, (Action.STOP,)),)
+        for state in (*_SILENT, *_ENERGISED, DaemonState.QUICK_STOP_ACTIVE)
     },
     **{
-        (state, Kind.STOP): (Rule(state, (Action.STOP,)),)
-        for state in (State.FAULT_REACTION_ACTIVE, State.FAULT, State.COMM_LOST)
+        (state, Trigger.STOP): (Transition(state, (Action.STOP,)),)
+        for state in (
+            DaemonState.FAULT_REACTION_ACTIVE,
+            DaemonState.FAULT,
+            DaemonState.COMM_LOST,
+        )
     },
     **{
-        (state, Kind.FAULT): (Rule(State.FAULT_REACTION_ACTIVE, (Action.REACT,)),)
-        for state in (*_SILENT, *_ENERGISED, State.QUICK_STOP_ACTIVE)
+        (state, Trigger.FAULT): (Transition(DaemonState.FAULT_REACTION_ACTIVE, (Action.REACT,)),)
+        for state in (*_SILENT, *_ENERGISED, DaemonState.QUICK_STOP_ACTIVE)
     },
-    (State.FAULT, Kind.FAULT): (Rule(State.FAULT),),
-    (State.FAULT_REACTION_ACTIVE, Kind.REACTED): (Rule(State.FAULT),),
+    (DaemonState.FAULT, Trigger.FAULT): (Transition(DaemonState.FAULT),),
+    (DaemonState.FAULT_REACTION_ACTIVE, Trigger.REACTION_DONE): (Transition(DaemonState.FAULT),),
     **{
-        (state, Kind.CLEAR): (Rule(state, (Action.CLEAR,)),)
-        for state in (State.QUICK_STOP_ACTIVE, State.FAULT)
-    },
-    **{
-        (state, Kind.SOUND): (Rule(State.SWITCH_ON_DISABLED, (Action.VERIFY,), _acknowledged),)
-        for state in (State.QUICK_STOP_ACTIVE, State.FAULT)
+        (state, Trigger.CLEAR): (Transition(state, (Action.CLEAR,)),)
+        for state in (DaemonState.QUICK_STOP_ACTIVE, DaemonState.FAULT)
     },
     **{
-        (state, Kind.LINK_LOST): (Rule(State.COMM_LOST, (Action.STOP, Action.RECONNECT)),)
+        (state, Trigger.VERIFIED): (
+            Transition(DaemonState.SWITCH_ON_DISABLED, (Action.VERIFY,), _is_acknowledged),
+        )
+        for state in (DaemonState.QUICK_STOP_ACTIVE, DaemonState.FAULT)
+    },
+    **{
+        (state, Trigger.LINK_LOST): (
+            Transition(DaemonState.COMM_LOST, (Action.STOP, Action.RECONNECT)),
+        )
         for state in _OPEN
     },
-    (State.COMM_LOST, Kind.LINK_LOST): (
-        Rule(State.COMM_LOST, (Action.RECONNECT,), lambda machine, now: machine.reopened),
+    (DaemonState.COMM_LOST, Trigger.LINK_LOST): (
+        Transition(
+            DaemonState.COMM_LOST,
+            (Action.RECONNECT,),
+            lambda machine, now: machine.is_reconnected,
+        ),
     ),
-    (State.COMM_LOST, Kind.REOPENED): _BACK,
-    (State.COMM_LOST, Kind.TICK): _BACK,
-    **{(state, Kind.CLOSE): (Rule(State.NOT_READY, (Action.CLOSE,)),) for state in State},
+    (DaemonState.COMM_LOST, Trigger.RECONNECTED): _LEAVE_COMM_LOST,
+    (DaemonState.COMM_LOST, Trigger.TICK): _LEAVE_COMM_LOST,
+    **{
+        (state, Trigger.CLOSE): (Transition(DaemonState.NOT_READY, (Action.CLOSE,)),)
+        for state in DaemonState
+    },
 }
-"""Rules by state and event, the first that holds counts; whatever is not here changes nothing."""
+"""Transitions by state and trigger; the first whose condition holds applies."""
 
 
-def step(machine: Machine, event: Event, now: float) -> tuple[Machine, tuple[Action, ...]]:
-    """What follows from an event at a time [s], and what is to be done then."""
-    after = _noted(machine, event, now)
-    for rule in TABLE.get((machine.state, event.kind), ()):
-        if rule.when(after, now):
-            return _entered(machine, after, rule.to, event), rule.actions
+def step(
+    machine: StateMachine, event: DaemonEvent, now: float
+) -> tuple[StateMachine, tuple[Action, ...]]:
+    """Apply an event at a time [s]; return the new state machine and the actions to carry out."""
+    updated = _with_event(machine, event, now)
+    for transition in TRANSITIONS.get((machine.state, event.trigger), ()):
+        if transition.when(updated, now):
+            return _enter(machine, updated, transition.to, event), transition.actions
     return machine, ()
 
 
-def _noted(machine: Machine, event: Event, now: float) -> Machine:
-    """The machine with what an event alone says, whatever state follows."""
-    match event.kind:
-        case Kind.CLEAR:
-            return replace(machine, acknowledged=True)
-        case Kind.FAULT:
-            return replace(machine, acknowledged=False)
-        case Kind.STOP:
-            return replace(machine, acknowledged=False, latched=True)
-        case Kind.LINK_LOST if machine.state is not State.COMM_LOST:
-            latched = machine.latched or machine.state in _ENERGISED
+def _with_event(machine: StateMachine, event: DaemonEvent, now: float) -> StateMachine:
+    """Update the flags that an event sets regardless of the next state."""
+    match event.trigger:
+        case Trigger.CLEAR:
+            return replace(machine, is_acknowledged=True)
+        case Trigger.FAULT:
+            return replace(machine, is_acknowledged=False)
+        case Trigger.STOP:
+            return replace(machine, is_acknowledged=False, is_latched=True)
+        case Trigger.LINK_LOST if machine.state is not DaemonState.COMM_LOST:
             return replace(
-                machine, lost_at=now, reopened=False, latched=latched, acknowledged=False
+                machine,
+                lost_at=now,
+                is_reconnected=False,
+                is_latched=machine.is_latched or machine.state in _ENERGISED,
+                is_acknowledged=False,
             )
-        case Kind.REOPENED:
-            return replace(machine, reopened=True)
+        case Trigger.RECONNECTED:
+            return replace(machine, is_reconnected=True)
         case _:
             return machine
 
 
-def _entered(before: Machine, after: Machine, to: State, event: Event) -> Machine:
-    """The machine in the state that a rule leads to."""
-    if event.kind is Kind.LINK_LOST:
-        after = replace(after, reopened=False)
+def _enter(
+    before: StateMachine, updated: StateMachine, to: DaemonState, event: DaemonEvent
+) -> StateMachine:
+    """Enter the next state of a transition with its cause and remedy."""
+    if event.trigger is Trigger.LINK_LOST:
+        updated = replace(updated, is_reconnected=False)
     if to is before.state:
-        # A fault that is still there may have another reason by now.
-        told = event.kind is Kind.FAULT and bool(event.cause)
-        return replace(after, cause=event.cause, remedy=event.remedy) if told else after
-    latched = to in _LATCHING or (to is State.COMM_LOST and after.latched)
-    # Back on a link, what it was lost for is still the reason, but no longer how it is.
+        # A persisting fault may have a new cause.
+        is_new_cause = event.trigger is Trigger.FAULT and bool(event.cause)
+        return replace(updated, cause=event.cause, remedy=event.remedy) if is_new_cause else updated
+    is_latched = to in _LATCHING or (to is DaemonState.COMM_LOST and updated.is_latched)
     cause, remedy = event.cause or before.cause, event.remedy
-    if before.state is State.COMM_LOST and to in (State.FAULT, State.SWITCH_ON_DISABLED):
-        cause = f"all amplifiers answer again, and are disarmed; before that: {cause}"
-        remedy = ACKNOWLEDGE if to is State.FAULT else None
-    return replace(after, state=to, cause=cause, remedy=remedy, latched=latched, acknowledged=False)
+    is_back = to in (DaemonState.FAULT, DaemonState.SWITCH_ON_DISABLED)
+    if before.state is DaemonState.COMM_LOST and is_back:
+        cause = f"all amplifiers reply again and are disarmed; before: {cause}"
+        remedy = ACKNOWLEDGE if to is DaemonState.FAULT else None
+    return replace(
+        updated, state=to, cause=cause, remedy=remedy, is_latched=is_latched, is_acknowledged=False
+    )

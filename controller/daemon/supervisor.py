@@ -1,14 +1,22 @@
-"""Runs the daemon's state table on a controller: events in, actions done, the link kept up."""
+"""Runs the daemon's state machine: applies events, carries out actions, restores lost links."""
 
 import asyncio
-import contextlib
 import logging
 from collections.abc import Awaitable, Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 
-from controller.daemon.reopening import TICK, reopen, what_is_wrong
-from controller.daemon.states import ACKNOWLEDGE, Action, Event, Kind, Machine, State, step
+from controller.daemon.read_back import READ_BACK_INTERVAL, find_problem, read_statuses
+from controller.daemon.reconnect import ALIVE_INTERVAL, LinkChange, error_text, reconnect
+from controller.daemon.states import (
+    ACKNOWLEDGE,
+    Action,
+    DaemonEvent,
+    DaemonState,
+    StateMachine,
+    Trigger,
+    step,
+)
 from controller.group.amplifier_group import Phase
 from controller.loop.loop import Controller
 from controller.loop.observer import Observer
@@ -16,123 +24,122 @@ from drivers import clock
 from drivers.amplifier import Amplifier
 from drivers.errors import CommandRefused, DriverError, LinkError
 from drivers.link.turns import Preempted
-from drivers.protocol.messages import AmplifierEvent, AmplifierState, Fault, Status
+from drivers.protocol.messages import AmplifierEvent, AmplifierState, Fault
 
-LOOK_EVERY = 0.5  # s; how often a disarmed amplifier is asked how it is
-_READ_BACKS = 15
-_READ_BACK_PAUSE = 0.02  # s
+STATUS_INTERVAL = 0.5  # s; between status requests to disarmed amplifiers
+_MAX_READ_BACKS = 15
 
-_LOG_LEVELS = {State.COMM_LOST: logging.ERROR, State.FAULT_REACTION_ACTIVE: logging.ERROR}
-
-_SETTLED = (AmplifierState.SWITCH_ON_DISABLED, AmplifierState.READY_TO_SWITCH_ON)
-
+_LOG_LEVELS = {
+    DaemonState.COMM_LOST: logging.ERROR,
+    DaemonState.FAULT_REACTION_ACTIVE: logging.ERROR,
+}
 
 _logger = logging.getLogger(__name__)
+_rate_limited_logger = logging.getLogger(f"{__name__}.background")
 
 
 class Supervisor:
-    """Keeps a controller's amplifiers open, armed only as the state table allows, and silent else.
+    """Keeps the amplifiers of a controller connected, and armed only as the state machine allows.
 
-    controller: made with `observe(observer)` of this; amplifiers: the same as the controller's.
-    state_changed is told of every change, old and new; link_told, with amplifiers and a message,
-    that the link to them is lost, and, without amplifiers, of each attempt to come back (retry) and
-    that it is reopened; alive is called whenever the control loop, or what stands in for it while
-    there is no link, has run.
+    The controller must be created with `observe(observer)` of this supervisor and the same
+    amplifiers. state_changed receives the old and new state machine at every transition;
+    link_changed the kind of change, the lost amplifiers ("lost" only) and a message; alive is
+    called after each cycle of the control loop and periodically while there is no link.
     """
 
     def __init__(
         self,
         amplifiers: Mapping[str, Amplifier],
         *,
-        state_changed: Callable[[Machine, Machine], None],
-        link_told: Callable[[str, Sequence[str], str], None],
+        state_changed: Callable[[StateMachine, StateMachine], None],
+        link_changed: Callable[[LinkChange, Sequence[str], str], None],
         alive: Callable[[], None],
     ) -> None:
-        self.machine = Machine()
+        self.machine = StateMachine()
         self._amplifiers = amplifiers
         self._state_changed = state_changed
-        self._link_told = link_told
+        self._link_changed = link_changed
         self._alive = alive
-        self._controller: Controller | None = None
+        self._opened_controller: Controller | None = None
         self._refusal = ""
         self._tasks: set[asyncio.Task[None]] = set()
-        self._losing = asyncio.Lock()  # held until all are closed that were lost
+        self._loss_lock = asyncio.Lock()  # held until the lost amplifiers are closed
 
     def observe(self, observer: Observer) -> Observer:
-        """The observer that the controller is to be made with: this one, and ours before it."""
+        """Wrap an observer so that the supervisor sees refusals and cycles first."""
 
         def refused(reason: str) -> None:
             self._refusal = reason
-            if not self._is_stopped_by_itself:  # or the fault that follows tells
+            if not self._has_stopped_itself:  # the fault that follows reports it
                 observer.refused(reason)
 
         def turned() -> None:
-            self._look_at_phase()
+            self._check_phase()
             self._alive()
             observer.turned()
 
         return replace(observer, refused=refused, turned=turned)
 
     async def open(self, controller: Controller) -> None:
-        """Open the amplifiers and find out how they are; raises what `Controller.open` raises.
+        """Open and verify the amplifiers; raises what `Controller.open` raises.
 
-        One that is in a fault, or refuses, is no reason not to begin: the state tells.
+        An amplifier in a fault, or one that refuses, leads to the state FAULT instead.
         """
-        self._controller = controller
+        self._opened_controller = controller
         for name, amplifier in self._amplifiers.items():
-            amplifier.listen(partial(self._heard, name))
+            amplifier.listen(partial(self._amplifier_event, name))
         await controller.open()
         try:
-            await self.handle(Event(Kind.OPENED, "every amplifier has answered"))
+            await self.handle(DaemonEvent(Trigger.OPENED, "every amplifier has replied"))
         except LinkError:
             raise
         except DriverError as error:
-            _quiet_logger.warning("%s", error)
+            _rate_limited_logger.warning("%s", error)
 
     async def run(self) -> None:
-        """Run the control loop, and come back after every loss, until `close`."""
-        watching = asyncio.create_task(self._watch())
+        """Run the control loop, and reconnect after every loss, until `close`."""
+        polling = asyncio.create_task(self._poll_disarmed())
         try:
-            while self.machine.state is not State.NOT_READY:
+            while self.machine.state is not DaemonState.NOT_READY:
                 try:
-                    await self._the_controller.run()
+                    await self._controller.run()
                 except LinkError as error:
-                    await self._quietly(self._lost(error))
-                while self.machine.state is State.COMM_LOST:
-                    await self._come_back()
+                    await self._in_background(self._handle_loss(error))
+                while self.machine.state is DaemonState.COMM_LOST:
+                    await self._restore_link()
         finally:
-            watching.cancel()
-            await asyncio.gather(watching, *self._tasks, return_exceptions=True)
+            polling.cancel()
+            await asyncio.gather(polling, *self._tasks, return_exceptions=True)
 
     async def close(self, cause: str) -> None:
-        """Silent, read back, disarmed, closed; ends `run`."""
-        await self.handle(Event(Kind.CLOSE, cause))
+        """Ramp down, read back, disarm and close the amplifiers; ends `run`."""
+        await self.handle(DaemonEvent(Trigger.CLOSE, cause))
 
-    async def handle(self, event: Event) -> None:
-        """See an event through, with all that follows; raises what went wrong in doing so."""
+    async def handle(self, event: DaemonEvent) -> None:
+        """Apply an event and carry out its actions; raises the error of an action."""
         for action in self._step(event):
             await self._do(action)
 
-    def tell(self, event: Event) -> None:
-        """Take an event in at once, and do what follows beside; for those who cannot wait."""
+    def post(self, event: DaemonEvent) -> None:
+        """Apply an event at once and carry out its actions in a task."""
         actions = self._step(event)
 
         async def do_all() -> None:
             for action in actions:
                 await self._do(action)
 
-        task = asyncio.ensure_future(self._quietly(do_all()))
+        task = asyncio.ensure_future(self._in_background(do_all()))
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
 
     @property
-    def _the_controller(self) -> Controller:
-        if self._controller is None:
-            raise RuntimeError("the supervisor was not opened")
-        return self._controller
+    def _controller(self) -> Controller:
+        if self._opened_controller is None:
+            raise RuntimeError("supervisor is not open")
+        return self._opened_controller
 
-    def _step(self, event: Event) -> tuple[Action, ...]:
-        """One step of the table; a change is told before anything is done."""
+    def _step(self, event: DaemonEvent) -> tuple[Action, ...]:
+        """Apply one transition and report it; return its actions."""
         before = self.machine
         self.machine, actions = step(before, event, clock.now())
         after = self.machine
@@ -148,202 +155,187 @@ class Supervisor:
         return actions
 
     async def _do(self, action: Action) -> None:
-        controller = self._the_controller
         match action:
             case Action.VERIFY:
-                await self._on_the_link(self._verify())
+                await self._over_link(self._verify())
             case Action.ARM:
                 await self._arm()
             case Action.DISARM:
-                await self._on_the_link(controller.disarm())
+                await self._over_link(self._controller.disarm())
             case Action.STOP:
                 await self._stop()
             case Action.REACT:
                 await self._stop()
-                await self.handle(Event(Kind.REACTED, self.machine.cause, self.machine.remedy))
+                cause, remedy = self.machine.cause, self.machine.remedy
+                await self.handle(DaemonEvent(Trigger.REACTION_DONE, cause, remedy))
             case Action.CLEAR:
-                await self._on_the_link(self._clear())
+                await self._over_link(self._clear())
             case Action.RECONNECT | Action.CLOSE:
-                await controller.close()
+                await self._controller.close()
 
-    async def _on_the_link(self, work: Awaitable[object]) -> None:
-        """Do something that needs the link; its loss, or a refusal, is an event of its own."""
+    async def _over_link(self, work: Awaitable[object]) -> None:
+        """Await work that needs the link; a loss or refusal becomes an event, then is raised."""
         try:
             await work
         except LinkError as error:
-            await self._lost(error)
+            await self._handle_loss(error)
             raise
         except Preempted:
-            raise  # no fault of the amplifiers': what it gave way to is an event of its own
+            raise  # not a fault: the request that preempted it is an event of its own
         except DriverError as error:
-            await self.handle(Event(Kind.FAULT, str(error), ACKNOWLEDGE))
+            await self.handle(DaemonEvent(Trigger.FAULT, str(error), ACKNOWLEDGE))
             raise
 
     async def _stop(self) -> None:
-        """Stop all; raises LinkError where one did not hear it, which is a loss from now on."""
-        await self._the_controller.stop()
+        """Stop all amplifiers; raises LinkError for one that did not reply, now a lost link."""
+        await self._controller.stop()
         for amplifier in self._amplifiers.values():
-            if amplifier.is_lost and self.machine.state not in (State.COMM_LOST, State.NOT_READY):
-                await self._on_the_link(amplifier.status())  # raises at once why it is lost
+            if amplifier.is_lost and self.machine.state not in (
+                DaemonState.COMM_LOST,
+                DaemonState.NOT_READY,
+            ):
+                await self._over_link(amplifier.status())  # raises the cause of the loss at once
 
     async def _arm(self) -> None:
         try:
-            await self._the_controller.arm()
+            await self._controller.arm()
         except LinkError as error:
-            await self._lost(error)
+            await self._handle_loss(error)
             raise
         except DriverError as error:
-            # Where somebody stopped or disarmed meanwhile, that is why, and it is no fault.
-            if self.machine.state is State.SWITCHED_ON:
-                await self.handle(Event(Kind.FAULT, str(error), ACKNOWLEDGE))
+            # A stop or disarm in the meantime explains the error and is not a fault.
+            if self.machine.state is DaemonState.SWITCHED_ON:
+                await self.handle(DaemonEvent(Trigger.FAULT, str(error), ACKNOWLEDGE))
             raise
-        await self.handle(Event(Kind.ARMED, self.machine.cause))
+        await self.handle(DaemonEvent(Trigger.ARMED, self.machine.cause))
 
     async def _verify(self) -> None:
-        """Disarm whatever still plays, then look whether all are as they should be."""
-        statuses = await self._statuses()
+        """Disarm what still plays, then read back all amplifiers."""
+        statuses = await read_statuses(self._amplifiers)
         if any(each.state is AmplifierState.OPERATION_ENABLED for each in statuses.values()):
-            await self._the_controller.disarm()
-        problem = await self._unsound()
-        if self.machine.state is not State.SWITCH_ON_DISABLED:
-            return  # somebody has stopped them meanwhile: that is why they are not settled
+            await self._controller.disarm()
+        problem = await self._read_back()
+        if self.machine.state is not DaemonState.SWITCH_ON_DISABLED:
+            return  # stopped in the meantime, so they need not be disarmed yet
         if problem is None:
-            await self.handle(Event(Kind.SOUND, "all amplifiers are sound, disarmed and at zero"))
+            cause = "all amplifiers are disarmed, at level zero and without a fault"
+            await self.handle(DaemonEvent(Trigger.VERIFIED, cause))
         else:
-            await self.handle(Event(Kind.FAULT, problem, ACKNOWLEDGE))
+            await self.handle(DaemonEvent(Trigger.FAULT, problem, ACKNOWLEDGE))
 
     async def _clear(self) -> None:
-        # An amplifier that still falls silent overhears it, so it is said again at each look.
-        problem = await self._unsound(before_each=self._acknowledge)
+        # An amplifier that is still ramping down ignores Clear, so it is repeated before each read.
+        problem = await self._read_back(before_each=self._acknowledge)
         self._check_acknowledged()
         if problem is None:
-            await self.handle(Event(Kind.SOUND, "acknowledged, and the cause is gone"))
+            await self.handle(DaemonEvent(Trigger.VERIFIED, "acknowledged, and the cause is gone"))
             return
-        await self.handle(Event(Kind.FAULT, problem, ACKNOWLEDGE))
-        raise CommandRefused(f"{problem}; the cause is not gone, so nothing was cleared")
+        await self.handle(DaemonEvent(Trigger.FAULT, problem, ACKNOWLEDGE))
+        raise CommandRefused(f"{problem}; the cause persists, so nothing was cleared")
 
     async def _acknowledge(self) -> None:
-        """Clear what was acknowledged; raises Preempted where there is something since."""
+        """Clear the amplifiers; raises Preempted if a stop or fault came after the request."""
         self._check_acknowledged()
         try:
-            await self._the_controller.clear()
+            await self._controller.clear()
         except Preempted:
             self._check_acknowledged()
             raise
 
     def _check_acknowledged(self) -> None:
-        if not self.machine.acknowledged:
+        if not self.machine.is_acknowledged:
             raise Preempted(
-                "somebody has stopped the amplifiers since, or there is a fault since: that is not "
-                "cleared; find the cause, then clear again"
+                "not cleared: a stop or fault came after the request; find the cause, then clear "
+                "again"
             )
 
-    async def _unsound(
+    async def _read_back(
         self, *, before_each: Callable[[], Awaitable[None]] | None = None
     ) -> str | None:
-        """What is wrong with an amplifier that should be disarmed, once ramps had their time.
+        """Read back until all amplifiers are silent; return the problem that remains, if any.
 
-        before_each: to be done before each look. It ends where the state is another.
+        before_each: awaited before each read. Ends early when the state changes.
         """
-        problem, begun_in = None, self.machine.state
-        for _ in range(_READ_BACKS):
+        problem, initial_state = None, self.machine.state
+        for _ in range(_MAX_READ_BACKS):
             if before_each is not None:
                 await before_each()
-            problem = _problem(await self._statuses())
-            if problem is None or self.machine.state is not begun_in:
+            problem = find_problem(await read_statuses(self._amplifiers))
+            if problem is None or self.machine.state is not initial_state:
                 break
-            await asyncio.sleep(_READ_BACK_PAUSE)
+            await asyncio.sleep(READ_BACK_INTERVAL)
         return problem
 
-    async def _statuses(self) -> dict[str, Status]:
-        """How each amplifier is; asked again where a stop or disarm went before it."""
-        while True:
-            with contextlib.suppress(Preempted):
-                return {name: await each.status() for name, each in self._amplifiers.items()}
-            await asyncio.sleep(_READ_BACK_PAUSE)
-
-    async def _lost(self, error: LinkError) -> None:
-        """See a loss through; whoever comes with the same one waits for that, then reopens."""
-        async with self._losing:
+    async def _handle_loss(self, error: LinkError) -> None:
+        """Handle a loss; concurrent reports of the same loss wait until it is handled."""
+        async with self._loss_lock:
             lost = [name for name, amplifier in self._amplifiers.items() if amplifier.is_lost]
-            wrong = what_is_wrong(error)
-            if self.machine.state is not State.COMM_LOST:  # told already
-                self._link_told("lost", lost, wrong)
-            cause = f"amplifier {', '.join(lost)}: {wrong}" if lost else wrong
-            remedy = (
-                "look at cables and supply; the daemon tries again by itself, and stays disarmed"
-            )
-            await self.handle(Event(Kind.LINK_LOST, cause, remedy))
+            text = error_text(error)
+            if self.machine.state is not DaemonState.COMM_LOST:
+                self._link_changed("lost", lost, text)
+            cause = f"amplifier {', '.join(lost)}: {text}" if lost else text
+            remedy = "check cables and supply; the daemon reconnects by itself and stays disarmed"
+            await self.handle(DaemonEvent(Trigger.LINK_LOST, cause, remedy))
 
-    async def _come_back(self) -> None:
-        """Do the next thing towards leaving COMM_LOST."""
-        if self.machine.reopened:  # it lasts as long as a lost amplifier may play
-            await asyncio.sleep(TICK)
+    async def _restore_link(self) -> None:
+        """Take the next step towards leaving COMM_LOST."""
+        if self.machine.is_reconnected:  # wait for the watchdog of the lost amplifier
+            await asyncio.sleep(ALIVE_INTERVAL)
             self._alive()
-            await self._quietly(self.handle(Event(Kind.TICK)))
-        elif await reopen(
-            self._the_controller,
-            is_wanted=lambda: self.machine.state is State.COMM_LOST,
-            told=lambda event, message: self._link_told(event, (), message),
+            await self._in_background(self.handle(DaemonEvent(Trigger.TICK)))
+        elif await reconnect(
+            self._controller,
+            is_wanted=lambda: self.machine.state is DaemonState.COMM_LOST,
+            report=lambda change, message: self._link_changed(change, (), message),
             alive=self._alive,
         ):
-            await self._quietly(self.handle(Event(Kind.REOPENED)))
+            await self._in_background(self.handle(DaemonEvent(Trigger.RECONNECTED)))
 
-    async def _watch(self) -> None:
-        """Ask disarmed amplifiers how they are; armed ones are asked by the control loop."""
+    async def _poll_disarmed(self) -> None:
+        """Poll the status of disarmed amplifiers; the control loop polls armed ones."""
         while True:
-            await asyncio.sleep(LOOK_EVERY)
-            if self._the_controller.phase is not Phase.DISARMED:
+            await asyncio.sleep(STATUS_INTERVAL)
+            if self._controller.phase is not Phase.DISARMED:
                 continue
             try:
-                problem = _problem(await self._statuses())
+                problem = find_problem(await read_statuses(self._amplifiers))
             except LinkError as error:
-                if self._the_controller.phase is Phase.DISARMED:
-                    await self._quietly(self._lost(error))
+                if self._controller.phase is Phase.DISARMED:
+                    await self._in_background(self._handle_loss(error))
             except DriverError:
-                continue  # somebody else took the turn: that will tell
+                continue  # preempted by another request, which reports for itself
             except Exception:
-                _quiet_logger.exception("the amplifiers could not be asked how they are")
+                _rate_limited_logger.exception("status read failed")
             else:
-                if problem is not None and self.machine.state is State.READY_TO_SWITCH_ON:
-                    await self._quietly(self.handle(Event(Kind.FAULT, problem, ACKNOWLEDGE)))
+                is_ready = self.machine.state is DaemonState.READY_TO_SWITCH_ON
+                if problem is not None and is_ready:
+                    fault = DaemonEvent(Trigger.FAULT, problem, ACKNOWLEDGE)
+                    await self._in_background(self.handle(fault))
 
-    def _look_at_phase(self) -> None:
-        """After a turn of the control loop: it is a fault if that has stopped the amplifiers."""
-        if self._is_stopped_by_itself:
-            self.tell(Event(Kind.FAULT, self._refusal or "an amplifier refused", ACKNOWLEDGE))
+    def _check_phase(self) -> None:
+        """Post a fault if the control loop has stopped the amplifiers by itself."""
+        if self._has_stopped_itself:
+            cause = self._refusal or "an amplifier refused a command"
+            self.post(DaemonEvent(Trigger.FAULT, cause, ACKNOWLEDGE))
 
     @property
-    def _is_stopped_by_itself(self) -> bool:
-        """Whether the control loop has stopped the amplifiers, and nobody has asked for it."""
-        is_armed = self.machine.state is State.OPERATION_ENABLED
-        return is_armed and self._the_controller.phase is Phase.DISARMED
+    def _has_stopped_itself(self) -> bool:
+        """Whether the control loop has stopped the amplifiers without a request to do so."""
+        is_armed = self.machine.state is DaemonState.OPERATION_ENABLED
+        return is_armed and self._controller.phase is Phase.DISARMED
 
-    def _heard(self, name: str, event: AmplifierEvent) -> None:
-        """What an amplifier says unasked; a heartbeat would tell later."""
-        if event.fault is Fault.NONE or self.machine.state is not State.OPERATION_ENABLED:
+    def _amplifier_event(self, name: str, event: AmplifierEvent) -> None:
+        """Post a fault that an amplifier reports by itself, ahead of the next heartbeat."""
+        is_armed = self.machine.state is DaemonState.OPERATION_ENABLED
+        if event.fault is Fault.NONE or not is_armed:
             return
         channel = "" if event.channel is None else f", channel {event.channel}"
         cause = f"amplifier {name} reports {event.fault.name}{channel}"
-        self.tell(Event(Kind.FAULT, cause, ACKNOWLEDGE))
+        self.post(DaemonEvent(Trigger.FAULT, cause, ACKNOWLEDGE))
 
-    async def _quietly(self, work: Awaitable[None]) -> None:
-        """Do something for nobody who could be told what goes wrong: the state tells it."""
+    async def _in_background(self, work: Awaitable[None]) -> None:
+        """Await work without a caller: its errors are already part of the state."""
         try:
             await work
         except DriverError as error:
-            _quiet_logger.info("not done: %s", error)
-
-
-_quiet_logger = logging.getLogger(f"{__name__}.beside")
-
-
-def _problem(statuses: Mapping[str, Status]) -> str | None:
-    """What is wrong with amplifiers that should be disarmed, at zero and without a fault."""
-    for name, status in statuses.items():
-        if status.state not in _SETTLED or status.fault is not Fault.NONE:
-            fault = "" if status.fault is Fault.NONE else f", fault {status.fault.name}"
-            return f"amplifier {name} is in {status.state.name}{fault}"
-        if any(status.levels):
-            return f"amplifier {name} reports a level though it is disarmed"
-    return None
+            _rate_limited_logger.info("failed: %s", error)

@@ -7,7 +7,7 @@ from pathlib import Path
 from controller.daemon.config import load_daemon_config
 from controller.daemon.daemon import Daemon
 from controller.daemon.log import start_log
-from controller.daemon.notify import ServiceManager
+from controller.daemon.service_manager import ServiceManager
 from controller.daemon.socket_lock import SocketLock
 from controller.demo.far_end import open_far_end
 from controller.gateway.installed import require_gateway
@@ -28,7 +28,7 @@ async def run_live(rig_file: Path, table: LocalizationTable, *, wire: str, dashb
         file = Path(folder) / "daemon.yaml"
         file.write_text(f"rig: {rig_file}\nlog: {{level: warning}}\n", encoding="utf-8")
         config = load_daemon_config(file)
-        place = SocketLock(config.socket)
+        lock = SocketLock(config.socket)
         try:
             log = start_log(None, level=config.section.log.level)
             try:
@@ -40,8 +40,8 @@ async def run_live(rig_file: Path, table: LocalizationTable, *, wire: str, dashb
                         manager=ServiceManager(),
                         dashboard=dashboard,
                     )
-                    await daemon.run(place)
+                    await daemon.run(lock)
             finally:
                 log.close()
         finally:
-            place.leave()
+            lock.release()

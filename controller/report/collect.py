@@ -14,14 +14,14 @@ from packaging.requirements import Requirement
 from controller.api.client import Client
 from controller.api.jsonrpc import RpcError
 from controller.daemon.config import is_daemon_document
-from controller.daemon.dumps import DUMPS
+from controller.daemon.fault_dumps import DUMP_PATTERN
 from controller.report.redaction import redacted
 from drivers.errors import LinkError
 from model.config.document import read_document
 from model.errors import InputError
 
 LARGEST_FILE = 1 << 20  # bytes of one file that is put in
-MOST_DUMPS = 5
+MAX_DUMPS = 5
 _GROUPS = "era_haptics."  # what the groups of our entry points begin with
 _NAMED = ("rig", "layout")  # files that a daemon's file names; a table is large and can be built
 
@@ -112,8 +112,8 @@ def _with_named(path: Path, missing: list[str]) -> Iterable[Path]:
     dumps = document.data.get("dumps")
     folder = dumps.get("folder") if isinstance(dumps, dict) else None
     if isinstance(folder, str):
-        found = (path.parent / Path(folder).expanduser()).glob(DUMPS)
-        yield from sorted(found, key=lambda file: file.name)[-MOST_DUMPS:]
+        found = (path.parent / Path(folder).expanduser()).glob(DUMP_PATTERN)
+        yield from sorted(found, key=lambda file: file.name)[-MAX_DUMPS:]
 
 
 def _take(path: Path, files: dict[str, str], missing: list[str]) -> None:

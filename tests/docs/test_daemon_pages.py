@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from controller.daemon.sections import (
+from controller.daemon.config_sections import (
     CalibrationSection,
     DaemonSection,
     DumpSection,

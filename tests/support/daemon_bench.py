@@ -13,7 +13,7 @@ from controller.api.async_client import AsyncClient
 from controller.daemon.config import load_daemon_config
 from controller.daemon.daemon import Daemon
 from controller.daemon.log import LogHandler, LogThread
-from controller.daemon.notify import ServiceManager
+from controller.daemon.service_manager import ServiceManager
 from controller.daemon.socket_lock import SocketLock
 from model.rig.file import load_rig
 from model.table.table import LocalizationTable
@@ -104,13 +104,13 @@ async def daemon_at(
             task.result()
         yield DaemonBench(daemon, far, folder, config.socket)
     finally:
-        daemon.end("the test is over")
+        daemon.shut_down("the test is over")
         try:
             await asyncio.wait_for(task, PATIENCE)
         finally:
             logging.getLogger().removeHandler(handler)
             log.close()
-            place.leave()
+            place.release()
 
 
 async def until(holds: Callable[[], object], *, patience: float = PATIENCE) -> None:

@@ -7,7 +7,7 @@ from drivers.errors import LinkError
 from drivers.protocol.messages import AmplifierState
 
 
-async def reopen(amplifier: Amplifier, *, tries: int = 100, pause: float = 0.01) -> None:
+async def reconnect(amplifier: Amplifier, *, tries: int = 100, pause: float = 0.01) -> None:
     """Open it, at the latest with the last try; what keeps that one from it is raised.
 
     pause [s]: between tries.

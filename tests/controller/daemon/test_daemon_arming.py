@@ -13,7 +13,7 @@ from controller.api.jsonrpc import ErrorCode, RpcError
 from controller.daemon.config import load_daemon_config
 from controller.daemon.daemon import Daemon
 from controller.daemon.log import LogThread
-from controller.daemon.notify import ServiceManager
+from controller.daemon.service_manager import ServiceManager
 from controller.daemon.socket_lock import SocketLock
 from daemon_bench import daemon_table, far_end, running_daemon, until, until_state, write_daemon
 from drivers.errors import LinkError
@@ -49,11 +49,11 @@ async def test_arming_that_takes_longer_than_the_lease(
     async with running_daemon(tmp_path) as bench, await bench.client() as era:
         await until_state(era, READY)
         daemon = bench.daemon
-        book = daemon._service._lease
+        book = daemon._api._lease
 
         def pass_time() -> None:
             assert book._lease is not None
-            book._lease = replace(book._lease, ends=0.0)
+            book._lease = replace(book._lease, expires_at=0.0)
 
         goes_on = arming_waits(daemon, monkeypatch, then=pass_time)
         arming = asyncio.ensure_future(era.arm("me", lease_s=1))
@@ -149,10 +149,10 @@ async def test_an_end_during_a_reload_starts_nothing(
 
         with monkeypatch.context() as patched:
             patched.setattr("controller.daemon.daemon.in_thread", slowly)
-            daemon._reload_soon()
+            daemon._request_reload()
             await reads.wait()
         (reload,) = daemon._reloads
-        daemon.end("the test is over")
+        daemon.shut_down("the test is over")
         await until(reload.done)
         with contextlib.suppress(asyncio.CancelledError):
             await reload
@@ -170,12 +170,12 @@ async def test_an_end_while_an_amplifier_is_waited_for(tmp_path: Path) -> None:
         try:
             await asyncio.sleep(0.1)
             begin = asyncio.get_running_loop().time()
-            daemon.end("told to end")
+            daemon.shut_down("told to end")
             await asyncio.wait_for(running, 20)
             assert asyncio.get_running_loop().time() - begin < 1.0
         finally:
             log.close()
-            place.leave()
+            place.release()
 
 
 async def test_an_end_while_a_lost_amplifier_is_tried_again(
@@ -224,7 +224,7 @@ async def test_a_name_that_is_no_text_is_told_all_the_same(tmp_path: Path) -> No
         await era.subscribe("log")
         record = logging.makeLogRecord({"msg": "written to %s", "args": ("/tmp/\udcff",)})
         record.levelno, record.levelname = logging.WARNING, "WARNING"
-        bench.daemon._news.logged(record)
+        bench.daemon._publisher.logged(record)
         async with asyncio.timeout(20):
             async for told in era.events():
                 if told.topic == "log" and "written" in told.data["message"]:

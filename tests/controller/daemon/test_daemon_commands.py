@@ -126,7 +126,7 @@ def test_a_log_that_cannot_be_written_keeps_the_daemon_from_beginning(tmp_path: 
     path = write_daemon(tmp_path, {"main": "sim://"}, "log: {file: taken}\n")
     with socket.socket(socket.AF_UNIX) as taken:
         taken.bind(str(tmp_path / "taken"))
-        with pytest.raises(InputError, match=r"daemon\.yaml: log\.file: .*taken cannot be written"):
+        with pytest.raises(InputError, match=r"daemon\.yaml: log\.file: .*taken"):
             run_daemon(path, dashboard=None)
     assert not (tmp_path / "era.sock").exists()
 

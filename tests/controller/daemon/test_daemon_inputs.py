@@ -9,7 +9,7 @@ import pytest
 from controller.api.methods import TouchParams
 from controller.api.schema import TouchPoint
 from controller.daemon.config import TouchInput
-from controller.daemon.inputs import MOST_SOURCES, ApiTouches, TouchInputs
+from controller.daemon.touch_inputs import MAX_SOURCES_PER_CLIENT, ApiTouches, TouchInputs
 from controller.sources.calibration import TouchCalibration
 from controller.sources.touch import Touch, TouchFrame, TouchSource
 from model.errors import InputError
@@ -28,7 +28,7 @@ async def test_metres_become_what_touch_sources_say() -> None:
     """x to the right, y downwards, 0..1 over the plate; the time is that of the arrival."""
     frames: list[TouchFrame] = []
     touches = ApiTouches(PLATE, frames.append)
-    touches.take("client", said("me", (0.1, 0.05), (9.0, 0.0)), client_name="7", now=12.5)
+    touches.add("client", said("me", (0.1, 0.05), (9.0, 0.0)), client_name="7", now=12.5)
     assert frames == []
     await asyncio.sleep(0)
     assert frames == [TouchFrame("api:7:me", 12.5, (Touch(0, 0.25, 0.75), Touch(1, 22.5, 1.0)))]
@@ -39,8 +39,8 @@ async def test_of_many_frames_in_a_turn_the_newest_counts() -> None:
     frames: list[TouchFrame] = []
     touches = ApiTouches(PLATE, frames.append)
     for number in range(1000):
-        touches.take("client", said("me", (0.0004 * number, 0.0)), client_name="1", now=number)
-        touches.take("client", said("you", (0.1, 0.0)), client_name="1", now=number)
+        touches.add("client", said("me", (0.0004 * number, 0.0)), client_name="1", now=number)
+        touches.add("client", said("you", (0.1, 0.0)), client_name="1", now=number)
     await asyncio.sleep(0)
     assert [(frame.source, frame.time) for frame in frames] == [
         ("api:1:me", 999),
@@ -53,14 +53,14 @@ async def test_a_client_that_leaves_lifts_its_fingers_and_no_others() -> None:
     """An empty frame for each of its sources that has fingers down, at once."""
     frames: list[TouchFrame] = []
     touches = ApiTouches(PLATE, frames.append)
-    touches.take("a", said("me", (0.1, 0.1)), client_name="1", now=1)
-    touches.take("a", said("lifted", (0.1, 0.1)), client_name="1", now=1)
-    touches.take("a", said("lifted"), client_name="1", now=1)
-    touches.take("b", said("me", (0.1, 0.1)), client_name="2", now=1)
+    touches.add("a", said("me", (0.1, 0.1)), client_name="1", now=1)
+    touches.add("a", said("lifted", (0.1, 0.1)), client_name="1", now=1)
+    touches.add("a", said("lifted"), client_name="1", now=1)
+    touches.add("b", said("me", (0.1, 0.1)), client_name="2", now=1)
     await asyncio.sleep(0)
     frames.clear()
-    touches.leave("a", now=2)
-    touches.leave("nobody", now=2)
+    touches.lift_all("a", now=2)
+    touches.lift_all("nobody", now=2)
     await asyncio.sleep(0)
     assert frames == [TouchFrame("api:1:me", 2, ())]
 
@@ -70,12 +70,12 @@ def test_sources_of_a_client_are_bounded() -> None:
 
     async def scenario() -> None:
         touches = ApiTouches(PLATE, lambda frame: None)
-        for number in range(MOST_SOURCES):
-            touches.take("a", said(str(number), (0.1, 0.1)), client_name="1", now=1)
+        for number in range(MAX_SOURCES_PER_CLIENT):
+            touches.add("a", said(str(number), (0.1, 0.1)), client_name="1", now=1)
         with pytest.raises(InputError, match="at most 64"):
-            touches.take("a", said("more", (0.1, 0.1)), client_name="1", now=1)
-        touches.take("a", said("0"), client_name="1", now=1)
-        touches.take("a", said("more", (0.1, 0.1)), client_name="1", now=1)
+            touches.add("a", said("more", (0.1, 0.1)), client_name="1", now=1)
+        touches.add("a", said("0"), client_name="1", now=1)
+        touches.add("a", said("more", (0.1, 0.1)), client_name="1", now=1)
 
     asyncio.run(scenario())
 
@@ -119,11 +119,11 @@ async def test_sources_run_under_their_names_and_are_exchanged(
         TouchInput(name, url, TouchCalibration())
         for name, url in (("left", "a:"), ("right", "b:"), ("table", "c:"))
     )
-    await inputs.exchange([one, two])
+    await inputs.replace([one, two])
     await asyncio.sleep(0.01)
     assert frames == ["left:'x\\x1b[2J'", "right:y"]
     assert failed == [("right", "unplugged")]
-    await inputs.exchange([one, three])
+    await inputs.replace([one, three])
     await asyncio.sleep(0.01)
     assert frames[2:] == ["table:z"]
     assert panels["a:"].ended == []
@@ -151,12 +151,12 @@ async def test_a_source_that_fails_is_begun_again(monkeypatch: pytest.MonkeyPatc
         await sleep(0)
 
     monkeypatch.setattr("controller.daemon.config.open_source", lambda url: Late())
-    monkeypatch.setattr("controller.daemon.inputs.asyncio.sleep", pause)
+    monkeypatch.setattr("controller.daemon.touch_inputs.asyncio.sleep", pause)
     failed: list[str] = []
     inputs = TouchInputs(
         lambda frame: None, failed=lambda name, error: failed.append(f"{name}: {error}")
     )
-    await inputs.exchange([TouchInput("left", "a:", TouchCalibration())])
+    await inputs.replace([TouchInput("left", "a:", TouchCalibration())])
     for _ in range(20):
         await sleep(0)
     assert failed == ["left: not plugged in", "left: gone"]

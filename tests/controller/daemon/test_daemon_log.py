@@ -14,11 +14,11 @@ import pytest
 from typer.testing import CliRunner
 
 from controller.cli.daemon import app
-from controller.daemon.dumps import write_dump
-from controller.daemon.latency import Latencies
-from controller.daemon.log import JsonFormatter, LogHandler, LogThread, RateLimit
-from controller.daemon.notify import ServiceManager
-from controller.daemon.records import KEPT, Record, RecordedBackend, Recorder
+from controller.daemon.fault_dumps import write_dump
+from controller.daemon.latency import LatencyStatistics
+from controller.daemon.log import JsonFormatter, LogHandler, LogThread, RateLimitFilter
+from controller.daemon.message_recorder import MAX_RECORDS, Record, RecordedBackend, Recorder
+from controller.daemon.service_manager import ServiceManager
 from drivers.backend import Backend
 from drivers.protocol.messages import AmplifierState, Arm, Fault, Status
 
@@ -48,19 +48,19 @@ def test_a_message_without_end_is_cut() -> None:
 def test_one_place_cannot_flood_the_log() -> None:
     """Five lines at once and one a second from then on; the next says how many were left out."""
     now = 0.0
-    limit = RateLimit(clock=lambda: now)
+    limit = RateLimitFilter(clock=lambda: now)
     assert sum(limit.filter(record("again")) for _ in range(1000)) == 5
     assert limit.filter(record("another place", line=2))
     now = 1.0
     told = record("again")
     assert limit.filter(told)
-    assert told.__dict__["left_out"] == 995
+    assert told.__dict__["skipped"] == 995
     assert not limit.filter(record("again"))
 
 
 def test_every_change_of_state_is_written() -> None:
     """What the supervisor logs is not limited: each transition with its cause."""
-    limit = RateLimit(clock=lambda: 0.0)
+    limit = RateLimitFilter(clock=lambda: 0.0)
     told = record("READY -> ON")
     told.name = "controller.daemon.supervisor"
     assert all(limit.filter(told) for _ in range(1000))
@@ -202,10 +202,10 @@ def test_without_systemd_nobody_is_told() -> None:
 def test_the_last_messages_are_kept_and_no_more() -> None:
     """Memory is bounded, the newest stay."""
     recorder = Recorder()
-    for number in range(3 * KEPT):
-        recorder.note("main", "out", number)
-    last = recorder.last()
-    assert [each.what for each in last] == list(range(2 * KEPT, 3 * KEPT))
+    for number in range(3 * MAX_RECORDS):
+        recorder.add("main", "out", number)
+    last = recorder.records()
+    assert [each.what for each in last] == list(range(2 * MAX_RECORDS, 3 * MAX_RECORDS))
 
 
 def test_a_dump_is_lines_of_json_for_its_owner_alone(tmp_path: Path) -> None:
@@ -237,10 +237,10 @@ def test_a_dump_is_lines_of_json_for_its_owner_alone(tmp_path: Path) -> None:
 
 def test_percentiles_are_latencies_that_were() -> None:
     """Of 1, 2, ... 1000 ms: the 500th, 990th and 999th; the histogram counts each once."""
-    latencies = Latencies()
+    latencies = LatencyStatistics()
     assert latencies.summary().median is None
     for milliseconds in range(1, 1001):
-        latencies.note(milliseconds / 1e3)
+        latencies.add(milliseconds / 1e3)
     summary = latencies.summary()
     assert (summary.median, summary.p99, summary.p999) == (500, 990, 999)
     counts = dict(summary.histogram)

@@ -15,11 +15,11 @@ def test_the_socket_is_its_users_alone(tmp_path: Path) -> None:
     before = os.umask(0)
     try:
         place = SocketLock(tmp_path / "new" / "era.sock")
-        with place.bound():
+        with place.bind():
             assert place.path.stat().st_mode & 0o777 == 0o600
             assert place.path.parent.stat().st_mode & 0o777 == 0o700
         assert os.umask(0) == 0
-        place.leave()
+        place.release()
         assert not place.path.exists()
     finally:
         os.umask(before)
@@ -30,9 +30,9 @@ def test_a_folder_that_is_a_groups(tmp_path: Path, folder: int, socket: int) -> 
     """Where the folder is for a group and nobody else, so is the socket; never for everybody."""
     tmp_path.chmod(folder)
     place = SocketLock(tmp_path / "era.sock")
-    with place.bound():
+    with place.bind():
         assert place.path.stat().st_mode & 0o777 == socket
-    place.leave()
+    place.release()
 
 
 def test_a_socket_that_a_killed_daemon_left_is_no_obstacle(tmp_path: Path) -> None:
@@ -41,14 +41,14 @@ def test_a_socket_that_a_killed_daemon_left_is_no_obstacle(tmp_path: Path) -> No
     script = (
         "import os, sys; from pathlib import Path; "
         "from controller.daemon.socket_lock import SocketLock; "
-        "place = SocketLock(Path(sys.argv[1])); place.bound(); os.kill(os.getpid(), 9)"
+        "place = SocketLock(Path(sys.argv[1])); place.bind(); os.kill(os.getpid(), 9)"
     )
     done = subprocess.run([sys.executable, "-c", script, str(path)], check=False)
     assert done.returncode == -9
     assert path.is_socket()
     place = SocketLock(path)
-    place.bound().close()
-    place.leave()
+    place.bind().close()
+    place.release()
 
 
 def test_a_folder_where_others_may_write_is_refused(tmp_path: Path) -> None:
@@ -56,7 +56,7 @@ def test_a_folder_where_others_may_write_is_refused(tmp_path: Path) -> None:
     folder = tmp_path / "open"
     folder.mkdir()
     folder.chmod(0o777)
-    with pytest.raises(InputError, match="others may write here"):
+    with pytest.raises(InputError, match="other users"):
         SocketLock(folder / "era.sock")
 
 
@@ -67,10 +67,10 @@ def test_a_link_of_somebody_elses_is_refused(
     (tmp_path / "ours").mkdir()
     link = tmp_path / "link"
     link.symlink_to("ours")
-    SocketLock(link / "era.sock").leave()
+    SocketLock(link / "era.sock").release()
     theirs = os.stat_result((0o120777, *link.lstat()[1:4], os.getuid() + 1, *link.lstat()[5:10]))
     monkeypatch.setattr(Path, "lstat", lambda path: theirs)
-    with pytest.raises(InputError, match="or it is theirs"):
+    with pytest.raises(InputError, match="other users"):
         SocketLock(link / "era.sock")
 
 
@@ -84,10 +84,10 @@ def test_two_places_in_one_folder_are_two(tmp_path: Path) -> None:
     """Each socket has its own lock."""
     places = [SocketLock(tmp_path / name) for name in ("a.sock", "b.sock")]
     for place in places:
-        bound = place.bound()
+        bound = place.bind()
         assert isinstance(bound, socket.socket)
         bound.close()
-        place.leave()
+        place.release()
 
 
 @pytest.mark.parametrize("what", ["file", "folder", "link"])
@@ -101,6 +101,6 @@ def test_what_is_no_socket_is_left_alone(tmp_path: Path, what: str) -> None:
             path.mkdir()
         case _:
             path.symlink_to(tmp_path / "nowhere")
-    with pytest.raises(InputError, match="something else than a socket is there; move it away"):
+    with pytest.raises(InputError, match="is not a socket"):
         SocketLock(path)
     assert [each.name for each in tmp_path.iterdir()] == ["there"]

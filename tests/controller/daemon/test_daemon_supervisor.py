@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
-from controller.daemon.states import Event, Kind, Machine
-from controller.daemon.states import State as DaemonState
+from controller.daemon.states import DaemonEvent, StateMachine, Trigger
+from controller.daemon.states import DaemonState as DaemonState
 from controller.daemon.supervisor import Supervisor
 from controller.loop.loop import Controller
 from controller.loop.observer import Observer
@@ -37,7 +37,7 @@ from drivers.protocol.messages import (
 )
 from virtual_loop import in_virtual_time
 
-ARM = Event(Kind.ARM, "somebody armed")
+ARM = DaemonEvent(Trigger.ARM, "somebody armed")
 
 
 @dataclass
@@ -76,13 +76,13 @@ async def watched() -> AsyncIterator[Watched]:
     amplifiers = {"main": Amplifier(bench.far_end)}
     loop = asyncio.get_running_loop()
 
-    def changed(old: Machine, new: Machine) -> None:
+    def changed(old: StateMachine, new: StateMachine) -> None:
         made.states.append(new.state)
 
     supervisor = Supervisor(
         amplifiers,
         state_changed=changed,
-        link_told=lambda event, lost, message: made.links.append(event),
+        link_changed=lambda event, lost, message: made.links.append(event),
         alive=lambda: made.alive.append(loop.time()),
     )
     controller = Controller(
@@ -162,8 +162,8 @@ def unreachable(request: Request) -> Reply | None:
     raise LinkError("the wire is cut")
 
 
-@pytest.mark.parametrize("kind", [Kind.STOP, Kind.FAULT])
-def test_a_stop_that_is_not_heard_is_told_as_a_loss(kind: Kind) -> None:
+@pytest.mark.parametrize("kind", [Trigger.STOP, Trigger.FAULT])
+def test_a_stop_that_is_not_heard_is_told_as_a_loss(kind: Trigger) -> None:
     """At once, to whoever asked for it, not with the next look half a second later; and latched."""
 
     @in_virtual_time
@@ -171,7 +171,7 @@ def test_a_stop_that_is_not_heard_is_told_as_a_loss(kind: Kind) -> None:
         async with watched() as daemon:
             daemon.far_end.answer = unreachable
             with pytest.raises(LinkError, match=r"the wire is cut.*energised"):
-                await daemon.supervisor.handle(Event(kind, "somebody stopped"))
+                await daemon.supervisor.handle(DaemonEvent(kind, "somebody stopped"))
             assert daemon.state is DaemonState.COMM_LOST
             assert daemon.links == ["lost"]
             daemon.far_end.answer = lambda request: None
@@ -209,7 +209,9 @@ async def test_a_loss_that_two_find_is_seen_through_before_anything_is_opened_ag
         controller.close = early_close  # type: ignore[method-assign]
         controller.open = noted_open  # type: ignore[method-assign]
         daemon.far_end.answer = unreachable
-        stopping = asyncio.create_task(daemon.supervisor.handle(Event(Kind.STOP, "somebody")))
+        stopping = asyncio.create_task(
+            daemon.supervisor.handle(DaemonEvent(Trigger.STOP, "somebody"))
+        )
         await asyncio.sleep(0.4)  # it stops what else there may be once more, for it is lost
         daemon.far_end.answer = lambda request: None
         controller.step = lost_step  # type: ignore[method-assign]
@@ -235,7 +237,9 @@ async def test_a_daemon_that_ends_while_a_loss_is_seen_through_ends() -> None:
 
         daemon.controller.stop = slow_stop  # type: ignore[method-assign]
         daemon.far_end.answer = unreachable
-        stopping = asyncio.create_task(daemon.supervisor.handle(Event(Kind.STOP, "somebody")))
+        stopping = asyncio.create_task(
+            daemon.supervisor.handle(DaemonEvent(Trigger.STOP, "somebody"))
+        )
         await asyncio.sleep(0.4)
         assert daemon.state is DaemonState.COMM_LOST
     with pytest.raises(LinkError, match="the wire is cut"):
@@ -263,7 +267,7 @@ async def test_a_lost_link_is_tried_again_with_growing_pauses() -> None:
         await asyncio.sleep(6)
         assert daemon.state is DaemonState.FAULT
         assert not daemon.far_end.requests(Arm, Apply)
-        await daemon.supervisor.handle(Event(Kind.CLEAR))
+        await daemon.supervisor.handle(DaemonEvent(Trigger.CLEAR))
         assert daemon.state is DaemonState.READY_TO_SWITCH_ON
 
 
@@ -273,7 +277,7 @@ async def test_comm_lost_lasts_as_long_as_a_lost_amplifier_may_play() -> None:
     async with watched() as daemon:
         await daemon.supervisor.handle(ARM)
         lost = asyncio.get_running_loop().time()
-        await daemon.supervisor.handle(Event(Kind.LINK_LOST, "cut"))
+        await daemon.supervisor.handle(DaemonEvent(Trigger.LINK_LOST, "cut"))
         await asyncio.sleep(0.2)
         assert daemon.links == ["reopened"]
         assert daemon.state is DaemonState.COMM_LOST
@@ -314,13 +318,13 @@ async def test_clear_is_refused_while_the_cause_is_there() -> None:
         daemon.far_end.answer = lambda request: (
             hot if isinstance(request, Clear | GetStatus) else None
         )
-        with pytest.raises(CommandRefused, match="not gone"):
-            await daemon.supervisor.handle(Event(Kind.CLEAR))
+        with pytest.raises(CommandRefused, match="persists"):
+            await daemon.supervisor.handle(DaemonEvent(Trigger.CLEAR))
         assert daemon.state is DaemonState.FAULT
         daemon.far_end.answer = lambda request: None
         await asyncio.sleep(10)
         assert daemon.state is DaemonState.FAULT
-        await daemon.supervisor.handle(Event(Kind.CLEAR))
+        await daemon.supervisor.handle(DaemonEvent(Trigger.CLEAR))
         assert daemon.state is DaemonState.READY_TO_SWITCH_ON
 
 
@@ -328,11 +332,11 @@ async def test_clear_is_refused_while_the_cause_is_there() -> None:
 async def test_clear_waits_for_level_zero() -> None:
     """A level that is still reported is no silence, whatever state the amplifier is in."""
     async with watched() as daemon:
-        await daemon.supervisor.handle(Event(Kind.STOP, "stop"))
+        await daemon.supervisor.handle(DaemonEvent(Trigger.STOP, "stop"))
         loud = daemon.status(AmplifierState.SWITCH_ON_DISABLED, level=0.01)
         daemon.far_end.answer = lambda request: loud if isinstance(request, GetStatus) else None
         with pytest.raises(CommandRefused, match="level"):
-            await daemon.supervisor.handle(Event(Kind.CLEAR))
+            await daemon.supervisor.handle(DaemonEvent(Trigger.CLEAR))
         assert daemon.state is DaemonState.FAULT
 
 
@@ -342,11 +346,11 @@ async def test_clear_right_after_a_stop_waits_for_the_ramp() -> None:
     loop = asyncio.get_running_loop()
     async with watched() as daemon:
         await daemon.supervisor.handle(ARM)
-        await daemon.supervisor.handle(Event(Kind.STOP, "stop"))
+        await daemon.supervisor.handle(DaemonEvent(Trigger.STOP, "stop"))
         silent = loop.time() + 0.05
         stopping = daemon.status(AmplifierState.QUICK_STOP_ACTIVE)
         daemon.far_end.answer = lambda request: stopping if loop.time() < silent else None
-        await daemon.supervisor.handle(Event(Kind.CLEAR))
+        await daemon.supervisor.handle(DaemonEvent(Trigger.CLEAR))
         assert daemon.state is DaemonState.READY_TO_SWITCH_ON
 
 
@@ -356,21 +360,21 @@ async def test_a_stop_is_not_acknowledged_by_who_asked_before_it(later: float) -
     """A clear that is said again and again ends with the next stop: who asked is told, nothing
     more is said to the amplifier, and the state is that of the stop."""
     async with watched() as daemon:
-        await daemon.supervisor.handle(Event(Kind.STOP, "the first"))
+        await daemon.supervisor.handle(DaemonEvent(Trigger.STOP, "the first"))
         stopping = daemon.status(AmplifierState.QUICK_STOP_ACTIVE)
         daemon.far_end.answer = lambda request: stopping
         daemon.far_end.delay = 0.004
-        clearing = asyncio.create_task(daemon.supervisor.handle(Event(Kind.CLEAR)))
+        clearing = asyncio.create_task(daemon.supervisor.handle(DaemonEvent(Trigger.CLEAR)))
         await asyncio.sleep(later)
-        await daemon.supervisor.handle(Event(Kind.STOP, "the second"))
+        await daemon.supervisor.handle(DaemonEvent(Trigger.STOP, "the second"))
         daemon.far_end.answer = lambda request: None
-        with pytest.raises(CommandRefused, match="stopped"):
+        with pytest.raises(CommandRefused, match="clear again"):
             await clearing
         await asyncio.sleep(1)
         assert daemon.state is DaemonState.QUICK_STOP_ACTIVE
         orders = daemon.far_end.requests(Stop, Clear)
         assert isinstance(orders[-1], Stop)
-        await daemon.supervisor.handle(Event(Kind.CLEAR))
+        await daemon.supervisor.handle(DaemonEvent(Trigger.CLEAR))
         assert daemon.state is DaemonState.READY_TO_SWITCH_ON
 
 
@@ -382,9 +386,9 @@ async def test_a_stop_while_disarming_is_a_stop_and_no_fault(later: float) -> No
         await daemon.supervisor.handle(ARM)
         await asyncio.sleep(0.005)
         daemon.far_end.delay = 0.010
-        disarming = asyncio.create_task(daemon.supervisor.handle(Event(Kind.DISARM)))
+        disarming = asyncio.create_task(daemon.supervisor.handle(DaemonEvent(Trigger.DISARM)))
         await asyncio.sleep(later)
-        await daemon.supervisor.handle(Event(Kind.STOP, "stop"))
+        await daemon.supervisor.handle(DaemonEvent(Trigger.STOP, "stop"))
         await asyncio.gather(disarming, return_exceptions=True)
         assert daemon.state is DaemonState.QUICK_STOP_ACTIVE
         assert DaemonState.FAULT not in daemon.states
@@ -411,7 +415,7 @@ async def test_a_stop_while_arming_is_a_stop_and_no_fault() -> None:
         daemon.far_end.delay = 0.005
         arming = asyncio.create_task(daemon.supervisor.handle(ARM))
         await asyncio.sleep(0.002)
-        await daemon.supervisor.handle(Event(Kind.STOP, "stop"))
+        await daemon.supervisor.handle(DaemonEvent(Trigger.STOP, "stop"))
         with pytest.raises(CommandRefused):
             await arming
         assert daemon.state is DaemonState.QUICK_STOP_ACTIVE

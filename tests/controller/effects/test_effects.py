@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from controller.daemon.meaning import Meaning
+from controller.daemon.active_layout import ActiveLayout
 from controller.effects.effect import Course, Effect, Feeling, Nothing
 from controller.effects.kinds import effect_kind, effect_kinds
 from controller.effects.layout import Layout, Region
@@ -436,7 +436,7 @@ def test_effects_of_plug_ins_are_listed() -> None:
         beats: tuple[float, ...] = (0.1, 0.2)
         count: int = 3
 
-    listed = Meaning(Layout(effects={"buzz": Buzz(), "rhythm": Rhythm()})).effects().effects
+    listed = ActiveLayout(Layout(effects={"buzz": Buzz(), "rhythm": Rhythm()})).effects().effects
     (_, rhythm) = (each.model_dump(mode="json") for each in listed)
     assert rhythm["description"] == "Beats of one's own."
     assert (rhythm["parameters"]["beats"], rhythm["parameters"]["count"]) == ([0.1, 0.2], 3)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from controller.report.collect import MOST_DUMPS, collect, versions
+from controller.report.collect import MAX_DUMPS, collect, versions
 from controller.report.redaction import redacted
 from model.rig.file import example_rig_path
 
@@ -53,11 +53,11 @@ def test_everything_that_a_daemon_names(tmp_path: Path) -> None:
     )
     (tmp_path / "t.npz").write_bytes(b"x" * 100)
     (tmp_path / "dumps").mkdir()
-    for number in range(MOST_DUMPS + 2):
+    for number in range(MAX_DUMPS + 2):
         (tmp_path / "dumps" / f"era-fault-2026-{number}.jsonl").write_text(str(number), "utf-8")
     (tmp_path / "dumps" / "letter.txt").write_text("dear", "utf-8")
     report = collect([tmp_path / "d.yaml"], socket=tmp_path / "no.sock", home=HOME)
-    dumps = [f"era-fault-2026-{number}.jsonl" for number in range(2, MOST_DUMPS + 2)]
+    dumps = [f"era-fault-2026-{number}.jsonl" for number in range(2, MAX_DUMPS + 2)]
     assert set(report.files) == {"d.yaml", "rig.yaml", *dumps, "versions.json"}
     layout, daemon = report.missing
     assert "none.yaml" in layout

@@ -1,6 +1,6 @@
 """Coming back after a loss: attempt by attempt, each from a closed controller."""
 
-from controller.daemon.reopening import reopen
+from controller.daemon.reconnect import reconnect
 from drivers.errors import LinkError
 from virtual_loop import in_virtual_time
 
@@ -30,10 +30,10 @@ class Controller:
 async def test_what_was_opened_and_not_disarmed_is_closed_before_it_is_tried_again() -> None:
     """Nothing stays open that may be armed, and each attempt is told."""
     controller, told = Controller(), []
-    done = await reopen(
+    done = await reconnect(
         controller,  # type: ignore[arg-type]
         is_wanted=lambda: True,
-        told=lambda event, message: told.append(event),
+        report=lambda event, message: told.append(event),
         alive=lambda: None,
     )
     assert done

@@ -1,4 +1,4 @@
-"""What may stand in a daemon's configuration: its sections, keys, defaults and bounds."""
+"""The schema of the daemon's configuration: sections, keys, defaults and bounds."""
 
 import re
 from typing import Annotated, Literal
@@ -22,29 +22,29 @@ _POINT = Annotated[tuple[_LENGTH, _LENGTH], Strict(strict=False)]
 
 def _mode(text: str) -> str:
     if text not in DRIVE_MODES:
-        raise ValueError(f"{text[:40]!r} is no drive mode; choose {', '.join(DRIVE_MODES)}")
+        raise ValueError(f"must be one of {', '.join(DRIVE_MODES)}, got {text[:40]!r}")
     return text
 
 
 def _file(text: str) -> str:
     if "\0" in text:
-        raise ValueError(f"{text[:40]!r} is no file's name: it holds a zero byte; leave that out")
+        raise ValueError(f"file name must not contain a zero byte, got {text[:40]!r}")
     return text
 
 
 def loopback_address(text: str) -> str:
-    """The text if it is HOST:PORT on the loopback interface; ValueError for anything else."""
+    """Return HOST:PORT on the loopback interface unchanged; raises ValueError otherwise."""
     match = re.fullmatch(r"(127\.0\.0\.1|localhost|\[::1\]):(\d{1,5})", text)
     if match is None or int(match[2]) > 65535:
         raise ValueError(
-            f"{text[:40]!r} is no loopback address with a port, such as 127.0.0.1:8137; for others "
-            "run the gateway by itself: era gateway --help"
+            f"must be a loopback address with a port, such as 127.0.0.1:8137, got {text[:40]!r}; "
+            "for other addresses run era gateway separately"
         )
     return text
 
 
-LONGEST_WAIT = 0.1
-"""How long [s] a touch may wait for its shaped onset at most: later it is no answer to it."""
+MAX_TOUCH_WAIT = 0.1
+"""Upper bound of touch_wait [s]: a longer delay is felt as a separate event."""
 
 Port = Annotated[int, Field(ge=0, le=65535)]
 File = Annotated[str, Field(min_length=1, max_length=4096), AfterValidator(_file)]
@@ -52,14 +52,14 @@ LevelDbSl = Annotated[float, Quantity(RATIO, least=-20, most=60)]
 
 
 class CalibrationPoint(Section):
-    """Where `era status` shows a finger without a calibration, and where it really is."""
+    """A touched point: as shown by `era status` without calibration, and its true place."""
 
     shown: _POINT
     at: _POINT
 
 
 class CalibrationSection(Section):
-    """How a sensor lies on the plate: turned clockwise, then mirrored; a matrix; or points."""
+    """The sensor's orientation: turned clockwise, then mirrored; a matrix; or touched points."""
 
     turned: Literal[0, 90, 180, 270] = 0
     mirror: Literal["x", "y"] | None = None
@@ -83,20 +83,20 @@ class LogSection(Section):
 
 
 class DumpSection(Section):
-    """Where the last messages are written on a fault, and how many such files are kept."""
+    """Folder of fault dumps, and how many are kept."""
 
     folder: File
     keep: Annotated[int, Field(ge=1, le=1000)] = 20
 
 
 class DaemonSection(Section):
-    """A daemon's configuration; files count from the folder that it lies in."""
+    """The daemon's configuration; paths are relative to its folder."""
 
     rig: File
     table: File | None = None
     mode: Annotated[str, AfterValidator(_mode)] | None = None
     level_db_sl: LevelDbSl = STRONG_DB_SL
-    touch_wait: Annotated[float, Quantity(TIME, least=0, most=LONGEST_WAIT)] = ENVELOPE_TIME
+    touch_wait: Annotated[float, Quantity(TIME, least=0, most=MAX_TOUCH_WAIT)] = ENVELOPE_TIME
     layout: File | None = None
     touch: Annotated[list[TouchSection], Field(max_length=16, default_factory=list)]
     serial_numbers: Annotated[dict[Identifier, str], Field(max_length=64, default_factory=dict)]

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from controller.daemon.dumps import DUMPS, Dumps
-from controller.daemon.records import Recorder
+from controller.daemon.fault_dumps import DUMP_PATTERN, FaultDumps
+from controller.daemon.message_recorder import Recorder
 from drivers import clock
 
 
@@ -25,12 +25,12 @@ def _writers() -> list[threading.Thread]:
 
 def test_faults_in_company_are_one_dump(tmp_path: Path, now: list[float]) -> None:
     """Within a second of a dump there is no other; after it there is."""
-    dumps = Dumps(Recorder())
+    dumps = FaultDumps(Recorder())
     for now[0], files in ((0.0, 1), (0.5, 1), (1.0, 2)):
         dumps.write(tmp_path, cause="arc", keep=5)
         for thread in _writers():
             thread.join(20)
-        assert len(list(tmp_path.glob(DUMPS))) == files
+        assert len(list(tmp_path.glob(DUMP_PATTERN))) == files
 
 
 def test_a_disk_that_hangs_holds_one_thread_however_many_faults_come(
@@ -47,9 +47,9 @@ def test_a_disk_that_hangs_holds_one_thread_however_many_faults_come(
         over.wait(20)
         return tmp_path
 
-    dumps = Dumps(Recorder())
+    dumps = FaultDumps(Recorder())
     with monkeypatch.context() as patched, caplog.at_level(logging.WARNING):
-        patched.setattr("controller.daemon.dumps.write_dump", hang)
+        patched.setattr("controller.daemon.fault_dumps.write_dump", hang)
         for now[0] in (0.0, 10.0, 20.0):
             dumps.write(tmp_path, cause="arc", keep=5)
         assert begun.wait(20)
@@ -61,4 +61,4 @@ def test_a_disk_that_hangs_holds_one_thread_however_many_faults_come(
     dumps.write(tmp_path, cause="arc", keep=5)
     for thread in _writers():
         thread.join(20)
-    assert len(list(tmp_path.glob(DUMPS))) == 1
+    assert len(list(tmp_path.glob(DUMP_PATTERN))) == 1

@@ -1,4 +1,4 @@
-"""What touches mean at the moment, exchangeable while the control loop runs."""
+"""The surface layout in force, replaceable while the control loop runs."""
 
 import math
 from collections.abc import Iterable, Sequence
@@ -12,30 +12,30 @@ from controller.loop.intent import HapticIntent
 from controller.loop.selection import MOST_DB_SL
 from controller.sources.contacts import Contact, ContactKey
 
-REACH = 0.020
-"""An effect that is asked for at a place is felt by a finger within this distance [m]."""
+PLAY_RADIUS = 0.020
+"""Largest distance [m] from the place of a requested effect to the finger that feels it."""
 
 
-class Meaning:
-    """Plays the effects of a layout, and those that are asked for by name."""
+class ActiveLayout:
+    """Plays the effects of a layout, and effects requested by name."""
 
     def __init__(self, layout: Layout) -> None:
         self._player = EffectPlayer(layout)
 
     def intent(self, contacts: Sequence[Contact], now: float) -> HapticIntent:
-        """As `IntentSource`."""
+        """Return which contacts shall feel what at a time [s]; see `IntentSource`."""
         return self._player.intent(contacts, now)
 
-    def exchange(self, layout: Layout) -> None:
-        """From now on touches mean this; nothing that is over in a moment is felt again."""
+    def replace(self, layout: Layout) -> None:
+        """Replace the layout; effects of a press are not repeated for fingers that rest."""
         self._player = EffectPlayer(layout, known=self._player.fingers)
 
     def effect_of(self, key: ContactKey) -> str | None:
-        """The effect that plays for a finger, None for none."""
+        """The effect that plays for a contact, or None."""
         return self._player.effect_of(key)
 
     def effects(self) -> EffectsResult:
-        """What can be asked for."""
+        """Describe the effects that can be requested by name."""
         return EffectsResult(
             effects=[
                 EffectDescription(
@@ -49,39 +49,39 @@ class Meaning:
         )
 
     def play(self, params: PlayParams, contacts: Iterable[Contact], *, now: float) -> None:
-        """Begin an effect at the finger nearest to its place, at its own level or below.
+        """Start an effect at the contact nearest to a place, at its own level or below.
 
-        Raises RpcError where there is no such effect, or no finger: nothing vibrates that nobody
-        touches.
+        Raises RpcError for an unknown effect, a level above the effect's own, and a place without a
+        contact within `PLAY_RADIUS`.
         """
         effect = self._player.layout.effects.get(params.effect)
         if effect is None:
             known = ", ".join(sorted(self._player.layout.effects))
             raise RpcError(
                 ErrorCode.REFUSED,
-                f"there is no effect {params.effect!a}",
+                f"unknown effect {params.effect!a}",
                 where="effect",
-                remedy=f"known are {known}",
+                remedy=f"choose one of {known}",
             )
-        highest = MOST_DB_SL if effect.level_db_sl is None else effect.level_db_sl
-        if params.level_db_sl is not None and params.level_db_sl > highest:
+        level_max = MOST_DB_SL if effect.level_db_sl is None else effect.level_db_sl
+        if params.level_db_sl is not None and params.level_db_sl > level_max:
             raise RpcError(
                 ErrorCode.REFUSED,
-                f"the effect {params.effect!a} has {highest:g} dB SL, and may be asked for at that "
-                f"or below, not at {params.level_db_sl:g}",
+                f"level of effect {params.effect!a} must be at most {level_max:g} dB SL, got "
+                f"{params.level_db_sl:g}",
                 where="level_db_sl",
-                remedy="raise it in the surface layout if that is wanted",
+                remedy="raise its level in the surface layout",
             )
 
         def distance(contact: Contact) -> float:
             return math.dist((contact.x, contact.y), (params.x_m, params.y_m))
 
         nearest = min(contacts, key=distance, default=None)
-        if nearest is None or distance(nearest) > REACH:
+        if nearest is None or distance(nearest) > PLAY_RADIUS:
             raise RpcError(
                 ErrorCode.REFUSED,
-                f"no finger is within {1e3 * REACH:g} mm of ({params.x_m:g}, {params.y_m:g}) m",
+                f"no finger within {1e3 * PLAY_RADIUS:g} mm of ({params.x_m:g}, {params.y_m:g}) m",
                 where="x_m",
-                remedy="touch the plate there, or over the API with touch",
+                remedy="touch the plate there, or send a touch over the API",
             )
         self._player.play(params.effect, nearest, now, level_db_sl=params.level_db_sl)

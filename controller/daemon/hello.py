@@ -1,4 +1,4 @@
-"""How the daemon introduces itself to a client that says hello."""
+"""The daemon's reply to a client's hello: rig, table, drive mode, layout."""
 
 from collections.abc import Mapping
 from importlib.metadata import version
@@ -12,7 +12,7 @@ from model.rig.rig import Rig
 from model.table.table import LocalizationTable
 
 
-def introduction(
+def hello_result(
     config: DaemonConfig,
     table: LocalizationTable,
     amplifiers: Mapping[str, Amplifier],
@@ -20,7 +20,7 @@ def introduction(
     drive_mode: str,
     layout: dict[str, object] | None,
 ) -> HelloResult:
-    """What the daemon drives, in which mode, by which surface layout."""
+    """Describe what the daemon drives."""
     return HelloResult(
         api_version=API_VERSION,
         software_version=version("era-haptics"),
@@ -57,7 +57,7 @@ def _rig_summary(rig: Rig, amplifiers: Mapping[str, Amplifier]) -> RigSummary:
 
 
 def _product(amplifier: Amplifier) -> str:
-    """What an amplifier calls itself; nothing before it has answered."""
+    """The product name of an amplifier; empty before it was identified."""
     try:
         return amplifier.identity.product
     except CommandError:

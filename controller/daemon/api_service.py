@@ -1,0 +1,284 @@
+"""The methods of the API, implemented by the daemon."""
+
+import asyncio
+import time
+from collections.abc import Mapping
+
+from controller.api.connection import Connection
+from controller.api.jsonrpc import ErrorCode, RpcError
+from controller.api.methods import (
+    ArmParams,
+    ArmResult,
+    HelloParams,
+    HelloResult,
+    PlayParams,
+    RenewParams,
+    RenewResult,
+    StatusResult,
+    SubscribeParams,
+    TouchParams,
+    UnsubscribeParams,
+)
+from controller.api.schema import (
+    Empty,
+    PhaseName,
+)
+from controller.api.server import Handler
+from controller.daemon.active_layout import ActiveLayout
+from controller.daemon.config import DaemonConfig
+from controller.daemon.hello import hello_result
+from controller.daemon.lease import LeaseHolder
+from controller.daemon.publisher import EventPublisher
+from controller.daemon.states import DaemonEvent, DaemonState, StateMachine, Trigger
+from controller.daemon.supervisor import Supervisor
+from controller.daemon.touch_inputs import ApiTouches
+from controller.loop.loop import Controller
+from drivers import clock
+from drivers.amplifier import WATCHDOG, Amplifier
+from model.table.table import LocalizationTable
+
+_ARMABLE = (DaemonState.SWITCHED_ON, DaemonState.OPERATION_ENABLED)
+_REMEDIES = {
+    DaemonState.SWITCH_ON_DISABLED: "wait a moment and try again",
+    DaemonState.READY_TO_SWITCH_ON: "arm first (era arm)",
+}
+"""Remedies of requests in states that have no remedy of their own."""
+
+
+class ApiService:
+    """Handles requests of clients. Arming takes a lease; every client may disarm and stop."""
+
+    def __init__(
+        self,
+        config: DaemonConfig,
+        table: LocalizationTable,
+        controller: Controller,
+        supervisor: Supervisor,
+        *,
+        amplifiers: Mapping[str, Amplifier],
+        publisher: EventPublisher,
+        touches: ApiTouches,
+        layout: ActiveLayout,
+    ) -> None:
+        self.longest_lease = config.section.longest_lease
+        self._config = config
+        self._table = table
+        self._controller = controller
+        self._supervisor = supervisor
+        self._amplifiers = amplifiers
+        self._publisher = publisher
+        self._touches = touches
+        self._layout = layout
+        self._lease = LeaseHolder()
+        self._expiry: asyncio.TimerHandle | None = None
+        self._client_numbers: dict[Connection, int] = {}
+        self._client_count = 0
+        self._started = clock.now()
+
+    def handlers(self) -> Mapping[str, Handler]:
+        """Handlers by method name."""
+        return {
+            "hello": self._hello,
+            "status": lambda client, params: self.status(),
+            "arm": self._arm,
+            "renew": self._renew,
+            "disarm": lambda client, params: self._disarm(client),
+            "stop": lambda client, params: self._stop(client),
+            "clear": lambda client, params: self._clear(client),
+            "touch": self._touch,
+            "effects": lambda client, params: self._layout.effects(),
+            "play": self._play,
+            "subscribe": self._subscribe,
+            "unsubscribe": self._unsubscribe,
+        }
+
+    def state_changed(self, new: StateMachine) -> None:
+        """End the lease when the armed state ends."""
+        if new.state not in _ARMABLE:
+            self._lease.end()
+            self._publisher.view.clear_pattern()
+
+    def client_left(self, client: Connection) -> None:
+        """Release what a disconnected client holds; lift its fingers."""
+        self._publisher.hub.forget(client)
+        self._client_numbers.pop(client, None)
+        self._touches.lift_all(client, now=clock.now())
+
+    def keeps(self, client: Connection) -> bool:
+        """Whether a client must not be evicted for another: it has subscriptions."""
+        return self._publisher.hub.is_subscribed(client)
+
+    def status(self) -> StatusResult:
+        """Return the status of daemon, plate and amplifiers."""
+        machine, view, now = self._supervisor.machine, self._publisher.view, clock.now()
+        lease = self._lease.current(now)
+        pattern = view.pattern_event()
+        return StatusResult(
+            time_s=now,
+            unix_time_s=time.time(),
+            state=machine.state.value,
+            cause=machine.cause,
+            remedy=machine.remedy,
+            phase=_phase(self._controller),
+            assume_energised=machine.assume_energised(now),
+            lost_for_s=machine.lost_for(now),
+            watchdog_s=WATCHDOG,
+            armed_by=lease.owner if lease else None,
+            lease_left_s=lease.expires_at - now if lease else None,
+            contacts=view.contact_statuses(),
+            drive=view.drive(),
+            silent_because=view.silent_because if lease else None,
+            plain_because=self._controller.plain_because,
+            predicted_contrast_db=pattern.predicted_contrast_db if pattern else None,
+            robust_contrast_db=pattern.robust_contrast_db if pattern else None,
+            predicted_level_db_sl=pattern.predicted_level_db_sl if pattern else None,
+            amplifiers=self._publisher.amplifiers(),
+            latency_ms=self._publisher.latencies.summary(),
+            rejected_touches=dict(self._controller.rejected_touches),
+            uptime_s=now - self._started,
+        )
+
+    def _hello(self, client: Connection, params: HelloParams) -> HelloResult:
+        client.name = params.client
+        return hello_result(
+            self._config,
+            self._table,
+            self._amplifiers,
+            drive_mode=self._controller.capabilities.drive_mode,
+            layout=self._publisher.layout_event().layout,
+        )
+
+    async def _arm(self, client: Connection, params: ArmParams) -> ArmResult:
+        machine, now = self._supervisor.machine, clock.now()
+        if machine.state not in (DaemonState.READY_TO_SWITCH_ON, *_ARMABLE):
+            raise _wrong_state(machine)
+        if machine.state is DaemonState.SWITCHED_ON:
+            raise RpcError(ErrorCode.LEASE, "another client is arming", remedy="wait, or disarm")
+        duration = min(params.lease_s, self.longest_lease)
+        lease = self._lease.grant(params.owner, duration=duration, now=now)
+        try:
+            await self._supervisor.handle(
+                DaemonEvent(Trigger.ARM, f"armed by {params.owner!a}", "era disarm, or era stop")
+            )
+        except BaseException:
+            self._end_lease(lease.token)
+            raise
+        if self._supervisor.machine.state is not DaemonState.OPERATION_ENABLED:
+            self._end_lease(lease.token)
+            raise _wrong_state(self._supervisor.machine)
+        # Arming may have taken longer than the lease, so its time starts now.
+        lease = self._lease.restart(lease.token, now=clock.now())
+        self._schedule_lease_check()
+        # After the reply was sent, or failed to be sent.
+        asyncio.get_running_loop().call_soon(self._check_holder, client, lease.token)
+        return ArmResult(lease=lease.token, lease_s=lease.duration)
+
+    def _renew(self, client: Connection, params: RenewParams) -> RenewResult:
+        lease = self._lease.renew(params.lease, now=clock.now())
+        self._schedule_lease_check()
+        return RenewResult(lease_s=lease.duration)
+
+    async def _disarm(self, client: Connection) -> Empty:
+        await self._supervisor.handle(DaemonEvent(Trigger.DISARM, f"disarmed by {client.name!a}"))
+        return Empty()
+
+    async def _stop(self, client: Connection) -> Empty:
+        await self._supervisor.handle(
+            DaemonEvent(
+                Trigger.STOP, f"stopped by {client.name!a}", "clear (era clear), then arm again"
+            )
+        )
+        return Empty()
+
+    async def _clear(self, client: Connection) -> Empty:
+        machine = self._supervisor.machine
+        if machine.state is DaemonState.COMM_LOST:
+            raise _wrong_state(machine, ErrorCode.LINK)
+        await self._supervisor.handle(
+            DaemonEvent(Trigger.CLEAR, f"acknowledged by {client.name!a}")
+        )
+        return Empty()
+
+    def _touch(self, client: Connection, params: TouchParams) -> Empty:
+        if client not in self._client_numbers:
+            self._client_count += 1
+            self._client_numbers[client] = self._client_count
+        self._touches.add(
+            client, params, client_name=str(self._client_numbers[client]), now=client.heard_at
+        )
+        return Empty()
+
+    def _play(self, client: Connection, params: PlayParams) -> Empty:
+        machine = self._supervisor.machine
+        if machine.state is not DaemonState.OPERATION_ENABLED:
+            raise _wrong_state(machine)
+        self._layout.play(params, self._publisher.view.contacts, now=clock.now())
+        self._controller.reconsider()
+        return Empty()
+
+    def _subscribe(self, client: Connection, params: SubscribeParams) -> Empty:
+        # After the reply, so that no event precedes it.
+        asyncio.get_running_loop().call_soon(self._subscribe_now, client, params)
+        return Empty()
+
+    def _subscribe_now(self, client: Connection, params: SubscribeParams) -> None:
+        if client.is_open:
+            self._publisher.hub.subscribe(client, params.topics, rate=params.rate_hz)
+
+    def _unsubscribe(self, client: Connection, params: UnsubscribeParams) -> Empty:
+        self._publisher.hub.unsubscribe(client, params.topics)
+        return Empty()
+
+    def _end_lease(self, token: str) -> None:
+        """End a lease unless another has replaced it."""
+        held = self._lease.current(clock.now())
+        if held is not None and held.token == token:
+            self._lease.end()
+
+    def _schedule_lease_check(self) -> None:
+        """Check the lease when it expires."""
+        if self._expiry is not None:
+            self._expiry.cancel()
+        expires_at = self._lease.expires_at
+        if expires_at is not None:
+            self._expiry = asyncio.get_running_loop().call_later(
+                max(0.0, expires_at - clock.now()), self._check_lease
+            )
+
+    def _check_holder(self, client: Connection, token: str) -> None:
+        """Disarm if the client disconnected before it received its lease."""
+        held = self._lease.current(clock.now())
+        if held is not None and held.token == token and not client.is_open:
+            self._supervisor.post(
+                DaemonEvent(Trigger.LEASE_LOST, "the arming client disconnected", "arm again")
+            )
+
+    def _check_lease(self) -> None:
+        self._expiry = None
+        if self._lease.expires_at is None:
+            return
+        if self._lease.current(clock.now()) is not None:
+            self._schedule_lease_check()
+            return
+        self._supervisor.post(
+            DaemonEvent(Trigger.LEASE_LOST, "the arming lease was not renewed", "arm again")
+        )
+
+
+def _wrong_state(machine: StateMachine, code: ErrorCode = ErrorCode.WRONG_STATE) -> RpcError:
+    return RpcError(
+        code,
+        f"the daemon is in {machine.state.value}: {machine.cause}",
+        where="state",
+        remedy=machine.remedy or _REMEDIES.get(machine.state),
+    )
+
+
+def _phase(controller: Controller) -> PhaseName:
+    names: dict[str, PhaseName] = {
+        "CLOSED": "closed",
+        "DISARMED": "disarmed",
+        "ARMED": "armed",
+        "LOST": "lost",
+    }
+    return names[controller.phase.name]

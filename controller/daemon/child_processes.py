@@ -1,0 +1,80 @@
+"""Child processes of the daemon that must not disturb its loop: gateway and metrics.
+
+Each is an ordinary API client. A child that exits is restarted after a growing pause; all end with
+the daemon, even if that is killed.
+"""
+
+import asyncio
+import contextlib
+import logging
+import os
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from drivers.operation.pauses import pauses
+
+_MAX_PAUSE = 30.0  # s
+_TERMINATE_TIMEOUT = 0.3  # s
+
+_logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class ChildProcess:
+    """A Python module to run as a process, with its arguments."""
+
+    module: str
+    arguments: Sequence[str]
+
+
+class ChildProcesses:
+    """Starts child processes and restarts them when they exit."""
+
+    def __init__(self) -> None:
+        self._tasks: list[asyncio.Task[None]] = []
+
+    def start(self, child: ChildProcess) -> None:
+        """Keep a child running until `close`."""
+        self._tasks.append(asyncio.create_task(self._keep_running(child), name=child.module))
+
+    async def close(self) -> None:
+        """Terminate all children; kill those that do not exit in time."""
+        for task in self._tasks:
+            task.cancel()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
+
+    async def _keep_running(self, child: ChildProcess) -> None:
+        for pause in pauses(first=1.0, longest=_MAX_PAUSE):
+            try:
+                process = await asyncio.create_subprocess_exec(
+                    # -P: do not import a folder named controller in the working directory
+                    *(sys.executable, "-P", "-m", "controller.daemon.child_main"),
+                    *(str(os.getpid()), child.module, *child.arguments),
+                    stdin=asyncio.subprocess.DEVNULL,
+                    start_new_session=True,  # Ctrl-C is handled by the daemon
+                )
+            except OSError as error:
+                _logger.warning("%s: start failed: %s", child.module, error)
+            else:
+                status = await self._wait(process)
+                _logger.warning(
+                    "%s: exited with status %d, restarting in %g s", child.module, status, pause
+                )
+            await asyncio.sleep(pause)
+
+    async def _wait(self, process: asyncio.subprocess.Process) -> int:
+        """Wait for a process to exit; terminate it when cancelled."""
+        try:
+            return await process.wait()
+        except asyncio.CancelledError:
+            with contextlib.suppress(ProcessLookupError):
+                process.terminate()
+            try:
+                async with asyncio.timeout(_TERMINATE_TIMEOUT):
+                    await process.wait()
+            except TimeoutError:
+                with contextlib.suppress(ProcessLookupError):
+                    process.kill()
+                await process.wait()
+            raise

@@ -1,0 +1,105 @@
+"""Fault dumps: the last messages of all links as a file of JSON lines."""
+
+import json
+import logging
+import os
+import threading
+import time
+from collections.abc import Iterable
+from dataclasses import asdict, is_dataclass
+from enum import Enum
+from pathlib import Path
+
+from controller.daemon.message_recorder import Record, Recorder
+from drivers import clock
+
+DUMP_PATTERN = "era-fault-*.jsonl"
+"""File names of dumps."""
+
+_MIN_INTERVAL = 1.0  # s; one dump for faults that come together
+
+_logger = logging.getLogger(__name__)
+
+
+class FaultDumps:
+    """Writes recorded messages in a thread, since a disk may be slow, full or gone.
+
+    One dump at a time, so that a hanging disk costs one thread.
+    """
+
+    def __init__(self, recorder: Recorder) -> None:
+        self._recorder = recorder
+        self._written_at = float("-inf")
+        self._writer: threading.Thread | None = None
+
+    def write(self, folder: Path, *, cause: str, keep: int) -> None:
+        """Write a dump unless one was written within the last second; keep the newest `keep`."""
+        if clock.now() - self._written_at < _MIN_INTERVAL:
+            return
+        self._written_at = clock.now()
+        if self._writer is not None and self._writer.is_alive():
+            _logger.warning("dump in %s skipped: previous dump still being written", folder)
+            return
+        records = self._recorder.records()
+
+        def write() -> None:
+            try:
+                path = write_dump(folder, records, cause=cause, keep=keep)
+                _logger.info("dump: wrote %s", path)
+            except OSError as error:
+                _logger.warning("dump in %s failed: %s", folder, error)
+
+        self._writer = threading.Thread(target=write, name="dump", daemon=True)
+        self._writer.start()
+
+
+def write_dump(folder: Path, records: Iterable[Record], *, cause: str, keep: int) -> Path:
+    """Write records to a new file and delete the oldest dumps beyond `keep`; raises OSError.
+
+    A file that cannot be written completely is deleted.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    stamp = time.strftime("%Y%m%dT%H%M%S", time.gmtime())
+    path = folder / DUMP_PATTERN.replace("*", f"{stamp}-{time.monotonic_ns() % 10**9:09d}")
+    opened = open(path, "x", encoding="utf-8", opener=_owner_only)  # noqa: SIM115
+    try:
+        with opened as stream:
+            stream.write(json.dumps({"cause": cause, "unix_time_s": time.time()}) + "\n")
+            for record in records:
+                stream.write(json.dumps(_as_json(record)) + "\n")
+    except OSError:
+        path.unlink(missing_ok=True)
+        raise
+    # The new file may sort first: boards without a battery start in 1970.
+    others = sorted(each for each in folder.glob(DUMP_PATTERN) if each != path)
+    for old in others[: max(0, len(others) + 1 - keep)]:
+        old.unlink(missing_ok=True)
+    return path
+
+
+def _owner_only(path: str, flags: int) -> int:
+    """Open a file with mode 0600 from its creation on."""
+    return os.open(path, flags, 0o600)
+
+
+def _as_json(record: Record) -> dict[str, object]:
+    what = record.what
+    line: dict[str, object] = {
+        "time_s": round(record.time, 6),
+        "link": record.link,
+        "way": record.way,
+        "message": type(what).__name__,
+    }
+    if is_dataclass(what) and not isinstance(what, type):
+        line["content"] = _plain(asdict(what))
+    elif what:
+        line["content"] = str(what)
+    return line
+
+
+def _plain(value: object) -> object:
+    if isinstance(value, dict):
+        return {str(key): _plain(each) for key, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(each) for each in value]
+    return value.name if isinstance(value, Enum) else value

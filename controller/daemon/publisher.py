@@ -1,0 +1,159 @@
+"""Publishes what happens in the daemon to its clients, and keeps the current state of it."""
+
+import asyncio
+import contextlib
+import logging
+from collections.abc import Callable, Sequence
+
+from controller.api.hub import Hub
+from controller.api.schema import AmplifierStatus
+from controller.api.topics import (
+    AmplifiersEvent,
+    LatencyEvent,
+    LayoutEvent,
+    LinkEvent,
+    LogEvent,
+    SilenceEvent,
+    StateEvent,
+)
+from controller.daemon.api_views import PlateView
+from controller.daemon.latency import LatencyStatistics
+from controller.daemon.reconnect import LinkChange
+from controller.daemon.states import DaemonState, StateMachine
+from controller.effects.layout import Layout
+from controller.loop.observer import Applied, Observer, Silenced
+from controller.sources.contacts import Change, Contact, ContactKey
+from drivers import clock
+
+_MAX_MESSAGE = 1000  # characters
+
+_logger = logging.getLogger(__name__)
+
+
+class EventPublisher:
+    """Keeps the current state of the plate and publishes every change at `hub`.
+
+    machine: the daemon's state machine; amplifiers: their statuses; effect_of: the effect that
+    plays for a contact; plain_because: why onsets are plain ramps; layout: the surface layout.
+    """
+
+    def __init__(
+        self,
+        *,
+        machine: Callable[[], StateMachine],
+        amplifiers: Callable[[], list[AmplifierStatus]],
+        effect_of: Callable[[ContactKey], str | None],
+        plain_because: Callable[[], str | None],
+        layout: Layout | None,
+    ) -> None:
+        self.view = PlateView(effect_of)
+        self.latencies = LatencyStatistics()
+        self.amplifiers = amplifiers
+        self._machine = machine
+        self._layout = layout
+        self._last_link_message = ""
+        self._loop = asyncio.get_running_loop()
+        self.hub = Hub(
+            {
+                "state": self._state_event,
+                "contacts": self.view.contacts_event,
+                "pattern": self.view.pattern_event,
+                "silence": self.view.silence_event,
+                "amplifiers": lambda: AmplifiersEvent(amplifiers=amplifiers()),
+                "latency": lambda: LatencyEvent(
+                    latency_ms=self.latencies.summary(), plain_because=plain_because()
+                ),
+                "layout": self.layout_event,
+            },
+            clock=clock.now,
+        )
+
+    def observer(self) -> Observer:
+        """The observer of the control loop."""
+        return Observer(
+            contacts_changed=self._contacts_changed,
+            pattern_applied=self._pattern_applied,
+            silenced=self._silenced,
+            refused=lambda reason: _logger.warning("refused: %s", reason),
+        )
+
+    def state_changed(self, old: StateMachine, new: StateMachine) -> None:
+        """Publish a transition; outside OPERATION_ENABLED nothing plays any more."""
+        self.hub.publish(
+            "state",
+            lambda: StateEvent(
+                old=old.state.value, new=new.state.value, cause=new.cause, remedy=new.remedy
+            ),
+        )
+        if self.view.applied is not None and new.state is not DaemonState.OPERATION_ENABLED:
+            # The control loop does not report the end of what others have silenced.
+            self.view.clear_pattern()
+            silence = SilenceEvent(
+                contacts=self.view.contact_statuses(), reason=new.cause, latency_ms=None
+            )
+            self.hub.publish("silence", lambda: silence)
+
+    def layout_changed(self, layout: Layout | None) -> None:
+        """Publish another surface layout; None for the same effect everywhere."""
+        self._layout = layout
+        self.hub.publish("layout", self.layout_event)
+
+    def link_changed(self, change: LinkChange, lost: Sequence[str], message: str) -> None:
+        """Publish that the link to amplifiers was lost, is being retried, or was reopened."""
+        if change == "retry" and message != self._last_link_message:
+            _logger.warning("link: retrying: %s", message, extra={"topic": "link"})
+        self._last_link_message = message
+        if change != "retry":  # contacts are not followed without a link and start anew with it
+            self._contacts_changed((), Change())
+        event = LinkEvent(
+            event=change,
+            amplifier=lost[0] if len(lost) == 1 else None,
+            message=message,
+            remedy=None if change == "reopened" else "check cables and supply",
+        )
+        self.hub.publish("link", lambda: event)
+
+    def logged(self, record: logging.LogRecord) -> None:
+        """Publish a log record from any thread, unless it is marked with another topic."""
+        if hasattr(record, "topic"):
+            return
+        event = {
+            "level": "error" if record.levelno >= logging.ERROR else record.levelname.lower(),
+            # file names may contain bytes that are not valid text
+            "message": record.getMessage()[:_MAX_MESSAGE]
+            .encode(errors="backslashreplace")
+            .decode(),
+            "cause": getattr(record, "cause", None),
+            "remedy": getattr(record, "remedy", None),
+        }
+
+        def publish() -> None:
+            self.hub.publish("log", lambda: LogEvent.model_validate(event))
+
+        with contextlib.suppress(RuntimeError):  # the loop may be closed
+            self._loop.call_soon_threadsafe(publish)
+
+    def layout_event(self) -> LayoutEvent:
+        """The surface layout as an event."""
+        return LayoutEvent(layout=None if self._layout is None else self._layout.drawn())
+
+    def _state_event(self) -> StateEvent:
+        now = self._machine()
+        return StateEvent(
+            old=now.state.value, new=now.state.value, cause=now.cause, remedy=now.remedy
+        )
+
+    def _contacts_changed(self, contacts: tuple[Contact, ...], change: Change) -> None:
+        self.view.contacts = contacts
+        self.hub.publish("contacts", self.view.contacts_event)
+
+    def _pattern_applied(self, applied: Applied) -> None:
+        self.view.set_pattern(applied)
+        self.latencies.add(applied.latency)
+        self.hub.publish("pattern", self.view.pattern_event)
+
+    def _silenced(self, silenced: Silenced) -> None:
+        self.view.set_silence(silenced)
+        if silenced.latency is not None:
+            self.latencies.add(silenced.latency)
+        self.hub.publish("silence", self.view.silence_event)

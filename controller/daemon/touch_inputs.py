@@ -1,0 +1,119 @@
+"""Touch inputs of the daemon: the configured sources, and the touches of API clients."""
+
+import asyncio
+import logging
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+
+from controller.api.methods import TouchParams
+from controller.daemon.config import API_SOURCES, TouchInput
+from controller.sources.touch import Touch, TouchFrame
+from drivers.operation.pauses import pauses
+from model.errors import InputError
+from model.structure.plate import Plate
+
+_MIN_PAUSE, _MAX_PAUSE = 1.0, 30.0  # s; before a failed source is restarted
+MAX_SOURCES_PER_CLIENT = 64  # with fingers down; a gateway forwards those of many browsers
+
+_logger = logging.getLogger(__name__)
+
+
+class TouchInputs:
+    """Runs touch sources concurrently; sources can be replaced while others keep running.
+
+    deliver receives their frames, each source name prefixed with the configured name; failed
+    receives the error of a source, which is then restarted after a growing pause. Contacts of a
+    removed source time out.
+    """
+
+    def __init__(
+        self,
+        deliver: Callable[[TouchFrame], None],
+        *,
+        failed: Callable[[str, Exception], None],
+    ) -> None:
+        self._deliver = deliver
+        self._failed = failed
+        self._running: dict[TouchInput, asyncio.Task[None]] = {}
+
+    async def replace(self, inputs: Iterable[TouchInput]) -> None:
+        """Run exactly these sources; those that are running already are not restarted."""
+        wanted = list(inputs)
+        for old in [each for each in self._running if each not in wanted]:
+            task = self._running.pop(old)
+            task.cancel()
+            await asyncio.gather(task, return_exceptions=True)
+        for new in wanted:
+            if new not in self._running:
+                self._running[new] = asyncio.create_task(self._run(new), name=f"touch {new.name}")
+
+    async def close(self) -> None:
+        """Stop all sources."""
+        await self.replace(())
+
+    async def _run(self, touch_input: TouchInput) -> None:
+        def deliver(frame: TouchFrame) -> None:
+            # The sender chooses the name, which is printed on terminals.
+            source = frame.source if frame.source.isprintable() else ascii(frame.source)
+            self._deliver(replace(frame, source=f"{touch_input.name}:{source}"))
+
+        for pause in pauses(first=_MIN_PAUSE, longest=_MAX_PAUSE):
+            try:
+                await touch_input.make().run(deliver)
+            except Exception as error:
+                self._failed(touch_input.name, error)
+            else:
+                _logger.info("touch source %s: finished", touch_input.name)
+                return
+            await asyncio.sleep(pause)  # a panel may be plugged in later, a port be released
+
+
+class ApiTouches:
+    """Touch frames of API clients: the newest of each source, delivered once per loop iteration."""
+
+    def __init__(self, plate: Plate, deliver: Callable[[TouchFrame], None]) -> None:
+        self._plate = plate
+        self._deliver = deliver
+        self._newest: dict[str, TouchFrame] = {}
+        self._sources: dict[object, set[str]] = {}
+        self._is_scheduled = False
+
+    def add(self, client: object, params: TouchParams, *, client_name: str, now: float) -> None:
+        """Add a frame that arrived at a time [s]; raises InputError for too many sources.
+
+        The same source name of two clients denotes two sources.
+        """
+        source = f"{API_SOURCES}:{client_name}:{params.source}"
+        sources = self._sources.setdefault(client, set())
+        if not params.touches:
+            sources.discard(source)
+        elif source not in sources:
+            if len(sources) >= MAX_SOURCES_PER_CLIENT:
+                raise InputError(
+                    f"a client must have at most {MAX_SOURCES_PER_CLIENT} touch sources with "
+                    "fingers down; lift some first"
+                )
+            sources.add(source)
+        touches = tuple(
+            Touch(point.id, point.x_m / self._plate.length, 1 - point.y_m / self._plate.width)
+            for point in params.touches
+        )
+        self._newest[source] = TouchFrame(source, now, touches)
+        self._schedule()
+
+    def lift_all(self, client: object, *, now: float) -> None:
+        """Lift all fingers of a client at a time [s]."""
+        for source in self._sources.pop(client, ()):
+            self._newest[source] = TouchFrame(source, now, ())
+            self._schedule()
+
+    def _schedule(self) -> None:
+        if not self._is_scheduled:
+            self._is_scheduled = True
+            asyncio.get_running_loop().call_soon(self._deliver_newest)
+
+    def _deliver_newest(self) -> None:
+        self._is_scheduled = False
+        newest, self._newest = self._newest, {}
+        for frame in newest.values():
+            self._deliver(frame)

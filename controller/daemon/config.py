@@ -20,6 +20,7 @@ from model.errors import InputError
 from model.finger.perception import STRONG_DB_SL
 from model.rig.file import load_rig
 from model.rig.rig import Rig
+from model.structure.support import check_supported
 
 API_SOURCES = "api"
 """Prefix of the touch sources of API clients, reserved for them."""
@@ -142,7 +143,9 @@ def _rig(validation: Validation, file: Path | None) -> tuple[Rig | None, str]:
     if file is None:
         return None, ""
     try:
-        return load_rig(file), file.read_text("utf-8")
+        rig = load_rig(file)
+        check_supported(rig.plate, rig.eras, loads=rig.loads)
+        return rig, file.read_text("utf-8")
     except ConfigError as error:
         validation.add(("rig",), "invalid rig:\n    " + str(error).replace("\n", "\n  "))
     except (InputError, OSError) as error:

@@ -105,7 +105,7 @@ def study(
                 err=True,
             )
             raise
-    ranking = rank(cases, run.results, drive=DRIVES.index(active))
+    ranking = rank(rig, cases, run.results, drive=DRIVES.index(active))
     data = read_document(rig_file).data
     files = [str(path) for path in write_outcome(output, what, rig, data=data, ranking=ranking)]
     elapsed = time.perf_counter() - started
@@ -150,9 +150,12 @@ def _show(summary: dict[str, Any]) -> None:
         print(
             f"{case['rank']:4d}  {case['layout']:28s} {stiffness:6.4g} kN/m {lowest:6.1f} g "
             f"{median:6.1f} g {highest:6.1f} g {100 * case['unfelt_share']:7.2f} %"
+            f"{'' if case['supported'] else '  not supported'}"
         )
     recommended = summary["recommended"]
     why = "" if recommended["rank"] == 1 else ", fewest and softest within a tenth of the best"
+    if not recommended["supported"]:
+        print("No layout supports the plate: put at least three ERAs under it, not in one line")
     print(f"Recommended{why}: {recommended['words']}")
 
 

@@ -22,10 +22,10 @@ import numpy as np
 from scipy import linalg
 
 from model.arrays import FloatArray
-from model.errors import InputError
 from model.structure.actuator import Era
 from model.structure.plate import Plate
 from model.structure.point_load import PointLoad, load_positions
+from model.structure.support import check_supported
 
 
 class Reduced(Protocol):
@@ -57,8 +57,9 @@ def modal_matrices(
     """M, C, K (r, r) of the plate on its ERAs, with what it carries and the fingers in contact.
 
     held: shapes at the ERAs, loads and contacts (n, r) where they are known already. Raises
-    InputError for ERAs that do not hold the plate (fewer than three, or all in one line).
+    InputError for ERAs that do not support the plate.
     """
+    check_supported(reduced.plate, eras, loads=loads)
     fixed = [PointLoad(e.x, e.y, e.stiffness, e.damping, e.bolt_mass) for e in eras]
     fixed += loads
     phi = reduced.at(load_positions([*fixed, *contacts])) if held is None else held
@@ -67,11 +68,6 @@ def modal_matrices(
     M += np.eye(len(elastic))
     K += elastic
     squares, psi = linalg.eigh(K, M)
-    if squares[0] < 1.0:  # (rad/s)²: slower than one sway in six seconds is not held at all
-        raise InputError(
-            "the plate does not stand on its ERAs and would tip over; put at least three under it "
-            "that do not lie in one line"
-        )
     omega = np.sqrt(squares)
     viscous = reduced.plate.loss_factor * (psi.T @ elastic @ psi) / np.sqrt(np.outer(omega, omega))
     back = M @ psi

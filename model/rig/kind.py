@@ -8,6 +8,7 @@ from model.config.kinds import Good
 from model.rig.amplifiers import check_amplifiers
 from model.rig.file import example_rig_path, load_rig, rig_schema
 from model.rig.rig import Rig
+from model.structure.support import support_problem
 
 
 class RigKind:
@@ -30,6 +31,9 @@ class RigKind:
         except ConfigError as error:
             problems += error.problems
         wrong, warnings = check_amplifiers(document, rig)
+        support = None if rig is None else support_problem(rig.plate, rig.eras, loads=rig.loads)
+        if support is not None:
+            problems.append(document.problem(("eras",), support))
         known = {problem.key for problem in problems}
         problems += [problem for problem in wrong if problem.key not in known]
         if rig is None or problems:

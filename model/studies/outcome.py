@@ -11,11 +11,10 @@ from model.figures import save_figure
 from model.files.array_file import whole_or_nothing
 from model.files.csv_file import Column, Columns, write_columns
 from model.rig.rig import Rig
-from model.studies.cases import Cases
 from model.studies.pictures import PICTURES
 from model.studies.ranking import Ranking, era_counts
 from model.studies.recommended import in_words, rig_yaml
-from model.studies.solve import DRIVE_NAMES, DRIVES, CaseResults
+from model.studies.solve import DRIVE_NAMES, DRIVES
 from model.vibration.activation import STATISTICS
 
 SHOWN = 10
@@ -34,7 +33,7 @@ def write_outcome(
     with whole_or_nothing(recommended) as stream:
         stream.write(text.encode())
     table = folder / f"{study}.csv"
-    write_columns(table, all_columns(ranking.cases, ranking.results))
+    write_columns(table, all_columns(ranking))
     for name, figure in PICTURES[study].items():
         save_figure(figure(rig, ranking), folder / name)
     return [recommended, table, *(folder / name for name in PICTURES[study])]
@@ -66,6 +65,7 @@ def case_summary(rig: Rig, ranking: Ranking, case: int) -> dict[str, object]:
     statistics = ranking.results.statistics[case, ranking.drive]
     return {
         "layout": ranking.cases.names[case],
+        "supported": bool(ranking.supported[case]),
         "at_m": {era.name: [era.x, era.y] for era in eras},
         "stiffness_n_m": {era.name: era.stiffness for era in eras},
         "active": [eras[era].name for era in driven],
@@ -77,8 +77,9 @@ def case_summary(rig: Rig, ranking: Ranking, case: int) -> dict[str, object]:
     }
 
 
-def all_columns(cases: Cases, results: CaseResults) -> Columns:
+def all_columns(ranking: Ranking) -> Columns:
     """Every case and drive, one a row."""
+    cases, results = ranking.cases, ranking.results
     at = [
         " ".join(f"({x:.6g};{y:.6g})" for x, y in cases.positions_of(case).tolist())
         for case in range(len(cases))
@@ -90,6 +91,7 @@ def all_columns(cases: Cases, results: CaseResults) -> Columns:
         "eras": era_counts(cases)[rows],
         "stiffness_factor": cases.stiffness_factors[rows],
         "at_m": [at[case] for case in rows],
+        "supported": ["yes" if ranking.supported[case] else "no" for case in rows],
         "driven": [DRIVES[drive] for drive in drives],
         "active": [
             "+".join(str(era + 1) for era in results.active_eras(case, drive))

@@ -3,8 +3,11 @@
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from model.arrays import FloatArray, IntArray
+from model.rig.rig import Rig
+from model.structure.support import support_problem
 from model.studies.cases import OWN, VACANT, Cases
 from model.studies.solve import CaseResults
 from model.vibration.activation import MEDIAN
@@ -17,13 +20,15 @@ GOOD_ENOUGH = 0.9
 class Ranking:
     """Cases by the median over the plate of what a drive makes of them, the best first.
 
-    drive: number in DRIVES; order (n,) numbers of the cases that can be driven so.
+    drive: number in DRIVES; order (n,) numbers of the cases that can be driven so; supported (n,)
+    whether the ERAs of each case support the plate, without which it cannot be built.
     """
 
     cases: Cases
     results: CaseResults
     drive: int
     order: IntArray
+    supported: NDArray[np.bool_]
 
     @property
     def medians(self) -> FloatArray:
@@ -57,13 +62,16 @@ class Ranking:
     def recommended(self) -> int:
         """Of the cases that reach GOOD_ENOUGH of the best, the best with fewest and softest ERAs.
 
-        In a study of placement that is the best case.
+        In a study of placement that is the best case. Cases that do not support the plate are
+        passed over, unless none does.
         """
         counts = era_counts(self.cases)
+        order = self.order[self.supported[self.order]]
+        order = order if len(order) else self.order
         good = [
             int(case)
-            for case in self.order
-            if self.medians[case] >= GOOD_ENOUGH * self.medians[self.best]
+            for case in order
+            if self.medians[case] >= GOOD_ENOUGH * self.medians[order[0]]
         ]
         return min(good, key=lambda case: (counts[case], self.cases.stiffness_factors[case]))
 
@@ -75,13 +83,18 @@ class Ranking:
         return dict(sorted(best.items()))
 
 
-def rank(cases: Cases, results: CaseResults, *, drive: int) -> Ranking:
-    """Rank cases by the median; those with too few ERAs for the drive are left out."""
+def rank(rig: Rig, cases: Cases, results: CaseResults, *, drive: int) -> Ranking:
+    """Rank cases of a rig by the median; those with too few ERAs for the drive are skipped."""
     medians = results.statistics[:, drive, MEDIAN]
     ranked = np.flatnonzero(~np.isnan(medians))
     # Equal by symmetry is equal: then in the order of the cases, whatever rounding says.
     rounded = np.array([float(f"{median:.9g}") for median in medians[ranked]])
-    return Ranking(cases, results, drive, ranked[np.argsort(-rounded, kind="stable")])
+    supported = [
+        support_problem(rig.plate, cases.eras_of(case, rig.eras), loads=rig.loads) is None
+        for case in range(len(cases))
+    ]
+    order = ranked[np.argsort(-rounded, kind="stable")]
+    return Ranking(cases, results, drive, order, np.array(supported))
 
 
 def era_counts(cases: Cases) -> IntArray:

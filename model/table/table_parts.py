@@ -19,6 +19,7 @@ from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.reduction.reduced_plate import reduce_plate
 from model.rig.rig import Rig
 from model.structure.point_load import load_positions
+from model.structure.support import check_supported
 from model.table.file import MAX_BYTES
 from model.table.raster import Raster
 from model.version import code_version
@@ -42,7 +43,8 @@ class Part:
 class TableProblem:
     """All that the numbers of a table depend on; the drive mode is not among it.
 
-    frequencies (f,) [Hz], ascending, within the rig's limits. Raises InputError for others.
+    frequencies (f,) [Hz], ascending, within the rig's limits. Raises InputError for others, and
+    for a rig whose ERAs do not support its plate.
     """
 
     rig: Rig
@@ -52,6 +54,7 @@ class TableProblem:
     def __post_init__(self) -> None:
         """Refuse frequencies that make no table, and a table that would be too large to be read."""
         _check_frequencies(self.frequencies, self.rig)
+        check_supported(self.rig.plate, self.rig.eras, loads=self.rig.loads)
         eras, f = len(self.rig.eras), len(self.frequencies)
         sources = eras * (eras + 1) // 2 * f + 1
         size = 8 * self.raster.point_count * eras * f + 4 * sources * self.grid.cell_count

@@ -49,6 +49,14 @@ def test_a_file_that_names_a_rig_only_is_enough(folder: Path) -> None:
     assert config.rig_text == example_rig_path().read_text("utf-8")
 
 
+def test_daemon_refuses_a_rig_that_does_not_support_its_plate(folder: Path) -> None:
+    """At the key that names the rig."""
+    rig = folder / "rig.yaml"
+    lines = rig.read_text("utf-8").splitlines(keepends=True)
+    rig.write_text("".join(line for line in lines if line[:5] not in ("  NE:", "  NW:")), "utf-8")
+    assert problems(written(folder, "rig: rig.yaml\n")) == [(1, "rig")]
+
+
 def test_files_count_from_the_folder_of_the_configuration(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -8,6 +8,7 @@ import pytest
 from model.config.document import ConfigError, read_document
 from model.errors import InputError
 from model.rig.file import example_rig_path, load_rig, parse_rig, rig_schema
+from model.rig.kind import RIG
 from model.rig.parts import parse_mesh
 from model.rig.rig import Channel
 from model.structure.materials import material
@@ -467,6 +468,15 @@ def test_the_schema_for_editors_knows_what_the_example_says() -> None:
         assert set(sections[section].get("required", [])) <= content.keys()
         assert sections[section]["additionalProperties"] is False
     assert json.loads(json.dumps(schema)) == schema
+
+
+def test_config_check_refuses_a_rig_that_does_not_support_its_plate(tmp_path: Path) -> None:
+    """Two ERAs let the plate tip over; such a rig loads, so that a study can start from it."""
+    path = write(tmp_path, GOOD)
+    assert len(load_rig(path).eras) == 2
+    with pytest.raises(ConfigError) as caught:
+        RIG.check(path)
+    assert [(each.line, each.key) for each in caught.value.problems] == [(7, "eras")]
 
 
 def test_text_of_a_rig() -> None:

@@ -123,7 +123,7 @@ def test_one_era_has_no_pair_and_two_have_no_more():
     assert np.isnan(by_drive["2"][0]).all()
     np.testing.assert_array_equal(by_drive["all"][0], by_drive["1"][0])
     np.testing.assert_array_equal(by_drive["all"][1], by_drive["2"][1])
-    pairs = rank(cases, results, drive=DRIVES.index("2"))
+    pairs = rank(problem.rig, cases, results, drive=DRIVES.index("2"))
     assert sorted(era_counts(cases)[pairs.order]) == [2, 3, 4, 5, 6]
 
 
@@ -253,8 +253,8 @@ def test_a_worker_process_that_dies_is_replaced(study, results, caplog):
 
 def test_the_ranking_is_by_the_median_of_the_drive(study, results):
     """Best first, the middle in the middle, the worst last; the rig has its place in it."""
-    _, cases = study
-    ranking = rank(cases, results, drive=DRIVES.index("2"))
+    problem, cases = study
+    ranking = rank(problem.rig, cases, results, drive=DRIVES.index("2"))
     medians = results.statistics[:, 1, MEDIAN]
     assert ranking.best == medians.argmax()
     assert ranking.worst == medians.argmin()
@@ -270,9 +270,27 @@ def test_the_rig_as_it_is_is_told_even_from_the_end_of_the_ranking(study):
     statistics = np.ones((30, 3, 6))
     statistics[:, 1, MEDIAN] = np.arange(30)  # the first one, the rig's, comes last
     results = CaseResults(statistics, np.ones((30, 3), dtype=np.uint64))
-    told = ranking_summary(problem.rig, rank(part, results, drive=1))["ranking"]
+    told = ranking_summary(problem.rig, rank(problem.rig, part, results, drive=1))["ranking"]
     assert [case["rank"] for case in told] == [*range(1, 11), 30]
     assert told[-1]["layout"] == "own"
+
+
+def test_unsupported_layouts_are_marked_and_not_recommended() -> None:
+    """One or two ERAs are ranked, and the best layout of three or more is recommended."""
+    rig = make_paper_rig(12, 9)
+    cases = count_cases(rig, layouts=6, seed=0, raster=(7, 5))
+    statistics = np.zeros((6, 3, 6))
+    statistics[:, 1, MEDIAN] = [6, 5, 4, 3, 2, 1]
+    results = CaseResults(statistics, np.zeros((6, 3), dtype=np.uint64))
+    ranking = rank(rig, cases, results, drive=1)
+    assert not ranking.supported[:2].any()
+    assert ranking.supported[3]
+    assert ranking.best == 0
+    assert ranking.supported[ranking.recommended]
+    summary = ranking_summary(rig, ranking)
+    assert [case["supported"] for case in summary["ranking"]] == ranking.supported.tolist()
+    nothing = rank(rig, cases.part(0, 2), CaseResults(statistics[:2], results.active[:2]), drive=1)
+    assert nothing.recommended == 0
 
 
 def test_softer_eras_are_recommended_where_they_do_as_well():
@@ -282,7 +300,7 @@ def test_softer_eras_are_recommended_where_they_do_as_well():
     statistics = np.zeros((9, 3, 6))
     statistics[:, 1, MEDIAN] = [1, 2, 3, 8, 9.1, 9.5, 10, 9.9, 9.8]
     results = CaseResults(statistics, np.zeros((9, 3), dtype=np.uint64))
-    ranking = rank(cases, results, drive=1)
+    ranking = rank(rig, cases, results, drive=1)
     assert (ranking.best, ranking.recommended) == (6, 4)
     assert ranking.best_by(cases.stiffness_factors) == {2.0**k: k + 4 for k in range(-4, 5)}
 

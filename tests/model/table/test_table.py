@@ -378,7 +378,7 @@ def test_a_small_plate_has_no_contact_sets_to_show():
         rig,
         plate=replace(rig.plate, length=0.03, width=0.03),
         mesh=replace(rig.mesh, length=0.03, width=0.03),
-        eras=(replace(rig.eras[0], x=0.0, y=0.0),),
+        eras=tuple(replace(era, x=0.03 * (era.x > 0), y=0.03 * (era.y > 0)) for era in rig.eras),
     )
     built = build_table(small, grid=Grid(2, 2))
     summary = summarize(built, find_weak_cells(built))

@@ -9,7 +9,7 @@ from scipy.sparse.linalg import LinearOperator, eigsh
 
 from model.arrays import FloatArray
 from model.fem.assembly import ElementMatrices
-from model.fem.factorisation import Factor, factorise_definite
+from model.fem.factorisation import Solve, factorise_definite
 from model.fem.symmetry import SymmetryClass
 
 
@@ -17,12 +17,12 @@ from model.fem.symmetry import SymmetryClass
 class ClassModes:
     """One symmetry class: its factors, and its modes up to the cut-off.
 
-    factor: of K + shift M; mass M (n, n); eigenvalues omega² (r,) [rad²/s²] and vectors Phi (n, r)
+    solve: (K + shift M) x = f; mass M (n, n); eigenvalues omega² (r,) [rad²/s²] and vectors Phi (n, r)
     with Phi^T M Phi = I; next_eigenvalue: of the lowest truncated mode.
     """
 
     symmetry: SymmetryClass
-    factor: Factor
+    solve: Solve
     mass: sparse.csr_array
     eigenvalues: FloatArray
     vectors: FloatArray
@@ -42,7 +42,7 @@ class ClassModes:
         result = np.empty((2, len(forces), terms, forces.shape[1]))
         force = forces.T
         for term in range(terms):
-            deflection = self.factor.solve(force) / scale
+            deflection = self.solve(force) / scale
             # The kept modes' share is taken out; once leaves rounding behind, twice is enough.
             for _ in range(2):
                 deflection -= self.vectors @ (self._mass_weighted_modes.T @ deflection)
@@ -59,9 +59,9 @@ def solve_class(
     count: how many to look for at first; more where they do not reach the cut.
     """
     shifted, unsummed = symmetry.assemble(elements, shift)
-    factor, mass = factorise_definite(shifted), sparse.csr_array(unsummed)
+    solve, mass = factorise_definite(shifted), sparse.csr_array(unsummed)
     while True:
-        eigenvalues, vectors = _lowest(factor, mass, count, shift=shift)
+        eigenvalues, vectors = _lowest(solve, mass, count, shift=shift)
         if eigenvalues[-1] >= cut or len(eigenvalues) == symmetry.size:
             break
         count += count // 3 + 1
@@ -69,7 +69,7 @@ def solve_class(
     eigenvalues[np.abs(eigenvalues) < 1e-6 * shift] = 0.0
     return ClassModes(
         symmetry,
-        factor,
+        solve,
         mass,
         eigenvalues[:kept],
         vectors[:, :kept],
@@ -78,12 +78,12 @@ def solve_class(
 
 
 def _lowest(
-    factor: Factor, mass: sparse.csr_array, count: int, *, shift: float
+    solve: Solve, mass: sparse.csr_array, count: int, *, shift: float
 ) -> tuple[FloatArray, FloatArray]:
     """The lowest eigenpairs; all of them where that is no more work."""
     size = mass.shape[0]
     if count >= size / 2:
-        inverse = factor.solve(np.eye(size))
+        inverse = solve(np.eye(size))
         # u phi = (K + shift M)^-1 M phi, made symmetric with the mass's own root.
         root = linalg.cholesky(mass.toarray(), lower=True)
         u, vectors = linalg.eigh(root.T @ inverse @ root)
@@ -94,7 +94,7 @@ def _lowest(
             count,
             M=mass,
             sigma=-shift,
-            OPinv=LinearOperator(mass.shape, matvec=factor.solve, dtype=float),
+            OPinv=LinearOperator(mass.shape, matvec=solve, dtype=float),
             v0=np.random.default_rng(0).standard_normal(size),  # ARPACK's own start is random
         )
         u = 1 / (eigenvalues + shift)

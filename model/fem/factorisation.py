@@ -1,4 +1,4 @@
-"""Factorisations for the plate's matrices: SuperLU in general, banded Cholesky on a quarter mesh."""
+"""Factorisations of the plate's matrices: SuperLU, or banded Cholesky on a quarter mesh."""
 
 from collections.abc import Callable
 from functools import partial

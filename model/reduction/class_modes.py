@@ -17,8 +17,8 @@ from model.fem.symmetry import SymmetryClass
 class ClassModes:
     """One symmetry class: its factors, and its modes up to the cut-off.
 
-    solve: (K + shift M) x = f; mass M (n, n); eigenvalues omega² (r,) [rad²/s²] and vectors Phi (n, r)
-    with Phi^T M Phi = I; next_eigenvalue: of the lowest truncated mode.
+    solve: (K + shift M) x = f; mass M (n, n); eigenvalues omega² (r,) [rad²/s²] and vectors Phi
+    (n, r) with Phi^T M Phi = I; next_eigenvalue: of the lowest truncated mode.
     """
 
     symmetry: SymmetryClass

@@ -9,7 +9,7 @@ from controller.api.schema import EffectDescription
 from controller.effects.layout import Layout
 from controller.effects.player import EffectPlayer
 from controller.loop.intent import HapticIntent
-from controller.loop.selection import MOST_DB_SL
+from controller.loop.selection import MAX_DB_SL
 from controller.sources.contacts import Contact, ContactKey
 
 PLAY_RADIUS = 0.020
@@ -63,7 +63,7 @@ class ActiveLayout:
                 where="effect",
                 remedy=f"choose one of {known}",
             )
-        level_max = MOST_DB_SL if effect.level_db_sl is None else effect.level_db_sl
+        level_max = MAX_DB_SL if effect.level_db_sl is None else effect.level_db_sl
         if params.level_db_sl is not None and params.level_db_sl > level_max:
             raise RpcError(
                 ErrorCode.REFUSED,

@@ -10,7 +10,7 @@ from controller.demo.far_end import BenchControl, FingerFelt
 from controller.demo.measure import finger_level, measure, peak_contrast_db
 from controller.demo.rows import Onset, Place, PlayedPattern, TouchRow
 from controller.loop.observer import Applied, Observer, Silenced
-from controller.loop.selection import Felt
+from controller.loop.selection import Prediction
 from controller.sources.contacts import Change, Contact, ContactKey
 from drivers import clock
 from drivers.errors import LinkError
@@ -126,7 +126,7 @@ class TouchRecorder:
 
     def _silenced(self, silenced: Silenced) -> None:
         self._end_pattern(silenced.time)
-        for contact, _ in silenced.selection.targets:
+        for contact in silenced.targets:
             if touch := self._touches.get(contact.key):
                 touch.reason = silenced.reason
 
@@ -243,7 +243,7 @@ async def _onset(touch: _Touch, first: _Playing) -> Onset:
     )
 
 
-def _felt_of(touch: _Touch, playing: _Playing) -> Felt:
+def _felt_of(touch: _Touch, playing: _Playing) -> Prediction:
     """What a touch was predicted to feel of a pattern that was played for it."""
     return next(felt for felt in playing.applied.targets if felt.contact.key == touch.contact.key)
 

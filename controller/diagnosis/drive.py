@@ -136,11 +136,11 @@ class Drive:
         wanted = route(excitation, self._rig, token=self._token, ramp=RAMP)
         self._ramp = max(commands.ramp for commands in wanted.values())
         safe = {name: self._guards[name].check(commands) for name, commands in wanted.items()}
-        achieved = await self._group.play(safe)
-        assert achieved is not None  # noqa: S101  nobody else silences them
-        played = None
+        played = await self._group.play(safe)
+        assert played is not None  # noqa: S101  nothing else silences them
+        frequency = None
         for name, commands in wanted.items():
-            plays = {command.channel: command for command in achieved[name].commands}
+            plays = {command.channel: command for command in played.achieved[name].commands}
             for asked in commands.commands:
                 if not asked.level:
                     continue
@@ -152,8 +152,8 @@ class Drive:
                         f"place of {asked.level:g}: let it cool down, or choose a level that it "
                         "plays with --level, then check again"
                     )
-                played = found.frequency
-        return played
+                frequency = found.frequency
+        return frequency
 
     def _silence(self) -> dict[str, SafeCommandSet]:
         """Silence for every amplifier that has a guard yet."""

@@ -1,4 +1,4 @@
-"""A guard for every amplifier of a rig, by the limits that its file sets."""
+"""A guard for every amplifier of a rig, by the limits of the rig file."""
 
 from collections.abc import Mapping
 from dataclasses import asdict
@@ -10,22 +10,22 @@ from model.rig.rig import Limits, Rig
 
 
 def make_guards(rig: Rig, amplifiers: Mapping[str, Amplifier]) -> dict[str, Guard]:
-    """A guard per open amplifier, by its name.
+    """Make a guard for each open amplifier, by its name.
 
-    Raises InputError for a channel that an amplifier has not, CommandError for limits that leave
-    nothing to play.
+    Raises InputError for a wired channel that its amplifier does not have, CommandError for limits
+    that leave nothing to play.
     """
     for era, wired in rig.wiring.items():
         channels = amplifiers[wired.amplifier].capabilities.channels
         if wired.number >= channels:
             raise InputError(
-                f"ERA {era} is wired to channel {wired.number} of amplifier "
-                f"{wired.amplifier}, which has channels 0 to {channels - 1}; change the rig"
+                f"channel of ERA {era} must be 0 to {channels - 1} on amplifier "
+                f"{wired.amplifier}, got {wired.number}; change its wiring in the rig file"
             )
     limits = guard_limits(rig.limits)
     return {name: Guard(limits, amplifier.capabilities) for name, amplifier in amplifiers.items()}
 
 
 def guard_limits(limits: Limits) -> GuardLimits:
-    """The rig's limits as a guard takes them."""
+    """Return the limits of a rig file as a guard takes them: the same names and units."""
     return GuardLimits(**asdict(limits))

@@ -1,4 +1,4 @@
-"""Quick stops of all amplifiers of a rig, however many ask for them."""
+"""Quick stops of all amplifiers of a rig, coalesced over concurrent requests."""
 
 import asyncio
 from collections.abc import Collection, Sequence
@@ -11,34 +11,34 @@ from drivers.errors import LinkError
 
 
 class QuickStops:
-    """QuickStops amplifiers once more for all who request it while they are being stopped.
+    """Stops every amplifier once more for all requests that arrive while it is being stopped.
 
-    Those that share a bus are told by one frame before each of them is asked, so that none of them
-    waits for the answer of another.
+    Amplifiers that share a bus get one broadcast before each of them is stopped by itself, so that
+    none waits for the reply of another.
     """
 
     def __init__(self, amplifiers: Collection[Amplifier]) -> None:
-        self._on_buses = [
-            CoalescedCalls(partial(_tell, several)) for several in _sharing_a_bus(amplifiers)
+        self._broadcasts = [
+            CoalescedCalls(partial(_broadcast, sharing)) for sharing in _by_shared_bus(amplifiers)
         ]
-        self._of_each = [(amplifier, CoalescedCalls(amplifier.stop)) for amplifier in amplifiers]
+        self._stops = [(amplifier, CoalescedCalls(amplifier.stop)) for amplifier in amplifiers]
 
     def request(self) -> "list[asyncio.Task[None]]":
-        """What stops all that can be reached, to be waited for; raises what that raises."""
-        reachable = [stop for amplifier, stop in self._of_each if not amplifier.is_lost]
-        return [stop.request() for stop in (*self._on_buses, *reachable)]
+        """Return the tasks that stop all amplifiers that are not lost; they raise DriverError."""
+        reachable = [stop for amplifier, stop in self._stops if not amplifier.is_lost]
+        return [stop.request() for stop in (*self._broadcasts, *reachable)]
 
 
-def _sharing_a_bus(amplifiers: Collection[Amplifier]) -> list[list[Amplifier]]:
-    """Those that one broadcast reaches, where it reaches several."""
+def _by_shared_bus(amplifiers: Collection[Amplifier]) -> list[list[Amplifier]]:
+    """Group the amplifiers that one broadcast reaches, where it reaches several."""
     buses: dict[str, list[Amplifier]] = {}
     for amplifier in amplifiers:
         if amplifier.bus is not None:
             buses.setdefault(amplifier.bus, []).append(amplifier)
-    return [several for several in buses.values() if len(several) > 1]
+    return [sharing for sharing in buses.values() if len(sharing) > 1]
 
 
-async def _tell(several: Sequence[Amplifier]) -> None:
-    """Stop all on a bus, by the link of one that is not lost if there is one; nobody answers."""
-    with suppress(LinkError):  # whoever can be reached is asked as well, and tells
-        await next((each for each in several if not each.is_lost), several[0]).stop_on_bus()
+async def _broadcast(sharing: Sequence[Amplifier]) -> None:
+    """Stop all amplifiers of a bus over the link of one that is not lost, if there is one."""
+    with suppress(LinkError):  # the stop of each amplifier reports it
+        await next((each for each in sharing if not each.is_lost), sharing[0]).stop_on_bus()

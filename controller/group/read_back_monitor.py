@@ -1,6 +1,6 @@
-"""Whether the amplifiers of a rig play what they were told, heartbeat by heartbeat."""
+"""Comparison of commanded levels with those that amplifiers report at every heartbeat."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 from drivers.errors import CommandRefused
 from drivers.guard import SafeCommandSet
@@ -9,19 +9,19 @@ from drivers.protocol.messages import Achieved, Status
 
 
 class ReadBackMonitor:
-    """What each amplifier should report, by its name; nothing at first."""
+    """The levels that each amplifier should report, by its name; none at first."""
 
     def __init__(self) -> None:
         self._expected: dict[str, Expectation] = {}
 
     def forget(self) -> None:
-        """What they play is not known any more."""
+        """Expect nothing, because it is unknown what the amplifiers play."""
         self._expected.clear()
 
     def expect(
         self, played: Mapping[str, SafeCommandSet], achieved: Mapping[str, Achieved], *, now: float
     ) -> None:
-        """From a time [s] on they play this; of a set that ends by itself nothing is expected."""
+        """Expect these levels from now [s] on; nothing of a set that ends by itself."""
         self._expected = {
             name: Expectation.of(
                 achieved[name].commands, settled_from=now + played[name].settled_after
@@ -31,22 +31,18 @@ class ReadBackMonitor:
         }
 
     def check(self, name: str, status: Status, *, now: float) -> None:
-        """Raise CommandRefused where levels have been others than commanded for too long."""
-        expected = self._expected.get(name)
-        if expected is None:
+        """Raise CommandRefused if reported levels have differed for too long."""
+        if name not in self._expected:
             return
-        expected = read_back(expected, status.levels, now)
-        self._expected[name] = expected
+        expected = self._expected[name] = read_back(self._expected[name], status.levels, now)
         if is_fault(expected, now):
-            wanted = tuple(
-                expected.levels.get(channel, 0.0) for channel in range(len(status.levels))
-            )
+            wanted = [expected.levels.get(channel, 0.0) for channel in range(len(status.levels))]
             raise CommandRefused(
-                f"amplifier {name} has reported the levels {_shown(status.levels)} instead of "
-                f"{_shown(wanted)} for {BORNE * 1e3:g} ms; all were stopped: look for a derated or "
-                "broken channel, then clear and arm again"
+                f"amplifier {name}: levels must be {_format(wanted)}, got {_format(status.levels)} "
+                f"for {BORNE * 1e3:g} ms; all were stopped: look for a derated or broken channel, "
+                "then clear and arm again"
             )
 
 
-def _shown(levels: tuple[float, ...]) -> str:
+def _format(levels: Sequence[float]) -> str:
     return ", ".join(f"{level:.2f}" for level in levels)

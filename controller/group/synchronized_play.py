@@ -1,6 +1,7 @@
-"""How several amplifiers play one set together: load, stage, commit at one moment, look at it."""
+"""Playing one set on several amplifiers: load, stage, commit at one moment, read back."""
 
 from collections.abc import Callable, Coroutine, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -10,100 +11,118 @@ from drivers.amplifier import Amplifier
 from drivers.errors import CommandRefused
 from drivers.guard import SafeCommandSet, SafeEnvelope
 from drivers.operation.simultaneous import at_one_moment
-from drivers.protocol.messages import Achieved, Status
+from drivers.protocol.messages import Achieved
+
+
+@dataclass(frozen=True)
+class Played:
+    """What amplifiers play after a set, by name.
+
+    sent [s]: when the last byte of the set left for any amplifier, by the event loop's clock;
+    loading_time [s]: how long loading the envelopes before it took, None without envelopes.
+    """
+
+    achieved: Mapping[str, Achieved]
+    sent: float
+    loading_time: float | None
 
 
 class SynchronizedPlay:
-    """Sets for amplifiers by their names in the rig; what goes wrong is raised, and left so.
+    """Plays sets on amplifiers, by name, so that all of them start at one moment.
 
-    goes_on: whether anything is to be played still; silence may come in between at any step.
-    is_set_incomplete: whether a set may have been committed by some of them only. loading_time [s]:
-    duration of the last loading of envelopes; last_sent [s]: when the last byte of the last set
-    went out to any of them, by the event loop's clock.
+    is_set_incomplete: whether possibly only some amplifiers have committed the last set.
     """
 
-    def __init__(self, amplifiers: Mapping[str, Amplifier], *, goes_on: Callable[[], bool]) -> None:
+    def __init__(self, amplifiers: Mapping[str, Amplifier]) -> None:
         self.is_set_incomplete = False
-        self.loading_time = 0.0
-        self.last_sent = 0.0
         self._amplifiers = amplifiers
-        self._goes_on = goes_on
-
-    def begin(self) -> None:
-        """All of them are at zero."""
-        self.is_set_incomplete = False
 
     async def play(
         self,
-        commands: Mapping[str, SafeCommandSet],
+        sets: Mapping[str, SafeCommandSet],
         envelopes: Mapping[str, Sequence[SafeEnvelope]],
-    ) -> dict[str, Achieved] | None:
-        """What they make of their sets, by name; None where silence came in between.
+        *,
+        may_play: Callable[[], bool],
+    ) -> Played | None:
+        """Load the envelopes and play the sets; None once `may_play` is False between two steps.
 
-        Raises DriverError.
+        Raises DriverError, and leaves the amplifiers as they are then.
         """
-        if not self._goes_on():
-            return None  # silence came after whatever this follows
-        if any(envelopes.values()):
-            begin = clock.now()
-            await gather_all(self._load(name, each) for name, each in envelopes.items())
-            self.loading_time = clock.now() - begin
-            if not self._goes_on():
-                return None  # whatever is played now would undo that silence
-        if len(commands) == 1 or all(safe.is_silent for safe in commands.values()):
-            # One has nobody to wait for, and silence waits for nobody.
-            applied = await gather_all(
-                self._amplifiers[name].apply(safe) for name, safe in commands.items()
-            )
-            self._note_sent()
-            self.is_set_incomplete = False
-            return dict(zip(commands, applied, strict=True))
-        achieved = await gather_all(
-            self._amplifiers[name].stage(safe) for name, safe in commands.items()
-        )
-        if not self._goes_on():
-            return None  # a commit now would undo that silence
-        self.is_set_incomplete = True
-        await gather_all(self._commits(commands))
-        self._note_sent()  # what is asked from here on is no part of it
-        if not self._goes_on():
+        if not may_play():
             return None
-        for name, status in (await self.statuses()).items():
-            if status.token != commands[name].token:
-                raise CommandRefused(
-                    f"amplifier {name} plays set {status.token} instead of {commands[name].token}"
-                )
+        loading_time = None
+        if any(envelopes.values()):
+            start = clock.now()
+            await gather_all(
+                self._load(name, several, may_play) for name, several in envelopes.items()
+            )
+            loading_time = clock.now() - start
+            if not may_play():
+                return None  # playing now would undo the silence that came meanwhile
+        if len(sets) == 1 or all(safe.is_silent for safe in sets.values()):
+            # A single amplifier needs no staging, and silence is not delayed by it.
+            achieved = await gather_all(
+                self._amplifiers[name].apply(safe) for name, safe in sets.items()
+            )
+            sent = self._last_sent
+        else:
+            achieved = await gather_all(
+                self._amplifiers[name].stage(safe) for name, safe in sets.items()
+            )
+            if not may_play():
+                return None  # as above
+            self.is_set_incomplete = True
+            await gather_all(self._commits(sets, may_play))
+            sent = self._last_sent  # before the read-back
+            if not may_play():
+                return None
+            await self._check_tokens(sets)
         self.is_set_incomplete = False
-        return dict(zip(commands, achieved, strict=True))
+        return Played(dict(zip(sets, achieved, strict=True)), sent, loading_time)
 
-    async def statuses(self) -> dict[str, Status]:
-        """The status of every amplifier, by name; raises DriverError."""
-        statuses = await gather_all(amplifier.status() for amplifier in self._amplifiers.values())
-        return dict(zip(self._amplifiers, statuses, strict=True))
+    @property
+    def _last_sent(self) -> float:
+        return max(amplifier.last_sent for amplifier in self._amplifiers.values())
 
-    def _note_sent(self) -> None:
-        self.last_sent = max(amplifier.last_sent for amplifier in self._amplifiers.values())
-
-    async def _load(self, name: str, envelopes: Sequence[SafeEnvelope]) -> None:
+    async def _load(
+        self, name: str, envelopes: Sequence[SafeEnvelope], may_play: Callable[[], bool]
+    ) -> None:
         for envelope in envelopes:
-            if not self._goes_on():
-                return  # nothing will be played
-            await self._amplifiers[name].load_envelope(envelope)
+            if may_play():
+                await self._amplifiers[name].load_envelope(envelope)
 
-    async def _commit(self, amplifier: Amplifier, token: int, *, for_all: bool) -> None:
-        """Commit, unless silence came while this waited for those whose wires are slower."""
-        if self._goes_on():
-            await (amplifier.commit_on_bus(token) if for_all else amplifier.commit(token))
-
-    def _commits(self, sets: Mapping[str, SafeCommandSet]) -> Iterable[Coroutine[Any, Any, object]]:
-        """Commit everything that is staged, to arrive at one moment; once where a bus is shared."""
-        together: dict[tuple[str, int], list[Amplifier]] = {}
+    def _commits(
+        self, sets: Mapping[str, SafeCommandSet], may_play: Callable[[], bool]
+    ) -> Iterable[Coroutine[Any, Any, object]]:
+        """Commit all staged sets so that they arrive at one moment; once for each shared bus."""
+        by_bus: dict[tuple[str, int], list[Amplifier]] = {}
         for name, safe in sets.items():
             amplifier = self._amplifiers[name]
-            together.setdefault((amplifier.bus or name, safe.token), []).append(amplifier)
+            by_bus.setdefault((amplifier.bus or name, safe.token), []).append(amplifier)
         return at_one_moment(
             [
-                (one.wire_times.commit(), partial(self._commit, one, token, for_all=bool(others)))
-                for (_, token), (one, *others) in together.items()
+                (
+                    first.wire_times.commit(),
+                    partial(_commit, first, token, on_bus=bool(others), may_play=may_play),
+                )
+                for (_, token), (first, *others) in by_bus.items()
             ]
         )
+
+    async def _check_tokens(self, sets: Mapping[str, SafeCommandSet]) -> None:
+        """Raise CommandRefused unless every amplifier reports that it plays its set."""
+        statuses = await gather_all(self._amplifiers[name].status() for name in sets)
+        for (name, safe), status in zip(sets.items(), statuses, strict=True):
+            if status.token != safe.token:
+                raise CommandRefused(
+                    f"amplifier {name}: playing set must be {safe.token}, got {status.token}; all "
+                    "were stopped: clear and arm again"
+                )
+
+
+async def _commit(
+    amplifier: Amplifier, token: int, *, on_bus: bool, may_play: Callable[[], bool]
+) -> None:
+    """Commit, unless silence came while this waited for an amplifier on a slower wire."""
+    if may_play():
+        await (amplifier.commit_on_bus(token) if on_bus else amplifier.commit(token))

@@ -1,4 +1,4 @@
-"""Waiting for several amplifiers at once."""
+"""Awaiting requests to several amplifiers at once."""
 
 import asyncio
 from collections.abc import Awaitable, Callable, Coroutine, Iterable
@@ -11,32 +11,32 @@ _T = TypeVar("_T")
 
 @final
 class CoalescedCalls:
-    """Does something so that it begins after each request, one after the other.
+    """Runs an action at least once after each request for it, never twice at a time.
 
-    However many requests come while it is being done, it is done once more for all of them.
+    All requests that arrive while it runs share one further run.
     """
 
-    def __init__(self, do: Callable[[], Awaitable[object]]) -> None:
-        self._do = do
-        self._doing = asyncio.Lock()
+    def __init__(self, action: Callable[[], Awaitable[object]]) -> None:
+        self._action = action
+        self._running = asyncio.Lock()
         self._next: asyncio.Task[None] | None = None
 
     def request(self) -> "asyncio.Task[None]":
-        """The one that begins next; raises what that raises."""
+        """Return the run that starts next; it raises what the action raises."""
         if self._next is None:
-            self._next = asyncio.ensure_future(self._begin())
+            self._next = asyncio.ensure_future(self._run())
         return self._next
 
-    async def _begin(self) -> None:
-        async with self._doing:
+    async def _run(self) -> None:
+        async with self._running:
             self._next = None
-            await self._do()
+            await self._action()
 
 
 async def gather_all(requests: Iterable[Coroutine[Any, Any, _T]]) -> list[_T]:
-    """Wait for all, then raise the gravest of what they raised: a lost link before a refusal.
+    """Await all, then raise the most severe error: a LinkError before any other.
 
-    A single one goes out at once, without a turn of the event loop in between.
+    A single request is awaited directly, without a further turn of the event loop.
     """
     pending = list(requests)
     if len(pending) == 1:
@@ -49,7 +49,7 @@ async def gather_all(requests: Iterable[Coroutine[Any, Any, _T]]) -> list[_T]:
 
 
 async def run_to_completion(work: Coroutine[Any, Any, None]) -> None:
-    """See work through, however often the caller is cancelled meanwhile; that is raised then."""
+    """Await work, however often the caller is cancelled meanwhile; re-raise that at the end."""
     task = asyncio.ensure_future(work)
     cancellation = None
     while not task.done():

@@ -1,11 +1,11 @@
-"""Envelopes of a pattern as amplifiers keep them, and whether their wires have the time for it.
+"""Envelopes of a pattern in the slots of amplifiers, and whether the wires load them in time.
 
-A channel's onset and ending have a slot each, the same for every pattern: a set takes its envelopes
-with it, so a slot may be loaded anew while they play. What the table ends an envelope with, the
-pattern itself or silence, is the command's own and not among the knots on the wire.
+The onset and the ending of a channel have a slot each, the same for every pattern: a set takes its
+envelopes with it, so a slot may be reloaded while they play. The last value of an envelope, the
+pattern itself or silence, belongs to the command and is not among the knots on the wire.
 
-A touch waits for its onset only. Endings fit nothing before the onset is over, so they follow then:
-the same tones again, which changes nothing that is felt, now with their brakes.
+A touch waits for its onset only. Endings follow once the onset is over: the same tones again, which
+changes nothing that is felt, now with their endings.
 """
 
 import cmath
@@ -24,16 +24,16 @@ from model.transients.envelope import KNOT_STEP
 from model.transients.knots import ENDING_KNOTS, ONSET_KNOTS
 
 ENVELOPE_TIME = 0.030
-"""How long [s] the loading of envelopes may hold up a touch: one that is felt within 50 ms is felt
-at once, and what a shaped onset wins is worth no more."""
+"""How long [s] loading envelopes may delay a touch: up to 50 ms in total feel immediate, and a
+shaped onset gains no more."""
 
-# A stroke is told in 1e-4 on the wire; below that lie only the roundings of the search for knots.
+# Levels have steps of 1e-4 on the wire; smaller digits are rounding errors of the knot search.
 _DIGITS = 9
 
 
 @dataclass(frozen=True, slots=True)
 class Shaping:
-    """Which envelopes are played: onsets, endings, none."""
+    """Which envelopes are played: onsets, endings, both or none."""
 
     onsets: bool
     endings: bool
@@ -47,24 +47,24 @@ PLAIN = Shaping(onsets=False, endings=False)
 """Ramps only."""
 
 
-class Loading(Protocol):
-    """What is to be known of an open amplifier."""
+class OpenAmplifier(Protocol):
+    """The part of an open amplifier that decides what it can play."""
 
     @property
     def capabilities(self) -> Capabilities:
-        """What it can play."""
+        """Its reported capabilities."""
 
     @property
     def bus(self) -> str | None:
-        """Names the wire, where others may share it."""
+        """Name of the bus that it shares, None without one."""
 
     @property
     def wire_times(self) -> WireTimes:
-        """How long things take on its wire."""
+        """Durations on its wire."""
 
 
-def shaping_of(rig: Rig, amplifiers: Mapping[str, Loading], *, within: float) -> Shaping:
-    """What all amplifiers, by name, play, and that is loaded within a time [s]."""
+def shaping_of(rig: Rig, amplifiers: Mapping[str, OpenAmplifier], *, within: float) -> Shaping:
+    """Return what all amplifiers, by name, can play and load within a time [s]."""
     if within <= 0:
         return PLAIN
     return Shaping(
@@ -74,7 +74,7 @@ def shaping_of(rig: Rig, amplifiers: Mapping[str, Loading], *, within: float) ->
 
 
 def onset_slots(rig: Rig) -> dict[str, int]:
-    """The slot of every ERA's onset, by its name; from 1 on every amplifier."""
+    """Return the slot of every ERA's onset, by its name; from 1 on every amplifier."""
     counts: dict[str, int] = defaultdict(int)
     slots = {}
     for name, channel in rig.wiring.items():
@@ -84,7 +84,7 @@ def onset_slots(rig: Rig) -> dict[str, int]:
 
 
 def ending_slots(rig: Rig) -> dict[str, int]:
-    """The slot of every ERA's ending, by its name, after those of the onsets."""
+    """Return the slot of every ERA's ending, by its name, after those of the onsets."""
     wired = _wired(rig)
     return {
         name: slot + wired[rig.wiring[name].amplifier] for name, slot in onset_slots(rig).items()
@@ -92,7 +92,7 @@ def ending_slots(rig: Rig) -> dict[str, int]:
 
 
 def wire_envelopes(pattern: Pattern, rig: Rig) -> dict[str, tuple[Envelope, ...]]:
-    """The envelopes of a pattern to be loaded, by amplifier; none for one without."""
+    """Return the envelopes of a pattern to load, by amplifier; an empty tuple without any."""
     loads: dict[str, list[Envelope]] = {name: [] for name in rig.amplifiers}
     for shapes, slots in (
         (pattern.onset, onset_slots(rig)),
@@ -111,13 +111,13 @@ def wire_envelopes(pattern: Pattern, rig: Rig) -> dict[str, tuple[Envelope, ...]
 
 
 def _knot(value: complex) -> Knot:
-    """A knot from a complex amplitude in strokes."""
+    """Return the knot of a complex amplitude in strokes."""
     degrees = math.degrees(cmath.phase(value))
     return Knot(round(abs(value), _DIGITS), 180.0 if degrees == -180.0 else degrees)
 
 
 def _wired(rig: Rig) -> dict[str, int]:
-    """How many channels of each amplifier are wired."""
+    """Count the wired channels of each amplifier."""
     counts = dict.fromkeys(rig.amplifiers, 0)
     for channel in rig.wiring.values():
         counts[channel.amplifier] += 1
@@ -125,11 +125,11 @@ def _wired(rig: Rig) -> dict[str, int]:
 
 
 def _fits(
-    rig: Rig, amplifiers: Mapping[str, Loading], *, knots: int, slots: int, within: float
+    rig: Rig, amplifiers: Mapping[str, OpenAmplifier], *, knots: int, slots: int, within: float
 ) -> bool:
-    """Whether an envelope for every ERA is played everywhere, and loaded in time.
+    """Whether every amplifier plays an envelope of this many knots per ERA and loads it in time.
 
-    slots: how many each channel then has.
+    slots: per channel.
     """
     busy: dict[str, float] = defaultdict(float)
     for name, wired in _wired(rig).items():

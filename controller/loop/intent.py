@@ -1,7 +1,7 @@
-"""Who wants to feel what: the seam between what touches mean and how that is played.
+"""Haptic intent: which contacts shall feel something, how strongly, and until when.
 
-Whoever gives touches a meaning says which contacts shall feel it and how strongly; all others on
-the plate are kept quiet. The rest, from the table to the wire, does not know why.
+The interface between what touches mean and how that is played: all other contacts are kept quiet,
+and the rest, from the table to the wire, does not know why.
 """
 
 from collections.abc import Sequence
@@ -11,9 +11,9 @@ from typing import Protocol
 from controller.sources.contacts import Contact, ContactKey
 from model.finger.perception import STRONG_DB_SL
 
-_SHORTEST_WAIT = 0.001  # s
+_MIN_WAIT = 0.001  # s
 
-NO_CONTACTS = "nobody touches the plate"
+NO_CONTACTS = "no contact on the plate"
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,8 +21,8 @@ class Target:
     """A contact that shall feel something.
 
     level_db_sl: how strongly; None for as strongly as the neighbours allow. Among targets with a
-    level one without feels it as the strongest of them does. or_less: where the plate cannot reach
-    the level, as strongly as the neighbours allow instead of nothing.
+    level, one without gets the highest of theirs. or_less: where the plate cannot reach the level,
+    as strongly as the neighbours allow instead of nothing.
     """
 
     key: ContactKey
@@ -32,38 +32,35 @@ class Target:
 
 @dataclass(frozen=True)
 class HapticIntent:
-    """What is wanted now.
+    """What is intended now.
 
-    targets: each contact once; those that are not on the plate are left out. reason: why there are
-    none. until: when [s] the intent may be another though no contact has changed; None for never.
+    targets: each contact once; those that are not on the plate are ignored. reason: why there are
+    none. until: when [s] the intent may change though no contact has; None for never.
     """
 
     targets: tuple[Target, ...]
-    reason: str = "nobody is to feel anything"
+    reason: str = "no target"
     until: float | None = None
 
     def due(self, now: float) -> float | None:
-        """When [s] to ask again; an intent that has run out already does not keep the loop busy."""
+        """Return when [s] to query again; an expired intent must not keep the loop busy."""
         if self.until is None:
             return None
-        return self.until if self.until > now else now + _SHORTEST_WAIT
+        return self.until if self.until > now else now + _MIN_WAIT
 
 
 class IntentSource(Protocol):
     """Where intents come from; queried when contacts change and when an intent expires."""
 
     def intent(self, contacts: Sequence[Contact], now: float) -> HapticIntent:
-        """The intent for contacts in their order of arrival, at a time [s]; must return at once.
+        """Return the intent for contacts in their order of arrival, at a time [s], at once.
 
-        What it raises silences all channels for as long as it does.
+        While it raises, all channels are silent.
         """
 
 
 class NewestBuzzes:
-    """The newest contact buzzes where it is, and nobody else feels it.
-
-    When it lifts, all is silent until the next contact comes.
-    """
+    """The newest contact buzzes where it is; after it lifts, all is silent until the next one."""
 
     def __init__(self, level_db_sl: float | None = STRONG_DB_SL) -> None:
         self._level = level_db_sl
@@ -71,7 +68,7 @@ class NewestBuzzes:
         self._target: ContactKey | None = None
 
     def intent(self, contacts: Sequence[Contact], now: float) -> HapticIntent:
-        """The newest contact if it is new, or else the target that was, while it is down."""
+        """Target the newest contact if it is new, else the previous target while it is down."""
         keys = [contact.key for contact in contacts]
         if keys and keys[-1] not in self._seen:
             self._target = keys[-1]

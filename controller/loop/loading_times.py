@@ -1,60 +1,60 @@
-"""Whether envelopes are loaded in time, by how long that took of late.
+"""Whether envelopes are loaded in time, judged by the recent loading times.
 
-A wire that turns out too slow gets plain ramps. It may have been busy with something else, so it is
-tried again: after half a minute, and after pauses twice as long each time it is too slow again.
+A wire that turns out too slow gets plain ramps. It may have been busy with something else, so
+loading is retried after half a minute, and after twice the pause each time it is too slow again.
 """
 
 import logging
 
-SLOW_IN_A_ROW = 3
-"""One slow loading is a hiccup; so many in a row are how this wire is. As many in time make up."""
+MAX_SLOW = 3
+"""Slow loadings in a row until ramps take over; as many in time reset the pause."""
 
-FIRST_PAUSE, LONGEST_PAUSE = 30.0, 480.0
-"""Until it is tried again [s]: each time it may cost one touch a late onset."""
+FIRST_PAUSE, MAX_PAUSE = 30.0, 480.0
+"""Until loading is retried [s]: each attempt may delay the onset of one touch."""
 
 _logger = logging.getLogger(__name__)
 
 
 class LoadingTimes:
-    """Follows how long [s] the loading of envelopes takes; at most `longest` is in time.
+    """Follows how long [s] loading envelopes takes; `longest` is still in time.
 
-    Times [s] are handed in and never go back.
+    Times [s] are arguments and never decrease.
     """
 
     def __init__(self, longest: float) -> None:
         self._longest = longest
-        self._slow = 0  # in a row
-        self._in_time = 0  # in a row
+        self._slow_in_a_row = 0
+        self._in_time_in_a_row = 0
         self._pause = FIRST_PAUSE  # the next
         self._resumes = float("-inf")
         self._last = 0.0
 
-    def took(self, duration: float, *, now: float) -> None:
-        """Another loading took so long [s]."""
+    def note(self, duration: float, *, now: float) -> None:
+        """Note that a loading took so long [s]."""
         self._last = duration
         if duration <= self._longest:
-            self._slow = 0
-            self._in_time += 1
-            if self._in_time >= SLOW_IN_A_ROW:
+            self._slow_in_a_row = 0
+            self._in_time_in_a_row += 1
+            if self._in_time_in_a_row >= MAX_SLOW:
                 self._pause = FIRST_PAUSE
             return
-        self._in_time = 0
-        self._slow += 1
+        self._in_time_in_a_row = 0
+        self._slow_in_a_row += 1
         is_known_as_slow = self._pause > FIRST_PAUSE
-        if self._slow < SLOW_IN_A_ROW and not is_known_as_slow:
+        if self._slow_in_a_row < MAX_SLOW and not is_known_as_slow:
             return
-        self._slow = 0
+        self._slow_in_a_row = 0
         self._resumes = now + self._pause
-        self._pause = min(2 * self._pause, LONGEST_PAUSE)
-        _logger.warning("there are plain ramps in place of envelopes: %s", self.problem(now))
+        self._pause = min(2 * self._pause, MAX_PAUSE)
+        _logger.warning("loop: plain ramps instead of envelopes: %s", self.problem(now))
 
     def problem(self, now: float) -> str | None:
-        """Why none are to be loaded at a time, None where they are."""
+        """Return why no envelopes are to be loaded at a time [s], None if they are."""
         left = self._resumes - now
         if left <= 0:
             return None
         return (
-            f"loading envelopes took {1000 * self._last:.0f} ms, and touches may wait for "
-            f"{1000 * self._longest:.0f} ms; it is tried again in {left:.0f} s; use a "
-            "faster wire, or let touches wait for longer"
+            f"loading envelopes took {1000 * self._last:.0f} ms, more than the "
+            f"{1000 * self._longest:.0f} ms that a touch may wait; retrying in {left:.0f} s; use a "
+            "faster wire, or allow a longer wait"
         )

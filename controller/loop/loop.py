@@ -1,4 +1,4 @@
-"""The control loop: from touch frames to the amplifiers, and a heartbeat while it is alive."""
+"""The control loop: decide, send what changed, then feed the amplifiers' watchdogs."""
 
 import asyncio
 import contextlib
@@ -8,13 +8,14 @@ from typing import ParamSpec
 
 from controller.group.amplifier_group import AmplifierGroup, Phase
 from controller.group.guards import make_guards
+from controller.group.synchronized_play import Played
 from controller.loop.capabilities import PlaybackCapabilities, playback_capabilities
 from controller.loop.decision import RELEASE_RAMP, Decider, Decision
 from controller.loop.envelopes import ENVELOPE_TIME
 from controller.loop.intent import IntentSource, NewestBuzzes
 from controller.loop.observer import Observer, applied_by, silenced_by
-from controller.loop.orders import Order, PatternTiming
 from controller.loop.routing import drive_of_eras
+from controller.loop.safe_sets import PatternTiming, SafeSets
 from controller.loop.selection import PatternTable
 from controller.sources.contacts import Change
 from controller.sources.reject_counter import RejectCounter
@@ -28,27 +29,26 @@ from model.errors import InputError
 from model.rig.rig import Rig
 from registry.plugins import failure_text
 
-# On an orderly end nobody waits, so the end is soft.
+# Closing is not urgent, so it fades out softly.
 CLOSING_RAMP = 0.050
 
-# With nothing to do the loop runs all the same, for whoever watches whether it still does.
-IDLE_TURN = 0.5
+# s; the loop runs even with nothing to do, for a supervisor that checks whether it is alive.
+IDLE_INTERVAL = 0.5
 
 _logger = logging.getLogger(__name__)
 _P = ParamSpec("_P")
 
 
 class Controller:
-    """Drives the amplifiers of a rig by what touch sources say: open, arm, run, close.
+    """Drives the amplifiers of a rig from touch sources: open, arm, run, close.
 
-    table must be for this rig; amplifiers by their names in it, not yet open. Starts disarmed: then
-    contacts are followed but nothing is sent. The heartbeat is sent by the loop itself after it has
-    run, so that a loop that hangs lets the amplifiers' watchdogs trip.
+    table: for this rig; amplifiers by name, not yet open. Starts disarmed: contacts are followed
+    but nothing is sent. The loop sends the heartbeat itself after it has run, so that the watchdogs
+    of the amplifiers trip when it hangs.
 
-    intent_source: who feels what; by default the newest contact buzzes where it is. timing: what
-    shapes the table's patterns; ramps only without it. drive_mode: that of the patterns, None for
-    the best that the amplifiers can play. envelope_time [s]: how long loading envelopes may hold up
-    a touch, 0 for ramps only.
+    intent_source: by default the newest contact buzzes where it is. timing: shapes the patterns of
+    the table, ramps only without it. drive_mode: None for the best that the amplifiers can play.
+    envelope_time [s]: how long loading envelopes may delay a touch, 0 for ramps only.
     """
 
     def __init__(
@@ -66,7 +66,7 @@ class Controller:
     ) -> None:
         if amplifiers.keys() != rig.amplifiers.keys():
             raise InputError(
-                f"the rig names the amplifiers {', '.join(sorted(rig.amplifiers))}, but given are "
+                f"amplifiers must be those of the rig ({', '.join(sorted(rig.amplifiers))}), got "
                 f"{', '.join(sorted(amplifiers)) or 'none'}"
             )
         self._rig = rig
@@ -79,37 +79,37 @@ class Controller:
         self._timing = timing
         self._drive_mode = drive_mode
         self._envelope_time = envelope_time if timing is not None else 0.0
-        self._tally = RejectCounter(_logger)
-        self._opened_decider: Decider | None = None
+        self._rejects = RejectCounter(_logger)
+        self._decider_if_open: Decider | None = None
         self._wake = asyncio.Event()
         self._heartbeat_due = 0.0
         self._expiry: asyncio.TimerHandle | None = None
 
     @property
     def phase(self) -> Phase:
-        """How the amplifiers stand."""
+        """State of all amplifiers together."""
         return self._group.phase
 
     @property
     def capabilities(self) -> PlaybackCapabilities:
-        """What the opened amplifiers can play together; raises CommandError before `open`."""
+        """What the open amplifiers can play together; raises CommandError before `open`."""
         return self._decider.capabilities
 
     @property
     def plain_because(self) -> str | None:
-        """Why touches begin along plain ramps just now though the amplifiers play envelopes."""
-        return self._decider.plain_because(clock.now()) if self._opened_decider else None
+        """Why touches start along plain ramps now though the amplifiers play envelopes."""
+        return self._decider.plain_because(clock.now()) if self._decider_if_open else None
 
     @property
     def rejected_touches(self) -> Mapping[str, int]:
-        """How many touches could not be contacts, by the reason."""
-        return self._tally.counts
+        """Number of touches that could not be contacts, by reason."""
+        return self._rejects.counts
 
     async def open(self) -> None:
-        """Open every amplifier and prepare what they can play; all stay disarmed.
+        """Open every amplifier, or none, and prepare what they can play; all stay disarmed.
 
-        Raises LinkError, CommandError, and InputError if the rig wires a channel that an amplifier
-        has not or one cannot play the mode; then none stays open.
+        Raises LinkError, CommandError, and InputError for a wired channel that its amplifier does
+        not have or a drive mode that one cannot play.
         """
         await self._group.open()
         try:
@@ -131,48 +131,48 @@ class Controller:
         except BaseException:
             await self._group.close({})
             raise
-        self._opened_decider = decider
+        self._decider_if_open = decider
 
     async def arm(self) -> None:
-        """High voltage on; from now on touches are felt. `run` must be running or start at once."""
+        """Switch the high voltage on, so that touches are felt; `run` must run or start at once."""
         decider = self._decider
         await self._group.arm()
         decider.forget()
         self._heartbeat_due = clock.now()
-        self._watch_leases()  # from now on: fingers may have rested since before
+        self._schedule_expiry()  # fingers may have rested since before
         self._wake.set()
 
     async def disarm(self) -> None:
-        """Silent along a short ramp, then high voltage off."""
+        """Ramp to silence, then switch the high voltage off."""
         await self._group.disarm()
 
     async def stop(self) -> None:
-        """Quick stop of every amplifier that can be reached; latched until `clear`."""
+        """Quick-stop every amplifier that can be reached; latched until `clear`."""
         await self._group.stop()
 
     async def clear(self) -> None:
-        """Acknowledge stops, and faults whose cause is gone; nothing arms by itself."""
+        """Acknowledge stops, and faults whose cause has gone; nothing arms by itself."""
         await self._group.clear()
 
     async def close(self) -> None:
         """Ramp to zero in 50 ms, confirm it by reading back, disarm and close; ends `run`."""
-        decider = self._opened_decider
-        silence = decider.silence(ramp=CLOSING_RAMP).commands if decider else {}
+        decider = self._decider_if_open
+        silence = decider.silence(ramp=CLOSING_RAMP).sets if decider else {}
         self._wake.set()
         await self._group.close(silence)
 
     async def run(self) -> None:
         """Run the loop until `close` or cancellation; raises LinkError when an amplifier is lost.
 
-        By then all others have been stopped. A source that fails or ends does not end the loop.
-        While they are disarmed nothing is asked of them here: a link that is lost then shows in
-        what is asked next, which raises, and in `phase`; the daemon's supervisor looks at both.
+        All others have been stopped by then. A source that fails or ends does not end the loop.
+        While disarmed the loop sends nothing: a lost link then shows in the next request, which
+        raises, and in `phase`; the daemon's supervisor checks both.
         """
         listening = [asyncio.create_task(self._listen(source)) for source in self._sources]
         try:
             while self.phase is not Phase.CLOSED:
                 await self.step()
-                self._tell(self._observer.turned)
+                self._report(self._observer.turned)
                 await self._next_cause()
         finally:
             if self._expiry is not None:
@@ -182,56 +182,56 @@ class Controller:
             await asyncio.gather(*listening, return_exceptions=True)
 
     async def step(self) -> None:
-        """One turn of the loop: decide, send what is new, then the heartbeat if it is due."""
+        """Run the loop once: decide, send what changed, then the heartbeat if it is due."""
         self._wake.clear()
-        decision = self._decider.decide(clock.now())
-        for change in decision.changes:
-            self._tell(self._observer.contacts_changed, decision.contacts, change)
+        now = clock.now()
+        self._report_change(self._decider.expire(now))
+        decision = self._decider.decide(now)
         try:
-            if self.phase is Phase.ARMED and (decision.is_new or decision.order is not None):
+            if self.phase is Phase.ARMED and decision is not None:
                 await self._carry_out(decision)
             if self._is_heartbeat_due and await self._group.heartbeat():
                 self._heartbeat_due = clock.now() + HEARTBEAT
         except LinkError as error:
-            self._tell(self._observer.link_lost, str(error))
+            self._report(self._observer.link_lost, str(error))
             raise
         except DriverError as error:
-            self._tell(self._observer.refused, str(error))
+            self._report(self._observer.refused, str(error))
 
     def deliver(self, frame: TouchFrame) -> None:
-        """Take over a touch frame; to be called in the loop's thread."""
+        """Take a touch frame; to be called in the loop's thread."""
         change = self._decider.take(frame)
         for reason in change.rejected:
-            self._tally.count(reason, f"touch of {frame.source}")
+            self._rejects.count(reason, f"touch of {frame.source}")
         self._follow(change)
 
     def reconsider(self) -> None:
-        """Ask for intents again, for they are others though no contact has changed."""
+        """Query the intent source again, because its intent changed by itself."""
         self._wake.set()
 
     @property
     def _is_heartbeat_due(self) -> bool:
-        """Whether the amplifiers are to be told that the loop has run; silence goes before that."""
+        """Whether to feed the watchdogs now; silence that is owed goes first."""
         is_time = self.phase is Phase.ARMED and clock.now() >= self._heartbeat_due
         return is_time and not self._decider.owes_silence
 
     @property
     def _decider(self) -> Decider:
-        """What decides; raises CommandError before `open`."""
-        if self._opened_decider is None:
-            raise CommandError("the controller is not open yet; call open() first")
-        return self._opened_decider
+        if self._decider_if_open is None:
+            raise CommandError("controller must be open; call open() first")
+        return self._decider_if_open
 
     def _follow(self, change: Change) -> None:
-        """See to what follows from a change, also while the amplifiers are being waited for."""
+        """Act on a change of contacts, also while amplifiers are being awaited."""
+        self._report_change(change)
         if change:
             self._wake.set()
         if self._decider.owes_silence:
             self._group.abort_unsent()
-        self._watch_leases()
+        self._schedule_expiry()
 
-    def _watch_leases(self) -> None:
-        """Look again when the next source is overdue."""
+    def _schedule_expiry(self) -> None:
+        """Check for expired sources when the next one times out."""
         if self._expiry is not None:
             self._expiry.cancel()
             self._expiry = None
@@ -241,69 +241,60 @@ class Controller:
             self._expiry = asyncio.get_running_loop().call_later(pause, self._expire)
 
     def _expire(self) -> None:
-        """A source may be overdue."""
         self._follow(self._decider.expire(clock.now()))
 
     async def _carry_out(self, decision: Decision) -> None:
-        """Send the commands of a decision and tell what came of them; raises DriverError."""
-        drive: Mapping[str, DriveCommand] | None = {}
-        if decision.order is not None:
-            drive = await self._play(decision.order)
-        if drive is not None:
-            self._tell_outcome(decision, drive)
-
-    async def _play(self, order: Order) -> Mapping[str, DriveCommand] | None:
-        """Have an order played; what plays then, by ERA. None if silence came in between."""
-        achieved = None
-        try:
-            if self._group.is_set_incomplete and order.pattern is not None:
-                # Half of a set is none: silence goes before whatever shall be played instead.
-                silence = self._decider.silence(ramp=RELEASE_RAMP).commands
-                if await self._group.play(silence) is None:
-                    return None
-            achieved = await self._group.play(order.commands, envelopes=order.envelopes)
-        finally:
-            if achieved is None:  # whoever goes on from here must not count on it
-                self._decider.forget()
-        if achieved is None:
-            return None
-        drive = drive_of_eras(achieved, self._rig)
-        self._decider.confirm(drive, now=clock.now())
-        if any(order.envelopes.values()):
-            self._decider.loaded_in(self._group.loading_time, now=clock.now())
-        return drive
-
-    def _tell_outcome(self, decision: Decision, drive: Mapping[str, DriveCommand]) -> None:
-        """Tell what a decision has led to; what plays now, by ERA."""
-        order = decision.order
-        if order is not None and order.problem is not None:
-            self._tell(self._observer.refused, order.problem)
-        if order is not None and order.is_brake:
-            return  # nothing else is felt by it
-        sent = self._group.last_sent
-        if order is not None and order.pattern is not None:
-            self._tell(
-                self._observer.pattern_applied,
-                applied_by(decision, order.pattern, drive=drive, sent=sent, timing=self._timing),
+        """Send the sets of a decision and report the outcome; raises DriverError."""
+        drive: Mapping[str, DriveCommand] = {}
+        sent = None
+        if decision.sets is not None:
+            played = await self._play(decision.sets, is_pattern=decision.pattern is not None)
+            if played is None:
+                return
+            drive, sent = drive_of_eras(played.achieved, self._rig), played.sent
+            self._decider.confirm(drive, now=clock.now())
+            if played.loading_time is not None:
+                self._decider.note_loading_time(played.loading_time, now=clock.now())
+        if decision.refusal is not None:
+            self._report(self._observer.refused, decision.refusal)
+        if decision.is_brake:
+            return  # what is felt stays the same
+        if decision.pattern is not None and sent is not None:
+            applied = applied_by(
+                decision, decision.pattern, drive=drive, sent=sent, timing=self._timing
             )
+            self._report(self._observer.pattern_applied, applied)
         else:
-            self._tell(
-                self._observer.silenced,
-                silenced_by(decision, sent=None if order is None else sent, now=clock.now()),
-            )
+            silenced = silenced_by(decision, sent=sent, now=clock.now())
+            self._report(self._observer.silenced, silenced)
+
+    async def _play(self, sets: SafeSets, *, is_pattern: bool) -> Played | None:
+        """Play sets on all amplifiers; None if silence came in between."""
+        played = None
+        try:
+            if self._group.is_set_incomplete and is_pattern:
+                # Half a set is no pattern: silence goes before the next one.
+                silence = self._decider.silence(ramp=RELEASE_RAMP)
+                if await self._group.play(silence.sets) is None:
+                    return None
+            played = await self._group.play(sets.sets, envelopes=sets.envelopes)
+        finally:
+            if played is None:  # what the amplifiers play is unknown from here on
+                self._decider.forget()
+        return played
 
     async def _listen(self, source: TouchSource) -> None:
-        """Take what a source says; one that fails is told, and leaves its contacts to expire."""
+        """Run a source; report one that fails, and leave its contacts to time out."""
         try:
             await source.run(self.deliver)
         except Exception as error:
-            _logger.exception("a touch source failed")
-            self._tell(self._observer.source_failed, failure_text(error))
+            _logger.exception("touch source: failed")
+            self._report(self._observer.source_failed, failure_text(error))
 
     async def _next_cause(self) -> None:
-        """Wait until there is a reason to run: news, a heartbeat, an overdue source or intent."""
+        """Wait for a change, a heartbeat, a timeout of a source or the end of an intent."""
         now = clock.now()
-        moments = [now + IDLE_TURN]
+        moments = [now + IDLE_INTERVAL]
         if self._decider.due is not None:
             moments.append(self._decider.due)
         if self.phase is Phase.ARMED:
@@ -312,9 +303,13 @@ class Controller:
             async with asyncio.timeout(max(0.0, min(moments) - now)):
                 await self._wake.wait()
 
-    def _tell(self, callback: Callable[_P, None], *args: _P.args, **kwargs: _P.kwargs) -> None:
-        """Call an observer; whatever it raises stays here."""
+    def _report_change(self, change: Change) -> None:
+        if change:
+            self._report(self._observer.contacts_changed, self._decider.contacts, change)
+
+    def _report(self, callback: Callable[_P, None], *args: _P.args, **kwargs: _P.kwargs) -> None:
+        """Call an observer; its exceptions are only logged."""
         try:
             callback(*args, **kwargs)
         except Exception:
-            _logger.exception("an observer of the control loop failed")
+            _logger.exception("loop: observer failed")

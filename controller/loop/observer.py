@@ -1,12 +1,12 @@
-"""What the control loop tells whoever watches it: a demo, a log, a dashboard."""
+"""What the control loop reports to a demo, a log or a dashboard."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 
 from controller.loop.decision import Decision
-from controller.loop.orders import PatternTiming
-from controller.loop.selection import Felt, Selection
+from controller.loop.safe_sets import PatternTiming
+from controller.loop.selection import Prediction
 from controller.sources.contacts import Change, Contact
 from drivers.command import DriveCommand
 from model.table.pattern import Pattern
@@ -17,15 +17,14 @@ from model.table.question import Question
 class Applied:
     """A pattern that the amplifiers have confirmed.
 
-    contacts: all of them, in order of arrival; targets: who feels it, with the level and the
-    contrast of each, and quiet: who must not, as it was chosen; pattern: as it is played, with its
-    mode, its ramp, and envelopes where there are any; drive: what the amplifiers really play, by
-    ERA, silent ones left out; latency [s]: from the touch frame that asked for it to the last byte
-    of the command on the wire; time [s] of that byte; from_rest: whether nothing played before.
+    contacts: all, in order of arrival; targets: a prediction for each; quiet: who must not feel it;
+    pattern: as it is played, with its ramp and envelopes; drive: what the amplifiers play, by ERA,
+    without silent ones; latency [s]: from the touch frame to the last byte of the command on the
+    wire; time [s] of that byte; from_rest: whether nothing played before.
     """
 
     contacts: tuple[Contact, ...]
-    targets: tuple[Felt, ...]
+    targets: tuple[Prediction, ...]
     quiet: tuple[Contact, ...]
     pattern: Pattern
     drive: Mapping[str, DriveCommand]
@@ -39,9 +38,8 @@ class Applied:
     def transient_contrast_db(self) -> float | None:
         """Predicted contrast over the first 100 ms [dB], with the onset as it is played.
 
-        Worked out when it is first asked for, some two milliseconds: not before the touch is on its
-        way. None where nobody is to be quiet, where another pattern played before, or where the
-        controller knows no `timing`.
+        Computed when it is first read, in about two milliseconds, so that no touch waits for it.
+        None without quiet contacts, after another pattern, or without `timing`.
         """
         if self.timing is None or self.question is None or not (self.from_rest and self.quiet):
             return None
@@ -51,13 +49,14 @@ class Applied:
 
 @dataclass(frozen=True)
 class Silenced:
-    """All channels were brought to zero, or stay there, for a reason; latency and time [s].
+    """All channels are silent, for a reason; latency and time [s].
 
-    latency counts to the last byte of the command, or is None where silence needed none.
+    targets: contacts for which a pattern was asked for. latency: up to the last byte of the
+    command, None if none was needed.
     """
 
     contacts: tuple[Contact, ...]
-    selection: Selection
+    targets: tuple[Contact, ...]
     reason: str
     latency: float | None
     time: float
@@ -71,10 +70,10 @@ def applied_by(
     sent: float,
     timing: PatternTiming | None,
 ) -> Applied:
-    """What is told of a decision by which a pattern plays; sent [s]: its last byte."""
+    """Report a decision whose pattern plays; sent [s]: its last byte."""
     return Applied(
         contacts=decision.contacts,
-        targets=decision.selection.felt,
+        targets=decision.selection.predictions,
         quiet=decision.selection.quiet,
         pattern=pattern,
         drive=drive,
@@ -87,26 +86,25 @@ def applied_by(
 
 
 def silenced_by(decision: Decision, *, sent: float | None, now: float) -> Silenced:
-    """What is told of a decision by which nothing plays; sent, now [s]: None where none was."""
-    problem = None if decision.order is None else decision.order.problem
+    """Report a decision for silence; sent [s]: its last byte, None if nothing was sent."""
     return Silenced(
         contacts=decision.contacts,
-        selection=decision.selection,
-        reason=problem or decision.selection.reason or "",
+        targets=tuple(contact for contact, _ in decision.selection.targets),
+        reason=decision.refusal or decision.selection.reason or "",
         latency=None if sent is None else sent - decision.since,
         time=now,
     )
 
 
 def _ignore(*_: object) -> None:
-    """Nobody listens."""
+    """Do nothing."""
 
 
 @dataclass(frozen=True)
 class Observer:
     """Callbacks of the control loop, called within it: they must return at once.
 
-    What they raise is logged and goes no further.
+    Their exceptions are logged and go no further.
     """
 
     contacts_changed: Callable[[tuple[Contact, ...], Change], None] = _ignore
@@ -116,4 +114,4 @@ class Observer:
     link_lost: Callable[[str], None] = _ignore
     source_failed: Callable[[str], None] = _ignore
     turned: Callable[[], None] = _ignore
-    """The loop has run once more: at least every second, whatever happens or does not."""
+    """The loop has run once more: at least once a second, with or without an event."""

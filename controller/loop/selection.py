@@ -1,4 +1,4 @@
-"""From intents to a pattern: who feels it and how strongly, who must feel nothing, by what."""
+"""Selection: from a haptic intent to the pattern of the table that realises it."""
 
 import logging
 import math
@@ -23,46 +23,46 @@ from model.vibration.excitation import Excitation
 from model.vibration.peak import peak_acceleration
 from registry.plugins import failure_text
 
-# Fields vary over a good part of a bending wavelength, 17 cm and more below 500 Hz; a fingertip
-# that moved by less than its own radius is still within the disc it was chosen for.
+# Bending wavelengths are 17 cm and more below 500 Hz; a fingertip that has moved by about its own
+# radius is still within the disc that the pattern was chosen for.
 MOVE_TOLERANCE = 0.008
 
-MOST_DB_SL = 26.0
-"""Where `as strongly as the neighbours allow` ends: at twice what is strong, lest a finger without
-neighbours be numbed."""
+MAX_DB_SL = 26.0
+"""Upper bound of `as strongly as the neighbours allow`: twice a strong vibration, so that a finger
+without neighbours is not numbed."""
 
 _logger = logging.getLogger(__name__)
 
 
 class PatternTable(Protocol):
-    """What selection needs of a localization table."""
+    """The part of a localization table that selection needs."""
 
     @property
     def plate(self) -> Plate:
-        """The plate that it is for."""
+        """The plate."""
 
     @property
     def frequencies(self) -> FloatArray:
-        """What its patterns may use [Hz]."""
+        """Frequencies of its patterns [Hz]."""
 
     def prepare(self, drive_mode: str) -> None:
-        """Work out what the first question in a mode would have to wait for."""
+        """Precompute what the first question in a drive mode needs."""
 
     def query(self, question: Question) -> Pattern:
-        """The best pattern; raises InputError where there is none."""
+        """Return the best pattern; raises InputError if there is none."""
 
     def amplitudes(
         self, excitation: Excitation, points: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Frequencies (f,) [Hz] and peak acceleration [m/s²] at points (p, 2) [m], (f, p)."""
+        """Return frequencies (f,) [Hz] and peak acceleration (f, p) [m/s²] at points (p, 2) [m]."""
 
 
 @dataclass(frozen=True)
-class Felt:
-    """What a target is predicted to feel once the vibration is steady.
+class Prediction:
+    """What a target is predicted to feel in the steady state.
 
-    contact: where it was when the pattern was chosen; wanted_db_sl: None for as strongly as the
-    neighbours allow; contrast_db: to the loudest quiet point, None where nobody is to be quiet.
+    contact: as it was when the pattern was chosen; wanted_db_sl: None for as strongly as the
+    neighbours allow; contrast_db: to the loudest quiet point, None without quiet contacts.
     """
 
     contact: Contact
@@ -73,11 +73,10 @@ class Felt:
 
 @dataclass(frozen=True)
 class Selection:
-    """What was chosen: for whom, who must feel nothing, and the pattern.
+    """The pattern for some contacts, or None and the reason for silence.
 
-    Contacts stand where they were when it was chosen; targets: whom it was chosen for with what
-    they want; felt: what each of them will feel. Without a pattern all is silent, and reason says
-    why. question: what the table was asked.
+    targets, quiet: contacts as they were when the pattern was chosen, targets with what is intended
+    for them; question: as the table was asked; predictions: one per target.
     """
 
     targets: tuple[tuple[Contact, Target], ...]
@@ -85,15 +84,14 @@ class Selection:
     pattern: Pattern | None
     reason: str | None
     question: Question | None = None
-    felt: tuple[Felt, ...] = ()
+    predictions: tuple[Prediction, ...] = ()
 
 
 class Selector:
-    """Chooses the pattern of a table that does what is wished for the contacts on its plate.
+    """Chooses the pattern of a table that realises an intent for the contacts on its plate.
 
-    A pattern stays while its targets and their levels do and no contact has moved more than 8 mm
-    from where it was chosen for; a quiet contact that lifts leaves it as it is, since less is asked
-    of it then and a change would be felt.
+    A pattern stays as long as its targets and their levels do and no contact has moved more than
+    8 mm. A quiet contact that lifts leaves it as it is: a change would be felt.
     """
 
     def __init__(self, table: PatternTable) -> None:
@@ -101,23 +99,26 @@ class Selector:
         self._current = Selection((), (), None, None)
 
     def select(
-        self, contacts: Sequence[Contact], intent: HapticIntent, capabilities: PlaybackCapabilities
+        self,
+        contacts: Sequence[Contact],
+        intent: HapticIntent,
+        capabilities: PlaybackCapabilities,
     ) -> Selection:
-        """The selection for contacts in their order of arrival; the same object if it stays."""
+        """Return the selection for contacts in their order of arrival; the same object if kept."""
         wanted = {target.key: target for target in intent.targets}
         targets = tuple((each, wanted[each.key]) for each in contacts if each.key in wanted)
         quiet = tuple(each for each in contacts if each.key not in wanted)
-        if not self._holds(intent, targets, quiet):
+        if not self._still_fits(intent, targets, quiet):
             self._current = self._choose(intent, targets, quiet, capabilities)
         return self._current
 
-    def _holds(
+    def _still_fits(
         self,
         intent: HapticIntent,
         targets: tuple[tuple[Contact, Target], ...],
         quiet: tuple[Contact, ...],
     ) -> bool:
-        """Whether what was chosen for contacts elsewhere still serves."""
+        """Whether the current selection also serves these contacts."""
         current = self._current
         if not targets or not current.targets:
             return not targets and not current.targets and current.reason == intent.reason
@@ -138,29 +139,33 @@ class Selector:
         quiet: tuple[Contact, ...],
         capabilities: PlaybackCapabilities,
     ) -> Selection:
-        """Ask the table; whatever goes wrong there is silence until something else is wanted."""
+        """Ask the table; any failure there selects silence until the intent changes."""
         if not targets:
             return Selection((), quiet, None, intent.reason)
         try:
             question, pattern = self._ask(
                 _question(targets, quiet, capabilities),
                 [target for _, target in targets],
-                largest=capabilities.largest,
+                max_amplitudes=capabilities.max_amplitudes,
             )
-            felt = self._felt(targets, quiet, pattern)
+            predictions = self._predict(targets, quiet, pattern)
         except InputError as error:
             return Selection(targets, quiet, None, str(error))
         except Exception as error:
-            _logger.exception("the table failed, all channels fall silent")
+            _logger.exception("loop: table failed, silencing all channels")
             return Selection(targets, quiet, None, failure_text(error))
-        return Selection(targets, quiet, pattern, None, question, felt)
+        return Selection(targets, quiet, pattern, None, question, predictions)
 
     def _ask(
-        self, question: Question, targets: Sequence[Target], *, largest: Mapping[str, float]
+        self,
+        question: Question,
+        targets: Sequence[Target],
+        *,
+        max_amplitudes: Mapping[str, float],
     ) -> tuple[Question, Pattern]:
-        """The pattern, and what the table was asked in the end; raises InputError."""
+        """Return the pattern and the question that it finally answers; raises InputError."""
         if all(target.level_db_sl is None for target in targets):
-            return question, strongest(self._table.query(question), largest)
+            return question, strongest(self._table.query(question), max_amplitudes)
         try:
             return question, self._table.query(question)
         except InputError:
@@ -168,18 +173,20 @@ class Selector:
                 raise
         wanted = question.level_db_sl
         question = replace(question, level_db_sl=min(wanted, FELT_DB_SL))
-        return question, strongest(self._table.query(question), largest, at_most=wanted)
+        return question, strongest(self._table.query(question), max_amplitudes, max_db_sl=wanted)
 
-    def _felt(
+    def _predict(
         self,
         targets: tuple[tuple[Contact, Target], ...],
         quiet: tuple[Contact, ...],
         pattern: Pattern,
-    ) -> tuple[Felt, ...]:
-        """What each target will feel; of a lone one the pattern says it."""
+    ) -> tuple[Prediction, ...]:
+        """Predict what each target will feel; a pattern states it for a single target."""
         if len(targets) == 1:
             ((contact, target),) = targets
-            return (Felt(contact, target.level_db_sl, pattern.level_db_sl, pattern.contrast_db),)
+            return (
+                Prediction(contact, target.level_db_sl, pattern.level_db_sl, pattern.contrast_db),
+            )
         fingers = [*(contact for contact, _ in targets), *quiet]
         discs = [fingertip_points(each.x, each.y, self._table.plate) for each in fingers]
         frequencies, all_fields = self._table.amplitudes(pattern.excitation, np.concatenate(discs))
@@ -187,7 +194,7 @@ class Selector:
         *fields, at_quiet = np.split(all_fields, ends, axis=1)
         loudest = peak_acceleration(at_quiet)
         return tuple(
-            Felt(
+            Prediction(
                 contact,
                 target.level_db_sl,
                 mean_level_db_sl(frequencies, field),
@@ -202,7 +209,7 @@ def _question(
     quiet: tuple[Contact, ...],
     capabilities: PlaybackCapabilities,
 ) -> Question:
-    """What the table is to be asked."""
+    """Return the question that puts an intent to the table."""
     given = [target.level_db_sl for _, target in targets if target.level_db_sl is not None]
     level = max(given, default=FELT_DB_SL)
     levels = [level if t.level_db_sl is None else t.level_db_sl for _, t in targets]
@@ -219,28 +226,29 @@ def _question(
 
 
 def strongest(
-    pattern: Pattern, largest: Mapping[str, float], *, at_most: float = MOST_DB_SL
+    pattern: Pattern, max_amplitudes: Mapping[str, float], *, max_db_sl: float = MAX_DB_SL
 ) -> Pattern:
-    """The pattern turned up or down to as strong as the neighbours allow.
+    """Scale a pattern to as strong as the neighbours allow.
 
-    No quiet finger is aware of it then, no ERA exceeds its largest amplitude [m], by its name, and
-    no target is beyond a level [dB SL]. Raises InputError where that leaves nothing to be felt.
+    No quiet finger is aware of it then, no ERA exceeds its largest amplitude [m], by name, and no
+    target exceeds max_db_sl [dB SL]. Raises InputError if nothing remains to be felt.
     """
-    room = [
-        20 * math.log10(largest[name] / tone.amplitude)
+    headroom = [
+        20 * math.log10(max_amplitudes[name] / tone.amplitude)
         for name, tone in pattern.excitation.items()
         if tone.amplitude > 0
     ]
-    gain = min([at_most - pattern.level_db_sl, *room])
-    if pattern.quiet_level_db_sl is not None:
-        gain = min(gain, UNAWARE_DB_SL - pattern.quiet_level_db_sl)
+    gain = min([max_db_sl - pattern.level_db_sl, *headroom])
+    quiet = pattern.quiet_level_db_sl
+    if quiet is not None:
+        gain = min(gain, UNAWARE_DB_SL - quiet)
     level = pattern.level_db_sl + gain
     if level <= 0:
         raise InputError(
-            "whatever can be felt there is felt by another finger too; lift it, or move it away"
+            "every pattern that the target feels is also felt by another finger; lift it, or move "
+            "it away"
         )
     factor = 10 ** (gain / 20)
-    quiet = pattern.quiet_level_db_sl
     return replace(
         pattern,
         excitation={

@@ -1,1 +1,1 @@
-"""What a bug report should hold, gather_all in one file."""
+"""What a bug report should hold, gathered in one file."""

@@ -39,10 +39,10 @@ def report(
     from controller.report.collect import collect
     from controller.report.zip_file import write_zip
 
-    gather_all = collect(configs or [], socket=socket, home=Path.home())
-    write_zip(output, gather_all)
-    for name, text in gather_all.files.items():
+    gathered = collect(configs or [], socket=socket, home=Path.home())
+    write_zip(output, gathered)
+    for name, text in gathered.files.items():
         print(f"  {name}: {len(text)} characters")
-    for what in gather_all.missing:
+    for what in gathered.missing:
         print(f"  left out: {what}")
     print(f"Wrote {output}\nNext: look at it, then attach it to your report")

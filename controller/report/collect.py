@@ -28,7 +28,7 @@ _NAMED = ("rig", "layout")  # files that a daemon's file names; a table is large
 
 @dataclass(frozen=True)
 class Report:
-    """Files of a report by name, and what could not be gather_all, in words."""
+    """Files of a report by name, and what could not be gathered, in words."""
 
     files: Mapping[str, str]
     missing: tuple[str, ...]

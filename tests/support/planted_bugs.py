@@ -21,7 +21,7 @@ import witness_scenarios as scenarios
 from controller.group import amplifier_group
 from controller.group.quick_stops import QuickStops
 from controller.group.synchronized_play import SynchronizedPlay
-from controller.loop import decision, loop, orders
+from controller.loop import decision, loop, safe_sets
 from controller.loop.decision import Decider
 from controller.loop.loop import Controller
 from controller.loop.selection import Selector
@@ -112,7 +112,7 @@ def routed(change: Callable[[DriveCommand], DriveCommand]) -> Plant:
         sets = route(*args, **kwargs)
         return {name: _with_commands(wanted, change) for name, wanted in sets.items()}
 
-    return wrapped(orders, "route", around)
+    return wrapped(safe_sets, "route", around)
 
 
 def _kept(tracker: ContactTracker, keys: Iterable[Any]) -> tuple[Any, ...]:
@@ -155,16 +155,8 @@ async def _sleeps_past_heartbeats(next_cause: Any, controller: Any) -> None:
             controller._heartbeat_due = due
 
 
-async def _remembers_sets(play: Any, group: Any, commands: Any, envelopes: Any) -> Any:
-    group.wanted = commands
-    return await play(group, commands, envelopes)
-
-
-async def _reports_wanted_tokens(statuses: Any, group: Any) -> Any:
-    return {
-        name: replace(status, token=group.wanted[name].token)
-        for name, status in (await statuses(group)).items()
-    }
+async def _checks_no_tokens(playback: Any, sets: Any) -> None:
+    pass
 
 
 async def _arms_again(clear: Any, controller: Any) -> None:
@@ -174,7 +166,7 @@ async def _arms_again(clear: Any, controller: Any) -> None:
 
 def _deaf_to_one(decide: Any, decider: Decider, now: float) -> Any:
     made = decide(decider, now)
-    return replace(made, is_new=False, order=None) if len(made.contacts) == 1 else made
+    return None if made is not None and len(made.contacts) == 1 else made
 
 
 def _wakes_nothing(follow: Any, controller: Any, change: Any) -> None:
@@ -202,7 +194,7 @@ CONTROLLER: dict[str, Bug] = {
         "pattern", routed(lambda one: replace(one, level=one.level / 2))
     ),
     "the pattern of the first finger stays": Bug(
-        "touch", wrapped(Selector, "_holds", _keeps_targets)
+        "touch", wrapped(Selector, "_still_fits", _keeps_targets)
     ),
     "fingers beside the plate count": Bug(
         "justified", wrapped(ContactTracker, "update", _on_the_plate), scenarios.touched_beside
@@ -222,14 +214,13 @@ CONTROLLER: dict[str, Bug] = {
     "a set is committed by one amplifier only": Bug(
         "commit",
         both(
-            both(
-                wrapped(SynchronizedPlay, "play", _remembers_sets),
-                wrapped(SynchronizedPlay, "statuses", _reports_wanted_tokens),
-            ),
+            replaced(SynchronizedPlay, "_check_tokens", _checks_no_tokens),
             wrapped(
                 SynchronizedPlay,
                 "_commits",
-                lambda commits, group, sets: commits(group, dict(list(sets.items())[:1])),
+                lambda commits, playback, sets, may_play: commits(
+                    playback, dict(list(sets.items())[:1]), may_play
+                ),
             ),
         ),
         amplifiers=_TWO,
@@ -246,7 +237,7 @@ CONTROLLER: dict[str, Bug] = {
             replaced(decision, "FADE_RAMP", 0.3),
             wrapped(
                 Decider,
-                "_ending",
+                "_end",
                 lambda ending, decider, left, **how: ending(decider, left or ("one",), **how),
             ),
         ),
@@ -320,7 +311,7 @@ DRIVERS: dict[str, Bug] = {
         both(_without(rules._check_finite), wrapped(Quantity, "to_wire", _nan_as_integer)),
         scenarios.not_a_number,
     ),
-    "every set has the same token": Bug("token", replaced(orders, "token_after", lambda _: 1)),
+    "every set has the same token": Bug("token", replaced(safe_sets, "token_after", lambda _: 1)),
     "levels have 1000 steps": Bug(
         "pattern",
         wrapped(

@@ -35,7 +35,7 @@ def test_another_level_for_100_ms_is_refused() -> None:
     read_backs.check("main", reported(0.1, 0.0), now=10.01)  # it fades
     for moment in (10.05, 10.10):
         read_backs.check("main", reported(0.25, 0.0), now=moment)
-    with pytest.raises(CommandRefused, match=r"main has reported .* 0\.25, 0\.00 instead of 0\.50"):
+    with pytest.raises(CommandRefused, match=r"main: .*0\.50, 0\.00, got 0\.25, 0\.00.*clear"):
         read_backs.check("main", reported(0.25, 0.0), now=10.151)
     for moment in (10.0, 11.0, 12.0):
         expecting(tone()).check("main", reported(0.5, 0.0), now=moment)

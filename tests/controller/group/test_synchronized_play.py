@@ -23,8 +23,13 @@ async def test_what_is_silenced_goes_no_further(steps: int, asked: list[type[Req
     before = len(far_ends["a"].asked)
     guard = Guard(GuardLimits(40.0, 500.0, 1.0), amplifiers["a"].capabilities)
     wanted = CommandSet(1, (DriveCommand(0, 110.0, 0.2),), ramp=0.01, valid_for=0.0)
-    joint = SynchronizedPlay(amplifiers, goes_on=lambda: len(far_ends["b"].asked) < before + steps)
-    assert await joint.play(dict.fromkeys(NAMES, guard.check(wanted)), {}) is None
+    joint = SynchronizedPlay(amplifiers)
+    played = await joint.play(
+        dict.fromkeys(NAMES, guard.check(wanted)),
+        {},
+        may_play=lambda: len(far_ends["b"].asked) < before + steps,
+    )
+    assert played is None
     assert not joint.is_set_incomplete
     for far_end in far_ends.values():
         assert [type(request) for _, request in far_end.asked[before:]] == asked
@@ -43,8 +48,8 @@ async def test_a_set_is_sent_when_the_last_has_what_it_needs() -> None:
         far_end.delay = 0.003
     guard = Guard(GuardLimits(40.0, 500.0, 1.0), amplifiers["a"].capabilities)
     wanted = CommandSet(1, (DriveCommand(0, 110.0, 0.2),), ramp=0.01, valid_for=0.0)
-    joint = SynchronizedPlay(amplifiers, goes_on=lambda: True)
-    assert await joint.play(dict.fromkeys(NAMES, guard.check(wanted)), {}) is not None
+    sets = dict.fromkeys(NAMES, guard.check(wanted))
+    played = await SynchronizedPlay(amplifiers).play(sets, {}, may_play=lambda: True)
     first, last = sorted(
         time
         for far_end in far_ends.values()
@@ -52,4 +57,5 @@ async def test_a_set_is_sent_when_the_last_has_what_it_needs() -> None:
         if isinstance(request, Commit)
     )
     assert last - first == pytest.approx(0.010)
-    assert joint.last_sent == last
+    assert played is not None
+    assert played.sent == last

@@ -10,6 +10,7 @@ from itertools import pairwise
 import pytest
 
 from controller.group.amplifier_group import Phase
+from controller.loop.intent import NO_CONTACTS
 from controller.loop.observer import Observer
 from controller.sources.touch import Touch, TouchFrame, TouchSource
 from controller_bench import FINGER, OTHER, make_bench, running
@@ -119,7 +120,7 @@ async def test_last_finger_up() -> None:
         assert zero.is_silent
         assert {command.channel for command in zero.commands} == {0, 1}
         assert bench.far_end.times(Apply)[-1] + zero.ramp - lifted <= 0.020
-        assert bench.told.silenced[-1].reason == "nobody touches the plate"
+        assert bench.told.silenced[-1].reason == NO_CONTACTS
         assert bench.told.silenced[-1].latency == 0.0
 
 
@@ -419,7 +420,7 @@ async def test_silence_is_not_sent_twice() -> None:
         await bench.hold(FINGER, seconds=0.1)
         assert [each.is_silent for each in bench.far_end.sets()] == [True]
         told = [(silenced.reason, silenced.latency is None) for silenced in bench.told.silenced]
-        assert told == [("nobody touches the plate", False), ("nothing is felt there", True)]
+        assert told == [(NO_CONTACTS, False), ("nothing is felt there", True)]
 
 
 @in_virtual_time

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from controller.loop.intent import HapticIntent, NewestBuzzes, Target
+from controller.loop.intent import NO_CONTACTS, HapticIntent, NewestBuzzes, Target
 from controller.sources.contacts import Contact, ContactKey
 
 
@@ -47,10 +47,10 @@ def test_it_is_wanted_at_the_given_level_for_as_long_as_it_is_down() -> None:
 def test_it_says_why_nobody_is_to_feel_anything() -> None:
     """After a lift another reason than on an empty plate."""
     source = NewestBuzzes()
-    assert source.intent((), 0.0).reason == "nobody touches the plate"
+    assert source.intent((), 0.0).reason == NO_CONTACTS
     source.intent((at(1), at(2)), 0.0)
     assert source.intent((at(1),), 0.0).reason == "the target was lifted"
-    assert source.intent((), 0.0).reason == "nobody touches the plate"
+    assert source.intent((), 0.0).reason == NO_CONTACTS
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,6 @@
 """When envelopes are loaded no more, and when that is tried again."""
 
-from controller.loop.loading_times import FIRST_PAUSE, LONGEST_PAUSE, LoadingTimes
+from controller.loop.loading_times import FIRST_PAUSE, MAX_PAUSE, LoadingTimes
 
 SLOW, FAST = 0.031, 0.030
 
@@ -14,9 +14,9 @@ def test_three_slow_ones_in_a_row_are_too_many() -> None:
     """One in time between them, and it is counted anew; just as long as allowed is in time."""
     times = LoadingTimes(FAST)
     for duration in (SLOW, SLOW, FAST, SLOW, SLOW):
-        times.took(duration, now=5.0)
+        times.note(duration, now=5.0)
         assert times.problem(5.0) is None
-    times.took(SLOW, now=5.0)
+    times.note(SLOW, now=5.0)
     assert times.problem(5.0) is not None
     assert "took 31 ms" in str(times.problem(5.0))
     assert pause_after(times, 5.0) == FIRST_PAUSE
@@ -25,24 +25,24 @@ def test_three_slow_ones_in_a_row_are_too_many() -> None:
 def test_pauses_grow_to_a_bound_while_it_stays_slow() -> None:
     """Each attempt costs one slow loading only: 30, 60, 120, 240, 480, 480 s."""
     times, now, pauses = LoadingTimes(FAST), 0.0, []
-    times.took(SLOW, now=now)
-    times.took(SLOW, now=now)
+    times.note(SLOW, now=now)
+    times.note(SLOW, now=now)
     for _ in range(6):
-        times.took(SLOW, now=now)
+        times.note(SLOW, now=now)
         pauses.append(pause_after(times, now))
         now += pauses[-1]
-    assert pauses == [30.0, 60.0, 120.0, 240.0, LONGEST_PAUSE, LONGEST_PAUSE]
+    assert pauses == [30.0, 60.0, 120.0, 240.0, MAX_PAUSE, MAX_PAUSE]
 
 
 def test_a_wire_that_is_fast_again_is_as_it_was() -> None:
     """After three in time a slow one is a hiccup again, and the pause is the first one."""
     times = LoadingTimes(FAST)
     for _ in range(3):
-        times.took(SLOW, now=0.0)
+        times.note(SLOW, now=0.0)
     for duration in (FAST, FAST, FAST, SLOW, SLOW):
-        times.took(duration, now=FIRST_PAUSE)
+        times.note(duration, now=FIRST_PAUSE)
         assert times.problem(FIRST_PAUSE) is None
-    times.took(SLOW, now=FIRST_PAUSE)
+    times.note(SLOW, now=FIRST_PAUSE)
     assert pause_after(times, FIRST_PAUSE) == FIRST_PAUSE
 
 
@@ -50,7 +50,7 @@ def test_two_in_time_are_not_yet_trusted() -> None:
     """A wire that is fast for a moment is left at its first slow loading, for twice as long."""
     times = LoadingTimes(FAST)
     for _ in range(3):
-        times.took(SLOW, now=0.0)
+        times.note(SLOW, now=0.0)
     for duration in (FAST, FAST, SLOW):
-        times.took(duration, now=FIRST_PAUSE)
+        times.note(duration, now=FIRST_PAUSE)
     assert pause_after(times, FIRST_PAUSE) == 2 * FIRST_PAUSE

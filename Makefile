@@ -61,7 +61,7 @@ bench-localization: .venv/installed
 	$(BIN)/python -m benchmarks.localization --report
 
 bench-plant: .venv/installed
-	$(BIN)/python -m benchmarks.plant_time
+	$(BIN)/python -m benchmarks.plant
 
 bench-wires: .venv/installed-test
 	$(BIN)/python -m benchmarks.wires

@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.latency_machine import busy_ticks
-from benchmarks.latency_match import Command, Matched, match
-from benchmarks.latency_programs import Ended
-from benchmarks.latency_report import HEAD_CELLS, cases, report, write_report
-from benchmarks.latency_run import Case, Disturbed, Failed, Found, attempt
+from benchmarks.latency.machine import busy_ticks
+from benchmarks.latency.match import Command, Matched, match
+from benchmarks.latency.programs import Ended
+from benchmarks.latency.report import HEAD_CELLS, cases, report, write_report
+from benchmarks.latency.run import Case, Disturbed, Failed, Found, attempt
 from controller.api.jsonrpc import ErrorCode, RpcError
 from controller.api.schema import LatencySummary
 

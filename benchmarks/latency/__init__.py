@@ -1,0 +1,1 @@
+"""Time from touch to wire, measured with the real processes."""

@@ -1,0 +1,69 @@
+"""From a touch datagram to the last byte of the command on the wire, measured from outside.
+
+    python -m benchmarks.latency [--seconds 100] [--seed 1] [--report | --check WIRE]
+
+The daemon, the amplifier at the other end of a wire, the panel and whoever disturbs them are
+processes of their own (`benchmarks.latency.run`). Leave the machine alone meanwhile, some nine
+minutes; with --seconds 2 it takes one, which shows that it works. A case that is disturbed is
+tried once more; where that fails too, the others are measured all the same.
+
+With --report, docs/measured/latency.md and its picture are written as well. With --check only taps
+at 100 Hz are measured, over `tcp` or a `pty`, and what was measured is printed as JSON: for tests.
+"""
+
+import argparse
+import json
+import os
+import sys
+import tempfile
+import time
+from functools import partial
+from pathlib import Path
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.latency", description=__doc__)
+    parser.add_argument(
+        "--seconds", type=float, default=100.0, help="how long the longest cases last"
+    )
+    parser.add_argument("--seed", type=int, default=1)
+    purpose = parser.add_mutually_exclusive_group()
+    purpose.add_argument("--report", action="store_true")
+    purpose.add_argument("--check", choices=("tcp", "pty"))
+    options = parser.parse_args()
+    for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ[variable] = "1"  # before numpy loads: with two threads the daemon would compete
+
+    from benchmarks.latency.report import as_json, cases, check_case, lines, write_report
+    from benchmarks.latency.run import Failed, Found, attempt, measure
+    from model.rig.file import example_rig_path, load_rig
+    from model.table.file import save_table
+    from model.table.table_cache import cached_table
+
+    table, _ = cached_table(load_rig(example_rig_path()))
+    found: list[Found | Failed] = []
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "table.npz"
+        save_table(table, file)
+        if options.check:
+            checked = check_case(options.check, options.seconds, options.seed)
+            one = attempt(checked, partial(measure, checked, file, table))
+            if isinstance(one, Failed):
+                sys.exit(f"no figures: {'; then: '.join(one.why)}")
+            print(json.dumps(as_json(one)))
+            return
+        begun = time.monotonic()
+        for case in cases(options.seconds, options.seed):
+            found.append(attempt(case, partial(measure, case, file, table)))
+            print(lines(found[-1:], first=len(found) == 1), flush=True)
+        minutes = (time.monotonic() - begun) / 60
+        print(f"{minutes:.1f} minutes")
+    if options.report:
+        write_report(found, seconds=options.seconds, seed=options.seed, minutes=minutes)
+    failed = [each for each in found if isinstance(each, Failed)]
+    if failed:
+        sys.exit(f"no figures of {len(failed)} of {len(found)} cases: leave the machine alone")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,92 @@
+"""The far end of the latency benchmark: a simulated amplifier on a wire, and a clock.
+
+    python -m benchmarks.latency.far_end RIG FILE WIRE
+
+WIRE: `pty`, a pseudo-terminal, or `tcp`, a connection as to a serial server. Prints the URL. On
+SIGUSR1 it writes when each frame that asks for a set had arrived whole, on CLOCK_MONOTONIC, its
+number and what it carries, a JSON line each, and prints that it has. The plate takes no part.
+"""
+
+import asyncio
+import gc
+import json
+import signal
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import cast
+
+from drivers.codec.serial_line.exchanges import decode_request, encode_reply
+from drivers.codec.serial_line.frame import Frame, FrameReader, encode_frame
+from drivers.protocol.definition import PROTOCOL
+from model.rig.file import load_rig
+from sim.amplifier.amplifier import SimulatedAmplifier
+from sim.transport.pseudo_terminal import make_terminal
+
+
+class Wire(asyncio.Protocol):
+    """A wire to the daemon; on_data is called with what comes, `write` sends, once it is open."""
+
+    def __init__(self, on_data: Callable[[bytes], None]) -> None:
+        self.write: Callable[[bytes], object] = len  # nobody is there yet
+        self._on_data = on_data
+
+    async def open_terminal(self) -> str:
+        """A pseudo-terminal; its URL."""
+        terminal = make_terminal(self._on_data)
+        terminal.listen()
+        self.write = terminal.write
+        return f"serial://{terminal.port}?baud={PROTOCOL.serial.baud}"
+
+    async def open_server(self) -> str:
+        """A TCP port on the loopback that takes one connection at a time; its URL."""
+        loop = asyncio.get_running_loop()
+        self._server = await loop.create_server(lambda: self, "127.0.0.1", 0)
+        return f"socket://127.0.0.1:{self._server.sockets[0].getsockname()[1]}"
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        """The daemon has come."""
+        self.write = cast(asyncio.Transport, transport).write
+
+    def data_received(self, data: bytes) -> None:
+        """Bytes of the daemon."""
+        self._on_data(data)
+
+
+async def main() -> None:
+    rig = load_rig(Path(sys.argv[1]))
+    (name,) = rig.amplifiers
+    amplifier = SimulatedAmplifier(name, channels=4)
+    reader = FrameReader()
+    seen: list[tuple[int, Frame]] = []
+
+    def arrived(data: bytes) -> None:
+        now = time.monotonic_ns()
+        for frame in reader.feed(data):
+            if frame.kind == PROTOCOL.types["apply"]:
+                seen.append((now, frame))
+            amplifier.tick(now * 1e-9)
+            reply = amplifier.handle(decode_request(frame), now * 1e-9)
+            wire.write(encode_frame(encode_reply(reply, frame)))
+
+    wire = Wire(arrived)
+    url = await (wire.open_terminal() if sys.argv[3] == "pty" else wire.open_server())
+
+    def write() -> None:
+        with Path(sys.argv[2]).open("w", encoding="utf-8") as stream:
+            for when, frame in seen:
+                line = json.dumps([when, frame.sequence, frame.payload.hex()])
+                stream.write(f"{line}\n")
+        print("written", flush=True)
+
+    asyncio.get_running_loop().add_signal_handler(signal.SIGUSR1, write)
+    gc.collect()
+    gc.freeze()
+    gc.disable()  # it holds on to everything that it sees, so there is nothing to be collected
+    print(url, flush=True)
+    await asyncio.Event().wait()
+
+
+if __name__ == "__main__":
+    asyncio.run(main())

@@ -1,0 +1,182 @@
+"""Which touch each command answers, found from outside: by what was touched, and what is played.
+
+The table is asked again, offline, what it answers for a touch; a command that plays that answers
+it. So nothing that the daemon says of itself takes part.
+"""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from benchmarks.latency.touches import FLOODING, HELD, Work, places
+from controller.loop.capabilities import PlaybackCapabilities
+from controller.loop.intent import NewestBuzzes
+from controller.loop.routing import route
+from controller.loop.selection import MOVE_TOLERANCE, Selector
+from controller.sources.contacts import Contact, ContactKey
+from drivers.codec.serial_line.exchanges import decode_request
+from drivers.codec.serial_line.frame import Frame
+from drivers.command import DriveCommand
+from drivers.protocol.messages import Apply
+from model.rig.rig import Rig
+from model.table.table import LocalizationTable
+
+LONGEST = 0.5  # s; a command answers no touch that is older
+_CLOSE = (1e-4, 2e-3)  # of full stroke, and of the level: steps on the wire, and the flood's finger
+
+
+@dataclass(frozen=True)
+class Command:
+    """A set as it arrived at the far end: when [s], its frame's number, token and what it plays."""
+
+    time: float
+    sequence: int
+    token: int
+    commands: tuple[DriveCommand, ...]
+
+    @classmethod
+    def read(cls, line: Sequence[int | str], kind: int) -> "Command":
+        """From what the far end wrote; kind: of the frame."""
+        when, sequence, payload = line
+        request = decode_request(Frame(kind, 1, int(sequence), bytes.fromhex(str(payload))))
+        assert isinstance(request, Apply)
+        wanted = request.command_set
+        return cls(int(when) * 1e-9, int(sequence), wanted.token, wanted.commands)
+
+
+@dataclass(frozen=True)
+class Matched:
+    """Commands and the touches (by number) that they answer; unmatched: commands of no touch.
+
+    newest [s]: from the touch that is answered; oldest [s]: from the first one that came after the
+    touch that the command before answers, and so waited the longest for this.
+    """
+
+    touch: np.ndarray
+    newest: np.ndarray
+    oldest: np.ndarray
+    unmatched: int
+
+
+def match(
+    commands: Sequence[Command],
+    sent: np.ndarray,
+    *errors: Callable[[int, Command], float],
+    first: Callable[[int, int], int],
+) -> Matched:
+    """Match commands to touches that were sent at times (n,) [s], each to a newer one.
+
+    errors: how far a command is from what answers a touch, 1 at the most where it does; the nearest
+    counts, and a later error only where no touch does by those before it. first: after which touch
+    answered last, up to the one that is answered now, a command was first due.
+    """
+    found: list[tuple[int, float, float]] = []
+    before, unmatched = -1, 0
+    for command in commands:
+        newest = int(np.searchsorted(sent, command.time)) - 1
+        oldest = int(np.searchsorted(sent, command.time - LONGEST))
+        # Of equal ones the newest, which no daemon can be blamed for.
+        touches = range(newest, max(before, oldest - 1), -1)
+        touch = _nearest(touches, command, errors)
+        if touch is None:
+            unmatched += 1
+            continue
+        since = sent[first(before, touch)]
+        found.append((touch, command.time - sent[touch], command.time - since))
+        before = touch
+    numbers, newest_, oldest_ = np.array(found).T if found else np.zeros((3, 0))
+    return Matched(numbers.astype(int), newest_, oldest_, unmatched)
+
+
+def _nearest(
+    touches: Sequence[int],
+    command: Command,
+    errors: Sequence[Callable[[int, Command], float]],
+) -> int | None:
+    """The touch that a command answers, by the first of the errors by which it answers any."""
+    for error in errors if touches else ():
+        found = [error(touch, command) for touch in touches]
+        nearest = int(np.argmin(found))
+        if found[nearest] <= 1:
+            return touches[nearest]
+    return None
+
+
+class Expected:
+    """What the daemon's table answers for each touch of some work.
+
+    flooded: how far the flood has moved its finger [m]; None where it has none.
+    """
+
+    def __init__(
+        self,
+        work: Work,
+        rig: Rig,
+        table: LocalizationTable,
+        capabilities: PlaybackCapabilities,
+        *,
+        flooded: float | None,
+    ) -> None:
+        self._rig, self._table, self._capabilities = rig, table, capabilities
+        self._places = [self._on_plate(x, y) for _, x, y in places(work, rig.plate)]
+        self._work = work
+        self._others = [self._on_plate(*HELD)]
+        if flooded is not None:
+            length, width = rig.plate.length, rig.plate.width
+            self._others.append((FLOODING[0] * length + flooded, FLOODING[1] * width))
+        self._known: dict[int, Mapping[int, tuple[float, complex]]] = {}
+
+    def error(self, touch: int, command: Command) -> float:
+        """How far a command is from what the table answers for a touch; 1 is just that."""
+        expected = self._expected(touch)
+        absolute, relative = _CLOSE
+        loudest = max((abs(amplitude) for _, amplitude in expected.values()), default=0.0)
+        most = 0.0
+        for played in command.commands:
+            frequency, amplitude = expected.get(played.channel, (played.frequency, 0j))
+            if played.level > 0 and abs(played.frequency - frequency) > 0.01:
+                return math.inf
+            difference = abs(played.phasor - amplitude)
+            most = max(most, difference / (absolute + relative * loudest))
+        return most
+
+    def first(self, before: int, touch: int) -> int:
+        """The first touch after one that was answered that asks for something else."""
+        if self._work.kind == "taps" or before < 0:
+            return before + 1 if before >= 0 else touch
+        then = self._places[before]
+        for number in range(before + 1, touch):
+            if math.dist(self._places[number], then) > MOVE_TOLERANCE:
+                return number
+        return touch
+
+    def _expected(self, touch: int) -> Mapping[int, tuple[float, complex]]:
+        """By channel: frequency [Hz], and level and phase as a complex amplitude."""
+        if touch not in self._known:
+            contacts = [
+                Contact(ContactKey("bench", number), x, y, since=float(number))
+                for number, (x, y) in enumerate([*self._others, self._places[touch]])
+            ]
+            intent = NewestBuzzes().intent(contacts, 0.0)
+            pattern = Selector(self._table).select(contacts, intent, self._capabilities).pattern
+            commands: Sequence[DriveCommand] = ()
+            if pattern is not None:
+                sets = route(pattern.excitation, self._rig, token=1, ramp=pattern.ramp)
+                ((_, only),) = sets.items()
+                commands = only.commands
+            self._known[touch] = {
+                each.channel: (
+                    each.frequency,
+                    each.phasor,
+                )
+                for each in commands
+                if each.level > 0
+            }
+        return self._known[touch]
+
+    def _on_plate(self, x: float, y: float) -> tuple[float, float]:
+        """Where a touch is on the plate [m]; a bundle carries single precision."""
+        plate = self._rig.plate
+        return float(np.float32(x)) * plate.length, (1 - float(np.float32(y))) * plate.width

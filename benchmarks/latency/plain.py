@@ -1,0 +1,99 @@
+"""The same exchange with asyncio alone: a datagram in, the smallest decision, the same bytes out.
+
+    python -m benchmarks.latency.plain RIG URL SOCKET
+
+What a hub of haptic toys would do: python-osc reads the touch, the place chooses among sets that
+were encoded beforehand, and the set goes out without waiting for the answer to the one before.
+Nothing is checked, nobody is kept quiet. The flood comes in as lines of JSON that are read. Prints
+the UDP port; a set carries the number of its touch as its sequence.
+"""
+
+import asyncio
+import contextlib
+import gc
+import json
+import os
+import socket
+import sys
+from dataclasses import replace
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import serial
+from pythonosc.osc_packet import OscPacket
+
+from benchmarks.wires.bench import make_sets
+from drivers.backends.urls.serial_line import SerialUrl
+from drivers.codec.serial_line.exchanges import encode_request
+from drivers.codec.serial_line.frame import encode_frame
+from drivers.protocol.messages import Apply, Arm
+from sim.amplifier.amplifier import capabilities
+
+SETS = 100
+
+
+class Panel(asyncio.DatagramProtocol):
+    """Touches in, sets out."""
+
+    def __init__(self, port: int) -> None:
+        self._port = port
+        self._sets = [
+            encode_request(Apply(safe), address=1, sequence=0)
+            for safe in make_sets(capabilities(4), SETS)
+        ]
+
+    def datagram_received(self, data: bytes, addr: tuple[str, int]) -> None:
+        """Decide and send."""
+        x = number = 0
+        for timed in OscPacket(data).messages:
+            match timed.message.params:
+                case ["set", _, x, *_]:
+                    pass
+                case ["fseq", number]:
+                    pass
+        chosen = replace(self._sets[int(x * SETS) % SETS], sequence=number & 0xFFFF)
+        with contextlib.suppress(BlockingIOError):  # there is no room: the touch is lost
+            os.write(self._port, encode_frame(chosen))
+
+
+class Flooded(asyncio.Protocol):
+    """Lines of JSON in."""
+
+    def __init__(self) -> None:
+        self._rest = b""
+
+    def data_received(self, data: bytes) -> None:
+        """Read them."""
+        *lines, self._rest = (self._rest + data).split(b"\n")
+        for line in lines:
+            json.loads(line)
+
+
+def _opened(url: SerialUrl) -> serial.Serial | socket.socket:
+    """The wire: a port, or a connection to a serial server."""
+    if url.is_local:
+        return serial.Serial(url.port, url.baud, timeout=0, exclusive=True)
+    place = urlsplit(url.port)
+    line = socket.create_connection((place.hostname or "", place.port or 0))
+    line.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    line.setblocking(False)
+    return line
+
+
+async def main() -> None:
+    loop = asyncio.get_running_loop()
+    with _opened(SerialUrl.parse(sys.argv[2])) as port:
+        os.write(port.fileno(), encode_frame(encode_request(Arm(2.0), address=1, sequence=0)))
+        loop.add_reader(port.fileno(), os.read, port.fileno(), 4096)
+        transport, _ = await loop.create_datagram_endpoint(
+            lambda: Panel(port.fileno()), local_addr=("127.0.0.1", 0)
+        )
+        await loop.create_unix_server(Flooded, path=Path(sys.argv[3]))
+        gc.collect()
+        gc.freeze()
+        print(transport.get_extra_info("sockname")[1], flush=True)
+        await asyncio.Event().wait()
+
+
+if __name__ == "__main__":
+    asyncio.run(main())

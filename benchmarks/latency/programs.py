@@ -1,0 +1,136 @@
+"""The programs that take part in the latency benchmark, each as urgent as it is in life.
+
+A device of its own, the amplifier or the panel, shares no processor with the daemon's machine. Here
+it has to, so it comes first. The daemon is as urgent as the unit makes it that `era systemd
+install` prints. Whoever disturbs is an ordinary program.
+"""
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Mapping
+from enum import Enum, auto
+from pathlib import Path
+
+from controller.deploy.files import NICE
+
+PATIENCE = 60.0  # s
+DEVICE_NICE = -20
+_DEVICE_PRIORITY = 1  # of SCHED_RR: before whatever is no device, after the kernel's own
+
+
+class Rank(Enum):
+    """How urgent a program is."""
+
+    DEVICE = auto()
+    SERVICE = auto()
+    ORDINARY = auto()
+
+
+class Ended(Exception):
+    """A part of the benchmark has ended before its time, or does not get ready."""
+
+
+class Program:
+    """A process that ends with the stack, as urgent as its rank, as far as that is allowed.
+
+    is_urgent: whether it was allowed.
+    """
+
+    def __init__(
+        self, stack: contextlib.ExitStack, *command: object, rank: Rank = Rank.ORDINARY
+    ) -> None:
+        self._process = subprocess.Popen(
+            list(map(str, command)),
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            env={**os.environ, **_ONE_THREAD},
+            text=True,
+            start_new_session=rank is not Rank.ORDINARY,
+        )
+        self._name = " ".join(map(str, command[1:4]))
+        stack.callback(self.end)
+        self.is_urgent = rank is Rank.ORDINARY or _is_made_urgent(self._process.pid, rank)
+
+    def line(self) -> str:
+        """The next line that it prints; raises Ended."""
+        assert self._process.stdout is not None
+        line = self._process.stdout.readline().strip()
+        if not line:
+            raise Ended(f"{self._name} has ended before its time")
+        return line
+
+    def tell(self, text: str) -> None:
+        """A line for it."""
+        assert self._process.stdin is not None
+        self._process.stdin.write(f"{text}\n")
+        self._process.stdin.flush()
+
+    def wait(self, timeout: float) -> None:
+        """Until it has ended by itself; raises Ended where it does not in time [s], or badly."""
+        try:
+            status = self._process.wait(timeout)
+        except subprocess.TimeoutExpired:
+            raise Ended(f"{self._name} does not come to its end") from None
+        if status:
+            raise Ended(f"{self._name} has ended with status {status}")
+
+    def check(self) -> None:
+        """Raise Ended if it has ended."""
+        if self._process.poll() is not None:
+            raise Ended(f"{self._name} has ended; its log says why")
+
+    def computed(self) -> float:
+        """Processor time [s] of all its threads so far; 0 where the system does not say."""
+        total = 0
+        for file in Path(f"/proc/{self._process.pid}/task").glob("*/schedstat"):
+            with contextlib.suppress(OSError):  # a thread that has ended meanwhile
+                total += int(file.read_text("ascii").split()[0])
+        return total * 1e-9
+
+    def finish(self) -> None:
+        """Let it write what it has seen, and go on."""
+        self._process.send_signal(signal.SIGUSR1)
+        self.line()
+
+    def end(self) -> None:
+        """Tell it to end, unless it has."""
+        if self._process.poll() is None:
+            self._process.terminate()
+        self._process.wait(PATIENCE)
+        for stream in (self._process.stdin, self._process.stdout):
+            if stream is not None:
+                with contextlib.suppress(OSError):
+                    stream.close()
+
+
+def module(name: str) -> tuple[str, ...]:
+    """The command that runs a program of the benchmark."""
+    return (sys.executable, "-m", f"benchmarks.latency.{name}")
+
+
+ERA = Path(sys.executable).with_name("era")
+
+
+def _is_made_urgent(process: int, rank: Rank) -> bool:
+    """Make a process urgent; False where this user may not."""
+    nice = DEVICE_NICE if rank is Rank.DEVICE else NICE
+    try:
+        os.setpriority(os.PRIO_PROCESS, process, nice)
+        # Where sessions share the cores among them, nice counts within a session only.
+        group = Path(f"/proc/{process}/autogroup")
+        if group.exists():
+            group.write_text(str(nice), "ascii")
+    except PermissionError:
+        return False
+    if rank is Rank.DEVICE and hasattr(os, "sched_setscheduler"):
+        with contextlib.suppress(PermissionError):  # nice serves, less well
+            os.sched_setscheduler(process, os.SCHED_RR, os.sched_param(_DEVICE_PRIORITY))
+    return True
+
+
+_ONE_THREAD: Mapping[str, str] = dict.fromkeys(
+    ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1"
+)

@@ -1,0 +1,258 @@
+"""The cases of the latency benchmark, and their figures as a page of the documentation."""
+
+import platform
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.latency.picture import draw
+from benchmarks.latency.programs import DEVICE_NICE
+from benchmarks.latency.run import FLOOD_RATE, WORKERS, Case, Failed, Found
+from benchmarks.latency.touches import SLIDE, Work
+from controller.deploy.files import NICE
+from controller.loop.selection import MOVE_TOLERANCE
+
+DOCS = Path(__file__).parents[2] / "docs"
+PICTURE = "pictures/latency.png"
+TARGETS = (2.0, 5.0, 10.0)  # ms: median, 99th percentile, 99.9th
+
+FAST, CALM = 1000.0, 100.0  # Hz
+USUAL = 100.0  # s; a hundred thousand touches
+SHORTER = 5  # so much shorter than the first are most cases
+QUIET = 0.25  # processors; where others kept more of them busy, it is said
+
+HEAD = (
+    "| case | touches | commands | no touch's | median | 99th | 99.9th | most | jitter | "
+    "longest waiting: median | 99th | 99.9th | daemon: median | 99th | 99.9th | computing | "
+    "others |\n"
+    "|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|"
+)
+
+HEAD_CELLS = HEAD.split("\n")[1].count("---")
+
+INTRODUCTION = """# How long a touch takes to the wire
+
+Printed by `make bench-latency`, which runs `python -m benchmarks.latency --report`{options} on a
+machine that does nothing else (two cores); {lasts}.{machine}
+`python -m benchmarks.latency --seconds 2` takes a minute, and shows that it works.
+
+**What is measured.** A panel sends TUIO datagrams over UDP. The daemon reads them, asks the table
+who feels what, lets the guard check it and writes the set to a serial line. At its far end a
+program notes when the last byte of each set has arrived. Both ends read CLOCK_MONOTONIC, the panel
+just before it sends. Which touch a set answers is found from outside too: the table is asked again,
+offline, what it answers for the touches that were sent, and a set that plays that answers it. Sets
+that answer none would be counted under *no touch's*.
+
+- **The line** is a TCP connection on the loopback, as to a serial server (`socket://`): what the
+  daemon writes is at the far end when the system call returns. The same over a **pseudo-terminal**
+  stands beside it, where a thread of the kernel carries the bytes on, which is as urgent as any
+  program and has to get a core first, there and back: that is no part of a real port, which has its
+  own way and its own time, by arithmetic ([wires](../reference/wire-protocol.md)).
+- **Devices of their own**: an amplifier and a panel do not share the daemon's processors. The
+  programs that stand for them have to, so they come first (SCHED_RR, else nice {device}), and
+  what they compute is lost to the daemon, as it would not be.
+- **Taps**: every frame is another finger somewhere else, a thousand times a second, beside one that
+  stays and is to feel nothing. Each asks the table anew, and each answer is another set.
+- **Slide**: one finger wanders at {slide:g} m/s. What plays stays while no finger has moved by more
+  than {tolerance:g} mm since it was chosen, so about every ninth frame asks for a set; frames that
+  ask for none have no latency and are not counted.
+- **Faster than sets**: only one set is on its way at a time, since the next one depends on what the
+  amplifier made of it. Touches that come meanwhile are taken together, and the next set answers the
+  newest; the fingers of those before are gone by then. The latency counts from the newest, the one
+  that is answered. *Longest waiting* counts from the oldest of those that were taken together, and
+  that is what the daemon counts for itself: in `era status`, the topic `latency` and Prometheus,
+  from when the system received the datagram until the last byte was written.
+- **Loaded**: another client sends {flood} touches a second to the API, each of them news, and
+  {workers} other programs compute all the time, all of them ordinary programs. The daemon runs at
+  nice {nice}, as in the unit that `era systemd install` prints.
+- **Beside it** *plain asyncio*: python-osc reads the same datagrams, the place chooses among sets
+  that were encoded beforehand, and out they go, over the same line to the same far end.
+  No table, no guard, nobody kept quiet, no answer waited for.
+
+Jitter is the standard deviation. *Computing* is the processor time of the daemon for each set, all
+else that it does meanwhile included. All times in milliseconds. *Others* is how many processors
+were kept busy by whoever does not belong to this, the kernel's own work among them: a machine that
+does nothing else shows next to none.
+
+"""
+
+WITHOUT = "No figures yet: the command writes them here, with the histogram.\n"
+
+END = """
+**Shaped onsets.** With `touch_wait: 30 ms`, the default of the [daemon](../reference/daemon.md), a
+touch that starts from rest waits until its [shaped onset](../concepts/transients.md) is found and
+loaded: four envelopes, each with an answer of its own. With `touch_wait: 0 ms` it starts along a
+plain ramp, at once. That costs contrast while it starts, not afterwards: over the first 100 ms
+19 dB in place of 28 to one quiet finger, 12 in place of 16 to two
+([measured](../concepts/transients.md)). A finger that slides waits in neither case,
+for what plays already needs no onset.
+
+**Nice and sessions.** Where the system shares the cores among sessions first (autogroup, see
+sched(7)), nice counts within a session only: the daemon has a session of its own here, as urgent as
+itself. Why it is not scheduled in real time is a
+[decision](../decisions/0019-nice-not-real-time.md).
+"""
+
+
+def cases(seconds: float, seed: int) -> list[Case]:
+    """What is measured, the targets' case first, for so long [s], most others for a fifth of it."""
+    shorter = seconds / SHORTER
+    fast = Work("taps", _count(seconds, FAST), FAST, seed)
+    some = Work("taps", _count(shorter, FAST), FAST, seed)
+    slide = Work("slide", _count(shorter, FAST), FAST, seed)
+    calm = Work("taps", _count(shorter, CALM), CALM, seed)
+    return [
+        Case("taps, loaded", fast, True, 0.0),
+        Case("plain asyncio, loaded", fast, True, None),
+        Case("taps", some, False, 0.0),
+        Case("plain asyncio", some, False, None),
+        Case("taps, loaded, pseudo-terminal", some, True, 0.0, wire="pty"),
+        Case("slide, loaded", slide, True, 0.0),
+        Case("taps at 100 Hz, loaded", calm, True, 0.0),
+        Case("taps at 100 Hz, loaded, shaped onsets", calm, True, 30.0),
+    ]
+
+
+def check_case(wire: str, seconds: float, seed: int) -> Case:
+    """What tests look at."""
+    work = Work("taps", _count(seconds, CALM), CALM, seed)
+    return Case("taps at 100 Hz", work, False, 0.0, wire=wire)
+
+
+def _count(seconds: float, rate: float) -> int:
+    return max(1, round(seconds * rate))
+
+
+def as_json(found: Found) -> dict[str, object]:
+    """What was measured, command by command, in milliseconds, and what the daemon says itself."""
+    matched = found.matched
+    return {
+        "sent": found.sent,
+        "unmatched": matched.unmatched,
+        "touch": matched.touch.tolist(),
+        "newest_ms": (1e3 * matched.newest).tolist(),
+        "oldest_ms": (1e3 * matched.oldest).tolist(),
+        "own": None if found.own is None else found.own.model_dump(),
+    }
+
+
+def lines(found: Sequence[Found | Failed], *, first: bool) -> str:
+    """Rows of the table, with its head if they are the first."""
+    return "\n".join([*([HEAD] if first else []), *map(_row, found)])
+
+
+def write_report(
+    found: Sequence[Found | Failed], *, seconds: float, seed: int, minutes: float, docs: Path = DOCS
+) -> None:
+    """The page and its picture below a folder; without any figures the page that is to be filled.
+
+    minutes: how long it all took.
+    """
+    page = docs / "measured" / "latency.md"
+    page.write_text(report(found, seconds=seconds, seed=seed, minutes=minutes), encoding="utf-8")
+    measured = [one for one in found if isinstance(one, Found) and is_drawn(one.case)]
+    if measured:
+        draw(measured, docs / PICTURE, targets=TARGETS)
+    print(f"wrote {page}")
+
+
+def report(found: Sequence[Found | Failed], *, seconds: float, seed: int, minutes: float) -> str:
+    """The text of the page."""
+    options = "" if (seconds, seed) == (USUAL, 1) else f" with --seconds {seconds:g} --seed {seed}"
+    machine = f" Python {platform.python_version()}, {platform.system()} {platform.machine()}."
+    text = INTRODUCTION.format(
+        options=options,
+        machine=machine if found else "",
+        lasts=f"it took {minutes:.0f} minutes" if found else "it takes some nine minutes",
+        slide=SLIDE,
+        tolerance=1e3 * MOVE_TOLERANCE,
+        flood=f"{FLOOD_RATE:_}".replace("_", " "),
+        workers=WORKERS,
+        nice=NICE,
+        device=DEVICE_NICE,
+    )
+    if not found:
+        return text + WITHOUT + END
+    parts = [lines(found, first=True), *filter(None, map(_disturbance, found))]
+    first, second = found[:2]
+    if isinstance(first, Found) and isinstance(second, Found):
+        parts.append(_verdict(first, second))
+    if any(isinstance(one, Found) and is_drawn(one.case) for one in found):
+        parts.append(f"![Histogram](../{PICTURE})")
+    return text + "\n\n".join(parts) + "\n" + END
+
+
+def is_drawn(case: Case) -> bool:
+    """Whether the picture shows a case."""
+    return case.work.kind == "taps" and case.work.rate == FAST
+
+
+def _disturbance(one: Found | Failed) -> str | None:
+    """What disturbed a case, None where nothing did."""
+    if isinstance(one, Failed):
+        attempts = "; then: ".join(one.why)
+        return f"**No figures of *{one.case.name}***: {attempts}."
+    if one.others > QUIET:
+        return (
+            f"***{one.case.name}* was disturbed**: others kept {one.others:.1f} processors busy, "
+            "so its figures are those of a machine that has other work as well."
+        )
+    return None
+
+
+def _row(found: Found | Failed) -> str:
+    if isinstance(found, Failed):
+        return f"| {' | '.join([found.case.name, 'no figures', *[''] * (HEAD_CELLS - 2)])} |"
+    matched = found.matched
+    cells = [
+        found.case.name + ("" if found.is_urgent else " (nice not allowed)"),
+        str(found.sent),
+        str(len(matched.touch)),
+        str(matched.unmatched),
+        *_quantiles(matched.newest),
+        _ms(matched.newest.max(initial=0.0)),
+        _ms(float(np.std(matched.newest)) if len(matched.newest) else 0.0),
+        *_quantiles(matched.oldest),
+    ]
+    own = found.own
+    cells += ["", "", ""] if own is None else [_own(own.median), _own(own.p99), _own(own.p999)]
+    computing = found.computed / max(1, len(matched.touch))
+    return f"| {' | '.join([*cells, _ms(computing), f'{found.others:.2f}'])} |"
+
+
+def _quantiles(times: np.ndarray) -> list[str]:
+    if len(times) == 0:
+        return ["", "", ""]
+    return [_ms(value) for value in np.quantile(times, [0.5, 0.99, 0.999], method="inverted_cdf")]
+
+
+def _ms(seconds: float) -> str:
+    return f"{1e3 * seconds:.2f}"
+
+
+def _own(milliseconds: float | None) -> str:
+    return "" if milliseconds is None else f"{milliseconds:.2f}"
+
+
+def _verdict(daemon: Found, exchange: Found) -> str:
+    """Whether a case is within the targets, and how it stands to the plain exchange."""
+    ours, plain = (
+        1e3 * np.quantile(one.matched.newest, [0.5, 0.99, 0.999], method="inverted_cdf")
+        for one in (daemon, exchange)
+    )
+    limits = ", ".join(
+        f"{name} {value:.2f} of {limit:g} ms ({'met' if value <= limit else '**missed**'})"
+        for name, value, limit in zip(_NAMES, ours, TARGETS, strict=True)
+    )
+    ratios = ", ".join(
+        f"{name} {value:.1f}" for name, value in zip(_NAMES, ours / plain, strict=True)
+    )
+    more = ours[0] - plain[0]
+    return (
+        f"Targets, loaded: {limits}. Times the plain exchange in the same run: {ratios}; the "
+        f"table, the guard and the rest cost {more:.2f} ms of the median."
+    )
+
+
+_NAMES = ("median", "99th percentile", "99.9th")

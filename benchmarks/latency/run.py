@@ -1,0 +1,239 @@
+"""One measurement: every part a process of its own, started, armed, touched and taken apart."""
+
+import contextlib
+import json
+import os
+import socket
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.latency.machine import Others
+from benchmarks.latency.match import Command, Expected, Matched, match
+from benchmarks.latency.programs import ERA, PATIENCE, Ended, Program, Rank, module
+from benchmarks.latency.touches import WANDERS, Work
+from controller.api.client import Client
+from controller.api.jsonrpc import RpcError
+from controller.api.schema import LatencySummary
+from controller.loop.capabilities import PlaybackCapabilities, playback_capabilities
+from drivers.protocol.definition import PROTOCOL
+from drivers.protocol.messages import Capabilities
+from drivers.protocol.wire_times import NoTimes, WireTimes
+from model.rig.file import example_rig_path, load_rig
+from model.rig.rig import Rig
+from model.table.table import LocalizationTable
+from sim.amplifier.amplifier import capabilities
+
+FLOOD_RATE = 10_000  # Hz
+WORKERS = 2  # programs at work in the loaded case, one for each core
+ATTEMPTS = 2  # at each case
+_SETTLE = 1.0  # s
+
+
+@dataclass(frozen=True)
+class Case:
+    """What is measured: the work; whether others flood and work; touch_wait [ms] of the daemon,
+    None for the plain exchange beside it; wire: `tcp` or `pty`."""
+
+    name: str
+    work: Work
+    is_loaded: bool
+    touch_wait: float | None
+    wire: str = "tcp"
+
+
+@dataclass(frozen=True)
+class Found:
+    """What came of it; own: what the daemon says itself, None for the plain exchange.
+
+    sent: how many datagrams; computed [s]: processor time meanwhile; others: processors that were
+    kept busy by whoever does not belong to it; is_urgent: whether all were as urgent as they should
+    be.
+    """
+
+    case: Case
+    matched: Matched
+    own: LatencySummary | None
+    sent: int
+    computed: float
+    others: float
+    is_urgent: bool
+
+
+@dataclass(frozen=True)
+class Failed:
+    """A case that could not be measured, and why, attempt by attempt."""
+
+    case: Case
+    why: tuple[str, ...]
+
+
+class Disturbed(Exception):
+    """The machine was so busy with something else that nothing could be measured."""
+
+
+@dataclass(frozen=True)
+class _Open:
+    """An amplifier as far as it decides what is played."""
+
+    capabilities: Capabilities
+    bus: str | None = None
+    wire_times: WireTimes = field(default_factory=NoTimes)
+
+
+def attempt(
+    case: Case,
+    measured: Callable[[], Found],
+    *,
+    attempts: int = ATTEMPTS,
+) -> Found | Failed:
+    """Measure a case, once more where that is disturbed."""
+    why: list[str] = []
+    while len(why) < attempts:
+        try:
+            return measured()
+        # A daemon that has lost its amplifier, or has too little time, answers its clients so.
+        except (Disturbed, Ended, RpcError, OSError) as error:
+            # What the daemon then says to whoever disarms it is no more than what follows.
+            first = error.__context__ if isinstance(error.__context__, Disturbed) else error
+            why.append(f"{first} (load average {os.getloadavg()[0]:.1f})")
+    return Failed(case, tuple(why))
+
+
+def measure(case: Case, table_file: Path, table: LocalizationTable) -> Found:
+    """Run one case; table: as in its file. Raises Disturbed, Ended, RpcError and OSError."""
+    with tempfile.TemporaryDirectory(prefix="era-latency-") as name, contextlib.ExitStack() as all_:
+        folder = Path(name)
+        rig_file, seen, sent_file = folder / "rig.yaml", folder / "seen.jsonl", folder / "sent.npy"
+        rig_file.write_text(example_rig_path().read_text("utf-8"), "utf-8")
+        far = Program(all_, *module("far_end"), rig_file, seen, case.wire, rank=Rank.DEVICE)
+        url = far.line()
+        path = folder / "socket"
+        daemon: Client | None = None
+        if case.touch_wait is None:
+            plain = Program(all_, *module("plain"), rig_file, url, path, rank=Rank.SERVICE)
+            port, tested = int(plain.line()), plain
+        else:
+            port = _free_port()
+            config = _daemon_file(folder, url, table_file, port, case.touch_wait)
+            tested = Program(all_, ERA, "daemon", config, rank=Rank.SERVICE)
+            daemon = _client(all_, path, tested)
+            all_.enter_context(daemon.armed("latency"))
+        panel = Program(
+            all_,
+            *(*module("clients"), "panel", rig_file, port),
+            *(case.work.kind, case.work.count, case.work.rate, case.work.seed, sent_file),
+            rank=Rank.DEVICE,
+        )
+        panel.line()
+        programs = [far, tested, panel]
+        if case.is_loaded:
+            flood = Program(all_, *module("clients"), "flood", path, rig_file, FLOOD_RATE)
+            flood.line()
+            programs.append(flood)
+            programs += [Program(all_, *module("clients"), "work") for _ in range(WORKERS)]
+        time.sleep(_SETTLE)
+        others = Others(lambda: sum(program.computed() for program in programs))
+        computed = -tested.computed()
+        panel.tell("go")
+        panel.line()
+        computed += tested.computed()
+        busy = others.processors()
+        own = None
+        if daemon is not None:
+            status = daemon.status()
+            if status.state != "OPERATION_ENABLED":
+                raise Disturbed(
+                    f"while others kept {busy:.1f} processors busy the daemon went to "
+                    f"{status.state}: {status.cause}"
+                )
+            own = status.latency_ms
+        panel.tell("done")
+        panel.wait(PATIENCE)
+        far.finish()
+        rig = load_rig(rig_file)
+        sent = np.load(sent_file) * 1e-9
+        commands = [
+            Command.read(json.loads(line), PROTOCOL.types["apply"])
+            for line in seen.read_text("utf-8").splitlines()
+        ]
+    matched = _matched(case, commands, sent, rig, table)
+    is_urgent = all(program.is_urgent for program in programs)
+    return Found(case, matched, own, len(sent), computed, busy, is_urgent)
+
+
+def _matched(
+    case: Case,
+    commands: Sequence[Command],
+    sent: np.ndarray,
+    rig: Rig,
+    table: LocalizationTable,
+) -> Matched:
+    """The commands from the first touch on, by the touches that they answer."""
+    since = [each for each in commands if sent[0] <= each.time <= sent[-1] + LAST]
+    if case.touch_wait is None:
+        return match(
+            since,
+            sent,
+            lambda touch, command: abs((touch + 1 & 0xFFFF) - command.sequence),
+            first=lambda before, touch: touch,
+        )
+    capabilities = _capabilities(rig, case.touch_wait)
+    # Of two patterns that are as good a hundredth of a millimetre may decide; and the flood's
+    # finger is lifted where the flood itself gets no processor for 150 ms.
+    floods = (0.0, WANDERS, None) if case.is_loaded else (None,)
+    expected = [Expected(case.work, rig, table, capabilities, flooded=each) for each in floods]
+    # A set whose answer was late is sent once more, under its token.
+    repeated = {id(each) for one, each in pairwise(since) if each.token == one.token}
+    vibrating = [
+        each
+        for each in since
+        if id(each) not in repeated and any(command.level > 0 for command in each.commands)
+    ]
+    return match(vibrating, sent, *(each.error for each in expected), first=expected[0].first)
+
+
+LAST = 0.03  # s; after the last touch fingers expire, and silence answers none
+
+
+def _capabilities(rig: Rig, touch_wait: float) -> PlaybackCapabilities:
+    opened = {name: _Open(capabilities(4)) for name in rig.amplifiers}
+    return playback_capabilities(rig, opened, envelope_time=touch_wait * 1e-3)
+
+
+def _daemon_file(folder: Path, url: str, table: Path, port: int, touch_wait: float) -> Path:
+    rig = folder / "rig.yaml"
+    rig.write_text(rig.read_text("utf-8").replace('"sim://"', f'"{url}"'), "utf-8")
+    path = folder / "daemon.yaml"
+    path.write_text(
+        f"rig: rig.yaml\nsocket: socket\ntable: {table}\ntouch_wait: {touch_wait:g} ms\n"
+        f"touch:\n  - {{name: panel, url: 'tuio:127.0.0.1:{port}'}}\nlog: {{level: warning}}\n",
+        "utf-8",
+    )
+    return path
+
+
+def _client(stack: contextlib.ExitStack, path: Path, serving: Program) -> Client:
+    """A client, until the stack ends, of a daemon that has come up and can be armed."""
+    end = time.monotonic() + PATIENCE
+    client: Client | None = None
+    while time.monotonic() < end:
+        serving.check()
+        if client is None:
+            with contextlib.suppress(OSError):
+                client = stack.enter_context(Client.connect(path, name="latency"))
+        elif client.status().state == "READY_TO_SWITCH_ON":
+            return client
+        time.sleep(0.05)
+    raise Disturbed(f"the daemon was not ready within {PATIENCE:g} s")
+
+
+def _free_port() -> int:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as line:
+        line.bind(("127.0.0.1", 0))
+        return int(line.getsockname()[1])

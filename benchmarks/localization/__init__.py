@@ -1,0 +1,1 @@
+"""Contrast and speed of the drive modes, beside other methods and bounds."""

@@ -1,0 +1,1 @@
+"""Speed of the plate in time, and a picture of it."""

@@ -1,0 +1,23 @@
+"""What is simulated when the plate in time is timed: values only, so that numpy loads later."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+RIG = Path(__file__).parents[2] / "examples" / "paper_plate.yaml"
+STEP = 0.01  # s
+FINGERS = ((0.10, 0.08), (0.25, 0.17), (0.05, 0.19), (0.18, 0.03), (0.28, 0.05),
+           (0.15, 0.14), (0.21, 0.20), (0.03, 0.03), (0.12, 0.21), (0.20, 0.10))  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Case:
+    """What is simulated: so many ERAs on so many amplifiers, and who touches the plate."""
+
+    eras: int = 4
+    amplifiers: int = 1
+    fingers: int = 2
+    loading: bool = False
+    frequency_max: float = 500.0
+    step: float = STEP
+    taps: int = 0  # a second
+    commands: int = 0  # a second

@@ -1,0 +1,1 @@
+"""The same plate solved by other programs."""

@@ -1,0 +1,1 @@
+"""Shaped onsets and endings beside plain ramps."""

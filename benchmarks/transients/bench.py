@@ -1,0 +1,176 @@
+"""Onsets and endings of many patterns on one rig, and how long shaping them takes."""
+
+import time
+from collections import defaultdict
+from collections.abc import Callable
+from functools import partial
+from typing import TypeVar
+
+import numpy as np
+
+from benchmarks.transients.cases import (
+    FREQUENCIES,
+    Case,
+    case_of,
+    quantised,
+    with_errors,
+    wrong,
+)
+from model.fem.assembly import era_positions
+from model.reduction.reduced_plate import reduce_plate
+from model.rig.rig import Rig
+from model.structure.point_load import load_positions
+from model.table.build import build_table
+from model.table.question import Question
+from model.transients.envelope import Bases, ramped_ending, ramped_onset, shaped
+from model.transients.measures import Transients
+from model.transients.shaping import Shaper
+from model.transients.time_response import PlateInTime, plate_in_time
+from model.vibration.excitation import Excitation
+
+T = TypeVar("T")
+Columns = dict[str, list[float]]
+
+
+class Stopwatch:
+    """Processor times [s] of calls by what was called, which other work does not lengthen."""
+
+    def __init__(self) -> None:
+        self.times: dict[str, list[float]] = defaultdict(list)
+
+    def __call__(self, name: str, call: Callable[[], T]) -> T:
+        started = time.thread_time()
+        result = call()
+        self.times[name].append(time.thread_time() - started)
+        return result
+
+    def show(self) -> None:
+        print("\nprocessor time of one thread, median and 99th percentile")
+        for name, times in sorted(self.times.items()):
+            middle, most = 1e3 * np.median(times), 1e3 * np.percentile(times, 99)
+            print(f"  {name:34s} {middle:6.2f} ms {most:6.2f} ms  ({len(times)} calls)")
+
+
+class Bench:
+    """One rig, what shapes for it and what predicts."""
+
+    def __init__(self, rig: Rig, *, draws: int, rng: np.random.Generator) -> None:
+        self.rig = rig
+        self.plate = in_time(rig)
+        self.shaper, self.transients = Shaper(self.plate), Transients(self.plate)
+        self.clock = Stopwatch()
+        self.table = build_table(rig, frequencies=FREQUENCIES)
+        self._draws, self._rng = draws, rng
+        self._prepared: set[float] = set()
+
+    def onsets(self, cases: list[list[Case]]) -> Columns:
+        columns: Columns = defaultdict(list)
+        for patterns in cases:
+            case = patterns[0]
+            excitation = case.excitation(self.rig)
+            errors = wrong(self._rng, len(self.rig.eras), self._draws)
+            columns["steady"].append(case.steady_db(case.weights))
+            columns["steady, realised"].append(
+                float(np.median([case.steady_db(case.weights * each) for each in errors]))
+            )
+            for name, ramp in (("abrupt", 0.0), ("20 ms ramp", 0.02), ("40 ms ramp", 0.04)):
+                bases = ramped_onset(excitation, self.rig.eras, ramp=ramp)
+                columns[name].append(self._contrast(case, bases))
+            chosen = self.table.query(
+                Question(
+                    tuple(case.targets), tuple(case.quiet), drive_mode="phased", level_db_sl=12.0
+                )
+            )
+            bases = ramped_onset(chosen.excitation, self.rig.eras, ramp=chosen.ramp)
+            columns["the table's pattern and ramp"].append(self._contrast(case, bases))
+            played = case_of(chosen.excitation, patterns, self.rig)
+            columns["the same, steady, realised"].append(
+                float(np.median([played.steady_db(played.weights * each) for each in errors]))
+            )
+            if case.frequency not in self._prepared:
+                self._prepared.add(case.frequency)
+                self.clock("a frequency's first use", partial(self.shaper.prepare, case.frequency))
+            envelopes = self.clock(
+                f"onset, {len(case.quiet)} quiet",
+                partial(self.shaper.onset, excitation, targets=case.targets, quiet=case.quiet),
+            )
+            columns["shaped"].append(self._contrast(case, shaped(envelopes, self.rig.eras)))
+            columns["shaped, as a wire carries it"].append(
+                self._contrast(case, shaped(quantised(envelopes, self.rig), self.rig.eras))
+            )
+            realised = [
+                self._contrast(case, shaped(with_errors(envelopes, self.rig, each), self.rig.eras))
+                for each in errors
+            ]
+            columns["shaped, realised"].append(float(np.median(realised)))
+            columns["largest level"].append(
+                max(each.largest / self.rig.era(name).stroke for name, each in envelopes.items())
+            )
+        return columns
+
+    def endings(self, cases: list[Case], *, full: bool) -> tuple[Columns, Columns]:
+        left: Columns = defaultdict(list)
+        contrast: Columns = defaultdict(list)
+        eras = self.rig.eras
+        for case in cases:
+            level = 1.0 if full else case.felt_level
+            excitation = case.excitation(self.rig, level)
+            errors = wrong(self._rng, len(eras), self._draws)
+            for name, ramp in (("stopped", 0.0), ("20 ms ramp", 0.02), ("40 ms ramp", 0.04)):
+                bases = ramped_ending(excitation, eras, ramp=ramp)
+                left[name].append(self._left(excitation, bases))
+                contrast[name].append(self._end_contrast(case, excitation, bases))
+            brake = self.clock("ending", partial(self.shaper.ending, excitation))
+            quiet_brake = self.clock(
+                f"ending, {len(case.quiet)} quiet",
+                partial(self.shaper.ending, excitation, targets=case.targets, quiet=case.quiet),
+            )
+            for name, envelopes in (("40 ms brake", brake), ("the same, quietly", quiet_brake)):
+                bases = shaped(envelopes, eras)
+                left[name].append(self._left(excitation, bases))
+                contrast[name].append(self._end_contrast(case, excitation, bases))
+                realised = [
+                    (
+                        case.excitation(self.rig, level, each),
+                        shaped(with_errors(envelopes, self.rig, each), eras),
+                    )
+                    for each in errors
+                ]
+                left[f"{name}, realised"].append(
+                    float(np.median([self._left(*each) for each in realised]))
+                )
+                contrast[f"{name}, realised"].append(
+                    float(np.median([self._end_contrast(case, *each) for each in realised]))
+                )
+                left[f"{name}, largest level"].append(
+                    max(each.largest / self.rig.era(era).stroke for era, each in envelopes.items())
+                )
+        return left, contrast
+
+    def _end_contrast(self, case: Case, excitation: Excitation, bases: Bases) -> float:
+        return self.transients.ending_contrast_db(
+            excitation, bases, targets=case.targets, quiet=case.quiet
+        )
+
+    def _left(self, excitation: Excitation, bases: Bases) -> float:
+        return self.clock("level left", lambda: self.transients.left_db(excitation, bases))
+
+    def _contrast(self, case: Case, bases: Bases) -> float:
+        return self.clock(
+            f"transient contrast, {len(case.quiet)} quiet",
+            lambda: self.transients.contrast_db(bases, targets=case.targets, quiet=case.quiet),
+        )
+
+
+def in_time(rig: Rig) -> PlateInTime:
+    """The rig's plate on its ERAs in time."""
+    attachments = np.vstack([era_positions(rig.eras), load_positions(rig.loads)])
+    reduced = reduce_plate(rig.plate, rig.mesh, attachments, frequency_max=rig.limits.frequency_max)
+    return plate_in_time(reduced, rig.eras, loads=rig.loads)
+
+
+def print_columns(title: str, columns: Columns, *, worse: float) -> None:
+    print(f"\n{title}")
+    for name, values in columns.items():
+        unit = "" if name.endswith("largest level") else " dB"
+        print(f"  {name:34s} {np.median(values):6.1f} ({np.percentile(values, worse):6.1f}){unit}")

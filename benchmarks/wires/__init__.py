@@ -1,0 +1,1 @@
+"""What each wire costs beside the bare library."""

@@ -1,56 +1,58 @@
-"""The daemon's API for asyncio programs; `controller.api.client` is the same for others.
+"""asyncio client of the daemon's API; `controller.api.client` is the blocking one.
 
 async with await AsyncClient.connect() as era:
     await era.subscribe("pattern")
-    async for told in era.events():
-        print(told.data)
+    async for event in era.events():
+        print(event.data)
 """
 
 import asyncio
 import contextlib
-from collections.abc import AsyncIterator, Callable, Coroutine
+from collections.abc import AsyncIterator, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Concatenate, ParamSpec, Self, TypeVar
+from typing import Any, Self, TypeVar
 
-from controller.api import calls
-from controller.api.calls import Call, as_message
 from controller.api.client_protocol import (
-    Greeting,
+    DEFAULT_LEASE,
+    MAX_QUEUED_EVENTS,
+    READ_SIZE,
+    RESPONSE_TIMEOUT,
+    ClientProtocol,
     Notification,
     Response,
     Unreachable,
     check_version,
+    make_params,
+    position,
+    read_result,
+    touch_params,
 )
-from controller.api.conversation import CHUNK, MAX_QUEUED_EVENTS, RESPONSE_TIMEOUT, Conversation
 from controller.api.jsonrpc import RpcError
-from controller.api.methods import ArmResult
-from controller.api.schema import Message
+from controller.api.methods import (
+    ArmParams,
+    ArmResult,
+    EffectsResult,
+    HelloParams,
+    HelloResult,
+    PlayParams,
+    RenewParams,
+    RenewResult,
+    StatusResult,
+    SubscribeParams,
+    UnsubscribeParams,
+)
+from controller.api.schema import Empty, Message, Topic
 from controller.api.socket_path import find_socket
 
-_P = ParamSpec("_P")
-_ResultT = TypeVar("_ResultT")
-_MessageT = TypeVar("_MessageT", bound=Message)
-
-
-def _method(
-    make: Callable[_P, Call[_ResultT]],
-) -> Callable[Concatenate["AsyncClient", _P], Coroutine[Any, Any, _ResultT]]:
-    """The method that makes a call and gives its answer."""
-
-    checked = calls.in_words(make)
-
-    async def ask(client: "AsyncClient", /, *args: _P.args, **kwargs: _P.kwargs) -> _ResultT:
-        return await client._ask(checked(*args, **kwargs))
-
-    calls.name_after(make, ask)
-    return ask
+_ResultT = TypeVar("_ResultT", bound=Message)
 
 
 class AsyncClient:
-    """A connection to a daemon, made by `connect`; any number of calls may be under way.
+    """A connection to a daemon, made by `connect`; any number of calls may be pending.
 
-    Errors of the daemon raise RpcError, and Unreachable, a LinkError, where no answer comes.
+    Every method raises RpcError for an error of the daemon, and Unreachable, a LinkError, without a
+    response.
     """
 
     def __init__(
@@ -65,11 +67,11 @@ class AsyncClient:
         self._reader = reader
         self._writer = writer
         self._timeout = timeout
-        self._conversation = Conversation()
-        self._waiting: dict[int, asyncio.Future[Response]] = {}
+        self._protocol = ClientProtocol()
+        self._pending: dict[int, asyncio.Future[Response]] = {}
         self._events: asyncio.Queue[Notification | None] = asyncio.Queue()
-        self._gone: Unreachable | None = None
-        self._reading = asyncio.create_task(self._read_all(), name="daemon's answers")
+        self._lost: Unreachable | None = None
+        self._receiving = asyncio.create_task(self._receive(), name="API client")
 
     @classmethod
     async def connect(
@@ -79,17 +81,16 @@ class AsyncClient:
         name: str = "python",
         timeout: float = RESPONSE_TIMEOUT,
     ) -> Self:
-        """A connection that has said hello; as `Client.connect`."""
-        greeting = calls.greeting(name)
-        at = find_socket(path)
+        """Connect and introduce this client, like `Client.connect`."""
+        params = make_params(HelloParams, client=name)
+        socket = find_socket(path)
         try:
-            reader, writer = await asyncio.open_unix_connection(str(at))
+            reader, writer = await asyncio.open_unix_connection(str(socket))
         except OSError as error:
-            raise Unreachable.at(at, error) from error
-        client = cls(at, reader, writer, timeout=timeout)
+            raise Unreachable.at(socket, error) from error
+        client = cls(socket, reader, writer, timeout=timeout)
         try:
-            said = await client.call("hello", greeting, Greeting)
-            check_version(said, at)
+            check_version(await client.request("hello", params), socket)
         except BaseException:
             await client.close()
             raise
@@ -107,36 +108,75 @@ class AsyncClient:
         await self.close()
 
     async def close(self) -> None:
-        """Hang up: fingers that were put down are lifted."""
+        """Close the connection; the daemon lifts this client's fingers."""
         self._writer.close()
-        self._reading.cancel()
-        await asyncio.gather(self._reading, return_exceptions=True)
+        self._receiving.cancel()
+        await asyncio.gather(self._receiving, return_exceptions=True)
         with contextlib.suppress(OSError):
             await self._writer.wait_closed()
 
-    hello = _method(calls.hello)
-    status = _method(calls.status)
-    arm = _method(calls.arm)
-    renew = _method(calls.renew)
-    disarm = _method(calls.disarm)
-    stop = _method(calls.stop)
-    clear = _method(calls.clear)
-    touch = _method(calls.touch)
-    effects = _method(calls.effects)
-    play = _method(calls.play)
-    subscribe = _method(calls.subscribe)
-    unsubscribe = _method(calls.unsubscribe)
+    async def hello(self, client: str) -> HelloResult:
+        """Introduce this client by another name; return what the daemon drives."""
+        return await self.call("hello", make_params(HelloParams, client=client), HelloResult)
+
+    async def status(self) -> StatusResult:
+        """Return the state of the daemon, the amplifiers and the plate."""
+        return await self.call("status", Empty(), StatusResult)
+
+    async def arm(self, owner: str, *, lease_s: float = DEFAULT_LEASE) -> ArmResult:
+        """Switch high voltage on until the lease expires; `armed` renews it by itself."""
+        params = make_params(ArmParams, owner=owner, lease_s=lease_s)
+        return await self.call("arm", params, ArmResult)
+
+    async def renew(self, lease: str) -> RenewResult:
+        """Extend the lease by its full length from now."""
+        return await self.call("renew", make_params(RenewParams, lease=lease), RenewResult)
+
+    async def disarm(self) -> None:
+        """Ramp to silence and switch high voltage off."""
+        await self.call("disarm", Empty(), Empty)
+
+    async def stop(self) -> None:
+        """Quick stop, latched until `clear`."""
+        await self.call("stop", Empty(), Empty)
+
+    async def clear(self) -> None:
+        """Acknowledge a stop, or a fault whose cause is gone."""
+        await self.call("clear", Empty(), Empty)
+
+    async def touch(self, places: Sequence[tuple[float, float]], *, source: str = "python") -> None:
+        """Report all fingers of a source, at x, y [m]; valid for 150 ms, so repeat it."""
+        await self.call("touch", touch_params(places, source), Empty)
+
+    async def effects(self) -> EffectsResult:
+        """List the effects."""
+        return await self.call("effects", Empty(), EffectsResult)
+
+    async def play(
+        self, effect: str, place: tuple[float, float], *, level_db_sl: float | None = None
+    ) -> None:
+        """Play an effect at the finger nearest to x, y [m]."""
+        x, y = position(place)
+        params = make_params(PlayParams, effect=effect, x_m=x, y_m=y, level_db_sl=level_db_sl)
+        await self.call("play", params, Empty)
+
+    async def subscribe(self, *topics: Topic, rate_hz: float | None = None) -> None:
+        """Receive notifications of topics; see `events`."""
+        params = make_params(SubscribeParams, topics=list(topics), rate_hz=rate_hz)
+        await self.call("subscribe", params, Empty)
+
+    async def unsubscribe(self, *topics: Topic) -> None:
+        """Receive no more notifications of topics."""
+        await self.call("unsubscribe", make_params(UnsubscribeParams, topics=list(topics)), Empty)
 
     @contextlib.asynccontextmanager
-    async def armed(
-        self, owner: str, *, lease_s: float = calls.DEFAULT_LEASE
-    ) -> AsyncIterator[None]:
+    async def armed(self, owner: str, *, lease_s: float = DEFAULT_LEASE) -> AsyncIterator[None]:
         """Armed within the block, disarmed after it; a task renews the lease meanwhile."""
         arming = asyncio.ensure_future(self.arm(owner, lease_s=lease_s))
         try:
             lease = await asyncio.shield(arming)
         except asyncio.CancelledError:
-            with contextlib.suppress(RpcError, Unreachable):  # refused, it is somebody else's
+            with contextlib.suppress(RpcError, Unreachable):  # if refused, another client's lease
                 await arming
                 await self.disarm()
             raise
@@ -149,65 +189,65 @@ class AsyncClient:
             await self.disarm()
 
     async def events(self) -> AsyncIterator[Notification]:
-        """What the daemon tells, as it comes; ends with the connection."""
-        while (told := await self._events.get()) is not None:
-            yield told
-        self._events.put_nowait(None)  # it has ended for whoever listens next, too
+        """Yield notifications as they arrive; end with the connection."""
+        while (event := await self._events.get()) is not None:
+            yield event
+        self._events.put_nowait(None)  # for later iterators
 
-    async def call(self, method: str, params: Message, result: type[_MessageT]) -> _MessageT:
-        """Ask by any method of the API, and wait for the answer."""
-        return await self._ask(Call(method, params, as_message(result)))
+    async def call(self, method: str, params: Message, result: type[_ResultT]) -> _ResultT:
+        """Call any method and return its result."""
+        return read_result(await self.request(method, params), result)
 
-    async def _ask(self, call: Call[_ResultT]) -> _ResultT:
-        if self._gone is not None:
-            raise self._gone
-        number, line = self._conversation.ask(call)
-        answer = self._waiting[number] = asyncio.get_running_loop().create_future()
+    async def request(self, method: str, params: Message) -> Any:
+        """Call any method and return its result as parsed JSON."""
+        if self._lost is not None:
+            raise self._lost
+        id, line = self._protocol.request(method, params)
+        response = self._pending[id] = asyncio.get_running_loop().create_future()
         try:
             self._writer.write(line)
             async with asyncio.timeout(self._timeout):
                 await self._writer.drain()
-                said = (await answer).said
+                return (await response).result()
         except Unreachable:
             raise
         except OSError as error:
             raise Unreachable.at(self.path, error) from error
         finally:
-            del self._waiting[number]
-        return call.read(said)
+            del self._pending[id]
 
-    async def _read_all(self) -> None:
-        """Give every reply to whoever waits for it, until the connection ends."""
-        gone = Unreachable.at(self.path, ConnectionResetError("the daemon has hung up"))
+    async def _receive(self) -> None:
+        """Hand out responses and notifications until the connection ends."""
+        lost = Unreachable.at(self.path, ConnectionResetError("closed by the daemon"))
         try:
-            while data := await self._reader.read(CHUNK):
-                for reply in self._conversation.hear(data):
-                    if isinstance(reply, Notification):
-                        self._keep(reply)
+            while data := await self._reader.read(READ_SIZE):
+                for received in self._protocol.receive(data):
+                    if isinstance(received, Notification):
+                        self._queue(received)
                     else:
-                        self._settle(reply)
+                        self._resolve(received)
         except Unreachable as error:
-            gone = error
+            lost = error
         except OSError as error:
-            gone = Unreachable.at(self.path, error)
+            lost = Unreachable.at(self.path, error)
         finally:
-            self._gone = gone
-            for answer in self._waiting.values():
-                if not answer.done():
-                    answer.set_exception(gone)
+            self._lost = lost
+            for pending in self._pending.values():
+                if not pending.done():
+                    pending.set_exception(lost)
             self._events.put_nowait(None)
 
-    def _keep(self, told: Notification) -> None:
-        """Keep a notification for `events`; the oldest gives way."""
+    def _queue(self, event: Notification) -> None:
+        """Queue a notification for `events`, dropping the oldest of too many."""
         if self._events.qsize() >= MAX_QUEUED_EVENTS:
             self._events.get_nowait()
-        self._events.put_nowait(told)
+        self._events.put_nowait(event)
 
-    def _settle(self, answer: Response) -> None:
-        """Hand an answer to whoever waits for it; one to no request in particular to everybody."""
-        for number, waiting in self._waiting.items():
-            if answer.number in (number, None) and not waiting.done():
-                waiting.set_result(answer)
+    def _resolve(self, response: Response) -> None:
+        """Resolve the call that a response is for; without an id, all of them."""
+        for id, pending in self._pending.items():
+            if response.id in (id, None) and not pending.done():
+                pending.set_result(response)
 
     async def _keep_renewing(self, lease: ArmResult) -> None:
         with contextlib.suppress(RpcError, Unreachable):

@@ -1,105 +1,165 @@
-"""What clients make of the daemon's lines.
+"""The client's side of the API without I/O: calls to lines, lines to responses and events.
 
-A daemon of a later minor version says more than this program knows of: that is ignored here, while
-the server itself is strict about everything that it is asked.
+A daemon of a later minor version sends keys that this program does not know: they are ignored here,
+whereas the server is strict about every request.
 """
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeAlias, TypeVar
+from typing import Any, TypeVar, cast
 
 from pydantic import ValidationError
 
-from controller.api.jsonrpc import ErrorCode, RpcError
-from controller.api.schema import API_VERSION, Message
+from controller.api.jsonrpc import ErrorCode, RpcError, request_line
+from controller.api.methods import TouchParams
+from controller.api.schema import API_VERSION, Message, TouchPoint
 from drivers.errors import LinkError
+from model.arguments import shown
+from model.errors import InputError, first_problem
+
+RESPONSE_TIMEOUT = 5.0  # s; arming takes longest, some tenths of a second
+DEFAULT_LEASE = 10.0  # s
+MAX_QUEUED_EVENTS = 1000  # not yet taken from `events`; the oldest is dropped
+READ_SIZE = 1 << 16  # bytes
 
 _MessageT = TypeVar("_MessageT", bound=Message)
 
 
 class Unreachable(LinkError):
-    """Nobody answers at the daemon's socket, or not any more, or nobody who can be understood."""
+    """No daemon answers at the socket, or one of an incompatible version."""
 
     @classmethod
     def at(cls, path: Path, error: OSError) -> "Unreachable":
-        """With what to do about it."""
+        """The failure to talk to a daemon at a socket, with its remedy."""
         if path.exists() and not path.is_socket():
-            return cls(f"{path} is no socket; give the one that `era daemon` says it serves at")
+            return cls(f"{path} is not a socket; give the one that `era daemon` printed")
         if isinstance(error, FileNotFoundError | ConnectionRefusedError):
             return cls(
                 f"no daemon runs at {path}; start one (era daemon CONFIG), or give the socket of "
-                "the one that runs (--socket PATH)"
+                "the running one (--socket PATH)"
             )
         if isinstance(error, PermissionError):
-            return cls(f"{path} belongs to somebody else; ask whoever runs the daemon")
+            return cls(f"{path} belongs to another user; run as the user of the daemon")
         if isinstance(error, TimeoutError):
-            return cls(f"the daemon at {path} does not answer; see its log, or start it anew")
-        why = error.strerror or error
-        return cls(f"the daemon at {path} is gone ({why}); see its log, or start it anew")
+            return cls(f"the daemon at {path} does not respond; see its log, or restart it")
+        reason = error.strerror or error
+        return cls(
+            f"connection to the daemon at {path} lost ({reason}); see its log, or restart it"
+        )
 
 
 @dataclass(frozen=True)
 class Notification:
-    """What the daemon tells of a topic: when [s], how many were lost before it, and its data."""
+    """An event: topic, time [s], number of events dropped before it, data; line: as received."""
 
     topic: str
     time: float
     lost: int
     data: Mapping[str, Any]
+    line: bytes = b""
 
 
 @dataclass(frozen=True)
 class Response:
-    """What the daemon says to the request of a number; of None: to whatever it was."""
+    """The response to the request of an id; id None: to a request that could not be read."""
 
-    number: int | None
-    said: Mapping[str, Any]
+    id: int | None
+    content: Mapping[str, Any]
+
+    def result(self) -> Any:
+        """The result; raises the RpcError that the response holds instead."""
+        try:
+            if "error" in self.content:
+                raise _rpc_error(self.content["error"])
+            return self.content["result"]
+        except (KeyError, TypeError, ValueError, ValidationError) as error:
+            raise _not_understood() from error
 
 
-Reply: TypeAlias = Response | Notification
+class ClientProtocol:
+    """Numbers requests, and assembles the daemon's bytes to responses and notifications."""
+
+    def __init__(self) -> None:
+        self._last_id = 0
+        self._rest = b""
+
+    def request(self, method: str, params: Message) -> tuple[int, bytes]:
+        """The id of a new request, and the line to send."""
+        self._last_id += 1
+        return self._last_id, request_line(self._last_id, method, params)
+
+    def receive(self, data: bytes) -> list[Response | Notification]:
+        """What these bytes complete; raises Unreachable for what is not a daemon's."""
+        *lines, self._rest = (self._rest + data).split(b"\n")
+        return [_read(line) for line in lines]
 
 
-class Greeting(Message):
-    """Of what `hello` answers the one thing that every version has."""
-
-    api_version: str
-
-
-def reply_of(line: bytes) -> Reply:
-    """What a line is; raises Unreachable for one that a daemon would not say."""
+def make_params(model: type[_MessageT], **values: object) -> _MessageT:
+    """The parameters of a method; raises InputError with the key and the value that is wrong."""
     try:
-        said = json.loads(line)
-        if said.get("method") != "event":
-            return Response(said["id"], said)
-        params = said["params"]
-        return Notification(params["topic"], params["time_s"], params["lost"], params["data"])
-    except (ValueError, AttributeError, KeyError, TypeError) as error:
-        raise _foreign() from error
+        return model(**values)
+    except ValidationError as error:
+        method = model.__name__.removesuffix("Params").lower()
+        key, problem = first_problem(error)
+        value = error.errors()[0]["input"]
+        raise InputError(f"{method}: {key} {problem}, got {shown(value)}") from None
 
 
-def result_of(said: Mapping[str, Any], model: type[_MessageT]) -> _MessageT:
-    """The result that an answer tells; raises the RpcError that it tells instead."""
+def touch_params(places: Iterable[tuple[float, float]], source: str) -> TouchParams:
+    """A touch frame with fingers at x, y [m]; raises InputError."""
+    if not isinstance(places, Iterable):
+        raise InputError(f"touch: places must be a list of x, y in metres, got {shown(places)}")
+    positions = [position(place) for place in places]
+    touches = [TouchPoint(id=id, x_m=x, y_m=y) for id, (x, y) in enumerate(positions, start=1)]
+    return make_params(TouchParams, source=source, touches=touches)
+
+
+def position(place: object) -> tuple[float, float]:
+    """A finger's x, y [m]; raises InputError."""
     try:
-        if "error" in said:
-            raise _error_of(said["error"])
-        return model.model_validate_json(json.dumps(said["result"]), extra="ignore")
-    except (KeyError, TypeError, ValueError, ValidationError) as error:
-        raise _foreign() from error
+        x, y = (float(each) for each in cast("Iterable[float]", place))
+    except (TypeError, ValueError):
+        raise InputError(
+            "a finger's place must be x, y in metres from the plate's south-west corner, such as "
+            f"(0.10, 0.05), got {shown(place)}"
+        ) from None
+    return x, y
 
 
-def check_version(greeting: Greeting, at: Path) -> None:
-    """Raise Unreachable for a daemon at a socket that speaks another major version."""
-    theirs = greeting.api_version
-    if theirs.partition(".")[0] != API_VERSION.partition(".")[0]:
+def read_result(result: object, model: type[_MessageT]) -> _MessageT:
+    """Validate a result, ignoring unknown keys; raises Unreachable."""
+    try:
+        return model.model_validate_json(json.dumps(result), extra="ignore")
+    except ValidationError as error:
+        raise _not_understood() from error
+
+
+def check_version(hello: object, path: Path) -> None:
+    """Check the daemon's major version in the result of `hello`; raises Unreachable."""
+    version = hello.get("api_version") if isinstance(hello, dict) else None
+    if not isinstance(version, str):
+        raise _not_understood()
+    if version.partition(".")[0] != API_VERSION.partition(".")[0]:
         raise Unreachable(
-            f"the daemon at {at} speaks version {theirs:.20} of the API, this program "
+            f"the daemon at {path} speaks version {version:.20} of the API, this program "
             f"{API_VERSION}; update the older of the two"
         )
 
 
-def _error_of(error: Mapping[str, Any]) -> RpcError:
+def _read(line: bytes) -> Response | Notification:
+    try:
+        content = json.loads(line)
+        if content.get("method") != "event":
+            return Response(content["id"], content)
+        params = content["params"]
+        return Notification(params["topic"], params["time_s"], params["lost"], params["data"], line)
+    except (ValueError, AttributeError, KeyError, TypeError) as error:
+        raise _not_understood() from error
+
+
+def _rpc_error(error: Mapping[str, Any]) -> RpcError:
     data = error.get("data") or {}
     return RpcError(
         ErrorCode(error["code"]),
@@ -109,8 +169,7 @@ def _error_of(error: Mapping[str, Any]) -> RpcError:
     )
 
 
-def _foreign() -> Unreachable:
+def _not_understood() -> Unreachable:
     return Unreachable(
-        "the daemon answered something that this program does not understand; update the older of "
-        "the two"
+        "the daemon sent a line that this program does not understand; update the older of the two"
     )

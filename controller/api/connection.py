@@ -1,7 +1,7 @@
-"""One client of the API: bytes in, lines out, and bounds on both.
+"""One client's connection to the API server: bytes in, lines out, bounds on both.
 
-Nothing here waits. Lines are taken one at a time by whoever serves all connections in turn, so that
-a flood on one costs the others nothing; what a client does not read is bounded, and then lost.
+Nothing here waits. The server takes lines one at a time from all connections in turn, so that a
+flood on one costs the others nothing; output that a client does not read is bounded, then dropped.
 """
 
 import asyncio
@@ -13,35 +13,39 @@ from controller.api.jsonrpc import MAX_LINE_LENGTH, ErrorCode, RpcError, error_l
 from controller.api.rate_limit import RateLimiter
 from controller.api.superseded import is_superseded
 
-MAX_UNREAD_BYTES = 1 << 18  # bytes that a client has not read
-_NOTIFICATION_LIMIT = MAX_UNREAD_BYTES // 2  # the rest is for answers
-_INCOMING_LIMIT = 1 << 16  # bytes that are read ahead of what was served
-UNREAD_TIMEOUT = 5.0  # s; how long a client may lose notifications before it loses the connection
+MAX_UNREAD_BYTES = 1 << 18  # written but not read by the client
+_MAX_UNREAD_NOTIFICATIONS = MAX_UNREAD_BYTES // 2  # bytes; the rest is reserved for responses
+_MAX_READ_AHEAD = 1 << 16  # bytes of lines that wait to be served
+UNREAD_TIMEOUT = 5.0  # s; for losing notifications before the connection is closed
 
-MAX_REQUEST_RATE = 2000.0  # 1/s, and as many at once
+MAX_REQUEST_RATE = 2000.0  # 1/s, and as many in a burst
 
 
 class Connection(asyncio.Protocol):
-    """A client; on_lines is called when there is something to serve, on_end once in the end."""
+    """A client's connection.
+
+    on_connect: returns False to refuse it; on_lines: lines wait to be served; on_disconnect: called
+    once at the end.
+    """
 
     def __init__(
         self,
         *,
-        on_begin: "Callable[[Connection], bool]",
+        on_connect: "Callable[[Connection], bool]",
         on_lines: "Callable[[Connection], None]",
-        on_end: "Callable[[Connection], None]",
+        on_disconnect: "Callable[[Connection], None]",
         clock: Callable[[], float],
     ) -> None:
-        self.name = "somebody"
-        self.heard_at = clock()  # s; when the last bytes came
+        self.name = "unnamed client"
+        self.received_at = clock()  # s; when the last bytes arrived
         self.pending: set[asyncio.Task[None]] = set()
-        self._on_begin = on_begin
+        self._on_connect = on_connect
         self._on_lines = on_lines
-        self._on_end = on_end
+        self._on_disconnect = on_disconnect
         self._clock = clock
         self._transport: asyncio.Transport | None = None
         self._lines: deque[bytes] = deque()
-        self._ahead = 0
+        self._waiting_bytes = 0  # in _lines
         self._rest = b""
         self._is_at_end = False
         self._lost = 0
@@ -55,82 +59,82 @@ class Connection(asyncio.Protocol):
 
     @property
     def has_lines(self) -> bool:
-        """Whether there is something to serve."""
+        """Whether lines wait to be served."""
         return bool(self._lines) and self.is_open
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Begin, unless there are too many already."""
+        """Start, or refuse a client too many."""
         self._transport = cast(asyncio.Transport, transport)
-        # Write buffers are bounded here, by what is in them.
+        # Output is bounded here, by the size of the write buffer.
         self._transport.set_write_buffer_limits(high=MAX_UNREAD_BYTES)
-        if not self._on_begin(self):
+        if not self._on_connect(self):
             self.refuse(RpcError(ErrorCode.BUSY, "too many connections", remedy="try again later"))
 
     def data_received(self, data: bytes) -> None:
-        """Take lines apart; more is only read once these were served."""
-        self.heard_at = self._clock()
+        """Split into lines; pause reading while many wait to be served."""
+        self.received_at = self._clock()
         *lines, self._rest = (self._rest + data).split(b"\n")
         self._lines.extend(lines)
-        self._ahead += sum(map(len, lines))
-        too_long = max(map(len, lines), default=0) >= MAX_LINE_LENGTH
-        if too_long or len(self._rest) >= MAX_LINE_LENGTH:
-            self.refuse(RpcError(ErrorCode.PARSE, f"a line is longer than {MAX_LINE_LENGTH} bytes"))
+        self._waiting_bytes += sum(map(len, lines))
+        longest = max(map(len, (*lines, self._rest)))
+        if longest >= MAX_LINE_LENGTH:
+            self.refuse(RpcError(ErrorCode.PARSE, f"line longer than {MAX_LINE_LENGTH} bytes"))
             return
-        if self._ahead > _INCOMING_LIMIT and self._transport is not None:
+        if self._waiting_bytes > _MAX_READ_AHEAD and self._transport is not None:
             self._transport.pause_reading()
         if lines:
             self._on_lines(self)
 
     def eof_received(self) -> bool:
-        """Answer what was asked before the client said its last, then close."""
+        """Finish what the client requested before it closed its side, then close."""
         self._is_at_end = True
-        self.settle()
+        self.close_if_finished()
         return True
 
     def connection_lost(self, error: Exception | None) -> None:
-        """Tell that it is over; what is still being done for it goes on."""
+        """Report the end; pending requests are carried out all the same."""
         self._transport = None
         self._lines.clear()
-        self._on_end(self)
+        self._on_disconnect(self)
 
     @property
-    def next_is_superseded(self) -> bool:
-        """Whether the next line, of those there are, needs no serving, for the one after it."""
+    def is_next_superseded(self) -> bool:
+        """Whether the line after the next one makes serving the next one unnecessary."""
         return len(self._lines) > 1 and is_superseded(self._lines[0], self._lines[1])
 
     def next_line(self) -> bytes:
-        """The next line to serve, of those there are."""
+        """Take the next line; only while `has_lines`."""
         line = self._lines.popleft()
-        self._ahead -= len(line)
+        self._waiting_bytes -= len(line)
         if not self._lines and self._transport is not None and not self._transport.is_reading():
             self._transport.resume_reading()
         return line
 
-    def settle(self) -> None:
-        """Close after the last answer, where the client has said its last."""
-        if self._is_at_end and not self._lines and not self.pending and self._transport:
-            self._transport.close()
+    def close_if_finished(self) -> None:
+        """Close after the last response, if the client has closed its side."""
+        if self._is_at_end and not self._lines and not self.pending:
+            self.close()
 
-    def may_ask(self) -> bool:
+    def take_request(self) -> bool:
         """Whether another request is within the rate; counts it."""
         return self._rate.take()
 
-    def answer(self, line: bytes) -> None:
-        """Send an answer; a client that has not read for long is left instead."""
+    def respond(self, line: bytes) -> None:
+        """Send a response, or close the connection of a client that does not read."""
         if self._transport is None or self._transport.is_closing():
             return
-        waiting = self._waiting(self._transport)
-        if waiting and waiting + len(line) > MAX_UNREAD_BYTES:
+        unread = self._transport.get_write_buffer_size()
+        if unread and unread + len(line) > MAX_UNREAD_BYTES:
             self._transport.abort()
             return
         self._transport.write(line)
 
-    def notify(self, make: Callable[[int], bytes]) -> None:
-        """Send a notification, made from how many were lost before it, or lose it, too."""
+    def notify(self, make_line: Callable[[int], bytes]) -> None:
+        """Send a notification, made with the number of those dropped before it, or drop it too."""
         if self._transport is None or self._transport.is_closing():
             return
-        if self._waiting(self._transport) < _NOTIFICATION_LIMIT:
-            self._transport.write(make(self._lost))
+        if self._transport.get_write_buffer_size() < _MAX_UNREAD_NOTIFICATIONS:
+            self._transport.write(make_line(self._lost))
             self._lost, self._losing_since = 0, None
             return
         self._lost += 1
@@ -141,13 +145,13 @@ class Connection(asyncio.Protocol):
             self._transport.abort()
 
     def refuse(self, error: RpcError) -> None:
-        """Say why, and close."""
+        """Send an error and close."""
         self._lines.clear()
-        self.answer(error_line(None, error))
+        self.respond(error_line(None, error))
         self.close()
 
     def close(self) -> None:
-        """Close once all answers are out."""
+        """Close after all output is sent."""
         if self._transport is not None:
             self._transport.close()
 
@@ -155,7 +159,3 @@ class Connection(asyncio.Protocol):
         """Close at once."""
         if self._transport is not None:
             self._transport.abort()
-
-    @staticmethod
-    def _waiting(transport: asyncio.Transport) -> int:
-        return transport.get_write_buffer_size()

@@ -1,8 +1,8 @@
-"""Who is told of what: subscriptions, and how often each is served.
+"""Subscriptions to topics, and how often each topic is sent.
 
-Changes of `state`, `log` and `link` go out one by one. Of `contacts`, `pattern` and `silence` the
-newest goes out, 60 times a second at most, for touches come faster than anybody looks. `amplifiers`
-and `latency` are asked for at the rate each client wishes.
+`state`, `log`, `link` and `layout` are sent at every change. Of `contacts`, `pattern` and `silence`
+the newest is sent, at most 60 times per second. `amplifiers` and `latency` are sent at the rate
+that each client subscribed with.
 """
 
 import asyncio
@@ -18,7 +18,7 @@ _PERIODIC: frozenset[Topic] = frozenset({"amplifiers", "latency"})
 
 
 class Hub:
-    """Tells clients what they have subscribed to; current: what is so now, None for nothing."""
+    """Sends notifications to subscribers; current: a topic's present data, None if it has none."""
 
     def __init__(
         self,
@@ -37,51 +37,51 @@ class Hub:
     def subscribe(
         self, connection: Connection, topics: Iterable[Topic], *, rate: float | None = None
     ) -> None:
-        """Tell a client of more topics, from what is so now on; rate [Hz] of what is periodic."""
+        """Add topics, and send their current data; rate [Hz]: of the periodic ones."""
         topics = set(topics)
         self._topics.setdefault(connection, set()).update(topics)
         for topic in sorted(topics & self._current.keys()):
             self._send([connection], topic, self._current[topic])
         if topics & _PERIODIC:
-            self._cancel(connection)
-            self._repeat(connection, 1 / (rate or DEFAULT_RATE))
+            self._cancel_timer(connection)
+            self._start_timer(connection, 1 / (rate or DEFAULT_RATE))
 
     def unsubscribe(self, connection: Connection, topics: Iterable[Topic]) -> None:
-        """Tell a client of these no more."""
-        left = self._topics.get(connection, set())
-        left.difference_update(topics)
-        if not left & _PERIODIC:
-            self._cancel(connection)
-        if not left:
+        """Remove topics."""
+        remaining = self._topics.get(connection, set())
+        remaining.difference_update(topics)
+        if not remaining & _PERIODIC:
+            self._cancel_timer(connection)
+        if not remaining:
             self._topics.pop(connection, None)
 
     def forget(self, connection: Connection) -> None:
-        """A client is gone."""
-        self._cancel(connection)
+        """Remove a client that has disconnected."""
+        self._cancel_timer(connection)
         self._topics.pop(connection, None)
 
     def is_subscribed(self, connection: Connection) -> bool:
-        """Whether a client has subscribed to anything."""
+        """Whether a client has subscribed to any topic."""
         return connection in self._topics
 
-    def publish(self, topic: Topic, make: Callable[[], Message | None]) -> None:
-        """Tell all who have subscribed; make is only called where there is somebody.
+    def publish(self, topic: Topic, make_data: Callable[[], Message | None]) -> None:
+        """Send to all subscribers; make_data is called only if there are any.
 
-        What it makes None of is not told: it is over by then.
+        Nothing is sent if it returns None: the data is out of date by then.
         """
         if topic not in _COALESCED:
-            self._send(self._listeners(topic), topic, make)
+            self._send(self._subscribers(topic), topic, make_data)
             return
         if not self._topics:
             return
-        self._newest.pop(topic, None)  # the order is that of the newest
-        self._newest[topic] = make
+        self._newest.pop(topic, None)  # sent in the order of the newest
+        self._newest[topic] = make_data
         if self._flush is None:
-            due = max(0.0, self._flushed_at + 1 / MAX_RATE - self._clock())
-            self._flush = asyncio.get_running_loop().call_later(due, self._flush_now)
+            delay = max(0.0, self._flushed_at + 1 / MAX_RATE - self._clock())
+            self._flush = asyncio.get_running_loop().call_later(delay, self._flush_now)
 
     def close(self) -> None:
-        """Tell nobody any more."""
+        """Remove all clients."""
         for connection in list(self._topics):
             self.forget(connection)
         if self._flush is not None:
@@ -91,37 +91,37 @@ class Hub:
         self._flush = None
         self._flushed_at = self._clock()
         newest, self._newest = self._newest, {}
-        for topic, make in newest.items():
-            self._send(self._listeners(topic), topic, make)
+        for topic, make_data in newest.items():
+            self._send(self._subscribers(topic), topic, make_data)
 
-    def _listeners(self, topic: Topic) -> list[Connection]:
-        return [one for one, topics in self._topics.items() if topic in topics]
+    def _subscribers(self, topic: Topic) -> list[Connection]:
+        return [connection for connection, topics in self._topics.items() if topic in topics]
 
     def _send(
         self,
-        listeners: Sequence[Connection],
+        subscribers: Sequence[Connection],
         topic: Topic,
-        make: Callable[[], Message | None],
+        make_data: Callable[[], Message | None],
     ) -> None:
-        said = make() if listeners else None
-        if said is None:
+        message = make_data() if subscribers else None
+        if message is None:
             return
-        now, data = self._clock(), said.model_dump_json().encode()
-        for connection in listeners:
+        now, data = self._clock(), message.model_dump_json().encode()
+        for connection in subscribers:
             connection.notify(lambda lost: event_line(topic, time=now, lost=lost, data=data))
 
-    def _repeat(self, connection: Connection, period: float) -> None:
-        """Send what is periodic again and again, every period [s]."""
+    def _start_timer(self, connection: Connection, period: float) -> None:
+        """Send the periodic topics every period [s]."""
 
-        def tell() -> None:
+        def send() -> None:
             for topic in sorted(self._topics.get(connection, set()) & _PERIODIC):
                 self._send([connection], topic, self._current[topic])
-            self._timers[connection] = loop.call_later(period, tell)
+            self._timers[connection] = loop.call_later(period, send)
 
         loop = asyncio.get_running_loop()
-        self._timers[connection] = loop.call_later(period, tell)
+        self._timers[connection] = loop.call_later(period, send)
 
-    def _cancel(self, connection: Connection) -> None:
+    def _cancel_timer(self, connection: Connection) -> None:
         timer = self._timers.pop(connection, None)
         if timer is not None:
             timer.cancel()

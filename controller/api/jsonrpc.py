@@ -1,14 +1,14 @@
-"""JSON-RPC 2.0, one object a line: bytes into requests, results and errors into bytes.
+"""JSON-RPC 2.0, one object per line: bytes to requests, results and errors to bytes.
 
-The rules it lives by: UTF-8, a line feed ends a message, at most 64 KiB with it; no batches; an id
-is a short text or a whole number; a request without an id gets no answer. No NaN, no infinity.
-Nothing here knows what a method means.
+UTF-8; a line feed ends a message; a request line has at most 64 KiB; no batches; an id is a short
+text or an integer; a request without an id gets no response. NaN and infinity are refused.
 """
 
 import json
+from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Annotated, Any, Literal, TypeAlias
+from typing import Annotated, Any, Literal, TypeAlias, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic_core import from_json
@@ -17,13 +17,14 @@ from controller.api.schema import Message
 from model.errors import in_our_words
 
 MAX_LINE_LENGTH = 1 << 16  # bytes, with the line feed
-_LONGEST_TEXT = 600  # characters of an error's message
+_MAX_ERROR_TEXT = 600  # characters of an error's message
 
 Id: TypeAlias = int | str | None
+_MessageT = TypeVar("_MessageT", bound=Message)
 
 
 class ErrorCode(IntEnum):
-    """Codes of JSON-RPC 2.0, and from 1001 on our own."""
+    """Codes of JSON-RPC 2.0, and our own from 1001 on."""
 
     PARSE = -32700
     INVALID_REQUEST = -32600
@@ -38,22 +39,22 @@ class ErrorCode(IntEnum):
 
 
 ERROR_MEANINGS = {
-    ErrorCode.PARSE: "the line is no JSON, or longer than 64 KiB",
-    ErrorCode.INVALID_REQUEST: "the JSON is no request",
-    ErrorCode.UNKNOWN_METHOD: "there is no such method",
-    ErrorCode.INVALID_PARAMS: "the parameters are not those of the method",
+    ErrorCode.PARSE: "the line is not valid JSON, or longer than 64 KiB",
+    ErrorCode.INVALID_REQUEST: "the JSON is not a JSON-RPC 2.0 request",
+    ErrorCode.UNKNOWN_METHOD: "the method does not exist",
+    ErrorCode.INVALID_PARAMS: "a parameter is missing, unknown or out of range",
     ErrorCode.INTERNAL: "a bug in the daemon; its log has the details",
     ErrorCode.WRONG_STATE: "the daemon's state does not allow it, such as not being armed",
-    ErrorCode.LEASE: "the lease is lost, or somebody else's",
+    ErrorCode.LEASE: "the lease has expired, or belongs to another client",
     ErrorCode.REFUSED: "the guard, a limit or an amplifier refused",
     ErrorCode.LINK: "the link to an amplifier failed",
     ErrorCode.BUSY: "too many requests or connections at once",
 }
-"""What each error code means."""
+"""Meaning of each error code."""
 
 
 class ErrorData(Message):
-    """What went wrong, where, and what to do."""
+    """What is wrong, where, and the remedy."""
 
     what: str
     where: str | None = None
@@ -61,9 +62,9 @@ class ErrorData(Message):
 
 
 class RpcError(Exception):
-    """A request that failed, as it is told to whoever asked.
+    """A request that failed.
 
-    Raised by the server's methods, and by clients when the daemon answers so.
+    Raised by the server's methods, and by clients when the daemon responds with an error.
     """
 
     def __init__(
@@ -75,7 +76,7 @@ class RpcError(Exception):
 
 
 class _Envelope(BaseModel):
-    """The members of a request."""
+    """Members of a request."""
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
 
@@ -89,93 +90,98 @@ class _Envelope(BaseModel):
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """One request; wants_answer is False for a notification, which gets none, not even an error."""
+    """One request; without `expects_response` it gets none, not even an error."""
 
     method: str
     params: dict[str, Any]
     id: Id
-    wants_answer: bool
+    expects_response: bool
 
 
 def read_request(line: bytes) -> Request:
     """Read one line; raises RpcError."""
     try:
-        said = from_json(line, allow_inf_nan=False)
+        document = from_json(line, allow_inf_nan=False)
     except ValueError as error:
         raise RpcError(
             ErrorCode.PARSE,
-            f"the line is no JSON: {error!s:.200}",
-            remedy="send one JSON object a line, in UTF-8",
+            f"the line is not valid JSON: {error!s:.200}",
+            remedy="send one JSON object per line, in UTF-8",
         ) from error
     try:
-        envelope = _Envelope.model_validate(said)
+        envelope = _Envelope.model_validate(document)
     except ValidationError as error:
         raise RpcError(
             ErrorCode.INVALID_REQUEST,
-            f"this is no request of JSON-RPC 2.0: {_first_problem(error)}",
+            f"not a JSON-RPC 2.0 request: {_first_problem(error)}",
             remedy='send {"jsonrpc": "2.0", "id": 1, "method": ..., "params": {...}}; no batches',
         ) from error
-    return Request(envelope.method, envelope.params, envelope.id, "id" in said)
+    return Request(envelope.method, envelope.params, envelope.id, "id" in document)
 
 
-def read_params(model: type[Message], request: Request) -> Message:
-    """The parameters of a request by their model; raises RpcError."""
+def read_params(model: type[_MessageT], request: Request) -> _MessageT:
+    """Validate the parameters of a request; raises RpcError."""
     try:
         return model.model_validate(request.params)
     except ValidationError as error:
         raise RpcError(
             ErrorCode.INVALID_PARAMS,
             f"{request.method}: {_first_problem(error)}",
-            where=_where(error),
+            where=_key(error),
             remedy="see the method in docs/reference/api.md",
         ) from error
 
 
-def result_line(id: Id, result: Message) -> bytes:
-    """The answer to a request."""
-    return _line(f'{{"jsonrpc":"2.0","id":{json.dumps(id)},"result":{result.model_dump_json()}}}')
-
-
-def error_line(id: Id, error: RpcError) -> bytes:
-    """The answer to a request that failed; id None where it could not be read."""
-    said = {
-        "code": int(error.code),
-        "message": str(error)[:_LONGEST_TEXT],
-        "data": error.data.model_dump(),
-    }
-    return _line(json.dumps({"jsonrpc": "2.0", "id": id, "error": said}))
-
-
-def request_line(id: Id, method: str, params: Message) -> bytes:
-    """A request, as a client sends it; id None for one that wants no answer."""
-    identified = "" if id is None else f'"id":{json.dumps(id)},'
-    return _line(
-        f'{{"jsonrpc":"2.0",{identified}"method":{json.dumps(method)},'
-        f'"params":{params.model_dump_json(exclude_none=True)}}}'
+def unknown_method(method: str, known: Iterable[str]) -> RpcError:
+    """The error for a method that does not exist."""
+    return RpcError(
+        ErrorCode.UNKNOWN_METHOD,
+        f"unknown method {method[:40]!a}",
+        remedy=f"use one of {', '.join(known)}",
     )
 
 
+def result_line(id: Id, result: str) -> bytes:
+    """The response to a request; result: as JSON."""
+    return f'{{"jsonrpc":"2.0","id":{json.dumps(id)},"result":{result}}}\n'.encode()
+
+
+def error_line(id: Id, error: RpcError) -> bytes:
+    """The response to a request that failed; id None if it could not be read."""
+    content = {
+        "code": int(error.code),
+        "message": str(error)[:_MAX_ERROR_TEXT],
+        "data": error.data.model_dump(),
+    }
+    return json.dumps({"jsonrpc": "2.0", "id": id, "error": content}).encode() + b"\n"
+
+
+def request_line(id: Id, method: str, params: Message) -> bytes:
+    """A request as clients send it; id None for one that expects no response."""
+    member = "" if id is None else f'"id":{json.dumps(id)},'
+    return (
+        f'{{"jsonrpc":"2.0",{member}"method":{json.dumps(method)},'
+        f'"params":{params.model_dump_json(exclude_none=True)}}}\n'
+    ).encode()
+
+
 def event_line(topic: str, *, time: float, lost: int, data: bytes) -> bytes:
-    """A notification; data: a topic's data as JSON already, for it goes to many; time [s]."""
+    """An `event` notification; data: as JSON, serialised once for all subscribers; time [s]."""
     head = f'{{"jsonrpc":"2.0","method":"event","params":{{"topic":"{topic}","time_s":{time:.6f}'
     return f'{head},"lost":{lost},"data":'.encode() + data + b"}}\n"
 
 
-def _line(text: str) -> bytes:
-    return text.encode() + b"\n"
-
-
 def _first_problem(error: ValidationError) -> str:
-    """The first thing that is wrong, and how many more there are; nothing of the input is said."""
+    """Describe the first problem and count the others, without quoting the input."""
     problems = error.errors(include_url=False, include_context=False, include_input=False)
     more = f" ({len(problems) - 1} more)" if len(problems) > 1 else ""
-    where = _where(error)
-    return f"{where + ': ' if where else ''}{in_our_words(problems[0]['msg'])}{more}"
+    key = _key(error)
+    return f"{key + ': ' if key else ''}{in_our_words(problems[0]['msg'])}{more}"
 
 
-def _where(error: ValidationError) -> str | None:
-    """The key of the first problem, shortened and without what could garble a log."""
+def _key(error: ValidationError) -> str | None:
+    """The key of the first problem, shortened and free of control characters."""
     location = error.errors(include_url=False, include_context=False, include_input=False)[0]["loc"]
     name = ".".join(str(part) for part in location)
-    shown = name if name.isprintable() else ascii(name)
-    return shown[:80] or None
+    printable = name if name.isprintable() else ascii(name)
+    return printable[:80] or None

@@ -1,7 +1,7 @@
-"""The methods of the API: what is asked, and what is answered.
+"""The twelve methods of the API: parameters, results and the table `METHODS` of them.
 
-One table, `METHODS`, says which parameters and which result belong to a method; the server, the
-clients, the reference in docs/reference/api.md and the gateway's description all go by it.
+The server, the clients, the reference in docs/reference/api.md and the gateway's OpenAPI
+description all use this table.
 """
 
 from typing import Annotated, Any, NamedTuple
@@ -29,149 +29,151 @@ from controller.api.schema import (
     TouchPoint,
 )
 
-MAX_TOUCHES = 64  # of a frame; a panel reports ten, a forearm some more
+MAX_TOUCHES = 64  # per frame; a panel reports ten, a forearm some more
 
 
 class HelloParams(Message):
-    """Who asks; for the log."""
+    """Name of the client, for the log."""
 
     client: Name
 
 
 class HelloResult(Message):
-    """What the daemon drives; none of it changes while it runs, but for the layout."""
+    """What the daemon drives; constant while it runs, except for the layout."""
 
-    api_version: str = Field(description="major.minor; another major cannot be talked to")
+    api_version: str = Field(description="major.minor; major versions are incompatible")
     software_version: str
     rig: RigSummary
     table: TableSummary
-    rig_text: str = Field(description="the rig's file, from which fields can be computed")
-    layout: dict[str, Any] | None = Field(description="the surface layout, null without one")
+    rig_text: str = Field(description="the rig file, from which vibration fields can be computed")
+    layout: dict[str, Any] | None = Field(description="the surface layout; null without one")
 
 
 class StatusResult(Message):
-    """How everything is at this moment."""
+    """State of the daemon, the amplifiers and the plate."""
 
-    time_s: float = Field(description="of this answer, on the daemon's CLOCK_MONOTONIC")
-    unix_time_s: float = Field(description="the same moment on the wall clock")
+    time_s: float = Field(description="time of this response on CLOCK_MONOTONIC")
+    unix_time_s: float = Field(description="the same time on the wall clock")
     state: DaemonStateName
-    cause: str = Field(description="why it is in this state")
-    remedy: str | None = Field(description="what to do about it, where anything is to be done")
+    cause: str = Field(description="why the daemon is in this state")
+    remedy: str | None = Field(description="what to do about it; null if nothing")
     phase: PhaseName
-    assume_energised: bool = Field(
-        description="whether amplifiers that were lost may still be playing"
+    assume_energised: bool = Field(description="whether lost amplifiers may still be playing")
+    lost_for_s: float | None = Field(
+        description="how long a link has been lost; null if all are up"
     )
-    lost_for_s: float | None = Field(description="how long a link has been lost; null if none is")
     watchdog_s: float = Field(
-        description="an armed amplifier that hears nothing falls silent by itself after this time"
+        description="time without commands after which an armed amplifier silences itself"
     )
     armed_by: str | None
     lease_left_s: float | None
-    contacts: list[ContactStatus] = Field(description="in order of arrival, the newest last")
-    drive: dict[str, PlayedTone] = Field(description="by ERA, silent ones left out")
-    silent_because: str | None = Field(None, description="why nothing is played though armed")
+    contacts: list[ContactStatus] = Field(description="in order of arrival, newest last")
+    drive: dict[str, PlayedTone] = Field(description="by ERA, without silent ones")
+    silent_because: str | None = Field(None, description="why nothing plays although armed")
     plain_because: str | None = Field(
-        None, description="why touches begin along plain ramps though shaped onsets are possible"
+        None, description="why onsets are plain ramps although shaped ones are possible"
     )
     predicted_contrast_db: float | None
     robust_contrast_db: float | None
     predicted_level_db_sl: float | None
     amplifiers: list[AmplifierStatus]
     latency_ms: LatencySummary
-    rejected_touches: dict[str, Count] = Field(description="how many, by the reason")
+    rejected_touches: dict[str, Count] = Field(description="number by reason")
     uptime_s: float
 
 
 class ArmParams(Message):
-    """High voltage on, for as long as the lease is renewed."""
+    """Who arms, and how long the lease lasts without renewal."""
 
     owner: Name
     lease_s: Annotated[float, Field(ge=MIN_LEASE, le=MAX_LEASE)]
 
 
 class ArmResult(Message):
-    """The lease: keep it, renew it within lease_s."""
+    """The lease, to be renewed within lease_s."""
 
     lease: str
     lease_s: float
 
 
 class RenewParams(Message):
-    """The lease that arm gave."""
+    """The lease that `arm` returned."""
 
     lease: Annotated[str, Field(min_length=1, max_length=80)]
 
 
 class RenewResult(Message):
-    """How long the lease lasts from now."""
+    """Time until the lease expires."""
 
     lease_s: float
 
 
 class TouchParams(Message):
-    """All fingers of this client under a source name; valid for 150 ms, so repeat it."""
+    """All fingers of one source of this client; valid for 150 ms, to be repeated."""
 
     source: Name
     touches: Annotated[list[TouchPoint], Field(max_length=MAX_TOUCHES)]
 
 
 class EffectsResult(Message):
-    """The effects that play can be asked for."""
+    """The effects that `play` accepts."""
 
     effects: list[EffectDescription]
 
 
 class PlayParams(Message):
-    """Play an effect at the finger that is nearest to a place, once; it ends with the finger."""
+    """Play an effect once at the finger nearest to a position; it ends when the finger lifts."""
 
     effect: Name
-    x_m: float = Field(description="a finger must be within 20 mm of the place")
+    x_m: float = Field(description="a finger must be within 20 mm of the position")
     y_m: float
-    level_db_sl: float | None = Field(
-        None, description="at most the effect's own, which it has if this is left out"
-    )
+    level_db_sl: float | None = Field(None, description="at most, and by default, the effect's own")
 
 
 class SubscribeParams(Message):
-    """Topics to be told of; rate_hz is how often of what is measured all the time."""
+    """Topics to receive, and the rate of the periodic ones."""
 
     topics: Annotated[list[Topic], Field(min_length=1, max_length=16)]
     rate_hz: Annotated[float, Field(ge=1, le=MAX_RATE)] | None = Field(
-        None, description="of amplifiers and latency; 10 if left out"
+        None, description="of amplifiers and latency; default 10"
     )
 
 
 class UnsubscribeParams(Message):
-    """Topics not to be told of any more."""
+    """Topics to receive no longer."""
 
     topics: Annotated[list[Topic], Field(min_length=1, max_length=16)]
 
 
 class Method(NamedTuple):
-    """Parameters, result and meaning of a method."""
+    """Parameters, result and summary of a method."""
 
     params: type[Message]
     result: type[Message]
-    meaning: str
+    summary: str
 
 
 METHODS: dict[str, Method] = {
-    "hello": Method(HelloParams, HelloResult, "who is there and what it drives"),
-    "status": Method(Empty, StatusResult, "how everything is"),
-    "arm": Method(ArmParams, ArmResult, "high voltage on; touches are felt while the lease lasts"),
-    "renew": Method(RenewParams, RenewResult, "the owner of the lease is still there"),
-    "disarm": Method(Empty, Empty, "silent along a short ramp, high voltage off; by anyone"),
+    "hello": Method(
+        HelloParams, HelloResult, "introduce the client; returns what the daemon drives"
+    ),
+    "status": Method(Empty, StatusResult, "state of the daemon, the amplifiers and the plate"),
+    "arm": Method(
+        ArmParams, ArmResult, "switch high voltage on; touches are felt until the lease expires"
+    ),
+    "renew": Method(RenewParams, RenewResult, "extend the lease"),
+    "disarm": Method(Empty, Empty, "ramp to silence and switch high voltage off; any client may"),
     "stop": Method(
         Empty,
         Empty,
-        "quick stop, latched until clear; by anyone, at any time; 1004 where an amplifier that is "
-        "lost from then on did not hear it",
+        "quick stop, latched until clear; any client may, at any time; error 1004 if an amplifier "
+        "did not receive it and is therefore lost",
     ),
     "clear": Method(Empty, Empty, "acknowledge a stop, or a fault whose cause is gone"),
-    "touch": Method(TouchParams, Empty, "all fingers of this client, as a touch source"),
-    "effects": Method(Empty, EffectsResult, "which effects there are"),
+    "touch": Method(TouchParams, Empty, "report all fingers of a touch source of this client"),
+    "effects": Method(Empty, EffectsResult, "list the effects"),
     "play": Method(PlayParams, Empty, "play an effect at a finger; only while armed"),
-    "subscribe": Method(SubscribeParams, Empty, "be told of topics from now on"),
-    "unsubscribe": Method(UnsubscribeParams, Empty, "be told of them no more"),
+    "subscribe": Method(SubscribeParams, Empty, "receive notifications of topics"),
+    "unsubscribe": Method(UnsubscribeParams, Empty, "receive no more notifications of topics"),
 }
 """Every method of the API, by name."""

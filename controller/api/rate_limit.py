@@ -1,10 +1,10 @@
-"""How often something may be done: so many times a second, and as many at once."""
+"""Token bucket: a rate, and as many at once as in a second."""
 
 from collections.abc import Callable
 
 
 class RateLimiter:
-    """A bucket that holds `per_second` and fills at that rate; clock [s]."""
+    """Allows `per_second` actions per second, and as many in a burst; clock [s]."""
 
     def __init__(self, per_second: float, *, clock: Callable[[], float]) -> None:
         self._per_second = per_second
@@ -13,7 +13,7 @@ class RateLimiter:
         self._counted_at = clock()
 
     def take(self) -> bool:
-        """Whether it may be done once more now; counts it."""
+        """Whether another action is allowed now; counts it."""
         now = self._clock()
         self._left = min(self._per_second, self._left + self._per_second * (now - self._counted_at))
         self._counted_at = now

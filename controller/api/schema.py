@@ -1,4 +1,4 @@
-"""What several messages of the API are made of; every number's key carries its unit."""
+"""Data types that messages of the API share; every number's key carries its unit."""
 
 import re
 from typing import Annotated, Any, Literal, TypeAlias
@@ -6,11 +6,11 @@ from typing import Annotated, Any, Literal, TypeAlias
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 API_VERSION = "1.0"
-"""Major and minor: another major cannot be talked to, a higher minor only has more to say."""
+"""major.minor: major versions are incompatible; a higher minor version only adds."""
 
 MIN_LEASE = 1.0  # s
-MAX_LEASE = 60.0  # s; whoever is gone for longer cannot say stop
-MAX_RATE = 60.0  # Hz; no screen shows more
+MAX_LEASE = 60.0  # s; a client that has gone away cannot stop anything meanwhile
+MAX_RATE = 60.0  # Hz; of notifications, as fast as a screen shows them
 
 DaemonStateName: TypeAlias = Literal[
     "NOT_READY",
@@ -23,10 +23,10 @@ DaemonStateName: TypeAlias = Literal[
     "FAULT",
     "COMM_LOST",
 ]
-"""The daemon's state, by the names of CiA 402, and COMM_LOST."""
+"""State of the daemon: the names of CiA 402, and COMM_LOST."""
 
 PhaseName: TypeAlias = Literal["closed", "disarmed", "armed", "lost"]
-"""How the amplifiers stand, all of them together."""
+"""State of all amplifiers together."""
 
 Topic: TypeAlias = Literal[
     "state", "contacts", "pattern", "silence", "amplifiers", "latency", "log", "link", "layout"
@@ -35,34 +35,34 @@ Topic: TypeAlias = Literal[
 _ONE_LINE = r"^[^\x00-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069]+$"
 
 
-def _on_one_line(text: str) -> str:
+def _check_one_line(text: str) -> str:
     if not re.fullmatch(_ONE_LINE, text):
-        raise ValueError("must be one line, without characters that a terminal obeys")
+        raise ValueError("must be one line without control characters")
     return text
 
 
 Name: TypeAlias = Annotated[
     str,
     Field(min_length=1, max_length=80, json_schema_extra={"pattern": _ONE_LINE}),
-    AfterValidator(_on_one_line),
+    AfterValidator(_check_one_line),
 ]
-"""A short text on one line, without what could garble a terminal."""
+"""A short text on one line, without control characters."""
 
 Count: TypeAlias = Annotated[int, Field(ge=0)]
 
 
 class Message(BaseModel):
-    """Part of a message: no unknown keys, nothing converted behind one's back, no NaN."""
+    """Part of a message: no unknown keys, no implicit conversion, no NaN."""
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
 
 
 class Empty(Message):
-    """An empty object: no parameters, or nothing to say but that it was done."""
+    """An empty object: no parameters, or no result."""
 
 
 class EraPosition(Message):
-    """Where an ERA stands under the plate, from its south-west corner, and how it is wired."""
+    """Position of an ERA under the plate, from the south-west corner, and its wiring."""
 
     name: str
     x_m: float
@@ -72,19 +72,19 @@ class EraPosition(Message):
 
 
 class RigSummary(Message):
-    """The rig, as far as a picture of it needs."""
+    """The rig, as far as drawing it needs."""
 
     length_m: float
     width_m: float
     eras: list[EraPosition]
-    simulated: bool = Field(description="whether any of its amplifiers is a simulated one")
+    simulated: bool = Field(description="whether any of its amplifiers is simulated")
     frequency_hz: list[float] = Field(description="lowest and highest that the rig allows")
 
 
 class TableSummary(Message):
     """The localization table in use."""
 
-    fingerprint: str = Field(description="of the plate on its ERAs that it was built for")
+    fingerprint: str = Field(description="of the plate and ERAs that it was built for")
     mode: str = Field(description="switched, graded, signed or phased")
     frequencies_hz: list[float]
     cells_x: Count
@@ -95,33 +95,33 @@ class TouchPoint(Message):
     """One finger of a touch frame."""
 
     id: Annotated[int, Field(ge=-(2**31), lt=2**31)] = Field(
-        description="the client's own, the same from down to up"
+        description="chosen by the client, constant from touch-down to lift"
     )
     x_m: float = Field(description="from the plate's south-west corner")
     y_m: float = Field(description="from the plate's south-west corner, upwards")
 
 
 class ContactStatus(Message):
-    """A finger on the plate, and what it is predicted to feel."""
+    """A finger on the plate and its predicted sensation."""
 
     source: str
     id: int
     x_m: float
     y_m: float
     role: Literal["target", "quiet"] | None = Field(
-        None, description="who shall feel it, and who nothing; null while nothing is decided"
+        None, description="whether it is to feel the pattern; null before the first decision"
     )
     level_db_sl: float | None = Field(
-        None, description="predicted vibration above the threshold of feeling; null if unknown"
+        None, description="predicted sensation level; null if unknown"
     )
     contrast_db: float | None = Field(
-        None, description="predicted, from the target to the loudest quiet finger; null if alone"
+        None, description="predicted, target over loudest quiet finger; null for a single finger"
     )
-    effect: str | None = Field(None, description="the effect that plays for it, where one does")
+    effect: str | None = Field(None, description="the effect that plays for it, if any")
 
 
 class PlayedTone(Message):
-    """What an amplifier really plays on one ERA."""
+    """What an amplifier plays on one ERA, as confirmed."""
 
     frequency_hz: float
     level: float = Field(description="0 to 1 of the full stroke")
@@ -129,12 +129,12 @@ class PlayedTone(Message):
 
 
 class LinkCounters(Message):
-    """How well the link to an amplifier does, since it was opened; see the wire protocol."""
+    """Counters of the link to an amplifier since it was opened; see the wire protocol."""
 
     frames_out: Count
     frames_in: Count
-    bad: Count = Field(description="damaged frames")
-    foreign: Count = Field(description="good frames that nobody waited for")
+    bad: Count = Field(description="frames with CRC errors")
+    foreign: Count = Field(description="valid but unexpected frames")
     events: Count
     retries: Count
     timeouts: Count
@@ -143,31 +143,31 @@ class LinkCounters(Message):
 
 
 class AmplifierStatus(Message):
-    """One amplifier, as its last answer tells; what nobody knows of it is null."""
+    """One amplifier according to its last reply; null where unknown."""
 
     name: str
     url: str
     serial_number: str | None
-    state: str | None = Field(description="its own, by the names of CiA 402")
+    state: str | None = Field(description="its own state, by the names of CiA 402")
     fault: str | None
     levels: list[float] = Field(
-        description="0 to 1 of the full stroke, by channel, as it reports; empty if nobody knows"
+        description="0 to 1 of the full stroke, by channel, as it reports; empty if unknown"
     )
     temperature_c: float | None
     high_voltage: bool | None
     high_voltage_v: float | None
-    reply_age_s: float | None = Field(description="since its last answer")
-    lost: bool = Field(description="whether it cannot be reached: nobody knows how it is")
+    reply_age_s: float | None = Field(description="time since its last reply")
+    lost: bool = Field(description="whether the link to it is lost")
     closed_with_lost: bool = Field(
-        description="whether it answered to the last, but was closed with another that is lost"
+        description="whether it still replied but was closed because another one is lost"
     )
     statistics: LinkCounters
 
 
 class LatencySummary(Message):
-    """From a touch frame's arrival to the last byte of the command it led to, all in ms.
+    """Latency from a touch frame's arrival to the last byte of the resulting command, all in ms.
 
-    Of the last patterns; median and percentiles are null before the first.
+    Over the last patterns; median and percentiles are null before the first.
     """
 
     count: Count
@@ -175,13 +175,13 @@ class LatencySummary(Message):
     p99: float | None
     p999: float | None
     histogram: list[tuple[float, int]] = Field(
-        description="[upper edge in ms, how many up to it and above the edge before]; "
-        "what is above the last edge counts there"
+        description="[upper edge in ms, number above the previous edge and up to this one]; "
+        "values above the last edge are counted in the last"
     )
 
 
 class EffectDescription(Message):
-    """An effect that can be played by its name."""
+    """An effect that `play` accepts."""
 
     name: str
     kind: str

@@ -1,8 +1,7 @@
-"""The API's server: all clients in turn, a little at a time, within the control loop's own loop.
+"""The API's server: serves all clients in turn, within the control loop's event loop.
 
-A turn takes a quarter of a millisecond at most, however much was sent; then everything else gets
-its turn, the control loop first of all. What takes longer than a turn, such as arming, goes on
-beside.
+A turn takes at most a quarter of a millisecond, however much was sent; then everything else runs,
+the control loop first. What takes longer, such as arming, runs as a task of its own.
 """
 
 import asyncio
@@ -22,6 +21,7 @@ from controller.api.jsonrpc import (
     read_params,
     read_request,
     result_line,
+    unknown_method,
 )
 from controller.api.methods import METHODS
 from controller.api.schema import Message
@@ -30,54 +30,54 @@ from drivers.errors import CommandRefused, DriverError, LinkError
 from model.errors import InputError
 
 MAX_CONNECTIONS = 32
-IDLE_TIMEOUT = 1.0  # s; who has said nothing for so long gives way when all places are taken
-MAX_TURN_TIME = 0.00025  # s; so long a touch waits for clients that flood
-_AT_ONCE = 4  # connections that are taken in a turn
-_QUEUE = 64  # that wait for it
-MAX_PENDING = 8  # requests of one client that take long; a stop is always taken
+IDLE_TIMEOUT = 1.0  # s; a client silent for this long can be replaced when there are too many
+MAX_TURN_TIME = 0.00025  # s; how long a touch waits for clients that flood
+MAX_PENDING = 8  # requests of one client that take long; stop is not counted
+_ACCEPT_PER_TURN = 4  # connections
+_ACCEPT_QUEUE = 64  # connections
 
 Handler: TypeAlias = Callable[[Connection, Any], Message | Awaitable[Message]]
 
-_FREE = frozenset({"stop", "touch"})
-"""Not counted by the rate: nobody is too busy to stop, and touches are never queued."""
+_UNLIMITED = frozenset({"stop", "touch"})
+"""Methods that the request rate does not limit: a stop is always served, touches never queue up."""
 
 _logger = logging.getLogger(__name__)
 
 
 class ApiServer:
-    """Serves the methods of the API; handlers by method, each takes the client and the parameters.
+    """Serves the methods of the API.
 
-    left: told of every client that is gone; keeps: whether a client must not give way to another.
+    handlers: by method, called with the client and the parameters; on_disconnect: called with every
+    client that disconnects; is_protected: whether an idle client must not be replaced by a new one.
     """
 
     def __init__(
         self,
         handlers: Mapping[str, Handler],
         *,
-        left: Callable[[Connection], None],
-        keeps: Callable[[Connection], bool],
+        on_disconnect: Callable[[Connection], None],
+        is_protected: Callable[[Connection], bool],
         clock: Callable[[], float] = clock.now,
     ) -> None:
-        missing = METHODS.keys() ^ handlers.keys()
-        if missing:
-            raise ValueError(f"handlers and methods differ in {', '.join(sorted(missing))}")
         self._handlers = handlers
-        self._left = left
-        self._keeps = keeps
+        self._on_disconnect = on_disconnect
+        self._is_protected = is_protected
         self._clock = clock
         self._connections: set[Connection] = set()
         self._waiting: deque[Connection] = deque()
-        self._turn_is_due = False
+        self._is_turn_scheduled = False
         self._server: asyncio.Server | None = None
 
     async def open(self, bound: socket.socket) -> None:
-        """Listen on a Unix socket that is bound; who may open it is up to whoever bound it."""
+        """Listen on a bound Unix socket; its permissions decide who may connect."""
         loop = asyncio.get_running_loop()
-        self._server = await loop.create_unix_server(self._connection, sock=bound, backlog=_AT_ONCE)
-        bound.listen(_QUEUE)  # asyncio takes as many in a turn as it was told may wait
+        self._server = await loop.create_unix_server(
+            self._make_connection, sock=bound, backlog=_ACCEPT_PER_TURN
+        )
+        bound.listen(_ACCEPT_QUEUE)  # asyncio accepts up to its own backlog per turn
 
     async def close(self) -> None:
-        """Listen no more, and leave all clients after what was said to them."""
+        """Stop listening and close all connections after their pending output."""
         if self._server is None:
             return
         self._server.close()
@@ -88,129 +88,125 @@ class ApiServer:
             connection.abort()
         await self._server.wait_closed()
 
-    def _connection(self) -> Connection:
+    def _make_connection(self) -> Connection:
         return Connection(
-            on_begin=self._begun,
-            on_lines=self._has_said,
-            on_end=self._ended,
+            on_connect=self._connected,
+            on_lines=self._lines_received,
+            on_disconnect=self._disconnected,
             clock=self._clock,
         )
 
-    def _begun(self, connection: Connection) -> bool:
-        """Take a client in, if need be in place of one that says nothing."""
+    def _connected(self, connection: Connection) -> bool:
+        """Accept a client, if necessary in place of the one that has been idle for longest."""
         if len(self._connections) >= MAX_CONNECTIONS:
-            idle = [one for one in self._connections if not self._keeps(one) and not one.pending]
-            longest = min(idle, key=lambda one: one.heard_at, default=None)
-            if longest is None or self._clock() - longest.heard_at < IDLE_TIMEOUT:
+            idle = [c for c in self._connections if not self._is_protected(c) and not c.pending]
+            longest = min(idle, key=lambda each: each.received_at, default=None)
+            if longest is None or self._clock() - longest.received_at < IDLE_TIMEOUT:
                 return False
             self._connections.discard(longest)
             longest.abort()
         self._connections.add(connection)
         return True
 
-    def _ended(self, connection: Connection) -> None:
+    def _disconnected(self, connection: Connection) -> None:
         self._connections.discard(connection)
-        self._left(connection)
+        self._on_disconnect(connection)
 
-    def _has_said(self, connection: Connection) -> None:
+    def _lines_received(self, connection: Connection) -> None:
         if connection not in self._waiting:
             self._waiting.append(connection)
-        self._see_to_a_turn()
-
-    def _see_to_a_turn(self) -> None:
-        if not self._turn_is_due:
-            self._turn_is_due = True
+        if not self._is_turn_scheduled:
+            self._is_turn_scheduled = True
             asyncio.get_running_loop().call_soon(self._turn)
 
     def _turn(self) -> None:
-        """Serve waiting clients a line each, until the turn is over."""
-        self._turn_is_due = False
+        """Serve one line of each waiting client, round and round, until the turn's time is up."""
+        self._is_turn_scheduled = False
         end = time.perf_counter() + MAX_TURN_TIME
         while self._waiting:
             connection = self._waiting.popleft()
             if connection.has_lines:
-                if connection.next_is_superseded:
-                    connection.next_line()
-                else:
-                    self._serve(connection, connection.next_line())
+                is_superseded = connection.is_next_superseded
+                line = connection.next_line()
+                if not is_superseded:
+                    self._serve(connection, line)
                 if connection.has_lines:
                     self._waiting.append(connection)
-            connection.settle()
+            connection.close_if_finished()
             if time.perf_counter() >= end:
                 break
-        if self._waiting and not self._turn_is_due:
-            # Not the next but one after it: what came in meanwhile and what follows from it, such
-            # as the control loop that wakes for a touch, is before it then.
-            self._turn_is_due = True
+        if self._waiting and not self._is_turn_scheduled:
+            # Two iterations of the event loop from now: data that arrived meanwhile and what it
+            # wakes, such as the control loop for a touch, run first.
+            self._is_turn_scheduled = True
             loop = asyncio.get_running_loop()
             loop.call_soon(loop.call_soon, self._turn)
 
     def _serve(self, connection: Connection, line: bytes) -> None:
-        """Answer one line, or begin to."""
+        """Serve one line, or start to."""
         request: Request | None = None
         try:
             request = read_request(line)
-            if request.method == "arm" and not request.wants_answer:
-                return  # nobody would know the lease, and so hold or end what it arms
+            if request.method == "arm" and not request.expects_response:
+                return  # without a response no client has the lease to renew or end
             result = self._call(connection, request)
         except Exception as error:
-            self._fail(connection, request, error)
+            self._respond_error(connection, request, error)
             return
         if isinstance(result, Message):
-            self._succeed(connection, request, result)
+            self._respond(connection, request, result)
             return
-        task = asyncio.ensure_future(self._see_through(connection, request, result))
+        task = asyncio.ensure_future(self._finish(connection, request, result))
         connection.pending.add(task)
         task.add_done_callback(connection.pending.discard)
-        task.add_done_callback(lambda _: connection.settle())
+        task.add_done_callback(lambda _: connection.close_if_finished())
 
     def _call(self, connection: Connection, request: Request) -> Message | Awaitable[Message]:
         method = METHODS.get(request.method)
-        if request.method not in _FREE and not connection.may_ask():
-            raise RpcError(ErrorCode.BUSY, "too many requests", remedy="ask less often")
+        if request.method not in _UNLIMITED and not connection.take_request():
+            raise RpcError(ErrorCode.BUSY, "too many requests", remedy="send fewer per second")
         if method is None:
-            raise RpcError(
-                ErrorCode.UNKNOWN_METHOD,
-                f"there is no method {request.method!a}",
-                remedy=f"known are {', '.join(METHODS)}",
-            )
+            raise unknown_method(request.method, METHODS)
         if len(connection.pending) >= MAX_PENDING and request.method != "stop":
-            raise RpcError(ErrorCode.BUSY, "too many requests under way", remedy="wait for answers")
+            raise RpcError(ErrorCode.BUSY, "too many pending requests", remedy="await responses")
         return self._handlers[request.method](connection, read_params(method.params, request))
 
-    async def _see_through(
+    async def _finish(
         self, connection: Connection, request: Request, result: Awaitable[Message]
     ) -> None:
         try:
-            self._succeed(connection, request, await result)
+            self._respond(connection, request, await result)
         except Exception as error:
-            self._fail(connection, request, error)
+            self._respond_error(connection, request, error)
 
-    def _succeed(self, connection: Connection, request: Request, result: Message) -> None:
-        if request.wants_answer:
-            connection.answer(result_line(request.id, result))
+    def _respond(self, connection: Connection, request: Request, result: Message) -> None:
+        if request.expects_response:
+            connection.respond(result_line(request.id, result.model_dump_json()))
 
-    def _fail(self, connection: Connection, request: Request | None, error: Exception) -> None:
-        if request is None or request.wants_answer:
+    def _respond_error(
+        self, connection: Connection, request: Request | None, error: Exception
+    ) -> None:
+        if request is None or request.expects_response:
             id = None if request is None else request.id
-            connection.answer(error_line(id, _told(error)))
+            connection.respond(error_line(id, _rpc_error(error)))
 
 
-def _told(error: Exception) -> RpcError:
-    """An error as a client is told it."""
-    if isinstance(error, RpcError):
-        return error
-    if isinstance(error, LinkError):
-        return RpcError(ErrorCode.LINK, str(error))
-    if isinstance(error, CommandRefused):
-        return RpcError(ErrorCode.REFUSED, str(error))
-    if isinstance(error, DriverError):
-        return RpcError(ErrorCode.WRONG_STATE, str(error))
-    if isinstance(error, InputError):
-        return RpcError(ErrorCode.INVALID_PARAMS, str(error))
-    _logger.error("a request failed", exc_info=error)
+def _rpc_error(error: Exception) -> RpcError:
+    """Translate an exception for the client; the details of a bug go to the log alone."""
+    match error:
+        case RpcError():
+            return error
+        case LinkError():
+            return RpcError(ErrorCode.LINK, str(error))
+        case CommandRefused():
+            return RpcError(ErrorCode.REFUSED, str(error))
+        case DriverError():
+            return RpcError(ErrorCode.WRONG_STATE, str(error))
+        case InputError():
+            return RpcError(ErrorCode.INVALID_PARAMS, str(error))
+    _logger.error("request failed", exc_info=error)
     return RpcError(
         ErrorCode.INTERNAL,
         f"a bug in the daemon ({type(error).__name__})",
-        remedy="see the daemon's log and report it",
+        remedy="report it with the daemon's log",
     )

@@ -1,4 +1,4 @@
-"""Where daemon and clients meet unless they are told otherwise."""
+"""Where the daemon's socket is by default."""
 
 import os
 import tempfile
@@ -8,7 +8,7 @@ from pathlib import Path
 from model.arguments import expect_path
 
 SYSTEM_SOCKET = Path("/run/era-haptics/daemon.sock")
-"""Where it is as a system service."""
+"""The socket of the system service."""
 
 
 def default_socket(environment: Mapping[str, str] = os.environ) -> Path:
@@ -23,19 +23,19 @@ def default_socket(environment: Mapping[str, str] = os.environ) -> Path:
 
 
 def find_socket(given: Path | str | None) -> Path:
-    """The socket to connect to: the given one, this user's, or else that of the system service."""
+    """The socket to connect to: the given one, this user's, or else the system service's."""
     if given is not None:
         return expect_path(given, what="path")
     own = default_socket()
-    return own if own.exists() or not _is_there(SYSTEM_SOCKET) else SYSTEM_SOCKET
+    return own if own.exists() or not _exists(SYSTEM_SOCKET) else SYSTEM_SOCKET
 
 
-def _is_there(path: Path) -> bool:
-    """Whether there is a socket; also in a folder of others: connecting tells that it is theirs."""
+def _exists(path: Path) -> bool:
+    """Whether a path exists, also in a folder that only other users may read."""
     try:
         path.stat()
     except PermissionError:
-        return True
+        return True  # connecting reports whose it is
     except OSError:
         return False
     return True

@@ -1,11 +1,8 @@
-"""Which lines that wait are made moot by the next one: touches, of which the newest counts.
+"""Whether a queued line is superseded by the next one: of touch frames only the newest counts.
 
-A client that floods sends more than anybody needs. To see that one is moot costs a fraction of
-doing what it says, so the newest is not far behind even then, and others wait less.
-
-A frame holds all fingers of its source, so that with the newest nothing is left down that was
-lifted; who lifted and touched again within the time that lines wait has moved. What would be
-refused takes no other's place, or a lift could get lost.
+Recognising this costs a fraction of serving the line, so a client that floods the daemon with
+touches neither lags behind nor delays others. A frame holds all fingers of its source, hence no
+lift is lost. A line that would be refused supersedes nothing.
 """
 
 from contextlib import suppress
@@ -17,21 +14,20 @@ from controller.api.methods import TouchParams
 
 
 def is_superseded(line: bytes, following: bytes) -> bool:
-    """Whether a line is a touch that wants no answer, and the following one takes its place."""
-    source = _source(line)
-    return source is not None and source == _source(following)
+    """Whether both lines are touch frames of one source, without an id."""
+    source = _touch_source(line)
+    return source is not None and source == _touch_source(following)
 
 
-@lru_cache(maxsize=2)  # what followed is asked about again, as the line that it is then
-def _source(line: bytes) -> str | None:
-    """The source of a touch that wants no answer; None of any other line."""
+@lru_cache(maxsize=2)  # the following line is the first one next time
+def _touch_source(line: bytes) -> str | None:
+    """The source of a valid touch frame without an id; None for any other line."""
     try:
-        said = from_json(line, allow_inf_nan=False)
+        content = from_json(line, allow_inf_nan=False)
     except ValueError:
         return None
-    match said:
-        # Nothing else is in it, least of all an id.
-        case {"jsonrpc": "2.0", "method": "touch", "params": params} if len(said) == 3:
+    match content:
+        case {"jsonrpc": "2.0", "method": "touch", "params": params} if len(content) == 3:
             with suppress(ValidationError):
                 return TouchParams.model_validate(params).source
     return None

@@ -1,4 +1,4 @@
-"""What the daemon tells subscribers unasked: notifications of the method `event`, by topic."""
+"""The topics of `event` notifications, and the data of each."""
 
 from typing import Any, Literal, NamedTuple
 
@@ -17,25 +17,25 @@ from controller.api.schema import (
 
 
 class StateEvent(Message):
-    """The daemon's state is another now."""
+    """The daemon changed its state."""
 
     old: DaemonStateName
     new: DaemonStateName
     cause: str
-    remedy: str | None = Field(description="what to do about it, where anything is to be done")
+    remedy: str | None = Field(description="what to do about it; null if nothing")
 
 
 class ContactsEvent(Message):
-    """The contacts changed; all of them, before anything is decided about them."""
+    """All contacts after a change, before a pattern is selected for them."""
 
     contacts: list[ContactStatus]
 
 
 class PatternEvent(Message):
-    """A pattern that the amplifiers have confirmed."""
+    """A pattern that the amplifiers confirmed."""
 
     contacts: list[ContactStatus]
-    drive: dict[str, PlayedTone] = Field(description="by ERA, silent ones left out")
+    drive: dict[str, PlayedTone] = Field(description="by ERA, without silent ones")
     predicted_contrast_db: float | None
     robust_contrast_db: float | None
     predicted_level_db_sl: float | None
@@ -43,30 +43,30 @@ class PatternEvent(Message):
 
 
 class SilenceEvent(Message):
-    """All channels are brought to zero, or stay there, or cannot be reached: the state tells."""
+    """No channel is driven; if a link is lost (see the state), as far as known."""
 
     contacts: list[ContactStatus]
     reason: str
-    latency_ms: float | None = Field(description="null where silence needed no command")
+    latency_ms: float | None = Field(description="null if no command was needed")
 
 
 class AmplifiersEvent(Message):
-    """All amplifiers, at the rate that was subscribed to."""
+    """All amplifiers, at the subscribed rate."""
 
     amplifiers: list[AmplifierStatus]
 
 
 class LatencyEvent(Message):
-    """LatencyStatistics, at the rate that was subscribed to."""
+    """Latencies, at the subscribed rate."""
 
     latency_ms: LatencySummary
     plain_because: str | None = Field(
-        description="why touches begin along plain ramps though shaped onsets are possible"
+        description="why onsets are plain ramps although shaped ones are possible"
     )
 
 
 class LogEvent(Message):
-    """A line of the daemon's log."""
+    """A record of the daemon's log."""
 
     level: Literal["info", "warning", "error"]
     message: str
@@ -75,48 +75,47 @@ class LogEvent(Message):
 
 
 class LinkEvent(Message):
-    """A link to amplifiers was lost, could not be reopened, or is back."""
+    """The link to amplifiers was lost, could not be reopened, or was reopened."""
 
     event: Literal["lost", "retry", "reopened"]
-    amplifier: str | None = Field(description="which one, where that is known")
+    amplifier: str | None = Field(description="its name, if known")
     message: str
     remedy: str | None
 
 
 class LayoutEvent(Message):
-    """What touches mean is another now: the layout as `hello` tells it; `effects` may be others."""
+    """The surface layout was replaced; `effects` may have changed with it."""
 
-    layout: dict[str, Any] | None = Field(description="the surface layout, null without one")
+    layout: dict[str, Any] | None = Field(description="the surface layout; null without one")
 
 
 class TopicData(NamedTuple):
-    """Data and meaning of a topic."""
+    """Data and summary of a topic."""
 
     data: type[Message]
-    meaning: str
+    summary: str
 
 
 TOPICS: dict[Topic, TopicData] = {
     "state": TopicData(StateEvent, "every change of state, with its cause"),
-    "contacts": TopicData(ContactsEvent, "fingers came, moved or went"),
-    "pattern": TopicData(PatternEvent, "what is played now, confirmed by the amplifiers"),
-    "silence": TopicData(SilenceEvent, "nothing is played now, and why"),
-    "amplifiers": TopicData(AmplifiersEvent, "how the amplifiers are, at rate_hz"),
-    "latency": TopicData(LatencyEvent, "how fast touches become commands, at rate_hz"),
-    "log": TopicData(
-        LogEvent,
-        "what the daemon logs, from info upwards, but for what `state` and `link` tell",
-    ),
-    "link": TopicData(LinkEvent, "links to amplifiers that are lost or come back"),
-    "layout": TopicData(LayoutEvent, "touches mean something else from now on, and what"),
+    "contacts": TopicData(ContactsEvent, "fingers touched, moved or lifted"),
+    "pattern": TopicData(PatternEvent, "what plays now, as the amplifiers confirmed it"),
+    "silence": TopicData(SilenceEvent, "nothing plays now, and why"),
+    "amplifiers": TopicData(AmplifiersEvent, "status of the amplifiers, at rate_hz"),
+    "latency": TopicData(LatencyEvent, "latency from touch to command, at rate_hz"),
+    "log": TopicData(LogEvent, "log records from level info, without those of `state` and `link`"),
+    "link": TopicData(LinkEvent, "links to amplifiers that were lost or reopened"),
+    "layout": TopicData(LayoutEvent, "the surface layout was replaced"),
 }
 """Every topic, by name."""
 
 
 class EventParams(Message):
-    """The parameters of an `event` notification; data is the topic's."""
+    """Parameters of an `event` notification."""
 
     topic: Topic
-    time_s: float = Field(description="on the daemon's CLOCK_MONOTONIC")
-    lost: Count = Field(description="notifications lost since the last, for this client is slow")
+    time_s: float = Field(description="on CLOCK_MONOTONIC")
+    lost: Count = Field(
+        description="notifications dropped before this one because the client reads too slowly"
+    )
     data: dict[str, object]

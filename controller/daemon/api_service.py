@@ -204,7 +204,7 @@ class ApiService:
             self._client_count += 1
             self._client_numbers[client] = self._client_count
         self._touches.add(
-            client, params, client_name=str(self._client_numbers[client]), now=client.heard_at
+            client, params, client_name=str(self._client_numbers[client]), now=client.received_at
         )
         return Empty()
 

@@ -110,8 +110,8 @@ class Daemon:
         )
         self._server = ApiServer(
             self._api.handlers(),
-            left=self._api.client_left,
-            keeps=self._api.keeps,
+            on_disconnect=self._api.client_left,
+            is_protected=self._api.keeps,
             clock=clock.now,
         )
         self._children = ChildProcesses()

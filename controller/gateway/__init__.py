@@ -1,1 +1,1 @@
-"""The web gateway: a process of its own that puts the API of the daemon before browsers."""
+"""The web gateway: a process that offers the daemon's API and the dashboard to browsers."""

@@ -15,30 +15,30 @@ from starlette.routing import Mount, Route, WebSocketRoute
 from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocket
 
-from controller.api.jsonrpc import ErrorCode, RpcError, read_params
+from controller.api.jsonrpc import ErrorCode, RpcError, read_params, unknown_method
 from controller.api.jsonrpc import Request as RpcRequest
-from controller.api.methods import METHODS, TouchParams
 from controller.api.rate_limit import RateLimiter
-from controller.gateway.access import LARGEST_BODY, SUBPROTOCOL, Access
+from controller.api.schema import Message
+from controller.gateway.access import MAX_BODY, SUBPROTOCOL, Access
 from controller.gateway.mirror import DaemonMirror
-from controller.gateway.openapi import NOT_OVER_HTTP, STATUS_OF, openapi
-from controller.gateway.session import TRY_AGAIN_LATER, Session, told_apart
+from controller.gateway.openapi import HTTP_METHODS, HTTP_STATUS, openapi
+from controller.gateway.session import TRY_AGAIN_LATER, Session, touch_params
 from controller.gateway.settings import Settings
 
 MAX_SESSIONS = 32
-HTTP_REQUESTS_PER_SECOND = 500.0  # of everybody together; a stop is not counted
+MAX_HTTP_RATE = 500.0  # 1/s; of all clients together, stops not counted
 
 _PAGE = Path(__file__).parent / "page"
 
 
 class Gateway:
-    """Everything that the routes share; `app` is the ASGI application."""
+    """State shared by the routes; `app` is the ASGI application."""
 
     def __init__(self, settings: Settings) -> None:
         self._sessions: set[Session] = set()
-        self._picture = DaemonMirror(settings.socket, tell=self._tell)
-        self._rate = RateLimiter(HTTP_REQUESTS_PER_SECOND, clock=time.monotonic)
-        self._description = json.dumps(openapi()).encode()
+        self._mirror = DaemonMirror(settings.socket, publish=self._publish)
+        self._rate = RateLimiter(MAX_HTTP_RATE, clock=time.monotonic)
+        self._openapi = json.dumps(openapi()).encode()
         self.app = Starlette(
             routes=[
                 Mount(
@@ -60,57 +60,52 @@ class Gateway:
                     allow_headers=["Authorization", "Content-Type"],
                 ),
             ],
-            exception_handlers={HTTPException: _refused},
+            exception_handlers={HTTPException: _http_error},
         )
 
     async def follow(self) -> None:
-        """Reach for the daemon, and follow what it tells, until cancelled."""
-        await self._picture.run()
+        """Follow the daemon until cancelled."""
+        await self._mirror.run()
 
-    def _tell(self, topic: str, frame: str | bytes) -> None:
+    def _publish(self, topic: str, frame: str | bytes) -> None:
         for session in self._sessions:
-            session.tell(topic, frame)
+            session.publish(topic, frame)
 
     async def _describe(self, _: Request) -> Response:
-        return Response(self._description, media_type="application/json")
+        return Response(self._openapi, media_type="application/json")
 
     async def _call(self, request: Request) -> Response:
-        """One method of the API, its parameters in the body."""
+        """Call one method of the API; its parameters are the body."""
         method = request.path_params["method"]
         try:
-            if method not in METHODS or method in NOT_OVER_HTTP:
-                known = ", ".join(name for name in METHODS if name not in NOT_OVER_HTTP)
-                raise RpcError(
-                    ErrorCode.UNKNOWN_METHOD,
-                    f"there is no method {method[:40]!a}",
-                    remedy=f"known are {known}",
-                )
-            params = await _body(request)
+            if method not in HTTP_METHODS:
+                raise unknown_method(method, HTTP_METHODS)
+            body = await _body(request)
             if method != "stop" and not self._rate.take():
-                raise RpcError(ErrorCode.BUSY, "too many requests", remedy="ask less often")
-            asked = read_params(
-                METHODS[method].params, RpcRequest(method, params, None, wants_answer=True)
-            )
-            if isinstance(asked, TouchParams):
-                asked = told_apart(asked, "http")
-            return JSONResponse(await self._picture.daemon.call(method, asked))
+                raise RpcError(ErrorCode.BUSY, "too many requests", remedy="send fewer per second")
+            call = RpcRequest(method, body, None, expects_response=True)
+            if method == "touch":
+                params: Message = touch_params(call, "http")
+            else:
+                params = read_params(HTTP_METHODS[method].params, call)
+            return JSONResponse(await self._mirror.daemon.call(method, params))
         except RpcError as error:
-            return _failed(STATUS_OF[error.code], error)
+            return _api_error(error)
         except ClientDisconnect:
-            return Response(status_code=400)  # which nobody will read
+            return Response(status_code=400)  # sent to nowhere
 
     async def _serve(self, socket: WebSocket) -> None:
-        """One browser."""
+        """Serve one browser."""
         if SUBPROTOCOL not in socket.scope["subprotocols"]:
-            await socket.close(1002, f"speak the subprotocol {SUBPROTOCOL}")
+            await socket.close(1002, f"the subprotocol must be {SUBPROTOCOL}")
             return
         if len(self._sessions) >= MAX_SESSIONS:
             await socket.close(TRY_AGAIN_LATER, "too many clients")
             return
         session = Session(
-            socket, self._picture.daemon, current=self._picture.current, clock=time.monotonic
+            socket, self._mirror.daemon, current=self._mirror.current, clock=time.monotonic
         )
-        self._sessions.add(session)  # before anything waits, or more would come in than may
+        self._sessions.add(session)  # before the first await, so that the limit holds
         try:
             await socket.accept(subprotocol=SUBPROTOCOL)
             await session.run()
@@ -119,34 +114,33 @@ class Gateway:
 
 
 async def _body(request: Request) -> dict[str, Any]:
-    """The JSON object in a request's body; raises RpcError and HTTPException."""
+    """The JSON object in a request's body; raises HTTPException."""
     media = request.headers.get("content-type", "").partition(";")[0].strip().lower()
     if media not in ("application/json", ""):
-        raise HTTPException(415, "the body is of another type; send application/json")
+        raise HTTPException(415, "the content type must be application/json")
     body = b""
     async for chunk in request.stream():
         body += chunk
-        if len(body) > LARGEST_BODY:
-            raise HTTPException(413, f"a request has at most {LARGEST_BODY} bytes")
-    if body and not media:  # what has no parameters needs no type either
-        raise HTTPException(415, "the body has no type; send application/json")
+        if len(body) > MAX_BODY:
+            raise HTTPException(413, f"the body must have at most {MAX_BODY} bytes")
+    if body and not media:  # an empty body needs no type
+        raise HTTPException(415, "the content type must be application/json")
     try:
         params = json.loads(body or b"{}")
     except (ValueError, RecursionError) as error:
-        raise HTTPException(400, "the body is no JSON; send one JSON object") from error
+        raise HTTPException(400, "the body must be a JSON object") from error
     if not isinstance(params, dict):
-        raise HTTPException(400, "the body is no JSON object; send one, such as {}")
+        raise HTTPException(400, "the body must be a JSON object")
     return params
 
 
-def _failed(status: int, error: RpcError) -> Response:
-    """An error of the API."""
+def _api_error(error: RpcError) -> Response:
     return JSONResponse(
-        {"error": str(error), "code": int(error.code), "data": error.data.model_dump()}, status
+        {"error": str(error), "code": int(error.code), "data": error.data.model_dump()},
+        HTTP_STATUS[error.code],
     )
 
 
-async def _refused(_: Request, error: Exception) -> Response:
-    """An error of HTTP."""
-    assert isinstance(error, HTTPException)  # noqa: S101 (it is registered for these alone)
+async def _http_error(_: Request, error: Exception) -> Response:
+    assert isinstance(error, HTTPException)  # noqa: S101 (registered for this class alone)
     return JSONResponse({"error": error.detail}, error.status_code, error.headers)

@@ -1,4 +1,4 @@
-"""`era gateway`: the daemon's API and its page in browsers."""
+"""`era gateway`: the daemon's API and the dashboard for browsers."""
 
 import os
 import threading
@@ -16,37 +16,35 @@ EXIT_STATUS: dict[type[BaseException], int] = {InputError: 2}
 
 @app.callback()
 def _only_commands() -> None:
-    """Keep `gateway` a command, though it is the only one."""
+    """Keep `gateway` a subcommand although it is the only one."""
 
 
 @app.command()
 def gateway(
     listen: Annotated[
-        str, typer.Option(metavar="HOST:PORT", help="Where browsers reach it; port 0: a free one.")
+        str, typer.Option(metavar="HOST:PORT", help="Address to listen on; port 0: any free one.")
     ] = "127.0.0.1:8137",
     socket: Annotated[
-        Path | None, typer.Option(help="The daemon's socket; its usual place if left out.")
+        Path | None, typer.Option(help="The daemon's socket (default: the usual one).")
     ] = None,
     token_file: Annotated[
         Path | None,
-        typer.Option(help="A file (mode 600) with the token; a new one is made if left out."),
+        typer.Option(help="File (mode 600) with the token (default: a random one)."),
     ] = None,
-    certificate: Annotated[
-        Path | None, typer.Option(help="For TLS: the certificate chain, PEM.")
-    ] = None,
-    key: Annotated[Path | None, typer.Option(help="For TLS: the certificate's key, PEM.")] = None,
+    certificate: Annotated[Path | None, typer.Option(help="TLS certificate chain, PEM.")] = None,
+    key: Annotated[Path | None, typer.Option(help="TLS key of the certificate, PEM.")] = None,
     allow_host: Annotated[
         list[str] | None,
-        typer.Option(metavar="NAME", help="A further name by which browsers call it."),
+        typer.Option(metavar="NAME", help="Further allowed host name."),
     ] = None,
     allow_origin: Annotated[
         list[str] | None,
-        typer.Option(metavar="ORIGIN", help="Pages of others that may use it: https://HOST[:PORT]"),
+        typer.Option(metavar="ORIGIN", help="Further allowed origin: https://HOST[:PORT]"),
     ] = None,
 ) -> None:
-    """Put the daemon's API and the dashboard before browsers.
+    """Serve the daemon's API and the dashboard to browsers.
 
-    Prints the URL to open; it holds the token. An operational interface, no emergency stop.
+    Prints the URL to open, with the token. An operational interface, not an emergency stop.
     """
     import asyncio
 
@@ -78,7 +76,7 @@ def gateway(
 
     asyncio.run(serve(settings, announce=announce))
     if threading.active_count() > 1:
-        # The plate's field is being solved: Python would abort within it. Nothing is left to do.
+        # The field is still being computed; Python would abort in that thread at its exit.
         os._exit(0)
 
 
@@ -86,5 +84,5 @@ def _host_and_port(text: str) -> tuple[str, int]:
     """Host and port of HOST:PORT, [HOST]:PORT or PORT alone."""
     host, _, port = text.rpartition(":")
     if not (port.isascii() and port.isdecimal()):
-        raise InputError(f"--listen {text}: expected HOST:PORT, such as 127.0.0.1:8137")
+        raise InputError(f"--listen must be HOST:PORT, such as 127.0.0.1:8137, got {text}")
     return host.strip("[]") or "127.0.0.1", int(port)

@@ -1,7 +1,7 @@
-"""HTTP and WebSocket connections as uvicorn serves them, with the bounds that it does not have.
+"""HTTP and WebSocket connections of uvicorn, with the bounds that uvicorn lacks.
 
-Whoever connects may be silent, slow, or not read what it is sent; none of it may keep others out or
-fill the memory. All times count from what was whole the last time, so that a trickle wins nothing.
+A client may be silent, slow, or not read; none of these keeps other clients out or fills memory.
+Timeouts count from the last complete request, so sending byte by byte gains nothing.
 """
 
 import asyncio
@@ -13,123 +13,122 @@ from websockets.frames import CloseCode, Frame
 
 from controller.api.rate_limit import RateLimiter
 
-MOST_WAITING = 128  # connections that have not sent a whole request yet
-REQUEST_PATIENCE = 5.0  # s; a connection without a whole request by then is closed
-UNREAD_PATIENCE = 5.0  # s; for whoever asks over HTTP and does not read the answer
-MOST_UNREAD = 1 << 18  # bytes for one WebSocket; answers are bounded before, pongs are not
-MOST_FRAGMENTS = 64  # of one message; a browser sends a message of 64 KiB in one or two
-CONTROLS_PER_SECOND = 100.0  # pings and pongs of one WebSocket; it needs one in ten seconds
-_SLICE = 1 << 12  # bytes that are looked at before it is asked again whether to go on
-PARTING = 1.0  # s; for the last words to a WebSocket that is left
+MAX_IDLE = 128  # connections that have not sent a complete request
+REQUEST_TIMEOUT = 5.0  # s; for a complete request
+UNREAD_TIMEOUT = 5.0  # s; for reading a response over HTTP
+MAX_UNREAD = 1 << 18  # bytes per WebSocket; bounds pongs, responses are bounded by the outbox
+MAX_FRAGMENTS = 64  # per message; a browser sends 64 KiB in one or two
+MAX_CONTROL_RATE = 100.0  # 1/s; pings and pongs of one WebSocket; one in ten seconds is needed
+CLOSE_TIMEOUT = 1.0  # s; for a WebSocket to close after its last frame
+_SLICE = 1 << 12  # bytes that are processed between checks of the bounds
 
 
 class HttpConnection(H11Protocol):
-    """HTTP for connections that come to ask something.
+    """HTTP with timeouts, and a bound on connections without a complete request.
 
-    Whoever has not sent a whole request holds a place for five seconds at most, or until 128
-    others have come after; so two thousand silent connections do not keep a browser out.
+    The oldest idle connection is closed for a new one, so thousands of silent connections do not
+    keep a browser out.
     """
 
-    _waiting: dict["HttpConnection", asyncio.TimerHandle] = {}  # noqa: RUF012 (of all connections)
+    _idle: dict["HttpConnection", asyncio.TimerHandle] = {}  # noqa: RUF012 (of all connections)
     _unread: asyncio.TimerHandle | None = None
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """Let it in, if need be in place of the one that has waited longest."""
+        """Accept it as idle."""
         super().connection_made(transport)
-        self._wait()
+        self._start_idle()
 
     def handle_events(self) -> None:
-        """Note that it has asked, once a request is whole."""
+        """End being idle at a complete request."""
         try:
             super().handle_events()
-        except h11.LocalProtocolError:  # garbage in a body that was answered already
+        except h11.LocalProtocolError:  # invalid data in the body of a request already answered
             self.transport.abort()
             return
         cycle: RequestResponseCycle | None = self.cycle
         if cycle is not None and not cycle.more_body and not cycle.response_complete:
-            self._heard()
+            self._end_idle()
 
     def on_response_complete(self) -> None:
-        """Wait for the next request as for the first."""
-        self._wait()
+        """Be idle until the next request."""
+        self._start_idle()
         super().on_response_complete()
 
     def handle_websocket_upgrade(self, event: h11.Request) -> None:
-        """A WebSocket takes the connection over."""
-        self._heard()
+        """Hand over to a WebSocket."""
+        self._end_idle()
         super().handle_websocket_upgrade(event)
 
     def pause_writing(self) -> None:
-        """It does not read: not for long."""
+        """Start the timeout of a client that does not read."""
         super().pause_writing()
-        self._unread = self.loop.call_later(UNREAD_PATIENCE, self.transport.abort)
+        self._unread = self.loop.call_later(UNREAD_TIMEOUT, self.transport.abort)
 
     def resume_writing(self) -> None:
-        """It reads again."""
+        """Cancel the timeout of a client that does not read."""
         super().resume_writing()
-        self._has_read()
+        self._cancel_unread()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Free its place."""
-        self._heard()
-        self._has_read()
+        """Cancel all timeouts."""
+        self._end_idle()
+        self._cancel_unread()
         super().connection_lost(exc)
 
-    def _wait(self) -> None:
-        """Begin to wait for a whole request."""
+    def _start_idle(self) -> None:
         if self.transport.is_closing():
             return
-        self._heard()
-        while len(self._waiting) >= MOST_WAITING:
-            oldest = next(iter(self._waiting))
-            oldest._heard()
+        self._end_idle()
+        while len(self._idle) >= MAX_IDLE:
+            oldest = next(iter(self._idle))
+            oldest._end_idle()
             oldest.transport.abort()
-        self._waiting[self] = self.loop.call_later(REQUEST_PATIENCE, self.transport.abort)
+        self._idle[self] = self.loop.call_later(REQUEST_TIMEOUT, self.transport.abort)
 
-    def _heard(self) -> None:
-        timer = self._waiting.pop(self, None)
+    def _end_idle(self) -> None:
+        timer = self._idle.pop(self, None)
         if timer is not None:
             timer.cancel()
 
-    def _has_read(self) -> None:
+    def _cancel_unread(self) -> None:
         if self._unread is not None:
             self._unread.cancel()
             self._unread = None
 
 
 class WebSocketConnection(WebSocketsSansIOProtocol):
-    """A WebSocket whose every buffer has an end, and which ends when the gateway leaves it."""
+    """A WebSocket with bounded buffers, fragments and control frames."""
 
     _controls: RateLimiter | None = None
 
     def data_received(self, data: bytes) -> None:
-        """Take what was sent, unless what it was sent before lies unread."""
-        for at in range(0, len(data), _SLICE):
-            if self.transport.get_write_buffer_size() > MOST_UNREAD:
+        """Process data unless too much output is unread."""
+        for start in range(0, len(data), _SLICE):
+            if self.transport.get_write_buffer_size() > MAX_UNREAD:
                 self.transport.abort()
             if self.transport.is_closing():
                 return
-            super().data_received(data[at : at + _SLICE])
+            super().data_received(data[start : start + _SLICE])
 
     def handle_ping(self) -> None:
-        """Answer a ping, but not a flood of them."""
-        if self._may_go_on():
+        """Answer a ping within the rate of control frames."""
+        if self._take_control():
             super().handle_ping()
 
     def handle_pong(self, event: Frame) -> None:
-        """Take a pong; many come from nobody who was asked."""
-        if self._may_go_on():
+        """Accept a pong within the rate of control frames."""
+        if self._take_control():
             super().handle_pong(event)
 
     def handle_cont(self, event: Frame) -> None:
-        """A further fragment of a message; empty ones have no size that could be bounded."""
-        if len(self.frames) >= MOST_FRAGMENTS:
+        """Accept a fragment, of a bounded number: the size of empty ones is no bound."""
+        if len(self.frames) >= MAX_FRAGMENTS:
             self.transport.abort()
             return
         super().handle_cont(event)
 
     def send_receive_event_to_app(self) -> None:
-        """Hand on a whole message; one that is no UTF-8 ends it, without a word in the log."""
+        """Pass a complete message on; invalid UTF-8 closes without a log record."""
         if self.curr_msg_data_type == "text" and not _is_utf8(b"".join(self.frames)):
             self.conn.send_close(CloseCode.INVALID_DATA)
             self.handle_parser_exception()
@@ -137,28 +136,28 @@ class WebSocketConnection(WebSocketsSansIOProtocol):
         super().send_receive_event_to_app()
 
     def keepalive_timeout(self) -> None:
-        """It does not answer: it need not be waited for."""
+        """Close without waiting for a client that does not answer pings."""
         super().keepalive_timeout()
         self.transport.abort()
 
-    def _may_go_on(self) -> bool:
-        """Whether it keeps within the rate of control frames; otherwise it is left."""
-        if self._controls is None:
-            self._controls = RateLimiter(CONTROLS_PER_SECOND, clock=self.loop.time)
-        is_fine = self._controls.take()
-        if not is_fine:
-            self.transport.abort()
-        return is_fine
-
     async def run_asgi(self) -> None:
-        """Serve it; then it ends, whether it reads the last words or not."""
+        """Run the application, then close, whether or not the client reads its last frames."""
         await super().run_asgi()
-        self.loop.call_later(PARTING, self.transport.abort)
+        self.loop.call_later(CLOSE_TIMEOUT, self.transport.abort)
+
+    def _take_control(self) -> bool:
+        """Count a control frame; close if there are too many."""
+        if self._controls is None:
+            self._controls = RateLimiter(MAX_CONTROL_RATE, clock=self.loop.time)
+        is_within = self._controls.take()
+        if not is_within:
+            self.transport.abort()
+        return is_within
 
 
-def _is_utf8(said: bytes) -> bool:
+def _is_utf8(data: bytes) -> bool:
     try:
-        said.decode()
+        data.decode()
     except UnicodeDecodeError:
         return False
     return True

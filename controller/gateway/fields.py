@@ -1,4 +1,4 @@
-"""How the plate vibrates, for the picture of it: complex amplitude per frequency on a raster."""
+"""The plate's vibration field for drawing: complex amplitude per frequency on a grid."""
 
 import math
 from collections import OrderedDict
@@ -12,26 +12,21 @@ from model.arrays import ComplexArray, lattice
 from model.reduction.free_plate import solve_free_plate
 from model.rig.rig import Rig
 
-_COLUMNS = 64  # points along the plate's longer side; bending waves are several of them long
-_MOST_FREQUENCIES = 64  # that are kept
+_COLUMNS = 64  # grid points along the longer side; several per bending wavelength
+_MAX_FREQUENCIES = 64  # in the cache
 _FULL_SCALE = 32767
 _HEADER = np.dtype("<f4")
 
 
 @dataclass(frozen=True)
 class Field:
-    """Complex acceleration [m/s²] per frequency [Hz] (f, ny, nx), south-west corner first."""
+    """Complex acceleration [m/s²] (f, ny, nx) per frequency [Hz], south-west corner first."""
 
     frequencies: tuple[float, ...]
     amplitude: ComplexArray
 
-    @property
-    def peak(self) -> float:
-        """The highest peak acceleration anywhere [m/s²]: the sum over the frequencies."""
-        return float(np.abs(self.amplitude).sum(axis=0).max(initial=0.0))
-
     def encoded(self) -> bytes:
-        """For the wire, all little-endian.
+        """Encode for the WebSocket, little-endian.
 
         u16 columns, u16 rows, u16 frequencies, u16 zero; f32 scale [m/s²]; f32 per frequency [Hz];
         then i16 per frequency, row and column: real and imaginary part, of 32767 as the scale.
@@ -45,8 +40,8 @@ class Field:
         return sizes.tobytes() + numbers.tobytes() + whole.tobytes()
 
 
-class FieldMaker:
-    """Fields of one rig; solves its plate once, and keeps what each frequency does."""
+class FieldSolver:
+    """Computes fields of one rig; solves its plate once and caches the response per frequency."""
 
     def __init__(self, rig: Rig) -> None:
         self._rig = rig
@@ -63,7 +58,7 @@ class FieldMaker:
         self._responses: OrderedDict[float, ComplexArray] = OrderedDict()
 
     def field(self, drive: Mapping[str, PlayedTone]) -> Field:
-        """The plate's steady vibration under a drive by ERA; raises InputError."""
+        """The steady-state vibration under a drive by ERA; raises InputError."""
         frequencies = tuple(sorted({tone.frequency_hz for tone in drive.values()}))
         names = [era.name for era in self._rig.eras]
         amplitude = np.zeros((len(frequencies), self.rows * self.columns), dtype=complex)
@@ -74,13 +69,13 @@ class FieldMaker:
         return Field(frequencies, amplitude.reshape(-1, self.rows, self.columns))
 
     def _response(self, frequency: float) -> ComplexArray:
-        """Acceleration of each ERA at full stroke [m/s²], (eras, points)."""
+        """Acceleration [m/s²] (eras, points) per ERA at full stroke."""
         if frequency not in self._responses:
             (response,) = self._free.acceleration(
                 self._rig.eras, np.array([frequency]), self._points, loads=self._rig.loads
             )
             self._responses[frequency] = response
-            if len(self._responses) > _MOST_FREQUENCIES:
+            if len(self._responses) > _MAX_FREQUENCIES:
                 self._responses.popitem(last=False)
         self._responses.move_to_end(frequency)
         return self._responses[frequency]

@@ -1,4 +1,4 @@
-"""Whether the libraries of the gateway are there: they come with an extra, not with the rest."""
+"""Check that the libraries of the gateway, an optional extra, are installed."""
 
 from importlib.util import find_spec
 
@@ -8,10 +8,10 @@ _LIBRARIES = ("starlette", "uvicorn", "websockets")
 
 
 def require_gateway() -> None:
-    """Raise InputError with what to install where one of its libraries is missing."""
+    """Raise InputError if a library of the gateway is missing."""
     for name in _LIBRARIES:
         if find_spec(name) is None:
             raise InputError(
-                f"the gateway and its page need {name}, which is not installed; "
+                f"the gateway needs {name}, which is not installed; "
                 "install it with  pip install 'era-haptics[gateway]'"
             )

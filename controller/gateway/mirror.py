@@ -1,7 +1,7 @@
-"""What all browsers are shown: the daemon's state as it was last told, and the plate's field."""
+"""The daemon's state as last reported, and the plate's vibration field, for all browsers."""
 
 import asyncio
-import contextlib
+import concurrent.futures
 import json
 import logging
 import threading
@@ -11,133 +11,123 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 from controller.api.client_protocol import Notification
-from controller.api.methods import HelloResult
 from controller.api.schema import PlayedTone
 from controller.gateway.daemon_link import DaemonLink
-from controller.gateway.fields import FieldMaker
-from controller.gateway.topics import FIELD, HELLO
+from controller.gateway.fields import FieldSolver
 from model.errors import InputError
 from model.rig.file import parse_rig
 
-_KEPT = frozenset({"state", "contacts", "pattern", "silence", "amplifiers", "latency", "layout"})
+FIELD = "field"
+"""Topic of the gateway: the plate's vibration, as binary frames; see `fields.Field.encoded`."""
+
+HELLO = "hello"
+"""Topic of the gateway: the daemon's `hello` result, null while disconnected."""
+
+_STATEFUL = frozenset(
+    {"state", "contacts", "pattern", "silence", "amplifiers", "latency", "layout"}
+)
 _NO_FIELD = bytes(8 + 4)  # no columns, no rows, no frequencies, scale 0
 
 _logger = logging.getLogger(__name__)
-Tell: TypeAlias = Callable[[str, str | bytes], None]
+Publish: TypeAlias = Callable[[str, str | bytes], None]
 
 
 class DaemonMirror:
-    """Follows the daemon at a socket and tells every change, topic by topic.
+    """Follows the daemon at a socket and publishes every change by topic.
 
-    tell: called with a topic and its frame, text as the daemon sent it, binary for the field.
+    publish: called with a topic and its frame: the daemon's own line as text, or a binary field.
     """
 
-    def __init__(self, socket: Path, *, tell: Tell) -> None:
+    def __init__(self, socket: Path, *, publish: Publish) -> None:
         self.daemon = DaemonLink(socket, on_hello=self._hello, on_event=self._event)
-        self._tell = tell
-        self._frames: dict[str, str | bytes] = {HELLO: _event_frame(HELLO, None)}
+        self._publish = publish
+        self._frames: dict[str, str | bytes] = {HELLO: _hello_frame(None)}
         self._rig_text: str | None = None
-        self._drawn: tuple[str, FieldMaker] | None = None  # of which rig; the thread's alone
+        self._solver: tuple[str, FieldSolver] | None = None  # by rig; used by the thread alone
         self._drive: dict[str, PlayedTone] = {}
-        self._wanted = asyncio.Event()
+        self._field_due = asyncio.Event()
 
     async def run(self) -> None:
         """Follow until cancelled."""
         async with asyncio.TaskGroup() as tasks:
             tasks.create_task(self.daemon.run())
-            tasks.create_task(self._draw())
+            tasks.create_task(self._update_field())
 
     def current(self, topic: str) -> str | bytes | None:
-        """What is so now of a topic, None if nothing was told."""
+        """The latest frame of a topic, None if there is none."""
         return self._frames.get(topic)
 
-    def _hello(self, hello: HelloResult | None) -> None:
-        """The daemon is there, another one perhaps, or gone."""
+    def _hello(self, hello: Mapping[str, Any] | None) -> None:
+        """Start over with a newly connected daemon, or without one."""
+        self._rig_text = None if hello is None else hello["rig_text"]
         self._frames.clear()
-        said = None if hello is None else hello.model_dump(mode="json")
-        self._show(HELLO, _event_frame(HELLO, said))
-        self._rig_text = None if hello is None else hello.rig_text
+        self._show(HELLO, _hello_frame(hello))
         self._drive = {}
-        self._wanted.set()
+        self._field_due.set()
 
-    def _event(self, told: Notification) -> None:
-        """Something happened."""
-        topic = told.topic
-        frame = _event_frame(topic, told.data, time_s=told.time, lost=told.lost)
+    def _event(self, event: Notification) -> None:
+        topic, frame = event.topic, event.line.decode()
         if topic in ("pattern", "silence"):
             self._frames.pop("silence" if topic == "pattern" else "pattern", None)
-            drive = told.data.get("drive", {})
             self._drive = {
-                name: PlayedTone.model_validate(tone, extra="ignore")
-                for name, tone in drive.items()
+                era: PlayedTone.model_validate(tone, extra="ignore")
+                for era, tone in event.data.get("drive", {}).items()
             }
-            self._wanted.set()
+            self._field_due.set()
         if topic == "layout":
-            self._exchange(told.data["layout"])
-        if topic in _KEPT:
+            self._replace_layout(event.data["layout"])
+        if topic in _STATEFUL:
             self._frames[topic] = frame
-        self._tell(topic, frame)
+        self._publish(topic, frame)
 
-    def _exchange(self, layout: dict[str, Any] | None) -> None:
-        """Say hello again if touches mean something else; at first it is what hello has said."""
+    def _replace_layout(self, layout: Mapping[str, Any] | None) -> None:
+        """Publish `hello` with the new layout, except for the one that `hello` had at first."""
         hello = self.daemon.hello
-        if hello is not None and ("layout" in self._frames or layout != hello.layout):
-            self.daemon.hello = hello.model_copy(update={"layout": layout})
-            self._show(HELLO, _event_frame(HELLO, self.daemon.hello.model_dump(mode="json")))
+        if hello is not None and ("layout" in self._frames or layout != hello["layout"]):
+            self.daemon.hello = {**hello, "layout": layout}
+            self._show(HELLO, _hello_frame(self.daemon.hello))
 
     def _show(self, topic: str, frame: str | bytes) -> None:
         self._frames[topic] = frame
-        self._tell(topic, frame)
+        self._publish(topic, frame)
 
-    async def _draw(self) -> None:
-        """Draw the field that is wanted last, in a thread: the routes go on meanwhile."""
+    async def _update_field(self) -> None:
+        """Compute the field of the newest drive, in a thread, whenever it is due."""
         while True:
-            await self._wanted.wait()
-            self._wanted.clear()
+            await self._field_due.wait()
+            self._field_due.clear()
             try:
-                frame = await _beside(partial(self._field, self._rig_text, dict(self._drive)))
+                frame = await _in_thread(partial(self._field, self._rig_text, dict(self._drive)))
             except InputError as error:
-                _logger.warning("the plate cannot be drawn: %s", error)
+                _logger.warning("field of the plate not computed: %s", error)
                 frame = _NO_FIELD
-            if not self._wanted.is_set():
+            if not self._field_due.is_set():
                 self._show(FIELD, frame)
 
     def _field(self, rig_text: str | None, drive: dict[str, PlayedTone]) -> bytes:
-        """The field under a drive."""
         if rig_text is None:
             return _NO_FIELD
-        if self._drawn is None or self._drawn[0] != rig_text:
-            self._drawn = rig_text, FieldMaker(parse_rig("the daemon's rig", rig_text))
-        return self._drawn[1].field(drive).encoded()
+        if self._solver is None or self._solver[0] != rig_text:
+            self._solver = rig_text, FieldSolver(parse_rig("the daemon's rig", rig_text))
+        return self._solver[1].field(drive).encoded()
 
 
-async def _beside(work: Callable[[], bytes]) -> bytes:
-    """Do work in a thread that the process does not wait for at its end, unlike a pool's."""
-    loop = asyncio.get_running_loop()
-    done: asyncio.Future[bytes] = loop.create_future()
-
-    def settle(result: bytes, error: Exception | None) -> None:
-        if done.cancelled():
-            return
-        if error is None:
-            done.set_result(result)
-        else:
-            done.set_exception(error)
+async def _in_thread(work: Callable[[], bytes]) -> bytes:
+    """Run work in a daemon thread, for which the process does not wait at its end."""
+    future: concurrent.futures.Future[bytes] = concurrent.futures.Future()
+    future.set_running_or_notify_cancel()
 
     def run() -> None:
-        result, failure = b"", None
         try:
-            result = work()
+            future.set_result(work())
         except Exception as error:
-            failure = error
-        with contextlib.suppress(RuntimeError):  # the loop may be over
-            loop.call_soon_threadsafe(settle, result, failure)
+            future.set_exception(error)
 
-    threading.Thread(target=run, name="the plate's field", daemon=True).start()
-    return await done
+    threading.Thread(target=run, name="vibration field", daemon=True).start()
+    return await asyncio.wrap_future(future)
 
 
-def _event_frame(topic: str, data: Mapping[str, Any] | None, **when: float) -> str:
-    """A notification, the daemon's or the gateway's own."""
-    said = {"jsonrpc": "2.0", "method": "event", "params": {"topic": topic, **when, "data": data}}
-    return json.dumps(said, separators=(",", ":"))
+def _hello_frame(hello: Mapping[str, Any] | None) -> str:
+    """A notification of the gateway's own topic."""
+    content = {"jsonrpc": "2.0", "method": "event", "params": {"topic": HELLO, "data": hello}}
+    return json.dumps(content, separators=(",", ":"))

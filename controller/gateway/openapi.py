@@ -1,4 +1,4 @@
-"""The OpenAPI description of the gateway, from the same models as everything else."""
+"""The OpenAPI description of the gateway, from the API's message models."""
 
 from typing import Any
 
@@ -8,10 +8,12 @@ from controller.api.jsonrpc import ERROR_MEANINGS, ErrorCode, ErrorData
 from controller.api.methods import METHODS, Method
 from controller.api.schema import API_VERSION, Empty, Message
 
-NOT_OVER_HTTP = frozenset({"subscribe", "unsubscribe"})
-"""What only makes sense where notifications arrive."""
+HTTP_METHODS = {
+    name: method for name, method in METHODS.items() if name not in ("subscribe", "unsubscribe")
+}
+"""Methods available over HTTP: notifications need a WebSocket."""
 
-STATUS_OF = {
+HTTP_STATUS = {
     ErrorCode.PARSE: 400,
     ErrorCode.INVALID_REQUEST: 400,
     ErrorCode.UNKNOWN_METHOD: 404,
@@ -23,20 +25,20 @@ STATUS_OF = {
     ErrorCode.LINK: 503,
     ErrorCode.BUSY: 429,
 }
-"""The HTTP status of each error of the API."""
+"""HTTP status of each error of the API."""
 
-_OF_THE_GATEWAY = {
-    400: "the body is no JSON object",
-    401: "the token is missing or another",
-    403: "the page that calls is one of others",
+_GATEWAY_ERRORS = {
+    400: "the body is not a JSON object",
+    401: "the token is missing or wrong",
+    403: "the origin is not allowed",
     413: "the body is too large",
-    415: "the body is not application/json",
-    421: "the host that was called is not this gateway's",
+    415: "the content type is not application/json",
+    421: "the Host header does not name this gateway",
 }
 
 
-class ErrorAnswer(Message):
-    """Why a request failed."""
+class ErrorBody(Message):
+    """Body of a response with an error status."""
 
     error: str
     code: int | None = None
@@ -45,11 +47,10 @@ class ErrorAnswer(Message):
 
 def openapi() -> dict[str, Any]:
     """The description, OpenAPI 3.1."""
-    methods = {name: method for name, method in METHODS.items() if name not in NOT_OVER_HTTP}
-    models = {method.params for method in methods.values()}
-    results = {method.result for method in methods.values()} | {ErrorAnswer}
+    params = {method.params for method in HTTP_METHODS.values()}
+    results = {method.result for method in HTTP_METHODS.values()} | {ErrorBody}
     references, definitions = models_json_schema(
-        [(model, "validation") for model in sorted(models, key=_name)]
+        [(model, "validation") for model in sorted(params, key=_name)]
         + [(model, "serialization") for model in sorted(results, key=_name)],
         ref_template="#/components/schemas/{model}",
     )
@@ -59,15 +60,15 @@ def openapi() -> dict[str, Any]:
             "title": "era-haptics gateway",
             "version": API_VERSION,
             "description": (
-                "The API of the daemon over HTTP. The same methods and, beside them, notifications "
-                "go over the WebSocket /api/v1/ws, see docs/reference/gateway.md. This is an "
-                "operational interface, not an emergency stop."
+                "The daemon's API over HTTP. The WebSocket /api/v1/ws has the same methods and "
+                "notifications, see docs/reference/gateway.md. This is an operational interface, "
+                "not an emergency stop."
             ),
         },
         "security": [{"token": []}],
         "paths": {
             f"/api/v1/{name}": {"post": _operation(name, method, references)}
-            for name, method in methods.items()
+            for name, method in HTTP_METHODS.items()
         },
         "components": {
             "securitySchemes": {"token": {"type": "http", "scheme": "bearer"}},
@@ -81,15 +82,15 @@ def _name(model: type[Message]) -> str:
 
 
 def _operation(name: str, method: Method, references: Any) -> dict[str, Any]:
-    """What one method takes and gives."""
-    refusals = dict(_OF_THE_GATEWAY)
-    for code, status in STATUS_OF.items():
-        refusals[status] = "; ".join(filter(None, (refusals.get(status), ERROR_MEANINGS[code])))
-    failure = {"application/json": {"schema": references[ErrorAnswer, "serialization"]}}
+    """Request and responses of one method."""
+    errors = dict(_GATEWAY_ERRORS)
+    for code, status in HTTP_STATUS.items():
+        errors[status] = "; ".join(filter(None, (errors.get(status), ERROR_MEANINGS[code])))
+    failure = {"application/json": {"schema": references[ErrorBody, "serialization"]}}
     success = {"application/json": {"schema": references[method.result, "serialization"]}}
     return {
         "operationId": name,
-        "summary": method.meaning,
+        "summary": method.summary,
         "requestBody": {
             "required": method.params is not Empty,
             "content": {"application/json": {"schema": references[method.params, "validation"]}},
@@ -98,7 +99,7 @@ def _operation(name: str, method: Method, references: Any) -> dict[str, Any]:
             "200": {"description": "done", "content": success},
             **{
                 str(status): {"description": meaning, "content": failure}
-                for status, meaning in sorted(refusals.items())
+                for status, meaning in sorted(errors.items())
             },
         },
     }

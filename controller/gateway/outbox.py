@@ -1,4 +1,4 @@
-"""What is to be sent to one browser: bounded, however slowly it reads."""
+"""Frames waiting to be sent to one browser: bounded, however slowly it reads."""
 
 import asyncio
 from collections import OrderedDict, deque
@@ -6,52 +6,52 @@ from typing import TypeAlias
 
 Frame: TypeAlias = str | bytes  # a text or a binary frame of a WebSocket
 
-MOST_ANSWERS = 256
-MOST_EVENTS = 256
+MAX_RESPONSES = 256
+MAX_EVENTS = 256
 
 
 class Outbox:
-    """Answers in order, events in order, and of everything that changes all the time the newest.
+    """Responses in order, then events in order, then the latest of each state.
 
-    Answers go first. Where more wait than is allowed, the oldest event is lost; too
-    many answers overflow: their reader asks faster than it reads, and is to be left.
+    Of too many events the oldest is dropped; too many responses overflow, and the connection is to
+    be closed.
     """
 
     def __init__(self) -> None:
-        self.is_overflowing = False
-        self._answers: deque[Frame] = deque()
-        self._events: deque[Frame] = deque(maxlen=MOST_EVENTS)
-        self._newest: OrderedDict[str, Frame] = OrderedDict()
+        self._is_overflowing = False
+        self._responses: deque[Frame] = deque()
+        self._events: deque[Frame] = deque(maxlen=MAX_EVENTS)
+        self._latest: OrderedDict[str, Frame] = OrderedDict()
         self._filled = asyncio.Event()
 
-    def answer(self, frame: Frame) -> None:
-        """What was asked for."""
-        if len(self._answers) >= MOST_ANSWERS:
-            self.is_overflowing = True
+    def respond(self, frame: Frame) -> None:
+        """Add a response."""
+        if len(self._responses) >= MAX_RESPONSES:
+            self._is_overflowing = True
         else:
-            self._answers.append(frame)
+            self._responses.append(frame)
         self._filled.set()
 
     def event(self, frame: Frame) -> None:
-        """What happened."""
+        """Add an event."""
         self._events.append(frame)
         self._filled.set()
 
     def state(self, name: str, frame: Frame) -> None:
-        """What is so now, in place of what was so under this name."""
-        self._newest[name] = frame
+        """Replace what is waiting under a name."""
+        self._latest[name] = frame
         self._filled.set()
 
     async def next(self) -> Frame:
-        """Wait for the next frame to send; raises OverflowError when answers pile up."""
+        """Wait for the next frame to send; raises OverflowError for too many responses."""
         while True:
-            if self.is_overflowing:
-                raise OverflowError("this client does not read the answers to what it asks")
-            if self._answers:
-                return self._answers.popleft()
+            if self._is_overflowing:
+                raise OverflowError("the client does not read its responses")
+            if self._responses:
+                return self._responses.popleft()
             if self._events:
                 return self._events.popleft()
-            if self._newest:
-                return self._newest.popitem(last=False)[1]
+            if self._latest:
+                return self._latest.popitem(last=False)[1]
             self._filled.clear()
             await self._filled.wait()

@@ -1,4 +1,4 @@
-"""The gateway as a process: uvicorn, from a socket to its end within a second."""
+"""The gateway's server process: uvicorn, its socket, and its end within a second."""
 
 import asyncio
 import contextlib
@@ -18,45 +18,45 @@ from controller.gateway.connections import HttpConnection, WebSocketConnection
 from controller.gateway.settings import Settings
 from model.errors import InputError
 
-_MOST_CONCURRENT = 256  # requests and connections; beyond it 503
-_LARGEST_MESSAGE = 1 << 16
-_MOST_SENT = 1 << 17  # bytes that the system keeps of what a connection has not read
-_NICER = 10  # than whoever starts it: the daemon's control loop goes first where both want to run
-_ENDING = 0.3  # s; for connections to end by themselves
+_MAX_CONCURRENT = 256  # requests and connections; above it 503
+_MAX_MESSAGE = 1 << 16  # bytes
+_SEND_BUFFER = 1 << 17  # bytes per connection in the system's buffer
+_NICENESS = 10  # added, so that the daemon's control loop has priority
+_SHUTDOWN_TIMEOUT = 0.3  # s; for connections to close by themselves
 
 
 class _Server(uvicorn.Server):
-    """Tells where it listens; leaves signals to the command, which wants its own exit status."""
+    """Announces its port; leaves signals to `serve`, which has its own exit status."""
 
     def __init__(self, config: uvicorn.Config, *, announce: Callable[[int], None]) -> None:
         super().__init__(config)
         self._announce = announce
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
-        """Listen, and say so."""
+        """Listen, and announce the port."""
         await super().startup(sockets)
         if sockets and self.started:
             self._announce(sockets[0].getsockname()[1])
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
-        """End; who does not read or never ends what it says is not waited for."""
-        asyncio.get_running_loop().call_later(_ENDING, self._abort)
+        """Close connections, aborting those that do not close in time."""
+        asyncio.get_running_loop().call_later(_SHUTDOWN_TIMEOUT, self._abort)
         await super().shutdown(sockets)
 
     @contextlib.contextmanager
     def capture_signals(self) -> Any:
-        """Not here."""
+        """Install no signal handlers."""
         yield
 
     def _abort(self) -> None:
         for connection in list(self.server_state.connections):
             connection.transport.abort()
-        self.force_exit = True  # an abort of TLS may wait for the other side
+        self.force_exit = True  # aborting TLS may wait for the peer
 
 
 async def serve(settings: Settings, *, announce: Callable[[int], None]) -> None:
-    """Serve until SIGINT or SIGTERM; announce is told the port. Raises InputError."""
-    os.nice(_NICER)
+    """Serve until SIGINT or SIGTERM; announce: called with the port. Raises InputError."""
+    os.nice(_NICENESS)
     _allow_many_descriptors()
     _check_certificate(settings)
     gateway = Gateway(settings)
@@ -65,26 +65,26 @@ async def serve(settings: Settings, *, announce: Callable[[int], None]) -> None:
         gateway.app,
         http=HttpConnection,
         ws=WebSocketConnection,
-        ws_max_size=_LARGEST_MESSAGE,
+        ws_max_size=_MAX_MESSAGE,
         ws_ping_interval=10.0,
         ws_ping_timeout=10.0,
-        ws_per_message_deflate=False,  # no bombs, and nothing to win over loopback
-        limit_concurrency=_MOST_CONCURRENT,
+        ws_per_message_deflate=False,  # no decompression bombs
+        limit_concurrency=_MAX_CONCURRENT,
         timeout_graceful_shutdown=1,
         lifespan="off",
-        log_level="error",  # its warnings are of what others send, as often as they like
+        log_level="error",  # clients can cause warnings without limit
         access_log=False,
         server_header=False,
-        proxy_headers=False,  # whoever calls could write into them what it likes
+        proxy_headers=False,  # clients can forge them
         ssl_certfile=settings.certificate,
         ssl_keyfile=settings.key,
     )
     server = _Server(config, announce=announce)
     following = asyncio.create_task(gateway.follow())
-    # Without it the page would show for ever what was so last.
+    # Without the daemon's events the page would show outdated state.
     following.add_done_callback(lambda _: setattr(server, "should_exit", True))
     try:
-        async with _ending(server):
+        async with _signals(server):
             await server.serve(sockets=[listening])
     finally:
         following.cancel()
@@ -94,46 +94,46 @@ async def serve(settings: Settings, *, announce: Callable[[int], None]) -> None:
 
 
 def _check_certificate(settings: Settings) -> None:
-    """Whether certificate and key are some, and belong together; raises InputError."""
+    """Check that certificate and key can be read and match; raises InputError."""
     if settings.certificate is None:
         return
     try:
         ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER).load_cert_chain(
             *(settings.certificate, settings.key),
-            password="",  # of a key that has one; nobody shall be asked for it at a start
+            password="",  # without it OpenSSL would prompt for one
         )
     except (OSError, ValueError) as error:
-        said = getattr(error, "reason", None) or getattr(error, "strerror", None) or error
-        reason = re.sub(r"^\[\w+\] | \(_ssl\.c:\d+\)$", "", str(said))
+        text = getattr(error, "reason", None) or getattr(error, "strerror", None) or error
+        reason = re.sub(r"^\[\w+\] | \(_ssl\.c:\d+\)$", "", str(text))
         raise InputError(
-            f"{settings.certificate} and {settings.key} cannot be used for TLS ({reason}): give a "
-            "certificate chain and the key that belongs to it, PEM both, the key without password"
+            f"{settings.certificate} and {settings.key} cannot be used for TLS ({reason}); give a "
+            "certificate chain and its key, both PEM, the key without password"
         ) from error
 
 
 def listen(settings: Settings) -> socket.socket:
-    """The socket to listen on; raises InputError."""
+    """Bind the socket to listen on; raises InputError."""
     family = socket.AF_INET6 if ":" in settings.host else socket.AF_INET
-    # Over sockets that say TCP asyncio sends at once; else the body of an answer waits 40 ms for
-    # the other side's acknowledgement of its head.
+    # With IPPROTO_TCP given asyncio sets TCP_NODELAY; without it a response's body waits 40 ms for
+    # the acknowledgement of its head.
     listening = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
     try:
         listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        # Of each connection that comes; the system's own bound is some megabytes.
-        listening.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _MOST_SENT)
+        # Inherited by accepted connections; the system's default limit is some megabytes.
+        listening.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER)
         listening.bind((settings.host, settings.port))
     except OSError as error:
         listening.close()
         raise InputError(
-            f"the gateway cannot listen on {settings.host} port {settings.port} "
-            f"({error.strerror}); another program may use it: stop that or name another port"
+            f"cannot listen on {settings.host} port {settings.port} ({error.strerror}); stop the "
+            "other program or give another port (--listen)"
         ) from error
     return listening
 
 
 @contextlib.asynccontextmanager
-async def _ending(server: uvicorn.Server) -> AsyncIterator[None]:
-    """SIGINT and SIGTERM end the server in order."""
+async def _signals(server: uvicorn.Server) -> AsyncIterator[None]:
+    """Shut the server down at SIGINT and SIGTERM."""
     loop = asyncio.get_running_loop()
 
     def end() -> None:
@@ -149,7 +149,7 @@ async def _ending(server: uvicorn.Server) -> AsyncIterator[None]:
 
 
 def _allow_many_descriptors() -> None:
-    """As many open files as may be: connections that only connect must not use them up."""
+    """Raise the limit of open files, so that idle connections do not use them up."""
     _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     most = 65_536 if hard == resource.RLIM_INFINITY else hard
     with contextlib.suppress(OSError, ValueError):

@@ -1,13 +1,13 @@
-"""One browser on a WebSocket: what it asks goes to the daemon, what happens comes back."""
+"""One browser on a WebSocket: its requests go to the daemon, the daemon's events to it."""
 
 import asyncio
 import itertools
 import json
 import logging
-from collections.abc import Callable, Mapping
-from dataclasses import replace
-from typing import Any, Protocol
+from collections.abc import Callable, Coroutine
+from typing import Annotated, Any, Literal, Protocol
 
+from pydantic import Field
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from controller.api.jsonrpc import (
@@ -17,38 +17,48 @@ from controller.api.jsonrpc import (
     error_line,
     read_params,
     read_request,
+    result_line,
+    unknown_method,
 )
-from controller.api.methods import METHODS, SubscribeParams, TouchParams, UnsubscribeParams
+from controller.api.methods import METHODS, TouchParams
 from controller.api.rate_limit import RateLimiter
-from controller.api.schema import Empty, Message
+from controller.api.schema import MAX_RATE, Empty, Message, Topic
 from controller.gateway.outbox import Outbox
-from controller.gateway.topics import OWN
 
-REQUESTS_PER_SECOND = 200.0  # touches and stop are not counted
-MOST_PENDING = 16
-MOST_STOPPING = 4
-MOST_TOUCH_SOURCES = 4  # of one session: a page has one
-_LONGEST_NAME = 80  # characters; as the API has it
-SEND_PATIENCE = 5.0  # s; for one frame to a reader that does not read
+MAX_REQUEST_RATE = 200.0  # 1/s; touches and stops are not counted
+MAX_PENDING = 16
+MAX_PENDING_STOPS = 4
+MAX_TOUCH_SOURCES = 4  # a page has one
+SEND_TIMEOUT = 5.0  # s; for one frame
+_MAX_SOURCE_NAME = 80  # characters; as in the API
 
 TRY_AGAIN_LATER, UNSUPPORTED_DATA = 1013, 1003  # close codes of RFC 6455 and its registry
 
-_EVERY_ONE: frozenset[str] = frozenset({"state", "log", "link"})  # of the others only the newest
-_numbers = itertools.count(1)
+_ALL_SENT: frozenset[str] = frozenset({"state", "log", "link"})  # of other topics the latest alone
+_session_numbers = itertools.count(1)
 _logger = logging.getLogger(__name__)
+
+_Topics = Annotated[list[Literal[Topic, "hello", "field"]], Field(min_length=1, max_length=16)]
+
+
+class SessionTopics(Message):
+    """Topics of the daemon or the gateway; the gateway has one rate for all browsers."""
+
+    topics: _Topics
+    rate_hz: Annotated[float, Field(ge=1, le=MAX_RATE)] | None = None
 
 
 class Daemon(Protocol):
-    """What a session needs of the way to the daemon."""
+    """What a session needs of the connection to the daemon."""
 
-    async def call(self, method: str, params: Message) -> dict[str, Any]:
-        """Ask the daemon; raises RpcError."""
+    async def call(self, method: str, params: Message) -> Any:
+        """Call a method and return its result as JSON; raises RpcError."""
 
 
 class Session:
-    """A browser that was let in; see `run`.
+    """An accepted WebSocket; see `run`.
 
-    current: what subscribers of a topic are told at once, a frame for each that is so now.
+    current: the current frame of a topic, sent on subscription; None if there is none.
     """
 
     def __init__(
@@ -59,115 +69,121 @@ class Session:
         current: Callable[[str], str | bytes | None],
         clock: Callable[[], float],
     ) -> None:
-        self.name = f"web:{next(_numbers)}"
+        self.name = f"web:{next(_session_numbers)}"
         self.outbox = Outbox()
         self._socket = socket
         self._daemon = daemon
         self._current = current
-        self._rate = RateLimiter(REQUESTS_PER_SECOND, clock=clock)
+        self._rate = RateLimiter(MAX_REQUEST_RATE, clock=clock)
         self._topics: set[str] = set()
         self._pending: set[asyncio.Task[None]] = set()
-        self._touches: dict[str, TouchParams] = {}  # the newest of each source, not yet told
-        self._touching: set[str] = set()  # sources that have fingers down
-        self._stopping = 0
-        self._told: asyncio.Task[None] | None = None
-        self._has_left = False
+        self._pending_stops = 0
+        self._touches: dict[str, TouchParams] = {}  # the newest frame of each source, to be sent
+        self._touching: set[str] = set()  # sources with fingers on the plate
+        self._touch_task: asyncio.Task[None] | None = None
+        self._is_closed = False
 
     async def run(self) -> None:
-        """Serve until it leaves, or is to be left; its fingers are lifted then.
+        """Serve until either side closes, then lift its fingers.
 
-        What it has asked for by then is seen through: no stop is taken back.
+        Requests received by then are carried out: no stop is cancelled.
         """
         sending = asyncio.create_task(self._send())
         receiving = asyncio.create_task(self._receive())
         try:
             await asyncio.wait({sending, receiving}, return_when=asyncio.FIRST_COMPLETED)
         finally:
-            self._has_left = True
-            told = () if self._told is None else (self._told,)
-            for task in (sending, receiving, *told):
+            self._is_closed = True
+            tasks = [task for task in (sending, receiving, self._touch_task) if task is not None]
+            for task in tasks:
                 task.cancel()
-            await self._end(sending, receiving, *told)
+            await self._finish(*tasks)
             await self._lift()
-            await self._end(*self._pending)
+            await self._finish(*self._pending)
 
-    async def _end(self, *tasks: "asyncio.Task[None]") -> None:
-        """Wait for the end of tasks, and tell of those that have failed."""
-        for ended in await asyncio.gather(*tasks, return_exceptions=True):
-            if isinstance(ended, Exception):
-                _logger.error("a session has failed", exc_info=ended)
+    async def _finish(self, *tasks: "asyncio.Task[None]") -> None:
+        """Wait for tasks, and log those that failed."""
+        for result in await asyncio.gather(*tasks, return_exceptions=True):
+            if isinstance(result, Exception):
+                _logger.error("session failed", exc_info=result)
 
-    def tell(self, topic: str, frame: str | bytes) -> None:
-        """What happened, if it wants to know."""
+    def publish(self, topic: str, frame: str | bytes) -> None:
+        """Send a frame of a topic, if subscribed."""
         if topic not in self._topics:
             return
-        if topic in _EVERY_ONE:
+        if topic in _ALL_SENT:
             self.outbox.event(frame)
         else:
             self.outbox.state(topic, frame)
 
+    async def _send(self) -> None:
+        """Send frames until the browser does not read them."""
+        try:
+            while True:
+                frame = await self.outbox.next()
+                async with asyncio.timeout(SEND_TIMEOUT):
+                    if isinstance(frame, str):
+                        await self._socket.send_text(frame)
+                    else:
+                        await self._socket.send_bytes(frame)
+        except (TimeoutError, OverflowError, WebSocketDisconnect, RuntimeError):
+            return
+
     async def _receive(self) -> None:
-        """Take what it sends, until it leaves."""
+        """Serve requests until the browser disconnects."""
         while True:
-            said = await self._socket.receive()
-            if said["type"] == "websocket.disconnect":
+            message = await self._socket.receive()
+            if message["type"] == "websocket.disconnect":
                 return
-            if said.get("text") is None:
+            if message.get("text") is None:
                 await self._socket.close(UNSUPPORTED_DATA, "send text frames")
                 return
-            self._take(said["text"])
-            await asyncio.sleep(0)  # what waits already would be taken before anything else is done
+            self._serve(message["text"])
+            await asyncio.sleep(0)  # let others run between queued messages
 
-    def _take(self, text: str) -> None:
-        """Begin what was asked for, or say why not."""
+    def _serve(self, text: str) -> None:
+        """Serve one request, or start to."""
         request: Request | None = None
         try:
             request = read_request(text.encode())
-            if request.method == "touch":
-                self._touch(request)
-            elif request.method == "subscribe":
-                self._subscribe(request)
-            elif request.method == "unsubscribe":
-                self._topics.difference_update(_topics(request, UnsubscribeParams))
-                self._answer(request, {})
-            else:
-                self._ask(request)
+            match request.method:
+                case "touch":
+                    self._touch(request)
+                case "subscribe":
+                    self._subscribe(request)
+                case "unsubscribe":
+                    self._topics.difference_update(_topics(request))
+                    self._respond(request, {})
+                case _:
+                    self._forward(request)
         except RpcError as error:
-            if request is None or request.wants_answer:
-                self.outbox.answer(
-                    error_line(None if request is None else request.id, error).decode()
-                )
+            self._respond_error(request, error)
 
     def _subscribe(self, request: Request) -> None:
-        topics = _topics(request, SubscribeParams)
+        topics = _topics(request)
         self._topics.update(topics)
-        self._answer(request, {})
+        self._respond(request, {})
         for topic in sorted(topics):
             frame = self._current(topic)
             if frame is not None:
-                self.tell(topic, frame)
+                self.publish(topic, frame)
 
     def _touch(self, request: Request) -> None:
-        """Keep the newest frame of a source; one at a time is told to the daemon."""
-        params = read_params(TouchParams, request)
-        assert isinstance(params, TouchParams)  # noqa: S101 (read_params gives what it is given)
-        params = told_apart(params, self.name)
-        source = params.source
-        known = self._touches.keys() | self._touching
-        if source not in known and len(known) >= MOST_TOUCH_SOURCES:
+        """Keep the newest frame of a source; one frame at a time is sent to the daemon."""
+        params = touch_params(request, self.name)
+        sources = self._touches.keys() | self._touching
+        if params.source not in sources and len(sources) >= MAX_TOUCH_SOURCES:
             raise RpcError(ErrorCode.BUSY, "too many touch sources", remedy="use one or two")
-        self._touches[source] = params
-        self._answer(request, {})
-        if self._told is None or self._told.done():
-            self._told = asyncio.create_task(self._tell_touches())
-            self._pending.add(self._told)
-            self._told.add_done_callback(self._pending.discard)
+        self._touches[params.source] = params
+        self._respond(request, {})
+        if self._touch_task is None or self._touch_task.done():
+            self._touch_task = self._start(self._send_touches())
 
-    async def _tell_touches(self) -> None:
-        """Tell the daemon the newest touches, until there are none newer."""
+    async def _send_touches(self) -> None:
+        """Send the newest frames to the daemon until none is left."""
         while self._touches:
-            source, params = next(iter(self._touches.items()))
-            del self._touches[source]
+            source = next(iter(self._touches))
+            params = self._touches.pop(source)
             if params.touches:
                 self._touching.add(source)
             else:
@@ -178,87 +194,64 @@ class Session:
                 self.outbox.state("touch-error", error_line(None, error).decode())
 
     async def _lift(self) -> None:
-        """Lift its fingers; where the daemon does not hear it they are lifted after 150 ms."""
+        """Lift the browser's fingers; if that fails, the daemon lifts them after 150 ms."""
         for source in self._touching:
             try:
                 await self._daemon.call("touch", TouchParams(source=source, touches=[]))
             except RpcError:
                 return
 
-    def _ask(self, request: Request) -> None:
-        """Pass a request on; a stop always."""
+    def _forward(self, request: Request) -> None:
+        """Forward a request to the daemon; stops have a limit of their own."""
         method = METHODS.get(request.method)
         if method is None:
-            raise RpcError(
-                ErrorCode.UNKNOWN_METHOD,
-                f"there is no method {request.method!a}",
-                remedy=f"known are {', '.join(METHODS)}",
-            )
+            raise unknown_method(request.method, METHODS)
         params = read_params(method.params, request)
         if request.method == "stop":
-            if self._stopping >= MOST_STOPPING:
+            if self._pending_stops >= MAX_PENDING_STOPS:
                 raise RpcError(
-                    ErrorCode.BUSY, "stops are under way already", remedy="wait for their answers"
+                    ErrorCode.BUSY, "stops are pending already", remedy="await their responses"
                 )
-            self._stopping += 1
-        else:
-            if not self._rate.take():
-                raise RpcError(ErrorCode.BUSY, "too many requests", remedy="ask less often")
-            if len(self._pending) >= MOST_PENDING:
-                raise RpcError(
-                    ErrorCode.BUSY, "too many requests under way", remedy="wait for answers"
-                )
-        task = asyncio.create_task(self._pass_on(request, params))
-        self._pending.add(task)
-        task.add_done_callback(self._pending.discard)
+            self._pending_stops += 1
+        elif not self._rate.take():
+            raise RpcError(ErrorCode.BUSY, "too many requests", remedy="send fewer per second")
+        elif len(self._pending) >= MAX_PENDING:
+            raise RpcError(ErrorCode.BUSY, "too many pending requests", remedy="await responses")
+        self._start(self._complete(request, params))
 
-    async def _pass_on(self, request: Request, params: Message) -> None:
+    async def _complete(self, request: Request, params: Message) -> None:
         try:
             result = await self._daemon.call(request.method, params)
-            if request.method == "arm" and self._has_left:  # nobody knows the lease
+            if request.method == "arm" and self._is_closed:  # the lease cannot be renewed any more
                 await self._daemon.call("disarm", Empty())
         except RpcError as error:
-            if request.wants_answer:
-                self.outbox.answer(error_line(request.id, error).decode())
+            self._respond_error(request, error)
         else:
-            self._answer(request, result)
+            self._respond(request, result)
         finally:
-            self._stopping -= request.method == "stop"
+            self._pending_stops -= request.method == "stop"
 
-    def _answer(self, request: Request, result: Mapping[str, Any]) -> None:
-        if request.wants_answer:
-            said = {"jsonrpc": "2.0", "id": request.id, "result": result}
-            self.outbox.answer(json.dumps(said, separators=(",", ":")))
+    def _start(self, work: Coroutine[Any, Any, None]) -> "asyncio.Task[None]":
+        task = asyncio.create_task(work)
+        self._pending.add(task)
+        task.add_done_callback(self._pending.discard)
+        return task
 
-    async def _send(self) -> None:
-        """Send what is to be sent, until it does not read."""
-        try:
-            while True:
-                frame = await self.outbox.next()
-                async with asyncio.timeout(SEND_PATIENCE):
-                    if isinstance(frame, str):
-                        await self._socket.send_text(frame)
-                    else:
-                        await self._socket.send_bytes(frame)
-        except (TimeoutError, OverflowError, WebSocketDisconnect, RuntimeError):
-            return
+    def _respond(self, request: Request, result: object) -> None:
+        if request.expects_response:
+            self.outbox.respond(result_line(request.id, json.dumps(result)).decode())
+
+    def _respond_error(self, request: Request | None, error: RpcError) -> None:
+        if request is None or request.expects_response:
+            id = None if request is None else request.id
+            self.outbox.respond(error_line(id, error).decode())
 
 
-def told_apart(params: TouchParams, who: str) -> TouchParams:
-    """Touches with whose they are in the name of their source: all go over one connection."""
-    return params.model_copy(update={"source": f"{who}:{params.source}"[:_LONGEST_NAME]})
+def touch_params(request: Request, client: str) -> TouchParams:
+    """A touch frame, its source prefixed by the client: all share one connection to the daemon."""
+    params = read_params(TouchParams, request)
+    return params.model_copy(update={"source": f"{client}:{params.source}"[:_MAX_SOURCE_NAME]})
 
 
-def _topics(request: Request, model: type[SubscribeParams | UnsubscribeParams]) -> set[str]:
-    """The topics of a request, the gateway's own among them; raises RpcError."""
-    said = request.params.get("topics")
-    named = said if isinstance(said, list) else []
-    own = OWN.intersection(topic for topic in named if isinstance(topic, str))
-    if own:
-        # `state` stands in for them, since the daemon's list must not be empty.
-        others = ["state", *(topic for topic in named if topic not in own)]
-        request = replace(request, params={**request.params, "topics": others})
-    params = read_params(model, request)
-    assert isinstance(params, model)  # noqa: S101 (read_params gives what it is given)
-    stood_in = {"state"} if own and "state" not in named else set()
-    return {*own, *params.topics} - stood_in
+def _topics(request: Request) -> set[str]:
+    return set(read_params(SessionTopics, request).topics)

@@ -1,1 +1,1 @@
-"""What the daemon counts, for Prometheus: a process of its own, a client of the API."""
+"""Prometheus metrics of the daemon: a process of its own, a client of the API."""

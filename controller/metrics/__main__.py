@@ -1,4 +1,4 @@
-"""`python -m controller.metrics --socket PATH --port N`: metrics of a daemon on the loopback."""
+"""`python -m controller.metrics --socket PATH --port N`: serve a daemon's metrics on 127.0.0.1."""
 
 import signal
 from pathlib import Path
@@ -14,24 +14,23 @@ from controller.metrics.collector import DaemonCollector
 
 
 def serve(
-    port: Annotated[int, typer.Option(help="On 127.0.0.1.", min=0, max=65535)],
+    port: Annotated[int, typer.Option(help="Port on 127.0.0.1.", min=0, max=65535)],
     socket: Annotated[Path | None, typer.Option(help="The daemon's socket.")] = None,
 ) -> None:
-    """Serve the metrics of a daemon to Prometheus, on 127.0.0.1, until told to end."""
+    """Serve a daemon's metrics to Prometheus on 127.0.0.1, until SIGINT or SIGTERM."""
 
-    def ask() -> StatusResult:
+    def read_status() -> StatusResult:
         with Client.connect(find_socket(socket), name="metrics") as era:
             return era.status()
 
     registry = CollectorRegistry(auto_describe=False)
-    registry.register(DaemonCollector(ask))
+    registry.register(DaemonCollector(read_status))
     try:
         server, _ = start_http_server(port, addr="127.0.0.1", registry=registry)
     except OSError as error:
         typer.echo(
-            f"era: error: metrics cannot be served on 127.0.0.1 port {port} ({error.strerror}); "
-            "another program may use it: stop that, or name another port with metrics: in the "
-            "daemon's file",
+            f"era: error: cannot serve metrics on 127.0.0.1 port {port} ({error.strerror}); stop "
+            "the other program or give another port as `metrics` in the daemon's file",
             err=True,
         )
         raise typer.Exit(2) from error

@@ -1,4 +1,4 @@
-"""A status of the daemon as Prometheus metrics."""
+"""The daemon's status as Prometheus metrics."""
 
 from collections.abc import Callable, Iterable, Iterator
 from itertools import accumulate
@@ -20,26 +20,26 @@ from drivers.errors import LinkError
 _LINK_COUNTS = {
     "frames_out": "Frames sent to an amplifier.",
     "frames_in": "Frames received from an amplifier.",
-    "bad": "Damaged frames.",
-    "foreign": "Good frames that nobody waited for.",
-    "events": "What an amplifier said unasked.",
-    "retries": "Requests that were repeated.",
-    "timeouts": "Requests that got no answer in time.",
-    "refusals": "Requests that an amplifier refused.",
+    "bad": "Frames with CRC errors.",
+    "foreign": "Valid but unexpected frames.",
+    "events": "Events sent by an amplifier.",
+    "retries": "Repeated requests.",
+    "timeouts": "Requests without a reply in time.",
+    "refusals": "Requests refused by an amplifier.",
 }
 
 
 class DaemonCollector(Collector):
-    """Asks the daemon at every scrape; ask raises LinkError or RpcError where nobody answers."""
+    """Reads the daemon's status at every scrape; read_status may raise LinkError or RpcError."""
 
-    def __init__(self, ask: Callable[[], StatusResult]) -> None:
-        self._ask = ask
+    def __init__(self, read_status: Callable[[], StatusResult]) -> None:
+        self._read_status = read_status
 
     def collect(self) -> Iterable[Metric]:
-        """All metrics; only `era_up 0` where no daemon answers."""
-        up = GaugeMetricFamily("era_up", "Whether the daemon answers.")
+        """All metrics; only `era_up 0` without a daemon."""
+        up = GaugeMetricFamily("era_up", "Whether the daemon responds.")
         try:
-            status = self._ask()
+            status = self._read_status()
         except (LinkError, RpcError):
             up.add_metric([], 0)
             return [up]
@@ -48,27 +48,29 @@ class DaemonCollector(Collector):
 
 
 def metrics_of(status: StatusResult) -> Iterator[Metric]:
-    """The metrics of one status."""
-    state = GaugeMetricFamily("era_state", "1 for the state that it is in.", labels=["state"])
+    """Metrics of one status."""
+    state = GaugeMetricFamily("era_state", "1 for the current state.", labels=["state"])
     for name in get_args(DaemonStateName):
         state.add_metric([name], float(name == status.state))
     yield state
-    yield _gauge("era_armed", "Whether somebody holds a lease.", float(status.armed_by is not None))
+    yield _gauge(
+        "era_armed", "Whether a client holds the lease.", float(status.armed_by is not None)
+    )
     yield _gauge(
         "era_assume_energised",
-        "Whether an amplifier that was lost may still be playing.",
+        "Whether a lost amplifier may still be playing.",
         float(status.assume_energised),
     )
     yield _gauge("era_contacts", "Fingers on the plate.", len(status.contacts))
-    yield _gauge("era_uptime_seconds", "Since the daemon began.", status.uptime_s)
+    yield _gauge("era_uptime_seconds", "Time since the daemon started.", status.uptime_s)
     for name, text, value in (
-        ("contrast", "Predicted contrast of what is played.", status.predicted_contrast_db),
+        ("contrast", "Predicted contrast of the current pattern.", status.predicted_contrast_db),
         ("level", "Predicted level at the target.", status.predicted_level_db_sl),
     ):
         if value is not None:
             yield _gauge(f"era_predicted_{name}_decibels", text, value)
     rejected = CounterMetricFamily(
-        "era_rejected_touches", "Touches that could not be contacts.", labels=["reason"]
+        "era_rejected_touches", "Touches rejected as contacts.", labels=["reason"]
     )
     for reason, count in status.rejected_touches.items():
         rejected.add_metric([reason], count)
@@ -82,13 +84,13 @@ def _gauge(name: str, text: str, value: float) -> Metric:
 
 
 def _latency(latency: LatencySummary) -> Metric:
-    """The histogram, in seconds; its sum is not known."""
+    """The histogram in seconds, without its unknown sum."""
     *edges, last = latency.histogram
     sums = accumulate(count for _, count in edges)
     buckets = [
         (f"{edge / 1e3:g}", float(sum_)) for (edge, _), sum_ in zip(edges, sums, strict=True)
     ]
-    # What is above the last edge counts there.
+    # The last count includes values above the last edge.
     buckets.append(("+Inf", sum(count for _, count in edges) + float(last[1])))
     return HistogramMetricFamily(
         "era_touch_to_wire_seconds",
@@ -102,12 +104,12 @@ def _amplifiers(amplifiers: Iterable[AmplifierStatus]) -> Iterator[Metric]:
     gauges = {
         name: GaugeMetricFamily(f"era_amplifier_{name}", text, labels=["amplifier"])
         for name, text in (
-            ("lost", "Whether the link to it is lost."),
+            ("lost", "Whether the link is lost."),
             ("fault", "Whether it reports a fault."),
-            ("high_voltage", "Whether its high voltage is on."),
-            ("temperature_celsius", "Its temperature."),
-            ("reply_age_seconds", "Since its last answer."),
-            ("round_trip_seconds", "From the last request to its answer."),
+            ("high_voltage", "Whether high voltage is on."),
+            ("temperature_celsius", "Temperature."),
+            ("reply_age_seconds", "Time since the last reply."),
+            ("round_trip_seconds", "From the last request to its reply."),
         )
     }
     counters = {

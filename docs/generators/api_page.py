@@ -1,10 +1,8 @@
-"""The reference in docs/reference/api.md: methods, topics, types and errors, from the models.
+"""The reference part of reference/api.md: methods, topics, types and errors of the API.
 
-`python docs/generators/api_page.py docs/reference/api.md` writes the tables anew between the page's
-two marks.
+`python docs/generators/api_page.py` rewrites it between the page's two marks.
 """
 
-import sys
 import types
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -17,20 +15,21 @@ from controller.api.topics import TOPICS, EventParams
 from page_part import insert
 
 WRITER = "docs/generators/api_page.py"
+PAGE = Path(__file__).parents[1] / "reference" / "api.md"
 
 
 def reference() -> str:
-    """The tables, as Markdown."""
+    """All tables, as Markdown."""
     models: dict[str, type[Message]] = {}
     lines = ["### Methods", ""]
     for name, method in METHODS.items():
-        lines += [f"#### {name}", "", f"{_sentence(method.meaning)}", ""]
+        lines += [f"#### {name}", "", f"{_sentence(method.summary)}", ""]
         lines += [*_table("parameter", method.params, models), ""]
         lines += [*_table("result", method.result, models), ""]
     lines += ["### Topics", "", "The parameters of every `event` notification:", ""]
     lines += [*_table("parameter", EventParams, models), ""]
     for topic, entry in TOPICS.items():
-        lines += [f"#### topic {topic}", "", f"{_sentence(entry.meaning)}", ""]
+        lines += [f"#### topic {topic}", "", f"{_sentence(entry.summary)}", ""]
         lines += [*_table("data", entry.data, models), ""]
     lines += ["### Types", ""]
     shown: set[str] = set()
@@ -47,7 +46,7 @@ def reference() -> str:
 
 
 def _table(head: str, model: type[Message], models: dict[str, type[Message]]) -> Iterator[str]:
-    """One row a field; models that a field is made of are noted."""
+    """One row per field; collects the models that fields are made of."""
     if not model.model_fields:
         yield f"*{head}:* an empty object, `{{}}`"
         return
@@ -55,8 +54,8 @@ def _table(head: str, model: type[Message], models: dict[str, type[Message]]) ->
     yield "|---|---|---|"
     for name, field in model.model_fields.items():
         kind = _kind(field.rebuild_annotation(), models)
-        left_out = "" if field.is_required() else "may be left out"
-        notes = "; ".join(part for part in (field.description, left_out) if part)
+        optional = "" if field.is_required() else "optional"
+        notes = "; ".join(part for part in (field.description, optional) if part)
         yield f"| `{name}` | {kind} | {notes} |"
 
 
@@ -75,7 +74,7 @@ def _kind(annotation: Any, models: dict[str, type[Message]]) -> str:
     if origin is tuple:
         return f"[{', '.join(_kind(argument, models) for argument in arguments)}]"
     if origin is dict:
-        return f"object, by name: {_kind(arguments[1], models)}"
+        return f"object with values: {_kind(arguments[1], models)}"
     if isinstance(annotation, type) and issubclass(annotation, Message):
         models[annotation.__name__] = annotation
         return f"[{annotation.__name__}](#{annotation.__name__.lower()})"
@@ -119,9 +118,5 @@ def _sentence(text: str) -> str:
     return f"{text[0].upper()}{text[1:]}."
 
 
-def _main(path: Path) -> None:
-    path.write_text(insert(path.read_text("utf-8"), reference(), writer=WRITER), encoding="utf-8")
-
-
 if __name__ == "__main__":
-    _main(Path(sys.argv[1]))
+    PAGE.write_text(insert(PAGE.read_text("utf-8"), reference(), writer=WRITER), encoding="utf-8")

@@ -103,8 +103,8 @@ class ScriptedDaemon:
         )
         server = ApiServer(
             {name: self._handler(name) for name in METHODS},
-            left=self._hub.forget,
-            keeps=self._hub.is_subscribed,
+            on_disconnect=self._hub.forget,
+            is_protected=self._hub.is_subscribed,
         )
         bound = socket.socket(socket.AF_UNIX)
         bound.bind(str(self.socket))

@@ -53,7 +53,10 @@ async def turns() -> None:
 def made(now: Callable[[], float]) -> tuple[Connection, Wire]:
     """A connection to a client that reads nothing."""
     connection = Connection(
-        on_begin=lambda one: True, on_lines=lambda one: None, on_end=lambda one: None, clock=now
+        on_connect=lambda one: True,
+        on_lines=lambda one: None,
+        on_disconnect=lambda one: None,
+        clock=now,
     )
     wire = Wire()
     connection.connection_made(wire)
@@ -63,13 +66,13 @@ def made(now: Callable[[], float]) -> tuple[Connection, Wire]:
 def test_answers_that_nobody_reads_are_bounded() -> None:
     """256 KiB of them may wait; one more byte, and the client is left. One long answer may go."""
     connection, wire = made(lambda: 0.0)
-    connection.answer(b"x" * (MAX_UNREAD_BYTES - 1))
-    connection.answer(b"\n")
+    connection.respond(b"x" * (MAX_UNREAD_BYTES - 1))
+    connection.respond(b"\n")
     assert (len(wire.waiting), wire.is_aborted) == (1 << 18, False)
-    connection.answer(b"\n")
+    connection.respond(b"\n")
     assert (len(wire.waiting), wire.is_aborted) == (1 << 18, True)
     connection, wire = made(lambda: 0.0)
-    connection.answer(b"x" * (4 * MAX_UNREAD_BYTES))
+    connection.respond(b"x" * (4 * MAX_UNREAD_BYTES))
     assert (len(wire.waiting), wire.is_aborted) == (1 << 20, False)
 
 
@@ -86,11 +89,11 @@ async def test_nobody_is_too_busy_to_stop() -> None:
 
     server = ApiServer(
         {name: does(name) for name in METHODS},
-        left=lambda client: None,
-        keeps=lambda client: True,
+        on_disconnect=lambda client: None,
+        is_protected=lambda client: True,
         clock=lambda: 0.0,
     )
-    connection = server._connection()
+    connection = server._make_connection()
     connection.connection_made(Wire())
 
     async def ask(method: str, params: str = "{}") -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from controller.gateway.topics import FIELD
 
 from controller.api.async_client import AsyncClient
 from controller.api.client import Client
@@ -19,7 +20,6 @@ from controller.api.schema import Empty
 from controller.api.topics import TOPICS, EventParams
 from controller.gateway.daemon_link import DaemonLink
 from controller.gateway.mirror import DaemonMirror
-from controller.gateway.topics import FIELD
 from daemon_bench import PLACE, running_daemon, until, until_state
 
 READY, ENABLED = "READY_TO_SWITCH_ON", "OPERATION_ENABLED"

@@ -124,7 +124,7 @@ async def test_the_banner_says_how_it_is_with_the_gateway_now(tab: Page, tmp_pat
         await tab.show(f"{first.url}#token={first.token}")
         await until_said("The daemon does not answer")
         listen = ("--listen", f"127.0.0.1:{first.port}")
-        first.end()
+        first.terminate()
     with gateway_process(tmp_path, daemon, *listen, token="another-token-than-before"):
         await until_said("The gateway refuses the token")
         assert await tab.evaluate("!document.querySelector('#door').hidden")

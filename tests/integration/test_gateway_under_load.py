@@ -30,7 +30,7 @@ from gateway_bench import (
     frame,
     gateway_process,
     http,
-    hurry,
+    raise_priority,
     real_daemon,
     upgrade,
     wait_for,
@@ -67,7 +67,7 @@ class Metronome:
         self._process = subprocess.Popen(
             [sys.executable, "-c", self._CODE], stdout=subprocess.PIPE, text=True
         )
-        hurry(self._process.pid)
+        raise_priority(self._process.pid)
         self._reading = threading.Thread(target=self._read)
         self._reading.start()
 
@@ -179,15 +179,15 @@ def gateway(watched: Watch, daemon: Path, tmp_path: Path) -> Iterator[GatewayPro
         wait_for_daemon(made)
         yield made
         if made.process.poll() is None:
-            assert made.said() == ""
+            assert made.log() == ""
 
 
 def stop_is_understood(gateway: GatewayProcess) -> None:
     """A browser that comes now is let in and answered, over HTTP and over a WebSocket."""
     assert http(gateway, "/api/v1/effects", body=b"{}").status == 200
     with RawWebSocket(gateway) as ws:
-        ws.ask("effects", {})
-        assert ws.answer()["result"]
+        ws.call("effects", {})
+        assert ws.response()["result"]
 
 
 def deaf_connection(gateway: GatewayProcess) -> socket.socket:
@@ -322,7 +322,7 @@ def test_gateways_killed_under_load_are_not_missed(
         with gateway_process(tmp_path, daemon) as gateway:
             wait_for_daemon(gateway)
             with RawWebSocket(gateway) as ws:
-                ws.ask("subscribe", {"topics": ["field", "pattern", "amplifiers"]})
+                ws.call("subscribe", {"topics": ["field", "pattern", "amplifiers"]})
                 with contextlib.suppress(OSError):
                     for _ in range(200):
                         ws.send(b'{"jsonrpc":"2.0","method":"status","params":{}}')
@@ -340,8 +340,8 @@ def test_fingers_of_a_gateway_that_is_killed_are_lifted(daemon: Path, tmp_path: 
             wait_for_daemon(gateway)
             point = {"id": 1, "x_m": 0.2, "y_m": 0.1}
             while not era.status().contacts:
-                ws.ask("touch", {"source": "me", "touches": [point]})
-                ws.answer()
+                ws.call("touch", {"source": "me", "touches": [point]})
+                ws.response()
             gateway.process.kill()
         wait_for(lambda: not era.status().contacts)
 

@@ -58,7 +58,7 @@ class ScriptedDaemon:
 
     def __init__(self, folder: Path) -> None:
         self.socket = folder / "era.sock"
-        self.asked: list[tuple[str, Message]] = []
+        self.calls: list[tuple[str, Message]] = []
         self._rig_text = write_rig(folder / "rig.yaml").read_text(encoding="utf-8")
         self._loop = asyncio.new_event_loop()
         self._serving = threading.Event()
@@ -94,7 +94,7 @@ class ScriptedDaemon:
     @property
     def methods(self) -> list[str]:
         """What was asked, without parameters."""
-        return [method for method, _ in self.asked]
+        return [method for method, _ in self.calls]
 
     async def _serve(self) -> None:
         self._hub = Hub(
@@ -120,7 +120,7 @@ class ScriptedDaemon:
             if name == "subscribe" and isinstance(params, SubscribeParams):
                 self._hub.subscribe(client, params.topics)
             if name not in ("hello", "subscribe"):  # those are the gateway's own
-                self.asked.append((name, params))
+                self.calls.append((name, params))
             return self._arm() if name == "arm" else self._answer(name)
 
         return handle
@@ -227,11 +227,11 @@ class GatewayProcess:
         plain = socket.create_connection((name, self.port), timeout=PATIENCE)
         return plain if self.context is None else self.context.wrap_socket(plain)
 
-    def said(self) -> str:
+    def log(self) -> str:
         """What it has written to standard error."""
         return self.errors.read_text(encoding="utf-8")
 
-    def end(self) -> int:
+    def terminate(self) -> int:
         """Tell it to end; its exit status."""
         self.process.terminate()
         return self.process.wait(PATIENCE)
@@ -291,7 +291,7 @@ def real_daemon(folder: Path, more: str = "") -> Iterator[Path]:
         ) as process,
     ):
         try:
-            hurry(process.pid)
+            raise_priority(process.pid)
             wait_for(lambda: made.is_socket() or process.poll() is not None)
             assert process.poll() is None, (folder / "daemon.log").read_text()
             yield made
@@ -303,7 +303,7 @@ def real_daemon(folder: Path, more: str = "") -> Iterator[Path]:
                 process.kill()
 
 
-def hurry(process: int) -> None:
+def raise_priority(process: int) -> None:
     """Let a process go before others, as the daemon's systemd unit does, where that is allowed."""
     with contextlib.suppress(PermissionError):
         os.setpriority(os.PRIO_PROCESS, process, -10)
@@ -330,7 +330,7 @@ ARM = b'{"owner": "me", "lease_s": 5}'
 
 
 @dataclass(frozen=True)
-class Answer:
+class HttpResponse:
     """An answer over HTTP; status 0 where the connection was closed without one."""
 
     status: int
@@ -349,7 +349,7 @@ def http(
     media: str | None = "application/json",
     more: Sequence[str] = (),
     length: int | None = None,
-) -> Answer:
+) -> HttpResponse:
     """Ask for something that would be granted but for what the caller makes different."""
     lines = [f"{method} {target} HTTP/1.1", "Connection: close"]
     lines += [f"Host: {each}" for each in ([gateway.host] if host is None else host)]
@@ -359,7 +359,7 @@ def http(
     return raw(gateway, "\r\n".join(lines).encode("latin-1") + b"\r\n\r\n" + body)
 
 
-def raw(gateway: GatewayProcess, said: bytes) -> Answer:
+def raw(gateway: GatewayProcess, said: bytes) -> HttpResponse:
     """Send bytes as they are; what comes back until the gateway closes."""
     with gateway.connect() as connection:
         heard = b""
@@ -371,7 +371,7 @@ def raw(gateway: GatewayProcess, said: bytes) -> Answer:
                 heard += part
     head, _, rest = heard.partition(b"\r\n\r\n")
     status = head[9:12]
-    return Answer(int(status) if status.isdigit() else 0, head.decode("latin-1"), rest)
+    return HttpResponse(int(status) if status.isdigit() else 0, head.decode("latin-1"), rest)
 
 
 def upgrade(
@@ -416,7 +416,7 @@ class RawWebSocket:
         """One frame; first: its first byte, FIN and text unless said otherwise."""
         self.connection.sendall(frame(payload, first=first, is_masked=is_masked))
 
-    def ask(self, method: str, params: object, *, id: int = 1) -> None:
+    def call(self, method: str, params: object, *, id: int = 1) -> None:
         """A request."""
         said = {"jsonrpc": "2.0", "id": id, "method": method, "params": params}
         self.send(json.dumps(said).encode())
@@ -434,7 +434,7 @@ class RawWebSocket:
         except ConnectionError:
             return 8, b""
 
-    def answer(self, id: int | None = 1) -> dict[str, object]:
+    def response(self, id: int | None = 1) -> dict[str, object]:
         """The answer with an id; what else comes before it is passed over."""
         while True:
             opcode, payload = self.next()

@@ -1,4 +1,4 @@
-"""Bounds of one connection to the daemon, to the byte and the request, on a clock of our own."""
+"""Bounds of one connection, to the byte and the request, in virtual time."""
 
 import asyncio
 from collections.abc import Callable
@@ -13,7 +13,7 @@ from controller.api.topics import ContactsEvent
 
 
 class Wire(asyncio.Transport):
-    """A client that reads nothing."""
+    """Transport of a client that reads nothing."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -21,37 +21,37 @@ class Wire(asyncio.Transport):
         self.is_aborted = False
 
     def is_closing(self) -> bool:
-        """Whether it was left."""
+        """Whether it was closed."""
         return self.is_aborted
 
     def is_reading(self) -> bool:
-        """Always."""
+        """Whether it reads: always."""
         return True
 
     def write(self, data: bytes | bytearray | memoryview) -> None:
-        """Keep it: nobody takes it."""
+        """Keep the data as unread."""
         self.waiting += bytes(data)
 
     def get_write_buffer_size(self) -> int:
-        """All that was written."""
+        """Size of the unread data."""
         return len(self.waiting)
 
     def set_write_buffer_limits(self, high: int | None = None, low: int | None = None) -> None:
-        """Nothing to do."""
+        """Do nothing."""
 
     def abort(self) -> None:
-        """Be left."""
+        """Close."""
         self.is_aborted = True
 
 
-async def turns() -> None:
-    """Let the event loop run on."""
+async def iterate() -> None:
+    """Run the event loop for a few iterations."""
     for _ in range(4):
         await asyncio.sleep(0)
 
 
-def made(now: Callable[[], float]) -> tuple[Connection, Wire]:
-    """A connection to a client that reads nothing."""
+def connect(now: Callable[[], float]) -> tuple[Connection, Wire]:
+    """A connection and its transport."""
     connection = Connection(
         on_connect=lambda one: True,
         on_lines=lambda one: None,
@@ -63,32 +63,32 @@ def made(now: Callable[[], float]) -> tuple[Connection, Wire]:
     return connection, wire
 
 
-def test_answers_that_nobody_reads_are_bounded() -> None:
-    """256 KiB of them may wait; one more byte, and the client is left. One long answer may go."""
-    connection, wire = made(lambda: 0.0)
+def test_connection_closes_when_unread_responses_exceed_256_kib() -> None:
+    """At 256 KiB and a byte; a single response may be longer."""
+    connection, wire = connect(lambda: 0.0)
     connection.respond(b"x" * (MAX_UNREAD_BYTES - 1))
     connection.respond(b"\n")
     assert (len(wire.waiting), wire.is_aborted) == (1 << 18, False)
     connection.respond(b"\n")
     assert (len(wire.waiting), wire.is_aborted) == (1 << 18, True)
-    connection, wire = made(lambda: 0.0)
+    connection, wire = connect(lambda: 0.0)
     connection.respond(b"x" * (4 * MAX_UNREAD_BYTES))
     assert (len(wire.waiting), wire.is_aborted) == (1 << 20, False)
 
 
-async def test_nobody_is_too_busy_to_stop() -> None:
-    """After 2000 requests in a moment the next is refused, but a stop and a touch are not."""
-    asked: list[str] = []
+async def test_server_limits_the_request_rate_except_for_stop_and_touch() -> None:
+    """After 2000 requests at once the next is refused; stop and touch are served."""
+    served: list[str] = []
 
-    def does(name: str) -> Callable[[Connection, Message], Message]:
+    def handler(name: str) -> Callable[[Connection, Message], Message]:
         def handle(client: Connection, params: Message) -> Message:
-            asked.append(name)
+            served.append(name)
             return METHODS[name].result.model_construct()
 
         return handle
 
     server = ApiServer(
-        {name: does(name) for name in METHODS},
+        {name: handler(name) for name in METHODS},
         on_disconnect=lambda client: None,
         is_protected=lambda client: True,
         clock=lambda: 0.0,
@@ -96,25 +96,25 @@ async def test_nobody_is_too_busy_to_stop() -> None:
     connection = server._make_connection()
     connection.connection_made(Wire())
 
-    async def ask(method: str, params: str = "{}") -> None:
+    async def send(method: str, params: str = "{}") -> None:
         line = f'{{"jsonrpc":"2.0","method":"{method}","params":{params}}}\n'
         connection.data_received(line.encode())
-        await turns()
+        await iterate()
 
     for _ in range(int(MAX_REQUEST_RATE) + 1):
-        await ask("disarm")
-    assert asked == ["disarm"] * 2000
-    await ask("stop")
-    await ask("touch", '{"source":"a","touches":[]}')
-    await ask("clear")
-    assert asked[2000:] == ["stop", "touch"]
+        await send("disarm")
+    assert served == ["disarm"] * 2000
+    await send("stop")
+    await send("touch", '{"source":"a","touches":[]}')
+    await send("clear")
+    assert served[2000:] == ["stop", "touch"]
 
 
-async def test_the_next_telling_waits_for_its_time() -> None:
-    """What was told at a moment is told again a sixtieth of a second later at the earliest."""
+async def test_hub_sends_a_coalesced_topic_at_most_sixty_times_per_second() -> None:
+    """The flush after one at this moment is a sixtieth of a second later."""
     now = 100.0
     hub = Hub({}, clock=lambda: now)
-    connection, wire = made(lambda: now)
+    connection, wire = connect(lambda: now)
     hub.subscribe(connection, ["contacts"])
     loop = asyncio.get_running_loop()
 

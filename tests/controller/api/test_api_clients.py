@@ -1,4 +1,4 @@
-"""Both Python clients against a daemon over a wire, and against what is no daemon."""
+"""Both Python clients against a daemon over a serial line, and against what is not a daemon."""
 
 import asyncio
 import contextlib
@@ -18,7 +18,7 @@ from controller.api.async_client import AsyncClient
 from controller.api.client import Client
 from controller.api.client_protocol import Unreachable
 from controller.api.jsonrpc import ErrorCode, RpcError
-from controller.api.methods import METHODS, ArmResult
+from controller.api.methods import METHODS
 from controller.api.schema import Message
 from controller.api.socket_path import SYSTEM_SOCKET, find_socket
 from daemon_bench import PLACE, running_daemon, until_state
@@ -28,8 +28,8 @@ PAGE = Path(controller.__file__).parent.parent / "docs" / "reference" / "api.md"
 READY, ENABLED = "READY_TO_SWITCH_ON", "OPERATION_ENABLED"
 
 
-async def test_the_waiting_client_does_all_there_is(tmp_path: Path) -> None:
-    """Armed for longer than a lease, touched, told of it, stopped, cleared: from another thread."""
+async def test_client_keeps_its_lease_and_receives_events(tmp_path: Path) -> None:
+    """Armed for longer than a lease, touched, notified, stopped and cleared, from a thread."""
     async with running_daemon(tmp_path) as bench:
 
         def study() -> list[str]:
@@ -50,7 +50,7 @@ async def test_the_waiting_client_does_all_there_is(tmp_path: Path) -> None:
                 assert caught.value.data.remedy is not None
                 era.clear()
                 seen.append(era.status().state)
-                seen += [told.topic for told in era.events(timeout=0.2)]
+                seen += [event.topic for event in era.events(timeout=0.2)]
             return seen
 
         async with await bench.client() as era:
@@ -61,40 +61,38 @@ async def test_the_waiting_client_does_all_there_is(tmp_path: Path) -> None:
         assert seen.count("state") >= 6
 
 
-async def test_the_asyncio_client_keeps_its_lease(tmp_path: Path) -> None:
-    """Armed for longer than a lease of a second, then disarmed by the end of the block."""
+async def test_async_client_keeps_its_lease(tmp_path: Path) -> None:
+    """Armed for longer than a lease of a second, then disarmed; concurrent calls all complete."""
     async with running_daemon(tmp_path) as bench, await bench.client() as era:
         await until_state(era, READY)
         async with era.armed("me", lease_s=1):
             await asyncio.sleep(1.3)
             assert (await era.status()).state == ENABLED
         await until_state(era, READY)
-        answers = await asyncio.gather(*(era.status() for _ in range(50)))
-        assert {answer.state for answer in answers} == {READY}
+        results = await asyncio.gather(*(era.status() for _ in range(50)))
+        assert {status.state for status in results} == {READY}
 
 
-async def test_a_daemon_that_ends_is_told_to_whoever_waits(tmp_path: Path) -> None:
-    """Calls raise Unreachable, events come to their end, for whoever listens later, too."""
+async def test_async_client_ends_when_the_daemon_does(tmp_path: Path) -> None:
+    """Calls raise Unreachable, `events` ends, also for later iterations."""
+
+    async def count_events(era: AsyncClient) -> int:
+        return len([event async for event in era.events()])
+
     async with running_daemon(tmp_path) as bench:
         era = await bench.client()
         await until_state(era, READY)
         await era.subscribe("state")
-        listening = asyncio.create_task(_all_events(era))
-    assert await asyncio.wait_for(listening, 20) >= 1
-    assert await asyncio.wait_for(_all_events(era), 20) == 0
+        counting = asyncio.create_task(count_events(era))
+    assert await asyncio.wait_for(counting, 20) >= 1
+    assert await asyncio.wait_for(count_events(era), 20) == 0
     with pytest.raises(Unreachable):
         await era.status()
     await era.close()
 
 
-async def _all_events(era: AsyncClient) -> int:
-    return len([told async for told in era.events()])
-
-
-async def test_the_example_of_the_page_runs(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The Python lines of the page, as they stand there, with the socket in its usual place."""
+async def test_example_of_the_page_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The Python lines of docs/reference/api.md, with the socket at its default path."""
     found = re.search(r"## In Python\n\n((?:    .*\n|\n)+)", PAGE.read_text("utf-8"))
     assert found is not None
     code = re.sub(r"^    ", "", found[1], flags=re.MULTILINE)
@@ -102,160 +100,157 @@ async def test_the_example_of_the_page_runs(
         monkeypatch.setattr("controller.api.client.find_socket", lambda path: bench.socket)
         async with await bench.client() as era:
             await until_state(era, READY)
-            running = asyncio.create_task(asyncio.to_thread(exec, code, {}))
-            await running
+            await asyncio.to_thread(exec, code, {})
             await until_state(era, READY)
 
 
+def test_clients_have_the_same_methods() -> None:
+    """Every method of the API, with the same parameters and result in both clients."""
+    for name in METHODS:
+        own = inspect.signature(getattr(Client, name))
+        other = inspect.signature(getattr(AsyncClient, name))
+        assert own == other
+        assert list(own.parameters)[1:] or not METHODS[name].params.model_fields
+
+
 @contextlib.contextmanager
-def answering(path: Path, *lines: bytes) -> Iterator[None]:
-    """Somebody at a socket who says these lines to the first who asks, and hangs up."""
+def responding(path: Path, *lines: bytes) -> Iterator[None]:
+    """A server that sends these lines to its first client and closes."""
     with socket.socket(socket.AF_UNIX) as server:
         server.bind(str(path))
         server.listen()
 
-        def answer() -> None:
+        def respond() -> None:
             with contextlib.suppress(OSError):
                 client, _ = server.accept()
                 with client:
                     client.recv(1000)
                     client.sendall(b"".join(lines))
 
-        thread = threading.Thread(target=answer)
+        thread = threading.Thread(target=respond)
         thread.start()
         yield
         thread.join()
 
 
-HELLO = (
-    b'{"jsonrpc":"2.0","id":1,"result":{"api_version":"2.0","software_version":"9","rig":'
-    b'{"length_m":1,"width_m":1,"eras":[],"simulated":true,"frequency_hz":[]},"table":'
-    b'{"fingerprint":"","mode":"","frequencies_hz":[],"cells_x":1,"cells_y":1},"rig_text":"",'
-    b'"layout":null}}\n'
-)
+async def connect_error(folder: Path, *lines: bytes) -> tuple[Exception, Exception]:
+    """The errors of both clients' `connect` to a server that sends these lines."""
+    with responding(folder / "a", *lines), pytest.raises((Unreachable, RpcError)) as one:
+        await asyncio.to_thread(Client.connect, folder / "a")
+    with responding(folder / "b", *lines), pytest.raises((Unreachable, RpcError)) as other:
+        await AsyncClient.connect(folder / "b")
+    return one.value, other.value
 
 
 @pytest.mark.parametrize(
-    ("lines", "message"),
+    ("lines", "words"),
     [
-        ((HELLO,), r"speaks version 2\.0 of the API"),
-        (
-            (b'{"jsonrpc":"2.0","id":1,"result":{"api_version":"2.0"}}\n',),
-            r"version 2\.0 of the API",
-        ),
-        ((b'{"jsonrpc":"2.0","id":1,"result":{"mood":"good"}}\n',), "does not understand"),
-        ((b'{"jsonrpc":"2.0","id":1,"error":{"code":1,"message":"?"}}\n',), "does not understand"),
-        ((b"SSH-2.0-OpenSSH_9.2\n",), "does not understand"),
-        ((), "is gone"),
-        ((b'{"jso',), "is gone"),
+        ((b'{"jsonrpc":"2.0","id":1,"result":{"api_version":"2.0"}}\n',), "version 2.0"),
+        ((b'{"jsonrpc":"2.0","id":1,"result":{"mood":"good"}}\n',), "update"),
+        ((b'{"jsonrpc":"2.0","id":1,"error":{"code":1,"message":"?"}}\n',), "update"),
+        ((b"SSH-2.0-OpenSSH_9.2\n",), "update"),
+        ((), "log"),
+        ((b'{"jso',), "log"),
     ],
 )
-async def test_whoever_answers_otherwise_is_no_daemon_of_ours(
-    tmp_path: Path, lines: tuple[bytes, ...], message: str
+async def test_connect_fails_when_the_peer_is_no_compatible_daemon(
+    tmp_path: Path, lines: tuple[bytes, ...], words: str
 ) -> None:
-    """Another major version, or a connection that ends: one error for both clients."""
-    with answering(tmp_path / "a", *lines), pytest.raises(Unreachable, match=message):
-        await asyncio.to_thread(Client.connect, tmp_path / "a")
-    with answering(tmp_path / "b", *lines), pytest.raises(Unreachable, match=message):
-        await AsyncClient.connect(tmp_path / "b")
+    """Another major version, another program, a closed connection: Unreachable with a remedy."""
+    for error in await connect_error(tmp_path, *lines):
+        assert isinstance(error, Unreachable)
+        assert words in str(error)
 
 
-async def test_a_refusal_of_the_whole_connection_is_told(tmp_path: Path) -> None:
-    """It is the answer to no request in particular, and so to the one that was asked."""
+async def test_connect_raises_an_error_without_id(tmp_path: Path) -> None:
+    """A daemon with too many clients says so before it reads anything."""
     busy = b'{"jsonrpc":"2.0","id":null,"error":{"code":1005,"message":"too many connections"}}\n'
-    with answering(tmp_path / "a", busy), pytest.raises(RpcError, match="too many") as caught:
-        await asyncio.to_thread(Client.connect, tmp_path / "a")
-    assert caught.value.code is ErrorCode.BUSY
-    with answering(tmp_path / "b", busy), pytest.raises(RpcError, match="too many"):
-        await AsyncClient.connect(tmp_path / "b")
+    for error in await connect_error(tmp_path, busy):
+        assert isinstance(error, RpcError)
+        assert error.code is ErrorCode.BUSY
 
 
-@pytest.mark.parametrize("client", [Client, AsyncClient])
-def test_both_clients_have_every_method_with_its_parameters(
-    client: type[Client] | type[AsyncClient],
-) -> None:
-    """As a notebook shows them: the signature, what comes back, and a sentence on each."""
-    for name in METHODS:
-        assert getattr(client, name).__doc__
-    assert list(inspect.signature(client.arm).parameters) == ["self", "owner", "lease_s"]
-    assert inspect.signature(client.arm).return_annotation is ArmResult
-
-
-def test_a_daemon_that_does_not_answer_is_given_up(tmp_path: Path) -> None:
-    """After the timeout, with what to do about it."""
+def test_connect_times_out_without_a_response(tmp_path: Path) -> None:
+    """A server that accepts and stays silent."""
     with socket.socket(socket.AF_UNIX) as server:
         server.bind(str(tmp_path / "s"))
         server.listen()
-        with pytest.raises(Unreachable, match="does not answer"):
+        with pytest.raises(Unreachable, match="see its log"):
             Client.connect(tmp_path / "s", timeout=0.05)
 
 
 class Note(Message):
-    """More than fits into a socket's buffer."""
+    """Parameters that exceed a socket's buffer."""
 
     text: str
 
 
-def test_half_a_line_is_never_gone_on_with(tmp_path: Path) -> None:
-    """A daemon that reads no more got half of a question: the connection is over, as for all."""
+def test_client_closes_after_an_incomplete_line(tmp_path: Path) -> None:
+    """After part of a request nothing more is sent: the daemon would misread it."""
+    hello = b'{"jsonrpc":"2.0","id":1,"result":{"api_version":"1.0"}}\n'
     with socket.socket(socket.AF_UNIX) as server:
         server.bind(str(tmp_path / "s"))
         server.listen()
         peers: list[socket.socket] = []
 
-        def greet() -> None:
+        def respond() -> None:
             peers.append(server.accept()[0])
             peers[0].recv(1000)
-            peers[0].sendall(HELLO.replace(b'"2.0","soft', b'"1.0","soft'))
+            peers[0].sendall(hello)
 
-        thread = threading.Thread(target=greet)
+        thread = threading.Thread(target=respond)
         thread.start()
         with Client.connect(tmp_path / "s", timeout=0.2) as era:
             thread.join()
             peers[0].settimeout(5)
             with peers[0] as daemon, daemon.makefile("rb") as lines:
-                with pytest.raises(Unreachable, match="does not answer"):
+                with pytest.raises(Unreachable):
                     era.call("note", Note(text="x" * 10_000_000), Note)
                 with pytest.raises(Unreachable):
                     era.stop()
                 assert lines.read().endswith(b"x")
 
 
-@pytest.mark.parametrize(
-    ("name", "said"),
-    [
-        (3, "name is 3; it must be a text"),
-        ("", "name is ''; it must have at least 1 character"),
-        ("a\nb", r"name is 'a\\nb'; it must be one line, without characters that a terminal obeys"),
-    ],
-)
-async def test_a_name_that_cannot_be_sent_is_told_before_anybody_is_called(
-    name: str, said: str, tmp_path: Path
-) -> None:
-    """In our words, and by what it is called here; no daemon is needed for that."""
-    with pytest.raises(InputError, match=f"^{said}$"):
-        Client.connect(tmp_path / "nobody", name=name)
-    with pytest.raises(InputError, match=f"^{said}$"):
-        await AsyncClient.connect(tmp_path / "nobody", name=name)
+@pytest.mark.parametrize("name", [3, "", "a\nb"])
+async def test_connect_refuses_an_invalid_name(name: str, tmp_path: Path) -> None:
+    """Before a connection is made, with the key and the value."""
+    with pytest.raises(InputError, match=f"client .*got {re.escape(repr(name))}$"):
+        Client.connect(tmp_path / "s", name=name)
+    with pytest.raises(InputError, match=f"client .*got {re.escape(repr(name))}$"):
+        await AsyncClient.connect(tmp_path / "s", name=name)
 
 
-def test_what_is_no_socket_is_named_as_such(tmp_path: Path) -> None:
-    """A file where the socket was meant: nobody should start a daemon for it."""
+def test_client_refuses_invalid_arguments(tmp_path: Path) -> None:
+    """Before anything is sent, with the method, the key and the value."""
+    with responding(tmp_path / "s"):
+        era = Client(tmp_path / "s")
+        for call, words in [
+            (lambda: era.arm("me", lease_s=0.5), "arm: lease_s .*got 0.5"),
+            (lambda: era.touch(0.1), "touch: places .*got 0.1"),  # type: ignore[arg-type]
+            (lambda: era.touch((0.1, 0.05)), "place .*got 0.1"),  # type: ignore[arg-type]
+            (lambda: era.play("tap", (0.1, 0.1, 0.1)), "place "),  # type: ignore[arg-type]
+            (lambda: era.subscribe("weather"), "subscribe: topics.0"),  # type: ignore[arg-type]
+        ]:
+            with pytest.raises(InputError, match=words):
+                call()
+        era.close()
+
+
+async def test_connect_names_the_problem_of_a_path(tmp_path: Path) -> None:
+    """A file that is not a socket, and a socket of which no daemon listens; text or Path."""
     (tmp_path / "rig.yaml").write_text("", encoding="utf-8")
-    with pytest.raises(Unreachable, match=r"rig\.yaml is no socket; give the one"):
+    with pytest.raises(Unreachable, match=r"rig\.yaml is not a socket"):
         Client.connect(tmp_path / "rig.yaml")
-
-
-async def test_a_socket_may_be_named_by_text() -> None:
-    """As rigs and tables may: whoever types a name at a prompt gets what is wrong with it."""
-    with pytest.raises(Unreachable, match=r"no daemon runs at nosuch\.sock; start one"):
+    with pytest.raises(Unreachable, match=r"nosuch\.sock; start one"):
         Client.connect("nosuch.sock")
-    with pytest.raises(Unreachable, match=r"no daemon runs at nosuch\.sock; start one"):
+    with pytest.raises(Unreachable, match=r"nosuch\.sock; start one"):
         await AsyncClient.connect("nosuch.sock")
 
 
-def test_a_daemon_of_others_is_named_as_such(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where one may not even look into its folder, connecting is what tells whose it is."""
+def test_find_socket_returns_the_system_socket_of_another_user(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Also in a folder that cannot be read; connecting then reports whose it is."""
 
     def forbidden(path: Path, **options: bool) -> os.stat_result:
         if path == SYSTEM_SOCKET:
@@ -265,4 +260,4 @@ def test_a_daemon_of_others_is_named_as_such(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr(Path, "stat", forbidden)
     assert find_socket(None) == SYSTEM_SOCKET
     monkeypatch.undo()
-    assert "belongs to somebody else" in str(Unreachable.at(SYSTEM_SOCKET, PermissionError()))
+    assert "another user" in str(Unreachable.at(SYSTEM_SOCKET, PermissionError()))

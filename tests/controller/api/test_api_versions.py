@@ -1,4 +1,4 @@
-"""Daemons of other versions than the client, and how strictly ours keeps to what it promises."""
+"""Clients and gateway with daemons of other versions, and our daemon against its own models."""
 
 import asyncio
 import contextlib
@@ -9,50 +9,50 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from controller.gateway.topics import FIELD
 
 from controller.api.async_client import AsyncClient
 from controller.api.client import Client
-from controller.api.client_protocol import Unreachable
 from controller.api.jsonrpc import ErrorCode, RpcError
 from controller.api.methods import METHODS
 from controller.api.schema import Empty
 from controller.api.topics import TOPICS, EventParams
 from controller.gateway.daemon_link import DaemonLink
-from controller.gateway.mirror import DaemonMirror
+from controller.gateway.mirror import FIELD, DaemonMirror
 from daemon_bench import PLACE, running_daemon, until, until_state
 
 READY, ENABLED = "READY_TO_SWITCH_ON", "OPERATION_ENABLED"
-BY_NAME = ("drive", "rejected_touches", "parameters", "layout")  # their keys are no message's
+MAPPINGS = ("drive", "rejected_touches", "parameters", "layout")  # keyed by name, not messages
 
 
-def with_news(said: Any, *, by_name: bool = False) -> Any:
-    """A message as a later minor version might say it: every object has a key more."""
-    if isinstance(said, list):
-        return [with_news(each) for each in said]
-    if not isinstance(said, dict):
-        return said
-    news = {} if by_name else {"news": [{"of": "later"}]}
-    return {key: with_news(value, by_name=key in BY_NAME) for key, value in said.items()} | news
+def with_extra_keys(content: Any, *, is_mapping: bool = False) -> Any:
+    """A message of a later minor version: every object has a further key."""
+    if isinstance(content, list):
+        return [with_extra_keys(each) for each in content]
+    if not isinstance(content, dict):
+        return content
+    extra = {} if is_mapping else {"extra": [{"of": "later"}]}
+    return {
+        key: with_extra_keys(value, is_mapping=key in MAPPINGS) for key, value in content.items()
+    } | extra
 
 
 @contextlib.asynccontextmanager
-async def between(
+async def relay(
     daemon: Path, path: Path, change: Callable[[dict[str, Any]], object]
 ) -> AsyncIterator[None]:
-    """Another socket for a daemon, at which everything that it says is changed."""
+    """A second socket of a daemon, on which all its output is changed."""
     under_way: set[asyncio.Task[None]] = set()
 
     async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        told, asked = await asyncio.open_unix_connection(daemon, limit=1 << 20)
+        daemon_reader, daemon_writer = await asyncio.open_unix_connection(daemon, limit=1 << 20)
 
         async def forth() -> None:
             while data := await reader.read(1 << 16):
-                asked.write(data)
-            asked.close()
+                daemon_writer.write(data)
+            daemon_writer.close()
 
         async def back() -> None:
-            while line := await told.readline():
+            while line := await daemon_reader.readline():
                 writer.write(json.dumps(change(json.loads(line))).encode() + b"\n")
             writer.close()
 
@@ -68,42 +68,42 @@ async def between(
         await asyncio.gather(*under_way, return_exceptions=True)
 
 
-async def test_keys_that_a_later_minor_version_adds_are_ignored(tmp_path: Path) -> None:
-    """In results and notifications at every depth: by both clients, and by the gateway."""
+async def test_extra_keys_of_a_later_minor_version_are_ignored(tmp_path: Path) -> None:
+    """In results and notifications at every depth: by both clients and by the gateway."""
 
-    def ask(path: Path) -> list[str]:
+    def use(path: Path) -> list[str]:
         with Client.connect(path) as era:
             era.subscribe("state")
-            seen = [era.status().state, *(told.topic for told in era.events(timeout=0.2))]
+            seen = [era.status().state, *(event.topic for event in era.events(timeout=0.2))]
             era.effects()
             return seen
 
     later = tmp_path / "later.sock"
     frames: dict[str, str | bytes] = {}
-    async with running_daemon(tmp_path) as bench, between(bench.socket, later, with_news):
+    async with running_daemon(tmp_path) as bench, relay(bench.socket, later, with_extra_keys):
         async with await AsyncClient.connect(later) as era:
             await until_state(era, READY)
-            assert await asyncio.to_thread(ask, later) == [READY, "state"]
-            drawing = asyncio.create_task(DaemonMirror(later, tell=frames.__setitem__).run())
+            assert await asyncio.to_thread(use, later) == [READY, "state"]
+            mirroring = asyncio.create_task(DaemonMirror(later, publish=frames.__setitem__).run())
             await until(lambda: FIELD in frames)
-            nothing = frames[FIELD]
+            empty = frames[FIELD]
             await era.subscribe("pattern")
             async with era.armed("me"), asyncio.timeout(20):
                 await era.touch([PLACE])
-                async for told in era.events():
-                    assert "news" in told.data["contacts"][0]
-                    assert "news" in next(iter(told.data["drive"].values()))
+                async for event in era.events():
+                    assert "extra" in event.data["contacts"][0]
+                    assert "extra" in next(iter(event.data["drive"].values()))
                     break
-                await until(lambda: "pattern" in frames and frames[FIELD] != nothing)
-        drawing.cancel()
-        await asyncio.gather(drawing, return_exceptions=True)
+                await until(lambda: "pattern" in frames and frames[FIELD] != empty)
+        mirroring.cancel()
+        await asyncio.gather(mirroring, return_exceptions=True)
 
 
-async def test_the_daemon_says_what_its_version_promises_and_no_more(tmp_path: Path) -> None:
-    """Read strictly, by the models that the reference is made of: no key too many or too few."""
+async def test_daemon_sends_exactly_the_documented_keys(tmp_path: Path) -> None:
+    """Results and notifications read strictly by the models of the reference page."""
     down = [{"id": 1, "x_m": PLACE[0], "y_m": PLACE[1]}]
     topics = sorted(TOPICS.keys() - {"link", "log"})
-    told: set[str] = set()
+    received: set[str] = set()
 
     async with contextlib.AsyncExitStack() as stack:
         bench = await stack.enter_async_context(running_daemon(tmp_path))
@@ -112,62 +112,57 @@ async def test_the_daemon_says_what_its_version_promises_and_no_more(tmp_path: P
         reader, writer = await asyncio.open_unix_connection(bench.socket, limit=1 << 20)
         stack.callback(writer.close)
 
-        async def next_answer() -> dict[str, Any]:
-            """The next line that is no notification; those are read strictly here."""
+        async def next_response() -> dict[str, Any]:
+            """The next response; notifications before it are read strictly."""
             while True:
-                said: dict[str, Any] = json.loads(await reader.readline())
-                if "method" not in said:
-                    return said
-                event = EventParams.model_validate(said["params"])
+                content: dict[str, Any] = json.loads(await reader.readline())
+                if "method" not in content:
+                    return content
+                event = EventParams.model_validate(content["params"])
                 TOPICS[event.topic].data.model_validate_json(json.dumps(event.data))
-                told.add(event.topic)
+                received.add(event.topic)
 
-        async def ask(method: str, **params: object) -> None:
-            asked = {"jsonrpc": "2.0", "id": 1, "method": method, "params": params}
-            writer.write(json.dumps(asked).encode() + b"\n")
-            said = await next_answer()
-            assert said.keys() == {"jsonrpc", "id", "result"}, said
-            METHODS[method].result.model_validate_json(json.dumps(said["result"]))
+        async def call(method: str, **params: object) -> None:
+            request = {"jsonrpc": "2.0", "id": 1, "method": method, "params": params}
+            writer.write(json.dumps(request).encode() + b"\n")
+            response = await next_response()
+            assert response.keys() == {"jsonrpc", "id", "result"}, response
+            METHODS[method].result.model_validate_json(json.dumps(response["result"]))
 
         async with asyncio.timeout(20):
-            await ask("hello", client="me")
-            await ask("subscribe", topics=topics, rate_hz=60.0)
-            await ask("effects")
-            await ask("arm", owner="me", lease_s=5.0)
+            await call("hello", client="me")
+            await call("subscribe", topics=topics, rate_hz=60.0)
+            await call("effects")
+            await call("arm", owner="me", lease_s=5.0)
             for touches, awaited in ((down, "pattern"), ([], "silence")):
-                while awaited not in told:
-                    await ask("touch", source="me", touches=touches)
-                    await ask("status")
+                while awaited not in received:
+                    await call("touch", source="me", touches=touches)
+                    await call("status")
                     await asyncio.sleep(0.01)
-            await ask("stop")
-            await ask("clear")
-            while told != set(topics):
-                await ask("status")
+            await call("stop")
+            await call("clear")
+            while received != set(topics):
+                await call("status")
                 await asyncio.sleep(0.01)
 
 
-async def test_a_daemon_of_another_major_version_is_named_as_such(tmp_path: Path) -> None:
-    """Whatever else its hello looks like: by both clients, and to whoever asks the gateway."""
+async def test_gateway_reports_a_daemon_of_another_major_version(tmp_path: Path) -> None:
+    """Its calls fail with both versions and the remedy, whatever else `hello` holds."""
 
-    def changed(said: dict[str, Any]) -> dict[str, Any]:
-        return said | {"result": {"api_version": "2.0", "era": 2}}
+    def changed(content: dict[str, Any]) -> dict[str, Any]:
+        return content | {"result": {"api_version": "2.0", "era": 2}}
 
-    spoken = r"speaks version 2\.0 of the API, this program 1\.\d+; update the older of the two"
     other = tmp_path / "other.sock"
-    async with running_daemon(tmp_path) as bench, between(bench.socket, other, changed):
-        with pytest.raises(Unreachable, match=spoken):
-            await AsyncClient.connect(other)
-        with pytest.raises(Unreachable, match=spoken):
-            await asyncio.to_thread(Client.connect, other)
-        link = DaemonLink(other, on_hello=lambda hello: None, on_event=lambda told: None)
+    async with running_daemon(tmp_path) as bench, relay(bench.socket, other, changed):
+        link = DaemonLink(other, on_hello=lambda hello: None, on_event=lambda event: None)
         following = asyncio.create_task(link.run())
-        said = ""
-        while "version" not in said:
+        message = ""
+        while "version" not in message:
             with pytest.raises(RpcError) as caught:
                 await link.call("status", Empty())
-            said = str(caught.value)
+            message = str(caught.value)
             await asyncio.sleep(0.01)
         following.cancel()
         await asyncio.gather(following, return_exceptions=True)
-        assert re.search(spoken, said)
+        assert re.search(r"2\.0 .* 1\.\d+; update the older", message)
         assert caught.value.code is ErrorCode.LINK

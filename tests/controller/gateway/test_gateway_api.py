@@ -42,7 +42,7 @@ def gateway(
 @pytest.fixture(autouse=True)
 def nothing_asked_yet(daemon: ScriptedDaemon) -> None:
     """Each test sees what itself has asked."""
-    daemon.asked.clear()
+    daemon.calls.clear()
 
 
 PARAMETERS: dict[str, dict[str, object]] = {
@@ -99,13 +99,13 @@ def test_nobody_can_give_the_gateway_another_name(
     status, said = ask(gateway, "hello")
     assert status == 200
     assert said["api_version"] == "1.0"
-    assert daemon.asked == []
+    assert daemon.calls == []
 
 
 def test_touches_over_http_say_so(gateway: GatewayProcess, daemon: ScriptedDaemon) -> None:
     """Their source cannot be taken for one of a browser."""
     ask(gateway, "touch")
-    (params,) = [params for _, params in daemon.asked]
+    (params,) = [params for _, params in daemon.calls]
     assert isinstance(params, TouchParams)
     assert params.source == "http:me"
 
@@ -211,8 +211,8 @@ def test_requests_made_from_the_description_find_no_fault(
 
 def subscribe(ws: RawWebSocket, *topics: str) -> None:
     """Be told of topics."""
-    ws.ask("subscribe", {"topics": topics}, id=100)
-    assert ws.answer(100)["result"] == {}
+    ws.call("subscribe", {"topics": topics}, id=100)
+    assert ws.response(100)["result"] == {}
 
 
 def told(ws: RawWebSocket, topic: str) -> dict[str, object] | None:
@@ -289,11 +289,11 @@ def test_browsers_fingers_are_kept_apart_and_lifted_when_they_leave(
     touch = PARAMETERS["touch"]
     with RawWebSocket(gateway) as one, RawWebSocket(gateway) as other:
         for ws in (one, other):
-            ws.ask("touch", touch)
-            assert ws.answer()["result"] == {}
-        wait_for(lambda: len(daemon.asked) == 2)
-    wait_for(lambda: len(daemon.asked) == 4)
-    frames = [params for _, params in daemon.asked]
+            ws.call("touch", touch)
+            assert ws.response()["result"] == {}
+        wait_for(lambda: len(daemon.calls) == 2)
+    wait_for(lambda: len(daemon.calls) == 4)
+    frames = [params for _, params in daemon.calls]
     assert all(isinstance(params, TouchParams) for params in frames)
     said = [(params.source, len(params.touches)) for params in frames]  # type: ignore[attr-defined]
     sources = {source for source, _ in said}
@@ -306,19 +306,19 @@ def test_a_stop_overtakes_what_waits(gateway: GatewayProcess, daemon: ScriptedDa
     with RawWebSocket(gateway) as ws:
         with daemon.holding():
             for id in range(17):
-                ws.ask("arm", PARAMETERS["arm"], id=id)
-            error = ws.answer(16)["error"]
+                ws.call("arm", PARAMETERS["arm"], id=id)
+            error = ws.response(16)["error"]
             assert isinstance(error, dict)
             assert error["code"] == 1005
-            ws.ask("stop", {}, id=99)
-            assert ws.answer(99)["result"] == {}
+            ws.call("stop", {}, id=99)
+            assert ws.response(99)["result"] == {}
         wait_for(lambda: is_taken(ws))  # after the answers to what waited, so that all are told
 
 
 def is_taken(ws: RawWebSocket) -> bool:
     """Whether the daemon takes another request; it refuses one where many are under way."""
-    ws.ask("effects", {}, id=300)
-    return "result" in ws.answer(300)
+    ws.call("effects", {}, id=300)
+    return "result" in ws.response(300)
 
 
 def test_a_request_without_id_gets_no_answer(
@@ -328,7 +328,7 @@ def test_a_request_without_id_gets_no_answer(
     with RawWebSocket(gateway) as ws:
         ws.send(b'{"jsonrpc": "2.0", "method": "stop"}')
         ws.send(b'{"jsonrpc": "2.0", "method": "arm", "params": {}}')
-        ws.ask("effects", {}, id=5)
+        ws.call("effects", {}, id=5)
         opcode, payload = ws.next()
         assert (opcode, json.loads(payload)["id"]) == (1, 5)
     assert daemon.methods == ["stop", "effects"]

@@ -11,12 +11,12 @@ from typing import TypeAlias
 
 import pytest
 
-from controller.gateway.connections import MOST_FRAGMENTS
+from controller.gateway.connections import MAX_FRAGMENTS
 from gateway_bench import (
     ARM,
     TOKEN,
-    Answer,
     GatewayProcess,
+    HttpResponse,
     RawWebSocket,
     ScriptedDaemon,
     frame,
@@ -27,7 +27,7 @@ from gateway_bench import (
     wait_for_daemon,
 )
 
-Attack: TypeAlias = Callable[[GatewayProcess], Answer]
+Attack: TypeAlias = Callable[[GatewayProcess], HttpResponse]
 Misuse: TypeAlias = Callable[[RawWebSocket], None]
 
 
@@ -46,13 +46,13 @@ def untouched(daemon: ScriptedDaemon, gateway: GatewayProcess) -> Iterator[None]
     """After an attack the daemon was asked nothing, what is allowed is granted as ever, and no line
     was written to the log: who attacks could fill it.
     """
-    daemon.asked.clear()
-    logged = gateway.said()
+    daemon.calls.clear()
+    logged = gateway.log()
     yield
-    assert daemon.asked == []
+    assert daemon.calls == []
     assert http(gateway).status == 200
     assert daemon.methods == ["arm"]
-    assert gateway.said() == logged
+    assert gateway.log() == logged
 
 
 def body(value: object) -> bytes:
@@ -362,7 +362,7 @@ MISUSES: dict[str, tuple[Misuse, set[int]]] = {
     ),
     "fragments without end": (
         lambda ws: ws.connection.sendall(
-            frame(b"", first=0x01) + frame(b"", first=0x00) * (2 * MOST_FRAGMENTS)
+            frame(b"", first=0x01) + frame(b"", first=0x00) * (2 * MAX_FRAGMENTS)
         ),
         {0},
     ),
@@ -429,8 +429,8 @@ def test_a_request_that_should_not_be_is_told_why(gateway: GatewayProcess, name:
         error = json.loads(payload)["error"]
         assert error["code"] == code
         assert error["message"].isprintable()
-        ws.ask("no_such", {}, id=2)
-        assert ws.answer(2)["error"]
+        ws.call("no_such", {}, id=2)
+        assert ws.response(2)["error"]
 
 
 def test_compression_is_not_agreed_on(gateway: GatewayProcess) -> None:

@@ -1,4 +1,4 @@
-"""What a browser has asked for when it leaves."""
+"""Requests that are pending when a browser disconnects."""
 
 import asyncio
 import json
@@ -9,49 +9,48 @@ import pytest
 from controller.api.schema import Message
 from controller.gateway.session import Session
 
+PARAMS = {"arm": {"owner": "browser", "lease_s": 60}}
+
 
 class Socket:
-    """A browser that says these methods, one after the other, and leaves."""
+    """A WebSocket that sends one request and disconnects."""
 
-    def __init__(self, *methods: str) -> None:
-        self._says = [
-            {"jsonrpc": "2.0", "id": 1, "method": method, "params": _PARAMS.get(method, {})}
-            for method in methods
+    def __init__(self, method: str) -> None:
+        params = PARAMS.get(method, {})
+        request = {"jsonrpc": "2.0", "id": 1, "method": method, "params": params}
+        self._messages = [
+            {"type": "websocket.receive", "text": json.dumps(request)},
+            {"type": "websocket.disconnect"},
         ]
 
     async def receive(self) -> dict[str, Any]:
-        """As of a WebSocket."""
-        if self._says:
-            return {"type": "websocket.receive", "text": json.dumps(self._says.pop(0))}
-        return {"type": "websocket.disconnect"}
-
-
-_PARAMS = {"arm": {"owner": "browser", "lease_s": 60}}
+        """The next message."""
+        return self._messages.pop(0)
 
 
 class Daemon:
-    """Answers once it may, and notes what it was asked and has answered."""
+    """A daemon that responds when it may, and records its calls."""
 
     def __init__(self) -> None:
-        self.may_answer = asyncio.Event()
-        self.asked: list[str] = []
-        self.answered: list[str] = []
+        self.is_called = asyncio.Event()
+        self.may_respond = asyncio.Event()
+        self.completed: list[str] = []
 
     async def call(self, method: str, params: Message) -> dict[str, Any]:
-        """As the way to the daemon."""
-        self.asked.append(method)
-        await self.may_answer.wait()
-        self.answered.append(method)
+        """Complete when it may."""
+        self.is_called.set()
+        await self.may_respond.wait()
+        self.completed.append(method)
         return {}
 
 
 @pytest.mark.parametrize(
-    ("method", "answered"), [("arm", ["arm", "disarm"]), ("stop", ["stop"]), ("clear", ["clear"])]
+    ("method", "completed"), [("arm", ["arm", "disarm"]), ("stop", ["stop"]), ("clear", ["clear"])]
 )
-async def test_what_was_asked_before_it_left_is_seen_through(
-    method: str, answered: list[str]
+async def test_session_completes_pending_requests_after_a_disconnect(
+    method: str, completed: list[str]
 ) -> None:
-    """No stop is taken back, and nothing stays armed by a lease that nobody knows."""
+    """No stop is cancelled, and nothing stays armed by a lease that cannot be renewed."""
     daemon = Daemon()
     session = Session(
         Socket(method),  # type: ignore[arg-type]
@@ -60,8 +59,10 @@ async def test_what_was_asked_before_it_left_is_seen_through(
         clock=asyncio.get_running_loop().time,
     )
     running = asyncio.create_task(session.run())
-    await asyncio.sleep(0.01)
-    assert daemon.asked == [method]
-    daemon.may_answer.set()
-    await asyncio.wait_for(running, 10)
-    assert daemon.answered == answered
+    async with asyncio.timeout(10):
+        await daemon.is_called.wait()
+        for _ in range(5):
+            await asyncio.sleep(0)  # the session learns of the disconnect
+        daemon.may_respond.set()
+        await running
+    assert daemon.completed == completed

@@ -142,7 +142,7 @@ def test_a_port_for_metrics_that_is_taken(capsys: pytest.CaptureFixture[str]) ->
     assert caught.value.exit_code == 2
     said = capsys.readouterr().err
     assert f"127.0.0.1 port {port} (Address already in use)" in said
-    assert "name another port with metrics:" in said
+    assert "`metrics`" in said
 
 
 def test_a_daemon_loads_nothing_that_only_others_compute_with() -> None:

@@ -121,7 +121,7 @@ async def hear(
     frequencies = next(iter(steady.values())).frequencies
     heard = replace(
         heard,
-        report=tuple(one.data for one in patterns),
+        told=tuple(one.data for one in patterns),
         delay=patterns[0].time - begin if patterns else math.inf,
         steady=steady,
         phasors=_phasors(signals, frequencies),

@@ -115,7 +115,7 @@ def run_plan(plan: Plan, *, trace: TextIO | None = None) -> Outcome:
             run_virtual(run.main(), dice=random.Random(plan.seed + 1), seen=seen)
         except Stuck as problem:
             run.violations.append(str(problem))
-    return Outcome(plan.seed, written.digest, run.violations, counts, plan.duration, plan.busy)
+    return Outcome(plan.seed, written.digest, run.violations, counts, plan.lasts, plan.busy)
 
 
 @dataclass
@@ -240,7 +240,7 @@ class _Run:
                     self.counts[f"operator {action.what}"] += 1
                     self.note("operator", action.what)
                     self._spawn(self._ask(action))
-        await self._until(self.plan.duration)
+        await self._until(self.plan.lasts)
 
     async def _until(self, at: float) -> None:
         await asyncio.sleep(max(0.0, START + at - self.loop.time()))
@@ -311,7 +311,7 @@ class _Run:
         if ask.what == "kill":
             await self._kill()
         elif ask.what == "stall":
-            self._stall(ask.duration)
+            self._stall(ask.lasts)
         elif controller is None:
             if self.plan.is_calm(ask.at - 0.4, ask.at):
                 self.checks.violate("could not be opened, and nothing was wrong")

@@ -87,7 +87,7 @@ class Chain:
                 break
         assert heard, self.daemon.log
         state = await self.control.ask("state")
-        status = await self.daemon.shut_down()
+        status = await self.daemon.end()
         return Played(
             heard,
             polls,
@@ -162,7 +162,7 @@ class Chain:
         if self.witness is not None:
             self.witness.wish(time.monotonic(), "disarm")
         return [
-            await hear(self.control, situation, begin, end, report=told)
+            await hear(self.control, situation, begin, end, told=told)
             for situation, begin, end in zip(stream.situations, went, went[1:], strict=False)
         ], polls
 

@@ -1,8 +1,15 @@
-"""By which code a result was made, so that what other code has made is not taken for it."""
+"""Versions of the code and of its numbers, which results carry."""
 
 import hashlib
 from functools import cache
 from importlib import metadata, resources
+
+NUMERICS_VERSION = 1
+"""Version of the numbers that the model computes: kept results of another one are not reused.
+
+Increase it with every change of figures beyond rounding, then record the new figures by
+`python tests/support/reference_figures.py`.
+"""
 
 
 @cache

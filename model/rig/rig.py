@@ -3,8 +3,9 @@
 import hashlib
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from numbers import Real
 
 from model.errors import InputError
 from model.fem.mesh import Mesh
@@ -104,14 +105,13 @@ class Rig:
 def physics_fingerprint(
     plate: Plate, eras: Sequence[Era], *, masses: Sequence[PointMass] = ()
 ) -> str:
-    """SHA-256 over what the plate's response depends on: plate, ERAs, masses, not mesh or wiring.
+    """SHA-256 over plate, ERAs and masses, which decide the plate's response; not mesh or wiring.
 
-    Rigs with the same fingerprint can use the same localization table, whatever their material is
-    called.
+    Rigs with the same fingerprint share localization tables, whatever their material is called.
     """
     numbers = asdict(plate)
     del numbers["material"]["name"]
-    # What has no gains keeps the fingerprint that it had before there were any.
+    # ERAs without gains have the fingerprint of a rig that has no such key.
     held = [
         {key: value for key, value in asdict(era).items() if key != "gains" or value}
         for era in eras
@@ -121,5 +121,23 @@ def physics_fingerprint(
         "eras": held,
         "masses": sorted((mass.x, mass.y, mass.mass) for mass in masses),
     }
-    text = json.dumps(physics, sort_keys=True, separators=(",", ":"))
-    return hashlib.sha256(text.encode()).hexdigest()
+    return hashlib.sha256(canonical_json(physics).encode()).hexdigest()
+
+
+def canonical_json(value: object) -> str:
+    """JSON of plain data with sorted keys, the same for 1 and 1.0, and for -0.0 and 0.0."""
+    return json.dumps(_with_floats(value), sort_keys=True, separators=(",", ":"))
+
+
+def _with_floats(value: object) -> object:
+    match value:
+        case bool() | str() | None:
+            return value
+        case Real():
+            return float(value) + 0.0
+        case Mapping():
+            return {key: _with_floats(each) for key, each in value.items()}
+        case Iterable():
+            return [_with_floats(each) for each in value]
+        case _:
+            raise TypeError(f"no plain data: {type(value).__name__}")

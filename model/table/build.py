@@ -21,6 +21,7 @@ from model.rig.rig import Rig
 from model.table.kept_parts import KeptParts
 from model.table.table import PAPER_FREQUENCIES, PAPER_GRID, LocalizationTable
 from model.table.table_parts import Part, TableProblem, solve_part
+from model.version import code_version
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,7 +112,7 @@ def _put_together(
         raster=problem.raster,
         grid=problem.grid,
         drive_mode=drive_mode,
-        code_version=problem.code_version,
+        code_version=code_version(),
         frequencies=problem.frequencies,
         reference_mesh=problem.reference_mesh,
         discretisation_error=joined("discretisation_error", axis=0),

@@ -1,7 +1,8 @@
-"""Tables kept between runs, by everything that makes them."""
+"""Tables kept between runs in the user's cache folder."""
 
-import hashlib
 import logging
+import os
+from contextlib import suppress
 from pathlib import Path
 
 import platformdirs
@@ -10,10 +11,15 @@ from model.arrays import FloatArray
 from model.errors import InputError
 from model.finger.grid import Grid
 from model.rig.rig import Rig
-from model.table.build import build_table
+from model.table.build import build_in_parts
 from model.table.file import FORMAT_VERSION, load_table, save_table
 from model.table.table import PAPER_GRID, LocalizationTable, default_drive_frequencies
-from model.version import code_version
+from model.table.table_parts import TableProblem
+from model.version import NUMERICS_VERSION
+
+MAX_CACHED_TABLES = 50  # of some megabytes each; the least recently used go first
+
+_CURRENT = f"table-{FORMAT_VERSION}.{NUMERICS_VERSION}-"
 
 _logger = logging.getLogger(__name__)
 
@@ -25,35 +31,41 @@ def cached_table(
     grid: Grid = PAPER_GRID,
     drive_mode: str = "switched",
 ) -> tuple[LocalizationTable, Path | None]:
-    """The table of a rig, from the user's cache folder or built and kept there; and its file.
+    """Return a rig's table from the user's cache folder, built if it is not there, and its file.
 
-    frequencies (f,) [Hz]: `default_drive_frequencies` if None. A damaged cache file, and one
-    that other code has made, is built anew. Where nothing can be written the table is built all the
-    same and the file is None.
+    frequencies (f,) [Hz]: `default_drive_frequencies` if None. A damaged file is built again. The
+    file is None where the folder cannot be written.
     """
     if frequencies is None:
         frequencies = default_drive_frequencies(rig.limits)
-    path = _cache_path(rig, frequencies, grid, drive_mode)
+    problem = TableProblem(rig, frequencies, grid)
+    folder = platformdirs.user_cache_path("era-haptics", appauthor=False)
+    path = folder / f"{_CURRENT}{problem.digest[:16]}-{drive_mode}.npz"
     try:
-        kept = load_table(path, fingerprint=rig.fingerprint)
+        table = load_table(path, fingerprint=rig.fingerprint)
     except InputError as error:
-        reason, _, _ = str(error).partition("; ")  # what is to be done about it is done here
-        _logger.info("building the localization table: %s", reason)
+        reason, _, _ = str(error).partition("; ")  # without the remedy, which follows here
+        _logger.info("table cache: building a table: %s", reason)
     else:
-        if kept.code_version == code_version():
-            return kept, path
-        _logger.info("building the localization table: %s made the one kept", kept.code_version)
-    table = build_table(rig, frequencies=frequencies, grid=grid, drive_mode=drive_mode)
+        with suppress(OSError):
+            os.utime(path)
+        return table, path
+    table = build_in_parts(problem, drive_mode=drive_mode).table
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+        folder.mkdir(parents=True, exist_ok=True)
         save_table(table, path)
     except OSError as error:
-        _logger.warning("the table is not kept for the next run: %s", error)
+        _logger.warning("table cache: table not kept for the next run: %s", error)
         return table, None
+    with suppress(OSError):
+        _clean_up(folder)
     return table, path
 
 
-def _cache_path(rig: Rig, frequencies: FloatArray, grid: Grid, drive_mode: str) -> Path:
-    name = f"{FORMAT_VERSION} {rig.mesh} {grid} {drive_mode} {frequencies.tolist()}"
-    digest = hashlib.sha256(f"{rig.fingerprint} {name}".encode()).hexdigest()[:16]
-    return platformdirs.user_cache_path("era-haptics", appauthor=False) / f"table-{digest}.npz"
+def _clean_up(folder: Path) -> None:
+    """Remove tables of other versions, and all but the most recently used ones."""
+    tables = list(folder.glob("table-*.npz"))
+    current = [path for path in tables if path.name.startswith(_CURRENT)]
+    recent = sorted(current, key=lambda path: path.stat().st_mtime)[-MAX_CACHED_TABLES:]
+    for path in set(tables) - set(recent):
+        path.unlink(missing_ok=True)

@@ -1,7 +1,6 @@
 """The parts of a table: what can be solved apart from the rest, and how."""
 
 import hashlib
-import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
@@ -17,12 +16,12 @@ from model.files.array_file import Arrays
 from model.finger.grid import CELL_SAMPLES, Grid
 from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.reduction.reduced_plate import reduce_plate
-from model.rig.rig import Rig
+from model.rig.rig import Rig, canonical_json
 from model.structure.point_load import load_positions
 from model.structure.support import check_supported
-from model.table.file import MAX_BYTES
+from model.table.file import FORMAT_VERSION, MAX_BYTES
 from model.table.raster import Raster
-from model.version import code_version
+from model.version import NUMERICS_VERSION
 from model.vibration.convergence import reference_mesh
 
 # Some ten milliseconds of work on the paper's plate, and some megabytes.
@@ -81,19 +80,19 @@ class TableProblem:
         limit = self.rig.limits.frequency_max
         return reference_mesh(self.rig.plate, frequency_max=limit)
 
-    @property
-    def code_version(self) -> str:
-        """Of the code that solves it."""
-        return code_version()
-
     @cached_property
     def digest(self) -> str:
-        """SHA-256 over everything in it and the code that solves it."""
-        mesh, reference = self.rig.mesh.to_dict(), self.reference_mesh.to_dict()
-        text = json.dumps([self.rig.fingerprint, mesh, reference, str(self.grid)], sort_keys=True)
-        digest = hashlib.sha256(f"{self.code_version}\n{text}\n".encode())
-        digest.update(self.frequencies.tobytes())
-        return digest.hexdigest()
+        """SHA-256 over all that decides the numbers of the table, and over their format."""
+        decisive = {
+            "format": FORMAT_VERSION,
+            "numerics": NUMERICS_VERSION,
+            "plate": self.rig.fingerprint,
+            "mesh": self.rig.mesh.to_dict(),
+            "reference_mesh": self.reference_mesh.to_dict(),  # follows from the rig's limits
+            "grid": [self.grid.nx, self.grid.ny],
+            "frequencies": self.frequencies.tolist(),
+        }
+        return hashlib.sha256(canonical_json(decisive).encode()).hexdigest()
 
     def parts(self) -> tuple[Part, ...]:
         """What there is to solve; the longest first."""

@@ -104,7 +104,7 @@ def test_kept_parts_are_for_any_mode(problem, tmp_path):
     assert build.table.drive_mode == "phased"
 
 
-@pytest.mark.parametrize("what", ["frequencies", "plate", "grid", "mesh", "code"])
+@pytest.mark.parametrize("what", ["frequencies", "plate", "grid", "mesh", "numerics"])
 def test_parts_of_another_table_are_not_used(problem, tmp_path, caplog, what):
     """Anything that changes the numbers changes what is looked for; nothing is called damaged."""
     interrupted(problem, tmp_path, after=3)
@@ -116,12 +116,12 @@ def test_parts_of_another_table_are_not_used(problem, tmp_path, caplog, what):
         ),
         "grid": lambda: replace(problem, grid=Grid(3, 4)),
         "mesh": lambda: replace(problem, rig=make_paper_rig(14, 9)),
-        "code": lambda: problem,
+        "numerics": lambda: problem,
     }[what]()
     digest = other.digest
-    if what == "code":
+    if what == "numerics":
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(table_parts, "code_version", lambda: "another")
+            patch.setattr(table_parts, "NUMERICS_VERSION", 0)
             digest = replace(problem).digest
     kept = KeptParts.beside(tmp_path / "t.npz", digest)
     with caplog.at_level(logging.WARNING):

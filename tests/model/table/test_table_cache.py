@@ -1,5 +1,6 @@
-"""Tables are kept between runs, and never the wrong one."""
+"""Tables kept between runs, and never a wrong one."""
 
+import os
 from dataclasses import replace
 
 import numpy as np
@@ -11,119 +12,110 @@ from model.table.table_cache import cached_table
 from paper_plate import make_paper_rig
 
 
-@pytest.fixture
-def rig():
-    """A mesh that is quick to solve, at five frequencies: 60 to 100 Hz."""
-    return quick_rig(12, 9)
-
-
 def quick_rig(nx, ny):
-    """The paper's plate, which is not to be driven beyond 100 Hz."""
+    """The paper's plate up to 100 Hz: five frequencies, solved quickly."""
     rig = make_paper_rig(nx, ny)
     return replace(rig, limits=replace(rig.limits, frequency_min=60.0, frequency_max=100.0))
+
+
+RIG = quick_rig(12, 9)
+STIFFER = replace(RIG, eras=(replace(RIG.eras[0], stiffness=18000.0), *RIG.eras[1:]))
 
 
 @pytest.fixture(autouse=True)
 def cache(tmp_path, monkeypatch):
     """A cache folder of the test's own."""
-    monkeypatch.setattr(
-        table_cache.platformdirs, "user_cache_path", lambda *_, **__: tmp_path / "cache"
-    )
-    return tmp_path / "cache"
+    folder = tmp_path / "cache"
+    monkeypatch.setattr(table_cache.platformdirs, "user_cache_path", lambda *_, **__: folder)
+    return folder
 
 
 @pytest.fixture
 def builds(monkeypatch):
-    """Counts how often a table is really built."""
-    counted = []
-    build = table_cache.build_table
+    """The problems that are solved."""
+    solved = []
+    build = table_cache.build_in_parts
 
-    def counting(rig, **options):
-        counted.append(rig)
-        return build(rig, **options)
+    def counting(problem, **options):
+        solved.append(problem)
+        return build(problem, **options)
 
-    monkeypatch.setattr(table_cache, "build_table", counting)
-    return counted
+    monkeypatch.setattr(table_cache, "build_in_parts", counting)
+    return solved
 
 
-def test_the_second_time_it_is_read(rig, builds):
-    """The same rig is solved once."""
-    first, path = cached_table(rig)
-    second, again = cached_table(rig)
+def test_cached_table_is_read_the_second_time(builds):
+    """A rig is solved once, also when its numbers are whole ones; its wiring does not matter."""
+    first, path = cached_table(RIG)
+    whole = replace(RIG, eras=tuple(replace(era, stiffness=17000) for era in RIG.eras))
+    for rig in (RIG, replace(RIG, wiring={}, amplifiers={}), whole):
+        again, same = cached_table(rig)
+        assert (same, again.fingerprint) == (path, first.fingerprint)
     assert len(builds) == 1
-    assert path == again
-    assert second.fingerprint == first.fingerprint
 
 
-def test_who_builds_a_table_asks_nobody_else_to(rig, caplog):
-    """The log says why it is built, not how to build one: first there is none, then a bad one."""
-    caplog.set_level("INFO", logger="model.table.table_cache")
-    _, path = cached_table(rig)
-    path.write_bytes(b"damaged")
-    cached_table(rig)
-    assert caplog.messages == [
-        f"building the localization table: there is no table {path}",
-        f"building the localization table: {path} is not a readable localization table "
-        "(it is no .npz file)",
+def test_cached_table_is_built_for_each_rig_and_choice(builds):
+    """Stiffness, mesh, limits, frequencies, grid and mode each decide a table."""
+    low, high = np.array([70.0, 80.0]), np.array([70.0, 90.0])
+    choices = [
+        (RIG, {}),
+        (STIFFER, {}),
+        (quick_rig(16, 12), {}),
+        (replace(RIG, limits=replace(RIG.limits, frequency_max=200.0)), {"frequencies": low}),
+        (RIG, {"frequencies": low}),
+        (RIG, {"frequencies": high}),
+        (RIG, {"frequencies": low, "grid": Grid(3, 2)}),
+        (RIG, {"frequencies": low, "drive_mode": "phased"}),
     ]
+    tables = [cached_table(rig, **options) for rig, options in choices]
+    assert len(builds) == len({path for _, path in tables}) == len(choices)
+    assert tables[5][0].frequencies.tolist() == [70.0, 90.0]
+    assert tables[6][0].grid == Grid(3, 2)
+    assert tables[7][0].drive_mode == "phased"
 
 
-def test_another_plate_or_mesh_is_another_table(rig, builds):
-    """A stiffer ERA, and a finer mesh, each get a table of their own."""
-    stiffer = replace(rig, eras=(replace(rig.eras[0], stiffness=18000.0), *rig.eras[1:]))
-    paths = {cached_table(r)[1] for r in (rig, stiffer, quick_rig(16, 12))}
-    assert len(builds) == len(paths) == 3
-
-
-def test_a_damaged_cache_is_built_anew(rig, builds):
-    """A flipped byte costs a rebuild, not a wrong answer."""
-    _, path = cached_table(rig)
+def test_cached_table_is_built_again_when_its_file_is_damaged_or_foreign(builds):
+    """A flipped byte, no table at all, or the table of another rig costs a build."""
+    _, path = cached_table(RIG)
     data = bytearray(path.read_bytes())
     data[len(data) // 2] ^= 1
-    path.write_bytes(data)
-    cached_table(rig)
-    assert len(builds) == 2
-    assert cached_table(rig)[1] == path
-    assert len(builds) == 2
+    _, other = cached_table(STIFFER)
+    for content in (data, b"damaged", other.read_bytes()):
+        path.write_bytes(content)
+        table, again = cached_table(RIG)
+        assert (table.fingerprint, again) == (RIG.fingerprint, path)
+    assert len(builds) == 2 + 3
+    assert cached_table(RIG)[1] == path
+    assert len(builds) == 2 + 3
 
 
-def test_another_rigs_table_under_its_name_is_built_anew(rig, builds):
-    """A file that was copied over the right one is whole, and of another plate."""
-    stiffer = replace(rig, eras=(replace(rig.eras[0], stiffness=18000.0), *rig.eras[1:]))
-    _, path = cached_table(rig)
-    _, other = cached_table(stiffer)
-    path.write_bytes(other.read_bytes())
-    table, again = cached_table(rig)
-    assert (len(builds), again) == (3, path)
-    assert table.fingerprint == rig.fingerprint
-
-
-def test_what_other_code_made_is_built_anew(rig, builds, monkeypatch):
-    """A table that an older model left behind is not what this one would say, so it is replaced."""
+def test_cached_table_of_other_numerics_is_replaced(builds, monkeypatch, cache):
+    """A table of another NUMERICS_VERSION is not used, and removed with the next that is kept."""
     with monkeypatch.context() as older:
-        older.setattr(table_parts, "code_version", lambda: "0.0.1+000000000000")
-        table, path = cached_table(rig)
-        assert table.code_version == "0.0.1+000000000000"
-    table, again = cached_table(rig)
-    assert (len(builds), again) == (2, path)
-    assert table.code_version != "0.0.1+000000000000"
-    assert cached_table(rig)[0].code_version == table.code_version
+        older.setattr(table_parts, "NUMERICS_VERSION", 0)
+        older.setattr(table_cache, "_CURRENT", "table-3.0-")
+        cached_table(RIG)
+    (cache / "table-0123456789abcdef.npz").touch()
+    _, path = cached_table(RIG)
     assert len(builds) == 2
+    assert list(cache.iterdir()) == [path]
 
 
-def test_every_choice_has_a_table_of_its_own(rig, builds):
-    """Other frequencies, as many of them, another grid and another mode are not mixed up."""
-    low, high = np.array([70.0, 80.0]), np.array([70.0, 90.0])
-    cached_table(rig, frequencies=low)
-    assert cached_table(rig, frequencies=high)[0].frequencies.tolist() == [70.0, 90.0]
-    assert cached_table(rig, frequencies=low, grid=Grid(3, 2))[0].grid == Grid(3, 2)
-    assert cached_table(rig, frequencies=low, drive_mode="phased")[0].drive_mode == "phased"
-    assert len(builds) == 4
+def test_cached_table_least_recently_used_is_removed(monkeypatch, cache):
+    """Of three tables two stay, a read one among them."""
+    monkeypatch.setattr(table_cache, "MAX_CACHED_TABLES", 2)
+    paths = []
+    for age, frequency in ((200, 60.0), (100, 70.0)):
+        paths.append(cached_table(RIG, frequencies=np.array([frequency]))[1])
+        os.utime(paths[-1], (paths[-1].stat().st_atime, paths[-1].stat().st_mtime - age))
+    cached_table(RIG, frequencies=np.array([60.0]))
+    _, newest = cached_table(RIG, frequencies=np.array([80.0]))
+    assert set(cache.iterdir()) == {paths[0], newest}
 
 
-def test_without_a_place_to_keep_it_the_table_is_built_all_the_same(rig, cache, builds):
+def test_cached_table_is_built_without_a_folder_to_keep_it(cache):
     """A cache folder that cannot be made is no reason to fail."""
     cache.write_text("a file where the folder should be")
-    table, path = cached_table(rig)
+    table, path = cached_table(RIG)
     assert path is None
     assert table.frequencies.tolist() == [60.0, 70.0, 80.0, 90.0, 100.0]

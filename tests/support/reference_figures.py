@@ -1,0 +1,68 @@
+"""Figures of the model that decide whether kept results can be reused, and their record.
+
+    python tests/support/reference_figures.py
+
+records them with the present NUMERICS_VERSION.
+"""
+
+import json
+from pathlib import Path
+
+import numpy as np
+
+from model.drive_modes import DRIVE_MODES
+from model.fem.assembly import assemble
+from model.fem.modal import modes
+from model.table.build import build_in_parts
+from model.table.query import query_table
+from model.table.question import Question
+from model.table.timing import Timing
+from model.version import NUMERICS_VERSION
+from paper_plate import make_paper_rig
+from small_table import small_problem
+
+RECORD = Path(__file__).parents[1] / "model" / "reference_figures.json"
+
+CONTACTS = {"quiet": ((0.22, 0.16), (0.05, 0.19)), "alone": ()}
+
+
+def reference_figures() -> dict[str, list[float]]:
+    """Figures by name; levels and contrasts, found by searches, end in _db."""
+    rig = make_paper_rig(12, 9)
+    matrices = assemble(rig.plate, rig.mesh)
+    figures = {
+        f"natural_frequencies_{support}": modes(
+            matrices, 5, support=support, eras=rig.eras
+        ).natural_frequencies
+        for support in ("eras", "simply-supported")
+    }
+    table = build_in_parts(small_problem(), drive_mode="switched").table
+    figures |= {
+        "table_omega": table.omega[:8],
+        "table_acceleration": np.linalg.norm(table.acceleration, axis=0).ravel(),
+        "table_cell_sources": table.cell_sources.mean(axis=1),
+        "table_discretisation_error": table.discretisation_error,
+        "table_shapes": np.linalg.norm(table.shapes[:, :8], axis=0),
+    }
+    timing = Timing(table)
+    for drive_mode in DRIVE_MODES:
+        for name, quiet in CONTACTS.items():
+            question = Question(((0.09, 0.07),), quiet, drive_mode=drive_mode, envelopes=True)
+            pattern, _ = query_table(table, question, timing)
+            measures = (
+                pattern.contrast_db,
+                pattern.surroundings_contrast_db,
+                pattern.quiet_level_db_sl,
+                pattern.robust_contrast_db,
+                pattern.transient_contrast_db,
+                pattern.left_after_db,
+            )
+            figures[f"query_{drive_mode}_{name}_db"] = np.array(
+                [each for each in measures if each is not None]
+            )
+    return {name: [float(each) for each in values] for name, values in figures.items()}
+
+
+if __name__ == "__main__":
+    record = {"numerics_version": NUMERICS_VERSION, "figures": reference_figures()}
+    RECORD.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")

@@ -68,11 +68,17 @@ fails
         ("first\n...\nlast", "first\nbetween\nbetween\nlast"),
         ("...\nlast", "last"),
         ("first\n...", "first"),
-        ("-13.4 dB SL, unaware", "-13.5 dB SL, unaware"),
+        ("-13.4 dB SL, unaware", "-13.5 dB SL, below its threshold"),
+        ("level 20.0 dB", "contrast 20.0 dB"),
+        ("armed by 'era', ... s left", "armed by 'era'; 59.8 s left"),
+        ("mesh 11x7 ..., ERAs SW", "mesh 11x7, ERAs SW"),
+        ("mesh 11x7 ...: within 0.09 % ...", "mesh 11x7 Q5, strips of 4 mm: within 0.09 % (17x11)"),
+        ("armed until Ctrl-C", "armed; Ctrl-C disarms"),
+        ("READY: all is well", "READY: nothing is wrong"),
     ],
 )
-def test_this_is_printed_as_shown(shown: str, printed: str) -> None:
-    """Blanks, last digits and what `...` stands for make no difference."""
+def test_difference_is_none(shown: str, printed: str) -> None:
+    """Words, blanks, last digits and what `...` stands for make no difference."""
     assert difference(shown, printed) is None
 
 
@@ -80,16 +86,18 @@ def test_this_is_printed_as_shown(shown: str, printed: str) -> None:
     ("shown", "printed", "line"),
     [
         ("level 20.0 dB", "level 21.0 dB", "line 1"),
-        ("level 20.0 dB", "contrast 20.0 dB", "line 1"),
+        ("READY: all is well", "FAULT: all is well", "line 1"),
+        ("wrote my.yaml", "wrote your.yaml", "line 1"),
         ("5 ERAs", "6 ERAs", "line 1"),  # a count is exact
-        ("a\nb", "a", "line 2"),
-        ("a", "a\nb", "beyond"),
-        ("first\n...\nlast", "first\nbetween", "line 3"),
+        ("1 a\n2 b", "1 a", "line 2"),
+        ("1 a", "1 a\n2 b", "beyond"),
+        ("1 first\n...\n3 last", "1 first\n2 between", "line 3"),
+        ("ready", "", "lines"),
         ("33.4 dB", "-33.4 dB", "line 1"),
     ],
 )
-def test_this_is_not(shown: str, printed: str, line: str) -> None:
-    """Another word, number, sign, count, or line is told, with its place."""
+def test_difference_has_its_place(shown: str, printed: str, line: str) -> None:
+    """Another name, number, sign, count, or line is reported with its place."""
     assert line in (difference(shown, printed) or "")
 
 

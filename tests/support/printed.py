@@ -1,46 +1,80 @@
-"""Whether a command prints what a page shows: words as they are, numbers about.
+"""Whether a command prints the facts that a page shows; the words around them are free.
 
-`...` stands for whatever a line holds there, and on a line of its own for any lines. A number may
-be off by one in its last printed digit, or by two parts in a hundred, whichever is more.
+Facts are numbers and what holds a digit, an underscore, a slash, a dot within, or two capitals:
+names of states, files and addresses. `...` stands for any of them within a line, and on a line of
+its own for any lines. A number may be off by one in its last printed digit, or by two parts in a
+hundred, whichever is more. Lines without facts are not compared.
 """
 
 import re
+from collections.abc import Sequence
+from functools import cache
 
-_NUMBER = re.compile(r"(?<![\w.])[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?(?![\w]|\.\d)")
-_PARTS = re.compile(rf"(\.\.\.|{_NUMBER.pattern})")
+_NUMBER = re.compile(r"[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
+_FACT = re.compile(r"\d|_|/|\w\.\w|[A-Z]{2}")
+GAP = "..."
+_WORDS = re.compile(r"ERAs?|JSON|YAML|SL")
+_PUNCTUATION = ",;:()[]{}'\"`"
 _SHARE = 0.02
 
 
 def difference(shown: str, printed: str) -> str | None:
-    """The first shown line that is not printed where it should be; None: all as shown."""
-    wanted = [line.rstrip() for line in shown.strip("\n").splitlines()]
-    lines = [line.rstrip() for line in printed.strip("\n").splitlines()]
-    at, gap = 0, False
-    for number, want in enumerate(wanted):
-        if want.strip() == "...":
-            gap = True
-            continue
-        ends = range(at, len(lines)) if gap else range(at, min(at + 1, len(lines)))
-        found = next((place for place in ends if is_line(want, lines[place])), None)
-        if found is None:
-            instead = lines[at] if at < len(lines) else "the end"
-            return f"line {number + 1} shown: {want!r}; printed there: {instead!r}"
-        at, gap = found + 1, False
-    return None if gap or at == len(lines) else f"printed beyond what is shown: {lines[at]!r}"
+    """Return the first shown line whose facts are not printed where they should be, else None."""
+    wanted = [_facts(line) for line in shown.splitlines()]
+    lines = [facts for line in printed.splitlines() if (facts := _facts(line))]
+    if not any(wanted):
+        enough = len(printed.splitlines()) >= len(wanted)
+        return None if enough else f"{len(wanted)} lines shown; printed: {printed!r}"
+    reached = (0, 0)
+
+    @cache
+    def fits(number: int, at: int) -> bool:
+        """Whether the shown lines from this one on are the printed ones from there on."""
+        nonlocal reached
+        reached = max(reached, (number, at))
+        if number == len(wanted):
+            return at == len(lines)
+        if not wanted[number]:
+            return fits(number + 1, at)
+        if set(wanted[number]) == {GAP}:
+            return any(fits(number + 1, later) for later in range(at, len(lines) + 1))
+        return at < len(lines) and _match(wanted[number], lines[at]) and fits(number + 1, at + 1)
+
+    if fits(0, 0):
+        return None
+    number, at = reached
+    instead = " ".join(lines[at]) if at < len(lines) else "the end"
+    if number == len(wanted):
+        return f"printed beyond what is shown: {instead}"
+    return f"line {number + 1} shown: {shown.splitlines()[number]!r}; printed there: {instead!r}"
 
 
-def is_line(shown: str, printed: str) -> bool:
-    """Whether one line is as shown."""
-    parts = _PARTS.split(" ".join(shown.split()))
-    pattern = "".join(
-        r"(.*)" if part == "..." else f"({_NUMBER.pattern})" if index % 2 else re.escape(part)
-        for index, part in enumerate(parts)
-    )
-    found = re.fullmatch(pattern, " ".join(printed.split()))
-    return found is not None and all(
-        part == "..." or _is_about(part, there)
-        for part, there in zip(parts[1::2], found.groups(), strict=True)
-    )
+def _match(shown: Sequence[str], printed: Sequence[str]) -> bool:
+    """Whether the facts of a printed line are those of the shown one."""
+    if not shown:
+        return not printed
+    first, *rest = shown
+    if first == GAP:
+        return any(_match(rest, printed[at:]) for at in range(len(printed) + 1))
+    return bool(printed) and _is_same(first, printed[0]) and _match(rest, printed[1:])
+
+
+def _is_same(shown: str, printed: str) -> bool:
+    if _NUMBER.fullmatch(shown) and _NUMBER.fullmatch(printed):
+        return _is_about(shown, printed)
+    return re.fullmatch(".*".join(map(re.escape, shown.split(GAP))), printed) is not None
+
+
+def _facts(line: str) -> list[str]:
+    tokens = (token.strip(_PUNCTUATION) for token in line.split())
+    cut = [token if token.endswith(GAP) else token.removesuffix(".") for token in tokens]
+    known = [GAP if GAP in token and not _is_fact(token) else token for token in cut]
+    return [token for token in known if token == GAP or _is_fact(token)]
+
+
+def _is_fact(token: str) -> bool:
+    words = token.replace(GAP, " ")
+    return _FACT.search(words) is not None and not _WORDS.fullmatch(token)
 
 
 def _is_about(shown: str, printed: str) -> bool:

@@ -1,4 +1,4 @@
-"""Words that identifiers no longer use, each with its replacement: `python vocabulary.py` lists them.
+"""Retired words in identifiers, each with its replacement: run as a program it lists them.
 
 The glossary of CONTRIBUTING.md defines the words that are used instead.
 """

@@ -1,8 +1,8 @@
-"""What every backend must do: carry one request to an amplifier and bring its reply back.
+"""The backend interface: carry one request to an amplifier and return its reply.
 
-Written by whoever adds a wire, registered as an entry point of `era_haptics.backends` under the
-scheme of its URLs, and held to `drivers.conformance`. The first five members are its own; the
-others have answers that suit a wire with one amplifier that only speaks when it is asked.
+A backend is registered as an entry point of `era_haptics.backends` under the scheme of its URLs and
+checked by `drivers.conformance`. The first five members are abstract; the defaults of the others
+suit a wire with one amplifier that sends nothing unsolicited.
 """
 
 from abc import ABC, abstractmethod
@@ -20,86 +20,81 @@ class Backend(ABC):
 
     @abstractmethod
     def __init__(self, url: str) -> None:
-        """Take the URL apart without touching the wire; raises CommandError."""
+        """Parse the URL without touching the wire; raises CommandError."""
 
     @abstractmethod
     async def open(self) -> None:
-        """Open the wire, exclusively where it can be; raises LinkError with what to do about it.
+        """Open the wire, exclusively if possible; raises LinkError with a remedy.
 
-        A wire that several amplifiers share is opened once in a process, for all of them.
+        A wire shared by several amplifiers is opened once per process.
         """
 
     @abstractmethod
     async def close(self) -> None:
-        """Close the wire; safe to call twice and on a wire that is already lost."""
+        """Close the wire; safe to call twice and on a lost wire."""
 
     @abstractmethod
     async def exchange(self, request: Request, *, timeout: float) -> Reply:
-        """Send one request and wait for its own reply; a late reply to another is dropped.
+        """Send one request and wait for its reply; late replies to others are discarded.
 
-        timeout [s]: for all of it; longer where the wire itself needs longer. Raises LinkTimeout,
-        LinkError. A Nak is returned, not raised. Cancelling leaves the wire usable.
-        Sets and envelopes must have been let through by a guard: TypeError for others, as
-        `require_safe` raises it.
+        timeout [s]: of the whole exchange, extended if the wire is slower. Raises LinkTimeout,
+        LinkError; TypeError for a set or envelope that has not passed a guard (`require_safe`). A
+        Nak is returned, not raised. Cancelling leaves the wire usable.
         """
 
     @property
     @abstractmethod
     def last_sent(self) -> float:
-        """When the last byte of the last request went out, by the event loop's clock [s]."""
+        """Time [s] when the last byte of the last request went out, by the event loop's clock."""
 
     @property
     def counters(self) -> WireCounters:
-        """What was seen on the wire; all zero where nothing is counted."""
+        """Frame counters; all zero if nothing is counted."""
         return WireCounters()
 
     def listen(
         self, on_event: Callable[[AmplifierEvent], None], on_loss: Callable[[str], None]
     ) -> None:
-        """Whom to tell, in the event loop, what comes unasked.
+        """Register callbacks, called in the event loop, before `open`.
 
-        on_event: the amplifier's own events; on_loss: once after each opening, when the wire or the
-        amplifier on it was found to be gone without a request being on its way. To be called before
-        `open`. A wire that notices neither calls nobody.
+        on_event: for unsolicited events; on_loss: once per opening, if the wire or the amplifier is
+        found lost while no request is pending.
         """
         return
 
     @property
     def bus(self) -> str | None:
-        """Names what it shares with others that one broadcast reaches; None without broadcasts."""
+        """Identifier of what one broadcast reaches; None without broadcasts."""
         return None
 
     @property
     def takes_turns(self) -> bool:
-        """Whether all who share its bus are asked one after the other, and wait for each other."""
+        """Whether amplifiers on its bus are addressed one after the other."""
         return False
 
     @property
     def is_unsent(self) -> bool:
-        """Whether nothing of the request that is being exchanged has gone out yet.
+        """Whether the request being exchanged still waits for the wire.
 
-        As where it waits for others on the wire: if it is cancelled then, nothing is sent.
+        Nothing is sent if it is cancelled then.
         """
         return False
 
     def silencing(self, request: Request) -> AbstractContextManager[None]:
-        """A context in which a request that silences waits for its turn: keep the wire free for it.
-
-        What others would send meanwhile waits, on a wire that they share.
-        """
+        """A context that reserves a shared wire for a stop-class request waiting for its turn."""
         return nullcontext()
 
     async def broadcast(self, request: Broadcast) -> None:
-        """Send a commit or a stop to every amplifier of the bus at once; nobody answers.
+        """Send a commit or a stop to every amplifier of the bus; there are no replies.
 
-        Raises LinkError, and CommandError where there is no bus.
+        Raises LinkError, and CommandError if there is no bus.
         """
         raise CommandError(
-            f"this wire knows no broadcast, so none of a {type(request).__name__}; tell each "
-            "amplifier by itself"
+            f"this wire does not support broadcasts, got {type(request).__name__}; send it to each "
+            "amplifier"
         )
 
     @property
     def wire_times(self) -> WireTimes:
-        """How long things take on its wire; none where nobody knows."""
+        """Durations on its wire; `NoTimes` if unknown."""
         return NoTimes()

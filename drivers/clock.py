@@ -1,7 +1,6 @@
-"""The clock by which everything on a link happens.
+"""The clock of links and far ends: that of the event loop.
 
-It is the event loop's: time.monotonic() on the loops of asyncio, virtual on one that has a clock of
-its own, so that drivers and far ends run in virtual time without knowing it.
+It is time.monotonic() on asyncio's own loops, and virtual time on a loop with a virtual clock.
 """
 
 import asyncio
@@ -9,7 +8,7 @@ import time
 
 
 def now() -> float:
-    """The time [s] of the running event loop, or time.monotonic() where none runs."""
+    """Return the time [s] of the running event loop, or time.monotonic() if none runs."""
     try:
         return asyncio.get_running_loop().time()
     except RuntimeError:

@@ -1,8 +1,8 @@
-"""What is asked of an amplifier: a drive command per channel, several of them as one set.
+"""Drive commands of one amplifier: one per channel, together a command set; and envelopes.
 
-An envelope shapes how a channel gets from what it plays to what it shall play: its complex
-amplitude, level and phase, goes along straight lines from where it is through the knots, one every
-step, and reaches what the command says one step after the last knot. So nothing can jump.
+An envelope shapes the transition of a channel: its complex amplitude (level and phase) is linear
+between knots a fixed step apart, starts at the present amplitude, and reaches that of the command
+one step after the last knot. So the output never jumps.
 """
 
 import cmath
@@ -12,14 +12,14 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class DriveCommand:
-    """What one channel shall play, in electricity.
+    """What one channel plays, in electrical terms.
 
     frequency: mechanical frequency [Hz]; level: 0..1 of full stroke; phase [degrees] of
-    level * sin(2 pi f t + phase), t counted from the commit for every channel of a set unless
-    keep_phase asks that a channel which already plays this frequency runs on undisturbed in time.
+    level * sin(2 pi f t + phase), with t = 0 at the commit for every channel of a set, unless
+    keep_phase continues the phase of a channel that already plays this frequency.
     A channel with level 0 falls silent.
-    onset, ending: slots of envelopes, 0 for none; see `Envelope`. skip_ending: a channel that falls
-    silent does so along the ramp, whatever ending it was given.
+    onset, ending: envelope slots, 0 for none; see `Envelope`. skip_ending: a channel that falls
+    silent follows the ramp and not an earlier ending.
     """
 
     channel: int
@@ -39,7 +39,7 @@ class DriveCommand:
 
 @dataclass(frozen=True, slots=True)
 class Knot:
-    """Where a channel is on its way: level 0..1 of full stroke, phase [degrees] as a command's."""
+    """A point of an envelope: level 0..1 of full stroke, phase [degrees] as in a command."""
 
     level: float
     phase: float
@@ -52,13 +52,13 @@ class Knot:
 
 @dataclass(frozen=True)
 class Envelope:
-    """How a channel gets to what it shall play, kept by the amplifier under a slot, 1..63.
+    """A transition of a channel, stored by the amplifier in a slot, 1..63.
 
-    step [s] between knots; without knots the slot is empty again. As an onset it begins at the
-    commit: from the present amplitude where the channel plays this frequency and keep_phase is
-    set, else from zero. As an ending it leads to silence: when the next set makes the channel
-    silent, or at the end of valid_for. Stop, disarm and faults know no endings. A set takes
-    its envelopes with it when it is staged: a slot may be loaded anew at any time.
+    step [s] between knots; no knots empty the slot. An onset begins at the commit: at the present
+    amplitude if the channel plays this frequency and keep_phase is set, else at zero. An ending
+    leads to silence: when the next set silences the channel, or at the end of valid_for. Stop,
+    disarm and faults skip endings. Staging a set copies its envelopes: a slot may be reloaded at
+    any time.
     """
 
     slot: int
@@ -68,11 +68,11 @@ class Envelope:
 
 @dataclass(frozen=True)
 class CommandSet:
-    """Drive commands that take effect together, all or nothing.
+    """Drive commands of an amplifier that take effect together, all or nothing.
 
-    token: 1..65535, names the set, applied at most once; ramp [s]: each channel fades from what it
-    plays to what it shall play along a raised cosine; valid_for [s]: the vibration ends by itself
-    after this time (0: it lasts until the next set). Channels that are not named keep silent.
+    token: 1..65535, identifies the set and is applied at most once; ramp [s]: each channel changes
+    along a raised cosine; valid_for [s]: the vibration ends after this time (0: at the next set).
+    Channels without a command are silent.
     """
 
     token: int
@@ -82,5 +82,5 @@ class CommandSet:
 
     @property
     def is_silent(self) -> bool:
-        """Whether the set asks for no vibration at all."""
+        """Whether every level is zero."""
         return all(command.level == 0 for command in self.commands)

@@ -1,20 +1,20 @@
-"""What can go wrong between the controller and an amplifier.
+"""Errors of the driver layer.
 
     DriverError
-    ├── LinkError (ConnectionError)       the wire or the far end is gone, or not what it was
-    │   └── LinkTimeout (TimeoutError)    no answer in time
-    ├── FrameError                        bytes that are no valid message; the far end's fault
-    ├── CommandRefused                    the amplifier or the guard said no
-    └── CommandError (ValueError)         a request that makes no sense; the caller's fault
+    ├── LinkError (ConnectionError)       the wire or the amplifier on it cannot be reached
+    │   └── LinkTimeout (TimeoutError)    no reply in time
+    ├── FrameError                        bytes that are not a valid message; the amplifier's fault
+    ├── CommandRefused                    refused by the amplifier or the guard
+    └── CommandError (ValueError)         an invalid request; the caller's fault
 
-Third-party exceptions are translated into these where a backend meets its library, cause kept.
+Backends translate exceptions of their libraries into these and keep the cause.
 """
 
 import re
 
 
 class DriverError(Exception):
-    """Anything that the driver layer raises on purpose."""
+    """Base class of the driver layer's errors."""
 
 
 class LinkError(DriverError, ConnectionError):
@@ -22,18 +22,18 @@ class LinkError(DriverError, ConnectionError):
 
 
 class LinkTimeout(LinkError, TimeoutError):
-    """The amplifier did not answer in time."""
+    """The amplifier did not reply in time."""
 
 
 class FrameError(DriverError):
-    """Bytes that do not make a valid message."""
+    """Bytes that are not a valid message."""
 
 
 class CommandRefused(DriverError):
     """The guard or the amplifier refused a request; nothing of it was applied.
 
-    channel: the one to blame, where one is; until: when [s] the same may be asked for again, where
-    that is all that is wrong with it.
+    channel: the one at fault, if any; until: time [s] from which the same request is allowed, if
+    only its time is wrong.
     """
 
     def __init__(
@@ -45,9 +45,9 @@ class CommandRefused(DriverError):
 
 
 class CommandError(DriverError, ValueError):
-    """A request that makes no sense: bad URL, unknown channel, value out of range."""
+    """An invalid request: bad URL, unknown channel, value out of range."""
 
 
-def said_by_system(problem: BaseException) -> str:
-    """What the system says of a port or a connection, once and without its number."""
+def system_message(problem: BaseException) -> str:
+    """Return the operating system's message of an error, without its number."""
     return re.sub(r"^.*\[Errno -?\d+\] ", "", str(problem), flags=re.DOTALL)

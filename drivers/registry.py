@@ -1,4 +1,4 @@
-"""Which backend speaks to an amplifier: found by the scheme of its URL.
+"""Backends by the scheme of a URL.
 
 Backends are the entry points of the group `era_haptics.backends`, named by scheme; each is a class
 derived from `Backend`, and made with the URL.
@@ -21,10 +21,10 @@ _BACKENDS: PluginRegistry[Callable[[str], Backend]] = PluginRegistry(
 
 
 def known_schemes() -> tuple[str, ...]:
-    """The URL schemes that are installed, sorted."""
+    """Return the installed URL schemes, sorted."""
     return _BACKENDS.names()
 
 
 def open_backend(url: str) -> Backend:
-    """A backend for this URL, not yet open; CommandError for a URL that no backend understands."""
+    """Make the backend of a URL, not yet open; CommandError for an unknown or invalid URL."""
     return _BACKENDS.make(url)

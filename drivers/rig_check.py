@@ -1,4 +1,4 @@
-"""What can be said of a rig's amplifiers by their URLs alone: nothing is opened.
+"""Check of a rig's amplifiers by their URLs alone; nothing is opened.
 
 An entry point of the group `era_haptics.rig_checks`, for `era config check`.
 """
@@ -17,90 +17,88 @@ from drivers.operation.watchdog import (
 )
 from drivers.registry import open_backend
 
-# s; how far apart commits on two links may arrive although they are sent together: USB adapters
-# send in frames of 1 ms, networks and operating systems are no better. See
-# docs/reference/several-amplifiers.md.
-APART = 0.001
+# s; skew of simultaneous commits on two links: USB adapters send in frames of 1 ms, networks and
+# operating systems are no better. See docs/reference/several-amplifiers.md.
+COMMIT_SKEW = 0.001
 
 
 def check_links(
     urls: Mapping[str, str], *, channels: Mapping[str, int], frequency_max: float
 ) -> tuple[dict[str, str], list[str]]:
-    """What is wrong, by the amplifier's name, and what to be warned of.
+    """Return errors by amplifier name, and warnings.
 
-    urls by name; channels: how many of each are wired, none for those left out; frequency_max [Hz]:
-    up to which ERAs are driven.
+    urls by name; channels: number of wired channels by name, missing if none; frequency_max [Hz]:
+    highest frequency of the ERAs.
     """
-    wrong: dict[str, str] = {}
+    errors: dict[str, str] = {}
     backends: dict[str, Backend] = {}
     by_url: dict[str, str] = {}
     for name, url in urls.items():
         other = by_url.setdefault(url, name)
         if other != name:
-            wrong[name] = f"{url!r} is amplifier {other}'s already; each has an address of its own"
+            errors[name] = f"URL must be unique, got {url!r} of amplifier {other} again"
             continue
         try:
-            backends[name] = open_backend(url)
-            check_watchdog(WATCHDOG, backends[name].wire_times.round_trip(channels.get(name, 0)))
+            backend = open_backend(url)
+            check_watchdog(WATCHDOG, backend.wire_times.round_trip(channels.get(name, 0)))
         except CommandError as error:
-            wrong[name] = str(error)
+            errors[name] = str(error)
+        else:
+            backends[name] = backend
+    used = {name: backend for name, backend in backends.items() if channels.get(name)}
     links = {
         backend.bus or urls[name]
-        for name, backend in backends.items()
-        if channels.get(name) and name not in wrong and not urls[name].startswith("sim://")
+        for name, backend in used.items()
+        if not urls[name].startswith("sim://")
     }
-    used = {
-        name: backend
-        for name, backend in backends.items()
-        if channels.get(name) and name not in wrong
-    }
-    return wrong, [*_apart(sorted(links), frequency_max), *_told_late(used, channels)]
+    warnings = _skew_warnings(sorted(links), frequency_max)
+    return errors, [*warnings, *_late_loss_warnings(used, channels)]
 
 
-def phase_error(frequency: float, apart: float) -> float:
-    """By how much [degrees] ERAs are out of phase whose amplifiers begin so far apart [s]."""
-    return 360.0 * frequency * apart
+def phase_error(frequency: float, skew: float) -> float:
+    """Phase [degrees] between ERAs whose amplifiers start with a skew [s]."""
+    return 360.0 * frequency * skew
 
 
-def contrast_left(frequency: float, apart: float) -> float:
-    """Contrast [dB] that is left at a null of two equal halves that begin so far apart [s].
+def remaining_contrast(frequency: float, skew: float) -> float:
+    """Contrast [dB] left at a null of two equal halves that start with a skew [s].
 
-    Of exp(i phase) - 1 against one half, so none is left from 60 degrees on.
+    The level of exp(i phase) - 1 relative to one half; 0 dB from 60 degrees on.
     """
-    phase = min(math.radians(phase_error(frequency, apart)), math.pi)
+    phase = min(math.radians(phase_error(frequency, skew)), math.pi)
     return max(0.0, -20.0 * math.log10(2.0 * math.sin(phase / 2.0)))
 
 
-def _told_late(backends: Mapping[str, Backend], channels: Mapping[str, int]) -> list[str]:
-    """Lines on which a loss cannot be told within three heartbeats, by arithmetic."""
+def _late_loss_warnings(backends: Mapping[str, Backend], channels: Mapping[str, int]) -> list[str]:
+    """Warn of lines on which a loss may be detected later than after three heartbeats."""
     lines: dict[str, list[str]] = {}
     for name, backend in backends.items():
         lines.setdefault((backend.takes_turns and backend.bus) or name, []).append(name)
-    bound = MAX_MISSED_HEARTBEATS * HEARTBEAT
+    limit = MAX_MISSED_HEARTBEATS * HEARTBEAT
     warnings = []
     for names in lines.values():
         took = loss_detection_time(
             backends[name].wire_times.round_trip(channels[name]) for name in names
         )
-        if took > bound:
+        if took > limit:
             warnings.append(
                 f"{', '.join(names)}: loss of the amplifiers may be detected only after "
-                f"{took * 1e3:.0f} ms, got a limit of {MAX_MISSED_HEARTBEATS} heartbeats, "
-                f"{bound * 1e3:.0f} ms; the watchdog stops them regardless: use a faster line, or "
+                f"{took * 1e3:.0f} ms, later than {MAX_MISSED_HEARTBEATS} heartbeats, "
+                f"{limit * 1e3:.0f} ms; the watchdog stops them regardless: use a faster line, or "
                 "one line per amplifier, if that is too late"
             )
     return warnings
 
 
-def _apart(links: Sequence[str], frequency_max: float) -> list[str]:
+def _skew_warnings(links: Sequence[str], frequency_max: float) -> list[str]:
     if len(links) < 2:
         return []
     low = 100.0
     return [
-        f"the ERAs hang on {len(links)} links ({', '.join(links)}), whose amplifiers may begin "
-        f"{APART * 1e3:g} ms apart: ERAs of different links are then {phase_error(low, APART):.0f} "
-        f"degrees out of phase at {low:g} Hz and {phase_error(frequency_max, APART):.0f} at "
-        f"{frequency_max:g} Hz, and where they shall cancel each other "
-        f"{contrast_left(low, APART):.0f} and {contrast_left(frequency_max, APART):.0f} dB of "
-        "contrast are left; put ERAs that play one frequency together on one amplifier or one bus"
+        f"ERAs are on {len(links)} links ({', '.join(links)}), whose amplifiers may start "
+        f"{COMMIT_SKEW * 1e3:g} ms apart: a phase error of {phase_error(low, COMMIT_SKEW):.0f} "
+        f"degrees at {low:g} Hz and {phase_error(frequency_max, COMMIT_SKEW):.0f} at "
+        f"{frequency_max:g} Hz, which leaves {remaining_contrast(low, COMMIT_SKEW):.0f} and "
+        f"{remaining_contrast(frequency_max, COMMIT_SKEW):.0f} dB of contrast where they cancel; "
+        "put ERAs that play one frequency together on one amplifier or bus"
     ]

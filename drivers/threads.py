@@ -1,7 +1,7 @@
-"""Work that blocks, in a thread that holds nobody up: neither who gives it up nor a program's end.
+"""Blocking work in daemon threads, which delay neither a cancellation nor the end of the program.
 
-The threads of asyncio's own pool are waited for before a program ends: where a connection or a disk
-hangs, that is seconds, or for ever.
+A program waits for the threads of asyncio's own pool before it ends, which may take for ever if a
+connection or a disk hangs.
 """
 
 import asyncio
@@ -11,7 +11,7 @@ from collections.abc import Callable
 from typing import TypeVar
 
 CLOSE_TIMEOUT = 0.7
-"""How long [s] a device may take to be closed: one far away 0.4 s; whoever ends has a second."""
+"""Longest time [s] to close a device; a remote one takes 0.4 s, a program has 1 s to end."""
 
 _logger = logging.getLogger(__name__)
 _T = TypeVar("_T")
@@ -20,10 +20,10 @@ _T = TypeVar("_T")
 async def in_thread(
     work: Callable[[], _T], *, name: str, undo: Callable[[_T], None] | None = None
 ) -> _T:
-    """What work gives, or raises; name: of its thread.
+    """Run work in a thread of this name and return its result.
 
-    undo: what is done, in a thread as well, with what comes of work that was given up, such as
-    closing what it opened. Given up by cancelling.
+    undo: called, in a thread too, with the result of work that was cancelled, to close what it
+    opened.
     """
     loop = asyncio.get_running_loop()
     done: asyncio.Future[_T] = loop.create_future()
@@ -55,25 +55,27 @@ async def in_thread(
     try:
         return await done
     except asyncio.CancelledError:
-        if not done.cancelled() and done.exception() is None:  # it came in this very moment
+        if (
+            not done.cancelled() and done.exception() is None
+        ):  # finished at the moment of the cancellation
             _undo(done.result())
         raise
 
 
 async def close_in_thread(close: Callable[[], object], *, name: str) -> None:
-    """Close something and wait for that, but not for a device that hangs: it is left to its thread.
+    """Close a device in a thread of this name, and wait at most CLOSE_TIMEOUT for it.
 
-    Raises what closing raises; name: of the thread.
+    Raises what closing raises.
     """
     try:
         async with asyncio.timeout(CLOSE_TIMEOUT):
             await in_thread(close, name=name)
     except TimeoutError:
-        _logger.warning("%s: not done after %g s, and not waited for", name, CLOSE_TIMEOUT)
+        _logger.warning("%s: still closing after %g s, continuing without it", name, CLOSE_TIMEOUT)
 
 
 def _post(loop: asyncio.AbstractEventLoop, callback: Callable[[_T], None], argument: _T) -> bool:
-    """Whether the loop is there still, and calls back."""
+    """Call back in the loop; returns whether it is still open."""
     try:
         loop.call_soon_threadsafe(callback, argument)
     except RuntimeError:

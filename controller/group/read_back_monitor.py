@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 
 from drivers.errors import CommandRefused
 from drivers.guard import SafeCommandSet
-from drivers.operation.read_back import BORNE, Expectation, is_fault, read_back
+from drivers.operation.read_back import MAX_MISMATCH_TIME, Expectation, is_fault, read_back
 from drivers.protocol.messages import Achieved, Status
 
 
@@ -39,8 +39,8 @@ class ReadBackMonitor:
             wanted = [expected.levels.get(channel, 0.0) for channel in range(len(status.levels))]
             raise CommandRefused(
                 f"amplifier {name}: levels must be {_format(wanted)}, got {_format(status.levels)} "
-                f"for {BORNE * 1e3:g} ms; all were stopped: look for a derated or broken channel, "
-                "then clear and arm again"
+                f"for {MAX_MISMATCH_TIME * 1e3:g} ms; all were stopped: look for a derated or "
+                "broken channel, then clear and arm again"
             )
 
 

@@ -15,7 +15,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from drivers.errors import LinkError, said_by_system
+from drivers.errors import LinkError, system_message
 from model.errors import InputError
 
 HEADER = "# era-haptics TUIO capture 1"
@@ -107,7 +107,7 @@ async def replay_capture(datagrams: Sequence[Datagram], host: str, port: int) ->
 
 def _nobody_at(host: str, port: int, problem: Exception) -> LinkError:
     return LinkError(
-        f"nobody listens on UDP {host}:{port} ({said_by_system(problem)}); look at the address, "
+        f"nobody listens on UDP {host}:{port} ({system_message(problem)}); look at the address, "
         "and start the controller first"
     )
 

@@ -1,1 +1,1 @@
-"""Which amplifiers can be reached from this machine."""
+"""Discovery of amplifiers that this machine can reach."""

@@ -1,6 +1,6 @@
-"""What amplifiers could be reached from this machine, and which of them answer.
+"""Search of ports and interfaces for amplifiers.
 
-Whoever is asked is asked who it is, and nothing else: no output is written.
+Only identify requests are sent; no output is driven.
 """
 
 import os
@@ -27,7 +27,7 @@ _GROUP_MAY = 0o060  # read and write
 
 @dataclass(frozen=True)
 class Candidate:
-    """A port or an interface: the URLs to try there, and what stands in the way, if anything."""
+    """A port or interface: the URLs to try, and the remedy if it cannot be used."""
 
     place: str
     description: str
@@ -39,9 +39,9 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Found:
-    """What came of asking at a URL: who answered, or why nobody did.
+    """Result of an identify request at a URL: the identity, or the problem.
 
-    was_asked: whether the port could be used at all, so that the problem is the silence there.
+    was_asked: whether the request was sent, so that the problem is a missing reply.
     """
 
     url: str
@@ -51,19 +51,19 @@ class Found:
 
 
 def candidates() -> list[Candidate]:
-    """Serial ports and CAN interfaces of this machine, whether or not they can be used."""
+    """List the serial ports and CAN interfaces of this machine, usable or not."""
     return [*_serial_ports(), *_can_interfaces()]
 
 
 async def ask(urls: Iterable[str]) -> list[Found]:
-    """Who answers at these URLs, one after the other."""
+    """Identify the amplifiers at these URLs, one after the other."""
     return [await _ask(url) for url in urls]
 
 
 def with_slcan(place: Candidate) -> Candidate:
-    """The same serial port, as a CAN adapter if it answers as one: its amplifiers are not asked.
+    """Turn a serial port into a CAN adapter if it replies as one.
 
-    Blocks; see `drivers.discovery.slcan` for what is sent.
+    Blocks; see `drivers.discovery.slcan` for what is sent. Its amplifiers are not identified.
     """
     if not place.is_serial or place.remedy is not None:
         return place
@@ -101,27 +101,27 @@ def _serial_ports() -> Iterator[Candidate]:
         urls = tuple(f"serial://{_absolute(path)}?baud={speed}" for speed in _SPEEDS)
         urls += (f"modbus+rtu://{_absolute(path)}?baud={_MODBUS['baud']}#{_MODBUS['unit']}",)
         description = "serial port" if port.description == _UNDESCRIBED else port.description
-        yield Candidate(path, description, urls, _why_not_usable(path), is_serial=True)
+        yield Candidate(path, description, urls, _permission_remedy(path), is_serial=True)
 
 
 def _absolute(path: str) -> str:
     return path if path.startswith("/") else f"/{path}"
 
 
-def _why_not_usable(path: str) -> str | None:
+def _permission_remedy(path: str) -> str | None:
     if not path.startswith("/") or os.access(path, os.R_OK | os.W_OK):
         return None
     momentary = f"sudo chmod a+rw {path}"
     try:
         is_for_group = Path(path).stat().st_mode & _GROUP_MAY == _GROUP_MAY
         group = Path(path).group()
-    except (OSError, KeyError):  # it has just gone; or a group that has no name
+    except (OSError, KeyError):  # removed meanwhile, or a group without a name
         is_for_group = False
     if not is_for_group:
-        return f"this user may not use it, nor may its group; for a moment only: {momentary}"
+        return f"no permission for this user or its group; temporarily: {momentary}"
     return (
-        f"this user may not use it: sudo usermod -aG {group} $USER, then log in again "
-        f"(for a moment only: {momentary})"
+        f"no permission: sudo usermod -aG {group} $USER, then log in again "
+        f"(temporarily: {momentary})"
     )
 
 
@@ -138,5 +138,5 @@ def _can_interfaces() -> Iterator[Candidate]:
         scheme = "can+socketcan"
         urls = (f"{scheme}://{name}#{node}",) if scheme in known_schemes() else ()
         bitrate = PROTOCOL.canopen["bitrate"]
-        remedy = f"it is down: sudo ip link set {name} up type can bitrate {bitrate}"
+        remedy = f"interface is down: sudo ip link set {name} up type can bitrate {bitrate}"
         yield Candidate(name, "CAN interface", urls, remedy=None if is_up else remedy)

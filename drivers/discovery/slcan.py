@@ -1,7 +1,7 @@
-"""Whether a serial port is a CAN adapter that speaks slcan, and which amplifiers are heard there.
+"""Detection of slcan adapters on serial ports, and of the amplifiers on their bus.
 
-A device of another kind gets two characters, V and CR, and nothing more unless it answers as an
-adapter does. The adapter is opened to listen only, and nothing is written onto the bus.
+Other devices receive two characters, V and CR, and nothing more. The adapter is opened in
+listen-only mode, so nothing is sent on the bus.
 """
 
 import re
@@ -15,8 +15,8 @@ import serial
 from drivers.codec.can_bus.adapter_text import SlcanReader
 from drivers.codec.can_bus.frame import CANOPEN, cob_id
 
-_BAUD = 115_200  # most adapters are USB devices, to which it does not matter
-_ANSWER_TIME = 0.1  # s; USB adapters and their drivers hold bytes back for 16 ms at most
+_BAUD = 115_200  # ignored by USB devices, which most adapters are
+_REPLY_TIMEOUT = 0.1  # s; USB adapters and their drivers delay bytes by 16 ms at most
 _LISTENING_TIME = 0.2  # s; four heartbeats of 50 ms
 _SPEEDS = (10_000, 20_000, 50_000, 100_000, 125_000, 250_000, 500_000, 750_000, 1_000_000)
 _VERSION = re.compile(rb"V([0-9A-Fa-f]{4})\r")
@@ -26,10 +26,10 @@ _DONE = b"\r"
 
 @dataclass(frozen=True)
 class SlcanAdapter:
-    """An adapter that has answered.
+    """A detected adapter.
 
-    version: of hardware and firmware, as it says it; nodes: whose heartbeats were heard, those that
-    an amplifier may have; problem: why it could not be listened to, if so.
+    version: of hardware and firmware, as reported; nodes: node numbers of amplifiers whose
+    heartbeats were received; problem: why it could not listen, if so.
     """
 
     version: str
@@ -38,12 +38,12 @@ class SlcanAdapter:
 
 
 def ask_for_slcan(port: str) -> SlcanAdapter | None:
-    """The adapter on a serial port; None where nobody answers as one. Blocks for half a second.
+    """Detect the adapter on a serial port; None if there is none. Blocks for half a second.
 
-    Raises OSError where the port cannot be used.
+    Raises OSError if the port cannot be used.
     """
     with serial.Serial(
-        port, _BAUD, timeout=_ANSWER_TIME, write_timeout=_ANSWER_TIME, exclusive=True
+        port, _BAUD, timeout=_REPLY_TIMEOUT, write_timeout=_REPLY_TIMEOUT, exclusive=True
     ) as line:
         line.reset_input_buffer()
         line.write(b"V\r")
@@ -53,14 +53,14 @@ def ask_for_slcan(port: str) -> SlcanAdapter | None:
         version = found.group(1).decode()
         with _listening(line) as is_listening:
             if not is_listening:
-                return SlcanAdapter(version, problem="it cannot only listen, so it was not opened")
+                return SlcanAdapter(version, problem="no listen-only mode, so it was not opened")
             return SlcanAdapter(version, nodes=tuple(sorted(set(_heard(line)))))
 
 
 @contextmanager
 def _listening(line: serial.Serial) -> Iterator[bool]:
-    """With the adapter open to listen only, if it can be; closed again afterwards."""
-    line.write(b"C\r")  # it may have been left open
+    """Open the adapter in listen-only mode if it has one, and close it afterwards."""
+    line.write(b"C\r")  # in case it was left open
     _text_until(line, _END)
     try:
         yield _is_done(line, b"S%d\r" % _SPEEDS.index(CANOPEN["bitrate"])) and _is_done(
@@ -78,15 +78,15 @@ def _is_done(line: serial.Serial, command: bytes) -> bool:
 
 
 def _text_until(line: serial.Serial, end: re.Pattern[bytes]) -> bytes:
-    """What comes until this does, or until its time is over."""
-    text, deadline = b"", time.monotonic() + _ANSWER_TIME
+    """Read until a match or the timeout."""
+    text, deadline = b"", time.monotonic() + _REPLY_TIMEOUT
     while not end.search(text) and time.monotonic() < deadline:
         text += line.read(max(1, line.in_waiting))
     return text
 
 
 def _heard(line: serial.Serial) -> Iterator[int]:
-    """The nodes whose heartbeats come while it is listened."""
+    """Yield the nodes whose heartbeats are received."""
     reader, deadline = SlcanReader(), time.monotonic() + _LISTENING_TIME
     nodes = {cob_id("heartbeat", node): node for node in range(1, int(CANOPEN["node_max"]) + 1)}
     while time.monotonic() < deadline:

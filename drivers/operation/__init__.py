@@ -1,1 +1,1 @@
-"""Amplifiers in operation: begun together, and looked after."""
+"""Amplifiers in operation: synchronized commits, watchdog and read-back."""

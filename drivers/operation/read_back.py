@@ -1,4 +1,4 @@
-"""Whether an amplifier plays what it was told: commanded levels against those it reports."""
+"""Comparison of commanded levels with those that an amplifier reports."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -6,18 +6,18 @@ from dataclasses import dataclass
 from drivers.command import DriveCommand
 
 TOLERANCE = 0.01
-"""Of full stroke: two amplifiers' ways of measuring a level, never a derating or a lost set."""
+"""Of full stroke: more than measuring errors, less than a derating or a lost set."""
 
-BORNE = 0.100
-"""How long [s] levels may differ before that is a fault."""
+MAX_MISMATCH_TIME = 0.100
+"""Longest time [s] that levels may differ before it is a fault."""
 
 
 @dataclass(frozen=True)
 class Expectation:
-    """What an amplifier should report from a time [s] on until it is told something else.
+    """Levels that an amplifier should report until the next set.
 
-    settled_from [s]: before it there may be a fade; levels: by channel, 0 for those not named;
-    differs_since [s]: when they were first seen to differ, None while they agree.
+    settled_from [s]: end of ramps and envelopes; levels: by channel, 0 for channels not listed;
+    differs_since [s]: first report that differed, None while they agree.
     """
 
     settled_from: float
@@ -26,13 +26,13 @@ class Expectation:
 
     @classmethod
     def of(cls, commands: Sequence[DriveCommand], *, settled_from: float) -> "Expectation":
-        """What follows from what was achieved."""
+        """Derive the expectation from achieved commands."""
         levels = {command.channel: command.level for command in commands}
         return cls(settled_from, levels)
 
 
 def read_back(expected: Expectation, levels: Sequence[float], now: float) -> Expectation:
-    """The expectation after levels were reported at a time [s]."""
+    """Return the expectation after levels were reported at a time [s]."""
     if now < expected.settled_from or _agree(expected.levels, levels):
         since = None
     else:
@@ -41,8 +41,11 @@ def read_back(expected: Expectation, levels: Sequence[float], now: float) -> Exp
 
 
 def is_fault(expected: Expectation, now: float) -> bool:
-    """Whether commanded and reported levels have differed for too long at a time [s]."""
-    return expected.differs_since is not None and now - expected.differs_since >= BORNE - 1e-9
+    """Whether levels have differed for too long at a time [s]."""
+    return (
+        expected.differs_since is not None
+        and now - expected.differs_since >= MAX_MISMATCH_TIME - 1e-9
+    )
 
 
 def _agree(commanded: Mapping[int, float], reported: Sequence[float]) -> bool:

@@ -1,7 +1,6 @@
-"""Letting amplifiers on different links begin at one moment, as far as their wires allow.
+"""Simultaneous commits on different links, compensated for their wire times.
 
-Nobody but the wire knows when a commit arrives, and a slow one takes longer. What is known by
-arithmetic is made up for; what remains is how far apart the operating system lets bytes go out.
+The remaining skew is that with which the operating system sends bytes.
 """
 
 from asyncio import sleep
@@ -10,15 +9,15 @@ from typing import Any
 
 from drivers import clock
 
-_SLACK = 0.002  # s; timers wake up to so much late, so the rest of a wait is spent awake
+_SLACK = 0.002  # s; timers are up to this late, so the rest of a wait is polled
 
 
 def at_one_moment(
     commits: Sequence[tuple[float, Callable[[], Awaitable[object]]]],
 ) -> list[Coroutine[Any, Any, object]]:
-    """Commits, each with its time [s] on the wire, as what to run so that all arrive together.
+    """Schedule commits, each given with its wire time [s], so that all arrive together.
 
-    The one whose wire takes longest goes first, the others later by what theirs take less.
+    Returns the coroutines to run concurrently, the slowest wire first.
     """
     by_time = sorted(commits, key=lambda commit: -commit[0])
     arrival = clock.now() + max((takes for takes, _ in by_time), default=0.0)
@@ -28,7 +27,7 @@ def at_one_moment(
 async def _commit_at(moment: float, commit: Callable[[], Awaitable[object]]) -> object:
     before = None
     while (left := moment - clock.now()) > 0:
-        # A clock that stands still while others run is virtual, and its timers are exact.
+        # Time that stands still between two readings is virtual, and its timers are exact.
         await sleep(left if left == before else max(0.0, left - _SLACK))
         before = left
     return await commit()

@@ -1,7 +1,7 @@
-"""Keeping a process from being held up while amplifiers depend on it.
+"""Avoidance of long garbage collections while amplifiers are armed.
 
-A full garbage collection looks at every object that was ever loaded: with the numerical and CAN
-libraries that is 80 ms of computing, and on a busy machine longer than an amplifier's watchdog.
+A full collection visits every loaded object: 80 ms with the numerical and CAN libraries, and on a
+busy machine longer than an amplifier's watchdog.
 """
 
 import gc
@@ -11,9 +11,9 @@ from contextlib import contextmanager
 
 @contextmanager
 def no_long_collections() -> Iterator[None]:
-    """Leave all that is loaded by now out of garbage collections, as long as the context lasts.
+    """Exclude all present objects from garbage collection while the context lasts.
 
-    Objects made within it are collected as ever. To be entered once everything is set up.
+    Objects created within it are collected as usual. Enter it once everything is set up.
     """
     gc.collect()
     gc.freeze()

@@ -1,7 +1,4 @@
-"""What the wire allows: how short a watchdog, and how soon a loss is told of.
-
-Worked out when a configuration is read.
-"""
+"""Shortest watchdog and loss detection time of a wire, computed when a configuration is read."""
 
 from collections.abc import Iterable
 
@@ -9,20 +6,19 @@ from drivers.errors import CommandError
 from drivers.link.link import REPLY_TIMEOUT, retries_on
 from drivers.protocol.definition import PROTOCOL
 
-HEARTBEAT = 0.05  # s; the control loop's own
-MAX_MISSED_HEARTBEATS = 3  # two may be lost or late before the amplifier falls silent
+HEARTBEAT = 0.05  # s; interval of the control loop's heartbeats
+MAX_MISSED_HEARTBEATS = 3  # until the amplifier falls silent
 
 
 def shortest_watchdog(round_trip: float) -> float:
-    """The shortest watchdog [s] that a wire with this round trip [s] allows."""
+    """Return the shortest watchdog [s] for a wire with this round trip [s]."""
     return MAX_MISSED_HEARTBEATS * HEARTBEAT + round_trip
 
 
 def check_watchdog(watchdog: float, round_trip: float) -> None:
-    """Refuse a watchdog [s] shorter than three heartbeats and one round trip [s] on the wire.
+    """Raise CommandError for a watchdog [s] shorter than three heartbeats and one round trip [s].
 
-    round_trip: of the longest exchange on the link (`Backend.round_trip`). Raises CommandError that
-    says what the wire allows.
+    round_trip: of the longest exchange on the link (`Amplifier.round_trip`).
     """
     shortest = shortest_watchdog(round_trip)
     if not watchdog >= shortest - 1e-9:  # sums of floats
@@ -34,11 +30,10 @@ def check_watchdog(watchdog: float, round_trip: float) -> None:
 
 
 def loss_detection_time(round_trips: Iterable[float]) -> float:
-    """How long [s] it takes at most until amplifiers on one line that fall silent count as lost.
+    """Return the longest time [s] until silent amplifiers on one line are detected as lost.
 
-    All of them at once, right after an answer, and each is asked for a set next: one after the
-    other, as often as `drivers.link` repeats it. round_trips [s]: of the longest exchange with
-    each, see `Backend.round_trip`.
+    Worst case: all fall silent right after a reply, and each is sent a set next, one after the
+    other, with the repetitions of `drivers.link`. round_trips [s]: of the longest exchange of each.
     """
     return HEARTBEAT + sum(
         (1 + retries_on(round_trip)) * max(REPLY_TIMEOUT, round_trip + PROTOCOL.reaction)

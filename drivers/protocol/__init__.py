@@ -1,1 +1,1 @@
-"""The amplifier protocol: what is said, in which numbers, whatever the wire."""
+"""The amplifier protocol: messages and numbers, whatever the wire."""

@@ -13,15 +13,15 @@ from drivers.errors import CommandError
 
 _STRUCT_CODES = {"u8": "B", "u16": "H", "u32": "I", "i16": "h"}
 
-# Sums of floats may miss the end of a range by rounding; a thousandth of a step is no overstepping.
+# Sums of floats may exceed a range by rounding: a thousandth of a step is allowed.
 _TOLERANCE = 1e-3
 
 
 @dataclass(frozen=True)
 class Quantity:
-    """One kind of number on the wire: an integer of `per_unit` steps to the unit, within a range.
+    """A kind of number on the wire: an integer of `per_unit` steps per unit, within a range.
 
-    wire: u8, u16, u32 or i16; minimum, maximum: as integers; wraps: an angle, taken modulo a turn.
+    wire: u8, u16, u32 or i16; minimum, maximum: as integers; wraps: an angle, modulo 360.
     """
 
     name: str
@@ -34,12 +34,12 @@ class Quantity:
 
     @cached_property
     def struct_code(self) -> str:
-        """Its character in the format strings of `struct`."""
+        """Format character of `struct`."""
         return _STRUCT_CODES[self.wire]
 
     @property
     def step(self) -> float:
-        """The smallest difference that the wire can tell, in the unit."""
+        """Resolution on the wire, in the unit."""
         return 1 / self.per_unit
 
     @property
@@ -53,28 +53,27 @@ class Quantity:
         return self.maximum / self.per_unit
 
     def to_wire(self, value: float) -> int:
-        """The integer for a value [unit], rounded to the nearest step.
+        """Encode a value [unit] as an integer, rounded to the nearest step.
 
-        Raises CommandError for NaN, infinities and values out of range: nothing is clipped.
+        Raises CommandError for NaN, infinities and values out of range; nothing is clipped.
         """
         scaled = value * self.per_unit
         if self.minimum <= scaled <= self.maximum:
             return round(scaled)
         if not math.isfinite(value):
-            raise CommandError(f"{self.name} is {value}, which is not a number that can be sent")
+            raise CommandError(f"{self.name} must be a finite number, got {value}")
         if self.wraps:
             span = self.maximum - self.minimum + 1
             return (round(scaled) - self.minimum) % span + self.minimum
         if not self.minimum - _TOLERANCE <= scaled <= self.maximum + _TOLERANCE:
             unit = f" {self.unit}" if self.unit else ""
             raise CommandError(
-                f"{self.name} is {value:g}{unit}; it must lie between {self.low:g} and "
-                f"{self.high:g}{unit}"
+                f"{self.name} must be {self.low:g} to {self.high:g}{unit}, got {value:g}{unit}"
             )
         return round(scaled)
 
     def from_wire(self, integer: int) -> float:
-        """The value [unit] of an integer, which must be in range (see `holds`)."""
+        """Decode an integer in range (see `holds`) to a value [unit]."""
         return integer / self.per_unit
 
     def holds(self, integer: int) -> bool:
@@ -82,13 +81,13 @@ class Quantity:
         return self.minimum <= integer <= self.maximum
 
     def quantise(self, value: float) -> float:
-        """The value [unit] that the far end reads when this one is sent."""
+        """Return the value [unit] that arrives when this one is sent."""
         return self.from_wire(self.to_wire(value))
 
 
 @dataclass(frozen=True)
 class Quantities:
-    """Every quantity of the protocol by its name."""
+    """Every quantity of the protocol, by name."""
 
     frequency: Quantity
     level: Quantity
@@ -126,10 +125,10 @@ class SerialLine:
 
 @dataclass(frozen=True)
 class Protocol:
-    """Everything that host and amplifier must agree on, in numbers.
+    """The numbers on which host and amplifier agree.
 
-    reaction [s]: a reply has begun by then; modbus, canopen: the sections of these names as they
-    stand in the file.
+    reaction [s]: longest time until a reply begins; modbus, canopen: the sections of these names
+    in the file.
     """
 
     version: int
@@ -171,5 +170,5 @@ PROTOCOL = _load()
 
 
 def token_after(token: int) -> int:
-    """The token that follows one, or 0 for the first: 1..65535, then from 1 again."""
+    """Return the token after this one (0 before the first): 1..65535, then 1 again."""
     return token % PROTOCOL.quantities.token.maximum + 1

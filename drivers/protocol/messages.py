@@ -1,24 +1,24 @@
-"""What host and amplifier say to each other, whatever the wire.
+"""Messages between host and amplifier, whatever the wire.
 
-A request is answered by exactly one reply: the one named beside it here, or a `Nak`.
+Every request has exactly one reply: the one listed beside it here, or a `Nak`.
 An `AmplifierEvent` comes unsolicited, on wires on which an amplifier may speak first. Codecs turn
 these into bytes and back; nothing here deals with bytes.
 
-    Hello       Identity            who is there
-    GetCaps     Capabilities        what it can play
+    Hello       Identity            identify the amplifier
+    GetCaps     Capabilities        read what it can play
     Arm         Status              high voltage on, outputs enabled at level zero
     Disarm      Status              silent, then high voltage off
     Stage       Achieved            keep a set ready under its token
     Commit      Achieved            play the staged set of this token
     Apply       Achieved            Stage and Commit in one
     Stop        Status              quick stop: silent within the ramp, latched until cleared
-    GetStatus   Status              how it is
-    GetFaults   FaultList           what went wrong, newest first
+    GetStatus   Status              read state and levels
+    GetFaults   FaultList           read latched and past faults, newest first
     Clear       Status              acknowledge faults whose cause is gone
     Ping        Status              heartbeat: feeds the watchdog
-    LoadEnvelope  Loaded            keep an envelope under its slot, for sets that refer to it
+    LoadEnvelope  Loaded            store an envelope in its slot, for sets that refer to it
 
-A Commit or a Stop may be broadcast to all amplifiers of a bus; nobody answers then.
+A Commit or a Stop may be broadcast to all amplifiers of a bus; there are no replies then.
 """
 
 from dataclasses import dataclass
@@ -42,7 +42,7 @@ class AmplifierState(IntEnum):
 
 
 class Fault(IntEnum):
-    """Why an amplifier is in FAULT; NONE where it is not."""
+    """Why an amplifier is in FAULT; NONE otherwise."""
 
     NONE = 0
     WATCHDOG = 1
@@ -54,7 +54,7 @@ class Fault(IntEnum):
 
 
 class NakCode(IntEnum):
-    """Why a request was refused."""
+    """Reason of a refusal."""
 
     UNKNOWN_TYPE = 1
     BAD_LENGTH = 2
@@ -69,17 +69,17 @@ class NakCode(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Hello:
-    """Who is there?"""
+    """Identify yourself."""
 
 
 @dataclass(frozen=True, slots=True)
 class GetCaps:
-    """What can you play?"""
+    """Report the capabilities."""
 
 
 @dataclass(frozen=True, slots=True)
 class Arm:
-    """Switch on and enable at level zero; watchdog [s] is how long silence of the host is borne."""
+    """Switch on and enable at level zero; watchdog [s]: longest time between heartbeats."""
 
     watchdog: float
 
@@ -93,14 +93,14 @@ class Disarm:
 
 @dataclass(frozen=True, slots=True)
 class Stage:
-    """Keep this set ready; nothing moves."""
+    """Keep this set ready; outputs do not change."""
 
     command_set: CommandSet
 
 
 @dataclass(frozen=True, slots=True)
 class Commit:
-    """Play the staged set with this token; a token that is already playing is left alone."""
+    """Play the staged set with this token; no effect if it is already playing."""
 
     token: int
 
@@ -121,34 +121,34 @@ class Stop:
 
 @dataclass(frozen=True, slots=True)
 class GetStatus:
-    """How are you? Does not feed the watchdog."""
+    """Report the status; does not feed the watchdog."""
 
 
 @dataclass(frozen=True, slots=True)
 class GetFaults:
-    """What went wrong?"""
+    """Report latched and past faults."""
 
 
 @dataclass(frozen=True, slots=True)
 class Clear:
-    """I have seen the faults; leave FAULT or QUICK_STOP_ACTIVE if their cause is gone."""
+    """Acknowledge; leave FAULT or QUICK_STOP_ACTIVE if the cause is gone."""
 
 
 @dataclass(frozen=True, slots=True)
 class Ping:
-    """I am alive: feeds the watchdog while armed."""
+    """Heartbeat: feeds the watchdog while armed."""
 
 
 @dataclass(frozen=True, slots=True)
 class LoadEnvelope:
-    """Keep this envelope under its slot until another takes its place or the supply is lost."""
+    """Store this envelope in its slot until it is replaced or the supply is lost."""
 
     envelope: Envelope
 
 
 @dataclass(frozen=True, slots=True)
 class Identity:
-    """Who an amplifier is; the serial number tells two of a kind apart."""
+    """Identity of an amplifier; the serial number is unique."""
 
     vendor: str
     product: str
@@ -161,8 +161,8 @@ class Identity:
 class Capabilities:
     """What an amplifier can play: frequencies [Hz], steps, watchdog range [s], longest ramp [s].
 
-    envelope_knots: how many an envelope may have; envelope_slots: how many envelopes it keeps;
-    their steps [s]; all 0 for an amplifier without envelopes. events: whether it speaks unasked.
+    envelope_knots: most knots of an envelope; envelope_slots: number of slots; envelope steps [s];
+    all 0 without envelopes. events: whether it sends unsolicited events.
     """
 
     channels: int
@@ -184,10 +184,10 @@ class Capabilities:
 
 @dataclass(frozen=True, slots=True)
 class Status:
-    """How an amplifier is: state, fault, the token it plays, the level each channel has now.
+    """Status of an amplifier: state, fault, playing token and present level of each channel.
 
-    token 0: nothing was played since it was armed; temperature [°C]; watchdog_left [s]; voltage
-    [V] of the high-voltage supply, 0 where it is not measured.
+    token 0: nothing played since arming; temperature [°C]; watchdog_left [s]; voltage [V] of the
+    high-voltage supply, 0 if not measured.
     """
 
     state: AmplifierState
@@ -202,7 +202,7 @@ class Status:
 
 @dataclass(frozen=True, slots=True)
 class Achieved:
-    """What will really be played under a token, after the amplifier's own quantisation."""
+    """What a token really plays, after the amplifier's quantisation."""
 
     token: int
     commands: tuple[DriveCommand, ...]
@@ -210,7 +210,7 @@ class Achieved:
 
 @dataclass(frozen=True, slots=True)
 class FaultRecord:
-    """One fault and how long ago [s] it happened."""
+    """A fault and its age [s]."""
 
     fault: Fault
     channel: int | None
@@ -226,7 +226,7 @@ class FaultList:
 
 @dataclass(frozen=True, slots=True)
 class Loaded:
-    """An envelope of so many knots is kept under this slot."""
+    """Confirmation that a slot holds an envelope with this number of knots."""
 
     slot: int
     knots: int
@@ -234,7 +234,7 @@ class Loaded:
 
 @dataclass(frozen=True, slots=True)
 class AmplifierEvent:
-    """The state has changed, or there is a fault; channel: the one to blame, where one is."""
+    """A change of state, or a fault; channel: the one at fault, if any."""
 
     state: AmplifierState
     fault: Fault
@@ -243,7 +243,7 @@ class AmplifierEvent:
 
 @dataclass(frozen=True, slots=True)
 class Nak:
-    """Refused: why, and which channel where one is to blame. Nothing of the request was applied."""
+    """Refusal: reason, and the channel at fault, if any. Nothing of the request was applied."""
 
     code: NakCode
     channel: int | None = None

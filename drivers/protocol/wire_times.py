@@ -1,37 +1,37 @@
-"""How long things take on a wire, by arithmetic; an amplifier's own delay is not counted."""
+"""Durations on a wire, by arithmetic; without the amplifier's own delay."""
 
 from abc import ABC, abstractmethod
 from typing import final
 
 
 class WireTimes(ABC):
-    """Times [s] on one wire, told before anything is sent there."""
+    """Durations [s] on one wire, known before anything is sent."""
 
     @abstractmethod
     def round_trip(self, channels: int) -> float:
-        """Of an apply of so many channels and its answer."""
+        """Duration of an apply with this number of channels and of its reply."""
 
     @abstractmethod
     def commit(self) -> float:
-        """Until a commit has arrived whole."""
+        """Duration until a commit has arrived completely."""
 
     @abstractmethod
     def loading(self, knots: int) -> float:
-        """Of loading an envelope of so many knots, and of the answer."""
+        """Duration of loading an envelope with this number of knots and of the reply."""
 
 
 @final
 class NoTimes(WireTimes):
-    """Zero for everything: of a wire that takes none, or of which nobody knows."""
+    """Zero for everything: a wire without delay, or of unknown speed."""
 
     def round_trip(self, channels: int) -> float:
-        """None."""
+        """Zero."""
         return 0.0
 
     def commit(self) -> float:
-        """None."""
+        """Zero."""
         return 0.0
 
     def loading(self, knots: int) -> float:
-        """None."""
+        """Zero."""
         return 0.0

@@ -15,7 +15,7 @@ from drivers.backends.can_bus.interfaces import open_bus, send_all, wake
 from drivers.backends.hardware import HARDWARE_PROVIDER, Adapter
 from drivers.backends.urls.can_bus import CanBusUrl
 from drivers.codec.can_bus.frame import CanFrame
-from drivers.errors import LinkError, LinkTimeout, said_by_system
+from drivers.errors import LinkError, LinkTimeout, system_message
 from drivers.threads import close_in_thread, in_thread
 
 _READ_TIMEOUT = 0.05  # s; how long the reader of a bus that cannot be woken notices its end
@@ -159,4 +159,4 @@ def _why_not_open(url: CanBusUrl, problem: Exception) -> str:
         )
     else:
         remedy = "check its name"
-    return f"CAN bus {url} cannot be opened: {remedy} (the system says: {said_by_system(problem)})"
+    return f"CAN bus {url} cannot be opened: {remedy} (the system says: {system_message(problem)})"

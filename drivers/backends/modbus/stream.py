@@ -10,7 +10,7 @@ from typing import cast
 from drivers.backends.hardware import Port
 from drivers.backends.ports.opening import open_port
 from drivers.backends.urls.modbus import ModbusUrl
-from drivers.errors import LinkError, LinkTimeout, said_by_system
+from drivers.errors import LinkError, LinkTimeout, system_message
 from drivers.threads import in_thread
 
 _CONNECT_TIMEOUT = 1.0  # s; an amplifier in the same building answers a hundred times faster
@@ -91,7 +91,7 @@ async def _connect(
     except OSError as problem:
         raise LinkError(
             f"{line.place} takes no Modbus connection: check the address and the port, and that "
-            f"the amplifier is switched on (the system says: {said_by_system(problem)})"
+            f"the amplifier is switched on (the system says: {system_message(problem)})"
         ) from problem
 
 

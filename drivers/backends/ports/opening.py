@@ -17,7 +17,7 @@ from drivers.backends.ports.watched import (
     connection_of,
     remedy_of,
 )
-from drivers.errors import LinkError, said_by_system
+from drivers.errors import LinkError, system_message
 from drivers.threads import in_thread
 
 _FAILURES: tuple[type[Exception], ...] = (OSError, ValueError)  # of pyserial, at opening
@@ -90,5 +90,5 @@ def _why_not_open(port: str, problem: Exception) -> str:
         remedy = "no port fits the pattern; list them: python -m serial.tools.list_ports -v"
     else:
         remedy = "check its name, that it is plugged in, its speed and its parity"
-    said = said_by_system(problem)
+    said = system_message(problem)
     return f"serial port {port} cannot be opened: {remedy} (the system says: {said})"

@@ -1,1 +1,1 @@
-"""Where an amplifier is: the URLs of every wire, taken apart."""
+"""Parsers of amplifier URLs, one per wire."""

@@ -1,4 +1,4 @@
-"""CAN amplifier URLs: can+socketcan://can0#NODE and so on, the node after the hash sign."""
+"""CAN amplifier URLs, such as can+socketcan://can0#NODE, with the node after the hash sign."""
 
 import re
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ _FORMS = (
     "can+socketcan://can0#1, can+slcan:///dev/ttyACM0?bitrate=500000#1, "
     "can+socketcand://HOST:PORT/can0#1 or can+virtual://CHANNEL#1"
 )
-_OPTIONS = {  # smallest and largest
+_OPTIONS = {  # lowest and highest
     "bitrate": (10_000, 1_000_000),
     "fd": (1, 8_000_000),  # bit/s of the data of CAN FD
     "heartbeat": (10, 10_000),  # ms
@@ -22,7 +22,7 @@ _OPTIONS = {  # smallest and largest
 
 @dataclass(frozen=True)
 class CanBusUrl:
-    """A bus: interface as python-can names it, channel, host and port of a server.
+    """A bus: interface as named by python-can, channel, host and port of a server.
 
     bitrate [bit/s]; fd: that of the data in CAN FD frames, 0 for classic frames only; baud of the
     adapter's serial port.
@@ -43,7 +43,7 @@ class CanBusUrl:
 
 @dataclass(frozen=True)
 class CanUrl:
-    """Where a CAN amplifier is: its bus and node, and how often it says that it is there [s]."""
+    """A CAN amplifier: its bus and node, and the interval [s] of its heartbeat."""
 
     bus: CanBusUrl
     node: int
@@ -51,12 +51,12 @@ class CanUrl:
 
     @classmethod
     def parse(cls, url: str) -> "CanUrl":
-        """Take a URL apart; CommandError says which part is wrong and what it should be."""
+        """Parse a URL; CommandError names the invalid part."""
         try:
             parts = urlsplit(url)
             port = parts.port if parts.scheme == "can+socketcand" else None
         except ValueError as problem:
-            raise CommandError(f"{url!r} is no CAN URL: {problem}; use {_FORMS}") from None
+            raise CommandError(f"{url!r} must be a CAN URL: {problem}; use {_FORMS}") from None
         options = options_of(parts.query, known=_OPTIONS, url=url, kind="a CAN")
         interface, host = parts.scheme.removeprefix("can+"), ""
         match interface:
@@ -70,9 +70,9 @@ class CanUrl:
                 channel, rest = parts.path.strip("/"), "" if port else "no port"
                 host = parts.hostname or ""
             case _:
-                raise CommandError(f"{url!r} names no CAN interface; use {_FORMS}")
+                raise CommandError(f"{url!r} must name a CAN interface; use {_FORMS}")
         if not channel.strip("/") or rest or (interface == "socketcand" and not host):
-            raise CommandError(f"{url!r} does not say where the bus is; use {_FORMS}")
+            raise CommandError(f"{url!r} must name the bus; use {_FORMS}")
         bus = CanBusUrl(
             interface=interface,
             channel=channel,

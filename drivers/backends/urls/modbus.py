@@ -17,11 +17,11 @@ _PARITIES = {"even": "E", "odd": "O", "none": "N"}
 
 @dataclass(frozen=True)
 class ModbusUrl:
-    """Where a Modbus amplifier is: a host and port, or a serial device; and its unit there.
+    """A Modbus amplifier: host and port or serial device, and its unit.
 
-    is_rtu: whether its frames are those of RTU, which a serial server passes on as well. baud,
-    parity (as pyserial names it) and stop bits are of a serial device, or of the line behind a
-    gateway or server; baud is 0 where nothing is known of such a line.
+    is_rtu: RTU frames, also through a serial server. baud, parity (as named by pyserial) and stop
+    bits are those of the serial device, or of the line behind a gateway or server; baud is 0 if
+    unknown.
     """
 
     is_rtu: bool
@@ -35,38 +35,40 @@ class ModbusUrl:
 
     @property
     def line(self) -> "ModbusUrl":
-        """The same without the unit: what several amplifiers share."""
+        """The URL without its unit: the line that several amplifiers share."""
         return replace(self, unit=0)
 
     @property
     def place(self) -> str:
-        """How to name the line to a person."""
+        """Name of the line in messages."""
         return self.device or f"{self.host}:{self.port}"
 
     @property
     def bits_per_byte(self) -> int:
-        """On a serial line: start, eight data, parity, stop."""
+        """Bits per byte on a serial line: start, eight data, parity, stop."""
         return 9 + (self.parity != "N") + self.stop
 
     @classmethod
     def parse(cls, url: str) -> "ModbusUrl":
-        """Take a URL apart; CommandError says which part is wrong and what it should be."""
+        """Parse a URL; CommandError names the invalid part."""
         try:
             parts = urlsplit(url)
             _ = parts.port
         except ValueError as problem:
-            raise CommandError(f"{url!r} is no Modbus URL: {problem}; use {_TCP_FORM}") from None
+            raise CommandError(
+                f"{url!r} must be a Modbus URL: {problem}; use {_TCP_FORM}"
+            ) from None
         if parts.scheme == "modbus+tcp":
             return _tcp(parts, url)
         if parts.scheme == "modbus+rtu":
             return _rtu(parts, url)
-        raise CommandError(f"{url!r} is no Modbus URL; use {_TCP_FORM} or {_RTU_FORM}")
+        raise CommandError(f"{url!r} must be a Modbus URL; use {_TCP_FORM} or {_RTU_FORM}")
 
 
 def _tcp(parts: SplitResult, url: str) -> ModbusUrl:
     options = options_of(parts.query, known=("baud",), url=url, kind="a Modbus TCP")
     if not parts.hostname or parts.fragment:
-        raise CommandError(f"{url!r}: a Modbus TCP URL has a host, a port and a unit: {_TCP_FORM}")
+        raise CommandError(f"{url!r}: a Modbus TCP URL must have a host and no #: {_TCP_FORM}")
     return ModbusUrl(
         False,
         host=parts.hostname,
@@ -84,13 +86,15 @@ def _rtu(parts: SplitResult, url: str) -> ModbusUrl:
         device = device[1:]
     if parts.netloc:
         if not parts.hostname or parts.port is None or device.strip("/"):
-            raise CommandError(f"{url!r} names no host and port; use modbus+rtu://HOST:PORT#UNIT")
+            raise CommandError(
+                f"{url!r} must name a host and port; use modbus+rtu://HOST:PORT#UNIT"
+            )
         device = ""
     elif not device.strip("/"):
-        raise CommandError(f"{url!r} names no port; use {_RTU_FORM}")
+        raise CommandError(f"{url!r} must name a port; use {_RTU_FORM}")
     parity = options.get("parity", "even")
     if parity not in _PARITIES:
-        raise CommandError(f"{url!r}: parity is {parity!r}; it must be {', '.join(_PARITIES)}")
+        raise CommandError(f"{url!r}: parity must be one of {', '.join(_PARITIES)}, got {parity!r}")
     return ModbusUrl(
         True,
         host=parts.hostname or "",

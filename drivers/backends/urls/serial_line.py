@@ -1,9 +1,9 @@
 """Serial amplifier URLs.
 
 serial:///dev/ttyUSB0?baud=921600&address=1     a port of this machine
-socket://HOST:PORT (or serial://HOST:PORT)      a serial server that passes bytes on
-rfc2217://HOST:PORT?baud=115200                 one whose speed is set from here
-hwgrep://0403:6001                              the port whose description fits the pattern
+socket://HOST:PORT (or serial://HOST:PORT)      a serial server with raw TCP
+rfc2217://HOST:PORT?baud=115200                 a serial server with RFC 2217
+hwgrep://0403:6001                              the port whose description matches
 """
 
 import re
@@ -20,7 +20,7 @@ _BAUD_MAX = 12_000_000  # the fastest USB adapters
 
 @dataclass(frozen=True)
 class SerialUrl:
-    """Where a serial amplifier is: port as pyserial names it, speed [baud], address on the line."""
+    """A serial amplifier: port as named by pyserial, speed [baud], address on the line."""
 
     port: str
     baud: int
@@ -28,32 +28,32 @@ class SerialUrl:
 
     @property
     def is_local(self) -> bool:
-        """Whether the speed is that of a line to the amplifier, and nothing else is in between."""
+        """Whether the port is a line to the amplifier without a server in between."""
         return not self.port.startswith(("socket://", "rfc2217://"))
 
     @classmethod
     def parse(cls, url: str) -> "SerialUrl":
-        """Take a URL apart; CommandError says which part is wrong and what it should be."""
+        """Parse a URL; CommandError names the invalid part."""
         try:
             parts = urlsplit(url)
             number = None if parts.scheme == "hwgrep" else parts.port
         except ValueError as problem:
-            raise CommandError(f"{url!r} is no serial URL: {problem}; use {_FORM}") from None
+            raise CommandError(f"{url!r} must be a serial URL: {problem}; use {_FORM}") from None
         if parts.fragment:
             raise CommandError(
-                f"{url!r}: a serial URL has no #; the address on the line is ?address="
-                f"{parts.fragment}"
+                f"{url!r}: a serial URL must not contain #; write ?address={parts.fragment} for "
+                "the address on the line"
             )
         options = options_of(parts.query, known=("baud", "address"), url=url, kind="a serial")
         path = unquote(parts.path)
         if parts.scheme == "hwgrep":
             pattern = unquote(parts.netloc) + path
             if not pattern:
-                raise CommandError(f"{url!r} names no pattern; use hwgrep://VENDOR:PRODUCT")
+                raise CommandError(f"{url!r} must name a pattern; use hwgrep://VENDOR:PRODUCT")
             port = f"hwgrep://{pattern}"
         elif parts.netloc:
             if parts.hostname is None or number is None or path.strip("/"):
-                raise CommandError(f"{url!r} names no host and port; use {_FORM}")
+                raise CommandError(f"{url!r} must name a host and port; use {_FORM}")
             kind = "rfc2217" if parts.scheme == "rfc2217" else "socket"
             port = f"{kind}://{parts.netloc}"
         elif re.fullmatch(r"/COM\d+", path, re.IGNORECASE):
@@ -61,7 +61,7 @@ class SerialUrl:
         elif path.strip("/"):
             port = path
         else:
-            raise CommandError(f"{url!r} names no port; use {_FORM}")
+            raise CommandError(f"{url!r} must name a port; use {_FORM}")
         line = PROTOCOL.serial
         return cls(
             port=port,

@@ -17,9 +17,7 @@ from drivers.backends.modbus.line import modbus_line
 from drivers.backends.urls.modbus import ModbusUrl
 from drivers.codec.modbus.exchanges import Read, Write
 from drivers.codec.modbus.timing import ModbusTimes
-from drivers.command import CommandSet
 from drivers.errors import CommandError, FrameError, LinkError, LinkTimeout
-from drivers.guard import SafeCommandSet
 from drivers.operation.watchdog import check_watchdog
 from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.messages import (
@@ -82,30 +80,6 @@ async def backend(far: Peer) -> AsyncIterator[ModbusBackend]:
     await backend.close()
 
 
-@pytest.mark.parametrize(
-    ("url", "expected"),
-    [
-        ("modbus+tcp://10.0.0.7", ModbusUrl(False, host="10.0.0.7", port=502, unit=1)),
-        ("modbus+tcp://amp:1502/247", ModbusUrl(False, host="amp", port=1502, unit=247)),
-        ("modbus+tcp://[::1]:1502/2", ModbusUrl(False, host="::1", port=1502, unit=2)),
-        (
-            "modbus+rtu:///dev/ttyS1?baud=19200&parity=none&stop=2#9",
-            ModbusUrl(True, device="/dev/ttyS1", baud=19200, parity="N", stop=2, unit=9),
-        ),
-        ("modbus+rtu:///dev/ttyS1", ModbusUrl(True, device="/dev/ttyS1", baud=115200, unit=1)),
-        ("modbus+rtu:///COM3", ModbusUrl(True, device="COM3", baud=115200, unit=1)),
-        ("modbus+tcp://gw/3?baud=9600", ModbusUrl(False, host="gw", port=502, baud=9600, unit=3)),
-        ("modbus+rtu://srv:4001#2", ModbusUrl(True, host="srv", port=4001, unit=2)),
-    ],
-)
-def test_urls_are_taken_apart(url: str, expected: ModbusUrl) -> None:
-    """Host, port and unit; device, speed, parity, stop bits and unit; with the usual defaults.
-
-    Of the line behind a gateway or a server nothing is known unless it is said.
-    """
-    assert ModbusUrl.parse(url) == expected
-
-
 async def test_a_slow_line_behind_a_gateway_is_waited_for() -> None:
     """Told of 9600 baud, it waits for what they take: 0.13 s for a set of four and its answer."""
     async with peer(is_rtu=False) as far:
@@ -125,30 +99,6 @@ async def test_a_slow_line_behind_a_gateway_is_waited_for() -> None:
             assert await backend.exchange(Ping(), timeout=0.001) == ARMED
         finally:
             await backend.close()
-
-
-@pytest.mark.parametrize(
-    ("url", "words"),
-    [
-        ("modbus+tcp://", "a host, a port and a unit"),
-        ("modbus+tcp://h:99999/1", "no Modbus URL"),
-        ("modbus+tcp://h/0", "unit is '0'; it must be a whole number from 1 to 247"),
-        ("modbus+tcp://h/1?speed=5", "unknown option speed; a Modbus TCP URL has baud"),
-        ("modbus+tcp://h/1?baud=0", "baud is .0.; it must be a whole number"),
-        ("modbus+tcp://h/one", "unit is 'one'"),
-        ("modbus+rtu://", "names no port"),
-        ("modbus+rtu://h#1", "names no host and port"),
-        ("modbus+rtu:///dev/x#248", "from 1 to 247"),
-        ("modbus+rtu:///dev/x?speed=3", "unknown option speed"),
-        ("modbus+rtu:///dev/x?baud=fast", "baud is 'fast'"),
-        ("modbus+rtu:///dev/x?parity=some", "parity is 'some'"),
-        ("modbus://h/1", "use modbus\\+tcp"),
-    ],
-)
-def test_bad_urls_say_what_is_wrong(url: str, words: str) -> None:
-    """CommandError with the part to blame."""
-    with pytest.raises(CommandError, match=words):
-        ModbusBackend(url)
 
 
 @pytest.mark.parametrize(
@@ -525,29 +475,6 @@ async def test_events_are_what_answers_show_to_have_changed(
         AmplifierEvent(AmplifierState.FAULT, Fault.WATCHDOG),
         AmplifierEvent(AmplifierState.OPERATION_ENABLED, Fault.NONE),
     ]
-
-
-async def test_only_what_a_guard_has_seen_is_sent(far: Peer, backend: ModbusBackend) -> None:
-    """A plain set is a TypeError, and nothing of it is on the wire."""
-    plain = CommandSet(1, SET.commands, 0.0, 0.0)
-    for request in (Apply(plain), Stage(plain)):
-        with pytest.raises(TypeError, match="SafeCommandSet"):
-            await backend.exchange(request, timeout=PATIENCE)
-    assert far.requests == []
-
-
-async def test_an_amplifier_stands_on_it(far: Peer, safe: Callable[..., SafeCommandSet]) -> None:
-    """Open, arm, play, and no answer three times: lost, by the one implementation of all wires."""
-    amplifier = Amplifier(ModbusBackend(far.url), reply_timeout=SHORT)
-    await amplifier.open()
-    assert amplifier.identity == IDENTITY
-    assert amplifier.capabilities == CAPABILITIES
-    assert (await amplifier.apply(safe(7))).token == 7
-    far.answer = lambda _: None
-    with pytest.raises(LinkTimeout, match="3 requests in a row"):
-        await amplifier.heartbeat()
-    assert amplifier.is_lost
-    await amplifier.close()
 
 
 def test_wire_time_is_arithmetic() -> None:

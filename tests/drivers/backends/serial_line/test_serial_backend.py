@@ -1,11 +1,10 @@
 import asyncio
 import contextlib
 import errno
-import gc
 import socket
 import sys
 import threading
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,12 +14,10 @@ import serial
 from drivers.amplifier import Amplifier
 from drivers.backends.ports import opening
 from drivers.backends.serial_line.backend import SerialBackend
-from drivers.backends.urls.serial_line import SerialUrl
 from drivers.codec.serial_line.exchanges import decode_request, encode_reply
 from drivers.codec.serial_line.frame import Frame, FrameReader, encode_frame
-from drivers.errors import CommandError, FrameError, LinkError, LinkTimeout
-from drivers.guard import SafeCommandSet
-from drivers.protocol.messages import Achieved, GetStatus, Hello, Nak, NakCode, Ping
+from drivers.errors import FrameError, LinkError, LinkTimeout
+from drivers.protocol.messages import GetStatus, Hello, Nak, NakCode, Ping
 from scripted_amplifier import IDENTITY, STATUS, FarEnd, usual_answer
 
 PATIENCE = 5.0  # s; for what is expected to come
@@ -157,20 +154,6 @@ async def test_an_unplugged_line_fails_what_waits_and_what_comes(far_end: FarEnd
     assert open_files() <= before
 
 
-async def test_the_amplifier_over_an_unplugged_line_stays_lost(
-    far_end: FarEnd, safe: Callable[[int], SafeCommandSet]
-) -> None:
-    """An unplugged line is one clear paragraph from every later call."""
-    amplifier = Amplifier(SerialBackend(far_end.url), reply_timeout=PATIENCE)
-    await amplifier.open()
-    far_end.unplug()
-    for _ in range(2):
-        with pytest.raises(LinkError, match=r"was lost.*check the cable.*it is disarmed"):
-            await amplifier.apply(safe(1))
-    await amplifier.close()
-    assert reader_threads() == []
-
-
 async def test_closing_ends_the_reader_and_what_waits(far_end: FarEnd) -> None:
     """Close leaves no thread and no descriptor, and a waiting exchange gets LinkError."""
     before = open_files()
@@ -185,63 +168,6 @@ async def test_closing_ends_the_reader_and_what_waits(far_end: FarEnd) -> None:
         await waiting
     assert reader_threads() == []
     assert open_files() <= before
-
-
-async def test_a_line_lost_while_writing_is_told_once(
-    far_end: FarEnd, caplog: pytest.LogCaptureFixture
-) -> None:
-    """The error reaches the caller, and no future is left behind with a copy of it."""
-    backend = SerialBackend(far_end.url)
-    await backend.open()
-    far_end.unplug()
-    with pytest.raises(LinkError, match="was lost"):
-        await backend.exchange(Ping(), timeout=PATIENCE)
-    gc.collect()
-    assert caplog.text == ""
-    await backend.close()
-
-
-async def test_it_can_be_opened_again(far_end: FarEnd) -> None:
-    """After a close the same backend opens the same line anew."""
-    backend = SerialBackend(far_end.url)
-    for _ in range(2):
-        await backend.open()
-        assert await backend.exchange(Hello(), timeout=PATIENCE) == IDENTITY
-        await backend.close()
-    with pytest.raises(LinkError, match="was closed"):
-        await backend.exchange(Hello(), timeout=PATIENCE)
-
-
-async def test_cancelling_leaves_the_link_usable(backend: SerialBackend, far_end: FarEnd) -> None:
-    """A cancelled exchange raises CancelledError; its late reply is dropped by its number."""
-    far_end.answer = lambda request, frame: None
-    waiting = asyncio.create_task(backend.exchange(GetStatus(), timeout=PATIENCE))
-    await far_end.count(1)
-    waiting.cancel()
-    with pytest.raises(asyncio.CancelledError):
-        await waiting
-    far_end.send(STATUS, far_end.frames[0])
-    far_end.answer = lambda request, frame: usual_answer(request)
-    assert await backend.exchange(Hello(), timeout=PATIENCE) == IDENTITY
-    assert backend.counters.unexpected_frames == 1
-
-
-async def test_a_lost_reply_is_asked_for_again_over_the_wire(
-    far_end: FarEnd, safe: Callable[[int], SafeCommandSet]
-) -> None:
-    """The amplifier repeats an apply with the same token under a new sequence number."""
-    amplifier = Amplifier(SerialBackend(far_end.url), reply_timeout=0.2)
-    await amplifier.open()
-    del far_end.frames[:]
-    far_end.answer = lambda request, frame: (
-        Achieved(9, request.command_set.commands) if len(far_end.frames) == 2 else None
-    )
-    achieved = await amplifier.apply(safe(9))
-    assert achieved.token == 9
-    first, second = far_end.frames
-    assert first.payload == second.payload
-    assert first.sequence != second.sequence
-    await amplifier.close()
 
 
 async def test_a_line_is_opened_by_one_only(far_end: FarEnd, backend: SerialBackend) -> None:
@@ -319,46 +245,6 @@ async def test_a_server_that_is_not_there_says_what_to_do() -> None:
         port = listener.getsockname()[1]
     with pytest.raises(LinkError, match="nobody answers there"):
         await SerialBackend(f"serial://127.0.0.1:{port}").open()
-
-
-@pytest.mark.parametrize(
-    ("url", "expected"),
-    [
-        ("serial:///dev/ttyUSB0", SerialUrl("/dev/ttyUSB0", 921_600, 1)),
-        ("serial:///dev/ttyS1?baud=115200&address=7", SerialUrl("/dev/ttyS1", 115_200, 7)),
-        ("serial:///COM3?baud=9600", SerialUrl("COM3", 9600, 1)),
-        ("socket://box.local:4001", SerialUrl("socket://box.local:4001", 921_600, 1)),
-        ("rfc2217://box:4001?baud=9600", SerialUrl("rfc2217://box:4001", 9600, 1)),
-        ("hwgrep://0403:6001?address=3", SerialUrl("hwgrep://0403:6001", 921_600, 3)),
-        ("serial://box.local:4001", SerialUrl("socket://box.local:4001", 921_600, 1)),
-    ],
-)
-def test_urls_are_understood(url: str, expected: SerialUrl) -> None:
-    """Port, speed and address come out of the URL, the latter two with their defaults."""
-    assert SerialUrl.parse(url) == expected
-
-
-@pytest.mark.parametrize(
-    ("url", "problem"),
-    [
-        ("serial://", "names no port"),
-        ("hwgrep://", "names no pattern"),
-        ("serial://host", "no host and port"),
-        ("serial://host:99999", "no serial URL"),
-        ("serial:///dev/x?baud=fast", "baud is 'fast'"),
-        ("serial:///dev/x?baud=0", "baud is '0'"),
-        ("serial:///dev/x?baud=", "baud is ''"),
-        ("serial:///dev/x?address=248", "from 1 to 247"),
-        ("serial:///dev/x?speed=9600", "unknown option speed"),
-        ("serial:///dev/x?baud=9600&baud=1200", "given twice"),
-        (f"serial:///dev/x?baud={'9' * 5000}", "baud is '999"),
-        ("serial:///dev/x#7", "the address on the line is .address=7"),
-    ],
-)
-def test_bad_urls_are_refused(url: str, problem: str) -> None:
-    """Each bad part of a URL is named."""
-    with pytest.raises(CommandError, match=problem):
-        SerialBackend(url)
 
 
 async def test_two_amplifiers_of_one_address_are_refused(far_end: FarEnd) -> None:

@@ -13,7 +13,7 @@ from model.counting import counted
 from model.errors import InputError
 
 if TYPE_CHECKING:
-    from controller.demo.rows import TouchRow
+    from controller.demo.touch_row import TouchRow
 
 app = typer.Typer()
 app.add_typer(rig_app, name="rig")
@@ -136,9 +136,8 @@ def _line(row: "TouchRow") -> str:
     eras = ", ".join(f"{' '.join(some)} {hertz:g} Hz" for hertz, some in by_frequency.items())
     numbers = (
         *(played.predicted_contrast_db, played.measured_contrast_db),
-        *(played.onset.predicted_contrast_db, played.onset.measured_contrast_db),
-        played.predicted_level_db_sl,
-        played.measured.level_db_sl if played.measured else None,
+        *(played.predicted_transient_contrast_db, played.measured_transient_contrast_db),
+        *(played.predicted_level_db_sl, played.measured_level_db_sl),
     )
     return (
         f"{start}{eras:22s} {' '.join(f'{_number(number):>6s}' for number in numbers)} "

@@ -1,1 +1,1 @@
-"""The demonstration: recorded touches in, what each fingertip felt out, over a real wire."""
+"""The demonstration: recorded touches in, vibration at the fingertips out."""

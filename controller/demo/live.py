@@ -1,4 +1,4 @@
-"""The demonstration to be touched: simulated amplifiers, a daemon, and its page in a browser."""
+"""The interactive demonstration: simulated amplifiers, a daemon, and the dashboard."""
 
 import tempfile
 from dataclasses import replace
@@ -16,11 +16,11 @@ from model.table.table import LocalizationTable
 
 
 async def run_live(rig_file: Path, table: LocalizationTable, *, wire: str, dashboard: str) -> None:
-    """Serve the page of a rig over a wire until Ctrl-C; it starts disarmed, as every daemon.
+    """Serve the dashboard of a rig over a wire until Ctrl-C; starts disarmed.
 
-    wire: as for `run_demo`; dashboard: HOST:PORT of the loopback. The daemon listens where daemons
-    do, so that `era status` and its like reach it. Raises InputError where one runs already, or
-    where the gateway is not installed, and LinkError.
+    wire: as for `run_demo`; dashboard: HOST:PORT of the loopback. The daemon uses the default
+    socket, so that `era status` and others reach it. Raises InputError if one runs already or
+    the gateway is not installed, and LinkError.
     """
     require_gateway()
     rig = load_rig(rig_file)

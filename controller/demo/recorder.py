@@ -1,4 +1,4 @@
-"""Watches the control loop and the simulated plate, and makes a row of every touch."""
+"""Observes the control loop and the simulated plate, and makes a row of every touch."""
 
 import asyncio
 import math
@@ -6,9 +6,15 @@ from collections.abc import Callable, Coroutine, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from controller.demo.far_end import BenchControl, FingerFelt
-from controller.demo.measure import finger_level, measure, peak_contrast_db
-from controller.demo.rows import Onset, Place, PlayedPattern, TouchRow
+from controller.demo.far_end import SimulatedPlate
+from controller.demo.touch_row import (
+    FingerVibration,
+    Place,
+    PlayedPattern,
+    TouchRow,
+    peak_contrast_db,
+    steady_contrast_db,
+)
 from controller.loop.observer import Applied, Observer, Silenced
 from controller.loop.selection import Prediction
 from controller.sources.contacts import Change, Contact, ContactKey
@@ -16,19 +22,19 @@ from drivers import clock
 from drivers.errors import LinkError
 from model.transients.measures import FIRST
 
-# The last part of a pattern is judged: by then the plate has settled, if the pattern was held long
-# enough, and a quarter of a second tells frequencies 10 Hz apart from each other.
-WINDOW = 0.25
-# From the last byte on the wire to the plate, and before the next command.
+STEADY_WINDOW = 0.25
+"""Length [s] of the measured end of a pattern: settled, and it separates tones 10 Hz apart."""
+
 MARGIN = 0.005
-# A finger that moves less than this [m] stays in one place for the plate's sensors; a trembling one
-# would never be measured otherwise.
-TREMBLE = 0.001
+"""Time [s] from the last byte on the wire to the plate, and before the next command."""
+
+MIN_MOVEMENT = 0.001
+"""Movement [m] below which a finger's sensor stays in place, so that its window is not broken."""
 
 
 @dataclass
 class _Touch:
-    """A touch, with every pattern that was played for it."""
+    """A touch and the patterns that were played for it."""
 
     contact: Contact
     quiet: Mapping[str, Place]
@@ -36,23 +42,19 @@ class _Touch:
     patterns: list["_Playing"] = field(default_factory=list)
     reason: str = "another finger came down at the same moment and was the target"
 
-    @property
-    def is_lifted(self) -> bool:
-        return self.until < math.inf
-
 
 @dataclass
 class _Playing:
-    """A pattern from its commit to the next command [s], and what was felt meanwhile.
+    """A pattern from its commit to the next command [s], with its measurements.
 
-    touches: the targets that are still known; onset: what was felt in its first 100 ms.
+    touches: its targets; steady, onset: vibration by finger over its end and its first 100 ms.
     """
 
     applied: Applied
     touches: list[_Touch]
     until: float = math.inf
-    felt: asyncio.Task[dict[str, FingerFelt]] | None = None
-    onset: asyncio.Task[dict[str, FingerFelt]] | None = None
+    steady: asyncio.Task[dict[str, FingerVibration]] | None = None
+    onset: asyncio.Task[dict[str, FingerVibration]] | None = None
 
     @property
     def duration(self) -> float:
@@ -60,21 +62,21 @@ class _Playing:
 
 
 class TouchRecorder:
-    """Collects a row per touch: hand `observer` to the controller, await `finish` at the end.
+    """Collects a row per touch: pass `observer` to the controller and await `finish` at the end.
 
-    Times of rows count from `begin`. on_row is called with every row as soon as the touch was
-    lifted and its pattern measured.
+    Times of rows count from `begin`. on_row is called with each row once the touch was lifted and
+    its pattern measured.
     """
 
-    def __init__(self, bench: BenchControl, *, on_row: Callable[[TouchRow], None]) -> None:
+    def __init__(self, plate: SimulatedPlate, *, on_row: Callable[[TouchRow], None]) -> None:
         self.rows: list[TouchRow] = []
-        self._problems: list[str] = []
-        self._bench = bench
+        self._errors: list[str] = []
+        self._plate = plate
         self._on_row = on_row
         self._start = clock.now()
         self._touches: dict[ContactKey, _Touch] = {}
         self._playing: _Playing | None = None
-        self._resting: dict[str, Place] = {}
+        self._sensors: dict[str, Place] = {}
         self._tasks: set[asyncio.Task[Any]] = set()
 
     @property
@@ -90,30 +92,27 @@ class TouchRecorder:
         )
 
     def begin(self) -> None:
-        """Say that the recorded touches begin to come."""
+        """Set the start of the recording to now."""
         self._start = clock.now()
 
     async def finish(self) -> None:
-        """Wait until every touch that was lifted has its row.
-
-        Raises LinkError where something went wrong meanwhile, with what was first.
-        """
+        """Wait for the rows of all lifted touches; raises LinkError with the first error."""
         while self._tasks:
             await asyncio.wait(self._tasks)
-        if self._problems:
-            raise LinkError(f"the demonstration did not run through: {self._problems[0]}")
+        if self._errors:
+            raise LinkError(f"demonstration aborted: {self._errors[0]}")
         self.rows.sort(key=lambda row: row.time)
 
     def _contacts_changed(self, contacts: tuple[Contact, ...], change: Change) -> None:
-        self._rest(contacts)
+        self._move_sensors(contacts)
         for contact in change.down:
-            others = [other for other in contacts if other.key != contact.key]
-            self._touches[contact.key] = _Touch(contact, {_id(o): (o.x, o.y) for o in others})
+            others = {_id(other): (other.x, other.y) for other in contacts if other != contact}
+            self._touches[contact.key] = _Touch(contact, others)
         for contact in change.up:
             touch = self._touches.pop(contact.key)
             touch.until = clock.now()
             if self._playing is None or touch not in self._playing.touches:
-                self._run(self._complete(touch))
+                self._run(self._add_row(touch))
 
     def _pattern_applied(self, applied: Applied) -> None:
         self._end_pattern(applied.time)
@@ -122,7 +121,7 @@ class TouchRecorder:
         for touch in self._playing.touches:
             touch.patterns.append(self._playing)
         if applied.from_rest and applied.quiet:
-            self._playing.onset = self._run(self._feel_onset(self._playing))
+            self._playing.onset = self._run(self._measure_onset(self._playing))
 
     def _silenced(self, silenced: Silenced) -> None:
         self._end_pattern(silenced.time)
@@ -130,59 +129,58 @@ class TouchRecorder:
             if touch := self._touches.get(contact.key):
                 touch.reason = silenced.reason
 
-    def _failed(self, problem: str) -> None:
+    def _failed(self, error: str) -> None:
         self._end_pattern(clock.now())
-        self._problems.append(problem)
+        self._errors.append(error)
 
     def _end_pattern(self, now: float) -> None:
-        """Close the pattern that is played and have its last part measured."""
+        """Close the playing pattern and measure its end."""
         ended, self._playing = self._playing, None
         if ended is None:
             return
         ended.until = now
         settled = ended.applied.time + ended.applied.pattern.ramp
-        since, until = max(settled, now - WINDOW) + MARGIN, now - MARGIN
+        since, until = max(settled, now - STEADY_WINDOW) + MARGIN, now - MARGIN
         if since < until:
-            ended.felt = self._run(self._bench.felt(since, until))
+            ended.steady = self._run(self._plate.vibration(since, until))
         for touch in ended.touches:
-            if touch.is_lifted:
-                self._run(self._complete(touch))
+            if touch.until < math.inf:
+                self._run(self._add_row(touch))
 
-    async def _feel_onset(self, playing: _Playing) -> dict[str, FingerFelt]:
-        """What fingers felt in the first 100 ms of a pattern; nothing if it was over before."""
+    async def _measure_onset(self, playing: _Playing) -> dict[str, FingerVibration]:
+        """Vibration over the first 100 ms of a pattern; empty if it ended earlier."""
         since = playing.applied.time
         await asyncio.sleep(max(0.0, since + FIRST + MARGIN - clock.now()))
         if playing.until < since + FIRST:
             return {}
-        return await self._bench.felt(since, since + FIRST)
+        return await self._plate.vibration(since, since + FIRST)
 
-    def _rest(self, contacts: tuple[Contact, ...]) -> None:
-        """Let the plate's sensors follow the fingers."""
-        resting = {}
+    def _move_sensors(self, contacts: tuple[Contact, ...]) -> None:
+        """Make the plate's sensors follow the fingers."""
+        sensors = {}
         for contact in contacts:
             place = (contact.x, contact.y)
-            before = self._resting.get(_id(contact))
-            resting[_id(contact)] = (
-                before if before and math.dist(before, place) < TREMBLE else place
-            )
-        if resting != self._resting:
-            self._resting = resting
-            self._run(self._bench.place_fingers(resting))
+            before = self._sensors.get(_id(contact), (math.inf, math.inf))
+            is_at_rest = math.dist(before, place) < MIN_MOVEMENT
+            sensors[_id(contact)] = before if is_at_rest else place
+        if sensors != self._sensors:
+            self._sensors = sensors
+            self._run(self._plate.place_fingers(sensors))
 
-    async def _complete(self, touch: _Touch) -> None:
-        """Make the row of a lifted touch from the pattern that was played longest for it."""
+    async def _add_row(self, touch: _Touch) -> None:
+        """Make the row of a lifted touch from the pattern that played longest for it."""
         longest = max(touch.patterns, key=lambda playing: playing.duration, default=None)
-        contact, quiet, together = touch.contact, touch.quiet, []
+        contact, quiet, targets = touch.contact, touch.quiet, []
         if longest is not None:
-            contact = _felt_of(touch, longest).contact
-            together = [each.contact for each in longest.applied.targets]
+            contact = _prediction(touch, longest).contact
+            targets = [each.contact for each in longest.applied.targets]
             quiet = {_id(other): (other.x, other.y) for other in longest.applied.quiet}
         row = TouchRow(
             target_id=_id(contact),
             time=contact.since - self._start,
             until=touch.until - self._start,
             target=(contact.x, contact.y),
-            together=tuple((each.x, each.y) for each in together if each.key != contact.key),
+            other_targets=tuple((each.x, each.y) for each in targets if each.key != contact.key),
             quiet=quiet,
             played=await _played(touch, longest) if longest else None,
             reason=None if longest else touch.reason,
@@ -193,61 +191,61 @@ class TouchRecorder:
     def _run(self, work: Coroutine[Any, Any, Any]) -> asyncio.Task[Any]:
         task = asyncio.create_task(work)
         self._tasks.add(task)
-        task.add_done_callback(self._finished)
+        task.add_done_callback(self._task_done)
         return task
 
-    def _finished(self, task: asyncio.Task[Any]) -> None:
+    def _task_done(self, task: asyncio.Task[Any]) -> None:
         self._tasks.discard(task)
         if not task.cancelled() and (error := task.exception()) is not None:
-            self._problems.append(str(error))
+            self._errors.append(str(error))
 
 
 async def _played(touch: _Touch, longest: _Playing) -> PlayedPattern:
-    """The longest pattern of a touch as it was felt; latency and onset are those of its first."""
-    applied, first = longest.applied, touch.patterns[0]
-    predicted = _felt_of(touch, longest)
-    felt = await longest.felt if longest.felt else {}
-    target = felt.get(_id(predicted.contact))
-    others = [felt[_id(contact)] for contact in applied.quiet if _id(contact) in felt]
+    """The longest pattern of a touch as measured; latency and onset are of its first pattern."""
+    first = touch.patterns[0]
+    applied, predicted = longest.applied, _prediction(touch, longest)
+    vibration = await longest.steady if longest.steady else {}
+    target, quiet = _fingers(vibration, predicted.contact, applied)
+    onset = await first.onset if first.onset else {}
+    onset_target, onset_quiet = _fingers(onset, touch.contact, first.applied)
     return PlayedPattern(
         pattern=applied.pattern,
-        predicted_level_db_sl=predicted.level_db_sl,
-        predicted_contrast_db=predicted.contrast_db,
-        onset=await _onset(touch, first),
         drive={
-            era: {
-                "frequency_hz": command.frequency,
-                "level": command.level,
-                "phase_deg": command.phase,
-            }
-            for era, command in applied.drive.items()
+            era: {"frequency_hz": each.frequency, "level": each.level, "phase_deg": each.phase}
+            for era, each in applied.drive.items()
         },
         latency=first.applied.latency,
         duration=longest.duration,
-        measured=measure(target, others) if target and len(others) == len(applied.quiet) else None,
-        levels={id: finger_level(finger) for id, finger in felt.items()},
+        is_onset_shaped=bool(first.applied.pattern.onset),
+        predicted_level_db_sl=predicted.level_db_sl,
+        measured_level_db_sl=target.level_db_sl if target else None,
+        predicted_contrast_db=predicted.contrast_db,
+        measured_contrast_db=steady_contrast_db(target, quiet) if target else None,
+        predicted_transient_contrast_db=first.applied.transient_contrast_db,
+        measured_transient_contrast_db=(
+            peak_contrast_db(onset_target, onset_quiet) if onset_target and onset_quiet else None
+        ),
+        levels_db_sl={id: finger.level_db_sl for id, finger in vibration.items()},
     )
 
 
-async def _onset(touch: _Touch, first: _Playing) -> Onset:
-    """The first 100 ms of the first pattern of a touch."""
-    applied = first.applied
-    felt = await first.onset if first.onset else {}
-    target = felt.get(_id(touch.contact))
-    others = [felt[_id(contact)] for contact in applied.quiet if _id(contact) in felt]
-    is_felt = target is not None and others and len(others) == len(applied.quiet)
-    return Onset(
-        is_shaped=bool(applied.pattern.onset),
-        predicted_contrast_db=applied.transient_contrast_db,
-        measured_contrast_db=peak_contrast_db(target, others) if target and is_felt else None,
+def _fingers(
+    vibration: Mapping[str, FingerVibration], contact: Contact, applied: Applied
+) -> tuple[FingerVibration | None, list[FingerVibration]]:
+    """Vibration of a target and of the quiet fingers; no target unless all were measured."""
+    target = vibration.get(_id(contact))
+    quiet = [vibration[_id(each)] for each in applied.quiet if _id(each) in vibration]
+    is_complete = (
+        target is not None and len(target.frequencies) and len(quiet) == len(applied.quiet)
     )
+    return (target, quiet) if is_complete else (None, [])
 
 
-def _felt_of(touch: _Touch, playing: _Playing) -> Prediction:
-    """What a touch was predicted to feel of a pattern that was played for it."""
+def _prediction(touch: _Touch, playing: _Playing) -> Prediction:
+    """What was predicted for a touch under a pattern that played for it."""
     return next(felt for felt in playing.applied.targets if felt.contact.key == touch.contact.key)
 
 
 def _id(contact: Contact) -> str:
-    """A contact's id on the bench."""
+    """The id of a contact's sensor on the plate."""
     return f"{contact.key.source}#{contact.key.id}"

@@ -1,14 +1,14 @@
-"""The whole demonstration: table, far end, controller, touches, rows, picture."""
+"""Runs the demonstration: far end, controller, recorded touches, rows, picture."""
 
 import asyncio
 from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import TypeAlias
 
-from controller.demo.far_end import OPTIONS, open_far_end
+from controller.demo.far_end import SIM_OPTIONS, open_far_end
 from controller.demo.picture import choose_rows, touches_figure
 from controller.demo.recorder import TouchRecorder
-from controller.demo.rows import TouchRow
+from controller.demo.touch_row import TouchRow
 from controller.loop.loop import Controller
 from controller.sources.capture import read_capture, replay_capture
 from controller.sources.contacts import CONTACT_TIMEOUT
@@ -26,78 +26,23 @@ from model.table.timing import Timing
 Play: TypeAlias = Callable[[], Awaitable[None]]
 RecordedTouches: TypeAlias = Callable[[], Awaitable[tuple[TouchSource, Play]]]
 
-WIRES = (*OPTIONS, "sim")
+WIRES = (*SIM_OPTIONS, "sim")
 
-# The plate rings on for a moment after the last touch.
-AFTERGLOW = 0.1
+DECAY = 0.1
+"""Time [s] for the plate to ring down after the last touch."""
 
 
 def example_touches_path() -> Path:
-    """Where the recorded touches lie that the demonstration plays by itself.
-
-    A wheel carries them beside this package; a checkout has them in its examples only.
-    """
+    """The recorded touches of the demonstration: installed with this package, or in a checkout."""
     package = Path(__file__).parents[1]
     installed = package / "data" / "touches.tuio"
     return installed if installed.exists() else package.parent / "examples" / "touches.tuio"
 
 
-async def run_demo(
-    rig_file: Path,
-    table: LocalizationTable,
-    *,
-    wire: str,
-    touches: RecordedTouches,
-    on_row: Callable[[TouchRow], None],
-) -> list[TouchRow]:
-    """Play recorded touches into a controller, over a wire, onto a simulated plate.
-
-    wire: one of WIRES; touches: from `read_touches`. on_row is called with every row as it is
-    complete; all are returned in order of time. Raises LinkError if the far end is lost.
-    """
-    rig = load_rig(rig_file)
-    async with open_far_end(rig_file, rig.amplifiers, wire=wire) as far_end:
-        source, play = await touches()
-        recorder = TouchRecorder(far_end.bench, on_row=on_row)
-        controller = Controller(
-            rig,
-            table,
-            amplifiers={name: Amplifier(open_backend(url)) for name, url in far_end.urls.items()},
-            sources=[source],
-            observer=recorder.observer,
-            timing=Timing(table),
-        )
-
-        async def play_from_now() -> None:
-            recorder.begin()
-            await play()
-
-        await controller.open()
-        try:
-            with no_long_collections():
-                await _drive(controller, play_from_now)
-            await recorder.finish()
-        finally:
-            await controller.close()
-    return recorder.rows
-
-
-def write_picture(table: LocalizationTable, rows: list[TouchRow], folder: Path) -> list[Path]:
-    """Draw some of the touches into a folder; no file where none was played."""
-    chosen = choose_rows(rows)
-    if not chosen:
-        return []
-    folder.mkdir(parents=True, exist_ok=True)
-    path = folder / "touches.png"
-    save_figure(touches_figure(table, chosen), path)
-    return [path]
-
-
 def read_touches(path: Path) -> RecordedTouches:
-    """Read a TUIO capture, or an evemu recording (.events).
+    """Read a TUIO capture or an evemu recording (.events); raises InputError.
 
-    What is returned opens its source, and says what to await while it plays. Raises InputError for
-    a recording that is none.
+    Return a function that opens the touch source and returns it with a function that plays it.
     """
     if path.suffix == ".events":
         recording = EvemuSource(f"evemu:{path}")
@@ -116,20 +61,65 @@ def read_touches(path: Path) -> RecordedTouches:
     return open_port
 
 
-async def _drive(controller: Controller, play: Play) -> None:
-    """Arm, let the touches come, and wait until the last one has been noticed as lifted."""
-    await controller.arm()
-    tasks = [asyncio.create_task(controller.run()), asyncio.create_task(_play_out(play))]
-    try:
-        done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
-        for task in done:
-            task.result()
-    finally:
-        for task in tasks:
-            task.cancel()
-        await asyncio.gather(*tasks, return_exceptions=True)
+async def run_demo(
+    rig_file: Path,
+    table: LocalizationTable,
+    *,
+    wire: str,
+    touches: RecordedTouches,
+    on_row: Callable[[TouchRow], None],
+) -> list[TouchRow]:
+    """Play recorded touches into a controller, over a wire, onto a simulated plate.
+
+    wire: one of WIRES; touches: from `read_touches`; on_row: called with each row when complete.
+    Return all rows in order of time. Raises LinkError if the far end is lost.
+    """
+    rig = load_rig(rig_file)
+    async with open_far_end(rig_file, rig.amplifiers, wire=wire) as far_end:
+        source, play = await touches()
+        recorder = TouchRecorder(far_end.plate, on_row=on_row)
+        controller = Controller(
+            rig,
+            table,
+            amplifiers={name: Amplifier(open_backend(url)) for name, url in far_end.urls.items()},
+            sources=[source],
+            observer=recorder.observer,
+            timing=Timing(table),
+        )
+        await controller.open()
+        try:
+            with no_long_collections():
+                await controller.arm()
+                running = asyncio.create_task(controller.run())
+                playing = asyncio.create_task(_play(play, recorder))
+                try:
+                    await asyncio.wait({running, playing}, return_when=asyncio.FIRST_COMPLETED)
+                    for task in (running, playing):
+                        if task.done():
+                            task.result()
+                finally:
+                    running.cancel()
+                    playing.cancel()
+                    await asyncio.gather(running, playing, return_exceptions=True)
+            await recorder.finish()
+        finally:
+            await controller.close()
+    return recorder.rows
 
 
-async def _play_out(play: Play) -> None:
+async def _play(play: Play, recorder: TouchRecorder) -> None:
+    """Play the touches and wait until the last one counts as lifted and the plate is at rest."""
+    recorder.begin()
     await play()
-    await asyncio.sleep(CONTACT_TIMEOUT + AFTERGLOW)
+    await asyncio.sleep(CONTACT_TIMEOUT + DECAY)
+
+
+def write_picture(table: LocalizationTable, rows: list[TouchRow], folder: Path) -> list[Path]:
+    """Draw some of the touches into a folder; return no file if nothing was played."""
+    chosen = choose_rows(rows)
+    if not chosen:
+        return []
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / "touches.png"
+    save_figure(touches_figure(table, chosen), path)
+    return [path]

@@ -6,16 +6,13 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
 from model.commands.next_line import next_line
 from model.commands.plate_cli import JsonOption, MeshOption, RigArgument
 from model.counting import counted
-
-if TYPE_CHECKING:
-    from model.studies.workers import Workers
 
 study_app = typer.Typer()
 
@@ -67,17 +64,18 @@ def study(
     mesh: MeshOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Compare layouts of ERAs by how strongly the plate vibrates. Goes on where one stopped."""
+    """Compare layouts of ERAs by how strongly the plate vibrates; an interrupted study resumes."""
     from model.config.document import read_document
     from model.config.points import parse_frequencies, parse_pair
     from model.errors import InputError
     from model.rig.file import load_rig
-    from model.studies.cache import ResultCache
+    from model.studies.finished import FinishedCases
     from model.studies.kinds import STUDIES
     from model.studies.outcome import ranking_summary, write_outcome
     from model.studies.ranking import rank
     from model.studies.run import run_study
     from model.studies.solve import DRIVES, study_problem
+    from model.studies.workers import on_cluster, on_processes
 
     rig = load_rig(rig_file, mesh=mesh)
     if what is not Study.COUNT and active is Driven.TWO and len(rig.eras) < 2:
@@ -91,17 +89,21 @@ def study(
         rig, layouts=layouts, seed=seed, raster=parse_pair(candidates, what="--candidates")
     )
     problem = study_problem(rig, cases, parse_frequencies(frequencies))
-    cache = ResultCache(output / "chunks", problem.digest)
     output.mkdir(parents=True, exist_ok=True)
+    finished = FinishedCases(output, problem.digest)
     with _progress(len(cases)) as advance:
         try:
             run = run_study(
-                problem, cases, workers=_who(workers, cluster), cache=cache, progress=advance
+                problem,
+                cases,
+                workers=on_processes(workers) if cluster is None else on_cluster(cluster),
+                finished=finished,
+                progress=advance,
             )
         except KeyboardInterrupt:
             typer.echo(
-                f"era: interrupted; what is done is kept in {cache.folder}, and the same command "
-                "goes on from there",
+                f"era: interrupted; finished cases are in {finished.path}, run the same command "
+                "to resume",
                 err=True,
             )
             raise
@@ -157,16 +159,6 @@ def _show(summary: dict[str, Any]) -> None:
     if not recommended["supported"]:
         print("No layout supports the plate: put at least three ERAs under it, not in one line")
     print(f"Recommended{why}: {recommended['words']}")
-
-
-def _who(workers: int, cluster: str | None) -> "Workers":
-    """Who solves: this process, more of them, or a cluster."""
-    from model.studies.cluster import on_cluster
-    from model.studies.workers import in_process, on_processes
-
-    if cluster is not None:
-        return on_cluster(cluster)
-    return on_processes(workers) if workers > 1 else in_process
 
 
 @contextmanager

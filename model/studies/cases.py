@@ -37,14 +37,11 @@ class Cases:
     def __len__(self) -> int:
         return len(self.places)
 
-    def part(self, start: int, stop: int) -> "Cases":
-        """Cases start to stop - 1."""
-        return Cases(
-            self.positions,
-            self.places[start:stop],
-            self.stiffness_factors[start:stop],
-            self.names[start:stop],
-        )
+    def take(self, numbers: IntArray | range) -> "Cases":
+        """The cases of these numbers."""
+        rows = np.asarray(numbers)
+        names = tuple(self.names[row] for row in rows)
+        return Cases(self.positions, self.places[rows], self.stiffness_factors[rows], names)
 
     def places_of(self, case: int) -> IntArray:
         """Numbers of the positions of one case's ERAs, (eras,)."""

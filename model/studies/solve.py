@@ -81,6 +81,14 @@ class CaseResults:
         return tuple(era for era in range(bits.bit_length()) if bits >> era & 1)
 
 
+def empty_results(count: int) -> CaseResults:
+    """Results of no case, with room for so many."""
+    return CaseResults(
+        np.full((count, len(DRIVES), len(STATISTICS)), np.nan),
+        np.zeros((count, len(DRIVES)), dtype=np.uint64),
+    )
+
+
 def study_problem(rig: Rig, cases: Cases, frequencies: FloatArray) -> StudyProblem:
     """The problem of a study; raises InputError for frequencies (f,) [Hz] that no mesh carries."""
     if len(frequencies) == 0:
@@ -92,8 +100,7 @@ def study_problem(rig: Rig, cases: Cases, frequencies: FloatArray) -> StudyProbl
 def solve_cases(receptances: Receptances, eras: tuple[Era, ...], cases: Cases) -> CaseResults:
     """Statistics of every case, its ERAs like those of the rig; no case depends on another."""
     felt = felt_acceleration(receptances.frequencies)
-    statistics = np.full((len(cases), len(DRIVES), len(STATISTICS)), np.nan)
-    active = np.zeros((len(cases), len(DRIVES)), dtype=np.uint64)
+    results = empty_results(len(cases))
     rooms: dict[int, ComplexArray] = {}
     for case in range(len(cases)):
         placed = cases.eras_of(case, eras)
@@ -110,6 +117,6 @@ def solve_cases(receptances: Receptances, eras: tuple[Era, ...], cases: Cases) -
                 continue
             # Equal by symmetry is equal: the first then, not the one that rounding favours.
             best = max(rows, key=lambda row: float(f"{every[row, MEDIAN]:.9g}"))
-            statistics[case, drive] = every[best]
-            active[case, drive] = sum(1 << era for era in sets[best])
-    return CaseResults(statistics, active)
+            results.statistics[case, drive] = every[best]
+            results.active[case, drive] = sum(1 << era for era in sets[best])
+    return results

@@ -2,7 +2,7 @@
 
 from distributed import Client, Worker, WorkerPlugin
 
-from model.studies import cluster
+from model.studies import workers
 from model.version import code_version
 
 
@@ -15,7 +15,7 @@ class SameCode(WorkerPlugin):
     def setup(self, worker: Worker) -> None:
         """In the worker."""
         version = self.version
-        cluster.code_version = lambda: version  # type: ignore[assignment]
+        workers.code_version = lambda: version  # type: ignore[assignment]
 
 
 def give_same_code(address: str) -> None:

@@ -22,7 +22,10 @@ def small_study(*, layouts: int, seed: int = 0) -> tuple[StudyProblem, Cases]:
 def chunks_of(cases: Cases, size: int) -> dict[int, Cases]:
     """Cases in chunks, by number."""
     starts = range(0, len(cases), size)
-    return {number: cases.part(start, start + size) for number, start in enumerate(starts)}
+    return {
+        number: cases.take(range(start, min(start + size, len(cases))))
+        for number, start in enumerate(starts)
+    }
 
 
 def same_to_the_bit(first: Mapping[int, CaseResults], second: Mapping[int, CaseResults]) -> bool:

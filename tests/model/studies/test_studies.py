@@ -14,13 +14,13 @@ from model.fem.harmonic import direct_acceleration
 from model.structure.actuator import Era
 from model.structure.point_load import PointLoad
 from model.structure.point_mass import PointMass
-from model.studies.cache import ResultCache
+from model.studies.finished import FinishedCases
 from model.studies.kinds import count_cases, placement_cases, stiffness_cases
 from model.studies.outcome import ranking_summary
 from model.studies.ranking import era_counts, rank
 from model.studies.run import CHUNK, run_study
 from model.studies.solve import DRIVES, CaseResults, solve_cases, study_problem
-from model.studies.workers import in_process, on_processes
+from model.studies.workers import on_processes
 from model.vibration.activation import MEDIAN, cumulative_statistics
 from paper_plate import make_paper_rig
 from studies import FREQUENCIES, chunks_of, same_to_the_bit, small_study
@@ -56,7 +56,7 @@ def counting(solved):
 
     def solve_and_note(problem, chunks):
         solved.extend(chunks)
-        yield from in_process(problem, chunks)
+        yield from on_processes(1)(problem, chunks)
 
     return solve_and_note
 
@@ -101,7 +101,7 @@ def test_what_the_plate_carries_is_in_the_answer(study):
     loaded = replace(problem.rig, masses=(mass,))
     carried = study_problem(loaded, cases, FREQUENCIES)
     assert carried.digest != problem.digest
-    solved = solve_cases(carried.solve(), loaded.eras, cases.part(8, 9))
+    solved = solve_cases(carried.solve(), loaded.eras, cases.take(range(8, 9)))
     direct = direct_acceleration(
         assemble(loaded.plate, loaded.mesh),
         cases.eras_of(8, loaded.eras),
@@ -132,7 +132,7 @@ def test_more_workers_give_the_same_to_the_bit(study):
     problem, cases = study
     chunks = chunks_of(cases, 30)
     two = dict(on_processes(2)(problem, chunks))
-    assert same_to_the_bit(two, dict(in_process(problem, chunks)))
+    assert same_to_the_bit(two, dict(on_processes(1)(problem, chunks)))
 
 
 def test_a_run_puts_chunks_together_in_order(study, results, tmp_path):
@@ -140,66 +140,66 @@ def test_a_run_puts_chunks_together_in_order(study, results, tmp_path):
     problem, cases = study
 
     def backwards(problem, chunks):
-        yield from reversed(list(in_process(problem, chunks)))
+        yield from reversed(list(on_processes(1)(problem, chunks)))
 
     told = []
     run = run_study(
         problem,
         cases,
         workers=backwards,
-        cache=ResultCache(tmp_path, problem.digest),
+        finished=FinishedCases(tmp_path, problem.digest),
         progress=told.append,
     )
     assert same_to_the_bit({0: run.results}, {0: results})
     assert (sum(told), run.solved_count, run.cached_count) == (len(cases), len(cases), 0)
 
 
-def test_an_interrupted_run_resumes_without_solving_anything_twice(study, results, tmp_path):
+def test_interrupted_run_resumes_without_solving_anything_twice(study, results, tmp_path):
     """Ctrl-C after the first chunk; the second run solves the other two, the third none at all."""
     problem, cases = study
-    cache = ResultCache(tmp_path / "chunks", problem.digest)
 
     def interrupted(problem, chunks):
-        yield next(in_process(problem, chunks))
+        yield next(on_processes(1)(problem, chunks))
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        run_study(problem, cases, workers=interrupted, cache=cache)
+        run_study(
+            problem, cases, workers=interrupted, finished=FinishedCases(tmp_path, problem.digest)
+        )
     asked = []
-    run = run_study(problem, cases, workers=counting(asked), cache=cache)
-    assert asked == [1, 2]
-    assert (run.solved_count, run.cached_count) == (len(cases) - CHUNK, CHUNK)
-    assert same_to_the_bit({0: run.results}, {0: results})
-    run_study(problem, cases, workers=counting(asked), cache=cache)
-    assert asked == [1, 2]
+    for solved in (len(cases) - CHUNK, 0):
+        finished = FinishedCases(tmp_path, problem.digest)
+        run = run_study(problem, cases, workers=counting(asked), finished=finished)
+        assert (run.solved_count, run.cached_count) == (solved, len(cases) - solved)
+        assert same_to_the_bit({0: run.results}, {0: results})
+    assert asked == [0, 1]
+    assert list(tmp_path.iterdir()) == [finished.path]
 
 
 @pytest.mark.parametrize("harm", ["cut", "flipped", "emptied", "foreign", "an array"])
-def test_a_damaged_chunk_is_told_and_solved_again(study, results, tmp_path, caplog, harm):
-    """Cut short, a bit flipped, empty, or not a chunk at all: one warning, right numbers."""
+def test_damaged_file_is_logged_and_solved_again(study, results, tmp_path, caplog, harm):
+    """Cut short, a bit flipped, empty, or not such a file at all: one warning, right numbers."""
     problem, cases = study
-    cache = ResultCache(tmp_path, problem.digest)
-    run_study(problem, cases, workers=in_process, cache=cache)
-    chunk = sorted(tmp_path.iterdir())[1]
-    content = chunk.read_bytes()
+    finished = FinishedCases(tmp_path, problem.digest)
+    finished.add(cases, results)
+    content = finished.path.read_bytes()
     middle = len(content) // 3
-    chunk.write_bytes(
+    finished.path.write_bytes(
         {
             "cut": content[:middle],
             "flipped": content[:middle] + bytes([content[middle] ^ 1]) + content[middle + 1 :],
             "emptied": b"",
-            "foreign": b"PK\x03\x04 not a chunk",
+            "foreign": b"PK\x03\x04 not such a file",
             "an array": npy_bytes(np.zeros(3)),
         }[harm]
     )
-    asked = []
     with caplog.at_level(logging.WARNING):
-        run = run_study(problem, cases, workers=counting(asked), cache=cache)
-    assert len(asked) == 1
-    assert [record.args[0] for record in caplog.records] == [chunk]
-    assert "again" in caplog.text
+        again = FinishedCases(tmp_path, problem.digest)
+    assert [record.args[0] for record in caplog.records] == [finished.path]
+    assert not again.find(cases)[0].any()
+    run = run_study(problem, cases, workers=on_processes(1), finished=again)
     assert same_to_the_bit({0: run.results}, {0: results})
-    assert chunk.read_bytes() == content
+    assert finished.path.read_bytes() == content
 
 
 @pytest.mark.parametrize(
@@ -212,27 +212,30 @@ def test_a_damaged_chunk_is_told_and_solved_again(study, results, tmp_path, capl
     ],
     ids=["frequencies", "code", "mesh", "ERAs"],
 )
-def test_what_another_problem_left_is_not_used(study, tmp_path, change):
-    """Results are kept by all that made them."""
+def test_results_of_another_problem_are_not_used(study, results, tmp_path, change):
+    """Each problem has a file of its own, and no other may be renamed to it."""
     problem, cases = study
-    part = cases.part(0, 4)
-    solved = solve_cases(problem.solve(), problem.rig.eras, part)
-    ResultCache(tmp_path, problem.digest).store(part, solved)
-    assert ResultCache(tmp_path, problem.digest).load(part) is not None
-    assert ResultCache(tmp_path, replace(problem, **change).digest).load(part) is None
+    FinishedCases(tmp_path, problem.digest).add(cases, results)
+    other = replace(problem, **change).digest
+    assert FinishedCases(tmp_path, problem.digest).find(cases)[0].all()
+    assert not FinishedCases(tmp_path, other).find(cases)[0].any()
+    ours = FinishedCases(tmp_path, problem.digest).path
+    ours.rename(FinishedCases(tmp_path, other).path)
+    assert not FinishedCases(tmp_path, other).find(cases)[0].any()
 
 
-def test_results_are_kept_by_the_cases_themselves(study, tmp_path):
+def test_results_are_found_by_the_cases_themselves(study, results, tmp_path):
     """The same layouts of a longer list are found again, others or stiffer ones are not."""
     problem, cases = study
-    solved = solve_cases(problem.solve(), problem.rig.eras, cases.part(0, 4))
-    cache = ResultCache(tmp_path, problem.digest)
-    cache.store(cases.part(0, 4), solved)
+    first = cases.take(range(4))
+    finished = FinishedCases(tmp_path, problem.digest)
+    finished.add(first, CaseResults(results.statistics[:4], results.active[:4]))
     longer = placement_cases(problem.rig, layouts=900, seed=0, raster=(7, 5))
-    assert cache.load(longer.part(0, 4)) is not None
-    assert cache.load(longer.part(1, 5)) is None
-    stiffer = replace(longer.part(0, 4), stiffness_factors=np.array([1.0, 1.0, 1.0, 2.0]))
-    assert cache.load(stiffer) is None
+    done, found = finished.find(longer.take(range(1, 6)))
+    assert done.tolist() == [True, True, True, False, False]
+    np.testing.assert_array_equal(found.statistics[:3], results.statistics[1:4])
+    stiffer = replace(first, stiffness_factors=np.array([1.0, 1.0, 1.0, 2.0]))
+    assert finished.find(stiffer)[0].tolist() == [True, True, True, False]
 
 
 def test_a_worker_process_that_dies_is_replaced(study, results, caplog):
@@ -247,7 +250,7 @@ def test_a_worker_process_that_dies_is_replaced(study, results, caplog):
     for worker in workers:
         worker.kill()
     there |= dict(solving)
-    assert same_to_the_bit(there, dict(in_process(problem, chunks)))
+    assert same_to_the_bit(there, dict(on_processes(1)(problem, chunks)))
     assert "died" in caplog.text
 
 
@@ -266,7 +269,7 @@ def test_the_ranking_is_by_the_median_of_the_drive(study, results):
 def test_the_rig_as_it_is_is_told_even_from_the_end_of_the_ranking(study):
     """Ten cases and, where it is not among them, the rig's own with its rank."""
     problem, cases = study
-    part = cases.part(0, 30)
+    part = cases.take(range(0, 30))
     statistics = np.ones((30, 3, 6))
     statistics[:, 1, MEDIAN] = np.arange(30)  # the first one, the rig's, comes last
     results = CaseResults(statistics, np.ones((30, 3), dtype=np.uint64))
@@ -289,7 +292,9 @@ def test_unsupported_layouts_are_marked_and_not_recommended() -> None:
     assert ranking.supported[ranking.recommended]
     summary = ranking_summary(rig, ranking)
     assert [case["supported"] for case in summary["ranking"]] == ranking.supported.tolist()
-    nothing = rank(rig, cases.part(0, 2), CaseResults(statistics[:2], results.active[:2]), drive=1)
+    nothing = rank(
+        rig, cases.take(range(0, 2)), CaseResults(statistics[:2], results.active[:2]), drive=1
+    )
     assert nothing.recommended == 0
 
 

@@ -35,7 +35,7 @@ SCREENS = (
     Screen("phone_across", 844, 390, is_phone=True),
     Screen("small_phone", 320, 568, is_phone=True),
 )
-STATE = "document.querySelector('#state').dataset.state"
+STATE = "document.querySelector('#state')?.dataset.state"
 PLACES = ((0.2, 0.7), (0.72, 0.74))
 """On the keypad and on the knob of the example's layout, as `on_plate` has it."""
 

@@ -27,7 +27,7 @@ from drivers.protocol.messages import AmplifierEvent, AmplifierState, Fault
 from drivers.registry import open_backend
 from memory_machine import live_in_memory
 from model.rig.rig import Rig
-from reopened import reopen
+from reconnection import reconnect
 from sim.far_ends.wires import Wire
 from sim.faults.fault_window import FaultKind, FaultWindow
 from virtual_loop import run_virtual
@@ -59,7 +59,7 @@ class Link:
         self.amplifier.listen(self.events.append)
 
     async def __aenter__(self) -> "Link":
-        await reopen(self.amplifier)
+        await reconnect(self.amplifier)
         self.guard = Guard(LIMITS, self.amplifier.capabilities)
         return self
 
@@ -72,7 +72,7 @@ class Link:
         async with asyncio.timeout(60):
             while True:
                 with contextlib.suppress(LinkError, CommandRefused):  # not yet silent
-                    await reopen(self.amplifier, tries=20, pause=0.0)
+                    await reconnect(self.amplifier, tries=20, pause=0.0)
                     await self.amplifier.clear()
                     await self.amplifier.arm(2.0)
                     return
@@ -146,7 +146,7 @@ async def test_a_link_that_is_cut_leaves_silence_and_is_told(far: FarSide, kind:
         assert far.silent_from() - max(fed, fed_at(far)) <= WATCHDOG + REACTION + 1e-9
         await eventually(lambda: far.device.status().state is AmplifierState.FAULT)
         far.device.recover()
-        await reopen(link.amplifier, tries=200)
+        await reconnect(link.amplifier, tries=200)
         status = await link.amplifier.status()  # that it was opened again has armed nothing
         assert (status.state, status.levels) == (AmplifierState.FAULT, (0.0,) * 4)
 
@@ -164,7 +164,7 @@ async def test_a_wire_that_is_pulled_out_is_told_within_60_ms(far: FarSide) -> N
             if took[-1] <= 0.060:
                 return
             far.device.recover()
-            await reopen(host.amplifier, tries=200)
+            await reconnect(host.amplifier, tries=200)
     raise AssertionError(f"told after {', '.join(f'{1e3 * one:.0f} ms' for one in took)}")
 
 
@@ -430,7 +430,7 @@ async def test_a_reboot_is_noticed_and_nothing_is_armed(far: FarSide) -> None:
         try:
             status = await link.amplifier.heartbeat()
         except LinkError:  # of a wire that tells by itself who has started anew
-            await reopen(link.amplifier, tries=50)
+            await reconnect(link.amplifier, tries=50)
             status = await link.amplifier.status()
         assert status.state is AmplifierState.SWITCH_ON_DISABLED
         with pytest.raises(CommandRefused):
@@ -444,7 +444,7 @@ async def test_another_amplifier_is_refused(far: FarSide) -> None:
         own = far.amplifier.identity
         far.amplifier.identity = type(own)(own.vendor, own.product, "OTHER", own.firmware, 1)
         with pytest.raises(LinkError, match="SIM-main, got OTHER"):
-            await reopen(link.amplifier, tries=3, pause=0.0)
+            await reconnect(link.amplifier, tries=3, pause=0.0)
         assert link.amplifier.is_lost
 
 
@@ -514,7 +514,7 @@ async def test_a_hundred_replugs_leak_nothing(far: FarSide) -> None:
             with pytest.raises(LinkError):
                 await beat(link.amplifier, MAX_MISSED_HEARTBEATS)
             far.device.recover()
-            await reopen(link.amplifier, tries=200)
+            await reconnect(link.amplifier, tries=200)
             if number == 4:
                 before = in_use()
         after = in_use()

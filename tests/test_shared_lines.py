@@ -16,7 +16,7 @@ from drivers.guard import Guard, GuardLimits, SafeCommandSet
 from drivers.protocol.messages import AmplifierState, Status
 from drivers.registry import open_backend
 from model.rig.rig import Channel, Rig
-from reopened import reopen
+from reconnection import reconnect
 from sim.far_ends.wires import Wire
 from sim.faults.fault_window import FaultWindow
 from wires import SHARED_WIRES, FarSide, far_side, patient
@@ -130,7 +130,7 @@ async def test_a_close_that_is_cancelled_is_a_close(far: FarSide) -> None:
     with contextlib.suppress(asyncio.CancelledError):
         await closing
     other = Amplifier(open_backend(patient(far.url)), reply_timeout=1.0)
-    await reopen(other, tries=200)
+    await reconnect(other, tries=200)
     await other.close()
 
 
@@ -151,10 +151,10 @@ async def test_one_comes_back_while_the_other_is_left_lost(wire: Wire, two_ampli
                         await one.status()
         for device in far.devices.values():
             device.recover()
-        await reopen(east, tries=200)
+        await reconnect(east, tries=200)
         with pytest.raises(LinkError):
             await west.status()
-        await reopen(west, tries=200)
+        await reconnect(west, tries=200)
         assert (
             (await east.status()).state
             is (await west.status()).state

@@ -1,4 +1,4 @@
-"""A lost amplifier, opened again as the daemon does it: disarmed, and armed by nobody."""
+"""A lost amplifier is opened again as the daemon does it: disarmed."""
 
 import asyncio
 
@@ -8,7 +8,7 @@ from drivers.protocol.messages import AmplifierState
 
 
 async def reconnect(amplifier: Amplifier, *, tries: int = 100, pause: float = 0.01) -> None:
-    """Open it, at the latest with the last try; what keeps that one from it is raised.
+    """Open it within a number of tries; the last failure is raised.
 
     pause [s]: between tries.
     """

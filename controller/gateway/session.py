@@ -207,6 +207,8 @@ class Session:
         if method is None:
             raise unknown_method(request.method, METHODS)
         params = read_params(method.params, request)
+        if request.method == "arm" and not request.expects_response:
+            return  # without a response the browser has no lease to renew or end
         if request.method == "stop":
             if self._pending_stops >= MAX_PENDING_STOPS:
                 raise RpcError(

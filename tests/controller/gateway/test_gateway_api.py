@@ -1,4 +1,4 @@
-"""What the gateway offers to those that it lets in: HTTP, its description, and the WebSocket."""
+"""The gateway for allowed clients: HTTP, OpenAPI and the WebSocket."""
 
 import json
 import re
@@ -14,6 +14,7 @@ from controller.api.methods import METHODS, TouchParams
 from controller.api.schema import PlayedTone
 from controller.api.topics import LogEvent, PatternEvent
 from gateway_bench import (
+    ARM,
     TOKEN,
     GatewayProcess,
     RawWebSocket,
@@ -31,7 +32,7 @@ ALLOWED = "https://panel.example"
 def gateway(
     daemon: ScriptedDaemon, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[GatewayProcess]:
-    """One for all tests here, that lets in the pages of another origin, too."""
+    """One gateway for all tests, with a further allowed origin and host."""
     folder = tmp_path_factory.mktemp("gateway")
     options = ("--allow-origin", ALLOWED, "--allow-host", "panel.example")
     with gateway_process(folder, daemon.socket, *options) as made:
@@ -40,8 +41,8 @@ def gateway(
 
 
 @pytest.fixture(autouse=True)
-def nothing_asked_yet(daemon: ScriptedDaemon) -> None:
-    """Each test sees what itself has asked."""
+def no_calls_yet(daemon: ScriptedDaemon) -> None:
+    """Each test sees its own calls."""
     daemon.calls.clear()
 
 
@@ -59,59 +60,56 @@ PARAMETERS: dict[str, dict[str, object]] = {
 }
 
 
-def ask(gateway: GatewayProcess, method: str) -> tuple[int, dict[str, object]]:
-    """A method over HTTP: status and what it says."""
-    answer = http(gateway, f"/api/v1/{method}", body=json.dumps(PARAMETERS[method]).encode())
-    return answer.status, json.loads(answer.body)
+def call(gateway: GatewayProcess, method: str) -> tuple[int, dict[str, object]]:
+    """Call a method over HTTP; status and body."""
+    response = http(gateway, f"/api/v1/{method}", body=json.dumps(PARAMETERS[method]).encode())
+    return response.status, json.loads(response.body)
 
 
 @pytest.mark.parametrize("method", [name for name in PARAMETERS if name not in ("hello", "play")])
-def test_a_method_over_http_is_the_daemons(
+def test_http_method_is_forwarded_to_the_daemon(
     gateway: GatewayProcess, daemon: ScriptedDaemon, method: str
 ) -> None:
-    """It is asked once, with these parameters, and its result comes back as the API says."""
-    status, said = ask(gateway, method)
+    """Once, and its result is returned as documented."""
+    status, result = call(gateway, method)
     assert status == 200
-    METHODS[method].result.model_validate_json(json.dumps(said))
+    METHODS[method].result.model_validate_json(json.dumps(result))
     assert daemon.methods == [method]
 
 
-def test_all_methods_but_those_of_notifications_are_there_over_http() -> None:
-    """Subscriptions need a connection that stays."""
-    assert METHODS.keys() - PARAMETERS.keys() == {"subscribe", "unsubscribe"}
-
-
-def test_an_error_of_the_daemon_keeps_its_code_and_remedy(gateway: GatewayProcess) -> None:
-    """What the daemon refuses is 409, with the words, code and remedy of the API."""
-    status, said = ask(gateway, "play")
+def test_http_error_has_the_code_and_data_of_the_api(gateway: GatewayProcess) -> None:
+    """A refusal of the daemon is 409."""
+    status, body = call(gateway, "play")
     assert status == 409
-    assert said == {
+    assert body == {
         "error": "there is no such effect; see effects",
         "code": 1003,
         "data": {"what": "there is no such effect", "where": None, "remedy": "see effects"},
     }
 
 
-def test_nobody_can_give_the_gateway_another_name(
+def test_http_hello_is_answered_by_the_gateway(
     gateway: GatewayProcess, daemon: ScriptedDaemon
 ) -> None:
-    """The gateway answers hello itself: the daemon goes on to log it by its own name."""
-    status, said = ask(gateway, "hello")
+    """So that no client can rename the gateway in the daemon's log."""
+    status, result = call(gateway, "hello")
     assert status == 200
-    assert said["api_version"] == "1.0"
+    assert result["api_version"] == "1.0"
     assert daemon.calls == []
 
 
-def test_touches_over_http_say_so(gateway: GatewayProcess, daemon: ScriptedDaemon) -> None:
-    """Their source cannot be taken for one of a browser."""
-    ask(gateway, "touch")
+def test_http_touches_have_a_source_prefix(gateway: GatewayProcess, daemon: ScriptedDaemon) -> None:
+    """Distinct from those of WebSockets."""
+    call(gateway, "touch")
     (params,) = [params for _, params in daemon.calls]
     assert isinstance(params, TouchParams)
     assert params.source == "http:me"
 
 
-def test_an_empty_body_is_no_parameters(gateway: GatewayProcess, daemon: ScriptedDaemon) -> None:
-    """A stop needs nothing but the token, not even the type of nothing."""
+def test_http_method_without_parameters_needs_no_body(
+    gateway: GatewayProcess, daemon: ScriptedDaemon
+) -> None:
+    """Nor a content type: a stop needs only the token."""
     assert http(gateway, "/api/v1/stop", body=b"").status == 200
     assert http(gateway, "/api/v1/stop", body=b"", media=None).status == 200
     assert daemon.methods == ["stop", "stop"]
@@ -120,31 +118,31 @@ def test_an_empty_body_is_no_parameters(gateway: GatewayProcess, daemon: Scripte
 @pytest.mark.parametrize(
     "file", ["", *sorted(p.name for p in Path("controller/gateway/page").glob("*"))]
 )
-def test_a_file_of_the_page_is_for_everybody(gateway: GatewayProcess, file: str) -> None:
-    """Without a token, never from an old copy, and with a policy to load nothing from outside."""
-    answer = http(gateway, f"/{file}", method="GET", body=b"", token=())
-    assert answer.status == 200
-    headers = answer.headers.lower()
+def test_page_file_is_served_without_a_token(gateway: GatewayProcess, file: str) -> None:
+    """With the security headers, and without references to other hosts."""
+    response = http(gateway, f"/{file}", method="GET", body=b"", token=())
+    assert response.status == 200
+    headers = response.headers.lower()
     assert "content-security-policy: default-src 'none'; script-src 'self';" in headers
     assert "x-content-type-options: nosniff" in headers
     assert "x-frame-options: deny" in headers
     assert "cache-control: no-cache" in headers
     assert "\r\nserver:" not in headers
-    named = set(re.findall(rb"(?:https?:)?//[\w.-]+\.\w+", answer.body))
-    assert named <= {b"http://www.w3.org"}  # the name of SVG, which nothing fetches
+    named = set(re.findall(rb"(?:https?:)?//[\w.-]+\.\w+", response.body))
+    assert named <= {b"http://www.w3.org"}  # the namespace of SVG, not fetched
 
 
-def test_a_link_to_the_page_can_be_followed(gateway: GatewayProcess) -> None:
-    """From a page of others, as a visit; not as a part of it."""
+def test_page_can_be_opened_by_a_foreign_link(gateway: GatewayProcess) -> None:
+    """But not embedded in the foreign page."""
     visit = ["Sec-Fetch-Site: cross-site", "Sec-Fetch-Mode: navigate"]
     part = ["Sec-Fetch-Site: cross-site", "Sec-Fetch-Mode: no-cors"]
     assert http(gateway, "/", method="GET", body=b"", more=visit).status == 200
     assert http(gateway, "/app.js", method="GET", body=b"", more=part).status == 403
 
 
-def test_an_allowed_origin_may_ask_and_read(gateway: GatewayProcess) -> None:
-    """Its preflight is granted for this one origin, and so is reading the answer."""
-    said = http(
+def test_allowed_origin_may_call_and_read(gateway: GatewayProcess) -> None:
+    """Preflight and response allow this origin, and only to its requests."""
+    response = http(
         gateway,
         method="OPTIONS",
         body=b"",
@@ -155,36 +153,35 @@ def test_an_allowed_origin_may_ask_and_read(gateway: GatewayProcess) -> None:
             "Access-Control-Request-Headers: authorization, content-type",
         ],
     )
-    assert said.status == 200
-    assert f"access-control-allow-origin: {ALLOWED}" in said.headers.lower()
-    said = http(gateway, more=[f"Origin: {ALLOWED}"])
-    assert said.status == 200
-    assert f"access-control-allow-origin: {ALLOWED}" in said.headers.lower()
+    for each in (response, http(gateway, more=[f"Origin: {ALLOWED}"])):
+        assert each.status == 200
+        assert f"access-control-allow-origin: {ALLOWED}" in each.headers.lower()
     assert "access-control" not in http(gateway).headers.lower()
 
 
-def test_an_allowed_host_is_served(gateway: GatewayProcess) -> None:
-    """Under the name that was allowed, in any case and with any port."""
+def test_allowed_host_is_served(gateway: GatewayProcess) -> None:
+    """In any case and with any port."""
     assert http(gateway, host=["PANEL.example:443"]).status == 200
 
 
-def test_the_description_is_of_what_is_there(gateway: GatewayProcess) -> None:
-    """Every method, with its parameters, results and errors, for whoever has no token yet."""
-    answer = http(gateway, "/api/v1/openapi.json", method="GET", body=b"", token=())
-    described = json.loads(answer.body)
-    assert described["openapi"].startswith("3.1")
-    assert set(described["paths"]) == {f"/api/v1/{name}" for name in PARAMETERS}
-    arm = described["paths"]["/api/v1/arm"]["post"]
+def test_openapi_describes_every_http_method(gateway: GatewayProcess) -> None:
+    """With parameters, results and errors; no token needed. Subscriptions need a WebSocket."""
+    response = http(gateway, "/api/v1/openapi.json", method="GET", body=b"", token=())
+    document = json.loads(response.body)
+    assert document["openapi"].startswith("3.1")
+    assert set(document["paths"]) == {f"/api/v1/{name}" for name in PARAMETERS}
+    assert METHODS.keys() - PARAMETERS.keys() == {"subscribe", "unsubscribe"}
+    arm = document["paths"]["/api/v1/arm"]["post"]
     assert set(arm["responses"]) >= {"200", "401", "403", "409", "413", "415", "421", "422", "429"}
-    lease = described["components"]["schemas"]["ArmParams"]["properties"]["lease_s"]
+    lease = document["components"]["schemas"]["ArmParams"]["properties"]["lease_s"]
     assert (lease["minimum"], lease["maximum"]) == (1.0, 60.0)
 
 
-def test_requests_made_from_the_description_find_no_fault(
+def test_openapi_matches_the_responses(
     gateway: GatewayProcess, daemon: ScriptedDaemon, tmp_path: Path
 ) -> None:
-    """Schemathesis makes good and bad requests of every method; all is answered as described."""
-    # By JSON Schema 1.0 is an integer; by the API a finger's id is one without a point.
+    """Schemathesis makes valid and invalid requests of every method."""
+    # JSON Schema accepts 1.0 as an integer, the API does not.
     (tmp_path / "schemathesis.toml").write_text(
         '[[operations]]\ninclude-name = "POST /api/v1/touch"\n'
         "checks.positive_data_acceptance.enabled = false\n",
@@ -210,13 +207,13 @@ def test_requests_made_from_the_description_find_no_fault(
 
 
 def subscribe(ws: RawWebSocket, *topics: str) -> None:
-    """Be told of topics."""
+    """Subscribe to topics."""
     ws.call("subscribe", {"topics": topics}, id=100)
     assert ws.response(100)["result"] == {}
 
 
-def told(ws: RawWebSocket, topic: str) -> dict[str, object] | None:
-    """The data of a topic's next notification."""
+def next_event(ws: RawWebSocket, topic: str) -> dict[str, object] | None:
+    """The data of the next event of a topic."""
     while True:
         opcode, payload = ws.next()
         assert opcode in (1, 2), payload
@@ -225,30 +222,37 @@ def told(ws: RawWebSocket, topic: str) -> dict[str, object] | None:
             return params["data"]  # type: ignore[no-any-return]
 
 
-def test_a_browser_is_told_what_is_so_and_what_happens(
+def test_websocket_receives_current_state_and_events(
     gateway: GatewayProcess, daemon: ScriptedDaemon
 ) -> None:
-    """At once who the daemon is and its state, then every event, its text as it was."""
+    """`hello` and state at once, then every event, its text unchanged."""
     text = '<img src=x onerror=alert(1)> "quoted" \u2028'
     with RawWebSocket(gateway) as ws:
         subscribe(ws, "hello", "state", "log")
-        state = told(ws, "state")
+        state = next_event(ws, "state")
         assert state is not None
         assert state["new"] == "READY_TO_SWITCH_ON"
-        hello = told(ws, "hello")
+        hello = next_event(ws, "hello")
         assert hello is not None
         rig = hello["rig"]
         assert isinstance(rig, dict)
         assert rig["length_m"] == pytest.approx(0.3048)  # 12 inches, as in the rig's file
         daemon.publish("log", LogEvent(level="error", message=text, cause=text, remedy=text))
-        assert told(ws, "log") == {"level": "error", "message": text, "cause": text, "remedy": text}
+        assert next_event(ws, "log") == {
+            "level": "error",
+            "message": text,
+            "cause": text,
+            "remedy": text,
+        }
 
 
-def test_the_field_is_that_of_the_drive(gateway: GatewayProcess, daemon: ScriptedDaemon) -> None:
-    """By the layout of docs/reference/gateway.md.
+def test_websocket_receives_the_field_of_the_drive(
+    gateway: GatewayProcess, daemon: ScriptedDaemon
+) -> None:
+    """Encoded as docs/reference/gateway.md says.
 
-    Below all natural frequencies the plate is a board on four springs: pushed at its south-west
-    corner it moves most there, least at the far one.
+    Far below the first natural frequency the plate is rigid on four springs: driven at its
+    south-west corner it moves most there.
     """
     with RawWebSocket(gateway) as ws:
         subscribe(ws, "field")
@@ -282,10 +286,10 @@ def test_the_field_is_that_of_the_drive(gateway: GatewayProcess, daemon: Scripte
     assert south_west > 2 * max(south_east, north_west)
 
 
-def test_browsers_fingers_are_kept_apart_and_lifted_when_they_leave(
+def test_websocket_touches_are_separate_and_lifted_at_its_end(
     gateway: GatewayProcess, daemon: ScriptedDaemon
 ) -> None:
-    """Two pages that call their fingers the same are two sources; each lifts its own at the end."""
+    """Two pages with the same source name are two sources, each lifted when its page closes."""
     touch = PARAMETERS["touch"]
     with RawWebSocket(gateway) as one, RawWebSocket(gateway) as other:
         for ws in (one, other):
@@ -295,14 +299,16 @@ def test_browsers_fingers_are_kept_apart_and_lifted_when_they_leave(
     wait_for(lambda: len(daemon.calls) == 4)
     frames = [params for _, params in daemon.calls]
     assert all(isinstance(params, TouchParams) for params in frames)
-    said = [(params.source, len(params.touches)) for params in frames]  # type: ignore[attr-defined]
-    sources = {source for source, _ in said}
+    counts = [(params.source, len(params.touches)) for params in frames]  # type: ignore[attr-defined]
+    sources = {source for source, _ in counts}
     assert len(sources) == 2
-    assert sorted(said) == sorted((source, count) for source in sources for count in (0, 1))
+    assert sorted(counts) == sorted((source, count) for source in sources for count in (0, 1))
 
 
-def test_a_stop_overtakes_what_waits(gateway: GatewayProcess, daemon: ScriptedDaemon) -> None:
-    """Sixteen requests to arm are under way, more are refused; a stop is answered all the same."""
+def test_websocket_stop_is_served_while_requests_are_pending(
+    gateway: GatewayProcess, daemon: ScriptedDaemon
+) -> None:
+    """Sixteen may be pending, further ones are refused, a stop is served."""
     with RawWebSocket(gateway) as ws:
         with daemon.holding():
             for id in range(17):
@@ -312,21 +318,22 @@ def test_a_stop_overtakes_what_waits(gateway: GatewayProcess, daemon: ScriptedDa
             assert error["code"] == 1005
             ws.call("stop", {}, id=99)
             assert ws.response(99)["result"] == {}
-        wait_for(lambda: is_taken(ws))  # after the answers to what waited, so that all are told
+        wait_for(lambda: is_accepted(ws))  # all pending requests are completed
 
 
-def is_taken(ws: RawWebSocket) -> bool:
-    """Whether the daemon takes another request; it refuses one where many are under way."""
+def is_accepted(ws: RawWebSocket) -> bool:
+    """Whether another request is served."""
     ws.call("effects", {}, id=300)
     return "result" in ws.response(300)
 
 
-def test_a_request_without_id_gets_no_answer(
+def test_websocket_request_without_id_gets_no_response(
     gateway: GatewayProcess, daemon: ScriptedDaemon
 ) -> None:
-    """Not even where it is wrong; the next one is answered."""
+    """Not even an error; nor does such a request arm anything."""
     with RawWebSocket(gateway) as ws:
         ws.send(b'{"jsonrpc": "2.0", "method": "stop"}')
+        ws.send(b'{"jsonrpc": "2.0", "method": "arm", "params": ' + ARM + b"}")
         ws.send(b'{"jsonrpc": "2.0", "method": "arm", "params": {}}')
         ws.call("effects", {}, id=5)
         opcode, payload = ws.next()
@@ -334,13 +341,11 @@ def test_a_request_without_id_gets_no_answer(
     assert daemon.methods == ["stop", "effects"]
 
 
-def test_a_message_in_two_fragments_is_one(gateway: GatewayProcess) -> None:
-    """As RFC 6455 has it; a character may be cut through."""
-    said = json.dumps(
-        {"jsonrpc": "2.0", "id": "ü", "method": "disarm"}, ensure_ascii=False
-    ).encode()
-    at = said.index("ü".encode()) + 1
+def test_websocket_message_in_two_fragments_is_one(gateway: GatewayProcess) -> None:
+    """Also when the boundary is within a character."""
+    text = '{"jsonrpc": "2.0", "id": "ü", "method": "disarm"}'.encode()
+    at = text.index("ü".encode()) + 1
     with RawWebSocket(gateway) as ws:
-        ws.send(said[:at], first=0x01)
-        ws.send(said[at:], first=0x80)
+        ws.send(text[:at], first=0x01)
+        ws.send(text[at:], first=0x80)
         assert json.loads(ws.next()[1]) == {"jsonrpc": "2.0", "id": "ü", "result": {}}

@@ -18,7 +18,7 @@ from model.config.document import ConfigError, Document, read_document
 from model.config.sections import Validation
 from model.errors import InputError
 from model.finger.perception import STRONG_DB_SL
-from model.rig.file import load_rig
+from model.rig.file import rig_of
 from model.rig.rig import Rig
 from model.structure.support import check_supported
 
@@ -83,10 +83,9 @@ def load_daemon_config(path: Path) -> DaemonConfig:
     log_file = _beside(document, _named(document, "log", "file"))
     dump_folder = _beside(document, _named(document, "dumps", "folder"))
     _check_folders(validation, log_file, dump_folder)
-    validation.finish()
+    section = validation.finish()
     assert rig is not None  # noqa: S101  else a problem was reported
     assert rig_file is not None  # noqa: S101  else there is no rig
-    section = DaemonSection.model_validate(document.data)
     return DaemonConfig(
         source=path,
         section=section,
@@ -138,14 +137,15 @@ def _beside(document: Document, name: str | None) -> Path | None:
     return None if name is None else Path(document.source).parent / Path(name).expanduser()
 
 
-def _rig(validation: Validation, file: Path | None) -> tuple[Rig | None, str]:
+def _rig(validation: Validation[DaemonSection], file: Path | None) -> tuple[Rig | None, str]:
     """Load the rig and its text; problems are reported at the key that names it."""
     if file is None:
         return None, ""
     try:
-        rig = load_rig(file)
+        document = read_document(file)
+        rig = rig_of(document)
         check_supported(rig.plate, rig.eras, loads=rig.loads)
-        return rig, file.read_text("utf-8")
+        return rig, document.text
     except ConfigError as error:
         validation.add(("rig",), "invalid rig:\n    " + str(error).replace("\n", "\n  "))
     except (InputError, OSError) as error:
@@ -153,7 +153,9 @@ def _rig(validation: Validation, file: Path | None) -> tuple[Rig | None, str]:
     return None, ""
 
 
-def _layout(validation: Validation, document: Document, rig: Rig | None) -> Layout | None:
+def _layout(
+    validation: Validation[DaemonSection], document: Document, rig: Rig | None
+) -> Layout | None:
     """Load the surface layout; problems are reported at the key that names it."""
     file = _file(document, "layout")
     if file is None:
@@ -171,7 +173,9 @@ def _layout(validation: Validation, document: Document, rig: Rig | None) -> Layo
     return None
 
 
-def _urls(validation: Validation, rig: Rig | None, rig_file: Path | None) -> dict[str, str]:
+def _urls(
+    validation: Validation[DaemonSection], rig: Rig | None, rig_file: Path | None
+) -> dict[str, str]:
     """The URL of each amplifier; `sim://` becomes a simulated one over this rig."""
     if rig is None or rig_file is None:
         return {}
@@ -194,7 +198,9 @@ def _urls(validation: Validation, rig: Rig | None, rig_file: Path | None) -> dic
     return urls
 
 
-def _touch(validation: Validation, document: Document, rig: Rig | None) -> tuple[TouchInput, ...]:
+def _touch(
+    validation: Validation[DaemonSection], document: Document, rig: Rig | None
+) -> tuple[TouchInput, ...]:
     """The valid touch sources; each is created once to check its URL."""
     listed = document.data.get("touch")
     inputs: list[TouchInput] = []
@@ -245,7 +251,9 @@ def _calibration(section: CalibrationSection, rig: Rig | None) -> TouchCalibrati
     )
 
 
-def _check_folders(validation: Validation, log: Path | None, dumps: Path | None) -> None:
+def _check_folders(
+    validation: Validation[DaemonSection], log: Path | None, dumps: Path | None
+) -> None:
     """Check the places of files that are written later.
 
     The folder of the log must exist; that of the dumps is created when needed.
@@ -260,7 +268,7 @@ def _check_folders(validation: Validation, log: Path | None, dumps: Path | None)
             validation.add(("dumps", "folder"), f"must be a folder, got the file {existing}")
 
 
-def _check_serial_numbers(validation: Validation, rig: Rig | None) -> None:
+def _check_serial_numbers(validation: Validation[DaemonSection], rig: Rig | None) -> None:
     for name in validation.mapping(("serial_numbers",)):
         if rig is not None and name not in rig.amplifiers:
             validation.add(

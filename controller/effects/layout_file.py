@@ -80,8 +80,7 @@ def load_layout(path: Path, plate: Plate | None, *, level_db_sl: float = STRONG_
         _check_region(validation, ("regions", name), effects, plate)
     elsewhere = validation.field(("elsewhere",), LayoutSection)
     _check_use(validation, ("elsewhere",), elsewhere, effects, moves=None)
-    validation.finish()
-    section = LayoutSection.model_validate(document.data)
+    section = validation.finish()
     return Layout(
         regions=tuple(_region(name, region) for name, region in section.regions.items()),
         effects={name: effect for name, effect in effects.items() if effect is not None},
@@ -106,7 +105,7 @@ def _check_kind(document: Document) -> None:
         )
 
 
-def _effects(validation: Validation, level_db_sl: float) -> dict[str, Effect | None]:
+def _effects(validation: Validation[LayoutSection], level_db_sl: float) -> dict[str, Effect | None]:
     """Effects by name, the usual ones among them; None for one that is not in order."""
     effects: dict[str, Effect | None] = {**usual_effects(level_db_sl)}
     for name, parameters in validation.mapping(("effects",)).items():
@@ -126,7 +125,10 @@ def _effects(validation: Validation, level_db_sl: float) -> dict[str, Effect | N
 
 
 def _check_region(
-    validation: Validation, path: KeyPath, effects: dict[str, Effect | None], plate: Plate | None
+    validation: Validation[LayoutSection],
+    path: KeyPath,
+    effects: dict[str, Effect | None],
+    plate: Plate | None,
 ) -> None:
     """What a region by itself cannot know: that it lies on the plate, and its effects exist."""
     region = validation.part(path, RegionSection)
@@ -150,7 +152,7 @@ def _check_region(
 
 
 def _check_use(
-    validation: Validation,
+    validation: Validation[LayoutSection],
     path: KeyPath,
     name: str | None,
     effects: dict[str, Effect | None],

@@ -68,7 +68,7 @@ def study(
     from model.config.document import read_document
     from model.config.points import parse_frequencies, parse_pair
     from model.errors import InputError
-    from model.rig.file import load_rig
+    from model.rig.file import rig_of
     from model.studies.finished import FinishedCases
     from model.studies.kinds import STUDIES
     from model.studies.outcome import ranking_summary, write_outcome
@@ -77,7 +77,8 @@ def study(
     from model.studies.solve import DRIVES, study_problem
     from model.studies.workers import on_cluster, on_processes
 
-    rig = load_rig(rig_file, mesh=mesh)
+    document = read_document(rig_file)
+    rig = rig_of(document, mesh=mesh)
     if what is not Study.COUNT and active is Driven.TWO and len(rig.eras) < 2:
         raise InputError(
             f"{rig_file} has one ERA, so there is no pair to drive; rank by it with --active 1"
@@ -108,8 +109,9 @@ def study(
             )
             raise
     ranking = rank(rig, cases, run.results, drive=DRIVES.index(active))
-    data = read_document(rig_file).data
-    files = [str(path) for path in write_outcome(output, what, rig, data=data, ranking=ranking)]
+    files = [
+        str(path) for path in write_outcome(output, what, rig, data=document.data, ranking=ranking)
+    ]
     elapsed = time.perf_counter() - started
     summary = {
         "study": what.value,

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from types import UnionType
-from typing import Annotated, Any, TypeVar, Union, get_args, get_origin
+from typing import Annotated, Any, Generic, TypeVar, Union, get_args, get_origin
 
 from pydantic import BaseModel, ConfigDict, GetCoreSchemaHandler, TypeAdapter, ValidationError
 from pydantic_core import CoreSchema, ErrorDetails, core_schema
@@ -24,6 +24,7 @@ class Section(BaseModel):
 
 
 SectionT = TypeVar("SectionT", bound=Section)
+PartT = TypeVar("PartT", bound=Section)
 
 
 @dataclass(frozen=True)
@@ -68,20 +69,21 @@ class Quantity:
         return {"type": ["number", "string"], "description": description}
 
 
-class Validation:
-    """Checks a document against its sections, and gathers what is wrong with it."""
+class Validation(Generic[SectionT]):
+    """Checks a document against its sections, and collects all problems."""
 
-    def __init__(self, document: Document, root: type[Section]) -> None:
+    def __init__(self, document: Document, root: type[SectionT]) -> None:
         """Find every key that is unknown, missing, or has a value that its section refuses."""
+        self._section: SectionT | None = None
         self._document = document
         self._problems: list[Problem] = []
         try:
-            root.model_validate(document.data)
+            self._section = root.model_validate(document.data)
         except ValidationError as error:
             for details in error.errors(include_url=False):
                 self._problems.append(_problem(document, root, details))
 
-    def part(self, path: KeyPath, section: type[SectionT]) -> SectionT | None:
+    def part(self, path: KeyPath, section: type[PartT]) -> PartT | None:
         """A section if it is in order by itself, so that checks across sections need not wait."""
         try:
             return section.model_validate(self._document.value(path))
@@ -89,8 +91,8 @@ class Validation:
             return None
 
     def nested(
-        self, path: KeyPath, section: type[SectionT], *, without: str | None = None
-    ) -> SectionT | None:
+        self, path: KeyPath, section: type[PartT], *, without: str | None = None
+    ) -> PartT | None:
         """A section that its parent leaves open, but for one of its keys; problems are noted."""
         value = self.mapping(path)
         try:
@@ -119,10 +121,11 @@ class Validation:
         """Note a problem at a key."""
         self._problems.append(self._document.problem(path, message))
 
-    def finish(self) -> None:
-        """Raise ConfigError if anything is wrong."""
-        if self._problems:
+    def finish(self) -> SectionT:
+        """Return the root section; raises ConfigError with all problems."""
+        if self._problems or self._section is None:
             raise ConfigError(self._document.source, self._problems)
+        return self._section
 
 
 @cache

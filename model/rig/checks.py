@@ -8,12 +8,12 @@ from model.errors import InputError
 from model.fem.mesh import MIN_NODES_PER_WAVELENGTH, Mesh
 from model.rig.parts import laminate_of, mesh_of, plate_of
 from model.rig.rig import SAME_POINT
-from model.rig.sections import EraSection, LimitsSection, MassSection, PlateSection
+from model.rig.sections import EraSection, LimitsSection, MassSection, PlateSection, RigSection
 from model.structure.plate import Plate
 from registry.suggestions import did_you_mean
 
 
-def check_across(validation: Validation, *, mesh_given: bool) -> None:
+def check_across(validation: Validation[RigSection], *, mesh_given: bool) -> None:
     """Note what is wrong between sections, as far as these are in order by themselves."""
     plate = _check_plate(validation)
     if plate is not None and not mesh_given:
@@ -33,7 +33,7 @@ def check_across(validation: Validation, *, mesh_given: bool) -> None:
             )
 
 
-def _check_plate(validation: Validation) -> Plate | None:
+def _check_plate(validation: Validation[RigSection]) -> Plate | None:
     """The plate if all about it is in order; thickness and material, or layers, make it one."""
     given = {key for key, value in validation.mapping(("plate",)).items() if value is not None}
     if not given:
@@ -64,7 +64,7 @@ def _check_plate(validation: Validation) -> Plate | None:
     return plate
 
 
-def _check_mesh(validation: Validation, plate: Plate, *, frequency_max: float) -> None:
+def _check_mesh(validation: Validation[RigSection], plate: Plate, *, frequency_max: float) -> None:
     text = validation.mapping(()).get("mesh", "auto")
     if not isinstance(text, str):
         return
@@ -83,7 +83,9 @@ def _check_mesh(validation: Validation, plate: Plate, *, frequency_max: float) -
         )
 
 
-def _check_places(validation: Validation, names: tuple[str, ...], plate: Plate | None) -> None:
+def _check_places(
+    validation: Validation[RigSection], names: tuple[str, ...], plate: Plate | None
+) -> None:
     placed: dict[str, tuple[float, float]] = {}
     for name in names:
         place = validation.field(("eras", name, "at"), EraSection)
@@ -99,7 +101,7 @@ def _check_places(validation: Validation, names: tuple[str, ...], plate: Plate |
 
 
 def _check_on_plate(
-    validation: Validation,
+    validation: Validation[RigSection],
     key: tuple[str, ...],
     plate: Plate | None,
     place: tuple[float, float],
@@ -118,7 +120,7 @@ def _check_on_plate(
         )
 
 
-def _check_wiring(validation: Validation, names: tuple[str, ...]) -> None:
+def _check_wiring(validation: Validation[RigSection], names: tuple[str, ...]) -> None:
     amplifiers = validation.mapping(("amplifiers",))
     wired: dict[tuple[str, int], str] = {}
     for name in names:

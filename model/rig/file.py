@@ -21,20 +21,19 @@ def load_rig(path: Path | str, *, mesh: str | None = None) -> Rig:
     """
     if mesh is not None and not isinstance(mesh, str):
         raise InputError(f"mesh is {shown(mesh)}; give text, such as mesh='48x36', or 'auto'")
-    return _rig_of(read_document(expect_path(path, what="path")), mesh=mesh)
+    return rig_of(read_document(expect_path(path, what="path")), mesh=mesh)
 
 
 def parse_rig(source: str, text: str) -> Rig:
     """Read the text of a rig file that came from a source; raises ConfigError."""
-    return _rig_of(parse_document(source, text), mesh=None)
+    return rig_of(parse_document(source, text))
 
 
-def _rig_of(document: Document, *, mesh: str | None) -> Rig:
-    """The rig that a document says, with another mesh where one is given."""
+def rig_of(document: Document, *, mesh: str | None = None) -> Rig:
+    """Make the rig of a document, with another mesh if one is given; raises as `load_rig`."""
     validation = Validation(document, RigSection)
     check_across(validation, mesh_given=mesh is not None)
-    validation.finish()
-    section = RigSection.model_validate(document.data)
+    section = validation.finish()
     plate = plate_of(section.plate)
     wanted = section.mesh if mesh is None else mesh
     return Rig(

@@ -6,7 +6,7 @@ from typing import Any
 from model.config.document import ConfigError, Document, Problem, read_document
 from model.config.kinds import Good
 from model.rig.amplifiers import check_amplifiers
-from model.rig.file import example_rig_path, load_rig, rig_schema
+from model.rig.file import example_rig_path, rig_of, rig_schema
 from model.rig.rig import Rig
 from model.structure.support import support_problem
 
@@ -27,7 +27,7 @@ class RigKind:
         problems: list[Problem] = []
         rig = None
         try:
-            rig = load_rig(path)
+            rig = rig_of(document)
         except ConfigError as error:
             problems += error.problems
         wrong, warnings = check_amplifiers(document, rig)

@@ -61,8 +61,7 @@ def load_faults(path: Path, *, amplifiers: Collection[str]) -> FaultFile:
             validation.add(
                 ("faults", number, "amplifier"), f"{name!r} is none of the rig's: {known}"
             )
-    validation.finish()
-    section = _FaultFileSection.model_validate(document.data)
+    section = validation.finish()
     windows = tuple(FaultWindow(**window.model_dump()) for window in section.faults)
     return FaultFile(windows, seed=section.seed)
 

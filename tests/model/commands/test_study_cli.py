@@ -101,7 +101,7 @@ def test_the_csv_has_every_case_and_drive(tmp_path: Path) -> None:
 
 
 def test_a_second_run_takes_everything_from_the_first(tmp_path: Path) -> None:
-    """Nothing is solved, and the answer is the same but for its time; of another seed random layouts are new."""
+    """Nothing is solved and the answer is the same; with another seed, random layouts are new."""
     first = study("placement", tmp_path, "--layouts", "20")
     second = study("placement", tmp_path, "--layouts", "20")
     assert (first["solved"], first["from_cache"]) == (20, 0)

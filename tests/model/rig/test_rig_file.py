@@ -1,5 +1,6 @@
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,8 @@ from model.errors import InputError
 from model.rig.file import example_rig_path, load_rig, parse_rig, rig_schema
 from model.rig.kind import RIG
 from model.rig.parts import parse_mesh
-from model.rig.rig import Channel
+from model.rig.rig import Channel, physics_fingerprint
+from model.structure.actuator import Era
 from model.structure.materials import material
 from model.structure.plate import Plate
 from model.structure.point_mass import PointMass
@@ -437,6 +439,16 @@ def test_what_is_no_mesh_is_refused(text: str) -> None:
     with pytest.raises(InputError, match=r"mesh .*elements") as caught:
         parse_mesh(text, Plate(0.4, 0.3, 0.002, material("aluminium")))
     assert len(str(caught.value)) < 200
+
+
+def test_fingerprint_is_the_same_for_1_and_1_0() -> None:
+    """Numbers of Python code may be whole ones."""
+    plate = Plate(1, 1, 1e-3, material("steel"))
+    whole = Era("a", 0, 0, stiffness=17000, damping=2, bolt_mass=0, stroke=1)
+    floats = Era("a", 0.0, 0.0, stiffness=17000.0, damping=2.0, bolt_mass=0.0, stroke=1.0)
+    assert physics_fingerprint(plate, [whole]) == physics_fingerprint(
+        replace(plate, length=1.0, width=1.0), [floats], masses=()
+    )
 
 
 def test_the_same_plate_has_the_same_fingerprint_however_it_is_written(tmp_path: Path) -> None:

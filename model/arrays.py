@@ -8,6 +8,8 @@ from numpy.typing import NDArray
 FloatArray: TypeAlias = NDArray[np.float64]
 ComplexArray: TypeAlias = NDArray[np.complex128]
 IntArray: TypeAlias = NDArray[np.int64]
+Float32Array: TypeAlias = NDArray[np.float32]
+Complex64Array: TypeAlias = NDArray[np.complex64]
 
 
 def lattice(x: FloatArray, y: FloatArray) -> FloatArray:

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from model.arrays import ComplexArray, FloatArray, IntArray
-from model.drive_modes.fields import Drive, Fields, SingleComplex
+from model.arrays import Complex64Array, ComplexArray, FloatArray, IntArray
+from model.drive_modes.fields import DriveVector, Fields
 from model.finger.contrast import contrast_db
 from model.finger.fingertip import fingertip_points
 from model.finger.perception import STRONG_DB_SL
@@ -92,7 +92,7 @@ class Errors:
     def contrast_db(self, fields: Fields, weights: ComplexArray) -> FloatArray:
         """Contrast of weights (f, eras) in every draw, (draws,); of several targets the least."""
 
-        def peak(field: SingleComplex) -> FloatArray:
+        def peak(field: Complex64Array) -> FloatArray:
             active = np.flatnonzero(np.abs(weights).any(axis=1))
             tones = [np.abs((self.factors * weights[f]) @ field[f]) for f in active]
             return np.asarray(np.sum(tones, axis=0))
@@ -100,7 +100,7 @@ class Errors:
         return contrast_db([peak(target) for target in fields.targets], peak(fields.quiet))
 
 
-def weights_of(drive: Drive, fields: Fields) -> ComplexArray:
+def weights_of(drive: DriveVector, fields: Fields) -> ComplexArray:
     """A drive as weights (f, eras)."""
     weights = np.zeros((fields.frequency_count, fields.era_count), dtype=complex)
     for frequency, weight in drive.tones():

@@ -7,8 +7,8 @@ both are given the best of the 27 frequencies for every contact set.
 import numpy as np
 
 from benchmarks.localization.cases import LEAST, NO_ERRORS, Errors
-from model.arrays import ComplexArray, FloatArray, IntArray
-from model.drive_modes.fields import Fields, SingleComplex
+from model.arrays import Complex64Array, ComplexArray, FloatArray, IntArray
+from model.drive_modes.fields import Fields
 from model.finger.contrast import contrast_db
 
 
@@ -39,7 +39,7 @@ def reversed_pulse_contrast(fields: Fields, errors: Errors, *, samples: int = 51
     time = np.arange(samples) / samples
     turn = np.exp(2j * np.pi * np.outer(np.arange(fields.frequency_count), time))
 
-    def peak(field: SingleComplex, factor: ComplexArray) -> FloatArray:
+    def peak(field: Complex64Array, factor: ComplexArray) -> FloatArray:
         tones = np.einsum("fe,fep->pf", weights * factor, field)
         # The envelope of the analytic signal: what the step's offset turns is common to all.
         return np.asarray(np.abs(tones @ turn).max(axis=-1))

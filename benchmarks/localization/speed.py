@@ -63,14 +63,14 @@ def live_times(
 
 def search_cells(table: LocalizationTable, *, loudest: bool) -> tuple[int, int]:
     """The exact search for every cell of the grid: how many patterns, how many were looked at."""
-    count = looked_at = 0
+    count = evaluated_count = 0
     for x, y in table.cell_centres:
         fields = table.fields(Question(((float(x), float(y)),)))
         if loudest:
             fields = Fields(fields.targets, fields.quiet, False, fields.threshold, fields.wanted)
         found = search_exactly(fields, eras_at_most=len(table.eras))
-        count, looked_at = found.pattern_count, looked_at + found.looked_at
-    return count, looked_at
+        count, evaluated_count = found.pattern_count, evaluated_count + found.evaluated_count
+    return count, evaluated_count
 
 
 def speed_section(seed: int) -> Section:

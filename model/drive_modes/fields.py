@@ -1,9 +1,9 @@
-"""What a drive mode works on: fields of each ERA at the fingertips, and how a drive is judged.
+"""Input of the drive modes: each ERA's field at the fingertips, and the evaluation of a drive.
 
-A drive is a tone for each ERA. It is judged by its robust score: the target's peak acceleration to
-that at the quiet points, where each ERA's share is wrong by 10 % of itself at random (gains by 5 %,
-phases by 5 degrees: 0.05² + 0.087² = 0.1²). A naive optimum cancels to nothing what cannot be
-cancelled, and is 10 dB worse on the real plate than this one.
+A drive is ranked by its robust score: the target's peak acceleration to the expected one at the
+quiet points, where each ERA's contribution has a random error of 10 % (gain 5 %, phase 5 degrees:
+0.05² + 0.087² = 0.1²). The optimum without errors relies on cancellation and is 10 dB worse on a
+real plate.
 """
 
 from dataclasses import dataclass
@@ -12,39 +12,36 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from model.arrays import FloatArray
+from model.arrays import Complex64Array, Float32Array, FloatArray
 
 SILENT = -1
-"""Stands for the frequency of an ERA that is not driven."""
+"""Frequency index of an ERA that is not driven."""
 
 ERROR_SHARE = 0.1
-"""How wrong an ERA's share of a field is, relative to itself, root mean square (sigma).
+"""Rms error of an ERA's contribution to a field, relative (sigma).
 
-Of GAIN_ERROR and PHASE_ERROR of `model.vibration.excitation` together.
+GAIN_ERROR and PHASE_ERROR of `model.vibration.excitation` together.
 """
 
 _TINY, _LEAST = np.float32(1e-7), np.float32(1e-20)
 
-SingleComplex = NDArray[np.complex64]
-Single = NDArray[np.float32]
-
 
 @dataclass(frozen=True, eq=False)
-class Drive:
-    """A tone for each ERA: index of its frequency, or SILENT, and its weight.
+class DriveVector:
+    """A tone for each ERA.
 
-    index (eras,); weight (eras,) complex, 1 is full stroke at phase zero.
+    index (eras,): of its frequency, or SILENT; weight (eras,): complex amplitude in full strokes.
     """
 
     index: NDArray[np.int64]
-    weight: SingleComplex
+    weight: Complex64Array
 
     @classmethod
-    def at(cls, frequency: int, weight: SingleComplex) -> "Drive":
-        """All ERAs at one frequency."""
+    def at(cls, frequency: int, weight: Complex64Array) -> "DriveVector":
+        """Drive all ERAs at one frequency."""
         return cls(np.where(weight == 0, SILENT, frequency), weight)
 
-    def tones(self) -> list[tuple[int, SingleComplex]]:
+    def tones(self) -> list[tuple[int, Complex64Array]]:
         """Index of each distinct frequency, and the weights (eras,) at it."""
         frequencies = sorted({*self.index.tolist()} - {SILENT})
         return [
@@ -55,17 +52,17 @@ class Drive:
 
 @dataclass(frozen=True, eq=False)
 class Fields:
-    """Acceleration [m/s²] of each ERA alone at full stroke, and what is asked for.
+    """Acceleration [m/s²] of each ERA alone at full stroke at the contacts, and the wanted level.
 
-    targets: (f, eras, p) each; quiet: (f, eras, q). Where is_alone, the quiet points stand for the
-    rest of the plate and count by their root mean square, or else by their maximum. threshold (f,)
-    [m/s²]; wanted: how many times above it every target shall feel, mean over its points.
+    targets: (f, eras, p) each; quiet: (f, eras, q). is_alone: the quiet points are the rest of the
+    plate and count by their root mean square; else by their maximum. threshold (f,) [m/s²]; wanted:
+    amplitude to threshold for every target, mean over its points.
     """
 
-    targets: tuple[SingleComplex, ...]
-    quiet: SingleComplex
+    targets: tuple[Complex64Array, ...]
+    quiet: Complex64Array
     is_alone: bool
-    threshold: Single
+    threshold: Float32Array
     wanted: float
 
     @property
@@ -79,7 +76,7 @@ class Fields:
         return int(self.quiet.shape[1])
 
     def at(self, frequencies: NDArray[np.int64]) -> "Fields":
-        """The same at some of the frequencies, by index (n,)."""
+        """Select some of the frequencies, by index (n,)."""
         some = Fields(
             targets=tuple(field.take(frequencies, axis=0) for field in self.targets),
             quiet=self.quiet.take(frequencies, axis=0),
@@ -87,7 +84,7 @@ class Fields:
             threshold=self.threshold.take(frequencies),
             wanted=self.wanted,
         )
-        # What was worked out already is not worked out anew, round by round.
+        # Cached values are selected too, not computed again.
         known, also = vars(self), vars(some)
         if "quiet_power" in known:
             also["quiet_power"] = self.quiet_power.take(frequencies, axis=0)
@@ -98,16 +95,16 @@ class Fields:
         return some
 
     @cached_property
-    def quiet_power(self) -> Single:
+    def quiet_power(self) -> Float32Array:
         """Squared magnitude at the quiet points, (f, eras, q)."""
         return np.asarray(np.abs(self.quiet) ** 2)
 
     @cached_property
-    def quiet_forms(self) -> Single:
-        """Power at each quiet point, errors included, as a form w^H R w of weights w.
+    def quiet_forms(self) -> Float32Array:
+        """Expected power at each quiet point as a Hermitian form w^H R w of weights w.
 
-        R = conj(h) h^T, (eras, eras), with the errors on its diagonal; of every element the real
-        and the imaginary part, (f, 2 eras², q).
+        R = conj(h) h^T + sigma² diag |h|²; real and imaginary part of every element, (f, 2 eras²,
+        q).
         """
         f, eras, q = self.quiet.shape
         products = self.quiet.conj()[:, :, None] * self.quiet[:, None]
@@ -115,30 +112,30 @@ class Fields:
         forms[:, :, 0] = products.real.reshape(f, -1, q)
         forms[:, :, 1] = products.imag.reshape(f, -1, q)
         diagonal = forms[:, :: eras + 1, 0]
-        diagonal += added_by_errors(diagonal, sigma=ERROR_SHARE)
+        diagonal += error_power(diagonal, sigma=ERROR_SHARE)
         return forms.reshape(f, -1, q)
 
     @cached_property
-    def mean_targets(self) -> SingleComplex:
+    def mean_targets(self) -> Complex64Array:
         """Each ERA's field, mean over the points of each target, (targets, f, eras)."""
         return np.stack([field.mean(axis=-1) for field in self.targets])
 
 
-def added_by_errors(power: Single, *, sigma: float) -> Single:
-    """What errors of a share sigma of each ERA add to its own power (f, eras, ...).
+def error_power(power: Float32Array, *, sigma: float) -> Float32Array:
+    """Expected power that errors of sigma add to each ERA's own power (f, eras, ...).
 
-    An ERA that does not move the quiet points must still have a weight that is a number.
+    With a floor, so that R stays definite for an ERA that does not move the quiet points.
     """
     floor = _TINY * np.maximum.reduce(power, axis=1, keepdims=True) + _LEAST
     return np.asarray(np.float32(sigma**2) * power + floor)
 
 
 @dataclass(frozen=True)
-class Outcome:
-    """What a drive does at full level.
+class Evaluation:
+    """Measures of a drive at full level.
 
-    peak [m/s²], sensation (times above threshold): at the lesser target; quiet_peak,
-    quiet_sensation: at the loudest quiet point; score: see `robust_score`.
+    peak [m/s²], sensation (amplitude to threshold): at the lesser target; quiet_peak,
+    quiet_sensation: at the loudest quiet point; score: the robust score.
     """
 
     peak: float
@@ -153,8 +150,8 @@ class Outcome:
         return max(self.peak, 1e-30) / max(self.quiet_peak, 1e-30)
 
 
-def judge(fields: Fields, drive: Drive) -> Outcome:
-    """What a drive does; tones of different frequencies add as magnitudes (paper Eq. 28)."""
+def evaluate(fields: Fields, drive: DriveVector) -> Evaluation:
+    """Evaluate a drive; tones of different frequencies add as magnitudes (paper Eq. 28)."""
     tones = drive.tones()
     at = [index for index, _ in tones]
     rows = np.array([weight for _, weight in tones])[:, None]
@@ -167,18 +164,18 @@ def judge(fields: Fields, drive: Drive) -> Outcome:
         sensations.append(float(felt.sum()) / target.shape[-1])
     quiet = np.abs(rows @ fields.quiet.take(at, axis=0))[:, 0]
     wrong = (np.abs(rows) ** 2 @ fields.quiet_power.take(at, axis=0))[:, 0]
-    likely = np.sqrt(quiet**2 + ERROR_SHARE**2 * wrong).sum(axis=0)
-    return Outcome(
+    expected = np.sqrt(quiet**2 + ERROR_SHARE**2 * wrong).sum(axis=0)
+    return Evaluation(
         peak=min(peaks),
         sensation=min(sensations),
-        quiet_peak=quietness(quiet.sum(axis=0), fields),
+        quiet_peak=quiet_amplitude(quiet.sum(axis=0), fields),
         quiet_sensation=float(np.sqrt(((quiet / threshold) ** 2).sum(axis=0)).max()),
-        score=min(peaks) / quietness(likely, fields),
+        score=min(peaks) / quiet_amplitude(expected, fields),
     )
 
 
-def quietness(magnitude: Single | FloatArray, fields: Fields) -> float:
-    """What the quiet points (q,) count as: their maximum, or around a lone finger their rms."""
+def quiet_amplitude(magnitude: Float32Array | FloatArray, fields: Fields) -> float:
+    """Norm of the quiet points (q,): their maximum, or around a lone finger their rms."""
     if fields.is_alone:
         return float(np.sqrt((magnitude.astype(float) ** 2).mean()))
     return float(magnitude.max())

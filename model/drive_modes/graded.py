@@ -2,14 +2,14 @@
 
 import numpy as np
 
+from model.arrays import Complex64Array, Float32Array
 from model.drive_modes.coherent import Coherent
-from model.drive_modes.fields import Single, SingleComplex
 
 EXCHANGES = 8
 SWEEPS = 2
 
 
-def _solve(R: SingleComplex, c: SingleComplex) -> SingleComplex:
+def _solve(R: Complex64Array, c: Complex64Array) -> Complex64Array:
     """Minimise w^T Re(R) w / 2 - Re(c) w over w >= 0, for many forms at once.
 
     Block principal pivoting (Judice and Pires, Comput. Oper. Res. 21 (1994) 587-596): solve for the
@@ -38,7 +38,7 @@ def _solve(R: SingleComplex, c: SingleComplex) -> SingleComplex:
     return np.asarray(w, dtype=np.complex64)
 
 
-def _swept(w: Single, form: Single, pull: Single) -> Single:
+def _swept(w: Float32Array, form: Float32Array, pull: Float32Array) -> Float32Array:
     """Weights (n, eras) after the best for each ERA in turn, the others as they are."""
     for _ in range(SWEEPS):
         for era in range(w.shape[1]):

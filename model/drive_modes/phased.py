@@ -6,11 +6,11 @@ ERA adds is a force where one acts anyway, so without errors what can be had doe
 
 import numpy as np
 
+from model.arrays import Complex64Array
 from model.drive_modes.coherent import Coherent
-from model.drive_modes.fields import SingleComplex
 
 
-def _solve(R: SingleComplex, c: SingleComplex) -> SingleComplex:
+def _solve(R: Complex64Array, c: Complex64Array) -> Complex64Array:
     return np.asarray(np.linalg.solve(R, c[..., None])[..., 0])
 
 

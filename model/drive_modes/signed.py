@@ -2,11 +2,11 @@
 
 import numpy as np
 
+from model.arrays import Complex64Array
 from model.drive_modes.coherent import Coherent
-from model.drive_modes.fields import SingleComplex
 
 
-def _solve(R: SingleComplex, c: SingleComplex) -> SingleComplex:
+def _solve(R: Complex64Array, c: Complex64Array) -> Complex64Array:
     """Real weights for which |c^H w| is largest for its w^H R w, which then is w^T Re(R) w.
 
     All targets may be turned by one phase; the best one is the top eigenvector of the form of real

@@ -12,8 +12,8 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from model.arrays import ComplexArray, FloatArray, IntArray
-from model.drive_modes.fields import SILENT, Single, SingleComplex
+from model.arrays import Complex64Array, ComplexArray, Float32Array, FloatArray, IntArray
+from model.drive_modes.fields import SILENT
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +59,7 @@ def all_patterns(era_count: int, frequency_count: int) -> Patterns:
     return found
 
 
-def magnitudes_of_sources(acceleration: SingleComplex | ComplexArray) -> Single:
+def magnitudes_of_sources(acceleration: Complex64Array | ComplexArray) -> Float32Array:
     """Peak acceleration (sources, p) of all sources from each ERA's field (f, eras, p)."""
     f, eras, p = acceleration.shape
     one, other = _pairs(eras)
@@ -70,13 +70,13 @@ def magnitudes_of_sources(acceleration: SingleComplex | ComplexArray) -> Single:
     return rows
 
 
-def per_source(threshold: Single | FloatArray, era_count: int) -> Single:
+def per_source(threshold: Float32Array | FloatArray, era_count: int) -> Float32Array:
     """Threshold (f,) of every source, (sources, 1); of nothing it is 1."""
     blocks = era_count * (era_count + 1) // 2
     return np.append(np.tile(threshold, blocks), np.ones(1, threshold.dtype))[:, None]
 
 
-def sums_of_sources(rows: Single, eras: int) -> Single:
+def sums_of_sources(rows: Float32Array, eras: int) -> Float32Array:
     """From values of all sources (c, sources) those of all patterns, (c, n)."""
     c = len(rows)
     f = (rows.shape[1] - 1) // (eras * (eras + 1) // 2)

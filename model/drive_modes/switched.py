@@ -17,8 +17,8 @@ from itertools import combinations
 
 import numpy as np
 
-from model.arrays import IntArray
-from model.drive_modes.fields import SILENT, Drive, Fields, Single
+from model.arrays import Float32Array, IntArray
+from model.drive_modes.fields import SILENT, DriveVector, Fields
 from model.drive_modes.sources import (
     all_patterns,
     magnitudes_of_sources,
@@ -28,11 +28,11 @@ from model.drive_modes.sources import (
 
 # A bound on the quiet maximum comes from this many of the quiet points.
 BOUND_POINTS = 12
-AT_ONCE = 48  # patterns that are looked at in full together
+BATCH = 48  # patterns that are looked at in full together
 FEW_SOURCES = 500  # of these all sums are made faster than some of them are picked
 
 
-def find_switched(fields: Fields, least: float) -> Drive | None:
+def find_switched(fields: Fields, min_score: float) -> DriveVector | None:
     """The pattern of highest contrast that reaches the level; None where it is not above `least`.
 
     Contrast here is without errors, which can only lower it: at full stroke there is nothing to
@@ -42,7 +42,7 @@ def find_switched(fields: Fields, least: float) -> Drive | None:
     felt = [magnitudes_of_sources(field) for field in fields.targets]
     means = np.array([_mean(rows) for rows in felt])
     peak = means.mean(axis=0)
-    if least > 0 and not fields.is_alone and not _may_be_better(fields, means, least):
+    if min_score > 0 and not fields.is_alone and not _may_be_better(fields, means, min_score):
         return None
     quiet = magnitudes_of_sources(fields.quiet)
     powers = _powers(felt, fields)
@@ -50,7 +50,9 @@ def find_switched(fields: Fields, least: float) -> Drive | None:
     shares = _even_shares(quiet) if fields.is_alone else _shares(quiet)
     loud = quiet @ shares
 
-    def value(peaks: Single, at_quiet: Single, powers: list[Single]) -> Single:
+    def value(
+        peaks: Float32Array, at_quiet: Float32Array, powers: list[Float32Array]
+    ) -> Float32Array:
         """Contrast of patterns (n,), 0 where they do not reach the level.
 
         Peaks at each target (targets, n) and at the quiet points (n, q); powers: (n, p) each.
@@ -60,7 +62,7 @@ def find_switched(fields: Fields, least: float) -> Drive | None:
         return np.asarray(np.where(sensed >= fields.wanted, peaks.min(axis=0) / loudness, 0))
 
     nothing = len(quiet) - 1
-    contrast, best = least, (nothing, nothing)
+    contrast, best = min_score, (nothing, nothing)
     # What one source can do is had at once, and leaves fewer pairs of them.
     alone = value(means[:, :-1], quiet[:-1], [rows[:-1] for rows in powers])
     if alone.max() > contrast:
@@ -73,10 +75,10 @@ def find_switched(fields: Fields, least: float) -> Drive | None:
     bound = (peak[one] + peak[other]) / (loud[one] + loud[other])
     closer = fields.is_alone
     while len(one) > 0:
-        if len(one) > AT_ONCE:
-            order = np.argpartition(-bound, AT_ONCE)
+        if len(one) > BATCH:
+            order = np.argpartition(-bound, BATCH)
             one, other, bound = one[order], other[order], bound[order]
-        some, more = one[:AT_ONCE], other[:AT_ONCE]
+        some, more = one[:BATCH], other[:BATCH]
         found = value(
             means[:, some] + means[:, more],
             quiet[some] + quiet[more],
@@ -85,7 +87,7 @@ def find_switched(fields: Fields, least: float) -> Drive | None:
         if found.max() > contrast:
             at = int(found.argmax())
             contrast, best = float(found[at]), (int(one[at]), int(other[at]))
-        left = AT_ONCE + np.flatnonzero(bound[AT_ONCE:] > contrast)
+        left = BATCH + np.flatnonzero(bound[BATCH:] > contrast)
         one, other, bound = one[left], other[left], bound[left]
         if not closer and len(one) > 0:
             closer = True
@@ -96,27 +98,27 @@ def find_switched(fields: Fields, least: float) -> Drive | None:
     return None if best[0] == nothing else _drive(best, fields)
 
 
-def _may_be_better(fields: Fields, means: Single, least: float) -> bool:
+def _may_be_better(fields: Fields, means: Float32Array, min_score: float) -> bool:
     """Whether any pattern can have more contrast than `least`; means (targets, sources).
 
     Some of the quiet points will mostly do to see that nothing can.
     """
     step = max(1, fields.quiet.shape[2] // BOUND_POINTS)
     few = magnitudes_of_sources(np.ascontiguousarray(fields.quiet[:, :, ::step]))
-    gain = means.mean(axis=0) - least * few @ _shares(few)
+    gain = means.mean(axis=0) - min_score * few @ _shares(few)
     if gain.max() <= 0:  # and so no two of them have a sum above zero
         return False
     if means.shape[1] < FEW_SOURCES:
         peak = sums_of_sources(means, fields.era_count).min(axis=0)
-        return bool((peak > least * sums_of_sources(few.T, fields.era_count).max(axis=0)).any())
-    if (means.min(axis=0) > least * few.max(axis=1))[:-1].any():
+        return bool((peak > min_score * sums_of_sources(few.T, fields.era_count).max(axis=0)).any())
+    if (means.min(axis=0) > min_score * few.max(axis=1))[:-1].any():
         return True
     one, other = _pairs(gain, fields)
     loud = (few[one] + few[other]).max(axis=1, initial=0.0)
-    return bool(((means[:, one] + means[:, other]).min(axis=0) > least * loud).any())
+    return bool(((means[:, one] + means[:, other]).min(axis=0) > min_score * loud).any())
 
 
-def _pairs(gain: Single, fields: Fields) -> tuple[IntArray, IntArray]:
+def _pairs(gain: Float32Array, fields: Fields) -> tuple[IntArray, IntArray]:
     """Patterns of two ERAs at two frequencies whose gains (sources,) have a sum above zero."""
     count = fields.frequency_count
     of_era = gain[: fields.era_count * count].reshape(-1, count)
@@ -136,7 +138,7 @@ def _pairs(gain: Single, fields: Fields) -> tuple[IntArray, IntArray]:
     return np.concatenate(ones), np.concatenate(others)
 
 
-def _drive(sources: tuple[int, int], fields: Fields) -> Drive:
+def _drive(sources: tuple[int, int], fields: Fields) -> DriveVector:
     """All ERAs of two sources at full stroke; see `magnitudes_of_sources` for their order."""
     count, eras = fields.frequency_count, fields.era_count
     members = [(era,) for era in range(eras)] + list(combinations(range(eras), 2)) + [()]
@@ -144,10 +146,10 @@ def _drive(sources: tuple[int, int], fields: Fields) -> Drive:
     for source in sources:
         block, frequency = divmod(source, count)
         index[list(members[block])] = frequency
-    return Drive(index, (index != SILENT).astype(np.complex64))
+    return DriveVector(index, (index != SILENT).astype(np.complex64))
 
 
-def loudest_switched(fields: Fields) -> float:
+def max_sensation_switched(fields: Fields) -> float:
     """How many times above threshold the targets can be made to feel it.
 
     Of the loudest patterns by a bound, and of one and the same for all targets.
@@ -156,29 +158,29 @@ def loudest_switched(fields: Fields) -> float:
     powers = _powers([magnitudes_of_sources(field) for field in fields.targets], fields)
     means = np.array([_mean(rows) for rows in powers])
     most = sums_of_sources(means, fields.era_count).min(axis=0)
-    loudest = np.argsort(-most)[:AT_ONCE]
+    loudest = np.argsort(-most)[:BATCH]
     one, other = patterns.first[loudest], patterns.second[loudest]
     felt = np.min([np.sqrt(rows[one] + rows[other]).mean(axis=1) for rows in powers], axis=0)
     return float(felt.max())
 
 
-def _powers(felt: list[Single], fields: Fields) -> list[Single]:
+def _powers(felt: list[Float32Array], fields: Fields) -> list[Float32Array]:
     """Squared sensation of every source from its magnitudes at each target, (sources, p)."""
     threshold = per_source(fields.threshold, fields.era_count)
     return [(rows / threshold) ** 2 for rows in felt]
 
 
-def _mean(rows: Single) -> Single:
+def _mean(rows: Float32Array) -> Float32Array:
     """The mean over points of (n, p), as a product: a fifth of the time that `mean` takes."""
     return np.asarray(rows @ _even_shares(rows))
 
 
-def _even_shares(rows: Single) -> Single:
+def _even_shares(rows: Float32Array) -> Float32Array:
     """For a mean over points of (n, p) that all count the same, (p,)."""
     return np.full(rows.shape[1], 1 / rows.shape[1], dtype=rows.dtype)
 
 
-def _shares(quiet: Single) -> Single:
+def _shares(quiet: Float32Array) -> Float32Array:
     """For a mean over the quiet points: each counts as often as it is the loudest of a source."""
     often = np.bincount(quiet.argmax(axis=1), minlength=quiet.shape[1])
     return np.asarray(often / len(quiet), dtype=quiet.dtype)

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from model.arrays import FloatArray
-from model.drive_modes.fields import Drive
+from model.drive_modes.fields import DriveVector
 from model.structure.actuator import Era
 from model.vibration.excitation import Excitation, Tone
 
@@ -13,7 +13,7 @@ ROUNDING = 1e-6  # of single precision, in which drives are found
 
 
 def excitation_of(
-    drive: Drive, eras: Sequence[Era], frequencies: FloatArray, *, gain: float
+    drive: DriveVector, eras: Sequence[Era], frequencies: FloatArray, *, gain: float
 ) -> Excitation:
     """Tones by ERA, at a gain of up to 1; at each frequency the strongest has phase zero.
 

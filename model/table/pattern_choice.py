@@ -5,11 +5,11 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TypeAlias
 
-from model.arrays import FloatArray, IntArray
+from model.arrays import Complex64Array, FloatArray, IntArray
 from model.counting import counted
-from model.drive_modes import Choice, find_drives, loudest
-from model.drive_modes.exact_search import loudest_found, search_exactly
-from model.drive_modes.fields import Drive, Fields, Outcome, SingleComplex, judge
+from model.drive_modes import Choice, find_drives, max_sensation
+from model.drive_modes.exact_search import search_exactly, sensation_found
+from model.drive_modes.fields import DriveVector, Evaluation, Fields, evaluate
 from model.drive_modes.tones import excitation_of
 from model.errors import InputError
 from model.structure.actuator import Era
@@ -20,7 +20,7 @@ from model.table.question import Question
 # three of contrast in the first 100 ms (docs/decisions, on ramps).
 ONSET_WEIGHT = 1 / 3
 
-OnsetContrast: TypeAlias = Callable[[IntArray, SingleComplex], FloatArray | None]
+OnsetContrast: TypeAlias = Callable[[IntArray, Complex64Array], FloatArray | None]
 """Contrast of ramped onsets (n,) for indices of frequencies (n,) and weights of ERAs (n, eras).
 
 None where the plate cannot be solved in time.
@@ -66,25 +66,25 @@ def choose_pattern(question: Question, drive_mode: str, candidates: Candidates) 
     fields = candidates.fields
     choice = find_drives(fields, drive_mode)
     if choice is None:
-        raise _level_error(question, drive_mode, loudest(fields, drive_mode))
-    drive, outcome = choice.drive, choice.outcome
+        raise _level_error(question, drive_mode, max_sensation(fields, drive_mode))
+    drive, evaluation = choice.drive, choice.evaluation
     if question.quiet and not question.envelopes:
         better = _quietest_onset(choice, candidates.onset_contrast)
         if better is not None:
-            drive, outcome = better, judge(fields, better)
-    return _pattern(question, drive_mode, candidates, drive, outcome)
+            drive, evaluation = better, evaluate(fields, better)
+    return _pattern(question, drive_mode, candidates, drive, evaluation)
 
 
-def _quietest_onset(choice: Choice, onset_contrast: OnsetContrast) -> Drive | None:
+def _quietest_onset(choice: Choice, onset_contrast: OnsetContrast) -> DriveVector | None:
     """Find a drive near the best score whose plain ramp disturbs less, if there is one."""
-    near = choice.near()
+    near = choice.alternatives()
     if len(near.frequencies) < 2:
         return None
     contrast = onset_contrast(near.frequencies, near.weights)
     if contrast is None:
         return None
     best = int((near.score * contrast**ONSET_WEIGHT).argmax())
-    return Drive.at(int(near.frequencies[best]), near.weights[best]) if best > 0 else None
+    return DriveVector.at(int(near.frequencies[best]), near.weights[best]) if best > 0 else None
 
 
 def _choose_exactly(question: Question, candidates: Candidates) -> Pattern:
@@ -98,9 +98,9 @@ def _choose_exactly(question: Question, candidates: Candidates) -> Pattern:
             "time, or lower the level"
         )
     if found.drive is None:
-        raise _level_error(question, "switched", loudest_found(fields, eras_at_most=count))
-    outcome = judge(fields, found.drive)
-    pattern = _pattern(question, "switched", candidates, found.drive, outcome)
+        raise _level_error(question, "switched", sensation_found(fields, eras_at_most=count))
+    evaluation = evaluate(fields, found.drive)
+    pattern = _pattern(question, "switched", candidates, found.drive, evaluation)
     return replace(pattern, contrast_bound_db=20 * math.log10(found.bound))
 
 
@@ -119,11 +119,15 @@ def _level_error(question: Question, drive_mode: str, reachable: float) -> Unrea
 
 
 def _pattern(
-    question: Question, drive_mode: str, candidates: Candidates, drive: Drive, outcome: Outcome
+    question: Question,
+    drive_mode: str,
+    candidates: Candidates,
+    drive: DriveVector,
+    evaluation: Evaluation,
 ) -> Pattern:
-    gain = min(1.0, candidates.fields.wanted / outcome.sensation)
-    contrast = 20 * math.log10(max(outcome.peak, 1e-30) / max(outcome.quiet_peak, 1e-30))
-    quiet_level = 20 * math.log10(max(gain * outcome.quiet_sensation, 1e-30))
+    gain = min(1.0, candidates.fields.wanted / evaluation.sensation)
+    contrast = 20 * math.log10(max(evaluation.peak, 1e-30) / max(evaluation.quiet_peak, 1e-30))
+    quiet_level = 20 * math.log10(max(gain * evaluation.quiet_sensation, 1e-30))
     return Pattern(
         excitation=excitation_of(drive, candidates.eras, candidates.frequencies, gain=gain),
         ramp=ONSET_RAMP,

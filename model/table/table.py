@@ -14,9 +14,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from model.arrays import FloatArray, IntArray
+from model.arrays import Complex64Array, FloatArray, IntArray
 from model.drive_modes.exact_search import pattern_count
-from model.drive_modes.fields import Fields, SingleComplex
+from model.drive_modes.fields import Fields
 from model.drive_modes.sources import (
     magnitudes_of_sources,
     per_source,
@@ -81,7 +81,7 @@ class LocalizationTable:
     drive_mode: str
     code_version: str
     frequencies: FloatArray
-    acceleration: SingleComplex
+    acceleration: Complex64Array
     omega: FloatArray
     held: FloatArray
     shapes: NDArray[np.float32]
@@ -244,7 +244,7 @@ class LocalizationTable:
         return self.acceleration.reshape(self.raster.point_count, -1).view(np.float32)
 
     @cached_property
-    def _cell_fields(self) -> SingleComplex:
+    def _cell_fields(self) -> Complex64Array:
         """Fields at the centres of the cells, (f, eras, cells)."""
         return self._by_frequency(self.raster.at(self._values, self.cell_centres))
 
@@ -257,7 +257,7 @@ class LocalizationTable:
     ) -> OnsetContrast:
         """Contrast of plain ramps at the fingertips, by index among the playable frequencies."""
 
-        def contrast(rows: IntArray, weights: SingleComplex) -> FloatArray | None:
+        def contrast(rows: IntArray, weights: Complex64Array) -> FloatArray | None:
             if self.onsets is None:
                 return None
             shapes, ends = fingertips.read(self.shapes), fingertips.ends
@@ -273,6 +273,6 @@ class LocalizationTable:
 
         return contrast
 
-    def _by_frequency(self, values: NDArray[np.float32]) -> SingleComplex:
+    def _by_frequency(self, values: NDArray[np.float32]) -> Complex64Array:
         fields = values.view(np.complex64).reshape(len(values), len(self.frequencies), -1)
         return np.ascontiguousarray(fields.transpose(1, 2, 0))

@@ -14,11 +14,11 @@ from model.drive_modes import (
     coherent,
     fields,
     find_drives,
-    loudest,
+    max_sensation,
     playable_drive_modes,
 )
 from model.drive_modes import switched as switched_mode
-from model.drive_modes.fields import ERROR_SHARE, SILENT, Drive, Fields, Outcome, judge
+from model.drive_modes.fields import ERROR_SHARE, SILENT, DriveVector, Evaluation, Fields, evaluate
 from model.drive_modes.phased import PHASED
 from model.table.build import build_table
 from model.table.question import Question
@@ -55,7 +55,7 @@ def found_alone(mode, given, least):
         return switched_mode.find_switched(given, least)
     search = coherent.search(given, least)
     best = int(search.score.argmax())
-    return Drive.at(best, search.weights[best])
+    return DriveVector.at(best, search.weights[best])
 
 
 def contrast_by_hand(given, drive_index, weights):
@@ -88,7 +88,7 @@ def contrast_by_hand(given, drive_index, weights):
 @pytest.mark.parametrize("wanted", [1e-6, 1.4, 2.0])
 def test_switched_finds_the_best_of_all_patterns(is_alone, targets, wanted, monkeypatch):
     """One or two ERAs of three at five frequencies, every pattern tried by hand."""
-    monkeypatch.setattr(switched_mode, "AT_ONCE", 3)
+    monkeypatch.setattr(switched_mode, "BATCH", 3)
     monkeypatch.setattr(switched_mode, "BOUND_POINTS", 1)  # so that bounds mislead
     for seed in range(5):
         given = random_fields(seed, targets=targets, is_alone=is_alone, wanted=wanted)
@@ -111,22 +111,22 @@ def test_switched_says_whether_something_is_better(few, targets, monkeypatch):
     monkeypatch.setattr(switched_mode, "FEW_SOURCES", few)
     for seed in range(8):
         given = random_fields(seed, targets=targets)
-        best = judge(given, found_alone("switched", given, 0.0))
+        best = evaluate(given, found_alone("switched", given, 0.0))
         contrast = best.peak / best.quiet_peak
         again = found_alone("switched", given, 0.999 * contrast)
         assert again is not None
-        assert judge(given, again).peak == best.peak
+        assert evaluate(given, again).peak == best.peak
         assert found_alone("switched", given, 1.001 * contrast) is None
 
 
 def test_what_a_drive_does_is_equation_28():
     """Peak, level and contrast of a drive at two frequencies, by hand."""
     given = random_fields(1)
-    drive = Drive(np.array([2, 0, 2]), np.array([0.5j, 1.0, -0.25], dtype=np.complex64))
-    outcome = judge(given, drive)
+    drive = DriveVector(np.array([2, 0, 2]), np.array([0.5j, 1.0, -0.25], dtype=np.complex64))
+    evaluation = evaluate(given, drive)
     contrast, felt = contrast_by_hand(given, [2, 0, 2], [0.5j, 1.0, -0.25])
-    assert outcome.peak / outcome.quiet_peak == pytest.approx(contrast, rel=1e-5)
-    assert outcome.sensation == pytest.approx(felt, rel=1e-5)
+    assert evaluation.peak / evaluation.quiet_peak == pytest.approx(contrast, rel=1e-5)
+    assert evaluation.sensation == pytest.approx(felt, rel=1e-5)
 
 
 def test_what_a_quiet_finger_feels_of_two_tones_is_their_power():
@@ -136,9 +136,9 @@ def test_what_a_quiet_finger_feels_of_two_tones_is_their_power():
     given = Fields(
         (np.ones((2, 2, 1), dtype=np.complex64),), quiet, False, np.array([1.0, 10.0]), 1e-6
     )
-    outcome = judge(given, Drive(np.array([0, 1]), np.ones(2, dtype=np.complex64)))
-    assert outcome.quiet_sensation == pytest.approx(5.0)
-    assert outcome.quiet_peak == pytest.approx(43.0)
+    evaluation = evaluate(given, DriveVector(np.array([0, 1]), np.ones(2, dtype=np.complex64)))
+    assert evaluation.quiet_sensation == pytest.approx(5.0)
+    assert evaluation.quiet_peak == pytest.approx(43.0)
 
 
 @pytest.mark.parametrize(
@@ -153,13 +153,13 @@ def test_what_is_near_the_best_is_within_three_decibels(scores, near):
     """The best first, four at the most; none where the best drive is not among them."""
     frequencies = np.arange(10, 10 + len(scores))
     choice = Choice(
-        Drive(np.array([0, 1]), np.ones(2, dtype=np.complex64)),
-        Outcome(peak=1.0, sensation=1.0, quiet_peak=0.4, quiet_sensation=0.4, score=2.0),
+        DriveVector(np.array([0, 1]), np.ones(2, dtype=np.complex64)),
+        Evaluation(peak=1.0, sensation=1.0, quiet_peak=0.4, quiet_sensation=0.4, score=2.0),
         frequencies,
         np.repeat(frequencies[:, None], 2, axis=1).astype(np.complex64),
         np.array(scores, dtype=np.float32),
     )
-    found = choice.near()
+    found = choice.alternatives()
     assert (found.frequencies - 10).tolist() == near
     assert found.weights[:, 0].tolist() == found.frequencies.tolist()
     assert found.score == pytest.approx([scores[place] for place in near])
@@ -190,7 +190,7 @@ def test_phased_for_one_quiet_point_is_the_closed_form():
             R = np.outer(q.conj(), q) + ERROR_SHARE**2 * np.diag(np.abs(q) ** 2)
             best = max(best, np.sqrt((t @ np.linalg.solve(R, t.conj())).real))
         drive = found_alone("phased", given, 0.0)
-        assert judge(given, drive).score == pytest.approx(best, rel=1e-3)
+        assert evaluate(given, drive).score == pytest.approx(best, rel=1e-3)
 
 
 def test_phased_for_a_lone_finger_is_the_closed_form():
@@ -204,7 +204,7 @@ def test_phased_for_a_lone_finger_is_the_closed_form():
             R = q.conj() @ q.T / q.shape[1] + ERROR_SHARE**2 * np.diag(power)
             best = max(best, np.sqrt((t @ np.linalg.solve(R, t.conj())).real))
         drive = found_alone("phased", given, 0.0)
-        assert judge(given, drive).score == pytest.approx(best, rel=1e-3)
+        assert evaluate(given, drive).score == pytest.approx(best, rel=1e-3)
 
 
 def test_signed_for_a_lone_finger_is_the_top_eigenvector():
@@ -219,7 +219,7 @@ def test_signed_for_a_lone_finger_is_the_top_eigenvector():
             top = eigh(np.outer(t.conj(), t).real, R.real, eigvals_only=True)[-1]
             best = max(best, np.sqrt(top))
         drive = found_alone("signed", given, 0.0)
-        assert judge(given, drive).score == pytest.approx(best, rel=1e-3)
+        assert evaluate(given, drive).score == pytest.approx(best, rel=1e-3)
 
 
 @pytest.mark.parametrize(("mode", "lowest"), [("signed", -1.0), ("graded", 0.0)])
@@ -235,7 +235,7 @@ def test_real_weights_are_the_best_of_a_fine_grid(mode, lowest):
             q, t = given.quiet[f, :, 0], given.targets[0][f, :, 0]
             power = np.abs(grid @ q) ** 2 + ERROR_SHARE**2 * (grid**2 @ np.abs(q) ** 2)
             best = max(best, (np.abs(grid @ t) / np.sqrt(power)).max())
-        assert judge(given, found_alone(mode, given, 0.0)).score >= 0.995 * best
+        assert evaluate(given, found_alone(mode, given, 0.0)).score >= 0.995 * best
 
 
 def refined(given, frequency, start, free):
@@ -264,7 +264,7 @@ def test_a_general_optimiser_finds_nothing_better(mode, count, free):
     """On the plate, from several starts, Nelder-Mead gains no more than 2 % (0.17 dB)."""
     for number, places in enumerate(contact_sets(3, fingers=3, seed=4)):
         given = fields_on_plate(places, level=-60.0).at(np.array([2, 9, 16]))
-        score = judge(given, found_alone(mode, given, 0.0)).score
+        score = evaluate(given, found_alone(mode, given, 0.0)).score
         rng = np.random.default_rng(number)
         best = max(
             refined(given, f, rng.standard_normal(count), free) for f in range(3) for _ in range(4)
@@ -297,14 +297,14 @@ def test_more_freedom_is_never_worse(level):
         for places in contact_sets(10, fingers=quiet + targets, seed=quiet):
             given = fields_on_plate(places, targets=targets, level=level)
             found = [find_drives(given, mode) for mode in DRIVE_MODES]
-            scores = [one.outcome.score if one else 1e-3 for one in found]
+            scores = [one.evaluation.score if one else 1e-3 for one in found]
             switched, graded, signed, phased = 20 * np.log10(scores)
             assert graded >= switched
             assert signed >= graded - 1e-4
             assert phased >= switched
-            is_held_back = PHASED.search(given, 0.0).is_held_back
-            held_back += is_held_back
-            strict = is_held_back or targets > 1
+            is_level_limited = PHASED.search(given, 0.0).is_level_limited
+            held_back += is_level_limited
+            strict = is_level_limited or targets > 1
             assert phased >= signed - (1e-4 if strict else 0.5)
     assert (held_back > 10) == (level > 50.0)
 
@@ -322,14 +322,14 @@ def test_more_frequencies_and_eras_are_never_worse():
             given.wanted,
         )
         for mode, slack in (("switched", 1e-9), ("phased", 0.5)):
-            most = 20 * np.log10(find_drives(given, mode).outcome.score)
+            most = 20 * np.log10(find_drives(given, mode).evaluation.score)
             for less in (fewer, without):
-                outcome = find_drives(less, mode).outcome
+                evaluation = find_drives(less, mode).evaluation
                 if mode == "switched":  # goes by contrast, not by the score
-                    whole = find_drives(given, mode).outcome
-                    assert outcome.peak / outcome.quiet_peak <= whole.peak / whole.quiet_peak
+                    whole = find_drives(given, mode).evaluation
+                    assert evaluation.peak / evaluation.quiet_peak <= whole.peak / whole.quiet_peak
                 else:
-                    assert 20 * np.log10(outcome.score) <= most + slack
+                    assert 20 * np.log10(evaluation.score) <= most + slack
 
 
 def test_the_phased_optimum_does_not_depend_on_what_holds_the_plate(monkeypatch):
@@ -347,21 +347,21 @@ def test_the_phased_optimum_does_not_depend_on_what_holds_the_plate(monkeypatch)
     for places in contact_sets(8, fingers=2, seed=8):
         question = Question((places[0],), (places[1],), level_db_sl=-60.0)
         scores = [
-            20 * np.log10(judge(given, found_alone("phased", given, 0.0)).score)
+            20 * np.log10(evaluate(given, found_alone("phased", given, 0.0)).score)
             for given in (table.fields(question) for table in tables)
         ]
         assert scores[0] == pytest.approx(scores[1], abs=0.1)
 
 
 @pytest.mark.parametrize("mode", DRIVE_MODES)
-def test_what_is_said_to_be_the_loudest_is_had(mode):
+def test_max_sensation_is_reached_and_not_exceeded(mode):
     """A hair below the loudest level there is a drive; a tenth above there is none."""
     for places in contact_sets(5, fingers=2, seed=5):
         given = fields_on_plate(places)
-        most = loudest(given, mode)
+        most = max_sensation(given, mode)
         found = find_drives(replace(given, wanted=0.999 * most), mode)
         assert found is not None
-        assert found.outcome.sensation >= 0.999 * most * (1 - 1e-5)
+        assert found.evaluation.sensation >= 0.999 * most * (1 - 1e-5)
         assert find_drives(replace(given, wanted=1.1 * most), mode) is None
 
 
@@ -374,14 +374,14 @@ def test_two_tones_may_be_louder_than_any_drive_at_one_frequency():
     quiet = np.full((2, 2, 1), 0.1, dtype=np.complex64)
     given = Fields((target,), quiet, False, np.ones(2, dtype=np.float32), 1.0)
     for mode in DRIVE_MODES:
-        assert loudest(given, mode) == pytest.approx(np.sqrt(2), rel=1e-4)
+        assert max_sensation(given, mode) == pytest.approx(np.sqrt(2), rel=1e-4)
 
 
-def test_phased_is_loudest_with_all_eras_in_step():
+def test_max_sensation_of_phased_is_the_sum_of_magnitudes():
     """At one point no weights of up to full stroke give more than the sum of the magnitudes."""
     given = random_fields(2, points=1)
     sums = np.abs(given.targets[0][:, :, 0]).sum(axis=1) / given.threshold
-    assert DRIVE_MODES["phased"].loudest(given) == pytest.approx(sums.max(), rel=1e-4)
+    assert DRIVE_MODES["phased"].max_sensation(given) == pytest.approx(sums.max(), rel=1e-4)
 
 
 def test_two_targets_and_a_quiet_point_are_all_served():
@@ -392,7 +392,7 @@ def test_two_targets_and_a_quiet_point_are_all_served():
         (frequency, weight), *more = choice.drive.tones()
         assert not more
         reached = [np.abs(weight @ field[frequency])[0] for field in given.targets]
-        assert choice.outcome.peak == pytest.approx(min(reached), rel=1e-5)
+        assert choice.evaluation.peak == pytest.approx(min(reached), rel=1e-5)
 
         # No mixture of the two single solutions, at any phase and ratio, has a better lesser one.
         best = 0.0
@@ -405,7 +405,7 @@ def test_two_targets_and_a_quiet_point_are_all_served():
                 w = single[:, 0] + ratio * np.exp(1j * phase) * single[:, 1]
                 cost = np.sqrt((w.conj() @ R @ w).real)
                 best = max(best, np.abs(h @ w).min() / cost)
-        assert choice.outcome.score >= 0.98 * best
+        assert choice.evaluation.score >= 0.98 * best
 
 
 @pytest.mark.parametrize(

@@ -5,8 +5,9 @@ from itertools import product
 import numpy as np
 import pytest
 
-from model.drive_modes.exact_search import groupings, loudest_found, pattern_count, search_exactly
-from model.drive_modes.fields import SILENT, Drive, Fields, judge
+from benchmarks.localization.bounds import mixture_bound
+from model.drive_modes.exact_search import groupings, pattern_count, search_exactly, sensation_found
+from model.drive_modes.fields import SILENT, DriveVector, Fields, evaluate
 from model.drive_modes.switched import find_switched
 from model.errors import InputError
 from model.table.question import Question
@@ -33,20 +34,20 @@ def by_brute_force(given):
     for index in product([SILENT, *range(F)], repeat=E):
         if any(i != SILENT for i in index):
             weight = np.array([i != SILENT for i in index], dtype=np.complex64)
-            outcome = judge(given, Drive(np.array(index), weight))
-            if outcome.sensation >= given.wanted:
-                best = max(best, outcome.peak / outcome.quiet_peak)
+            evaluation = evaluate(given, DriveVector(np.array(index), weight))
+            if evaluation.sensation >= given.wanted:
+                best = max(best, evaluation.peak / evaluation.quiet_peak)
     return best
 
 
-def test_the_paper_has_614_655_patterns_of_up_to_four_eras():
+def test_pattern_count_of_the_paper_is_614_655():
     """28^4 - 1, of which 4482 drive one or two; eight ERAs have 28^8 - 1."""
     assert pattern_count(4, 27, eras_at_most=4) == 28**4 - 1 == 614_655
     assert pattern_count(4, 27, eras_at_most=2) == 4482
     assert pattern_count(8, 27, eras_at_most=8) == 28**8 - 1
 
 
-def test_groupings_are_all_ways_to_share_frequencies():
+def test_groupings_are_all_partitions():
     """Bell numbers: five things, one of them silence, fall into 52 partitions, one of them idle."""
     assert len(groupings(4, 4)) == 52 - 1
     assert len(groupings(8, 8)) == 21147 - 1
@@ -59,7 +60,7 @@ def test_groupings_are_all_ways_to_share_frequencies():
 @pytest.mark.parametrize("is_alone", [False, True])
 @pytest.mark.parametrize("wanted", [1e-6, 2.0, 3.0])
 @pytest.mark.parametrize("targets", [1, 2])
-def test_it_equals_trying_everything(is_alone, wanted, targets):
+def test_search_exactly_equals_brute_force(is_alone, wanted, targets):
     """Three ERAs and four frequencies: the best of all 124 patterns, proven to be."""
     for seed in range(6):
         given = random_fields(seed, is_alone=is_alone, wanted=wanted, targets=targets)
@@ -69,14 +70,16 @@ def test_it_equals_trying_everything(is_alone, wanted, targets):
         assert found.bound == found.contrast
         assert found.pattern_count == 124
         if found.drive is not None:
-            outcome = judge(given, found.drive)
-            assert outcome.peak / outcome.quiet_peak == pytest.approx(found.contrast, rel=1e-5)
-            assert outcome.sensation >= wanted * (1 - 1e-5)
+            evaluation = evaluate(given, found.drive)
+            assert evaluation.peak / evaluation.quiet_peak == pytest.approx(
+                found.contrast, rel=1e-5
+            )
+            assert evaluation.sensation >= wanted * (1 - 1e-5)
 
 
-def test_a_front_that_is_cut_in_pieces_holds_the_same(monkeypatch):
+def test_search_exactly_equals_brute_force_when_fronts_are_split(monkeypatch):
     """One choice at a time is extended, and still the best of all patterns is found."""
-    monkeypatch.setattr("model.drive_modes.exact_search.FRONT", 1)
+    monkeypatch.setattr("model.drive_modes.exact_search.MAX_FRONT", 1)
     for seed in range(6):
         given = random_fields(seed, is_alone=False, wanted=2.0)
         found = search_exactly(given, eras_at_most=E)
@@ -84,32 +87,34 @@ def test_a_front_that_is_cut_in_pieces_holds_the_same(monkeypatch):
         assert found.is_complete
 
 
-def test_where_nothing_is_loud_enough_there_is_no_drive():
+def test_search_exactly_has_no_drive_when_no_pattern_reaches_the_level():
     """A level beyond all ERAs together."""
     found = search_exactly(random_fields(0, is_alone=False, wanted=100.0), eras_at_most=E)
     assert found.drive is None
     assert found.is_complete
 
 
-def test_the_loudest_is_reached_and_nothing_is_much_louder():
+def test_sensation_found_is_within_1_5_db_of_the_maximum():
     """Of 1295 patterns of four ERAs on the plate, at one or two targets: within 1.5 dB below."""
     some = np.arange(0, 27, 6)
     patterns = [i for i in product([SILENT, *range(len(some))], repeat=4) if max(i) != SILENT]
-    drives = [Drive(np.array(i), (np.array(i) != SILENT).astype(np.complex64)) for i in patterns]
+    drives = [
+        DriveVector(np.array(i), (np.array(i) != SILENT).astype(np.complex64)) for i in patterns
+    ]
     for places in contact_sets(4, fingers=3, seed=8):
         for count in (1, 2):
             question = Question(tuple(places[:count]), tuple(places[count:]))
             given = smooth_table().fields(question).at(some)
-            most = max(judge(given, drive).sensation for drive in drives)
-            found = loudest_found(given, eras_at_most=4)
+            most = max(evaluate(given, drive).sensation for drive in drives)
+            found = sensation_found(given, eras_at_most=4)
             assert 10 ** (-1.5 / 20) * most <= found <= most * (1 + 1e-5)
 
 
 @pytest.mark.parametrize("is_alone", [False, True])
-def test_no_mixture_of_sources_exceeds_the_bound(is_alone):
+def test_mixture_bound_is_not_exceeded_by_random_mixtures(is_alone):
     """Amplitudes at random, on few sources or many: never above what the dual says."""
     given = random_fields(1, is_alone=is_alone, wanted=1e-6)
-    found = search_exactly(given, eras_at_most=E)
+    bound = mixture_bound(given, eras_at_most=E)
     rng = np.random.default_rng(0)
     member = np.array([[m >> era & 1 for era in range(E)] for m in range(1, 1 << E)])
     peak = np.abs(np.einsum("ge,fep->gfp", member, given.targets[0])).mean(axis=-1).ravel()
@@ -118,23 +123,28 @@ def test_no_mixture_of_sources_exceeds_the_bound(is_alone):
         amplitude = rng.exponential(size=len(peak)) ** rng.integers(1, 8)
         field = amplitude @ quiet
         loud = np.sqrt((field**2).mean()) if is_alone else field.max()
-        assert amplitude @ peak / loud <= found.mixture * (1 + 1e-6)
-    assert found.contrast <= found.mixture * (1 + 1e-6)
+        assert amplitude @ peak / loud <= bound * (1 + 1e-6)
+    found = search_exactly(given, eras_at_most=E)
+    assert found.contrast <= bound * (1 + 1e-6)
 
 
-def test_on_the_plate_two_eras_are_what_the_live_search_finds():
+def test_search_exactly_equals_find_switched_for_two_eras():
     """With at most two ERAs both searches have the same best; with four it is no worse."""
     for places in contact_sets(6, fingers=3, seed=6):
         given = smooth_table().fields(Question((places[0],), tuple(places[1:]), level_db_sl=12.0))
-        outcome = judge(given, find_switched(given, 0.0))
+        evaluation = evaluate(given, find_switched(given, 0.0))
         two = search_exactly(given, eras_at_most=2)
-        assert two.contrast == pytest.approx(outcome.peak / outcome.quiet_peak, rel=1e-5)
+        assert two.contrast == pytest.approx(evaluation.peak / evaluation.quiet_peak, rel=1e-5)
         four = search_exactly(given, eras_at_most=4)
-        assert two.contrast <= four.contrast * (1 + 1e-6) <= four.mixture * (1 + 1e-5)
-        assert 0 < four.looked_at < 0.01 * four.pattern_count
+        assert (
+            two.contrast
+            <= four.contrast * (1 + 1e-6)
+            <= mixture_bound(given, eras_at_most=4) * (1 + 1e-5)
+        )
+        assert 0 < four.evaluated_count < 0.01 * four.pattern_count
 
 
-def test_out_of_time_there_is_a_bound():
+def test_search_exactly_bounds_the_contrast_when_out_of_time():
     """Without any time the answer is what two ERAs do, and the bound is above the true best."""
     open_ends = 0
     for places in contact_sets(8, fingers=4, seed=7):
@@ -148,9 +158,9 @@ def test_out_of_time_there_is_a_bound():
     assert open_ends > 0
 
 
-def test_too_many_eras_are_refused():
+def test_search_exactly_refuses_ten_eras():
     """Ten ERAs fall into more groupings than can be gone through."""
     field = np.ones((1, 10, 1), dtype=np.complex64)
     given = Fields((field,), field, False, np.ones(1, np.float32), 1e-6)
-    with pytest.raises(InputError, match="too many ways"):
+    with pytest.raises(InputError, match="at most 9, got 10"):
         search_exactly(given, eras_at_most=10)

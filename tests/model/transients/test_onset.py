@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from model.drive_modes import find_drives
-from model.drive_modes.fields import Drive, judge
+from model.drive_modes.fields import DriveVector, evaluate
 from model.drive_modes.tones import excitation_of
 from model.table.pattern import ONSET_RAMP
 from model.table.question import Question
@@ -42,7 +42,9 @@ def test_the_contrast_of_an_onset_is_that_of_every_sample(ramp, within):
             quiet=np.concatenate(shapes[len(targets) :]),
         )
         for row, weight, contrast in zip(rows, weights, found, strict=True):
-            excitation = excitation_of(Drive.at(row, weight), table.eras, FREQUENCIES, gain=1.0)
+            excitation = excitation_of(
+                DriveVector.at(row, weight), table.eras, FREQUENCIES, gain=1.0
+            )
             bases = ramped_onset(excitation, table.eras, ramp=ramp)
             exact = transients.contrast_db(bases, targets=targets, quiet=quiet)
             errors.append(20 * np.log10(contrast) - exact)
@@ -68,8 +70,8 @@ def test_a_plain_ramp_takes_the_pattern_of_the_better_onset(mode):
             if tone is not None:
                 weights[number] = tone.amplitude * np.exp(1j * tone.phase) / era.stroke
         if len({tone.frequency for tone in plain.excitation.values()}) == 1:
-            chosen = Drive.at(int(np.abs(FREQUENCIES - frequency).argmin()), weights)
-            assert judge(fields, chosen).score >= 0.99 * 10 ** (-3 / 20) * best.outcome.score
+            chosen = DriveVector.at(int(np.abs(FREQUENCIES - frequency).argmin()), weights)
+            assert evaluate(fields, chosen).score >= 0.99 * 10 ** (-3 / 20) * best.evaluation.score
         transients = []
         for drive in (
             plain.excitation,
@@ -115,7 +117,7 @@ def test_a_decibel_of_the_score_counts_as_much_as_three_of_the_onset(softer, fre
             softer_db=softer,
             frequencies=frequencies,
         )
-        near = find_drives(table.fields(question).at(usable), "phased").near()
+        near = find_drives(table.fields(question).at(usable), "phased").alternatives()
 
         def worth(excitation, score, question=question):
             bases = ramped_onset(excitation, table.eras, ramp=ONSET_RAMP)
@@ -127,7 +129,9 @@ def test_a_decibel_of_the_score_counts_as_much_as_three_of_the_onset(softer, fre
 
         values, phases = [], []
         for row, weight, score in zip(near.frequencies, near.weights, near.score, strict=True):
-            tones = excitation_of(Drive.at(row, weight), table.eras, FREQUENCIES[usable], gain=1.0)
+            tones = excitation_of(
+                DriveVector.at(row, weight), table.eras, FREQUENCIES[usable], gain=1.0
+            )
             values.append(worth(tones, score))
             phases.append({name: (tone.frequency, tone.phase) for name, tone in tones.items()})
         if len(values) < 2:

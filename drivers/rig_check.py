@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from drivers.amplifier import WATCHDOG
 from drivers.backend import Backend
 from drivers.errors import CommandError
+from drivers.guard.limits import FREQUENCY_CEILING, FREQUENCY_FLOOR, GuardLimits
 from drivers.operation.watchdog import (
     HEARTBEAT,
     MAX_MISSED_HEARTBEATS,
@@ -23,12 +24,12 @@ COMMIT_SKEW = 0.001
 
 
 def check_links(
-    urls: Mapping[str, str], *, channels: Mapping[str, int], frequency_max: float
+    urls: Mapping[str, str], *, channels: Mapping[str, int], limits: Mapping[str, float]
 ) -> tuple[dict[str, str], list[str]]:
     """Return errors by amplifier name, and warnings.
 
-    urls by name; channels: number of wired channels by name, missing if none; frequency_max [Hz]:
-    highest frequency of the ERAs.
+    urls by name; channels: number of wired channels by name, missing if none; limits: those of
+    the rig, by the names of `GuardLimits`.
     """
     errors: dict[str, str] = {}
     backends: dict[str, Backend] = {}
@@ -51,8 +52,12 @@ def check_links(
         for name, backend in used.items()
         if not urls[name].startswith("sim://")
     }
-    warnings = _skew_warnings(sorted(links), frequency_max)
-    return errors, [*warnings, *_late_loss_warnings(used, channels)]
+    warnings = [
+        *_ceiling_warnings(GuardLimits(**limits)),
+        *_skew_warnings(sorted(links), limits["frequency_max"]),
+        *_late_loss_warnings(used, channels),
+    ]
+    return errors, warnings
 
 
 def phase_error(frequency: float, skew: float) -> float:
@@ -67,6 +72,17 @@ def remaining_contrast(frequency: float, skew: float) -> float:
     """
     phase = min(math.radians(phase_error(frequency, skew)), math.pi)
     return max(0.0, -20.0 * math.log10(2.0 * math.sin(phase / 2.0)))
+
+
+def _ceiling_warnings(limits: GuardLimits) -> list[str]:
+    """Warn of limits beyond what the guard passes whatever the configuration says."""
+    low, high = limits.frequency_min, limits.frequency_max
+    if low >= FREQUENCY_FLOOR and high <= FREQUENCY_CEILING:
+        return []
+    return [
+        f"limits.frequency should be within {FREQUENCY_FLOOR:g} to {FREQUENCY_CEILING:g} Hz, got "
+        f"{low:g} to {high:g} Hz; frequencies beyond are never played"
+    ]
 
 
 def _late_loss_warnings(backends: Mapping[str, Backend], channels: Mapping[str, int]) -> list[str]:

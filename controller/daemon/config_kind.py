@@ -1,6 +1,7 @@
 """Daemon files as a kind of configuration for `era config`."""
 
 from collections import Counter
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -23,9 +24,7 @@ class DaemonKind:
         config = load_daemon_config(path)
         rig = config.rig
         wired = Counter(channel.amplifier for channel in rig.wiring.values())
-        _, warnings = check_links(
-            config.urls, channels=wired, frequency_max=rig.limits.frequency_max
-        )
+        _, warnings = check_links(config.urls, channels=wired, limits=asdict(rig.limits))
         hint = "" if config.table is None else f". era daemon {path} --check reads its table, too"
         line = (
             f"good: ERAs {', '.join(era.name for era in config.rig.eras)} on "

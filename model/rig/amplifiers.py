@@ -6,11 +6,13 @@ as `RigCheck`.
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from typing import Protocol, runtime_checkable
 from urllib.parse import quote
 
 from model.config.document import Document, Problem
 from model.errors import InputError
+from model.rig.parts import limits_of
 from model.rig.rig import Rig
 from model.rig.sections import LimitsSection
 from registry.plugins import Instance, PluginRegistry
@@ -21,11 +23,11 @@ class RigCheck(Protocol):
     """Looks at URLs and opens nothing."""
 
     def __call__(
-        self, urls: Mapping[str, str], *, channels: Mapping[str, int], frequency_max: float
+        self, urls: Mapping[str, str], *, channels: Mapping[str, int], limits: Mapping[str, float]
     ) -> tuple[Mapping[str, str], Sequence[str]]:
         """What is wrong, by the amplifier's name, and what to be warned of.
 
-        channels: how many of each are wired; frequency_max [Hz]: up to which ERAs are driven.
+        channels: number wired by amplifier; limits: of the rig, by the names of `Limits`.
         """
 
 
@@ -38,11 +40,11 @@ def check_amplifiers(document: Document, rig: Rig | None) -> tuple[list[Problem]
     """Problems and warnings; rig: what the document became, if it did."""
     urls = _urls(document)
     wired = Counter(channel.amplifier for channel in rig.wiring.values()) if rig else Counter()
-    highest = rig.limits.frequency_max if rig else LimitsSection().frequency[1]
+    limits = rig.limits if rig else limits_of(LimitsSection())
     problems: list[Problem] = []
     warnings: list[str] = []
     for name in _CHECKS.names():
-        wrong, told = _CHECKS.find(name)(urls, channels=wired, frequency_max=highest)
+        wrong, told = _CHECKS.find(name)(urls, channels=wired, limits=asdict(limits))
         problems += [
             document.problem(("amplifiers", amplifier, "url"), what)
             for amplifier, what in wrong.items()

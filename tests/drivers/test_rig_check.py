@@ -1,18 +1,43 @@
 """Checks of a rig's amplifiers by their URLs, as in `era config check`."""
 
 import math
+from dataclasses import asdict, fields
 
 import pytest
 
+from drivers.guard.limits import FREQUENCY_CEILING, LEVEL_CEILING, RATE_CEILING, GuardLimits
 from drivers.rig_check import COMMIT_SKEW, check_links, phase_error, remaining_contrast
+from model.rig.rig import Limits
+from model.rig.sections import LimitsSection
 
+LIMITS = asdict(GuardLimits(40.0, 250.0, 1.0))
 BUS = "can+socketcan://can0"
 
 
 def checked(*urls: str, channels: int = 2) -> tuple[dict[str, str], list[str]]:
     """Amplifiers a, b, ... of these URLs, each with so many channels wired."""
     by_name = dict(zip("abcd", urls, strict=False))
-    return check_links(by_name, channels=dict.fromkeys(by_name, channels), frequency_max=250.0)
+    return check_links(by_name, channels=dict.fromkeys(by_name, channels), limits=LIMITS)
+
+
+@pytest.mark.parametrize("frequencies", [(5.0, 250.0), (40.0, FREQUENCY_CEILING + 1)])
+def test_check_links_warns_of_limits_beyond_the_ceilings(frequencies: tuple[float, float]) -> None:
+    """The guard would reduce them silently."""
+    limits = asdict(GuardLimits(*frequencies, 1.0))
+    _, warnings = check_links({}, channels={}, limits=limits)
+    assert len(warnings) == 1
+    assert check_links({}, channels={}, limits=LIMITS) == ({}, [])
+
+
+def test_limits_of_rig_and_guard_have_the_same_names_and_defaults() -> None:
+    """A rig states limits and the guard enforces them: same fields, units and bounds."""
+    ours = [(field.name, field.default) for field in fields(GuardLimits)]
+    assert [(field.name, field.default) for field in fields(Limits)] == ours
+    names = {name.removesuffix("_min").removesuffix("_max") for name, _ in ours}
+    assert LimitsSection.model_fields.keys() == names
+    for beyond in ({"level": LEVEL_CEILING + 0.1}, {"rate": RATE_CEILING + 1}):
+        with pytest.raises(ValueError, match=next(iter(beyond))):
+            LimitsSection.model_validate(beyond)
 
 
 @pytest.mark.parametrize(
@@ -50,8 +75,8 @@ def test_check_links_warns_of_eras_on_several_links() -> None:
     assert checked(f"{BUS}#1", f"{BUS}#5") == ({}, [])
     assert checked("modbus+tcp://host/1", "sim://rig.yaml") == ({}, [])
     urls = {"a": "serial:///dev/ttyUSB0", "b": f"{BUS}#1"}
-    assert check_links(urls, channels={"a": 4}, frequency_max=250.0) == ({}, [])
-    wrong, (warning,) = check_links(urls, channels={"a": 2, "b": 2}, frequency_max=250.0)
+    assert check_links(urls, channels={"a": 4}, limits=LIMITS) == ({}, [])
+    wrong, (warning,) = check_links(urls, channels={"a": 2, "b": 2}, limits=LIMITS)
     assert wrong == {}
     assert "2 links (/dev/ttyUSB0, can+socketcan://can0)" in warning
     assert "36 degrees at 100 Hz and 90 at 250 Hz" in warning

@@ -12,11 +12,11 @@ from typing import Any
 import pytest
 
 from controller.cli.main import run
+from controller.effects.buzz import Buzz
 from controller.effects.effect import Effect
-from controller.effects.kinds import effect_kind, effect_kinds
 from controller.effects.layout import Layout
 from controller.effects.player import EffectPlayer
-from controller.effects.timed import Buzz
+from controller.effects.registry import effect_kind, effect_kinds
 from controller.sources.contacts import Contact, ContactKey
 from controller.sources.registry import open_source
 from controller.sources.tuio import TuioSource
@@ -106,7 +106,7 @@ KINDS = [
         "from era_haptics.plugins.effects import Effect\n"
         "class THING(Effect):\n"
         "    kind = 'fine'\n"
-        "    def begin(self, contact, now, *, level_db_sl):\n"
+        "    def start(self, contact, now, *, level_db_sl):\n"
         "        pass\n",
         "a class derived from Effect",
         effect_kind,
@@ -115,8 +115,8 @@ KINDS = [
         fails="from era_haptics.plugins.effects import Effect\n"
         "class THING(Effect):\n"
         "    kind = 'fine'\n"
-        "    moves = False\n"
-        "    def begin(self, contact, now, *, level_db_sl):\n"
+        "    is_for_motion = False\n"
+        "    def start(self, contact, now, *, level_db_sl):\n"
         "        return 7\n",
         use=play_effect,
     ),

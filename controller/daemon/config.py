@@ -7,7 +7,7 @@ from urllib.parse import quote
 
 from controller.api.socket_path import default_socket
 from controller.daemon.config_sections import CalibrationSection, DaemonSection, TouchSection
-from controller.effects.layout import Layout, usual_effects
+from controller.effects.layout import Layout, default_effects
 from controller.effects.layout_file import is_layout_document, load_layout
 from controller.sources.calibration import CalibratedSource, TouchCalibration, fitted, turned
 from controller.sources.registry import open_source
@@ -63,7 +63,7 @@ class DaemonConfig:
     @property
     def effective_layout(self) -> Layout:
         """The layout, or one that buzzes at every touch if none is configured."""
-        return self.layout or Layout(effects=usual_effects(self.section.level_db_sl))
+        return self.layout or Layout(effects=default_effects(self.section.level_db_sl))
 
 
 def load_daemon_config(path: Path) -> DaemonConfig:

@@ -135,7 +135,7 @@ class EventPublisher:
 
     def layout_event(self) -> LayoutEvent:
         """The surface layout as an event."""
-        return LayoutEvent(layout=None if self._layout is None else self._layout.drawn())
+        return LayoutEvent(layout=None if self._layout is None else self._layout.as_json())
 
     def _state_event(self) -> StateEvent:
         now = self._machine()

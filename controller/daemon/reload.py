@@ -29,7 +29,7 @@ def plan_reload(old: DaemonConfig, new: DaemonConfig, *, is_armed: bool) -> Relo
     refused = tuple(key for key in REFUSED if key in changed)
     if refused:
         return ReloadPlan((), refused, f"{', '.join(refused)} changed, which needs a restart")
-    before, after = old.effective_layout.strongest_db_sl, new.effective_layout.strongest_db_sl
+    before, after = old.effective_layout.max_db_sl, new.effective_layout.max_db_sl
     if is_armed and after > before:
         return ReloadPlan(
             (),

@@ -1,4 +1,4 @@
-"""What every kind of effect is: parameters in a layout, and how it goes at a finger."""
+"""Base classes of effects: their parameters in a layout, and their course at one finger."""
 
 import math
 from abc import ABC, abstractmethod
@@ -13,26 +13,26 @@ from model.config.units import RATIO
 from model.finger.perception import STRONG_DB_SL
 
 NEIGHBOURS: Literal["neighbours"] = "neighbours"
-"""A level: as strong as the neighbours allow."""
+"""The level `as strong as the neighbours allow`."""
 
-LOWEST_LEVEL, HIGHEST_LEVEL = -20.0, 60.0  # dB SL
-_DB_SL = Quantity(RATIO, least=LOWEST_LEVEL, most=HIGHEST_LEVEL)
+MIN_DB_SL, MAX_DB_SL = -20.0, 60.0
+_DB_SL = Quantity(RATIO, least=MIN_DB_SL, most=MAX_DB_SL)
 
 
 def _level(value: object) -> object:
     if value == NEIGHBOURS:
         return NEIGHBOURS
     if isinstance(value, str):
-        raise ValueError(f"{value[:40]!r} is no level; write a number of dB SL, or {NEIGHBOURS}")
+        raise ValueError(f"level must be a number of dB SL or {NEIGHBOURS}, got {value[:40]!r}")
     return _DB_SL.read(value)
 
 
 Level: TypeAlias = Annotated[float | Literal["neighbours"], BeforeValidator(_level)]
-"""dB above the threshold of feeling, or `neighbours`."""
+"""dB above the detection threshold, or `neighbours`."""
 
 
 @dataclass(frozen=True, slots=True)
-class Feeling:
+class Sensation:
     """What a finger shall feel from now on.
 
     level_db_sl: None for as strong as the neighbours allow. until: when [s] that may change though
@@ -46,49 +46,49 @@ class Feeling:
 
 
 @dataclass(frozen=True, slots=True)
-class Nothing:
-    """A finger shall feel nothing now; until as in `Feeling`."""
+class NoSensation:
+    """A finger shall feel nothing now; until as in `Sensation`."""
 
     until: float | None = None
 
 
-class Course(ABC):
-    """One play of an effect at one finger, from when it began."""
+class EffectRun(ABC):
+    """One run of an effect at one finger, from its start."""
 
     @abstractmethod
-    def feel(self, contact: Contact, now: float) -> Feeling | Nothing | None:
-        """What the finger shall feel at a time [s]; None when the play is over, and stays so.
+    def feel(self, contact: Contact, now: float) -> Sensation | NoSensation | None:
+        """Return what the finger shall feel at a time [s]; None once the run is over.
 
-        Called at every change of the contact, and when the last answer ran out, in order of time.
+        Called in order of time: at every change of the contact and when `until` is reached.
         """
 
 
 class Effect(Section, ABC):
-    """The parameters of an effect; a kind of effect is a subclass of this.
+    """Parameters of an effect; each kind of effect is a subclass.
 
-    kind: its name in layouts; moves: whether it is about a finger that moves (then it belongs under
-    `on_move`), or goes by itself.
+    kind: its name in layouts; is_for_motion: whether it follows a moving finger and belongs under
+    `on_move`, or runs by itself.
     """
 
     kind: ClassVar[str]
-    moves: ClassVar[bool]
+    is_for_motion: ClassVar[bool]
 
     level: Level = STRONG_DB_SL
 
     @abstractmethod
-    def begin(self, contact: Contact, now: float, *, level_db_sl: float | None) -> Course:
-        """Begin at a finger, at a time [s], at a level; None for as strong as neighbours allow."""
+    def start(self, contact: Contact, now: float, *, level_db_sl: float | None) -> EffectRun:
+        """Start at a finger, at a time [s]; level None for as strong as the neighbours allow."""
 
     @property
-    def ends(self) -> bool:
-        """Whether it ends by itself, so that it may be played where nothing else would end it."""
+    def has_end(self) -> bool:
+        """Whether it ends by itself, so that it can be played where nothing else would end it."""
         return True
 
     @property
     def level_db_sl(self) -> float | None:
-        """The level; None for as strong as the neighbours allow."""
+        """Its level; None for as strong as the neighbours allow."""
         return None if isinstance(self.level, str) else self.level
 
-    def strongest_db_sl(self, level_db_sl: float | None) -> float:
-        """The highest level [dB SL] that is felt of a play at a level; infinite for None."""
+    def max_db_sl(self, level_db_sl: float | None) -> float:
+        """Return the highest level [dB SL] in a run at a level; infinite for None."""
         return math.inf if level_db_sl is None else level_db_sl

@@ -1,24 +1,24 @@
-"""A surface layout: which parts of the plate have which effects."""
+"""A surface layout: which regions of the plate have which effects."""
 
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from controller.effects.buzz import Buzz
+from controller.effects.click import Click
 from controller.effects.effect import Effect
 from controller.effects.shapes import Shape
-from controller.effects.timed import Buzz, Click
 from model.finger.perception import STRONG_DB_SL
 
 
 @dataclass(frozen=True)
 class Region:
-    """A part of the plate and the names of its effects, None for none.
+    """A region of the plate and the names of its effects, None for none.
 
-    on_press: when a finger comes down in it or slides in; on_move: while it moves in it;
-    on_release: when it slides out of it, felt where it is then. A finger that lifts feels nothing.
-    level_db_sl: in place of the effects' own, as an effect has it; has_level: whether it is. Where
-    several want to be felt, those of the highest priority are.
+    on_press: when a finger comes down or slides in; on_move: while it moves within; on_release:
+    when it slides out. A finger that lifts feels nothing. level_db_sl: replaces the level of the
+    effects if has_level. priority: the highest is felt.
     """
 
     name: str
@@ -30,11 +30,11 @@ class Region:
     has_level: bool = False
     priority: int = 0
 
-    def drawn(self) -> dict[str, Any]:
-        """As JSON."""
+    def as_json(self) -> dict[str, Any]:
+        """Return it as the API describes it."""
         return {
             "name": self.name,
-            **self.shape.drawn(),
+            **self.shape.as_json(),
             "on_press": self.on_press,
             "on_move": self.on_move,
             "on_release": self.on_release,
@@ -43,49 +43,49 @@ class Region:
 
 
 BUZZ = "buzz"
-"""The effect that plays where there is no layout."""
+"""Name of the effect that plays without a layout."""
 
 
-def usual_effects(level_db_sl: float = STRONG_DB_SL) -> dict[str, Effect]:
-    """Effects that need not be written down, at a level."""
+def default_effects(level_db_sl: float = STRONG_DB_SL) -> dict[str, Effect]:
+    """Return the effects that every layout has without defining them, at a level."""
     return {BUZZ: Buzz(level=level_db_sl), "click": Click(level=level_db_sl)}
 
 
 @dataclass(frozen=True)
 class Layout:
-    """Regions, of which a later one lies on top of an earlier one, and effects by their names.
+    """Regions, later ones on top of earlier ones, and effects by name.
 
-    elsewhere: the effect outside of all regions, None for none; most_at_once: how many fingers may
-    feel something at once, the newest of them.
+    elsewhere: the effect outside of all regions, None for none; most_at_once: number of fingers
+    that may feel something at once, the newest ones.
     """
 
     regions: tuple[Region, ...] = ()
-    effects: Mapping[str, Effect] = field(default_factory=usual_effects)
+    effects: Mapping[str, Effect] = field(default_factory=default_effects)
     elsewhere: str | None = BUZZ
     most_at_once: int = 1
 
     def region_at(self, x: float, y: float) -> Region | None:
-        """The topmost region at a place [m]; None where there is none."""
+        """Return the topmost region at a place [m], None if there is none."""
         return next(
             (region for region in reversed(self.regions) if region.shape.contains(x, y)), None
         )
 
     @property
-    def strongest_db_sl(self) -> float:
-        """The highest level that anything in it can have; infinite for what neighbours allow."""
-        levels = [effect.strongest_db_sl(effect.level_db_sl) for effect in self.effects.values()]
+    def max_db_sl(self) -> float:
+        """The highest level of all effects; infinite for what the neighbours allow."""
+        levels = [effect.max_db_sl(effect.level_db_sl) for effect in self.effects.values()]
         levels += [
-            self.effects[name].strongest_db_sl(region.level_db_sl)
+            self.effects[name].max_db_sl(region.level_db_sl)
             for region in self.regions
             for name in (region.on_press, region.on_move, region.on_release)
             if region.has_level and name is not None
         ]
         return max(levels, default=-math.inf)
 
-    def drawn(self) -> dict[str, Any]:
-        """As JSON, for whoever draws it."""
+    def as_json(self) -> dict[str, Any]:
+        """Return it as the API describes it."""
         return {
-            "regions": [region.drawn() for region in self.regions],
+            "regions": [region.as_json() for region in self.regions],
             "elsewhere": self.elsewhere,
             "most_at_once": self.most_at_once,
         }

@@ -1,4 +1,4 @@
-"""Reading a surface layout from its file, and refusing every one that could not work."""
+"""Reading and checking the file of a surface layout."""
 
 from pathlib import Path
 from typing import Annotated, Any
@@ -6,8 +6,8 @@ from typing import Annotated, Any
 from pydantic import Field, Strict
 
 from controller.effects.effect import Effect, Level
-from controller.effects.kinds import effect_kind
-from controller.effects.layout import BUZZ, Layout, Region, usual_effects
+from controller.effects.layout import BUZZ, Layout, Region, default_effects
+from controller.effects.registry import effect_kind
 from controller.effects.shapes import Circle, Polygon, Rectangle, Shape
 from model.config.document import Document, KeyPath, read_document
 from model.config.sections import Quantity, Section, Validation
@@ -18,18 +18,17 @@ from model.rig.sections import Identifier
 from model.structure.plate import Plate
 from registry.suggestions import did_you_mean
 
-_MOST_REGIONS = 256
+_MAX_REGIONS = 256
 _LENGTH = Annotated[float, Quantity(LENGTH, least=-10, most=10)]
 _POINT = Annotated[tuple[_LENGTH, _LENGTH], Strict(strict=False)]  # a list in the file
 _SIZE = Annotated[float, Quantity(LENGTH, above=0, most=10)]
 _SHAPES = ("rectangle", "circle", "polygon")
 
-# Beyond the plate's edge by less than this [m] is a rounding, not a mistake.
-_EDGE = 1e-9
+_TOLERANCE = 1e-9  # m; rounding errors at the edge of the plate
 
 
 class RectangleSection(Section):
-    """Two opposite corners, from the plate's south-west corner."""
+    """Two opposite corners."""
 
     start: _POINT
     end: _POINT
@@ -43,7 +42,7 @@ class CircleSection(Section):
 
 
 class RegionSection(Section):
-    """A part of the plate and its effects."""
+    """A region of the plate and its effects."""
 
     rectangle: RectangleSection | None = None
     circle: CircleSection | None = None
@@ -60,7 +59,7 @@ class LayoutSection(Section):
 
     effects: Annotated[dict[Identifier, dict[str, Any]], Field(max_length=64, default_factory=dict)]
     regions: Annotated[
-        dict[Identifier, RegionSection], Field(max_length=_MOST_REGIONS, default_factory=dict)
+        dict[Identifier, RegionSection], Field(max_length=_MAX_REGIONS, default_factory=dict)
     ]
     elsewhere: Identifier | None = BUZZ
     most_at_once: Annotated[int, Field(ge=1, le=4)] = 1
@@ -69,8 +68,7 @@ class LayoutSection(Section):
 def load_layout(path: Path, plate: Plate | None, *, level_db_sl: float = STRONG_DB_SL) -> Layout:
     """Read a layout; raises ConfigError with every problem of the file.
 
-    plate: which its regions must lie on, None for any. level_db_sl: of the effects that are there
-    without being written down.
+    plate: must contain all regions, None for any. level_db_sl: of the default effects.
     """
     document = read_document(path)
     _check_kind(document)
@@ -79,7 +77,7 @@ def load_layout(path: Path, plate: Plate | None, *, level_db_sl: float = STRONG_
     for name in validation.mapping(("regions",)):
         _check_region(validation, ("regions", name), effects, plate)
     elsewhere = validation.field(("elsewhere",), LayoutSection)
-    _check_use(validation, ("elsewhere",), elsewhere, effects, moves=None)
+    _check_use(validation, ("elsewhere",), elsewhere, effects, is_for_motion=None)
     section = validation.finish()
     return Layout(
         regions=tuple(_region(name, region) for name, region in section.regions.items()),
@@ -96,23 +94,23 @@ def is_layout_document(document: Document) -> bool:
 
 
 def _check_kind(document: Document) -> None:
-    """Refuse another kind of file as a whole, in place of all the keys that it does not know."""
+    """Refuse another kind of file as a whole instead of all its unknown keys."""
     if not is_layout_document(document) and document.data.keys() & {"plate", "rig"}:
-        kind = "a rig" if "plate" in document.data else "a daemon's file"
+        kind = "a rig" if "plate" in document.data else "a daemon file"
         raise InputError(
-            f"{document.source}: is {kind}, and no surface layout; "
+            f"{document.source}: must be a surface layout, got {kind}; "
             "era config init layout.yaml --kind layout  writes one"
         )
 
 
 def _effects(validation: Validation[LayoutSection], level_db_sl: float) -> dict[str, Effect | None]:
-    """Effects by name, the usual ones among them; None for one that is not in order."""
-    effects: dict[str, Effect | None] = {**usual_effects(level_db_sl)}
+    """Return effects by name, with the default ones; None for an invalid one."""
+    effects: dict[str, Effect | None] = {**default_effects(level_db_sl)}
     for name, parameters in validation.mapping(("effects",)).items():
         path = ("effects", name)
         effects[name] = None
         if not isinstance(parameters, dict):
-            continue  # the layout's own section has said so
+            continue  # reported with the section of the layout
         kind = parameters.get("kind", name)
         try:
             section = effect_kind(kind if isinstance(kind, str) else repr(kind))
@@ -130,25 +128,28 @@ def _check_region(
     effects: dict[str, Effect | None],
     plate: Plate | None,
 ) -> None:
-    """What a region by itself cannot know: that it lies on the plate, and its effects exist."""
+    """Check that a region has one shape, on the plate, and that its effects exist."""
     region = validation.part(path, RegionSection)
     if region is None:
         return
     given = [shape for shape in _SHAPES if getattr(region, shape) is not None]
     if len(given) != 1:
-        found = f"it has {' and '.join(given)}" if given else "it has none"
-        validation.add(path, f"needs one of {', '.join(_SHAPES)}; {found}")
+        found = " and ".join(given) or "none"
+        validation.add(path, f"must have one of {', '.join(_SHAPES)}, got {found}")
     elif plate is not None and not _is_on(plate, _shape(region)):
         validation.add(
             (*path, given[0]),
-            f"reaches beyond the plate, which is {plate.length:g} m by {plate.width:g} m; "
-            "places count from its south-west corner",
+            f"must lie on the plate of {plate.length:g} m by {plate.width:g} m; coordinates start "
+            "at its south-west corner",
         )
     uses = [region.on_press, region.on_move, region.on_release]
     if uses == [None, None, None] and region.level is not None:
-        validation.add((*path, "level"), "is the level of nothing: the region has no effect")
-    for key, moves in (("on_press", False), ("on_move", True), ("on_release", False)):
-        _check_use(validation, (*path, key), getattr(region, key), effects, moves=moves)
+        validation.add(
+            (*path, "level"), "has no effect to apply to; add an effect or remove the level"
+        )
+    for key, is_for_motion in (("on_press", False), ("on_move", True), ("on_release", False)):
+        name = getattr(region, key)
+        _check_use(validation, (*path, key), name, effects, is_for_motion=is_for_motion)
 
 
 def _check_use(
@@ -157,39 +158,40 @@ def _check_use(
     name: str | None,
     effects: dict[str, Effect | None],
     *,
-    moves: bool | None,
+    is_for_motion: bool | None,
 ) -> None:
-    """That an effect exists and fits where it is used; moves: None where every one does."""
+    """Check that an effect exists and fits its use; is_for_motion: None if any effect fits."""
     if name is None:
         return
     if name not in effects:
         validation.add(
             path,
-            f"there is no effect {name!r}; {did_you_mean(name, effects)}"
-            f"known are {', '.join(effects)}",
+            f"unknown effect {name!r}; {did_you_mean(name, effects)}"
+            f"choose one of {', '.join(effects)}",
         )
         return
     effect = effects[name]
-    if effect is None or moves is None:
+    if effect is None or is_for_motion is None:
         return
-    if effect.moves and not moves:
-        validation.add(path, f"{name} is felt while a finger moves; put it under on_move")
-    elif moves and not effect.moves:
-        validation.add(path, f"{name} goes by itself; put it under on_press or on_release")
-    elif path[-1] == "on_release" and not effect.ends:
-        validation.add(path, f"{name} would never end; give it a duration")
+    if effect.is_for_motion and not is_for_motion:
+        validation.add(path, f"{name} is for motion; put it under on_move")
+    elif is_for_motion and not effect.is_for_motion:
+        validation.add(path, f"{name} is not for motion; put it under on_press or on_release")
+    elif path[-1] == "on_release" and not effect.has_end:
+        validation.add(path, f"{name} must end by itself; give it a duration")
 
 
 def _is_on(plate: Plate, shape: Shape) -> bool:
     """Whether a shape lies on the plate."""
     return all(
-        -_EDGE <= x <= plate.length + _EDGE and -_EDGE <= y <= plate.width + _EDGE
+        -_TOLERANCE <= x <= plate.length + _TOLERANCE
+        and -_TOLERANCE <= y <= plate.width + _TOLERANCE
         for x, y in shape.corners()
     )
 
 
 def _shape(region: RegionSection) -> Shape:
-    """The one shape of a region."""
+    """Return the shape of a region."""
     if region.rectangle is not None:
         (x0, y0), (x1, y1) = region.rectangle.start, region.rectangle.end
         return Rectangle(min(x0, x1), min(y0, y1), abs(x1 - x0), abs(y1 - y0))

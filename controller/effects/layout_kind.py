@@ -1,10 +1,10 @@
-"""Surface layouts, as `era config` deals with them."""
+"""Surface layouts as a kind of configuration file of `era config`."""
 
 from pathlib import Path
 from typing import Any
 
-from controller.effects.kinds import effect_kind, effect_kinds
 from controller.effects.layout_file import LayoutSection, is_layout_document, load_layout
+from controller.effects.registry import effect_kind, effect_kinds
 from model.config.document import Document
 from model.config.kinds import Good
 
@@ -13,11 +13,11 @@ class LayoutKind:
     """A surface layout."""
 
     def recognises(self, document: Document) -> bool:
-        """It has regions."""
+        """Whether a document is a surface layout."""
         return is_layout_document(document)
 
     def check(self, path: Path) -> Good:
-        """Read it; whether it fits a plate is seen with the daemon's file that names it."""
+        """Read a layout; raises ConfigError. Its fit on a plate shows in the daemon's file."""
         layout = load_layout(path, None)
         return Good(
             f"good: regions {', '.join(region.name for region in layout.regions) or 'none'}; "
@@ -26,11 +26,11 @@ class LayoutKind:
         )
 
     def example(self) -> str:
-        """Every key, with what it is for."""
+        """Return a layout with every key explained."""
         return Path(__file__).with_name("example.yaml").read_text(encoding="utf-8")
 
     def schema(self) -> dict[str, Any]:
-        """For editors; what each kind of effect takes is under `$defs`."""
+        """Return the JSON schema for editors; the kinds of effects are under `$defs`."""
         schema = LayoutSection.model_json_schema()
         kinds = {f"effect {name}": effect_kind(name).model_json_schema() for name in effect_kinds()}
         return {

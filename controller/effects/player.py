@@ -1,36 +1,36 @@
-"""From contacts to intents by a surface layout: who feels which effect, and who gives way."""
+"""From contacts to a haptic intent by a surface layout: which finger feels which effect."""
 
 import math
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field
 
-from controller.effects.effect import Course, Effect, Feeling, Nothing
+from controller.effects.effect import EffectRun, NoSensation, Sensation
 from controller.effects.layout import Layout, Region
 from controller.loop.intent import NO_CONTACTS, HapticIntent, Target
 from controller.sources.contacts import Contact, ContactKey
 from registry.plugins import WrongResultError
 
-# A finger that rests on an edge must not go in and out with the noise of its sensor, so it stays in
-# the region that it came into until it is this far [m] from where it did.
+# A finger on the edge of a region must not flip between regions with sensor noise: it stays in one
+# until it is this far [m] from where it entered.
 _NOISE = 0.001
 
-ASKED = 1_000_000
-"""The priority of an effect that was asked for by name: above all regions."""
+REQUESTED_PRIORITY = 1_000_000
+"""Of an effect requested by name: above all regions."""
 
 
 @dataclass
 class _Play:
-    """One effect at one finger, the order in which it began, and how important it is."""
+    """A run of an effect at one finger, numbered in order of start."""
 
     name: str
-    course: Course
+    run: EffectRun
     number: int
     priority: int
 
 
 @dataclass
 class _Finger:
-    """The region that a finger is in, where it came into that, and what plays for it."""
+    """The region of a finger, where it entered it, and what plays for it."""
 
     region: Region | None
     entered: tuple[float, float]
@@ -38,16 +38,15 @@ class _Finger:
 
 
 class EffectPlayer:
-    """Plays the effects of a layout; `intent` is a pure function of what it was told, in order.
+    """Plays the effects of a layout; the intent depends on past calls and arguments only.
 
-    Every play asks for its finger. Of one finger the play that began last is felt; when it is over,
-    the one before goes on. Of several fingers those of the highest priority are felt, among equals
-    the one whose play began last, or as many of the last as the layout allows; all others are
-    quiet. An effect of a slider that is quiet at the moment (no detent passed, no movement) asks
-    for nothing and stands in nobody's way.
+    A finger feels its newest play; when that is over, the one before continues. Of several fingers
+    those of the highest priority feel theirs, among equals the newest, as many as the layout
+    allows; all others are quiet. A play without a sensation at the moment (no detent passed, no
+    movement) does not count.
 
-    known: fingers that have felt their press already, by another layout. For them begins what lasts
-    and what moves, and nothing that would be felt as another press.
+    known: fingers that have felt their press already, by another layout: for them only effects for
+    motion or without an end start.
     """
 
     def __init__(self, layout: Layout, *, known: Iterable[ContactKey] = ()) -> None:
@@ -57,55 +56,55 @@ class EffectPlayer:
         self._number = 0
 
     def intent(self, contacts: Sequence[Contact], now: float) -> HapticIntent:
-        """Who shall feel what at a time [s]."""
+        """Return which contacts shall feel what at a time [s]."""
         self._follow(contacts, now)
         if not contacts:
             return HapticIntent((), NO_CONTACTS)
-        asking: list[tuple[int, int, Contact, Feeling]] = []
+        felt: list[tuple[int, int, Contact, Sensation]] = []
         ends: list[float] = []
         for contact in contacts:
-            play, feeling = self._felt(contact, now, ends)
-            if play is not None and feeling is not None:
-                asking.append((play.priority, play.number, contact, feeling))
-        asking.sort(key=lambda one: one[:2], reverse=True)
-        chosen = [one for one in asking if one[0] == asking[0][0]][: self.layout.most_at_once]
+            play, sensation = self._feel(contact, now, ends)
+            if play is not None and sensation is not None:
+                felt.append((play.priority, play.number, contact, sensation))
+        felt.sort(key=lambda one: one[:2], reverse=True)
+        chosen = [one for one in felt if one[0] == felt[0][0]][: self.layout.most_at_once]
         return HapticIntent(
             tuple(
-                Target(contact.key, feeling.level_db_sl, or_less=feeling.or_less)
-                for _, _, contact, feeling in chosen
+                Target(contact.key, sensation.level_db_sl, or_less=sensation.or_less)
+                for _, _, contact, sensation in chosen
             ),
-            "no effect plays for the fingers that are there",
+            "no effect plays for the contacts on the plate",
             until=min(ends, default=None),
         )
 
     @property
     def fingers(self) -> Collection[ContactKey]:
-        """Those that were on the plate when it was last looked."""
+        """Fingers on the plate at the last call of `intent`."""
         return self._fingers.keys() | self._known
 
     def effect_of(self, key: ContactKey) -> str | None:
-        """The name of the effect that a finger has, None for none."""
+        """Return the name of the effect that plays for a finger, None for none."""
         finger = self._fingers.get(key)
         return finger.plays[-1].name if finger and finger.plays else None
 
     def play(self, name: str, contact: Contact, now: float, *, level_db_sl: float | None) -> None:
-        """Begin a named effect at a finger; level [dB SL] in place of its own, unless None.
+        """Start a named effect at a finger, again if it was requested there before.
 
-        One that was asked for there before begins anew.
-
-        Raises KeyError for an effect that the layout does not have.
+        level_db_sl: replaces its own unless None. Raises KeyError for an unknown effect.
         """
         effect = self.layout.effects[name]
         level = effect.level_db_sl if level_db_sl is None else level_db_sl
-        finger = self._fingers.get(contact.key) or self._come(contact, now)
-        # It begins anew; nobody can pile up plays that way.
+        finger = self._fingers.get(contact.key) or self._add(contact, now)
+        # Replacing the earlier one keeps requests from piling up.
         finger.plays = [
-            play for play in finger.plays if (play.name, play.priority) != (name, ASKED)
+            play
+            for play in finger.plays
+            if (play.name, play.priority) != (name, REQUESTED_PRIORITY)
         ]
-        self._begin(finger, name, contact, now, level=level, priority=ASKED)
+        self._start(finger, name, contact, now, level=level, priority=REQUESTED_PRIORITY)
 
     def _follow(self, contacts: Sequence[Contact], now: float) -> None:
-        """Begin and end what the fingers' ways through the regions begin and end."""
+        """Start and end effects by the fingers' ways through the regions."""
         keys = {contact.key for contact in contacts}
         self._known &= keys
         for key in [key for key in self._fingers if key not in keys]:
@@ -113,7 +112,7 @@ class EffectPlayer:
         for contact in contacts:
             finger = self._fingers.get(contact.key)
             if finger is None:
-                self._come(contact, now)
+                self._add(contact, now)
                 continue
             place = (contact.x, contact.y)
             if math.dist(place, finger.entered) < _NOISE:
@@ -121,48 +120,52 @@ class EffectPlayer:
             region = self.layout.region_at(*place)
             if finger.region is not region:
                 left, finger.region, finger.entered = finger.region, region, place
-                finger.plays = [play for play in finger.plays if play.priority == ASKED]
+                finger.plays = [
+                    play for play in finger.plays if play.priority == REQUESTED_PRIORITY
+                ]
                 self._enter(finger, contact, now)
                 if left is not None and left.on_release is not None:
-                    self._begin_of(finger, left, left.on_release, contact, now)
+                    self._start_in(finger, left, left.on_release, contact, now)
 
-    def _come(self, contact: Contact, now: float) -> _Finger:
-        """Take in a finger that was not there, and begin what there is for it."""
+    def _add(self, contact: Contact, now: float) -> _Finger:
+        """Add a new finger and start its effects."""
         place = (contact.x, contact.y)
         finger = _Finger(self.layout.region_at(*place), place)
         self._fingers[contact.key] = finger
         self._enter(finger, contact, now)
         if contact.key in self._known:
             self._known.discard(contact.key)
-            finger.plays = [play for play in finger.plays if self._goes_on(play)]
+            effects = self.layout.effects
+            finger.plays = [
+                play
+                for play in finger.plays
+                if effects[play.name].is_for_motion or not effects[play.name].has_end
+            ]
         return finger
 
-    def _goes_on(self, play: _Play) -> bool:
-        effect = self.layout.effects[play.name]
-        return effect.moves or not effect.ends
-
     def _enter(self, finger: _Finger, contact: Contact, now: float) -> None:
-        """Begin what a region, or the plate outside of all, has for a finger that comes."""
+        """Start the effects of the region that a finger enters, or those outside of all."""
         region = finger.region
         if region is None:
             name = self.layout.elsewhere
             if name is not None:
                 level = self.layout.effects[name].level_db_sl
-                self._begin(finger, name, contact, now, level=level, priority=0)
+                self._start(finger, name, contact, now, level=level, priority=0)
             return
-        # What moves begins first: a press is felt, then the movement that follows it.
+        # The effect for motion starts first: the press is felt, then the movement after it.
         for name in (region.on_move, region.on_press):
             if name is not None:
-                self._begin_of(finger, region, name, contact, now)
+                self._start_in(finger, region, name, contact, now)
 
-    def _begin_of(
+    def _start_in(
         self, finger: _Finger, region: Region, name: str, contact: Contact, now: float
     ) -> None:
-        effect: Effect = self.layout.effects[name]
+        """Start an effect with the level and priority of a region."""
+        effect = self.layout.effects[name]
         level = region.level_db_sl if region.has_level else effect.level_db_sl
-        self._begin(finger, name, contact, now, level=level, priority=region.priority)
+        self._start(finger, name, contact, now, level=level, priority=region.priority)
 
-    def _begin(
+    def _start(
         self,
         finger: _Finger,
         name: str,
@@ -174,31 +177,31 @@ class EffectPlayer:
     ) -> None:
         self._number += 1
         effect = self.layout.effects[name]
-        course = effect.begin(contact, now, level_db_sl=level)
-        if not isinstance(course, Course):
-            raise WrongResultError(effect, course, Course)
-        finger.plays.append(_Play(name, course, self._number, priority))
+        run = effect.start(contact, now, level_db_sl=level)
+        if not isinstance(run, EffectRun):
+            raise WrongResultError(effect, run, EffectRun)
+        finger.plays.append(_Play(name, run, self._number, priority))
 
-    def _felt(
+    def _feel(
         self, contact: Contact, now: float, ends: list[float]
-    ) -> tuple[_Play | None, Feeling | None]:
-        """The play that a finger feels now, with what; ends gains every moment when to look again.
+    ) -> tuple[_Play | None, Sensation | None]:
+        """Return the play that a finger feels now and its sensation; add all `until` to ends.
 
-        All its plays are followed, for those that move must know the finger's way.
+        All its plays are called, because those for motion must know the finger's way.
         """
         finger = self._fingers[contact.key]
-        felt: tuple[_Play | None, Feeling | None] = (None, None)
+        felt: tuple[_Play | None, Sensation | None] = (None, None)
         lasting: list[_Play] = []
         for play in finger.plays:
-            answer = play.course.feel(contact, now)
-            if answer is None:
+            result = play.run.feel(contact, now)
+            if result is None:
                 continue
-            if not isinstance(answer, Feeling | Nothing):
-                raise WrongResultError(play.course, answer, Feeling)
+            if not isinstance(result, Sensation | NoSensation):
+                raise WrongResultError(play.run, result, Sensation)
             lasting.append(play)
-            if answer.until is not None:
-                ends.append(answer.until)
-            if isinstance(answer, Feeling):
-                felt = (play, answer)
+            if result.until is not None:
+                ends.append(result.until)
+            if isinstance(result, Sensation):
+                felt = (play, result)
         finger.plays = lasting
         return felt

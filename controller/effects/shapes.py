@@ -1,4 +1,4 @@
-"""Shapes of regions on the plate: what lies within, and how they are told to whoever draws them."""
+"""Shapes of regions on the plate."""
 
 import math
 from collections.abc import Sequence
@@ -8,25 +8,25 @@ from typing import Any, Protocol, TypeAlias
 
 Point: TypeAlias = tuple[float, float]
 
-_SIDE = 1e-9  # m; a point this near to a side lies on it
+_TOLERANCE = 1e-9  # m; a point this close to a side lies on it
 
 
 class Shape(Protocol):
     """A part of the plate; lengths in metres, from the plate's south-west corner."""
 
     def contains(self, x: float, y: float) -> bool:
-        """Whether a point is within, its edge included."""
+        """Whether a point is within or on the edge."""
 
     def corners(self) -> Sequence[Point]:
-        """Points that bound it: all of it lies within their bounding box."""
+        """Return points whose bounding box contains it."""
 
-    def drawn(self) -> dict[str, Any]:
-        """As JSON: `shape` and its measures, every key with its unit."""
+    def as_json(self) -> dict[str, Any]:
+        """Return `shape` and its dimensions; every key has its unit."""
 
 
 @dataclass(frozen=True)
 class Rectangle:
-    """From a south-west corner (x, y) on, width along x and height along y."""
+    """A rectangle from its south-west corner (x, y), width along x and height along y."""
 
     x: float
     y: float
@@ -38,11 +38,11 @@ class Rectangle:
         return self.x <= x <= self.x + self.width and self.y <= y <= self.y + self.height
 
     def corners(self) -> Sequence[Point]:
-        """Two opposite corners."""
+        """Return two opposite corners."""
         return ((self.x, self.y), (self.x + self.width, self.y + self.height))
 
-    def drawn(self) -> dict[str, Any]:
-        """As JSON."""
+    def as_json(self) -> dict[str, Any]:
+        """Return it as the API describes it."""
         return {
             "shape": "rectangle",
             "x_m": self.x,
@@ -54,7 +54,7 @@ class Rectangle:
 
 @dataclass(frozen=True)
 class Circle:
-    """Around (x, y)."""
+    """A circle around (x, y)."""
 
     x: float
     y: float
@@ -65,25 +65,25 @@ class Circle:
         return math.dist((x, y), (self.x, self.y)) <= self.radius
 
     def corners(self) -> Sequence[Point]:
-        """Two opposite corners of its bounding box."""
+        """Return two opposite corners of its bounding box."""
         return (
             (self.x - self.radius, self.y - self.radius),
             (self.x + self.radius, self.y + self.radius),
         )
 
-    def drawn(self) -> dict[str, Any]:
-        """As JSON."""
+    def as_json(self) -> dict[str, Any]:
+        """Return it as the API describes it."""
         return {"shape": "circle", "x_m": self.x, "y_m": self.y, "radius_m": self.radius}
 
 
 @dataclass(frozen=True)
 class Polygon:
-    """Within its corners; of sides that cross, what they enclose an odd number of times."""
+    """A polygon by its corners; crossing sides follow the even-odd rule."""
 
     points: tuple[Point, ...]
 
     def contains(self, x: float, y: float) -> bool:
-        """Whether a point is within: a ray to the east crosses the sides an odd number of times."""
+        """Whether a ray to the east crosses the sides an odd number of times."""
         if not self._box.contains(x, y):
             return False
         is_within = False
@@ -96,29 +96,29 @@ class Polygon:
 
     @cached_property
     def _box(self) -> Rectangle:
-        """What all of it lies in: most fingers are outside, and looking at every side is slow."""
+        """The bounding box: a fast test that most points fail."""
         xs, ys = zip(*self.points, strict=True)
         return Rectangle(
-            min(xs) - _SIDE,
-            min(ys) - _SIDE,
-            max(xs) - min(xs) + 2 * _SIDE,
-            max(ys) - min(ys) + 2 * _SIDE,
+            min(xs) - _TOLERANCE,
+            min(ys) - _TOLERANCE,
+            max(xs) - min(xs) + 2 * _TOLERANCE,
+            max(ys) - min(ys) + 2 * _TOLERANCE,
         )
 
     def corners(self) -> Sequence[Point]:
-        """All of them."""
+        """Return all corners."""
         return self.points
 
-    def drawn(self) -> dict[str, Any]:
-        """As JSON."""
+    def as_json(self) -> dict[str, Any]:
+        """Return it as the API describes it."""
         return {"shape": "polygon", "points_m": [list(point) for point in self.points]}
 
 
 def _is_on_side(x: float, y: float, start: Point, end: Point) -> bool:
-    """Whether a point lies on a side, to a nanometre."""
+    """Whether a point lies on a side, within a nanometre."""
     length = math.dist(start, end)
     if length == 0:
         return (x, y) == start
     along = ((x - start[0]) * (end[0] - start[0]) + (y - start[1]) * (end[1] - start[1])) / length
     across = ((x - start[0]) * (end[1] - start[1]) - (y - start[1]) * (end[0] - start[0])) / length
-    return abs(across) <= _SIDE and -_SIDE <= along <= length + _SIDE
+    return abs(across) <= _TOLERANCE and -_TOLERANCE <= along <= length + _TOLERANCE

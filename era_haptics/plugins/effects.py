@@ -1,7 +1,7 @@
 """For what a finger feels over time: entry points `era_haptics.effects`."""
 
-from controller.effects.effect import Course, Effect, Feeling, Level, Nothing
-from controller.effects.kinds import effect_kind
+from controller.effects.effect import Effect, EffectRun, Level, NoSensation, Sensation
+from controller.effects.registry import effect_kind
 from controller.sources.contacts import Contact, ContactKey
 from model.config.sections import Quantity
 from model.config.units import FREQUENCY, LENGTH, RATIO, SPEED, TIME
@@ -14,11 +14,11 @@ __all__ = [
     "TIME",
     "Contact",
     "ContactKey",
-    "Course",
     "Effect",
-    "Feeling",
+    "EffectRun",
     "Level",
-    "Nothing",
+    "NoSensation",
     "Quantity",
+    "Sensation",
     "effect_kind",
 ]

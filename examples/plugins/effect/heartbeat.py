@@ -6,11 +6,11 @@ from typing import Annotated, ClassVar
 from era_haptics.plugins.effects import (
     TIME,
     Contact,
-    Course,
     Effect,
-    Feeling,
-    Nothing,
+    EffectRun,
+    NoSensation,
     Quantity,
+    Sensation,
 )
 
 PULSE = 0.08  # s; the plate needs 20 ms to follow, and a pulse that is felt as one some more
@@ -20,36 +20,36 @@ _ROUNDING = 1e-6  # s; who asks at the very end of a pulse is told what comes af
 
 
 @dataclass(frozen=True)
-class Beating(Course):
+class Beating(EffectRun):
     """One play of it at one finger."""
 
     start: float
     period: float
     level_db_sl: float | None
 
-    def feel(self, contact: Contact, now: float) -> Feeling | Nothing:
+    def feel(self, contact: Contact, now: float) -> Sensation | NoSensation:
         """The pulse or the pause that is on, and when it is over."""
         beats, into = divmod(now - self.start + _ROUNDING, self.period)
         begin = self.start + beats * self.period
         if into < PULSE:
-            return Feeling(self.level_db_sl, until=begin + PULSE)
+            return Sensation(self.level_db_sl, until=begin + PULSE)
         if into < SECOND:
-            return Nothing(until=begin + SECOND)
+            return NoSensation(until=begin + SECOND)
         if into < SECOND + PULSE:
             weaker = None if self.level_db_sl is None else self.level_db_sl - WEAKER
-            return Feeling(weaker, until=begin + SECOND + PULSE, or_less=True)
-        return Nothing(until=begin + self.period)
+            return Sensation(weaker, until=begin + SECOND + PULSE, or_less=True)
+        return NoSensation(until=begin + self.period)
 
 
 class Heartbeat(Effect):
     """Its fields are its parameters in a layout; `level` is there already."""
 
     kind: ClassVar[str] = "heartbeat"
-    moves: ClassVar[bool] = False  # it goes by itself: for on_press
+    is_for_motion: ClassVar[bool] = False  # it goes by itself: for on_press
 
     period: Annotated[float, Quantity(TIME, least=0.4, most=5.0)] = 0.9
 
-    def begin(self, contact: Contact, now: float, *, level_db_sl: float | None) -> Course:
+    def start(self, contact: Contact, now: float, *, level_db_sl: float | None) -> EffectRun:
         """Begin at a finger."""
         return Beating(now, self.period, level_db_sl)
 

@@ -6,7 +6,7 @@ python try_effect.py KIND
 import sys
 
 import era_haptics as era
-from era_haptics.plugins.effects import Contact, ContactKey, Feeling, effect_kind
+from era_haptics.plugins.effects import Contact, ContactKey, Sensation, effect_kind
 
 if len(sys.argv) != 2:
     sys.exit(__doc__)
@@ -15,7 +15,7 @@ try:
 except era.InputError as error:
     sys.exit(f"error: {error}")
 finger = Contact(ContactKey("try", 1), x=0.1, y=0.1, since=0.0)
-course = effect.begin(finger, 0.0, level_db_sl=effect.level_db_sl)
+course = effect.start(finger, 0.0, level_db_sl=effect.level_db_sl)
 now: float | None = 0.0
 while now is not None and now < 2.0:
     felt = course.feel(finger, now)
@@ -23,7 +23,7 @@ while now is not None and now < 2.0:
         print(f"{now:5.2f} s  over")
         break
     level = "nothing"
-    if isinstance(felt, Feeling):
+    if isinstance(felt, Sensation):
         level = "all that can be" if felt.level_db_sl is None else f"{felt.level_db_sl:g} dB SL"
     print(f"{now:5.2f} s  {level}")
     if felt.until is not None and felt.until <= now:

@@ -7,13 +7,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from controller.daemon.active_layout import ActiveLayout
-from controller.effects.effect import Course, Effect, Feeling, Nothing
-from controller.effects.kinds import effect_kind, effect_kinds
+from controller.effects.buzz import Buzz
+from controller.effects.click import Click
+from controller.effects.detents import Detents
+from controller.effects.effect import Effect, EffectRun, NoSensation, Sensation
 from controller.effects.layout import Layout, Region
-from controller.effects.moving import Detents, Texture
 from controller.effects.player import EffectPlayer
+from controller.effects.ramp import Ramp
+from controller.effects.registry import effect_kind, effect_kinds
 from controller.effects.shapes import Circle, Polygon, Rectangle
-from controller.effects.timed import Buzz, Click, Ramp
+from controller.effects.texture import Texture
 from controller.sources.contacts import Contact, ContactKey
 
 
@@ -57,14 +60,14 @@ def test_buzz_lasts_as_long_as_the_finger() -> None:
 
 def test_ramp_rises_in_steps() -> None:
     """From 6 to 20 dB in 2 dB steps are eight levels, each for an eighth of 0.8 s; then no more."""
-    course = Ramp(start_level=6.0, level=20.0, duration=0.8).begin(finger(1), 5.0, level_db_sl=20.0)
+    course = Ramp(start_level=6.0, level=20.0, duration=0.8).start(finger(1), 5.0, level_db_sl=20.0)
     levels = []
     now: float | None = 5.0
     while now is not None:
         felt = course.feel(finger(1), now + 1e-9)
         if felt is None:
             break
-        assert isinstance(felt, Feeling)
+        assert isinstance(felt, Sensation)
         levels.append((round(now - 5.0, 6), felt.level_db_sl))
         now = felt.until
     assert levels == [(round(0.1 * step, 6), 6.0 + 2 * step) for step in range(8)]
@@ -72,7 +75,7 @@ def test_ramp_rises_in_steps() -> None:
 
 def test_ramp_takes_no_steps_that_the_plate_cannot_follow() -> None:
     """40 dB in 0.1 s would be twenty steps: five levels of 20 ms, the least that is felt."""
-    course = Ramp(start_level=6.0, duration=0.1).begin(finger(1), 0.0, level_db_sl=46.0)
+    course = Ramp(start_level=6.0, duration=0.1).start(finger(1), 0.0, level_db_sl=46.0)
     felt = [course.feel(finger(1), 0.02 * step + 1e-9) for step in range(6)]
     assert [getattr(one, "level_db_sl", None) for one in felt] == [
         6.0,
@@ -88,18 +91,23 @@ def test_ramp_that_holds() -> None:
     """It stays at its last level; one as strong as the neighbours allow ends with that."""
     ramp = Ramp(start_level=6.0, duration=0.8, hold=True)
     for level in (20.0, None):
-        felt = ramp.begin(finger(1), 0.0, level_db_sl=level).feel(finger(1), 60.0)
-        assert felt == Feeling(level, or_less=True)
+        felt = ramp.start(finger(1), 0.0, level_db_sl=level).feel(finger(1), 60.0)
+        assert felt == Sensation(level, or_less=True)
 
 
 def test_ramp_that_holds_rises_first() -> None:
     """8, 10, 12 dB for a tenth of a second each, then 12 for good."""
-    course = Ramp(start_level=8.0, duration=0.3, hold=True, level=12.0).begin(
+    course = Ramp(start_level=8.0, duration=0.3, hold=True, level=12.0).start(
         finger(1), 0.0, level_db_sl=12.0
     )
     felt = [course.feel(finger(1), now) for now in (0.0, 0.11, 0.21, 9.0)]
-    assert [one.level_db_sl for one in felt if isinstance(one, Feeling)] == [8.0, 10.0, 12.0, 12.0]
-    assert [one.until for one in felt if isinstance(one, Feeling)] == [
+    assert [one.level_db_sl for one in felt if isinstance(one, Sensation)] == [
+        8.0,
+        10.0,
+        12.0,
+        12.0,
+    ]
+    assert [one.until for one in felt if isinstance(one, Sensation)] == [
         pytest.approx(0.1),
         pytest.approx(0.2),
         None,
@@ -114,18 +122,18 @@ def test_texture_by_speed() -> None:
     """
     texture = Texture(slow=0.01, fast=0.16, range=16.0)
     for speed, level in ((0.16, 20.0), (0.5, 20.0), (0.04, 12.0), (0.0101, 4.0)):
-        course = texture.begin(finger(1, 0.0), 0.0, level_db_sl=20.0)
+        course = texture.start(finger(1, 0.0), 0.0, level_db_sl=20.0)
         for step in range(1, 20):
             felt = course.feel(finger(1, speed * 0.01 * step), 0.01 * step)
-        assert isinstance(felt, Feeling)
+        assert isinstance(felt, Sensation)
         assert felt.level_db_sl == level
         assert felt.until is not None
         assert 0.08 <= felt.until - 0.18 <= 0.0901
-        assert course.feel(finger(1, speed * 0.19), felt.until) == Nothing()
-    course = texture.begin(finger(1, 0.0), 0.0, level_db_sl=20.0)
+        assert course.feel(finger(1, speed * 0.19), felt.until) == NoSensation()
+    course = texture.start(finger(1, 0.0), 0.0, level_db_sl=20.0)
     for step in range(1, 20):
         felt = course.feel(finger(1, 0.009 * 0.01 * step), 0.01 * step)
-    assert isinstance(felt, Nothing)
+    assert isinstance(felt, NoSensation)
 
 
 def test_texture_begins_with_the_stroke() -> None:
@@ -133,23 +141,23 @@ def test_texture_begins_with_the_stroke() -> None:
 
     3 mm within them are 5 cm/s, which is halfway between slow and fast along the logarithm.
     """
-    course = Texture(slow=0.01, fast=0.25, range=16.0).begin(finger(1, 0.0), 0, level_db_sl=20)
+    course = Texture(slow=0.01, fast=0.25, range=16.0).start(finger(1, 0.0), 0, level_db_sl=20)
     course.feel(finger(1, 0.001), 0.01)
-    assert course.feel(finger(1, 0.001), 0.2) == Nothing()
+    assert course.feel(finger(1, 0.001), 0.2) == NoSensation()
     felt = course.feel(finger(1, 0.004), 5.0)
-    assert isinstance(felt, Feeling)
+    assert isinstance(felt, Sensation)
     assert felt.level_db_sl == 12.0
 
 
 def test_texture_does_not_flutter() -> None:
     """Speeds around the border of two levels, 1 dB from each, keep the one that was first."""
-    course = Texture(slow=0.01, fast=0.1, range=20.0).begin(finger(1, 0), 0, level_db_sl=20)
+    course = Texture(slow=0.01, fast=0.1, range=20.0).start(finger(1, 0), 0, level_db_sl=20)
     levels, way = set(), 0.0
     for step in range(1, 60):
         # By turns 0.8 dB and 1.2 dB below `fast`: on both sides of the border at 1 dB.
         way += 0.01 * 0.1 * 10 ** -((0.8 if step // 10 % 2 else 1.2) / 20)
         felt = course.feel(finger(1, way), 0.01 * step)
-        assert isinstance(felt, Feeling)
+        assert isinstance(felt, Sensation)
         levels.add(felt.level_db_sl)
     assert len(levels) == 1
 
@@ -172,24 +180,24 @@ def test_times_that_run_backwards() -> None:
 
     No other effect asks for more than its level then, either.
     """
-    assert Ramp(start_level=6.0).begin(finger(1), 5.0, level_db_sl=20.0).feel(
+    assert Ramp(start_level=6.0).start(finger(1), 5.0, level_db_sl=20.0).feel(
         finger(1), 4.0
-    ) == Feeling(6.0, until=5.125, or_less=True)
+    ) == Sensation(6.0, until=5.125, or_less=True)
     for effect in (Click(), Buzz(), Texture(), Detents()):
-        course = effect.begin(finger(1), 5.0, level_db_sl=20.0)
+        course = effect.start(finger(1), 5.0, level_db_sl=20.0)
         for now, x in ((4.0, 0.2), (3.0, 0.1)):
             felt = course.feel(finger(1, x), now)
-            assert not isinstance(felt, Feeling) or (felt.level_db_sl or 0) <= 20.0
+            assert not isinstance(felt, Sensation) or (felt.level_db_sl or 0) <= 20.0
 
 
 def test_strongest_level_of_a_layout() -> None:
     """What may be felt at all: a ramp's first level too, also where a region lowers its last."""
     falling = Ramp(start_level=40.0, level=12.0)
-    assert Layout(effects={"fall": falling}).strongest_db_sl == 40.0
+    assert Layout(effects={"fall": falling}).max_db_sl == 40.0
     region = Region("pad", LEFT, on_press="soft", level_db_sl=30.0, has_level=True)
-    assert Layout((region,), {"soft": Click(level=10.0)}).strongest_db_sl == 30.0
+    assert Layout((region,), {"soft": Click(level=10.0)}).max_db_sl == 30.0
     free = Region("pad", LEFT, on_press="soft", level_db_sl=None, has_level=True)
-    assert Layout((free,), {"soft": Click(level=10.0)}).strongest_db_sl == float("inf")
+    assert Layout((free,), {"soft": Click(level=10.0)}).max_db_sl == float("inf")
 
 
 def test_detents_click_once_each() -> None:
@@ -197,13 +205,13 @@ def test_detents_click_once_each() -> None:
 
     Noise around one is no second click, and the way back clicks again.
     """
-    course = Detents(spacing=0.010, along="y").begin(finger(1, y=0.05), 0.0, level_db_sl=14.0)
+    course = Detents(spacing=0.010, along="y").start(finger(1, y=0.05), 0.0, level_db_sl=14.0)
     clicks = []
     for index, way in enumerate((1, 4, 5.3, 5.6, 5.2, 5.6, 14, 15.6, 30.6, 26, 24, 20)):
         now = 0.1 * index
-        if isinstance(course.feel(finger(1, x=0.9, y=0.05 + 1e-3 * way), now), Feeling):
+        if isinstance(course.feel(finger(1, x=0.9, y=0.05 + 1e-3 * way), now), Sensation):
             clicks.append(way)
-            assert course.feel(finger(1, y=0.05 + 1e-3 * way), now + 0.031) == Nothing()
+            assert course.feel(finger(1, y=0.05 + 1e-3 * way), now + 0.031) == NoSensation()
     assert clicks == [5.6, 15.6, 30.6, 24]
 
 
@@ -302,18 +310,18 @@ def test_asking_again_begins_anew() -> None:
     """An effect that never ends, asked for a thousand times, is one; it goes with its finger."""
     felt = 0
 
-    class Felt(Course):
+    class Felt(EffectRun):
         """Counts."""
 
-        def feel(self, contact: Contact, now: float) -> Feeling | Nothing | None:
+        def feel(self, contact: Contact, now: float) -> Sensation | NoSensation | None:
             nonlocal felt
             felt += 1
-            return Feeling(20.0)
+            return Sensation(20.0)
 
     class Endless(Buzz):
         """Never ends."""
 
-        def begin(self, contact: Contact, now: float, *, level_db_sl: float | None) -> Course:
+        def start(self, contact: Contact, now: float, *, level_db_sl: float | None) -> EffectRun:
             return Felt()
 
     player = EffectPlayer(Layout(effects={"hum": Endless()}, elsewhere=None))

@@ -4,10 +4,11 @@ import asyncio
 
 import pytest
 
-from controller.effects.effect import Course, Effect, Feeling, Nothing
+from controller.effects.buzz import Buzz
+from controller.effects.click import Click
+from controller.effects.effect import Effect, EffectRun, NoSensation, Sensation
 from controller.effects.layout import Layout
 from controller.effects.player import EffectPlayer
-from controller.effects.timed import Buzz, Click
 from controller.sources.contacts import Contact
 from controller_bench import FINGER, running
 from virtual_loop import in_virtual_time
@@ -39,19 +40,19 @@ async def test_an_effect_that_fails_is_silence_and_no_more() -> None:
         """Raises at the second look."""
 
         kind = "broken"
-        moves = False
+        is_for_motion = False
 
-        def begin(self, contact: Contact, now: float, *, level_db_sl: float | None) -> Course:
+        def start(self, contact: Contact, now: float, *, level_db_sl: float | None) -> EffectRun:
             return Breaking()
 
-    class Breaking(Course):
+    class Breaking(EffectRun):
         looks = 0
 
-        def feel(self, contact: Contact, now: float) -> Feeling | Nothing | None:
+        def feel(self, contact: Contact, now: float) -> Sensation | NoSensation | None:
             self.looks += 1
             if self.looks > 1:
                 raise ZeroDivisionError("in a plug-in")
-            return Feeling(20.0, until=now + 0.03)
+            return Sensation(20.0, until=now + 0.03)
 
     layout = Layout(effects={"broken": Broken(), "buzz": Buzz()}, elsewhere="broken")
     player = EffectPlayer(layout)

@@ -7,7 +7,10 @@ from typing import Literal, get_args, get_origin
 import pytest
 from pydantic.fields import FieldInfo
 
-from controller.effects.effect import HIGHEST_LEVEL, LOWEST_LEVEL, Effect
+from controller.effects.buzz import Buzz
+from controller.effects.click import Click
+from controller.effects.detents import Detents
+from controller.effects.effect import MAX_DB_SL, MIN_DB_SL, Effect
 from controller.effects.layout_file import (
     CircleSection,
     LayoutSection,
@@ -16,8 +19,8 @@ from controller.effects.layout_file import (
     load_layout,
 )
 from controller.effects.layout_kind import LAYOUT
-from controller.effects.moving import Detents, Texture
-from controller.effects.timed import Buzz, Click, Ramp
+from controller.effects.ramp import Ramp
+from controller.effects.texture import Texture
 from key_tables import bounds_in_words, key_rows, quantities
 from model.config.document import ConfigError
 from model.config.sections import Section
@@ -144,7 +147,7 @@ def test_unit_limits_and_default_are_those_that_are_checked(
 def bounds(key: str, field: FieldInfo) -> str:
     """A field's bounds in words; none where they are not numbers or choices."""
     if key == "level":
-        return f"at least {LOWEST_LEVEL:g}, at most {HIGHEST_LEVEL:g}"
+        return f"at least {MIN_DB_SL:g}, at most {MAX_DB_SL:g}"
     if get_origin(field.annotation) is Literal:
         return ", ".join(f"`{choice}`" for choice in get_args(field.annotation))
     carried = [*field.metadata]

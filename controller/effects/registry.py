@@ -1,4 +1,4 @@
-"""Kinds of effects by name, our own and those of installed plug-ins alike."""
+"""Kinds of effects by name: built in or from installed plug-ins."""
 
 from operator import attrgetter
 
@@ -16,10 +16,10 @@ _KINDS: PluginRegistry[type[Effect]] = PluginRegistry(
 
 
 def effect_kinds() -> tuple[str, ...]:
-    """Names of all installed kinds, without loading any."""
+    """Return the names of all installed kinds without loading any."""
     return _KINDS.names()
 
 
 def effect_kind(name: str) -> type[Effect]:
-    """The kind of a name; raises InputError if there is none, or its plug-in does not work."""
+    """Return the kind of a name; raises InputError if it is unknown or its plug-in fails."""
     return _KINDS.find(name)

@@ -1,0 +1,27 @@
+"""Buzz: a steady vibration, as long as the finger stays or for a duration."""
+
+from typing import Annotated, ClassVar
+
+from controller.effects.effect import Effect, EffectRun
+from controller.effects.steady import MAX_DURATION, MIN_DURATION, SteadyRun
+from controller.sources.contacts import Contact
+from model.config.sections import Quantity
+from model.config.units import TIME
+
+
+class Buzz(Effect):
+    """A steady vibration, as long as the finger stays or for a duration."""
+
+    kind: ClassVar[str] = "buzz"
+    is_for_motion: ClassVar[bool] = False
+
+    duration: Annotated[float, Quantity(TIME, least=MIN_DURATION, most=MAX_DURATION)] | None = None
+
+    def start(self, contact: Contact, now: float, *, level_db_sl: float | None) -> EffectRun:
+        """Start a steady vibration."""
+        return SteadyRun(level_db_sl, None if self.duration is None else now + self.duration)
+
+    @property
+    def has_end(self) -> bool:
+        """True with a duration."""
+        return self.duration is not None

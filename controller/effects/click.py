@@ -1,0 +1,22 @@
+"""Click: one short vibration."""
+
+from typing import Annotated, ClassVar
+
+from controller.effects.effect import Effect, EffectRun
+from controller.effects.steady import MIN_DURATION, SteadyRun
+from controller.sources.contacts import Contact
+from model.config.sections import Quantity
+from model.config.units import TIME
+
+
+class Click(Effect):
+    """One short vibration."""
+
+    kind: ClassVar[str] = "click"
+    is_for_motion: ClassVar[bool] = False
+
+    duration: Annotated[float, Quantity(TIME, least=MIN_DURATION, most=0.5)] = 0.040
+
+    def start(self, contact: Contact, now: float, *, level_db_sl: float | None) -> EffectRun:
+        """Start a vibration of its duration."""
+        return SteadyRun(level_db_sl, now + self.duration)

@@ -1,0 +1,71 @@
+"""Ramp: a level that rises or falls in steps."""
+
+from dataclasses import dataclass
+from typing import Annotated, ClassVar
+
+from controller.effects.effect import (
+    MAX_DB_SL,
+    MIN_DB_SL,
+    Effect,
+    EffectRun,
+    NoSensation,
+    Sensation,
+)
+from controller.effects.steady import MAX_DURATION, MIN_DURATION
+from controller.sources.contacts import Contact
+from model.config.sections import Quantity
+from model.config.units import RATIO, TIME
+from model.finger.perception import STRONG_DB_SL
+
+RAMP_STEP_DB = 2.0
+"""Between levels of a ramp [dB]: below the just noticeable difference."""
+
+
+class Ramp(Effect):
+    """From one level to another, then over, or held there while the finger stays."""
+
+    kind: ClassVar[str] = "ramp"
+    is_for_motion: ClassVar[bool] = False
+
+    start_level: Annotated[float, Quantity(RATIO, least=MIN_DB_SL, most=MAX_DB_SL)] = 6.0
+    duration: Annotated[float, Quantity(TIME, least=0.1, most=MAX_DURATION)] = 1.0
+    hold: bool = False
+
+    def start(self, contact: Contact, now: float, *, level_db_sl: float | None) -> EffectRun:
+        """Start at the first level, in steps of 2 dB, or larger ones where these are too short."""
+        end = STRONG_DB_SL if level_db_sl is None else level_db_sl
+        span = end - self.start_level
+        count = max(1, min(round(abs(span) / RAMP_STEP_DB), int(self.duration / MIN_DURATION) - 1))
+        rise = [self.start_level + span * index / count for index in range(count)]
+        levels = (*rise, level_db_sl)
+        return _RampRun(now, levels, self.duration / len(levels), self.hold)
+
+    @property
+    def has_end(self) -> bool:
+        """True unless it holds its last level."""
+        return not self.hold
+
+    def max_db_sl(self, level_db_sl: float | None) -> float:
+        """Return the higher of the first and the last level."""
+        return max(self.start_level, super().max_db_sl(level_db_sl))
+
+
+@dataclass(frozen=True)
+class _RampRun(EffectRun):
+    """Levels [dB SL] for equal steps of time [s]; the last one may be held."""
+
+    start: float
+    levels: tuple[float | None, ...]
+    step: float
+    is_held: bool
+
+    def feel(self, contact: Contact, now: float) -> Sensation | NoSensation | None:
+        """Return the level of the current step."""
+        index = max(0, int((now - self.start) / self.step))
+        if index >= len(self.levels) - 1 and self.is_held:
+            return Sensation(self.levels[-1], or_less=True)
+        if index >= len(self.levels):
+            return None
+        # Without or_less a ramp beyond the reach of the plate would break off instead of saturate.
+        until = self.start + (index + 1) * self.step
+        return Sensation(self.levels[index], until, or_less=True)

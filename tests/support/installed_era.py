@@ -79,7 +79,7 @@ class InstalledEra:
 
 
 def try_files(era: InstalledEra) -> None:
-    """Help, configuration files, the plate and a small table, a bug report, the vendors' files."""
+    """Help, configuration files, the plate and a small table, a bug report."""
     expect("Usage: era " in era("--help"), "help")
     era("config", "init", "rig.yaml")
     for kind in ("layout", "daemon"):

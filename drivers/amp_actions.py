@@ -84,9 +84,11 @@ async def drive(
     url: str, *, channel: int, frequency: float, level: float, duration: float
 ) -> dict[str, Any]:
     """Drive one channel for a time [s]; ends silent and disarmed."""
-    longest = PROTOCOL.quantities.valid_for.high
-    if not 0 < duration <= longest:
-        raise CommandError(f"--for must be above 0 and at most {longest:g} s, got {duration:g} s")
+    max_duration = PROTOCOL.quantities.valid_for.high
+    if not 0 < duration <= max_duration:
+        raise CommandError(
+            f"--for must be above 0 and at most {max_duration:g} s, got {duration:g} s"
+        )
     ceiling = GuardLimits(FREQUENCY_FLOOR, FREQUENCY_CEILING, LEVEL_CEILING)
     async with _opened(url) as amplifier:
         guard = Guard(ceiling, amplifier.capabilities)

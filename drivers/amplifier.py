@@ -274,10 +274,10 @@ class Amplifier:
 
     def _ramp(self, ramp: float) -> float:
         """Clip a ramp to the amplifier's range, so that a stop is never refused for it."""
-        longest = PROTOCOL.quantities.ramp.high
+        max_ramp = PROTOCOL.quantities.ramp.high
         if self._capabilities is not None:
-            longest = min(longest, self._capabilities.ramp_max)
-        return min(ramp, longest) if ramp > 0 else 0.0
+            max_ramp = min(max_ramp, self._capabilities.ramp_max)
+        return min(ramp, max_ramp) if ramp > 0 else 0.0
 
 
 def _safe(safe: SafeCommandSet) -> SafeCommandSet:

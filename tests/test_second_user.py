@@ -33,7 +33,7 @@ async def test_the_second_user_of_an_address_is_refused_and_the_first_undisturbe
     second = Amplifier(open_backend(far.url), reply_timeout=PATIENT)
     await first.open()
     await first.arm(2.0)
-    with pytest.raises(LinkError, match="this program has it open already; give every amplifier"):
+    with pytest.raises(LinkError, match="already open in this program"):
         await second.open()
     assert (await first.heartbeat()).state is AmplifierState.OPERATION_ENABLED
     await first.close()

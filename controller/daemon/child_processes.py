@@ -45,7 +45,7 @@ class ChildProcesses:
         await asyncio.gather(*self._tasks, return_exceptions=True)
 
     async def _keep_running(self, child: ChildProcess) -> None:
-        for pause in pauses(first=1.0, longest=_MAX_PAUSE):
+        for pause in pauses(first=1.0, maximum=_MAX_PAUSE):
             try:
                 process = await asyncio.create_subprocess_exec(
                     # -P: do not import a folder named controller in the working directory

@@ -57,7 +57,7 @@ class TouchInputs:
             source = frame.source if frame.source.isprintable() else ascii(frame.source)
             self._deliver(replace(frame, source=f"{touch_input.name}:{source}"))
 
-        for pause in pauses(first=_MIN_PAUSE, longest=_MAX_PAUSE):
+        for pause in pauses(first=_MIN_PAUSE, maximum=_MAX_PAUSE):
             try:
                 await touch_input.make().run(deliver)
             except Exception as error:

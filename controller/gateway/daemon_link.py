@@ -47,7 +47,7 @@ class DaemonLink:
     async def run(self) -> None:
         """Connect, follow the daemon and reconnect, until cancelled."""
         while True:
-            for pause in pauses(first=_MIN_RETRY_INTERVAL, longest=_MAX_RETRY_INTERVAL):
+            for pause in pauses(first=_MIN_RETRY_INTERVAL, maximum=_MAX_RETRY_INTERVAL):
                 try:
                     await self._follow()
                 except (RpcError, Unreachable) as error:

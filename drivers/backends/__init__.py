@@ -1,1 +1,1 @@
-"""Backends: an amplifier over one kind of wire, a package each."""
+"""Backends: a package for each kind of wire."""

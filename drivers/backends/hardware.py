@@ -1,8 +1,7 @@
-"""What backends take from the machine they run on, and who may stand in for it.
+"""Hardware and system resources of backends, replaceable for tests in virtual time.
 
-Serial ports, CAN adapters, threads for what blocks, and chance: that is the machine's, and what a
-bench in virtual time has to bring itself. Frames, turns, retries and time-outs are not in here, and
-run the same on both. TCP connections are the event loop's own.
+Serial ports, CAN adapters, worker threads and random numbers. Frames, turns, retries and timeouts
+are the same with every provider. TCP connections belong to the event loop.
 """
 
 import asyncio
@@ -22,57 +21,57 @@ _T = TypeVar("_T")
 
 
 class Port(Protocol):
-    """An open serial port. What it reads, and once why it was lost, goes to who opened it."""
+    """An open serial port; data and loss are reported to the callbacks of its opening."""
 
     def write(self, data: bytes) -> None:
-        """Send bytes; LinkTimeout where the line takes no more, LinkError where it is gone."""
+        """Send bytes; LinkTimeout if the line is blocked, LinkError if it is lost."""
 
     def close(self) -> None:
-        """Close it; nothing is told any more."""
+        """Close it; no callback is called any more."""
 
     async def wait_closed(self) -> None:
-        """See the closing through."""
+        """Wait until it is closed."""
 
 
 class Adapter(Protocol):
-    """An open CAN adapter. What it hears, and once why it was lost, goes to who opened it."""
+    """An open CAN adapter; frames and loss are reported to the callbacks of its opening."""
 
     def send(self, frames: Sequence[CanFrame]) -> None:
-        """Send frames without another's in between; LinkError where the bus is gone."""
+        """Send frames back to back; LinkError if the bus is lost."""
 
     def close(self) -> None:
-        """Close it; nothing is told any more."""
+        """Close it; no callback is called any more."""
 
     async def wait_closed(self) -> None:
-        """See the closing through."""
+        """Wait until it is closed."""
 
 
 class Worker(ABC):
-    """Does jobs that block, one after the other, beside the event loop.
+    """Runs blocking jobs one after the other, outside the event loop.
 
-    In a job, waiting is its own: its queues and its `sleep`.
+    Jobs wait only by its queues and its `sleep`.
     """
 
     @abstractmethod
     def submit(self, job: Callable[[], _T]) -> "asyncio.Future[_T]":
-        """Do a job when those before it are done; what it returns or raises."""
+        """Run a job after those before it; the future has its result or exception."""
 
     @abstractmethod
     async def close(self) -> None:
-        """Wait for what is under way; nothing is taken any more."""
+        """Finish the running job and take no more."""
 
     @abstractmethod
     def make_queue(self) -> "queue.Queue[bytes]":
-        """A queue whose `get` blocks."""
+        """Make a queue whose `get` blocks."""
 
     @abstractmethod
     def sleep(self, seconds: float) -> None:
-        """Block for so long [s]."""
+        """Block for a time [s]."""
 
 
 @final
 class ThreadWorker(Worker):
-    """Does them in a thread."""
+    """Runs them in a thread."""
 
     def __init__(self, name: str) -> None:
         self._thread = ThreadPoolExecutor(1, thread_name_prefix=name)
@@ -95,7 +94,7 @@ class ThreadWorker(Worker):
 
 
 class HardwareProvider(ABC):
-    """What stands in for the machine."""
+    """Replacement of the machine's hardware and system resources."""
 
     @abstractmethod
     async def open_port(
@@ -115,26 +114,26 @@ class HardwareProvider(ABC):
 
     @abstractmethod
     def make_worker(self) -> Worker:
-        """Somebody for jobs that block."""
+        """Make a worker for blocking jobs."""
 
     @abstractmethod
     def below(self, limit: int) -> int:
-        """A number from 0 to limit - 1, by chance."""
+        """Return a random number, 0 to limit - 1."""
 
 
 HARDWARE_PROVIDER: ContextVar[HardwareProvider | None] = ContextVar(
     "HARDWARE_PROVIDER", default=None
 )
-"""Who stands in for the machine in this context; nobody as a rule."""
+"""Provider in this context; None: the machine itself."""
 
 
 def make_worker(name: str) -> Worker:
-    """Somebody for jobs that block; name: of the thread."""
+    """Make a worker for blocking jobs; name: of its thread."""
     hardware = HARDWARE_PROVIDER.get()
     return ThreadWorker(name) if hardware is None else hardware.make_worker()
 
 
 def number_below(limit: int) -> int:
-    """A number from 0 to limit - 1 that nobody can guess, or that the stand-in has chosen."""
+    """Return an unpredictable number, 0 to limit - 1, or one that the provider chooses."""
     hardware = HARDWARE_PROVIDER.get()
     return secrets.randbelow(limit) if hardware is None else hardware.below(limit)

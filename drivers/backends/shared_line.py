@@ -1,4 +1,4 @@
-"""What several amplifiers of a process are on: opened by the first, closed by the last."""
+"""A line shared by several amplifiers of a process: opened by the first, closed by the last."""
 
 import asyncio
 from abc import ABC, abstractmethod
@@ -13,32 +13,32 @@ _OpenT = TypeVar("_OpenT", bound=Port | Adapter)
 
 
 class SharedLine(ABC, Generic[_OpenT]):
-    """A serial line, a Modbus line or a CAN bus; whoever is on it is known by a number.
+    """A serial line, a Modbus line or a CAN bus; its users are known by a number.
 
-    Who comes while it is opened or closed waits for that. A loss is one for all who are on it until
-    each joins again; the first of them opens it anew. place: its name for people.
+    Joining waits while it is being opened or closed. A loss holds for every user until that user
+    joins again; the first one to do so reopens the line. place: its name in messages.
     """
 
     number: ClassVar[str]
-    """What the number is called on this wire."""
+    """Name of the number on this wire."""
 
     def __init__(self, place: str) -> None:
         self.place = place
         self._users: dict[int, Callable[[str], None]] = {}
-        self._told: set[int] = set()  # of the loss, and not back since
+        self._notified: set[int] = set()  # of the loss, and not joined since
         self._loss: str | None = None
         self._opened: _OpenT | None = None
         self._changing = asyncio.Lock()  # held while it is opened or closed
 
     async def join(self, number: int, on_loss: Callable[[str], None]) -> None:
-        """Be on it from now on; on_loss: told once, in the event loop, why it was lost.
+        """Add a user; on_loss: called once, in the event loop, with the cause of a loss.
 
-        Raises LinkError: where it cannot be opened, and for a number that is in use.
+        Raises LinkError if the line cannot be opened, and for a number in use.
         """
         if number in self._users:
             raise LinkError(
-                f"{self.number} {number} on {self.place}: this program has it open already; give "
-                f"every amplifier there a {self.number} of its own"
+                f"{self.number} {number} on {self.place} is already open in this program; give "
+                f"each amplifier its own {self.number}"
             )
         self._users[number] = on_loss
         try:
@@ -48,54 +48,54 @@ class SharedLine(ABC, Generic[_OpenT]):
                 if self._opened is None:
                     self._loss = None
                     self._opened = await self._open()
-                self._told.discard(number)  # of a loss while this one waited to be on it
+                self._notified.discard(number)  # a loss while this one was waiting
         except BaseException:
             await self.leave(number)
             raise
 
     async def leave(self, number: int) -> None:
-        """Be on it no longer; the last to go closes it. Safe to call twice."""
+        """Remove a user; the last one closes the line. Safe to call twice."""
         self._users.pop(number, None)
-        self._told.discard(number)
+        self._notified.discard(number)
         if self._users:
             return
-        self._give_up(f"{self.place} was closed")
+        self._fail_pending(f"{self.place} was closed")
         async with self._changing:
-            if not self._users:  # nobody has come meanwhile
+            if not self._users:  # no user has joined meanwhile
                 await self._shut()
         if not self._users:
             _forget(self)
 
     def raise_if_lost(self, number: int | None = None) -> None:
-        """Raise LinkError where it is lost, or was, and this one is not back since.
+        """Raise LinkError if the line is lost, or was, and this user has not joined since.
 
-        To be called when something goes out: it may have waited while others opened it anew.
+        Call it before sending: the request may have waited while others reopened the line.
         """
         if self._loss is not None:
             raise LinkError(self._loss)
-        if number in self._told:
+        if number in self._notified:
             raise LinkError(
-                f"{self.place} was lost, and {self.number} {number} is not back on it; open that "
-                "amplifier again"
+                f"{self.place} was lost, and {self.number} {number} has not been reopened; open "
+                "that amplifier again"
             )
 
     def _ready(self) -> _OpenT:
-        """What is open, for whoever sends; LinkError where nothing is, or it is lost."""
+        """Return the open port or adapter; LinkError if it is closed or lost."""
         self.raise_if_lost()
-        opened = self._opened  # a thread may ask while it is closed
+        opened = self._opened  # a thread may call while it is being closed
         if opened is None:
             raise LinkError(f"{self.place} is not open; open the amplifier first")
         return opened
 
     def _lose(self, what: str) -> None:
-        """It is gone; to be called in the event loop by what notices."""
+        """Notify the users of a loss; called in the event loop."""
         if self._loss is not None:
             return
         self._loss = what
-        self._give_up(what)
+        self._fail_pending(what)
         for number, on_loss in tuple(self._users.items()):
-            if number not in self._told:
-                self._told.add(number)
+            if number not in self._notified:
+                self._notified.add(number)
                 on_loss(what)
 
     async def _shut(self) -> None:
@@ -106,10 +106,10 @@ class SharedLine(ABC, Generic[_OpenT]):
 
     @abstractmethod
     async def _open(self) -> _OpenT:
-        """Open it; raises LinkError."""
+        """Open the port or adapter; raises LinkError."""
 
-    def _give_up(self, what: str) -> None:
-        """End what still waits for an answer."""
+    def _fail_pending(self, what: str) -> None:
+        """Fail pending requests."""
         return
 
 
@@ -121,7 +121,7 @@ _LINES: "WeakKeyDictionary[asyncio.AbstractEventLoop, dict[Hashable, SharedLine[
 
 
 def shared_line(kind: type[_LineT], key: Hashable, make: Callable[[], _LineT]) -> _LineT:
-    """The line of this kind and key in the running event loop; made where nobody is on it yet."""
+    """Return the line of this kind and key in the running event loop, a new one if unused."""
     lines = _LINES.setdefault(asyncio.get_running_loop(), {})
     line = lines.get((kind, key))
     if not isinstance(line, kind):

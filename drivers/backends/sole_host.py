@@ -1,7 +1,7 @@
-"""One program of a machine that arms an amplifier which several can reach.
+"""Exclusive right of one program on this machine to arm an amplifier, for TCP.
 
-A serial port is for one program alone and a CAN node tells of another host by itself; over TCP
-nobody would notice. Asking how an amplifier is, and stopping it, stays open to all.
+Serial ports are exclusive and CAN nodes reveal another host; TCP does neither. Reading the status
+and stopping stay open to all programs.
 """
 
 import contextlib
@@ -13,9 +13,9 @@ from drivers.errors import LinkError
 
 
 class SoleHost:
-    """The right to arm what has this name; the system takes it back when the program ends.
+    """The right to arm the amplifier of this name; the system revokes it when the program ends.
 
-    Where the system knows no names for this (others than Linux) everybody has it.
+    Systems other than Linux have no such names: every program has the right there.
     """
 
     def __init__(self, name: str) -> None:
@@ -23,7 +23,7 @@ class SoleHost:
         self._held: socket.socket | None = None
 
     def claim(self) -> None:
-        """Have it from now on; LinkError where another on this machine has it."""
+        """Take the right; LinkError if another program on this machine has it."""
         if self._held is not None or sys.platform != "linux" or HARDWARE_PROVIDER.get() is not None:
             return
         claim = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
@@ -32,13 +32,13 @@ class SoleHost:
         except OSError as error:
             claim.close()
             raise LinkError(
-                f"another program on this machine drives the amplifier at {self._name}; end that "
-                "one, or stop it with era stop"
+                f"another program on this machine drives the amplifier at {self._name}; end it, or "
+                "stop it with era stop"
             ) from error
         self._held = claim
 
     def release(self) -> None:
-        """Give it back; safe without it."""
+        """Release the right; safe to call without it."""
         held, self._held = self._held, None
         if held is not None:
             with contextlib.suppress(OSError):

@@ -1,19 +1,19 @@
-"""Waiting for a reply, and no longer than is fair to whoever owes it."""
+"""Waiting for a reply, with allowance for delays of this process."""
 
 import asyncio
 from typing import TypeVar
 
-SETTLE = 0.02  # s; time for a second amplifier of the same address to answer
-_LATE = 0.005  # s; by so much a timer is late only where this process was held up
-_GRACE = 0.010  # s; then what came meanwhile may lie unread, here or in a reader's thread
+SETTLE = 0.02  # s; for a second amplifier of the same address to reply
+_LATE = 0.005  # s; a timer later than this means that this process was delayed
+_GRACE = 0.010  # s; for data received but not read yet, here or in a reader thread
 
 _T = TypeVar("_T")
 
 
 async def reply_within(reply: "asyncio.Future[_T]", timeout: float) -> _T:
-    """The reply; TimeoutError where it does not come within so long [s].
+    """Return the reply; TimeoutError if it does not arrive within the timeout [s].
 
-    One that has come counts, also where this process was held up and finds it after its time.
+    A reply that arrived in time counts even if this process was delayed and reads it late.
     """
     loop = asyncio.get_running_loop()
     due = loop.time() + timeout

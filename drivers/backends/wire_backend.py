@@ -1,4 +1,4 @@
-"""What the backends over real wires have in common: counters, the last byte, whom to tell."""
+"""Base of backends over real wires: counters, time of the last byte, callbacks."""
 
 from collections.abc import Callable
 
@@ -8,10 +8,10 @@ from drivers.statistics import WireCounters
 
 
 class WireBackend(Backend):
-    """A backend that counts, and tells of events and of a loss that nobody asked about.
+    """A backend with counters and callbacks.
 
-    What derives from it counts in `_counters`, puts the time into `_last_sent` when a request has
-    gone out, and calls `_on_event` and `_on_loss`, which nobody hears before `listen`.
+    Subclasses count in `_counters`, set `_last_sent` when a request has gone out, and call
+    `_on_event` and `_on_loss`, which have no effect before `listen`.
     """
 
     def __init__(self) -> None:
@@ -22,12 +22,12 @@ class WireBackend(Backend):
 
     @property
     def counters(self) -> WireCounters:
-        """What was seen for this amplifier, or on the line by all who share it."""
+        """Frame counters of this amplifier, or of the line that it shares."""
         return self._counters
 
     @property
     def last_sent(self) -> float:
-        """When system or adapter took the last request's last byte, by the loop's clock [s]."""
+        """Time [s] when system or adapter took the last byte, by the event loop's clock."""
         return self._last_sent
 
     def listen(

@@ -101,7 +101,7 @@ class Guard:
         if shaped or not command_set.is_silent:
             remaining = self._budget.remaining(self._clock())
             if remaining is not None:
-                valid_for = min(valid_for or remaining, remaining, _LONGEST)
+                valid_for = min(valid_for or remaining, remaining, _MAX_VALID_FOR)
         # A silent channel gets a frequency that the amplifier accepts.
         commands = tuple(
             DriveCommand(
@@ -202,7 +202,7 @@ class Guard:
         )
 
 
-_LONGEST = PROTOCOL.quantities.valid_for.high
+_MAX_VALID_FOR = PROTOCOL.quantities.valid_for.high
 _FOREVER = float("inf")
 
 

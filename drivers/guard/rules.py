@@ -86,12 +86,12 @@ def _check_token(command_set: CommandSet, context: GuardContext) -> None:
 
 
 def _check_times(command_set: CommandSet, context: GuardContext) -> None:
-    for name, value, longest in (
+    for name, value, highest in (
         ("ramp", command_set.ramp, context.capabilities.ramp_max),
         ("valid_for", command_set.valid_for, PROTOCOL.quantities.valid_for.high),
     ):
-        if not (is_finite(value) and 0 <= value <= longest):
-            raise CommandRefused(f"{name} must be 0 to {longest:g} s, got {value!r} s")
+        if not (is_finite(value) and 0 <= value <= highest):
+            raise CommandRefused(f"{name} must be 0 to {highest:g} s, got {value!r} s")
 
 
 def _check_channels(command_set: CommandSet, context: GuardContext) -> None:

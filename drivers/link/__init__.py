@@ -1,1 +1,1 @@
-"""One link to one amplifier: whose turn it is, what is asked again, and when it is lost."""
+"""The link to one amplifier: turns, retries and loss."""

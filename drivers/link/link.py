@@ -1,6 +1,6 @@
-"""One request at a time over one backend: repeated where no answer comes, given up where none does.
+"""One request at a time over one backend, repeated if there is no reply.
 
-What is lost stays lost until it is opened anew, and says so at once to whoever asks.
+A lost link stays lost until it is reopened: every request raises LinkError at once.
 """
 
 import asyncio
@@ -32,20 +32,20 @@ from drivers.statistics import LinkStatistics
 REPLY_TIMEOUT = 0.030  # s; a heartbeat and three of these are less than three heartbeats of 50 ms
 RETRIES = 2
 ASSUME_ENERGISED = (
-    ". Assume that the amplifier is energised until its watchdog has passed; once it is opened "
-    "again it is disarmed"
+    ". Assume that the amplifier is energised until its watchdog has passed; opened again, it is "
+    "disarmed"
 )
-"""What the text of every loss ends with."""
+"""End of every message of a loss."""
 
-BUSY_PAUSE = 0.005  # s; before a busy amplifier is asked again: short enough for a touch to be felt
+BUSY_PAUSE = 0.005  # s; before a retry to a busy amplifier; short against the latency of touch
 
 _ReplyT = TypeVar("_ReplyT", Identity, Capabilities, Status, Achieved, FaultList, Loaded)
 
 
 def retries_on(round_trip: float, *, reply_timeout: float = REPLY_TIMEOUT) -> int:
-    """How often a request is repeated on a wire whose longest exchange takes round_trip [s].
+    """Return the number of retries on a wire whose longest exchange takes round_trip [s].
 
-    Once less than else where that, and the amplifier's own delay, take more than the timeout [s].
+    One less than usual if that and the amplifier's own delay exceed the timeout [s].
     """
     is_slow = round_trip + PROTOCOL.reaction > reply_timeout
     return RETRIES - 1 if is_slow else RETRIES
@@ -55,9 +55,9 @@ def retries_on(round_trip: float, *, reply_timeout: float = REPLY_TIMEOUT) -> in
 class Link:
     """A backend with its turns, retries, loss and statistics.
 
-    reply_timeout [s]: how long one exchange may take, longer where the wire itself needs longer.
-    Three unanswered ones in a row are a loss; two, once `allow_for` was told of a wire too slow for
-    three within three heartbeats. on_event: told, in the event loop, what comes unasked.
+    reply_timeout [s]: of one exchange, extended on slow wires. Three requests in a row without a
+    reply are a loss; two on a wire too slow for three within three heartbeats, see `allow_for`.
+    on_event: called, in the event loop, with unsolicited events.
     """
 
     def __init__(
@@ -69,8 +69,8 @@ class Link:
         self._turns = Turns(lambda: backend.is_unsent)
         self._loss: str | None = "the amplifier is not open yet; call open() first"
         self._unanswered = 0
-        self._is_aborting_unsent = False  # whoever waits for an answer soon gives it up
-        self._is_stuck = False  # it was busy to the last: until it is not, nothing is repeated
+        self._is_aborting_unsent = False  # callers cancel soon
+        self._is_stuck = False  # it stayed busy: no retries until it replies otherwise
         self._retries = self._timeouts = self._refusals = 0
         self._last_round_trip: float | None = None
         self._last_heartbeat: float | None = None
@@ -83,7 +83,7 @@ class Link:
 
     @property
     def statistics(self) -> LinkStatistics:
-        """How well it does; counts since it was opened, retries since it was made."""
+        """Link statistics; frames since opening, retries since construction."""
         seen, beat = self.backend.counters, self._last_heartbeat
         return LinkStatistics(
             frames_out=seen.frames_out,
@@ -111,11 +111,11 @@ class Link:
         await self.backend.close()
 
     def allow_for(self, round_trip: float) -> None:
-        """Repeat once less on a wire whose longest exchange [s] takes more than the timeout."""
+        """Retry once less if the longest exchange on the wire [s] exceeds the timeout."""
         self._retries_allowed = retries_on(round_trip, reply_timeout=self._reply_timeout)
 
     def heartbeat_acknowledged(self) -> None:
-        """A heartbeat was answered."""
+        """Note the reply to a heartbeat."""
         self._last_heartbeat = clock.now()
 
     async def ask(
@@ -126,10 +126,10 @@ class Link:
         kind: RequestPriority = RequestPriority.ORDINARY,
         timeout: float | None = None,
     ) -> _ReplyT:
-        """The reply to a request in its turn; timeout [s] in place of the usual one.
+        """Send a request in its turn and return its reply; timeout [s]: None for the usual one.
 
-        Raises LinkError, CommandRefused for a refusal or where something else took its place, and
-        FrameError for a reply that makes no sense, or to another kind of request.
+        Raises LinkError, CommandRefused for a refusal or if superseded, and FrameError for an
+        invalid reply or one of another type.
         """
         self._raise_if_lost()
         timeout = timeout or self._reply_timeout
@@ -139,28 +139,27 @@ class Link:
             with silencing:
                 reply = await self._in_turn(request, kind, timeout)
         except FrameError as problem:
-            raise FrameError(
-                f"what the amplifier answered to {name} makes no sense: {problem}; {NO_PROTOCOL}"
-            ) from problem
+            raise FrameError(f"invalid reply to {name}: {problem}; {NO_PROTOCOL}") from problem
         if isinstance(reply, Nak):
             self._refusals += 1
             raise refusal(name, reply)
         if not isinstance(reply, expect):
             raise FrameError(
-                f"the amplifier answered {name} with {type(reply).__name__}; {NO_PROTOCOL}"
+                f"reply to {name} must be {expect.__name__}, got {type(reply).__name__}; "
+                f"{NO_PROTOCOL}"
             )
         return reply
 
     def abort_unsent(self) -> None:
-        """Neither send what still waits for the wire nor repeat what is on its way.
+        """Do not send requests that wait for the wire, and repeat none: they raise Preempted.
 
-        It raises Preempted instead, unless it silences.
+        Requests of the stop class are exempt.
         """
         self._is_aborting_unsent = True
         self._turns.preempt_unsent()
 
     async def broadcast(self, request: Broadcast, kind: RequestPriority) -> None:
-        """Say something to all of the bus in its turn; raises LinkError, CommandError."""
+        """Broadcast in its turn; raises LinkError, CommandError."""
         self._raise_if_lost()
         async with self._turns.take(kind):
             await self.backend.broadcast(request)
@@ -172,7 +171,7 @@ class Link:
                     self._raise_if_lost()
                     return await self._exchange(request, kind, timeout)
             except Preempted:
-                if not kind.silences:  # what silences is still wanted after the stop before it
+                if not kind.silences:  # a stop-class request is repeated after the stop before it
                     raise
 
     async def _exchange(self, request: Request, kind: RequestPriority, timeout: float) -> Reply:
@@ -184,10 +183,10 @@ class Link:
                 reply = await self.backend.exchange(request, timeout=timeout)
             except LinkTimeout as problem:
                 self._timeouts += 1
-                # Counted across requests: a stream of superseded ones must not hide a dead link.
+                # Counted across requests: superseded ones must not hide a lost link.
                 self._unanswered += 1
                 if self._unanswered > self._retries_allowed:
-                    what = f"{problem} ({self._unanswered} requests in a row were left unanswered)"
+                    what = f"{problem} (no reply to {self._unanswered} requests in a row)"
                     raise LinkTimeout(self._lose(what)) from problem
             except LinkError as problem:
                 raise LinkError(self._lose(str(problem))) from problem
@@ -208,7 +207,7 @@ class Link:
             self._retries += 1
 
     def _found_lost(self, what: str) -> None:
-        """The wire is gone, and no request was on its way to notice."""
+        """Note a loss found without a request."""
         if self._loss is None:
             self._lose(what)
 

@@ -3,12 +3,12 @@
 from collections.abc import Iterator
 
 FIRST_PAUSE = 0.1  # s; a loose contact has recovered by then
-LONGEST_PAUSE = 5.0  # s; the longest wait after an adapter was plugged in again
+MAX_PAUSE = 5.0  # s; the longest wait after an adapter was plugged in again
 
 
-def pauses(first: float = FIRST_PAUSE, longest: float = LONGEST_PAUSE) -> Iterator[float]:
+def pauses(first: float = FIRST_PAUSE, maximum: float = MAX_PAUSE) -> Iterator[float]:
     """Yield pauses [s] between attempts, each twice the previous one."""
     pause = first
     while True:
         yield pause
-        pause = min(2 * pause, longest)
+        pause = min(2 * pause, maximum)

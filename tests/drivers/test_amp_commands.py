@@ -253,7 +253,7 @@ def test_discover_says_why_a_port_could_not_be_asked(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr("drivers.discovery.search.os.access", lambda path, mode: True)
     result = CliRunner().invoke(app, ["amp", "discover"])
     assert result.exit_code == 0, result.output
-    assert "there is no such port" in result.stdout
+    assert "no such port" in result.stdout
 
 
 def test_the_page_of_commands_names_what_is_printed(background: BackgroundFarEnd) -> None:

@@ -267,7 +267,7 @@ async def test_wrong_reply_is_a_frame_error(
     )
     backend.script += [STATUS, Achieved(6, ()), FrameError("state 9"), Loaded(slot=2, knots=1)]
     for call, fault in (
-        (amplifier.apply(safe(5)), "Apply.*Status"),
+        (amplifier.apply(safe(5)), "Apply .*Achieved, got Status"),
         (amplifier.apply(safe(5)), "token 5.*token 6"),
         (amplifier.status(), "GetStatus.*state 9"),
         (amplifier.load_envelope(shape), "2 knots into slot 2, got 1"),

@@ -58,9 +58,9 @@ class MemoryMachine(HardwareProvider):
         await asyncio.sleep(self._loop.dice.uniform(*_PASSING))
         terminal = self._terminals.get(name)
         if terminal is None or not terminal.is_plugged:
-            raise LinkError(f"serial port {name} cannot be opened: there is no such port")
+            raise LinkError(f"serial port {name} cannot be opened: no such port")
         if name in self._open:
-            raise LinkError(f"serial port {name} cannot be opened: another program has it open")
+            raise LinkError(f"serial port {name} cannot be opened: in use by another program")
         port = self._open[name] = MemoryPort(self, terminal, on_data, on_loss)
         return port
 

@@ -1,4 +1,4 @@
-"""A CAN adapter, open: a thread reads it, for python-can knows no other way with all of them."""
+"""An open CAN adapter, read by a thread, which works with every python-can interface."""
 
 import asyncio
 import contextlib
@@ -18,12 +18,12 @@ from drivers.codec.can_bus.frame import CanFrame
 from drivers.errors import LinkError, LinkTimeout, system_message
 from drivers.threads import close_in_thread, in_thread
 
-_READ_TIMEOUT = 0.05  # s; how long the reader of a bus that cannot be woken notices its end
-_BUS_OFF = 0x40  # of the class of an error frame, as SocketCAN numbers them
+_READ_TIMEOUT = 0.05  # s; interval in which the reader notices its end
+_BUS_OFF = 0x40  # error class of SocketCAN
 _OFF = "the adapter went bus-off; check wiring, termination and bit rate"
-_TROUBLE = (can.CanError, OSError, ValueError, TypeError)  # TypeError: closed while it was read
+_TROUBLE = (can.CanError, OSError, ValueError, TypeError)  # TypeError: closed during a read
 
-logging.getLogger("can").addHandler(logging.NullHandler())  # what it says comes as errors of ours
+logging.getLogger("can").addHandler(logging.NullHandler())  # its messages become LinkErrors
 
 
 async def open_adapter(
@@ -31,8 +31,8 @@ async def open_adapter(
 ) -> Adapter:
     """Open the adapter to a bus; raises LinkError.
 
-    on_frame is called with each frame, in the reader's thread, on_loss once, in the event loop,
-    with why the bus was lost.
+    on_frame: called with each frame, in the reader thread; on_loss: called once, in the event loop,
+    with the cause of a loss.
     """
     hardware = HARDWARE_PROVIDER.get()
     if hardware is not None:
@@ -46,7 +46,7 @@ async def open_adapter(
 
 @final
 class _ThreadedAdapter:
-    """An adapter as `open_adapter` opens it."""
+    """An adapter opened by `open_adapter`."""
 
     def __init__(
         self,
@@ -67,13 +67,13 @@ class _ThreadedAdapter:
         self._thread.start()
 
     def send(self, frames: Sequence[CanFrame]) -> None:
-        """Send frames without another's in between; LinkTimeout where it is stuck, LinkError."""
+        """Send frames back to back; LinkTimeout if the adapter is blocked, LinkError."""
         try:
             with self._sending:
                 send_all(self._bus, frames)
         except serial.SerialTimeoutException as stuck:
             raise LinkTimeout(
-                f"{self._url} takes no more frames; check the adapter and flow control"
+                f"{self._url}: send timed out; check the adapter and flow control"
             ) from stuck
         except _TROUBLE as problem:
             what = self._what_was_lost(problem)
@@ -81,21 +81,21 @@ class _ThreadedAdapter:
             raise LinkError(what) from problem
 
     def close(self) -> None:
-        """Let the reader end and close the adapter."""
+        """Let the reader end, which closes the adapter."""
         self._closing.set()
         wake(self._bus)
 
     async def wait_closed(self) -> None:
-        """Wait until it has; not for an adapter that hangs."""
+        """Wait until it is closed, but not for an adapter that hangs."""
         await close_in_thread(self._thread.join, name=f"era-close {self._url}")
 
     def _read(self) -> None:
-        """Read until the bus is closed or lost; runs in the reader's thread, and closes it."""
+        """Read until the bus is closed or lost, then close it; reader thread."""
         problem: Exception | str = ""
         try:
             while not self._closing.is_set() and not problem:
                 message = self._bus.recv(timeout=_READ_TIMEOUT)
-                # Closed meanwhile it may hang, and others have the bus open by now.
+                # A closed adapter may hang here while others have reopened the bus.
                 if message is not None and not self._closing.is_set():
                     problem = self._take(message)
         except _TROUBLE as error:
@@ -103,11 +103,11 @@ class _ThreadedAdapter:
         finally:
             _shut(self._bus)
         if not self._closing.is_set():
-            with contextlib.suppress(RuntimeError):  # of a loop that is closed: nobody waits
+            with contextlib.suppress(RuntimeError):  # of a closed loop
                 self._loop.call_soon_threadsafe(self._lose, self._what_was_lost(problem))
 
     def _take(self, message: can.Message) -> str:
-        """Pass a frame on; says what is wrong with the bus where it tells."""
+        """Pass a frame on; returns the problem that an error frame reports, if any."""
         if message.is_error_frame:
             return _OFF if message.arbitration_id & _BUS_OFF else ""
         if not (message.is_remote_frame or message.is_extended_id):
@@ -130,7 +130,7 @@ class _ThreadedAdapter:
 
 
 def _shut(bus: can.BusABC) -> None:
-    """Close an adapter, also one that is gone."""
+    """Close an adapter, also a lost one."""
     with contextlib.suppress(*_TROUBLE):
         bus.shutdown()
 
@@ -143,18 +143,18 @@ def _why_not_open(url: CanBusUrl, problem: Exception) -> str:
         cause = cause.__cause__ or cause.__context__
     if url.interface == "slcan" and code in (errno.EACCES, errno.EPERM):
         remedy = (
-            "this user may not use the port; add the user to the group that owns it (often "
+            "no permission; add the user to the group that owns the port (often "
             "dialout: sudo usermod -aG dialout $USER) and log in again"
         )
     elif url.interface == "slcan" and code in (errno.EAGAIN, errno.EBUSY):
-        remedy = "another program has the port open; close that one"
+        remedy = "in use by another program; close that one"
     elif url.interface == "slcan":
-        remedy = "check the port's name, that the adapter is plugged in, and the bit rate"
+        remedy = "check the port's name, the adapter and the bit rate"
     elif url.interface == "socketcand":
-        remedy = "check address and port, that socketcand runs there, and that it serves this bus"
+        remedy = "check address and port, and that socketcand serves this bus there"
     elif url.interface == "socketcan":
         remedy = (
-            f"check that the interface is there (ip link) and up: sudo ip link set {url.channel} "
+            f"check that the interface exists (ip link) and is up: sudo ip link set {url.channel} "
             f"up type can bitrate {url.bitrate}"
         )
     else:

@@ -1,8 +1,8 @@
-"""An amplifier as a node of a CAN bus, by the conventions of CANopen.
+"""Backend for an amplifier on a CAN bus, by the conventions of CANopen.
 
-Orders go out as PDOs, and an answer belongs to the order whose sequence number it carries; what
-can wait is read and written as objects. The host's heartbeat is a part of Ping and sent by nobody
-else; each amplifier hears one of its own, so that one that was lost is not fed by those for others.
+Time-critical requests are PDOs, matched to their replies by sequence number; the others are SDO
+transfers. Only Ping sends the host's heartbeat; each amplifier has one of its own, so that a lost
+amplifier is not fed by the heartbeats of others.
 """
 
 import asyncio
@@ -48,14 +48,14 @@ from drivers.protocol.messages import (
 )
 from drivers.statistics import WireCounters
 
-_OBJECTS_WAIT = 40  # an object is read in so many answers at most
+_OBJECTS_WAIT = 40  # most SDO replies of one job
 _START = CANOPEN["nmt"]["start"]
 _T = TypeVar("_T")
 
 
 @dataclass(frozen=True)
 class _Joined:
-    """The bus while this is on it, the amplifier's objects, and who waits for them."""
+    """The joined bus, the amplifier's objects, and the worker for SDO transfers."""
 
     bus: CanBus
     objects: ObjectClient
@@ -69,30 +69,32 @@ class CanBackend(WireBackend):
         super().__init__()
         self._url = CanUrl.parse(url)
         self._joined: _Joined | None = None
-        self._node = NodeWatch(self._url, answered=self._answered, told=self._told, lost=self._lose)
-        self._orders = PendingRequests()
-        self._staged: Achieved | None = None  # as it was asked for
+        self._node = NodeWatch(
+            self._url, on_reply=self._received, on_event=self._notify, on_loss=self._lose
+        )
+        self._pending = PendingRequests()
+        self._staged: Achieved | None = None  # as requested
         self._channels = PROTOCOL.quantities.channel_count.maximum
         self._loss: str | None = None
         self._is_listening = False
 
     @property
     def is_unsent(self) -> bool:
-        """Whether it is still being listened for another host, before anything is sent."""
+        """Whether it still listens for another host before arming."""
         return self._is_listening
 
     @property
     def bus(self) -> str:
-        """The bus, on which every amplifier hears a broadcast."""
+        """The bus: a broadcast reaches every amplifier on it."""
         return str(self._url.bus)
 
     @property
     def wire_times(self) -> CanTimes:
-        """Of the bus."""
+        """Durations on the bus."""
         return CanTimes(self._url.bus.bitrate, self._url.bus.fd)
 
     async def open(self) -> None:
-        """Join the bus, which is opened by the first of its amplifiers; raises LinkError."""
+        """Join the bus, which its first amplifier opens; raises LinkError."""
         if self._joined is not None:
             return
         bus = can_bus(self._url.bus)
@@ -105,7 +107,7 @@ class CanBackend(WireBackend):
         self._node.join(bus, objects, self._counters)
 
     async def close(self) -> None:
-        """Leave the bus; what still waits for an answer gets LinkError."""
+        """Leave the bus; pending requests raise LinkError."""
         self._node.stop()
         self._fail(f"{self._url.bus} was closed")
         joined, self._joined = self._joined, None
@@ -118,10 +120,9 @@ class CanBackend(WireBackend):
             await joined.bus.leave(self._url.node)
 
     async def exchange(self, request: Request, *, timeout: float) -> Reply:
-        """Send a request and wait for its answer; LinkTimeout, LinkError or FrameError.
+        """Send a request and wait for its reply; LinkTimeout, LinkError or FrameError.
 
-        timeout [s]: for all of it, of objects for each of their frames; longer where the bus and an
-        amplifier that reacts in time need longer.
+        timeout [s]: of the whole exchange, in SDO transfers of each frame; extended on slow buses.
         """
         self._opened()
         match request:
@@ -142,10 +143,10 @@ class CanBackend(WireBackend):
                     lambda objects: objects.load_envelope(load, timeout=timeout), timeout
                 )
             case _:
-                return await self._order(request, timeout)
+                return await self._exchange_pdo(request, timeout)
 
     async def broadcast(self, request: Broadcast) -> None:
-        """Say a commit or a stop to every amplifier of the bus; raises LinkError."""
+        """Send a commit or a stop to every amplifier of the bus; raises LinkError."""
         self._opened()
         self._send(encode_broadcast(request))
 
@@ -162,26 +163,26 @@ class CanBackend(WireBackend):
         self._node.start()
         return identity
 
-    async def _order(self, order: PdoRequest, timeout: float) -> Reply:
-        if isinstance(order, Arm):
+    async def _exchange_pdo(self, request: PdoRequest, timeout: float) -> Reply:
+        if isinstance(request, Arm):
             self._is_listening = True
             try:
                 await self._node.check_no_other_host()
             finally:
                 self._is_listening = False
-        sequence = self._orders.next_sequence()
+        sequence = self._pending.next_sequence()
         frames = encode_request(
-            order, node=self._url.node, sequence=sequence, fd=bool(self._url.bus.fd)
+            request, node=self._url.node, sequence=sequence, fd=bool(self._url.bus.fd)
         )
-        if isinstance(order, Apply | Stage):
-            for command in order.command_set.commands:
-                if command.channel >= self._channels:  # its frame would be another node's
+        if isinstance(request, Apply | Stage):
+            for command in request.command_set.commands:
+                if command.channel >= self._channels:  # its COB-ID belongs to another node
                     return Nak(NakCode.BAD_CHANNEL, command.channel)
         bus = self._url.bus
         on_wire = 2 * self.wire_times.frames(frames)
         try:
-            answer = await self._orders.answer_to(
-                order,
+            answer = await self._pending.reply_to(
+                request,
                 sequence=sequence,
                 send=lambda: self._send(frames),
                 timeout=max(timeout, on_wire + PROTOCOL.reaction),
@@ -190,21 +191,21 @@ class CanBackend(WireBackend):
             raise
         except TimeoutError:
             raise LinkTimeout(
-                f"no answer from node {self._url.node} on {bus} within {timeout * 1e3:g} ms; check "
+                f"no reply from node {self._url.node} on {bus} within {timeout * 1e3:g} ms; check "
                 "that the amplifier is switched on and that the bit rates agree"
             ) from None
         reply = plain_reply(answer)
         if reply is not None:
-            return reply  # always, where the order is about no set
-        return await self._achieved(order, answer, timeout)
+            return reply  # always, unless the request carries a set
+        return await self._achieved(request, answer, timeout)
 
-    async def _achieved(self, order: PdoRequest, answer: CanReply, timeout: float) -> Achieved:
-        """What a set plays: what was asked for if the answer says so, else it is read."""
+    async def _achieved(self, request: PdoRequest, answer: CanReply, timeout: float) -> Achieved:
+        """Return what a set plays: the requested set if the reply is exact, else read it."""
         wanted = None
-        if isinstance(order, Apply | Stage):
-            token = order.command_set.token
-            wanted = Achieved(token, wanted_commands(order.command_set))
-        elif isinstance(order, Commit) and self._staged and self._staged.token == order.token:
+        if isinstance(request, Apply | Stage):
+            token = request.command_set.token
+            wanted = Achieved(token, wanted_commands(request.command_set))
+        elif isinstance(request, Commit) and self._staged and self._staged.token == request.token:
             wanted = self._staged
         if wanted is not None and answer.exact:
             achieved = wanted
@@ -214,12 +215,12 @@ class CanBackend(WireBackend):
             )
             if wanted is not None:
                 achieved = _in_order_of(wanted, achieved)
-        if isinstance(order, Apply | Stage):
+        if isinstance(request, Apply | Stage):
             self._staged = achieved
         return achieved
 
     async def _objects_job(self, job: Callable[[ObjectClient], _T], timeout: float) -> _T:
-        """Do something with the amplifier's objects, beside the event loop."""
+        """Run an SDO job outside the event loop."""
         joined = self._opened()
         objects = joined.objects
         future = joined.worker.submit(lambda: job(objects))
@@ -232,7 +233,7 @@ class CanBackend(WireBackend):
             objects.abandon()
             future.add_done_callback(_forget)
             raise LinkTimeout(
-                f"node {self._url.node} on {self._url.bus} took too long over an object; check "
+                f"node {self._url.node} on {self._url.bus}: SDO transfer timed out; check "
                 "that the bus is not overloaded"
             ) from None
         except asyncio.CancelledError:
@@ -248,15 +249,15 @@ class CanBackend(WireBackend):
         self._last_sent = clock.now()
         self._counters.frames_out += len(frames)
 
-    def _told(self, event: AmplifierEvent) -> None:
+    def _notify(self, event: AmplifierEvent) -> None:
         self._counters.events += 1
         self._on_event(event)
 
-    def _answered(self, answer: CanReply) -> None:
+    def _received(self, answer: CanReply) -> None:
         if answer.sequence == UNASKED:
-            self._told(answer.event)
+            self._notify(answer.event)
             return
-        if not self._orders.take(answer):
+        if not self._pending.take(answer):
             self._counters.unexpected_frames += 1
 
     def _lose(self, what: str) -> None:
@@ -270,7 +271,7 @@ class CanBackend(WireBackend):
         self._loss = self._loss or what
         if self._joined is not None:
             self._joined.objects.close()
-        self._orders.fail(self._loss)
+        self._pending.fail(self._loss)
 
     def _opened(self) -> _Joined:
         if self._joined is None or self._loss is not None:
@@ -279,7 +280,7 @@ class CanBackend(WireBackend):
 
 
 def _in_order_of(wanted: Achieved, achieved: Achieved) -> Achieved:
-    """The commands in the order in which they were asked for; those of others as they come."""
+    """Sort the achieved commands into the requested request."""
     places = {command.channel: place for place, command in enumerate(wanted.commands)}
     commands = sorted(
         achieved.commands, key=lambda command: places.get(command.channel, len(places))
@@ -288,6 +289,6 @@ def _in_order_of(wanted: Achieved, achieved: Achieved) -> Achieved:
 
 
 def _forget(future: "asyncio.Future[Any]") -> None:
-    """Nobody waits for it any more, also not for its error."""
+    """Mark the exception of an abandoned future as retrieved."""
     if not future.cancelled():
         future.exception()

@@ -1,7 +1,7 @@
-"""A CAN bus that the amplifiers of a process share: one adapter, and `canopen` sorts what comes.
+"""A CAN bus shared by the amplifiers of a process; `canopen` dispatches its frames.
 
-It is fed here rather than by python-can's Notifier, which spins on an adapter that was lost.
-Callbacks run in the adapter's thread.
+The network is fed here and not by python-can's Notifier, which spins on a lost adapter. Callbacks
+run in the adapter's thread.
 """
 
 import logging
@@ -16,14 +16,14 @@ from drivers.backends.shared_line import SharedLine, shared_line
 from drivers.backends.urls.can_bus import CanBusUrl
 from drivers.codec.can_bus.frame import CanFrame
 
-# What it has to say reaches users as errors of ours.
+# Its messages become LinkErrors.
 logging.getLogger("canopen").addHandler(logging.NullHandler())
 
 _logger = logging.getLogger(__name__)
 
 
 class _Network(canopen.Network):
-    """What `canopen` sends, sent by the bus."""
+    """A `canopen` network that sends through the bus."""
 
     def __init__(self, bus: "CanBus") -> None:
         super().__init__()
@@ -34,7 +34,7 @@ class _Network(canopen.Network):
 
 
 class CanBus(SharedLine[Adapter]):
-    """A bus, whose nodes are its numbers; see `can_bus`."""
+    """A bus, numbered by nodes; see `can_bus`."""
 
     number = "node"
 
@@ -44,7 +44,7 @@ class CanBus(SharedLine[Adapter]):
         self.network = _Network(self)
 
     def send(self, frames: Sequence[CanFrame]) -> None:
-        """Put frames on the bus, without another's in between; raises LinkError."""
+        """Send frames back to back; raises LinkError."""
         self._ready().send(frames)
 
     async def _open(self) -> Adapter:
@@ -54,10 +54,10 @@ class CanBus(SharedLine[Adapter]):
         """Pass a frame on, in the adapter's thread."""
         try:
             self.network.notify(frame.id, bytearray(frame.data), clock.now())
-        except Exception:  # whatever a frame of somebody else's brings about, the next is read
-            _logger.debug("frame %03x of %s was not taken", frame.id, self.place, exc_info=True)
+        except Exception:  # a frame of another device must not end the reader
+            _logger.debug("%s: frame %03x raised an exception", self.place, frame.id, exc_info=True)
 
 
 def can_bus(url: CanBusUrl) -> CanBus:
-    """The bus of a URL in the running event loop."""
+    """Return the bus of a URL in the running event loop."""
     return shared_line(CanBus, url, lambda: CanBus(url))

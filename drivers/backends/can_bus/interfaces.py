@@ -1,8 +1,8 @@
-"""Adapters to CAN as python-can knows them, made fit for a bus that may go away or talk nonsense.
+"""CAN adapters of python-can, made robust against lost servers and invalid text.
 
-python-can's socketcand never notices that its server has hung up, waits for ever for one that says
-nothing, and both it and slcan stumble for ever over text that makes no frame. So their text is read
-here (see `drivers.codec.can_bus.adapter_text`) and the frames of a request are written at once.
+python-can's socketcand does not detect a closed connection, waits for ever for a silent server, and
+fails permanently on invalid text, as slcan does. Their text is parsed here (see
+`drivers.codec.can_bus.adapter_text`), and the frames of a request are written at once.
 """
 
 import contextlib
@@ -28,8 +28,8 @@ from drivers.codec.can_bus.adapter_text import (
 )
 from drivers.codec.can_bus.frame import CanFrame
 
-_SEND_TIMEOUT = 0.02  # s; a frame fits into any driver's buffer unless the bus is stuck
-_SERIAL_TIMEOUT = 0.05  # s; how long a read of the serial port waits
+_SEND_TIMEOUT = 0.02  # s; a frame fits into every driver's buffer unless the bus is blocked
+_SERIAL_TIMEOUT = 0.05  # s; of a read of the serial port
 _CONNECT_TIMEOUT = 2.0  # s
 _READ_MAX = 4096
 _HANDSHAKE = (("", b"< hi"), ("< open {channel} >", b"< ok"), ("< rawmode >", b"< ok"))
@@ -37,14 +37,14 @@ _IS_FRAME = re.compile(rb"\s*< (fd)?frame ")
 
 
 def open_bus(url: CanBusUrl) -> can.BusABC:
-    """The adapter to a bus, open; raises can.CanError, OSError or ValueError."""
+    """Open the adapter to a bus; raises can.CanError, OSError or ValueError."""
     match url.interface:
         case "socketcand":
             return _Socketcand(url)
         case "slcan":
             return _Slcan(url)
         case "socketcan":
-            # The bit rate is the interface's own: ip link set can0 type can bitrate 500000.
+            # The bit rate is set with: ip link set can0 type can bitrate 500000.
             return can.Bus(
                 interface="socketcan", channel=url.channel, fd=bool(url.fd), ignore_config=True
             )
@@ -62,15 +62,15 @@ def send_all(bus: can.BusABC, frames: Sequence[CanFrame]) -> None:
 
 
 def wake(bus: can.BusABC) -> None:
-    """Let a thread that waits in `recv` return or fail soon, where the adapter can."""
+    """Let a thread that waits in `recv` return or fail soon, if the adapter can."""
     if isinstance(bus, _Socketcand | _Slcan):
         bus.wake()
     elif isinstance(bus, VirtualBus):
-        bus.queue.put(can.Message(is_error_frame=True))  # which says nothing
+        bus.queue.put(can.Message(is_error_frame=True))  # ignored
 
 
 class _TextBus(can.BusABC):
-    """A bus whose frames are text."""
+    """A bus with frames as text."""
 
     def _begin(self) -> None:
         self._messages: deque[can.Message] = deque()
@@ -85,11 +85,11 @@ class _TextBus(can.BusABC):
 
     @abstractmethod
     def _read_text(self, timeout: float | None) -> None:
-        """Wait for text for so long [s] and take it."""
+        """Wait for text for a time [s] and parse it."""
 
 
 class _Socketcand(_TextBus):
-    """A server of the socketcand daemon."""
+    """A socketcand server."""
 
     def __init__(self, url: CanBusUrl) -> None:
         self._begin()
@@ -99,8 +99,7 @@ class _Socketcand(_TextBus):
         try:
             self._connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             self._shake_hands(url.channel)
-            # Nobody reads without waiting for a byte first, so this only limits how long sending
-            # takes.
+            # Reads wait for data first, so this only limits sends.
             self._connection.settimeout(_SEND_TIMEOUT)
             can.BusABC.__init__(self, channel=url.channel)
         except BaseException:
@@ -108,7 +107,7 @@ class _Socketcand(_TextBus):
             raise
 
     def _shake_hands(self, channel: str) -> None:
-        """Open the bus there, in raw mode; frames may come as soon as the server says hi."""
+        """Open the bus in raw mode; frames may arrive from the first reply on."""
         text = b""
         for say, expected in _HANDSHAKE:
             self._connection.sendall(say.format(channel=channel).encode())
@@ -116,22 +115,24 @@ class _Socketcand(_TextBus):
             while _IS_FRAME.match(element):
                 element, text = self._element(text)
             if element.strip() != expected:
-                raise can.CanInitializationError(f"instead of {expected!r} it says {element!r}")
+                raise can.CanInitializationError(f"reply must be {expected!r}, got {element!r}")
         self._take(self._reader.feed(text))
 
     def _element(self, text: bytes) -> tuple[bytes, bytes]:
-        """The next element that the server says, without its end, and what follows it."""
+        """Read the next element, without its end; returns it and the following text."""
         deadline = time.monotonic() + _CONNECT_TIMEOUT
         while b">" not in text:
             data = self._connection.recv(_READ_MAX)
             text += data
             if not data or len(text) > _READ_MAX or time.monotonic() > deadline:
-                raise can.CanInitializationError(f"no socketcand server says {text!r}")
+                raise can.CanInitializationError(
+                    f"reply must be of a socketcand server, got {text!r}"
+                )
         element, _, rest = text.partition(b">")
         return element, rest
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
-        """Send one; see `send_frames`."""
+        """Send one frame; see `send_frames`."""
         self.send_frames([CanFrame(msg.arbitration_id, bytes(msg.data), fd=msg.is_fd)])
 
     def shutdown(self) -> None:
@@ -140,7 +141,7 @@ class _Socketcand(_TextBus):
         self._connection.close()
 
     def wake(self) -> None:
-        """End the connection."""
+        """Shut the connection down."""
         with contextlib.suppress(OSError):
             self._connection.shutdown(socket.SHUT_RDWR)
 
@@ -152,12 +153,12 @@ class _Socketcand(_TextBus):
         if select.select([self._connection], [], [], timeout)[0]:
             data = self._connection.recv(_READ_MAX)
             if not data:
-                raise can.CanOperationError("the socketcand server hung up")
+                raise can.CanOperationError("connection closed by the socketcand server")
             self._take(self._reader.feed(data))
 
 
 class _Slcan(_TextBus, slcanBus):
-    """A serial adapter, its port for this process alone."""
+    """A serial adapter with exclusive use of its port."""
 
     def __init__(self, url: CanBusUrl) -> None:
         self._begin()
@@ -182,21 +183,21 @@ class _Slcan(_TextBus, slcanBus):
             raise
 
     def wake(self) -> None:
-        """End a read that waits, for good."""
+        """Cancel reads, now and later."""
         self._is_ended = True
         with contextlib.suppress(OSError, AttributeError):
             self.serialPortOrig.cancel_read()
 
     def shutdown(self) -> None:
-        """Close channel and port, also where the adapter is gone."""
+        """Close channel and port, also of a lost adapter."""
         with contextlib.suppress(can.CanError, OSError):
             slcanBus.shutdown(self)
         with contextlib.suppress(OSError):
             self.serialPortOrig.close()
 
     def send_frames(self, frames: Sequence[CanFrame]) -> None:
-        """Send all at once, without python-can's wait until the last byte is out."""
-        begin = b"\r" if self._is_cut else b""  # so that what was left half sent ends here
+        """Send all at once; unlike python-can, do not wait for the last byte."""
+        begin = b"\r" if self._is_cut else b""  # ends a half-sent line
         self._is_cut = True
         write_all(self.serialPortOrig, begin + b"".join(map(slcan_line, frames)))
         self._is_cut = False
@@ -205,7 +206,7 @@ class _Slcan(_TextBus, slcanBus):
         port = self.serialPortOrig
         self._take(self._reader.feed(port.read(max(1, port.in_waiting))))
         if self._is_ended:
-            raise can.CanOperationError("the adapter is being closed")
+            raise can.CanOperationError("adapter is being closed")
 
 
 def _message(frame: CanFrame) -> can.Message:

@@ -1,4 +1,4 @@
-"""What one node of a CAN bus says: answers, events, and the heartbeat that it must not miss."""
+"""Receiver of one CAN node: replies, events, and supervision of its heartbeat."""
 
 import asyncio
 import contextlib
@@ -20,49 +20,46 @@ from drivers.errors import FrameError, LinkError
 from drivers.protocol.messages import AmplifierEvent
 from drivers.statistics import WireCounters
 
-MAX_MISSED_HEARTBEATS = 3  # of the amplifier's that may be missing before it counts as lost
-_LATE = 0.005  # s; by so much a timer is late, and a loss is to be told by the third heartbeat
-_SHORTEST = 1e-4  # s; of a pause
-_HOST_HEARTBEAT = CANOPEN["heartbeat_ms"] / 1000  # s; as every host sends it while it is armed
+MAX_MISSED_HEARTBEATS = 3  # of the amplifier, until it is lost
+_LATE = 0.005  # s; delay of timers, so that a loss is detected by the third heartbeat
+_SHORTEST = 1e-4  # s; shortest pause
+_HOST_HEARTBEAT = CANOPEN["heartbeat_ms"] / 1000  # s; interval of every host while armed
 _OPERATIONAL = CANOPEN["nmt_states"]["OPERATIONAL"]
 _BOOT_UP = CANOPEN["nmt_states"]["BOOT_UP"]
 _T = TypeVar("_T")
 
 
 class NodeWatch:
-    """Listens to a node; `answered`, `told` (events) and `lost` are called in the event loop.
-
-    What comes from the bus comes in the reader's thread, and is put together there.
-    """
+    """Receives the frames of a node, in the reader thread; callbacks run in the event loop."""
 
     def __init__(
         self,
         url: CanUrl,
         *,
-        answered: Callable[[CanReply], None],
-        told: Callable[[AmplifierEvent], None],
-        lost: Callable[[str], None],
+        on_reply: Callable[[CanReply], None],
+        on_event: Callable[[AmplifierEvent], None],
+        on_loss: Callable[[str], None],
     ) -> None:
         self._url = url
-        self._on_answer, self._on_event, self._on_loss = answered, told, lost
+        self._on_reply, self._on_event, self._on_loss = on_reply, on_event, on_loss
         self._loop: asyncio.AbstractEventLoop | None = None
         self._counters = WireCounters()
-        self._answers = CanReplyReader(url.node)
+        self._reply_reader = CanReplyReader(url.node)
         self._emergencies = EmcyConsumer()
         self._subscribed: list[tuple[int, Callable[..., None]]] = []
         self._is_watched = False
         self._was_operational = False
         self._joined = 0.0
-        self._heard = 0.0  # the node
-        self._host_heard = -math.inf  # another host of this node
-        self._next_look: asyncio.TimerHandle | None = None
-        self._look_due = 0.0
+        self._heard = 0.0  # last heartbeat of the node
+        self._host_heard = -math.inf  # last heartbeat of another host
+        self._next_check: asyncio.TimerHandle | None = None
+        self._check_due = 0.0
 
     def join(self, bus: CanBus, objects: ObjectClient, counters: WireCounters) -> None:
-        """Listen on a bus from now on, in the running event loop."""
+        """Subscribe on a bus, with callbacks in the running event loop."""
         self._loop = asyncio.get_running_loop()
         self._counters = counters
-        self._answers = CanReplyReader(self._url.node)
+        self._reply_reader = CanReplyReader(self._url.node)
         self._joined = clock.now()
         self._host_heard = -math.inf
         node, nmt = self._url.node, NmtMaster(self._url.node)
@@ -74,13 +71,13 @@ class NodeWatch:
             (cob_id("heartbeat", node), nmt.on_heartbeat),
             (cob_id("heartbeat", host_number(node)), self._other_host),
             (cob_id("emergency", node), self._emergencies.on_emcy),
-            *((can_id, self._answer_frame) for can_id in self._answers.ids),
+            *((can_id, self._reply_frame) for can_id in self._reply_reader.ids),
         ]
         for can_id, callback in self._subscribed:
             bus.network.subscribe(can_id, callback)
 
     def leave(self, bus: CanBus) -> None:
-        """Listen no more."""
+        """Unsubscribe."""
         self.stop()
         for can_id, callback in self._subscribed:
             with contextlib.suppress(KeyError, ValueError):
@@ -88,40 +85,40 @@ class NodeWatch:
         self._subscribed.clear()
 
     def start(self) -> None:
-        """From now on the node must be heard, and stay in operation."""
-        self._heard = self._look_due = clock.now()
+        """Start to supervise heartbeat and NMT state."""
+        self._heard = self._check_due = clock.now()
         self._was_operational = False
         if not self._is_watched:
             self._is_watched = True
-            self._look()
+            self._check_heartbeat()
 
     def stop(self) -> None:
-        """It may be silent again."""
+        """Stop the supervision."""
         self._is_watched = False
-        if self._next_look is not None:
-            self._next_look.cancel()
-            self._next_look = None
+        if self._next_check is not None:
+            self._next_check.cancel()
+            self._next_check = None
 
     async def check_no_other_host(self) -> None:
-        """Listen for the heartbeat of another host before arming; LinkError where there is one."""
+        """Listen for another host before arming; LinkError if there is one."""
         await asyncio.sleep(max(0.0, self._joined + 1.2 * _HOST_HEARTBEAT - clock.now()))
         if clock.now() - self._host_heard < MAX_MISSED_HEARTBEATS * _HOST_HEARTBEAT:
             raise LinkError(
                 f"another program drives node {self._url.node} on {self._url.bus}; end that one"
             )
 
-    def _answer_frame(self, can_id: int, data: bytearray, timestamp: float) -> None:
+    def _reply_frame(self, can_id: int, data: bytearray, timestamp: float) -> None:
         self._counters.frames_in += 1
         try:
-            answer = self._answers.feed(CanFrame(can_id, bytes(data)))
+            answer = self._reply_reader.feed(CanFrame(can_id, bytes(data)))
         except FrameError:
             self._counters.crc_errors += 1
             return
         if answer is not None:
-            self._post(self._on_answer, answer)
+            self._post(self._on_reply, answer)
 
     def _emergency(self, error: EmcyError) -> None:
-        self._emergencies.reset()  # it would keep them all
+        self._emergencies.reset()  # it keeps them all
         data = error.code.to_bytes(2, "little") + bytes([error.register]) + error.data
         try:
             self._post(self._on_event, decode_emergency(data))
@@ -133,15 +130,15 @@ class NodeWatch:
         if not self._is_watched:
             return
         if state == _BOOT_UP:
-            what = "has started anew, or another with its number has"
+            what = "has restarted, or another node with its number has"
         elif self._was_operational and state != _OPERATIONAL:
-            what = "was taken out of operation by somebody else"
+            what = "was taken out of operation by another master"
         else:
             self._was_operational = self._was_operational or state == _OPERATIONAL
             return
         self._post(
             self._on_loss,
-            f"node {self._url.node} on {self._url.bus} {what}: open it again and arm it anew",
+            f"node {self._url.node} on {self._url.bus} {what}: open and arm it again",
         )
 
     def _other_host(self, can_id: int, data: bytearray, timestamp: float) -> None:
@@ -151,25 +148,25 @@ class NodeWatch:
     def _post(self, callback: Callable[[_T], None], argument: _T) -> None:
         """Call back in the event loop."""
         if self._loop is not None:
-            with contextlib.suppress(RuntimeError):  # it is closed: nobody waits any more
+            with contextlib.suppress(RuntimeError):  # of a closed loop
                 self._loop.call_soon_threadsafe(callback, argument)
 
-    def _look(self) -> None:
-        """See whether the node was heard lately, by the reader's clock.
+    def _check_heartbeat(self) -> None:
+        """Check the age of the last heartbeat.
 
-        Where this process itself was held up, what the node said meanwhile may not be read yet.
+        If this process was delayed, heartbeats may have arrived but not been read yet.
         """
         now = clock.now()
         silent = now - self._heard
         limit = MAX_MISSED_HEARTBEATS * self._url.heartbeat - _LATE
-        was_held_up = now - self._look_due > self._url.heartbeat / 2
-        if silent < limit or was_held_up:
-            # A rest that rounding leaves must not be looked at again in this very moment.
+        was_delayed = now - self._check_due > self._url.heartbeat / 2
+        if silent < limit or was_delayed:
+            # A remainder by rounding must not lead to an immediate check.
             pause = max(limit - silent, _SHORTEST) if silent < limit else self._url.heartbeat
-            self._look_due = now + pause
-            self._next_look = asyncio.get_running_loop().call_later(pause, self._look)
+            self._check_due = now + pause
+            self._next_check = asyncio.get_running_loop().call_later(pause, self._check_heartbeat)
             return
         self._on_loss(
-            f"node {self._url.node} on {self._url.bus} was not heard for {silent * 1e3:.0f} ms: "
+            f"node {self._url.node} on {self._url.bus}: no heartbeat for {silent * 1e3:.0f} ms; "
             "check its supply and the cable, then open the amplifier again"
         )

@@ -1,7 +1,7 @@
-"""Objects of one amplifier, read and written with `canopen`'s SDO client; everything here blocks.
+"""SDO transfers with one amplifier by `canopen`; everything here blocks.
 
-One transfer at a time, by one thread. A transfer that was broken off may leave an answer on its
-way, so before the next an object that is never asked for otherwise is read until it is told.
+One transfer at a time, in one thread. An aborted transfer may leave a late reply, so the next one
+first reads an object that is not used otherwise until its reply arrives.
 """
 
 import queue
@@ -41,11 +41,11 @@ from drivers.protocol.messages import (
 )
 
 _LENGTH = 8
-_WAITING_MAX = 256  # answers; a bus that is flooded with them must not fill the memory
+_WAITING_MAX = 256  # replies; bounds the memory on a flooded bus
 _RESYNCHRONISE = 5  # tries
-_BLOCK_FROM = 15  # bytes; shorter ones are sooner sent in segments
-_ABORTED_COMMAND = 0x0504_0001  # the amplifier takes no block transfers
-_TIMED_OUT = 0x0504_0000  # one of the two sides has waited too long
+_BLOCK_FROM = 15  # bytes; segments are faster below
+_ABORTED_COMMAND = 0x0504_0001  # block transfers not supported
+_TIMED_OUT = 0x0504_0000  # SDO protocol timed out
 _DISTURBED = (_TIMED_OUT, 0x0503_0000, 0x0504_0003, 0x0504_0004)  # or toggle, sequence, CRC wrong
 _ABANDON = struct.pack("<BHBL", 0x80, 0, 0, _TIMED_OUT)
 
@@ -53,10 +53,10 @@ _T = TypeVar("_T")
 
 
 class _Client(SdoClient):
-    """`canopen`'s client, which waits as its worker does, and asks nothing that nobody wants."""
+    """`canopen`'s client with the queues of its worker; sends nothing for cancelled transfers."""
 
     def __init__(self, node: int, worker: Worker) -> None:
-        self.is_given_up = False  # the transfer that is under way
+        self.is_given_up = False  # the present transfer
         self.is_closed = False
         self._make_queue = worker.make_queue
         super().__init__(  # type: ignore[no-untyped-call]
@@ -65,23 +65,23 @@ class _Client(SdoClient):
 
     @property
     def responses(self) -> "queue.Queue[bytes]":
-        """What has come."""
+        """Received replies."""
         return self._responses
 
     @responses.setter
     def responses(self, empty: "queue.Queue[bytes]") -> None:
-        """The client forgets what has come by taking another queue."""
+        """Take another queue, by which the client discards replies."""
         self._responses = self._make_queue()
 
     def send_request(self, request: bytes) -> None:
-        """Send it, or end the transfer."""
+        """Send a request, or abort the transfer."""
         if self.is_given_up or self.is_closed:
             raise SdoAbortedError(_TIMED_OUT)
         super().send_request(request)  # type: ignore[no-untyped-call]
 
 
 class ObjectClient:
-    """The SDO client of one node, for jobs of a worker; `feed` takes its answers as they come."""
+    """SDO client of one node, for jobs of a worker; `feed` takes its replies."""
 
     def __init__(self, network: canopen.Network, node: int, worker: Worker) -> None:
         self.unexpected_frames = 0
@@ -95,7 +95,7 @@ class ObjectClient:
         self._takes_blocks = True
 
     def feed(self, can_id: int, data: bytearray, timestamp: float) -> None:
-        """An answer has come."""
+        """Take a reply."""
         is_wanted = self._busy and self._client.responses.qsize() < _WAITING_MAX
         if is_wanted and len(data) == _LENGTH:
             self._client.on_response(can_id, data, timestamp)
@@ -103,19 +103,19 @@ class ObjectClient:
             self.unexpected_frames += 1
 
     def abandon(self) -> None:
-        """Let the transfer that is under way end now: nobody waits for it any more."""
+        """Abort the present transfer."""
         if self._busy:
             self._broken = True
-            self._client.is_given_up = True  # before it is woken: it would try again
+            self._client.is_given_up = True  # before it wakes up and retries
             self._client.responses.put(_ABANDON)
 
     def close(self) -> None:
-        """Let no transfer be under way any more."""
+        """Abort the present transfer and refuse others."""
         self._client.is_closed = True
         self.abandon()
 
     def identity(self, *, timeout: float) -> Identity:
-        """Who it is; LinkError where two of this number answer."""
+        """Read the identity; LinkError if two nodes of this number reply."""
 
         def read() -> Identity:
             self._check_alone(timeout)
@@ -130,7 +130,7 @@ class ObjectClient:
         return self._transfer(read, timeout)
 
     def set_heartbeat(self, milliseconds: int, *, timeout: float) -> None:
-        """Have the amplifier say that it is there this often, if it does not already."""
+        """Set the interval of the amplifier's heartbeat if it differs."""
 
         def write() -> None:
             index, value = index_of("heartbeat_producer"), struct.pack("<H", milliseconds)
@@ -140,7 +140,7 @@ class ObjectClient:
         self._transfer(write, timeout)
 
     def capabilities(self, *, timeout: float) -> Capabilities:
-        """What it can play."""
+        """Read the capabilities."""
 
         def read() -> Capabilities:
             values = {}
@@ -152,19 +152,19 @@ class ObjectClient:
         return self._transfer(read, timeout)
 
     def faults(self, *, timeout: float) -> FaultList:
-        """What went wrong."""
+        """Read the faults."""
         return self._transfer(
             lambda: unpack_faults(self._client.upload(index_of("faults"), 0)), timeout
         )
 
     def achieved(self, *, timeout: float) -> Achieved:
-        """What the last set that was answered plays, where it is not what was asked for."""
+        """Read what the last set plays."""
         return self._transfer(
             lambda: unpack_achieved(self._client.upload(index_of("achieved"), 0)), timeout
         )
 
     def load_envelope(self, request: LoadEnvelope, *, timeout: float) -> Loaded | Nak:
-        """Keep an envelope under its slot."""
+        """Load an envelope into its slot."""
         data = pack_envelope(request)
         envelope = request.envelope
         index = index_of("envelope")
@@ -197,26 +197,25 @@ class ObjectClient:
         self._client.download(index, subindex, data, force_segment=True)
 
     def _check_alone(self, timeout: float) -> None:
-        """Read the serial number, and see that no other comes in answer."""
+        """Read the serial number; LinkError for a second, different reply."""
         index, subindex = index_of("identity"), 4
         object_named = struct.pack("<HB", index, subindex)
         self._client.send_request(b"\x40" + object_named + bytes(4))
-        answers = {bytes(self._client.read_response())}
+        replies = {bytes(self._client.read_response())}
         self._worker.sleep(SETTLE)
         while True:
             try:
-                answers.add(self._client.responses.get_nowait())
+                replies.add(self._client.responses.get_nowait())
             except queue.Empty:
                 break
-        # What an amplifier told too late of another object contradicts nothing.
-        if len({answer for answer in answers if answer[1:4] == object_named}) > 1:
+        # A late reply about another object is not a second amplifier.
+        if len({answer for answer in replies if answer[1:4] == object_named}) > 1:
             raise LinkError(
-                f"more than one amplifier answers as node {self._node}; give each on the bus a "
-                "number of its own"
+                f"several amplifiers reply as node {self._node}; give each its own node number"
             )
 
     def _transfer(self, work: Callable[[], _T], timeout: float) -> _T:
-        """Do one transfer; what `canopen` raises becomes an error of ours."""
+        """Run one transfer; translates exceptions of `canopen`."""
         self._client.RESPONSE_TIMEOUT = timeout
         self._client.is_given_up = False
         self._busy = True
@@ -229,14 +228,14 @@ class ObjectClient:
             if abort.code in _DISTURBED:
                 raise self._missed() from abort
             self._broken = False
-            raise FrameError(f"node {self._node} refuses an object ({abort})") from abort
+            raise FrameError(f"node {self._node} refuses an SDO transfer ({abort})") from abort
         except SdoCommunicationError as problem:
             raise LinkTimeout(
-                f"no answer from node {self._node} within {timeout * 1e3:g} ms ({problem}); check "
-                "that the amplifier is switched on, has this number, and that the bit rates agree"
+                f"no reply from node {self._node} within {timeout * 1e3:g} ms ({problem}); "
+                "check that the amplifier is on, has this number, and that the bit rates agree"
             ) from problem
         except (RuntimeError, ValueError, struct.error) as problem:
-            # `canopen` does not get over a last block of which the node has missed a part.
+            # `canopen` fails if the node has missed a part of the last block.
             raise self._missed() from problem
         finally:
             self._busy = False
@@ -245,8 +244,8 @@ class ObjectClient:
 
     def _missed(self) -> LinkTimeout:
         return LinkTimeout(
-            f"node {self._node} or this host missed a part of an object, or took too long over it; "
-            "check that the bus is not overloaded and the cable sound"
+            f"node {self._node}: SDO transfer incomplete or timed out; check that the bus is not "
+            "overloaded, and the cable"
         )
 
     def _resynchronise(self) -> None:

@@ -1,4 +1,4 @@
-"""Orders that are on a CAN bus, and which answer belongs to which."""
+"""Pending requests on a CAN bus, and the matching of their replies."""
 
 import asyncio
 from collections.abc import Callable
@@ -14,7 +14,7 @@ from drivers.protocol.messages import Apply, Commit
 
 @dataclass
 class _Pending:
-    """Who waits for the answer to an order, what it asked, and the token that it must name."""
+    """Future reply to a request, with the action and token that it must carry."""
 
     action: int
     token: int | None
@@ -22,29 +22,29 @@ class _Pending:
 
 
 class PendingRequests:
-    """By their sequence numbers; an answer must also name the action and the token."""
+    """Pending requests by sequence number; action and token of a reply must match too."""
 
     def __init__(self) -> None:
-        # Not from the first, so that an answer to an earlier run is no answer to this one.
+        # A random start, so that a reply to an earlier run does not match.
         self._sequence = number_below(SEQUENCE_MAX)
         self._pending: dict[int, _Pending] = {}
 
     def next_sequence(self) -> int:
-        """The number of the next order: 1..255, then from 1 again."""
+        """Return the next sequence number: 1..255, then 1 again."""
         self._sequence = self._sequence % SEQUENCE_MAX + 1
         return self._sequence
 
-    async def answer_to(
-        self, order: PdoRequest, *, sequence: int, send: Callable[[], None], timeout: float
+    async def reply_to(
+        self, request: PdoRequest, *, sequence: int, send: Callable[[], None], timeout: float
     ) -> CanReply:
-        """Send an order under its number and wait so long [s]; LinkError, TimeoutError."""
+        """Send a request and wait for its reply; LinkError, TimeoutError."""
         token = None
-        if isinstance(order, Apply):
-            token = order.command_set.token
-        elif isinstance(order, Commit):
-            token = order.token
+        if isinstance(request, Apply):
+            token = request.command_set.token
+        elif isinstance(request, Commit):
+            token = request.token
         answer: asyncio.Future[CanReply] = asyncio.get_running_loop().create_future()
-        self._pending[sequence] = pending = _Pending(action_of(order), token, answer)
+        self._pending[sequence] = pending = _Pending(action_of(request), token, answer)
         try:
             send()
             return await reply_within(answer, timeout)
@@ -53,7 +53,7 @@ class PendingRequests:
                 del self._pending[sequence]
 
     def take(self, answer: CanReply) -> bool:
-        """Whether somebody waited for this answer; it is handed over then."""
+        """Deliver a reply; returns whether a request was waiting for it."""
         pending = self._pending.get(answer.sequence)
         if pending is None or pending.answer.done() or pending.action != answer.action:
             return False
@@ -63,7 +63,7 @@ class PendingRequests:
         return True
 
     def fail(self, what: str) -> None:
-        """Nothing is answered any more."""
+        """Fail all pending requests."""
         for pending in self._pending.values():
             if not pending.answer.done():
                 pending.answer.set_exception(LinkError(what))

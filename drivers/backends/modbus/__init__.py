@@ -1,1 +1,1 @@
-"""An amplifier that speaks Modbus, and the line that several share."""
+"""Backend for amplifiers on Modbus."""

@@ -1,11 +1,11 @@
-"""An amplifier that speaks Modbus, over TCP or RTU.
+"""Backend for an amplifier on Modbus TCP or RTU.
 
-A request is one transaction, FC23: a block is written and one read back. An amplifier that cannot
-do that is found out by the first one and gets FC16 and FC4 in turn from then on. Why a write was
-refused is read afterwards. Every write carries a tag that is read back, so that no late answer is
-taken for another; identity and capabilities do not change and are read without one.
+A request is one transaction, FC23: a block is written and one read back. An amplifier that refuses
+FC23 gets FC16 and FC4 from then on. The reason of a refused write is read afterwards. Every write
+carries a tag that is read back, so that a late response is never credited to another request;
+identity and capabilities are constant and read without a tag.
 
-An amplifier cannot speak unasked here: events are what its answers show to have changed.
+Modbus has no unsolicited messages: events are changes of state or fault between responses.
 """
 
 import asyncio
@@ -43,13 +43,13 @@ from drivers.protocol.messages import (
 from drivers.protocol.wire_times import NoTimes, WireTimes
 
 _ILLEGAL_FUNCTION = 1
-_GATEWAY = (10, 11)  # a gateway has no path to the amplifier, or heard nothing from it
+_GATEWAY = (10, 11)  # gateway: no path to the amplifier, or no response from it
 _TAGS = (1 << 16) - 1
 
 
 @dataclass(frozen=True)
 class _Asked:
-    """How a request stands to others on the line, and how long each transaction may take [s]."""
+    """Priority of a request on the line, and timeout [s] of each transaction."""
 
     kind: RequestPriority
     timeout: float
@@ -63,34 +63,34 @@ class ModbusBackend(WireBackend):
         self._url = ModbusUrl.parse(url)
         self._line: ModbusLine | None = None
         self._sole_host = SoleHost(f"{self._url.place}/{self._url.unit}")
-        # Not from zero, so that an answer to an earlier run is no answer to this one.
+        # A random start, so that a response to an earlier run does not match.
         self._tag = number_below(_TAGS)
         self._can_read_back = True
         self._channels = exchanges.CHANNELS_MAX
-        self._condition: tuple[AmplifierState, Fault] | None = None
-        self._loss: str | None = None  # until it is opened anew, even if others have the line back
+        self._last_condition: tuple[AmplifierState, Fault] | None = None
+        self._loss: str | None = None  # until reopened, even if others have joined the line again
         self._is_asking = False
 
     @property
     def bus(self) -> str:
-        """The line, whose units a broadcast reaches."""
+        """The line: a broadcast reaches all its units."""
         return f"modbus {self._url.place}"
 
     @property
     def wire_times(self) -> WireTimes:
-        """Of a serial line, be it behind a gateway; none of a network."""
+        """Durations on a serial line, also behind a gateway; unknown on a network."""
         if not self._url.baud:
             return NoTimes()
         return ModbusTimes(self._url.baud, self._url.bits_per_byte)
 
     @property
     def takes_turns(self) -> bool:
-        """One answer at a time is on the line."""
+        """The line is half duplex."""
         return True
 
     @property
     def is_unsent(self) -> bool:
-        """Whether what is asked waits for others, or for the line to be silent."""
+        """Whether the request waits for others or for silence on the line."""
         return self._line is not None and self._line.is_unsent(self._url.unit)
 
     def silencing(self, request: Request) -> AbstractContextManager[None]:
@@ -100,10 +100,10 @@ class ModbusBackend(WireBackend):
         return self._line.silencing(request, self._url.unit)
 
     async def open(self) -> None:
-        """Open the line, or join those who have it open in this process; raises LinkError."""
+        """Open the line, or join it if open in this process; raises LinkError."""
         if self._line is not None:
             return
-        self._condition = None
+        self._last_condition = None
         self._loss = None
         line = modbus_line(self._url)
         await line.join(self._url.unit, self._lost)
@@ -111,19 +111,18 @@ class ModbusBackend(WireBackend):
         self._counters = line.counters
 
     async def close(self) -> None:
-        """Leave the line; the last one closes it."""
+        """Leave the line, which the last one closes."""
         line, self._line = self._line, None
         try:
             if line is not None:
                 await line.leave(self._url.unit)
-        finally:  # also where this is cancelled
+        finally:  # also if cancelled
             self._sole_host.release()
 
     async def exchange(self, request: Request, *, timeout: float) -> Reply:
         """Send a request and wait for its reply; LinkTimeout, LinkError or FrameError.
 
-        timeout [s]: for each transaction; longer where a slow line needs it (see `ModbusLine`), so
-        that a loss is told after three heartbeats on a line that is fast enough for them.
+        timeout [s]: of each transaction, extended on slow lines (see `ModbusLine`).
         """
         if isinstance(request, Arm) and not self._url.device:
             self._sole_host.claim()
@@ -142,7 +141,7 @@ class ModbusBackend(WireBackend):
         return reply
 
     async def broadcast(self, request: Broadcast) -> None:
-        """Write a commit or a stop to all units of the line; a stop goes before all that wait."""
+        """Write a commit or a stop to all units of the line; a stop has priority."""
         line = self._opened()
         kind = kind_on_line(request)
         unit = None if kind.silences else self._url.unit
@@ -150,13 +149,13 @@ class ModbusBackend(WireBackend):
         self._last_sent = line.last_sent
 
     async def _check_alone(self) -> None:
-        """Leave a second amplifier of this unit the time to answer; LinkError where one does."""
+        """Wait for a second amplifier of this unit; LinkError if one responds."""
         line = self._opened()
         await asyncio.sleep(SETTLE)
-        if line.is_contradicted:
+        if line.has_duplicate_responder:
             raise LinkError(
-                f"more than one amplifier answers as unit {self._url.unit} on {self._url.place}; "
-                "give each on the line a unit of its own"
+                f"several amplifiers respond as unit {self._url.unit} on {self._url.place}; give "
+                "each its own unit"
             )
 
     def _next_tag(self) -> int:
@@ -166,7 +165,7 @@ class ModbusBackend(WireBackend):
     async def _ask(
         self, request: Request, asked: "_Asked", *, records: int = exchanges.RECORDS_FIRST
     ) -> tuple[Reply, tuple[int, ...]]:
-        """The reply to a request and the registers that it stands in; records: how many faults."""
+        """Return the reply to a request, and its registers; records: number of faults to read."""
         tag = self._next_tag()
         exchange = exchanges.encode_request(
             request, tag=tag, channels=self._channels, records=records
@@ -174,7 +173,7 @@ class ModbusBackend(WireBackend):
         answer = await self._carry_out(exchange, tag, asked)
         if answer.exception:
             return await self._refusal(answer, tag, asked), ()
-        self._look_at(request, answer)
+        self._report_change(request, answer)
         if isinstance(request, Hello) and self._url.is_rtu:
             await self._check_alone()
         return exchanges.decode_reply(request, answer.registers), answer.registers
@@ -213,34 +212,34 @@ class ModbusBackend(WireBackend):
             self._last_sent = line.last_sent
         if answer.exception in _GATEWAY:
             raise LinkTimeout(
-                f"the gateway at {self._url.place} gets no answer from unit {self._url.unit}; "
+                f"gateway {self._url.place}: no response from unit {self._url.unit}; "
                 "check that the amplifier is switched on and has this unit"
             )
         return answer
 
     async def _refusal(self, answer: ModbusResponse, tag: int, asked: "_Asked") -> Nak:
-        """Why a write was refused; exceptions that only one refusal leads to need no asking."""
+        """Read the reason of a refused write, unless the exception is unambiguous."""
         if answer.exception == _ILLEGAL_FUNCTION:
             return Nak(NakCode.UNKNOWN_TYPE)
         only = exchanges.nak_of_exception(answer.exception)
         if only is not None and only.code is NakCode.BUSY:
             return only
-        told = await self._transact(exchanges.refusal_read(), None, asked, tag=None)
-        nak = None if told.exception else exchanges.decode_refusal(told.registers, tag=tag)
+        refusal = await self._transact(exchanges.refusal_read(), None, asked, tag=None)
+        nak = None if refusal.exception else exchanges.decode_refusal(refusal.registers, tag=tag)
         if nak is not None:
             return nak
-        # Not of this write: a late exception to an earlier one, so this one's answer was missed.
+        # A late exception to an earlier write, so the response to this one is missing.
         raise LinkTimeout(
-            f"unit {self._url.unit} on {self._url.place} answered with Modbus exception "
-            f"{answer.exception} and names no reason for it"
+            f"unit {self._url.unit} on {self._url.place}: Modbus exception {answer.exception} "
+            "without a reason for this request"
         )
 
-    def _look_at(self, request: Request, answer: ModbusResponse) -> None:
-        """Tell who listens what an answer shows to have changed."""
+    def _report_change(self, request: Request, answer: ModbusResponse) -> None:
+        """Report a change of state or fault as an event."""
         condition = exchanges.condition(request, answer.registers)
-        if condition is None or condition == self._condition:
+        if condition is None or condition == self._last_condition:
             return
-        before, self._condition = self._condition, condition
+        before, self._last_condition = self._last_condition, condition
         if before is not None:
             self._on_event(AmplifierEvent(*condition))
 

@@ -1,7 +1,7 @@
-"""One Modbus line, for all amplifiers of this process that are on it: a telegram at a time.
+"""A Modbus line shared by all amplifiers on it, one request at a time.
 
-Over RTU the line is silent for 3.5 characters before a telegram. Where nobody waits any more for an
-answer it is given the time to come all the same, or it would run into the next telegram.
+Over RTU the line is silent for 3.5 characters before a request. The next request also waits for the
+response to a cancelled one, which would collide with it.
 """
 
 import asyncio
@@ -28,11 +28,11 @@ from drivers.statistics import WireCounters
 _REACTION = PROTOCOL.reaction
 _BROADCAST: int = PROTOCOL.modbus["broadcast"]
 _TRANSACTIONS = 1 << 16
-_RTU_OVERHEAD = 3  # bytes of an answer around its PDU
+_RTU_OVERHEAD = 3  # bytes of a response around its PDU
 
 
 class ModbusLine(SharedLine[Port]):
-    """A line, whose units are its numbers; see `modbus_line`."""
+    """A line, numbered by units; see `modbus_line`."""
 
     number = "unit"
 
@@ -43,24 +43,24 @@ class ModbusLine(SharedLine[Port]):
         self.last_sent = 0.0
         self._turns = LineTurns()
         self._reader = ResponseReader(is_rtu=url.is_rtu, counters=self.counters)
-        self.is_contradicted = False  # whether the last answer was followed by another
-        self._given: ModbusResponse | None = None
+        self.has_duplicate_responder = False  # the last response was followed by a different one
+        self._last_response: ModbusResponse | None = None
         self._transaction = 0
-        self._telegram: RequestAdu | None = None
+        self._request: RequestAdu | None = None
         self._accept: Callable[[ModbusResponse], bool] = _any
         self._answer: asyncio.Future[ModbusResponse] | None = None
-        # Of a serial line: when it is free again, at the latest where an answer is owed.
+        # Time at which a serial line is free, at the latest if a response is pending.
         self._free_from = 0.0
-        self._is_owed = False
-        self._came = asyncio.Event()
+        self._is_response_pending = False
+        self._response_received = asyncio.Event()
         self._times = ModbusTimes(url.baud, url.bits_per_byte) if url.baud else None
         self._gap = self._times.silence if self._times and url.device else 0.0
 
     async def _open(self) -> Port:
         self.counters = WireCounters()
         self._reader = ResponseReader(is_rtu=self.url.is_rtu, counters=self.counters)
-        self._telegram = self._given = None
-        self._is_owed, self._free_from = False, 0.0
+        self._request = self._last_response = None
+        self._is_response_pending, self._free_from = False, 0.0
         return await open_stream(self.url, self._received, self._lose)
 
     async def transact(
@@ -73,31 +73,31 @@ class ModbusLine(SharedLine[Port]):
         timeout: float,
         accept: Callable[[ModbusResponse], bool],
     ) -> ModbusResponse:
-        """Write, read, or both in one transaction, and wait for the answer.
+        """Write, read, or both in one transaction, and wait for the response.
 
-        kind: how this stands to what others ask on the line (see `kind_on_line`); accept: whether
-        an answer in the right form is the right one. timeout [s]: for all of it; longer where a
-        slow line and an amplifier that reacts in time need longer. Raises LinkTimeout, LinkError.
+        kind: priority on the line (see `kind_on_line`); accept: whether a well-formed response
+        matches. timeout [s]: of the whole transaction, extended on slow lines. Raises LinkTimeout,
+        LinkError.
         """
 
         async def exchange() -> ModbusResponse:
             await self._await_silence()
             self.raise_if_lost(unit)
-            telegram = self._make(read, write, unit=unit)
-            self._telegram, self._accept = telegram, accept
+            request = self._make(read, write, unit=unit)
+            self._request, self._accept = request, accept
             self._answer = asyncio.get_running_loop().create_future()
-            on_line = self._time_of(len(telegram.frame) + _RTU_OVERHEAD + telegram.answer_size)
-            on_line += 2 * self._gap  # before the answer, and for the far end to see its end
+            on_line = self._time_of(len(request.frame) + _RTU_OVERHEAD + request.answer_size)
+            on_line += 2 * self._gap  # before the response, and at the end of the request
             try:
-                self._send(telegram.frame)
-                self._is_owed = True
+                self._send(request.frame)
+                self._is_response_pending = True
                 self._free_from = self.last_sent + on_line + _REACTION
                 return await reply_within(self._answer, max(timeout, on_line + _REACTION))
             except LinkError:
                 raise
             except TimeoutError:
                 raise LinkTimeout(
-                    f"no answer from unit {unit} on {self.place} within {timeout * 1e3:g} ms; "
+                    f"no response from unit {unit} on {self.place} within {timeout * 1e3:g} ms; "
                     "check that the amplifier is switched on and has this unit"
                     + (f" and {self.url.baud} baud" if self.url.device else "")
                 ) from None
@@ -107,22 +107,22 @@ class ModbusLine(SharedLine[Port]):
         return await self._turns.carry_out(kind, exchange, address=unit)
 
     async def broadcast(self, write: Write, kind: RequestPriority, *, unit: int | None) -> None:
-        """Write to all units, in the turn of this kind and unit; nobody answers.
+        """Write to all units with the priority of this kind; there are no responses.
 
-        unit: whose stop this gives way to, and which may be one that others ask meanwhile; or None.
+        unit: the one whose stop preempts this, or None.
         """
 
         async def send() -> None:
             await self._await_silence()
-            self._telegram = None
-            telegram = self._make(None, write, unit=_BROADCAST)
-            self._send(telegram.frame)
-            self._free_from = self.last_sent + self._time_of(len(telegram.frame)) + self._gap
+            self._request = None
+            request = self._make(None, write, unit=_BROADCAST)
+            self._send(request.frame)
+            self._free_from = self.last_sent + self._time_of(len(request.frame)) + self._gap
 
         await self._turns.carry_out(kind, send, address=unit)
 
     def is_unsent(self, unit: int) -> bool:
-        """Whether what is asked of a unit waits for others, or for the line to be silent."""
+        """Whether the request to a unit waits for others or for silence on the line."""
         return self._turns.is_unsent(unit)
 
     def silencing(self, request: Request, unit: int) -> AbstractContextManager[None]:
@@ -138,9 +138,9 @@ class ModbusLine(SharedLine[Port]):
         stream = self._ready()
         if self.url.is_rtu:
             self._reader.clear()
-        self._is_owed = False
-        self._given, self.is_contradicted = None, False
-        self._came.clear()
+        self._is_response_pending = False
+        self._last_response, self.has_duplicate_responder = None, False
+        self._response_received.clear()
         stream.write(frame)
         self._turns.sent()
         self.last_sent = clock.now()
@@ -150,40 +150,42 @@ class ModbusLine(SharedLine[Port]):
         """Wait until a serial line is free."""
         if not self.url.is_rtu:
             return
-        if self._is_owed and (wait := self._free_from - clock.now()) > 0:
+        if self._is_response_pending and (wait := self._free_from - clock.now()) > 0:
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(wait):
-                    await self._came.wait()
+                    await self._response_received.wait()
         if (wait := self._free_from - clock.now()) > 0:
             await asyncio.sleep(wait)
 
     def _time_of(self, size: int) -> float:
-        """Time [s] that so many bytes take on a serial line, be it behind a gateway."""
+        """Time [s] of a number of bytes on a serial line, also behind a gateway."""
         return self._times.of(size) if self._times else 0.0
 
     def _received(self, data: bytes) -> None:
-        for answer in self._reader.feed(data, self._telegram):
+        for answer in self._reader.feed(data, self._request):
             if not self._accept(answer):
                 self.counters.unexpected_frames += 1
                 continue
-            self._is_owed = False
-            self._came.set()
+            self._is_response_pending = False
+            self._response_received.set()
             if self._answer is None or self._answer.done():
                 self.counters.unexpected_frames += 1
-                self.is_contradicted = self.is_contradicted or answer != self._given
+                self.has_duplicate_responder = (
+                    self.has_duplicate_responder or answer != self._last_response
+                )
             else:
-                self._given = answer
+                self._last_response = answer
                 self._answer.set_result(answer)
-        if not self._is_owed:
+        if not self._is_response_pending:
             self._free_from = clock.now() + self._gap
 
-    def _give_up(self, what: str) -> None:
+    def _fail_pending(self, what: str) -> None:
         if self._answer is not None and not self._answer.done():
             self._answer.set_exception(LinkError(what))
 
 
 def modbus_line(url: ModbusUrl) -> ModbusLine:
-    """The line of a URL in the running event loop."""
+    """Return the line of a URL in the running event loop."""
     return shared_line(ModbusLine, url.line, lambda: ModbusLine(url.line))
 
 

@@ -1,4 +1,4 @@
-"""The bytes of a Modbus line, both ways: a TCP connection or a serial port."""
+"""Transport of a Modbus line: a TCP connection or a serial port."""
 
 import asyncio
 import contextlib
@@ -13,14 +13,14 @@ from drivers.backends.urls.modbus import ModbusUrl
 from drivers.errors import LinkError, LinkTimeout, system_message
 from drivers.threads import in_thread
 
-_CONNECT_TIMEOUT = 1.0  # s; an amplifier in the same building answers a hundred times faster
-_UNSENT_MAX = 4096  # bytes; sixteen frames that a peer does not take are no slow network any more
+_CONNECT_TIMEOUT = 1.0  # s; a hundred times the delay within a building
+_UNSENT_MAX = 4096  # bytes; sixteen unsent frames mean a blocked connection
 
 
 async def open_stream(
     line: ModbusUrl, on_data: Callable[[bytes], None], on_loss: Callable[[str], None]
 ) -> Port:
-    """Open a line; LinkError says what to do about one that cannot be opened."""
+    """Open a line; LinkError with a remedy."""
     if line.device:
         return await open_port(
             line.device,
@@ -43,7 +43,7 @@ class _Connection(asyncio.Protocol):
         self._on_data = on_data
         self._on_loss = on_loss
         self._is_closed = False
-        self._transport: asyncio.Transport  # from when it is connected, before anybody has it
+        self._transport: asyncio.Transport  # set when connected
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         self._transport = cast(asyncio.Transport, transport)
@@ -55,7 +55,7 @@ class _Connection(asyncio.Protocol):
     def connection_lost(self, exc: Exception | None) -> None:
         if not self._is_closed:
             self._is_closed = True
-            why = str(exc) if exc else "the other side hung up"
+            why = str(exc) if exc else "closed by the other side"
             self._on_loss(
                 f"the Modbus connection to {self._place} was lost ({why}): check the amplifier and "
                 "the network, then open the amplifier again"
@@ -63,18 +63,15 @@ class _Connection(asyncio.Protocol):
 
     def write(self, data: bytes) -> None:
         if self._transport.get_write_buffer_size() > _UNSENT_MAX:
-            raise LinkTimeout(
-                f"{self._place} takes no more bytes; check the network, and whether something on "
-                "it holds them back"
-            )
+            raise LinkTimeout(f"{self._place}: write blocked; check the network")
         self._transport.write(data)
 
     def close(self) -> None:
         self._is_closed = True
-        self._transport.abort()  # nothing that waits to be sent shall arrive later
+        self._transport.abort()  # discards unsent bytes
 
     async def wait_closed(self) -> None:
-        """Nothing is left to be waited for."""
+        """Return at once: abort does not block."""
 
 
 async def _connect(
@@ -85,18 +82,18 @@ async def _connect(
             return await _first_to_answer(line, lambda: _Connection(line.place, on_data, on_loss))
     except TimeoutError:
         raise LinkError(
-            f"{line.place} does not answer within {_CONNECT_TIMEOUT:g} s; check the address, the "
+            f"{line.place}: no connection within {_CONNECT_TIMEOUT:g} s; check the address, the "
             "network and that the amplifier is switched on"
         ) from None
     except OSError as problem:
         raise LinkError(
-            f"{line.place} takes no Modbus connection: check the address and the port, and that "
+            f"{line.place}: Modbus connection refused; check the address and the port, and that "
             f"the amplifier is switched on (the system says: {system_message(problem)})"
         ) from problem
 
 
 async def _first_to_answer(line: ModbusUrl, make: Callable[[], _Connection]) -> Port:
-    """The connection to the first of a host's addresses that takes one; raises OSError."""
+    """Connect to the first address of a host that accepts; raises OSError."""
     *others, last = await _addresses(line.host)
     loop = asyncio.get_running_loop()
     for address in others:
@@ -106,11 +103,11 @@ async def _first_to_answer(line: ModbusUrl, make: Callable[[], _Connection]) -> 
 
 
 async def _addresses(host: str) -> list[str]:
-    """What a host's name stands for, at least one; raises OSError."""
+    """Resolve a host name to at least one address; raises OSError."""
     try:
         return [str(ipaddress.ip_address(host))]
     except ValueError:
-        # asyncio would ask for it in a thread that a program waits for before it ends.
+        # asyncio resolves in a thread that delays the end of the program.
         found = await in_thread(
             lambda: socket.getaddrinfo(host, None, type=socket.SOCK_STREAM), name=f"era-name {host}"
         )
@@ -118,6 +115,6 @@ async def _addresses(host: str) -> list[str]:
 
 
 def _with_zone(address: str | int, *numbers: str | int | bytes) -> str:
-    """An address with the number of the network that it is good on, where it is of one only."""
-    *_, zone = numbers  # of an IPv4 address the port, for which nobody has asked
+    """Append the zone of a link-local IPv6 address."""
+    *_, zone = numbers  # of an IPv4 address the port, 0
     return f"{address}%{zone!s}" if zone else str(address)

@@ -1,4 +1,4 @@
-"""A serial port of this machine, a USB adapter, or a serial server, as pyserial names it."""
+"""Opening of serial ports, USB adapters and serial servers, named as in pyserial."""
 
 import contextlib
 import errno
@@ -36,10 +36,10 @@ async def open_port(
     on_data: Callable[[bytes], None],
     on_loss: Callable[[str], None],
 ) -> Port:
-    """Open a port, for this process alone where the system can; raises LinkError.
+    """Open a port, exclusively if the system can; raises LinkError.
 
-    parity, stop bits: as pyserial names them. on_data is called with what comes in, on_loss once
-    with why the port was lost.
+    parity, stop bits: as named by pyserial. on_data: called with received bytes; on_loss: called
+    once with the cause of a loss.
     """
     hardware = HARDWARE_PROVIDER.get()
     if hardware is not None:
@@ -54,7 +54,7 @@ async def open_port(
 
 
 def _open_port(name: str, baud: int, parity: str, stop: int) -> serial.Serial:
-    # A pseudo-terminal has no parity, and where it is asked for one it may refuse everything.
+    # A pseudo-terminal has no parity and may refuse all settings if one is given.
     is_pseudo = os.path.realpath(name).startswith("/dev/pts/")
     port = serial.serial_for_url(
         name,
@@ -63,18 +63,18 @@ def _open_port(name: str, baud: int, parity: str, stop: int) -> serial.Serial:
         parity=serial.PARITY_NONE if is_pseudo else parity,
         stopbits=stop,
         timeout=READ_TIMEOUT,
-        # pyserial has none over RFC 2217
+        # not supported by pyserial over RFC 2217
         write_timeout=None if name.startswith("rfc2217://") else WRITE_TIMEOUT,
         exclusive=True,
     )
     port.open()
-    # USB adapters hold bytes back for 16 ms unless they are told not to; most can be.
+    # USB adapters delay bytes by 16 ms unless low latency is set; most support it.
     with contextlib.suppress(OSError, ValueError, AttributeError, NotImplementedError):
         port.set_low_latency_mode(True)
     connection = connection_of(port)
     if connection is not None:
-        # Else the system holds a frame back until the one before is acknowledged, 40 ms perhaps:
-        # a stop must not wait for the answer to what it overtakes.
+        # Without it a frame may wait up to 40 ms for the acknowledgement of the one before, and a
+        # stop must not wait for that.
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     port.reset_input_buffer()
     return port
@@ -85,10 +85,10 @@ def _why_not_open(port: str, problem: Exception) -> str:
     if (remedy := remedy_of(problem)) is not None:
         pass
     elif refused or port.startswith(("socket://", "rfc2217://")):
-        remedy = "nobody answers there; check the address, and that the serial server runs"
+        remedy = "no server there; check the address, and that the serial server runs"
     elif port.startswith("hwgrep://"):
-        remedy = "no port fits the pattern; list them: python -m serial.tools.list_ports -v"
+        remedy = "no port matches; list them: python -m serial.tools.list_ports -v"
     else:
-        remedy = "check its name, that it is plugged in, its speed and its parity"
+        remedy = "check its name, the plug, its speed and its parity"
     said = system_message(problem)
     return f"serial port {port} cannot be opened: {remedy} (the system says: {said})"

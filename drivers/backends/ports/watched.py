@@ -1,7 +1,7 @@
-"""An open serial port, read by the event loop or by a thread; for every wire that is one.
+"""An open serial port, read by the event loop or by a thread.
 
-Where the port has a file descriptor the event loop itself watches it, which is as fast as asking
-the port in a loop; where it has none (RFC 2217, Windows) a thread reads and posts into the loop.
+The event loop watches the port's file descriptor; if there is none (RFC 2217, Windows), a thread
+reads the port.
 """
 
 import asyncio
@@ -19,16 +19,16 @@ from drivers.backends.ports.writing import descriptor, write_all
 from drivers.errors import LinkError, LinkTimeout
 from drivers.threads import close_in_thread
 
-READ_TIMEOUT = 0.1  # s; how long the reader of a port that cannot be woken notices its end
-WRITE_TIMEOUT = 0.02  # s; a frame fits into any driver's buffer unless the line is stuck
+READ_TIMEOUT = 0.1  # s; interval in which a reader thread notices its end
+WRITE_TIMEOUT = 0.02  # s; a frame fits into every driver's buffer unless the line is blocked
 _READ_MAX = 4096
 
 
 @final
 class WatchedPort:
-    """A port of pyserial's, opened with these time-outs; `Port` is what it does.
+    """A pyserial port opened with these timeouts; implements `Port`.
 
-    on_data is called with what comes in, on_loss once with why the port was lost.
+    on_data: called with received bytes; on_loss: called once with the cause of a loss.
     """
 
     def __init__(
@@ -54,12 +54,12 @@ class WatchedPort:
         self._thread.start()
 
     def write(self, data: bytes) -> None:
-        """Send bytes; raises LinkTimeout where the line is stuck, LinkError."""
+        """Send bytes; raises LinkTimeout if the line is blocked, LinkError."""
         try:
             write_all(self._port, data)
         except serial.SerialTimeoutException:
             raise LinkTimeout(
-                f"{self._name} takes no more bytes; check flow control and the adapter"
+                f"{self._name}: write timed out; check flow control and the adapter"
             ) from None
         except OSError as problem:
             what = self._what_was_lost(problem)
@@ -67,7 +67,7 @@ class WatchedPort:
             raise LinkError(what) from problem
 
     def close(self) -> None:
-        """Read no more; `wait_closed` gives the port back."""
+        """Stop reading; `wait_closed` closes the port."""
         self._ignore()
         self._closing.set()
         if self._thread is not None and hasattr(self._port, "cancel_read"):
@@ -75,11 +75,11 @@ class WatchedPort:
                 self._port.cancel_read()
 
     async def wait_closed(self) -> None:
-        """Wait until the reader has ended and the port is closed; not for a device that hangs."""
-        # Where the device takes nothing any more, the system waits half a minute for it.
-        await close_in_thread(self._give_back, name=f"era-close {self._name}")
+        """Wait until reader and port are closed, but not for a device that hangs."""
+        # The system waits half a minute for a device that takes no more bytes.
+        await close_in_thread(self._close_port, name=f"era-close {self._name}")
 
-    def _give_back(self) -> None:
+    def _close_port(self) -> None:
         if self._thread is not None:
             self._thread.join()
         close_port(self._port)
@@ -97,7 +97,7 @@ class WatchedPort:
         if data:
             self._on_data(data)
         else:
-            self._lose(self._what_was_lost("it hung up"))
+            self._lose(self._what_was_lost("end of file"))
 
     def _ignore(self) -> None:
         watched, self._descriptor = self._descriptor, None
@@ -105,16 +105,16 @@ class WatchedPort:
             self._loop.remove_reader(watched)
 
     def _read(self) -> None:
-        """Read until the port is closed or lost; runs in the reader thread."""
+        """Read until the port is closed or lost; reader thread."""
         port, post = self._port, self._loop.call_soon_threadsafe
-        with contextlib.suppress(RuntimeError):  # of a loop that is closed: nobody waits any more
+        with contextlib.suppress(RuntimeError):  # of a closed loop
             try:
                 while not self._closing.is_set():
                     data = port.read(1)
                     if data:
                         data += port.read(port.in_waiting)
                         post(self._received, data)
-            except (OSError, TypeError) as problem:  # TypeError: closed while it was being read
+            except (OSError, TypeError) as problem:  # TypeError: closed during a read
                 if not self._closing.is_set():
                     post(self._lose, self._what_was_lost(problem))
 
@@ -137,8 +137,8 @@ class WatchedPort:
 
 
 def close_port(port: serial.Serial) -> None:
-    """Give a port back, whatever became of it."""
-    # pyserial does not close the socket of a server that hung up first, so that is done here.
+    """Close a port, also a lost one."""
+    # pyserial does not close the socket if the server closed first.
     connection = connection_of(port)
     if connection is not None:
         connection.close()
@@ -147,23 +147,23 @@ def close_port(port: serial.Serial) -> None:
 
 
 def connection_of(port: serial.Serial) -> socket.socket | None:
-    """The connection to a serial server that passes bytes on as they are; None for other ports."""
+    """Return the connection to a raw TCP serial server; None for other ports."""
     is_server = str(port.port).startswith("socket://")
     return getattr(port, "_socket", None) if is_server else None
 
 
 def remedy_of(problem: Exception) -> str | None:
-    """What to do about a port that cannot be opened, where the system says enough about it."""
+    """Return the remedy for an opening error by its error code, if there is one."""
     code = getattr(problem, "errno", None)
     if code is None and isinstance(problem.__context__, OSError):
         code = problem.__context__.errno
     if code == errno.ENOENT:
-        return "there is no such port; plug the adapter in and look at its name in /dev"
+        return "no such port; plug in the adapter and check its name in /dev"
     if code in (errno.EACCES, errno.EPERM):
         return (
-            "this user may not use it; add the user to the group that owns the port "
+            "no permission; add the user to the group that owns the port "
             "(often dialout: sudo usermod -aG dialout $USER) and log in again"
         )
     if code in (errno.EAGAIN, errno.EBUSY):
-        return "another program has it open; close that one"
+        return "in use by another program; close that one"
     return None

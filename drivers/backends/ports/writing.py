@@ -1,7 +1,7 @@
-"""Writing to a serial port without being told of a time-out that is none.
+"""Writing to a serial port without false timeouts.
 
-pyserial looks at the clock after the system has taken the bytes: where this process was held up
-meanwhile it says that nothing could be sent, though all was. So the system is asked first.
+pyserial checks the timeout after the system has taken the bytes, and so reports one if this process
+was delayed meanwhile. Here the system is asked first.
 """
 
 import contextlib
@@ -11,20 +11,20 @@ import serial
 
 
 def descriptor(port: serial.Serial) -> int | None:
-    """The file descriptor of a port, where the system has such."""
+    """Return the file descriptor of a port, if it has one."""
     if os.name != "posix":
         return None
     try:
         return int(port.fileno())
-    except (OSError, AttributeError):  # UnsupportedOperation is one of OSError
+    except (OSError, AttributeError):  # UnsupportedOperation is an OSError
         return None
 
 
 def write_all(port: serial.Serial, data: bytes) -> None:
-    """Write all; SerialTimeoutException where the port takes no more, OSError where it is gone."""
+    """Write all; SerialTimeoutException if the port is blocked, OSError if it is lost."""
     opened = descriptor(port)
     if opened is not None:
-        with contextlib.suppress(BlockingIOError):  # its buffer is full: wait a little
+        with contextlib.suppress(BlockingIOError):  # buffer full: wait
             data = data[os.write(opened, data) :]
     if data:
         port.write(data)

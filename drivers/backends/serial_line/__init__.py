@@ -1,1 +1,1 @@
-"""An amplifier on a serial line, and the line that several share."""
+"""Backend for amplifiers on a serial line."""

@@ -1,7 +1,7 @@
-"""An amplifier on a serial line: a tty, a USB adapter, or a serial server on the network.
+"""Backend for an amplifier on a serial line: a tty, a USB adapter or a serial server.
 
-A reply belongs to the request whose sequence number it carries. Several amplifiers may share a
-line, each at its own address.
+Replies are matched by sequence number. Several amplifiers may share a line, each at its own
+address.
 """
 
 import asyncio
@@ -26,7 +26,7 @@ from drivers.statistics import WireCounters
 
 @dataclass
 class _Pending:
-    """A request on the wire and who waits for its reply."""
+    """A request on the wire and its future reply."""
 
     request: Frame
     reply: asyncio.Future[Reply]
@@ -41,37 +41,37 @@ class SerialBackend(WireBackend):
         self._times = SerialTimes(self._url.baud)
         self._line: SerialLine | None = None
         self._pending: dict[int, _Pending] = {}
-        # Not from zero, so that an answer to an earlier run is no answer to this one.
+        # A random start, so that a reply to an earlier run does not match.
         self._sequence = number_below(1 << 16)
-        self._answered: Frame | None = None  # the reply to the last request, once it is there
-        self._is_contradicted = False  # by another reply to that
+        self._last_reply: Frame | None = None  # the reply to the last request, if received
+        self._has_duplicate_responder = False  # a second, different reply
         self._why_closed = f"{self._url.port} is not open; open the amplifier first"
-        self._loss: str | None = None  # until it is opened anew, even if others have the line back
+        self._loss: str | None = None  # until reopened, even if others have joined the line again
 
     @property
     def counters(self) -> WireCounters:
-        """What was seen for this amplifier; damaged frames are those of the whole line."""
+        """Frame counters of this amplifier; damaged frames are those of the whole line."""
         crc_errors = self._counters.crc_errors if self._line is None else self._line.crc_errors
         return replace(self._counters, crc_errors=crc_errors)
 
     @property
     def bus(self) -> str:
-        """The port: a broadcast reaches all that share it."""
+        """The port: a broadcast reaches all amplifiers on it."""
         return self._url.port
 
     @property
     def wire_times(self) -> WireTimes:
-        """Of the line; none where its end is a server."""
+        """Durations on the line; unknown behind a server."""
         return self._times if self._url.is_local else NoTimes()
 
     @property
     def takes_turns(self) -> bool:
-        """One answer at a time is on the line."""
+        """The line is half duplex."""
         return True
 
     @property
     def is_unsent(self) -> bool:
-        """Whether what is asked waits for others on the line."""
+        """Whether the request waits for others on the line."""
         return self._line is not None and self._line.turns.is_unsent(self._url.address)
 
     def silencing(self, request: Request) -> AbstractContextManager[None]:
@@ -81,7 +81,7 @@ class SerialBackend(WireBackend):
         return self._line.turns.silencing(request, self._url.address)
 
     async def open(self) -> None:
-        """Open the port, for this process alone where the system can; raises LinkError."""
+        """Open the port, exclusively if the system can; raises LinkError."""
         if self._line is not None:
             return
         line = serial_line(self._url.port, baud=self._url.baud)
@@ -92,7 +92,7 @@ class SerialBackend(WireBackend):
         self._line = line
 
     async def close(self) -> None:
-        """Close the port if nobody else uses it; what waits for a reply gets LinkError."""
+        """Close the port if unused by others; pending requests raise LinkError."""
         line, self._line = self._line, None
         if line is None:
             return
@@ -105,11 +105,10 @@ class SerialBackend(WireBackend):
     async def exchange(self, request: Request, *, timeout: float) -> Reply:
         """Send a request and wait for its reply; LinkTimeout, LinkError or FrameError.
 
-        timeout [s]: for all of it; longer where a slow line and an amplifier that reacts in time
-        need longer.
+        timeout [s]: of the whole exchange, extended on slow lines.
         """
         line = self._opened()
-        # Also where nobody else is on the line: who joins it while an answer is owed must wait.
+        # Also on a line of its own: an amplifier that joins must wait for a pending reply.
         return await line.turns.carry_out(
             kind_on_line(request),
             lambda: self._exchange(line, request, timeout),
@@ -119,8 +118,7 @@ class SerialBackend(WireBackend):
     async def broadcast(self, request: Broadcast) -> None:
         """Send a commit to every amplifier of the line in its turn, or a stop at once.
 
-        A stop is sent again in its turn where an answer may have run into it: on one pair of wires
-        nobody understands either then.
+        A stop is repeated in its turn if it may have collided with a reply on the wires.
         """
         line = self._opened()
         is_stop, was_taken = isinstance(request, Stop), line.turns.is_taken
@@ -136,12 +134,12 @@ class SerialBackend(WireBackend):
             await line.turns.carry_out(kind_on_line(request), send, address=address)
 
     async def _check_alone(self) -> None:
-        """Leave a second amplifier of this address the time to answer; LinkError where one does."""
+        """Wait for a second amplifier of this address; LinkError if one replies."""
         await asyncio.sleep(SETTLE)
-        if self._is_contradicted:
+        if self._has_duplicate_responder:
             raise LinkError(
-                f"more than one amplifier answers at address {self._url.address} on "
-                f"{self._url.port}; give each on the line an address of its own"
+                f"several amplifiers reply at address {self._url.address} on {self._url.port}; "
+                "give each its own address"
             )
 
     async def _exchange(self, line: SerialLine, request: Request, timeout: float) -> Reply:
@@ -149,7 +147,7 @@ class SerialBackend(WireBackend):
         data = encode_frame(frame)
         pending = _Pending(frame, asyncio.get_running_loop().create_future())
         self._pending[frame.sequence] = pending
-        self._answered, self._is_contradicted = None, False
+        self._last_reply, self._has_duplicate_responder = None, False
         try:
             line.raise_if_lost(self._url.address)
             self._send(line, data)
@@ -160,13 +158,13 @@ class SerialBackend(WireBackend):
             raise
         except TimeoutError:
             raise LinkTimeout(
-                f"no answer from address {self._url.address} on {self._url.port} within "
+                f"no reply from address {self._url.address} on {self._url.port} within "
                 f"{timeout * 1e3:g} ms; check that the amplifier is switched on and set to "
                 f"{self._url.baud} baud"
             ) from None
         finally:
             del self._pending[frame.sequence]
-            pending.reply.cancel()  # one that was given an error nobody came for
+            pending.reply.cancel()  # also if it has an exception
         if isinstance(request, Hello):
             await self._check_alone()
         return reply
@@ -188,11 +186,11 @@ class SerialBackend(WireBackend):
     def _received(self, frame: Frame) -> None:
         self._counters.frames_in += 1
         if frame.address == self._url.address and is_event(frame):
-            self._told(frame)
+            self._notify(frame)
             return
-        first = self._answered
+        first = self._last_reply
         if first is not None and (frame.sequence, frame.address) == (first.sequence, first.address):
-            self._is_contradicted = self._is_contradicted or frame != first
+            self._has_duplicate_responder = self._has_duplicate_responder or frame != first
         pending = self._pending.get(frame.sequence)
         if (
             pending is None
@@ -202,13 +200,13 @@ class SerialBackend(WireBackend):
         ):
             self._counters.unexpected_frames += 1
             return
-        self._answered = frame
+        self._last_reply = frame
         try:
             pending.reply.set_result(decode_reply(frame, pending.request))
         except DriverError as problem:
             pending.reply.set_exception(problem)
 
-    def _told(self, frame: Frame) -> None:
+    def _notify(self, frame: Frame) -> None:
         try:
             event = decode_event(frame)
         except DriverError:

@@ -1,4 +1,4 @@
-"""One open serial port, shared by all amplifiers on it: frames out, and frames in to who waits."""
+"""A serial port shared by all amplifiers on it."""
 
 from collections.abc import Callable
 
@@ -12,9 +12,9 @@ from drivers.errors import LinkError
 
 
 class SerialLine(SharedLine[Port]):
-    """A port as pyserial names it, at a speed [baud]; see `serial_line`.
+    """A port, named as in pyserial, at a speed [baud]; see `serial_line`.
 
-    turns: for exchanges, for no two amplifiers may answer at once on one pair of wires.
+    turns: of exchanges, since only one amplifier may reply at a time.
     """
 
     number = "address"
@@ -29,18 +29,18 @@ class SerialLine(SharedLine[Port]):
 
     @property
     def crc_errors(self) -> int:
-        """How many damaged frames came in."""
+        """Number of damaged frames received."""
         return self._reader.counters.crc_errors
 
     def listen(self, address: int, on_frame: Callable[[Frame], None] | None) -> None:
-        """Whom to tell of frames from an address; None for nobody any more."""
+        """Set the callback for frames from an address; None removes it."""
         if on_frame is None:
             self._listeners.pop(address, None)
         else:
             self._listeners[address] = on_frame
 
     def send(self, data: bytes) -> None:
-        """Put a frame on the line; raises LinkTimeout where it is stuck, LinkError."""
+        """Send a frame; raises LinkTimeout if the line is blocked, LinkError."""
         self._ready().write(data)
         self.last_sent = clock.now()
 
@@ -52,7 +52,7 @@ class SerialLine(SharedLine[Port]):
 
     def _received(self, data: bytes) -> None:
         for frame in self._reader.feed(data):
-            # What is for nobody here is shown to one, who counts it as foreign.
+            # A frame without a listener goes to one that counts it as unexpected.
             listener = self._listeners.get(frame.address) or next(
                 iter(self._listeners.values()), None
             )
@@ -61,11 +61,11 @@ class SerialLine(SharedLine[Port]):
 
 
 def serial_line(port: str, *, baud: int) -> SerialLine:
-    """The line of a port in the running event loop; LinkError where it has another speed."""
+    """Return the line of a port in the running event loop; LinkError for another speed."""
     line = shared_line(SerialLine, port, lambda: SerialLine(port, baud=baud))
     if line.baud != baud:
         raise LinkError(
-            f"serial port {port} is open at {line.baud} baud and cannot have {baud} as well; "
-            "give all amplifiers on it one speed"
+            f"serial port {port}: baud must be {line.baud} as for the other amplifiers on it, got "
+            f"{baud}"
         )
     return line

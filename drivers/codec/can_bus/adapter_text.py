@@ -9,7 +9,7 @@ from collections.abc import Iterator
 
 from drivers.codec.can_bus.frame import CanFrame
 
-_LONGEST = 512  # characters without an end; a CAN FD frame has half of it
+_MAX_LENGTH = 512  # characters without an end; a CAN FD frame has half of it
 _FD_LENGTHS = (0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64)
 _CLASSIC_MAX = 8
 _ELEMENT = re.compile(
@@ -45,7 +45,7 @@ class SlcanReader:
     def feed(self, data: bytes) -> Iterator[CanFrame]:
         """Those that are whole now; frames with 29-bit identifiers and remote ones are left out."""
         *lines, rest = _LINE_END.split(self._rest + data)
-        self._rest = rest if len(rest) <= _LONGEST else b""
+        self._rest = rest if len(rest) <= _MAX_LENGTH else b""
         for line in lines:
             found = _LINE.fullmatch(line)
             if found:
@@ -67,7 +67,7 @@ class SocketcandReader:
     def feed(self, data: bytes) -> Iterator[CanFrame]:
         """Those that are whole now; other elements and long identifiers are left out."""
         *elements, rest = (self._rest + data).split(b">")
-        self._rest = rest if len(rest) <= _LONGEST else b""
+        self._rest = rest if len(rest) <= _MAX_LENGTH else b""
         for element in elements:
             found = _ELEMENT.fullmatch(element, element.rfind(b"<") if b"<" in element else 0)
             if found:

@@ -19,7 +19,7 @@ from drivers.protocol.messages import (
 UNASKED = 0  # the sequence number of what an amplifier says by itself
 _Q = PROTOCOL.quantities
 _ACTIONS: Mapping[str, int] = CANOPEN["actions"]
-_TORN: int = CANOPEN["torn"]
+_INCOMPLETE_SET: int = CANOPEN["torn"]
 _NO_CHANNEL: int = CANOPEN["no_channel"]
 _STATES = {state.value: state for state in AmplifierState}
 _FAULTS = {fault.value: fault for fault in Fault}
@@ -98,7 +98,7 @@ class CanReplyReader:
         sequence, action, result = values["sequence"], values["action"], values["result"]
         if values["state"] not in _STATES or values["fault"] not in _FAULTS:
             raise FrameError(f"an answer names state {values['state']}, fault {values['fault']}")
-        if result not in (0, _TORN) and result not in _NAKS:
+        if result not in (0, _INCOMPLETE_SET) and result not in _NAKS:
             raise FrameError(f"an answer has the result {result}")
         channel = values["channel"]
         if channel != _NO_CHANNEL and not _Q.channel.holds(channel):
@@ -177,7 +177,7 @@ def plain_reply(answer: CanReply) -> Reply | None:
 def _refusal(result: int, state: AmplifierState, channel: int | None) -> Nak | None:
     if result == 0:
         return None
-    if result != _TORN:
+    if result != _INCOMPLETE_SET:
         return Nak(_NAKS[result], channel)
     # A frame of the set was lost: the amplifier has done nothing, and can be asked again, unless it
     # says at once that it would refuse the whole set as well.

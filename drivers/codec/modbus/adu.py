@@ -106,7 +106,7 @@ class ResponseReader:
         """The answers to a telegram in these bytes; to: None where nothing was asked."""
         self._buffer += data
         split = self._next_rtu if self._is_rtu else self._next_tcp
-        answers = []
+        responses = []
         while (frame := split(to)) is not None:
             self._counters.frames_in += 1
             transaction, unit, pdu = frame
@@ -116,8 +116,8 @@ class ResponseReader:
             if answer is None:
                 self._counters.unexpected_frames += 1
             else:
-                answers.append(answer)
-        return answers
+                responses.append(answer)
+        return responses
 
     def _next_tcp(self, to: RequestAdu | None) -> tuple[int, int, bytes] | None:
         if len(self._buffer) < _MBAP:

@@ -120,8 +120,8 @@ def encode_broadcast(request: Broadcast) -> Write:
 
 def decode_refusal(registers: Sequence[int], *, tag: int) -> Nak | None:
     """The refusal of the write that carried this tag; None where it is that of another."""
-    told = blocks.unpack_refusal(registers)
-    return told[0] if told is not None and told[1] == tag else None
+    refusal = blocks.unpack_refusal(registers)
+    return refusal[0] if refusal is not None and refusal[1] == tag else None
 
 
 def refusal_read() -> Read:

@@ -54,7 +54,7 @@ class Line(SharedLine[Port]):
             await self.blocks.wait()
         self.happened.append(what)
 
-    def _give_up(self, what: str) -> None:
+    def _fail_pending(self, what: str) -> None:
         self.happened.append(f"gave up: {what}")
 
     def lose(self, what: str) -> None:
@@ -88,7 +88,7 @@ async def test_a_number_is_for_one() -> None:
     """Who comes second is told what to do, and the first is not disturbed."""
     line = the_line()
     await line.join(1, lambda _: None)
-    with pytest.raises(LinkError, match=r"place 1 on the line.*has it open already.*of its own"):
+    with pytest.raises(LinkError, match=r"place 1 on the line.*already open"):
         await line.join(1, lambda _: None)
     assert line.happened == ["opened"]
     await line.leave(1)
@@ -157,7 +157,7 @@ async def test_a_loss_is_told_once_to_each_and_over_for_who_comes_back() -> None
     await line.join(1, lambda what: told.append((1, what)))
     assert line.happened == ["opened", "gave up: pulled out", "closed", "opened"]
     line.raise_if_lost(1)
-    with pytest.raises(LinkError, match="place 2 is not back"):
+    with pytest.raises(LinkError, match="place 2 has not been reopened"):
         line.raise_if_lost(2)
     line.lose("burnt")
     assert told[2:] == [(1, "burnt")]
@@ -270,7 +270,7 @@ async def test_what_waited_while_the_line_was_lost_is_not_sent_when_others_open_
     await east.close()
     await east.open()
     for each in asked:
-        with pytest.raises(LinkError, match=r"pulled out|not back"):
+        with pytest.raises(LinkError, match=r"pulled out|reopened"):
             await each
     assert len(machine.sent) == before
     await west.close()

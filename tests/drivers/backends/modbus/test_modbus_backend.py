@@ -181,7 +181,7 @@ async def test_a_gateway_without_an_amplifier_is_no_answer(
 async def test_no_answer_is_a_timeout(far: Peer, backend: ModbusBackend) -> None:
     """A silent amplifier gives LinkTimeout with the unit; the line stays usable."""
     far.answer = lambda _: None
-    with pytest.raises(LinkTimeout, match="no answer from unit 1"):
+    with pytest.raises(LinkTimeout, match="unit 1"):
         await backend.exchange(Ping(), timeout=SHORT)
     far.answer = lambda request: far.unit.answer(request.pdu)
     assert await backend.exchange(Ping(), timeout=PATIENCE) == ARMED
@@ -236,7 +236,7 @@ async def test_a_late_refusal_is_not_credited_to_the_next_request(
         await backend.exchange(Apply(SET), timeout=SHORT)
     far.device.answer = far.device.usual_answer
     if far.is_rtu:
-        with pytest.raises(LinkTimeout, match="names no reason"):
+        with pytest.raises(LinkTimeout, match="without a reason"):
             await backend.exchange(Arm(0.25), timeout=PATIENCE)
     assert await backend.exchange(Arm(0.25), timeout=PATIENCE) == ARMED
 
@@ -258,7 +258,7 @@ async def test_an_exception_without_a_refusal_is_no_answer(
         return far.unit.answer(pdu) if pdu[0] == 4 else bytes([pdu[0] | 0x80, 3])
 
     far.answer = answer
-    with pytest.raises(LinkTimeout, match="names no reason"):
+    with pytest.raises(LinkTimeout, match="without a reason"):
         await backend.exchange(Arm(0.25), timeout=PATIENCE)
 
 
@@ -361,7 +361,7 @@ async def test_a_hang_up_is_told_at_once(far: Peer, backend: ModbusBackend) -> N
 
 async def test_nobody_there_says_so(far: Peer) -> None:
     """LinkError that names the address and what to check."""
-    with pytest.raises(LinkError, match=r"127\.0\.0\.1:1 takes no Modbus connection"):
+    with pytest.raises(LinkError, match=r"127\.0\.0\.1:1: .*refused; check"):
         await ModbusBackend("modbus+tcp://127.0.0.1:1/1").open()
     with pytest.raises(LinkError, match="no such port"):
         await ModbusBackend("modbus+rtu:///dev/no-such-port#1").open()
@@ -376,7 +376,7 @@ async def test_a_serial_port_is_for_one_program() -> None:
     terminal = PseudoTerminal(lambda _: None)
     first = ModbusBackend(f"modbus+rtu://{terminal.port}#1")
     await first.open()
-    with pytest.raises(LinkError, match="another program has it open"):
+    with pytest.raises(LinkError, match="another program"):
         await ModbusBackend(f"modbus+rtu://{terminal.port}?baud=9600#1").open()
     with pytest.raises(LinkTimeout):
         await first.exchange(Ping(), timeout=SHORT)
@@ -550,7 +550,7 @@ async def test_two_amplifiers_of_one_unit_are_refused() -> None:
 
         far.answer = answered_by(far.unit, other)
         amplifier = Amplifier(ModbusBackend(far.url), reply_timeout=PATIENCE)
-        with pytest.raises(LinkError, match="more than one amplifier answers as unit 1 on"):
+        with pytest.raises(LinkError, match=r"several amplifiers .*unit 1"):
             await amplifier.open()
         far.answer = answered_by(far.unit, far.unit)
         await amplifier.open()

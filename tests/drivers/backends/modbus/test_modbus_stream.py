@@ -22,9 +22,7 @@ async def test_an_address_that_does_not_answer_is_told_with_what_to_check(
     monkeypatch.setattr(stream, "_CONNECT_TIMEOUT", 0.0)
     with socket.create_server(("127.0.0.1", 0)) as listening:
         port = listening.getsockname()[1]
-        with pytest.raises(
-            LinkError, match=rf"127.0.0.1:{port} does not answer .*the address, the"
-        ):
+        with pytest.raises(LinkError, match=rf"127.0.0.1:{port}: .*check the address"):
             await open_stream(
                 ModbusUrl.parse(f"modbus+tcp://127.0.0.1:{port}/1"), lambda _: None, lambda _: None
             )
@@ -77,7 +75,7 @@ except LinkError as problem:
     ran = subprocess.run(
         [sys.executable, "-c", program], check=True, timeout=60, capture_output=True, text=True
     )
-    assert "amplifier.test:502 does not answer" in ran.stdout
+    assert "amplifier.test:502: no connection" in ran.stdout
 
 
 async def test_a_peer_that_reads_no_more_is_told_before_the_memory_is_full() -> None:
@@ -88,7 +86,7 @@ async def test_a_peer_that_reads_no_more_is_told_before_the_memory_is_full() -> 
             ModbusUrl.parse(f"modbus+tcp://127.0.0.1:{port}/1"), lambda _: None, lambda _: None
         )
         connection.write(bytes(64 * MEGABYTE))
-        with pytest.raises(LinkTimeout, match="takes no more bytes; check the network"):
+        with pytest.raises(LinkTimeout, match="check the network"):
             connection.write(b"x")
         connection.close()
         await connection.wait_closed()

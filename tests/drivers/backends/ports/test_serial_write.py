@@ -48,7 +48,7 @@ async def test_a_line_that_is_stuck_is_told_with_what_to_look_at(
     """As a timeout, which is asked again and then counts as a loss."""
     port, _ = ends
     watched = WatchedPort(port, "/dev/ttyUSB9", lambda data: None, lambda what: None)
-    with pytest.raises(LinkTimeout, match="/dev/ttyUSB9 takes no more bytes; check flow control"):
+    with pytest.raises(LinkTimeout, match=r"/dev/ttyUSB9.*check flow control"):
         watched.write(bytes(1 << 20))
     watched.close()
     await watched.wait_closed()

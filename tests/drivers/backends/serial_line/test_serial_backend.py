@@ -63,7 +63,7 @@ async def test_a_request_gets_its_reply(backend: SerialBackend, far_end: FarEnd)
 async def test_no_answer_is_a_timeout(backend: SerialBackend, far_end: FarEnd) -> None:
     """A far end that stays silent gives LinkTimeout with what to check."""
     far_end.answer = lambda request, frame: None
-    with pytest.raises(LinkTimeout, match=r"no answer from address 1.*921600 baud"):
+    with pytest.raises(LinkTimeout, match=r"address 1 .*921600 baud"):
         await backend.exchange(Ping(), timeout=SHORT)
 
 
@@ -172,7 +172,7 @@ async def test_closing_ends_the_reader_and_what_waits(far_end: FarEnd) -> None:
 
 async def test_a_line_is_opened_by_one_only(far_end: FarEnd, backend: SerialBackend) -> None:
     """Whoever opens the port a second time is told that it is in use, within a program too."""
-    with pytest.raises(LinkError, match="this program has it open already"):
+    with pytest.raises(LinkError, match="already open in this program"):
         await SerialBackend(far_end.url).open()
     script = (
         "import asyncio, sys; from drivers.backends.serial_line.backend import SerialBackend; "
@@ -182,19 +182,19 @@ async def test_a_line_is_opened_by_one_only(far_end: FarEnd, backend: SerialBack
         *(sys.executable, "-c", script, far_end.url), stderr=asyncio.subprocess.PIPE
     )
     _, errors = await process.communicate()
-    assert b"another program has it open" in errors
+    assert b"in use by another program" in errors
 
 
 async def test_a_line_has_one_speed(far_end: FarEnd, backend: SerialBackend) -> None:
     """A second amplifier at another is refused with both, and the first is not disturbed."""
-    with pytest.raises(LinkError, match="at 921600 baud and cannot have 9600 as well; give all"):
+    with pytest.raises(LinkError, match=r"921600 .*got 9600"):
         await SerialBackend(f"{far_end.url}?baud=9600&address=2").open()
     assert await backend.exchange(Hello(), timeout=PATIENCE) == IDENTITY
 
 
 async def test_a_missing_port_says_what_to_do() -> None:
     """One paragraph: which port, why, and what to do."""
-    with pytest.raises(LinkError, match=r"/dev/no-such-port cannot be opened: there is no such"):
+    with pytest.raises(LinkError, match=r"/dev/no-such-port.*plug in"):
         await SerialBackend("serial:///dev/no-such-port").open()
 
 
@@ -243,7 +243,7 @@ async def test_a_server_that_is_not_there_says_what_to_do() -> None:
     """A refused connection is a sentence about the server, not about dialout."""
     with socket.create_server(("127.0.0.1", 0)) as listener:
         port = listener.getsockname()[1]
-    with pytest.raises(LinkError, match="nobody answers there"):
+    with pytest.raises(LinkError, match="check the address"):
         await SerialBackend(f"serial://127.0.0.1:{port}").open()
 
 
@@ -260,7 +260,7 @@ async def test_two_amplifiers_of_one_address_are_refused(far_end: FarEnd) -> Non
 
     far_end.answer = both
     amplifier = Amplifier(SerialBackend(far_end.url), reply_timeout=PATIENCE)
-    with pytest.raises(LinkError, match="more than one amplifier answers at address 1 on"):
+    with pytest.raises(LinkError, match=r"several amplifiers .*address 1"):
         await amplifier.open()
     far_end.answer = twice
     await amplifier.open()

@@ -64,7 +64,7 @@ def study(
     mesh: MeshOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Compare layouts of ERAs by how strongly the plate vibrates; an interrupted study resumes."""
+    """Compare layouts of ERAs by how strongly the plate vibrates. Resumes an interrupted study."""
     from model.config.document import read_document
     from model.config.points import parse_frequencies, parse_pair
     from model.errors import InputError

@@ -37,7 +37,7 @@ def test_page_lists_every_command_with_its_options() -> None:
     known = dict(commands(own_commands()))
     assert {name for name in listed if name.startswith("era ")} == set(known)
     for name, command in known.items():
-        named = set(re.findall(r"^\| `.*?(--[a-z-]+)", listed[name], re.MULTILINE))
+        named = set(re.findall(r"^\| `(?:-\w, )?(--[a-z-]+)", listed[name], re.MULTILINE))
         options = {option.opts[-1] for option in command.params if option.opts[-1][:2] == "--"}
         assert named == options - {"--help"}, name
 

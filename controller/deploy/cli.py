@@ -39,7 +39,7 @@ def install(
         Path, typer.Option(help="Install below this folder, e.g. of a system image.")
     ] = Path("/"),
 ) -> None:
-    """Install a hardened systemd unit, its user and udev rules; print what to run next.
+    """Install a hardened systemd unit, its user and udev rules. Prints what to run next.
 
     The unit allows only the devices and networks that the daemon's file uses.
     """

@@ -173,7 +173,7 @@ def _replay(path: Path, seen: "Witness") -> list["Violation"]:
 
     end = None
     for piece in read_capture(path, wires=seen.wires):
-        seen.bytes(piece.wire, piece.toward, piece.time, piece.data)
+        seen.bytes(piece.wire, piece.direction, piece.time, piece.data)
         end = piece.time
     if end is None:
         raise InputError(

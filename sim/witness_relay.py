@@ -18,8 +18,8 @@ import serial
 
 from drivers.errors import LinkError
 from sim.transport.pseudo_terminal import PseudoTerminal
+from sim.witness.decoded import Direction
 from sim.witness.endpoint import WireEndpoint
-from sim.witness.seen import Toward
 from sim.witness.witness import Witness
 
 _READ_MAX = 4096
@@ -108,7 +108,7 @@ async def _network(place: WireEndpoint, name: str, witness: Witness) -> AsyncIte
         if not open_now:
             witness.closed(name, time.monotonic())
 
-    def shown(toward: Toward, data: bytes) -> None:
+    def shown(toward: Direction, data: bytes) -> None:
         witness.bytes(name, toward, time.monotonic(), data)
 
     async def connect(front: "_Half") -> None:
@@ -151,12 +151,12 @@ class _Half(asyncio.Protocol):
 
     def __init__(
         self,
-        toward: Toward,
-        shown: Callable[[Toward, bytes], None],
+        toward: Direction,
+        shown: Callable[[Direction, bytes], None],
         opened: Callable[["_Half"], None],
         closed: Callable[["_Half"], None],
     ) -> None:
-        self._toward: Toward = toward
+        self._toward: Direction = toward
         self._shown = shown
         self._opened = opened
         self._closed = closed

@@ -9,24 +9,24 @@ from collections.abc import Mapping
 
 from sim.witness import quantities as q
 from sim.witness.can_text import CanFrame, SlcanText, SocketcandText
-from sim.witness.quantities import OutOfRange, value, whole
-from sim.witness.seen import (
-    Answered,
-    Asked,
-    Condition,
+from sim.witness.decoded import (
+    BootUp,
+    ChannelCommand,
     Damaged,
-    Decoded,
-    Drive,
-    Kind,
-    Meaning,
-    Restarted,
-    Told,
-    Toward,
+    DecodedFrame,
+    Direction,
+    Message,
+    Reply,
+    Request,
+    RequestKind,
+    StateEvent,
+    Status,
 )
+from sim.witness.quantities import OutOfRange, value, whole
 
 _ACTIONS = (
-    *(Kind.STATUS, Kind.APPLY, Kind.STAGE, Kind.COMMIT),
-    *(Kind.ARM, Kind.DISARM, Kind.STOP, Kind.CLEAR),
+    *(RequestKind.STATUS, RequestKind.APPLY, RequestKind.STAGE, RequestKind.COMMIT),
+    *(RequestKind.ARM, RequestKind.DISARM, RequestKind.STOP, RequestKind.CLEAR),
 )
 _FILLING = b"\xff" * 8
 _PER_NODE = 4
@@ -43,33 +43,33 @@ class CanDecoder:
         }
         self._nodes = {node: _Node(node, channels) for node, channels in nodes.items()}
 
-    def feed(self, toward: Toward, time: float, data: bytes) -> list[Decoded]:
+    def feed(self, direction: Direction, time: float, data: bytes) -> list[DecodedFrame]:
         """What these bytes complete."""
-        seen: list[Decoded] = []
-        for text in self._text[toward].feed(data):
+        seen: list[DecodedFrame] = []
+        for text in self._text[direction].feed(data):
             if text.is_damaged:
                 seen.append((text.raw, Damaged("a line that makes no frame")))
             elif text.frame is not None:
-                seen += [(text.raw, meaning) for meaning in self.take(toward, text.frame)]
+                seen += [(text.raw, message) for message in self.take(direction, text.frame)]
         return seen
 
-    def is_amid(self, toward: Toward) -> bool:
+    def has_partial_frame(self, direction: Direction) -> bool:
         """Whether the last bytes that went this way have begun what others may complete."""
-        return self._text[toward].is_amid
+        return self._text[direction].has_partial_frame
 
-    def take(self, toward: Toward, frame: CanFrame) -> list[Meaning | None]:
+    def take(self, direction: Direction, frame: CanFrame) -> list[Message | None]:
         """What one frame means, to each amplifier that it concerns."""
         try:
-            if toward == "amplifier":
-                return self._asked(frame)
-            return self._said(frame)
+            if direction == "amplifier":
+                return self._decode_request(frame)
+            return self._decode_reply(frame)
         except (OutOfRange, struct.error, IndexError) as problem:
             node = frame.identifier & 0x7F
-            if toward == "amplifier":
-                return [Asked(Kind.LOOK, node, problem=str(problem))]
+            if direction == "amplifier":
+                return [Request(RequestKind.READ, node, problem=str(problem))]
             return [Damaged(f"a frame that makes no message: {problem}")]
 
-    def _asked(self, frame: CanFrame) -> list[Meaning | None]:
+    def _decode_request(self, frame: CanFrame) -> list[Message | None]:
         function, number = frame.identifier & 0x780, frame.identifier & 0x7F
         if frame.identifier == 0:
             return [None]
@@ -79,7 +79,7 @@ class CanDecoder:
                 node.shaped.clear()
             return [None]
         if function == 0x700:
-            return [Asked(Kind.PING, 128 - number)]
+            return [Request(RequestKind.PING, 128 - number)]
         if frame.identifier == 0x480:
             return [_broadcast(frame)]
         if function == 0x480 and number in self._nodes:
@@ -91,24 +91,24 @@ class CanDecoder:
         if function == 0x600 and number in self._nodes:
             index = int.from_bytes(frame.data[1:3], "little")
             identifies = frame.data[0] == 0x40 and index in (0x1018, 0x2000)
-            return [Asked(Kind.HELLO if identifies else Kind.LOOK, number)]
+            return [Request(RequestKind.HELLO if identifies else RequestKind.READ, number)]
         return [None]
 
-    def _said(self, frame: CanFrame) -> list[Meaning | None]:
+    def _decode_reply(self, frame: CanFrame) -> list[Message | None]:
         function, number = frame.identifier & 0x780, frame.identifier & 0x7F
         if function == 0x700 and frame.data == b"\0" and number in self._nodes:
-            return [Restarted(number)]
+            return [BootUp(number)]
         if function == 0x080 and number in self._nodes:
             state = frame.data[3] & 0xF
-            return [Told(number, state, frame.data[3] >> 4)]
+            return [StateEvent(number, state, frame.data[3] >> 4)]
         if function == 0x580 and number in self._nodes:
             # Of a transfer nobody knows here when it was carried out: it may have fed the watchdog.
-            return [Answered(number, "objects")]
+            return [Reply(number, "objects")]
         for node in self._nodes.values():
             if frame.identifier == 0x180 + node.number:
-                return [node.answer(frame)]
+                return [node.reply(frame)]
             if frame.identifier == 0x280 + node.number:
-                node.condition = frame.data
+                node.status = frame.data
                 return [None]
             if function == 0x380 and number in node.numbers:
                 node.levels[number - node.number] = frame.data
@@ -124,7 +124,7 @@ class _Node:
         self.numbers = range(number, number + max(1, -(-channels // _PER_NODE)))
         self.commands: dict[int, bytes] = {}
         self.shaped: dict[int, tuple[int, int, int]] = {}
-        self.condition: bytes | None = None
+        self.status: bytes | None = None
         self.levels: dict[int, bytes] = {}
 
     def owns(self, frame: CanFrame) -> bool:
@@ -154,7 +154,7 @@ class _Node:
             if block != _FILLING:
                 self.commands[block[6] >> 4] = block
 
-    def order(self, frame: CanFrame) -> Asked:
+    def order(self, frame: CanFrame) -> Request:
         """An order, with what has come under its number."""
         token, ramp, time, what, sequence = struct.unpack_from("<HHHBB", frame.data)
         kind, count = _ACTIONS[what & 7], what >> 3
@@ -163,28 +163,28 @@ class _Node:
             self.take_blocks(frame.data[8:])
         key = (self.number, sequence, kind)
         problem = "" if sequence else "an order with the sequence number 0"
-        drives: dict[int, Drive] = {}
+        commands: dict[int, ChannelCommand] = {}
         try:
-            if kind in (Kind.APPLY, Kind.STAGE):
-                drives = self._drives(sequence)
-                if len(drives) != count:
-                    problem = f"torn: {len(drives)} of {count} commands have come"
-            return Asked(
+            if kind in (RequestKind.APPLY, RequestKind.STAGE):
+                commands = self._channel_commands(sequence)
+                if len(commands) != count:
+                    problem = f"torn: {len(commands)} of {count} commands have come"
+            return Request(
                 kind,
                 self.number,
                 key,
                 token=whole(q.TOKEN, token, "token") if _has_token(kind) else 0,
                 ramp=value(q.RAMP, ramp, "ramp"),
-                valid_for=value(q.VALID_FOR, time, "valid_for") if drives else 0.0,
-                watchdog=value(q.WATCHDOG, time, "watchdog") if kind is Kind.ARM else 0.0,
-                drives=drives,
+                valid_for=value(q.VALID_FOR, time, "valid_for") if commands else 0.0,
+                watchdog=value(q.WATCHDOG, time, "watchdog") if kind is RequestKind.ARM else 0.0,
+                commands=commands,
                 problem=problem,
             )
         except OutOfRange as wrong:
-            return Asked(kind, self.number, key, problem=str(wrong))
+            return Request(kind, self.number, key, problem=str(wrong))
 
-    def _drives(self, sequence: int) -> dict[int, Drive]:
-        drives = {}
+    def _channel_commands(self, sequence: int) -> dict[int, ChannelCommand]:
+        commands = {}
         for channel, block in self.commands.items():
             frequency, level, phase, flags, own = struct.unpack("<HHhBB", block)
             if own != sequence:
@@ -194,7 +194,7 @@ class _Node:
             onset, ending, of = self.shaped.get(channel, (0, 0, -1)) if flags & 4 else (0, 0, own)
             if of != own:
                 raise OutOfRange(f"torn: the slots of channel {channel} are missing")
-            drives[channel] = Drive(
+            commands[channel] = ChannelCommand(
                 value(q.FREQUENCY, frequency, "frequency"),
                 value(q.LEVEL, level, "level"),
                 value(q.PHASE, phase, "phase"),
@@ -203,33 +203,37 @@ class _Node:
                 onset=onset,
                 ending=ending,
             )
-        return drives
+        return commands
 
-    def answer(self, frame: CanFrame) -> Meaning:
+    def reply(self, frame: CanFrame) -> Message:
         """An answer with the condition and levels that came before it, or an event."""
         sequence, what, both, _, token, left = struct.unpack_from("<BBBBHH", frame.data)
         state, fault = whole(q.STATE, both & 0xF, "state"), whole(q.FAULT, both >> 4, "fault")
         if sequence == 0:
-            return Told(self.number, state, fault)
+            return StateEvent(self.number, state, fault)
         if frame.is_fd:
             self._take_answer(frame.data[8:])
-        condition, levels = self.condition, self.levels
-        self.condition, self.levels = None, {}
+        status, levels = self.status, self.levels
+        self.status, self.levels = None, {}
         result = what >> 4
         high_voltage = temperature = said = None
-        if condition is not None and condition[0] == sequence:
-            _, flag, degrees, _, count = struct.unpack_from("<BBhHB", condition)
+        if status is not None and status[0] == sequence:
+            _, flag, degrees, _, count = struct.unpack_from("<BBhHB", status)
             high_voltage, temperature = bool(flag & 1), degrees * 0.1
             said = _levels(levels, count & 0x1F, sequence)
         kind = _ACTIONS[what & 7]
-        is_whole = said is not None or result or kind in (Kind.APPLY, Kind.STAGE, Kind.COMMIT)
-        return Answered(
+        is_whole = (
+            said is not None
+            or result
+            or kind in (RequestKind.APPLY, RequestKind.STAGE, RequestKind.COMMIT)
+        )
+        return Reply(
             self.number,
             (self.number, sequence, kind),
             refusal=result,
             problem="" if is_whole else "its condition or its levels are missing",
-            is_as_asked=bool(what & 8) if kind in (Kind.APPLY, Kind.STAGE) else None,
-            condition=Condition(
+            is_exact=bool(what & 8) if kind in (RequestKind.APPLY, RequestKind.STAGE) else None,
+            status=Status(
                 state=state,
                 fault=fault,
                 token=token,
@@ -244,21 +248,21 @@ class _Node:
         blocks = [data[at : at + 8] for at in range(0, len(data) - 7, 8)]
         blocks = [block for block in blocks if block != _FILLING]
         if blocks:
-            self.condition = blocks[0]
+            self.status = blocks[0]
             self.levels = dict(enumerate(blocks[1:]))
 
 
-def _has_token(kind: Kind) -> bool:
-    return kind in (Kind.APPLY, Kind.STAGE, Kind.COMMIT)
+def _has_token(kind: RequestKind) -> bool:
+    return kind in (RequestKind.APPLY, RequestKind.STAGE, RequestKind.COMMIT)
 
 
-def _broadcast(frame: CanFrame) -> Asked:
+def _broadcast(frame: CanFrame) -> Request:
     token, ramp, _, what, _ = struct.unpack_from("<HHHBB", frame.data)
     kind = _ACTIONS[what & 7]
-    if kind is Kind.COMMIT:
-        return Asked(kind, 0, token=whole(q.TOKEN, token, "token"))
-    if kind is Kind.STOP:
-        return Asked(kind, 0, ramp=value(q.RAMP, ramp, "ramp"))
+    if kind is RequestKind.COMMIT:
+        return Request(kind, 0, token=whole(q.TOKEN, token, "token"))
+    if kind is RequestKind.STOP:
+        return Request(kind, 0, ramp=value(q.RAMP, ramp, "ramp"))
     raise OutOfRange(f"{kind.value} to all")
 
 

@@ -8,7 +8,7 @@ each other beside frames means nothing here.
 import re
 from typing import NamedTuple
 
-from sim.witness.seen import Toward
+from sim.witness.decoded import Direction
 
 LENGTHS = (0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64)
 """That a CAN FD frame can have."""
@@ -40,12 +40,12 @@ class Text(NamedTuple):
 class SocketcandText:
     """Elements `< ... >` that go one way."""
 
-    def __init__(self, toward: Toward) -> None:
-        self._toward: Toward = toward
+    def __init__(self, direction: Direction) -> None:
+        self._toward: Direction = direction
         self._rest = b""
 
     @property
-    def is_amid(self) -> bool:
+    def has_partial_frame(self) -> bool:
         """Whether the last bytes have begun what others may complete."""
         return bool(self._rest)
 
@@ -76,11 +76,11 @@ class SocketcandText:
 class SlcanText:
     """Lines that go one way; each direction ends them with CR, refusals with BELL."""
 
-    def __init__(self, toward: Toward) -> None:
+    def __init__(self, direction: Direction) -> None:
         self._rest = b""
 
     @property
-    def is_amid(self) -> bool:
+    def has_partial_frame(self) -> bool:
         """Whether the last bytes have begun what others may complete."""
         return bool(self._rest)
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from model.errors import InputError
-from sim.witness.seen import Toward
+from sim.witness.decoded import Direction
 
 
 class Piece(NamedTuple):
@@ -21,7 +21,7 @@ class Piece(NamedTuple):
 
     time: float
     wire: str
-    toward: Toward
+    direction: Direction
     data: bytes
 
 
@@ -60,7 +60,7 @@ def read_capture(path: Path, *, wires: Collection[str] = ()) -> Iterator[Piece]:
 
 
 def _piece(text: str, where: str) -> Piece:
-    arrows: dict[str, Toward] = {">": "amplifier", "<": "host"}
+    arrows: dict[str, Direction] = {">": "amplifier", "<": "host"}
     parts = text.split(maxsplit=3)
     try:
         time, wire, arrow, digits = parts

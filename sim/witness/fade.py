@@ -7,7 +7,7 @@ both are added; tones add with any phase, so that a level is known within bounds
 import math
 from typing import NamedTuple
 
-FREE = (0.0, 1.0)
+UNKNOWN = (0.0, 1.0)
 """Bounds that say nothing."""
 
 
@@ -21,17 +21,17 @@ class Fade(NamedTuple):
     ramp: float = 0.0
     before: tuple[float, float] = (0.0, 0.0)
     after: float = 0.0
-    free_until: float = -math.inf
+    unknown_until: float = -math.inf
 
     @property
     def settled_from(self) -> float:
         """When nothing fades any more [s]."""
-        return max(self.begin[1] + self.ramp, self.free_until)
+        return max(self.begin[1] + self.ramp, self.unknown_until)
 
     def at(self, time: float) -> tuple[float, float]:
         """Lowest and highest level at a time [s]."""
-        if time < self.free_until:
-            return FREE
+        if time < self.unknown_until:
+            return UNKNOWN
         early, late = (self._gain(time - begin) for begin in self.begin)
         low = max(0.0, *self._left(time))
         return low, self.before[1] * (1 - late) + self.after * early

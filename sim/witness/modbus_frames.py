@@ -3,22 +3,22 @@
 import struct
 from typing import NamedTuple, Protocol
 
-from sim.witness.seen import Toward
+from sim.witness.decoded import Direction
 
 _SHORTEST, _LONGEST = 4, 256
 _PAUSE = 0.04  # s; what pauses longer inside a frame is none any more
-_SIZES: dict[Toward, dict[int, int]] = {
+_SIZES: dict[Direction, dict[int, int]] = {
     "amplifier": {3: 8, 4: 8, 6: 8, 43: 7},
     "host": {6: 8, 16: 8},
 }
 # Where the others say how many bytes follow, and how many frame them, CRC included.
-_COUNTS: dict[Toward, dict[int, tuple[int, int]]] = {
+_COUNTS: dict[Direction, dict[int, tuple[int, int]]] = {
     "amplifier": {16: (6, 9), 23: (10, 13)},
     "host": {3: (2, 5), 4: (2, 5), 23: (2, 5)},
 }
 
 
-class Telegram(NamedTuple):
+class Adu(NamedTuple):
     """A frame; number: the transaction of TCP, 0 over RTU. pdu is None for what was damaged."""
 
     raw: bytes
@@ -31,10 +31,10 @@ class Splitter(Protocol):
     """Takes telegrams that go one way out of a stream."""
 
     @property
-    def is_amid(self) -> bool:
+    def has_partial_frame(self) -> bool:
         """Whether the last bytes have begun what others may complete."""
 
-    def feed(self, time: float, data: bytes) -> list[Telegram]:
+    def feed(self, time: float, data: bytes) -> list[Adu]:
         """What these bytes complete."""
 
 
@@ -45,45 +45,45 @@ class TcpSplitter:
         self._buffer = b""
 
     @property
-    def is_amid(self) -> bool:
+    def has_partial_frame(self) -> bool:
         """Whether the last bytes have begun what others may complete."""
         return bool(self._buffer)
 
-    def feed(self, time: float, data: bytes) -> list[Telegram]:
+    def feed(self, time: float, data: bytes) -> list[Adu]:
         """What these bytes complete."""
         self._buffer += data
         found = []
         while len(self._buffer) >= 7:
             number, protocol, length, unit = struct.unpack_from(">HHHB", self._buffer)
             if protocol or not 2 <= length <= 254:
-                found.append(Telegram(self._buffer, unit, number, None))
+                found.append(Adu(self._buffer, unit, number, None))
                 self._buffer = b""
                 break
             if len(self._buffer) < 6 + length:
                 break
             raw, self._buffer = self._buffer[: 6 + length], self._buffer[6 + length :]
-            found.append(Telegram(raw, unit, number, raw[7:]))
+            found.append(Adu(raw, unit, number, raw[7:]))
         return found
 
 
 class RtuSplitter:
     """Telegrams whose length their function tells; CRC-16, low byte first."""
 
-    def __init__(self, toward: Toward) -> None:
-        self._toward: Toward = toward
+    def __init__(self, direction: Direction) -> None:
+        self._toward: Direction = direction
         self._buffer = b""
         self._last = 0.0
 
     @property
-    def is_amid(self) -> bool:
+    def has_partial_frame(self) -> bool:
         """Whether the last bytes have begun what others may complete."""
         return bool(self._buffer)
 
-    def feed(self, time: float, data: bytes) -> list[Telegram]:
+    def feed(self, time: float, data: bytes) -> list[Adu]:
         """What these bytes complete."""
         found = []
         if self._buffer and time - self._last > _PAUSE:
-            found.append(Telegram(self._buffer, self._buffer[0], 0, None))
+            found.append(Adu(self._buffer, self._buffer[0], 0, None))
             self._buffer = b""
         self._last = time
         self._buffer += data
@@ -94,7 +94,7 @@ class RtuSplitter:
             if begin:
                 found.append(self._damaged(begin))
             raw, self._buffer = self._buffer[:size], self._buffer[size:]
-            found.append(Telegram(raw, raw[0], 0, raw[1:-2]))
+            found.append(Adu(raw, raw[0], 0, raw[1:-2]))
         if len(self._buffer) >= _SHORTEST and not self._may_become_whole():
             found.append(self._damaged(len(self._buffer)))
         return found
@@ -114,9 +114,9 @@ class RtuSplitter:
         """Whether what has come may be the beginning of a telegram."""
         return len(self._buffer) < self._size(self._buffer)
 
-    def _damaged(self, size: int) -> Telegram:
+    def _damaged(self, size: int) -> Adu:
         raw, self._buffer = self._buffer[:size], self._buffer[size:]
-        return Telegram(raw, raw[0], 0, None)
+        return Adu(raw, raw[0], 0, None)
 
     def _size(self, data: bytes) -> int:
         """How long the telegram is that begins so; 0 where none can."""

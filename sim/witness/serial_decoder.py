@@ -6,76 +6,83 @@ from collections import deque
 from dataclasses import replace
 
 from sim.witness import quantities as q
-from sim.witness.quantities import OutOfRange, value, whole
-from sim.witness.seen import (
-    ANSWERS_DAMAGE,
-    Answered,
-    Asked,
-    Condition,
+from sim.witness.decoded import (
+    REPLY_TO_DAMAGED_FRAME,
+    ChannelCommand,
     Damaged,
-    Decoded,
-    Drive,
-    Kind,
-    Meaning,
-    Shape,
-    Told,
-    Toward,
+    DecodedFrame,
+    Direction,
+    EnvelopeLoad,
+    Message,
+    Reply,
+    Request,
+    RequestKind,
+    StateEvent,
+    Status,
 )
+from sim.witness.quantities import OutOfRange, value, whole
 
 _KINDS = {
-    1: Kind.HELLO,
-    2: Kind.CAPABILITIES,
-    3: Kind.ARM,
-    4: Kind.DISARM,
-    5: Kind.STAGE,
-    6: Kind.COMMIT,
-    7: Kind.APPLY,
-    8: Kind.STOP,
-    9: Kind.STATUS,
-    10: Kind.FAULTS,
-    11: Kind.CLEAR,
-    12: Kind.PING,
-    13: Kind.ENVELOPE,
+    1: RequestKind.HELLO,
+    2: RequestKind.CAPABILITIES,
+    3: RequestKind.ARM,
+    4: RequestKind.DISARM,
+    5: RequestKind.STAGE,
+    6: RequestKind.COMMIT,
+    7: RequestKind.APPLY,
+    8: RequestKind.STOP,
+    9: RequestKind.STATUS,
+    10: RequestKind.FAULTS,
+    11: RequestKind.CLEAR,
+    12: RequestKind.PING,
+    13: RequestKind.ENVELOPE,
 }
 _EVENT, _NAK = 30, 31
 _LONGEST = 249  # bytes between two zeros
 _DAMAGED = 16  # frames that are remembered, lest one of them is answered
-_STATUS_OF = {Kind.ARM, Kind.DISARM, Kind.STOP, Kind.STATUS, Kind.CLEAR, Kind.PING}
-_SET_OF = {Kind.STAGE, Kind.COMMIT, Kind.APPLY}
+_STATUS_OF = {
+    RequestKind.ARM,
+    RequestKind.DISARM,
+    RequestKind.STOP,
+    RequestKind.STATUS,
+    RequestKind.CLEAR,
+    RequestKind.PING,
+}
+_SET_OF = {RequestKind.STAGE, RequestKind.COMMIT, RequestKind.APPLY}
 
 
 class SerialDecoder:
     """Bytes both ways to meanings; any bytes may come."""
 
     def __init__(self) -> None:
-        self._rest: dict[Toward, bytes] = {"amplifier": b"", "host": b""}
+        self._rest: dict[Direction, bytes] = {"amplifier": b"", "host": b""}
         self._damaged: deque[int] = deque(maxlen=_DAMAGED)
 
-    def feed(self, toward: Toward, time: float, data: bytes) -> list[Decoded]:
+    def feed(self, direction: Direction, time: float, data: bytes) -> list[DecodedFrame]:
         """What these bytes complete."""
-        *pieces, rest = (self._rest[toward] + data).split(b"\0")
-        self._rest[toward] = rest[-2 * _LONGEST :]
-        return [(b"\0" + one + b"\0", self._meaning(toward, one)) for one in pieces if one]
+        *pieces, rest = (self._rest[direction] + data).split(b"\0")
+        self._rest[direction] = rest[-2 * _LONGEST :]
+        return [(b"\0" + one + b"\0", self._decode(direction, one)) for one in pieces if one]
 
-    def is_amid(self, toward: Toward) -> bool:
+    def has_partial_frame(self, direction: Direction) -> bool:
         """Whether the last bytes that went this way have begun what others may complete."""
-        return bool(self._rest[toward])
+        return bool(self._rest[direction])
 
-    def _meaning(self, toward: Toward, piece: bytes) -> Meaning:
-        meaning = _meaning(toward, piece)
-        if toward == "amplifier":
+    def _decode(self, direction: Direction, piece: bytes) -> Message:
+        message = _decode(direction, piece)
+        if direction == "amplifier":
             content = _unstuffed(piece) or b""
             sequence = int.from_bytes(content[2:4], "little")
-            if isinstance(meaning, Damaged):
+            if isinstance(message, Damaged):
                 self._damaged.append(sequence)
             elif sequence in self._damaged:
                 self._damaged.remove(sequence)
-        elif isinstance(meaning, Answered) and _sequence(meaning) in self._damaged:
-            return replace(meaning, key=None, problem=ANSWERS_DAMAGE)
-        return meaning
+        elif isinstance(message, Reply) and _sequence(message) in self._damaged:
+            return replace(message, key=None, problem=REPLY_TO_DAMAGED_FRAME)
+        return message
 
 
-def _meaning(toward: Toward, piece: bytes) -> Meaning:
+def _decode(direction: Direction, piece: bytes) -> Message:
     body = _unstuffed(piece)
     if body is None or len(body) < 8:
         return Damaged("no frame: it cannot be unstuffed, or is too short or too long")
@@ -86,21 +93,21 @@ def _meaning(toward: Toward, piece: bytes) -> Meaning:
     payload = content[4:]
     if first >> 5 & 3 != 1:
         return Damaged(f"version {first >> 5 & 3} of the protocol")
-    if bool(first & 0x80) != (toward == "host"):
+    if bool(first & 0x80) != (direction == "host"):
         return Damaged("a reply from the host, or a request from an amplifier")
     try:
-        if toward == "amplifier":
-            return _asked(first & 0x1F, address, sequence, payload)
-        return _said(first & 0x1F, address, sequence, payload)
+        if direction == "amplifier":
+            return _decode_request(first & 0x1F, address, sequence, payload)
+        return _decode_reply(first & 0x1F, address, sequence, payload)
     except (OutOfRange, struct.error, IndexError) as problem:
-        if toward == "amplifier":
-            kind = _KINDS.get(first & 0x1F, Kind.LOOK)
-            return Asked(kind, address, (sequence, kind), problem=str(problem) or "too short")
+        if direction == "amplifier":
+            kind = _KINDS.get(first & 0x1F, RequestKind.READ)
+            return Request(kind, address, (sequence, kind), problem=str(problem) or "too short")
         return Damaged(f"a payload that makes no message: {problem}")
 
 
-def _sequence(answer: Answered) -> object:
-    return answer.key[0] if isinstance(answer.key, tuple) else None
+def _sequence(reply: Reply) -> object:
+    return reply.key[0] if isinstance(reply.key, tuple) else None
 
 
 def _unstuffed(piece: bytes) -> bytes | None:
@@ -121,45 +128,52 @@ def _unstuffed(piece: bytes) -> bytes | None:
     return bytes(found)
 
 
-def _asked(number: int, address: int, sequence: int, payload: bytes) -> Asked:
+def _decode_request(number: int, address: int, sequence: int, payload: bytes) -> Request:
     if number not in _KINDS:
         raise OutOfRange(f"there is no message of type {number}")
     kind = _KINDS[number]
     key = None if address == 0 else (sequence, kind)
-    size = {Kind.ARM: 2, Kind.DISARM: 2, Kind.COMMIT: 2, Kind.STOP: 2}.get(kind, 0)
-    if kind in (Kind.STAGE, Kind.APPLY):
-        token, ramp, valid_for, drives = _set(payload)
-        return Asked(kind, address, key, token=token, ramp=ramp, valid_for=valid_for, drives=drives)
-    if kind is Kind.ENVELOPE:
-        return Asked(kind, address, key, shape=_shape(payload))
+    size = {
+        RequestKind.ARM: 2,
+        RequestKind.DISARM: 2,
+        RequestKind.COMMIT: 2,
+        RequestKind.STOP: 2,
+    }.get(kind, 0)
+    if kind in (RequestKind.STAGE, RequestKind.APPLY):
+        token, ramp, valid_for, commands = _set(payload)
+        return Request(
+            kind, address, key, token=token, ramp=ramp, valid_for=valid_for, commands=commands
+        )
+    if kind is RequestKind.ENVELOPE:
+        return Request(kind, address, key, envelope=_envelope(payload))
     if len(payload) != size:
         raise OutOfRange(f"{kind.value} has {len(payload)} bytes of payload instead of {size}")
     number = int.from_bytes(payload, "little")
     match kind:
-        case Kind.ARM:
-            return Asked(kind, address, key, watchdog=value(q.WATCHDOG, number, "watchdog"))
-        case Kind.DISARM | Kind.STOP:
-            return Asked(kind, address, key, ramp=value(q.RAMP, number, "ramp"))
-        case Kind.COMMIT:
-            return Asked(kind, address, key, token=whole(q.TOKEN, number, "token"))
+        case RequestKind.ARM:
+            return Request(kind, address, key, watchdog=value(q.WATCHDOG, number, "watchdog"))
+        case RequestKind.DISARM | RequestKind.STOP:
+            return Request(kind, address, key, ramp=value(q.RAMP, number, "ramp"))
+        case RequestKind.COMMIT:
+            return Request(kind, address, key, token=whole(q.TOKEN, number, "token"))
         case _:
-            return Asked(kind, address, key)
+            return Request(kind, address, key)
 
 
-def _set(payload: bytes) -> tuple[int, float, float, dict[int, Drive]]:
+def _set(payload: bytes) -> tuple[int, float, float, dict[int, ChannelCommand]]:
     token, ramp, valid_for = struct.unpack_from("<HHH", payload)
-    drives = _drives(payload[6:])
+    commands = _channel_commands(payload[6:])
     return (
         whole(q.TOKEN, token, "token"),
         value(q.RAMP, ramp, "ramp"),
         value(q.VALID_FOR, valid_for, "valid_for"),
-        drives,
+        commands,
     )
 
 
-def _drives(data: bytes) -> dict[int, Drive]:
+def _channel_commands(data: bytes) -> dict[int, ChannelCommand]:
     count = whole(q.CHANNEL_COUNT, data[0], "channel_count")
-    at, drives = 1, {}
+    at, commands = 1, {}
     for _ in range(count):
         channel, flags, frequency, level, phase = struct.unpack_from("<BBHHh", data, at)
         at += 8
@@ -167,9 +181,9 @@ def _drives(data: bytes) -> dict[int, Drive]:
         if flags & 4:
             onset, ending = struct.unpack_from("<BB", data, at)
             at += 2
-        if flags & ~7 or channel in drives:
+        if flags & ~7 or channel in commands:
             raise OutOfRange(f"flags {flags:#04x}, or channel {channel} named twice")
-        drives[whole(q.CHANNEL, channel, "channel")] = Drive(
+        commands[whole(q.CHANNEL, channel, "channel")] = ChannelCommand(
             value(q.FREQUENCY, frequency, "frequency"),
             value(q.LEVEL, level, "level"),
             value(q.PHASE, phase, "phase"),
@@ -180,10 +194,10 @@ def _drives(data: bytes) -> dict[int, Drive]:
         )
     if at != len(data):
         raise OutOfRange(f"{len(data) - at} bytes too many")
-    return drives
+    return commands
 
 
-def _shape(payload: bytes) -> Shape:
+def _envelope(payload: bytes) -> EnvelopeLoad:
     slot, step, count = struct.unpack_from("<BHB", payload)
     knots = [struct.unpack_from("<Hh", payload, 4 + 4 * number) for number in range(count)]
     if len(payload) != 4 + 4 * count:
@@ -191,39 +205,41 @@ def _shape(payload: bytes) -> Shape:
     whole(q.KNOTS, count, "envelope_knots")
     for _, phase in knots:
         value(q.PHASE, phase, "phase of a knot")
-    return Shape(
+    return EnvelopeLoad(
         whole(q.SLOT, slot, "envelope_slot"),
         value(q.STEP, step, "envelope_step"),
         tuple(value(q.LEVEL, level, "level of a knot") for level, _ in knots),
     )
 
 
-def _said(number: int, address: int, sequence: int, payload: bytes) -> Meaning:
+def _decode_reply(number: int, address: int, sequence: int, payload: bytes) -> Message:
     if number == _EVENT:
         state, fault, _ = struct.unpack("<BBB", payload)
-        return Told(address, whole(q.STATE, state, "state"), whole(q.FAULT, fault, "fault"))
+        return StateEvent(address, whole(q.STATE, state, "state"), whole(q.FAULT, fault, "fault"))
     if number == _NAK:
         refused, code, _ = struct.unpack("<BBB", payload)
-        return Answered(address, (sequence, _KINDS.get(refused)), refusal=code)
+        return Reply(address, (sequence, _KINDS.get(refused)), refusal=code)
     kind = _KINDS.get(number)
     if kind in _STATUS_OF:
-        return Answered(address, (sequence, kind), condition=_condition(payload))
+        return Reply(address, (sequence, kind), status=_decode_status(payload))
     if kind in _SET_OF:
         token = whole(q.TOKEN, int.from_bytes(payload[:2], "little"), "token")
-        return Answered(address, (sequence, kind), token=token, achieved=_drives(payload[2:]))
+        return Reply(
+            address, (sequence, kind), token=token, achieved=_channel_commands(payload[2:])
+        )
     if kind is None:
         raise OutOfRange(f"there is no message of type {number}")
-    return Answered(address, (sequence, kind))
+    return Reply(address, (sequence, kind))
 
 
-def _condition(payload: bytes) -> Condition:
+def _decode_status(payload: bytes) -> Status:
     state, fault, token, flags, temperature, left, _, count = struct.unpack_from(
         "<BBHBhHHB", payload
     )
     levels = struct.unpack_from(f"<{count}H", payload, 12)
     if len(payload) != 12 + 2 * count or flags & ~1:
         raise OutOfRange("a status of another length than its channels, or with unknown flags")
-    return Condition(
+    return Status(
         state=whole(q.STATE, state, "state"),
         fault=whole(q.FAULT, fault, "fault"),
         token=token,

@@ -3,81 +3,89 @@
 import math
 from collections.abc import Mapping
 
-from sim.witness.seen import Asked, Drive
-from sim.witness.side import Side
+from sim.witness.amplifier_session import AmplifierSession
+from sim.witness.decoded import ChannelCommand, Request
 
 _STEP = 0.6  # of a step of the wire: what rounding may make
 
-Expected = Mapping[str, Mapping[int, tuple[float, float, float]]]
+ExpectedSets = Mapping[str, Mapping[int, tuple[float, float, float]]]
 """What a touch should give, by amplifier and channel: Hz, level, degrees."""
 
 
-def check_set(side: Side, time: float, asked: Asked, expected: Expected | None) -> None:
+def check_set(
+    session: AmplifierSession, time: float, request: Request, expected: ExpectedSets | None
+) -> None:
     """Its token, its limits, and that it is what is expected, where anything is."""
-    _check_token(side, time, asked)
-    for channel, drive in asked.drives.items():
-        if drive.vibrates:
-            _check_limits(side, time, channel, drive, asked.ramp)
-    if asked.vibrates and expected is not None:
-        _check_expected(side, time, asked, expected)
+    _check_token(session, time, request)
+    for channel, command in request.commands.items():
+        if command.vibrates:
+            _check_limits(session, time, channel, command, request.ramp)
+    if request.vibrates and expected is not None:
+        _check_expected(session, time, request, expected)
 
 
-def check_shape(side: Side, time: float, level: float) -> None:
+def check_shape(session: AmplifierSession, time: float, level: float) -> None:
     """An envelope that goes to this level is within the limits of some channel."""
-    highest = max((limits.level for limits in side.plan.channels.values()), default=0.0)
+    highest = max((limits.level for limits in session.config.channels.values()), default=0.0)
     if level > highest + 1e-4 * _STEP:
-        side.complain(
+        session.report(
             "limits",
             time,
-            f"an envelope of {side.name} goes to level {level:g}; allowed is {highest:g}",
+            f"an envelope of {session.name} goes to level {level:g}; allowed is {highest:g}",
         )
 
 
-def _check_token(side: Side, time: float, asked: Asked) -> None:
-    for place, (token, other) in enumerate(side.tokens):
-        is_last = place == len(side.tokens) - 1
-        if token == asked.token and not (is_last and other.drives == asked.drives):
-            side.complain(
+def _check_token(session: AmplifierSession, time: float, request: Request) -> None:
+    for place, (token, other) in enumerate(session.tokens):
+        is_last = place == len(session.tokens) - 1
+        if token == request.token and not (is_last and other.commands == request.commands):
+            session.report(
                 "token",
                 time,
-                f"set {token} is sent to {side.name} again "
+                f"set {token} is sent to {session.name} again "
                 + ("with other contents" if is_last else "after others"),
             )
             return
-    if not any(token == asked.token for token, _ in side.tokens):
-        side.tokens.append((asked.token, asked))
+    if not any(token == request.token for token, _ in session.tokens):
+        session.tokens.append((request.token, request))
 
 
-def _check_limits(side: Side, time: float, channel: int, drive: Drive, ramp: float) -> None:
-    limits = side.plan.channels.get(channel)
-    what = f"channel {channel} of {side.name} is told {drive.frequency:g} Hz at {drive.level:g}"
+def _check_limits(
+    session: AmplifierSession, time: float, channel: int, command: ChannelCommand, ramp: float
+) -> None:
+    limits = session.config.channels.get(channel)
+    what = (
+        f"channel {channel} of {session.name} is told {command.frequency:g} Hz at {command.level:g}"
+    )
     if limits is None:
-        side.complain("limits", time, f"{what}, but there is no such channel")
+        session.report("limits", time, f"{what}, but there is no such channel")
         return
     fine = 0.01 * _STEP
-    if not limits.frequency_min - fine <= drive.frequency <= limits.frequency_max + fine:
-        side.complain(
+    if not limits.frequency_min - fine <= command.frequency <= limits.frequency_max + fine:
+        session.report(
             "limits",
             time,
             f"{what}; allowed are {limits.frequency_min:g} to {limits.frequency_max:g} Hz",
         )
-    if drive.level > limits.level + 1e-4 * _STEP:
-        side.complain("limits", time, f"{what}; allowed is a level of {limits.level:g}")
-    before = side.levels.get(channel)
-    goes_on = before is not None and before.frequency == drive.frequency
-    rise = drive.level - (before.level if before is not None and goes_on else 0.0)
-    if not drive.onset and rise > limits.slew * ramp + 1e-4 * _STEP:
-        side.complain(
+    if command.level > limits.level + 1e-4 * _STEP:
+        session.report("limits", time, f"{what}; allowed is a level of {limits.level:g}")
+    before = session.levels.get(channel)
+    goes_on = before is not None and before.frequency == command.frequency
+    rise = command.level - (before.level if before is not None and goes_on else 0.0)
+    if not command.onset and rise > limits.slew * ramp + 1e-4 * _STEP:
+        session.report(
             "limits", time, f"{what} within {ramp:g} s; allowed is {limits.slew:g} a second"
         )
 
 
-def _check_expected(side: Side, time: float, asked: Asked, expected: Expected) -> None:
-    wanted = expected.get(side.name, {})
+def _check_expected(
+    session: AmplifierSession, time: float, request: Request, expected: ExpectedSets
+) -> None:
+    wanted = expected.get(session.name, {})
     told = {
-        channel: (drive.frequency, drive.level, drive.phase)
-        for channel, drive in asked.drives.items()
-        if drive.vibrates
+        channel: (command.frequency, command.level, command.phase)
+        for channel, command in request.commands.items()
+        if command.vibrates
     }
     same = told.keys() == wanted.keys() and all(
         abs(told[channel][0] - frequency) < 0.01 * _STEP
@@ -86,10 +94,10 @@ def _check_expected(side: Side, time: float, asked: Asked, expected: Expected) -
         for channel, (frequency, level, phase) in wanted.items()
     )
     if not same:
-        side.complain(
+        session.report(
             "pattern",
             time,
-            f"{side.name} is told {_listed(told)}; the touch asks for {_listed(wanted)}",
+            f"{session.name} is told {_listed(told)}; the touch asks for {_listed(wanted)}",
         )
 
 

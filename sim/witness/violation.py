@@ -3,7 +3,7 @@
 from collections import deque
 from dataclasses import dataclass, replace
 
-from sim.witness.seen import Toward
+from sim.witness.decoded import Direction
 
 _BEFORE, _AFTER = 6, 3
 _MOST = 200
@@ -25,9 +25,9 @@ class Violation:
         return "\n".join((head, *(f"    {frame}" for frame in self.frames)))
 
 
-def shown(time: float, toward: Toward, raw: bytes) -> str:
+def shown(time: float, direction: Direction, raw: bytes) -> str:
     """One frame as a line of a capture."""
-    return f"{time:.6f} {'>' if toward == 'amplifier' else '<'} {raw.hex(' ').upper()}"
+    return f"{time:.6f} {'>' if direction == 'amplifier' else '<'} {raw.hex(' ').upper()}"
 
 
 class Report:
@@ -36,15 +36,15 @@ class Report:
     def __init__(self) -> None:
         self.dropped = 0
         self._found: list[Violation] = []
-        self._frames: dict[str, deque[tuple[float, Toward, bytes]]] = {}
+        self._frames: dict[str, deque[tuple[float, Direction, bytes]]] = {}
         self._open: dict[int, int] = {}  # by number in the list: frames that are still wanted
 
-    def frame(self, wire: str, time: float, toward: Toward, raw: bytes) -> None:
+    def frame(self, wire: str, time: float, direction: Direction, raw: bytes) -> None:
         """A frame has passed."""
-        self._frames.setdefault(wire, deque(maxlen=_BEFORE)).append((time, toward, raw))
+        self._frames.setdefault(wire, deque(maxlen=_BEFORE)).append((time, direction, raw))
         if not self._open:
             return
-        line = shown(time, toward, raw)
+        line = shown(time, direction, raw)
         for number in [number for number in self._open if self._found[number].wire == wire]:
             one = self._found[number]
             self._found[number] = replace(one, frames=(*one.frames, line))

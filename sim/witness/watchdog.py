@@ -2,7 +2,7 @@
 
 import math
 
-from sim.witness.seen import Complain
+from sim.witness.decoded import ReportViolation
 
 _LEFT = 0.003  # s; what its time left may be wrong by
 
@@ -14,11 +14,11 @@ class Watchdog:
     between two times [s].
     """
 
-    def __init__(self, name: str, *, slack: float, complain: Complain) -> None:
+    def __init__(self, name: str, *, slack: float, report: ReportViolation) -> None:
         self.time = math.inf
         self._name = name
         self._slack = slack
-        self._complain = complain
+        self._report = report
         self._fed = (-math.inf, math.inf)
         self._latest_before = math.inf
 
@@ -39,12 +39,12 @@ class Watchdog:
         """It was filled between two times [s]."""
         self._fed = between
 
-    def may_be_fed(self, time: float) -> None:
+    def may_feed(self, time: float) -> None:
         """Something may have filled it; `was_not_fed` takes that back."""
         self._latest_before = self._fed[1]
         self._fed = (self._fed[0], max(self._fed[1], time))
 
-    def was_not_fed(self) -> None:
+    def undo_feed(self) -> None:
         """What may have filled it was refused."""
         self._fed = (self._fed[0], self._latest_before)
 
@@ -59,7 +59,7 @@ class Watchdog:
     def check_trip(self, time: float) -> None:
         """It has run out: not before its time."""
         if time < self.runs_out[0] - self._slack:
-            self._complain(
+            self._report(
                 "watchdog",
                 time,
                 f"{self._name}'s watchdog ran out {time - self._fed[0]:.4f} s after it was fed, "
@@ -71,7 +71,7 @@ class Watchdog:
         low = self.time - (end - self._fed[0]) - _LEFT
         high = self.time - max(0.0, begin - self._fed[1]) + _LEFT
         if self.time < math.inf and not low <= left <= high:
-            self._complain(
+            self._report(
                 "watchdog",
                 end,
                 f"{self._name} says its watchdog has {left:g} s left; it must be {low:.3f} to "

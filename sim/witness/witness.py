@@ -4,21 +4,21 @@ import math
 from collections.abc import Callable, Collection, Hashable, Mapping, Sequence
 from typing import Any, Literal
 
+from sim.witness.amplifier_session import AmplifierSession
+from sim.witness.config import WitnessConfig, parse_config
+from sim.witness.decoded import STATE_CHANGING, Damaged, Data, Direction
 from sim.witness.exchanges import Exchanges
-from sim.witness.follower import Follower
-from sim.witness.host import Host
-from sim.witness.plan import Plan, plan_of
-from sim.witness.seen import MOVING, Damaged, Data, Toward
-from sim.witness.set_rules import Expected
-from sim.witness.side import Side
+from sim.witness.host_rules import HostRules
+from sim.witness.reference_amplifier import ReferenceAmplifier
+from sim.witness.set_rules import ExpectedSets
 from sim.witness.violation import Report, Violation
-from sim.witness.wire import Wire
+from sim.witness.watched_wire import WatchedWire
 
 OperatorCommand = Literal["arm", "disarm", "stop", "clear"]
 
 
 class Witness:
-    """Watches the wires of a plan (see `sim.witness.plan`); times [s] are of any one clock.
+    """Watches the wires of a plan (see `sim.witness.config`); times [s] are of any one clock.
 
     Bytes are all it needs. What it is told beside them makes more rules apply: contacts those about
     touches, wishes those about arming and stopping, levels those about silence where nobody asks.
@@ -26,89 +26,92 @@ class Witness:
     """
 
     def __init__(
-        self, plan: Mapping[str, Any] | Plan, *, record: Callable[[str], None] | None = None
+        self,
+        config: Mapping[str, Any] | WitnessConfig,
+        *,
+        record: Callable[[str], None] | None = None,
     ) -> None:
-        self._plan = plan if isinstance(plan, Plan) else plan_of(plan)
+        self._config = config if isinstance(config, WitnessConfig) else parse_config(config)
         self._report = Report()
         self._record = record
         self._now = -math.inf
         self.frames = 0
-        self._sides: dict[str, Side] = {}
-        self._wires: dict[str, Wire] = {}
-        for wire, kind in self._plan.wires.items():
-            sides = {}
-            for name, one in self._plan.amplifiers.items():
+        self._sessions: dict[str, AmplifierSession] = {}
+        self._wires: dict[str, WatchedWire] = {}
+        for wire, kind in self._config.wires.items():
+            sessions = {}
+            for name, one in self._config.amplifiers.items():
                 if one.wire == wire:
-                    sides[one.address] = self._sides[name] = self._side(name)
-            self._wires[wire] = Wire(wire, kind, sides)
-        times = self._plan.times
-        self._host = Host(self._sides, times=times)
+                    sessions[one.address] = self._sessions[name] = self._session(name)
+            self._wires[wire] = WatchedWire(wire, kind, sessions)
+        times = self._config.times
+        self._host = HostRules(self._sessions, times=times)
         self._exchanges = Exchanges(self._host, times=times, report=self._report)
 
-    def _side(self, name: str) -> Side:
-        plan = self._plan.amplifiers[name]
+    def _session(self, name: str) -> AmplifierSession:
+        config = self._config.amplifiers[name]
 
-        def complain(invariant: str, time: float, sentence: str) -> None:
-            self._report.add(invariant, plan.wire, time, sentence)
+        def report(invariant: str, time: float, sentence: str) -> None:
+            self._report.add(invariant, config.wire, time, sentence)
 
-        def is_troubled(time: float) -> bool:
-            return self._wires[plan.wire].is_troubled(time)
+        def is_disturbed(time: float) -> bool:
+            return self._wires[config.wire].is_disturbed(time)
 
         def complain_unless_troubled(invariant: str, time: float, sentence: str) -> None:
-            if not is_troubled(self._now):
-                complain(invariant, time, sentence)
+            if not is_disturbed(self._now):
+                report(invariant, time, sentence)
 
-        follower = Follower(
+        amplifier = ReferenceAmplifier(
             name,
-            plan,
-            times=self._plan.times,
-            complain=complain_unless_troubled,
-            insist=complain,
+            config,
+            times=self._config.times,
+            report=complain_unless_troubled,
+            report_always=report,
         )
-        return Side(name, plan, follower, complain, is_troubled)
+        return AmplifierSession(name, config, amplifier, report, is_disturbed)
 
     @property
     def wires(self) -> tuple[str, ...]:
         """The names of the wires."""
         return tuple(self._wires)
 
-    def bytes(self, link: str, direction: Toward, time: float, data: Data) -> None:
+    def bytes(self, link: str, direction: Direction, time: float, data: Data) -> None:
         """Bytes have passed on a wire, toward the amplifier or the host."""
-        self._pass_to(time)
+        self._advance(time)
         wire = self._wires[link]
         if self._record is not None:
             arrow = ">" if direction == "amplifier" else "<"
             self._record(f"{time:.6f} {link} {arrow} {data.hex()}")
-        for begun, (raw, meaning) in wire.feed(direction, time, data):
+        for begun, (raw, message) in wire.feed(direction, time, data):
             self.frames += 1
             self._report.frame(link, time, direction, raw)
-            if meaning is None:
+            if message is None:
                 continue
-            if isinstance(meaning, Damaged):
-                self._exchanges.damaged(wire, time, direction, meaning, begun=begun)
+            if isinstance(message, Damaged):
+                self._exchanges.damaged(wire, time, direction, message, begun=begun)
             if direction == "amplifier":
-                self._exchanges.sent(wire, time, raw, meaning)
+                self._exchanges.sent(wire, time, raw, message)
             else:
-                self._exchanges.said(wire, time, meaning)
+                self._exchanges.status_reported(wire, time, message)
 
     def opened(self, link: str, time: float) -> None:
         """A host has opened a wire: whoever answers there is not known yet."""
-        self._pass_to(time)
+        self._advance(time)
         self._wires[link].begin()
-        for side in self._wires[link].sides.values():
-            side.is_open, side.is_identified, side.vibrates = True, False, False
-            side.forget_pending()
-            side.follower.lose_track()
+        for session in self._wires[link].sessions.values():
+            session.is_open, session.is_identified, session.vibrates = True, False, False
+            session.forget_pending()
+            session.amplifier.forget_state()
 
     def closed(self, link: str, time: float) -> None:
         """The host has closed a wire, or lost it."""
-        self._pass_to(time)
-        for side in self._wires[link].sides.values():
-            side.is_open = False
-            if any(asked.kind in MOVING for _, asked in side.pending.values()):
-                side.follower.lose_track()  # it may have carried out what nobody hears it answer
-            side.forget_pending()
-            side.stop_wished = side.last_life = None
+        self._advance(time)
+        for session in self._wires[link].sessions.values():
+            session.is_open = False
+            if any(request.kind in STATE_CHANGING for _, request in session.pending.values()):
+                session.amplifier.forget_state()  # it may have carried out what nobody hears it answer
+            session.forget_pending()
+            session.stop_requested_at = session.last_feed = None
 
     def contacts(
         self, time: float, contacts: Collection[Hashable], *, is_answerable: bool = True
@@ -117,30 +120,30 @@ class Witness:
 
         is_answerable: whether a new one of them ought to get a pattern.
         """
-        self._pass_to(time)
+        self._advance(time)
         self._host.contacts(time, contacts, is_answerable=is_answerable)
 
-    def expect(self, expected: Expected | None) -> None:
+    def expect(self, expected: ExpectedSets | None) -> None:
         """What every pattern must be from now on, by amplifier and channel; None: any."""
         self._host.expect(expected)
 
-    def wish(self, time: float, what: OperatorCommand) -> None:
+    def operator_command(self, time: float, what: OperatorCommand) -> None:
         """Somebody wants the controller to do this, now."""
-        self._pass_to(time)
-        self._host.wish(time, what)
+        self._advance(time)
+        self._host.operator_command(time, what)
 
-    def hang(self, time: float, is_hung: bool = True) -> None:
+    def set_stalled(self, time: float, is_hung: bool = True) -> None:
         """The control loop hangs from now on, or runs again."""
-        self._pass_to(time)
-        self._host.hang(time if is_hung else None)
+        self._advance(time)
+        self._host.set_stalled(time if is_hung else None)
 
     def faults(self, time: float, link: str, *, are_on: bool) -> None:
         """Faults are put on a wire or its amplifiers from now on, or no more."""
-        self._pass_to(time)
-        self._wires[link].trouble(time, is_on=are_on)
+        self._advance(time)
+        self._wires[link].set_disturbed(time, is_on=are_on)
         if not are_on:  # what amplifiers did meanwhile need not have been seen
-            for side in self._wires[link].sides.values():
-                side.follower.lose_track()
+            for session in self._wires[link].sessions.values():
+                session.amplifier.forget_state()
 
     def levels(
         self,
@@ -151,27 +154,29 @@ class Witness:
         frequencies: Mapping[int, float] | None = None,
     ) -> None:
         """What sensors find on the channels of an amplifier: levels, 1 is full stroke, and Hz."""
-        self._pass_to(time)
-        side = self._sides[amplifier]
+        self._advance(time)
+        session = self._sessions[amplifier]
         for channel, level in enumerate(levels):
-            limits = side.plan.channels.get(channel)
+            limits = session.config.channels.get(channel)
             if level > (limits.level if limits is not None else 0.0) + 0.002:
-                side.complain(
+                session.report(
                     "limits", time, f"channel {channel} of {amplifier} has level {level:.4f}"
                 )
-        is_amid = any(asked.kind in MOVING for _, asked in side.pending.values())
-        if not (is_amid or side.is_troubled(time)):
-            side.follower.plays(levels, frequencies or {}, time)
+        has_partial_frame = any(
+            request.kind in STATE_CHANGING for _, request in session.pending.values()
+        )
+        if not (has_partial_frame or session.is_disturbed(time)):
+            session.amplifier.plays(levels, frequencies or {}, time)
 
     def finish(self, time: float | None = None) -> list[Violation]:
         """Everything that was wrong, in its order; time: until when it has watched [s]."""
         if time is not None:
-            self._pass_to(time)
+            self._advance(time)
         return self._report.found
 
-    def _pass_to(self, time: float) -> None:
+    def _advance(self, time: float) -> None:
         self._now = max(self._now, time)
-        self._host.pass_to(self._now)
-        for side in self._sides.values():
-            side.follower.pass_to(self._now)
-            self._exchanges.look_for_overdue(side, self._now)
+        self._host.advance(self._now)
+        for session in self._sessions.values():
+            session.amplifier.advance(self._now)
+            self._exchanges.check_overdue(session, self._now)

@@ -17,7 +17,7 @@ from model.rig.file import example_rig_path
 from model.rig.rig import Rig
 from sim.cli import app
 from sim.witness.capture import read_capture
-from sim.witness.plan import plan_of
+from sim.witness.config import parse_config
 from wires import WIRES, far_side
 
 URL = "serial:///dev/ttyUSB0"
@@ -141,7 +141,7 @@ def test_a_capture_is_read_as_it_was_written(tmp_path: Path) -> None:
 def test_plans_that_are_none_are_refused(plan: dict[str, object], named: str) -> None:
     """The key that is wrong is named."""
     with pytest.raises(InputError) as refused:
-        plan_of(plan)
+        parse_config(plan)
     assert named in str(refused.value)
 
 

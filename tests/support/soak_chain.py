@@ -332,7 +332,7 @@ class _Run:
         self, name: OperatorCommand, call: Callable[[], Coroutine[Any, Any, None]]
     ) -> None:
         """What an operator asks; a refusal is an answer, too."""
-        self.witness.wish(name)
+        self.witness.operator_command(name)
         self.asking += name == "arm"
         try:
             await call()
@@ -403,9 +403,9 @@ class _Run:
             finally:
                 self.running = None
             await asyncio.sleep(_ON_THE_WIRE)
-            self.witness.hang(True)
+            self.witness.set_stalled(True)
             await asyncio.sleep(lasts)
-            self.witness.hang(False)
+            self.witness.set_stalled(False)
 
     def _make_controller(self) -> Controller:
         return Controller(
@@ -427,7 +427,7 @@ class _Run:
     async def _end(self) -> None:
         """Close everything; then nothing plays, and nobody is left."""
         self.is_ending = True
-        self.witness.wish("disarm")
+        self.witness.operator_command("disarm")
         if self.controller is not None:
             await self.controller.close()
         else:

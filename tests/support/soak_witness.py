@@ -77,13 +77,13 @@ class SoakWitness:
             self._open.discard(link)
             self._witness.closed(link, self._loop.time())
 
-    def wish(self, what: OperatorCommand) -> None:
+    def operator_command(self, what: OperatorCommand) -> None:
         """An operator wants this."""
-        self._witness.wish(self._loop.time(), what)
+        self._witness.operator_command(self._loop.time(), what)
 
-    def hang(self, is_hung: bool) -> None:
+    def set_stalled(self, is_stalled: bool) -> None:
         """The control loop stands still from now on, or goes on."""
-        self._witness.hang(self._loop.time(), is_hung)
+        self._witness.set_stalled(self._loop.time(), is_stalled)
 
     def touched(
         self, source: str, stamp: float, touches: FrameTouches, *, must_be_felt: bool

@@ -131,7 +131,7 @@ class Chain:
         """Arm, send the stream, look on meanwhile, and ask what was felt."""
         if self.witness is not None:
             self.witness.contacts(time.monotonic(), ())
-            self.witness.wish(time.monotonic(), "arm")
+            self.witness.operator_command(time.monotonic(), "arm")
         polls: Polls = []
         told: list[Notification] = []
         went: list[float] = []
@@ -160,7 +160,7 @@ class Chain:
         finally:
             listening.cancel()
         if self.witness is not None:
-            self.witness.wish(time.monotonic(), "disarm")
+            self.witness.operator_command(time.monotonic(), "disarm")
         return [
             await hear(self.control, situation, begin, end, told=told)
             for situation, begin, end in zip(stream.situations, went, went[1:], strict=False)

@@ -166,27 +166,27 @@ class Chain:
 
     async def arm(self) -> None:
         """Somebody arms it."""
-        self.witness.wish(self.loop.time(), "arm")
+        self.witness.operator_command(self.loop.time(), "arm")
         await self._try(self.controller.arm())
 
     async def stop(self) -> None:
         """Somebody stops it."""
-        self.witness.wish(self.loop.time(), "stop")
+        self.witness.operator_command(self.loop.time(), "stop")
         await self._try(self.controller.stop())
 
     async def disarm(self) -> None:
         """Somebody disarms it."""
-        self.witness.wish(self.loop.time(), "disarm")
+        self.witness.operator_command(self.loop.time(), "disarm")
         await self._try(self.controller.disarm())
 
     async def clear(self) -> None:
         """Somebody clears what is latched."""
-        self.witness.wish(self.loop.time(), "clear")
+        self.witness.operator_command(self.loop.time(), "clear")
         await self._try(self.controller.clear())
 
     def run(self) -> None:
         """The control loop runs from now on."""
-        self.witness.hang(self.loop.time(), False)
+        self.witness.set_stalled(self.loop.time(), False)
         self.running = asyncio.get_running_loop().create_task(self._try(self.controller.run()))
 
     async def hang(self) -> None:
@@ -195,7 +195,7 @@ class Chain:
             self.running.cancel()
             await asyncio.gather(self.running, return_exceptions=True)
         await self.rest(0.002)  # what was on its way is on the wire by then
-        self.witness.hang(self.loop.time())
+        self.witness.set_stalled(self.loop.time())
 
     def touch_beside(self) -> None:
         """The source tells of a touch beside the plate, which nobody feels."""
@@ -220,7 +220,7 @@ class Chain:
 
     async def reopen(self) -> None:
         """Close everything and open it again, the control loop too."""
-        self.witness.wish(self.loop.time(), "disarm")
+        self.witness.operator_command(self.loop.time(), "disarm")
         await self._try(self.controller.close())
         for link in {*self.links.values()}:
             self.witness.closed(link, self.loop.time())
@@ -359,7 +359,7 @@ async def _end(chain: Chain) -> None:
         chain.holding.cancel()
     if chain.fingers:
         chain.witness.contacts(chain.loop.time(), ())
-    chain.witness.wish(chain.loop.time(), "disarm")
+    chain.witness.operator_command(chain.loop.time(), "disarm")
     await chain._try(chain.controller.close())
     for link in {*chain.links.values()}:
         chain.witness.closed(link, chain.loop.time())

@@ -11,28 +11,28 @@ from cobs import cobs
 
 from sim.witness.can_decoder import CanDecoder
 from sim.witness.can_text import CanFrame, SlcanText, SocketcandText
+from sim.witness.decoded import (
+    BootUp,
+    ChannelCommand,
+    Damaged,
+    Direction,
+    Message,
+    Reply,
+    Request,
+    RequestKind,
+    StateEvent,
+)
 from sim.witness.modbus_decoder import ModbusDecoder, check
 from sim.witness.modbus_frames import crc16
-from sim.witness.seen import (
-    Answered,
-    Asked,
-    Damaged,
-    Drive,
-    Kind,
-    Meaning,
-    Restarted,
-    Told,
-    Toward,
-)
 from sim.witness.serial_decoder import SerialDecoder
 from sim.witness.witness import Witness
 
 DOCS = Path(__file__).parents[3] / "docs" / "reference"
 # As the pages put it in words: 110 Hz, 0.2, 0 degrees; 250.5 Hz, 1, -90 degrees, keeping phase.
-SET = {0: Drive(110.0, 0.2, 0.0), 3: Drive(250.5, 1.0, -90.0, keep_phase=True)}
+SET = {0: ChannelCommand(110.0, 0.2, 0.0), 3: ChannelCommand(250.5, 1.0, -90.0, keep_phase=True)}
 
 
-def _serial() -> Iterator[tuple[str, Toward, bytes]]:
+def _serial() -> Iterator[tuple[str, Direction, bytes]]:
     for line in (DOCS / "wire-protocol.md").read_text(encoding="utf-8").splitlines():
         found = re.fullmatch(r"([\w ]+): `((?:[0-9A-F]{2} ?)+)`", line)
         if found:
@@ -40,7 +40,7 @@ def _serial() -> Iterator[tuple[str, Toward, bytes]]:
             yield found[1], "host" if is_answer else "amplifier", bytes.fromhex(found[2])
 
 
-def _modbus(transport: str) -> Iterator[tuple[str, Toward, bytes]]:
+def _modbus(transport: str) -> Iterator[tuple[str, Direction, bytes]]:
     for line in (DOCS / "wire-modbus.md").read_text(encoding="utf-8").splitlines():
         found = re.fullmatch(rf"([\w ]+), {transport}: `((?:[0-9A-F]{{2}} ?)+)`", line)
         if found:
@@ -48,24 +48,24 @@ def _modbus(transport: str) -> Iterator[tuple[str, Toward, bytes]]:
             yield found[1], "host" if is_answer else "amplifier", bytes.fromhex(found[2])
 
 
-def _can() -> Iterator[tuple[Toward, CanFrame]]:
+def _can() -> Iterator[tuple[Direction, CanFrame]]:
     for line in (DOCS / "wire-can.md").read_text(encoding="utf-8").splitlines():
         found = re.fullmatch(r"    ([<>]) ([0-9A-F]{3})( FD)?((?: [0-9A-F]{2})*)", line)
         if found:
-            toward: Toward = "amplifier" if found[1] == ">" else "host"
+            toward: Direction = "amplifier" if found[1] == ">" else "host"
             data = bytes.fromhex(found[4])
             yield toward, CanFrame(int(found[2], 16), data, bool(found[3]))
 
 
-def _check(name: str, meaning: Meaning | None) -> None:
+def _check(name: str, meaning: Message | None) -> None:
     """An example means what its name says."""
     assert meaning is not None
     assert not isinstance(meaning, Damaged)
-    if not isinstance(meaning, Asked):
+    if not isinstance(meaning, Request):
         return
     assert meaning.problem == ""
     words = {*name.split(), *name.removeprefix("Refused ").split()}
-    named = [kind for kind in Kind if kind.value in words]
+    named = [kind for kind in RequestKind if kind.value in words]
     if named and "FC4" not in words:
         assert meaning.kind is named[0]
 
@@ -81,18 +81,18 @@ def test_serial_examples() -> None:
         seen[name] = meaning
     assert len(seen) >= 30
     apply = seen["Apply request"]
-    assert isinstance(apply, Asked)
+    assert isinstance(apply, Request)
     assert (apply.token, apply.ramp, apply.valid_for) == (513, 0.02, 0.5)
-    assert apply.drives == pytest.approx(SET) or apply.drives == SET
+    assert apply.commands == pytest.approx(SET) or apply.commands == SET
     arm = seen["Arm reply"]
-    assert isinstance(arm, Answered)
-    assert arm.condition is not None
-    assert (arm.condition.state, arm.condition.watchdog_left, arm.condition.temperature) == (
+    assert isinstance(arm, Reply)
+    assert arm.status is not None
+    assert (arm.status.state, arm.status.watchdog_left, arm.status.temperature) == (
         4,
         0.25,
         25.0,
     )
-    assert seen["Event"] == Told(address=1, state=6, fault=4)
+    assert seen["Event"] == StateEvent(address=1, state=6, fault=4)
 
 
 @pytest.mark.parametrize("transport", ["RTU", "TCP"])
@@ -104,17 +104,17 @@ def test_modbus_examples(transport: str) -> None:
         ((raw, meaning),) = decoder.feed(toward, 0.0, data)
         assert raw == data
         _check(name, meaning)
-        if isinstance(meaning, Answered):
+        if isinstance(meaning, Reply):
             assert meaning.key is not None, name
         seen[name] = meaning
     assert len(seen) >= 35
     apply, status = seen["Apply request"], seen["GetStatus reply"]
-    assert isinstance(apply, Asked)
-    assert (apply.token, apply.drives) == (513, SET)
-    assert isinstance(status, Answered)
-    assert status.condition is not None
-    assert status.condition.temperature == pytest.approx(-5.3)
-    assert (status.condition.state, status.condition.fault) == (7, 1)
+    assert isinstance(apply, Request)
+    assert (apply.token, apply.commands) == (513, SET)
+    assert isinstance(status, Reply)
+    assert status.status is not None
+    assert status.status.temperature == pytest.approx(-5.3)
+    assert (status.status.state, status.status.fault) == (7, 1)
 
 
 def test_can_examples() -> None:
@@ -122,14 +122,14 @@ def test_can_examples() -> None:
     decoder = CanDecoder("slcan", {1: 4})
     seen = [meaning for toward, frame in _can() for meaning in decoder.take(toward, frame)]
     assert not any(isinstance(meaning, Damaged) for meaning in seen)
-    sets = [one for one in seen if isinstance(one, Asked) and one.kind is Kind.APPLY]
+    sets = [one for one in seen if isinstance(one, Request) and one.kind is RequestKind.APPLY]
     assert [one.token for one in sets] == [513, 513, 516, 517, 518]
     assert [bool(one.problem) for one in sets] == [False, False, True, False, False]
-    assert sets[0].drives == sets[4].drives == SET  # classic frames, and one CAN FD frame
-    refusals = [one.refusal for one in seen if isinstance(one, Answered) and one.refusal]
+    assert sets[0].commands == sets[4].commands == SET  # classic frames, and one CAN FD frame
+    refusals = [one.refusal for one in seen if isinstance(one, Reply) and one.refusal]
     assert refusals == [15, 5]  # torn, WRONG_STATE
-    assert Told(address=1, state=7, fault=1) in seen
-    assert seen[-1] == Restarted(1)
+    assert StateEvent(address=1, state=7, fault=1) in seen
+    assert seen[-1] == BootUp(1)
 
 
 @pytest.mark.parametrize("place", range(1, 12))
@@ -187,12 +187,12 @@ def test_a_refusal_of_an_earlier_write_answers_who_reads_it() -> None:
         decoder = ModbusDecoder(over_tcp=True)
         decoder.feed("amplifier", 0.0, PING)
         decoder.feed("host", 0.001, REFUSED)
-        ((_, asked),) = decoder.feed("amplifier", 0.002, WHY)
+        ((_, request),) = decoder.feed("amplifier", 0.002, WHY)
         ((_, answer),) = decoder.feed("host", 0.003, told)
-        assert isinstance(asked, Asked)
-        assert isinstance(answer, Answered)
+        assert isinstance(request, Request)
+        assert isinstance(answer, Reply)
         assert answer.problem == "it carries tag 21 instead of 22"
-        assert (answer.key == asked.key) is is_answer
+        assert (answer.key == request.key) is is_answer
 
 
 @pytest.mark.parametrize("are_on", [False, True])
@@ -202,7 +202,7 @@ def test_a_refusal_of_an_earlier_write_is_wrong_where_nothing_damages(are_on: bo
     if are_on:
         witness.faults(0.0, "line", are_on=True)
     again = PING[:1] + b"\3" + PING[2:-1] + b"\x17"
-    pieces: tuple[tuple[float, Toward, bytes], ...] = (
+    pieces: tuple[tuple[float, Direction, bytes], ...] = (
         (0.001, "amplifier", PING),
         (0.002, "host", REFUSED),
         (0.003, "amplifier", WHY),
@@ -244,7 +244,7 @@ def test_what_comes_again_from_another_unit_answers_nothing() -> None:
     first = [frames["Hello request"], frames["Hello reply"]]
     other = [b"\2" + data[1:-2] for data in first]
     decoder = ModbusDecoder(over_tcp=False)
-    pieces: tuple[tuple[Toward, bytes], ...] = (
+    pieces: tuple[tuple[Direction, bytes], ...] = (
         ("amplifier", first[0]),
         ("host", first[1]),
         ("amplifier", other[0] + crc16(other[0])),
@@ -252,9 +252,9 @@ def test_what_comes_again_from_another_unit_answers_nothing() -> None:
         ("host", other[1] + crc16(other[1])),
     )
     seen = [decoder.feed(toward, 0.0, data)[0][1] for toward, data in pieces]
-    asked = [one.key for one in seen if isinstance(one, Asked)]
-    answered = [(one.address, one.key) for one in seen if isinstance(one, Answered)]
-    assert answered == [(1, asked[0]), (1, None), (2, asked[1])]
+    request = [one.key for one in seen if isinstance(one, Request)]
+    answered = [(one.address, one.key) for one in seen if isinstance(one, Reply)]
+    assert answered == [(1, request[0]), (1, None), (2, request[1])]
 
 
 @pytest.mark.parametrize(("over", "broken"), [(0.02, ["answer"]), (0.04, [])])
@@ -278,7 +278,7 @@ def test_a_late_answer_to_what_was_repeated_tells_nothing_new() -> None:
     witness = Witness(PLAN)
     witness.faults(0.9, "line", are_on=True)
 
-    def passes(time: float, toward: Toward, name: str, number: int, token: int = 513) -> None:
+    def passes(time: float, toward: Direction, name: str, number: int, token: int = 513) -> None:
         data = bytearray(number.to_bytes(2, "big") + frames[name][2:])
         if token != 513:  # with no check, for other words have another one
             at = data.index((513).to_bytes(2, "big"), 14)
@@ -322,5 +322,5 @@ def test_an_envelope_is_held_to_its_bounds_on_every_wire(
     tcp = struct.pack(">HHHB", 8, 0, len(pdu) + 1, 1) + pdu
     for decoder, data in ((SerialDecoder(), line), (ModbusDecoder(over_tcp=True), tcp)):
         ((_, meaning),) = decoder.feed("amplifier", 0.0, data)
-        assert isinstance(meaning, Asked)
+        assert isinstance(meaning, Request)
         assert meaning.problem == problem

@@ -2,19 +2,25 @@
 
 import pytest
 
-from sim.witness.follower import Follower
-from sim.witness.plan import AmplifierPlan, Limits, Times
-from sim.witness.seen import Answered, Asked, Condition, Drive, Kind
+from sim.witness.config import AmplifierConfig, ChannelLimits, TimeLimits
+from sim.witness.decoded import ChannelCommand, Reply, Request, RequestKind, Status
+from sim.witness.reference_amplifier import ReferenceAmplifier
 
-PLAN = AmplifierPlan("line", 1, {0: Limits(40.0, 500.0, 1.0)})
-ARM = Asked(Kind.ARM, 1, key=1, watchdog=0.25)
-STOP = Asked(Kind.STOP, 1, key=2)
-DISARM = Asked(Kind.DISARM, 1, key=4, ramp=0.05)
-STATUS = Asked(Kind.STATUS, 1, key=5)
-STOP_ALL = Asked(Kind.STOP, 0)
+PLAN = AmplifierConfig("line", 1, {0: ChannelLimits(40.0, 500.0, 1.0)})
+ARM = Request(RequestKind.ARM, 1, key=1, watchdog=0.25)
+STOP = Request(RequestKind.STOP, 1, key=2)
+DISARM = Request(RequestKind.DISARM, 1, key=4, ramp=0.05)
+STATUS = Request(RequestKind.STATUS, 1, key=5)
+STOP_ALL = Request(RequestKind.STOP, 0)
 # Plays 0.2 for 0.3 s, then fades out along 50 ms.
-BRIEF = Asked(
-    Kind.APPLY, 1, key=3, token=1, ramp=0.05, valid_for=0.3, drives={0: Drive(110.0, 0.2, 0.0)}
+BRIEF = Request(
+    RequestKind.APPLY,
+    1,
+    key=3,
+    token=1,
+    ramp=0.05,
+    valid_for=0.3,
+    commands={0: ChannelCommand(110.0, 0.2, 0.0)},
 )
 # docs/reference/wire-protocol.md, States and Fault.
 SWITCHED_ON, ENABLED, STOPPED, REACTING, FAULT = 3, 4, 5, 6, 7
@@ -26,18 +32,22 @@ class Watched:
 
     def __init__(self, *, slack: float = 0.001) -> None:
         self.broken: list[str] = []
-        times = Times(slack=slack)
-        self.follower = Follower(
-            "main", PLAN, times=times, complain=self._complain, insist=self._complain
+        times = TimeLimits(slack=slack)
+        self.amplifier = ReferenceAmplifier(
+            "main",
+            PLAN,
+            times=times,
+            report=self._report,
+            report_always=self._report,
         )
 
-    def grants(self, asked: Asked, begin: float, state: int, fault: int = 0) -> None:
+    def grants(self, request: Request, begin: float, state: int, fault: int = 0) -> None:
         """A request at a time [s], and an answer 2 ms later that says how it is."""
-        condition = Condition(state, fault, high_voltage=state == ENABLED)
-        answer = Answered(1, asked.key, condition=condition)
-        self.follower.granted(asked, answer, begin, begin + 0.002)
+        status = Status(state, fault, high_voltage=state == ENABLED)
+        answer = Reply(1, request.key, status=status)
+        self.amplifier.request_granted(request, answer, begin, begin + 0.002)
 
-    def _complain(self, invariant: str, time: float, sentence: str) -> None:
+    def _report(self, invariant: str, time: float, sentence: str) -> None:
         self.broken.append(invariant)
 
 
@@ -45,7 +55,7 @@ def test_who_is_not_known_may_have_been_in_a_fault_before_a_stop() -> None:
     """Armed, lost sight of, stopped: its watchdog may have run out while nobody looked."""
     watched = Watched()
     watched.grants(ARM, 1.0, ENABLED)
-    watched.follower.lose_track()
+    watched.amplifier.forget_state()
     watched.grants(STOP, 9.0, FAULT, WATCHDOG)
     assert watched.broken == []
 
@@ -54,8 +64,8 @@ def test_a_fault_that_was_cleared_out_of_sight_is_not_latched() -> None:
     """In a fault, lost sight of, cleared and armed meanwhile, stopped: it has no fault any more."""
     watched = Watched()
     watched.grants(ARM, 1.0, ENABLED)
-    watched.follower.told(FAULT, WATCHDOG, 2.0)
-    watched.follower.lose_track()
+    watched.amplifier.told(FAULT, WATCHDOG, 2.0)
+    watched.amplifier.forget_state()
     watched.grants(STOP, 9.0, STOPPED)
     assert watched.broken == []
 
@@ -94,9 +104,9 @@ def test_a_set_that_ends_by_itself_may_fade_from_its_end_on(
     """Taken at 1.100 to 1.102 s, it fades from 1.4 s on: 0.2 (1 + cos(pi/5)) / 2 after 10 ms."""
     watched = Watched(slack=0.02)
     watched.grants(ARM, 1.0, ENABLED)
-    watched.follower.granted(BRIEF, Answered(1, 3), 1.1, 1.102)
-    watched.follower.fed(1.3)
-    watched.follower.said(Condition(ENABLED, 0, levels=(level,)), time, time + 0.001)
+    watched.amplifier.request_granted(BRIEF, Reply(1, 3), 1.1, 1.102)
+    watched.amplifier.fed(1.3)
+    watched.amplifier.status_reported(Status(ENABLED, 0, levels=(level,)), time, time + 0.001)
     assert watched.broken == rules
 
 
@@ -104,17 +114,17 @@ def test_who_is_lost_sight_of_may_play_on_beyond_the_end_of_a_set() -> None:
     """What was to end at 1.4 s may have been followed by another while nobody looked."""
     watched = Watched()
     watched.grants(ARM, 1.0, ENABLED)
-    watched.follower.granted(BRIEF, Answered(1, 3), 1.1, 1.102)
-    watched.follower.lose_track()
+    watched.amplifier.request_granted(BRIEF, Reply(1, 3), 1.1, 1.102)
+    watched.amplifier.forget_state()
     for time in (1.35, 1.6):
-        watched.follower.said(Condition(ENABLED, 0, levels=(0.2,)), time, time + 0.001)
+        watched.amplifier.status_reported(Status(ENABLED, 0, levels=(0.2,)), time, time + 0.001)
     assert watched.broken == []
 
 
 @pytest.mark.parametrize(
     ("asked", "says", "late"), [(DISARM, SWITCHED_ON, "latched"), (STATUS, ENABLED, "armed")]
 )
-def test_an_answer_may_be_older_than_a_stop_to_all(asked: Asked, says: int, late: str) -> None:
+def test_an_answer_may_be_older_than_a_stop_to_all(request: Request, says: int, late: str) -> None:
     """Asked, then all of the bus are stopped, and only then the answer comes: of how it was before.
 
     Nobody answers the stop, so it counts within 10 ms; after that it is stopped.
@@ -122,12 +132,12 @@ def test_an_answer_may_be_older_than_a_stop_to_all(asked: Asked, says: int, late
     for asked_at, broken in ((1.0995, []), (1.1095, [late])):
         watched = Watched()
         watched.grants(ARM, 1.0, ENABLED)
-        watched.follower.announced(STOP_ALL, 1.1)
-        watched.grants(asked, asked_at, says)
+        watched.amplifier.broadcast_sent(STOP_ALL, 1.1)
+        watched.grants(request, asked_at, says)
         assert watched.broken == broken
     watched = Watched()
     watched.grants(ARM, 1.0, ENABLED)
-    watched.follower.announced(STOP_ALL, 1.1)
-    watched.grants(asked, 1.0995, says)
+    watched.amplifier.broadcast_sent(STOP_ALL, 1.1)
+    watched.grants(request, 1.0995, says)
     watched.grants(STATUS, 1.12, STOPPED)
     assert watched.broken == []

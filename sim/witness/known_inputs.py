@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 
 @dataclass
-class People:
+class KnownInputs:
     """What the witness was told of them last; times [s], of what never was -inf.
 
     contacts: who touches, None where nobody tells; touched: when the last of them came; hung: since
@@ -15,28 +15,28 @@ class People:
     """
 
     contacts: frozenset[Hashable] | None = None
-    lifted: float = -math.inf
+    last_lift: float = -math.inf
     touched: float = -math.inf
-    hung: float | None = None
-    arm_wished: bool | None = None
-    wished: float = -math.inf
-    disarm_wished: float = -math.inf
-    silence_wished: float = -math.inf
+    stalled_since: float | None = None
+    is_arm_requested: bool | None = None
+    last_command: float = -math.inf
+    last_disarm: float = -math.inf
+    last_silencing: float = -math.inf
 
     def touch(self, time: float, contacts: Collection[Hashable]) -> frozenset[Hashable]:
         """These fingers are on the plate from now on; those of them who have just come."""
         before, self.contacts = self.contacts or frozenset(), frozenset(contacts)
         if before and not self.contacts:
-            self.lifted = time
+            self.last_lift = time
         if come := self.contacts - before:
-            self.touched = time
+            self.last_touch = time
         return come
 
-    def wish(self, time: float, what: str) -> None:
+    def operator_command(self, time: float, what: str) -> None:
         """Somebody wants it to arm, disarm, stop or clear."""
-        self.wished = time
+        self.last_command = time
         if what == "disarm":
-            self.disarm_wished = time
-        self.arm_wished = what == "arm" or (self.arm_wished is True and what == "clear")
+            self.last_disarm = time
+        self.is_arm_requested = what == "arm" or (self.is_arm_requested is True and what == "clear")
         if what in ("stop", "disarm"):
-            self.silence_wished = time
+            self.last_silencing = time

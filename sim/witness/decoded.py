@@ -8,17 +8,17 @@ from dataclasses import dataclass, field
 from enum import Enum
 from typing import Literal, TypeAlias
 
-Toward: TypeAlias = Literal["amplifier", "host"]
+Direction: TypeAlias = Literal["amplifier", "host"]
 """Which way bytes go."""
 
-Complain: TypeAlias = Callable[[str, float, str], None]
+ReportViolation: TypeAlias = Callable[[str, float, str], None]
 """Is told of a broken rule: its name, when [s], one sentence."""
 
 Data: TypeAlias = bytes
 """What goes over a wire."""
 
 
-class Kind(Enum):
+class RequestKind(Enum):
     """What a host asks. LOOK: only reads, and what has to do with no amplifier's state."""
 
     HELLO = "Hello"
@@ -34,25 +34,41 @@ class Kind(Enum):
     CLEAR = "Clear"
     PING = "Ping"
     ENVELOPE = "LoadEnvelope"
-    LOOK = "a look"
+    READ = "a look"
 
 
-FEEDING = frozenset(
+WATCHDOG_FEEDING = frozenset(
     {
-        *(Kind.ARM, Kind.DISARM, Kind.STAGE, Kind.COMMIT, Kind.APPLY, Kind.STOP, Kind.CLEAR),
-        *(Kind.PING, Kind.ENVELOPE),
+        *(
+            RequestKind.ARM,
+            RequestKind.DISARM,
+            RequestKind.STAGE,
+            RequestKind.COMMIT,
+            RequestKind.APPLY,
+            RequestKind.STOP,
+            RequestKind.CLEAR,
+        ),
+        *(RequestKind.PING, RequestKind.ENVELOPE),
     }
 )
 """Those that fill the watchdog again when they are not refused."""
 
-MOVING = frozenset(
-    {Kind.ARM, Kind.DISARM, Kind.STAGE, Kind.COMMIT, Kind.APPLY, Kind.STOP, Kind.CLEAR}
+STATE_CHANGING = frozenset(
+    {
+        RequestKind.ARM,
+        RequestKind.DISARM,
+        RequestKind.STAGE,
+        RequestKind.COMMIT,
+        RequestKind.APPLY,
+        RequestKind.STOP,
+        RequestKind.CLEAR,
+    }
 )
 """Those that change what an amplifier does, or will do."""
 
 
 @dataclass(frozen=True, slots=True)
-class Drive:
+class ChannelCommand:
     """One channel of a set: Hz, level 0..1, degrees, and its flags and envelope slots."""
 
     frequency: float
@@ -70,7 +86,7 @@ class Drive:
 
 
 @dataclass(frozen=True, slots=True)
-class Shape:
+class EnvelopeLoad:
     """An envelope for a slot: step [s] and the level of each knot."""
 
     slot: int
@@ -79,31 +95,31 @@ class Shape:
 
 
 @dataclass(frozen=True, slots=True)
-class Asked:
+class Request:
     """A request. address: of the amplifier, 0 for all; key: what its answer is known by, or None.
 
     ramp, valid_for, watchdog [s]; drives by channel; problem: what is wrong with it, if anything.
     """
 
-    kind: Kind
+    kind: RequestKind
     address: int
     key: Hashable = None
     token: int = 0
     ramp: float = 0.0
     valid_for: float = 0.0
     watchdog: float = 0.0
-    drives: Mapping[int, Drive] = field(default_factory=dict)
-    shape: Shape | None = None
+    commands: Mapping[int, ChannelCommand] = field(default_factory=dict)
+    envelope: EnvelopeLoad | None = None
     problem: str = ""
 
     @property
     def vibrates(self) -> bool:
         """Whether its own drives ask for any vibration."""
-        return any(drive.vibrates for drive in self.drives.values())
+        return any(command.vibrates for command in self.commands.values())
 
 
 @dataclass(frozen=True, slots=True)
-class Condition:
+class Status:
     """How an amplifier says it is; None where this wire does not say it here. Times [s], °C."""
 
     state: int
@@ -116,7 +132,7 @@ class Condition:
 
 
 @dataclass(frozen=True, slots=True)
-class Answered:
+class Reply:
     """A reply. key: None where it answers nothing that is known; refusal: 0 if it was granted.
 
     achieved: what the set plays, by channel, and its token.
@@ -125,15 +141,15 @@ class Answered:
     address: int
     key: Hashable = None
     refusal: int = 0
-    condition: Condition | None = None
+    status: Status | None = None
     token: int = 0
-    achieved: Mapping[int, Drive] | None = None
-    is_as_asked: bool | None = None
+    achieved: Mapping[int, ChannelCommand] | None = None
+    is_exact: bool | None = None
     problem: str = ""
 
 
 @dataclass(frozen=True, slots=True)
-class Told:
+class StateEvent:
     """A change of state that an amplifier tells unasked."""
 
     address: int
@@ -142,7 +158,7 @@ class Told:
 
 
 @dataclass(frozen=True, slots=True)
-class Restarted:
+class BootUp:
     """An amplifier, or what calls itself one, has just got its supply."""
 
     address: int
@@ -155,9 +171,9 @@ class Damaged:
     why: str
 
 
-ANSWERS_DAMAGE = "it answers a damaged frame"
+REPLY_TO_DAMAGED_FRAME = "it answers a damaged frame"
 """What is wrong with an answer that nobody but noise can have asked for."""
 
-Meaning: TypeAlias = Asked | Answered | Told | Restarted | Damaged
-Decoded: TypeAlias = tuple[bytes, Meaning | None]
+Message: TypeAlias = Request | Reply | StateEvent | BootUp | Damaged
+DecodedFrame: TypeAlias = tuple[bytes, Message | None]
 """The bytes of a frame and what they mean; None: a part of something, or nothing to us."""

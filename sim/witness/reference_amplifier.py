@@ -9,10 +9,18 @@ import math
 from collections import deque
 from collections.abc import Mapping, Sequence
 
-from sim.witness.achieved import check_achieved
-from sim.witness.outputs import Outputs
-from sim.witness.plan import AmplifierPlan, Times
-from sim.witness.seen import FEEDING, Answered, Asked, Complain, Condition, Drive, Kind
+from sim.witness.achieved_rules import check_achieved
+from sim.witness.config import AmplifierConfig, TimeLimits
+from sim.witness.decoded import (
+    WATCHDOG_FEEDING,
+    ChannelCommand,
+    Reply,
+    ReportViolation,
+    Request,
+    RequestKind,
+    Status,
+)
+from sim.witness.reference_outputs import ReferenceOutputs
 from sim.witness.watchdog import Watchdog
 
 SILENCING_RAMP = 0.005  # s; along which the watchdog and faults silence
@@ -36,7 +44,7 @@ NAMES = (
 )
 
 
-class Follower:
+class ReferenceAmplifier:
     """What one amplifier must be doing. state: None while nobody knows.
 
     insist: is told of what no fault of a wire excuses, complain of everything else.
@@ -45,29 +53,29 @@ class Follower:
     def __init__(
         self,
         name: str,
-        plan: AmplifierPlan,
+        config: AmplifierConfig,
         *,
-        times: Times,
-        complain: Complain,
-        insist: Complain,
+        times: TimeLimits,
+        report: ReportViolation,
+        report_always: ReportViolation,
     ) -> None:
         self._name = name
-        self._plan = plan
-        self._complain = complain
-        self._insist = insist
+        self._config = config
+        self._report = report
+        self._report_always = report_always
         self.state: int | None = None
         self._fault = 0
         self._is_reported = True  # the state, by the amplifier itself
         self.is_answered = True  # and in an answer to its host
-        self.faulted_at = -math.inf  # when it was seen to go into a fault last
-        self.watchdog = Watchdog(name, slack=times.slack, complain=complain)
-        self._seen_at = -math.inf  # when it last said how it is
+        self.last_fault = -math.inf  # when it was seen to go into a fault last
+        self.watchdog = Watchdog(name, slack=times.slack, report=report)
+        self._last_status = -math.inf  # when it last said how it is
         self._token: int | None = None
         self._token_before: tuple[int | None, float] = (None, -math.inf)  # and until when it counts
         self._states_before: tuple[set[int], float] = (set(), -math.inf)  # the same, of a stop
-        self._played: deque[int] = deque(maxlen=_REMEMBERED)
-        self._staged: Asked | None = None
-        self._outputs = Outputs(name, plan, slack=times.slack, complain=complain)
+        self._played_tokens: deque[int] = deque(maxlen=_REMEMBERED)
+        self._staged: Request | None = None
+        self._outputs = ReferenceOutputs(name, config, slack=times.slack, report=report)
 
     @property
     def is_enabled(self) -> bool:
@@ -79,7 +87,7 @@ class Follower:
         """Whether it is in a fault of its own, or of its watchdog."""
         return self.state in (_REACTING, _FAULT)
 
-    def lose_track(self) -> None:
+    def forget_state(self) -> None:
         """What it does now is not known until it says so."""
         self.state = self._token = None
         self._fault = 0
@@ -89,92 +97,94 @@ class Follower:
 
     def restarted(self, time: float) -> None:
         """It has got its supply anew: disarmed and silent."""
-        self.lose_track()
+        self.forget_state()
         self.state, self._token = 1, 0
         self._outputs.rest("its restart")
-        self._seen_at = time
+        self._last_status = time
 
     def fed(self, time: float) -> None:
         """Its watchdog was filled."""
         if self.state == _ENABLED:
             self.watchdog.fed((time, time))
 
-    def pass_to(self, time: float) -> None:
+    def advance(self, time: float) -> None:
         """Let happen what it must have done by itself until now."""
-        self._outputs.pass_to(time)
+        self._outputs.advance(time)
         if self.state == _ENABLED and self.watchdog.has_run_out(time):
             self._silence(self.watchdog.runs_out, SILENCING_RAMP, "the watchdog")
             self.state, self._fault, self._is_reported = _REACTING, 1, False
             self.is_answered = False
-            self.faulted_at = time
+            self.last_fault = time
 
     # what it grants
 
-    def granted(self, asked: Asked, answer: Answered, begin: float, end: float) -> None:
+    def request_granted(self, request: Request, reply: Reply, begin: float, end: float) -> None:
         """A request that was seen at `begin` was not refused, as is known at `end`."""
-        self.pass_to(begin)
-        self._check_state_allows(asked, end)
-        if asked.kind in FEEDING:
+        self.advance(begin)
+        self._check_state_allows(request, end)
+        if request.kind in WATCHDOG_FEEDING:
             self.watchdog.fed((begin, end))
-        match asked.kind:
-            case Kind.ARM:
+        match request.kind:
+            case RequestKind.ARM:
                 self._silence((begin, end), SILENCING_RAMP, "Arm")
                 self.state, self._fault, self._token = _ENABLED, 0, 0
-                self.watchdog.time = asked.watchdog
-                self._played.clear()
-            case Kind.DISARM | Kind.STOP:
-                self._stopped(asked, begin, end)
-            case Kind.STAGE:
-                self._staged = asked
-                self._check_achieved(asked, answer, end)
-            case Kind.APPLY:
-                self._check_achieved(asked, answer, end)
-                self._applied(asked, answer, begin, end)
-            case Kind.COMMIT:
-                self._committed(asked, answer, begin, end)
-            case Kind.CLEAR if self.state in (_STOPPED, _FAULT, _REACTING):
-                self._cleared(answer)
-            case Kind.ENVELOPE if asked.shape is not None:
-                self._outputs.load(asked.shape)
+                self.watchdog.time = request.watchdog
+                self._played_tokens.clear()
+            case RequestKind.DISARM | RequestKind.STOP:
+                self._stopped(request, begin, end)
+            case RequestKind.STAGE:
+                self._staged = request
+                self._check_achieved(request, reply, end)
+            case RequestKind.APPLY:
+                self._check_achieved(request, reply, end)
+                self._applied(request, reply, begin, end)
+            case RequestKind.COMMIT:
+                self._committed(request, reply, begin, end)
+            case RequestKind.CLEAR if self.state in (_STOPPED, _FAULT, _REACTING):
+                self._cleared(reply)
+            case RequestKind.ENVELOPE if request.envelope is not None:
+                self._outputs.load(request.envelope)
             case _:
                 pass
-        if answer.condition is not None:
-            self.said(answer.condition, begin, end)
+        if reply.status is not None:
+            self.status_reported(reply.status, begin, end)
 
-    def announced(self, asked: Asked, time: float) -> None:
+    def broadcast_sent(self, request: Request, time: float) -> None:
         """A broadcast that it may follow; nobody answers."""
-        self.pass_to(time)
+        self.advance(time)
         if self.state is None:
             return
-        self.watchdog.may_be_fed(time)
+        self.watchdog.may_feed(time)
         soon = (time, time + 0.010)  # as an answer would take
-        if asked.kind is Kind.STOP:
+        if request.kind is RequestKind.STOP:
             self._states_before = ({self.state}, soon[1])
-            self._stopped(asked, *soon)
+            self._stopped(request, *soon)
         elif (
-            asked.kind is Kind.COMMIT
+            request.kind is RequestKind.COMMIT
             and self._staged is not None
-            and asked.token == self._staged.token
+            and request.token == self._staged.token
             and self.state == _ENABLED
         ):
             self._token_before = (self._token, soon[1])
-            self._play(self._staged, self._staged.drives, *soon)
+            self._play(self._staged, self._staged.commands, *soon)
 
-    def _check_state_allows(self, asked: Asked, end: float) -> None:
-        sets = (Kind.STAGE, Kind.COMMIT, Kind.APPLY)
-        if asked.kind in sets and self.state not in (None, _ENABLED):
+    def _check_state_allows(self, request: Request, end: float) -> None:
+        sets = (RequestKind.STAGE, RequestKind.COMMIT, RequestKind.APPLY)
+        if request.kind in sets and self.state not in (None, _ENABLED):
             overdue = not self._is_reported
-            self._complain(
+            self._report(
                 "watchdog" if overdue else "enabled",
                 end,
-                f"{self._name} took a set although it must be in {self._named()}",
+                f"{self._name} took a set although it must be in {self._state_name()}",
             )
-        if asked.kind is Kind.ARM and self.state in _LATCHED and self._is_reported:
-            self._complain("latched", end, f"{self._name} let itself be armed in {self._named()}")
+        if request.kind is RequestKind.ARM and self.state in _LATCHED and self._is_reported:
+            self._report(
+                "latched", end, f"{self._name} let itself be armed in {self._state_name()}"
+            )
 
-    def _stopped(self, asked: Asked, begin: float, end: float) -> None:
-        self._silence((begin, end), asked.ramp, asked.kind.value)
-        if asked.kind is Kind.STOP:
+    def _stopped(self, request: Request, begin: float, end: float) -> None:
+        self._silence((begin, end), request.ramp, request.kind.value)
+        if request.kind is RequestKind.STOP:
             if self.state is None:  # it may have been in a fault for long
                 self.watchdog.fed((-math.inf, end))
             self.state = self.state if self.state in (_REACTING, _FAULT) else _STOPPED
@@ -183,58 +193,58 @@ class Follower:
         elif _ENABLED in self._states_before[0] and begin <= self._states_before[1]:
             self._states_before[0].add(3)  # it may have been disarmed before it was stopped
 
-    def _cleared(self, answer: Answered) -> None:
+    def _cleared(self, reply: Reply) -> None:
         """It may stay as it is, or go to disarmed."""
-        said = answer.condition
+        said = reply.status
         if said is None:
             self.state = None
         elif said.state in _OFF and not (self.state == _REACTING and self._is_reported):
             self.state, self._fault = 1, 0
             self._outputs.cause = "Clear"
 
-    def _committed(self, asked: Asked, answer: Answered, begin: float, end: float) -> None:
-        if asked.token == self._token:
+    def _committed(self, request: Request, reply: Reply, begin: float, end: float) -> None:
+        if request.token == self._token:
             return
-        if self._staged is None or self._staged.token != asked.token:
+        if self._staged is None or self._staged.token != request.token:
             if self.state is not None:
-                self._complain(
-                    "token", end, f"{self._name} played set {asked.token}, which is not staged"
+                self._report(
+                    "token", end, f"{self._name} played set {request.token}, which is not staged"
                 )
-            self.lose_track()
+            self.forget_state()
             return
-        self._check_achieved(self._staged, answer, end)
-        self._applied(self._staged, answer, begin, end)
+        self._check_achieved(self._staged, reply, end)
+        self._applied(self._staged, reply, begin, end)
 
-    def _applied(self, asked: Asked, answer: Answered, begin: float, end: float) -> None:
-        if asked.token == self._token:
+    def _applied(self, request: Request, reply: Reply, begin: float, end: float) -> None:
+        if request.token == self._token:
             return
-        if asked.token in self._played:
-            self._insist(
-                "token", end, f"{self._name} took set {asked.token} a second time after others"
+        if request.token in self._played_tokens:
+            self._report_always(
+                "token", end, f"{self._name} took set {request.token} a second time after others"
             )
-        drives = answer.achieved if answer.achieved is not None else asked.drives
-        self._play(asked, drives, begin, end)
-        if answer.is_as_asked is False and answer.achieved is None:
+        commands = reply.achieved if reply.achieved is not None else request.commands
+        self._play(request, commands, begin, end)
+        if reply.is_exact is False and reply.achieved is None:
             self._outputs.free(math.inf)  # only an object tells what it plays
 
     # what it says
 
-    def said(self, condition: Condition, begin: float, end: float) -> None:
+    def status_reported(self, status: Status, begin: float, end: float) -> None:
         """How it says it is, at some time between two [s]."""
-        self.pass_to(begin)
-        if condition.temperature is not None:
-            self._outputs.is_warm = condition.temperature >= _WARM
-        self._check_condition(condition, begin, end)
-        self._seen_at = end
+        self.advance(begin)
+        if status.temperature is not None:
+            self._outputs.is_warm = status.temperature >= _WARM
+        self._check_condition(status, begin, end)
+        self._last_status = end
         self.is_answered = True
 
     def told(self, state: int, fault: int, time: float) -> None:
         """What it says unasked."""
         was_answered = self.is_answered and state == self.state
-        self.said(Condition(state, fault), time, time)
+        self.status_reported(Status(state, fault), time, time)
         self.is_answered = was_answered
 
-    def _check_condition(self, said: Condition, begin: float, end: float) -> None:
+    def _check_condition(self, said: Status, begin: float, end: float) -> None:
         if self.state is None:
             self._adopt(said, end)
         else:
@@ -243,7 +253,7 @@ class Follower:
         was_earlier = end <= until and said.token == before  # than a commit that nobody answers
         if said.token is not None and not was_earlier:
             if self._token not in (None, said.token):
-                self._complain(
+                self._report(
                     "token",
                     end,
                     f"{self._name} says that set {said.token} plays, but the last that it took is "
@@ -259,13 +269,13 @@ class Follower:
             must = {_ENABLED: True, _FAULT: False, **dict.fromkeys(_OFF, False)}.get(said.state)
             if must is not None and must != said.high_voltage:
                 what = "off" if must else "on"
-                self._complain(
+                self._report(
                     "high_voltage",
                     end,
                     f"{self._name} has its high voltage {what} in {NAMES[said.state]}",
                 )
 
-    def _adopt(self, said: Condition, time: float) -> None:
+    def _adopt(self, said: Status, time: float) -> None:
         """The first that is known of it."""
         self.state, self._fault, self._is_reported = said.state, said.fault, True
         if said.state in _SILENT:
@@ -274,34 +284,34 @@ class Follower:
             self._outputs.free(math.inf)
             self.watchdog.fed((-math.inf, time))
 
-    def _check_state(self, said: Condition, end: float) -> None:
+    def _check_state(self, said: Status, end: float) -> None:
         here, now = self.state, said.state
         trips = now in (_REACTING, _FAULT) and here not in (None, *_OFF, _REACTING, _FAULT)
         states, until = self._states_before
-        if end <= until and any(now in _following(state) for state in states):
+        if end <= until and any(now in _possible_states(state) for state in states):
             return  # it was said before the stop that nobody answers
         if trips:
-            self.faulted_at = end
+            self.last_fault = end
             self._check_trip(said, end)
-        elif now not in _following(here or 0):
-            self._complain(self._rule_against(now), end, self._what_is_wrong(now))
+        elif now not in _possible_states(here or 0):
+            self._report(self._rule_against(now), end, self._what_is_wrong(now))
         elif now in _LATCHED and self._fault and said.fault != self._fault:
-            self._complain(
+            self._report(
                 "latched", end, f"{self._name} was in fault {self._fault}, now it says {said.fault}"
             )
         if now in (_REACTING, _FAULT):
             self._fault = said.fault
-        self._outputs.judge_suspicions(is_enabled=now not in (_REACTING, _FAULT))
+        self._outputs.resolve_suspicions(is_enabled=now not in (_REACTING, _FAULT))
         self.state, self._is_reported = now, True
 
-    def _check_trip(self, said: Condition, end: float) -> None:
+    def _check_trip(self, said: Status, end: float) -> None:
         """A fault of its own, or the watchdog, not before its time."""
-        since = (min(self._seen_at, end), end)
+        since = (min(self._last_status, end), end)
         if said.fault == 1:
             self.watchdog.check_trip(end)
-            since = (min(max(self.watchdog.runs_out[0], self._seen_at), end), end)
+            since = (min(max(self.watchdog.runs_out[0], self._last_status), end), end)
         elif said.fault == 0:
-            self._complain("state", end, f"{self._name} is in {NAMES[said.state]} without a fault")
+            self._report("state", end, f"{self._name} is in {NAMES[said.state]} without a fault")
         self._silence(since, SILENCING_RAMP, "a fault")
 
     def _rule_against(self, now: int) -> str:
@@ -314,19 +324,19 @@ class Follower:
     def _what_is_wrong(self, now: int) -> str:
         if not self._is_reported and now == _ENABLED:
             return f"{self._name} is still enabled although {self.watchdog}"
-        return f"{self._name} must be in {self._named()}, but it says {NAMES[now]}"
+        return f"{self._name} must be in {self._state_name()}, but it says {NAMES[now]}"
 
     def _check_left(self, left: float, state: int, begin: float, end: float) -> None:
         if state == _ENABLED:
             self.watchdog.check_left(left, begin, end)
         elif state in _OFF and left:
-            self._complain("watchdog", end, f"{self._name}'s watchdog runs while it is disarmed")
+            self._report("watchdog", end, f"{self._name}'s watchdog runs while it is disarmed")
 
     # what it plays
 
     def plays(self, levels: Sequence[float], frequencies: Mapping[int, float], time: float) -> None:
         """What a sensor finds on its channels: levels, and where it is known the frequency [Hz]."""
-        self.pass_to(time)
+        self.advance(time)
         self._outputs.check_sensors(
             levels,
             frequencies,
@@ -335,26 +345,35 @@ class Follower:
             is_enabled=self.is_enabled,
         )
 
-    def _play(self, asked: Asked, drives: Mapping[int, Drive], begin: float, end: float) -> None:
-        self._token, self._staged = asked.token, None
-        self._played.append(asked.token)
-        self._outputs.play(asked, drives, begin, end)
+    def _play(
+        self, request: Request, commands: Mapping[int, ChannelCommand], begin: float, end: float
+    ) -> None:
+        self._token, self._staged = request.token, None
+        self._played_tokens.append(request.token)
+        self._outputs.play(request, commands, begin, end)
 
     def _silence(self, begin: tuple[float, float], ramp: float, cause: str) -> None:
         self._staged = None
         self._outputs.silence(begin, ramp, cause)
 
-    def _check_achieved(self, asked: Asked, answer: Answered, time: float) -> None:
+    def _check_achieved(self, request: Request, reply: Reply, time: float) -> None:
         is_warm = self._outputs.is_warm
-        check_achieved(self._name, asked, answer, time, is_warm=is_warm, complain=self._complain)
+        check_achieved(
+            self._name,
+            request,
+            reply,
+            time,
+            is_warm=is_warm,
+            report=self._report,
+        )
 
     def _may_trip(self, time: float) -> bool:
         return self.state == _ENABLED and self.watchdog.may_have_run_out(time)
 
-    def _named(self) -> str:
+    def _state_name(self) -> str:
         return NAMES[self.state] if self.state is not None else "some state"
 
 
-def _following(state: int) -> tuple[int, ...]:
+def _possible_states(state: int) -> tuple[int, ...]:
     """The states in which an amplifier may be that was in one, and was asked nothing since."""
     return _BY_ITSELF.get(state, (state,))

@@ -20,7 +20,7 @@ KINDS = ("serial", "modbus-tcp", "modbus-rtu", "socketcand", "slcan")
 
 
 @dataclass(frozen=True, slots=True)
-class Limits:
+class ChannelLimits:
     """What one channel may be asked for: Hz, level 0..1, rise of the level in 1/s."""
 
     frequency_min: float
@@ -30,7 +30,7 @@ class Limits:
 
 
 @dataclass(frozen=True, slots=True)
-class Times:
+class TimeLimits:
     """How long things may take [s].
 
     lift: from the last finger's lift to a command of zero; release: to zero itself;
@@ -50,24 +50,24 @@ class Times:
 
 
 @dataclass(frozen=True)
-class AmplifierPlan:
+class AmplifierConfig:
     """An amplifier: on which wire, under which address, unit or node, and its channels' limits."""
 
     wire: str
     address: int
-    channels: Mapping[int, Limits]
+    channels: Mapping[int, ChannelLimits]
 
 
 @dataclass(frozen=True)
-class Plan:
+class WitnessConfig:
     """Wires with their kinds, amplifiers by name, and times."""
 
     wires: Mapping[str, str]
-    amplifiers: Mapping[str, AmplifierPlan]
-    times: Times = field(default_factory=Times)
+    amplifiers: Mapping[str, AmplifierConfig]
+    times: TimeLimits = field(default_factory=TimeLimits)
 
 
-def plan_of(given: Mapping[str, Any]) -> Plan:
+def parse_config(given: Mapping[str, Any]) -> WitnessConfig:
     """The plan in a plain dictionary; InputError says which key is wrong."""
     _check_keys(given, {"wires", "amplifiers", "times_s"}, "the plan")
     wires = dict(_mapping(given, "wires"))
@@ -78,12 +78,12 @@ def plan_of(given: Mapping[str, Any]) -> Plan:
         name: _amplifier(name, raw, wires) for name, raw in _mapping(given, "amplifiers").items()
     }
     raw_times = given.get("times_s", {})
-    _check_keys(raw_times, {one.name for one in fields(Times)}, "times_s")
+    _check_keys(raw_times, {one.name for one in fields(TimeLimits)}, "times_s")
     times = {key: _number(time, f"times_s.{key}") for key, time in raw_times.items()}
-    return Plan(wires, amplifiers, Times(**times))
+    return WitnessConfig(wires, amplifiers, TimeLimits(**times))
 
 
-def _amplifier(name: str, raw: Any, wires: Mapping[str, str]) -> AmplifierPlan:
+def _amplifier(name: str, raw: Any, wires: Mapping[str, str]) -> AmplifierConfig:
     where = f"amplifiers.{name}"
     if not isinstance(raw, Mapping):
         raise InputError(f"{where} must be a mapping with wire, address and channels")
@@ -95,10 +95,10 @@ def _amplifier(name: str, raw: Any, wires: Mapping[str, str]) -> AmplifierPlan:
         int(number): _limits(limits, f"{where}.channels.{number}")
         for number, limits in _mapping(raw, "channels", where).items()
     }
-    return AmplifierPlan(wire, int(_number(raw.get("address", 1), f"{where}.address")), channels)
+    return AmplifierConfig(wire, int(_number(raw.get("address", 1), f"{where}.address")), channels)
 
 
-def _limits(raw: Any, where: str) -> Limits:
+def _limits(raw: Any, where: str) -> ChannelLimits:
     if not isinstance(raw, Mapping):
         raise InputError(f"{where} must be a mapping with frequency_hz and level")
     _check_keys(raw, {"frequency_hz", "level", "slew_per_s"}, where)
@@ -107,7 +107,7 @@ def _limits(raw: Any, where: str) -> Limits:
         raise InputError(f"{where}.frequency_hz is {band!r}; it must be [lowest, highest]")
     low, high = (_number(one, f"{where}.frequency_hz") for one in band)
     slew = _number(raw["slew_per_s"], f"{where}.slew_per_s") if "slew_per_s" in raw else math.inf
-    return Limits(low, high, _number(raw.get("level"), f"{where}.level"), slew)
+    return ChannelLimits(low, high, _number(raw.get("level"), f"{where}.level"), slew)
 
 
 def _mapping(raw: Mapping[str, Any], key: str, where: str = "the plan") -> Mapping[Any, Any]:

@@ -1,4 +1,4 @@
-"""`era witness`: stand in the wires of amplifiers, or read a capture, and say what is wrong."""
+"""`era witness`: check the traffic of amplifiers, live or from a capture."""
 
 import json
 import math
@@ -19,36 +19,34 @@ if TYPE_CHECKING:
 
 
 def witness(
-    urls: Annotated[
-        list[str], typer.Argument(metavar="URL...", help="Amplifiers, as era sim prints them.")
-    ],
+    urls: Annotated[list[str], typer.Argument(metavar="URL...", help="URLs of the amplifiers.")],
     replay: Annotated[
         Path | None,
-        typer.Option(metavar="CAPTURE", help="Read this capture instead of standing in wires."),
+        typer.Option(metavar="CAPTURE", help="Check a capture instead of live wires."),
     ] = None,
     record: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Write a capture of all that passes.")
+        Path | None, typer.Option(metavar="FILE", help="Write a capture of all traffic.")
     ] = None,
     frequency: Annotated[
-        str, typer.Option(metavar="LOW,HIGH", help="Frequencies that are allowed [Hz].")
+        str, typer.Option(metavar="LOW,HIGH", help="Allowed frequencies [Hz].")
     ] = "10,655.35",
     level: Annotated[
-        float, typer.Option(metavar="LEVEL", help="The highest level that is allowed.")
+        float, typer.Option(metavar="LEVEL", help="Highest allowed level, 0..1.")
     ] = 1.0,
     slew: Annotated[
-        float | None, typer.Option(metavar="PER_S", help="How fast a level may rise.")
+        float | None, typer.Option(metavar="PER_S", help="Highest allowed rise of a level [1/s].")
     ] = None,
     channels: Annotated[
-        int, typer.Option(metavar="N", help="Channels that each amplifier has.", min=1, max=16)
+        int, typer.Option(metavar="N", help="Channels of each amplifier.", min=1, max=16)
     ] = 4,
     slack: Annotated[
-        float, typer.Option(metavar="MS", help="What times may be wrong by on this machine.")
+        float, typer.Option(metavar="MS", help="Tolerance of times on this machine [ms].")
     ] = 20.0,
-    as_json: Annotated[bool, typer.Option("--json", help="One JSON object and no text.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
-    """Watch the wires of amplifiers by decoders of its own. Exit status 1 if a rule was broken.
+    """Check the traffic of amplifiers against the documented protocol; exit status 1 on violations.
 
-    Prints a URL for each: use it in place of the amplifier's. Ends with Ctrl-C.
+    Print a relay URL for each amplifier, to be used in its place, and check until Ctrl-C.
     """
     from sim.witness.endpoint import parse_endpoint
     from sim.witness.witness import Witness
@@ -61,34 +59,34 @@ def witness(
         limits["slew_per_s"] = _in_range("--slew", slew, unit="of full stroke a second")
     slack = _in_range("--slack", slack, unit="ms")
     if replay is not None and record is not None:
-        raise InputError(
-            "--record writes what passes a wire, and with --replay nothing passes one: leave out "
-            "one of the two"
-        )
-    places = [parse_endpoint(url) for url in urls]
-    _check_apart(places)
-    wires = {place: f"wire{n}" for n, place in enumerate(dict.fromkeys(p.place for p in places), 1)}
-    plan = {
-        "wires": {wires[place.place]: place.kind for place in places},
+        raise InputError("--record and --replay exclude each other: give one of them")
+    endpoints = [parse_endpoint(url) for url in urls]
+    _check_apart(endpoints)
+    wires = {
+        location: f"wire{n}"
+        for n, location in enumerate(dict.fromkeys(each.location for each in endpoints), 1)
+    }
+    config = {
+        "wires": {wires[endpoint.location]: endpoint.kind for endpoint in endpoints},
         "amplifiers": {
-            place.url: {
-                "wire": wires[place.place],
-                "address": place.address,
+            endpoint.url: {
+                "wire": wires[endpoint.location],
+                "address": endpoint.address,
                 "channels": dict.fromkeys(range(channels), limits),
             }
-            for place in places
+            for endpoint in endpoints
         },
         "times_s": {"slack": slack * 1e-3},
     }
     with ExitStack() as stack:
         capture = None if record is None else stack.enter_context(closing(_Capture(record)))
-        seen = Witness(plan, record=None if capture is None else capture.write)
+        checker = Witness(config, record=None if capture is None else capture.write)
         if replay is not None:
-            found = _replay(replay, seen)
+            found = _replay(replay, checker)
         else:
-            names = [wires[place.place] for place in places]
-            found = _stand_in(places, names, seen, to=sys.stderr if as_json else sys.stdout)
-    _tell(found, seen, as_json=as_json)
+            names = [wires[endpoint.location] for endpoint in endpoints]
+            found = _relay(endpoints, names, checker, to=sys.stderr if as_json else sys.stdout)
+    _print(found, checker, as_json=as_json)
     if capture is not None:
         capture.check()
     if found:
@@ -101,39 +99,39 @@ def _band(text: str) -> list[float]:
     except ValueError:
         low = high = math.nan
     if not 0 <= low <= high < math.inf:
-        raise InputError(f"--frequency {text!r} is not LOW,HIGH in Hz, as in 40,500")
+        raise InputError(f"--frequency must be LOW,HIGH in Hz, as in 40,500, got {text!r}")
     return [low, high]
 
 
 def _in_range(option: str, given: float, *, most: float = math.inf, unit: str) -> float:
     if not 0 <= given <= most or math.isinf(given):
         to = "or more" if math.isinf(most) else f"to {most:g}"
-        raise InputError(f"{option} {given:g} is out of range; write 0 {to}, {unit}")
+        raise InputError(f"{option} must be 0 {to} {unit}, got {given:g}")
     return given
 
 
-def _check_apart(places: list["WireEndpoint"]) -> None:
-    """That no two URLs mean one amplifier, or one wire in two ways."""
-    for number, place in enumerate(places):
-        for other in places[:number]:
-            if place.place != other.place:
+def _check_apart(endpoints: list["WireEndpoint"]) -> None:
+    """Refuse two URLs for one amplifier, or for one wire in two ways."""
+    for number, endpoint in enumerate(endpoints):
+        for other in endpoints[:number]:
+            if endpoint.location != other.location:
                 continue
-            if place.kind != other.kind:
+            if endpoint.kind != other.kind:
                 raise InputError(
-                    f"{other.url} and {place.url} are one wire in two ways, {other.kind} and "
-                    f"{place.kind}; give the URL of the way that is spoken there"
+                    f"{other.url} and {endpoint.url}: one wire cannot be {other.kind} and "
+                    f"{endpoint.kind}; give the URL of its actual protocol"
                 )
-            if place.address == other.address:
+            if endpoint.address == other.address:
                 raise InputError(
-                    f"{other.url} and {place.url} are one amplifier, number {place.address}; give "
-                    "each once, and by the number that it has on the wire"
+                    f"{other.url} and {endpoint.url}: both are amplifier {endpoint.address} of one "
+                    "wire; give each amplifier once, by its address"
                 )
 
 
 class _Capture:
-    """A capture that is being written. Wires do not wait for a disk: whatever befalls it is kept.
+    """A capture file; write errors are kept until `check`, so that relaying goes on.
 
-    Raises InputError where it cannot be begun.
+    Raises InputError where it cannot be opened.
     """
 
     def __init__(self, path: Path) -> None:
@@ -142,10 +140,10 @@ class _Capture:
         try:
             self._file = path.open("w", encoding="utf-8")
         except OSError as problem:
-            raise InputError(f"--record {path} cannot be written: {problem.strerror}") from problem
+            raise InputError(f"--record {path}: cannot be written: {problem.strerror}") from problem
 
     def write(self, line: str) -> None:
-        """Add a line, unless one could not be written."""
+        """Append a line, unless an earlier one failed."""
         if self._problem is None:
             try:
                 print(line, file=self._file)
@@ -153,44 +151,42 @@ class _Capture:
                 self._problem = problem
 
     def close(self) -> None:
-        """Write what still waits."""
+        """Flush and close."""
         try:
             self._file.close()
         except OSError as problem:
             self._problem = self._problem or problem
 
     def check(self) -> None:
-        """Raise InputError if not all is in the file."""
+        """Raise InputError if the capture is incomplete."""
         if self._problem is not None:
             raise InputError(
-                f"--record {self._path}: the capture broke off ({self._problem.strerror}), and "
-                "what came later is not in it; make room, or record elsewhere"
+                f"--record {self._path}: capture incomplete: {self._problem.strerror}; free disk "
+                "space, or record elsewhere"
             ) from self._problem
 
 
-def _replay(path: Path, seen: "Witness") -> list["Violation"]:
+def _replay(path: Path, checker: "Witness") -> list["Violation"]:
     from sim.witness.capture import read_capture
 
     end = None
-    for piece in read_capture(path, wires=seen.wires):
-        seen.bytes(piece.wire, piece.direction, piece.time, piece.data)
+    for piece in read_capture(path, wires=checker.wires):
+        checker.bytes(piece.wire, piece.direction, piece.time, piece.data)
         end = piece.time
     if end is None:
         raise InputError(
-            f"{path} holds no bytes at all; a capture has a line TIME WIRE > HEX for each piece of "
-            "them, as --record writes it"
+            f"{path}: must hold lines TIME WIRE > HEX, as --record writes them, got none"
         )
-    found = seen.finish(end)
-    if not seen.frames:
+    found = checker.finish(end)
+    if not checker.frames:
         raise InputError(
-            f"in the bytes of {path} is not one frame, so nothing was checked; give URLs of the "
-            "kind of wire from which the capture is"
+            f"{path}: no frame decoded, nothing was checked; give URLs of the captured kind of wire"
         )
     return found
 
 
-def _stand_in(
-    places: list["WireEndpoint"], names: list[str], seen: "Witness", *, to: TextIO
+def _relay(
+    endpoints: list["WireEndpoint"], names: list[str], checker: "Witness", *, to: TextIO
 ) -> list["Violation"]:
     import asyncio
     import signal
@@ -202,16 +198,16 @@ def _stand_in(
         ended = asyncio.Event()
         for number in (signal.SIGTERM, signal.SIGINT):
             asyncio.get_running_loop().add_signal_handler(number, ended.set)
-        async with relays(places, names, seen) as ends:
-            for place, end in zip(places, ends, strict=True):
-                print(f"{place.url}: {end}", file=to, flush=True)
+        async with relays(endpoints, names, checker) as ends:
+            for endpoint, end in zip(endpoints, ends, strict=True):
+                print(f"{endpoint.url}: {end}", file=to, flush=True)
             await ended.wait()
 
     asyncio.run(run())
-    return seen.finish(time.monotonic())
+    return checker.finish(time.monotonic())
 
 
-def _tell(found: list["Violation"], seen: "Witness", *, as_json: bool) -> None:
+def _print(found: list["Violation"], checker: "Witness", *, as_json: bool) -> None:
     if as_json:
         listed = [
             {
@@ -223,9 +219,8 @@ def _tell(found: list["Violation"], seen: "Witness", *, as_json: bool) -> None:
             }
             for one in found
         ]
-        print(json.dumps({"frames": seen.frames, "violations": listed}))
+        print(json.dumps({"frames": checker.frames, "violations": listed}))
         return
     for one in found:
         print(one)
-    said = f"{len(found)} broken" if found else "no rule was broken"
-    print(f"{counted(seen.frames, 'frame')}: {said}")
+    print(f"{counted(checker.frames, 'frame')}, {counted(len(found), 'violation')}")

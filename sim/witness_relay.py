@@ -1,8 +1,6 @@
-"""A relay in a real wire: it passes bytes on and shows them to a witness.
+"""A relay in a real wire, which forwards bytes and passes a copy to a witness.
 
-A host uses the relay's end instead of the wire's; what it sends goes to the amplifier as it comes,
-and back. Bytes are passed on first and looked at then, so a relay adds what the system needs to
-hand them over twice.
+Bytes are forwarded before they are checked, to add as little latency as possible.
 """
 
 import asyncio
@@ -29,35 +27,36 @@ _logger = logging.getLogger(__name__)
 
 @asynccontextmanager
 async def relays(
-    places: Sequence[WireEndpoint],
+    endpoints: Sequence[WireEndpoint],
     names: Sequence[str],
     witness: Witness,
 ) -> AsyncIterator[list[str]]:
-    """Stand in these wires, each the witness's wire of its name; the URLs to use instead.
+    """Relay these endpoints, each under the witness's name of its wire; yields the URLs to use.
 
-    Places that are one wire share a relay. Raises LinkError where a wire cannot be opened.
+    Endpoints of one wire share a relay. Raises LinkError where a wire cannot be opened.
     """
-    ends: dict[str, str] = {}
+    relayed: dict[str, str] = {}
     async with contextlib.AsyncExitStack() as stack:
-        for place, name in zip(places, names, strict=True):
-            if place.place in ends:
-                continue
-            make = _line if place.is_device else _network
-            ends[place.place] = await stack.enter_async_context(make(place, name, witness))
-        yield [place.through(ends[place.place]) for place in places]
+        for endpoint, name in zip(endpoints, names, strict=True):
+            if endpoint.location not in relayed:
+                relay = _serial_relay if endpoint.is_device else _tcp_relay
+                relayed[endpoint.location] = await stack.enter_async_context(
+                    relay(endpoint, name, witness)
+                )
+        yield [endpoint.url_via(relayed[endpoint.location]) for endpoint in endpoints]
 
 
 @asynccontextmanager
-async def _line(place: WireEndpoint, name: str, witness: Witness) -> AsyncIterator[str]:
-    """A pseudo-terminal in front of a serial port."""
+async def _serial_relay(endpoint: WireEndpoint, name: str, witness: Witness) -> AsyncIterator[str]:
+    """Relay a serial port through a pseudo-terminal."""
     try:
-        port = serial.Serial(place.place, baudrate=place.baud, timeout=0, exclusive=True)
+        port = serial.Serial(endpoint.location, baudrate=endpoint.baud, timeout=0, exclusive=True)
     except (OSError, ValueError) as problem:
         number = getattr(problem, "errno", None)
-        said = os.strerror(number) if number else problem
+        reason = os.strerror(number) if number else problem
         raise LinkError(
-            f"serial port {place.place} cannot be opened: check its name, and that nobody else has "
-            f"it open (the system says: {said})"
+            f"serial port {endpoint.location}: cannot be opened: {reason}; check its name, and "
+            "close other programs that use it"
         ) from problem
     loop = asyncio.get_running_loop()
 
@@ -92,10 +91,10 @@ async def _line(place: WireEndpoint, name: str, witness: Witness) -> AsyncIterat
 
 
 @asynccontextmanager
-async def _network(place: WireEndpoint, name: str, witness: Witness) -> AsyncIterator[str]:
-    """A port of the loopback interface in front of a server."""
+async def _tcp_relay(endpoint: WireEndpoint, name: str, witness: Witness) -> AsyncIterator[str]:
+    """Relay a server through a port of the loopback interface."""
     loop = asyncio.get_running_loop()
-    host, _, number = place.place.rpartition(":")
+    host, _, number = endpoint.location.rpartition(":")
     open_now: set[_Half] = set()
     opening: set[asyncio.Task[None]] = set()
 
@@ -111,26 +110,25 @@ async def _network(place: WireEndpoint, name: str, witness: Witness) -> AsyncIte
     def shown(toward: Direction, data: bytes) -> None:
         witness.bytes(name, toward, time.monotonic(), data)
 
-    async def connect(front: "_Half") -> None:
+    async def open_back(front: "_Half") -> None:
         try:
             _, back = await loop.create_connection(
                 lambda: _Half("host", shown, lambda _: None, lambda _: None), host, int(number)
             )
         except OSError as problem:
             _logger.warning(
-                "%s takes no connection (%s), so whoever comes to the relay is hung up on: is the "
-                "amplifier switched on, and its URL right?",
-                place.place,
+                "%s: connection refused (%s), closing the relayed one; check power and URL",
+                endpoint.location,
                 problem.strerror or problem,
             )
-            front.hang_up()
+            front.close()
             return
-        back.meet(front)
-        front.meet(back)
+        back.connect(front)
+        front.connect(back)
 
     def make() -> "_Half":
         half = _Half("amplifier", shown, opened, closed)
-        task = loop.create_task(connect(half))
+        task = loop.create_task(open_back(half))
         opening.add(task)
         task.add_done_callback(opening.discard)
         return half
@@ -141,13 +139,13 @@ async def _network(place: WireEndpoint, name: str, witness: Witness) -> AsyncIte
     finally:
         server.close()
         for half in tuple(open_now):
-            half.hang_up()
+            half.close()
         await asyncio.gather(*opening, return_exceptions=True)
         await server.wait_closed()
 
 
 class _Half(asyncio.Protocol):
-    """One of the two connections of a relay; what it hears goes out at the other."""
+    """One of the two connections of a relay, which forwards to the other."""
 
     def __init__(
         self,
@@ -163,24 +161,24 @@ class _Half(asyncio.Protocol):
         self._other: _Half | None = None
         self._early = b""
         self._transport: asyncio.Transport | None = None
-        self._is_over = False
+        self._is_closed = False
 
-    def meet(self, other: "_Half") -> None:
-        """This is the other one, and what has come meanwhile is for it."""
+    def connect(self, other: "_Half") -> None:
+        """Connect the other half, and forward the bytes received meanwhile."""
         self._other = other
         early, self._early = self._early, b""
         if early:
             self.data_received(early)
-        if self._is_over:
-            other.hang_up()
+        if self._is_closed:
+            other.close()
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """It is there."""
+        """Note the transport."""
         self._transport = cast(asyncio.Transport, transport)
         self._opened(self)
 
     def data_received(self, data: bytes) -> None:
-        """Pass it on, then show it."""
+        """Forward, then show the witness."""
         if self._other is None or self._other._transport is None:
             self._early += data
             return
@@ -188,13 +186,13 @@ class _Half(asyncio.Protocol):
         self._shown(self._toward, data)
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Where one ends, the other does."""
-        self._is_over = True
+        """Close the other half, too."""
+        self._is_closed = True
         self._closed(self)
         if self._other is not None:
-            self._other.hang_up()
+            self._other.close()
 
-    def hang_up(self) -> None:
-        """End it."""
+    def close(self) -> None:
+        """Close the connection."""
         if self._transport is not None:
             self._transport.close()

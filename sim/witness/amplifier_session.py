@@ -1,4 +1,4 @@
-"""What is remembered of a host for each amplifier."""
+"""The host's communication with one amplifier, as far as rules need to remember it."""
 
 import math
 from collections import deque
@@ -9,40 +9,45 @@ from sim.witness.config import AmplifierConfig
 from sim.witness.decoded import ChannelCommand, ReportViolation, Request
 from sim.witness.reference_amplifier import ReferenceAmplifier
 
-_REMEMBERED = 16  # tokens since Arm
+_TOKENS_KEPT = 16  # since Arm
 
 
 @dataclass
 class AmplifierSession:
-    """A host's side of one amplifier; complain: see `Complain`."""
+    """Requests to one amplifier by name, and the reference model of it; times [s].
+
+    pending: requests by the key of their reply, each with its time; superseded: keys of requests
+    that were repeated and answered; abandoned: keys of a host that has disconnected since;
+    is_disturbed: whether faults were injected into the wire at or shortly before a time.
+    """
 
     name: str
     config: AmplifierConfig
     amplifier: ReferenceAmplifier
     report: ReportViolation
-    is_disturbed: Callable[[float], bool]  # at a time [s]
+    is_disturbed: Callable[[float], bool]
     pending: dict[Hashable, tuple[float, Request]] = field(default_factory=dict)
     overdue: set[Hashable] = field(default_factory=set)
-    superseded: set[Hashable] = field(default_factory=set)  # the same was asked again, and answered
-    abandoned: set[Hashable] = field(default_factory=set)  # asked by a host that has hung up since
-    vibrates: bool = False  # the last that it was told
-    last_vibration: float = -math.inf  # when a set that vibrates was granted last
-    last_silenced: float = -math.inf  # when it was told to be silent last
+    superseded: set[Hashable] = field(default_factory=set)
+    abandoned: set[Hashable] = field(default_factory=set)
+    vibrates: bool = False  # by the last set that was sent
+    last_vibration: float = -math.inf  # when a vibrating set was accepted
+    last_silenced: float = -math.inf  # when a silencing request was sent
     staged: dict[int, Request] = field(default_factory=dict)
-    tokens: deque[tuple[int, Request]] = field(default_factory=lambda: deque(maxlen=_REMEMBERED))
+    tokens: deque[tuple[int, Request]] = field(default_factory=lambda: deque(maxlen=_TOKENS_KEPT))
+    committed_tokens: deque[int] = field(default_factory=lambda: deque(maxlen=_TOKENS_KEPT))
     levels: dict[int, ChannelCommand] = field(default_factory=dict)
     is_identified: bool | None = None
     is_open: bool = True
     is_stopped: bool = False
-    armed_at: float = -math.inf  # as it was granted last
+    armed_at: float = -math.inf
     stop_requested_at: float | None = None
     last_feed: float | None = None
     last_token: int = 0
-    told: deque[int] = field(default_factory=lambda: deque(maxlen=_REMEMBERED))  # to play
-    preempted_at: float = -math.inf  # when silence went before whatever was waited for
+    preempted_at: float = -math.inf  # when a silencing request overtook pending ones
 
     def forget_pending(self) -> None:
-        """Nobody waits for an answer any more, though some may come yet."""
+        """Abandon the pending requests; their replies may still arrive."""
         if self.pending:
             self.abandoned = set(self.pending)
         self.pending.clear()

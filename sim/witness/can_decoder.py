@@ -1,7 +1,7 @@
-"""CAN, from docs/reference/wire-can.md: orders and answers, sets, heartbeats and emergencies.
+"""Decoder for CAN, from docs/reference/wire-can.md: requests, replies, sets, heartbeats, EMCY.
 
-A set is the commands that came under its order's sequence number. SDO and NMT mean nothing here but
-that somebody was identified, that an envelope was loaded, or that an amplifier starts anew.
+A set consists of the commands with the sequence number of its request. Of SDO and NMT only
+identification, envelope transfers and boot-up are decoded.
 """
 
 import struct
@@ -10,6 +10,8 @@ from collections.abc import Mapping
 from sim.witness import quantities as q
 from sim.witness.can_text import CanFrame, SlcanText, SocketcandText
 from sim.witness.decoded import (
+    INCOMPLETE_SET,
+    SETS,
     BootUp,
     ChannelCommand,
     Damaged,
@@ -33,7 +35,7 @@ _PER_NODE = 4
 
 
 class CanDecoder:
-    """Text of an adapter both ways to meanings; nodes: of the amplifiers, with their channels."""
+    """Decodes the text of an adapter; nodes: number of channels by node."""
 
     def __init__(self, kind: str, nodes: Mapping[int, int]) -> None:
         reader = SlcanText if kind == "slcan" else SocketcandText
@@ -44,21 +46,21 @@ class CanDecoder:
         self._nodes = {node: _Node(node, channels) for node, channels in nodes.items()}
 
     def feed(self, direction: Direction, time: float, data: bytes) -> list[DecodedFrame]:
-        """What these bytes complete."""
+        """Decode bytes; returns the complete frames."""
         seen: list[DecodedFrame] = []
         for text in self._text[direction].feed(data):
             if text.is_damaged:
-                seen.append((text.raw, Damaged("a line that makes no frame")))
+                seen.append((text.raw, Damaged("a malformed frame line")))
             elif text.frame is not None:
                 seen += [(text.raw, message) for message in self.take(direction, text.frame)]
         return seen
 
     def has_partial_frame(self, direction: Direction) -> bool:
-        """Whether the last bytes that went this way have begun what others may complete."""
+        """Whether the last bytes in this direction begin a frame."""
         return self._text[direction].has_partial_frame
 
     def take(self, direction: Direction, frame: CanFrame) -> list[Message | None]:
-        """What one frame means, to each amplifier that it concerns."""
+        """Decode one frame; one message for each amplifier that it concerns."""
         try:
             if direction == "amplifier":
                 return self._decode_request(frame)
@@ -67,7 +69,7 @@ class CanDecoder:
             node = frame.identifier & 0x7F
             if direction == "amplifier":
                 return [Request(RequestKind.READ, node, problem=str(problem))]
-            return [Damaged(f"a frame that makes no message: {problem}")]
+            return [Damaged(f"an invalid frame: {problem}")]
 
     def _decode_request(self, frame: CanFrame) -> list[Message | None]:
         function, number = frame.identifier & 0x780, frame.identifier & 0x7F
@@ -76,14 +78,14 @@ class CanDecoder:
         if frame.identifier == 0x080:
             for node in self._nodes.values():
                 node.commands.clear()
-                node.shaped.clear()
+                node.slots.clear()
             return [None]
         if function == 0x700:
             return [Request(RequestKind.PING, 128 - number)]
         if frame.identifier == 0x480:
             return [_broadcast(frame)]
         if function == 0x480 and number in self._nodes:
-            return [self._nodes[number].order(frame)]
+            return [self._nodes[number].request(frame)]
         for node in self._nodes.values():
             if node.owns(frame):
                 node.take(frame)
@@ -102,7 +104,7 @@ class CanDecoder:
             state = frame.data[3] & 0xF
             return [StateEvent(number, state, frame.data[3] >> 4)]
         if function == 0x580 and number in self._nodes:
-            # Of a transfer nobody knows here when it was carried out: it may have fed the watchdog.
+            # The transfer may have fed the watchdog at any time.
             return [Reply(number, "objects")]
         for node in self._nodes.values():
             if frame.identifier == 0x180 + node.number:
@@ -117,30 +119,30 @@ class CanDecoder:
 
 
 class _Node:
-    """What has come for and from one amplifier and is not whole yet."""
+    """Frames to and from one amplifier whose message is incomplete."""
 
     def __init__(self, number: int, channels: int) -> None:
         self.number = number
         self.numbers = range(number, number + max(1, -(-channels // _PER_NODE)))
         self.commands: dict[int, bytes] = {}
-        self.shaped: dict[int, tuple[int, int, int]] = {}
+        self.slots: dict[int, tuple[int, int, int]] = {}
         self.status: bytes | None = None
         self.levels: dict[int, bytes] = {}
 
     def owns(self, frame: CanFrame) -> bool:
-        """Whether it is a command, or slots, for this amplifier."""
+        """Whether a frame holds commands or slots for this amplifier."""
         function, number = frame.identifier & 0x780, frame.identifier & 0x7F
         if frame.identifier == 0x680 + self.number:
             return True
         return function in (0x200, 0x300, 0x400, 0x500) and number in self.numbers
 
     def take(self, frame: CanFrame) -> None:
-        """A command, commands in a CAN FD frame, or slots."""
+        """Store a command, the commands of a CAN FD frame, or slots."""
         if frame.identifier == 0x680 + self.number:
             word, group = int.from_bytes(frame.data[:6], "little"), frame.data[6] & 3
             for place in range(_PER_NODE):
                 pair = word >> 12 * place & 0xFFF
-                self.shaped[_PER_NODE * group + place] = pair & 0x3F, pair >> 6, frame.data[7]
+                self.slots[_PER_NODE * group + place] = pair & 0x3F, pair >> 6, frame.data[7]
         elif frame.is_fd:
             self.take_blocks(frame.data)
         else:
@@ -148,32 +150,32 @@ class _Node:
             self.commands[_PER_NODE * group + (frame.identifier >> 8) - 2] = frame.data
 
     def take_blocks(self, data: bytes) -> None:
-        """Commands one after the other, filled up."""
+        """Store consecutive commands; fillers are skipped."""
         for at in range(0, len(data) - 7, 8):
             block = data[at : at + 8]
             if block != _FILLING:
                 self.commands[block[6] >> 4] = block
 
-    def order(self, frame: CanFrame) -> Request:
-        """An order, with what has come under its number."""
+    def request(self, frame: CanFrame) -> Request:
+        """Decode a request with the commands of its sequence number."""
         token, ramp, time, what, sequence = struct.unpack_from("<HHHBB", frame.data)
         kind, count = _ACTIONS[what & 7], what >> 3
         self.commands = {at: block for at, block in self.commands.items() if block[7] == sequence}
         if frame.is_fd:
             self.take_blocks(frame.data[8:])
         key = (self.number, sequence, kind)
-        problem = "" if sequence else "an order with the sequence number 0"
+        problem = "" if sequence else "sequence number 0"
         commands: dict[int, ChannelCommand] = {}
         try:
             if kind in (RequestKind.APPLY, RequestKind.STAGE):
                 commands = self._channel_commands(sequence)
                 if len(commands) != count:
-                    problem = f"torn: {len(commands)} of {count} commands have come"
+                    problem = f"{INCOMPLETE_SET}: {len(commands)} of {count} commands"
             return Request(
                 kind,
                 self.number,
                 key,
-                token=whole(q.TOKEN, token, "token") if _has_token(kind) else 0,
+                token=whole(q.TOKEN, token, "token") if kind in SETS else 0,
                 ramp=value(q.RAMP, ramp, "ramp"),
                 valid_for=value(q.VALID_FOR, time, "valid_for") if commands else 0.0,
                 watchdog=value(q.WATCHDOG, time, "watchdog") if kind is RequestKind.ARM else 0.0,
@@ -190,10 +192,10 @@ class _Node:
             if own != sequence:
                 continue
             if flags >> 4 != channel or flags & 8:
-                raise OutOfRange(f"a command of channel {flags >> 4} in the frame of {channel}")
-            onset, ending, of = self.shaped.get(channel, (0, 0, -1)) if flags & 4 else (0, 0, own)
+                raise OutOfRange(f"command for channel {flags >> 4} in the frame of {channel}")
+            onset, ending, of = self.slots.get(channel, (0, 0, -1)) if flags & 4 else (0, 0, own)
             if of != own:
-                raise OutOfRange(f"torn: the slots of channel {channel} are missing")
+                raise OutOfRange(f"{INCOMPLETE_SET}: no slots for channel {channel}")
             commands[channel] = ChannelCommand(
                 value(q.FREQUENCY, frequency, "frequency"),
                 value(q.LEVEL, level, "level"),
@@ -206,13 +208,13 @@ class _Node:
         return commands
 
     def reply(self, frame: CanFrame) -> Message:
-        """An answer with the condition and levels that came before it, or an event."""
+        """Decode a reply with the status and levels sent before it, or an event."""
         sequence, what, both, _, token, left = struct.unpack_from("<BBBBHH", frame.data)
         state, fault = whole(q.STATE, both & 0xF, "state"), whole(q.FAULT, both >> 4, "fault")
         if sequence == 0:
             return StateEvent(self.number, state, fault)
         if frame.is_fd:
-            self._take_answer(frame.data[8:])
+            self._take_reply(frame.data[8:])
         status, levels = self.status, self.levels
         self.status, self.levels = None, {}
         result = what >> 4
@@ -222,16 +224,12 @@ class _Node:
             high_voltage, temperature = bool(flag & 1), degrees * 0.1
             said = _levels(levels, count & 0x1F, sequence)
         kind = _ACTIONS[what & 7]
-        is_whole = (
-            said is not None
-            or result
-            or kind in (RequestKind.APPLY, RequestKind.STAGE, RequestKind.COMMIT)
-        )
+        is_whole = said is not None or result or kind in SETS
         return Reply(
             self.number,
             (self.number, sequence, kind),
             refusal=result,
-            problem="" if is_whole else "its condition or its levels are missing",
+            problem="" if is_whole else "status or levels are missing",
             is_exact=bool(what & 8) if kind in (RequestKind.APPLY, RequestKind.STAGE) else None,
             status=Status(
                 state=state,
@@ -244,16 +242,12 @@ class _Node:
             ),
         )
 
-    def _take_answer(self, data: bytes) -> None:
+    def _take_reply(self, data: bytes) -> None:
         blocks = [data[at : at + 8] for at in range(0, len(data) - 7, 8)]
         blocks = [block for block in blocks if block != _FILLING]
         if blocks:
             self.status = blocks[0]
             self.levels = dict(enumerate(blocks[1:]))
-
-
-def _has_token(kind: RequestKind) -> bool:
-    return kind in (RequestKind.APPLY, RequestKind.STAGE, RequestKind.COMMIT)
 
 
 def _broadcast(frame: CanFrame) -> Request:
@@ -263,11 +257,11 @@ def _broadcast(frame: CanFrame) -> Request:
         return Request(kind, 0, token=whole(q.TOKEN, token, "token"))
     if kind is RequestKind.STOP:
         return Request(kind, 0, ramp=value(q.RAMP, ramp, "ramp"))
-    raise OutOfRange(f"{kind.value} to all")
+    raise OutOfRange(f"{kind.value} as a broadcast")
 
 
 def _levels(blocks: dict[int, bytes], count: int, sequence: int) -> tuple[float, ...] | None:
-    """The levels of so many channels; None where a block is missing."""
+    """Levels of `count` channels; None where a block is missing."""
     levels: list[float] = []
     for group in range(-(-count // _PER_NODE)):
         block = blocks.get(group)

@@ -1,8 +1,7 @@
-"""CAN frames out of the text that adapters speak: socketcand over TCP, slcan over a serial port.
+"""CAN frames in the text protocols of adapters: socketcand over TCP, slcan over a serial port.
 
-Written from the formats themselves: `< send ID LEN BYTES >` and `< frame ID TIME DATA >` with their
-`fd` siblings, and LAWICEL's `tIIILDD..` with `d` and `b` for CAN FD. What adapters and hosts say to
-each other beside frames means nothing here.
+`< send ID LEN BYTES >` and `< frame ID TIME DATA >` with their `fd` variants, and LAWICEL's
+`tIIILDD..` with `d` and `b` for CAN FD. Other text is ignored.
 """
 
 import re
@@ -11,9 +10,9 @@ from typing import NamedTuple
 from sim.witness.decoded import Direction
 
 LENGTHS = (0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64)
-"""That a CAN FD frame can have."""
+"""Data lengths of CAN FD frames, by length code."""
 
-_LONGEST = 512
+_MAX_LENGTH = 512
 _SEND = re.compile(rb"< send ([0-9A-Fa-f]+) (\d+)((?: [0-9A-Fa-f]+)*) +>")
 _FD_SEND = re.compile(rb"< fdsend ([0-9A-Fa-f]+) [0-9A-Fa-f]+ (\d+)((?: [0-9A-Fa-f]+)*) +>")
 _FRAME = re.compile(rb"< frame ([0-9A-Fa-f]+) [0-9.]+ ([0-9A-Fa-f ]*?) ?>")
@@ -30,7 +29,7 @@ class CanFrame(NamedTuple):
 
 
 class Text(NamedTuple):
-    """A piece of text: the frame in it; is_damaged: it ought to be one and is none."""
+    """A line or element; frame: None where it is none; is_damaged: a malformed frame."""
 
     raw: bytes
     frame: CanFrame | None
@@ -38,7 +37,7 @@ class Text(NamedTuple):
 
 
 class SocketcandText:
-    """Elements `< ... >` that go one way."""
+    """Splits elements `< ... >` of one direction."""
 
     def __init__(self, direction: Direction) -> None:
         self._toward: Direction = direction
@@ -46,13 +45,13 @@ class SocketcandText:
 
     @property
     def has_partial_frame(self) -> bool:
-        """Whether the last bytes have begun what others may complete."""
+        """Whether the last bytes begin a frame."""
         return bool(self._rest)
 
     def feed(self, data: bytes) -> list[Text]:
-        """What these bytes complete."""
+        """Decode bytes; returns the complete frames."""
         *elements, self._rest = re.split(rb"(?<=>)", self._rest + data)
-        self._rest = self._rest[-_LONGEST:]
+        self._rest = self._rest[-_MAX_LENGTH:]
         return [self._text(element.strip()) for element in elements]
 
     def _text(self, element: bytes) -> Text:
@@ -74,20 +73,20 @@ class SocketcandText:
 
 
 class SlcanText:
-    """Lines that go one way; each direction ends them with CR, refusals with BELL."""
+    """Splits lines of one direction, ended by CR, or BELL for refusals."""
 
     def __init__(self, direction: Direction) -> None:
         self._rest = b""
 
     @property
     def has_partial_frame(self) -> bool:
-        """Whether the last bytes have begun what others may complete."""
+        """Whether the last bytes begin a frame."""
         return bool(self._rest)
 
     def feed(self, data: bytes) -> list[Text]:
-        """What these bytes complete."""
+        """Decode bytes; returns the complete frames."""
         *lines, self._rest = re.split(rb"[\r\a]", self._rest + data)
-        self._rest = self._rest[-_LONGEST:]
+        self._rest = self._rest[-_MAX_LENGTH:]
         return [_slcan(line) for line in lines if line]
 
 

@@ -1,10 +1,9 @@
-"""Captures: the bytes of wires as text, a line a piece, to be witnessed later or elsewhere.
+"""Captures: the bytes of wires as text, one line per piece.
 
     TIME WIRE > HEX        toward the amplifier
     TIME WIRE < HEX        toward the host
 
-TIME in seconds of any clock. What begins with # is for people. Serial sniffers with two ports, and
-programs that read packets, are easily made to write this.
+TIME in seconds of any one clock; # begins a comment.
 """
 
 import math
@@ -17,7 +16,7 @@ from sim.witness.decoded import Direction
 
 
 class Piece(NamedTuple):
-    """Some bytes on a wire at a time [s]."""
+    """Bytes on a wire at a time [s]."""
 
     time: float
     wire: str
@@ -26,37 +25,35 @@ class Piece(NamedTuple):
 
 
 def read_capture(path: Path, *, wires: Collection[str] = ()) -> Iterator[Piece]:
-    """The pieces of a capture in their order, on these wires only if any are named.
+    """Read the pieces of a capture in order; wires: the names that are allowed, any if empty.
 
-    InputError says in which line it is none.
+    Raises InputError with file and line.
     """
     last = -math.inf
     try:
-        # What is no text is told of by its line, as everything that is no piece.
         with path.open(encoding="utf-8", errors="backslashreplace") as lines:
             for number, line in enumerate(lines, start=1):
                 text = line.partition("#")[0].strip()
                 if not text:
                     continue
-                where = f"{path}, line {number}"
+                where = f"{path}:{number}"
                 piece = _piece(text, where)
                 if piece.time < last:
                     raise InputError(
-                        f"{where}: its time, {piece.time:g} s, is before the {last:g} s of the "
-                        "line above; sort the lines by time, and let one clock tell all of them"
+                        f"{where}: time must not decrease, got {piece.time:g} s after {last:g} s; "
+                        "sort the lines, and use one clock for all wires"
                     )
                 if wires and piece.wire not in wires:
                     raise InputError(
-                        f"{where}: {piece.wire!r} is none of the wires: the URLs given are "
-                        f"{', '.join(wires)}, in their order; give a URL for each wire of the "
-                        "capture, and name the wires in it so"
+                        f"{where}: wire must be one of {', '.join(wires)} (by URL), "
+                        f"got {piece.wire!r}; give a URL for each wire of the capture"
                     )
                 last = piece.time
                 yield piece
     except FileNotFoundError:
-        raise InputError(f"{path}: no such file; check its name and folder") from None
+        raise InputError(f"{path}: no such file; check its name") from None
     except OSError as problem:
-        raise InputError(f"{path} cannot be read as a capture: {problem.strerror}") from problem
+        raise InputError(f"{path}: cannot be read: {problem.strerror}") from problem
 
 
 def _piece(text: str, where: str) -> Piece:
@@ -67,8 +64,9 @@ def _piece(text: str, where: str) -> Piece:
         piece = Piece(float(time), wire, arrows[arrow], bytes.fromhex(digits))
     except (ValueError, KeyError):
         raise InputError(
-            f"{where}: {text[:60]!r} is not TIME WIRE > HEX (or <), as in 0.0125 wire1 > 00 04 21"
+            f"{where}: must be TIME WIRE > HEX (or <), as in 0.0125 wire1 > 00 04 21, got "
+            f"{text[:60]!r}"
         ) from None
     if not math.isfinite(piece.time):
-        raise InputError(f"{where}: {parts[0]} is no time; write seconds, as in 0.0125")
+        raise InputError(f"{where}: time must be finite seconds, got {parts[0]}")
     return piece

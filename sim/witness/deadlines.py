@@ -1,7 +1,8 @@
-"""What a host owes within a time: silence, patterns and stops; looked at when the time is over."""
+"""What a host must do within a time limit: silence, patterns and stops."""
 
 from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass
+from functools import partial
 
 from sim.witness.amplifier_session import AmplifierSession
 from sim.witness.config import TimeLimits
@@ -10,17 +11,17 @@ from sim.witness.known_inputs import KnownInputs
 
 @dataclass
 class _Deadline:
-    """What must have happened when a time [s] is over; is_done is asked then."""
+    """A condition that must hold at time `due` [s]."""
 
     due: float
-    is_done: Callable[[], bool]
+    is_met: Callable[[], bool]
     invariant: str
     session: AmplifierSession
     sentence: str
 
 
 class Deadlines:
-    """Those of a host of these amplifiers; what a fault of a wire excuses is not complained of."""
+    """Pending deadlines of a host; those that end while a wire is disturbed are not checked."""
 
     def __init__(
         self, sessions: Mapping[str, AmplifierSession], inputs: KnownInputs, *, times: TimeLimits
@@ -28,105 +29,112 @@ class Deadlines:
         self._sessions = sessions
         self._inputs = inputs
         self._times = times
-        self._due: list[_Deadline] = []
+        self._pending: list[_Deadline] = []
 
     def advance(self, time: float) -> None:
-        """Look at those whose time is over."""
-        if any(deadline.due < time for deadline in self._due):
-            over = [deadline for deadline in self._due if deadline.due < time]
-            self._due = [deadline for deadline in self._due if deadline.due >= time]
-            for deadline in over:
-                if not (deadline.session.is_disturbed(deadline.due) or deadline.is_done()):
-                    deadline.session.report(deadline.invariant, deadline.due, deadline.sentence)
+        """Check the deadlines that have passed."""
+        passed = [deadline for deadline in self._pending if deadline.due < time]
+        if not passed:
+            return
+        self._pending = [deadline for deadline in self._pending if deadline.due >= time]
+        for deadline in passed:
+            session = deadline.session
+            if not (session.is_disturbed(deadline.due) or deadline.is_met()):
+                session.report(deadline.invariant, deadline.due, deadline.sentence)
 
-    def silence(self, last_lift: float) -> None:
-        """The last finger has gone."""
+    def expect_silence(self, last_lift: float) -> None:
+        """After the last lift every amplifier must be silenced."""
+        limit = self._times.lift
         for session in self._sessions.values():
-            self._due.append(
-                _Deadline(
-                    last_lift + self._times.lift,
-                    lambda session=session: self._is_released(session, last_lift),  # type: ignore[misc]
-                    "lift",
-                    session,
-                    f"the last finger was lifted at {last_lift:.4f} s, and "
-                    f"{self._times.lift * 1e3:g} ms later {session.name} was not told to be silent",
-                )
+            self._expect(
+                last_lift + limit,
+                partial(self._is_silenced, session, last_lift),
+                "lift",
+                session,
+                f"last finger lifted at {last_lift:.4f} s, {session.name} not silenced within "
+                f"{limit * 1e3:g} ms",
             )
 
-    def pattern(self, contact: Hashable, since: float) -> None:
-        """A finger has come."""
+    def expect_pattern(self, contact: Hashable, since: float) -> None:
+        """A new contact must lead to a pattern."""
         if not self._can_play():
             return
-        self._due.append(
-            _Deadline(
-                since + self._times.touch,
-                lambda: self._is_answered(contact, since),
-                "touch",
-                next(iter(self._sessions.values())),
-                f"a finger came at {since:.4f} s, and {self._times.touch * 1e3:g} ms later no "
-                "amplifier plays a pattern for it",
-            )
+        limit = self._times.touch
+        self._expect(
+            since + limit,
+            partial(self._has_pattern, contact, since),
+            "touch",
+            next(iter(self._sessions.values())),
+            f"touch at {since:.4f} s, no amplifier plays a pattern within {limit * 1e3:g} ms",
         )
 
-    def stop(self, session: AmplifierSession, time: float) -> None:
-        """A stop was wished."""
+    def expect_stop(self, session: AmplifierSession, time: float) -> None:
+        """A stop command must be sent to this amplifier."""
         session.stop_requested_at = time
-        self._due.append(
-            _Deadline(
-                time + self._times.stop,
-                lambda: session.stop_requested_at != time or not session.is_open,
-                "stop",
-                session,
-                f"a stop was wished at {time:.4f} s, and {self._times.stop * 1e3:g} ms later "
-                f"{session.name} has not been told",
-            )
+        limit = self._times.stop
+        self._expect(
+            time + limit,
+            lambda: session.stop_requested_at != time or not session.is_open,
+            "stop",
+            session,
+            f"stop requested at {time:.4f} s, not sent to {session.name} within {limit * 1e3:g} ms",
         )
 
     def expect_all_amplifiers(self, first: AmplifierSession, time: float, token: int) -> None:
-        """Where one amplifier plays a set, all do, or it is silenced."""
+        """A set played by one amplifier must be played by all, or silenced."""
+        limit = self._times.together
         for session in self._sessions.values():
-            if session is first or not session.amplifier.is_enabled:
-                continue
-            self._due.append(
-                _Deadline(
-                    time + self._times.together,
-                    lambda session=session: (  # type: ignore[misc]
-                        # Where nobody is left on the first one's wire, its watchdog silences it.
-                        token in session.told
-                        or not first.vibrates
-                        or first.last_silenced >= time  # since when it may play another set
-                        or not first.is_open
-                    ),
+            if session is not first and session.amplifier.is_enabled:
+                self._expect(
+                    time + limit,
+                    partial(_is_joined, session, first, time, token),
                     "commit",
                     session,
-                    f"{first.name} was told at {time:.4f} s to play set {token}, and "
-                    f"{self._times.together * 1e3:g} ms later {session.name} was not",
+                    f"{first.name} was commanded to play set {token} at {time:.4f} s, "
+                    f"{session.name} not within {limit * 1e3:g} ms",
                 )
-            )
 
-    def _is_released(self, session: AmplifierSession, last_lift: float) -> bool:
-        """Whether it was told to be silent after a lift, or has a good reason not to be."""
+    def _expect(
+        self,
+        due: float,
+        is_met: Callable[[], bool],
+        invariant: str,
+        session: AmplifierSession,
+        sentence: str,
+    ) -> None:
+        self._pending.append(_Deadline(due, is_met, invariant, session, sentence))
+
+    def _is_silenced(self, session: AmplifierSession, last_lift: float) -> bool:
+        """Whether it was silenced after a lift, or need not be."""
+        is_silent = not session.vibrates or session.amplifier.is_in_fault or not session.is_open
         is_touched_again = self._inputs.last_touch >= last_lift
-        told = not session.vibrates or session.amplifier.is_in_fault or not session.is_open
-        has_given_up = session.last_feed is None  # since some trouble
-        return told or is_touched_again or has_given_up or self._inputs.stalled_since is not None
+        is_given_up = session.last_feed is None  # since a disturbance
+        is_stalled = self._inputs.stalled_since is not None
+        return is_silent or is_touched_again or is_given_up or is_stalled
 
     def _can_play(self) -> bool:
-        sessions = self._sessions.values()
         return self._inputs.stalled_since is None and all(
             session.is_open and session.amplifier.is_enabled and not session.is_stopped
-            for session in sessions
+            for session in self._sessions.values()
         )
 
-    def _is_answered(self, contact: Hashable, since: float) -> bool:
-        """Whether a pattern plays since then, or there is a good reason why none does."""
+    def _has_pattern(self, contact: Hashable, since: float) -> bool:
+        """Whether a pattern plays since then, or none can."""
+        sessions = self._sessions.values()
         return (
-            any(session.last_vibration >= since for session in self._sessions.values())
+            any(session.last_vibration >= since for session in sessions)
             or contact not in (self._inputs.contacts or ())
             or self._inputs.last_silencing >= since
             or self._inputs.stalled_since is not None
-            or any(
-                session.amplifier.is_in_fault or not session.is_open
-                for session in self._sessions.values()
-            )
+            or any(session.amplifier.is_in_fault or not session.is_open for session in sessions)
         )
+
+
+def _is_joined(session: AmplifierSession, first: AmplifierSession, time: float, token: int) -> bool:
+    """Whether an amplifier plays the set of the first one too, or the first one is silenced."""
+    return (
+        token in session.committed_tokens
+        or not first.vibrates
+        or first.last_silenced >= time  # since then it may play another set
+        or not first.is_open  # its watchdog silences it
+    )

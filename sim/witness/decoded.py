@@ -1,7 +1,4 @@
-"""What the witness sees on a wire, whatever kind of wire it is.
-
-A frame becomes one of the meanings below; what is none of them was damaged.
-"""
+"""Decoded frames, the same for every kind of wire."""
 
 from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass, field
@@ -9,17 +6,16 @@ from enum import Enum
 from typing import Literal, TypeAlias
 
 Direction: TypeAlias = Literal["amplifier", "host"]
-"""Which way bytes go."""
+"""Where bytes go."""
 
 ReportViolation: TypeAlias = Callable[[str, float, str], None]
-"""Is told of a broken rule: its name, when [s], one sentence."""
+"""Called with the rule, the time [s] and a sentence."""
 
 Data: TypeAlias = bytes
-"""What goes over a wire."""
 
 
 class RequestKind(Enum):
-    """What a host asks. LOOK: only reads, and what has to do with no amplifier's state."""
+    """Kind of a request; READ: any read that does not concern the amplifier's state."""
 
     HELLO = "Hello"
     CAPABILITIES = "GetCaps"
@@ -34,42 +30,33 @@ class RequestKind(Enum):
     CLEAR = "Clear"
     PING = "Ping"
     ENVELOPE = "LoadEnvelope"
-    READ = "a look"
+    READ = "a read"
 
 
-WATCHDOG_FEEDING = frozenset(
-    {
-        *(
-            RequestKind.ARM,
-            RequestKind.DISARM,
-            RequestKind.STAGE,
-            RequestKind.COMMIT,
-            RequestKind.APPLY,
-            RequestKind.STOP,
-            RequestKind.CLEAR,
-        ),
-        *(RequestKind.PING, RequestKind.ENVELOPE),
-    }
-)
-"""Those that fill the watchdog again when they are not refused."""
+SETS = frozenset({RequestKind.STAGE, RequestKind.COMMIT, RequestKind.APPLY})
+"""Requests that carry a token."""
 
-STATE_CHANGING = frozenset(
-    {
-        RequestKind.ARM,
-        RequestKind.DISARM,
-        RequestKind.STAGE,
-        RequestKind.COMMIT,
-        RequestKind.APPLY,
-        RequestKind.STOP,
-        RequestKind.CLEAR,
-    }
-)
-"""Those that change what an amplifier does, or will do."""
+STATE_CHANGING = SETS | {
+    RequestKind.ARM,
+    RequestKind.DISARM,
+    RequestKind.STOP,
+    RequestKind.CLEAR,
+}
+"""Requests that change what the amplifier does."""
+
+WATCHDOG_FEEDING = STATE_CHANGING | {RequestKind.PING, RequestKind.ENVELOPE}
+"""Requests that feed the watchdog unless they are refused."""
+
+INCOMPLETE_SET = "incomplete set"
+"""How the problem of a set with missing frames begins."""
+
+REPLY_TO_DAMAGED_FRAME = "replies to a damaged frame"
+"""The problem of a reply to a request that arrived damaged."""
 
 
 @dataclass(frozen=True, slots=True)
 class ChannelCommand:
-    """One channel of a set: Hz, level 0..1, degrees, and its flags and envelope slots."""
+    """One channel of a set: frequency [Hz], level 0..1, phase [deg], flags and envelope slots."""
 
     frequency: float
     level: float
@@ -81,7 +68,7 @@ class ChannelCommand:
 
     @property
     def vibrates(self) -> bool:
-        """Whether it asks for any vibration."""
+        """Whether it commands any vibration."""
         return self.level > 0 or self.onset > 0
 
 
@@ -96,9 +83,9 @@ class EnvelopeLoad:
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """A request. address: of the amplifier, 0 for all; key: what its answer is known by, or None.
+    """A request. address: 0 for broadcast; key: matches its reply, None where there is none.
 
-    ramp, valid_for, watchdog [s]; drives by channel; problem: what is wrong with it, if anything.
+    ramp, valid_for, watchdog [s]; commands by channel; problem: what is wrong with it, or "".
     """
 
     kind: RequestKind
@@ -114,13 +101,18 @@ class Request:
 
     @property
     def vibrates(self) -> bool:
-        """Whether its own drives ask for any vibration."""
+        """Whether its own commands ask for any vibration."""
         return any(command.vibrates for command in self.commands.values())
+
+    @property
+    def is_incomplete_set(self) -> bool:
+        """Whether frames of the set are missing."""
+        return self.problem.startswith(INCOMPLETE_SET)
 
 
 @dataclass(frozen=True, slots=True)
 class Status:
-    """How an amplifier says it is; None where this wire does not say it here. Times [s], °C."""
+    """Reported status; None where the frame does not carry it. Times [s], temperature [°C]."""
 
     state: int
     fault: int
@@ -133,9 +125,9 @@ class Status:
 
 @dataclass(frozen=True, slots=True)
 class Reply:
-    """A reply. key: None where it answers nothing that is known; refusal: 0 if it was granted.
+    """A reply. key: of its request, None where it matches none; refusal: 0 if granted.
 
-    achieved: what the set plays, by channel, and its token.
+    achieved: the set as played, by channel, and its token; is_exact: whether it plays as commanded.
     """
 
     address: int
@@ -150,7 +142,7 @@ class Reply:
 
 @dataclass(frozen=True, slots=True)
 class StateEvent:
-    """A change of state that an amplifier tells unasked."""
+    """An unsolicited change of state."""
 
     address: int
     state: int
@@ -159,21 +151,18 @@ class StateEvent:
 
 @dataclass(frozen=True, slots=True)
 class BootUp:
-    """An amplifier, or what calls itself one, has just got its supply."""
+    """An amplifier, or another device with its address, has started."""
 
     address: int
 
 
 @dataclass(frozen=True, slots=True)
 class Damaged:
-    """Bytes that make no frame, or a frame that makes no message."""
+    """Bytes that form no frame, or a frame that decodes to no message."""
 
-    why: str
+    reason: str
 
-
-REPLY_TO_DAMAGED_FRAME = "it answers a damaged frame"
-"""What is wrong with an answer that nobody but noise can have asked for."""
 
 Message: TypeAlias = Request | Reply | StateEvent | BootUp | Damaged
 DecodedFrame: TypeAlias = tuple[bytes, Message | None]
-"""The bytes of a frame and what they mean; None: a part of something, or nothing to us."""
+"""A frame and its message; None for part of a message, or none that concerns the rules."""

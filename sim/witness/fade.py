@@ -1,20 +1,20 @@
-"""Between which levels a channel must be while it fades, from docs/reference/wire-protocol.md.
+"""Bounds of a channel's level during a cross-fade, from docs/reference/wire-protocol.md.
 
-What it played is multiplied by (1 + cos(pi s)) / 2, what it shall play by (1 - cos(pi s)) / 2, and
-both are added; tones add with any phase, so that a level is known within bounds only.
+The old tone is scaled by (1 + cos(pi s)) / 2, the new one by (1 - cos(pi s)) / 2; they add with any
+phase, so only bounds of the sum are known.
 """
 
 import math
 from typing import NamedTuple
 
 UNKNOWN = (0.0, 1.0)
-"""Bounds that say nothing."""
+"""Bounds of an unknown level."""
 
 
 class Fade(NamedTuple):
-    """A channel that began to fade within `begin` [s, s]; before, after: levels, within bounds.
+    """A fade that began within the interval `begin` [s]; before: bounds of the old level.
 
-    Until free_until [s] nothing is known but that a level is one.
+    The level is unknown until unknown_until [s].
     """
 
     begin: tuple[float, float] = (-math.inf, -math.inf)
@@ -25,26 +25,26 @@ class Fade(NamedTuple):
 
     @property
     def settled_from(self) -> float:
-        """When nothing fades any more [s]."""
+        """Time at which the fade is over [s]."""
         return max(self.begin[1] + self.ramp, self.unknown_until)
 
     def at(self, time: float) -> tuple[float, float]:
-        """Lowest and highest level at a time [s]."""
+        """Bounds of the level at a time [s]."""
         if time < self.unknown_until:
             return UNKNOWN
         early, late = (self._gain(time - begin) for begin in self.begin)
-        low = max(0.0, *self._left(time))
+        low = max(0.0, *self._remainder(time))
         return low, self.before[1] * (1 - late) + self.after * early
 
     def within(self, begin: float, end: float) -> tuple[float, float]:
-        """Lowest and highest level at some time of a span [s]."""
+        """Bounds of the level over an interval [s]."""
         lows, highs = zip(self.at(begin), self.at(end), strict=True)
-        # Where the one outweighs the other first and then is outweighed, they may cancel between.
-        is_crossed = self._left(begin)[0] > 0 and self._left(end)[1] > 0
+        # Old and new tone may cancel where their ratio crosses one.
+        is_crossed = self._remainder(begin)[0] > 0 and self._remainder(end)[1] > 0
         return 0.0 if is_crossed else min(lows), max(highs)
 
-    def _left(self, time: float) -> tuple[float, float]:
-        """What is left at least where they cancel: of what was played, of what shall be."""
+    def _remainder(self, time: float) -> tuple[float, float]:
+        """Least remainder of the old and of the new tone where they cancel."""
         early, late = (self._gain(time - begin) for begin in self.begin)
         return (
             self.before[0] * (1 - early) - self.after * early,
@@ -52,16 +52,16 @@ class Fade(NamedTuple):
         )
 
     def to(self, after: float, *, begin: tuple[float, float], ramp: float) -> "Fade":
-        """What follows where it is told to go to a level.
+        """The fade to another level.
 
-        What was fading out when it is told so may be gone before this ramp is over, and what added
-        to it then stands alone: of a fade that is cut short only the highest level is known.
+        A tone that was fading out may end before this ramp does: of an interrupted fade only the
+        upper bound is known.
         """
         low, high = self.within(*begin)
         return Fade(begin, ramp, (0.0 if begin[0] < self.settled_from else low, high), after)
 
     def _gain(self, elapsed: float) -> float:
-        """Share of what shall be played."""
+        """Gain of the new tone."""
         if elapsed <= 0:
             return 1.0 if self.ramp == 0 and elapsed == 0 else 0.0
         if elapsed >= self.ramp:

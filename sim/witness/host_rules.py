@@ -1,6 +1,6 @@
-"""What a host may send: to each amplifier, for those who touch, and for whoever arms and stops it.
+"""Rules for what a host sends: allowed requests, silence after lifts, heartbeats and stops.
 
-These rules are checked as a frame passes; what it owes within a time is in `duties`.
+Checked as each frame passes; time limits are in `deadlines`.
 """
 
 from collections.abc import Collection, Hashable, Mapping
@@ -10,15 +10,14 @@ from sim.witness.config import TimeLimits
 from sim.witness.deadlines import Deadlines
 from sim.witness.decoded import WATCHDOG_FEEDING, ChannelCommand, Request, RequestKind
 from sim.witness.known_inputs import KnownInputs
-from sim.witness.set_rules import ExpectedSets, check_set, check_shape
+from sim.witness.set_rules import ExpectedSets, check_envelope, check_set
 
-_SETS = (RequestKind.APPLY, RequestKind.STAGE)
-_BEGUN = 0.020  # s; for so long what was wished first may go before what was wished next
-_UNCOUNTED = (RequestKind.READ, RequestKind.HELLO, RequestKind.CAPABILITIES)
+_REORDER_WINDOW = 0.020  # s; of two commands given within it the earlier may still be sent first
+_UNORDERED = (RequestKind.READ, RequestKind.HELLO, RequestKind.CAPABILITIES)
 
 
 class HostRules:
-    """The rules about hosts, over all amplifiers of a plan."""
+    """The rules for hosts, over all amplifiers by name."""
 
     def __init__(self, sessions: Mapping[str, AmplifierSession], *, times: TimeLimits) -> None:
         self._sessions = sessions
@@ -27,66 +26,72 @@ class HostRules:
         self._deadlines = Deadlines(sessions, self._inputs, times=times)
         self._expected: ExpectedSets | None = None
 
-    # what the witness is told beside the wires
+    # inputs beside the wires
 
     def contacts(self, time: float, contacts: Collection[Hashable], *, is_answerable: bool) -> None:
-        """These fingers are on the plate from now on."""
+        """Replace the contacts on the plate; is_answerable: new ones must lead to a pattern."""
         was_touched = bool(self._inputs.contacts)
-        come = self._inputs.touch(time, contacts)
+        new = self._inputs.set_contacts(time, contacts)
         if was_touched and not self._inputs.contacts:
-            self._deadlines.silence(time)
+            self._deadlines.expect_silence(time)
         if is_answerable:
-            for contact in come:
-                self._deadlines.pattern(contact, time)
+            for contact in new:
+                self._deadlines.expect_pattern(contact, time)
 
     def expect(self, expected: ExpectedSets | None) -> None:
-        """What every pattern must be from now on; None: any."""
+        """Set what every pattern must be; None for any."""
         self._expected = expected
 
-    def operator_command(self, time: float, what: str) -> None:
-        """Somebody wants it to arm, disarm, stop or clear."""
-        self._inputs.operator_command(time, what)
-        if what == "stop":
+    def operator_command(self, time: float, command: str) -> None:
+        """Note an operator's arm, disarm, stop or clear."""
+        self._inputs.operator_command(time, command)
+        if command == "stop":
             for session in self._sessions.values():
                 if session.is_open and not session.is_disturbed(time):
-                    self._deadlines.stop(session, time)
+                    self._deadlines.expect_stop(session, time)
 
-    def set_stalled(self, time: float | None) -> None:
-        """The control loop hangs from a time [s] on; None: it runs again."""
-        self._inputs.stalled_since = time
-        if time is None:
+    def set_stalled(self, since: float | None) -> None:
+        """Note that the control loop stalls since a time [s]; None: it runs again."""
+        self._inputs.stalled_since = since
+        if since is None:
             for session in self._sessions.values():
-                session.last_feed = None  # it owes the next after it has run
+                session.last_feed = None  # the next heartbeat is due after the loop has run
 
-    # what it sends
+    # frames
 
     def check_request(self, session: AmplifierSession, time: float, request: Request) -> None:
-        """A request to one amplifier; a broadcast is one to each."""
+        """Check a request to one amplifier; a broadcast is checked for each."""
         if request.problem:
-            rule = "commit" if request.problem.startswith("torn") else "garbage"
-            session.report(rule, time, f"the host sent {request.kind.value}: {request.problem}")
+            session.report(
+                "commit" if request.is_incomplete_set else "garbage",
+                time,
+                f"host sent {request.kind.value}: {request.problem}",
+            )
         if request.key is not None:
             self._check_credit(session, time, request)
         self._check_stop(session, time, request)
         if request.kind in WATCHDOG_FEEDING:
-            self._check_feed(session, time, request)
+            self._check_stall(session, time, request)
         if request.kind is RequestKind.ARM:
             self._check_arm(session, time)
-        if request.kind in _SETS:
-            self._check_set(session, time, request)
+        if request.kind in (RequestKind.APPLY, RequestKind.STAGE):
+            check_set(session, time, request, self._expected)
+            if request.vibrates:
+                self._check_justified(session, time)
         if request.kind is RequestKind.ENVELOPE and request.envelope is not None:
-            check_shape(session, time, max(request.envelope.levels, default=0.0))
+            check_envelope(session, time, max(request.envelope.levels, default=0.0))
         self._remember(session, time, request)
 
     def request_granted(self, session: AmplifierSession, time: float, request: Request) -> None:
-        """A request of it was not refused."""
+        """Note that a request was not refused."""
         match request.kind:
             case RequestKind.HELLO:
                 session.is_identified = True
             case RequestKind.ARM:
                 if session.is_stopped:
-                    what = f"{session.name} is armed although its stop is not cleared"
-                    session.report("stop", time, what)
+                    session.report(
+                        "stop", time, f"{session.name} armed before its stop was cleared"
+                    )
                 session.tokens.clear()
                 session.armed_at = time
                 session.last_feed = time
@@ -97,127 +102,113 @@ class HostRules:
                     session.last_vibration = time
 
     def advance(self, time: float) -> None:
-        """Look at what was to be done by now."""
+        """Check the deadlines and heartbeats that are due by now."""
         self._deadlines.advance(time)
+        inputs = self._inputs
         for session in self._sessions.values():
-            self._check_pulse(session, time)
-            if (
-                session.amplifier.last_fault > self._inputs.last_command
-                and self._inputs.is_arm_requested
-            ):
-                self._inputs.is_arm_requested = False  # a fault ends what was wished before it
+            self._check_heartbeat(session, time)
+            if session.amplifier.last_fault > inputs.last_command and inputs.is_arm_requested:
+                inputs.is_arm_requested = False  # a fault cancels earlier commands
 
     # rules
 
     def _check_credit(self, session: AmplifierSession, time: float, request: Request) -> None:
-        """Nothing is asked while something else may still be answered, but for silence."""
+        """Only a silencing request may be sent while another reply is pending."""
         if self._is_silencing(request):
-            session.preempted_at = time  # what it overtakes is waited for no more
+            session.preempted_at = time
             return
         for at, other in session.pending.values():
-            # After a last lift it is waited for no more, though a finger may have come since.
-            if (
-                at > max(session.preempted_at, self._inputs.last_lift)
-                and time - at < self._times.reply - self._times.slack
-            ):
+            # A last lift preempts too, even if a finger has come since.
+            is_awaited = at > max(session.preempted_at, self._inputs.last_lift)
+            if is_awaited and time - at < self._times.reply - self._times.slack:
                 session.report(
                     "credit",
                     time,
-                    f"the host asked {session.name} {request.kind.value} {(time - at) * 1e3:.1f} ms "
-                    f"after {other.kind.value}, which nobody has answered: it took something else "
-                    "for the answer",
+                    f"host sent {request.kind.value} to {session.name} {(time - at) * 1e3:.1f} ms "
+                    f"after {other.kind.value}, whose reply is pending",
                 )
 
     def _check_stop(self, session: AmplifierSession, time: float, request: Request) -> None:
-        is_other = request.kind is not RequestKind.STOP and request.kind not in _UNCOUNTED
-        # What was asked before it, at the same moment, may go before it.
-        if session.stop_requested_at is not None and time > session.stop_requested_at and is_other:
-            if (
-                request.kind is RequestKind.DISARM
-                and session.stop_requested_at < self._inputs.last_disarm + _BEGUN
-            ):
-                return  # which silences as well
-            session.report(
-                "stop",
-                time,
-                f"a stop was wished at {session.stop_requested_at:.4f} s, but the next that {session.name} was "
-                f"told is {request.kind.value}",
-            )
-            session.stop_requested_at = None
-
-    def _check_feed(self, session: AmplifierSession, time: float, request: Request) -> None:
-        stalled_since = self._inputs.stalled_since
-        is_by_loop = (
-            request.kind in (RequestKind.PING, RequestKind.COMMIT, RequestKind.STAGE)
-            or request.vibrates
+        requested_at = session.stop_requested_at
+        is_other = request.kind is not RequestKind.STOP and request.kind not in _UNORDERED
+        # Requests made at the same moment as the stop may precede it.
+        if requested_at is None or time <= requested_at or not is_other:
+            return
+        if (
+            request.kind is RequestKind.DISARM
+            and requested_at < self._inputs.last_disarm + _REORDER_WINDOW
+        ):
+            return  # silences as well
+        session.report(
+            "stop",
+            time,
+            f"stop requested at {requested_at:.4f} s, but the next request to {session.name} is "
+            f"{request.kind.value}",
         )
-        if stalled_since is not None and time > stalled_since + self._times.slack and is_by_loop:
+        session.stop_requested_at = None
+
+    def _check_stall(self, session: AmplifierSession, time: float, request: Request) -> None:
+        """A stalled control loop must not feed the watchdog."""
+        since = self._inputs.stalled_since
+        is_by_loop = request.vibrates or request.kind in (
+            RequestKind.PING,
+            RequestKind.COMMIT,
+            RequestKind.STAGE,
+        )
+        if since is not None and time > since + self._times.slack and is_by_loop:
             session.report(
                 "heartbeat",
                 time,
-                f"the control loop hangs since {stalled_since:.4f} s, but {session.name} is sent "
-                f"{request.kind.value}, which feeds its watchdog",
+                f"control loop stalled since {since:.4f} s, but {request.kind.value} feeds the "
+                f"watchdog of {session.name}",
             )
         session.last_feed = time
 
-    def _check_pulse(self, session: AmplifierSession, time: float) -> None:
+    def _check_heartbeat(self, session: AmplifierSession, time: float) -> None:
         if session.is_disturbed(time):
-            session.last_feed = None  # who has given an amplifier up owes it nothing
+            session.last_feed = None  # the host may have given the amplifier up
         last = session.last_feed
-        is_ending = (
-            self._inputs.last_silencing >= session.armed_at
-        )  # heartbeats would only be in the way
+        is_ending = self._inputs.last_silencing >= session.armed_at
         is_running = self._inputs.stalled_since is None and not is_ending
-        is_owed = session.is_open and session.amplifier.is_enabled and is_running
-        if last is None or not is_owed:
+        if last is None or not (session.is_open and session.amplifier.is_enabled and is_running):
             return
         if time > last + self._times.heartbeat + self._times.slack:
             session.last_feed = time
-            session.report(
-                "heartbeat", time, f"{session.name} has had no sign of life since {last:.4f} s"
-            )
+            session.report("heartbeat", time, f"{session.name}: no heartbeat since {last:.4f} s")
 
     def _check_arm(self, session: AmplifierSession, time: float) -> None:
-        # What was begun may be sent yet, and is followed by what withdraws it.
+        # An Arm on its way may still be sent, followed by what withdraws it.
         is_withdrawn = time > self._inputs.last_silencing + self._times.stop
         if self._inputs.is_arm_requested is False and is_withdrawn:
-            session.report("armed", time, f"{session.name} is armed although nobody wished it")
+            session.report("armed", time, f"{session.name} armed without an operator's request")
         if session.is_identified is False:
-            session.report(
-                "identified", time, f"{session.name} is armed without being asked who it is"
-            )
-
-    def _check_set(self, session: AmplifierSession, time: float, request: Request) -> None:
-        check_set(session, time, request, self._expected)
-        if request.vibrates:
-            self._check_justified(session, time)
+            session.report("identified", time, f"{session.name} armed without identification")
 
     def _check_justified(self, session: AmplifierSession, time: float) -> None:
+        """Vibration needs an enabled, unstopped amplifier and a contact."""
         if session.is_stopped:
-            session.report("stop", time, f"{session.name} is told to vibrate after its stop")
-        elif self._knows_of_disarmed(session):
-            session.report(
-                "enabled", time, f"{session.name} is told to vibrate although it is not enabled"
-            )
+            session.report("stop", time, f"vibration commanded after a stop: {session.name}")
+        elif self._is_known_disabled(session):
+            session.report("enabled", time, f"vibration commanded while disabled: {session.name}")
         is_touched = self._inputs.contacts is None or self._inputs.contacts
-        if not is_touched and time > self._inputs.last_lift + self._times.lift + self._times.slack:
+        last_lift = self._inputs.last_lift
+        if not is_touched and time > last_lift + self._times.lift + self._times.slack:
             session.report(
                 "justified",
                 time,
-                f"{session.name} is told to vibrate although nobody touches the plate since "
-                f"{self._inputs.last_lift:.4f} s",
+                f"vibration commanded on {session.name} without a contact since {last_lift:.4f} s",
             )
 
-    def _knows_of_disarmed(self, session: AmplifierSession) -> bool:
-        """Whether an amplifier is not enabled, and an answer has said so, or the host has done it.
+    def _is_known_disabled(self, session: AmplifierSession) -> bool:
+        """Whether it is not enabled and the host can know.
 
-        A fault that it tells unasked may be on its way while a set goes to it, which it refuses.
+        A fault event may cross a set on the wire, which the amplifier then refuses.
         """
         amplifier = session.amplifier
         is_enabled = amplifier.state is None or amplifier.is_enabled
         return not is_enabled and (amplifier.is_answered or not amplifier.is_in_fault)
 
-    # what is remembered
+    # state of the session
 
     def _remember(self, session: AmplifierSession, time: float, request: Request) -> None:
         match request.kind:
@@ -225,7 +216,7 @@ class HostRules:
                 session.staged = {request.token: request}
             case RequestKind.APPLY | RequestKind.COMMIT:
                 is_new = request.token != session.last_token
-                session.told.append(request.token)
+                session.committed_tokens.append(request.token)
                 commands = self._channel_commands(session, request)
                 session.vibrates = self._vibrates(session, request)
                 session.last_token = request.token
@@ -256,21 +247,17 @@ class HostRules:
         ramp: float,
         commands: Mapping[int, ChannelCommand],
     ) -> None:
-        """Zero itself, not only its command, is there soon after the last lift."""
-        if self._inputs.contacts or not 0 <= time - self._inputs.last_lift <= self._times.lift:
+        """The ramp to zero must end within the release time after the last lift."""
+        last_lift = self._inputs.last_lift
+        if self._inputs.contacts or not 0 <= time - last_lift <= self._times.lift:
             return
-        has_endings = (
-            any(not command.skip_ending for command in commands.values()) and session.staged
-        )
-        if (
-            time + ramp > self._inputs.last_lift + self._times.release + self._times.slack
-            and not has_endings
-        ):
+        has_endings = session.staged and any(not one.skip_ending for one in commands.values())
+        if time + ramp > last_lift + self._times.release + self._times.slack and not has_endings:
             session.report(
                 "lift",
                 time,
-                f"the last finger was lifted at {self._inputs.last_lift:.4f} s, but {session.name} is "
-                f"silent only after a ramp of {ramp:g} s",
+                f"last finger lifted at {last_lift:.4f} s, {session.name} is silent only after a "
+                f"ramp of {ramp:g} s",
             )
 
     def _channel_commands(
@@ -282,9 +269,7 @@ class HostRules:
         return request.commands
 
     def _vibrates(self, session: AmplifierSession, request: Request) -> bool:
-        return any(
-            command.vibrates for command in self._channel_commands(session, request).values()
-        )
+        return any(one.vibrates for one in self._channel_commands(session, request).values())
 
     def _is_silencing(self, request: Request) -> bool:
         is_silent_set = request.kind is RequestKind.APPLY and not request.vibrates

@@ -1,4 +1,4 @@
-"""Modbus, from docs/reference/wire-modbus.md: registers written and read, and what they ask."""
+"""Decoder for Modbus, from docs/reference/wire-modbus.md."""
 
 import binascii
 import struct
@@ -36,7 +36,7 @@ _READ_TAGS = (*_TAGGED, _STATUS, _REFUSAL, _CAPABILITIES, _IDENTITY, _ACHIEVED, 
 
 @dataclass(frozen=True, slots=True)
 class _Open:
-    """A telegram that waits for its answer, from the unit that was asked."""
+    """A request ADU whose reply is pending."""
 
     unit: int
     key: object
@@ -47,7 +47,7 @@ class _Open:
 
 
 class ModbusDecoder:
-    """Bytes both ways to meanings, over TCP or RTU."""
+    """Decodes both directions, over TCP or RTU."""
 
     def __init__(self, *, over_tcp: bool) -> None:
         self._over_tcp = over_tcp
@@ -55,30 +55,30 @@ class ModbusDecoder:
             "amplifier": TcpSplitter() if over_tcp else RtuSplitter("amplifier"),
             "host": TcpSplitter() if over_tcp else RtuSplitter("host"),
         }
-        self._open: dict[int, _Open] = {}  # by transaction; over RTU there is one
+        self._open: dict[int, _Open] = {}  # by transaction; over RTU at most one
         self._decode_request = 0
-        self._is_damaged = False  # the last that the host sent
-        self._tags: dict[int, int] = {}  # by unit, the last that was written
+        self._is_damaged = False  # the last request
+        self._tags: dict[int, int] = {}  # the last written, by unit
 
     def feed(self, direction: Direction, time: float, data: bytes) -> list[DecodedFrame]:
-        """What these bytes complete."""
+        """Decode bytes; returns the complete frames."""
         take = self._request if direction == "amplifier" else self._answer
         seen: list[DecodedFrame] = []
         for one in self._split[direction].feed(time, data):
             if one.pdu is not None:
                 seen.append((one.raw, take(one)))
                 continue
-            seen.append((one.raw, Damaged("no telegram, or a wrong CRC")))
+            seen.append((one.raw, Damaged("a malformed ADU, or a wrong CRC")))
             if direction == "amplifier" and not self._over_tcp:
                 self._open.clear()
                 self._is_damaged = True
         return seen
 
     def has_partial_frame(self, direction: Direction) -> bool:
-        """Whether the last bytes that went this way have begun what others may complete."""
+        """Whether the last bytes in this direction begin a frame."""
         return self._split[direction].has_partial_frame
 
-    # what the host asks
+    # requests
 
     def _request(self, adu: Adu) -> Message:
         pdu = adu.pdu or b""
@@ -129,15 +129,15 @@ class ModbusDecoder:
         self._open[adu.number] = request
 
     def _tag(self, unit: int, at: int, words: Sequence[int]) -> int | None:
-        """The tag that a write carries, which is read back."""
+        """The tag of a write, which reads repeat."""
         if at in (*_TAGGED, _HEARTBEAT, _LOOK):
             self._tags[unit] = words[0]
             if at in _TAGGED and words[1] not in (0, check(words[2:])):
-                raise OutOfRange("the check of a block is wrong")
+                raise OutOfRange("wrong CRC of a block")
             return words[0]
         return None
 
-    # what the amplifier answers
+    # replies
 
     def _answer(self, adu: Adu) -> Message:
         pdu = adu.pdu or b""
@@ -152,14 +152,14 @@ class ModbusDecoder:
         try:
             reply = _of_read(adu.unit, pdu, request)
         except (OutOfRange, struct.error, IndexError) as problem:
-            return Damaged(f"an answer that makes no sense: {problem}")
+            return Damaged(f"an invalid reply: {problem}")
         if reply.key is not None:
             del self._open[adu.number]
         return reply
 
 
 def check(words: Sequence[int]) -> int:
-    """The check of a block: CRC-16, polynomial 1021, from FFFF; FFFF where that is 0."""
+    """CRC of a block: CRC-16, polynomial 1021, initial FFFF; 0 becomes FFFF."""
     return binascii.crc_hqx(struct.pack(f">{len(words)}H", *words), 0xFFFF) or 0xFFFF
 
 
@@ -167,14 +167,14 @@ def _written(body: bytes) -> tuple[int, list[int]]:
     at, count, size = struct.unpack_from(">HHB", body)
     words = list(struct.unpack(f">{count}H", body[5:]))
     if size != 2 * count:
-        raise OutOfRange("a write of another length than it says")
+        raise OutOfRange("byte count does not match the register count")
     return at, words
 
 
 def _of_write(
     unit: int, key: object, at: int, words: list[int], *, read_from: int | None
 ) -> Request:
-    """What a write asks for."""
+    """Decode a write."""
     if at == _HEARTBEAT:
         return Request(RequestKind.PING, unit, key)
     if at == _LOOK:
@@ -190,7 +190,7 @@ def _of_write(
         case 102:
             return Request(RequestKind.ENVELOPE, unit, key, envelope=_envelope(body))
         case _:
-            raise OutOfRange(f"register {at} is not written")
+            raise OutOfRange(f"register {at} cannot be written")
 
 
 def _control(unit: int, key: object, body: list[int]) -> Request:
@@ -246,7 +246,7 @@ def _envelope(body: list[int]) -> EnvelopeLoad:
     slot, step, count = body[:3]
     knots = body[3:]
     if len(knots) != 2 * count:
-        raise OutOfRange("an envelope of another length than its knots")
+        raise OutOfRange("envelope length does not match its knots")
     whole(q.KNOTS, count, "envelope_knots")
     for phase in knots[1::2]:
         value(q.PHASE, signed(phase), "phase of a knot")
@@ -258,21 +258,21 @@ def _envelope(body: list[int]) -> EnvelopeLoad:
 
 
 def _of_read(unit: int, pdu: bytes, request: _Open) -> Reply:
-    """What the registers that were read say; key None where they answer another write."""
+    """Decode a read; key None where it belongs to another write."""
     if request.read_from is None:
         return Reply(unit, request.key)
     words = struct.unpack(f">{pdu[1] // 2}H", pdu[2:])
     if len(words) != request.count:
-        raise OutOfRange(f"{len(words)} registers instead of {request.count}")
+        raise OutOfRange(f"{len(words)} registers, expected {request.count}")
     if request.read_from not in _READ_TAGS:
         return Reply(unit, request.key)
     if words[1] not in (0, check(words[2:])):
-        raise OutOfRange("the check of a block is wrong")
+        raise OutOfRange("wrong CRC of a block")
     constant = request.read_from in (_CAPABILITIES, _IDENTITY)
     if request.tag is not None and words[0] != request.tag and not constant:
-        problem = f"it carries tag {words[0]} instead of {request.tag}"
-        # A write that was damaged on its way is refused before its tag is read; the refusal that
-        # is told then is an earlier write's, but it is what was asked for.
+        problem = f"tag {words[0]}, expected {request.tag}"
+        # A damaged write is refused before its tag is stored: the refusal read then is that of an
+        # earlier write, and matches this read all the same.
         is_earlier = request.read_from == _REFUSAL and words[4] != request.tag
         return Reply(unit, request.key if is_earlier else None, problem=problem)
     body = words[2:]

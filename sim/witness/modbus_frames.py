@@ -1,17 +1,17 @@
-"""Modbus telegrams out of a stream of bytes, TCP and RTU, from docs/reference/wire-modbus.md."""
+"""Modbus ADUs in a stream of bytes, TCP and RTU, from docs/reference/wire-modbus.md."""
 
 import struct
 from typing import NamedTuple, Protocol
 
 from sim.witness.decoded import Direction
 
-_SHORTEST, _LONGEST = 4, 256
-_PAUSE = 0.04  # s; what pauses longer inside a frame is none any more
+_MIN_LENGTH, _MAX_LENGTH = 4, 256
+_PAUSE = 0.04  # s; a longer pause ends a partial frame
 _SIZES: dict[Direction, dict[int, int]] = {
     "amplifier": {3: 8, 4: 8, 6: 8, 43: 7},
     "host": {6: 8, 16: 8},
 }
-# Where the others say how many bytes follow, and how many frame them, CRC included.
+# Of the others: offset of the byte count, and bytes around the data, CRC included.
 _COUNTS: dict[Direction, dict[int, tuple[int, int]]] = {
     "amplifier": {16: (6, 9), 23: (10, 13)},
     "host": {3: (2, 5), 4: (2, 5), 23: (2, 5)},
@@ -19,7 +19,7 @@ _COUNTS: dict[Direction, dict[int, tuple[int, int]]] = {
 
 
 class Adu(NamedTuple):
-    """A frame; number: the transaction of TCP, 0 over RTU. pdu is None for what was damaged."""
+    """An ADU; number: the TCP transaction, 0 over RTU; pdu: None where it is damaged."""
 
     raw: bytes
     unit: int
@@ -28,29 +28,29 @@ class Adu(NamedTuple):
 
 
 class Splitter(Protocol):
-    """Takes telegrams that go one way out of a stream."""
+    """Splits the stream of one direction into ADUs."""
 
     @property
     def has_partial_frame(self) -> bool:
-        """Whether the last bytes have begun what others may complete."""
+        """Whether the last bytes begin a frame."""
 
     def feed(self, time: float, data: bytes) -> list[Adu]:
-        """What these bytes complete."""
+        """Decode bytes; returns the complete frames."""
 
 
 class TcpSplitter:
-    """Telegrams with their header: transaction, 0, length, unit."""
+    """Splits TCP ADUs by their header: transaction, 0, length, unit."""
 
     def __init__(self) -> None:
         self._buffer = b""
 
     @property
     def has_partial_frame(self) -> bool:
-        """Whether the last bytes have begun what others may complete."""
+        """Whether the last bytes begin a frame."""
         return bool(self._buffer)
 
     def feed(self, time: float, data: bytes) -> list[Adu]:
-        """What these bytes complete."""
+        """Decode bytes; returns the complete frames."""
         self._buffer += data
         found = []
         while len(self._buffer) >= 7:
@@ -67,7 +67,7 @@ class TcpSplitter:
 
 
 class RtuSplitter:
-    """Telegrams whose length their function tells; CRC-16, low byte first."""
+    """Splits RTU ADUs, whose function determines the length; CRC-16, low byte first."""
 
     def __init__(self, direction: Direction) -> None:
         self._toward: Direction = direction
@@ -76,32 +76,32 @@ class RtuSplitter:
 
     @property
     def has_partial_frame(self) -> bool:
-        """Whether the last bytes have begun what others may complete."""
+        """Whether the last bytes begin a frame."""
         return bool(self._buffer)
 
     def feed(self, time: float, data: bytes) -> list[Adu]:
-        """What these bytes complete."""
+        """Decode bytes; returns the complete frames."""
         found = []
         if self._buffer and time - self._last > _PAUSE:
             found.append(Adu(self._buffer, self._buffer[0], 0, None))
             self._buffer = b""
         self._last = time
         self._buffer += data
-        while len(self._buffer) >= _SHORTEST:
-            begin, size = self._good()
+        while len(self._buffer) >= _MIN_LENGTH:
+            begin, size = self._first_valid()
             if not size:
                 break
             if begin:
                 found.append(self._damaged(begin))
             raw, self._buffer = self._buffer[:size], self._buffer[size:]
             found.append(Adu(raw, raw[0], 0, raw[1:-2]))
-        if len(self._buffer) >= _SHORTEST and not self._may_become_whole():
+        if len(self._buffer) >= _MIN_LENGTH and not self._may_be_partial():
             found.append(self._damaged(len(self._buffer)))
         return found
 
-    def _good(self) -> tuple[int, int]:
-        """Where the first good telegram begins, maybe behind a damaged one, and its size or 0."""
-        for begin in range(len(self._buffer) - _SHORTEST + 1):
+    def _first_valid(self) -> tuple[int, int]:
+        """Offset and size of the first valid ADU; size 0 for none."""
+        for begin in range(len(self._buffer) - _MIN_LENGTH + 1):
             size = self._size(self._buffer[begin:])
             end = begin + size
             if size and end <= len(self._buffer):
@@ -110,8 +110,8 @@ class RtuSplitter:
                     return begin, size
         return 0, 0
 
-    def _may_become_whole(self) -> bool:
-        """Whether what has come may be the beginning of a telegram."""
+    def _may_be_partial(self) -> bool:
+        """Whether the buffer may begin an ADU."""
         return len(self._buffer) < self._size(self._buffer)
 
     def _damaged(self, size: int) -> Adu:
@@ -119,7 +119,7 @@ class RtuSplitter:
         return Adu(raw, raw[0], 0, None)
 
     def _size(self, data: bytes) -> int:
-        """How long the telegram is that begins so; 0 where none can."""
+        """Size of the ADU that begins with these bytes; 0 where it is invalid."""
         function = data[1]
         if self._toward == "host" and function & 0x80:
             return 5
@@ -131,11 +131,11 @@ class RtuSplitter:
             return 0
         at, around = _COUNTS[self._toward][function]
         size = around + data[at] if len(data) > at else around
-        return size if size <= _LONGEST else 0
+        return size if size <= _MAX_LENGTH else 0
 
 
 def _identification_size(data: bytes) -> int:
-    """Of an answer to function 43: eight bytes, then each object with its length."""
+    """Size of a reply to function 43: eight bytes, then each object with its length."""
     at = 8
     for _ in range(data[7] if len(data) > 7 else 0):
         at += 2 + (data[at + 1] if len(data) > at + 1 else 0)
@@ -143,7 +143,7 @@ def _identification_size(data: bytes) -> int:
 
 
 def crc16(data: bytes) -> bytes:
-    """CRC-16 of Modbus (polynomial 8005 reflected, from FFFF) as it goes on the line."""
+    """CRC-16 of Modbus (polynomial 8005 reflected, initial FFFF), low byte first."""
     crc = 0xFFFF
     for byte in data:
         crc ^= byte

@@ -1,10 +1,10 @@
-"""The numbers of docs/reference/wire-protocol.md, typed off its table: step and bounds."""
+"""Quantities of docs/reference/wire-protocol.md: step and bounds, copied from its table."""
 
 from typing import NamedTuple
 
 
 class Quantity(NamedTuple):
-    """A kind of number on a wire."""
+    """A quantity on a wire."""
 
     step: float
     low: int
@@ -31,18 +31,18 @@ FAULT = Quantity(1, 0, 6)
 
 
 class OutOfRange(ValueError):
-    """An integer that the table does not allow."""
+    """An integer out of range."""
 
 
 def value(quantity: Quantity, integer: int, name: str) -> float:
-    """The value of an integer; raises OutOfRange."""
+    """Scale an integer to its unit; raises OutOfRange."""
     if not quantity.low <= integer <= quantity.high:
-        raise OutOfRange(f"{name} {integer} is not within {quantity.low} to {quantity.high}")
+        raise OutOfRange(f"{name} must be {quantity.low} to {quantity.high}, got {integer}")
     return integer * quantity.step
 
 
 def whole(quantity: Quantity, integer: int, name: str) -> int:
-    """The integer itself; raises OutOfRange."""
+    """Check an integer; raises OutOfRange."""
     value(quantity, integer, name)
     return integer
 

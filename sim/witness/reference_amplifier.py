@@ -1,8 +1,7 @@
-"""Follows one amplifier by the documented protocol, and says where it does something else.
+"""A reference model of one amplifier by the documented protocol, compared with its replies.
 
-State, fault, active set, watchdog and levels are known within the time between a request and its
-answer, and what is said about them holds for all of that time. What it grants and what it says are
-told here together: each is judged by what the other has left.
+State, fault, active set, watchdog and levels are known only within the interval between a request
+and its reply; reports are compared with all of that interval.
 """
 
 import math
@@ -25,12 +24,12 @@ from sim.witness.watchdog import Watchdog
 
 SILENCING_RAMP = 0.005  # s; along which the watchdog and faults silence
 _REMEMBERED = 16  # tokens since Arm
-_WARM = 60.0  # °C; from here on an amplifier may play less than it was told
+_WARM = 60.0  # °C; from here on an amplifier may derate
 _ENABLED, _STOPPED, _REACTING, _FAULT = 4, 5, 6, 7
 _OFF = (0, 1, 2)
 _LATCHED = (_STOPPED, _REACTING, _FAULT)
-_SILENT = (*_OFF, _FAULT)  # in which no level may be left
-_BY_ITSELF = {3: (3, 1), _REACTING: (_REACTING, _FAULT), **dict.fromkeys(_OFF, _OFF)}
+_SILENT = (*_OFF, _FAULT)
+_SPONTANEOUS = {3: (3, 1), _REACTING: (_REACTING, _FAULT), **dict.fromkeys(_OFF, _OFF)}
 
 NAMES = (
     "NOT_READY",
@@ -45,9 +44,9 @@ NAMES = (
 
 
 class ReferenceAmplifier:
-    """What one amplifier must be doing. state: None while nobody knows.
+    """The expected state of one amplifier; None while it is unknown.
 
-    insist: is told of what no fault of a wire excuses, complain of everything else.
+    report_always: for violations that no fault of the wire excuses; report: for all others.
     """
 
     def __init__(
@@ -65,30 +64,33 @@ class ReferenceAmplifier:
         self._report_always = report_always
         self.state: int | None = None
         self._fault = 0
-        self._is_reported = True  # the state, by the amplifier itself
-        self.is_answered = True  # and in an answer to its host
-        self.last_fault = -math.inf  # when it was seen to go into a fault last
+        self._is_reported = True  # the amplifier has reported this state
+        self.is_answered = True  # in a reply
+        self.last_fault = -math.inf  # when it was seen to enter a fault
         self.watchdog = Watchdog(name, slack=times.slack, report=report)
-        self._last_status = -math.inf  # when it last said how it is
+        self._last_status = -math.inf  # time of its last status
         self._token: int | None = None
-        self._token_before: tuple[int | None, float] = (None, -math.inf)  # and until when it counts
-        self._states_before: tuple[set[int], float] = (set(), -math.inf)  # the same, of a stop
+        self._token_before: tuple[int | None, float] = (
+            None,
+            -math.inf,
+        )  # and until when it is valid
+        self._states_before: tuple[set[int], float] = (set(), -math.inf)  # of a stop
         self._played_tokens: deque[int] = deque(maxlen=_REMEMBERED)
         self._staged: Request | None = None
         self._outputs = ReferenceOutputs(name, config, slack=times.slack, report=report)
 
     @property
     def is_enabled(self) -> bool:
-        """Whether it is armed, as far as anybody knows."""
+        """Whether it is armed, as far as is known."""
         return self.state == _ENABLED
 
     @property
     def is_in_fault(self) -> bool:
-        """Whether it is in a fault of its own, or of its watchdog."""
+        """Whether it is in a fault, or reacting to one."""
         return self.state in (_REACTING, _FAULT)
 
     def forget_state(self) -> None:
-        """What it does now is not known until it says so."""
+        """Treat the state as unknown until the next status."""
         self.state = self._token = None
         self._fault = 0
         self.watchdog.forget()
@@ -96,34 +98,34 @@ class ReferenceAmplifier:
         self._outputs.forget()
 
     def restarted(self, time: float) -> None:
-        """It has got its supply anew: disarmed and silent."""
+        """Note a restart: disarmed and silent."""
         self.forget_state()
         self.state, self._token = 1, 0
-        self._outputs.rest("its restart")
+        self._outputs.settle("a restart")
         self._last_status = time
 
-    def fed(self, time: float) -> None:
-        """Its watchdog was filled."""
+    def feed(self, time: float) -> None:
+        """Feed its watchdog."""
         if self.state == _ENABLED:
-            self.watchdog.fed((time, time))
+            self.watchdog.feed((time, time))
 
     def advance(self, time: float) -> None:
-        """Let happen what it must have done by itself until now."""
+        """Apply what must have happened without a request until now."""
         self._outputs.advance(time)
-        if self.state == _ENABLED and self.watchdog.has_run_out(time):
-            self._silence(self.watchdog.runs_out, SILENCING_RAMP, "the watchdog")
+        if self.state == _ENABLED and self.watchdog.has_expired(time):
+            self._silence(self.watchdog.expiry, SILENCING_RAMP, "the watchdog")
             self.state, self._fault, self._is_reported = _REACTING, 1, False
             self.is_answered = False
             self.last_fault = time
 
-    # what it grants
+    # requests
 
     def request_granted(self, request: Request, reply: Reply, begin: float, end: float) -> None:
-        """A request that was seen at `begin` was not refused, as is known at `end`."""
+        """Apply a request sent at `begin` and granted by a reply at `end` [s]."""
         self.advance(begin)
         self._check_state_allows(request, end)
         if request.kind in WATCHDOG_FEEDING:
-            self.watchdog.fed((begin, end))
+            self.watchdog.feed((begin, end))
         match request.kind:
             case RequestKind.ARM:
                 self._silence((begin, end), SILENCING_RAMP, "Arm")
@@ -150,12 +152,12 @@ class ReferenceAmplifier:
             self.status_reported(reply.status, begin, end)
 
     def broadcast_sent(self, request: Request, time: float) -> None:
-        """A broadcast that it may follow; nobody answers."""
+        """Apply a broadcast, which has no reply."""
         self.advance(time)
         if self.state is None:
             return
         self.watchdog.may_feed(time)
-        soon = (time, time + 0.010)  # as an answer would take
+        soon = (time, time + 0.010)  # as a reply would take
         if request.kind is RequestKind.STOP:
             self._states_before = ({self.state}, soon[1])
             self._stopped(request, *soon)
@@ -175,18 +177,16 @@ class ReferenceAmplifier:
             self._report(
                 "watchdog" if overdue else "enabled",
                 end,
-                f"{self._name} took a set although it must be in {self._state_name()}",
+                f"{self._name} accepted a set in {self._state_name()}",
             )
         if request.kind is RequestKind.ARM and self.state in _LATCHED and self._is_reported:
-            self._report(
-                "latched", end, f"{self._name} let itself be armed in {self._state_name()}"
-            )
+            self._report("latched", end, f"{self._name} accepted Arm in {self._state_name()}")
 
     def _stopped(self, request: Request, begin: float, end: float) -> None:
         self._silence((begin, end), request.ramp, request.kind.value)
         if request.kind is RequestKind.STOP:
-            if self.state is None:  # it may have been in a fault for long
-                self.watchdog.fed((-math.inf, end))
+            if self.state is None:  # it may have been in a fault before
+                self.watchdog.feed((-math.inf, end))
             self.state = self.state if self.state in (_REACTING, _FAULT) else _STOPPED
         elif self.state == _ENABLED:
             self.state = 3
@@ -194,7 +194,7 @@ class ReferenceAmplifier:
             self._states_before[0].add(3)  # it may have been disarmed before it was stopped
 
     def _cleared(self, reply: Reply) -> None:
-        """It may stay as it is, or go to disarmed."""
+        """Apply Clear, which may leave the state as it is."""
         said = reply.status
         if said is None:
             self.state = None
@@ -208,7 +208,7 @@ class ReferenceAmplifier:
         if self._staged is None or self._staged.token != request.token:
             if self.state is not None:
                 self._report(
-                    "token", end, f"{self._name} played set {request.token}, which is not staged"
+                    "token", end, f"{self._name} committed set {request.token}, which is not staged"
                 )
             self.forget_state()
             return
@@ -220,17 +220,19 @@ class ReferenceAmplifier:
             return
         if request.token in self._played_tokens:
             self._report_always(
-                "token", end, f"{self._name} took set {request.token} a second time after others"
+                "token", end, f"{self._name} accepted set {request.token} again after others"
             )
         commands = reply.achieved if reply.achieved is not None else request.commands
         self._play(request, commands, begin, end)
         if reply.is_exact is False and reply.achieved is None:
-            self._outputs.free(math.inf)  # only an object tells what it plays
+            self._outputs.set_unknown(
+                math.inf
+            )  # it plays something else, which only an object reports
 
-    # what it says
+    # reports
 
     def status_reported(self, status: Status, begin: float, end: float) -> None:
-        """How it says it is, at some time between two [s]."""
+        """Compare a status that was true at some time between two [s]."""
         self.advance(begin)
         if status.temperature is not None:
             self._outputs.is_warm = status.temperature >= _WARM
@@ -238,8 +240,8 @@ class ReferenceAmplifier:
         self._last_status = end
         self.is_answered = True
 
-    def told(self, state: int, fault: int, time: float) -> None:
-        """What it says unasked."""
+    def event_received(self, state: int, fault: int, time: float) -> None:
+        """Compare an unsolicited state event."""
         was_answered = self.is_answered and state == self.state
         self.status_reported(Status(state, fault), time, time)
         self.is_answered = was_answered
@@ -250,14 +252,13 @@ class ReferenceAmplifier:
         else:
             self._check_state(said, end)
         before, until = self._token_before
-        was_earlier = end <= until and said.token == before  # than a commit that nobody answers
+        was_earlier = end <= until and said.token == before  # than a broadcast commit
         if said.token is not None and not was_earlier:
             if self._token not in (None, said.token):
                 self._report(
                     "token",
                     end,
-                    f"{self._name} says that set {said.token} plays, but the last that it took is "
-                    f"{self._token}",
+                    f"{self._name} reports active set {said.token}, expected {self._token}",
                 )
             self._token = said.token
         if said.watchdog_left is not None:
@@ -272,32 +273,32 @@ class ReferenceAmplifier:
                 self._report(
                     "high_voltage",
                     end,
-                    f"{self._name} has its high voltage {what} in {NAMES[said.state]}",
+                    f"{self._name} reports high voltage {what} in {NAMES[said.state]}",
                 )
 
     def _adopt(self, said: Status, time: float) -> None:
-        """The first that is known of it."""
+        """Adopt a reported status where the state is unknown."""
         self.state, self._fault, self._is_reported = said.state, said.fault, True
         if said.state in _SILENT:
-            self._outputs.rest(NAMES[said.state])
+            self._outputs.settle(NAMES[said.state])
         else:
-            self._outputs.free(math.inf)
-            self.watchdog.fed((-math.inf, time))
+            self._outputs.set_unknown(math.inf)
+            self.watchdog.feed((-math.inf, time))
 
     def _check_state(self, said: Status, end: float) -> None:
         here, now = self.state, said.state
         trips = now in (_REACTING, _FAULT) and here not in (None, *_OFF, _REACTING, _FAULT)
         states, until = self._states_before
         if end <= until and any(now in _possible_states(state) for state in states):
-            return  # it was said before the stop that nobody answers
+            return  # reported before the broadcast stop
         if trips:
             self.last_fault = end
             self._check_trip(said, end)
         elif now not in _possible_states(here or 0):
-            self._report(self._rule_against(now), end, self._what_is_wrong(now))
+            self._report(self._rule_against(now), end, self._state_problem(now))
         elif now in _LATCHED and self._fault and said.fault != self._fault:
             self._report(
-                "latched", end, f"{self._name} was in fault {self._fault}, now it says {said.fault}"
+                "latched", end, f"{self._name} reports fault {said.fault} instead of {self._fault}"
             )
         if now in (_REACTING, _FAULT):
             self._fault = said.fault
@@ -305,11 +306,11 @@ class ReferenceAmplifier:
         self.state, self._is_reported = now, True
 
     def _check_trip(self, said: Status, end: float) -> None:
-        """A fault of its own, or the watchdog, not before its time."""
+        """Check a transition into a fault: the watchdog not before its time."""
         since = (min(self._last_status, end), end)
         if said.fault == 1:
             self.watchdog.check_trip(end)
-            since = (min(max(self.watchdog.runs_out[0], self._last_status), end), end)
+            since = (min(max(self.watchdog.expiry[0], self._last_status), end), end)
         elif said.fault == 0:
             self._report("state", end, f"{self._name} is in {NAMES[said.state]} without a fault")
         self._silence(since, SILENCING_RAMP, "a fault")
@@ -321,21 +322,23 @@ class ReferenceAmplifier:
             return "armed"
         return "latched" if self.state in _LATCHED else "state"
 
-    def _what_is_wrong(self, now: int) -> str:
+    def _state_problem(self, now: int) -> str:
         if not self._is_reported and now == _ENABLED:
-            return f"{self._name} is still enabled although {self.watchdog}"
-        return f"{self._name} must be in {self._state_name()}, but it says {NAMES[now]}"
+            return f"{self._name} is still enabled: {self.watchdog}"
+        return f"{self._name} must be in {self._state_name()}, got {NAMES[now]}"
 
     def _check_left(self, left: float, state: int, begin: float, end: float) -> None:
         if state == _ENABLED:
             self.watchdog.check_left(left, begin, end)
         elif state in _OFF and left:
-            self._report("watchdog", end, f"{self._name}'s watchdog runs while it is disarmed")
+            self._report("watchdog", end, f"{self._name}: watchdog runs while disarmed")
 
-    # what it plays
+    # outputs
 
-    def plays(self, levels: Sequence[float], frequencies: Mapping[int, float], time: float) -> None:
-        """What a sensor finds on its channels: levels, and where it is known the frequency [Hz]."""
+    def check_sensors(
+        self, levels: Sequence[float], frequencies: Mapping[int, float], time: float
+    ) -> None:
+        """Compare what sensors measure on its channels: levels, and known frequencies [Hz]."""
         self.advance(time)
         self._outputs.check_sensors(
             levels,
@@ -368,12 +371,12 @@ class ReferenceAmplifier:
         )
 
     def _may_trip(self, time: float) -> bool:
-        return self.state == _ENABLED and self.watchdog.may_have_run_out(time)
+        return self.state == _ENABLED and self.watchdog.may_have_expired(time)
 
     def _state_name(self) -> str:
-        return NAMES[self.state] if self.state is not None else "some state"
+        return NAMES[self.state] if self.state is not None else "an unknown state"
 
 
 def _possible_states(state: int) -> tuple[int, ...]:
-    """The states in which an amplifier may be that was in one, and was asked nothing since."""
-    return _BY_ITSELF.get(state, (state,))
+    """The states that an amplifier may enter from a state without a request."""
+    return _SPONTANEOUS.get(state, (state,))

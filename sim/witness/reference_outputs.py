@@ -1,4 +1,4 @@
-"""What the channels of one amplifier must play, and whether they do."""
+"""Reference model of an amplifier's channels: the levels and frequencies they must have."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -8,16 +8,16 @@ from sim.witness.decoded import ChannelCommand, EnvelopeLoad, ReportViolation, R
 from sim.witness.fade import Fade
 
 LEVEL = 0.002
-"""Of full stroke: what rounding and the last bit of a fade may make."""
+"""Tolerance of levels, in full strokes: rounding, and the last step of a fade."""
 
 _FINE = 0.011  # Hz; one step of the wire
-_LONGEST = 3.3  # s; that an envelope can take
+_LONGEST = 3.3  # s; the longest envelope
 
 
 class ReferenceOutputs:
-    """The channels of an amplifier by its name; times [s] within bounds, as of `Fade`.
+    """The channels of an amplifier; times [s] are intervals, as in `Fade`.
 
-    cause: what they do what they do for; is_warm: it may play less than it was told.
+    cause: of the present output, for messages; is_warm: it may derate.
     """
 
     def __init__(
@@ -36,26 +36,26 @@ class ReferenceOutputs:
         self._durations: dict[int, float] = {}  # of envelopes, by slot
         self._ends: tuple[float, float] | None = None
         self._ramp = 0.0
-        # Of sensors that find too little, while it may be in a fault of its own that nobody knows.
+        # Levels that sensors measured too low, which an unreported fault would explain.
         self._suspicions: list[tuple[str, float, str]] = []
 
     def advance(self, time: float) -> None:
-        """Let a set end whose time is over."""
+        """End a set whose valid_for has passed."""
         if self._ends is not None and time > self._ends[1] + self._slack:
             self._fades = {channel: self._fade_by(channel, time) for channel in self._channels}
-            self._is_silent_after("the end of valid_for")
+            self._set_silent("the end of valid_for")
 
-    def rest(self, cause: str) -> None:
-        """They have been silent for as long as matters."""
+    def settle(self, cause: str) -> None:
+        """Treat all channels as silent, their fades over."""
         self._fades, self._channel_commands, self.cause = {}, {}, cause
         self._ends = None
 
     def load(self, envelope: EnvelopeLoad) -> None:
-        """An envelope is in its slot."""
+        """Note the duration of a loaded envelope."""
         self._durations[envelope.slot] = envelope.step * (len(envelope.levels) + 1)
 
     def resolve_suspicions(self, *, is_enabled: bool) -> None:
-        """It says how it is: what sensors found before is wrong, unless it is in a fault."""
+        """Report suspicions, unless a fault explains them."""
         if is_enabled:
             for suspicion in self._suspicions:
                 self._report(*suspicion)
@@ -64,7 +64,7 @@ class ReferenceOutputs:
     def play(
         self, request: Request, commands: Mapping[int, ChannelCommand], begin: float, end: float
     ) -> None:
-        """A set is played, taken over within two times [s]."""
+        """Play a set, started between two times [s]."""
         self._levels_before = {channel: fade.after for channel, fade in self._fades.items()}
         for channel in self._channels | set(commands):
             command = commands.get(channel)
@@ -80,19 +80,19 @@ class ReferenceOutputs:
         self._ends = (begin + request.valid_for, end + request.valid_for) if ends else None
 
     def silence(self, begin: tuple[float, float], ramp: float, cause: str) -> None:
-        """All fall silent along a ramp [s]."""
+        """Silence all channels along a ramp [s]."""
         for channel in self._channels:
             fade = self._fade_by(channel, begin[1])
             self._fades[channel] = fade.to(0.0, begin=begin, ramp=ramp)
-        self._is_silent_after(cause)
+        self._set_silent(cause)
 
     def forget(self) -> None:
-        """Nobody knows what they play, nor whether it ends by itself."""
+        """Treat the output as unknown, its end included."""
         self._ends = None
-        self.free(math.inf)
+        self.set_unknown(math.inf)
 
-    def free(self, until: float) -> None:
-        """Nobody knows what they play until a time [s]."""
+    def set_unknown(self, until: float) -> None:
+        """Treat the output as unknown until a time [s]."""
         for channel in self._channels:
             fade = self._fades.get(channel, Fade())
             self._fades[channel] = fade._replace(unknown_until=until, before=(0.0, 1.0))
@@ -106,17 +106,17 @@ class ReferenceOutputs:
         may_be_off: bool,
         is_enabled: bool,
     ) -> None:
-        """What a sensor finds on its channels: levels, and where it is known the frequency [Hz]."""
+        """Compare measured levels, and known frequencies [Hz]."""
         self.check_levels(levels, time, time, may_be_off=may_be_off, of_sensor=is_enabled)
         for channel, frequency in frequencies.items():
             command = self._channel_commands.get(channel)
             is_settled = time > self._fades.get(channel, Fade()).settled_from
-            is_told = command is not None and command.level > 0 and is_settled
-            if command is not None and is_told and abs(frequency - command.frequency) > _FINE:
+            is_commanded = command is not None and command.level > 0 and is_settled
+            if command is not None and is_commanded and abs(frequency - command.frequency) > _FINE:
                 self._report(
                     "plays",
                     time,
-                    f"channel {channel} of {self._name} vibrates at {frequency:g} Hz; it was told "
+                    f"channel {channel} of {self._name} vibrates at {frequency:g} Hz, commanded "
                     f"{command.frequency:g} Hz",
                 )
 
@@ -129,9 +129,9 @@ class ReferenceOutputs:
         may_be_off: bool,
         of_sensor: bool = False,
     ) -> None:
-        """Complain of levels that they cannot have at some time between two [s].
+        """Report levels that are impossible at every time between two [s].
 
-        may_be_off: whether its watchdog may have run out by now.
+        may_be_off: whether the watchdog may have expired.
         """
         for channel, level in enumerate(levels):
             fade = self._fade_by(channel, end + self._slack)
@@ -148,7 +148,7 @@ class ReferenceOutputs:
             found = (
                 self._rule_of_level(channel, level, is_settled=is_settled),
                 end,
-                f"channel {channel} of {self._name} has level {level:.4f}; it must be {wrong}, "
+                f"channel {channel} of {self._name}: level must be {wrong}, got {level:.4f} "
                 f"{'' if is_settled else 'fading '}after {self.cause}",
             )
             if is_low and of_sensor:
@@ -161,7 +161,7 @@ class ReferenceOutputs:
         return {*self._config.channels, *self._fades}
 
     def _fade_by(self, channel: int, time: float) -> Fade:
-        """What a channel does up to a time [s], by which its set may have ended."""
+        """The fade of a channel at a time [s], by which its set may have ended."""
         fade = self._fades.get(channel, Fade())
         if self._ends is None or time < self._ends[0]:
             return fade
@@ -169,7 +169,7 @@ class ReferenceOutputs:
         free = max((self._duration(slot) for slot in self._endings.values()), default=0.0)
         return fade._replace(unknown_until=self._ends[1] + free) if free else fade
 
-    def _is_silent_after(self, cause: str) -> None:
+    def _set_silent(self, cause: str) -> None:
         self._channel_commands, self.cause = {}, cause
         self._ends = None
         self._endings = {}
@@ -185,7 +185,7 @@ class ReferenceOutputs:
         return "commit" if abs(level - before) < LEVEL else "plays"
 
     def _shaping(self, channel: int, command: ChannelCommand | None) -> float:
-        """How long an envelope shapes what a channel does now [s]; 0 for none."""
+        """Duration of the envelope that a channel follows [s]; 0 for none."""
         if command is not None and command.onset:
             return self._duration(command.onset)
         is_silent = command is None or command.level == 0

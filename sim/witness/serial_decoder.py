@@ -1,4 +1,4 @@
-"""The serial wire, from docs/reference/wire-protocol.md: COBS between zeros, CRC-32, messages."""
+"""Decoder for the serial wire, from docs/reference/wire-protocol.md: COBS, CRC-32, messages."""
 
 import struct
 import zlib
@@ -8,6 +8,7 @@ from dataclasses import replace
 from sim.witness import quantities as q
 from sim.witness.decoded import (
     REPLY_TO_DAMAGED_FRAME,
+    SETS,
     ChannelCommand,
     Damaged,
     DecodedFrame,
@@ -38,9 +39,9 @@ _KINDS = {
     13: RequestKind.ENVELOPE,
 }
 _EVENT, _NAK = 30, 31
-_LONGEST = 249  # bytes between two zeros
-_DAMAGED = 16  # frames that are remembered, lest one of them is answered
-_STATUS_OF = {
+_MAX_LENGTH = 249  # bytes of a frame
+_DAMAGED = 16  # damaged requests kept, to recognise replies to them
+_WITH_STATUS = {
     RequestKind.ARM,
     RequestKind.DISARM,
     RequestKind.STOP,
@@ -48,30 +49,29 @@ _STATUS_OF = {
     RequestKind.CLEAR,
     RequestKind.PING,
 }
-_SET_OF = {RequestKind.STAGE, RequestKind.COMMIT, RequestKind.APPLY}
 
 
 class SerialDecoder:
-    """Bytes both ways to meanings; any bytes may come."""
+    """Decodes both directions."""
 
     def __init__(self) -> None:
         self._rest: dict[Direction, bytes] = {"amplifier": b"", "host": b""}
         self._damaged: deque[int] = deque(maxlen=_DAMAGED)
 
     def feed(self, direction: Direction, time: float, data: bytes) -> list[DecodedFrame]:
-        """What these bytes complete."""
+        """Decode bytes; returns the complete frames."""
         *pieces, rest = (self._rest[direction] + data).split(b"\0")
-        self._rest[direction] = rest[-2 * _LONGEST :]
+        self._rest[direction] = rest[-2 * _MAX_LENGTH :]
         return [(b"\0" + one + b"\0", self._decode(direction, one)) for one in pieces if one]
 
     def has_partial_frame(self, direction: Direction) -> bool:
-        """Whether the last bytes that went this way have begun what others may complete."""
+        """Whether the last bytes in this direction begin a frame."""
         return bool(self._rest[direction])
 
     def _decode(self, direction: Direction, piece: bytes) -> Message:
         message = _decode(direction, piece)
         if direction == "amplifier":
-            content = _unstuffed(piece) or b""
+            content = _cobs_decode(piece) or b""
             sequence = int.from_bytes(content[2:4], "little")
             if isinstance(message, Damaged):
                 self._damaged.append(sequence)
@@ -83,18 +83,18 @@ class SerialDecoder:
 
 
 def _decode(direction: Direction, piece: bytes) -> Message:
-    body = _unstuffed(piece)
+    body = _cobs_decode(piece)
     if body is None or len(body) < 8:
-        return Damaged("no frame: it cannot be unstuffed, or is too short or too long")
+        return Damaged("a frame of invalid COBS or length")
     content, crc = body[:-4], int.from_bytes(body[-4:], "little")
     if zlib.crc32(content) != crc:
-        return Damaged("the CRC is wrong")
+        return Damaged("a wrong CRC")
     first, address, sequence = struct.unpack_from("<BBH", content)
     payload = content[4:]
     if first >> 5 & 3 != 1:
-        return Damaged(f"version {first >> 5 & 3} of the protocol")
+        return Damaged(f"protocol version {first >> 5 & 3}")
     if bool(first & 0x80) != (direction == "host"):
-        return Damaged("a reply from the host, or a request from an amplifier")
+        return Damaged("a frame of the wrong direction")
     try:
         if direction == "amplifier":
             return _decode_request(first & 0x1F, address, sequence, payload)
@@ -103,16 +103,16 @@ def _decode(direction: Direction, piece: bytes) -> Message:
         if direction == "amplifier":
             kind = _KINDS.get(first & 0x1F, RequestKind.READ)
             return Request(kind, address, (sequence, kind), problem=str(problem) or "too short")
-        return Damaged(f"a payload that makes no message: {problem}")
+        return Damaged(f"an invalid payload: {problem}")
 
 
 def _sequence(reply: Reply) -> object:
     return reply.key[0] if isinstance(reply.key, tuple) else None
 
 
-def _unstuffed(piece: bytes) -> bytes | None:
-    """COBS undone: each block begins with its length, and a zero stands between two."""
-    if len(piece) > _LONGEST:
+def _cobs_decode(piece: bytes) -> bytes | None:
+    """Decode COBS; None where it is invalid."""
+    if len(piece) > _MAX_LENGTH:
         return None
     found = bytearray()
     at = 0
@@ -130,7 +130,7 @@ def _unstuffed(piece: bytes) -> bytes | None:
 
 def _decode_request(number: int, address: int, sequence: int, payload: bytes) -> Request:
     if number not in _KINDS:
-        raise OutOfRange(f"there is no message of type {number}")
+        raise OutOfRange(f"unknown message type {number}")
     kind = _KINDS[number]
     key = None if address == 0 else (sequence, kind)
     size = {
@@ -147,7 +147,7 @@ def _decode_request(number: int, address: int, sequence: int, payload: bytes) ->
     if kind is RequestKind.ENVELOPE:
         return Request(kind, address, key, envelope=_envelope(payload))
     if len(payload) != size:
-        raise OutOfRange(f"{kind.value} has {len(payload)} bytes of payload instead of {size}")
+        raise OutOfRange(f"{kind.value} payload must have {size} bytes, got {len(payload)}")
     number = int.from_bytes(payload, "little")
     match kind:
         case RequestKind.ARM:
@@ -193,7 +193,7 @@ def _channel_commands(data: bytes) -> dict[int, ChannelCommand]:
             ending=whole(q.SLOT, ending, "ending"),
         )
     if at != len(data):
-        raise OutOfRange(f"{len(data) - at} bytes too many")
+        raise OutOfRange(f"{len(data) - at} excess bytes")
     return commands
 
 
@@ -201,7 +201,7 @@ def _envelope(payload: bytes) -> EnvelopeLoad:
     slot, step, count = struct.unpack_from("<BHB", payload)
     knots = [struct.unpack_from("<Hh", payload, 4 + 4 * number) for number in range(count)]
     if len(payload) != 4 + 4 * count:
-        raise OutOfRange("an envelope of another length than its knots")
+        raise OutOfRange("envelope length does not match its knots")
     whole(q.KNOTS, count, "envelope_knots")
     for _, phase in knots:
         value(q.PHASE, phase, "phase of a knot")
@@ -220,15 +220,15 @@ def _decode_reply(number: int, address: int, sequence: int, payload: bytes) -> M
         refused, code, _ = struct.unpack("<BBB", payload)
         return Reply(address, (sequence, _KINDS.get(refused)), refusal=code)
     kind = _KINDS.get(number)
-    if kind in _STATUS_OF:
+    if kind in _WITH_STATUS:
         return Reply(address, (sequence, kind), status=_decode_status(payload))
-    if kind in _SET_OF:
+    if kind in SETS:
         token = whole(q.TOKEN, int.from_bytes(payload[:2], "little"), "token")
         return Reply(
             address, (sequence, kind), token=token, achieved=_channel_commands(payload[2:])
         )
     if kind is None:
-        raise OutOfRange(f"there is no message of type {number}")
+        raise OutOfRange(f"unknown message type {number}")
     return Reply(address, (sequence, kind))
 
 
@@ -238,7 +238,7 @@ def _decode_status(payload: bytes) -> Status:
     )
     levels = struct.unpack_from(f"<{count}H", payload, 12)
     if len(payload) != 12 + 2 * count or flags & ~1:
-        raise OutOfRange("a status of another length than its channels, or with unknown flags")
+        raise OutOfRange("status length does not match its channels, or unknown flags")
     return Status(
         state=whole(q.STATE, state, "state"),
         fault=whole(q.FAULT, fault, "fault"),

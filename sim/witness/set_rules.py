@@ -1,4 +1,4 @@
-"""The rules about a single set that a host sends: token, limits, and what the touch asks for."""
+"""Rules for one set that a host sends: token, limits and expected pattern."""
 
 import math
 from collections.abc import Mapping
@@ -6,16 +6,16 @@ from collections.abc import Mapping
 from sim.witness.amplifier_session import AmplifierSession
 from sim.witness.decoded import ChannelCommand, Request
 
-_STEP = 0.6  # of a step of the wire: what rounding may make
+_STEP = 0.6  # of a step of the wire; tolerance of rounding
 
 ExpectedSets = Mapping[str, Mapping[int, tuple[float, float, float]]]
-"""What a touch should give, by amplifier and channel: Hz, level, degrees."""
+"""Expected frequency [Hz], level and phase [deg] by amplifier and channel."""
 
 
 def check_set(
     session: AmplifierSession, time: float, request: Request, expected: ExpectedSets | None
 ) -> None:
-    """Its token, its limits, and that it is what is expected, where anything is."""
+    """Check token, limits and, where it is given, the expected pattern."""
     _check_token(session, time, request)
     for channel, command in request.commands.items():
         if command.vibrates:
@@ -24,14 +24,14 @@ def check_set(
         _check_expected(session, time, request, expected)
 
 
-def check_shape(session: AmplifierSession, time: float, level: float) -> None:
-    """An envelope that goes to this level is within the limits of some channel."""
+def check_envelope(session: AmplifierSession, time: float, level: float) -> None:
+    """Check the highest level of an envelope against the limits of the channels."""
     highest = max((limits.level for limits in session.config.channels.values()), default=0.0)
     if level > highest + 1e-4 * _STEP:
         session.report(
             "limits",
             time,
-            f"an envelope of {session.name} goes to level {level:g}; allowed is {highest:g}",
+            f"{session.name}: envelope level must be at most {highest:g}, got {level:g}",
         )
 
 
@@ -42,7 +42,7 @@ def _check_token(session: AmplifierSession, time: float, request: Request) -> No
             session.report(
                 "token",
                 time,
-                f"set {token} is sent to {session.name} again "
+                f"set {token} sent to {session.name} again "
                 + ("with other contents" if is_last else "after others"),
             )
             return
@@ -54,27 +54,28 @@ def _check_limits(
     session: AmplifierSession, time: float, channel: int, command: ChannelCommand, ramp: float
 ) -> None:
     limits = session.config.channels.get(channel)
-    what = (
-        f"channel {channel} of {session.name} is told {command.frequency:g} Hz at {command.level:g}"
-    )
+    what = f"channel {channel} of {session.name} set to {command.frequency:g} Hz, {command.level:g}"
     if limits is None:
-        session.report("limits", time, f"{what}, but there is no such channel")
+        session.report("limits", time, f"{what}: no such channel")
         return
     fine = 0.01 * _STEP
-    if not limits.frequency_min - fine <= command.frequency <= limits.frequency_max + fine:
+    low, high = limits.frequency_hz
+    if not low - fine <= command.frequency <= high + fine:
         session.report(
             "limits",
             time,
-            f"{what}; allowed are {limits.frequency_min:g} to {limits.frequency_max:g} Hz",
+            f"{what}; frequency must be {low:g} to {high:g} Hz",
         )
     if command.level > limits.level + 1e-4 * _STEP:
-        session.report("limits", time, f"{what}; allowed is a level of {limits.level:g}")
+        session.report("limits", time, f"{what}; level must be at most {limits.level:g}")
     before = session.levels.get(channel)
-    goes_on = before is not None and before.frequency == command.frequency
-    rise = command.level - (before.level if before is not None and goes_on else 0.0)
-    if not command.onset and rise > limits.slew * ramp + 1e-4 * _STEP:
+    continues = before is not None and before.frequency == command.frequency
+    rise = command.level - (before.level if before is not None and continues else 0.0)
+    if not command.onset and rise > limits.slew_per_s * ramp + 1e-4 * _STEP:
         session.report(
-            "limits", time, f"{what} within {ramp:g} s; allowed is {limits.slew:g} a second"
+            "limits",
+            time,
+            f"{what} within {ramp:g} s; slew must be at most {limits.slew_per_s:g} 1/s",
         )
 
 
@@ -82,22 +83,22 @@ def _check_expected(
     session: AmplifierSession, time: float, request: Request, expected: ExpectedSets
 ) -> None:
     wanted = expected.get(session.name, {})
-    told = {
+    sent = {
         channel: (command.frequency, command.level, command.phase)
         for channel, command in request.commands.items()
         if command.vibrates
     }
-    same = told.keys() == wanted.keys() and all(
-        abs(told[channel][0] - frequency) < 0.01 * _STEP
-        and abs(told[channel][1] - level) < 1e-4 * _STEP
-        and abs(math.remainder(told[channel][2] - phase, 360.0)) < 0.01 * _STEP
+    same = sent.keys() == wanted.keys() and all(
+        abs(sent[channel][0] - frequency) < 0.01 * _STEP
+        and abs(sent[channel][1] - level) < 1e-4 * _STEP
+        and abs(math.remainder(sent[channel][2] - phase, 360.0)) < 0.01 * _STEP
         for channel, (frequency, level, phase) in wanted.items()
     )
     if not same:
         session.report(
             "pattern",
             time,
-            f"{session.name} is told {_listed(told)}; the touch asks for {_listed(wanted)}",
+            f"{session.name} commanded {_listed(sent)}, expected {_listed(wanted)}",
         )
 
 

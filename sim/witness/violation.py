@@ -1,17 +1,17 @@
-"""What was wrong, and the frames around it."""
+"""Violations of rules, each with the frames around it."""
 
 from collections import deque
 from dataclasses import dataclass, replace
 
 from sim.witness.decoded import Direction
 
-_BEFORE, _AFTER = 6, 3
-_MOST = 200
+_FRAMES_BEFORE, _FRAMES_AFTER = 6, 3
+_MAX_VIOLATIONS = 200
 
 
 @dataclass(frozen=True)
 class Violation:
-    """A broken rule: its name, on which wire, when [s], one sentence, and the frames around it."""
+    """A broken rule: its name, wire, time [s], a sentence, and the frames around it."""
 
     invariant: str
     wire: str
@@ -20,48 +20,48 @@ class Violation:
     frames: tuple[str, ...] = ()
 
     def __str__(self) -> str:
-        """A paragraph for people."""
+        """The violation as a paragraph."""
         head = f"{self.time:.6f} {self.wire}: {self.invariant}: {self.sentence}"
         return "\n".join((head, *(f"    {frame}" for frame in self.frames)))
 
 
-def shown(time: float, direction: Direction, raw: bytes) -> str:
+def format_frame(time: float, direction: Direction, raw: bytes) -> str:
     """One frame as a line of a capture."""
     return f"{time:.6f} {'>' if direction == 'amplifier' else '<'} {raw.hex(' ').upper()}"
 
 
 class Report:
-    """Collects violations, each with the frames before it and after; 200 at most."""
+    """Collects violations, at most 200; further ones are counted in `dropped`."""
 
     def __init__(self) -> None:
         self.dropped = 0
         self._found: list[Violation] = []
         self._frames: dict[str, deque[tuple[float, Direction, bytes]]] = {}
-        self._open: dict[int, int] = {}  # by number in the list: frames that are still wanted
+        self._incomplete: dict[int, int] = {}  # by index: frames still to be added
 
     def frame(self, wire: str, time: float, direction: Direction, raw: bytes) -> None:
-        """A frame has passed."""
-        self._frames.setdefault(wire, deque(maxlen=_BEFORE)).append((time, direction, raw))
-        if not self._open:
+        """Note a frame, and add it to the violations just before it."""
+        self._frames.setdefault(wire, deque(maxlen=_FRAMES_BEFORE)).append((time, direction, raw))
+        if not self._incomplete:
             return
-        line = shown(time, direction, raw)
-        for number in [number for number in self._open if self._found[number].wire == wire]:
-            one = self._found[number]
-            self._found[number] = replace(one, frames=(*one.frames, line))
-            self._open[number] -= 1
-            if not self._open[number]:
-                del self._open[number]
+        line = format_frame(time, direction, raw)
+        for index in [index for index in self._incomplete if self._found[index].wire == wire]:
+            violation = self._found[index]
+            self._found[index] = replace(violation, frames=(*violation.frames, line))
+            self._incomplete[index] -= 1
+            if not self._incomplete[index]:
+                del self._incomplete[index]
 
     def add(self, invariant: str, wire: str, time: float, sentence: str) -> None:
-        """A rule was broken."""
-        if len(self._found) >= _MOST:
+        """Add a violation of a rule."""
+        if len(self._found) >= _MAX_VIOLATIONS:
             self.dropped += 1
             return
-        frames = tuple(shown(*frame) for frame in self._frames.get(wire, ()))
-        self._open[len(self._found)] = _AFTER
+        frames = tuple(format_frame(*frame) for frame in self._frames.get(wire, ()))
+        self._incomplete[len(self._found)] = _FRAMES_AFTER
         self._found.append(Violation(invariant, wire, time, sentence, frames))
 
     @property
     def found(self) -> list[Violation]:
-        """All so far, in the order in which they were found."""
+        """The violations so far, in order."""
         return list(self._found)

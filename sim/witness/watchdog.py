@@ -1,17 +1,16 @@
-"""When an amplifier's watchdog was filled, and when it runs out, within bounds."""
+"""When an amplifier's watchdog was fed and when it expires, as intervals."""
 
 import math
 
 from sim.witness.decoded import ReportViolation
 
-_LEFT = 0.003  # s; what its time left may be wrong by
+_LEFT = 0.003  # s; tolerance of the reported time left
 
 
 class Watchdog:
-    """The watchdog of an amplifier by its name; time [s]: as Arm has set it, none before.
+    """The watchdog of an amplifier; time [s]: as set by Arm, infinite before.
 
-    What fills it is seen before anybody knows whether and when it was taken: it was filled last
-    between two times [s].
+    The time of the last feed is known only as an interval, from request to reply.
     """
 
     def __init__(self, name: str, *, slack: float, report: ReportViolation) -> None:
@@ -23,57 +22,57 @@ class Watchdog:
         self._latest_before = math.inf
 
     def __str__(self) -> str:
-        """What it is, as the second half of a sentence."""
-        return f"it was fed last at {self._fed[1]:.4f} s and its watchdog is set to {self.time:g} s"
+        """Its state, for messages."""
+        return f"last fed at {self._fed[1]:.4f} s, watchdog {self.time:g} s"
 
     @property
-    def runs_out(self) -> tuple[float, float]:
-        """When it does so, at the earliest and at the latest [s]."""
+    def expiry(self) -> tuple[float, float]:
+        """Earliest and latest time of expiry [s]."""
         return self._fed[0] + self.time, self._fed[1] + self.time
 
     def forget(self) -> None:
-        """Nobody knows when it was filled."""
+        """Treat the time of the last feed as unknown."""
         self._fed = (-math.inf, math.inf)
 
-    def fed(self, between: tuple[float, float]) -> None:
-        """It was filled between two times [s]."""
+    def feed(self, between: tuple[float, float]) -> None:
+        """Feed it at some time between two [s]."""
         self._fed = between
 
     def may_feed(self, time: float) -> None:
-        """Something may have filled it; `was_not_fed` takes that back."""
+        """Note a request that feeds it unless refused; `undo_feed` takes it back."""
         self._latest_before = self._fed[1]
         self._fed = (self._fed[0], max(self._fed[1], time))
 
     def undo_feed(self) -> None:
-        """What may have filled it was refused."""
+        """Note the refusal of the request given to `may_feed`."""
         self._fed = (self._fed[0], self._latest_before)
 
-    def has_run_out(self, time: float) -> bool:
-        """Whether it must have run out by now."""
-        return time > self.runs_out[1] + self._slack
+    def has_expired(self, time: float) -> bool:
+        """Whether it must have expired."""
+        return time > self.expiry[1] + self._slack
 
-    def may_have_run_out(self, time: float) -> bool:
-        """Whether it may have run out by now."""
-        return time > self.runs_out[0] - self._slack
+    def may_have_expired(self, time: float) -> bool:
+        """Whether it may have expired."""
+        return time > self.expiry[0] - self._slack
 
     def check_trip(self, time: float) -> None:
-        """It has run out: not before its time."""
-        if time < self.runs_out[0] - self._slack:
+        """Check that it did not expire early."""
+        if time < self.expiry[0] - self._slack:
             self._report(
                 "watchdog",
                 time,
-                f"{self._name}'s watchdog ran out {time - self._fed[0]:.4f} s after it was fed, "
-                f"but it was set to {self.time:g} s",
+                f"{self._name}: watchdog of {self.time:g} s expired "
+                f"{time - self._fed[0]:.4f} s after its last feed",
             )
 
     def check_left(self, left: float, begin: float, end: float) -> None:
-        """What it is said to have left [s], at some time between two."""
+        """Check the reported time left [s], true at some time between two."""
         low = self.time - (end - self._fed[0]) - _LEFT
         high = self.time - max(0.0, begin - self._fed[1]) + _LEFT
         if self.time < math.inf and not low <= left <= high:
             self._report(
                 "watchdog",
                 end,
-                f"{self._name} says its watchdog has {left:g} s left; it must be {low:.3f} to "
-                f"{high:.3f} s, for it was set to {self.time:g} s and fed at {self._fed[0]:.4f} s",
+                f"{self._name}: watchdog_left must be {low:.3f} to {high:.3f} s, got {left:g} s "
+                f"(set to {self.time:g} s, fed at {self._fed[0]:.4f} s)",
             )

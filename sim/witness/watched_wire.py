@@ -1,4 +1,4 @@
-"""One wire: what takes its bytes apart, the amplifiers on it, and whether it is in trouble."""
+"""One watched wire: its decoder, the amplifiers on it, and whether it is disturbed."""
 
 import math
 from collections import deque
@@ -11,25 +11,22 @@ from sim.witness.decoded import Data, DecodedFrame, Direction
 from sim.witness.modbus_decoder import ModbusDecoder
 from sim.witness.serial_decoder import SerialDecoder
 
-_RECOVERY = 0.5  # s; after a fault of a wire nobody can say at once what is owed
-_COPIES = 64  # frames among which one that comes again during a fault is looked for
+_RECOVERY = 0.5  # s; after a fault a wire counts as disturbed for so long
+_COPIES = 64  # frames kept to recognise repeated ones
 
 
 class Decoder(Protocol):
-    """What takes the bytes of a kind of wire apart."""
+    """Decoder for one kind of wire."""
 
     def feed(self, direction: Direction, time: float, data: Data) -> list[DecodedFrame]:
-        """What these bytes complete."""
+        """Decode bytes; returns the complete frames."""
 
     def has_partial_frame(self, direction: Direction) -> bool:
-        """Whether the last bytes that went this way have begun what others may complete."""
+        """Whether the last bytes in this direction begin a frame."""
 
 
 class WatchedWire:
-    """A wire by its name; sides: by the addresses of the amplifiers.
-
-    recent: the last frames toward the amplifiers.
-    """
+    """A wire; sessions: by the addresses of the amplifiers; recent: last frames of the host."""
 
     def __init__(self, name: str, kind: str, sessions: Mapping[int, AmplifierSession]) -> None:
         self.name = name
@@ -37,11 +34,11 @@ class WatchedWire:
         self.sessions = sessions
         self.recent: deque[Data] = deque(maxlen=_COPIES)
         self._disturbed_until = -math.inf
-        self.begin()
+        self.reset()
 
-    def begin(self) -> None:
-        """As after it was opened."""
-        self._begun: dict[Direction, float] = {}  # when [s] what is not complete yet has begun
+    def reset(self) -> None:
+        """Reset the decoder, as after opening."""
+        self._begun: dict[Direction, float] = {}  # start of partial frames [s]
         self.decoder: Decoder
         match self.kind:
             case "serial":
@@ -58,7 +55,7 @@ class WatchedWire:
     def feed(
         self, direction: Direction, time: float, data: Data
     ) -> list[tuple[float, DecodedFrame]]:
-        """What these bytes complete, each with when [s] the first of its bytes have passed."""
+        """Decode bytes; returns frames, each with the time [s] of its first byte."""
         begun = self._begun.pop(direction, time)
         found = self.decoder.feed(direction, time, data)
         if self.decoder.has_partial_frame(direction):
@@ -66,9 +63,9 @@ class WatchedWire:
         return [(time if number else begun, one) for number, one in enumerate(found)]
 
     def is_disturbed(self, time: float) -> bool:
-        """Whether faults are put on it at a time [s], or were shortly before."""
+        """Whether faults are injected at a time [s], or were shortly before."""
         return time <= self._disturbed_until
 
     def set_disturbed(self, time: float, *, is_on: bool) -> None:
-        """Faults are put on it from now on, or no more."""
+        """Note the begin or the end of injected faults."""
         self._disturbed_until = math.inf if is_on else time + _RECOVERY

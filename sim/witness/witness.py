@@ -1,4 +1,4 @@
-"""The witness: bytes of every wire in, broken rules out; it reads no clock, waits for nothing."""
+"""The witness: bytes of every wire in, violations out. No clock, no I/O."""
 
 import math
 from collections.abc import Callable, Collection, Hashable, Mapping, Sequence
@@ -18,11 +18,10 @@ OperatorCommand = Literal["arm", "disarm", "stop", "clear"]
 
 
 class Witness:
-    """Watches the wires of a plan (see `sim.witness.config`); times [s] are of any one clock.
+    """Checks the wires of a configuration (see `sim.witness.config`); times [s] of any one clock.
 
-    Bytes are all it needs. What it is told beside them makes more rules apply: contacts those about
-    touches, wishes those about arming and stopping, levels those about silence where nobody asks.
-    record is called with every piece of bytes as a line of a capture.
+    Bytes are sufficient; contacts, operator commands, stalls and sensor levels enable further
+    rules. record: called with each piece of bytes as a line of a capture.
     """
 
     def __init__(
@@ -44,7 +43,7 @@ class Witness:
                 if one.wire == wire:
                     sessions[one.address] = self._sessions[name] = self._session(name)
             self._wires[wire] = WatchedWire(wire, kind, sessions)
-        times = self._config.times
+        times = self._config.times_s
         self._host = HostRules(self._sessions, times=times)
         self._exchanges = Exchanges(self._host, times=times, report=self._report)
 
@@ -57,15 +56,15 @@ class Witness:
         def is_disturbed(time: float) -> bool:
             return self._wires[config.wire].is_disturbed(time)
 
-        def complain_unless_troubled(invariant: str, time: float, sentence: str) -> None:
+        def report_unless_disturbed(invariant: str, time: float, sentence: str) -> None:
             if not is_disturbed(self._now):
                 report(invariant, time, sentence)
 
         amplifier = ReferenceAmplifier(
             name,
             config,
-            times=self._config.times,
-            report=complain_unless_troubled,
+            times=self._config.times_s,
+            report=report_unless_disturbed,
             report_always=report,
         )
         return AmplifierSession(name, config, amplifier, report, is_disturbed)
@@ -76,7 +75,7 @@ class Witness:
         return tuple(self._wires)
 
     def bytes(self, link: str, direction: Direction, time: float, data: Data) -> None:
-        """Bytes have passed on a wire, toward the amplifier or the host."""
+        """Process bytes on a wire, toward the amplifier or the host."""
         self._advance(time)
         wire = self._wires[link]
         if self._record is not None:
@@ -92,56 +91,56 @@ class Witness:
             if direction == "amplifier":
                 self._exchanges.sent(wire, time, raw, message)
             else:
-                self._exchanges.status_reported(wire, time, message)
+                self._exchanges.received(wire, time, message)
 
     def opened(self, link: str, time: float) -> None:
-        """A host has opened a wire: whoever answers there is not known yet."""
+        """Note that a host has opened a wire: its amplifiers are not identified yet."""
         self._advance(time)
-        self._wires[link].begin()
+        self._wires[link].reset()
         for session in self._wires[link].sessions.values():
             session.is_open, session.is_identified, session.vibrates = True, False, False
             session.forget_pending()
             session.amplifier.forget_state()
 
     def closed(self, link: str, time: float) -> None:
-        """The host has closed a wire, or lost it."""
+        """Note that the host has closed or lost a wire."""
         self._advance(time)
         for session in self._wires[link].sessions.values():
             session.is_open = False
             if any(request.kind in STATE_CHANGING for _, request in session.pending.values()):
-                session.amplifier.forget_state()  # it may have carried out what nobody hears it answer
+                session.amplifier.forget_state()  # it may execute a request unheard
             session.forget_pending()
             session.stop_requested_at = session.last_feed = None
 
     def contacts(
         self, time: float, contacts: Collection[Hashable], *, is_answerable: bool = True
     ) -> None:
-        """These fingers, by any name, are on the plate from now on.
+        """Replace the contacts on the plate, by any id.
 
-        is_answerable: whether a new one of them ought to get a pattern.
+        is_answerable: whether new ones must lead to a pattern.
         """
         self._advance(time)
         self._host.contacts(time, contacts, is_answerable=is_answerable)
 
     def expect(self, expected: ExpectedSets | None) -> None:
-        """What every pattern must be from now on, by amplifier and channel; None: any."""
+        """Set what every pattern must be, by amplifier and channel; None for any."""
         self._host.expect(expected)
 
-    def operator_command(self, time: float, what: OperatorCommand) -> None:
-        """Somebody wants the controller to do this, now."""
+    def operator_command(self, time: float, command: OperatorCommand) -> None:
+        """Note an operator's command to the controller."""
         self._advance(time)
-        self._host.operator_command(time, what)
+        self._host.operator_command(time, command)
 
-    def set_stalled(self, time: float, is_hung: bool = True) -> None:
-        """The control loop hangs from now on, or runs again."""
+    def set_stalled(self, time: float, is_stalled: bool = True) -> None:
+        """Note that the control loop stalls, or runs again."""
         self._advance(time)
-        self._host.set_stalled(time if is_hung else None)
+        self._host.set_stalled(time if is_stalled else None)
 
     def faults(self, time: float, link: str, *, are_on: bool) -> None:
-        """Faults are put on a wire or its amplifiers from now on, or no more."""
+        """Note the begin or the end of injected faults on a wire or its amplifiers."""
         self._advance(time)
         self._wires[link].set_disturbed(time, is_on=are_on)
-        if not are_on:  # what amplifiers did meanwhile need not have been seen
+        if not are_on:  # what amplifiers did meanwhile may be unseen
             for session in self._wires[link].sessions.values():
                 session.amplifier.forget_state()
 
@@ -153,7 +152,7 @@ class Witness:
         *,
         frequencies: Mapping[int, float] | None = None,
     ) -> None:
-        """What sensors find on the channels of an amplifier: levels, 1 is full stroke, and Hz."""
+        """Compare measured levels (1 is full stroke) and frequencies [Hz] of an amplifier."""
         self._advance(time)
         session = self._sessions[amplifier]
         for channel, level in enumerate(levels):
@@ -162,14 +161,12 @@ class Witness:
                 session.report(
                     "limits", time, f"channel {channel} of {amplifier} has level {level:.4f}"
                 )
-        has_partial_frame = any(
-            request.kind in STATE_CHANGING for _, request in session.pending.values()
-        )
-        if not (has_partial_frame or session.is_disturbed(time)):
-            session.amplifier.plays(levels, frequencies or {}, time)
+        is_changing = any(request.kind in STATE_CHANGING for _, request in session.pending.values())
+        if not (is_changing or session.is_disturbed(time)):
+            session.amplifier.check_sensors(levels, frequencies or {}, time)
 
     def finish(self, time: float | None = None) -> list[Violation]:
-        """Everything that was wrong, in its order; time: until when it has watched [s]."""
+        """The violations in order; time [s]: end of the observation."""
         if time is not None:
             self._advance(time)
         return self._report.found

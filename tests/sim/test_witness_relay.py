@@ -20,14 +20,14 @@ from wires import WIRES, far_side
 
 
 def _witness(url: str, *, level: float) -> Witness:
-    place = parse_endpoint(url)
+    endpoint = parse_endpoint(url)
     limits = {"frequency_hz": [40, 500], "level": level}
     plan: dict[str, Any] = {
-        "wires": {"line": place.kind},
+        "wires": {"line": endpoint.kind},
         "amplifiers": {
             "main": {
                 "wire": "line",
-                "address": place.address,
+                "address": endpoint.address,
                 "channels": dict.fromkeys(range(4), limits),
             }
         },
@@ -81,8 +81,8 @@ async def test_what_passes_a_relay_is_seen(wire: str, coarse_rig: Rig) -> None:
 def test_urls_are_taken_apart(url: str, place: str, address: int) -> None:
     """Device or server and number are those of the URL, and all else stays in the new one."""
     taken = parse_endpoint(url)
-    assert (taken.place, taken.address) == (place, address)
-    assert taken.through("X").replace("X", place) == url
+    assert (taken.location, taken.address) == (place, address)
+    assert taken.url_via("X").replace("X", place) == url
 
 
 @pytest.mark.parametrize("url", ["sim://rig.yaml", "serial://", "modbus+tcp://host/1", "nonsense"])
@@ -117,9 +117,9 @@ async def test_a_relay_before_nobody_says_so(caplog: pytest.LogCaptureFixture) -
         bound.bind(("127.0.0.1", 0))
         url = f"modbus+tcp://127.0.0.1:{bound.getsockname()[1]}/1"
         async with relays([parse_endpoint(url)], ["line"], _witness(url, level=0.5)) as (end,):
-            host, _, port = parse_endpoint(end).place.rpartition(":")
+            host, _, port = parse_endpoint(end).location.rpartition(":")
             reader, writer = await asyncio.open_connection(host, int(port))
             assert await reader.read() == b""
             writer.close()
     (record,) = caplog.records
-    assert parse_endpoint(url).place in record.getMessage()
+    assert parse_endpoint(url).location in record.getMessage()

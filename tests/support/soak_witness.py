@@ -33,16 +33,16 @@ class SoakWitness:
     def __init__(
         self, loop: VirtualLoop, urls: Mapping[str, str], *, channels: int, release: float
     ) -> None:
-        places = {name: parse_endpoint(url) for name, url in urls.items()}
+        endpoints = {name: parse_endpoint(url) for name, url in urls.items()}
         plan: dict[str, Any] = {
-            "wires": {place.place: place.kind for place in places.values()},
+            "wires": {endpoint.location: endpoint.kind for endpoint in endpoints.values()},
             "amplifiers": {
                 name: {
-                    "wire": place.place,
-                    "address": place.address,
+                    "wire": endpoint.location,
+                    "address": endpoint.address,
                     "channels": dict.fromkeys(range(channels), _CHANNEL),
                 }
-                for name, place in places.items()
+                for name, endpoint in endpoints.items()
             },
             "times_s": {
                 "lift": release,

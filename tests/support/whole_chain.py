@@ -234,21 +234,21 @@ async def _witnessed(
     stack: contextlib.AsyncExitStack, far_end: FarEndProcess
 ) -> tuple[dict[str, str], Witness]:
     """A witness in every wire of a far end, and the URLs that lead through it."""
-    places = {name: parse_endpoint(url) for name, url in far_end.urls.items()}
+    endpoints = {name: parse_endpoint(url) for name, url in far_end.urls.items()}
     limits = {"frequency_hz": list(FREQUENCY_LIMITS), "level": LEVEL_LIMIT}
     plan = {
-        "wires": {name: place.kind for name, place in places.items()},
+        "wires": {name: endpoint.kind for name, endpoint in endpoints.items()},
         "amplifiers": {
             name: {
                 "wire": name,
-                "address": place.address,
-                "channels": dict.fromkeys(range(4 if len(places) == 1 else 2), limits),
+                "address": endpoint.address,
+                "channels": dict.fromkeys(range(4 if len(endpoints) == 1 else 2), limits),
             }
-            for name, place in places.items()
+            for name, endpoint in endpoints.items()
         },
         # Times of real processes on a machine that does other work, too.
         "times_s": {"slack": 0.3},
     }
     witness = Witness(plan)
-    ends = await stack.enter_async_context(relays([*places.values()], [*places], witness))
-    return dict(zip(places, ends, strict=True)), witness
+    ends = await stack.enter_async_context(relays([*endpoints.values()], [*endpoints], witness))
+    return dict(zip(endpoints, ends, strict=True)), witness

@@ -34,7 +34,9 @@ class Watched:
             session.amplifier.request_granted(ARM, Reply(1, ARM.key, status=ENABLED), 1.0, 1.001)
 
     def _session(self, name: str) -> AmplifierSession:
-        plan = AmplifierConfig(f"line of {name}", 1, {0: ChannelLimits(40.0, 500.0, 1.0)})
+        plan = AmplifierConfig(
+            wire=name, channels={0: ChannelLimits(frequency_hz=(40.0, 500.0), level=1.0)}
+        )
         amplifier = ReferenceAmplifier(
             name,
             plan,

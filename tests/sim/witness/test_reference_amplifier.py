@@ -6,7 +6,9 @@ from sim.witness.config import AmplifierConfig, ChannelLimits, TimeLimits
 from sim.witness.decoded import ChannelCommand, Reply, Request, RequestKind, Status
 from sim.witness.reference_amplifier import ReferenceAmplifier
 
-PLAN = AmplifierConfig("line", 1, {0: ChannelLimits(40.0, 500.0, 1.0)})
+PLAN = AmplifierConfig(
+    wire="line", channels={0: ChannelLimits(frequency_hz=(40.0, 500.0), level=1.0)}
+)
 ARM = Request(RequestKind.ARM, 1, key=1, watchdog=0.25)
 STOP = Request(RequestKind.STOP, 1, key=2)
 DISARM = Request(RequestKind.DISARM, 1, key=4, ramp=0.05)
@@ -64,7 +66,7 @@ def test_a_fault_that_was_cleared_out_of_sight_is_not_latched() -> None:
     """In a fault, lost sight of, cleared and armed meanwhile, stopped: it has no fault any more."""
     watched = Watched()
     watched.grants(ARM, 1.0, ENABLED)
-    watched.amplifier.told(FAULT, WATCHDOG, 2.0)
+    watched.amplifier.event_received(FAULT, WATCHDOG, 2.0)
     watched.amplifier.forget_state()
     watched.grants(STOP, 9.0, STOPPED)
     assert watched.broken == []
@@ -105,7 +107,7 @@ def test_a_set_that_ends_by_itself_may_fade_from_its_end_on(
     watched = Watched(slack=0.02)
     watched.grants(ARM, 1.0, ENABLED)
     watched.amplifier.request_granted(BRIEF, Reply(1, 3), 1.1, 1.102)
-    watched.amplifier.fed(1.3)
+    watched.amplifier.feed(1.3)
     watched.amplifier.status_reported(Status(ENABLED, 0, levels=(level,)), time, time + 0.001)
     assert watched.broken == rules
 
@@ -122,9 +124,9 @@ def test_who_is_lost_sight_of_may_play_on_beyond_the_end_of_a_set() -> None:
 
 
 @pytest.mark.parametrize(
-    ("asked", "says", "late"), [(DISARM, SWITCHED_ON, "latched"), (STATUS, ENABLED, "armed")]
+    ("query", "says", "late"), [(DISARM, SWITCHED_ON, "latched"), (STATUS, ENABLED, "armed")]
 )
-def test_an_answer_may_be_older_than_a_stop_to_all(request: Request, says: int, late: str) -> None:
+def test_an_answer_may_be_older_than_a_stop_to_all(query: Request, says: int, late: str) -> None:
     """Asked, then all of the bus are stopped, and only then the answer comes: of how it was before.
 
     Nobody answers the stop, so it counts within 10 ms; after that it is stopped.
@@ -133,11 +135,11 @@ def test_an_answer_may_be_older_than_a_stop_to_all(request: Request, says: int, 
         watched = Watched()
         watched.grants(ARM, 1.0, ENABLED)
         watched.amplifier.broadcast_sent(STOP_ALL, 1.1)
-        watched.grants(request, asked_at, says)
+        watched.grants(query, asked_at, says)
         assert watched.broken == broken
     watched = Watched()
     watched.grants(ARM, 1.0, ENABLED)
     watched.amplifier.broadcast_sent(STOP_ALL, 1.1)
-    watched.grants(request, 1.0995, says)
+    watched.grants(query, 1.0995, says)
     watched.grants(STATUS, 1.12, STOPPED)
     assert watched.broken == []

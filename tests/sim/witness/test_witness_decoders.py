@@ -191,7 +191,7 @@ def test_a_refusal_of_an_earlier_write_answers_who_reads_it() -> None:
         ((_, answer),) = decoder.feed("host", 0.003, told)
         assert isinstance(request, Request)
         assert isinstance(answer, Reply)
-        assert answer.problem == "it carries tag 21 instead of 22"
+        assert answer.problem == "tag 21, expected 22"
         assert (answer.key == request.key) is is_answer
 
 
@@ -303,8 +303,8 @@ def test_a_late_answer_to_what_was_repeated_tells_nothing_new() -> None:
     [
         (2, 17999, ""),
         (32, 0, ""),
-        (33, 0, "envelope_knots 33 is not within 0 to 32"),
-        (2, 18000, "phase of a knot 18000 is not within -18000 to 17999"),
+        (33, 0, "envelope_knots must be 0 to 32, got 33"),
+        (2, 18000, "phase of a knot must be -18000 to 17999, got 18000"),
     ],
 )
 def test_an_envelope_is_held_to_its_bounds_on_every_wire(

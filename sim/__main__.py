@@ -1,4 +1,4 @@
-"""`python -m sim RIG --serial`: the far end without the rest of the `era` command."""
+"""`python -m sim RIG --serial`: the simulation without the other `era` commands."""
 
 import os
 import sys
@@ -7,17 +7,17 @@ import sys
 def main() -> int:
     """Run the command line; returns the exit status."""
     for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
-        os.environ.setdefault(variable, "1")  # before numpy loads: two are slower here, and erratic
-    from sim.process.endings import gone_when_told
+        os.environ.setdefault(variable, "1")  # before numpy loads: more are slower
+    from sim.process.early_exit import exit_on_signal
 
     try:
-        with gone_when_told():  # while all the rest loads
+        with exit_on_signal():
             import typer
 
             from sim.cli import EXIT_STATUS, sim
 
             app = typer.Typer(pretty_exceptions_enable=False)
-            app.command()(sim)  # alone, whatever else the package offers
+            app.command()(sim)
             app(prog_name="python -m sim")
     except tuple(EXIT_STATUS) as error:
         sys.stderr.write(f"sim: error: {error}\n")

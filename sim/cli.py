@@ -14,7 +14,6 @@ from sim.witness_cli import witness
 if TYPE_CHECKING:
     from sim.control.context import SimulationContext
     from sim.far_ends.wires import Wire
-    from sim.process.far_end import FarEnd
     from sim.process.view import PlateView
     from sim.sensors.accelerometer import Accelerometer
 
@@ -22,102 +21,103 @@ app = typer.Typer(pretty_exceptions_enable=False)
 app.command()(witness)
 
 EXIT_STATUS: dict[type[BaseException], int] = {InputError: 2, LinkError: 3}
-"""Exit status of the errors that this command raises on purpose."""
+"""Exit status by class of error."""
 
 
 @app.command()
 def sim(
     rig: Annotated[Path, typer.Argument(metavar="RIG", help="Rig file, e.g. RIG.yaml.")],
     serial: Annotated[
-        bool, typer.Option("--serial", help="Put every amplifier on a pseudo-terminal.")
+        bool, typer.Option("--serial", help="Put each amplifier on a pseudo-terminal.")
     ] = False,
     modbus_tcp: Annotated[
         int | None,
         typer.Option(
             metavar="PORT",
-            help="Modbus TCP on this port of the loopback interface; 0: any.",
+            help="Serve Modbus TCP on this loopback port; 0: any.",
             min=0,
             max=65535,
         ),
     ] = None,
     modbus_rtu: Annotated[
-        bool, typer.Option("--modbus-rtu", help="Modbus RTU, all on one pseudo-terminal.")
+        bool, typer.Option("--modbus-rtu", help="Serve Modbus RTU on one pseudo-terminal.")
     ] = False,
     socketcand: Annotated[
         int | None,
         typer.Option(
             metavar="PORT",
-            help="A CAN bus behind a socketcand server on this loopback port; 0: any.",
+            help="Serve a CAN bus by socketcand on this loopback port; 0: any.",
             min=0,
             max=65535,
         ),
     ] = None,
     slcan: Annotated[
-        bool, typer.Option("--slcan", help="A CAN bus behind a serial adapter (slcan).")
+        bool, typer.Option("--slcan", help="Serve a CAN bus behind a serial adapter (slcan).")
     ] = False,
     wire: Annotated[
         list[str] | None,
         typer.Option(
             metavar="NAME=WIRE",
-            help="Put one amplifier elsewhere: main=serial, side=modbus-tcp:5020; repeatable. "
-            "What no option names is on the wire that its url in the rig asks for.",
+            help="Choose the wire of one amplifier: main=serial, side=modbus-tcp:5020; repeatable. "
+            "Without an option the scheme of its url in the rig decides.",
         ),
     ] = None,
     shared: Annotated[
-        bool, typer.Option("--shared", help="All amplifiers on one line, at addresses 1, 2, ...")
+        bool,
+        typer.Option("--shared", help="Put all amplifiers on one line, at addresses 1, 2, ..."),
     ] = False,
     speed: Annotated[
         int | None,
-        typer.Option(metavar="BIT/S", help="Let bytes take their time on the wire.", min=300),
+        typer.Option(metavar="BIT/S", help="Simulate the transmission time of bytes.", min=300),
     ] = None,
     faults: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="What shall go wrong, and when.")
+        Path | None, typer.Option(metavar="FILE", help="Inject the faults of a fault file.")
     ] = None,
     finger: Annotated[
         list[str] | None,
-        typer.Option(metavar="X,Y", help="A finger that rests here [m]; may be repeated."),
+        typer.Option(metavar="X,Y", help="Place a finger [m]; repeatable."),
     ] = None,
     finger_load: Annotated[
         str | None,
         typer.Option(
             metavar="LOAD",
-            help="Fingers load the plate: light, or N/m,N s/m,kg. Else they only feel.",
+            help="Let fingers load the plate: light, or N/m,N s/m,kg.",
         ),
     ] = None,
     sensor: Annotated[
         list[str] | None,
-        typer.Option(metavar="NAME=X,Y", help="An accelerometer here [m]; may be repeated."),
+        typer.Option(metavar="NAME=X,Y", help="Place an accelerometer [m]; repeatable."),
     ] = None,
     record: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Record sensors and fingers: .csv, .wav or .uff."),
+        typer.Option(metavar="FILE", help="Record sensors and fingers to .csv, .wav or .uff."),
     ] = None,
     rate: Annotated[
-        float, typer.Option(metavar="HZ", help="Sampling rate of sensors and fingers.")
+        float, typer.Option(metavar="HZ", help="Set the sampling rate of sensors and fingers.")
     ] = 10_000.0,
     control: Annotated[
-        Path | None, typer.Option(metavar="PATH", help="Serve a control socket at this path.")
+        Path | None, typer.Option(metavar="PATH", help="Serve the control socket at this path.")
     ] = None,
     virtual_time: Annotated[
         bool,
-        typer.Option("--virtual-time", help="Time passes only as the control socket says."),
+        typer.Option("--virtual-time", help="Advance time only by the control socket."),
     ] = False,
     until_eof: Annotated[
         bool,
-        typer.Option("--until-eof", help="End with standard input, as when its writer dies."),
+        typer.Option("--until-eof", help="Exit at the end of standard input."),
     ] = False,
 ) -> None:
-    """Simulate a rig behind real wires. Prints a URL per amplifier; Ctrl-C or SIGTERM ends it."""
-    from sim.process.endings import gone_when_told
+    """Simulate the amplifiers of a rig on real wires. Print a URL for each; Ctrl-C ends."""
+    from sim.process.early_exit import exit_on_signal
 
-    with gone_when_told():  # until there is something to end in order
+    with exit_on_signal():
         from model.config.points import parse_point
         from model.finger.load import parse_finger_load
         from model.rig.file import load_rig
-        from sim.far_ends.wire_choice import choose_wires
+        from sim.far_ends.wire_assignment import assign_wires
         from sim.far_ends.wires import Wire
         from sim.faults.fault_file import FaultFile, load_faults
-        from sim.process.far_end import FarEnd
+        from sim.process.simulation import Simulation
 
         plain = Wire("serial", speed=speed, shared=shared, unpluggable=faults is not None)
         common = _common_wire(
@@ -131,12 +131,12 @@ def sim(
             },
         )
         if virtual_time and control is None:
-            raise InputError("--virtual-time: who lets time pass? Add --control PATH")
+            raise InputError("--virtual-time needs --control PATH, which advances the time")
         loaded = load_rig(rig)
         _check_rate(rate, frequency_max=loaded.limits.frequency_max)
-        far_end = FarEnd(
+        simulation = Simulation(
             loaded,
-            choose_wires(loaded.amplifiers, common=common, own=wire or [], plain=plain),
+            assign_wires(loaded.amplifiers, common=common, options=wire or [], plain=plain),
             faults=load_faults(faults, amplifiers=loaded.amplifiers) if faults else FaultFile(()),
             fingers={
                 str(number): parse_point(text, what="--finger")
@@ -151,19 +151,19 @@ def sim(
             record=record,
             until_eof=until_eof,
         )
-        _run(far_end, virtual_time=virtual_time)
+        _run(simulation, virtual_time=virtual_time)
 
 
 def _common_wire(plain: "Wire", ports: Mapping[str, int | None]) -> "Wire | None":
-    """The wire that all amplifiers are on, by the port of the one kind that was asked for."""
+    """The wire of all amplifiers, by the one option given; ports: None for options not given."""
     from dataclasses import replace
 
     given = {kind: port for kind, port in ports.items() if port is not None}
     if len(given) > 1:
         named = " and ".join(f"--{kind}" for kind in given)
         raise InputError(
-            f"{named}: all amplifiers can be on one of them only; leave one, or say which "
-            "amplifier is where, as in --wire main=serial --wire side=slcan"
+            f"{named} exclude each other; give one, or the wire of each amplifier, as in "
+            "--wire main=serial --wire side=slcan"
         )
     return next((replace(plain, kind=kind, port=port) for kind, port in given.items()), None)
 
@@ -172,8 +172,8 @@ def _check_rate(rate: float, *, frequency_max: float) -> None:
     least = 2.5 * frequency_max
     if not least <= rate <= 1e6:
         raise InputError(
-            f"--rate {rate:g}: the plate is driven at up to {frequency_max:g} Hz, "
-            f"which {least:g} to 1e+06 Hz can follow"
+            f"--rate must be {least:g} to 1e+06 Hz for a plate driven at up to "
+            f"{frequency_max:g} Hz, got {rate:g}"
         )
 
 
@@ -181,28 +181,28 @@ def _sensor(text: str) -> "Accelerometer":
     from model.config.points import parse_point
     from sim.sensors.accelerometer import Accelerometer
 
-    name, equals, place = text.partition("=")
+    name, equals, position = text.partition("=")
     if not (name and equals):
-        raise InputError(f"--sensor {text}: write its name and place, as in --sensor P1=0.10,0.08")
-    return Accelerometer(name, *parse_point(place, what="--sensor"))
+        raise InputError(f"--sensor must be NAME=X,Y, as in P1=0.10,0.08, got {text}")
+    return Accelerometer(name, *parse_point(position, what="--sensor"))
 
 
-def _run(far_end: "FarEnd", *, virtual_time: bool) -> None:
+def _run(simulation: "Simulation", *, virtual_time: bool) -> None:
     import asyncio
 
-    from sim.process.far_end import run_far_end
+    from sim.process.simulation import run_simulation
     from sim.process.virtual_time import SteppedLoop
 
     view = _LiveView() if sys.stdout.isatty() else None
     factory = SteppedLoop if virtual_time else None
     try:
         with asyncio.Runner(loop_factory=factory) as runner:
-            said = runner.run(run_far_end(far_end, ready=_announce, view=view))
+            message = runner.run(run_simulation(simulation, ready=_announce, view=view))
     finally:
         if view is not None:
             view.close()
-    if said is not None:
-        print(said)
+    if message is not None:
+        print(message)
 
 
 def _announce(urls: Mapping[str, str]) -> None:
@@ -212,7 +212,7 @@ def _announce(urls: Mapping[str, str]) -> None:
 
 
 class _LiveView:
-    """A picture that is drawn over again in place, from the first call on."""
+    """The live view, redrawn in place at each call."""
 
     def __init__(self) -> None:
         from rich.live import Live

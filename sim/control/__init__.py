@@ -1,1 +1,1 @@
-"""Control of a running far end from outside: fingers, sensors, faults and time, over a socket."""
+"""Control of a running simulation over a socket: fingers, sensors, faults and time."""

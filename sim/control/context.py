@@ -1,4 +1,4 @@
-"""A running far end as control sees it: the bench and all that stands around it."""
+"""The running simulation: its bench, devices, sensors and recording."""
 
 import asyncio
 from collections.abc import Callable, Coroutine, Mapping, Sequence
@@ -15,10 +15,9 @@ from sim.sensors.recorder import Recorder
 
 @dataclass
 class SimulationContext:
-    """A bench, and what else there is.
+    """A bench with its devices on wires and their URLs, both by name.
 
-    devices: amplifiers on wires, urls: where, both by name; step: lets virtual time [s] pass, None
-    where time is the clock's; recorder: the recording that is being made, if there is one.
+    step: advances virtual time [s], None in real time; recorder: None while nothing is recorded.
     """
 
     bench: Bench
@@ -29,13 +28,13 @@ class SimulationContext:
     accelerometers: Accelerometers = field(init=False)
 
     def __post_init__(self) -> None:
-        """No sensor is there at first."""
+        """Start without sensors."""
         self.accelerometers = Accelerometers(self.bench)
 
     def record(self, path: Path) -> None:
-        """Record sensors and fingers that are there now; InputError if one is being made."""
+        """Start recording the present sensors and fingers; InputError while another one runs."""
         if self.recorder is not None:
-            raise InputError(f"{self.recorder.path} is being recorded; finish it first")
+            raise InputError(f"already recording {self.recorder.path}; finish it first")
         self.recorder = Recorder(
             self.bench,
             path,
@@ -44,28 +43,28 @@ class SimulationContext:
         )
 
     def stop_recording(self) -> Recorder:
-        """Record no more; what comes back is still to be finished. InputError if there is none."""
+        """Stop recording; returns the recorder to be finished. InputError if there is none."""
         recorder, self.recorder = self.recorder, None
         if recorder is None:
-            raise InputError("nothing is being recorded")
+            raise InputError("no recording is running")
         recorder.stop()
         return recorder
 
     def devices_of(self, amplifier: str | None) -> Sequence[SimulatedDevice]:
-        """One amplifier's, or those of all; InputError for none."""
+        """The device of an amplifier, or all devices; InputError for an unknown name."""
         if amplifier is None:
             return tuple(self.devices.values())
         if amplifier not in self.devices:
-            known = ", ".join(self.devices) or "no amplifier on a wire"
-            raise InputError(f"{str(amplifier)[:40]!r} is none of the far end's: {known}")
+            known = ", ".join(self.devices) or "(none on a wire)"
+            raise InputError(f"amplifier must be one of {known}, got {str(amplifier)[:40]!r}")
         return (self.devices[amplifier],)
 
 
 async def finish_recording(context: SimulationContext) -> str | None:
-    """Write the recording that is being made; what to say of it, None where there is none."""
+    """Write the running recording; returns a message about it, None where there is none."""
     if context.recorder is None:
         return None
     recorder = context.stop_recording()
     await asyncio.to_thread(recorder.finish)
-    full = " (as long as it may become; the rest is not in it)" if recorder.is_full else ""
+    full = " (truncated at its maximum size)" if recorder.is_full else ""
     return f"wrote {recorder.path}: {recorder.seconds:.1f} s{full}"

@@ -1,23 +1,21 @@
-"""Operations of control on faults: what befalls amplifiers and their wires, and when it is over."""
+"""Control operations on faults."""
 
 import math
 from collections.abc import Mapping
-from typing import Any
 
-from sim.control.answers import Answer, Operation, already
 from sim.control.context import SimulationContext
+from sim.control.responses import Operation, Request, ResponseBuilder, ready
 from sim.faults.fault_file import parse_fault
 
 
-def _inject_fault(context: SimulationContext, request: dict[str, Any], now: float) -> Answer:
-    told = {key: value for key, value in request.items() if key != "op"}
-    window = parse_fault(told)
+def _inject_fault(context: SimulationContext, request: Request, now: float) -> ResponseBuilder:
+    window = parse_fault({key: value for key, value in request.items() if key != "op"})
     for device in context.devices_of(window.amplifier):
         device.inject_fault(window)
-    return already({"ok": True, "time_s": now})
+    return ready({"ok": True, "time_s": now})
 
 
-def _faults(context: SimulationContext, request: dict[str, Any], now: float) -> Answer:
+def _faults(context: SimulationContext, request: Request, now: float) -> ResponseBuilder:
     listed = {}
     for name, device in context.devices.items():
         begin = device.faults.begin
@@ -30,13 +28,13 @@ def _faults(context: SimulationContext, request: dict[str, Any], now: float) -> 
             }
             for window in device.faults.windows
         ]
-    return already({"faults": listed})
+    return ready({"faults": listed})
 
 
-def _recover(context: SimulationContext, request: dict[str, Any], now: float) -> Answer:
+def _recover(context: SimulationContext, request: Request, now: float) -> ResponseBuilder:
     for device in context.devices_of(request.get("amplifier")):
         device.recover()
-    return already({"ok": True, "time_s": now})
+    return ready({"ok": True, "time_s": now})
 
 
 OPERATIONS: Mapping[str, Operation] = {

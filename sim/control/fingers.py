@@ -1,68 +1,74 @@
-"""Operations of control on fingers: where they rest, and what they felt."""
+"""Control operations on fingers."""
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Mapping
 
 from model.errors import InputError
-from sim.control.answers import Answer, Operation, already
 from sim.control.context import SimulationContext
-from sim.control.values import finger_of, place_of, window_of
+from sim.control.responses import Operation, Request, Response, ResponseBuilder, ready
+from sim.control.values import parse_finger, parse_position, parse_window
 from sim.plant.felt import feel
-from sim.plant.finger import Position, Record
+from sim.plant.finger import Position
 
 
-def _fingers(context: SimulationContext, request: dict[str, Any], now: float) -> Answer:
+def _fingers(context: SimulationContext, request: Request, now: float) -> ResponseBuilder:
     fingers = request.get("fingers")
     if not isinstance(fingers, dict):
         raise InputError('fingers must be an object of positions, as in {"1": [0.10, 0.08]}')
-    places = {
-        name: place_of(place, what=f"finger {name[:40]!r}") for name, place in fingers.items()
+    positions = {
+        name: parse_position(at, what=f"finger {name[:40]!r}") for name, at in fingers.items()
     }
-    return _placed(context, places, now)
+    return _placed(context, positions, now)
 
 
-def _come(context: SimulationContext, request: dict[str, Any], now: float) -> Answer:
-    name, present = finger_of(request), context.bench.fingers.layout.positions
+def _touch_or_move(context: SimulationContext, request: Request, now: float) -> ResponseBuilder:
+    name, present = parse_finger(request), context.bench.fingers.layout.positions
     if (name in present) != (request["op"] == "move"):
-        there = "is on the plate already" if name in present else "is not on the plate"
-        raise InputError(f"finger {name!r} {there}")
-    at = place_of(request.get("at_m"), what=f"finger {name!r}")
+        state = "already" if name in present else "not"
+        raise InputError(f"finger {name!r} is {state} on the plate")
+    at = parse_position(request.get("at_m"), what=f"finger {name!r}")
     return _placed(context, {**present, name: at}, now)
 
 
-def _go(context: SimulationContext, request: dict[str, Any], now: float) -> Answer:
-    name, present = finger_of(request), context.bench.fingers.layout.positions
+def _lift(context: SimulationContext, request: Request, now: float) -> ResponseBuilder:
+    name, present = parse_finger(request), context.bench.fingers.layout.positions
     if name not in present:
         raise InputError(f"finger {name!r} is not on the plate")
     return _placed(context, {id: at for id, at in present.items() if id != name}, now)
 
 
-def _placed(context: SimulationContext, places: Mapping[str, Position], now: float) -> Answer:
-    context.bench.place_fingers(places, now=now)
-    return already({"ok": True, "time_s": context.bench.time})
+def _placed(
+    context: SimulationContext, positions: Mapping[str, Position], now: float
+) -> ResponseBuilder:
+    context.bench.place_fingers(positions, now=now)
+    return ready({"ok": True, "time_s": context.bench.time})
 
 
-def _felt(context: SimulationContext, request: dict[str, Any], now: float) -> Answer:
-    since, until = window_of(request)
+def _felt(context: SimulationContext, request: Request, now: float) -> ResponseBuilder:
+    since, until = parse_window(request)
     context.bench.advance(now)
     records, frequencies = context.bench.records(since, until)
-    return lambda: {"fingers": {id: _as_felt(rec, frequencies) for id, rec in records.items()}}
 
+    def build() -> Response:
+        felt = {id: feel(record, frequencies) for id, record in records.items()}
+        return {
+            "fingers": {
+                id: {
+                    "points_m": one.points.tolist(),
+                    "frequencies_hz": list(one.frequencies),
+                    "amplitude_m_s2": one.amplitude.tolist(),
+                    "peak_m_s2": one.peak.tolist(),
+                }
+                for id, one in felt.items()
+            }
+        }
 
-def _as_felt(record: Record, frequencies: Sequence[float]) -> dict[str, Any]:
-    felt = feel(record, frequencies)
-    return {
-        "points_m": felt.points.tolist(),
-        "frequencies_hz": list(felt.frequencies),
-        "amplitude_m_s2": felt.amplitude.tolist(),
-        "peak_m_s2": felt.peak.tolist(),
-    }
+    return build
 
 
 OPERATIONS: Mapping[str, Operation] = {
     "fingers": _fingers,
-    "come": _come,
-    "move": _come,
-    "go": _go,
+    "touch": _touch_or_move,
+    "move": _touch_or_move,
+    "lift": _lift,
     "felt": _felt,
 }

@@ -1,16 +1,16 @@
-"""What the control socket of a far end takes: version 2 of its lines.
+"""Operations of the control socket, version 3: one JSON object per line in each direction.
 
-    {"op": "hello"}                            {"protocol": "era-sim-control", "version": 2,
+    {"op": "hello"}                            {"protocol": "era-sim-control", "version": 3,
                                                 "clock": "wall" or "virtual", "ops": [...],
                                                 "urls": {NAME: URL}}
     {"op": "state"}                            {"time_s": t, "fingers": {ID: [x, y]},
                                                 "amplifiers": {NAME: {"state", "fault", "token",
                                                 "high_voltage", "levels"}}}
 
-    fingers, their places [x, y] in metres
-    {"op": "fingers", "fingers": {ID: [x, y]}} these rest there, no others: {"ok": true, "time_s"}
-    {"op": "come", "finger": ID, "at_m": [x, y]}       one more; "move": one that is there;
-    {"op": "go", "finger": ID}                         lifted
+    fingers, positions [x, y] in metres
+    {"op": "fingers", "fingers": {ID: [x, y]}} replace all fingers: {"ok": true, "time_s"}
+    {"op": "touch", "finger": ID, "at_m": [x, y]}      add one; "move": move one
+    {"op": "lift", "finger": ID}                       remove one
     {"op": "felt", "since_s": t0, "until_s": t1}
         {"fingers": {ID: {"points_m": [[x, y], ...], "frequencies_hz": [f, ...],
                           "amplitude_m_s2": [[one per point], one row per frequency],
@@ -19,87 +19,90 @@
     sensors
     {"op": "sensors", "sensors": {NAME: {"at_m": [x, y], "noise_m_s2_rthz", "reach_m_s2",
                                          "resolution_m_s2", "scale"}}}
-                                                       all but at_m may be left out; no others stay
+                                                       replace all sensors; only at_m is required
     {"op": "signals", "since_s": t0, "until_s": t1}    {"sample_rate_hz", "start_s",
                                                         "sensors": {NAME: {"at_m", "m_s2": [...]}}}
     {"op": "tones", "since_s", "until_s", "frequencies_hz": [f, ...]}
         {"sensors": {NAME: {"at_m", "real_m_s2": [one per frequency], "imag_m_s2": [...]}}}
-        by least squares over the signals; Im[a exp(i omega t)], t the far end's time
+        least squares over the signals; Im[a exp(i omega t)], t on the simulation's clock
 
-    {"op": "inject_fault", "fault": ..., "lasts": ..., ...}  a fault as in a fault file, from now on
+    {"op": "inject_fault", "fault": ..., "lasts": ..., ...}   keys as in a fault file, begins now
     {"op": "faults"}                                   {"faults": {NAME: [{"fault", "begin_s",
                                                            "end_s" or null, "is_on"}]}}
-    {"op": "recover", "amplifier": NAME}               every fault ends; without a name, of all
-    {"op": "step", "seconds": s}                       lets virtual time pass: {"time_s": t}
-    {"op": "record", "file": PATH}                     sensors and fingers that are there now
-    {"op": "finish"}                                   writes it: {"file", "seconds", "is_full"}
+    {"op": "recover", "amplifier": NAME}               end all faults; of all without a name
+    {"op": "step", "seconds": s}                       advance virtual time: {"time_s": t}
+    {"op": "record", "file": PATH}                     record the present sensors and fingers
+    {"op": "finish"}                                   write it: {"file", "seconds", "is_full"}
 
-Times are the far end's [s]: time.monotonic(), or the virtual clock, which begins at 0. Of felt,
-signals and tones the last ten seconds can be had. What is wrong gets {"error": TEXT} and changes
-nothing.
+Times are seconds of the simulation's clock: time.monotonic(), or virtual time from 0. Felt, signals
+and tones cover the last ten seconds. An invalid request returns {"error": TEXT}
+and changes nothing.
 """
 
 import json
 from collections.abc import Mapping
-from typing import Any
 
 from model.errors import InputError
 from sim.control import faults, fingers, sensors
-from sim.control.answers import Answer, Operation, Wait, already
 from sim.control.context import SimulationContext
-from sim.control.values import number_of
+from sim.control.responses import (
+    Deferred,
+    Operation,
+    Request,
+    Response,
+    ResponseBuilder,
+    ready,
+)
+from sim.control.values import parse_number
 
-VERSION = 2
-_STEP_MAX = 3600.0  # s of virtual time in one request
+VERSION = 3
+_MAX_STEP = 3600.0  # s of virtual time in one request
 
 
-def carry_out(context: SimulationContext, line: bytes, *, now: float) -> Answer | Wait:
-    """Do what one line of control asks now [s]; returns what makes the answer to it.
-
-    Making it may take long and touches nothing of the bench any more: any thread may do it.
-    """
+def carry_out(context: SimulationContext, line: bytes, *, now: float) -> ResponseBuilder | Deferred:
+    """Execute one request line at a time [s]; returns what builds the response."""
     try:
         request = json.loads(line)
         if not isinstance(request, dict):
             raise InputError("a line must be a JSON object")
         op = request.get("op")
-        if not isinstance(op, str) or op not in _OPS:
-            raise InputError(f"op is {str(op)[:40]!r}; it must be one of {', '.join(_OPS)}")
-        made = _OPS[op](context, request, now)
+        if not isinstance(op, str) or op not in _OPERATIONS:
+            raise InputError(f"op must be one of {', '.join(_OPERATIONS)}, got {str(op)[:40]!r}")
+        result = _OPERATIONS[op](context, request, now)
     except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
-        return already({"error": f"not a line of JSON: {error}"})
+        return ready({"error": f"invalid JSON: {error}"})
     except (InputError, OSError) as error:
-        return already({"error": _in_words(error)})
-    return made if isinstance(made, Wait) else lambda: _made(made)
+        return ready({"error": _message(error)})
+    return result if isinstance(result, Deferred) else lambda: _build(result)
 
 
-def _made(answer: Answer) -> dict[str, Any]:
+def _build(builder: ResponseBuilder) -> Response:
     try:
-        return answer()
+        return builder()
     except (InputError, OSError) as error:
-        return {"error": _in_words(error)}
+        return {"error": _message(error)}
 
 
-def _in_words(error: InputError | OSError) -> str:
-    """What the system says of a file, without its number for it."""
+def _message(error: InputError | OSError) -> str:
+    """The message of an error, without the errno of one about a file."""
     if isinstance(error, OSError) and error.strerror:
-        return f"{error.filename or 'the file'} cannot be written: {error.strerror}"
+        return f"{error.filename or 'file'}: cannot be written: {error.strerror}"
     return str(error)
 
 
-def _hello(context: SimulationContext, request: dict[str, Any], now: float) -> Answer:
-    return already(
+def _hello(context: SimulationContext, request: Request, now: float) -> ResponseBuilder:
+    return ready(
         {
             "protocol": "era-sim-control",
             "version": VERSION,
             "clock": "wall" if context.step is None else "virtual",
-            "ops": list(_OPS),
+            "ops": list(_OPERATIONS),
             "urls": dict(context.urls),
         }
     )
 
 
-def _state(context: SimulationContext, request: dict[str, Any], now: float) -> Answer:
+def _state(context: SimulationContext, request: Request, now: float) -> ResponseBuilder:
     bench = context.bench
     bench.advance(now)
     amplifiers = {}
@@ -112,25 +115,25 @@ def _state(context: SimulationContext, request: dict[str, Any], now: float) -> A
             "high_voltage": status.high_voltage,
             "levels": list(status.levels),
         }
-    resting = {name: list(place) for name, place in bench.fingers.layout.positions.items()}
-    return already({"time_s": bench.time, "fingers": resting, "amplifiers": amplifiers})
+    resting = {name: list(position) for name, position in bench.fingers.layout.positions.items()}
+    return ready({"time_s": bench.time, "fingers": resting, "amplifiers": amplifiers})
 
 
-def _step(context: SimulationContext, request: dict[str, Any], now: float) -> Wait:
-    seconds, step = number_of(request, "seconds", "seconds"), context.step
+def _step(context: SimulationContext, request: Request, now: float) -> Deferred:
+    seconds, step = parse_number(request, "seconds", "seconds"), context.step
     if step is None:
-        raise InputError("time is the clock's here; start the far end with --virtual-time")
-    if not 0 < seconds <= _STEP_MAX:
-        raise InputError(f"seconds is {seconds:g}; it must lie between 0 and {_STEP_MAX:g}")
+        raise InputError("step needs virtual time: start era sim with --virtual-time")
+    if not 0 < seconds <= _MAX_STEP:
+        raise InputError(f"seconds must be above 0 and at most {_MAX_STEP:g}, got {seconds:g}")
 
-    async def passes() -> None:
+    async def wait() -> None:
         await step(seconds)
         context.bench.advance(now + seconds)
 
-    return Wait(passes, lambda: {"ok": True, "time_s": context.bench.time})
+    return Deferred(wait, lambda: {"ok": True, "time_s": context.bench.time})
 
 
-_OPS: Mapping[str, Operation] = {
+_OPERATIONS: Mapping[str, Operation] = {
     "hello": _hello,
     "state": _state,
     **fingers.OPERATIONS,

@@ -1,136 +1,122 @@
-"""Operations of control on sensors: where they are, what they read, and recordings of it."""
+"""Control operations on sensors and recordings."""
 
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 from model.errors import InputError
-from sim.control.answers import Answer, Operation, already
 from sim.control.context import SimulationContext
-from sim.control.values import is_number, number_of, place_of, window_of
+from sim.control.responses import Operation, Request, Response, ResponseBuilder, ready
+from sim.control.values import is_number, parse_number, parse_position, parse_window
 from sim.sensors.accelerometer import Accelerometer
-from sim.sensors.recorder import Recorder
 from sim.sensors.recording import Recording
 from sim.sensors.signal_measures import tone_phasors
 
-_TONES_MAX = 64
-
-
-def _sensors(context: SimulationContext, request: dict[str, Any], now: float) -> Answer:
-    asked = request.get("sensors")
-    if not isinstance(asked, dict):
-        raise InputError('sensors must be an object, as in {"P1": {"at_m": [0.10, 0.08]}}')
-    sensors = [_sensor(name, told) for name, told in asked.items()]
-    context.bench.advance(now)
-    context.accelerometers.place(sensors)
-    return already({"ok": True, "time_s": context.bench.time})
-
-
-def _sensor(name: str, told: object) -> Accelerometer:
-    if not isinstance(told, dict):
-        raise InputError(f'sensor {name[:40]!r} needs {{"at_m": [x, y]}} at least')
-    unknown = sorted(told.keys() - {"at_m", *_SENSOR_KEYS})
-    if unknown:
-        raise InputError(f"sensor {name[:40]!r}: {unknown[0][:40]!r} is unknown")
-    x, y = place_of(told.get("at_m"), what=f"sensor {name[:40]!r}")
-    values = {key: number_of(told, key, unit) for key, unit in _SENSOR_KEYS.items() if key in told}
-    return Accelerometer(
-        name,
-        x,
-        y,
-        values.get("noise_m_s2_rthz", 0.0),
-        values.get("reach_m_s2", math.inf),
-        values.get("resolution_m_s2", 0.0),
-        values.get("scale", 1.0),
-    )
-
-
-_SENSOR_KEYS = {
-    "noise_m_s2_rthz": "m/s²/√Hz",
-    "reach_m_s2": "m/s²",
-    "resolution_m_s2": "m/s²",
-    "scale": "readings per truth",
+_MAX_TONES = 64
+_SENSOR_KEYS = {  # by key: unit, and the value where it is left out
+    "noise_m_s2_rthz": ("m/s²/√Hz", 0.0),
+    "reach_m_s2": ("m/s²", math.inf),
+    "resolution_m_s2": ("m/s²", 0.0),
+    "scale": ("reading per acceleration", 1.0),
 }
 
 
-def _signals(context: SimulationContext, request: dict[str, Any], now: float) -> Answer:
+def _sensors(context: SimulationContext, request: Request, now: float) -> ResponseBuilder:
+    given = request.get("sensors")
+    if not isinstance(given, dict):
+        raise InputError('sensors must be an object, as in {"P1": {"at_m": [0.10, 0.08]}}')
+    sensors = [_sensor(name, values) for name, values in given.items()]
+    context.bench.advance(now)
+    context.accelerometers.place(sensors)
+    return ready({"ok": True, "time_s": context.bench.time})
+
+
+def _sensor(name: str, given: object) -> Accelerometer:
+    what = f"sensor {name[:40]!r}"
+    if not isinstance(given, dict):
+        raise InputError(f'{what} must be an object, as in {{"at_m": [0.10, 0.08]}}')
+    unknown = sorted(given.keys() - {"at_m", *_SENSOR_KEYS})
+    if unknown:
+        raise InputError(f"{what}: {unknown[0][:40]!r} is unknown")
+    x, y = parse_position(given.get("at_m"), what=what)
+    values = (
+        parse_number(given, key, unit) if key in given else default
+        for key, (unit, default) in _SENSOR_KEYS.items()
+    )
+    return Accelerometer(name, x, y, *values)
+
+
+def _signals(context: SimulationContext, request: Request, now: float) -> ResponseBuilder:
     recording = _recorded(context, request, now)
-    return lambda: {
-        "sample_rate_hz": recording.sample_rate,
-        "start_s": recording.start,
-        "sensors": {
-            name: {"at_m": at, "m_s2": samples}
-            for name, at, samples in zip(
-                recording.names,
-                recording.points.tolist(),
-                recording.samples.T.tolist(),
-                strict=True,
-            )
-        },
-    }
+
+    def build() -> Response:
+        columns = zip(
+            recording.names, recording.points.tolist(), recording.samples.T.tolist(), strict=True
+        )
+        return {
+            "sample_rate_hz": recording.sample_rate,
+            "start_s": recording.start,
+            "sensors": {name: {"at_m": at, "m_s2": samples} for name, at, samples in columns},
+        }
+
+    return build
 
 
-def _tones(context: SimulationContext, request: dict[str, Any], now: float) -> Answer:
+def _tones(context: SimulationContext, request: Request, now: float) -> ResponseBuilder:
     frequencies = request.get("frequencies_hz")
+    nyquist = context.bench.sample_rate / 2
     if not (
         isinstance(frequencies, list)
-        and 0 < len(frequencies) <= _TONES_MAX
-        and all(is_number(f) and 0 < f < context.bench.sample_rate / 2 for f in frequencies)
+        and 0 < len(frequencies) <= _MAX_TONES
+        and all(is_number(f) and 0 < f < nyquist for f in frequencies)
         and len(set(frequencies)) == len(frequencies)
     ):
         raise InputError(
-            f"frequencies_hz must be 1 to {_TONES_MAX} different frequencies below "
-            f"{context.bench.sample_rate / 2:g} Hz"
+            f"frequencies_hz must be 1 to {_MAX_TONES} different frequencies below {nyquist:g} Hz"
         )
     recording = _recorded(context, request, now)
 
-    def answer() -> dict[str, Any]:
-        found = tone_phasors(recording, frequencies)
+    def build() -> Response:
+        phasors = tone_phasors(recording, frequencies)
+        columns = zip(recording.names, recording.points.tolist(), phasors.T, strict=True)
         return {
             "sensors": {
-                name: {"at_m": at, "real_m_s2": column.real.tolist(), "imag_m_s2": imag}
-                for name, at, column, imag in zip(
-                    recording.names,
-                    recording.points.tolist(),
-                    found.T,
-                    found.imag.T.tolist(),
-                    strict=True,
-                )
+                name: {"at_m": at, "real_m_s2": a.real.tolist(), "imag_m_s2": a.imag.tolist()}
+                for name, at, a in columns
             }
         }
 
-    return answer
+    return build
 
 
-def _recorded(context: SimulationContext, request: dict[str, Any], now: float) -> Recording:
-    since, until = window_of(request)
+def _recorded(context: SimulationContext, request: Request, now: float) -> Recording:
+    since, until = parse_window(request)
     context.bench.advance(now)
     return context.accelerometers.read(since, until)
 
 
-def _record(context: SimulationContext, request: dict[str, Any], now: float) -> Answer:
+def _record(context: SimulationContext, request: Request, now: float) -> ResponseBuilder:
     file = request.get("file")
     if not isinstance(file, str) or not file:
         raise InputError("file must be the name of a recording, as in run.csv")
     context.bench.advance(now)
     context.record(Path(file))
-    return already({"ok": True, "time_s": context.bench.time})
+    return ready({"ok": True, "time_s": context.bench.time})
 
 
-def _finish(context: SimulationContext, request: dict[str, Any], now: float) -> Answer:
+def _finish(context: SimulationContext, request: Request, now: float) -> ResponseBuilder:
     context.bench.advance(now)
     recorder = context.stop_recording()
-    return lambda: _finished(recorder)
 
+    def build() -> Response:
+        recorder.finish()
+        return {
+            "file": str(recorder.path),
+            "seconds": recorder.seconds,
+            "is_full": recorder.is_full,
+        }
 
-def _finished(recorder: Recorder) -> dict[str, Any]:
-    recorder.finish()
-    return {
-        "file": str(recorder.path),
-        "seconds": recorder.seconds,
-        "is_full": recorder.is_full,
-    }
+    return build
 
 
 OPERATIONS: Mapping[str, Operation] = {

@@ -1,6 +1,6 @@
-"""Control of a running far end: JSON, a line each way, over a Unix socket for its owner only.
+"""The control socket: JSON lines over a Unix socket that only its owner may open.
 
-What may be asked stands in `sim.control.operations`.
+The operations are documented in `sim.control.operations`.
 """
 
 import asyncio
@@ -15,16 +15,16 @@ from typing import Any
 
 from drivers import clock
 from drivers.errors import LinkError
-from sim.control.answers import Answer, Wait
 from sim.control.context import SimulationContext
 from sim.control.operations import carry_out
+from sim.control.responses import Deferred, ResponseBuilder
 
 LINE_MAX = 64 * 1024  # bytes; thirty fingers take a tenth of it
 
 
 @asynccontextmanager
 async def control_socket(context: SimulationContext, path: Path) -> AsyncIterator[None]:
-    """Serve control of a far end at a path; raises LinkError where no socket can be made."""
+    """Serve control at a path; raises LinkError where no socket can be created."""
     sock = _bind(path)
     loop = asyncio.get_running_loop()
     clients: dict[asyncio.Task[None], socket.socket] = {}
@@ -35,10 +35,10 @@ async def control_socket(context: SimulationContext, path: Path) -> AsyncIterato
     def accept() -> None:
         try:
             connection, _ = sock.accept()
-        except OSError:  # the client has left again already
+        except OSError:  # the client has disconnected already
             return
         connection.setblocking(False)
-        client = loop.create_task(_converse(context, connection), name=f"control at {path}")
+        client = loop.create_task(_serve_client(context, connection), name=f"control at {path}")
         clients[client] = connection
         client.add_done_callback(forget)
 
@@ -54,29 +54,29 @@ async def control_socket(context: SimulationContext, path: Path) -> AsyncIterato
         await asyncio.gather(*clients, return_exceptions=True)
 
 
-async def _converse(context: SimulationContext, connection: socket.socket) -> None:
-    """Answer a client line by line until it leaves. Plain sockets: no transport to outlive us."""
+async def _serve_client(context: SimulationContext, connection: socket.socket) -> None:
+    """Serve a client line by line until it disconnects."""
     loop = asyncio.get_running_loop()
     rest = b""
     with contextlib.suppress(ConnectionError):
         while data := await loop.sock_recv(connection, LINE_MAX):
             *lines, rest = (rest + data).split(b"\n")
             for line in lines:
-                make_answer = carry_out(context, line, now=clock.now())
-                if isinstance(make_answer, Wait):
-                    await make_answer.passes()
-                    make_answer = make_answer.then
-                # A long fit must not hold up the amplifiers, whose hosts wait for 50 ms at most.
-                reply = await asyncio.to_thread(_encode_made, make_answer)
+                builder = carry_out(context, line, now=clock.now())
+                if isinstance(builder, Deferred):
+                    await builder.wait()
+                    builder = builder.then
+                # In a thread: a long fit must not delay the amplifiers' replies.
+                reply = await asyncio.to_thread(_build_and_encode, builder)
                 await loop.sock_sendall(connection, reply)
-            if len(rest) > LINE_MAX:  # where the next line starts will never be known: hang up
-                error = {"error": f"a line is longer than {LINE_MAX} bytes"}
+            if len(rest) > LINE_MAX:  # the next line cannot be found
+                error = {"error": f"line must be at most {LINE_MAX} bytes"}
                 await loop.sock_sendall(connection, _encode(error))
                 return
 
 
-def _encode_made(make_answer: Answer) -> bytes:
-    return _encode(make_answer())
+def _build_and_encode(builder: ResponseBuilder) -> bytes:
+    return _encode(builder())
 
 
 def _encode(reply: dict[str, Any]) -> bytes:
@@ -84,9 +84,9 @@ def _encode(reply: dict[str, Any]) -> bytes:
 
 
 def _bind(path: Path) -> socket.socket:
-    """A listening socket that only its owner may use; takes the place of one that is dead."""
+    """Create a listening socket for the owner only; a stale one is replaced."""
     sock = socket.socket(socket.AF_UNIX)
-    mask = os.umask(0o177)  # from its first moment on
+    mask = os.umask(0o177)
     try:
         if path.is_socket() and _is_dead(path):
             path.unlink()
@@ -96,8 +96,8 @@ def _bind(path: Path) -> socket.socket:
     except OSError as error:
         sock.close()
         raise LinkError(
-            f"no control socket can be made at {path} ({error.strerror or error}): give a path "
-            "of under 100 characters in a folder of yours that no other program serves at"
+            f"{path}: cannot create control socket: {error.strerror or error}; give an unused path "
+            "of under 100 characters in a writable folder"
         ) from error
     finally:
         os.umask(mask)

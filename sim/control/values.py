@@ -1,4 +1,4 @@
-"""Values in the lines of control: taken out of their keys, or refused in words."""
+"""Check the values in requests of the control socket."""
 
 import math
 from typing import Any, TypeGuard
@@ -7,25 +7,25 @@ from model.errors import InputError
 from sim.plant.finger import Position
 
 
-def window_of(request: dict[str, Any]) -> tuple[float, float]:
-    """The window of time that is asked for: since_s before until_s [s]."""
-    since = number_of(request, "since_s", "seconds")
-    until = number_of(request, "until_s", "seconds")
+def parse_window(request: dict[str, Any]) -> tuple[float, float]:
+    """The time window since_s to until_s [s]."""
+    since = parse_number(request, "since_s", "seconds")
+    until = parse_number(request, "until_s", "seconds")
     if since >= until:
-        raise InputError(f"since_s {since} must come before until_s {until}")
+        raise InputError(f"since_s must be less than until_s, got {since} and {until}")
     return since, until
 
 
-def number_of(told: dict[str, Any], key: str, unit: str) -> float:
+def parse_number(given: dict[str, Any], key: str, unit: str) -> float:
     """The finite number under a key; unit: for the error."""
-    value = told.get(key)
+    value = given.get(key)
     if not is_number(value):
-        raise InputError(f"{key} is {str(value)[:40]!r}; it must be a number of {unit}")
+        raise InputError(f"{key} must be a number of {unit}, got {str(value)[:40]!r}")
     return float(value)
 
 
 def is_number(value: object) -> TypeGuard[int | float]:
-    """Whether it is a finite number; JSON has NaN and truth values, too."""
+    """Whether a JSON value is a finite number."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         return False
     try:
@@ -34,16 +34,16 @@ def is_number(value: object) -> TypeGuard[int | float]:
         return False
 
 
-def finger_of(request: dict[str, Any]) -> str:
+def parse_finger(request: dict[str, Any]) -> str:
     """The id of a finger."""
     name = request.get("finger")
     if not isinstance(name, str) or not 0 < len(name) <= 40:
-        raise InputError("finger must be the finger's id, a short text")
+        raise InputError("finger must be an id of 1 to 40 characters")
     return name
 
 
-def place_of(place: object, *, what: str) -> Position:
-    """A place [x, y] [m]; what: whose, for the error."""
-    if not (isinstance(place, list) and len(place) == 2 and all(is_number(p) for p in place)):
-        raise InputError(f"{what} needs a position [x, y] in metres")
-    return float(place[0]), float(place[1])
+def parse_position(given: object, *, what: str) -> Position:
+    """A position [x, y] [m]; what: for the error."""
+    if not (isinstance(given, list) and len(given) == 2 and all(map(is_number, given))):
+        raise InputError(f"{what} must have a position [x, y] in metres")
+    return float(given[0]), float(given[1])

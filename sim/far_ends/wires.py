@@ -1,7 +1,7 @@
-"""Which far end stands behind which wire.
+"""Open the far end of each kind of wire.
 
-A far end is an asynchronous context in which devices answer on a real wire; it gives the URL of
-each amplifier by its name. A new one is a file of its own and one line in `_OPENERS`.
+A far end is an asynchronous context in which devices reply on a real wire; it yields the URL of
+each amplifier by name. A new kind is a module and a line in `_OPENERS`.
 """
 
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
@@ -16,11 +16,10 @@ from sim.bench.simulated_device import SimulatedDevice
 class Wire:
     """How simulated amplifiers are reached.
 
-    kind: a key of this module's table; speed [bit/s]: telegrams take as long as at this speed, None
-    for no time; port: where to listen on the loopback interface, 0 for any that is free; shared:
-    all amplifiers on one wire, told apart by their numbers, where the kind leaves the choice;
-    unpluggable: the URLs hold when the wire is unplugged and comes back; line: tells wires apart
-    that are alike otherwise.
+    kind: a key of `_OPENERS`; speed [bit/s]: None for no transmission time; port: on the loopback
+    interface, 0 for any; shared: all amplifiers on one serial line, at addresses 1, 2, ...;
+    unpluggable: URLs stay valid when the wire is unplugged and plugged in again; line: tells apart
+    wires that are otherwise equal.
     """
 
     kind: str
@@ -35,7 +34,7 @@ FarEnd: TypeAlias = AbstractAsyncContextManager[Mapping[str, str]]
 
 
 def open_wire(wire: Wire, devices: Sequence[SimulatedDevice]) -> FarEnd:
-    """The far end of this wire with these devices on it; entering it may raise LinkError."""
+    """The far end of a wire with these devices; entering it may raise LinkError."""
     return _OPENERS[wire.kind](wire, devices)
 
 
@@ -43,9 +42,9 @@ def open_wire(wire: Wire, devices: Sequence[SimulatedDevice]) -> FarEnd:
 async def open_wires(
     wires: Mapping[str, Wire], devices: Sequence[SimulatedDevice]
 ) -> AsyncIterator[Mapping[str, str]]:
-    """The far ends of devices on several wires, by their names: those with equal ones on one.
+    """The far ends of devices on several wires, both by name; equal wires are shared.
 
-    Gives the URL of each by its name, in the devices' order. Raises LinkError.
+    Yields the URLs by name, in the order of the devices. Raises LinkError.
     """
     lines: dict[Wire, list[SimulatedDevice]] = {}
     for device in devices:

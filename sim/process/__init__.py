@@ -1,1 +1,1 @@
-"""The far end as a process of its own: how it runs, what it shows, and how it ends."""
+"""The simulation as a process: run loop, live view and shutdown."""

@@ -1,7 +1,4 @@
-"""What a person sees of a running far end: amplifiers, plate, fingers and sensors on the terminal.
-
-The plate is drawn as it vibrates: the darker a cell, the larger the peak acceleration there lately.
-"""
+"""The live view of a simulation on the terminal: amplifiers, peak accelerations, fingers."""
 
 import numpy as np
 from rich.console import Group, RenderableType
@@ -13,12 +10,12 @@ from model.vibration.peak import G
 from sim.bench.bench import Bench
 from sim.control.context import SimulationContext
 
-WINDOW = 0.2  # s; as long as a picture stays
+WINDOW = 0.2  # s; of the peaks shown for fingers
 _SHADES = " ·-+*#@"
-_FULL = 5.0  # g; shown as the last shade, and what lies above
-_NOTHING = 0.002  # of it; what is less is not drawn
+_FULL = 5.0  # g; the last shade
+_THRESHOLD = 0.002  # of _FULL; smaller values are not drawn
 _COLUMNS, _ROWS = 28, 10
-_FADING = 0.5  # of the peaks from one picture to the next
+_DECAY = 0.5  # of the peaks per picture
 
 
 class PlateView:
@@ -35,23 +32,23 @@ class PlateView:
 
     @property
     def shapes(self) -> FloatArray:
-        """Where it listens, in the coordinates that the plate has now."""
+        """Shapes at its points, in the present coordinates of the plate."""
         return self._bench.shapes_at(self._points)
 
     def record(self, times: FloatArray, accelerations: FloatArray) -> None:
-        """Keep the largest of what is there, (n, p) [m/s²]."""
+        """Keep the peaks of accelerations (n, p) [m/s²]."""
         if len(times):
             np.maximum(self._peaks, np.abs(accelerations).max(axis=0), out=self._peaks)
 
     def take(self) -> FloatArray:
-        """The peaks, which fade by being looked at."""
+        """Return the peaks and fade them."""
         peaks = self._peaks.copy()
-        self._peaks *= _FADING
+        self._peaks *= _DECAY
         return peaks.reshape(_ROWS, _COLUMNS)
 
 
 def draw(context: SimulationContext, plate: PlateView) -> RenderableType:
-    """The present state of a far end; one that nobody touches fits on 24 lines of 80 columns."""
+    """Render the present state; without fingers it fits on 24 lines of 80 columns."""
     bench = context.bench
     amplifiers = Table("amplifier", "state", "fault", "set", "level of each channel")
     for name, amplifier in bench.amplifiers.items():
@@ -63,17 +60,17 @@ def draw(context: SimulationContext, plate: PlateView) -> RenderableType:
     for name, (x, y) in bench.fingers.layout.positions.items():
         peak = f"{felt[name].peak.max() / G:.2f} g" if name in felt else ""
         fingers.add_row(name, f"{x * 1000:.0f}, {y * 1000:.0f} mm", peak)
-    said = [f"{bench.time - plate.begun:.1f} s"]
+    footer = [f"{bench.time - plate.begun:.1f} s"]
     if context.recorder is not None:
         full = ", full" if context.recorder.is_full else ""
-        said.append(f"recording {context.recorder.path}: {context.recorder.seconds:.1f} s{full}")
+        footer.append(f"recording {context.recorder.path}: {context.recorder.seconds:.1f} s{full}")
     touched = [fingers] if fingers.row_count else []
-    return Group(amplifiers, _picture(bench, plate.take()), *touched, Text("   ".join(said)))
+    return Group(amplifiers, _picture(bench, plate.take()), *touched, Text("   ".join(footer)))
 
 
 def _picture(bench: Bench, peaks: FloatArray) -> Text:
-    """The plate with y upwards; fingers are O, ERAs are E."""
-    share = np.maximum(peaks / (_FULL * G) - _NOTHING, 0)
+    """The plate with y upwards; O are fingers, E are ERAs."""
+    share = np.maximum(peaks / (_FULL * G) - _THRESHOLD, 0)
     shade = np.ceil(share * (len(_SHADES) - 1)).astype(int)
     rows = [[_SHADES[min(cell, len(_SHADES) - 1)] for cell in row] for row in shade]
     size = bench.rig.plate.length, bench.rig.plate.width

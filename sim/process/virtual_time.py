@@ -1,15 +1,12 @@
-"""An event loop whose clock goes on only when it is told to, for a far end that tests step through.
-
-Wires and control are served as ever; what waits for a time waits for this clock.
-"""
+"""An event loop with a virtual clock that is stepped explicitly; I/O is served as usual."""
 
 import asyncio
 
-STEP = 0.005  # s; things that wait for a time come at most this much late
+STEP = 0.005  # s; the largest delay of a timer
 
 
 class SteppedLoop(asyncio.SelectorEventLoop):
-    """A loop that begins at 0 s."""
+    """An event loop whose time begins at 0 s."""
 
     def __init__(self) -> None:
         self._now = 0.0
@@ -20,10 +17,10 @@ class SteppedLoop(asyncio.SelectorEventLoop):
         return self._now
 
     async def step(self, seconds: float) -> None:
-        """Let so much time [s] pass, and everything happen that is due in it."""
+        """Advance the time by so many seconds, and run the timers due in it."""
         end = self._now + seconds
         while self._now < end:
             self._now = min(self._now + STEP, end)
-            # Twice: what is due now may ask for more to be done at once.
+            # Twice: a due timer may schedule another call.
             await asyncio.sleep(0)
             await asyncio.sleep(0)

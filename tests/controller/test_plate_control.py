@@ -54,7 +54,7 @@ async def test_a_question_that_is_refused_leaves_the_connection_to_the_next(
     answers = saying(b'{"error": "finger is 1; it must be a text"}\n', b'{"time_s": 1.5}\n')
     async with listening(tmp_path / "sock", answers) as control:
         with pytest.raises(LinkError, match="the simulated plate refused come: finger is 1; it"):
-            await control.ask({"op": "come"})
+            await control.ask({"op": "touch"})
         assert await control.ask({"op": "state"}) == {"time_s": 1.5}
 
 

@@ -1,7 +1,8 @@
-"""`era witness`: captures read, relays stood in, and what it says about input that is none."""
+"""`era witness`: captures, relays, and invalid input."""
 
 import asyncio
 import json
+import math
 import signal
 import sys
 from pathlib import Path
@@ -30,7 +31,9 @@ SESSION = """
 0.012 wire1 < 0004A30107020401010301FA02FA040807040101010101010105C005795C00
 """
 DAMAGED = "0.020 wire1 > 00 04 28 01 07 02 05 05 B4 C3 FD 86 00\n"
-PATIENCE = 30  # s; for a loaded machine, not an expectation
+TIMEOUT = 30  # s; for a loaded machine, not an expectation
+LIMITS = {0: {"frequency_hz": [40, 500], "level": 1.0}}
+CONFIG = {"wires": {"a": "serial"}, "amplifiers": {"m": {"wire": "a", "channels": LIMITS}}}
 
 
 def _replay(tmp_path: Path, text: str, *options: str) -> tuple[int, str]:
@@ -43,13 +46,13 @@ def _replay(tmp_path: Path, text: str, *options: str) -> tuple[int, str]:
     return result.exit_code, result.stdout
 
 
-def test_a_capture_without_fault_passes(tmp_path: Path) -> None:
+def test_witness_replay_passes_a_valid_session(tmp_path: Path) -> None:
     """Four good frames break no rule: exit status 0."""
     status, out = _replay(tmp_path, SESSION)
     assert (status, json.loads(out)) == (0, {"frames": 4, "violations": []})
 
 
-def test_a_capture_with_a_fault_does_not(tmp_path: Path) -> None:
+def test_witness_replay_reports_a_damaged_frame(tmp_path: Path) -> None:
     """A damaged frame of the host is named, with its time and the frames before it."""
     status, out = _replay(tmp_path, SESSION + DAMAGED)
     (found,) = json.loads(out)["violations"]
@@ -59,62 +62,64 @@ def test_a_capture_with_a_fault_does_not(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "named"),
+    ("text", "line"),
     [
-        ("", "no bytes"),
-        ("0.1 wire1 > 0Z\n", "line 1"),
-        ("0.1 wire1 = 00\n", "line 1"),
-        ("0.2 wire1 > 00\n0.1 wire1 > 00\n", "line 2"),
-        ("nan wire1 > 00\n", "line 1"),
-        ("# begin\n0.1 wire1 > 00\n0.1 other > 00\n", "line 3: 'other' is none of the wires"),
-        ("0.1 wire1 > 00\n\udcff\n", "line 2"),
-        ("0.1 wire1 > 00 04\n", "not one frame"),
+        ("", None),
+        ("0.1 wire1 > 0Z\n", 1),
+        ("0.1 wire1 = 00\n", 1),
+        ("0.2 wire1 > 00\n0.1 wire1 > 00\n", 2),
+        ("nan wire1 > 00\n", 1),
+        ("# begin\n0.1 wire1 > 00\n0.1 other > 00\n", 3),
+        ("0.1 wire1 > 00\n\udcff\n", 2),
+        ("0.1 wire1 > 00 04\n", None),
     ],
 )
-def test_what_is_no_capture_is_refused(tmp_path: Path, text: str, named: str) -> None:
-    """The line, or the wire, is named."""
+def test_witness_replay_refuses_an_invalid_capture(
+    tmp_path: Path, text: str, line: int | None
+) -> None:
+    """The error names file and line."""
     capture = tmp_path / "capture.txt"
     capture.write_bytes(text.encode("utf-8", errors="surrogateescape"))
     result = CliRunner().invoke(app, ["witness", URL, "--replay", str(capture)])
     assert isinstance(result.exception, InputError)
-    assert named in str(result.exception)
+    place = str(capture) if line is None else f"{capture}:{line}:"
+    assert str(result.exception).startswith(place)
 
 
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [
-        (["--frequency", "500,40"], "--frequency '500,40'"),
-        (["--frequency", "nan,40"], "--frequency 'nan,40'"),
-        (["--level", "7"], "--level 7"),
-        (["--level", "nan"], "--level nan"),
-        (["--slew", "-1"], "--slew -1"),
-        (["--slack", "-4"], "--slack -4"),
-        (["--slack", "inf"], "--slack inf"),
-        (["--replay", "missing.txt"], "missing.txt: no such file"),
-        (["--replay", "."], "Is a directory"),
-        ([f"{URL}?address=1"], "one amplifier, number 1"),
-        (["modbus+rtu:///dev/ttyUSB0"], "one wire in two ways, serial and modbus-rtu"),
+        (["--frequency", "500,40"], "--frequency"),
+        (["--frequency", "nan,40"], "--frequency"),
+        (["--level", "7"], "--level"),
+        (["--level", "nan"], "--level"),
+        (["--slew", "-1"], "--slew"),
+        (["--slack", "-4"], "--slack"),
+        (["--slack", "inf"], "--slack"),
+        (["--replay", "missing.txt"], "missing.txt"),
+        (["--replay", "."], "."),
+        ([f"{URL}?address=1"], f"{URL}?address=1"),
+        (["modbus+rtu:///dev/ttyUSB0"], "modbus+rtu:///dev/ttyUSB0"),
     ],
 )
-def test_what_cannot_be_witnessed_is_said(
+def test_witness_refuses_invalid_arguments(
     arguments: list[str], named: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The option, the file or the URLs are named before anything is opened."""
+    """The option, file or URL is named before anything is opened."""
     monkeypatch.chdir(tmp_path)
     result = CliRunner().invoke(app, ["witness", URL, *arguments])
     assert isinstance(result.exception, InputError)
     assert named in str(result.exception)
 
 
-def test_a_capture_is_not_written_over_while_it_is_read(tmp_path: Path) -> None:
-    """To record what is replayed is refused, and the capture is what it was."""
-    status, said = _replay(tmp_path, SESSION, "--record", str(tmp_path / "capture.txt"))
-    assert status == 2
-    assert "leave out one" in said
+def test_witness_refuses_record_with_replay(tmp_path: Path) -> None:
+    """The capture is left as it was."""
+    status, error = _replay(tmp_path, SESSION, "--record", str(tmp_path / "capture.txt"))
+    assert (status, "--record" in error) == (2, True)
     assert (tmp_path / "capture.txt").read_text(encoding="utf-8") == SESSION
 
 
-def test_a_capture_is_read_as_it_was_written(tmp_path: Path) -> None:
+def test_capture_is_read_as_written(tmp_path: Path) -> None:
     """Time, wire, direction and bytes of each line; comments and empty lines are nothing."""
     capture = tmp_path / "capture.txt"
     capture.write_text("# a session\n\n0.5 a > 00 04\n0.75 b < ff # back\n", encoding="utf-8")
@@ -129,28 +134,28 @@ def test_a_capture_is_read_as_it_was_written(tmp_path: Path) -> None:
     [
         ({}, "wires"),
         ({"wires": {"a": "smoke"}, "amplifiers": {}}, "wires.a"),
-        ({"wires": {"a": "serial"}, "amplifiers": {"m": {"wire": "b"}}}, "amplifiers.m.wire"),
-        ({"wires": {"a": "serial"}, "amplifiers": {"m": 1}}, "amplifiers.m"),
+        (CONFIG | {"amplifiers": {"m": {"wire": "b", "channels": LIMITS}}}, "amplifiers.m.wire"),
+        (CONFIG | {"amplifiers": {"m": 1}}, "amplifiers.m"),
         (
-            {"wires": {"a": "serial"}, "amplifiers": {"m": {"wire": "a", "channels": {0: {}}}}},
+            CONFIG | {"amplifiers": {"m": {"wire": "a", "channels": {0: {}}}}},
             "channels.0.frequency_hz",
         ),
-        ({"wires": {"a": "serial"}, "amplifiers": {"m": {"wire": "a"}}, "x": 1}, "'x'"),
+        (CONFIG | {"x": 1}, "x:"),
+        (CONFIG | {"times_s": {"lift": math.inf}}, "times_s.lift"),
     ],
 )
-def test_plans_that_are_none_are_refused(plan: dict[str, object], named: str) -> None:
-    """The key that is wrong is named."""
+def test_witness_config_refuses_an_invalid_key(plan: dict[str, object], named: str) -> None:
+    """The error names the key."""
     with pytest.raises(InputError) as refused:
         parse_config(plan)
     assert named in str(refused.value)
 
 
 @pytest.mark.parametrize("room", [RLIM_INFINITY, 64])
-async def test_the_command_stands_in_a_wire(coarse_rig: Rig, tmp_path: Path, room: int) -> None:
-    """A host that uses the URL it prints works as ever; told to end, it says that all was right.
-
-    On a disk with room for 64 bytes of the capture, too, but for what then is not in it.
-    """
+async def test_witness_relays_a_wire_until_interrupted(
+    coarse_rig: Rig, tmp_path: Path, room: int
+) -> None:
+    """A session through the relay passes; a full disk only makes the capture incomplete."""
     capture = tmp_path / "capture.txt"
     async with far_side(WIRES["serial"], coarse_rig) as far:
         options = ("--slack", "5000", "--record", str(capture))
@@ -162,7 +167,7 @@ async def test_the_command_stands_in_a_wire(coarse_rig: Rig, tmp_path: Path, roo
             cwd=example_rig_path().parent.parent,
         )
         assert process.stdout is not None
-        line = await asyncio.wait_for(process.stdout.readline(), PATIENCE)
+        line = await asyncio.wait_for(process.stdout.readline(), TIMEOUT)
         prlimit(process.pid, RLIMIT_FSIZE, (room, RLIM_INFINITY))
         url = line.decode().split(": ")[1].strip()
         amplifier = Amplifier(open_backend(url), reply_timeout=2.0)
@@ -170,12 +175,12 @@ async def test_the_command_stands_in_a_wire(coarse_rig: Rig, tmp_path: Path, roo
         await amplifier.status()
         await amplifier.close()
         process.send_signal(signal.SIGINT)
-        out, err = await asyncio.wait_for(process.communicate(), PATIENCE)
-    assert out.decode().strip() == "6 frames: no rule was broken"
+        out, err = await asyncio.wait_for(process.communicate(), TIMEOUT)
+    assert out.decode().split()[0] == "6"
     if room == RLIM_INFINITY:
         assert process.returncode == 0
         assert sum(len(piece.data) > 0 for piece in read_capture(capture)) >= 6
     else:
         assert process.returncode == 2
-        (said,) = err.decode().splitlines()
-        assert "capture.txt: the capture broke off (File too large), and what came later" in said
+        (error,) = err.decode().splitlines()
+        assert "capture.txt" in error

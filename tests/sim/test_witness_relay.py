@@ -1,6 +1,7 @@
-"""A relay in every real wire: the host notices nothing, and the witness sees it all."""
+"""Relays in real wires."""
 
 import asyncio
+import re
 import socket
 from typing import Any
 
@@ -31,7 +32,6 @@ def _witness(url: str, *, level: float) -> Witness:
                 "channels": dict.fromkeys(range(4), limits),
             }
         },
-        # How late this machine is with its work is not what is tried here.
         "times_s": dict.fromkeys(("slack", "reply", "heartbeat"), 5.0),
     }
     return Witness(plan)
@@ -55,8 +55,8 @@ async def _drive(url: str) -> None:
 
 
 @pytest.mark.parametrize("wire", WIRES)
-async def test_what_passes_a_relay_is_seen(wire: str, coarse_rig: Rig) -> None:
-    """A session passes clean; the same session is found to be too loud where 0.3 is the limit."""
+async def test_relay_shows_a_session_to_the_witness(wire: str, coarse_rig: Rig) -> None:
+    """A session passes at a limit of 0.5, and breaks a limit of 0.3."""
     async with far_side(WIRES[wire], coarse_rig) as far:
         for level, broken in ((0.5, set()), (0.3, {"limits"})):
             witness = _witness(far.url, level=level)
@@ -78,42 +78,33 @@ async def test_what_passes_a_relay_is_seen(wire: str, coarse_rig: Rig) -> None:
         ("can+socketcand://localhost:29536/can0#1", "localhost:29536", 1),
     ],
 )
-def test_urls_are_taken_apart(url: str, place: str, address: int) -> None:
-    """Device or server and number are those of the URL, and all else stays in the new one."""
+def test_parse_endpoint_splits_a_url(url: str, place: str, address: int) -> None:
+    """Location and address are parsed; the relayed URL keeps all else."""
     taken = parse_endpoint(url)
     assert (taken.location, taken.address) == (place, address)
     assert taken.url_via("X").replace("X", place) == url
 
 
-@pytest.mark.parametrize("url", ["sim://rig.yaml", "serial://", "modbus+tcp://host/1", "nonsense"])
-def test_urls_that_lead_to_no_wire_are_refused(url: str) -> None:
-    """What a relay cannot stand in is said in one sentence."""
-    with pytest.raises(InputError, match=r"URL|HOST:PORT"):
-        parse_endpoint(url)
-
-
 @pytest.mark.parametrize(
-    ("url", "named"),
+    "url",
     [
-        ("serial:///dev/ttyUSB0?address=300", "1 to 247"),
-        ("modbus+tcp://127.0.0.1:502/0", "1 to 255"),
-        ("can+slcan:///dev/ttyACM0#64", "1 to 63"),
-        ("modbus+rtu:///dev/ttyS1#two", "'two'"),
-        ("serial:///dev/ttyUSB0?baud=fast", "'fast'"),
-        ("modbus+tcp://127.0.0.1:99999/1", "1 to 65535"),
+        *("sim://rig.yaml", "serial://", "modbus+tcp://host/1", "nonsense"),
+        *("serial:///dev/ttyUSB0?address=300", "serial:///dev/ttyUSB0?baud=fast"),
+        *("modbus+tcp://127.0.0.1:502/0", "modbus+tcp://127.0.0.1:99999/1"),
+        *("can+slcan:///dev/ttyACM0#64", "modbus+rtu:///dev/ttyS1#two"),
     ],
 )
-def test_numbers_that_none_can_have_are_refused(url: str, named: str) -> None:
-    """Who watches for an amplifier that cannot be there would find nothing wrong with it."""
-    with pytest.raises(InputError) as refused:
+def test_parse_endpoint_refuses_an_invalid_url(url: str) -> None:
+    """Scheme, location, address and baud rate are checked; the error names the URL."""
+    with pytest.raises(InputError, match=re.escape(url)):
         parse_endpoint(url)
-    assert url in str(refused.value)
-    assert named in str(refused.value)
 
 
-async def test_a_relay_before_nobody_says_so(caplog: pytest.LogCaptureFixture) -> None:
-    """Whoever comes is hung up on, and the wire that takes no connection is named."""
-    with socket.socket() as bound:  # and nobody listens there
+async def test_relay_closes_connections_when_the_server_refuses(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """The log names the location."""
+    with socket.socket() as bound:
         bound.bind(("127.0.0.1", 0))
         url = f"modbus+tcp://127.0.0.1:{bound.getsockname()[1]}/1"
         async with relays([parse_endpoint(url)], ["line"], _witness(url, level=0.5)) as (end,):

@@ -97,24 +97,24 @@ def report(found: Iterator[tuple[Outcome, bool]], *, again: str) -> int:
         totals.update(outcome.counts)
         if outcome.violations:
             failed += 1
-            _say(f"seed {outcome.seed} failed:")
+            _print(f"seed {outcome.seed} failed:")
             for violation in outcome.violations:
-                _say(f"    {violation}")
+                _print(f"    {violation}")
             one = f"--seed {outcome.seed}" + " --short" * short
-            _say(f"    again: {again} {one} --trace seed-{outcome.seed}.txt")
+            _print(f"    again: {again} {one} --trace seed-{outcome.seed}.txt")
         if sum(runs.values()) % _TOLD_EVERY == 0:
-            _say(f"    {sum(runs.values())} seeds, {virtual / 3600:.1f} h, {failed} failed")
+            _print(f"    {sum(runs.values())} seeds, {virtual / 3600:.1f} h, {failed} failed")
     wall = time.perf_counter() - begin
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
     busy_cpu = used.ru_utime + used.ru_stime
-    _say(f"seeds                     {runs[True]} short, {runs[False]} long")
-    _say(f"virtual time              {virtual / 3600:.2f} h, of which busy {busy / 3600:.2f} h")
+    _print(f"seeds                     {runs[True]} short, {runs[False]} long")
+    _print(f"virtual time              {virtual / 3600:.2f} h, of which busy {busy / 3600:.2f} h")
     for name, count in sorted(totals.items()):
-        _say(f"{name:<25} {count}")
-    _say(f"runs with violations      {failed}")
-    _say(f"wall time                 {wall:.1f} s, {virtual / max(wall, 1e-9):.0f} times faster")
-    _say(f"processor time            {busy_cpu:.1f} s, {virtual / busy_cpu:.0f} times faster")
-    _say(f"most memory of a process  {used.ru_maxrss / 1024:.0f} MB")
+        _print(f"{name:<25} {count}")
+    _print(f"runs with violations      {failed}")
+    _print(f"wall time                 {wall:.1f} s, {virtual / max(wall, 1e-9):.0f} times faster")
+    _print(f"processor time            {busy_cpu:.1f} s, {virtual / busy_cpu:.0f} times faster")
+    _print(f"most memory of a process  {used.ru_maxrss / 1024:.0f} MB")
     return 1 if failed else 0
 
 
@@ -148,15 +148,15 @@ def main() -> int:
         plan = _only(plan, [int(number) for number in options.keep.split(",") if number])
     if options.shrink:
         plan, kept = shrink(plan)
-        _say(f"needed: --keep {','.join(map(str, kept))}")
+        _print(f"needed: --keep {','.join(map(str, kept))}")
         for action in plan.actions:
-            _say(f"    {str(action)[:200]}")
+            _print(f"    {str(action)[:200]}")
     opened = options.trace.open("w") if options.trace else nullcontext()
     with opened as file:
         outcome = run_plan(plan, trace=file)
     for violation in outcome.violations:
-        _say(violation)
-    _say(
+        _print(violation)
+    _print(
         f"seed {outcome.seed} on {plan.wire}: {len(outcome.violations)} violations, "
         f"trace {outcome.digest}"
     )
@@ -181,7 +181,7 @@ def _again(wire: str | None) -> str:
     return f"{Path(sys.executable).name} tests/support/soak.py{options}"
 
 
-def _say(line: str) -> None:
+def _print(line: str) -> None:
     sys.stdout.write(line + "\n")
     sys.stdout.flush()
 

@@ -34,8 +34,8 @@ from sim.far_ends.wires import Wire, open_wires
 from sim.faults.fault_window import Faults
 from sim.witness.witness import OperatorCommand
 from small_table import small_table
-from soak_checks import RELEASE, Checks, Touched
-from soak_plan import Ask, Hand, Plan, Trouble
+from soak_checks import RELEASE, Checks, TouchState
+from soak_plan import FaultInjection, OperatorAction, Plan, TouchSequence
 from soak_witness import SoakWitness
 from virtual_loop import START, Stuck, VirtualLoop, run_virtual
 
@@ -140,8 +140,8 @@ class _Run:
         self.machine = live_in_memory()
         self.rig = make_soak_rig(self.plan.amplifiers)
         self.bench = Bench(self.rig, now=loop.time())
-        self.touched = Touched()
-        self.asking = 0
+        self.touched = TouchState()
+        self.arm_requests = 0
         self.is_ending = False
         self.stalled_for = 0.0
         self.is_reopening = False
@@ -153,8 +153,8 @@ class _Run:
             self.plan,
             begin=loop.time(),
             release=self._release(),
-            touched=self.touched,
-            arming=lambda: self.asking > 0,
+            touch_state=self.touched,
+            arming=lambda: self.arm_requests > 0,
         )
         self.checks.violations = self.violations
         devices = self._devices()
@@ -226,20 +226,20 @@ class _Run:
         for action in self.plan.actions:
             await self._until(action.at)
             match action:
-                case Hand():
+                case TouchSequence():
                     self.counts["gestures"] += 1
                     self._spawn(self._touch(action))
-                case Trouble(number=number, window=window):
+                case FaultInjection(number=number, window=window):
                     self.counts[f"fault {window.fault}"] += 1
                     self.note("fault", by_number[number].name, window)
                     self.witness.inject_fault(window)
                     by_number[number].inject_fault(window)
                     if window.fault == "unplug":
                         self._expect_loss(number)
-                case Ask():
+                case OperatorAction():
                     self.counts[f"operator {action.what}"] += 1
                     self.note("operator", action.what)
-                    self._spawn(self._ask(action))
+                    self._spawn(self._operate(action))
         await self._until(self.plan.lasts)
 
     async def _until(self, at: float) -> None:
@@ -249,21 +249,21 @@ class _Run:
         self.tasks = [task for task in self.tasks if not task.done()]
         self.tasks.append(asyncio.create_task(work))
 
-    async def _touch(self, hand: Hand) -> None:
+    async def _touch(self, sequence: TouchSequence) -> None:
         begin = self.loop.time()
-        for time, stamp, touches in hand.frames:
+        for time, stamp, touches in sequence.frames:
             await asyncio.sleep(max(0.0, begin + time - self.loop.time()))
             now = self.loop.time()
-            self.note("touch", hand.source, stamp, touches)
+            self.note("touch", sequence.source, stamp, touches)
             self.counts["touch frames"] += 1
             was_touched = self.touched.is_touched(now)
-            self.touched.frame(hand.source, now + stamp, touches, now)
-            is_new = not was_touched and self.touched.is_touched(now) and hand.gesture == "hold"
+            self.touched.frame(sequence.source, now + stamp, touches, now)
+            is_new = not was_touched and self.touched.is_touched(now) and sequence.gesture == "hold"
             must_be_felt = is_new and self._must_be_felt()
-            self.witness.touched(hand.source, now + stamp, touches, must_be_felt=must_be_felt)
+            self.witness.touched(sequence.source, now + stamp, touches, must_be_felt=must_be_felt)
             if self.controller is not None:
                 frame = TouchFrame(
-                    hand.source, now + stamp, tuple(Touch(*touch) for touch in touches)
+                    sequence.source, now + stamp, tuple(Touch(*touch) for touch in touches)
                 )
                 self.controller.deliver(frame)
             self.checks.lifted()
@@ -306,41 +306,41 @@ class _Run:
 
         self.loop.call_later(_NOTICED, look)
 
-    async def _ask(self, ask: Ask) -> None:
+    async def _operate(self, action: OperatorAction) -> None:
         controller = self.controller
-        if ask.what == "kill":
+        if action.what == "kill":
             await self._kill()
-        elif ask.what == "stall":
-            self._stall(ask.lasts)
+        elif action.what == "stall":
+            self._stall(action.lasts)
         elif controller is None:
-            if self.plan.is_calm(ask.at - 0.4, ask.at):
+            if self.plan.is_calm(action.at - 0.4, action.at):
                 self.checks.violate("could not be opened, and nothing was wrong")
-        elif ask.what == "ready":
+        elif action.what == "ready":
             if controller.phase is not Phase.ARMED:
                 await self._call("clear", controller.clear)
                 await self._call("arm", controller.arm)
             at = self.loop.time() - START
-            is_calm = self.plan.is_calm(ask.at - 0.1, at)
+            is_calm = self.plan.is_calm(action.at - 0.1, at)
             if controller.phase is Phase.LOST and controller is self.controller:
                 self._reopen()
             elif is_calm and controller.phase is not Phase.ARMED:
                 self.checks.violate("could not be armed, and nothing was wrong")
         else:
-            await self._call(ask.what, getattr(controller, ask.what))
+            await self._call(action.what, getattr(controller, action.what))
 
     async def _call(
         self, name: OperatorCommand, call: Callable[[], Coroutine[Any, Any, None]]
     ) -> None:
         """What an operator asks; a refusal is an answer, too."""
         self.witness.operator_command(name)
-        self.asking += name == "arm"
+        self.arm_requests += name == "arm"
         try:
             await call()
             self.note("done", name)
         except DriverError as problem:
             self.note("refused", name, type(problem).__name__, problem)
         finally:
-            self.asking -= name == "arm"
+            self.arm_requests -= name == "arm"
 
     async def _kill(self) -> None:
         """The host's process dies; another comes up."""

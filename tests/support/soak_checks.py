@@ -26,7 +26,7 @@ from sim.waveform.output import level_of
 from soak_plan import Plan
 
 AUDIBLE = 1e-3  # of full stroke; below it a ramp counts as ended
-LEASE = 0.150  # s; a contact without news for so long counts as lifted
+CONTACT_TIMEOUT = 0.150  # s; a contact without news for so long counts as lifted
 WATCHDOG = 0.25 + 0.005  # s; then every channel is silent
 RELEASE = 0.020  # s; from the last finger up to zero
 # s; three unanswered requests, then the watchdog, and a heartbeat that was on its way.
@@ -47,7 +47,7 @@ _PLAYING = (
 Sense = Callable[[str, SimulatedAmplifier, Sequence[float]], None]
 
 
-class Touched:
+class TouchState:
     """Whether somebody touches, by the frames alone; times [s]."""
 
     def __init__(self) -> None:
@@ -64,7 +64,7 @@ class Touched:
             0 <= x <= 1 and 0 <= y <= 1
             for _, x, y in touches  # NaN is not
         )
-        heard_until = min(stamp, now) + LEASE if valid else -math.inf
+        heard_until = min(stamp, now) + CONTACT_TIMEOUT if valid else -math.inf
         self._until[source] = max(heard_until, was_until)
         self.last = max(self._until.values(), default=-math.inf)
 
@@ -87,7 +87,7 @@ class Checks:
         *,
         begin: float,
         release: float,
-        touched: Touched,
+        touch_state: TouchState,
         arming: Callable[[], bool],
     ) -> None:
         self.violations: list[str] = []
@@ -95,7 +95,7 @@ class Checks:
         self._plan = plan
         self._begin = begin
         self._release = release
-        self._touched = touched
+        self._touched = touch_state
         self._arming = arming
         self._fed = dict.fromkeys(bench.amplifiers, -math.inf)
         self.sense: Sense = lambda name, amplifier, levels: None

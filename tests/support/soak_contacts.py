@@ -4,7 +4,7 @@ import math
 from collections.abc import Sequence
 from typing import TypeAlias
 
-LEASE = 0.150  # s; a source without news for so long has lost its fingers
+CONTACT_TIMEOUT = 0.150  # s; a source without news for so long has lost its fingers
 
 FrameTouches: TypeAlias = Sequence[tuple[int, float, float]]
 """Of one frame: id, x, y, where 0 to 1 is the plate."""
@@ -26,7 +26,7 @@ class SourceContacts:
         )
         is_heard = math.isfinite(stamp)
         self._now[source] = (
-            min(stamp, now) + LEASE if is_heard else -math.inf,
+            min(stamp, now) + CONTACT_TIMEOUT if is_heard else -math.inf,
             numbers if is_heard else frozenset(),
         )
 

@@ -57,7 +57,7 @@ class Line:
 
 
 @dataclass(frozen=True)
-class Hand:
+class TouchSequence:
     """Touches of one source: frames at times [s] after `at`, each (time, stamp, touches).
 
     stamp [s]: how much later than it arrives a frame says that it was made; may be NaN.
@@ -70,7 +70,7 @@ class Hand:
 
 
 @dataclass(frozen=True)
-class Ask:
+class OperatorAction:
     """Something that the operator does, or that happens to the host.
 
     ready: clears and arms; kill: the process dies and another is started; stall: the control loop
@@ -83,7 +83,7 @@ class Ask:
 
 
 @dataclass(frozen=True)
-class Trouble:
+class FaultInjection:
     """A fault of the amplifier `number`, or of its wire."""
 
     at: float
@@ -91,7 +91,7 @@ class Trouble:
     window: FaultWindow
 
 
-Action: TypeAlias = Hand | Ask | Trouble
+Action: TypeAlias = TouchSequence | OperatorAction | FaultInjection
 
 
 @dataclass(frozen=True)
@@ -118,9 +118,9 @@ class Plan:
     def _troubled(self) -> list[tuple[float, float]]:
         spans = []
         for action in self.actions:
-            if isinstance(action, Trouble):
+            if isinstance(action, FaultInjection):
                 spans.append((action.at, action.at + action.window.lasts + SETTLED))
-            elif isinstance(action, Ask) and action.what != "ready":
+            elif isinstance(action, OperatorAction) and action.what != "ready":
                 spans.append((action.at, action.at + action.lasts + SETTLED))
         return spans
 
@@ -139,12 +139,12 @@ def make_plan(seed: int, wire: str | None = None, *, short: bool = False) -> Pla
     for _ in range(1 if short else dice.randint(2, 5)):
         scene = dice.choice((_calm, _calm, _rough, _rough, _operated))
         length = dice.uniform(2.0, 4.0) if short else dice.uniform(4.0, 15.0)
-        actions.append(Ask(time, "ready"))
+        actions.append(OperatorAction(time, "ready"))
         actions += scene(dice, time + 1.0, length, amplifiers)
         time += 1.0 + length + SETTLED
         busy += 1.0 + length + SETTLED
         if not short and dice.random() < 0.3:
-            actions.append(Ask(time, "disarm"))
+            actions.append(OperatorAction(time, "disarm"))
             time += 60 * dice.uniform(2, 60)
     ordered = tuple(sorted(actions, key=lambda action: action.at))
     return Plan(seed, tuple(lines), amplifiers, ordered, time, busy)
@@ -152,37 +152,37 @@ def make_plan(seed: int, wire: str | None = None, *, short: bool = False) -> Pla
 
 def _calm(dice: random.Random, begin: float, length: float, amplifiers: int) -> list[Action]:
     """Touches only."""
-    return [*_hands(dice, begin, length)]
+    return [*_touch_sequences(dice, begin, length)]
 
 
 def _rough(dice: random.Random, begin: float, length: float, amplifiers: int) -> list[Action]:
     """Touches, faults, and an operator who arms again."""
-    actions: list[Action] = [*_hands(dice, begin, length)]
+    actions: list[Action] = [*_touch_sequences(dice, begin, length)]
     for _ in range(dice.randint(1, 6)):
         at = begin + dice.uniform(0, length)
-        actions.append(Trouble(at, dice.randrange(amplifiers), _fault_window(dice)))
+        actions.append(FaultInjection(at, dice.randrange(amplifiers), _fault_window(dice)))
     if dice.random() < 0.3:
         what, lasts = dice.choice((("kill", 0.0), ("stall", dice.uniform(0.05, 1.0))))
-        actions.append(Ask(begin + dice.uniform(0, length), what, lasts))
-    return actions + _minder(dice, begin, length)
+        actions.append(OperatorAction(begin + dice.uniform(0, length), what, lasts))
+    return actions + _rearming(dice, begin, length)
 
 
 def _operated(dice: random.Random, begin: float, length: float, amplifiers: int) -> list[Action]:
     """Touches, and an operator who does anything at any time."""
-    actions: list[Action] = [*_hands(dice, begin, length)]
+    actions: list[Action] = [*_touch_sequences(dice, begin, length)]
     for _ in range(dice.randint(2, 15)):
         what = dice.choice(("arm", "arm", "disarm", "stop", "clear", "clear"))
-        actions.append(Ask(begin + dice.uniform(0, length), what))
+        actions.append(OperatorAction(begin + dice.uniform(0, length), what))
         if dice.random() < 0.3:  # at the same moment, or nearly
             at = actions[-1].at + dice.choice((0.0, 0.0005, 0.003, 0.02))
-            actions.append(Ask(at, dice.choice(("arm", "disarm", "stop", "clear"))))
-    return actions + _minder(dice, begin, length)
+            actions.append(OperatorAction(at, dice.choice(("arm", "disarm", "stop", "clear"))))
+    return actions + _rearming(dice, begin, length)
 
 
-def _minder(dice: random.Random, begin: float, length: float) -> list[Action]:
+def _rearming(dice: random.Random, begin: float, length: float) -> list[Action]:
     moments, at = [], begin
     while (at := at + dice.uniform(0.5, 3.0)) < begin + length:
-        moments.append(Ask(at, "ready"))
+        moments.append(OperatorAction(at, "ready"))
     return [*moments]
 
 
@@ -200,19 +200,19 @@ def _fault_window(dice: random.Random) -> FaultWindow:
     return FaultWindow(fault, lasts=scale * dice.uniform(0.05, 1.5))
 
 
-def _hands(dice: random.Random, begin: float, length: float) -> list[Hand]:
+def _touch_sequences(dice: random.Random, begin: float, length: float) -> list[TouchSequence]:
     """Gestures of up to three sources, those of one source one after the other."""
-    hands = []
+    sequences = []
     for source in SOURCES[: dice.choice((1, 1, 2, 3))]:
         at = begin + dice.uniform(0, 0.5)
         while at < begin + length:
-            hand = _hand(dice, at, source)
-            hands.append(hand)
-            at += hand.frames[-1][0] + dice.choice((0.0, 0.02, 0.2, 1.0)) * dice.uniform(0.2, 2)
-    return hands
+            sequence = _touch_sequence(dice, at, source)
+            sequences.append(sequence)
+            at += sequence.frames[-1][0] + dice.choice((0.0, 0.02, 0.2, 1.0)) * dice.uniform(0.2, 2)
+    return sequences
 
 
-def _hand(dice: random.Random, at: float, source: str) -> Hand:
+def _touch_sequence(dice: random.Random, at: float, source: str) -> TouchSequence:
     gesture = dice.choice(GESTURES)
     lasts = dice.uniform(0.03, 0.3) if gesture == "tap" else dice.uniform(0.2, 1.5)
     every = 0.002 if gesture == "flood" else dice.choice((0.01, 0.033, 0.08))
@@ -237,13 +237,13 @@ def _hand(dice: random.Random, at: float, source: str) -> Hand:
                 place[axis] = min(max(place[axis] + dice.uniform(-step, step), 0.0), 1.0)
         time += every
     if gesture == "wrong":
-        frames = [_wrong(dice, frame) if dice.random() < 0.5 else frame for frame in frames]
+        frames = [_malformed(dice, frame) if dice.random() < 0.5 else frame for frame in frames]
     if gesture != "vanish":
         frames.append((lasts, 0.0, ()))
-    return Hand(at, gesture, source, tuple(frames))
+    return TouchSequence(at, gesture, source, tuple(frames))
 
 
-def _wrong(
+def _malformed(
     dice: random.Random, frame: tuple[float, float, tuple[tuple[int, float, float], ...]]
 ) -> tuple[float, float, tuple[tuple[int, float, float], ...]]:
     """A frame as no source should send it."""

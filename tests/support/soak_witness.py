@@ -56,7 +56,7 @@ class SoakWitness:
         self._witness = Witness(plan)
         self._open: set[str] = set()
         self._contacts = SourceContacts()
-        self._troubles = 0
+        self._active_faults = 0
         self._witness.contacts(loop.time(), ())
         self.closes()
 
@@ -93,12 +93,12 @@ class SoakWitness:
         self._contacts.frame(source, stamp, touches, now)
         self._witness.contacts(now, self._contacts.at(now), is_answerable=must_be_felt)
         if (end := self._contacts.next_end(now)) < math.inf:
-            self._loop.call_at(end + _ENDED, self._look_at_leases)
+            self._loop.call_at(end + _ENDED, self._expire_contacts)
 
     def inject_fault(self, window: FaultWindow) -> None:
         """A fault begins. What it does to one wire, a controller of all may show on each."""
-        self._troubles += 1
-        self._tell_trouble()
+        self._active_faults += 1
+        self._report_disturbance()
         lasts = window.lasts + (window.delay if window.fault == "delay" else 0.0)
         self._loop.call_later(lasts, self._over)
 
@@ -126,14 +126,14 @@ class SoakWitness:
         """How many it has seen."""
         return self._witness.frames
 
-    def _look_at_leases(self) -> None:
+    def _expire_contacts(self) -> None:
         now = self._loop.time()
         self._witness.contacts(now, self._contacts.at(now))
 
     def _over(self) -> None:
-        self._troubles -= 1
-        self._tell_trouble()
+        self._active_faults -= 1
+        self._report_disturbance()
 
-    def _tell_trouble(self) -> None:
+    def _report_disturbance(self) -> None:
         for link in self._witness.wires:
-            self._witness.faults(self._loop.time(), link, are_on=self._troubles > 0)
+            self._witness.faults(self._loop.time(), link, are_on=self._active_faults > 0)

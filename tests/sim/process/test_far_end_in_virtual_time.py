@@ -45,9 +45,9 @@ async def test_stepped_recorded_touched_and_broken(tmp_path: Path) -> None:
             assert await far_end.ask("step", seconds=0.4) == {"ok": True, "time_s": 0.4}
             assert (await far_end.ask("state"))["amplifiers"]["main"]["levels"][0] == 0.5
             assert (await far_end.ask("move", finger="1", at_m=[0.05, 0.05]))["ok"]
-            assert (await far_end.ask("come", finger="2", at_m=[0.2, 0.2]))["ok"]
-            assert "already" in (await far_end.ask("come", finger="2", at_m=[0.2, 0.2]))["error"]
-            assert (await far_end.ask("go", finger="1"))["ok"]
+            assert (await far_end.ask("touch", finger="2", at_m=[0.2, 0.2]))["ok"]
+            assert "already" in (await far_end.ask("touch", finger="2", at_m=[0.2, 0.2]))["error"]
+            assert (await far_end.ask("lift", finger="1"))["ok"]
             assert "not on the plate" in (await far_end.ask("move", finger="1"))["error"]
             assert (await far_end.ask("state"))["fingers"] == {"2": [0.2, 0.2]}
             tones = await far_end.ask("tones", since_s=0.2, until_s=0.4, frequencies_hz=[110.0])

@@ -1,7 +1,6 @@
-"""How a far end is told to end before it has anything to end in order.
+"""Exit on signals while Python still loads, before anything needs an orderly shutdown.
 
-While Python still loads, the usual KeyboardInterrupt may be raised inside a callback that swallows
-it, or show as a traceback. Nothing is open yet, so the process may simply be gone.
+A KeyboardInterrupt at that time may be swallowed by a callback or print a traceback.
 """
 
 import os
@@ -13,8 +12,8 @@ _INTERRUPTED = 130
 
 
 @contextmanager
-def gone_when_told() -> Iterator[None]:
-    """SIGTERM and SIGINT end the process at once, with exit status 130, unless others take over."""
+def exit_on_signal() -> Iterator[None]:
+    """Exit at once with status 130 on SIGTERM and SIGINT."""
     numbers = (signal.SIGTERM, signal.SIGINT)
     before = [signal.signal(number, lambda *_: os._exit(_INTERRUPTED)) for number in numbers]
     try:

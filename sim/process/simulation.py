@@ -1,4 +1,4 @@
-"""The far end as a process: a bench behind its wires, until it is told to end."""
+"""The simulation as a process: a bench behind its wires, until a signal ends it."""
 
 import asyncio
 import contextlib
@@ -19,7 +19,7 @@ from sim.bench.real_time import keep_time
 from sim.bench.simulated_device import SimulatedDevice
 from sim.control.context import SimulationContext, finish_recording
 from sim.control.server import control_socket
-from sim.far_ends.wire_choice import Choice
+from sim.far_ends.wire_assignment import WireAssignment
 from sim.far_ends.wires import open_wires
 from sim.faults.fault_file import FaultFile
 from sim.plant.finger import Position
@@ -27,22 +27,21 @@ from sim.plant.plant import SAMPLE_RATE
 from sim.process.virtual_time import SteppedLoop
 from sim.sensors.accelerometer import Accelerometer
 
-_VIEW_EVERY = 0.2  # s; a person reads no faster
+_VIEW_INTERVAL = 0.2  # s
 
 
 @dataclass(frozen=True)
-class FarEnd:
-    """What is simulated: a rig, and which wire each of its amplifiers is on, by its name.
+class Simulation:
+    """A rig and the wires of its amplifiers, by name.
 
-    faults: what goes wrong, counted from when the URLs are there; fingers rest where they are told
-    [m], and load the plate by finger_load, or not at all; sensors are there from the first;
-    sample_rate [Hz]: of all that is measured; control: where the control socket is served, record:
-    where sensors and fingers are recorded to, from the first to the end; until_eof: whether it ends
-    with standard input.
+    faults: with times from when the URLs are printed; fingers: initial positions [m];
+    finger_load: None for fingers without weight; sample_rate [Hz]: of sensors and fingers; control:
+    path of the control socket; record: file for the readings of the whole run; until_eof: end with
+    standard input.
     """
 
     rig: Rig
-    wires: Mapping[str, Choice]
+    wires: Mapping[str, WireAssignment]
     faults: FaultFile = field(default_factory=lambda: FaultFile(()))
     fingers: Mapping[str, Position] = field(default_factory=dict)
     finger_load: FingerLoad | None = None
@@ -53,71 +52,70 @@ class FarEnd:
     until_eof: bool = False
 
 
-async def run_far_end(
-    far_end: FarEnd,
+async def run_simulation(
+    simulation: Simulation,
     *,
     ready: Callable[[Mapping[str, str]], None],
     view: Callable[[SimulationContext], None] | None,
 ) -> str | None:
-    """Simulate until SIGTERM, SIGINT or SIGHUP, or the end of standard input where that counts.
+    """Simulate until SIGTERM, SIGINT or SIGHUP, or the end of standard input.
 
-    ready is called once with the URL of each amplifier by its name, view a few times a second.
-    Virtual where the running loop is a `SteppedLoop`. Returns what is to be said of what was
-    written. Raises InputError, LinkError.
+    ready is called once with the URLs by amplifier, view a few times a second. Time is virtual in a
+    `SteppedLoop`. Returns a message about the file written. Raises InputError, LinkError.
     """
     ended = asyncio.Event()
     loop = asyncio.get_running_loop()
-    for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):  # the last: a terminal closes
+    for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):  # SIGHUP: the terminal closes
         loop.add_signal_handler(number, ended.set)
-    if far_end.until_eof:
-        # A thread, for a loop cannot wait for every kind of standard input.
+    if simulation.until_eof:
+        # In a thread, since not every kind of standard input can be polled.
         threading.Thread(target=_await_eof, args=(loop, ended), daemon=True).start()
     bench = await asyncio.to_thread(
         Bench,
-        far_end.rig,
+        simulation.rig,
         now=clock.now(),
-        sample_rate=far_end.sample_rate,
-        finger_load=far_end.finger_load,
+        sample_rate=simulation.sample_rate,
+        finger_load=simulation.finger_load,
     )
     if ended.is_set():
         return None
-    bench.place_fingers(far_end.fingers, now=clock.now())
+    bench.place_fingers(simulation.fingers, now=clock.now())
     context = SimulationContext(bench, step=loop.step if isinstance(loop, SteppedLoop) else None)
-    context.accelerometers.place(far_end.sensors)
-    if far_end.record is not None:
-        context.record(far_end.record)
+    context.accelerometers.place(simulation.sensors)
+    if simulation.record is not None:
+        context.record(simulation.record)
     try:
-        await _serve(far_end, context, ended=ended, ready=ready, view=view)
+        await _serve(simulation, context, ended=ended, ready=ready, view=view)
     finally:
-        said = await finish_recording(context)
-    return said
+        message = await finish_recording(context)
+    return message
 
 
 async def _serve(
-    far_end: FarEnd,
+    simulation: Simulation,
     context: SimulationContext,
     *,
     ended: asyncio.Event,
     ready: Callable[[Mapping[str, str]], None],
     view: Callable[[SimulationContext], None] | None,
 ) -> None:
-    """Put the amplifiers on their wires, and let time pass until the end."""
+    """Open the wires and serve until the end."""
     bench = context.bench
     async with contextlib.AsyncExitStack() as stack:
         devices = [
             SimulatedDevice(
                 bench,
                 name,
-                number=far_end.wires[name].number or number,
-                faults=far_end.faults.of(name, begin=clock.now()),
+                number=simulation.wires[name].number or number,
+                faults=simulation.faults.of(name, begin=clock.now()),
             )
             for number, name in enumerate(bench.amplifiers, start=1)
         ]
-        wires = {name: choice.wire for name, choice in far_end.wires.items()}
+        wires = {name: choice.wire for name, choice in simulation.wires.items()}
         context.urls = await stack.enter_async_context(open_wires(wires, devices))
         context.devices = {device.name: device for device in devices}
-        if far_end.control is not None:
-            await stack.enter_async_context(control_socket(context, far_end.control))
+        if simulation.control is not None:
+            await stack.enter_async_context(control_socket(context, simulation.control))
         for device in devices:
             stack.callback(device.close)
             device.start()
@@ -130,11 +128,11 @@ async def _serve(
 
 
 def _await_eof(loop: asyncio.AbstractEventLoop, ended: asyncio.Event) -> None:
-    """Read standard input to its end, which the system brings about when a parent dies."""
-    with contextlib.suppress(OSError):  # closed from the first is at its end, too
+    """Read standard input until its end, which also comes when the parent dies."""
+    with contextlib.suppress(OSError):  # closed already
         while os.read(0, 4096):
             pass
-    with contextlib.suppress(RuntimeError):  # the loop has closed for another reason
+    with contextlib.suppress(RuntimeError):  # the loop is closed already
         loop.call_soon_threadsafe(ended.set)
 
 
@@ -143,14 +141,14 @@ async def _keep_viewing(
 ) -> None:
     while True:
         view(context)
-        await asyncio.sleep(_VIEW_EVERY)
+        await asyncio.sleep(_VIEW_INTERVAL)
 
 
 @asynccontextmanager
 async def _in_background(
     work: Coroutine[None, None, None], ended: asyncio.Event
 ) -> AsyncIterator[None]:
-    """Work beside everything else; where it fails, the far end ends with that failure."""
+    """Run a task in the background; its failure ends the simulation."""
     task = asyncio.create_task(work)
     task.add_done_callback(lambda _: ended.set())
     try:

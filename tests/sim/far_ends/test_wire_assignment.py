@@ -3,7 +3,7 @@
 import pytest
 
 from model.errors import InputError
-from sim.far_ends.wire_choice import Choice, choose_wires
+from sim.far_ends.wire_assignment import WireAssignment, assign_wires
 from sim.far_ends.wires import Wire
 
 PLAIN = Wire("serial")
@@ -19,8 +19,10 @@ URLS = {
 
 def test_the_urls_of_a_rig_ask_for_their_wires() -> None:
     """Kind, port and address as the URL has them; a line that two URLs name is one line."""
-    chosen = choose_wires(URLS, common=None, own=[], plain=PLAIN)
-    assert [(choice.wire.kind, choice.wire.port, choice.number) for choice in chosen.values()] == [
+    assigned = assign_wires(URLS, common=None, options=[], plain=PLAIN)
+    assert [
+        (choice.wire.kind, choice.wire.port, choice.number) for choice in assigned.values()
+    ] == [
         ("serial", 0, 3),
         ("serial", 0, 4),
         ("modbus-tcp", 5020, 9),
@@ -28,18 +30,18 @@ def test_the_urls_of_a_rig_ask_for_their_wires() -> None:
         ("socketcand", 29536, 5),
         ("slcan", 0, 7),
     ]
-    assert chosen["a"].wire == chosen["b"].wire
-    assert chosen["a"].wire.shared
+    assert assigned["a"].wire == assigned["b"].wire
+    assert assigned["a"].wire.shared
 
 
 def test_an_option_for_one_goes_before_that_for_all_before_the_url() -> None:
     """And the answer has the rig's order, whatever order the options have."""
     modbus = Wire("modbus-tcp", port=1502)
-    chosen = choose_wires(URLS, common=modbus, own=["c=slcan", "a=socketcand:7"], plain=PLAIN)
-    assert list(chosen) == list(URLS)
-    assert chosen["a"] == Choice(Wire("socketcand", port=7))
-    assert chosen["b"] == Choice(modbus)
-    assert chosen["c"] == Choice(Wire("slcan"))
+    assigned = assign_wires(URLS, common=modbus, options=["c=slcan", "a=socketcand:7"], plain=PLAIN)
+    assert list(assigned) == list(URLS)
+    assert assigned["a"] == WireAssignment(Wire("socketcand", port=7))
+    assert assigned["b"] == WireAssignment(modbus)
+    assert assigned["c"] == WireAssignment(Wire("slcan"))
 
 
 @pytest.mark.parametrize(
@@ -54,10 +56,10 @@ def test_an_option_for_one_goes_before_that_for_all_before_the_url() -> None:
         (["main=modbus-tcp:x"], "'modbus-tcp:x' is no wire"),
     ],
 )
-def test_what_is_no_choice_is_refused(own: list[str], words: str) -> None:
+def test_what_is_no_choice_is_refused(options: list[str], words: str) -> None:
     """Each with the option as it was typed, and what may stand in its place."""
     with pytest.raises(InputError, match="--wire") as problem:
-        choose_wires({"main": "sim://"}, common=None, own=own, plain=PLAIN)
+        assign_wires({"main": "sim://"}, common=None, options=options, plain=PLAIN)
     assert words in str(problem.value)
 
 
@@ -67,5 +69,5 @@ def test_what_is_no_choice_is_refused(own: list[str], words: str) -> None:
 def test_a_url_that_names_no_wire_to_simulate_is_named(url: str) -> None:
     """A kernel's CAN, no wire at all, a port that is missing or none: the amplifier is named."""
     with pytest.raises(InputError, match="amplifier main: ") as problem:
-        choose_wires({"main": url}, common=None, own=[], plain=PLAIN)
+        assign_wires({"main": url}, common=None, options=[], plain=PLAIN)
     assert url in str(problem.value)

@@ -1,6 +1,6 @@
-"""Which wire each amplifier of a rig gets: as told on the command line, or as its own URL asks.
+"""Assign a wire to each amplifier: by options of the command line, else by its URL.
 
-Nothing of a URL is opened: a serial port becomes a pseudo-terminal, an address a loopback port.
+A serial port in a URL becomes a pseudo-terminal, a network address a loopback port.
 """
 
 from collections.abc import Mapping, Sequence
@@ -22,69 +22,69 @@ _KIND_OF_SCHEME = {
 
 
 @dataclass(frozen=True)
-class Choice:
-    """The wire of an amplifier; number: its address there, None where any will do."""
+class WireAssignment:
+    """The wire of an amplifier; number: its address there, None for any."""
 
     wire: Wire
     number: int | None = None
 
 
-def choose_wires(
-    amplifiers: Mapping[str, str], *, common: Wire | None, own: Sequence[str], plain: Wire
-) -> dict[str, Choice]:
-    """The wire of each amplifier, by its name.
+def assign_wires(
+    amplifiers: Mapping[str, str], *, common: Wire | None, options: Sequence[str], plain: Wire
+) -> dict[str, WireAssignment]:
+    """The wire of each amplifier, by name.
 
-    amplifiers: URLs by name; common: of all that `own`, texts like `main=modbus-tcp:5020`, does not
-    name, None to do as their URLs say; plain: speed, sharing and so on of those wires. Amplifiers
-    with equal wires are on one. Raises InputError.
+    amplifiers: URLs by name; options: texts like `main=modbus-tcp:5020`; common: the wire of all
+    others, None to follow their URLs; plain: speed and sharing of those wires. Equal wires are
+    shared. Raises InputError.
     """
-    chosen: dict[str, Choice] = {}
-    for text in own:
+    assigned: dict[str, WireAssignment] = {}
+    for text in options:
         name, equals, kind = text.partition("=")
-        if not equals or name not in amplifiers or name in chosen:
+        if not equals or name not in amplifiers or name in assigned:
             problem = (
-                "is not NAME=WIRE"
+                "must be NAME=WIRE"
                 if not equals
-                else "is chosen twice"
-                if name in chosen
-                else f"names no amplifier of the rig; it has {', '.join(amplifiers)}"
+                else "is given twice"
+                if name in assigned
+                else f"amplifier must be one of {', '.join(amplifiers)}"
             )
             raise InputError(f"--wire {text}: {problem}; as in --wire main=serial")
-        chosen[name] = Choice(_named(kind, text, plain))
+        assigned[name] = WireAssignment(_wire_of_option(kind, text, plain))
     for name, url in amplifiers.items():
-        if name not in chosen:
-            chosen[name] = Choice(common) if common else _asked_for(name, url, plain)
-    return {name: chosen[name] for name in amplifiers}
+        if name not in assigned:
+            assigned[name] = WireAssignment(common) if common else _wire_of_url(name, url, plain)
+    return {name: assigned[name] for name in amplifiers}
 
 
-def _named(text: str, option: str, plain: Wire) -> Wire:
+def _wire_of_option(text: str, option: str, plain: Wire) -> Wire:
     kind, colon, port = text.partition(":")
     if kind in _KIND_OF_SCHEME.values() and bool(colon) <= (kind in _PORTED):
         if not colon:
             return replace(plain, kind=kind)
         if port.isascii() and port.isdigit() and int(port) <= 65535:
             return replace(plain, kind=kind, port=int(port))
-    raise InputError(f"--wire {option}: {text!r} is no wire; choose one of {', '.join(_KINDS)}")
+    raise InputError(f"--wire {option}: wire must be one of {', '.join(_KINDS)}, got {text!r}")
 
 
-def _asked_for(name: str, url: str, plain: Wire) -> Choice:
+def _wire_of_url(name: str, url: str, plain: Wire) -> WireAssignment:
     """The wire that a URL names."""
     parts = urlsplit(url)
     kind = _KIND_OF_SCHEME.get(parts.scheme)
     try:
         port = parts.port if kind in _PORTED else None
     except ValueError as error:
-        raise InputError(f"amplifier {name}: {url} has no port that can be used: {error}") from None
+        raise InputError(f"amplifier {name}: {url}: invalid port: {error}") from None
     if kind is None or (kind in _PORTED and port is None):
         raise InputError(
-            f"amplifier {name}: its url {url} names no wire that can be simulated. Which one? Add "
-            "one of --serial (a pseudo-terminal each), --modbus-tcp PORT, --modbus-rtu, "
-            f"--socketcand PORT and --slcan for all, or --wire {name}=serial for this one"
+            f"amplifier {name}: {url} names no wire that can be simulated; add --serial (a "
+            "pseudo-terminal each), --modbus-tcp PORT, --modbus-rtu, --socketcand PORT or --slcan "
+            f"for all, or --wire {name}=serial"
         )
     wire = replace(plain, kind=kind, port=port or 0)
-    if port is None:  # amplifiers with one line in their URLs share it
+    if port is None:  # amplifiers whose URLs name one line share it
         wire = replace(wire, line=parts.netloc + parts.path, shared=True)
-    return Choice(wire, _number(parts))
+    return WireAssignment(wire, _number(parts))
 
 
 def _number(parts: SplitResult) -> int | None:

@@ -1,7 +1,7 @@
-"""The simulated amplifier inside this process, behind the same interface as one on a wire.
+"""The backend of `sim://`: a simulated amplifier in this process.
 
-Each backend has a plate of its own, at rest when it is opened. A rig with several amplifiers under
-one plate needs the far end as a process (`era sim`). Not modelled: the time a wire takes.
+Each backend has a plate of its own; several amplifiers under one plate need `era sim`. Not
+modelled: transmission time.
 """
 
 import asyncio
@@ -23,14 +23,11 @@ from sim.bench.real_time import keep_time
 from sim.control.context import SimulationContext
 from sim.control.server import control_socket
 
-_FORM = "sim://RIG.yaml, with ?control=PATH and &amplifier=NAME where they are wanted"
+_FORM = "sim://RIG.yaml, optionally with ?control=PATH and &amplifier=NAME"
 
 
 class SimulatedBackend(Backend):
-    """An amplifier of the rig file in a URL `sim://RIG.yaml[?control=PATH][&amplifier=NAME]`.
-
-    The plate behind it moves with the clock while it is open.
-    """
+    """An amplifier of the rig in a URL `sim://RIG.yaml[?control=PATH][&amplifier=NAME]`."""
 
     def __init__(self, url: str) -> None:
         self._url = url
@@ -38,7 +35,7 @@ class SimulatedBackend(Backend):
         options = dict(parse_qsl(query, keep_blank_values=True))
         unknown = sorted(options.keys() - {"control", "amplifier"})
         if not url.startswith("sim://") or not path or unknown:
-            what = f"unknown option {', '.join(unknown)}" if unknown else "it names no rig file"
+            what = f"unknown option {', '.join(unknown)}" if unknown else "no rig file"
             raise CommandError(f"{url!r}: {what}; use {_FORM}")
         self._rig = Path(unquote(path))
         self._control = Path(options["control"]) if options.get("control") else None
@@ -52,27 +49,27 @@ class SimulatedBackend(Backend):
 
     @property
     def counters(self) -> WireCounters:
-        """Requests and replies; nothing is ever damaged here."""
+        """Counters of requests and replies."""
         return self._counters
 
     def listen(
         self, on_event: Callable[[AmplifierEvent], None], on_loss: Callable[[str], None]
     ) -> None:
-        """Whom to tell of events; nothing is ever lost here."""
+        """Register the callback for events; a link in this process is never lost."""
         self._on_event = on_event
 
     @property
     def last_sent(self) -> float:
-        """When the last request was handed over, on time.monotonic() [s]."""
+        """Time of the last request, by time.monotonic() [s]."""
         return self._last_sent
 
     async def open(self) -> None:
-        """Read the rig and set its plate up at rest; CommandError for a rig that cannot be used."""
+        """Load the rig, its plate at rest; raises CommandError."""
         if self._open is not None:
             return
         try:
             rig = load_rig(self._rig)
-            name = self._chosen_from(tuple(rig.amplifiers))
+            name = self._select(tuple(rig.amplifiers))
             bench = await asyncio.to_thread(Bench, rig, now=clock.now())
         except (InputError, OSError) as error:
             raise CommandError(f"{self._url}: {error}") from error
@@ -83,19 +80,19 @@ class SimulatedBackend(Backend):
                 )
             task = asyncio.create_task(keep_time(bench), name=f"simulated plate of {self._url}")
             stack.push_async_callback(_cancel, task)
-            bench.amplifiers[name].listeners.append(self._tell)
+            bench.amplifiers[name].listeners.append(self._forward)
             self._bench, self._name = bench, name
             self._open = stack.pop_all()
 
     async def close(self) -> None:
-        """Stop simulating; the plate and its amplifiers are gone."""
+        """End the simulation."""
         stack, self._open = self._open, None
         self._bench = None
         if stack is not None:
             await stack.aclose()
 
     async def exchange(self, request: Request, *, timeout: float) -> Reply:
-        """Hand a request over; the answer is there at once. LinkError if it is not open."""
+        """Exchange a request; raises LinkError if not open."""
         require_safe(request)
         if self._bench is None:
             raise LinkError(f"{self._url} is not open")
@@ -104,19 +101,16 @@ class SimulatedBackend(Backend):
         self._counters.frames_in += 1
         return self._bench.exchange(self._name, request, now=self._last_sent)
 
-    def _tell(self, event: AmplifierEvent, moment: float) -> None:
+    def _forward(self, event: AmplifierEvent, moment: float) -> None:
         self._counters.events += 1
         self._on_event(event)
 
-    def _chosen_from(self, names: tuple[str, ...]) -> str:
+    def _select(self, names: tuple[str, ...]) -> str:
         if self._amplifier is None and len(names) == 1:
             return names[0]
         if self._amplifier in names:
             return self._amplifier
-        raise CommandError(
-            f"{self._url}: the rig has the amplifiers {', '.join(names)}; name one of them with "
-            "amplifier=NAME"
-        )
+        raise CommandError(f"{self._url}: amplifier=NAME must name one of {', '.join(names)}")
 
 
 async def _cancel(task: "asyncio.Task[None]") -> None:

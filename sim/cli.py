@@ -14,6 +14,7 @@ from sim.witness_cli import witness
 if TYPE_CHECKING:
     from sim.control.context import SimulationContext
     from sim.far_ends.wires import Wire
+    from sim.process.simulation import Simulation
     from sim.process.view import PlateView
     from sim.sensors.accelerometer import Accelerometer
 

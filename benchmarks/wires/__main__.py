@@ -93,7 +93,7 @@ _UNIT = ModbusUnit(_Taker())
 def _modbus_codec(safe: SafeCommandSet) -> None:
     exchange = exchanges.encode_request(Apply(safe), tag=1, channels=CHANNELS)
     telegram = build_adu(exchange.read, exchange.write, unit=1, transaction=1, is_rtu=False)
-    answer = _UNIT.answer(telegram.frame[7:])
+    answer = _UNIT.reply(telegram.frame[7:])
     assert answer is not None
 
 

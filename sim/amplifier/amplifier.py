@@ -1,11 +1,9 @@
-"""One simulated amplifier: requests in, replies out, by a clock that is handed in.
+"""One simulated amplifier: requests in, replies out; time is passed in.
 
-Everything happens at its own time: a watchdog that ran out between two calls ran out when it did,
-and what a channel plays is a description in time (`sim.waveform`), not samples. Nothing here reads
-a clock or knows a wire. State, watchdog, warmth and silence stand together here, for each ends the
-others; what can be played, what is staged and what sounds are files of their own.
+Events happen at their own time: a watchdog that expired between two calls expired when it was due,
+and outputs are descriptions in time (`sim.waveform`), not samples.
 
-Not modelled: the time high voltage takes to rise, and the voltage waveform behind a tone.
+Not modelled: the rise time of high voltage, and the voltage waveform of a tone.
 """
 
 import math
@@ -47,7 +45,7 @@ from sim.amplifier.sets import Sets
 from sim.amplifier.states import ENABLED, next_state
 from sim.waveform.output import Output
 
-SILENCING_RAMP = 0.005  # s; a fault must be silent within 5 ms of the watchdog's expiry
+SILENCING_RAMP = 0.005  # s; a fault must be silent 5 ms after the watchdog expires
 _Q = PROTOCOL.quantities
 _FAULTS_KEPT = 16
 _HIGH_VOLTAGE = 1800.0  # V
@@ -57,7 +55,7 @@ _NOT_FEEDING = (Hello, GetCaps, GetStatus, GetFaults)
 
 
 def capabilities(channels: int) -> Capabilities:
-    """What a simulated amplifier with so many channels can play."""
+    """Capabilities of a simulated amplifier with so many channels."""
     return Capabilities(
         channels=channels,
         frequency_min=10.0,  # the guard's floor: below it a plate only rocks
@@ -78,9 +76,9 @@ def capabilities(channels: int) -> Capabilities:
 
 
 class SimulatedAmplifier:
-    """An amplifier by its name, with a number of channels; times are seconds of any one clock.
+    """An amplifier with a name and a number of channels; times [s] are of any one clock.
 
-    Whoever is in `listeners` is told of every change of state or fault, and when [s] it was.
+    listeners: called with every change of state or fault, and its time [s].
     """
 
     def __init__(self, name: str, *, channels: int) -> None:
@@ -100,29 +98,29 @@ class SimulatedAmplifier:
         self._start()
 
     def _start(self) -> None:
-        """As when its supply comes back: nothing is remembered but the temperature and faults."""
+        """Reset all but the temperature and the fault history."""
         self._channels = Channels(self.capabilities.channels)
         self._sets = Sets(self.capabilities)
         self._watchdog = 0.0
         self._fed = 0.0
         self._vibration_end = math.inf
-        self._silent_from = -math.inf  # when the last silence that was ordered is reached
+        self._silent_from = -math.inf  # end of the last silencing ramp
         self._is_derated = False
 
     @property
     def outputs(self) -> Sequence[Output]:
-        """What each channel plays from now on, if nothing else happens."""
+        """The output of each channel from now on, without further events."""
         return self._channels.outputs
 
     @property
     def next_event(self) -> float:
-        """When something will happen by itself: the time up to which `outputs` holds."""
+        """Time of the next event [s], up to which `outputs` holds."""
         return min(
             self._vibration_end, self._watchdog_end, self._silence_reached, self._too_warm_from
         )
 
     def tick(self, now: float) -> None:
-        """Let happen what is due by now, in its order and each thing at its own time."""
+        """Process the events due by now, in order."""
         while (moment := self.next_event) <= now:
             if moment == self._vibration_end:
                 self._channels.end(moment)
@@ -141,7 +139,7 @@ class SimulatedAmplifier:
             self._is_derated = False
 
     def handle(self, request: Request, now: float) -> Reply:
-        """Answer a request that arrives now [s]; a Nak means that nothing was applied."""
+        """Reply to a request at a time [s]; a Nak means that nothing was applied."""
         self.tick(now)
         following = next_state(self.state, type(request))
         if following is None:
@@ -152,11 +150,11 @@ class SimulatedAmplifier:
             reply = refusal.nak
         if not isinstance(request, _NOT_FEEDING) and not isinstance(reply, Nak):
             self._fed = now
-        # A watchdog that is fed by this very request is full when its status is told.
+        # After feeding the watchdog, so that the status shows it full.
         return self.status(now) if reply is None else reply
 
     def status(self, now: float) -> Status:
-        """How the amplifier is at a time [s] up to which it has been ticked."""
+        """Status at a time [s] up to which it has been ticked."""
         levels = self._channels.levels(now)
         left = self._fed + self._watchdog - now if self.state in ENABLED else 0.0
         is_on = self.state in (AmplifierState.SWITCHED_ON, *ENABLED) or any(levels)
@@ -173,9 +171,9 @@ class SimulatedAmplifier:
         )
 
     def trip(self, fault: Fault, moment: float, *, channel: int | None = None) -> None:
-        """A fault: silent within the shortest ramp, then high voltage off, latched.
+        """Enter a fault: silent within the shortest ramp, then high voltage off, latched.
 
-        Where nothing can play it is only noted among the faults.
+        While disarmed it is only added to the fault history.
         """
         self._faults.appendleft((fault, channel, moment))
         if self.state in (*ENABLED, AmplifierState.SWITCHED_ON, AmplifierState.QUICK_STOP_ACTIVE):
@@ -184,7 +182,7 @@ class SimulatedAmplifier:
             self._enter(AmplifierState.FAULT_REACTION_ACTIVE, moment, channel=channel)
 
     def set_temperature(self, temperature: float, moment: float) -> None:
-        """Bring it to a temperature [°C] from outside; what follows from that follows."""
+        """Set the temperature [°C], with its consequences."""
         self._heat = Heat(moment, temperature, self._heat.final)
         if temperature > DERATE_ABOVE and not self._is_derated:
             self._too_warm(moment)
@@ -192,14 +190,14 @@ class SimulatedAmplifier:
             self._too_warm(moment)
 
     def restart(self, moment: float) -> None:
-        """Lose the supply and start anew: silent at once, disarmed, sets and envelopes gone."""
+        """Power-cycle: silent at once, disarmed, without sets and envelopes."""
         self._heat = Heat(moment, self._heat.at(moment))
         self.fault = Fault.NONE
         self._start()
         self._enter(AmplifierState.SWITCH_ON_DISABLED, moment)
 
     def _carry_out(self, request: Request, following: AmplifierState, now: float) -> Reply | None:
-        """Do what is asked in a state that allows it; None where the reply is the status."""
+        """Execute an allowed request; None where the reply is the status."""
         match request:
             case Hello():
                 return self.identity
@@ -231,7 +229,7 @@ class SimulatedAmplifier:
                 if self._sets.playing(wanted.token) is None:
                     self._sets.stage(wanted, share=self._share)
                 return self._commit(wanted.token, now)
-            case _:  # GetStatus and Ping ask for nothing more
+            case _:  # GetStatus, Ping
                 pass
         return None
 
@@ -239,7 +237,7 @@ class SimulatedAmplifier:
         low, high = self.capabilities.watchdog_min, self.capabilities.watchdog_max
         if not low <= watchdog <= high:
             return Nak(NakCode.BAD_VALUE)
-        # To arm means level zero, also for an amplifier that another host has left playing.
+        # Arming starts at level zero, even if another host left it playing.
         self._silence(now, ramp=SILENCING_RAMP)
         self._watchdog = watchdog
         self._fed = now
@@ -260,17 +258,17 @@ class SimulatedAmplifier:
 
     @property
     def _share(self) -> float:
-        """Of its level, which it plays now."""
+        """Share of the level that it plays."""
         return DERATED if self._is_derated else 1.0
 
     def _stopping_ramp(self, ramp: float) -> float:
-        """A ramp that can be played: a stop is never refused for its ramp."""
+        """The nearest allowed ramp: a stop is never refused for its ramp."""
         if math.isnan(ramp):
             return SILENCING_RAMP
         return min(max(ramp, 0.0), self.capabilities.ramp_max)
 
     def _silence(self, moment: float, *, ramp: float) -> None:
-        """Every channel falls silent within the ramp [s], and nothing staged is left."""
+        """Silence every channel within the ramp [s], and discard the staged set."""
         self._channels.silence(moment, ramp=ramp)
         self._silent_from = self._channels.silent_from(moment)
         self._vibration_end = math.inf
@@ -278,7 +276,7 @@ class SimulatedAmplifier:
         self._warm(moment)
 
     def _enter(self, state: AmplifierState, moment: float, *, channel: int | None = None) -> None:
-        """Go to a state and tell who listens, where it is another or a fault was cleared."""
+        """Enter a state, and notify the listeners of a change."""
         told = AmplifierEvent(state, self.fault, channel)
         if state is not self.state:
             self.state = state
@@ -304,7 +302,7 @@ class SimulatedAmplifier:
         self._heat = self._heat.driven(moment, load=self._channels.load)
 
     def _too_warm(self, moment: float) -> None:
-        """Derate at the lower of two temperatures, trip at the higher."""
+        """Derate at the lower threshold, trip at the higher."""
         if self._is_derated:
             self.trip(Fault.OVER_TEMPERATURE, moment)
             return
@@ -313,5 +311,5 @@ class SimulatedAmplifier:
         self._warm(moment)
 
     def _is_still_hot(self, now: float) -> bool:
-        """Whether the cause of an over-temperature fault is still there."""
+        """Whether the cause of an over-temperature fault persists."""
         return self.fault is Fault.OVER_TEMPERATURE and self._heat.at(now) >= GOOD_BELOW

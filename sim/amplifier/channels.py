@@ -1,4 +1,4 @@
-"""What the channels of a simulated amplifier play, and how one set gives way to the next."""
+"""Outputs of the channels of a simulated amplifier, and the transition between sets."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -30,11 +30,11 @@ class PlayableSet:
 
     @property
     def achieved(self) -> Achieved:
-        """What the host is told of it."""
+        """The reply about it."""
         return Achieved(self.token, self.commands)
 
     def derated(self, factor: float) -> "PlayableSet":
-        """The same with every level, those of the knots included, at this share."""
+        """The set with all levels scaled, knots included."""
         return PlayableSet(
             replace(
                 self.command_set,
@@ -48,21 +48,21 @@ class PlayableSet:
 
 
 class Channels:
-    """The outputs of so many channels, each silent at first; times in s of any one clock."""
+    """Outputs of the channels, at first silent; times [s] of any one clock."""
 
     def __init__(self, count: int) -> None:
         self._outputs: list[Output] = [()] * count
         self._endings: Mapping[int, Envelope] = {}
-        self._ramp = 0.0  # of the set that plays
+        self._ramp = 0.0  # of the active set
 
     @property
     def outputs(self) -> Sequence[Output]:
-        """What each plays from now on, if nothing else happens."""
+        """The output of each channel from now on."""
         return tuple(self._outputs)
 
     @property
     def load(self) -> float:
-        """Mean over the channels of the squared level that each settles at."""
+        """Mean squared settled level of the channels."""
         levels = [
             sum(abs(tone.settled_amplitude) for tone in output if tone.lasts)
             for output in self._outputs
@@ -70,16 +70,16 @@ class Channels:
         return sum(level**2 for level in levels) / max(len(levels), 1)
 
     def levels(self, time: float) -> tuple[float, ...]:
-        """Level 0..1 that each has at a time."""
+        """Level 0..1 of each channel at a time."""
         # The sum of two fades may round to a little above 1.
         return tuple(min(level_of(output, time), 1.0) for output in self._outputs)
 
     def silent_from(self, time: float) -> float:
-        """When all are silent, if nothing else happens; a time for those that are."""
+        """Time from which all are silent, not before `time`."""
         return max([time, *(tone.silent_from for output in self._outputs for tone in output)])
 
     def play(self, playable: PlayableSet, time: float) -> None:
-        """Take over a set; channels that it does not name fall silent."""
+        """Play a set; channels that it does not name are silenced."""
         commands = {command.channel: command for command in playable.commands}
         ramp = playable.command_set.ramp
         for channel, playing in enumerate(self._outputs):
@@ -103,7 +103,7 @@ class Channels:
         self._ramp = ramp
 
     def end(self, time: float) -> None:
-        """The vibration ends by itself: along its endings, or the ramp of its set."""
+        """End the vibration along its endings, or the ramp of its set."""
         self._outputs = [
             _ended(playing, time, self._endings[channel], self._ramp)
             if channel in self._endings
@@ -113,12 +113,12 @@ class Channels:
         self._endings = {}
 
     def silence(self, time: float, *, ramp: float) -> None:
-        """Everything falls silent within the ramp, whatever endings there are."""
+        """Silence all channels within the ramp, without endings."""
         self._outputs = [fade_to(output, time, ramp=ramp) for output in self._outputs]
         self._endings = {}
 
     def derate(self, time: float, factor: float) -> None:
-        """What plays goes to this share of its level; phases run on."""
+        """Scale the levels; phases continue."""
         for channel, playing in enumerate(self._outputs):
             tone = next((tone for tone in playing if tone.lasts), None)
             if tone is not None:

@@ -1,4 +1,4 @@
-"""Whether a simulated amplifier can play something, and what its finite steps make of it."""
+"""Check commands against capabilities, and round them to the steps of the protocol."""
 
 from dataclasses import replace
 
@@ -11,7 +11,7 @@ _Q = PROTOCOL.quantities
 
 
 class RefusedSet(Exception):
-    """A set or an envelope that cannot be played; nak says why."""
+    """A set or an envelope that is refused with a Nak."""
 
     def __init__(self, code: NakCode, channel: int | None = None) -> None:
         super().__init__(code.name)
@@ -19,10 +19,9 @@ class RefusedSet(Exception):
 
 
 def quantise_set(wanted: CommandSet, capabilities: Capabilities) -> CommandSet:
-    """The set as it will really be played; raises RefusedSet if any part of it cannot be.
+    """The set as it will be played; raises RefusedSet.
 
-    Every number is rounded to the step of the protocol, as any wire would. The frequency of a
-    silent channel may lie outside what the amplifier can play.
+    The frequency of a silent channel may be out of range.
     """
     if not _Q.token.holds(wanted.token):
         raise RefusedSet(NakCode.BAD_TOKEN)
@@ -39,7 +38,7 @@ def quantise_set(wanted: CommandSet, capabilities: Capabilities) -> CommandSet:
 
 
 def quantise_envelope(wanted: Envelope, capabilities: Capabilities) -> Envelope:
-    """The envelope as it will be kept; raises RefusedSet if it cannot be."""
+    """The envelope as it will be stored; raises RefusedSet."""
     low, high = capabilities.envelope_step_min, capabilities.envelope_step_max
     step = _in_steps(_Q.envelope_step, wanted.step)
     if (

@@ -1,4 +1,4 @@
-"""What a host has given a simulated amplifier to play: envelopes, and sets that refer to them."""
+"""Sets and envelopes stored in a simulated amplifier."""
 
 from collections import deque
 
@@ -7,14 +7,11 @@ from drivers.protocol.messages import Achieved, Capabilities, Loaded, NakCode
 from sim.amplifier.channels import PlayableSet
 from sim.amplifier.quantiser import RefusedSet, quantise_envelope, quantise_set
 
-_TOKENS_REMEMBERED = 16  # duplicates of old sets are older than a few exchanges at most
+_TOKENS_REMEMBERED = 16  # late duplicates are older than a few exchanges at most
 
 
 class Sets:
-    """One set is staged, one is active; what cannot be taken raises RefusedSet and changes nothing.
-
-    slots: the envelopes that are loaded; staged: waits for its commit; active: was committed last.
-    """
+    """The staged and the active set, and loaded envelopes by slot; RefusedSet changes nothing."""
 
     def __init__(self, capabilities: Capabilities) -> None:
         self._capabilities = capabilities
@@ -25,7 +22,7 @@ class Sets:
 
     @property
     def token(self) -> int:
-        """That of the active set, 0 for none."""
+        """Token of the active set, 0 for none."""
         return self.active.token if self.active else 0
 
     def playing(self, token: int) -> PlayableSet | None:
@@ -33,7 +30,7 @@ class Sets:
         return self.active if self.active and self.active.token == token else None
 
     def load(self, envelope: Envelope) -> Loaded:
-        """Keep an envelope in its slot; one without knots empties it."""
+        """Store an envelope in its slot; one without knots clears it."""
         kept = quantise_envelope(envelope, self._capabilities)
         if kept.knots:
             self.slots[kept.slot] = kept
@@ -42,15 +39,15 @@ class Sets:
         return Loaded(slot=kept.slot, knots=len(kept.knots))
 
     def stage(self, wanted: CommandSet, *, share: float) -> Achieved:
-        """Keep a set, with the envelopes as they are loaded now, at this share of its levels."""
-        if wanted.token in self.tokens:  # a late copy, which must not oust what is staged now
+        """Stage a set with the present envelopes, at a share of its levels."""
+        if wanted.token in self.tokens:  # a late duplicate
             raise RefusedSet(NakCode.BAD_TOKEN)
         staged = self._with_envelopes(quantise_set(wanted, self._capabilities))
         self.staged = staged if share == 1 else staged.derated(share)
         return self.staged.achieved
 
     def commit(self, token: int) -> PlayableSet:
-        """The staged set, which is active from now on."""
+        """Make the staged set active."""
         if self.staged is None or self.staged.token != token:
             raise RefusedSet(NakCode.BAD_TOKEN)
         self.active, self.staged = self.staged, None
@@ -58,7 +55,7 @@ class Sets:
         return self.active
 
     def forget(self) -> None:
-        """As if no set had come; envelopes stay."""
+        """Discard the sets; envelopes stay."""
         self.staged = self.active = None
         self.tokens.clear()
 

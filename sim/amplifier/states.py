@@ -1,9 +1,8 @@
-"""Which request is taken in which state, and which state it leads to: a table.
+"""State table: which request is allowed in which state, and the state that follows.
 
-A request that is not in the table for a state is refused (WRONG_STATE). What happens by itself,
-the watchdog and the end of a ramp, is the amplifier's own: OPERATION_ENABLED goes to
-FAULT_REACTION_ACTIVE when the watchdog runs out and from there to FAULT once silent; SWITCHED_ON,
-entered by Disarm, goes to SWITCH_ON_DISABLED once silent. Clear takes effect once silent.
+Any other request is refused (WRONG_STATE). Transitions without a request are in the amplifier:
+OPERATION_ENABLED to FAULT_REACTION_ACTIVE when the watchdog expires, from there to FAULT once
+silent; SWITCHED_ON, entered by Disarm, to SWITCH_ON_DISABLED once silent. Clear needs silence.
 """
 
 from collections.abc import Mapping
@@ -43,7 +42,7 @@ _STOPPED = (
 
 TRANSITIONS: Table = {
     **{(state, request): state for state in AmplifierState for request in _ASKING},
-    # Whatever the state, a wish for silence is granted and never undoes a latched stop or fault.
+    # Silencing is allowed in every state, and never clears a latched stop or fault.
     **{(state, Disarm): state for state in (AmplifierState.NOT_READY, *_OFF, *_STOPPED)},
     (AmplifierState.SWITCHED_ON, Disarm): AmplifierState.SWITCHED_ON,
     (AmplifierState.OPERATION_ENABLED, Disarm): AmplifierState.SWITCHED_ON,
@@ -73,5 +72,5 @@ TRANSITIONS: Table = {
 
 
 def next_state(state: AmplifierState, request: type[Request]) -> AmplifierState | None:
-    """The state that a request leads to, or None where it is refused."""
+    """The state after a request, or None where it is refused."""
     return TRANSITIONS.get((state, request))

@@ -1,1 +1,1 @@
-"""A rig in numbers only: amplifiers on one plate, tied to a clock, and as far ends see them."""
+"""The simulated rig: amplifiers on one plate, their clock, and their devices."""

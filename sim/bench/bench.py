@@ -1,7 +1,7 @@
-"""A rig that exists in numbers only: its amplifiers, its plate in time, and fingers on it.
+"""The simulated rig: its amplifiers, its plate in the time domain, and fingers on it.
 
-It moves when it is told the time and never reads a clock itself. Amplifier channels reach the ERAs
-through the rig's wiring, level 1 being the ERA's full stroke, with what imperfections there are.
+Time is passed in; no clock is read. Channels drive the ERAs by the rig's wiring, level 1 being the
+full stroke, with the imperfections given.
 """
 
 from collections import OrderedDict, deque
@@ -30,29 +30,28 @@ from sim.plant.imperfections import ChannelErrors, Imperfections, delayed, draw_
 from sim.plant.plant import SAMPLE_RATE, Plant
 from sim.waveform.output import Output, Tone
 
-_PORTION = 1.0  # s; what is sampled at once, however long nobody asked
-_SHAPES_KEPT = 16  # sets of points; as many listeners ask for them again and again
+_MAX_STEP = 1.0  # s; sampled at once
+_MAX_SHAPES = 16  # sets of points
 
 
 class Tap(Protocol):
-    """Something that hears the plate all the time, by its reduced shapes at points (p, r)."""
+    """A listener to the plate at fixed points, by their reduced shapes (p, r)."""
 
     @property
     def shapes(self) -> FloatArray:
-        """Where it listens."""
+        """Shapes at its points."""
         ...
 
     def record(self, times: FloatArray, accelerations: FloatArray) -> None:
-        """Take what was there: (n,) [s], (n, p) [m/s²]; without a gap to what came before."""
+        """Take samples: times (n,) [s], accelerations (n, p) [m/s²]; calls are contiguous."""
         ...
 
 
 class Bench:
-    """A simulated rig that is at rest at time now [s]; sample_rate [Hz]: of all that is measured.
+    """A simulated rig at rest at time now [s]; sample_rate [Hz]: of sensors and fingers.
 
-    taps: what listens beside the fingers; finger_load: what every finger does to the plate, None
-    for fingers that only feel; imperfections: how its amplifiers differ from what they are told.
-    Raises InputError for imperfections of what the rig does not have.
+    taps: listeners beside the fingers; finger_load: None for fingers without weight;
+    imperfections: errors of amplifiers and channels. Raises InputError for unknown channels.
     """
 
     def __init__(
@@ -75,61 +74,61 @@ class Bench:
         )
         self.fingers = Fingers(reduced)
         self._time = now
-        # It is moved when its drive changes or somebody listens: in between it needs no attention.
+        # Advanced only where its drive changes or its motion is sampled.
         self._plant = Plant(reduced, rig.eras, loads=rig.loads, time=now)
         self.amplifiers: Mapping[str, SimulatedAmplifier] = {
             name: SimulatedAmplifier(name, channels=_channel_count(rig, name))
             for name in rig.amplifiers
         }
-        # By ERA: what its channel plays, as it was heard last and as the plant has been told; in
-        # between lie the changes that are under way, each with its time [s].
-        self._heard: list[Output] = [()] * len(rig.eras)
-        self._told: list[Output] = [()] * len(rig.eras)
-        self._coming: list[deque[tuple[float, Output]]] = [deque() for _ in rig.eras]
+        # By ERA: the output of its channel, the output that moves the base, and the changes between
+        # them that are delayed, each with its time [s].
+        self._commanded: list[Output] = [()] * len(rig.eras)
+        self._moving: list[Output] = [()] * len(rig.eras)
+        self._delayed: list[deque[tuple[float, Output]]] = [deque() for _ in rig.eras]
         self._noise = [draw_noise(seed=imperfections.seed, number=n) for n in range(len(rig.eras))]
         self._shapes: OrderedDict[bytes, FloatArray] = OrderedDict()
-        self._played: deque[tuple[Tone, float]] = deque()  # and when it was replaced [s]
+        self._played: deque[tuple[Tone, float]] = deque()  # with the time of its end [s]
 
     @property
     def time(self) -> float:
-        """How far everything has been moved [s]."""
+        """The present time [s]."""
         return self._time
 
     def advance(self, now: float) -> None:
-        """Let everything happen that happens until now [s], each thing at its own moment."""
-        if now - self.time > KEPT and not self.taps:  # what nobody could ask for is not sampled
-            self._advance_amplifiers(now - KEPT, watched=False)
-        while now - self.time > _PORTION:
-            self._advance_amplifiers(self.time + _PORTION, watched=True)
-        self._advance_amplifiers(now, watched=True)
+        """Advance to a time [s]; each event happens at its own time."""
+        if now - self.time > KEPT and not self.taps:  # older samples are not kept
+            self._advance_amplifiers(now - KEPT, is_sampled=False)
+        while now - self.time > _MAX_STEP:
+            self._advance_amplifiers(self.time + _MAX_STEP, is_sampled=True)
+        self._advance_amplifiers(now, is_sampled=True)
 
     def shapes_at(self, points: FloatArray) -> FloatArray:
-        """The reduced shapes (p, r) at points (p, 2) [m]: what a tap there listens by.
+        """Reduced shapes (p, r) at points (p, 2) [m].
 
-        They hold until fingers that load the plate come, go or move: ask again every time.
+        Valid until fingers that load the plate change.
         """
         key = points.tobytes()
         if key not in self._shapes:
-            while len(self._shapes) >= _SHAPES_KEPT:
+            while len(self._shapes) >= _MAX_SHAPES:
                 self._shapes.popitem(last=False)
             self._shapes[key] = self._plant.reduced.at(points)
         self._shapes.move_to_end(key)
         return self._shapes[key]
 
     def exchange(self, amplifier: str, request: Request, *, now: float) -> Reply:
-        """What an amplifier answers to a request that arrives now [s]."""
+        """The reply of an amplifier to a request at a time [s]."""
         now = max(now, self.time)
         self.advance(now)
         reply = self.amplifiers[amplifier].handle(request, now)
-        self._tell_plant()
+        self._update_plant()
         return reply
 
     def place_fingers(
         self, positions: Mapping[str, Position], *, now: float, observers: Collection[str] = ()
     ) -> None:
-        """Fingers rest here [m] from now [s] on, and no others; InputError changes nothing.
+        """Replace the fingers by those at these positions [m]; InputError changes nothing.
 
-        observers: those that only feel, whatever the others do to the plate.
+        observers: fingers without weight.
         """
         self.fingers.check(positions)
         self.advance(now)
@@ -145,66 +144,66 @@ class Bench:
         self.fingers.place(positions, reduced=self._plant.reduced)
 
     def records(self, since: float, until: float) -> tuple[dict[str, Record], list[float]]:
-        """What each finger went through in a window of the last ten seconds [s], by its id.
+        """The record of each finger in a window of the last ten seconds [s], by id.
 
-        Also the frequencies [Hz] that were driven in it, ascending.
+        Also the frequencies [Hz] driven in it, ascending.
         """
         return self.fingers.felt(since, until), self._frequencies(since, until)
 
     def felt(self, since: float, until: float) -> dict[str, Felt]:
-        """What each finger felt in such a window, by its id."""
+        """What each finger felt in such a window, by id."""
         records, frequencies = self.records(since, until)
         return {name: feel(record, frequencies) for name, record in records.items()}
 
-    def _advance_amplifiers(self, to_time: float, *, watched: bool) -> None:
+    def _advance_amplifiers(self, to_time: float, *, is_sampled: bool) -> None:
         while True:
             moment = min((a.next_event for a in self.amplifiers.values()), default=to_time)
-            moment = min(moment, *(coming[0][0] for coming in self._coming if coming), to_time)
-            self._move_plant(moment, watched=watched)
+            moment = min(moment, *(waiting[0][0] for waiting in self._delayed if waiting), to_time)
+            self._move_plant(moment, is_sampled=is_sampled)
             for amplifier in self.amplifiers.values():
                 amplifier.tick(moment)
-            self._tell_plant()
+            self._update_plant()
             if moment >= to_time:
                 return
 
-    def _move_plant(self, to_time: float, *, watched: bool) -> None:
+    def _move_plant(self, to_time: float, *, is_sampled: bool) -> None:
         if to_time <= self.time:
             return
         since, self._time = self._time, to_time
-        if not (watched and (self.fingers.layout.positions or self.taps)):
+        if not (is_sampled and (self.fingers.layout.positions or self.taps)):
             return
         self._plant.skip(since)
-        heard = [self.fingers.layout.shapes, *(tap.shapes for tap in self.taps)]
+        shapes = [self.fingers.layout.shapes, *(tap.shapes for tap in self.taps)]
         times, accelerations = self._plant.advance(
-            to_time, sample_rate=self.sample_rate, shapes=np.concatenate(heard)
+            to_time, sample_rate=self.sample_rate, shapes=np.concatenate(shapes)
         )
-        parts = np.split(accelerations, np.cumsum([len(shapes) for shapes in heard])[:-1], axis=1)
+        parts = np.split(accelerations, np.cumsum([len(shapes) for shapes in shapes])[:-1], axis=1)
         self.fingers.record(times, parts[0])
         for tap, part in zip(self.taps, parts[1:], strict=True):
             tap.record(times, part)
 
-    def _tell_plant(self) -> None:
-        """Pass on what the channels play, where it is not what the plant knows already."""
+    def _update_plant(self) -> None:
+        """Pass changed outputs of the channels on to the plant, after their delay."""
         for index, era in enumerate(self.rig.eras):
             channel = self.rig.wiring[era.name]
             playing = self.amplifiers[channel.amplifier].outputs[channel.number]
-            coming = self._coming[index]
-            if playing is not self._heard[index]:
-                self._heard[index] = playing
+            waiting = self._delayed[index]
+            if playing is not self._commanded[index]:
+                self._commanded[index] = playing
                 delay = self.imperfections.delay(channel.amplifier)
-                coming.append((self.time + delay, delayed(playing, delay)))
-            while coming and coming[0][0] <= self.time:
-                _, playing = coming.popleft()
-                told = self._told[index]
+                waiting.append((self.time + delay, delayed(playing, delay)))
+            while waiting and waiting[0][0] <= self.time:
+                _, playing = waiting.popleft()
+                before = self._moving[index]
                 self._plant.skip(self._time)
                 self._plant.set_input(index, self._motion(index, playing))
-                self._played.extend((tone, self.time) for tone in told if tone not in playing)
-                self._told[index] = playing
+                self._played.extend((tone, self.time) for tone in before if tone not in playing)
+                self._moving[index] = playing
         while self._played and self._played[0][1] < self.time - KEPT:
             self._played.popleft()
 
     def _motion(self, index: int, playing: Output) -> list[Term]:
-        """How the base of an ERA moves while its channel plays, imperfections and all."""
+        """The base motion of an ERA by the output of its channel, imperfections included."""
         era = self.rig.eras[index]
         terms = [term for tone in playing for term in terms_of(tone, stroke=era.stroke)]
         errors = self.imperfections.channels.get(self.rig.wiring[era.name], ChannelErrors())
@@ -216,15 +215,15 @@ class Bench:
         return terms
 
     def _frequencies(self, since: float, until: float) -> list[float]:
-        """Every frequency [Hz] that some channel was asked to play at some time in a window."""
+        """The frequencies [Hz] that channels were commanded to play in a window."""
         ended = [(tone, min(end, tone.silent_from)) for tone, end in self._played]
-        present = [(tone, tone.silent_from) for output in self._told for tone in output]
+        present = [(tone, tone.silent_from) for output in self._moving for tone in output]
         return sorted(
             {tone.frequency for tone, end in ended + present if tone.start < until and end > since}
         )
 
 
-@lru_cache(maxsize=2)  # benches are made one after the other, of one rig
+@lru_cache(maxsize=2)  # successive benches of one rig share it
 def _reduced(
     plate: Plate,
     mesh: Mesh,

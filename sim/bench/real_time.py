@@ -1,14 +1,11 @@
-"""The bench and the clock: here simulated time is tied to time.monotonic().
-
-That clock is the same in all processes of a machine, so a host can name moments to the far end.
-"""
+"""Advance a bench with time.monotonic(), the same clock in all processes of a machine."""
 
 import asyncio
 
 from drivers import clock
 from sim.bench.bench import Bench
 
-TICK = 0.01  # s; how far the plate may lag behind when nobody asks for anything
+TICK = 0.01  # s
 
 
 async def keep_time(bench: Bench) -> None:

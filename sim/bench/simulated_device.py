@@ -1,8 +1,4 @@
-"""One simulated amplifier as every far end sees it: requests in, replies out, and its faults.
-
-A far end turns the telegrams of its wire into requests; here is decided, for all wires alike,
-whether the amplifier answers at all.
-"""
+"""A simulated amplifier on any wire: requests in, replies out, with injected faults."""
 
 import asyncio
 import math
@@ -27,7 +23,7 @@ from sim.amplifier.heat import AMBIENT, DERATE_ABOVE, FAULT_ABOVE
 from sim.bench.bench import Bench
 from sim.faults.fault_window import Faults, FaultWindow
 
-_FAILS = {
+_FAULTS = {
     "over_voltage": Fault.OVER_VOLTAGE,
     "arc": Fault.ARC,
     "channel": Fault.CHANNEL,
@@ -35,10 +31,9 @@ _FAILS = {
 
 
 class SimulatedDevice:
-    """An amplifier of a bench by its name; number: its address on a wire, 1 or more.
+    """An amplifier of a bench by name; number: its address on a wire, from 1.
 
-    Simulated time is the event loop's, by default time.monotonic(), the same in all processes of a
-    machine.
+    Its time is that of the running event loop.
     """
 
     def __init__(
@@ -50,40 +45,40 @@ class SimulatedDevice:
         self._bench = bench
         self._amplifier = bench.amplifiers[name]
         self._on_plug: list[Callable[[bool], None]] = []
-        self._pulled_out = 0  # how many faults hold the wire out now
-        self._expected: list[asyncio.TimerHandle] = []
+        self._unplugged = 0  # active unplug faults
+        self._timers: list[asyncio.TimerHandle] = []
 
     @property
     def identity(self) -> Identity:
-        """Who it is."""
+        """Its identity."""
         return self._amplifier.identity
 
     @property
     def capabilities(self) -> Capabilities:
-        """What it can play."""
+        """Its capabilities."""
         return self._amplifier.capabilities
 
     @property
     def is_answering(self) -> bool:
-        """Whether it does anything at all now: a far end keeps still as long as it does not."""
+        """Whether it replies at all: neither hung nor without supply."""
         now = clock.now()
         return not (self.faults.now("hang", now) or self.faults.now("reboot", now))
 
     def on_plug(self, on_plug: Callable[[bool], None]) -> None:
-        """Be told False when the wire is pulled out and True when it is back."""
+        """Register a callback for the wire unplugged (False) and plugged in again (True)."""
         self._on_plug.append(on_plug)
 
     def listen(self, on_event: Callable[[AmplifierEvent], None]) -> None:
-        """Be told when state or fault changes."""
+        """Register a callback for changes of state or fault."""
         self._amplifier.listeners.append(lambda event, _: on_event(event))
 
     def status(self) -> Status:
-        """How it is now; for what a wire sends by itself."""
+        """Its present status."""
         self._bench.advance(clock.now())
         return self._amplifier.status(self._bench.time)
 
     def exchange(self, request: Request) -> Reply | None:
-        """Its answer to a request that arrives now; None if it keeps still."""
+        """The reply to a request that arrives now; None for no reply."""
         now = clock.now()
         if not self.is_answering:
             return None
@@ -92,45 +87,45 @@ class SimulatedDevice:
         return self._bench.exchange(self.name, request, now=now)
 
     def broadcast(self, request: Broadcast) -> None:
-        """Carry out what was said to all; nobody hears the answer."""
+        """Execute a broadcast, which has no reply."""
         self.exchange(request)
 
     def restart(self) -> None:
-        """Lose the supply for a moment, as when it is told to start anew."""
+        """Power-cycle it."""
         now = clock.now()
         self._bench.advance(now)
         self._amplifier.restart(now)
         self._bench.advance(now)
 
     def start(self) -> None:
-        """Let the faults that are due later come, in the running event loop."""
+        """Schedule the fault windows, in the running event loop."""
         for window in self.faults.windows:
-            self._expect(window)
+            self._schedule(window)
 
     def inject_fault(self, window: FaultWindow) -> None:
-        """One more fault, from now on: its `at` is not looked at."""
+        """Add a fault that begins now, whatever its `at`."""
         now = clock.now()
         window = replace(window, at=now - self.faults.begin)
         self.faults.windows = (*self.faults.windows, window)
-        self._expect(window)
+        self._schedule(window)
 
     def recover(self) -> None:
-        """Every fault that is on ends now, and none comes any more."""
+        """End all active faults, and cancel the scheduled ones."""
         self.close()
         over = clock.now() - self.faults.begin
         for window in self.faults.windows:
             if window.at <= over < window.end:
-                self._pass(replace(window, lasts=over - window.at), "end")
+                self._handle_edge(replace(window, lasts=over - window.at), "end")
         self.faults.windows = ()
 
     def close(self) -> None:
-        """No more faults come."""
-        for timer in self._expected:
+        """Cancel the scheduled faults."""
+        for timer in self._timers:
             timer.cancel()
-        self._expected.clear()
+        self._timers.clear()
 
-    def _expect(self, window: FaultWindow) -> None:
-        """Bring about, when they are due, those faults that nobody needs to ask for."""
+    def _schedule(self, window: FaultWindow) -> None:
+        """Schedule the begin, middle and end of a fault window."""
         begin = self.faults.begin + window.at - clock.now()
         edges: dict[_Edge, float] = {
             "begin": begin,
@@ -140,29 +135,29 @@ class SimulatedDevice:
         loop = asyncio.get_running_loop()
         for edge, delay in edges.items():
             if edge == "begin" and delay <= 0:
-                self._pass(window, edge)
+                self._handle_edge(window, edge)
             elif delay < math.inf:
-                self._expected.append(loop.call_later(delay, self._pass, window, edge))
+                self._timers.append(loop.call_later(delay, self._handle_edge, window, edge))
 
-    def _pass(self, window: FaultWindow, edge: "_Edge") -> None:
+    def _handle_edge(self, window: FaultWindow, edge: "_Edge") -> None:
         """An window begins, is half over or ends."""
         now = clock.now()
         self._bench.advance(now)
         match window.fault, edge:
             case "unplug", "begin":
-                self._pulled_out += 1
-                if self._pulled_out == 1:
+                self._unplugged += 1
+                if self._unplugged == 1:
                     self._plug(is_plugged=False)
             case "unplug", "end":
-                self._pulled_out -= 1
-                if self._pulled_out == 0:
+                self._unplugged -= 1
+                if self._unplugged == 0:
                     self._plug(is_plugged=True)
             case "reboot", "begin":
                 self._amplifier.restart(now)
             case ("over_voltage" | "arc" | "channel") as fault, "begin":
-                self._amplifier.trip(_FAILS[fault], now)
+                self._amplifier.trip(_FAULTS[fault], now)
             case "over_temperature", _:
-                self._amplifier.set_temperature(_WARMTH[edge], now)
+                self._amplifier.set_temperature(_TEMPERATURES[edge], now)
         self._bench.advance(now)
 
     def _plug(self, *, is_plugged: bool) -> None:
@@ -171,4 +166,8 @@ class SimulatedDevice:
 
 
 _Edge: TypeAlias = Literal["begin", "half", "end"]
-_WARMTH: dict[_Edge, float] = {"begin": DERATE_ABOVE + 1, "half": FAULT_ABOVE + 1, "end": AMBIENT}
+_TEMPERATURES: dict[_Edge, float] = {
+    "begin": DERATE_ABOVE + 1,
+    "half": FAULT_ABOVE + 1,
+    "end": AMBIENT,
+}

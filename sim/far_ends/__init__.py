@@ -1,1 +1,1 @@
-"""The amplifiers' side of every wire: bytes on it, messages behind it."""
+"""The amplifiers' side of every wire."""

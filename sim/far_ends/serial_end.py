@@ -1,9 +1,8 @@
 """The amplifiers' side of a serial line: a pseudo-terminal in front of simulated amplifiers.
 
-Several share a line as on RS-485, each with its own address; then none speaks unasked. A line that
-is unplugged is another pseudo-terminal once it is there again: its URL names a link to it.
+Several amplifiers share a line as on RS-485, each with its address, and then send no events.
 
-Not modelled: noise, parity, two that speak at once.
+Not modelled: noise, parity, collisions.
 """
 
 import contextlib
@@ -20,10 +19,9 @@ from sim.transport.pseudo_terminal import make_terminal
 
 
 class SerialEnd:
-    """A pseudo-terminal on which devices answer, each at the address that is its number.
+    """A pseudo-terminal with devices at the addresses of their numbers.
 
-    baud: bytes take as long as at this speed; None for no time at all. unpluggable: the port is
-    named by a link that outlives the pseudo-terminal.
+    baud: None for no transmission time; unpluggable: see `make_terminal`.
     """
 
     def __init__(
@@ -57,7 +55,7 @@ class SerialEnd:
 
     @property
     def dropped_replies(self) -> int:
-        """Replies that nobody made room for."""
+        """Replies lost because the host did not read."""
         return self._terminal.dropped
 
     @property
@@ -72,30 +70,30 @@ class SerialEnd:
 
     @property
     def counters(self) -> FrameCounters:
-        """What came in, frames by their fate."""
+        """Counters of received frames."""
         return self._reader.counters
 
     def start(self) -> None:
-        """Answer from now on, in the running event loop."""
+        """Serve in the running event loop."""
         self._terminal.listen()
         if self._is_unpluggable:
             self._first.on_plug(self._plug)
         if len(self._devices) == 1:
-            self._first.listen(self._tell)
+            self._first.listen(self._send_event)
 
     def close(self) -> None:
-        """Hang up; to be called in the event loop that it was started in."""
+        """Close, in the event loop of `start`."""
         self._line.close()
         self._terminal.close()
 
     def _plug(self, is_plugged: bool) -> None:
-        """The line has come, or gone."""
+        """Unplug the line, or plug it in again."""
         self._line.close()
         self._terminal.plug(is_plugged)
 
     def _arrived(self, data: bytes) -> None:
         for frame in self._reader.feed(data):
-            if frame.is_reply:  # an echo is no request
+            if frame.is_reply:  # an echo
                 continue
             if frame.address == PROTOCOL.serial.broadcast:
                 self._broadcast(frame)
@@ -118,7 +116,7 @@ class SerialEnd:
                 for device in self._devices.values():
                     device.broadcast(request)
 
-    def _tell(self, event: AmplifierEvent) -> None:
+    def _send_event(self, event: AmplifierEvent) -> None:
         if self._first.is_answering:
             self._events = (self._events + 1) & 0xFFFF
             frame = encode_event(event, address=PROTOCOL.serial.address, sequence=self._events)

@@ -1,1 +1,1 @@
-"""What goes wrong with an amplifier and its wire on demand, and when."""
+"""Fault injection into amplifiers and wires."""

@@ -1,8 +1,8 @@
-"""Faults on demand, read from a file:
+"""Fault files:
 
-seed: 7                      # the same seed, the same faults
+seed: 7                      # makes faults reproducible
 faults:
-  - {fault: drop, at: 2, lasts: 10, share: 0.2}         # seconds from the begin
+  - {fault: drop, at: 2, lasts: 10, share: 0.2}         # seconds
   - {fault: unplug, at: 15, lasts: 0.5, amplifier: main}
 """
 
@@ -17,7 +17,7 @@ from pydantic import ValidationError
 from model.config.document import read_document
 from model.config.sections import Quantity, Section, Validation
 from model.config.units import RATIO, TIME
-from model.errors import InputError, in_our_words
+from model.errors import InputError, first_problem
 from sim.faults.fault_window import FaultKind, Faults, FaultWindow, Toward
 
 
@@ -38,13 +38,13 @@ class _FaultFileSection(Section):
 
 @dataclass(frozen=True)
 class FaultFile:
-    """What shall go wrong with the amplifiers of a rig."""
+    """Fault windows for the amplifiers of a rig."""
 
     windows: tuple[FaultWindow, ...]
     seed: int = 0
 
     def of(self, amplifier: str, *, begin: float) -> Faults:
-        """What concerns one of them, counted from a time [s]."""
+        """The faults of one amplifier; begin [s]: when their time scale begins."""
         own = [window for window in self.windows if window.amplifier in (None, amplifier)]
         return Faults(own, begin=begin, seed=self.seed)
 
@@ -58,21 +58,16 @@ def load_faults(path: Path, *, amplifiers: Collection[str]) -> FaultFile:
         name = entry.get("amplifier") if isinstance(entry, dict) else None
         if isinstance(name, str) and name not in amplifiers:
             known = ", ".join(sorted(amplifiers))
-            validation.add(
-                ("faults", number, "amplifier"), f"{name!r} is none of the rig's: {known}"
-            )
+            validation.add(("faults", number, "amplifier"), f"must be one of {known}, got {name!r}")
     section = validation.finish()
     windows = tuple(FaultWindow(**window.model_dump()) for window in section.faults)
     return FaultFile(windows, seed=section.seed)
 
 
-def parse_fault(told: Mapping[str, Any]) -> FaultWindow:
-    """One fault from its keys, which are those of a file; InputError says what is wrong."""
+def parse_fault(given: Mapping[str, Any]) -> FaultWindow:
+    """Parse one fault, with the keys of a fault file; raises InputError."""
     try:
-        return FaultWindow(**_FaultSection.model_validate(dict(told)).model_dump())
+        return FaultWindow(**_FaultSection.model_validate(dict(given)).model_dump())
     except ValidationError as error:
-        problems = (
-            f"{'.'.join(map(str, details['loc']))}: {in_our_words(details['msg'])}"
-            for details in error.errors(include_url=False)
-        )
-        raise InputError("; ".join(problems)) from None
+        key, problem = first_problem(error)
+        raise InputError(f"{key}: {problem}") from None

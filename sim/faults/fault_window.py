@@ -1,9 +1,9 @@
-"""Faults on demand: what goes wrong with an amplifier and its wire, and when.
+"""Fault windows: which fault is active on an amplifier or its wire, and when.
 
-What happens to telegrams (drop, delay, duplicate, corrupt, truncate) is decided here for every
-wire, whatever its telegrams are: whole frames going out, pieces of the stream as they come in.
+Faults of frames (drop, delay, duplicate, corrupt, truncate) apply to whole frames sent by the
+amplifier, and to pieces of the stream received from the host.
 
-Not modelled: noise between telegrams, collisions of two senders.
+Not modelled: noise between frames, collisions.
 """
 
 import math
@@ -13,33 +13,33 @@ from dataclasses import dataclass, field
 from typing import Literal, TypeAlias
 
 FaultKind: TypeAlias = Literal[
-    # of telegrams
+    # of frames
     "drop",
     "delay",
     "duplicate",
     "corrupt",
     "truncate",
-    "incomplete_set",  # of a set in several frames some are lost, of one in one frame the end
+    "incomplete_set",  # frames of a set are lost, or the end of a single one
     # of the wire
     "unplug",
     # of the amplifier
-    "hang",  # nothing is answered, and nothing done
-    "reboot",  # the supply is lost at once; it comes back at the end
-    "nak_storm",  # everything is refused: busy
-    "over_temperature",  # derated from the begin, a fault halfway, cool at the end
+    "hang",  # neither replies nor acts
+    "reboot",  # without supply until the end
+    "nak_storm",  # refuses everything: BUSY
+    "over_temperature",  # derated, from halfway a fault, cool at the end
     "over_voltage",
     "arc",
-    "channel",  # one channel has failed
+    "channel",  # one channel fails
 ]
 Toward: TypeAlias = Literal["amplifier", "host"]
 
 
 @dataclass(frozen=True)
 class FaultWindow:
-    """One fault from `at` [s after the begin] on, for `lasts` [s].
+    """A fault that is active from `at` for `lasts` [s].
 
-    amplifier: whose; None for all. Of telegrams: share, how many of them, 0..1; toward: in which
-    direction, None for both; delay [s], at most, evenly spread.
+    amplifier: None for all. Of frames: share 0..1 that is hit; toward: the direction, None for
+    both; delay [s]: maximum, uniformly distributed.
     """
 
     fault: FaultKind
@@ -52,15 +52,15 @@ class FaultWindow:
 
     @property
     def end(self) -> float:
-        """When it is over [s after the begin]."""
+        """Its end, on the scale of `at` [s]."""
         return self.at + self.lasts
 
 
 @dataclass
 class Faults:
-    """What goes wrong with one amplifier and its wire, by a clock that is handed in.
+    """The faults of one amplifier and its wire; begin [s]: when the windows' time scale begins.
 
-    begin [s] of that clock: from when the windows count. The same seed gives the same faults.
+    The same seed gives the same faults.
     """
 
     windows: Sequence[FaultWindow] = ()
@@ -69,20 +69,20 @@ class Faults:
     _random: random.Random = field(init=False)
 
     def __post_init__(self) -> None:
-        self._random = random.Random(self.seed)  # noqa: S311  to be repeated, not to be secret
+        self._random = random.Random(self.seed)  # noqa: S311  reproducible, not secret
 
     def now(self, fault: FaultKind, time: float) -> bool:
-        """Whether a fault is on at a time [s]."""
+        """Whether a fault is active at a time [s]."""
         return any(self._is_on(window, time) for window in self.windows if window.fault == fault)
 
-    def pass_on(self, telegram: bytes, *, toward: Toward, time: float) -> list[tuple[float, bytes]]:
-        """What arrives of a telegram that is sent at a time [s], and how much later [s]."""
-        arriving = [(0.0, telegram)]
+    def pass_on(self, frame: bytes, *, toward: Toward, time: float) -> list[tuple[float, bytes]]:
+        """What arrives of a frame sent at a time [s]: pieces, each with its delay [s]."""
+        arriving = [(0.0, frame)]
         for window in self.windows:
-            hit = self._is_on(window, time) and window.toward in (None, toward)
-            if hit and self._random.random() < window.share:
+            is_hit = self._is_on(window, time) and window.toward in (None, toward)
+            if is_hit and self._random.random() < window.share:
                 arriving = self._apply(window, arriving, toward)
-                arriving = [(delay, data) for delay, data in arriving if data]  # cut to nothing
+                arriving = [(delay, data) for delay, data in arriving if data]
         return arriving
 
     def _apply(
@@ -105,7 +105,7 @@ class Faults:
                 return arriving
 
     def _corrupt(self, data: bytes) -> bytes:
-        """One to three flipped bits."""
+        """Flip one to three bits."""
         damaged = bytearray(data)
         for _ in range(self._random.randint(1, 3)):
             bit = self._random.randrange(8 * len(damaged))

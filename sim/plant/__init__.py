@@ -1,1 +1,1 @@
-"""The plate in time, what moves it, and the fingers that rest on it."""
+"""The plate in the time domain: excitation, contacts, and what fingers feel."""

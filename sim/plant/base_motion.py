@@ -1,4 +1,4 @@
-"""How the base of an ERA moves when its channel plays a tone."""
+"""Base motion of an ERA whose channel plays a tone."""
 
 import cmath
 import math
@@ -10,13 +10,13 @@ from sim.waveform.shaped_tone import ShapedTone
 
 
 def terms_of(tone: FadingTone | ShapedTone, *, stroke: float) -> tuple[Term, ...]:
-    """The base motion of an ERA with this stroke [m] whose channel plays the tone."""
+    """Base motion of an ERA with this stroke [m] while its channel plays the tone."""
     omega = 2 * math.pi * tone.frequency
     if isinstance(tone, ShapedTone):
         return _along_knots(tone, omega, stroke)
-    turn = cmath.exp(1j * omega * (tone.start - tone.origin))
+    phase_factor = cmath.exp(1j * omega * (tone.start - tone.origin))
     return fade(
-        stroke * tone.full * turn,
+        stroke * tone.full * phase_factor,
         omega=omega,
         start=tone.start,
         ramp=tone.ramp,
@@ -25,14 +25,16 @@ def terms_of(tone: FadingTone | ShapedTone, *, stroke: float) -> tuple[Term, ...
 
 
 def _along_knots(tone: ShapedTone, omega: float, stroke: float) -> tuple[Term, ...]:
-    """Straight lines in the complex amplitude, which the plate is solved for exactly."""
+    """Terms of linearly varying complex amplitude, solved exactly."""
     terms = []
     for number, (here, there) in enumerate(pairwise(tone.values)):
         since = tone.start + number * tone.step
-        turn = stroke * cmath.exp(1j * omega * (since - tone.origin))
+        phase_factor = stroke * cmath.exp(1j * omega * (since - tone.origin))
         slope = (there - here) / tone.step
-        terms.append(Term(since, since + tone.step, omega, here * turn, slope * turn))
+        terms.append(
+            Term(since, since + tone.step, omega, here * phase_factor, slope * phase_factor)
+        )
     if tone.lasts:
-        turn = stroke * cmath.exp(1j * omega * (tone.settled - tone.origin))
-        terms.append(Term(tone.settled, math.inf, omega, tone.values[-1] * turn))
+        phase_factor = stroke * cmath.exp(1j * omega * (tone.settled - tone.origin))
+        terms.append(Term(tone.settled, math.inf, omega, tone.values[-1] * phase_factor))
     return tuple(terms)

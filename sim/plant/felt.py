@@ -1,4 +1,4 @@
-"""What a finger felt over a window of time, at each point of its tip: peak and steady parts."""
+"""Vibration felt by a finger in a time window: peaks and steady amplitudes."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -20,12 +20,11 @@ class Felt:
 
 
 def feel(record: Record, frequencies: Sequence[float]) -> Felt:
-    """Raw peak of each point, and the amplitude of each frequency [Hz] by least squares.
+    """Peak at each point, and the amplitude of each frequency [Hz] by least squares.
 
-    The fit of sines and cosines is a lock-in amplifier for several frequencies at once. It is
-    steady vibration only where the window leaves the transients out, and it separates frequencies
-    only if the window is longer than the inverse of their difference; a window with fewer samples
-    than the fit has unknowns gives the smallest amplitudes that fit.
+    The fit of sines and cosines assumes steady vibration: the window must exclude transients, and
+    be longer than the inverse of the smallest frequency difference. With fewer samples than
+    unknowns the result is the minimum-norm solution.
     """
     times, samples = record.times, record.accelerations
     if not len(times):

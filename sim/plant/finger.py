@@ -1,6 +1,6 @@
-"""Fingers that rest on the plate and feel it: what each of their points went through, kept a while.
+"""Fingers as sensors: accelerations at the points of each fingertip, kept for ten seconds.
 
-Here a finger is a sensor only; what it does to the plate is the plant's (`sim.plant.contacts`).
+The load of a finger on the plate is in `sim.plant.contacts`.
 """
 
 import math
@@ -18,17 +18,17 @@ from model.finger.fingertip import fingertip_points
 from model.reduction.reduced_plate import ReducedPlate
 from model.structure.plate import Plate
 
-KEPT = 10.0  # s; what is older is forgotten
-FINGERS_MAX = 32  # four people with eight fingers each; what they feel still fits into memory
+KEPT = 10.0  # s
+MAX_FINGERS = 32  # four people with eight fingers each
 
 Position: TypeAlias = tuple[float, float]
 
 
 @dataclass(frozen=True, eq=False)
 class Layout:
-    """Which fingers rest where: their points [m] one after the other, and the shapes there.
+    """Positions of fingers, the points of their tips (p, 2) [m], and the shapes there.
 
-    shapes (p, r); columns: by finger, which of the p points are its own.
+    shapes (p, r); columns: the points of each finger.
     """
 
     positions: Mapping[str, Position]
@@ -39,7 +39,7 @@ class Layout:
 
 @dataclass(frozen=True)
 class Record:
-    """What one finger went through while it rested in one place.
+    """Accelerations under one finger while it stayed at one position.
 
     points (p, 2) [m]; times (n,) [s]; accelerations (n, p) [m/s²].
     """
@@ -50,18 +50,18 @@ class Record:
 
 
 def check_position(name: str, position: Position, *, plate: Plate) -> None:
-    """Raise InputError for a position [m] where no finger can rest."""
+    """Raise InputError for a position [m] off the plate."""
     x, y = position
     if not (math.isfinite(x) and math.isfinite(y) and plate.contains(x, y)):
         raise InputError(
-            f"finger {name} is at ({x:g}, {y:g}) m, which is not on the plate: it reaches from "
-            f"(0, 0) to ({plate.length:g}, {plate.width:g}) m"
+            f"finger {name} must be on the plate, (0, 0) to ({plate.length:g}, {plate.width:g}) m, "
+            f"got ({x:g}, {y:g}) m"
             f"{in_metres(x, y, length=plate.length, width=plate.width)}"
         )
 
 
 class Fingers:
-    """The fingers on a reduced plate, by their ids, and what they felt in the last ten seconds."""
+    """Fingers on a reduced plate by id, and their accelerations in the last ten seconds."""
 
     def __init__(self, reduced: ReducedPlate) -> None:
         self._reduced = reduced
@@ -71,9 +71,9 @@ class Fingers:
     def place(
         self, positions: Mapping[str, Position], *, reduced: ReducedPlate | None = None
     ) -> None:
-        """From now on these fingers rest here [m] and no others; InputError changes nothing.
+        """Replace the fingers by those at these positions [m]; InputError changes nothing.
 
-        reduced: the plate in the coordinates that it vibrates in from now on, where others.
+        reduced: the plate in new coordinates, where they change.
         """
         self.check(positions)
         reduced = reduced or self._reduced
@@ -82,14 +82,16 @@ class Fingers:
             self.layout = self._lay_out(positions)
 
     def check(self, positions: Mapping[str, Position]) -> None:
-        """Raise InputError for fingers that cannot rest here [m], one of them or together."""
-        if len(positions) > FINGERS_MAX:
-            raise InputError(f"{len(positions)} fingers are too many; at most {FINGERS_MAX}")
+        """Raise InputError for too many fingers, or positions [m] off the plate."""
+        if len(positions) > MAX_FINGERS:
+            raise InputError(
+                f"number of fingers must be at most {MAX_FINGERS}, got {len(positions)}"
+            )
         for name, position in positions.items():
             check_position(name, position, plate=self._reduced.plate)
 
     def record(self, times: FloatArray, accelerations: FloatArray) -> None:
-        """Keep what the points of the present layout went through: (n,) [s], (n, p) [m/s²]."""
+        """Keep samples at the points of the layout: times (n,) [s], accelerations (n, p) [m/s²]."""
         if not len(times):
             return
         if accelerations.shape[1]:
@@ -98,10 +100,9 @@ class Fingers:
             self._pieces.popleft()
 
     def felt(self, since: float, until: float) -> dict[str, Record]:
-        """What each finger went through in since <= t <= until [s], in the place where it was last.
+        """The record of each finger in since <= t <= until [s], at its last position.
 
-        A finger that moved within the window is judged by the part after its last move; one that
-        was not there at all is not in the answer.
+        Of a finger that moved only the part after the last move is included.
         """
         pieces = [piece for piece in self._pieces if piece[1][-1] >= since and piece[1][0] <= until]
         last = {name: layout for layout, _, _ in pieces for name in layout.positions}
@@ -129,11 +130,11 @@ def _join(
     since: float,
     until: float,
 ) -> Record:
-    """One finger's record from the pieces in which it rested in its last place."""
+    """The record of one finger from the pieces at its last position."""
     stay: list[tuple[FloatArray, FloatArray]] = []
     for layout, times, accelerations in reversed(pieces):
         if not stay and name not in layout.positions:
-            continue  # it was lifted before the window ended
+            continue  # lifted before the end of the window
         if layout.positions.get(name) != last.positions[name]:
             break
         inside = (times >= since) & (times <= until)

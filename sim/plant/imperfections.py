@@ -1,9 +1,6 @@
-"""How real amplifiers differ from what they are told: gain, phase, noise, and time.
+"""Imperfections of amplifiers: errors of gain and phase, noise, latency and skew.
 
-The simulated bench is perfect unless it is given some. What a channel plays then reaches the base
-of its ERA with the channel's gain and phase, with its noise on top while it plays, and late: by the
-latency that all amplifiers have, and each by its own skew. Not modelled: clocks that run at
-different speeds, distortion, and errors that drift.
+Not modelled: clock drift, distortion, drifting errors.
 """
 
 import cmath
@@ -25,27 +22,26 @@ NOISE_LOW, NOISE_HIGH = 10.0, 1000.0  # Hz
 
 @dataclass(frozen=True)
 class ChannelErrors:
-    """Of one channel: gain, a factor; phase [rad]; noise, rms in full strokes while it plays."""
+    """Errors of one channel: gain factor, phase [rad], noise rms in full strokes while it plays."""
 
     gain: float = 1.0
     phase: float = 0.0
     noise: float = 0.0
 
     def __post_init__(self) -> None:
-        """Refuse what no channel does."""
+        """Check the ranges."""
         if not all(math.isfinite(value) for value in (self.gain, self.phase, self.noise)):
             raise InputError(f"{self}: gain, phase and noise must be finite numbers")
         if self.gain < 0 or self.noise < 0:
-            raise InputError(f"{self}: gain and noise must not be below zero")
+            raise InputError(f"{self}: gain and noise must not be negative")
 
 
 @dataclass(frozen=True)
 class Imperfections:
-    """Of a whole bench; none by default.
+    """Imperfections of a bench, by default none.
 
-    channels: those that are not perfect; latency [s]: from when a command is carried out until a
-    base moves as it says; skew [s]: how much later or earlier than that an amplifier is, by name;
-    seed: of the noise.
+    channels: errors by channel; latency [s]: from a command to the base motion; skew [s]: added to
+    the latency, by amplifier; seed: of the noise.
     """
 
     channels: Mapping[Channel, ChannelErrors] = field(default_factory=dict)
@@ -54,12 +50,12 @@ class Imperfections:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        """Refuse times that are none, and a base that moves before it was told to."""
+        """Check that every delay is finite and not negative."""
         for delay in (self.latency, *(self.latency + skew for skew in self.skew.values())):
             if not (math.isfinite(delay) and delay >= 0):
                 raise InputError(
-                    f"a latency of {self.latency:g} s with skews {dict(self.skew)} would move a "
-                    f"base {delay:g} s after its command; latency plus skew must not be below zero"
+                    f"latency plus skew must be finite and not negative, got {delay:g} s (latency "
+                    f"{self.latency:g} s, skew {dict(self.skew)})"
                 )
 
     def check(self, rig: Rig) -> None:
@@ -74,11 +70,12 @@ class Imperfections:
         for name in self.skew:
             if name not in rig.amplifiers:
                 raise InputError(
-                    f"imperfections: {name} is no amplifier of the rig: {', '.join(rig.amplifiers)}"
+                    f"imperfections: amplifier must be one of {', '.join(rig.amplifiers)}, "
+                    f"got {name}"
                 )
 
     def delay(self, amplifier: str) -> float:
-        """From a command of this amplifier until bases move [s]."""
+        """Delay from a command of this amplifier to the base motion [s]."""
         return self.latency + self.skew.get(amplifier, 0.0)
 
 
@@ -92,10 +89,10 @@ def draw_imperfections(
     skew: float = 0.0,
     seed: int = 0,
 ) -> Imperfections:
-    """Errors for every channel and amplifier of a rig, the same for the same seed.
+    """Draw errors for all channels and amplifiers of a rig.
 
-    gain and phase [rad]: standard deviations, normal, those of the robust contrast by default;
-    noise: that of every channel; latency [s]; skew [s]: amplifiers differ by up to this, uniform.
+    gain, phase [rad]: standard deviations, by default those of the robust contrast; noise: rms of
+    every channel; latency [s]; skew [s]: maximum, uniformly distributed.
     """
     rng = np.random.default_rng(seed)
     channels = {
@@ -109,7 +106,7 @@ def draw_imperfections(
 
 
 def delayed(output: Output, delay: float) -> Output:
-    """What a channel plays, so much later [s]."""
+    """The output of a channel, delayed [s]."""
     if delay == 0:
         return output
     return tuple(
@@ -118,26 +115,26 @@ def delayed(output: Output, delay: float) -> Output:
 
 
 def realised(terms: Sequence[Term], errors: ChannelErrors) -> list[Term]:
-    """The motion of a base that these terms would move, with its channel's gain and phase."""
+    """Base motion with the gain and phase errors of its channel."""
     if (errors.gain, errors.phase) == (1.0, 0.0):
         return list(terms)
-    turn = cmath.rect(errors.gain, errors.phase)
-    return [replace(term, c0=turn * term.c0, c1=turn * term.c1) for term in terms]
+    phase_factor = cmath.rect(errors.gain, errors.phase)
+    return [replace(term, c0=phase_factor * term.c0, c1=phase_factor * term.c1) for term in terms]
 
 
 @dataclass(frozen=True)
 class Noise:
-    """Stationary noise from 10 to 1000 Hz, as sinusoids that the plate is solved for exactly.
+    """Stationary noise from 10 to 1000 Hz as a sum of sinusoids.
 
-    One line at a random place and with a random phase in each of 32 equal bands, all of one size;
-    near enough to a normal distribution. omegas [rad/s] and phases [rad] at time 0: (n,).
+    One line of random frequency and phase in each of 32 equal bands, all of equal amplitude; nearly
+    normally distributed. omegas [rad/s], phases [rad] at time 0: (n,).
     """
 
     omegas: tuple[float, ...]
     phases: tuple[float, ...]
 
     def terms(self, rms: float, *, start: float, end: float) -> list[Term]:
-        """Its share in the motion of a base from start to end [s]; rms [m]."""
+        """Its base motion from start to end [s]; rms [m]."""
         size = rms * math.sqrt(2 / len(self.omegas))
         return [
             Term(start, end, omega, cmath.rect(size, phase + omega * start))
@@ -146,7 +143,7 @@ class Noise:
 
 
 def draw_noise(*, seed: int, number: int) -> Noise:
-    """The noise of one of many sources, by its number."""
+    """Draw the noise of a source by its number."""
     rng = np.random.default_rng([seed, number])
     edges = np.linspace(NOISE_LOW, NOISE_HIGH, NOISE_LINES + 1)
     frequencies = rng.uniform(edges[:-1], edges[1:])

@@ -1,8 +1,7 @@
-"""The plate in time, from one change of the drive or of the contacts to the next.
+"""The plate in the time domain, advanced from one change of drive or contacts to the next.
 
-The equations of motion and their exact solutions are the model's (`model.transients.time_response`,
-which says what is not modelled); here is what a running plant adds: its clock, what the bases do
-now, and the free vibration that every change leaves behind.
+The exact solutions are those of `model.transients.time_response`; the plant adds the clock, the
+present base motion, and the free vibration that remains after each change.
 """
 
 from collections.abc import Sequence
@@ -16,19 +15,20 @@ from model.structure.actuator import Era
 from model.structure.point_load import PointLoad
 from model.transients.base_motion import Term
 from model.transients.time_response import Answer
-from sim.plant.contacts import BLOCK, Carried, ContactPlates
+from sim.plant.contacts import BLOCK, LoadedPlate, LoadedPlateCache
 
 SAMPLE_RATE = 10_000.0
-"""Of what is measured on it [Hz], unless somebody says: the peak of 500 Hz is seen to 1.3 %."""
+"""Default sampling rate [Hz]: peaks at 500 Hz are sampled to within 1.3 %."""
 
-_NEGLIGIBLE = 1e-60  # modal amplitude far below anything measurable, above slow subnormal numbers
+_NEGLIGIBLE = (
+    1e-60  # modal amplitude; smaller values are set to zero, since subnormal numbers are slow
+)
 
 
 class Plant:
-    """A reduced plate on its ERAs, with what it carries, vibrating in time.
+    """A reduced plate on its ERAs with loads, at rest at `time` [s].
 
-    time [s] starts at rest where it is told to. Raises InputError for ERAs that do not hold the
-    plate (fewer than three, or all in one line).
+    Raises InputError for ERAs that do not support the plate.
     """
 
     def __init__(
@@ -40,24 +40,24 @@ class Plant:
         time: float = 0.0,
     ) -> None:
         self.time = time
-        self._plates = ContactPlates(reduced, eras, loads)
-        self._now: Carried = self._plates.carrying((), time=time)
+        self._plates = LoadedPlateCache(reduced, eras, loads)
+        self._now: LoadedPlate = self._plates.under((), time=time)
         self._free = np.zeros(len(self._now.plate.decay), dtype=complex)
         self._answers: list[list[Answer]] = [[] for _ in eras]
 
     @property
     def reduced(self) -> ReducedPlate:
-        """The plate in the coordinates that it vibrates in now; other contacts, other ones."""
+        """The plate in its present coordinates, which depend on the contacts."""
         return self._now.reduced
 
     @property
     def contacts(self) -> tuple[PointLoad, ...]:
-        """The fingers that load it now."""
+        """The present contacts."""
         return self._now.contacts
 
     @property
     def state(self) -> tuple[FloatArray, FloatArray]:
-        """Displacement and velocity (r,) each, now, in the coordinates of `reduced`."""
+        """Present displacement and velocity, (r,) each, in the coordinates of `reduced`."""
         x = (self._now.plate.free_state @ self._free).real
         for answer in self._active():
             x = x + answer.state(self.time)
@@ -65,8 +65,8 @@ class Plant:
         return x[:r], x[r:]
 
     def set_input(self, era: int, terms: Sequence[Term]) -> None:
-        """From now on the base of this ERA moves as these terms say; terms may start later."""
-        # A term that goes on as it is leaves nothing behind: only the others are exchanged.
+        """Set the base motion of an ERA from now on; terms may start later."""
+        # Unchanged terms continue; only the others are exchanged.
         known = {answer.term: answer for answer in self._answers[era]}
         wanted = _united([term for term in terms if term.end > self.time])
         new = self._now.plate.answers(era, [term for term in wanted if term not in known])
@@ -78,16 +78,16 @@ class Plant:
         self._exchange(self._active_of(gone), self._active_of(new))
 
     def set_contacts(self, contacts: Sequence[PointLoad]) -> None:
-        """From now on these fingers load the plate and no others, each from its rest plane.
+        """Replace the contacts; each finger's spring is relaxed at the rest plane.
 
-        Displacement and velocity of the plate stay what they are at this moment, and with them its
-        energy: what a finger's own spring and mass hold comes and goes with the finger.
+        Displacement and velocity of the plate are continuous; energy in the spring and mass of a
+        finger comes and goes with it.
         """
         if tuple(contacts) == self.contacts:
             return
         q, v = self.state
         before = self._now.reduced
-        self._now = self._plates.carrying(contacts, time=self.time)
+        self._now = self._plates.under(contacts, time=self.time)
         if self._now.reduced is not before:
             carried = self._now.reduced.carried_over_from(before)
             q, v = carried @ q, carried @ v
@@ -95,37 +95,37 @@ class Plant:
             self._now.plate.answers(era, [answer.term for answer in answers])
             for era, answers in enumerate(self._answers)
         ]
-        left = np.concatenate([q, v])
+        remainder = np.concatenate([q, v])
         for answer in self._active():
-            left = left - answer.state(self.time)
-        self._free = self._now.plate.to_free @ left
+            remainder = remainder - answer.state(self.time)
+        self._free = self._now.plate.to_free @ remainder
 
     def advance(
         self, to_time: float, *, sample_rate: float, shapes: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Let the plate vibrate until to_time [s]; times (n,) [s], accelerations (n, p) [m/s²].
+        """Advance to a time [s]; returns times (n,) [s] and accelerations (n, p) [m/s²].
 
-        shapes (p, r): those of `reduced` at the points to measure at. Samples lie on the fixed grid
-        k / sample_rate [Hz], those after the present time up to and including to_time.
+        shapes (p, r): of `reduced` at the points. Samples lie on the grid k / sample_rate [Hz],
+        after the present time up to and including to_time.
         """
         first = np.floor(self.time * sample_rate) + 1
         last = np.floor(to_time * sample_rate)
         times = np.arange(first, last + 1) / sample_rate
-        # Few points are sampled as they are, many by way of the coordinates.
-        seen = shapes if len(shapes) < 2 * shapes.shape[1] else np.eye(shapes.shape[1])
-        samples = np.empty((len(times), len(seen)))
+        # Few points are sampled directly, many by way of the coordinates.
+        points = shapes if len(shapes) < 2 * shapes.shape[1] else np.eye(shapes.shape[1])
+        samples = np.empty((len(times), len(points)))
         done = 0
         for boundary in self._boundaries(to_time):
             upto = int(np.searchsorted(times, boundary))
-            self._sample(times[done:upto], samples[done:upto], sample_rate, seen)
+            self._sample(times[done:upto], samples[done:upto], sample_rate, points)
             done = upto
             self._pass(boundary)
-        self._sample(times[done:], samples[done:], sample_rate, seen)
+        self._sample(times[done:], samples[done:], sample_rate, points)
         self._coast(to_time)
-        return times, samples if seen is shapes else samples @ shapes.T
+        return times, samples if points is shapes else samples @ shapes.T
 
     def skip(self, to_time: float) -> None:
-        """Let the plate vibrate until to_time [s] without looking at it."""
+        """Advance to a time [s] without sampling."""
         if to_time <= self.time:
             return
         for boundary in self._boundaries(to_time):
@@ -148,7 +148,7 @@ class Plant:
         return sorted(moment for moment in moments if self.time < moment <= to_time)
 
     def _exchange(self, before: Sequence[Answer], after: Sequence[Answer]) -> None:
-        """Replace particular solutions, and keep displacement and velocity as they are."""
+        """Replace particular solutions; displacement and velocity stay continuous."""
         if before or after:
             jump = np.zeros(self._now.plate.free_state.shape[0])
             for answer in before:
@@ -163,7 +163,7 @@ class Plant:
         self.time = to_time
 
     def _pass(self, boundary: float) -> None:
-        """Go to a moment at which terms start or end."""
+        """Advance to a time at which terms start or end."""
         before = self._active()
         self._coast(boundary)
         after = self._active()
@@ -177,33 +177,33 @@ class Plant:
         ]
 
     def _sample(
-        self, times: FloatArray, out: FloatArray, sample_rate: float, seen: FloatArray
+        self, times: FloatArray, out: FloatArray, sample_rate: float, points: FloatArray
     ) -> None:
-        """Write what is seen of the accelerations at times on the grid, the drive being as now.
+        """Write accelerations at times on the grid under the present drive.
 
-        seen: (q, r); out: (n, q).
+        points: shapes (q, r); out: (n, q).
         """
         if not len(times):
             return
         decay = self._now.plate.decay
         free = self._free * np.exp(decay * (times[0] - self.time))
-        shown = ((seen @ self._now.plate.free_acceleration) * free).T
+        modal = ((points @ self._now.plate.free_acceleration) * free).T
         table = self._now.exponentials(sample_rate)
-        forced = _Forced(self._active(), seen)
+        forced = _ForcedResponse(self._active(), points)
         for start in range(0, len(times), BLOCK):
             block = times[start : start + BLOCK]
             into = out[start : start + BLOCK]
             if start:
-                shown = shown * np.exp(decay * (BLOCK / sample_rate))[:, None]
-            if shown.any():
-                np.matmul(table[: len(block)], np.vstack([shown.real, shown.imag]), out=into)
+                modal = modal * np.exp(decay * (BLOCK / sample_rate))[:, None]
+            if modal.any():
+                np.matmul(table[: len(block)], np.vstack([modal.real, modal.imag]), out=into)
             else:
                 into[:] = 0
             forced.add(block, into)
 
 
 def _united(terms: Sequence[Term]) -> list[Term]:
-    """The same motion in terms that differ in when they hold, or in frequency."""
+    """Merge terms of equal interval and frequency."""
     united: dict[tuple[float, float, float], Term] = {}
     for term in terms:
         key = (term.start, term.end, term.omega)
@@ -215,28 +215,28 @@ def _united(terms: Sequence[Term]) -> list[Term]:
     return list(united.values())
 
 
-class _Forced:
-    """What is seen of the accelerations that the bases' terms force, (q, r) telling what is."""
+class _ForcedResponse:
+    """Forced accelerations at points of shapes (q, r)."""
 
-    def __init__(self, active: Sequence[Answer], seen: FloatArray) -> None:
+    def __init__(self, active: Sequence[Answer], points: FloatArray) -> None:
         self._starts = np.array([answer.term.start for answer in active])
         self._omegas = np.array([answer.term.omega for answer in active])
-        r = seen.shape[1]
+        r = points.shape[1]
         b0 = np.array([answer.b0 for answer in active]).reshape(-1, r)
         b1 = np.array([answer.b1 for answer in active]).reshape(-1, r)
         s = 1j * self._omegas[:, None]
-        constant = (s**2 * b0 + 2 * s * b1) @ seen.T
+        constant = (s**2 * b0 + 2 * s * b1) @ points.T
         self._constant = np.vstack([constant.imag, constant.real])
-        growth = (s**2 * b1) @ seen.T
+        growth = (s**2 * b1) @ points.T
         self._growth = np.vstack([growth.imag, growth.real]) if b1.any() else None
 
     def add(self, times: FloatArray, out: FloatArray) -> None:
-        """Add it at times (n,) [s] to out (n, q)."""
+        """Add the response at times (n,) [s] to out (n, q)."""
         if not len(self._omegas):
             return
         tau = times[:, None] - self._starts
         angle = self._omegas * tau
-        turn = np.hstack([np.cos(angle), np.sin(angle)])
-        out += turn @ self._constant
+        phase_factor = np.hstack([np.cos(angle), np.sin(angle)])
+        out += phase_factor @ self._constant
         if self._growth is not None:
-            out += (turn * np.hstack([tau, tau])) @ self._growth
+            out += (phase_factor * np.hstack([tau, tau])) @ self._growth

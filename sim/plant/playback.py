@@ -1,7 +1,6 @@
-"""An excitation played straight on the plate in time, and what each fingertip felt of it.
+"""Play an excitation on the plate in the time domain, without wires and amplifiers.
 
-No wire and no amplifier stand between, as they do on the bench: from rest on the bases move exactly
-as they are told, along shaped onsets or a ramp.
+From rest the bases move exactly as commanded, along shaped onsets or a ramp.
 """
 
 from dataclasses import dataclass
@@ -29,23 +28,19 @@ from sim.plant.finger import Record
 from sim.plant.plant import SAMPLE_RATE, Plant
 
 STEADY = 0.25
-"""The last part [s] of what was played, in which steady amplitudes are read.
+"""Length [s] of the last part, in which steady amplitudes are fitted; resolves 10 Hz."""
 
-A quarter of a second tells frequencies 10 Hz apart from each other.
-"""
-
-LONGEST = 10.0
-"""More [s] than any mode of a plate rings; ten fingers fill 150 megabytes by then."""
+MAX_DURATION = 10.0
+"""Longest playback [s]; ten fingers take 150 MB."""
 
 
 @dataclass(frozen=True, eq=False)
 class Playback:
-    """What fingertips went through while an excitation played, from rest at time 0 on.
+    """Records of fingertips while an excitation played, from rest at time 0.
 
-    frequencies (f,) [Hz]: what was driven; targets, quiet: the record of each finger; settled [s]:
-    from when on the bases moved steadily. Measures are defined and named as those of a `Pattern`;
-    those of the steady vibration are read in the last STEADY seconds, and are true where the plate
-    does not ring any more by then, which takes it from 50 ms to a second.
+    frequencies (f,) [Hz]: driven; targets, quiet: records of the fingers; settled [s]: end of the
+    onset. Measures are named as those of a `Pattern`; steady ones are fitted to the last STEADY
+    seconds, after the plate has settled (50 ms to 1 s).
     """
 
     frequencies: tuple[float, ...]
@@ -60,7 +55,7 @@ class Playback:
 
     @property
     def level_db_sl(self) -> float:
-        """Steady level at the target [dB SL], mean over its fingertip; of several the least."""
+        """Steady level at the target [dB SL], mean over its fingertip; minimum over targets."""
         return min(mean_level_db_sl(*_tones(felt)) for felt in self._felt[: len(self.targets)])
 
     @property
@@ -92,7 +87,7 @@ class Playback:
 
     @cached_property
     def _felt(self) -> tuple[Felt, ...]:
-        """What each finger felt steadily, targets first."""
+        """Steady vibration of each finger, targets first."""
         return tuple(
             feel(self._last(record), self.frequencies) for record in (*self.targets, *self.quiet)
         )
@@ -114,20 +109,19 @@ def play(
     onset: Envelopes | None = None,
     finger_load: FingerLoad | None = None,
 ) -> Playback:
-    """Let an excitation play for a while [s] on a plate that is at rest, under these fingers.
+    """Play an excitation for a duration [s] on a plate at rest, under these fingers.
 
-    reduced: the rig's plate for forces at its ERAs and loads; fingers: targets and quiet ones;
-    ramp [s], or onset in its place: how it starts; finger_load: what each finger does to the plate,
-    None for fingers that only feel. Raises InputError for fingers off the plate, for an excitation
-    that the rig cannot play, and for a time in which nothing becomes steady or that is too long.
+    reduced: the rig's plate for forces at its ERAs and loads; ramp [s], or onset in its place;
+    finger_load: None for fingers without weight. Raises InputError for fingers off the plate, an
+    excitation that the rig cannot play, and a duration out of range.
     """
     fingers.check_on(rig.plate)
     frequencies, _ = base_amplitudes(excitation, rig.eras)
     settled = max(envelope.duration for envelope in onset.values()) if onset else ramp
-    if not settled < duration <= LONGEST:  # not true of NaN either
+    if not settled < duration <= MAX_DURATION:  # false for NaN, too
         raise InputError(
-            f"nothing can be played for {duration:g} s: the onset takes {settled:g} s, and "
-            f"{LONGEST:g} s are the longest; one second shows most plates settled"
+            f"duration must be above {settled:g} s (the onset) and at most {MAX_DURATION:g} s, got "
+            f"{duration:g} s; one second suffices for most plates"
         )
     plant = Plant(reduced, rig.eras, loads=rig.loads)
     contacts = (*fingers.targets, *fingers.quiet)

@@ -1,1 +1,1 @@
-"""Virtual accelerometers, recordings of what they read, and what their signals say."""
+"""Virtual accelerometers, recordings, and measures of their signals."""

@@ -1,8 +1,8 @@
-"""Virtual accelerometers on the simulated plate, one by one or as a scanning grid.
+"""Virtual accelerometers on the simulated plate.
 
-A sensor turns the acceleration across the plate at its point into readings: times its scale, plus
-white noise over the whole band up to half the sampling rate, cut off at its range, rounded to its
-resolution. Not modelled: its mass, its own resonance, an anti-alias filter, cross-axis motion.
+A reading is the acceleration times the scale, plus white noise up to half the sampling rate,
+clipped to the range and rounded to the resolution. Not modelled: mass, resonance, anti-alias
+filter, cross-axis sensitivity.
 """
 
 import math
@@ -21,9 +21,8 @@ from sim.sensors.recording import Recording
 class Accelerometer:
     """A sensor at x, y [m].
 
-    noise_density [m/s²/sqrt(Hz)]; reach: the largest acceleration that it can tell [m/s²], either
-    way; resolution: its smallest step [m/s²], 0 for none; scale: reading per truth, 1 for a sensor
-    that is right, 0 for a dead one.
+    noise_density [m/s²/sqrt(Hz)]; reach: range, plus or minus [m/s²]; resolution: step [m/s²], 0
+    for none; scale: reading per acceleration.
     """
 
     name: str
@@ -35,29 +34,28 @@ class Accelerometer:
     scale: float = 1.0
 
     def __post_init__(self) -> None:
-        """Refuse what no sensor can be."""
+        """Check the ranges."""
         for key in ("x", "y", "noise_density", "resolution", "scale"):
             if not math.isfinite(getattr(self, key)):
-                raise InputError(f"sensor {self.name}: {key} is not a finite number")
+                raise InputError(
+                    f"sensor {self.name}: {key} must be finite, got {getattr(self, key)}"
+                )
         if self.noise_density < 0 or self.resolution < 0 or not self.reach > 0:
             raise InputError(
-                f"sensor {self.name}: noise density {self.noise_density:g} and resolution "
-                f"{self.resolution:g} must not be below zero, its reach {self.reach:g} above"
+                f"sensor {self.name}: noise density and resolution must be >= 0, reach > 0, got "
+                f"{self.noise_density:g}, {self.resolution:g}, {self.reach:g}"
             )
 
 
 def positions(sensors: Sequence[Accelerometer]) -> FloatArray:
-    """Where sensors are [m], (s, 2)."""
+    """Positions of sensors [m], (s, 2)."""
     return np.array([[sensor.x, sensor.y] for sensor in sensors], dtype=float).reshape(-1, 2)
 
 
 def scanning_grid(plate: Plate, nx: int, ny: int, *, like: Accelerometer) -> list[Accelerometer]:
-    """nx by ny sensors in the middle of as many equal cells, alike but for name and place.
-
-    P1 is nearest the origin; numbers run along x first.
-    """
+    """nx by ny equal sensors in the centres of as many cells; P1 is nearest the origin, x first."""
     if nx < 1 or ny < 1:
-        raise InputError(f"a scanning grid of {nx}x{ny} points is none; take 1x1 at least")
+        raise InputError(f"scanning grid must have at least 1x1 points, got {nx}x{ny}")
     return [
         Accelerometer(
             f"P{row * nx + column + 1}",
@@ -81,10 +79,7 @@ def read_sensors(
     start: float,
     rng: np.random.Generator,
 ) -> Recording:
-    """What sensors read while the plate at their points accelerates so, (n, s) [m/s²].
-
-    start: time of the first sample [s].
-    """
+    """Readings of sensors for accelerations (n, s) [m/s²]; start: time of the first sample [s]."""
     density = np.array([sensor.noise_density for sensor in sensors])
     reach = np.array([sensor.reach for sensor in sensors])
     resolution = np.array([sensor.resolution for sensor in sensors])

@@ -1,4 +1,4 @@
-"""Virtual accelerometers on a running bench: what they read in the last ten seconds."""
+"""Virtual accelerometers on a running bench, with their readings of the last ten seconds."""
 
 from collections import deque
 from collections.abc import Sequence
@@ -13,11 +13,11 @@ from sim.plant.finger import KEPT
 from sim.sensors.accelerometer import Accelerometer, positions, read_sensors
 from sim.sensors.recording import Recording
 
-SENSORS_MAX = 64  # ten seconds of them take 50 MB
+MAX_SENSORS = 64  # ten seconds of readings take 50 MB
 
 
 class Accelerometers:
-    """The sensors on a bench, none at first; their noise is the same every time."""
+    """The sensors on a bench, at first none; their noise is reproducible."""
 
     def __init__(self, bench: Bench) -> None:
         self._bench = bench
@@ -27,22 +27,22 @@ class Accelerometers:
 
     @property
     def shapes(self) -> FloatArray:
-        """Where they listen, in the coordinates that the plate has now."""
+        """Shapes at the sensors, in the present coordinates of the plate."""
         return self._bench.shapes_at(positions(self.sensors))
 
     def place(self, sensors: Sequence[Accelerometer]) -> None:
-        """From now on these sensors are there and no others; InputError changes nothing."""
-        if len(sensors) > SENSORS_MAX:
-            raise InputError(f"{len(sensors)} sensors are too many; at most {SENSORS_MAX}")
+        """Replace the sensors; InputError changes nothing."""
+        if len(sensors) > MAX_SENSORS:
+            raise InputError(f"number of sensors must be at most {MAX_SENSORS}, got {len(sensors)}")
         names = [sensor.name for sensor in sensors]
         if len(set(names)) < len(names):
-            raise InputError("two sensors have one name; give each its own")
+            raise InputError(f"names of sensors must be unique, got {', '.join(names)}")
         plate = self._bench.rig.plate
         for sensor in sensors:
             if not plate.contains(sensor.x, sensor.y):
                 raise InputError(
-                    f"sensor {sensor.name} is at ({sensor.x:g}, {sensor.y:g}) m, which is not on "
-                    f"the plate: it reaches from (0, 0) to ({plate.length:g}, {plate.width:g}) m"
+                    f"sensor {sensor.name} must be on the plate, (0, 0) to ({plate.length:g}, "
+                    f"{plate.width:g}) m, got ({sensor.x:g}, {sensor.y:g}) m"
                     f"{in_metres(sensor.x, sensor.y, length=plate.length, width=plate.width)}"
                 )
         self.sensors = tuple(sensors)
@@ -53,7 +53,7 @@ class Accelerometers:
             self._bench.taps.append(self)
 
     def record(self, times: FloatArray, accelerations: FloatArray) -> None:
-        """Read what is there: (n,) [s], (n, s) [m/s²]."""
+        """Read accelerations: times (n,) [s], (n, s) [m/s²]."""
         if not len(times):
             return
         self._pieces.append(
@@ -69,14 +69,14 @@ class Accelerometers:
             self._pieces.popleft()
 
     def read(self, since: float, until: float) -> Recording:
-        """What they read in since <= t < until [s]; InputError where there is nothing."""
+        """Readings in since <= t < until [s]; InputError where there are none."""
         pieces = [
             piece for piece in self._pieces if piece.times[-1] >= since and piece.start < until
         ]
         if not pieces:
             raise InputError(
-                f"no sensor read anything from {since:g} to {until:g} s; place sensors first, and "
-                f"ask for no more than the last {KEPT:g} s"
+                f"no readings from {since:g} to {until:g} s; place sensors first, and ask for the "
+                f"last {KEPT:g} s at most"
             )
         first = pieces[0]
         whole = Recording(

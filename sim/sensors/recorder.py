@@ -1,8 +1,7 @@
-"""A recording that is being made: what sensors read and fingers feel, from now until its end.
+"""Record sensors and fingers of a bench to a file.
 
-Samples wait in a file without a name beside the one that is wanted, which appears at the end and
-whole: a run that is killed leaves nothing behind. A recording that has become too long goes on no
-further, and says so.
+Samples are spooled to an unnamed file in the same folder; the recording is written at the end, so a
+killed run leaves nothing behind. A recording stops at its maximum size.
 """
 
 import tempfile
@@ -16,15 +15,15 @@ from model.errors import InputError
 from sim.bench.bench import Bench
 from sim.sensors.accelerometer import Accelerometer, positions, read_sensors
 from sim.sensors.recording import Recording
-from sim.sensors.recording_file import check_recordable, values_max, write_recording
+from sim.sensors.recording_file import check_recordable, max_values, write_recording
 
 
 class Recorder:
-    """Records a bench to a file; its ending is its format.
+    """Records a bench to a file in the format of its suffix.
 
-    sensors: read as they are, noise and all; fingers: their ids, the acceleration at the middle of
-    each, zero where it is not on the plate. Raises InputError for a place that cannot be written,
-    or nothing to record.
+    sensors: readings, noise included; fingers: ids, the acceleration at the centre of each, zero
+    while it is off the plate. Raises InputError for a path that cannot be written, or nothing to
+    record.
     """
 
     def __init__(
@@ -41,22 +40,19 @@ class Recorder:
         self._fingers = tuple(fingers)
         names = [*(sensor.name for sensor in sensors), *(f"finger_{id}" for id in fingers)]
         if not names:
-            raise InputError(
-                f"{path}: nothing to record: there is neither a sensor nor a finger on the plate; "
-                "add --sensor NAME=X,Y or --finger X,Y"
-            )
+            raise InputError(f"{path}: nothing to record; add --sensor NAME=X,Y or --finger X,Y")
         check_recordable(path, names, sample_rate=bench.sample_rate)
         self._names = tuple(names)
-        self._room = values_max(path) // len(names)
+        self._room = max_values(path) // len(names)
         at = [bench.fingers.layout.positions[id] for id in fingers]
         self._points = np.concatenate([positions(sensors), np.array(at).reshape(-1, 2)])
         self._rng = np.random.default_rng(0)
         try:
-            # Unbuffered, so that a full disk is told by the write, and not again at the end.
+            # Unbuffered, so that a full disk fails the write itself.
             self._spool = tempfile.TemporaryFile(dir=path.parent, buffering=0)  # noqa: SIM115
         except OSError as error:
             raise InputError(
-                f"{path}: nothing can be written there: {error.strerror}; choose another folder"
+                f"{path}: cannot be written: {error.strerror}; choose another folder"
             ) from error
         self._start = 0.0
         self._count = 0
@@ -65,17 +61,17 @@ class Recorder:
 
     @property
     def is_full(self) -> bool:
-        """Whether it has become too long, and records no more."""
+        """Whether it has reached its maximum size."""
         return self._count >= self._room
 
     @property
     def seconds(self) -> float:
-        """How long it is [s]."""
+        """Its duration [s]."""
         return self._count / self._bench.sample_rate
 
     @property
     def shapes(self) -> FloatArray:
-        """Where it listens now: fingers move."""
+        """Shapes at sensors and fingers, which may move."""
         layout = self._bench.fingers.layout
         at_sensors = self._bench.shapes_at(positions(self._sensors))
         rows = [
@@ -87,7 +83,7 @@ class Recorder:
         return np.vstack([at_sensors, *rows])
 
     def record(self, times: FloatArray, accelerations: FloatArray) -> None:
-        """Keep what is read: (n,) [s], (n, p) [m/s²]."""
+        """Spool readings: times (n,) [s], accelerations (n, p) [m/s²]."""
         if not len(times) or self._failure is not None:
             return
         if not self._count:
@@ -105,26 +101,26 @@ class Recorder:
         try:
             while left:
                 left = left[self._spool.write(left) :]
-        except OSError as error:  # a full disk must not end the far end
+        except OSError as error:  # a full disk must not end the simulation
             self._failure = error
         else:
             self._count += len(accelerations)
 
     def stop(self) -> None:
-        """Record no more; to be called where the bench is."""
+        """Stop recording, in the thread of the bench."""
         if self in self._bench.taps:
             self._bench.taps.remove(self)
 
     def finish(self) -> None:
-        """Write the file and forget the samples; any thread may do it, once it has been stopped.
+        """Write the file and discard the spool, in any thread, after `stop`.
 
-        Raises InputError for a recording that has not even two samples, OSError.
+        Raises InputError for fewer than two samples, OSError.
         """
         with self._spool:
             if self._failure is not None:
                 raise InputError(
-                    f"{self.path}: the recording broke off after {self.seconds:g} s, and is not "
-                    f"written: {self._failure.strerror}; make room"
+                    f"{self.path}: recording failed after {self.seconds:g} s and is not written: "
+                    f"{self._failure.strerror}; free disk space"
                 )
             shape = (self._count, len(self._names))
             samples = (

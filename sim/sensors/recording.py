@@ -1,4 +1,4 @@
-"""Readings of sensors over a while: who read, where, from when on and how often."""
+"""Recordings: readings of sensors over time."""
 
 import math
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ from model.errors import InputError
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """Readings [m/s²] of some sensors, samples (n, s), the first at start [s].
+    """Readings [m/s²] of sensors, samples (n, s), the first at start [s].
 
     names, points (s, 2) [m]: of the sensors; sample_rate [Hz].
     """
@@ -23,25 +23,26 @@ class Recording:
     samples: FloatArray
 
     def __post_init__(self) -> None:
-        """Refuse what does not fit together."""
+        """Check shapes and sampling rate."""
         shape = (len(self.samples), len(self.names))
         if np.shape(self.samples) != shape or np.shape(self.points) != (len(self.names), 2):
             raise InputError(
-                f"a recording of {len(self.names)} sensors needs as many columns and points"
+                f"samples and points must match the {len(self.names)} sensors, got shapes "
+                f"{np.shape(self.samples)} and {np.shape(self.points)}"
             )
         if not (math.isfinite(self.sample_rate) and self.sample_rate > 0):
-            raise InputError(f"sampling rate {self.sample_rate} Hz is none, must be above zero")
+            raise InputError(f"sampling rate must be positive, got {self.sample_rate} Hz")
 
     @property
     def times(self) -> FloatArray:
-        """When each sample was taken [s], (n,)."""
+        """Time of each sample [s], (n,)."""
         return np.asarray(self.start + np.arange(len(self.samples)) / self.sample_rate)
 
     def during(self, since: float, until: float) -> "Recording":
         """The part with since <= t < until [s]."""
         inside = np.flatnonzero((self.times >= since) & (self.times < until))
         if len(inside) == 0:
-            raise InputError(f"nothing was recorded from {since:g} to {until:g} s")
+            raise InputError(f"no samples from {since:g} to {until:g} s")
         return Recording(
             self.names,
             self.points,

@@ -1,7 +1,7 @@
-"""Recordings written to files and read again; the ending of its name says what kind a file is.
+"""Read and write recordings; the suffix selects the format.
 
-A file appears when it is whole, or not at all. A new kind is a file in `sim.sensors.formats` and a
-line in `_FORMATS`.
+Files are replaced atomically. A new format is a module in `sim.sensors.formats` and a line in
+`_FORMATS`.
 """
 
 from collections.abc import Sequence
@@ -21,21 +21,21 @@ _FORMATS = {".csv": CSV, ".wav": WAV, ".uff": UFF, ".unv": UFF}
 
 
 def write_recording(path: Path, recording: Recording) -> None:
-    """Write a recording in the format that its name ends in: .csv, .wav, .uff or .unv.
+    """Write a recording in the format of the suffix: .csv, .wav, .uff or .unv.
 
-    Raises InputError for another ending and what a format cannot hold, OSError with the name.
+    Raises InputError for another suffix or what the format cannot hold, OSError.
     """
     if not len(recording.samples) > 1:
-        raise InputError(f"{path}: a recording of fewer than two samples cannot be written")
+        raise InputError(f"{path}: a recording must have at least two samples")
     if not np.isfinite(recording.samples).all():
-        raise InputError(f"{path}: the recording has values that are not finite")
+        raise InputError(f"{path}: samples must be finite")
     check_recordable(path, recording.names, sample_rate=recording.sample_rate)
-    form = _of_ending(path)
+    kind = _format_of(path)
     part = path.with_name(f".{path.stem}.part{path.suffix}")
-    # The file itself comes last: where it is, what stands beside it is there.
-    parts = dict(zip((*form.beside(part), part), (*form.beside(path), path), strict=True))
+    # The main file last: where it exists, its sidecar does.
+    parts = dict(zip((*kind.sidecars(part), part), (*kind.sidecars(path), path), strict=True))
     try:
-        form.write(part, recording)
+        kind.write(part, recording)
         for made, wanted in parts.items():
             made.replace(wanted)
     except OSError as error:
@@ -46,32 +46,28 @@ def write_recording(path: Path, recording: Recording) -> None:
 
 
 def check_recordable(path: Path, names: Sequence[str], *, sample_rate: float) -> None:
-    """Raise InputError for what a file of this name cannot hold, or where another one stands.
-
-    sample_rate [Hz]; names: of what is recorded.
-    """
-    form = _of_ending(path)
-    if path.is_file() and not begins_with(path, form.start):
+    """Raise InputError for a recording that the format cannot hold, or an unrelated file there."""
+    kind = _format_of(path)
+    if path.is_file() and not begins_with(path, kind.start):
         raise InputError(
-            f"{path}: a file is there that is no recording; it is left alone. Give another name, "
-            "or remove it first"
+            f"{path}: exists and is not a recording; give another name, or remove it first"
         )
-    why_not = form.cannot_hold(names, sample_rate)
+    why_not = kind.cannot_hold(names, sample_rate)
     if why_not is not None:
         raise InputError(f"{path}: {why_not}")
 
 
-def values_max(path: Path) -> int:
-    """How many values a recording of this name may have, so that memory stays bounded."""
-    return _of_ending(path).values_max
+def max_values(path: Path) -> int:
+    """Maximum number of values of a recording in this file."""
+    return _format_of(path).max_values
 
 
 def read_recording(path: Path) -> Recording:
     """Read what `write_recording` writes; InputError, with file and line, for anything else."""
-    return _of_ending(path).read(path)
+    return _format_of(path).read(path)
 
 
-def _of_ending(path: Path) -> Format:
+def _format_of(path: Path) -> Format:
     if path.suffix.lower() not in _FORMATS:
-        raise InputError(f"{path}: a recording ends in {', '.join(_FORMATS)}")
+        raise InputError(f"{path}: suffix must be one of {', '.join(_FORMATS)}")
     return _FORMATS[path.suffix.lower()]

@@ -1,4 +1,4 @@
-"""What sensors' signals alone say of a vibration: its tones, contrast, and how it dies away."""
+"""Measures of sensor signals: tones, spectrum, contrast and reverberation time."""
 
 import math
 from collections.abc import Sequence
@@ -12,16 +12,15 @@ from model.finger.contrast import contrast_db
 from model.transients.measures import FIRST
 from sim.sensors.recording import Recording
 
-# T60 is read from -5 dB on, as in ISO 3382-1, and as deep as noise allows, for beats make steps: at
-# least to -25 dB, at most to -45 dB.
+# T60 is fitted from -5 dB, as in ISO 3382-1, down to the noise: at least -25 dB, at most -45 dB.
 _DECAY_FROM, _DECAY_TO, _DECAY_DEEPEST = -5.0, -25.0, -45.0
 _ABOVE_NOISE = 10.0  # dB
-_FLOOR_SHARE = 0.1  # of a decay's end, taken for the sensor's noise
+_FLOOR_SHARE = 0.1  # of the recording, at its end, taken as noise
 
 
 @dataclass(frozen=True, eq=False)
 class Spectrum:
-    """Peak amplitude [m/s²] by frequency (f,) [Hz], (f, s): a steady tone shows its own."""
+    """Peak amplitude (f, s) [m/s²] by frequency (f,) [Hz]."""
 
     frequencies: FloatArray
     amplitude: FloatArray
@@ -30,14 +29,14 @@ class Spectrum:
 def tone_phasors(recording: Recording, frequencies: Sequence[float]) -> ComplexArray:
     """Complex amplitude (f, s) [m/s²] of tones, Im[a exp(i omega t)], t on the plate's clock.
 
-    Least squares of all tones and a constant at once: a lock-in amplifier that separates tones
-    where the recording lasts longer than the inverse of their difference. Raises InputError for a
-    recording with fewer samples than unknowns.
+    Least squares of all tones and a constant; the recording must be longer than the inverse of the
+    smallest frequency difference. Raises InputError for fewer samples than unknowns.
     """
     count = len(frequencies)
     if len(recording.samples) < 2 * count + 1:
         raise InputError(
-            f"{count} tones cannot be told by {len(recording.samples)} samples; record longer"
+            f"{count} tones need {2 * count + 1} samples, got {len(recording.samples)}: "
+            "record longer"
         )
     angles = 2 * np.pi * np.outer(recording.times, np.asarray(frequencies, dtype=float))
     basis = np.hstack([np.sin(angles), np.cos(angles), np.ones((len(angles), 1))])
@@ -46,10 +45,10 @@ def tone_phasors(recording: Recording, frequencies: Sequence[float]) -> ComplexA
 
 
 def spectrum(recording: Recording) -> Spectrum:
-    """Amplitude spectrum with a Hann window: a tone within its bins is at most 15 % low."""
+    """Amplitude spectrum with a Hann window; tones between bins are at most 15 % low."""
     count = len(recording.samples)
     if count < 4:
-        raise InputError(f"a spectrum needs four samples, not {count}; record longer")
+        raise InputError(f"a spectrum needs at least 4 samples, got {count}; record longer")
     window = np.hanning(count + 1)[:-1]
     level = recording.samples - recording.samples.mean(axis=0)
     lines = np.fft.rfft(level * window[:, None], axis=0)
@@ -75,23 +74,21 @@ def steady_contrast_db(
 def transient_contrast_db(
     recording: Recording, *, onset: float, target: Sequence[str], quiet: Sequence[str]
 ) -> float:
-    """The same of the peaks over the first 100 ms from an onset [s] on."""
+    """Contrast [dB] of the peaks in the first 100 ms after an onset [s]."""
     peak = np.abs(recording.during(onset, onset + FIRST).samples).max(axis=0)
     return _contrast(recording, peak, target, quiet)
 
 
 def reverberation_time(recording: Recording, *, end: float) -> float:
-    """T60 [s]: how long the vibration takes to fall by 60 dB once the drive is silent at end [s].
+    """T60 [s]: time in which the vibration falls by 60 dB after the drive ends at end [s].
 
     Schroeder's backward integral of the squared signals, summed over the sensors, with the noise of
-    its last tenth taken off; a line through its level from -5 dB down to 10 dB above the noise.
-    (Beats of neighbouring modes, which bend a logarithmic envelope, are steps in the integral.)
-    Raises InputError where the recording ends, or noise begins, before the level has fallen by
-    25 dB.
+    its last tenth subtracted; a line fitted to its level from -5 dB to 10 dB above the noise.
+    Raises InputError where the level falls by less than 25 dB before noise or the end.
     """
     power = (recording.during(end, math.inf).samples ** 2).sum(axis=1)
     floor = power[-max(int(_FLOOR_SHARE * len(power)), 1) :].mean()
-    # Up to where the decay meets the noise: what comes after would only add its wander.
+    # Only up to where the decay meets the noise.
     width = max(len(power) // 200, 1)
     smooth = np.convolve(power, np.ones(width) / width, mode="same")
     last = int(np.argmax(smooth <= 2 * floor)) or len(power)
@@ -102,9 +99,8 @@ def reverberation_time(recording: Recording, *, end: float) -> float:
     inside = (level <= _DECAY_FROM) & (level >= deepest)
     if deepest > _DECAY_TO or inside.sum() < 3:
         raise InputError(
-            f"the vibration falls by {range_db:.0f} dB from {end:g} s on before it is lost in "
-            f"noise or the recording ends; {_ABOVE_NOISE - _DECAY_TO:g} dB are needed: record "
-            "longer, or drive the plate harder"
+            f"decay after {end:g} s must span {_ABOVE_NOISE - _DECAY_TO:g} dB, got "
+            f"{range_db:.0f} dB; record longer, or drive the plate harder"
         )
     times = np.arange(len(level))[inside] / recording.sample_rate
     slope = np.polyfit(times, level[inside], 1)[0]
@@ -123,8 +119,8 @@ def _columns(recording: Recording, names: Sequence[str]) -> list[int]:
     unknown = [name for name in names if name not in recording.names]
     if unknown or not names:
         raise InputError(
-            f"no sensor {unknown[0]!r} was recorded"
+            f"sensor must be one of {', '.join(recording.names)}, got {unknown[0]!r}"
             if unknown
-            else "name a sensor for target and quiet each"
+            else "target and quiet must name at least one sensor each"
         )
     return [recording.names.index(name) for name in names]

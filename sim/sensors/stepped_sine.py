@@ -1,7 +1,6 @@
-"""A modal test on the simulated plate: one ERA after the other, one frequency after the other.
+"""Stepped-sine test on the simulated plate: each ERA at each frequency, after settling.
 
-Each is left to settle and then recorded by the virtual sensors; a lock-in makes of the signals the
-acceleration per base displacement that was asked for.
+A lock-in gives acceleration per base displacement at the virtual sensors.
 """
 
 import math
@@ -34,16 +33,15 @@ def record_responses(
     sample_rate: float = 5000.0,
     seed: int = 0,
 ) -> Responses:
-    """Measure the frequency responses of a rig's plate in time, at a level 0..1 of full stroke.
+    """Measure the frequency responses of a rig's plate, at a level 0..1 of full stroke.
 
-    The plate vibrates with all that the rig says, gains of its ERAs among them; its structural
-    damping is the viscous equivalent of `model.reduction.modal_matrices`. Raises InputError for
-    frequencies [Hz] that the sampling rate [Hz] cannot tell.
+    Structural damping is the viscous equivalent of `model.reduction.modal_matrices`. Raises
+    InputError for frequencies [Hz] above 0.4 of the sampling rate [Hz].
     """
     if frequencies.max() >= 0.4 * sample_rate:
         raise InputError(
-            f"{frequencies.max():g} Hz is too high for {sample_rate:g} samples a second; take more "
-            "than 2.5 samples in a period"
+            f"frequencies must be below {0.4 * sample_rate:g} Hz at a sampling rate of "
+            f"{sample_rate:g} Hz, got {frequencies.max():g} Hz"
         )
     attached = np.vstack([era_positions(rig.eras), load_positions(rig.loads)])
     reduced = reduce_plate(
@@ -58,7 +56,7 @@ def record_responses(
             omega = 2 * math.pi * float(frequency)
             begin = plant.time
             base = level * era.stroke
-            # Begun in the phase that the plate's clock has, so that phases are those of the clock.
+            # The phase is that of the plate's clock.
             tone = Term(begin, math.inf, omega, base * np.exp(1j * omega * begin))
             plant.set_input(number, [tone])
             plant.skip(begin + _SETTLE)

@@ -1,1 +1,1 @@
-"""How bytes get to a far end: pseudo-terminals, and lines that take time and have faults."""
+"""Transport of bytes to a far end: pseudo-terminals, and lines with delay and faults."""

@@ -1,6 +1,6 @@
-"""A simulated wire: how long telegrams take on it each way, and what befalls them.
+"""A simulated wire: transmission time and injected faults.
 
-Not modelled: the gaps between the bytes of one telegram; it arrives whole, when its last bit would.
+Not modelled: gaps between the bytes of a frame; it arrives at once, at the time of its last bit.
 """
 
 import asyncio
@@ -12,10 +12,10 @@ from sim.faults.fault_window import Faults, Toward
 
 
 class Line:
-    """One direction. Carries telegrams one way, in the running event loop.
+    """One direction of a wire, in the running event loop.
 
-    deliver is called with each that arrives; bits_per_second: of the wire, None for one that takes
-    no time; bits_per_byte: on it, framing included.
+    deliver: called with each frame that arrives; bits_per_second: None for no transmission time;
+    bits_per_byte: framing included.
     """
 
     def __init__(
@@ -32,37 +32,37 @@ class Line:
         self._faults = faults
         self._byte_time = bits_per_byte / bits_per_second if bits_per_second else 0.0
         self._free_from = 0.0
-        self._on_the_way: set[asyncio.TimerHandle] = set()
+        self._in_flight: set[asyncio.TimerHandle] = set()
 
-    def send(self, telegram: bytes) -> None:
-        """Put a telegram on the wire; it waits for those before it."""
+    def send(self, frame: bytes) -> None:
+        """Send a frame; it queues behind earlier ones."""
         now = clock.now()
-        arriving = self._faults.pass_on(telegram, toward=self._toward, time=now)
+        arriving = self._faults.pass_on(frame, toward=self._toward, time=now)
         for delay, data in arriving:
             self._free_from = max(now, self._free_from) + len(data) * self._byte_time
             due = self._free_from + delay
-            if due <= now and not self._on_the_way:
+            if due <= now and not self._in_flight:
                 self._deliver(data)
             else:
                 self._deliver_later(due - now, data)
 
     def close(self) -> None:
-        """What is on the way is lost."""
-        for timer in self._on_the_way:
+        """Discard the frames in flight."""
+        for timer in self._in_flight:
             timer.cancel()
-        self._on_the_way.clear()
+        self._in_flight.clear()
 
     def _deliver_later(self, delay: float, data: bytes) -> None:
         def arrive() -> None:
-            self._on_the_way.discard(timer)
+            self._in_flight.discard(timer)
             self._deliver(data)
 
         timer = asyncio.get_running_loop().call_later(delay, arrive)
-        self._on_the_way.add(timer)
+        self._in_flight.add(timer)
 
 
 class TwoWayLine:
-    """A wire: `inward` carries to the amplifier, `outward` to the host; the rest as for `Line`."""
+    """Both directions: `inward` to the amplifier, `outward` to the host; see `Line`."""
 
     def __init__(
         self,
@@ -80,6 +80,6 @@ class TwoWayLine:
         self.outward = make(to_host, toward="host")
 
     def close(self) -> None:
-        """What is on the way is lost."""
+        """Discard the frames in flight."""
         self.inward.close()
         self.outward.close()

@@ -1,4 +1,4 @@
-"""A pseudo-terminal as a line: a host opens one side of it, the far end reads the other."""
+"""Pseudo-terminals: the host opens one side, the far end the other."""
 
 import asyncio
 import os
@@ -16,9 +16,9 @@ _READ_MAX = 4096
 
 
 class Terminal(ABC):
-    """A serial line that can be pulled out and put in again, as far ends see it.
+    """The far end's side of a serial line that can be unplugged.
 
-    dropped: writes that nobody made room for; an amplifier does not wait for its host.
+    dropped: writes lost because the host did not read.
     """
 
     dropped: int
@@ -30,7 +30,7 @@ class Terminal(ABC):
 
     @abstractmethod
     def plug_in(self) -> None:
-        """Make the line, where there is none; raises LinkError."""
+        """Create the line if it is unplugged; raises LinkError."""
 
     @abstractmethod
     def listen(self) -> None:
@@ -38,10 +38,10 @@ class Terminal(ABC):
 
     @abstractmethod
     def unplug(self) -> None:
-        """Take the line away: for the host it is gone."""
+        """Remove the line."""
 
     def plug(self, is_plugged: bool) -> None:
-        """Pull the line out, or put it in again and read from then on."""
+        """Unplug the line, or plug it in and read again."""
         if is_plugged:
             self.plug_in()
             self.listen()
@@ -50,37 +50,36 @@ class Terminal(ABC):
 
     @abstractmethod
     def close(self) -> None:
-        """Give everything back."""
+        """Release all resources."""
 
     @abstractmethod
     def write(self, data: bytes) -> None:
-        """To the host; nothing where the line is unplugged."""
+        """Write to the host; discarded while unplugged."""
 
 
 class TerminalMaker(Protocol):
-    """Makes terminals; see `make_terminal`."""
+    """Factory of terminals; see `make_terminal`."""
 
     def __call__(self, on_data: Callable[[bytes], None], *, unpluggable: bool) -> Terminal:
         """A terminal."""
 
 
 TERMINAL_MAKER: ContextVar[TerminalMaker | None] = ContextVar("TERMINAL_MAKER", default=None)
-"""Who makes the terminals in this context; the system as a rule, a bench in virtual time itself."""
+"""The factory in this context; None for the system's pseudo-terminals."""
 
 
 def make_terminal(on_data: Callable[[bytes], None], *, unpluggable: bool = False) -> Terminal:
-    """A serial line; on_data is called with what the host has written. Raises LinkError.
+    """Create a serial line; on_data: called with bytes from the host. Raises LinkError.
 
-    unpluggable: its port has the same path when it is plugged in again.
+    unpluggable: its port keeps its path when it is plugged in again.
     """
     return (TERMINAL_MAKER.get() or PseudoTerminal)(on_data, unpluggable=unpluggable)
 
 
 class PseudoTerminal(Terminal):
-    """A terminal of the system's.
+    """A pseudo-terminal of the system.
 
-    unpluggable: the port is named by a link that outlives the pseudo-terminal, for each time it is
-    plugged in it is another one.
+    unpluggable: the port is a symbolic link, which outlives each pseudo-terminal.
     """
 
     def __init__(self, on_data: Callable[[bytes], None], *, unpluggable: bool = False) -> None:
@@ -101,17 +100,17 @@ class PseudoTerminal(Terminal):
         return os.ttyname(self._slave)
 
     def plug_in(self) -> None:
-        """Make the line, where there is none; raises LinkError."""
+        """Create the line if it is unplugged; raises LinkError."""
         if self._master >= 0:
             return
         try:
             self._master, self._slave = os.openpty()
         except OSError as error:
             raise LinkError(
-                f"the system gives no pseudo-terminal ({error.strerror}); close programs that hold "
-                "some, or raise their number"
+                f"cannot create a pseudo-terminal: {error.strerror}; close programs that use some, "
+                "or raise kernel.pty.max"
             ) from error
-        # The slave stays open here, so that a host may come and go without a hang-up.
+        # Kept open, so that hosts may disconnect without a hang-up.
         tty.setraw(self._slave)
         os.set_blocking(self._master, False)
         if self._folder is not None:
@@ -122,7 +121,7 @@ class PseudoTerminal(Terminal):
         asyncio.get_running_loop().add_reader(self._master, self._readable)
 
     def unplug(self) -> None:
-        """Take the line away: for the host it is gone."""
+        """Remove the line."""
         if self._master < 0:
             return
         asyncio.get_running_loop().remove_reader(self._master)
@@ -133,13 +132,13 @@ class PseudoTerminal(Terminal):
             Path(self.port).unlink(missing_ok=True)
 
     def close(self) -> None:
-        """Give everything back."""
+        """Release all resources."""
         self.unplug()
         if self._folder is not None:
             self._folder.cleanup()
 
     def write(self, data: bytes) -> None:
-        """To the host; nothing where the line is unplugged."""
+        """Write to the host; discarded while unplugged."""
         if self._master < 0:
             return
         try:

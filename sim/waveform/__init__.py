@@ -1,1 +1,1 @@
-"""What a channel plays, described in time: sinusoids that fade, or follow an envelope."""
+"""Output of a channel in time: sinusoids that fade, or follow an envelope."""

@@ -6,11 +6,11 @@ from dataclasses import dataclass, replace
 
 @dataclass(frozen=True, slots=True)
 class FadingTone:
-    """gain(t) Im[full exp(2 pi i frequency (t - origin))] from start on.
+    """gain(t) Im[full exp(2 pi i frequency (t - origin))] from start.
 
-    frequency [Hz]; full: complex amplitude at gain 1, in full strokes; origin: when its phase was
-    set [s]. The gain goes from gain_from at start [s] to gain_to along a raised cosine of ramp [s]
-    and stays there; a ramp of 0 is a jump.
+    frequency [Hz]; full: complex amplitude at gain 1, in full strokes; origin [s]: of its phase.
+    The gain goes from gain_from at start [s] to gain_to along a raised cosine of ramp [s];
+    a ramp of 0 is a step.
     """
 
     frequency: float
@@ -23,22 +23,22 @@ class FadingTone:
 
     @property
     def settled(self) -> float:
-        """When the fade is over [s]."""
+        """End of the fade [s]."""
         return self.start + self.ramp
 
     @property
     def lasts(self) -> bool:
-        """Whether it stays, once it has settled."""
+        """Whether it is audible once settled."""
         return self.gain_to > 0
 
     @property
     def settled_amplitude(self) -> complex:
-        """Complex amplitude in full strokes once it has settled."""
+        """Settled complex amplitude in full strokes."""
         return self.full * self.gain_to
 
     @property
     def silent_from(self) -> float:
-        """When the tone has faded out [s]; infinity for one that stays."""
+        """Time of silence [s]; infinity for a lasting tone."""
         return self.settled if self.gain_to == 0 else math.inf
 
     def gain(self, time: float) -> float:
@@ -53,9 +53,9 @@ class FadingTone:
         return self.full * self.gain(time)
 
     def fade_out(self, time: float, *, ramp: float) -> "FadingTone":
-        """This tone, silent within ramp [s]; a fade-out that ends sooner is left as it is.
+        """This tone, silent within ramp [s]; a fade-out that ends sooner is kept.
 
-        A fade that is cut short goes on from the gain it has reached: its value is continuous.
+        An interrupted fade continues from its present gain.
         """
         if self.silent_from <= time + ramp:
             return self

@@ -1,7 +1,6 @@
-"""What a channel of a simulated amplifier plays: sinusoids that fade, or follow an envelope.
+"""Output of a channel: a sum of sinusoids that fade, or follow an envelope.
 
-Every change is a fade: what was played fades out while what shall be played fades in, both along
-the same raised cosine, so that their gains add up to one at any moment.
+Every change is a cross-fade along a raised cosine, whose two gains add up to one.
 """
 
 import cmath
@@ -15,7 +14,7 @@ from sim.waveform.shaped_tone import ShapedTone
 Tone: TypeAlias = FadingTone | ShapedTone
 
 Output: TypeAlias = tuple[Tone, ...]
-"""What one channel plays: the sum of these tones."""
+"""The output of one channel: the sum of these tones."""
 
 
 def fade_to(
@@ -27,11 +26,10 @@ def fade_to(
     amplitude: complex = 0j,
     keep_phase: bool = False,
 ) -> Output:
-    """What a channel plays once it was told at time [s] to go to this tone within ramp [s].
+    """The output after a command at a time [s] to fade to a tone within ramp [s].
 
-    amplitude in full strokes, 0 is silence. Its phase counts from now, unless keep_phase is
-    set and the channel is about to play this frequency already: then it counts from where that
-    one's does.
+    amplitude in full strokes, 0 for silence. Its phase counts from `time`; with keep_phase, from
+    the origin of a lasting tone of the same frequency.
     """
     faded = (tone.fade_out(time, ramp=ramp) for tone in playing)
     fading = tuple(tone for tone in faded if tone.silent_from > time)
@@ -56,27 +54,27 @@ def shape_to(
     amplitude: complex,
     keep_phase: bool,
 ) -> Output:
-    """What a channel plays once it was told at time [s] to go to this tone along an envelope.
+    """The output after a command at a time [s] to follow an envelope to a tone.
 
-    amplitude and knots in full strokes, ramp and step in s. Where the channel is about to play this
-    frequency already and keep_phase is set, the tone that does goes on from the amplitude it has;
-    else the new one begins at zero. All others fade out within ramp.
+    amplitude and knots in full strokes, ramp and step in s. With keep_phase a lasting tone of the
+    same frequency continues from its present amplitude; else the new one begins at zero. All others
+    fade out within ramp.
     """
-    going_on = next(
+    continuing = next(
         (tone for tone in playing if keep_phase and tone.lasts and tone.frequency == frequency),
         None,
     )
-    faded = (tone.fade_out(time, ramp=ramp) for tone in playing if tone is not going_on)
+    faded = (tone.fade_out(time, ramp=ramp) for tone in playing if tone is not continuing)
     fading = tuple(tone for tone in faded if tone.silent_from > time)
-    begin = 0j if going_on is None else going_on.amplitude(time)
-    origin = time if going_on is None else going_on.origin
+    begin = 0j if continuing is None else continuing.amplitude(time)
+    origin = time if continuing is None else continuing.origin
     return (*fading, ShapedTone(frequency, origin, time, step, (begin, *knots, amplitude)))
 
 
 def end_along(
     playing: Output, time: float, *, ramp: float, step: float, knots: tuple[complex, ...]
 ) -> Output:
-    """What a channel plays once it was told at time [s] to end along an envelope; as `shape_to`."""
+    """The output after a command at a time [s] to end along an envelope; see `shape_to`."""
     lasting = next((tone for tone in playing if tone.lasts), None)
     if lasting is None:
         return tuple(tone for tone in playing if tone.silent_from > time)
@@ -93,14 +91,14 @@ def end_along(
 
 
 def level_of(playing: Output, time: float) -> float:
-    """Level 0..1 that a channel has at a time [s], its fades included.
+    """Level 0..1 of a channel at a time [s], fades included.
 
     Tones of one frequency add as complex amplitudes, magnitudes add across frequencies.
     """
-    if len(playing) < 2:  # which is most of the time
+    if len(playing) < 2:
         return sum(abs(tone.amplitude(time)) for tone in playing)
     amplitudes: dict[float, complex] = defaultdict(complex)
     for tone in playing:
-        turn = cmath.exp(-2j * math.pi * tone.frequency * tone.origin)
-        amplitudes[tone.frequency] += tone.amplitude(time) * turn
+        phase_factor = cmath.exp(-2j * math.pi * tone.frequency * tone.origin)
+        amplitudes[tone.frequency] += tone.amplitude(time) * phase_factor
     return sum(abs(amplitude) for amplitude in amplitudes.values())

@@ -8,10 +8,10 @@ from sim.waveform.fading_tone import FadingTone
 
 @dataclass(frozen=True, slots=True)
 class ShapedTone:
-    """Im[a(t) exp(2 pi i frequency (t - origin))] from start on, a in full strokes.
+    """Im[a(t) exp(2 pi i frequency (t - origin))] from start, a in full strokes.
 
-    frequency [Hz]; start, origin [s]; a goes along straight lines through `values`, the first at
-    start, then one every step [s], and stays at the last.
+    frequency [Hz]; start, origin [s]; a interpolates `values` linearly, one per step [s] from
+    start, and stays at the last.
     """
 
     frequency: float
@@ -22,22 +22,22 @@ class ShapedTone:
 
     @property
     def settled(self) -> float:
-        """When the last value is reached [s]."""
+        """Time of the last value [s]."""
         return self.start + self.step * (len(self.values) - 1)
 
     @property
     def lasts(self) -> bool:
-        """Whether it stays, once it has settled."""
+        """Whether it is audible once settled."""
         return self.values[-1] != 0
 
     @property
     def settled_amplitude(self) -> complex:
-        """Complex amplitude once it has settled."""
+        """Settled complex amplitude."""
         return self.values[-1]
 
     @property
     def silent_from(self) -> float:
-        """When the tone has ended [s]; infinity for one that stays."""
+        """Time of silence [s]; infinity for a lasting tone."""
         return math.inf if self.lasts else self.settled
 
     def amplitude(self, time: float) -> complex:
@@ -50,10 +50,7 @@ class ShapedTone:
         return here + (there - here) * (steps - before)
 
     def fade_out(self, time: float, *, ramp: float) -> "FadingTone | ShapedTone":
-        """The tone with the amplitude it has reached, silent within ramp [s].
-
-        One that ends sooner by itself is left as it is.
-        """
+        """Fade from the present amplitude, within ramp [s], unless it ends sooner."""
         if self.silent_from <= time + ramp:
             return self
         reached = self.amplitude(time)

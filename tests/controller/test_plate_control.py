@@ -53,7 +53,7 @@ async def test_a_question_that_is_refused_leaves_the_connection_to_the_next(
     """What the plate says is told with what was asked; the next answer is the next question's."""
     answers = saying(b'{"error": "finger is 1; it must be a text"}\n', b'{"time_s": 1.5}\n')
     async with listening(tmp_path / "sock", answers) as control:
-        with pytest.raises(LinkError, match="the simulated plate refused come: finger is 1; it"):
+        with pytest.raises(LinkError, match="the simulated plate refused touch: finger is 1; it"):
             await control.ask({"op": "touch"})
         assert await control.ask({"op": "state"}) == {"time_s": 1.5}
 

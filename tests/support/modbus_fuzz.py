@@ -9,8 +9,8 @@ from drivers.errors import FrameError
 from drivers.protocol.messages import AmplifierState, Arm, Clear, Reply, Request
 from drivers.statistics import WireCounters
 from sim.amplifier.amplifier import SimulatedAmplifier
-from sim.far_ends.modbus.frames import PAUSE, RtuReader, TcpReader, rtu_frame, tcp_frame
-from sim.far_ends.modbus.frames import Request as Asked
+from sim.far_ends.modbus.frames import FRAME_TIMEOUT, RtuReader, TcpReader, rtu_frame, tcp_frame
+from sim.far_ends.modbus.frames import RequestAdu as Asked
 from sim.far_ends.modbus.unit import ModbusUnit
 from sim.waveform.shaped_tone import ShapedTone
 
@@ -74,7 +74,7 @@ class ModbusEnds:
             exchange = exchanges.encode_request(request, tag=_TAG, channels=4)
             telegram = build_adu(exchange.read, exchange.write, unit=1, transaction=0, is_rtu=True)
             pdu = telegram.frame[1:-2]
-            answer = self._unit.answer(pdu)
+            answer = self._unit.reply(pdu)
             assert answer is not None
             self.telegrams += [pdu, answer]
             self._requests_by_size[answer[1]] = request
@@ -105,7 +105,7 @@ class ModbusEnds:
             for request in self._far.feed(piece, self._device.now):
                 self._serve(request)
         understood = [*self._device.asked, *self._read(data)]
-        self._device.pass_time(self._chance.choice((0.0, 0.0, 0.001, 0.02, 2 * PAUSE)))
+        self._device.pass_time(self._chance.choice((0.0, 0.0, 0.001, 0.02, 2 * FRAME_TIMEOUT)))
         return understood
 
     def _pieces(self, data: bytes) -> Iterator[bytes]:
@@ -118,9 +118,9 @@ class ModbusEnds:
     def _serve(self, request: Asked) -> None:
         """Let the unit answer; the answer must be one that a frame can hold."""
         if request.unit == 0:
-            self._unit.hear(request.pdu)
+            self._unit.handle_broadcast(request.pdu)
             return
-        pdu = self._unit.answer(request.pdu)
+        pdu = self._unit.reply(request.pdu)
         if pdu is not None:
             assert 2 <= len(pdu) <= 253
             assert pdu[0] & 0x7F == request.pdu[0] & 0x7F

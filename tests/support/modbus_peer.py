@@ -7,7 +7,7 @@ from contextlib import asynccontextmanager
 from typing import TypeAlias, cast
 
 from modbus_session import ScriptedDevice
-from sim.far_ends.modbus.frames import Request, RtuReader, TcpReader, rtu_frame, tcp_frame
+from sim.far_ends.modbus.frames import RequestAdu, RtuReader, TcpReader, rtu_frame, tcp_frame
 from sim.far_ends.modbus.unit import ModbusUnit
 
 Answer: TypeAlias = bytes | None
@@ -25,9 +25,9 @@ class Peer(asyncio.Protocol):
         self.is_rtu = is_rtu
         self.device = ScriptedDevice()
         self.unit = ModbusUnit(self.device)
-        self.requests: list[Request] = []
+        self.requests: list[RequestAdu] = []
         self.connections = 0
-        self.answer: Callable[[Request], Answer] = lambda request: self.unit.answer(request.pdu)
+        self.answer: Callable[[RequestAdu], Answer] = lambda request: self.unit.reply(request.pdu)
         self.url = ""
         self._reader: RtuReader | TcpReader = TcpReader()
         self._transport: asyncio.Transport | None = None
@@ -48,11 +48,11 @@ class Peer(asyncio.Protocol):
             if pdu is not None:
                 self.send(request, pdu)
 
-    def send(self, request: Request, pdu: bytes) -> None:
+    def send(self, request: RequestAdu, pdu: bytes) -> None:
         """Answer a request."""
         self.send_raw(self.frame(request, pdu))
 
-    def frame(self, request: Request, pdu: bytes) -> bytes:
+    def frame(self, request: RequestAdu, pdu: bytes) -> bytes:
         """The frame of an answer."""
         return rtu_frame(request.unit, pdu) if self.is_rtu else tcp_frame(request, pdu)
 

@@ -1,1 +1,1 @@
-"""The amplifiers' side of CAN: a bus, CANopen nodes on it, and adapters for the host."""
+"""The amplifiers' side of CAN: a bus, CANopen nodes and adapters."""

@@ -1,8 +1,7 @@
-"""A CAN bus within this process: what one of its members sends, all others hear.
+"""A CAN bus within this process: a frame of one member is received by all others.
 
-Each amplifier hangs on it by a line of its own each way, which takes time and has faults. A frame
-that was damaged on the way fails the check of its CRC, as on a real bus, and is not seen. Not
-modelled: arbitration, the repetition of a damaged frame by its sender, bus-off.
+Each amplifier has a line of its own each way, with transmission time and faults; a damaged frame
+fails its CRC and is dropped. Not modelled: arbitration, retransmission, bus-off.
 """
 
 import struct
@@ -14,7 +13,7 @@ from sim.faults.fault_window import Faults
 from sim.transport.line import TwoWayLine
 
 LENGTHS = (0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64)
-"""How many bytes a frame may have, by its length code; those up to eight without CAN FD."""
+"""Data lengths by length code; above eight bytes CAN FD only."""
 
 Listener = Callable[[CanFrame], None]
 
@@ -23,40 +22,40 @@ _FD = 1 << 31
 
 
 class CanBus:
-    """Members are known by what they are called with."""
+    """A bus whose members are identified by their listeners."""
 
     def __init__(self) -> None:
         self._members: list[Listener] = []
 
     def join(self, listener: Listener) -> None:
-        """Hear what the others send from now on."""
+        """Add a member."""
         self._members.append(listener)
 
     def leave(self, listener: Listener) -> None:
-        """Hear nothing any more; safe for one that has left."""
+        """Remove a member, if it is one."""
         if listener in self._members:
             self._members.remove(listener)
 
     def send(self, frame: CanFrame, *, sender: Listener) -> None:
-        """Let all but the sender hear a frame."""
+        """Deliver a frame to all but its sender."""
         for member in tuple(self._members):
             if member is not sender:
                 member(frame)
 
 
 class Stub:
-    """What connects one amplifier with the bus; hears is called with each frame that arrives.
+    """The connection of one amplifier; receive: called with each frame.
 
-    bitrate [bit/s]: frames take as long as at this speed, None for no time.
+    bitrate [bit/s]: None for no transmission time.
     """
 
     def __init__(
-        self, bus: CanBus, hears: Listener, *, faults: Faults, bitrate: int | None = None
+        self, bus: CanBus, receive: Listener, *, faults: Faults, bitrate: int | None = None
     ) -> None:
         self._bus = bus
-        self._hears = hears
+        self._hears = receive
         self.damaged = 0
-        # A telegram has eight bytes beside the data: about what frame, stuffing and gap cost.
+        # Eight bytes beside the data, about the overhead of a frame with stuffing and gap.
         self._line = TwoWayLine(
             to_amplifier=self._arrive,
             to_host=self._leave,
@@ -64,33 +63,33 @@ class Stub:
             bits_per_second=bitrate,
             bits_per_byte=8,
         )
-        self._listener = self._hear  # one object, by which the bus knows it
+        self._listener = self._hear  # one object, which identifies the member
         bus.join(self._listener)
 
     def send(self, frame: CanFrame) -> None:
-        """Send a frame of the amplifier's."""
-        self._line.outward.send(_telegram(frame))
+        """Send a frame of the amplifier."""
+        self._line.outward.send(_to_bytes(frame))
 
     def close(self) -> None:
-        """Leave the bus; what is on the way is lost."""
+        """Leave the bus and discard frames in flight."""
         self._bus.leave(self._listener)
         self._line.close()
 
     def _hear(self, frame: CanFrame) -> None:
-        self._line.inward.send(_telegram(frame))
+        self._line.inward.send(_to_bytes(frame))
 
-    def _arrive(self, telegram: bytes) -> None:
-        frame = self._checked(telegram)
+    def _arrive(self, frame_bytes: bytes) -> None:
+        frame = self._checked(frame_bytes)
         if frame is not None:
             self._hears(frame)
 
-    def _leave(self, telegram: bytes) -> None:
-        frame = self._checked(telegram)
+    def _leave(self, frame_bytes: bytes) -> None:
+        frame = self._checked(frame_bytes)
         if frame is not None:
             self._bus.send(frame, sender=self._listener)
 
-    def _checked(self, telegram: bytes) -> CanFrame | None:
-        body, check = telegram[:-4], telegram[-4:]
+    def _checked(self, frame_bytes: bytes) -> CanFrame | None:
+        body, check = frame_bytes[:-4], frame_bytes[-4:]
         if len(body) < _HEAD.size or zlib.crc32(body).to_bytes(4, "little") != check:
             self.damaged += 1
             return None
@@ -98,6 +97,6 @@ class Stub:
         return CanFrame(head & ~_FD, body[_HEAD.size :], fd=bool(head & _FD))
 
 
-def _telegram(frame: CanFrame) -> bytes:
+def _to_bytes(frame: CanFrame) -> bytes:
     body = _HEAD.pack(frame.id | (_FD if frame.fd else 0)) + frame.data
     return body + zlib.crc32(body).to_bytes(4, "little")

@@ -1,4 +1,4 @@
-"""Values of objects that are longer than a number: what plays, past faults, and envelopes."""
+"""DOMAIN objects: the achieved set, the fault history, and envelopes."""
 
 import struct
 from collections.abc import Sequence
@@ -14,7 +14,7 @@ _Q = PROTOCOL.quantities
 
 
 def achieved_domain(achieved: Achieved) -> bytes:
-    """What a set plays, as the object of that name holds it."""
+    """The object `achieved`."""
     data = struct.pack("<HB", achieved.token, len(achieved.commands))
     for command in achieved.commands:
         flags = command.keep_phase | command.skip_ending << 1 | command.channel << 4
@@ -32,7 +32,7 @@ def achieved_domain(achieved: Achieved) -> bytes:
 
 
 def faults_domain(records: Sequence[FaultRecord]) -> bytes:
-    """Past faults, as the object of that name holds them."""
+    """The object `faults`."""
     longest = _Q.age.maximum
     return b"".join(
         struct.pack(
@@ -46,7 +46,7 @@ def faults_domain(records: Sequence[FaultRecord]) -> bytes:
 
 
 def envelope_of(slot: int, data: bytes) -> Envelope:
-    """The envelope that is written to a slot; raises SdoAbort."""
+    """Decode an envelope written to a slot; raises SdoAbort."""
     if len(data) < 3 or len(data) != 3 + 4 * data[2]:
         raise SdoAbort(BAD_LENGTH)
     step, _ = struct.unpack_from("<HB", data)

@@ -1,4 +1,4 @@
-"""The amplifiers' side of a CAN bus: nodes on it, and the adapter by which a host gets there."""
+"""The amplifiers' side of a CAN bus: nodes, and the adapter for the host."""
 
 import asyncio
 import contextlib
@@ -20,9 +20,9 @@ _PER_NODE: int = PROTOCOL.canopen["channels_per_node"]
 async def nodes_on(
     bus: CanBus, devices: Sequence[SimulatedDevice], *, bitrate: int | None = None
 ) -> AsyncIterator[dict[str, int]]:
-    """Amplifiers as nodes of a bus; the node of each by its name.
+    """Put amplifiers on a bus; yields the node of each by name.
 
-    bitrate [bit/s]: frames take as long as at this speed, None for no time.
+    bitrate [bit/s]: None for no transmission time.
     """
     with contextlib.ExitStack() as stack:
         numbers = {}
@@ -39,7 +39,7 @@ async def nodes_on(
 async def socketcand(
     devices: Sequence[SimulatedDevice], *, port: int = 0, bitrate: int | None = None
 ) -> AsyncIterator[Mapping[str, str]]:
-    """All amplifiers on one bus behind a socketcand server; their URLs by their names."""
+    """Serve amplifiers on one bus by socketcand; yields their URLs by name."""
     bus = CanBus()
     end = SocketcandEnd(bus, port=port)
     opening: set[asyncio.Task[None]] = set()
@@ -69,7 +69,7 @@ async def socketcand(
 async def slcan(
     devices: Sequence[SimulatedDevice], *, bitrate: int | None = None, unpluggable: bool = False
 ) -> AsyncIterator[Mapping[str, str]]:
-    """All amplifiers on one bus behind a serial adapter; their URLs by their names."""
+    """Serve amplifiers on one bus behind a serial adapter; yields their URLs by name."""
     bus = CanBus()
     end = SlcanEnd(bus, unpluggable=unpluggable)
     async with AsyncExitStack() as stack:

@@ -1,8 +1,6 @@
-"""The amplifier's side of CANopen: NMT, heartbeat and emergencies, and who hears which frame.
+"""A CANopen node: NMT, heartbeat, EMCY, and the dispatch of frames.
 
-Written from protocol.yaml's description, with nothing of the host's code in it, so that the two
-check each other. Not modelled: SYNC and heartbeat messages that a real node would miss while it
-is busy.
+Written from protocol.yaml, without code of the host's side. Not modelled: frames missed while busy.
 """
 
 import asyncio
@@ -23,15 +21,15 @@ _NMT = CANOPEN["nmt"]
 _NMT_STATES = CANOPEN["nmt_states"]
 _OPERATIONAL, _STOPPED = _NMT_STATES["OPERATIONAL"], _NMT_STATES["STOPPED"]
 _PRE_OPERATIONAL = _NMT_STATES["PRE_OPERATIONAL"]
-_QUICK = 0.005  # s; the shortest ramp that is no step
-_LOOK = 0.02  # s; how often it is looked whether the supply is back
+_SHORTEST_RAMP = 0.005  # s
+_POLL_INTERVAL = 0.02  # s; between checks whether the supply is back
 
 
 CallLater: TypeAlias = Callable[[float, Callable[[], None]], asyncio.TimerHandle]
 
 
 class CanNode:
-    """An amplifier as node `node` of a bus; send puts a frame of its own on the bus."""
+    """An amplifier as a node of a bus; send: puts a frame on the bus."""
 
     def __init__(
         self, device: SimulatedDevice, node: int, *, send: Callable[[CanFrame], None]
@@ -49,24 +47,24 @@ class CanNode:
         self._requests = RequestHandler(device, node, objects=self._objects, send=send)
         self._fault = Fault.NONE
         self._was_off = False
-        self._look_again: asyncio.TimerHandle | None = None
-        self._beat: asyncio.TimerHandle | None = None
+        self._poll_timer: asyncio.TimerHandle | None = None
+        self._heartbeat_timer: asyncio.TimerHandle | None = None
 
     def start(self, call_later: CallLater | None = None) -> None:
-        """Boot; what comes later is left to the running event loop, unless to somebody else."""
+        """Boot; call_later: the running event loop's by default."""
         self._call_later = call_later or asyncio.get_running_loop().call_later
-        self._device.listen(self._tell)
+        self._device.listen(self._send_event)
         self._boot()
-        self._look()
+        self._poll_supply()
 
     def close(self) -> None:
-        """No more heartbeats."""
-        for timer in (self._look_again, self._beat):
+        """Stop the timers."""
+        for timer in (self._poll_timer, self._heartbeat_timer):
             if timer is not None:
                 timer.cancel()
 
     def receive(self, frame: CanFrame) -> None:
-        """Take a frame from the bus."""
+        """Receive a frame from the bus."""
         if not self._is_awake():
             return
         if frame.id == IDS["nmt"]:
@@ -80,7 +78,7 @@ class CanNode:
         else:
             self._pdo(frame.id, frame.data, fd=frame.fd)
 
-    # what the network says
+    # network management
 
     def _nmt_command(self, data: bytes) -> None:
         if len(data) != 2 or data[1] not in (0, self._node):
@@ -99,9 +97,9 @@ class CanNode:
             self._boot()
 
     def _leave_operation(self, state: int) -> None:
-        """Nothing is heard of the host then, so nothing may play."""
+        """Leave OPERATIONAL, in which alone requests arrive: stop first."""
         if self._device.status().state is AmplifierState.OPERATION_ENABLED:
-            self._device.exchange(Stop(_QUICK))
+            self._device.exchange(Stop(_SHORTEST_RAMP))
         self._state = state
         self._requests.forget()
 
@@ -111,24 +109,24 @@ class CanNode:
         self._requests.forget()
         self._state = _PRE_OPERATIONAL
         self._send(CanFrame(IDS["heartbeat"] + self._node, b"\x00"))
-        if self._beat is not None:
-            self._beat.cancel()
+        if self._heartbeat_timer is not None:
+            self._heartbeat_timer.cancel()
         self._next_heartbeat()
 
     def _next_heartbeat(self) -> None:
         period = self._objects.heartbeat
-        delay = period / 1000 if period else _LOOK  # 0: none, until another is written
-        self._beat = self._call_later(delay, self._heartbeat)
+        delay = period / 1000 if period else _POLL_INTERVAL  # 0: no heartbeat
+        self._heartbeat_timer = self._call_later(delay, self._heartbeat)
 
     def _heartbeat(self) -> None:
         if self._is_awake() and self._objects.heartbeat:
             self._send(CanFrame(IDS["heartbeat"] + self._node, bytes([self._state])))
         self._next_heartbeat()
 
-    def _look(self) -> None:
-        """Notice that the supply has come back."""
+    def _poll_supply(self) -> None:
+        """Boot when the supply is back."""
         self._is_awake()
-        self._look_again = self._call_later(_LOOK, self._look)
+        self._poll_timer = self._call_later(_POLL_INTERVAL, self._poll_supply)
 
     def _is_awake(self) -> bool:
         is_off = self._device.faults.now("reboot", clock.now())
@@ -138,22 +136,22 @@ class CanNode:
         self._was_off = is_off
         return self._device.is_answering
 
-    # what is for the amplifier, and from it
+    # requests and events
 
     def _pdo(self, cob_id: int, data: bytes, *, fd: bool = False) -> None:
         if self._state == _OPERATIONAL:
             self._requests.take(cob_id, data, fd=fd)
 
-    def _tell(self, event: AmplifierEvent) -> None:
-        """A change of state or fault: an emergency for faults, an answer to nobody for others."""
+    def _send_event(self, event: AmplifierEvent) -> None:
+        """Send a change of state: EMCY for faults, else an unsolicited reply."""
         concerns_fault = event.fault is not Fault.NONE or self._fault is not Fault.NONE
         self._fault = event.fault
         if not self._device.is_answering or self._state == _STOPPED:
             return
         channel = NO_CHANNEL if event.channel is None else event.channel
         if concerns_fault:
-            said = CANOPEN["emergencies"][event.fault.name]
-            head = (said["code"], said["error_register"], event.state | event.fault << 4)
+            emergency = CANOPEN["emergencies"][event.fault.name]
+            head = (emergency["code"], emergency["error_register"], event.state | event.fault << 4)
             data = struct.pack("<HBBB3x", *head, channel)
             self._send(CanFrame(IDS["emergency"] + self._node, data))
         elif self._state == _OPERATIONAL:

@@ -1,7 +1,6 @@
-"""The object dictionary of a simulated amplifier: what an SDO client reads and writes.
+"""The object dictionary of a simulated amplifier.
 
-Indices and ranges are those of protocol.yaml; how they become bytes is written here anew, so that
-host and far end check each other.
+Indices and ranges are those of protocol.yaml; the encoding shares no code with the host's side.
 """
 
 import struct
@@ -30,14 +29,14 @@ _INDEX = {name: declared["index"] for name, declared in CANOPEN["objects"].items
 _WIDTH = {"u8": "<B", "u16": "<H", "u32": "<L", "i16": "<h"}
 _PDO_SYNCHRONOUS, _PDO_ASYNCHRONOUS = 0, 255
 _RPDO, _RPDO_MAP, _TPDO, _TPDO_MAP = 0x1400, 0x1600, 0x1800, 0x1A00
-_ORDER_PDO, _SLOTS_PDO = 16, 17  # RPDO 17 and 18 and so on, whatever the number of channels
+_REQUEST_PDO, _SLOTS_PDO = 16, 17  # RPDO 17, 18, ..., for any number of channels
 
 Read = Callable[[], bytes]
 Write = Callable[[bytes], None]
 
 
 def channel_ids(node: int, channels: int) -> dict[int, int]:
-    """The channel that each RPDO identifier of a node is for."""
+    """Channel by RPDO identifier of a node."""
     return {
         IDS["command"] + 0x100 * (channel % 4) + node + channel // 4: channel
         for channel in range(channels)
@@ -45,15 +44,15 @@ def channel_ids(node: int, channels: int) -> dict[int, int]:
 
 
 def sent_ids(node: int, channels: int) -> tuple[int, ...]:
-    """The TPDO identifiers of a node: answer, condition, then the levels of four channels each."""
+    """TPDO identifiers of a node: reply, status, then levels of four channels each."""
     levels = (IDS["levels"] + node + group for group in range(-(-channels // 4)))
     return (IDS["answer"] + node, IDS["condition"] + node, *levels)
 
 
 class ObjectDictionary:
-    """What one amplifier keeps under its indices; pdo_written: an RPDO's object was written.
+    """The objects of one amplifier; pdo_written: called when an RPDO object is written.
 
-    host: the node whose heartbeat feeds the watchdog, 0 for none; heartbeat [ms]: its own.
+    host: node whose heartbeat feeds the watchdog, 0 for none; heartbeat [ms]: its own interval.
     """
 
     def __init__(
@@ -64,27 +63,27 @@ class ObjectDictionary:
         self._pdo_written = pdo_written
         self._channels = device.capabilities.channels
         self.achieved = b""
-        self.blocks: dict[int, bytes] = {}  # the last of each PDO, by its identifier
+        self.blocks: dict[int, bytes] = {}  # last data by PDO identifier
         self.reset()
         self._reads: dict[tuple[int, int], Read] = {}
         self._writes: dict[tuple[int, int], Write] = {}
         self._fill()
 
     def reset(self) -> None:
-        """Communication as after the supply came."""
+        """Reset the communication objects."""
         self.host = 0
         self.watchdog = 0
         self.heartbeat = int(CANOPEN["heartbeat_ms"])
 
     def read(self, index: int, subindex: int) -> bytes:
-        """The value; raises SdoAbort."""
+        """Read an object; raises SdoAbort."""
         found = self._reads.get((index, subindex))
         if found is None:
             raise SdoAbort(self._missing(index, subindex, elsewhere=self._writes, code=WRITE_ONLY))
         return found()
 
     def write(self, index: int, subindex: int, data: bytes) -> None:
-        """Take a value over; raises SdoAbort."""
+        """Write an object; raises SdoAbort."""
         found = self._writes.get((index, subindex))
         if found is None:
             raise SdoAbort(self._missing(index, subindex, elsewhere=self._reads, code=READ_ONLY))
@@ -105,8 +104,8 @@ class ObjectDictionary:
 
     def _fill(self) -> None:
         self._communication()
-        self._who_it_is()
-        self._how_it_is()
+        self._identity()
+        self._status()
         self._pdos()
         for slot in range(1, 64):
             self._writes[_INDEX["envelope"], slot] = partial(self._load, slot)
@@ -124,7 +123,7 @@ class ObjectDictionary:
         self._reads[producer, 0] = lambda: _pack("u16", self.heartbeat)
         self._writes[producer, 0] = self._set_producer
 
-    def _who_it_is(self) -> None:
+    def _identity(self) -> None:
         numbers = [CANOPEN["vendor_id"], CANOPEN["product_code"], CANOPEN["revision"]]
         self._record("identity", [_pack("u32", value) for value in numbers])
         self._count(_INDEX["identity"], 4)
@@ -141,7 +140,7 @@ class ObjectDictionary:
             [_scaled(_quantity(kind), values[name]) for name, kind in kinds.items()],
         )
 
-    def _how_it_is(self) -> None:
+    def _status(self) -> None:
         status, index = self._device.status, _INDEX["status"]
         self._count(index, 7)
         self._reads[index, 1] = lambda: bytes([status().state])
@@ -159,14 +158,14 @@ class ObjectDictionary:
         self._reads[_INDEX["faults"], 0] = self._faults
 
     def _pdos(self) -> None:
-        """The PDOs, which are as they are, and the objects that they map."""
+        """The fixed PDOs, and the objects that they map."""
         command, order, slots = _INDEX["command"], _INDEX["order"], _INDEX["slots"]
         groups = -(-self._channels // 4)
         self._count(command, self._channels)
         self._count(slots, groups)
         for cob_id, channel in channel_ids(self._node, self._channels).items():
             self._received_pdo(channel, cob_id, command, channel + 1)
-        self._received_pdo(_ORDER_PDO, IDS["order"] + self._node, order, 0)
+        self._received_pdo(_REQUEST_PDO, IDS["order"] + self._node, order, 0)
         for group in range(groups):
             self._received_pdo(_SLOTS_PDO + group, IDS["slots"] + self._node, slots, group + 1)
         sent = [("answer", 0), ("condition", 0), *(("levels", 1 + n) for n in range(groups))]
@@ -206,7 +205,7 @@ class ObjectDictionary:
         self._pdo_written(cob_id, data)
 
     def _serial_number(self) -> bytes:
-        """A number that the text of it makes, and no other is likely to."""
+        """The CRC-32 of its text."""
         return _pack("u32", zlib.crc32(self._device.identity.serial_number.encode()))
 
     def _text(self, name: str) -> bytes:

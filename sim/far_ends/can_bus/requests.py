@@ -35,7 +35,7 @@ from sim.far_ends.can_bus.sets import (
     SETS,
     TO_ALL,
     Action,
-    Refused,
+    RefusedRequest,
     RequestFrame,
     SetBuffer,
     integers_of,
@@ -45,7 +45,7 @@ _Q = PROTOCOL.quantities
 
 
 class RequestHandler:
-    """What a node is told to do; send puts an answer on the bus."""
+    """Executes the requests to a node; send: puts a frame on the bus."""
 
     def __init__(
         self,
@@ -63,11 +63,11 @@ class RequestHandler:
         self._channel_of = channel_ids(node, channels)
         self._sent_ids = sent_ids(node, channels)
         self._buffer = SetBuffer(channels)
-        self._waiting: RequestFrame | None = None  # for its SYNC
-        self._asked: tuple[int, list[tuple[object, ...]]] = (0, [])  # token, what was asked
+        self._waiting: RequestFrame | None = None  # for SYNC
+        self._asked: tuple[int, list[tuple[object, ...]]] = (0, [])  # token and commands
 
     def take(self, cob_id: int, data: bytes, *, fd: bool = False) -> None:
-        """A process data object of a host's; nothing where it is none for this node."""
+        """Receive a PDO; ignored unless it is for this node."""
         if len(data) < 8:
             return
         if cob_id == IDS["order"] + self._node:
@@ -82,20 +82,20 @@ class RequestHandler:
             self._buffer.take(self._channel_of[cob_id], data)
 
     def sync(self) -> None:
-        """Carry out the set that has come, if one has."""
+        """Execute the set that waits for SYNC, if any."""
         request, self._waiting = self._waiting, None
         if request is not None and request.own:
             self._carry_out(request, lambda: self._set_request(request))
         elif request is not None and _Q.token.holds(request.token):
             self._device.broadcast(Commit(request.token))
         elif request is None and self._buffer.sequence is not None:
-            # Commands without their request: it was lost, and whoever sent it waits.
+            # Commands whose request was lost: reply, since the host waits.
             lost = RequestFrame(0, 0, 0, Action.APPLY, 0, self._buffer.sequence, own=True, fd=False)
             self._answer(lost, result=INCOMPLETE_SET)
         self.forget()
 
     def forget(self) -> None:
-        """What has come since the last SYNC has not come."""
+        """Discard what was received since the last SYNC."""
         self._buffer.clear()
         self._waiting = None
 
@@ -121,7 +121,7 @@ class RequestHandler:
     def _carry_out(self, request: RequestFrame, make: Callable[[], Request]) -> None:
         try:
             reply = self._device.exchange(make())
-        except Refused as refused:
+        except RefusedRequest as refused:
             self._answer(request, result=refused.code, channel=refused.channel)
             return
         if reply is None:
@@ -134,14 +134,14 @@ class RequestHandler:
         else:
             if request.action is Action.ARM:
                 self._objects.host, self._objects.watchdog = request.token, request.time
-            self._answer(request, condition=self._condition(request, reply))
+            self._answer(request, condition=self._status_blocks(request, reply))
 
     def _plain_request(self, request: RequestFrame) -> Request:
         ramp = _nearest_ramp(request.ramp)
         match request.action:
-            case Action.ARM:  # arm; its token is the number of the host
+            case Action.ARM:  # the token is the node of the host
                 if not _Q.watchdog.holds(request.time) or not 1 <= request.token <= 127:
-                    raise Refused(NakCode.BAD_VALUE)
+                    raise RefusedRequest(NakCode.BAD_VALUE)
                 return Arm(request.time / 1000)
             case Action.DISARM:
                 return Disarm(ramp)
@@ -154,7 +154,7 @@ class RequestHandler:
 
     def _set_request(self, request: RequestFrame) -> Request:
         if not _Q.token.holds(request.token):
-            raise Refused(NakCode.BAD_TOKEN)
+            raise RefusedRequest(NakCode.BAD_TOKEN)
         if request.action is Action.COMMIT:
             return Commit(request.token)
         wanted = self._buffer.command_set(request)
@@ -162,14 +162,14 @@ class RequestHandler:
         return Apply(wanted) if request.action is Action.APPLY else Stage(wanted)
 
     def _is_exact(self, achieved: Achieved) -> bool:
-        """Whether a set plays as it was asked for; if not, the host reads what it does."""
+        """Whether a set plays as commanded; else the host reads `achieved`."""
         self._objects.achieved = achieved_domain(achieved)
         token, asked = self._asked
         played = sorted(integers_of(command) for command in achieved.commands)
         return token == achieved.token and played == asked
 
-    def _condition(self, request: RequestFrame, reply: Reply) -> list[bytes]:
-        """How it is: the condition, and the levels of four channels at a time."""
+    def _status_blocks(self, request: RequestFrame, reply: Reply) -> list[bytes]:
+        """The status, then levels of four channels each."""
         status = reply if isinstance(reply, Status) else self._device.status()
         levels = [_Q.level.to_wire(min(level, 1.0)) for level in status.levels]
         blocks = [
@@ -196,7 +196,7 @@ class RequestHandler:
         exact: bool = False,
         condition: Sequence[bytes] = (),
     ) -> None:
-        """Answer in the kind of frame in which it was asked; the answer itself comes last."""
+        """Reply in classic or FD frames, as requested; the reply itself comes last."""
         status = self._device.status()
         answer = struct.pack(
             "<BBBBHH",
@@ -208,7 +208,7 @@ class RequestHandler:
             min(max(round(status.watchdog_left * 1000), 0), _Q.watchdog_left.maximum),
         )
         blocks = [answer, *condition]
-        sent = dict(zip(self._sent_ids, blocks, strict=False))  # the condition may be left out
+        sent = dict(zip(self._sent_ids, blocks, strict=False))  # the status may be left out
         self._objects.blocks.update(sent)
         if request.fd:
             data = b"".join(blocks)
@@ -221,5 +221,5 @@ class RequestHandler:
 
 
 def _nearest_ramp(ramp: int) -> float:
-    """The nearest ramp [s] in range: silence is never refused for its ramp."""
+    """The nearest ramp [s] in range: silencing is never refused for its ramp."""
     return min(ramp, _Q.ramp.maximum) / _Q.ramp.per_unit

@@ -1,7 +1,7 @@
-"""The server's side of CANopen's SDO: objects read and written in frames of eight bytes (CiA 301).
+"""SDO server (CiA 301).
 
 Expedited, segmented and block downloads, expedited and segmented uploads. Not modelled: block
-uploads, which are refused as the standard allows.
+uploads, which are refused.
 """
 
 import binascii
@@ -12,8 +12,8 @@ from drivers import clock
 
 LENGTH = 8
 BLOCK_SIZE = 127  # segments before an acknowledgement
-_LONGEST = 1024  # bytes; the longest envelope takes an eighth of it
-_PATIENCE = 1.0  # s; a client that has not gone on by then has given up
+_MAX_LENGTH = 1024  # bytes
+_TIMEOUT = 1.0  # s; then a transfer is abandoned
 
 TOGGLE = 0x0503_0000
 UNKNOWN_COMMAND = 0x0504_0001
@@ -27,7 +27,7 @@ NO_SUBINDEX = 0x0609_0011
 
 
 class SdoAbort(Exception):
-    """A transfer that ends with this code."""
+    """Aborts a transfer with a code."""
 
     def __init__(self, code: int) -> None:
         super().__init__(f"{code:#010x}")
@@ -35,7 +35,7 @@ class SdoAbort(Exception):
 
 
 class SdoServer:
-    """Answers the requests of one client; read and write raise SdoAbort for what is not there."""
+    """Serves one client; read and write raise SdoAbort."""
 
     def __init__(
         self,
@@ -51,22 +51,22 @@ class SdoServer:
         self._rest: bytes | None = None  # of an upload
         self._taken: bytearray | None = None  # of a download
         self._toggle = 0
-        self._block = 0  # the last segment of a block download that came in order; -1: its end
+        self._block = 0  # last segment in order of a block download; -1 at its end
         self._in_block = False
         self._check_crc = False
         self._heard = 0.0
 
     def reset(self) -> None:
-        """Forget a transfer that is under way."""
+        """Abandon the present transfer."""
         self._rest = self._taken = None
         self._in_block = False
 
     def receive(self, data: bytes) -> None:
-        """Take a request and answer it; what has not eight bytes is no request."""
+        """Process a request; frames of other than eight bytes are ignored."""
         if len(data) != LENGTH:
             return
         now = clock.now()
-        if now - self._heard > _PATIENCE:
+        if now - self._heard > _TIMEOUT:
             self.reset()
         self._heard = now
         try:
@@ -130,7 +130,7 @@ class SdoServer:
             length = 4 - (command >> 2 & 3) if command & 1 else 4
             self._write(*self._object, data[4 : 4 + length])
         else:
-            if command & 1 and int.from_bytes(data[4:8], "little") > _LONGEST:
+            if command & 1 and int.from_bytes(data[4:8], "little") > _MAX_LENGTH:
                 raise SdoAbort(NO_MEMORY)
             self._taken = bytearray()
         self._send(struct.pack("<BHB4x", 0x60, *self._object))
@@ -152,7 +152,7 @@ class SdoServer:
             return
         self._begin(data)
         self._check_crc = bool(data[0] & 4)
-        if data[0] & 2 and int.from_bytes(data[4:8], "little") > _LONGEST:
+        if data[0] & 2 and int.from_bytes(data[4:8], "little") > _MAX_LENGTH:
             raise SdoAbort(NO_MEMORY)
         self._taken = bytearray()
         self._in_block, self._block = True, 0
@@ -182,7 +182,7 @@ class SdoServer:
 
     def _take(self, piece: bytes) -> None:
         taken = self._taken if self._taken is not None else bytearray()
-        if len(taken) + len(piece) > _LONGEST:
+        if len(taken) + len(piece) > _MAX_LENGTH:
             raise SdoAbort(NO_MEMORY)
         taken += piece
 

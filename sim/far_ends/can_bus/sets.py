@@ -19,7 +19,7 @@ _Q = PROTOCOL.quantities
 
 
 class Action(IntEnum):
-    """What a request is for."""
+    """Action of a request."""
 
     STATUS = 0
     APPLY = 1
@@ -32,15 +32,15 @@ class Action(IntEnum):
 
 
 SETS = (Action.APPLY, Action.STAGE, Action.COMMIT)
-"""Those that wait for a SYNC."""
+"""Actions that wait for SYNC."""
 
 TO_ALL = (Action.COMMIT, Action.STOP)
-"""Those that may be said to every amplifier of the bus."""
+"""Actions that may be broadcast."""
 
 
 @dataclass(frozen=True, slots=True)
 class RequestFrame:
-    """A request frame as it came; own: not said to all."""
+    """A request frame as received; own: not broadcast."""
 
     token: int
     ramp: int
@@ -53,7 +53,7 @@ class RequestFrame:
 
 
 class _Command(NamedTuple):
-    """A channel's command as it came, integers as on the wire."""
+    """A command frame of a channel, integers as on the wire."""
 
     frequency: int
     level: int
@@ -62,8 +62,8 @@ class _Command(NamedTuple):
     sequence: int
 
 
-class Refused(Exception):
-    """A request that says nonsense, or a set with a frame missing."""
+class RefusedRequest(Exception):
+    """An invalid request, or an incomplete set."""
 
     def __init__(self, code: int, channel: int = NO_CHANNEL) -> None:
         super().__init__(code, channel)
@@ -72,20 +72,20 @@ class Refused(Exception):
 
 
 class SetBuffer:
-    """What has come since the last SYNC, for an amplifier with so many channels."""
+    """Frames received since the last SYNC, for an amplifier with so many channels."""
 
     def __init__(self, channels: int) -> None:
         self._channels = channels
         self._commands: dict[int, _Command] = {}
-        self._slots: dict[int, tuple[int, int]] = {}  # by channel: word of both slots, sequence
+        self._slots: dict[int, tuple[int, int]] = {}  # by channel: both slots, sequence
 
     @property
     def sequence(self) -> int | None:
-        """That of some command that has come; None where none has."""
+        """Sequence number of some buffered command, None for none."""
         return next((command.sequence for command in self._commands.values()), None)
 
     def clear(self) -> None:
-        """A SYNC has come."""
+        """Discard all frames."""
         self._commands.clear()
         self._slots.clear()
 
@@ -96,33 +96,33 @@ class SetBuffer:
         self._slots = {channel: one for channel, one in self._slots.items() if one[1] == sequence}
 
     def take(self, channel: int, block: bytes) -> None:
-        """A command; its channel is named twice, by the frame's identifier and in the flags."""
+        """Buffer a command of the channel of its identifier."""
         self._commands[channel] = _Command(*struct.unpack("<HHhBB", block))
 
     def take_blocks(self, data: bytes) -> None:
-        """Commands in a row, as CAN FD carries them; eight bytes FF fill up."""
+        """Buffer the commands of a CAN FD frame; eight bytes FF are fillers."""
         for begin in range(0, len(data) - 7, 8):
             block = data[begin : begin + 8]
             if block != b"\xff" * 8:
                 self.take(block[6] >> 4, block)
 
     def take_slots(self, data: bytes) -> None:
-        """The envelope slots of four channels."""
+        """Buffer the envelope slots of four channels."""
         word = int.from_bytes(data[:6], "little")
         for place in range(4):
             self._slots[4 * (data[6] & 3) + place] = (word >> 12 * place & 0xFFF, data[7])
 
     def command_set(self, request: RequestFrame) -> CommandSet:
-        """The set of a request; raises Refused."""
+        """The set of a request; raises RefusedRequest."""
         if not (_Q.ramp.holds(request.ramp) and _Q.valid_for.holds(request.time)):
-            raise Refused(NakCode.BAD_VALUE)
+            raise RefusedRequest(NakCode.BAD_VALUE)
         own = {
             channel: command
             for channel, command in self._commands.items()
             if command.sequence == request.sequence
         }
         if len(own) != request.count:
-            raise Refused(INCOMPLETE_SET)
+            raise RefusedRequest(INCOMPLETE_SET)
         commands = tuple(
             self._drive_command(channel, command) for channel, command in sorted(own.items())
         )
@@ -130,16 +130,16 @@ class SetBuffer:
 
     def _drive_command(self, channel: int, command: _Command) -> DriveCommand:
         if command.flags >> 4 != channel or channel >= self._channels:
-            raise Refused(NakCode.BAD_CHANNEL, command.flags >> 4)
+            raise RefusedRequest(NakCode.BAD_CHANNEL, command.flags >> 4)
         if command.flags & 0b1000 or not (
             _Q.level.holds(command.level) and _Q.phase.holds(command.phase)
         ):
-            raise Refused(NakCode.BAD_VALUE, channel)
+            raise RefusedRequest(NakCode.BAD_VALUE, channel)
         slots = 0
         if command.flags & 4:
             slots, of = self._slots.get(channel, (0, -1))
             if of != command.sequence:
-                raise Refused(INCOMPLETE_SET)
+                raise RefusedRequest(INCOMPLETE_SET)
         return DriveCommand(
             channel=channel,
             frequency=command.frequency / 100,
@@ -153,7 +153,7 @@ class SetBuffer:
 
 
 def integers_of(command: DriveCommand) -> tuple[object, ...]:
-    """A command as it reads on the wire."""
+    """The integers of a command on the wire."""
     return (
         command.channel,
         _Q.frequency.to_wire(command.frequency),

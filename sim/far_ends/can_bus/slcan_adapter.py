@@ -1,8 +1,7 @@
-"""A serial CAN adapter in numbers only: LAWICEL's ASCII commands on a pseudo-terminal.
+"""A simulated serial CAN adapter: LAWICEL's ASCII commands on a pseudo-terminal.
 
-Commands end with CR and are answered with CR, or BELL where they make no sense; CAN FD frames as
-CANable adapters have them. Not modelled: acceptance masks, time stamps and polling, which are
-accepted and do nothing.
+Commands end with CR; replies are CR, or BELL for errors; CAN FD frames as of CANable adapters. Not
+modelled: acceptance masks, time stamps and polling, which are accepted without effect.
 """
 
 import re
@@ -13,7 +12,7 @@ from sim.far_ends.can_bus.bus import LENGTHS, CanBus
 from sim.transport.pseudo_terminal import make_terminal
 
 _CR, _BELL = b"\r", b"\x07"
-_LONGEST = 160  # characters; a CAN FD frame has 133
+_MAX_LENGTH = 160  # characters; a CAN FD frame has 133
 _FRAME = re.compile(rb"([tdb])([0-7][0-9A-Fa-f]{2})([0-9A-Fa-f])((?:[0-9A-Fa-f]{2})*)")
 _REMOTE = re.compile(rb"r[0-7][0-9A-Fa-f]{2}[0-8]|R[01][0-9A-Fa-f]{7}[0-8]")
 _EXTENDED = re.compile(rb"[TDB][01][0-9A-Fa-f]{7}[0-9A-Fa-f](?:[0-9A-Fa-f]{2})*")
@@ -34,18 +33,18 @@ class SlcanEnd:
         return self._port.port
 
     def plug(self, is_plugged: bool) -> None:
-        """Have the adapter plugged in, or pulled out."""
+        """Plug the adapter in, or unplug it."""
         self._adapter.reset()
         self._port.plug(is_plugged)
 
     def close(self) -> None:
-        """Leave bus and port."""
+        """Leave the bus and close the port."""
         self._adapter.close()
         self._port.close()
 
 
 class SlcanAdapter:
-    """The adapter itself: text in, `write` called with text, frames to and from a bus."""
+    """The adapter: text in, `write` called with text, frames to and from a bus."""
 
     def __init__(self, bus: CanBus, write: Callable[[bytes], None]) -> None:
         self._bus = bus
@@ -56,7 +55,7 @@ class SlcanAdapter:
         bus.join(self._listener)
 
     def reset(self) -> None:
-        """As after it was plugged in."""
+        """Reset, as after plugging in."""
         self._rest = b""
         self._is_open = self._may_send = False
 
@@ -65,11 +64,11 @@ class SlcanAdapter:
         self._bus.leave(self._listener)
 
     def receive(self, data: bytes) -> None:
-        """Do what the host asks."""
+        """Process text from the host."""
         *lines, self._rest = (self._rest + data).split(_CR)
         for line in lines:
             self._write(self._answer(line.strip(b"\n")))
-        if len(self._rest) > _LONGEST:
+        if len(self._rest) > _MAX_LENGTH:
             self._rest = b""
             self._write(self._refuse())
 
@@ -78,7 +77,7 @@ class SlcanAdapter:
             case b"O" | b"L" if not self._is_open:
                 self._is_open, self._may_send = True, line == b"O"
                 return _CR
-            case b"C":  # also where it is closed already: hosts begin with it
+            case b"C":  # also when closed: hosts begin with it
                 self._is_open = False
                 return _CR
             case b"V" | b"v":
@@ -89,7 +88,7 @@ class SlcanAdapter:
                 return b"F00" + _CR
         if self._is_open and self._may_send:
             if _REMOTE.fullmatch(line) or _EXTENDED.fullmatch(line):
-                return (b"z" if line[:1] in b"rt" else b"Z") + _CR  # nobody here listens to these
+                return (b"z" if line[:1] in b"rt" else b"Z") + _CR  # no receiver for these
             if frame := _parse(line):
                 self._bus.send(frame, sender=self._listener)
                 return b"z" + _CR
@@ -110,7 +109,7 @@ class SlcanAdapter:
 
 
 def _parse(line: bytes) -> CanFrame | None:
-    """The frame of a command t, d or b; None for what is none."""
+    """The frame of a command t, d or b, else None."""
     found = _FRAME.fullmatch(line)
     if found is None:
         return None

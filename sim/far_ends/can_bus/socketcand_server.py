@@ -1,8 +1,6 @@
-"""A CAN bus over TCP, as the socketcand daemon serves one: ASCII elements `< ... >`.
+"""A CAN bus over TCP in the protocol of socketcand: ASCII elements `< ... >`.
 
-A client is greeted, opens the one bus that there is, and goes into raw mode; then every frame of
-the bus comes to it, and it sends its own. Not modelled: the other modes, extended identifiers, and
-discovery by broadcast.
+Not modelled: modes other than raw mode, extended identifiers, discovery by broadcast.
 """
 
 import asyncio
@@ -15,8 +13,8 @@ from drivers.errors import LinkError
 from sim.far_ends.can_bus.bus import LENGTHS, CanBus
 
 BUS_NAME = "can0"
-_LONGEST = 512  # characters of an element; a CAN FD frame has 220
-_UNREAD_MAX = 1 << 18  # bytes; a client that does not take them is hung up on
+_MAX_LENGTH = 512  # characters of an element; a CAN FD frame has 220
+_MAX_UNREAD = 1 << 18  # bytes; then the client is disconnected
 _SEND = re.compile(r"send ([0-9A-Fa-f]{1,8}) ([0-9A-Fa-f]{1,2})((?: [0-9A-Fa-f]{1,2})*)")
 _FD_SEND = re.compile(
     r"fdsend ([0-9A-Fa-f]{1,8}) ([0-9A-Fa-f]{1,2}) (\d{1,2})((?: [0-9A-Fa-f]{1,2})*)"
@@ -24,7 +22,7 @@ _FD_SEND = re.compile(
 
 
 class SocketcandEnd:
-    """Serves a bus on a loopback port, 0 for any that is free."""
+    """Serves a bus on a loopback port, 0 for any."""
 
     def __init__(self, bus: CanBus, *, port: int = 0) -> None:
         self._bus = bus
@@ -36,19 +34,19 @@ class SocketcandEnd:
         self.refused = 0
 
     async def open(self) -> None:
-        """Listen; raises LinkError where the port is taken."""
+        """Listen; raises LinkError where the port is in use."""
         loop = asyncio.get_running_loop()
         try:
             self._server = await loop.create_server(self._make_client, "127.0.0.1", self.port)
         except OSError as error:
             raise LinkError(
-                f"port {self.port} cannot be listened on ({error.strerror or error}); choose "
-                "another, or 0 for any that is free"
+                f"port {self.port}: cannot listen: {error.strerror or error}; choose another, or 0 "
+                "for any"
             ) from error
         self.port = self._server.sockets[0].getsockname()[1]
 
     def unplug(self) -> None:
-        """Hang up on every client and listen no more."""
+        """Stop listening and close all connections."""
         server, self._server = self._server, None
         if server is not None:
             server.close()
@@ -56,7 +54,7 @@ class SocketcandEnd:
             client.abort()
 
     async def close(self) -> None:
-        """As `unplug`, and see it through."""
+        """Stop listening, and wait until all connections are closed."""
         server = self._server
         self.unplug()
         if server is not None:
@@ -67,12 +65,12 @@ class SocketcandEnd:
         return _Client(self._bus, self)
 
     def joined(self, client: "_Client") -> None:
-        """A client has come."""
+        """Note a new client."""
         self._clients.add(client)
         self._is_empty.clear()
 
     def left(self, client: "_Client") -> None:
-        """A client has gone."""
+        """Note a closed client."""
         self._clients.discard(client)
         if not self._clients:
             self._is_empty.set()
@@ -80,7 +78,7 @@ class SocketcandEnd:
 
 @dataclass(eq=False)
 class _Client(asyncio.Protocol):
-    """One connection: greeted, then with the bus open, then raw."""
+    """One connection, through the states new, open and raw."""
 
     bus: CanBus
     end: SocketcandEnd
@@ -90,13 +88,13 @@ class _Client(asyncio.Protocol):
     is_raw: bool = False
 
     def __post_init__(self) -> None:
-        self.listener = self.hear  # one object, by which the bus knows it
+        self.listener = self.forward  # one object, by which the bus knows it
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """Greet."""
         self.transport = transport  # type: ignore[assignment]  # TCP's is one
         self.end.joined(self)
-        self.say("< hi >")
+        self.send("< hi >")
 
     def connection_lost(self, exc: Exception | None) -> None:
         """Leave the bus."""
@@ -105,7 +103,7 @@ class _Client(asyncio.Protocol):
         self.end.left(self)
 
     def data_received(self, data: bytes) -> None:
-        """Take the elements that are whole; what lies between them is skipped."""
+        """Process complete elements; text between them is skipped."""
         text = self.rest + data.decode("ascii", errors="replace")
         while self.transport is not None:
             begin, end = text.find("<"), text.find(">")
@@ -114,68 +112,68 @@ class _Client(asyncio.Protocol):
             if 0 <= begin < end:
                 self.element(text[begin + 1 : end].strip())
             text = text[end + 1 :]
-        if len(text) > _LONGEST:
+        if len(text) > _MAX_LENGTH:
             self.end.refused += 1
             text = ""
         self.rest = text
 
     def element(self, element: str) -> None:
-        """Do what one element asks."""
+        """Process one element."""
         name = element.partition(" ")[0]
         if not self.is_open:
             if element == f"open {BUS_NAME}":
                 self.is_open = True
-                self.say("< ok >")
+                self.send("< ok >")
             else:
-                self.refuse("could not open bus")
+                self.send_error("could not open bus")
                 if self.transport is not None:
                     self.transport.close()
         elif element == "rawmode":
-            self.say("< ok >")
+            self.send("< ok >")
             if not self.is_raw:
                 self.is_raw = True
                 self.bus.join(self.listener)
         elif element == "echo":
-            self.say("< echo >")
+            self.send("< echo >")
         elif name in ("send", "fdsend"):
             frame = _parse(element)
             if frame is None:
-                self.end.refused += 1  # the daemon tells nobody either
+                self.end.refused += 1  # socketcand sends no error either
             else:
                 self.bus.send(frame, sender=self.listener)
         else:
-            self.refuse("unknown command")
+            self.send_error("unknown command")
 
-    def hear(self, frame: CanFrame) -> None:
-        """Pass a frame of the bus on."""
-        stamp = f"{clock.now():.6f}"  # only differences of it mean anything
+    def forward(self, frame: CanFrame) -> None:
+        """Forward a frame of the bus."""
+        stamp = f"{clock.now():.6f}"  # only differences are meaningful
         data = frame.data.hex().upper()
         if frame.fd:
-            self.say(f"< fdframe {frame.id:03X} 00 {stamp} {data} >")
+            self.send(f"< fdframe {frame.id:03X} 00 {stamp} {data} >")
         else:
-            self.say(f"< frame {frame.id:03X} {stamp} {data} >")
+            self.send(f"< frame {frame.id:03X} {stamp} {data} >")
 
-    def refuse(self, why: str) -> None:
-        """Say what was wrong."""
+    def send_error(self, why: str) -> None:
+        """Send an error."""
         self.end.refused += 1
-        self.say(f"< error {why} >")
+        self.send(f"< error {why} >")
 
-    def say(self, text: str) -> None:
-        """Send; a client that takes nothing is hung up on."""
+    def send(self, text: str) -> None:
+        """Send text; a client that does not read is disconnected."""
         if self.transport is None:
             return
         self.transport.write(text.encode("ascii"))
-        if self.transport.get_write_buffer_size() > _UNREAD_MAX:
+        if self.transport.get_write_buffer_size() > _MAX_UNREAD:
             self.abort()
 
     def abort(self) -> None:
-        """Hang up at once."""
+        """Close at once."""
         if self.transport is not None:
             self.transport.abort()
 
 
 def _parse(element: str) -> CanFrame | None:
-    """The frame of an element send or fdsend; None for what is none, or has a long identifier."""
+    """The frame of an element send or fdsend, else None."""
     if found := _SEND.fullmatch(element):
         identifier, length, data = found.groups()
         count, is_fd = int(length, 16), False

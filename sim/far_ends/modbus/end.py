@@ -1,10 +1,10 @@
 """The amplifiers' side of Modbus: a TCP port on the loopback interface, or a pseudo-terminal.
 
-All amplifiers are behind one port or on one line, each the unit of its number; unit 0 is all of
-them. Over TCP unit 255 is the only one too, as gateways and masters without units have it.
+All amplifiers share one port or line, each at the unit of its number; unit 0 is broadcast. Over TCP
+unit 255 addresses a single amplifier.
 
-Not modelled: parity, two that speak at once. A TCP port that is unplugged hangs up on everybody;
-a real cable says nothing.
+Not modelled: parity, collisions. An unplugged TCP port closes its connections, unlike a
+cable.
 """
 
 import asyncio
@@ -18,9 +18,9 @@ from drivers.errors import LinkError
 from drivers.protocol.definition import PROTOCOL
 from sim.bench.simulated_device import SimulatedDevice
 from sim.far_ends.modbus.frames import (
-    PAUSE,
+    FRAME_TIMEOUT,
     Reader,
-    Request,
+    RequestAdu,
     RtuReader,
     TcpReader,
     rtu_frame,
@@ -32,9 +32,9 @@ from sim.transport.pseudo_terminal import make_terminal
 
 _MAP = PROTOCOL.modbus
 _HOST = "127.0.0.1"
-_ALONE = 255
-_CONNECTIONS_MAX = 16
-_UNSENT_MAX = 16384  # bytes; a master that does not read is hung up on
+_ANY_UNIT = 255
+_MAX_CONNECTIONS = 16
+_MAX_UNSENT = 16384  # bytes; then a client that does not read is disconnected
 _BITS_PER_BYTE = 11  # start, eight data, parity, stop
 
 
@@ -45,21 +45,21 @@ class _Units:
         self.devices = devices
         self.units = {device.number: ModbusUnit(device) for device in devices}
 
-    def answer(self, request: Request, *, over_tcp: bool) -> bytes | None:
-        """The PDU that answers a request, if one does."""
+    def reply(self, request: RequestAdu, *, over_tcp: bool) -> bytes | None:
+        """The reply PDU to a request, or None."""
         if request.unit == _MAP["broadcast"]:
             for unit in self.units.values():
-                unit.hear(request.pdu)
+                unit.handle_broadcast(request.pdu)
             return None
         number = request.unit
-        if over_tcp and number == _ALONE and len(self.units) == 1:
+        if over_tcp and number == _ANY_UNIT and len(self.units) == 1:
             number = next(iter(self.units))
         addressed = self.units.get(number)
-        return None if addressed is None else addressed.answer(request.pdu)
+        return None if addressed is None else addressed.reply(request.pdu)
 
 
 class _Wire(ABC):
-    """One stream of requests, with what befalls it on the way; `send` takes the answers."""
+    """One stream of requests, with transmission time and faults."""
 
     def __init__(self, units: _Units, reader: Reader, *, speed: int | None) -> None:
         self.units = units
@@ -73,28 +73,28 @@ class _Wire(ABC):
             bits_per_byte=_BITS_PER_BYTE,
         )
 
-    def hang_up(self) -> None:
-        """What is on the way is lost."""
+    def abandon(self) -> None:
+        """Discard what is in flight."""
         self.line.close()
         if self._timer is not None:
             self._timer.cancel()
 
     @abstractmethod
     def send(self, data: bytes) -> None:
-        """Bytes for the host have arrived there."""
+        """Send bytes that have arrived at the host's side."""
 
     @abstractmethod
-    def reply_to(self, request: Request) -> bytes | None:
-        """The frame that answers a request."""
+    def reply_to(self, request: RequestAdu) -> bytes | None:
+        """The reply frame to a request, or None."""
 
     def _arrived(self, data: bytes) -> None:
         self._take(self.reader.feed(data, clock.now()))
 
-    def _paused(self) -> None:
+    def _frame_timeout(self) -> None:
         self._timer = None
         self._take(self.reader.pause(clock.now()))
 
-    def _take(self, requests: Sequence[Request]) -> None:
+    def _take(self, requests: Sequence[RequestAdu]) -> None:
         for request in requests:
             frame = self.reply_to(request)
             if frame is not None:
@@ -102,16 +102,17 @@ class _Wire(ABC):
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
-        if self.reader.is_amid:
-            # A little more, for a timer may be early by the clock's resolution.
-            self._timer = asyncio.get_running_loop().call_later(PAUSE + 0.002, self._paused)
+        if self.reader.has_partial_frame:
+            # Timers may be early by the clock's resolution.
+            self._timer = asyncio.get_running_loop().call_later(
+                FRAME_TIMEOUT + 0.002, self._frame_timeout
+            )
 
 
 class ModbusRtuEnd(_Wire):
-    """A pseudo-terminal on which devices answer, each as the unit of its number.
+    """A pseudo-terminal with devices at the units of their numbers.
 
-    speed [bit/s]: bytes take as long as at this speed; None for no time at all. unpluggable: the
-    port is named by a link that outlives the pseudo-terminal.
+    speed [bit/s]: None for no transmission time; unpluggable: see `make_terminal`.
     """
 
     def __init__(
@@ -133,32 +134,32 @@ class ModbusRtuEnd(_Wire):
         return {device.name: f"{line}#{device.number}" for device in self.units.devices}
 
     def start(self) -> None:
-        """Answer from now on, in the running event loop."""
+        """Serve in the running event loop."""
         self._terminal.listen()
         if self._is_unpluggable:
             self.units.devices[0].on_plug(self._plug)
 
     def close(self) -> None:
-        """Hang up; to be called in the event loop that it was started in."""
-        self.hang_up()
+        """Close, in the event loop of `start`."""
+        self.abandon()
         self._terminal.close()
 
     def send(self, data: bytes) -> None:
-        """Bytes for the host have arrived there."""
+        """Send bytes that have arrived at the host's side."""
         self._terminal.write(data)
 
-    def reply_to(self, request: Request) -> bytes | None:
-        """The frame that answers a request."""
-        pdu = self.units.answer(request, over_tcp=False)
+    def reply_to(self, request: RequestAdu) -> bytes | None:
+        """The reply frame to a request, or None."""
+        pdu = self.units.reply(request, over_tcp=False)
         return None if pdu is None else rtu_frame(request.unit, pdu)
 
     def _plug(self, is_plugged: bool) -> None:
-        self.hang_up()
+        self.abandon()
         self._terminal.plug(is_plugged)
 
 
 class _Connection(_Wire, asyncio.Protocol):
-    """One master over TCP."""
+    """One client over TCP."""
 
     def __init__(self, end: "ModbusTcpEnd", units: _Units) -> None:
         super().__init__(units, TcpReader(), speed=None)
@@ -168,7 +169,7 @@ class _Connection(_Wire, asyncio.Protocol):
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         self._transport = cast(asyncio.Transport, transport)
         open_socket: socket.socket = transport.get_extra_info("socket")
-        open_socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _UNSENT_MAX)
+        open_socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _MAX_UNSENT)
         self._end.connected(self)
 
     def data_received(self, data: bytes) -> None:
@@ -176,29 +177,29 @@ class _Connection(_Wire, asyncio.Protocol):
 
     def connection_lost(self, exc: Exception | None) -> None:
         self._end.connections.discard(self)
-        self.hang_up()
+        self.abandon()
 
     def abort(self) -> None:
-        """Hang up at once."""
+        """Close at once."""
         if self._transport is not None:
             self._transport.abort()
 
     def send(self, data: bytes) -> None:
-        """Bytes for the host have arrived there."""
+        """Send bytes that have arrived at the host's side."""
         if self._transport is None or self._transport.is_closing():
             return
         self._transport.write(data)
-        if self._transport.get_write_buffer_size() > _UNSENT_MAX:
+        if self._transport.get_write_buffer_size() > _MAX_UNSENT:
             self._transport.abort()
 
-    def reply_to(self, request: Request) -> bytes | None:
-        """The frame that answers a request."""
-        pdu = self.units.answer(request, over_tcp=True)
+    def reply_to(self, request: RequestAdu) -> bytes | None:
+        """The reply frame to a request, or None."""
+        pdu = self.units.reply(request, over_tcp=True)
         return None if pdu is None else tcp_frame(request, pdu)
 
 
 class ModbusTcpEnd:
-    """A TCP port on the loopback interface; port 0 is any that is free."""
+    """A TCP port on the loopback interface; 0 for any."""
 
     def __init__(self, devices: Sequence[SimulatedDevice], *, port: int = 0) -> None:
         self._units = _Units(devices)
@@ -209,36 +210,36 @@ class ModbusTcpEnd:
 
     @property
     def urls(self) -> dict[str, str]:
-        """The URL of each amplifier, by its name; once it has started."""
+        """The URL of each amplifier by name, after `start`."""
         return {
             device.name: f"modbus+tcp://{_HOST}:{self._port}/{device.number}"
             for device in self._units.devices
         }
 
     async def start(self) -> None:
-        """Answer from now on; raises LinkError where the port is taken."""
+        """Listen; raises LinkError where the port is in use."""
         try:
             self._server = await asyncio.get_running_loop().create_server(
                 lambda: _Connection(self, self._units), _HOST, self._port
             )
         except OSError as error:
             raise LinkError(
-                f"port {self._port} cannot be listened on ({error.strerror or error}); take "
-                "another, or 0 for any"
+                f"port {self._port}: cannot listen: {error.strerror or error}; choose another, "
+                "or 0 for any"
             ) from error
         self._port = self._server.sockets[0].getsockname()[1]
         self._units.devices[0].on_plug(self._plug)
 
     async def close(self) -> None:
-        """Hang up and listen no more."""
+        """Stop listening and close the connections."""
         self._drop_all()
         if self._server is not None:
             self._server.close()
             await self._server.wait_closed()
 
     def connected(self, connection: _Connection) -> None:
-        """A master has come."""
-        if not self._is_plugged or len(self.connections) >= _CONNECTIONS_MAX:
+        """Note a new client."""
+        if not self._is_plugged or len(self.connections) >= _MAX_CONNECTIONS:
             connection.abort()
         else:
             self.connections.add(connection)

@@ -1,4 +1,4 @@
-"""Device identification over Modbus (function 43/14): who the amplifier is, in texts by number."""
+"""Device identification over Modbus (function 43/14)."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -8,7 +8,7 @@ from sim.far_ends.modbus.pdu import ILLEGAL_ADDRESS, ILLEGAL_VALUE, ModbusExcept
 from sim.far_ends.modbus.words import MAP, text_bytes
 
 IDENTIFY = 43
-_READ = 0x0E  # the one kind of function 43 that is understood
+_READ = 0x0E  # MEI type
 _BASIC, _ONE = (1, 2), 4  # codes: 1 and 2 without the vendor's own objects, 3 with them, 4 one
 _NUMBERS: Mapping[str, int] = MAP["device_identification"]
 _EXTENDED = 0x80  # objects from here on are the vendor's own
@@ -17,22 +17,22 @@ _CONFORMITY = 0x83  # extended identification, as a stream and one by one
 
 @dataclass(frozen=True)
 class IdentificationRequest:
-    """Which texts are asked for: by a code, and the number of the first."""
+    """A request for texts: its code, and the number of the first."""
 
     code: int
     first: int
 
     @classmethod
     def of(cls, body: bytes) -> "IdentificationRequest":
-        """What the bytes after the function ask for; raises ModbusException."""
+        """Decode the bytes after the function; raises ModbusException."""
         if len(body) != 3 or not 1 <= body[1] <= _ONE:
             raise ModbusException(ILLEGAL_VALUE)
         return cls(code=body[1], first=body[2])
 
-    def answered(self, who: Identity) -> bytes:
-        """The answer PDU; raises ModbusException."""
+    def response(self, identity: Identity) -> bytes:
+        """The reply PDU; raises ModbusException."""
         texts = {
-            number: text_bytes(getattr(who, name))
+            number: text_bytes(getattr(identity, name))
             for name, number in _NUMBERS.items()
             if self.code not in _BASIC or number < _EXTENDED
         }

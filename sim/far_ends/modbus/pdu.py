@@ -1,4 +1,4 @@
-"""Request PDUs of Modbus taken apart, and the exceptions of those that cannot be."""
+"""Decode request PDUs of Modbus, with the exceptions of invalid ones."""
 
 import struct
 from collections.abc import Sequence
@@ -25,7 +25,7 @@ def pair(body: bytes) -> tuple[int, int]:
 
 
 def check_range(address: int, count: int, *, end: int) -> None:
-    """Whether so many registers from here on can be read, up to an end; raises ModbusException."""
+    """Check a register range against the end of the map; raises ModbusException."""
     if not 1 <= count <= _READ_MAX:
         raise ModbusException(ILLEGAL_VALUE)
     if address + count > end:
@@ -33,7 +33,7 @@ def check_range(address: int, count: int, *, end: int) -> None:
 
 
 def to_write(function: int, body: bytes) -> tuple[int, Sequence[int]]:
-    """From where on which words are written."""
+    """The address and the words of a write."""
     if function == WRITE_ONE:
         address, word = pair(body)
         return address, [word]
@@ -47,5 +47,5 @@ def to_write(function: int, body: bytes) -> tuple[int, Sequence[int]]:
 
 
 def registers_read(function: int, words: Sequence[int]) -> bytes:
-    """The answer of a function that reads."""
+    """The reply PDU of a read."""
     return struct.pack(f">BB{len(words)}H", function, 2 * len(words), *words)

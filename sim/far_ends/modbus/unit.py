@@ -1,7 +1,7 @@
-"""The registers of a simulated amplifier: request PDUs of a Modbus master in, answer PDUs out.
+"""The registers of a simulated amplifier: request PDUs in, reply PDUs out.
 
-Written apart from the host's side, from protocol.yaml alone, so that the two check each other. What
-is refused is not applied and does not feed the watchdog; what is damaged is not answered.
+Written from protocol.yaml, without code of the host's side. A refused write is not applied and does
+not feed the watchdog; a damaged one gets no reply.
 """
 
 from collections.abc import Mapping, Sequence
@@ -50,14 +50,14 @@ from sim.far_ends.modbus.pdu import (
 from sim.far_ends.modbus.words import (
     MAP,
     NO_CHANNEL,
-    Unfit,
+    RefusedWrite,
     achieved_words,
     capability_words,
     checksum,
-    envelope_load,
+    decode_envelope,
+    decode_set,
     fault_words,
     identity_words,
-    playing,
     status_words,
     value_of,
 )
@@ -92,30 +92,30 @@ _ENDS = {
     block["address"]: block["address"] + _SIZES[name] for name, block in MAP["holding"].items()
 }
 _STARTS = {*_ENDS, *(block["address"] for block in MAP["input"].values())}
-_WORDS: Mapping[int, str] = {word: name for name, word in MAP["controlwords"].items()}
+_CONTROLWORDS: Mapping[int, str] = {word: name for name, word in MAP["controlwords"].items()}
 _END = MAP["input"]["faults"]["address"] + _SIZES["faults"]
 
 
 class Amplifier(Protocol):
-    """Whose registers these are."""
+    """The amplifier behind the registers."""
 
     @property
     def is_answering(self) -> bool:
-        """Whether it does anything at all."""
+        """Whether it replies at all."""
 
     def exchange(self, request: Request) -> Reply | None:
-        """Its answer to a request; None if it keeps still."""
+        """Its reply to a request; None for no reply."""
 
     def broadcast(self, request: Broadcast) -> None:
-        """Carry out what was said to all."""
+        """Execute a broadcast."""
 
 
-class _Still(Exception):
-    """No answer at all."""
+class _NoReply(Exception):
+    """No reply is sent."""
 
 
 class ModbusUnit:
-    """The registers of one amplifier. damaged: writes whose check was wrong."""
+    """The registers of one amplifier. damaged: writes with a wrong CRC."""
 
     def __init__(self, amplifier: Amplifier) -> None:
         self._amplifier = amplifier
@@ -123,28 +123,28 @@ class ModbusUnit:
         self._tag = 0
         self._refusal = [0, NO_CHANNEL, 0]
         self._achieved: Achieved | None = None
-        # As they were written last; at first the watchdog and ramp that a bare controlword takes.
+        # As written last; initially the defaults of watchdog and ramp.
         self._written = {_CONTROL + 3: _Q.watchdog.to_wire(0.25), _CONTROL + 4: 5}
 
-    def answer(self, pdu: bytes) -> bytes | None:
-        """The answer to a request of at least one byte; None if there is none."""
+    def reply(self, pdu: bytes) -> bytes | None:
+        """The reply to a request of at least one byte; None for no reply."""
         if not self._amplifier.is_answering:
             return None
         try:
             return self._carry_out(pdu[0], pdu[1:])
         except ModbusException as exception:
             return bytes([pdu[0] | 0x80, exception.code])
-        except _Still:
+        except _NoReply:
             return None
 
-    def hear(self, pdu: bytes) -> None:
-        """Carry out a broadcast: a commit or a stop, and nothing else."""
+    def handle_broadcast(self, pdu: bytes) -> None:
+        """Execute a broadcast commit or stop; anything else is ignored."""
         try:
             if pdu[0] not in (WRITE_ONE, WRITE):
                 return
             address, words = to_write(pdu[0], pdu[1:])
             request = self._request(address, self._without_head(address, words))
-        except (ModbusException, _Still, Unfit):
+        except (ModbusException, _NoReply, RefusedWrite):
             return
         if isinstance(request, Commit | Stop):
             self._amplifier.broadcast(request)
@@ -164,23 +164,23 @@ class ModbusUnit:
             return registers_read(function, self._read(*wanted))
         if function == IDENTIFY and body[:1] == b"\x0e":
             asked = IdentificationRequest.of(body)
-            return asked.answered(_of(Identity, self._asked(Hello())))
+            return asked.response(_expect(Identity, self._query(Hello())))
         raise ModbusException(ILLEGAL_FUNCTION)
 
-    def _ask(self, request: Request) -> Reply:
+    def _exchange(self, request: Request) -> Reply:
         reply = self._amplifier.exchange(request)
         if reply is None:
-            raise _Still
+            raise _NoReply
         if isinstance(reply, Nak):
-            raise Unfit(reply.code, reply.channel)
+            raise RefusedWrite(reply.code, reply.channel)
         return reply
 
-    def _asked(self, request: Request) -> Reply:
-        """The same where only a busy amplifier refuses."""
+    def _query(self, request: Request) -> Reply:
+        """Exchange a request that only a busy amplifier refuses."""
         try:
-            return self._ask(request)
-        except Unfit as unfit:
-            raise ModbusException(MAP["exceptions"][unfit.code.name]) from None
+            return self._exchange(request)
+        except RefusedWrite as refused:
+            raise ModbusException(MAP["exceptions"][refused.code.name]) from None
 
     # Reading
 
@@ -203,15 +203,15 @@ class ModbusUnit:
             case "refusal":
                 return self._refusal
             case "capabilities":
-                return capability_words(_of(Capabilities, self._asked(GetCaps())))
+                return capability_words(_expect(Capabilities, self._query(GetCaps())))
             case "identity":
-                return identity_words(_of(Identity, self._asked(Hello())))
+                return identity_words(_expect(Identity, self._query(Hello())))
             case "faults":
-                return fault_words(_of(FaultList, self._asked(GetFaults())))
+                return fault_words(_expect(FaultList, self._query(GetFaults())))
             case "achieved":
-                return achieved_words(self._achieved, _of(Status, self._asked(GetStatus())))
+                return achieved_words(self._achieved, _expect(Status, self._query(GetStatus())))
             case _:
-                return status_words(_of(Status, self._asked(GetStatus())))
+                return status_words(_expect(Status, self._query(GetStatus())))
 
     # Writing
 
@@ -224,30 +224,30 @@ class ModbusUnit:
             if tag:
                 self._tag = tag
             request = self._request(address, fields)
-            reply = None if request is None else self._ask(request)
-        except Unfit as unfit:
-            channel = NO_CHANNEL if unfit.channel is None else unfit.channel & 0xFFFF
-            self._refusal = [int(unfit.code), channel, tag]
-            raise ModbusException(MAP["exceptions"][unfit.code.name]) from None
+            reply = None if request is None else self._exchange(request)
+        except RefusedWrite as refused:
+            channel = NO_CHANNEL if refused.channel is None else refused.channel & 0xFFFF
+            self._refusal = [int(refused.code), channel, tag]
+            raise ModbusException(MAP["exceptions"][refused.code.name]) from None
         if isinstance(reply, Achieved):
             self._achieved = reply
         self._written.update(enumerate(words, start=address))
-        if isinstance(reply, Loaded):  # read back as it is kept
+        if isinstance(reply, Loaded):  # reads return it as stored
             self._written.update({_ENVELOPE + 2: reply.slot, _ENVELOPE + 4: reply.knots})
 
     def _without_head(self, address: int, words: Sequence[int]) -> Sequence[int]:
-        """The words after the tag and the check, where a write begins with them."""
+        """The words after tag and CRC, where a write begins with them."""
         if address not in _ENDS:
             return words
         if len(words) <= _HEAD:
-            raise Unfit(NakCode.BAD_LENGTH)
+            raise RefusedWrite(NakCode.BAD_LENGTH)
         if words[1] not in (0, checksum(words[_HEAD:])):
             self.damaged += 1
-            raise _Still
+            raise _NoReply
         return words[_HEAD:]
 
     def _request(self, address: int, words: Sequence[int]) -> Request | None:
-        """What these words ask for, a block's without its head; None for nothing."""
+        """Decode the words of a write, without tag and CRC; None where no request follows."""
         if address in (MAP["heartbeat"], MAP["look"]):
             if len(words) > 1:
                 raise ModbusException(ILLEGAL_ADDRESS)
@@ -260,16 +260,16 @@ class ModbusUnit:
         else:
             raise ModbusException(ILLEGAL_ADDRESS)
         if begin == _CONTROL:
-            return self._order(address, words)
-        if address != begin + _HEAD:  # a part of it would be a torn one
+            return self._control_request(address, words)
+        if address != begin + _HEAD:  # no partial writes
             raise ModbusException(ILLEGAL_ADDRESS)
-        return playing(words) if begin == _SET else envelope_load(words)
+        return decode_set(words) if begin == _SET else decode_envelope(words)
 
-    def _order(self, address: int, words: Sequence[int]) -> Request | None:
+    def _control_request(self, address: int, words: Sequence[int]) -> Request | None:
         control = {**self._written, **dict(enumerate(words, start=address))}
         if address > _CONTROL + _HEAD:
             return None
-        name = _WORDS.get(words[0])
+        name = _CONTROLWORDS.get(words[0])
         ramp = min(control[_CONTROL + 4], _Q.ramp.maximum) / _Q.ramp.per_unit
         match name:
             case "ARM":
@@ -281,10 +281,10 @@ class ModbusUnit:
             case "CLEAR":
                 return Clear()
             case _:
-                raise Unfit(NakCode.BAD_VALUE)
+                raise RefusedWrite(NakCode.BAD_VALUE)
 
 
-def _of(kind: type[_T], reply: Reply) -> _T:
+def _expect(kind: type[_T], reply: Reply) -> _T:
     if not isinstance(reply, kind):
-        raise TypeError(f"a {kind.__name__} was asked for, not a {type(reply).__name__}")
+        raise TypeError(f"reply must be {kind.__name__}, got {type(reply).__name__}")
     return reply

@@ -1,8 +1,9 @@
-"""What stands in the registers of a simulated amplifier: messages to 16-bit words and back.
+"""Register contents of a simulated amplifier: messages to 16-bit words and back.
 
-Written apart from the host's side, from protocol.yaml alone.
+Written from protocol.yaml, without code of the host's side.
 """
 
+import binascii
 import struct
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -30,8 +31,8 @@ _KNOWN_FLAGS = sum((2 ** flag["bits"] - 1) * 2 ** flag["bit"] for flag in _FLAGS
 NO_CHANNEL = 255
 
 
-class Unfit(Exception):
-    """Words that cannot be taken; code and channel are those of the refusal."""
+class RefusedWrite(Exception):
+    """A write that is refused with this code and channel."""
 
     def __init__(self, code: NakCode, channel: int | None = None) -> None:
         super().__init__(code.name)
@@ -40,40 +41,27 @@ class Unfit(Exception):
 
 
 def checksum(words: Sequence[int]) -> int:
-    """CRC-16 with polynomial 1021 from FFFF; FFFF stands for 0, which says that there is none."""
-    remainder = 0xFFFF
-    for byte in struct.pack(f">{len(words)}H", *words):
-        remainder = (remainder << 8) & 0xFF00 ^ _CHECK_OF_BYTE[remainder >> 8 ^ byte]
-    return remainder or 0xFFFF
-
-
-def _check_of_byte(byte: int) -> int:
-    remainder = byte << 8
-    for _ in range(8):
-        remainder = (remainder << 1) ^ (0x1021 if remainder & 0x8000 else 0)
-    return remainder & 0xFFFF
-
-
-_CHECK_OF_BYTE = [_check_of_byte(byte) for byte in range(256)]
+    """CRC-16 with polynomial 1021, initial FFFF; 0, which means no CRC, becomes FFFF."""
+    return binascii.crc_hqx(struct.pack(f">{len(words)}H", *words), 0xFFFF) or 0xFFFF
 
 
 def value_of(quantity: Quantity, word: int, *, channel: int | None = None) -> float:
-    """The value [unit] in a word; raises Unfit where it is out of range."""
+    """The value [unit] in a word; raises RefusedWrite where it is out of range."""
     number = word - 0x10000 if quantity.minimum < 0 and word >= 0x8000 else word
     if not quantity.minimum <= number <= quantity.maximum:
         bad_token = quantity is _Q.token
-        raise Unfit(NakCode.BAD_TOKEN if bad_token else NakCode.BAD_VALUE, channel)
+        raise RefusedWrite(NakCode.BAD_TOKEN if bad_token else NakCode.BAD_VALUE, channel)
     return number / quantity.per_unit
 
 
 def word_of(quantity: Quantity, value: float) -> int:
-    """The word of a value [unit], the nearest in range: an answer says what it can."""
+    """The word of a value [unit], clipped to the range."""
     nearest = min(max(round(value * quantity.per_unit), quantity.minimum), quantity.maximum)
     return nearest % 0x10000
 
 
 def commands_of(words: Sequence[int]) -> tuple[DriveCommand, ...]:
-    """What the channels shall play, in groups of four words; one of zeros names none."""
+    """Commands of channels in groups of four words; a group of zeros names no channel."""
     groups = [words[at : at + _GROUP] for at in range(0, len(words), _GROUP)]
     return tuple(_command(channel, group) for channel, group in enumerate(groups) if any(group))
 
@@ -81,23 +69,23 @@ def commands_of(words: Sequence[int]) -> tuple[DriveCommand, ...]:
 def _command(channel: int, group: Sequence[int]) -> DriveCommand:
     frequency, level, phase, flags = group
     if flags & ~_KNOWN_FLAGS:
-        raise Unfit(NakCode.BAD_VALUE, channel)
-    said = {name: flags // 2 ** flag["bit"] % 2 ** flag["bits"] for name, flag in _FLAGS.items()}
+        raise RefusedWrite(NakCode.BAD_VALUE, channel)
+    fields = {name: flags // 2 ** flag["bit"] % 2 ** flag["bits"] for name, flag in _FLAGS.items()}
     return DriveCommand(
         channel=channel,
         frequency=value_of(_Q.frequency, frequency, channel=channel),
         level=value_of(_Q.level, level, channel=channel),
         phase=value_of(_Q.phase, phase, channel=channel),
-        keep_phase=said["keep_phase"] == 1,
-        onset=said["onset"],
-        ending=said["ending"],
-        skip_ending=said["skip_ending"] == 1,
+        keep_phase=fields["keep_phase"] == 1,
+        onset=fields["onset"],
+        ending=fields["ending"],
+        skip_ending=fields["skip_ending"] == 1,
     )
 
 
 def command_words(command: DriveCommand) -> list[int]:
     """The four words of a channel."""
-    said = {
+    fields = {
         "keep_phase": int(command.keep_phase),
         "skip_ending": int(command.skip_ending),
         "onset": command.onset,
@@ -107,13 +95,13 @@ def command_words(command: DriveCommand) -> list[int]:
         word_of(_Q.frequency, command.frequency),
         word_of(_Q.level, command.level),
         word_of(_Q.phase, command.phase),
-        sum(said[name] * 2 ** flag["bit"] for name, flag in _FLAGS.items()),
+        sum(fields[name] * 2 ** flag["bit"] for name, flag in _FLAGS.items()),
     ]
 
 
 def status_words(status: Status) -> list[int]:
-    """Its registers in their order, then a level for each channel."""
-    said = {
+    """The registers of a status, then a level per channel."""
+    fields = {
         "state": int(status.state),
         "fault": int(status.fault),
         "active_token": status.token,
@@ -123,13 +111,13 @@ def status_words(status: Status) -> list[int]:
         "watchdog_left": word_of(_Q.watchdog_left, status.watchdog_left),
         "channel_count": len(status.levels),
     }
-    words = [said[name] for name in MAP["input"]["status"]["registers"]]
+    words = [fields[name] for name in MAP["input"]["status"]["registers"]]
     return words + [word_of(_Q.level, level) for level in status.levels]
 
 
 def achieved_words(achieved: Achieved | None, status: Status) -> list[int]:
-    """What plays or would, after the condition; token 0 and no channels where there is nothing."""
-    said = {
+    """The registers of the achieved set; token 0 and no channels for none."""
+    fields = {
         "state": int(status.state),
         "fault": int(status.fault),
         "token": achieved.token if achieved else 0,
@@ -138,49 +126,49 @@ def achieved_words(achieved: Achieved | None, status: Status) -> list[int]:
     groups = [[0] * _GROUP for _ in status.levels]
     for command in achieved.commands if achieved else ():
         groups[command.channel] = command_words(command)
-    words = [said[name] for name in MAP["input"]["achieved"]["registers"]]
+    words = [fields[name] for name in MAP["input"]["achieved"]["registers"]]
     return words + [word for group in groups for word in group]
 
 
-def capability_words(can: Capabilities) -> list[int]:
-    """Its registers in their order."""
-    said = {
+def capability_words(capabilities: Capabilities) -> list[int]:
+    """The registers of capabilities."""
+    fields = {
         "protocol_version": PROTOCOL.version,
-        "channel_count": can.channels,
-        "frequency_min": word_of(_Q.frequency, can.frequency_min),
-        "frequency_max": word_of(_Q.frequency, can.frequency_max),
-        "frequency_step": word_of(_Q.frequency, can.frequency_step),
-        "level_max": word_of(_Q.level, can.level_max),
-        "level_step": word_of(_Q.level, can.level_step),
-        "phase_step": word_of(_Q.phase_step, can.phase_step),
-        "ramp_max": word_of(_Q.ramp, can.ramp_max),
-        "watchdog_min": word_of(_Q.watchdog, can.watchdog_min),
-        "watchdog_max": word_of(_Q.watchdog, can.watchdog_max),
-        "envelope_knots": can.envelope_knots,
-        "envelope_slots": can.envelope_slots,
-        "envelope_step_min": word_of(_Q.envelope_step, can.envelope_step_min),
-        "envelope_step_max": word_of(_Q.envelope_step, can.envelope_step_max),
+        "channel_count": capabilities.channels,
+        "frequency_min": word_of(_Q.frequency, capabilities.frequency_min),
+        "frequency_max": word_of(_Q.frequency, capabilities.frequency_max),
+        "frequency_step": word_of(_Q.frequency, capabilities.frequency_step),
+        "level_max": word_of(_Q.level, capabilities.level_max),
+        "level_step": word_of(_Q.level, capabilities.level_step),
+        "phase_step": word_of(_Q.phase_step, capabilities.phase_step),
+        "ramp_max": word_of(_Q.ramp, capabilities.ramp_max),
+        "watchdog_min": word_of(_Q.watchdog, capabilities.watchdog_min),
+        "watchdog_max": word_of(_Q.watchdog, capabilities.watchdog_max),
+        "envelope_knots": capabilities.envelope_knots,
+        "envelope_slots": capabilities.envelope_slots,
+        "envelope_step_min": word_of(_Q.envelope_step, capabilities.envelope_step_min),
+        "envelope_step_max": word_of(_Q.envelope_step, capabilities.envelope_step_max),
     }
-    return [said[name] for name in MAP["input"]["capabilities"]["registers"]]
+    return [fields[name] for name in MAP["input"]["capabilities"]["registers"]]
 
 
-def identity_words(who: Identity) -> list[int]:
-    """The version of the protocol, then the texts."""
-    words = [who.protocol_version]
+def identity_words(identity: Identity) -> list[int]:
+    """The protocol version, then the texts."""
+    words = [identity.protocol_version]
     for name in MAP["input"]["identity"]["texts"]:
         size = 2 * MAP["text_registers"]
-        raw = text_bytes(getattr(who, name)).ljust(size, b"\0")
+        raw = text_bytes(getattr(identity, name)).ljust(size, b"\0")
         words += struct.unpack(f">{size // 2}H", raw)
     return words
 
 
 def text_bytes(text: str) -> bytes:
-    """A text in UTF-8, cut to what fits."""
+    """A text in UTF-8, truncated to its registers."""
     return text.encode()[: 2 * MAP["text_registers"]].decode(errors="ignore").encode()
 
 
 def fault_words(faults: FaultList) -> list[int]:
-    """How many, then four words each, newest first."""
+    """The number of faults, then four words each, newest first."""
     newest = faults.faults[: MAP["fault_count"]]
     words = [len(newest)]
     for record in newest:
@@ -190,25 +178,25 @@ def fault_words(faults: FaultList) -> list[int]:
     return words
 
 
-def playing(words: Sequence[int]) -> Stage | Apply | Commit:
-    """What the words of the set block ask for; raises Unfit."""
+def decode_set(words: Sequence[int]) -> Stage | Apply | Commit:
+    """Decode the set block; raises RefusedWrite."""
     commit, *rest = words
     if not rest:
         return Commit(token=int(value_of(_Q.token, commit)))
     if len(rest) < 3 or (len(rest) - 3) % _GROUP:
-        raise Unfit(NakCode.BAD_LENGTH)
+        raise RefusedWrite(NakCode.BAD_LENGTH)
     token = int(value_of(_Q.token, rest[0]))
     ramp, valid_for = value_of(_Q.ramp, rest[1]), value_of(_Q.valid_for, rest[2])
     wanted = CommandSet(token, commands_of(rest[3:]), ramp=ramp, valid_for=valid_for)
     if commit not in (0, token):
-        raise Unfit(NakCode.BAD_TOKEN)
+        raise RefusedWrite(NakCode.BAD_TOKEN)
     return Apply(wanted) if commit else Stage(wanted)
 
 
-def envelope_load(words: Sequence[int]) -> LoadEnvelope:
-    """What the words of the envelope block ask for; raises Unfit."""
+def decode_envelope(words: Sequence[int]) -> LoadEnvelope:
+    """Decode the envelope block; raises RefusedWrite."""
     if len(words) < 3 or len(words) != 3 + 2 * words[2]:
-        raise Unfit(NakCode.BAD_LENGTH)
+        raise RefusedWrite(NakCode.BAD_LENGTH)
     pairs = zip(words[3::2], words[4::2], strict=True)
     knots = tuple(Knot(value_of(_Q.level, a), value_of(_Q.phase, b)) for a, b in pairs)
     slot = int(value_of(_Q.envelope_slot, words[0]))

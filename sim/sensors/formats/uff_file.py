@@ -1,6 +1,6 @@
 """Recordings as universal files (UFF 58), for modal software.
 
-One record a sensor, 12 digits; start and sampling interval have six.
+One record per sensor with 12 digits; start and sampling interval have six.
 """
 
 from collections.abc import Sequence
@@ -22,7 +22,7 @@ from sim.sensors.formats.format import Format, rounded
 from sim.sensors.recording import Recording
 
 _UP = 3
-_LONGEST_NAME = 10
+_MAX_NAME = 10
 
 
 def _write(path: Path, recording: Recording) -> None:
@@ -49,22 +49,19 @@ def _read(path: Path) -> Recording:
     content = read_universal(path)
     records = [f for f in content.functions if f.function_type == TIME_RESPONSE]
     if not records:
-        raise InputError(f"{path}: holds no signals (dataset 58, function type 1)")
+        raise InputError(f"{path}: no signals (dataset 58, function type 1)")
     first = records[0]
     for record in records:
         if record.kinds[0] != TIME or record.kinds[1] != ACCELERATION:
-            raise InputError(f"{record.place}: the record is no acceleration over time")
+            raise InputError(f"{record.place}: must be acceleration over time")
         if record.units[0].replace(" ", "") not in ("m/s^2", "m/s2", "m/s²"):
-            raise InputError(
-                f"{record.place}: the record is in {record.units[0] or 'no unit'!r}, not in m/s²"
-            )
+            raise InputError(f"{record.place}: unit must be m/s^2, got {record.units[0]!r}")
         if len(record.x) < 2 or not np.array_equal(record.x, first.x):
-            raise InputError(
-                f"{record.place}: the record's times are not those of the first; only sensors that "
-                "were recorded together can be read"
-            )
+            raise InputError(f"{record.place}: times must equal those of the first record")
         if record.response not in content.nodes:
-            raise InputError(f"{record.place}: node {record.response} has no place (dataset 2411)")
+            raise InputError(
+                f"{record.place}: node {record.response} has no position (dataset 2411)"
+            )
     rate = (len(first.x) - 1) / (first.x[-1] - first.x[0])
     return Recording(
         tuple(record.names[0] or f"node {record.response}" for record in records),
@@ -76,14 +73,14 @@ def _read(path: Path) -> Recording:
 
 
 def _cannot_hold(names: Sequence[str], sample_rate: float) -> str | None:
-    long = [name for name in names if len(name) > _LONGEST_NAME]
-    return f"a UFF keeps {_LONGEST_NAME} characters of a name; {long[0]!r}" if long else None
+    long = [name for name in names if len(name) > _MAX_NAME]
+    return f"names must have at most {_MAX_NAME} characters, got {long[0]!r}" if long else None
 
 
 UFF = Format(
     _write,
     _read,
     start=b"    -1",
-    values_max=1 << 22,  # as text in memory, 20 bytes a value
+    max_values=1 << 22,  # as text in memory, 20 bytes a value
     cannot_hold=_cannot_hold,
 )

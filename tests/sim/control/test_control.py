@@ -1,4 +1,4 @@
-"""The control socket of the far end: what it takes, and what it refuses."""
+"""The control socket: operations and errors."""
 
 import asyncio
 import contextlib
@@ -41,8 +41,8 @@ def ask(bench: Bench, now: float, **request: Any) -> dict[str, Any]:
     return made()
 
 
-def test_place_play_and_feel(coarse_rig: Rig) -> None:
-    """The answers have the shape that is promised, in units that their keys say."""
+def test_control_places_fingers_and_returns_felt_and_state(coarse_rig: Rig) -> None:
+    """Responses have the documented keys and shapes."""
     bench = Bench(coarse_rig, now=5.0)
     placed = ask(bench, 5.1, op="fingers", fingers={"7": [0.1, 0.08], "x": [0, 0]})
     assert placed == {"ok": True, "time_s": 5.1}
@@ -96,8 +96,8 @@ def test_place_play_and_feel(coarse_rig: Rig) -> None:
         b"[" * 60_000 + b"\n",
     ],
 )
-def test_malformed_lines_get_an_error_and_change_nothing(coarse_rig: Rig, line: bytes) -> None:
-    """Whatever the line, there is an answer, it says what is wrong, and no finger moves."""
+def test_control_refuses_an_invalid_line(coarse_rig: Rig, line: bytes) -> None:
+    """The response is a short error, and nothing changes."""
     bench = Bench(coarse_rig, now=1.0)
     ask(bench, 1.0, op="fingers", fingers={"a": [0.1, 0.1]})
     made = carry_out(SimulationContext(bench), line, now=1.0)
@@ -108,10 +108,8 @@ def test_malformed_lines_get_an_error_and_change_nothing(coarse_rig: Rig, line: 
     assert bench.fingers.layout.positions == {"a": (0.1, 0.1)}
 
 
-async def test_the_socket_is_its_owners_and_goes_with_the_bench(
-    coarse_rig: Rig, socket_path: Path
-) -> None:
-    """Mode 0600; several lines on one connection; no file is left behind."""
+async def test_control_socket_is_private_and_removed(coarse_rig: Rig, socket_path: Path) -> None:
+    """Mode 0600; several lines per connection; no file is left."""
     bench = Bench(coarse_rig, now=0.0)
     async with control_socket(SimulationContext(bench), socket_path):
         assert mode(socket_path) == 0o600
@@ -119,7 +117,7 @@ async def test_the_socket_is_its_owners_and_goes_with_the_bench(
         writer.write(b'{"op": "state"}\nnonsense\n{"op": "state"}\n')
         replies = [json.loads(await reader.readline()) for _ in range(3)]
         assert ["error" in reply for reply in replies] == [False, True, False]
-        with pytest.raises(LinkError, match="no other program"):
+        with pytest.raises(LinkError, match=str(socket_path)):
             async with control_socket(SimulationContext(bench), socket_path):
                 pass
         writer.close()
@@ -127,15 +125,15 @@ async def test_the_socket_is_its_owners_and_goes_with_the_bench(
     assert mode(socket_path) is None
 
 
-async def test_an_endless_line_is_cut_off(coarse_rig: Rig, socket_path: Path) -> None:
-    """A line beyond the bound gets an error and the connection ends; others go on."""
+async def test_control_closes_on_an_endless_line(coarse_rig: Rig, socket_path: Path) -> None:
+    """The client gets an error; other connections continue."""
     bench = Bench(coarse_rig, now=0.0)
     async with control_socket(SimulationContext(bench), socket_path):
         reader, writer = await asyncio.open_unix_connection(socket_path)
         writer.write(b" " * (2 * LINE_MAX))
-        assert "longer than" in json.loads(await reader.readline())["error"]
+        assert str(LINE_MAX) in json.loads(await reader.readline())["error"]
         writer.close()
-        with contextlib.suppress(ConnectionError):  # it left with bytes of ours unread
+        with contextlib.suppress(ConnectionError):
             await writer.wait_closed()
         again, other = await asyncio.open_unix_connection(socket_path)
         other.write(b'{"op": "state"}\n')
@@ -144,8 +142,8 @@ async def test_an_endless_line_is_cut_off(coarse_rig: Rig, socket_path: Path) ->
         await other.wait_closed()
 
 
-async def test_a_dead_socket_is_replaced(coarse_rig: Rig, socket_path: Path) -> None:
-    """A far end that was killed leaves a socket that nobody serves; the next one takes over."""
+async def test_control_replaces_a_stale_socket(coarse_rig: Rig, socket_path: Path) -> None:
+    """A killed simulation leaves one behind."""
     with socket.socket(socket.AF_UNIX) as dead:
         dead.bind(str(socket_path))
     async with control_socket(SimulationContext(Bench(coarse_rig, now=0.0)), socket_path):
@@ -154,13 +152,13 @@ async def test_a_dead_socket_is_replaced(coarse_rig: Rig, socket_path: Path) -> 
         await writer.wait_closed()
 
 
-async def test_a_place_for_no_socket_is_an_error(coarse_rig: Rig, socket_path: Path) -> None:
-    """A missing folder, a path too long and a plain file are each refused with the path."""
+async def test_control_refuses_an_unusable_path(coarse_rig: Rig, socket_path: Path) -> None:
+    """A missing folder, a long path and a plain file are refused by name."""
     bench = Bench(coarse_rig, now=0.0)
     plain = socket_path.parent / "plain"
     plain.write_text("kept")
     for path in (socket_path / "deeper", socket_path.parent / ("x" * 200), plain):
-        with pytest.raises(LinkError, match="control socket"):
+        with pytest.raises(LinkError, match=str(path)):
             async with control_socket(SimulationContext(bench), path):
                 pass
     assert plain.read_text() == "kept"

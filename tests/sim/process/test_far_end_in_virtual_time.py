@@ -1,4 +1,4 @@
-"""A far end as a process whose time passes only as its control socket says."""
+"""The simulation as a process in virtual time."""
 
 import signal
 from pathlib import Path
@@ -15,11 +15,8 @@ from rig_files import write_rig
 from sim.sensors.recording_file import read_recording
 
 
-async def test_stepped_recorded_touched_and_broken(tmp_path: Path) -> None:
-    """Hours of real time may pass between two steps: time, watchdog and faults know steps only.
-
-    A recording holds exactly what was stepped through; its file appears when it is finished.
-    """
+async def test_simulation_in_virtual_time_advances_only_by_steps(tmp_path: Path) -> None:
+    """Watchdog, faults and recordings follow the steps."""
     rig, file = write_rig(tmp_path / "rig.yaml"), tmp_path / "run.csv"
     async with far_end_process(
         rig, "--serial", "--virtual-time", "--rate", "2000", "--finger", "0.1,0.1"
@@ -27,7 +24,7 @@ async def test_stepped_recorded_touched_and_broken(tmp_path: Path) -> None:
         hello = await far_end.ask("hello")
         assert (hello["protocol"], hello["version"], hello["clock"]) == (
             "era-sim-control",
-            2,
+            3,
             "virtual",
         )
         assert hello["urls"] == far_end.urls
@@ -46,9 +43,9 @@ async def test_stepped_recorded_touched_and_broken(tmp_path: Path) -> None:
             assert (await far_end.ask("state"))["amplifiers"]["main"]["levels"][0] == 0.5
             assert (await far_end.ask("move", finger="1", at_m=[0.05, 0.05]))["ok"]
             assert (await far_end.ask("touch", finger="2", at_m=[0.2, 0.2]))["ok"]
-            assert "already" in (await far_end.ask("touch", finger="2", at_m=[0.2, 0.2]))["error"]
+            assert "2" in (await far_end.ask("touch", finger="2", at_m=[0.2, 0.2]))["error"]
             assert (await far_end.ask("lift", finger="1"))["ok"]
-            assert "not on the plate" in (await far_end.ask("move", finger="1"))["error"]
+            assert "1" in (await far_end.ask("move", finger="1"))["error"]
             assert (await far_end.ask("state"))["fingers"] == {"2": [0.2, 0.2]}
             tones = await far_end.ask("tones", since_s=0.2, until_s=0.4, frequencies_hz=[110.0])
             assert abs(complex(tones["sensors"]["P1"]["real_m_s2"][0])) > 0
@@ -56,7 +53,7 @@ async def test_stepped_recorded_touched_and_broken(tmp_path: Path) -> None:
             readings = np.array(signals["sensors"]["P1"]["m_s2"])
             assert (signals["sample_rate_hz"], len(readings)) == (2000, 400)
             np.testing.assert_array_equal(readings, 0.5 * np.round(readings / 0.5))
-            # 0.1 s more and nobody feeds the watchdog.
+            # The watchdog of 0.5 s expires 0.1 s later.
             assert (await far_end.ask("step", seconds=0.09)) == {"ok": True, "time_s": 0.49}
             assert (await far_end.ask("state"))["amplifiers"]["main"]["fault"] == "NONE"
             await far_end.ask("step", seconds=0.51)
@@ -65,16 +62,14 @@ async def test_stepped_recorded_touched_and_broken(tmp_path: Path) -> None:
             await amplifier.arm(0.5)
             assert (await far_end.ask("inject_fault", fault="arc", amplifier="main"))["ok"]
             assert (await far_end.ask("state"))["amplifiers"]["main"]["fault"] == "ARC"
-            befallen = (await far_end.ask("state"))["time_s"]
+            begin = (await far_end.ask("state"))["time_s"]
             assert (await far_end.ask("faults"))["faults"]["main"] == [
-                {"fault": "arc", "begin_s": befallen, "end_s": None, "is_on": True}
+                {"fault": "arc", "begin_s": begin, "end_s": None, "is_on": True}
             ]
             assert (await far_end.ask("recover"))["ok"]
             assert (await far_end.ask("faults")) == {"faults": {"main": []}}
-            assert (
-                "none of the far end's"
-                in (await far_end.ask("inject_fault", fault="arc", amplifier="x"))["error"]
-            )
+            unknown = await far_end.ask("inject_fault", fault="arc", amplifier="x")
+            assert "amplifier" in unknown["error"]
             assert "share" in (await far_end.ask("inject_fault", fault="drop", share=2))["error"]
             assert "seconds" in (await far_end.ask("step", seconds=-1))["error"]
         finally:
@@ -82,15 +77,15 @@ async def test_stepped_recorded_touched_and_broken(tmp_path: Path) -> None:
         assert not file.exists()
         finished = await far_end.ask("finish")
         assert finished == {"file": str(file), "seconds": 1.0, "is_full": False}
-        assert "nothing is being recorded" in (await far_end.ask("finish"))["error"]
+        assert (await far_end.ask("finish")).keys() == {"error"}
         assert (await far_end.end())[0] == 0
     recording = read_recording(file)
     assert recording.names == ("P1", "finger_1")
     assert (recording.start, recording.samples.shape) == (0.0005, (2000, 2))
 
 
-async def test_what_is_due_within_a_step_happens_at_its_time(tmp_path: Path) -> None:
-    """A fault half a second on, in one step of 0.8 s: silent 15 ms after it, and not before."""
+async def test_simulation_applies_a_fault_within_a_step_at_its_time(tmp_path: Path) -> None:
+    """Half a second into a step of 0.8 s the fault silences the amplifier, not before."""
     async with far_end_process(
         write_rig(tmp_path / "rig.yaml"), "--serial", "--virtual-time", "--sensor", "P1=0.0,0.0"
     ) as far_end:
@@ -113,31 +108,27 @@ async def test_what_is_due_within_a_step_happens_at_its_time(tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
-async def test_a_recording_of_the_whole_run_is_written_at_its_end(
+async def test_simulation_writes_its_recording_on_a_signal(
     tmp_path: Path, number: signal.Signals
 ) -> None:
-    """Told to end, or its terminal closed, it writes the file and says so."""
+    """SIGTERM and SIGHUP write the file and print its name."""
     file = tmp_path / "run.wav"
     async with far_end_process(
         write_rig(tmp_path / "rig.yaml"),
         *("--modbus-tcp", "0", "--sensor", "P1=0.1,0.1", "--record", str(file)),
     ) as far_end:
         assert "--virtual-time" in (await far_end.ask("step", seconds=1))["error"]
-        assert await far_end.ask("tones", since_s=0, until_s=1) == {
-            "error": "frequencies_hz must be 1 to 64 different frequencies below 5000 Hz"
-        }
-        status, said = await far_end.end(number)
+        assert "frequencies_hz" in (await far_end.ask("tones", since_s=0, until_s=1))["error"]
+        status, printed = await far_end.end(number)
     assert status == 0
-    assert said.startswith(f"wrote {file}: ")
+    assert str(file) in printed
     assert read_recording(file).names == ("P1",)
     assert not far_end.control.exists()
 
 
 @pytest.mark.parametrize("after", [0.06, 0.15, 0.3, 0.45])
-async def test_a_signal_while_it_starts_is_heard_and_makes_no_noise(
-    tmp_path: Path, after: float
-) -> None:
-    """At whatever moment of its start it is told to end, it ends, without a traceback."""
+async def test_simulation_exits_on_a_signal_while_it_starts(tmp_path: Path, after: float) -> None:
+    """It exits without a traceback."""
     import asyncio
     import sys
 
@@ -150,7 +141,6 @@ async def test_a_signal_while_it_starts_is_heard_and_makes_no_noise(
         await asyncio.sleep(after)
         process.terminate()
         _, err = await asyncio.wait_for(process.communicate(), 30)
-        # By SIGINT where it came within an exec(), as dataclasses are made: CPython then ends so
-        # though the KeyboardInterrupt was caught; a shell shows that as 130, too.
+        # -SIGINT: CPython exits so where the signal interrupts an exec(), as of dataclasses.
         assert process.returncode in (0, 130, -signal.SIGTERM, -signal.SIGINT)
         assert err == b""

@@ -1,4 +1,4 @@
-"""The far end as a process of its own: its first lines, its end, its errors."""
+"""`python -m sim` as a process: output, shutdown and errors."""
 
 import asyncio
 import signal
@@ -17,11 +17,11 @@ from drivers.protocol.messages import AmplifierState
 from model.rig.file import example_rig_path
 
 ROOT = example_rig_path().parent.parent
-PATIENCE = 30  # s; for a loaded machine, not an expectation
+TIMEOUT = 30  # s; for a loaded machine, not an expectation
 
 
 async def start(arguments: Sequence[str]) -> asyncio.subprocess.Process:
-    """A far end as users start it."""
+    """Start a simulation as users do."""
     return await asyncio.create_subprocess_exec(
         *(sys.executable, "-P", "-m", "sim", *arguments),
         stdin=asyncio.subprocess.PIPE,
@@ -32,15 +32,15 @@ async def start(arguments: Sequence[str]) -> asyncio.subprocess.Process:
 
 
 async def wait(process: asyncio.subprocess.Process) -> tuple[int, str, str]:
-    """Exit status and what is left of both outputs."""
-    out, err = await asyncio.wait_for(process.communicate(), PATIENCE)
+    """Exit status and the rest of both outputs."""
+    out, err = await asyncio.wait_for(process.communicate(), TIMEOUT)
     assert process.returncode is not None
     return process.returncode, out.decode(), err.decode()
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-async def test_serves_until_it_is_told_to_end(number: signal.Signals) -> None:
-    """It says where the amplifier is, drives it as told, and ends with 0 and nothing left."""
+async def test_sim_serves_until_a_signal(number: signal.Signals) -> None:
+    """It prints a URL, serves the amplifier, and exits with status 0 and no files left."""
     with tempfile.TemporaryDirectory() as folder:
         control = Path(folder) / "control"
         process = await start(
@@ -48,7 +48,7 @@ async def test_serves_until_it_is_told_to_end(number: signal.Signals) -> None:
         )
         try:
             assert process.stdout is not None
-            line = (await asyncio.wait_for(process.stdout.readline(), PATIENCE)).decode()
+            line = (await asyncio.wait_for(process.stdout.readline(), TIMEOUT)).decode()
             assert line.startswith("main: serial:///dev/")
             assert line.endswith("?baud=921600\n")
             assert control.is_socket()
@@ -69,12 +69,12 @@ async def test_serves_until_it_is_told_to_end(number: signal.Signals) -> None:
         assert not control.exists()
 
 
-async def test_ends_with_its_standard_input_where_that_was_asked_for() -> None:
-    """A parent that dies closes its end of the pipe; that alone ends the far end in order."""
+async def test_sim_until_eof_exits_with_standard_input() -> None:
+    """The end of standard input suffices for an orderly exit."""
     process = await start([str(example_rig_path()), "--serial", "--until-eof"])
     assert process.stdin is not None
     assert process.stdout is not None
-    line = await asyncio.wait_for(process.stdout.readline(), PATIENCE)
+    line = await asyncio.wait_for(process.stdout.readline(), TIMEOUT)
     assert line.startswith(b"main: serial://")
     amplifier = Amplifier(SerialBackend(line.decode().split()[1]), reply_timeout=5.0)
     await amplifier.open()
@@ -89,13 +89,15 @@ async def test_ends_with_its_standard_input_where_that_was_asked_for() -> None:
         ([str(example_rig_path())], 2, "--serial"),
         (["no_such_rig.yaml", "--serial"], 2, "no_such_rig.yaml"),
         ([str(example_rig_path()), "--serial", "--finger", "0.1"], 2, "--finger"),
-        ([str(example_rig_path()), "--serial", "--finger", "9,9"], 2, "not on the plate"),
+        ([str(example_rig_path()), "--serial", "--finger", "9,9"], 2, "finger"),
         ([str(example_rig_path()), "--serial", "--finger-load", "1,2"], 2, "--finger-load"),
         ([str(example_rig_path()), "--serial", "--control", "/no/where"], 3, "/no/where"),
     ],
 )
-async def test_bad_usage_is_one_paragraph(arguments: list[str], status: int, words: str) -> None:
-    """Exit status 2 for input, 3 for the link; a line that names what is wrong; no traceback."""
+async def test_sim_refuses_bad_usage_in_one_line(
+    arguments: list[str], status: int, words: str
+) -> None:
+    """Exit status 2 for input, 3 for the link; one line that names the option or file."""
     returned, out, err = await wait(await start(arguments))
     assert (returned, out) == (status, "")
     assert words in err

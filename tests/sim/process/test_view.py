@@ -1,4 +1,4 @@
-"""The live view of a far end: what a person reads off it."""
+"""The live view."""
 
 import numpy as np
 from rich.console import Console
@@ -24,8 +24,8 @@ def rows_of(text: str) -> list[str]:
     return [line[1:-1] for line in text.splitlines() if line.startswith("|")]
 
 
-def test_the_plate_is_drawn_the_right_way_up_and_as_it_shakes(coarse_rig: Rig) -> None:
-    """ERAs in the corners, the finger where it is, nothing at rest, and the most where most is."""
+def test_view_shows_eras_fingers_and_peaks_in_place(coarse_rig: Rig) -> None:
+    """y points upwards; peaks are darkest near the driven ERA; nothing at rest."""
     bench = Bench(coarse_rig, now=0.0)
     context = SimulationContext(bench, urls={"main": "serial:///dev/pts/7?baud=921600"})
     plate = PlateView(bench)

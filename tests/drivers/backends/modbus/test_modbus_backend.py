@@ -55,7 +55,7 @@ from modbus_session import (
     TRIPPED,
     ScriptedDevice,
 )
-from sim.far_ends.modbus.frames import Request as Telegram
+from sim.far_ends.modbus.frames import RequestAdu as Telegram
 from sim.far_ends.modbus.unit import ModbusUnit
 from sim.transport.pseudo_terminal import PseudoTerminal
 
@@ -142,7 +142,7 @@ async def test_more_faults_than_usual_are_read_in_two_steps(
 async def test_without_function_23_it_goes_on_with_two(far: Peer, backend: ModbusBackend) -> None:
     """Exception 1 to the first one is remembered: from then on 16 (or 6) and 4."""
     far.answer = lambda request: (
-        bytes([0x97, 1]) if request.pdu[0] == 23 else far.unit.answer(request.pdu)
+        bytes([0x97, 1]) if request.pdu[0] == 23 else far.unit.reply(request.pdu)
     )
     assert await backend.exchange(Apply(SET), timeout=PATIENCE) == Achieved(513, COMMANDS)
     assert await backend.exchange(Ping(), timeout=PATIENCE) == ARMED
@@ -183,7 +183,7 @@ async def test_no_answer_is_a_timeout(far: Peer, backend: ModbusBackend) -> None
     far.answer = lambda _: None
     with pytest.raises(LinkTimeout, match="unit 1"):
         await backend.exchange(Ping(), timeout=SHORT)
-    far.answer = lambda request: far.unit.answer(request.pdu)
+    far.answer = lambda request: far.unit.reply(request.pdu)
     assert await backend.exchange(Ping(), timeout=PATIENCE) == ARMED
 
 
@@ -194,7 +194,7 @@ async def test_a_late_answer_is_not_credited_to_the_next_request(
     late: list[bytes] = []
 
     def answer(request: object) -> bytes | None:
-        pdu = far.unit.answer(far.requests[-1].pdu)
+        pdu = far.unit.reply(far.requests[-1].pdu)
         if not late:
             assert pdu is not None
             late.append(far.frame(far.requests[-1], pdu))
@@ -220,7 +220,7 @@ async def test_a_late_refusal_is_not_credited_to_the_next_request(
     late: list[bytes] = []
 
     def answer(request: object) -> bytes | None:
-        pdu = far.unit.answer(far.requests[-1].pdu)
+        pdu = far.unit.reply(far.requests[-1].pdu)
         if not late:
             assert pdu is not None
             late.append(far.frame(far.requests[-1], pdu))
@@ -255,7 +255,7 @@ async def test_an_exception_without_a_refusal_is_no_answer(
 
     def answer(request: object) -> bytes | None:
         pdu = far.requests[-1].pdu
-        return far.unit.answer(pdu) if pdu[0] == 4 else bytes([pdu[0] | 0x80, 3])
+        return far.unit.reply(pdu) if pdu[0] == 4 else bytes([pdu[0] | 0x80, 3])
 
     far.answer = answer
     with pytest.raises(LinkTimeout, match="without a reason"):
@@ -284,7 +284,7 @@ async def test_an_answer_that_is_none_is_dropped(
     spoil = off_by(place)
 
     def answer(request: object) -> bytes | None:
-        pdu = far.unit.answer(far.requests[-1].pdu)
+        pdu = far.unit.reply(far.requests[-1].pdu)
         assert pdu is not None
         asyncio.get_running_loop().call_later(0.01, far.send, far.requests[-1], pdu)
         far.send_raw(spoil(far.frame(far.requests[-1], pdu)))
@@ -298,7 +298,7 @@ async def test_an_answer_that_is_none_is_dropped(
         assert place == 5  # a length that is longer swallows the beginning of the next frame
     counters = backend.counters
     assert counters.crc_errors + counters.unexpected_frames >= 1
-    far.answer = lambda request: far.unit.answer(request.pdu)
+    far.answer = lambda request: far.unit.reply(request.pdu)
     assert await backend.exchange(Ping(), timeout=PATIENCE) == ARMED
 
 
@@ -310,7 +310,7 @@ async def test_an_echo_of_another_write_is_dropped(place: int) -> None:
         await link.join(1, lambda _: None)
 
         def answer(request: object) -> bytes | None:
-            pdu = far.unit.answer(far.requests[-1].pdu)
+            pdu = far.unit.reply(far.requests[-1].pdu)
             assert pdu is not None
             return off_by(place)(pdu)
 
@@ -353,7 +353,7 @@ async def test_a_hang_up_is_told_at_once(far: Peer, backend: ModbusBackend) -> N
     lost = asyncio.get_running_loop().create_future()
     backend.listen(lambda _: None, lost.set_result)
     await backend.open()
-    far.answer = lambda request: far.unit.answer(request.pdu)
+    far.answer = lambda request: far.unit.reply(request.pdu)
     assert await backend.exchange(Ping(), timeout=PATIENCE) == ARMED
     far.hang_up()
     assert "was lost" in await asyncio.wait_for(lost, PATIENCE)
@@ -404,7 +404,7 @@ async def test_units_of_one_line_share_it(far: Peer) -> None:
 
         def reply() -> None:
             waiting.clear()
-            pdu = far.unit.answer(far.requests[-1].pdu)
+            pdu = far.unit.reply(far.requests[-1].pdu)
             assert pdu is not None
             far.send(far.requests[-1], pdu)
 
@@ -432,8 +432,8 @@ async def test_a_broadcast_goes_to_unit_0_and_waits_for_nobody(
     assert await backend.exchange(Ping(), timeout=PATIENCE) == ARMED
     assert [request.unit for request in far.requests] == [0, 0, 1]
     assert far.requests[0].pdu == bytes.fromhex("06 00 10 02 01")  # as on the vendor page
-    far.unit.hear(far.requests[0].pdu)
-    far.unit.hear(far.requests[1].pdu)
+    far.unit.handle_broadcast(far.requests[0].pdu)
+    far.unit.handle_broadcast(far.requests[1].pdu)
     assert far.device.heard == [Commit(513), Stop(0.005)]
 
 
@@ -451,11 +451,11 @@ async def test_what_is_cancelled_leaves_its_answer_the_time_to_come(
             await far.count(1)
             asking.cancel()
             await asyncio.gather(asking, return_exceptions=True)
-            far.answer = lambda request, far=far: far.unit.answer(request.pdu)
+            far.answer = lambda request, far=far: far.unit.reply(request.pdu)
             stopping = asyncio.create_task(backend.exchange(Stop(0.0), timeout=PATIENCE))
             await asyncio.sleep(SHORT)
             assert len(far.requests) == (1 if is_rtu else 2)
-            pdu = far.unit.answer(far.requests[0].pdu)
+            pdu = far.unit.reply(far.requests[0].pdu)
             assert pdu is not None
             far.send(far.requests[0], pdu)
             assert await asyncio.wait_for(stopping, PATIENCE) == ARMED
@@ -542,7 +542,7 @@ async def test_two_amplifiers_of_one_unit_are_refused() -> None:
         def answered_by(*units: ModbusUnit) -> Callable[[Telegram], None]:
             def answer(request: Telegram) -> None:
                 for unit in units:
-                    pdu = unit.answer(request.pdu)
+                    pdu = unit.reply(request.pdu)
                     assert pdu is not None
                     far.send(request, pdu)
 

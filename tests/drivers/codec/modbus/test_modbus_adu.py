@@ -12,7 +12,14 @@ from drivers.errors import FrameError
 from drivers.protocol.messages import Apply, Ping, Status
 from drivers.statistics import WireCounters
 from modbus_session import ARMED, SET, ScriptedDevice
-from sim.far_ends.modbus.frames import PAUSE, Request, RtuReader, TcpReader, rtu_frame, tcp_frame
+from sim.far_ends.modbus.frames import (
+    FRAME_TIMEOUT,
+    Request,
+    RtuReader,
+    TcpReader,
+    rtu_frame,
+    tcp_frame,
+)
 from sim.far_ends.modbus.unit import ModbusUnit
 
 
@@ -23,7 +30,7 @@ def asked_and_answered(is_rtu: bool) -> tuple[RequestAdu, bytes]:
         exchange.read, exchange.write, unit=1, transaction=0 if is_rtu else 300, is_rtu=is_rtu
     )
     unit = ModbusUnit(ScriptedDevice())
-    pdu = unit.answer(telegram.frame[1:-2] if is_rtu else telegram.frame[7:])
+    pdu = unit.reply(telegram.frame[1:-2] if is_rtu else telegram.frame[7:])
     assert pdu is not None
     return telegram, rtu_frame(1, pdu) if is_rtu else tcp_frame(Request(1, b"", 300), pdu)
 
@@ -110,4 +117,4 @@ def test_what_was_cut_off_is_gone_before_the_host_asks_again(
         found = reader.feed(frame, 10.0 + 0.05)
         assert [request.pdu for request in found] == [frame[1:-2] if is_rtu else frame[7:]]
         assert reader.counters.good == 1
-    assert PAUSE < 0.05
+    assert FRAME_TIMEOUT < 0.05

@@ -13,7 +13,7 @@ from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.messages import Apply, Commit, LoadEnvelope, Nak, Ping, Request, Stage, Stop
 from drivers.statistics import WireCounters
 from modbus_session import EXAMPLES, ScriptedDevice
-from sim.far_ends.modbus.frames import Request as Asked
+from sim.far_ends.modbus.frames import RequestAdu as Asked
 from sim.far_ends.modbus.frames import rtu_frame, tcp_frame
 from sim.far_ends.modbus.unit import ModbusUnit
 from sim.far_ends.modbus.words import checksum
@@ -58,7 +58,7 @@ def telegram(
 def answered(device: ScriptedDevice, name: str, wire: str) -> bytes:
     """What the far end answers to a request of the page, as a frame."""
     request = FRAMES[f"{name} request, {wire}"]
-    pdu = ModbusUnit(device).answer(pdu_of(request, wire))
+    pdu = ModbusUnit(device).reply(pdu_of(request, wire))
     assert pdu is not None
     if wire == "RTU":
         return rtu_frame(1, pdu)
@@ -127,10 +127,10 @@ def test_the_reason_of_a_refusal_can_be_read(wire: str) -> None:
     number = dict(NUMBERED)[name]
     device.tell(EXAMPLES[name])
     unit = ModbusUnit(device)
-    unit.answer(pdu_of(FRAMES[f"{name} request, {wire}"], wire))
+    unit.reply(pdu_of(FRAMES[f"{name} request, {wire}"], wire))
     sent = telegram(exchanges.refusal_read(), None, number, wire)
     assert sent.frame == FRAMES[f"Refusal request, {wire}"]
-    pdu = unit.answer(pdu_of(sent.frame, wire))
+    pdu = unit.reply(pdu_of(sent.frame, wire))
     assert pdu == pdu_of(FRAMES[f"Refusal reply, {wire}"], wire)
     reader = ResponseReader(is_rtu=wire == "RTU", counters=WireCounters())
     (answer,) = reader.feed(FRAMES[f"Refusal reply, {wire}"], sent)
@@ -149,7 +149,7 @@ def test_without_function_23_it_takes_two(wire: str) -> None:
     for number, (name, (read, write)) in enumerate(steps.items(), start=20):
         sent = telegram(read, write, number, wire)
         assert sent.frame == FRAMES[f"{name} request, {wire}"]
-        pdu = unit.answer(pdu_of(sent.frame, wire))
+        pdu = unit.reply(pdu_of(sent.frame, wire))
         assert pdu == pdu_of(FRAMES[f"{name} reply, {wire}"], wire)
         reader = ResponseReader(is_rtu=wire == "RTU", counters=WireCounters())
         (answer,) = reader.feed(FRAMES[f"{name} reply, {wire}"], sent)
@@ -165,7 +165,7 @@ def test_broadcasts_are_heard(name: str, wire: str) -> None:
     sent = telegram(None, exchanges.encode_broadcast(request), number, wire, unit=0)
     assert sent.frame == FRAMES[f"{name} request, {wire}"]
     device = ScriptedDevice()
-    ModbusUnit(device).hear(pdu_of(sent.frame, wire))
+    ModbusUnit(device).handle_broadcast(pdu_of(sent.frame, wire))
     assert device.heard == [request]
 
 

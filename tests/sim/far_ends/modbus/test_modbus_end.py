@@ -21,7 +21,7 @@ from modbus_session import EXAMPLES, ScriptedDevice
 from model.rig.file import example_rig_path
 from model.rig.rig import Rig
 from sim.far_ends.modbus.end import ModbusRtuEnd, ModbusTcpEnd
-from sim.far_ends.modbus.frames import PAUSE, crc
+from sim.far_ends.modbus.frames import FRAME_TIMEOUT, crc
 from sim.far_ends.wires import Wire
 from wires import FarSide, far_side
 
@@ -186,7 +186,7 @@ async def test_the_next_good_frame_is_understood(wire: str, damage: str) -> None
     device = ScriptedDevice()
     async with scripted(wire, device) as master:
         master.send(damaged)
-        await asyncio.sleep(PAUSE + 0.02)
+        await asyncio.sleep(FRAME_TIMEOUT + 0.02)
         device.tell(EXAMPLES["Ping"])
         master.received.clear()
         master.send(ping)

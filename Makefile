@@ -36,7 +36,7 @@ fuzz: .venv/installed-test
 kill-test: .venv/installed-test
 	$(BIN)/python tests/support/kills.py $(KILLS)
 
-# What befalls the daemon, each by the real process, with the figures that were measured.
+# Faults of the daemon, each by the real process, with the figures measured.
 fault-test: .venv/installed-test
 	$(BIN)/pytest -q -s tests/integration/test_daemon_faults_*.py
 

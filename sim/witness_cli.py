@@ -53,7 +53,7 @@ def witness(
 
     limits: dict[str, Any] = {
         "frequency_hz": _band(frequency),
-        "level": _in_range("--level", level, most=1.0, unit="of full stroke"),
+        "level": _in_range("--level", level, maximum=1.0, unit="of full stroke"),
     }
     if slew is not None:
         limits["slew_per_s"] = _in_range("--slew", slew, unit="of full stroke a second")
@@ -103,9 +103,9 @@ def _band(text: str) -> list[float]:
     return [low, high]
 
 
-def _in_range(option: str, given: float, *, most: float = math.inf, unit: str) -> float:
-    if not 0 <= given <= most or math.isinf(given):
-        to = "or more" if math.isinf(most) else f"to {most:g}"
+def _in_range(option: str, given: float, *, maximum: float = math.inf, unit: str) -> float:
+    if not 0 <= given <= maximum or math.isinf(given):
+        to = "or more" if math.isinf(maximum) else f"to {maximum:g}"
         raise InputError(f"{option} must be 0 {to} {unit}, got {given:g}")
     return given
 

@@ -277,11 +277,11 @@ class SimulatedAmplifier:
 
     def _enter(self, state: AmplifierState, moment: float, *, channel: int | None = None) -> None:
         """Enter a state, and notify the listeners of a change."""
-        told = AmplifierEvent(state, self.fault, channel)
+        event = AmplifierEvent(state, self.fault, channel)
         if state is not self.state:
             self.state = state
             for listener in self.listeners:
-                listener(told, moment)
+                listener(event, moment)
 
     @property
     def _watchdog_end(self) -> float:

@@ -43,7 +43,7 @@ class Plant:
         self._plates = LoadedPlateCache(reduced, eras, loads)
         self._now: LoadedPlate = self._plates.under((), time=time)
         self._free = np.zeros(len(self._now.plate.decay), dtype=complex)
-        self._answers: list[list[Answer]] = [[] for _ in eras]
+        self._particular: list[list[Answer]] = [[] for _ in eras]
 
     @property
     def reduced(self) -> ReducedPlate:
@@ -59,20 +59,20 @@ class Plant:
     def state(self) -> tuple[FloatArray, FloatArray]:
         """Present displacement and velocity, (r,) each, in the coordinates of `reduced`."""
         x = (self._now.plate.free_state @ self._free).real
-        for answer in self._active():
-            x = x + answer.state(self.time)
+        for solution in self._active():
+            x = x + solution.state(self.time)
         r = len(x) // 2
         return x[:r], x[r:]
 
     def set_input(self, era: int, terms: Sequence[Term]) -> None:
         """Set the base motion of an ERA from now on; terms may start later."""
         # Unchanged terms continue; only the others are exchanged.
-        known = {answer.term: answer for answer in self._answers[era]}
+        known = {solution.term: solution for solution in self._particular[era]}
         wanted = _united([term for term in terms if term.end > self.time])
         new = self._now.plate.answers(era, [term for term in wanted if term not in known])
-        gone = [answer for term, answer in known.items() if term not in wanted]
-        self._answers[era] = [
-            *(answer for term, answer in known.items() if term in wanted),
+        gone = [solution for term, solution in known.items() if term not in wanted]
+        self._particular[era] = [
+            *(solution for term, solution in known.items() if term in wanted),
             *new,
         ]
         self._exchange(self._active_of(gone), self._active_of(new))
@@ -91,13 +91,13 @@ class Plant:
         if self._now.reduced is not before:
             carried = self._now.reduced.carried_over_from(before)
             q, v = carried @ q, carried @ v
-        self._answers = [
-            self._now.plate.answers(era, [answer.term for answer in answers])
-            for era, answers in enumerate(self._answers)
+        self._particular = [
+            self._now.plate.answers(era, [solution.term for solution in solutions])
+            for era, solutions in enumerate(self._particular)
         ]
         remainder = np.concatenate([q, v])
-        for answer in self._active():
-            remainder = remainder - answer.state(self.time)
+        for solution in self._active():
+            remainder = remainder - solution.state(self.time)
         self._free = self._now.plate.to_free @ remainder
 
     def advance(
@@ -133,17 +133,23 @@ class Plant:
         self._coast(to_time)
 
     def _active(self) -> list[Answer]:
-        return [answer for answers in self._answers for answer in self._active_of(answers)]
+        return [
+            solution for solutions in self._particular for solution in self._active_of(solutions)
+        ]
 
-    def _active_of(self, answers: Sequence[Answer]) -> list[Answer]:
-        return [answer for answer in answers if answer.term.start <= self.time < answer.term.end]
+    def _active_of(self, solutions: Sequence[Answer]) -> list[Answer]:
+        return [
+            solution
+            for solution in solutions
+            if solution.term.start <= self.time < solution.term.end
+        ]
 
     def _boundaries(self, to_time: float) -> list[float]:
         moments = {
             moment
-            for answers in self._answers
-            for answer in answers
-            for moment in (answer.term.start, answer.term.end)
+            for solutions in self._particular
+            for solution in solutions
+            for moment in (solution.term.start, solution.term.end)
         }
         return sorted(moment for moment in moments if self.time < moment <= to_time)
 
@@ -151,10 +157,10 @@ class Plant:
         """Replace particular solutions; displacement and velocity stay continuous."""
         if before or after:
             jump = np.zeros(self._now.plate.free_state.shape[0])
-            for answer in before:
-                jump += answer.state(self.time)
-            for answer in after:
-                jump -= answer.state(self.time)
+            for solution in before:
+                jump += solution.state(self.time)
+            for solution in after:
+                jump -= solution.state(self.time)
             self._free = self._free + self._now.plate.to_free @ jump
 
     def _coast(self, to_time: float) -> None:
@@ -168,12 +174,12 @@ class Plant:
         self._coast(boundary)
         after = self._active()
         self._exchange(
-            [answer for answer in before if answer not in after],
-            [answer for answer in after if answer not in before],
+            [solution for solution in before if solution not in after],
+            [solution for solution in after if solution not in before],
         )
-        self._answers = [
-            [answer for answer in answers if answer.term.end > boundary]
-            for answers in self._answers
+        self._particular = [
+            [solution for solution in solutions if solution.term.end > boundary]
+            for solutions in self._particular
         ]
 
     def _sample(
@@ -219,11 +225,11 @@ class _ForcedResponse:
     """Forced accelerations at points of shapes (q, r)."""
 
     def __init__(self, active: Sequence[Answer], points: FloatArray) -> None:
-        self._starts = np.array([answer.term.start for answer in active])
-        self._omegas = np.array([answer.term.omega for answer in active])
+        self._starts = np.array([solution.term.start for solution in active])
+        self._omegas = np.array([solution.term.omega for solution in active])
         r = points.shape[1]
-        b0 = np.array([answer.b0 for answer in active]).reshape(-1, r)
-        b1 = np.array([answer.b1 for answer in active]).reshape(-1, r)
+        b0 = np.array([solution.b0 for solution in active]).reshape(-1, r)
+        b1 = np.array([solution.b1 for solution in active]).reshape(-1, r)
         s = 1j * self._omegas[:, None]
         constant = (s**2 * b0 + 2 * s * b1) @ points.T
         self._constant = np.vstack([constant.imag, constant.real])

@@ -11,7 +11,7 @@ LEVEL = 0.002
 """Tolerance of levels, in full strokes: rounding, and the last step of a fade."""
 
 _FINE = 0.011  # Hz; one step of the wire
-_LONGEST = 3.3  # s; the longest envelope
+_MAX_ENVELOPE_TIME = 3.3  # s; the longest envelope
 
 
 class ReferenceOutputs:
@@ -195,4 +195,4 @@ class ReferenceOutputs:
         return 0.0
 
     def _duration(self, slot: int) -> float:
-        return self._durations.get(slot, _LONGEST)
+        return self._durations.get(slot, _MAX_ENVELOPE_TIME)

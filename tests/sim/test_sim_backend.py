@@ -18,7 +18,7 @@ URL = f"sim://{example_rig_path()}"
 SET = CommandSet(1, (DriveCommand(0, 110.004, 0.5),), ramp=0.0, valid_for=0.0)
 
 
-async def test_plays_what_the_guard_let_through() -> None:
+async def test_sim_backend_plays_a_checked_set() -> None:
     """Armed, a safe set is achieved as quantised, and felt by a finger through the control."""
     with tempfile.TemporaryDirectory() as folder:
         backend = SimulatedBackend(f"{URL}?control={folder}/control&amplifier=main")
@@ -43,7 +43,7 @@ async def test_plays_what_the_guard_let_through() -> None:
         assert os.listdir(folder) == []  # noqa: PTH208 - a string is what there is
 
 
-async def test_the_plate_moves_while_it_is_open() -> None:
+async def test_sim_backend_advances_the_plate_while_open() -> None:
     """Simulated time follows the clock without being asked, and the backend closes twice."""
     backend = SimulatedBackend(URL)
     await backend.open()
@@ -57,7 +57,7 @@ async def test_the_plate_moves_while_it_is_open() -> None:
     assert task.done()
 
 
-async def test_sets_that_no_guard_has_seen_are_refused() -> None:
+async def test_sim_backend_refuses_unchecked_sets() -> None:
     """A plain CommandSet is a mistake of the program, not of the user."""
     backend = SimulatedBackend(URL)
     for request in (Apply(SET), Stage(SET)):
@@ -65,7 +65,7 @@ async def test_sets_that_no_guard_has_seen_are_refused() -> None:
             await backend.exchange(request, timeout=1)
 
 
-async def test_a_closed_backend_is_a_lost_link() -> None:
+async def test_sim_backend_closed_raises_link_error() -> None:
     """Before open and after close there is nobody to ask."""
     backend = SimulatedBackend(URL)
     with pytest.raises(LinkError, match="not open"):
@@ -73,14 +73,14 @@ async def test_a_closed_backend_is_a_lost_link() -> None:
 
 
 @pytest.mark.parametrize("url", ["sim://", "sim://?control=x", "sim://rig.yaml?speed=2"])
-def test_urls_that_make_no_sense_are_refused(url: str) -> None:
+def test_sim_backend_refuses_an_invalid_url(url: str) -> None:
     """No rig, or an unknown option: the error says what a good URL looks like."""
     with pytest.raises(CommandError, match=r"sim://RIG\.yaml"):
         SimulatedBackend(url)
 
 
 @pytest.mark.parametrize("rest", ["/no/such/rig.yaml", f"{example_rig_path()}?amplifier=aux"])
-async def test_a_rig_that_cannot_be_used_is_refused(rest: str) -> None:
+async def test_sim_backend_refuses_an_invalid_rig(rest: str) -> None:
     """A missing file and an amplifier that the rig has not are named with the URL."""
     backend = SimulatedBackend(f"sim://{rest}")
     with pytest.raises(CommandError, match="sim://"):

@@ -33,13 +33,13 @@ def achieved_domain(achieved: Achieved) -> bytes:
 
 def faults_domain(records: Sequence[FaultRecord]) -> bytes:
     """The object `faults`."""
-    longest = _Q.age.maximum
+    max_age = _Q.age.maximum
     return b"".join(
         struct.pack(
             "<BBL",
             record.fault,
             NO_CHANNEL if record.channel is None else record.channel,
-            min(round(record.age * 1000), longest),
+            min(round(record.age * 1000), max_age),
         )
         for record in records
     )

@@ -37,11 +37,11 @@ def to_write(function: int, body: bytes) -> tuple[int, Sequence[int]]:
     if function == WRITE_ONE:
         address, word = pair(body)
         return address, [word]
-    most = _WRITE_MAX if function == WRITE else _WRITE_BESIDE_READ_MAX
+    maximum = _WRITE_MAX if function == WRITE else _WRITE_BESIDE_READ_MAX
     if len(body) < 5:
         raise ModbusException(ILLEGAL_VALUE)
     address, count, size = struct.unpack_from(">HHB", body)
-    if not (1 <= count <= most and size == 2 * count == len(body) - 5):
+    if not (1 <= count <= maximum and size == 2 * count == len(body) - 5):
         raise ModbusException(ILLEGAL_VALUE)
     return address, struct.unpack(f">{count}H", body[5:])
 

@@ -38,7 +38,7 @@ def armed() -> SimulatedAmplifier:
     return amplifier
 
 
-def test_what_is_played_warms_it() -> None:
+def test_temperature_rises_with_the_load() -> None:
     """First order with 120 s: 63 % of 30 K after that time at full stroke, a quarter at half."""
     for level, rise in ((1.0, 30.0), (0.5, 7.5)):
         amplifier = armed()
@@ -48,7 +48,7 @@ def test_what_is_played_warms_it() -> None:
         assert warm == pytest.approx(25 + rise * (1 - math.exp(-1)), abs=1e-9)
 
 
-def test_it_cools_down_when_it_is_silent() -> None:
+def test_temperature_falls_when_silent() -> None:
     """From the moment of silence on towards 25 °C, with the same time constant."""
     amplifier = armed()
     amplifier.handle(Apply(playing(1, 1.0)), 0.0)
@@ -58,7 +58,7 @@ def test_it_cools_down_when_it_is_silent() -> None:
     assert cooler - 25 == pytest.approx((hot - 25) * math.exp(-1), rel=1e-9)
 
 
-def test_over_70_degrees_it_derates_and_over_85_it_trips() -> None:
+def test_temperature_derates_above_70_and_trips_above_85() -> None:
     """Half of the level, told by Achieved too; then silent in 5 ms, latched until it is cool."""
     amplifier = armed()
     amplifier.handle(Apply(playing(1, 0.8)), 0.0)
@@ -90,7 +90,7 @@ def test_over_70_degrees_it_derates_and_over_85_it_trips() -> None:
 
 
 @pytest.mark.parametrize("threshold", [70.0, 85.0])
-def test_a_threshold_is_crossed_when_it_is_crossed(threshold: float) -> None:
+def test_temperature_crosses_a_threshold_at_its_time(threshold: float) -> None:
     """From 64 °C in a place of 90 °C; one that is not on the way is never reached."""
     heat = Heat(since=3.0, temperature=64.0, final=90.0)
     assert heat.when(threshold) == pytest.approx(3 + 120 * math.log(26 / (90 - threshold)))
@@ -98,7 +98,7 @@ def test_a_threshold_is_crossed_when_it_is_crossed(threshold: float) -> None:
     assert heat.when(60.0) == math.inf
 
 
-def test_high_voltage_is_there_while_armed_and_discharges_afterwards() -> None:
+def test_high_voltage_is_on_while_armed_and_discharges() -> None:
     """1800 V; 1800/e after 20 ms without it."""
     amplifier = armed()
     assert amplifier.status(0.1).voltage == 1800.0
@@ -109,7 +109,7 @@ def test_high_voltage_is_there_while_armed_and_discharges_afterwards() -> None:
 
 
 @pytest.mark.parametrize("fault", [Fault.OVER_VOLTAGE, Fault.ARC, Fault.CHANNEL])
-def test_a_fault_silences_and_latches(fault: Fault) -> None:
+def test_fault_silences_and_latches(fault: Fault) -> None:
     """Silent within 5 ms, high voltage off, listed with its channel, told to listeners in order."""
     amplifier = armed()
     events: list[tuple[AmplifierEvent, float]] = []
@@ -130,7 +130,7 @@ def test_a_fault_silences_and_latches(fault: Fault) -> None:
     assert amplifier.handle(Arm(2.0), 2.0) == Nak(NakCode.WRONG_STATE)
 
 
-def test_a_fault_while_disarmed_is_only_noted() -> None:
+def test_fault_while_disarmed_is_only_recorded() -> None:
     """There is nothing to silence; the list of faults tells of it."""
     amplifier = SimulatedAmplifier("main", channels=4)
     amplifier.trip(Fault.ARC, 1.0)
@@ -139,7 +139,7 @@ def test_a_fault_while_disarmed_is_only_noted() -> None:
     assert listed == FaultList((FaultRecord(Fault.ARC, None, 0.5),))
 
 
-def test_a_restart_forgets_everything_but_is_silent_at_once() -> None:
+def test_restart_is_silent_and_discards_sets() -> None:
     """Without its supply nothing plays; then it is disarmed, without envelopes, tokens, faults."""
     amplifier = armed()
     amplifier.handle(LoadEnvelope(Envelope(1, 0.005, (Knot(0.5, 0.0),))), 0.0)

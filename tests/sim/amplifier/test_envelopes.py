@@ -64,7 +64,7 @@ def motion(terms: list[Term], times: np.ndarray) -> np.ndarray:
     return y
 
 
-def test_an_onset_goes_through_its_knots_to_the_command() -> None:
+def test_onset_follows_its_knots() -> None:
     """From zero, one knot every 5 ms, the level of the command after a third step, then steady."""
     amplifier = armed()
     amplifier.handle(Apply(playing(1, 0.8, onset=1)), 1.0)
@@ -75,7 +75,7 @@ def test_an_onset_goes_through_its_knots_to_the_command() -> None:
         assert level(amplifier, moment) == pytest.approx(value, abs=1e-9)
 
 
-def test_the_base_moves_as_the_model_says() -> None:
+def test_envelope_moves_the_base_as_modelled() -> None:
     """The plant's terms are those of the model's own envelope with the destination as last knot."""
     amplifier = armed()
     amplifier.handle(Apply(playing(1, 0.8, onset=1)), 0.25)  # 27.5 periods: a phase of its own
@@ -86,7 +86,7 @@ def test_the_base_moves_as_the_model_says() -> None:
     assert motion(terms, times + 0.25) == pytest.approx(motion(model, times), abs=1e-12)
 
 
-def test_an_ending_plays_when_the_next_set_is_silent() -> None:
+def test_ending_plays_before_a_silent_set() -> None:
     """Through its knots to zero, whatever the ramp; the phase still counts from the first set."""
     amplifier = armed()
     amplifier.handle(Apply(playing(1, 0.8, ending=2)), 1.0)
@@ -100,7 +100,7 @@ def test_an_ending_plays_when_the_next_set_is_silent() -> None:
     assert tone.silent_from == pytest.approx(1.215)
 
 
-def test_an_ending_can_be_skipped() -> None:
+def test_ending_is_skipped_on_command() -> None:
     """With the flag the channel falls silent along the ramp."""
     amplifier = armed()
     amplifier.handle(Apply(playing(1, 0.8, ending=2)), 1.0)
@@ -109,7 +109,7 @@ def test_an_ending_can_be_skipped() -> None:
     assert level(amplifier, 1.21) == pytest.approx(0.4)
 
 
-def test_a_vibration_that_ends_by_itself_uses_its_ending() -> None:
+def test_ending_plays_after_valid_for() -> None:
     """valid_for leads into the ending."""
     amplifier = armed()
     amplifier.handle(Apply(playing(1, 0.8, ramp=0.5, valid_for=0.1, ending=2)), 1.0)
@@ -120,7 +120,7 @@ def test_a_vibration_that_ends_by_itself_uses_its_ending() -> None:
 
 
 @pytest.mark.parametrize("request_", [Stop(0.005), Disarm(0.005)])
-def test_a_stop_knows_no_ending(request_: Stop | Disarm) -> None:
+def test_stop_skips_endings(request_: Stop | Disarm) -> None:
     """Silent within the ramp of 5 ms, also in the midst of an onset, from what was reached."""
     amplifier = armed()
     amplifier.handle(Apply(playing(1, 0.8, onset=1, ending=2)), 1.0)
@@ -129,7 +129,7 @@ def test_a_stop_knows_no_ending(request_: Stop | Disarm) -> None:
     assert level(amplifier, 1.0151) == 0.0
 
 
-def test_the_watchdog_knows_no_ending() -> None:
+def test_watchdog_skips_endings() -> None:
     """5 ms after it ran out everything is silent."""
     amplifier = armed()
     amplifier.handle(Arm(0.1), 1.0)
@@ -138,7 +138,7 @@ def test_the_watchdog_knows_no_ending() -> None:
     assert level(amplifier, 1.1051) == 0.0
 
 
-def test_an_onset_that_keeps_the_phase_goes_on_from_what_plays() -> None:
+def test_onset_with_keep_phase_continues_the_tone() -> None:
     """Nothing jumps: it begins at the amplitude that the channel has, and counts its t on."""
     amplifier = armed()
     amplifier.handle(Apply(playing(1, 0.6)), 1.0)
@@ -149,7 +149,7 @@ def test_an_onset_that_keeps_the_phase_goes_on_from_what_plays() -> None:
     assert level(amplifier, 1.305) == pytest.approx(0.2)
 
 
-def test_an_onset_may_lead_to_silence() -> None:
+def test_onset_to_level_zero() -> None:
     """An ERA that only helps during the onset has level 0 in its command."""
     amplifier = armed()
     amplifier.handle(Apply(playing(1, 0.0, onset=1)), 1.0)
@@ -159,7 +159,7 @@ def test_an_onset_may_lead_to_silence() -> None:
     assert amplifier.outputs[0][0].silent_from == pytest.approx(1.015)
 
 
-def test_a_set_that_refers_to_an_empty_slot_is_refused_whole() -> None:
+def test_set_with_an_empty_slot_is_refused() -> None:
     """NO_ENVELOPE with the channel; what plays and what is staged stays."""
     amplifier = armed()
     amplifier.handle(Apply(playing(1, 0.3)), 1.0)
@@ -172,7 +172,7 @@ def test_a_set_that_refers_to_an_empty_slot_is_refused_whole() -> None:
     assert amplifier.handle(Apply(playing(3, 0.5, onset=1)), 1.2) == Nak(NakCode.NO_ENVELOPE, 0)
 
 
-def test_a_set_takes_its_envelopes_with_it() -> None:
+def test_staged_set_keeps_its_envelopes() -> None:
     """What is loaded into the slot after Stage changes nothing of what Commit plays."""
     amplifier = armed()
     staged = amplifier.handle(Stage(playing(1, 0.8, onset=1)), 1.0)
@@ -194,7 +194,7 @@ def test_a_set_takes_its_envelopes_with_it() -> None:
         Envelope(1, 0.005, (Knot(math.nan, 0.0),)),
     ],
 )
-def test_an_envelope_that_cannot_be_kept_is_refused(envelope: Envelope) -> None:
+def test_load_envelope_refuses_invalid_values(envelope: Envelope) -> None:
     """Slots, steps, numbers of knots and levels out of range; what was there stays."""
     amplifier = armed()
     assert amplifier.handle(LoadEnvelope(envelope), 1.0) == Nak(NakCode.BAD_VALUE)

@@ -115,7 +115,7 @@ def brought_to(state: AmplifierState, request: Request) -> SimulatedAmplifier:
 
 @pytest.mark.parametrize("state", list(AmplifierState), ids=lambda state: state.name)
 @pytest.mark.parametrize("column", range(12), ids=[type(r).__name__ for r in REQUESTS])
-def test_every_request_in_every_state(state: AmplifierState, column: int) -> None:
+def test_amplifier_follows_the_state_table(state: AmplifierState, column: int) -> None:
     """Each pair leads where the protocol says, or is refused and changes nothing."""
     request, expected = REQUESTS[column], EXPECTED[state][column]
     amplifier = brought_to(state, request)
@@ -131,7 +131,7 @@ def test_every_request_in_every_state(state: AmplifierState, column: int) -> Non
         assert amplifier.state is (state if expected == "." else expected)
 
 
-def test_arming_leaves_every_level_at_zero() -> None:
+def test_arm_starts_at_level_zero() -> None:
     """Armed: enabled, high voltage on, silent, no token; watchdogs out of range are refused."""
     amplifier = SimulatedAmplifier("main", channels=4)
     assert not status(amplifier, 0.0).high_voltage
@@ -144,7 +144,7 @@ def test_arming_leaves_every_level_at_zero() -> None:
     assert now.watchdog_left == pytest.approx(0.15)
 
 
-def test_watchdog_trips_exactly_at_its_time_even_if_noticed_late() -> None:
+def test_watchdog_expires_at_its_time_when_ticked_late() -> None:
     """Playing until 0.25 s, half down 2.5 ms later, silent and in FAULT 5 ms later."""
     amplifier = armed()
     amplifier.handle(Apply(playing(1, 1.0)), 0.0)
@@ -165,7 +165,7 @@ def test_watchdog_trips_exactly_at_its_time_even_if_noticed_late() -> None:
 
 
 @pytest.mark.parametrize("request_", REQUESTS, ids=lambda request: type(request).__name__)
-def test_what_feeds_the_watchdog(request_: Request) -> None:
+def test_watchdog_is_fed_by_accepted_requests(request_: Request) -> None:
     """Every good request feeds it but Hello, GetCaps, GetStatus and GetFaults."""
     amplifier = armed()
     if isinstance(request_, Commit):
@@ -176,7 +176,7 @@ def test_what_feeds_the_watchdog(request_: Request) -> None:
     assert (amplifier.state is AmplifierState.FAULT) == asking
 
 
-def test_refused_requests_do_not_feed_the_watchdog() -> None:
+def test_watchdog_is_not_fed_by_refused_requests() -> None:
     """A host that only sends nonsense does not keep the plate alive."""
     amplifier = armed()
     refused(amplifier.handle(Commit(99), 0.2), NakCode.BAD_TOKEN)
@@ -184,7 +184,7 @@ def test_refused_requests_do_not_feed_the_watchdog() -> None:
     assert status(amplifier, 0.25).fault is Fault.WATCHDOG
 
 
-def test_a_watchdog_fault_must_be_cleared_and_never_re_arms() -> None:
+def test_watchdog_fault_remains_until_cleared() -> None:
     """FAULT takes no Arm; Clear leads to SWITCH_ON_DISABLED with the fault acknowledged."""
     amplifier = armed()
     refused(amplifier.handle(Arm(0.25), 1.0), NakCode.WRONG_STATE)
@@ -208,9 +208,7 @@ BAD = [
 
 
 @pytest.mark.parametrize(("bad", "code", "channel"), BAD)
-def test_a_set_is_applied_whole_or_not_at_all(
-    bad: DriveCommand, code: NakCode, channel: int
-) -> None:
+def test_apply_is_atomic(bad: DriveCommand, code: NakCode, channel: int) -> None:
     """One bad channel refuses the set; what was playing and what was staged stay as they were."""
     amplifier = armed()
     amplifier.handle(Apply(playing(1, 0.1, 0.2)), 0.0)
@@ -236,7 +234,7 @@ def test_a_set_is_applied_whole_or_not_at_all(
         (1, 0.0, 61.0, NakCode.BAD_VALUE),
     ],
 )
-def test_a_set_with_a_bad_head_is_refused(
+def test_apply_refuses_an_invalid_header(
     token: int, ramp: float, valid_for: float, code: NakCode
 ) -> None:
     """Token, ramp and duration must be within the protocol's ranges."""
@@ -244,7 +242,7 @@ def test_a_set_with_a_bad_head_is_refused(
     refused(armed().handle(Apply(wanted), 0.1), code)
 
 
-def test_channels_of_a_set_that_are_not_named_fall_silent() -> None:
+def test_apply_silences_unnamed_channels() -> None:
     """A set is the whole plate's: what it does not name is silent after its ramp."""
     amplifier = armed()
     amplifier.handle(Apply(playing(1, 0.5, 0.6, 0.7)), 0.0)
@@ -252,7 +250,7 @@ def test_channels_of_a_set_that_are_not_named_fall_silent() -> None:
     assert status(amplifier, 0.12).levels == (0.5, 0, 0, 0)
 
 
-def test_a_token_is_applied_once() -> None:
+def test_apply_ignores_a_repeated_token() -> None:
     """A repeated Apply or Commit answers as the first did and leaves the phase running."""
     amplifier = armed()
     first = amplifier.handle(Apply(playing(1, 0.5)), 0.0)
@@ -269,7 +267,7 @@ def test_a_token_is_applied_once() -> None:
 
 
 @pytest.mark.parametrize("late", [Stage, Apply])
-def test_a_late_copy_leaves_what_is_staged(late: type[Stage] | type[Apply]) -> None:
+def test_stage_refuses_a_late_copy(late: type[Stage] | type[Apply]) -> None:
     """A copy of an earlier set is refused, and the set that is staged meanwhile can be played."""
     amplifier = armed()
     for token in (1, 2):
@@ -280,7 +278,7 @@ def test_a_late_copy_leaves_what_is_staged(late: type[Stage] | type[Apply]) -> N
     assert status(amplifier, 0.0).levels[0] == pytest.approx(0.3)
 
 
-def test_nothing_moves_before_the_commit() -> None:
+def test_stage_changes_no_output() -> None:
     """Stage changes no output; Commit of its token does, of any other does not."""
     amplifier = armed()
     amplifier.handle(Stage(playing(3, 0.4)), 0.0)
@@ -290,7 +288,7 @@ def test_nothing_moves_before_the_commit() -> None:
     assert status(amplifier, 0.1).levels[0] == 0.4
 
 
-def test_vibration_ends_by_itself() -> None:
+def test_set_ends_after_valid_for() -> None:
     """After valid_for the set fades out along its ramp; its token stays and is not played again."""
     amplifier = armed()
     amplifier.handle(Apply(playing(1, 1.0, ramp=0.02, valid_for=0.1)), 0.0)
@@ -303,7 +301,7 @@ def test_vibration_ends_by_itself() -> None:
     assert status(amplifier, 0.24).levels[0] == 0
 
 
-def test_achieved_says_what_the_steps_leave() -> None:
+def test_achieved_reports_rounded_values() -> None:
     """0.01 Hz, 1e-4 of full stroke, 0.01 degrees within half a turn, the protocol's steps."""
     wanted = CommandSet(1, (DriveCommand(2, 110.00499, 0.123449, 270.0),), 0.0, 0.0)
     reply = armed().handle(Apply(wanted), 0.0)
@@ -317,7 +315,7 @@ def test_achieved_says_what_the_steps_leave() -> None:
     assert reply.commands == (DriveCommand(2, 110.01, 0.1235, 12.34),)
 
 
-def test_quick_stop_is_latched() -> None:
+def test_stop_is_latched() -> None:
     """Silent within its ramp, then it stays stopped until Clear, which needs level zero."""
     amplifier = armed()
     amplifier.handle(Apply(playing(1, 1.0)), 0.0)
@@ -335,7 +333,7 @@ def test_quick_stop_is_latched() -> None:
 
 
 @pytest.mark.parametrize("ramp", [math.nan, -1.0, 1e9])
-def test_a_stop_is_never_refused(ramp: float) -> None:
+def test_stop_accepts_any_ramp(ramp: float) -> None:
     """Whatever ramp a stop asks for, the plate is silent within the longest allowed one."""
     amplifier = armed(watchdog=2.0)
     amplifier.handle(Apply(playing(1, 1.0)), 0.0)
@@ -343,7 +341,7 @@ def test_a_stop_is_never_refused(ramp: float) -> None:
     assert status(amplifier, 1.1001).levels[0] == 0
 
 
-def test_disarm_ramps_down_before_high_voltage_goes() -> None:
+def test_disarm_ramps_down_before_high_voltage_is_off() -> None:
     """High voltage stays while a channel still plays, and is off afterwards."""
     amplifier = armed()
     amplifier.handle(Apply(playing(1, 1.0)), 0.0)

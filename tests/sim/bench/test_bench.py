@@ -31,7 +31,7 @@ def keep_alive(bench: Bench, since: float, until: float) -> None:
     bench.advance(until)
 
 
-def test_what_a_finger_feels_is_what_the_model_predicts(coarse_rig: Rig) -> None:
+def test_bench_felt_vibration_agrees_with_the_model(coarse_rig: Rig) -> None:
     """Steady state of two ERAs at two frequencies, against the sparse direct solve, within 1 %."""
     bench = Bench(coarse_rig, now=START)
     bench.place_fingers({"a": (0.08, 0.06), "b": (0.25, 0.2)}, now=START)
@@ -57,7 +57,7 @@ def test_what_a_finger_feels_is_what_the_model_predicts(coarse_rig: Rig) -> None
         np.testing.assert_array_equal(felt[name].points, points)
 
 
-def test_what_the_plate_carries_moves_with_it(coarse_rig: Rig) -> None:
+def test_bench_includes_point_masses(coarse_rig: Rig) -> None:
     """With 80 g on it, fingers feel what the sparse direct solve says, and not what they did."""
     heavy = replace(coarse_rig, masses=(PointMass(0.1, 0.15, 0.05), PointMass(0.3048, 0.1, 0.03)))
     points = fingertip_points(0.08, 0.06, heavy.plate)
@@ -76,7 +76,7 @@ def test_what_the_plate_carries_moves_with_it(coarse_rig: Rig) -> None:
     assert np.linalg.norm(felt - np.abs(bare)) > 0.3 * np.linalg.norm(felt)
 
 
-def test_the_watchdog_silences_the_plate_at_its_own_time(coarse_rig: Rig) -> None:
+def test_bench_watchdog_silences_at_its_time(coarse_rig: Rig) -> None:
     """Noticed two seconds late, the plate has been ringing down since the watchdog ran out."""
     prompt, late = Bench(coarse_rig, now=START), Bench(coarse_rig, now=START)
     for bench in (prompt, late):
@@ -96,7 +96,7 @@ def test_the_watchdog_silences_the_plate_at_its_own_time(coarse_rig: Rig) -> Non
     assert late.felt(START + 1.9, START + 2.1)["a"].peak.max() < 0.02 * driven
 
 
-def test_frequencies_of_a_window_are_those_driven_in_it(coarse_rig: Rig) -> None:
+def test_bench_frequencies_of_a_window(coarse_rig: Rig) -> None:
     """A tone counts while it fades in and out, not before or after."""
     bench = Bench(coarse_rig, now=0.0)
     bench.place_fingers({"a": (0.1, 0.1)}, now=0.0)
@@ -115,7 +115,7 @@ def test_frequencies_of_a_window_are_those_driven_in_it(coarse_rig: Rig) -> None
     assert frequencies(0.53, 0.6) == (150.0,)
 
 
-def test_a_long_pause_is_bridged_without_sampling_it(coarse_rig: Rig) -> None:
+def test_bench_skips_a_long_pause(coarse_rig: Rig) -> None:
     """A process that was paused for a day comes back to a silent plate, ten seconds recorded."""
     bench = Bench(coarse_rig, now=0.0)
     bench.place_fingers({"a": (0.1, 0.1)}, now=0.0)
@@ -127,7 +127,7 @@ def test_a_long_pause_is_bridged_without_sampling_it(coarse_rig: Rig) -> None:
     assert bench.fingers.felt(0.0, 86_400.0)["a"].times[0] >= 86_390.0
 
 
-def test_a_clock_that_is_behind_moves_nothing_back(coarse_rig: Rig) -> None:
+def test_bench_ignores_an_earlier_time(coarse_rig: Rig) -> None:
     """A request stamped before the present is taken now."""
     bench = Bench(coarse_rig, now=10.0)
     bench.exchange("main", Arm(0.25), now=10.0)

@@ -50,7 +50,7 @@ def apart(found: FloatArray, truth: FloatArray) -> float:
     return float(np.linalg.norm(found - truth) / np.linalg.norm(truth))
 
 
-def test_fingers_load_the_plate_as_they_come_and_go(coarse_rig: Rig) -> None:
+def test_bench_fingers_load_the_plate(coarse_rig: Rig) -> None:
     """What A feels alone, after B came, and after B went, each once the plate has settled."""
     load = FingerLoad(2000.0, 3.0, 0.005)
     bench = Bench(coarse_rig, now=0.0, finger_load=load)
@@ -65,7 +65,7 @@ def test_fingers_load_the_plate_as_they_come_and_go(coarse_rig: Rig) -> None:
     assert apart(truth, expected(coarse_rig, (load.at(*A), load.at(*B)))) > 0.02
 
 
-def test_observers_and_fingers_that_only_feel_weigh_nothing(coarse_rig: Rig) -> None:
+def test_bench_observers_have_no_weight(coarse_rig: Rig) -> None:
     """By default no finger loads the plate; where fingers do, an observer beside them does not."""
     bare = Bench(coarse_rig, now=0.0)
     observed = Bench(coarse_rig, now=0.0, finger_load=FingerLoad(mass=0.02))
@@ -78,7 +78,7 @@ def test_observers_and_fingers_that_only_feel_weigh_nothing(coarse_rig: Rig) -> 
         assert apart(amplitude, expected(coarse_rig, ())) < 0.01
 
 
-def test_sensors_go_on_reading_through_a_touch(coarse_rig: Rig) -> None:
+def test_bench_sensors_read_through_a_touch(coarse_rig: Rig) -> None:
     """An accelerometer hears the whole time while a finger comes, at every sample, truly."""
     load = FingerLoad(mass=0.005)
     bench = Bench(coarse_rig, now=0.0, finger_load=load)
@@ -104,22 +104,22 @@ def test_sensors_go_on_reading_through_a_touch(coarse_rig: Rig) -> None:
     assert amplitude == pytest.approx(abs(answer[0, 1, 0]), rel=0.01)
 
 
-def test_a_finger_off_the_plate_changes_nothing(coarse_rig: Rig) -> None:
+def test_bench_refuses_a_finger_off_the_plate(coarse_rig: Rig) -> None:
     """It is refused, and those that were there go on resting where they are."""
     bench = Bench(coarse_rig, now=0.0, finger_load=FingerLoad())
     bench.place_fingers({"a": A}, now=0.0)
-    with pytest.raises(InputError, match="not on the plate"):
+    with pytest.raises(InputError, match="finger c"):
         bench.place_fingers({"a": B, "c": (1.0, 1.0)}, now=0.1)
     assert bench.fingers.layout.positions == {"a": A}
 
 
-def test_a_light_finger_is_that_of_the_robust_contrast() -> None:
+def test_light_finger_load_is_that_of_the_robust_contrast() -> None:
     """1 kN/m, 2 N s/m and 0.2 g, as the founding experiment's errors have it."""
     assert finger_loads([A]) == (PointLoad(*A, 1000.0, 2.0, 0.0002),)
     assert parse_finger_load("light", what="--finger-load") == FingerLoad(1000.0, 2.0, 0.0002)
 
 
-def test_a_finger_is_written_with_units_or_without() -> None:
+def test_parse_finger_load_with_and_without_units() -> None:
     """Stiffness, damping, mass; bare numbers are SI."""
     wanted = FingerLoad(1500.0, 0.5, 0.0003)
     assert parse_finger_load("1.5 kN/m, 0.5 N s/m, 0.3 g", what="--finger-load") == wanted
@@ -127,22 +127,15 @@ def test_a_finger_is_written_with_units_or_without() -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ("heavy", "write light, or"),
-        ("1,2", "write light, or"),
-        ("1000,2,0.2 m", "0.2 m"),
-        ("-1000,2,0", "below zero"),
-        ("nan,2,0", "nan"),
-    ],
+    "text", ["heavy", "1,2", "1000,2,0.2 m", "-1000,2,0", "nan,2,0"]
 )
-def test_what_is_no_finger_is_refused(text: str, words: str) -> None:
-    """The option is named, and what to write."""
-    with pytest.raises(InputError, match=f"--finger-load.*{words}"):
+def test_parse_finger_load_refuses_invalid_text(text: str) -> None:
+    """The error names the option."""
+    with pytest.raises(InputError, match="--finger-load"):
         parse_finger_load(text, what="--finger-load")
 
 
-def test_a_heavier_finger_is_another(coarse_rig: Rig) -> None:
+def test_bench_heavier_finger_is_another_contact(coarse_rig: Rig) -> None:
     """The same place with another load is another contact, not the one that was solved before."""
     heavy = replace(FingerLoad(), mass=0.02)
     light, heavier = (expected(coarse_rig, (each.at(*A),)) for each in (FingerLoad(), heavy))

@@ -163,7 +163,7 @@ def energy(plant: Plant, M: FloatArray, K: FloatArray) -> float:
     return float(q @ K @ q + v @ M @ v) / 2
 
 
-def test_energy_falls_when_nothing_drives(reduced: ReducedPlate) -> None:
+def test_plant_energy_decreases_without_drive(reduced: ReducedPlate) -> None:
     """After the drive ends the plate's energy only falls, and comes to nothing."""
     M, _, K = modal_matrices(reduced, eras())
     plant = Plant(reduced, eras())
@@ -179,7 +179,7 @@ def test_energy_falls_when_nothing_drives(reduced: ReducedPlate) -> None:
     assert energies[-1] < 1e-3 * energies[0]
 
 
-def test_structural_damping_never_feeds_the_plate(reduced: ReducedPlate) -> None:
+def test_plant_structural_damping_is_passive(reduced: ReducedPlate) -> None:
     """The viscous equivalent is symmetric and positive semidefinite."""
     _, C, _ = modal_matrices(reduced, eras(damping=0.0))
     np.testing.assert_allclose(C, C.T, atol=1e-9 * np.abs(C).max())
@@ -203,7 +203,7 @@ def test_displacement_and_velocity_are_continuous_through_changes(reduced: Reduc
         np.testing.assert_allclose(new, old, rtol=1e-6, atol=1e-9 * np.abs(old).max())
 
 
-def test_how_time_is_cut_does_not_matter(reduced: ReducedPlate) -> None:
+def test_plant_result_is_independent_of_steps(reduced: ReducedPlate) -> None:
     """Many short advances give the same samples as one long one: none lost, none twice."""
     shapes = reduced.at(fingertip_points(0.1, 0.1, PLATE))
     terms = [Term(0.0, 0.031, 700.0, STROKE), Term(0.02, np.inf, 1100.0, 1j * STROKE)]
@@ -221,7 +221,7 @@ def test_how_time_is_cut_does_not_matter(reduced: ReducedPlate) -> None:
     np.testing.assert_allclose(found, expected, atol=1e-8 * np.abs(expected).max())
 
 
-def test_terms_that_hold_together_move_the_base_together(reduced: ReducedPlate) -> None:
+def test_plant_superposes_terms(reduced: ReducedPlate) -> None:
     """As when a tone fades into one of its own frequency: two terms are one of their sum."""
     w, a, b = 2 * np.pi * 110.0, (1 + 2j) * STROKE / 4, (-0.5 + 1j) * STROKE / 4
     felt = []
@@ -235,7 +235,7 @@ def test_terms_that_hold_together_move_the_base_together(reduced: ReducedPlate) 
     np.testing.assert_allclose(felt[0], felt[1], atol=1e-9 * np.abs(felt[1]).max())
 
 
-def test_a_plate_that_would_tip_over_is_refused(reduced: ReducedPlate) -> None:
+def test_plant_refuses_an_unsupported_plate(reduced: ReducedPlate) -> None:
     """Two ERAs hold no plate: the axis through them is free to turn."""
     with pytest.raises(InputError, match="supported"):
         Plant(reduced, eras()[:2])

@@ -76,7 +76,7 @@ def apart(found: FloatArray, expected: FloatArray) -> float:
     return float(np.linalg.norm(found - expected) / np.linalg.norm(expected))
 
 
-def test_ramps_follow_a_stepping_solver(rig: Rig, whole: WholePlate, reduced: ReducedPlate) -> None:
+def test_plant_ramps_agree_with_newmark(rig: Rig, whole: WholePlate, reduced: ReducedPlate) -> None:
     """Without a finger: within 0.1 % of Newmark's method, over the plate, nothing filtered."""
     plant = Plant(reduced, rig.eras)
     set_bases(plant, BASES[:3])
@@ -87,7 +87,7 @@ def test_ramps_follow_a_stepping_solver(rig: Rig, whole: WholePlate, reduced: Re
     assert apart(found, stepped[:, 0::3]) < 1e-3
 
 
-def test_fingers_that_come_move_and_go_follow_a_stepping_solver(
+def test_plant_with_changing_contacts_agrees_with_newmark(
     rig: Rig, whole: WholePlate, reduced: ReducedPlate
 ) -> None:
     """Ramps, an envelope and two fingers: displacement, velocity and what can be felt within 1 %.
@@ -133,7 +133,7 @@ def phasors(
 
 
 @pytest.mark.parametrize("frequency", [60.0, 110.0, 207.0, 250.0, 320.0, 410.0, 500.0])
-def test_steady_state_is_that_of_the_whole_plate(
+def test_plant_steady_state_agrees_with_the_full_model(
     frequency: float, rig: Rig, whole: WholePlate, reduced: ReducedPlate
 ) -> None:
     """Within 0.1 % of the unreduced plate's frequency response, before, under and after fingers."""
@@ -149,7 +149,7 @@ def test_steady_state_is_that_of_the_whole_plate(
         assert apart(found, whole.steady(2, frequency, points, contacts)) < 1e-3
 
 
-def test_steady_state_under_fingers_is_that_of_the_direct_solve(rig: Rig) -> None:
+def test_plant_steady_state_under_fingers_agrees_with_the_direct_solve(rig: Rig) -> None:
     """Where only ERAs and fingers damp, both domains have one law: within 0.1 % of the tables' own.
 
     On a mesh as fine as tables use, against the sparse solve that they are checked with.
@@ -177,7 +177,7 @@ def test_steady_state_under_fingers_is_that_of_the_direct_solve(rig: Rig) -> Non
         plant.set_contacts([MOVED])
 
 
-def test_the_loss_factor_damps_as_in_the_tables_but_for_a_tenth_of_a_percent() -> None:
+def test_plant_viscous_equivalent_agrees_with_the_loss_factor() -> None:
     """Against the hysteretic direct solve: magnitudes over the plate, 0.1 % in the median.
 
     No causal law of damping can have the same loss at all frequencies; this is what is left.

@@ -56,7 +56,7 @@ def stored(plant: Plant, rig: Rig) -> float:
     return float(q @ K @ q + v @ M @ v) / 2
 
 
-def test_displacement_and_velocity_run_through_every_change(
+def test_contacts_keep_displacement_and_velocity_continuous(
     coarse_rig: Rig, reduced: ReducedPlate
 ) -> None:
     """Fingers come, press harder, move and go: the whole plate goes on from where it is."""
@@ -76,9 +76,7 @@ def test_displacement_and_velocity_run_through_every_change(
         assert stored(plant, coarse_rig) == pytest.approx(energy, rel=1e-9)
 
 
-def test_the_coordinates_of_a_finger_that_left_are_dropped_once_they_are_still(
-    coarse_rig: Rig, reduced: ReducedPlate
-) -> None:
+def test_contacts_drop_vectors_of_lifted_fingers(coarse_rig: Rig, reduced: ReducedPlate) -> None:
     """Half a second later the plate is as small as before, and nothing of it has jumped."""
     plant = Plant(reduced, coarse_rig.eras)
     plant.set_input(0, [Term(0.0, np.inf, 2 * np.pi * 207.0, STROKE)])
@@ -97,9 +95,7 @@ def test_the_coordinates_of_a_finger_that_left_are_dropped_once_they_are_still(
         assert_allclose(new, old, rtol=0, atol=1e-4 * np.abs(old).max())
 
 
-def test_a_finger_that_taps_gives_no_more_than_it_brought(
-    coarse_rig: Rig, reduced: ReducedPlate
-) -> None:
+def test_contacts_tap_is_passive(coarse_rig: Rig, reduced: ReducedPlate) -> None:
     """While nothing drives, plate and finger together only lose, whatever the length of a tap.
 
     What a finger brings is what its spring and mass hold at the moment at which it lands.
@@ -122,7 +118,7 @@ def test_a_finger_that_taps_gives_no_more_than_it_brought(
     assert stored(plant, coarse_rig) < 0.1 * start
 
 
-def test_a_finger_quickens_the_ringing_down(coarse_rig: Rig, reduced: ReducedPlate) -> None:
+def test_contacts_increase_the_decay(coarse_rig: Rig, reduced: ReducedPlate) -> None:
     """Half a second after the drive there is far less left under a finger than without one."""
     left = []
     for contacts in ([], FINGERS):
@@ -135,9 +131,7 @@ def test_a_finger_quickens_the_ringing_down(coarse_rig: Rig, reduced: ReducedPla
     assert left[1] < 0.1 * left[0]
 
 
-def test_bases_that_start_later_know_the_finger_that_came_before(
-    coarse_rig: Rig, reduced: ReducedPlate
-) -> None:
+def test_contacts_apply_to_later_drives(coarse_rig: Rig, reduced: ReducedPlate) -> None:
     """It does not matter whether the drive or the finger is announced first."""
     shapes, samples = reduced.at(np.array([[0.05, 0.2]])), []
     for drive_first in (True, False):
@@ -177,16 +171,14 @@ def run(
     return np.vstack(samples)
 
 
-def test_how_time_is_cut_makes_no_difference(coarse_rig: Rig, reduced: ReducedPlate) -> None:
+def test_contacts_result_is_independent_of_steps(coarse_rig: Rig, reduced: ReducedPlate) -> None:
     """Cut at three hundred moments by chance, or not at all: the same samples to rounding."""
     whole = run(coarse_rig, reduced, BASES, np.array([]))
     cut = run(coarse_rig, reduced, BASES, np.random.default_rng(1).uniform(0, 0.1, 300))
     assert_allclose(cut, whole, rtol=0, atol=1e-10 * np.abs(whole).max())
 
 
-def test_several_bases_do_what_each_does_alone_together(
-    coarse_rig: Rig, reduced: ReducedPlate
-) -> None:
+def test_contacts_superpose_drives(coarse_rig: Rig, reduced: ReducedPlate) -> None:
     """Superposition holds while fingers come and go, since the plate is linear throughout."""
     together = run(coarse_rig, reduced, BASES, np.array([]))
     alone = sum(
@@ -196,7 +188,7 @@ def test_several_bases_do_what_each_does_alone_together(
     assert_allclose(alone, together, rtol=0, atol=1e-10 * np.abs(together).max())
 
 
-def test_a_set_of_fingers_is_solved_once(
+def test_contacts_are_solved_once(
     coarse_rig: Rig, reduced: ReducedPlate, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A finger that taps on one spot again and again costs one solve, not one a tap."""
@@ -211,7 +203,7 @@ def test_a_set_of_fingers_is_solved_once(
         plant.set_contacts([])
 
 
-def test_a_plate_of_which_only_coordinates_are_known_is_loaded_in_them(coarse_rig: Rig) -> None:
+def test_contacts_on_a_plate_without_nodes(coarse_rig: Rig) -> None:
     """Without its origin a plate keeps its coordinates; a rigid one sways on all its springs."""
     # Three rigid motions of a plate of 1 kg: up and down, and two tilts.
     mesh = Mesh(2, 2, coarse_rig.plate.length, coarse_rig.plate.width)
@@ -231,7 +223,7 @@ def test_a_plate_of_which_only_coordinates_are_known_is_loaded_in_them(coarse_ri
     assert np.abs(samples).max() == pytest.approx(expected, rel=1e-3)
 
 
-def test_fingers_lie_where_they_are_told(coarse_rig: Rig, reduced: ReducedPlate) -> None:
+def test_contacts_positions(coarse_rig: Rig, reduced: ReducedPlate) -> None:
     """The static deflection under a stiff finger is next to none: it holds the plate there."""
     plant = Plant(reduced, coarse_rig.eras)
     stiff = PointLoad(0.11, 0.07, stiffness=1e7, damping=1e3)
@@ -247,7 +239,7 @@ def test_fingers_lie_where_they_are_told(coarse_rig: Rig, reduced: ReducedPlate)
     assert held < 0.01 * free
 
 
-def test_the_sampling_rate_may_change_in_between(coarse_rig: Rig, reduced: ReducedPlate) -> None:
+def test_plant_sampling_rate_may_change(coarse_rig: Rig, reduced: ReducedPlate) -> None:
     """Every tenth sample at 10 kHz is the sample at 1 kHz, also right after the other rate."""
     quick, mixed = (vibrating(reduced, coarse_rig) for _ in range(2))
     shapes = reduced.at(POINTS)

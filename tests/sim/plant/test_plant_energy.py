@@ -93,7 +93,7 @@ def kept_for(plant: Plant, rig: Rig, until: float) -> Books:
     return Books(float(put_in), float(lost), float(stored[0]), float(stored[-1]))
 
 
-def test_work_is_stored_or_lost(rig: Rig) -> None:
+def test_plant_energy_balance(rig: Rig) -> None:
     """From knot to knot the books balance to 1e-5 of what went through them, for ramps as well.
 
     When a finger comes or goes, what is stored changes by what its spring and its mass hold, and by

@@ -46,7 +46,7 @@ def steady(rig: Rig, place: tuple[float, float], *loads: PointLoad) -> np.ndarra
 
 
 @pytest.mark.parametrize("finger_load", [None, HEAVY])
-def test_steady_measures_are_those_of_the_frequency_domain(
+def test_playback_steady_measures_agree_with_the_frequency_domain(
     coarse_rig: Rig, reduced: ReducedPlate, finger_load: FingerLoad | None
 ) -> None:
     """Level and contrast by a direct solve, within 0.1 dB, fingers that load the plate or not."""
@@ -61,7 +61,7 @@ def test_steady_measures_are_those_of_the_frequency_domain(
     assert (abs(level - free) > 1) is (finger_load is not None)
 
 
-def test_measures_count_as_those_of_patterns_do() -> None:
+def test_playback_measures_of_several_targets() -> None:
     """Of made-up records: means over targets, the loudest quiet point, the lesser target."""
     times = np.arange(1, 10_001) / 10_000
     points = np.zeros((2, 2))
@@ -82,9 +82,7 @@ def test_measures_count_as_those_of_patterns_do() -> None:
     assert (alone.contrast_db, alone.transient_contrast_db, alone.quiet_level_db_sl) == (None,) * 3
 
 
-def test_an_envelope_stands_in_the_place_of_the_ramp(
-    coarse_rig: Rig, reduced: ReducedPlate
-) -> None:
+def test_playback_with_an_onset_envelope(coarse_rig: Rig, reduced: ReducedPlate) -> None:
     """What fingertips go through is what another solution in time says, the model's own."""
     excitation = {"SW": Tone(110.0, 1e-5)}
     onset = {"SW": Envelope(110.0, 2e-6, (4e-6j, -1e-5, 1e-5)), "NE": Envelope(110.0, 0, (5e-6, 0))}
@@ -102,13 +100,13 @@ def test_an_envelope_stands_in_the_place_of_the_ramp(
 @pytest.mark.parametrize(
     ("fingers", "duration", "says"),
     [
-        (FINGERS, 0.04, "the onset takes 0.04 s"),
-        (FINGERS, math.nan, "nothing can be played for nan s"),
-        (FINGERS, 11.0, "10 s are the longest"),
-        (Question(((8.0, 6.0),)), 1.0, "is not on the plate"),
+        (FINGERS, 0.04, "duration"),
+        (FINGERS, math.nan, "duration"),
+        (FINGERS, 11.0, "duration"),
+        (Question(((8.0, 6.0),)), 1.0, "plate"),
     ],
 )
-def test_what_cannot_be_played_is_refused(
+def test_playback_refuses_invalid_input(
     coarse_rig: Rig, reduced: ReducedPlate, fingers: Question, duration: float, says: str
 ) -> None:
     """Times in which nothing settles or that fill the memory, and fingers beside the plate."""
@@ -116,7 +114,7 @@ def test_what_cannot_be_played_is_refused(
         play(coarse_rig, reduced, EXCITATION, fingers, duration=duration)
 
 
-def test_what_is_steady_is_read_at_the_end() -> None:
+def test_playback_reads_steady_measures_at_the_end() -> None:
     """Ten times as much until a quarter of a second before the end does not count."""
     times = np.arange(10_000) / 10_000.0
     tone = np.where(times < 0.75, 10.0, 1.0) * np.sin(2 * np.pi * 100.0 * times)

@@ -44,7 +44,7 @@ def record(
     )
 
 
-def test_steady_contrast_is_the_models(coarse_rig: Rig, reduced: ReducedPlate) -> None:
+def test_steady_contrast_agrees_with_the_model(coarse_rig: Rig, reduced: ReducedPlate) -> None:
     """From signals alone, once settled, as the steady state in frequency within 0.2 dB.
 
     In the first 100 ms it is another one, since the plate's own modes ring.
@@ -59,7 +59,9 @@ def test_steady_contrast_is_the_models(coarse_rig: Rig, reduced: ReducedPlate) -
     assert abs(transient_contrast_db(recording, onset=0.0, **names) - measured) > 1
 
 
-def test_t60_is_that_of_the_mode_that_rings(coarse_rig: Rig, reduced: ReducedPlate) -> None:
+def test_reverberation_time_is_that_of_the_ringing_mode(
+    coarse_rig: Rig, reduced: ReducedPlate
+) -> None:
     """Driven at a resonance and let go: ln(1000) over the decay rate of that eigenvalue."""
     eigenvalues = plate_in_time(reduced, coarse_rig.eras).eigenvalues
     bending = eigenvalues[

@@ -22,7 +22,7 @@ def moved(terms: tuple[Term, ...], t: float) -> float:
     return total
 
 
-def test_raised_cosine_in_and_out() -> None:
+def test_fade_follows_a_raised_cosine() -> None:
     """A quarter, half and three quarters into a 20 ms ramp the gain is as the cosine says."""
     playing = fade_to((), 1.0, ramp=0.02, frequency=100.0, amplitude=0.8)
     quarter = (1 - math.sqrt(0.5)) / 2
@@ -33,7 +33,7 @@ def test_raised_cosine_in_and_out() -> None:
     assert level_of(ending, 2.02) == 0
 
 
-def test_base_motion_is_the_tone_under_its_ramp() -> None:
+def test_base_motion_matches_the_faded_tone() -> None:
     """The exponentials add up to stroke x level x gain(t) x sin(2 pi f (t - origin) + phase)."""
     tone = FadingTone(110.0, cmath.rect(0.5, 0.7), 0.95, 1.0, 0.02, 0.3, 1.0)
     terms = terms_of(tone, stroke=1e-4)
@@ -43,14 +43,14 @@ def test_base_motion_is_the_tone_under_its_ramp() -> None:
         assert moved(terms, t) == pytest.approx(expected, abs=1e-13)
 
 
-def test_ramp_of_zero_is_a_jump() -> None:
+def test_fade_with_zero_ramp_is_a_step() -> None:
     """Without a ramp the new tone is there at full level and the old one is gone."""
     playing = fade_to((), 1.0, ramp=0.0, frequency=100.0, amplitude=0.5)
     assert level_of(playing, 1.0) == 0.5
     assert fade_to(playing, 2.0, ramp=0.0) == ()
 
 
-def test_phase_counts_from_the_commit_or_runs_on() -> None:
+def test_fade_phase_with_and_without_keep_phase() -> None:
     """Only keep_phase at the same frequency leaves the phase running through a change of level."""
 
     def motion(playing: Output, t: float) -> float:
@@ -71,7 +71,7 @@ def test_phase_counts_from_the_commit_or_runs_on() -> None:
         assert level_of(same, t) == pytest.approx(1.0)
 
 
-def test_tones_of_one_frequency_have_the_level_of_their_sum() -> None:
+def test_level_adds_tones_of_one_frequency_coherently() -> None:
     """Set at other times and in other phases: the most that the base moves within a period."""
     first = fade_to((), 0.0, ramp=0.0, frequency=110.0, amplitude=cmath.rect(0.6, 0.4))
     playing = fade_to(first, 0.0013, ramp=0.5, frequency=110.0, amplitude=cmath.rect(0.9, -1.1))
@@ -84,7 +84,7 @@ def test_tones_of_one_frequency_have_the_level_of_their_sum() -> None:
     assert level_of(playing, t) == pytest.approx(most, rel=1e-4)
 
 
-def test_a_change_within_a_ramp_is_continuous_and_prolongs_nothing() -> None:
+def test_fade_interrupted_is_continuous() -> None:
     """A tone caught half faded in leaves from half; one fading out keeps its own, earlier end."""
     first = fade_to((), 0.0, ramp=0.02, frequency=100.0, amplitude=1.0)
     second = fade_to(first, 0.01, ramp=0.02, frequency=150.0, amplitude=1.0)

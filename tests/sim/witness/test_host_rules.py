@@ -58,7 +58,7 @@ class Watched:
         (("west", "east"), []),  # it died: nobody is there to tell anybody anything
     ],
 )
-def test_what_one_plays_all_play_as_long_as_there_is_a_host(
+def test_host_rules_require_a_set_on_all_amplifiers(
     closed: tuple[str, ...], broken: list[str]
 ) -> None:
     """A set goes to one of two amplifiers only, then 20 ms pass."""
@@ -70,7 +70,7 @@ def test_what_one_plays_all_play_as_long_as_there_is_a_host(
     assert watched.broken == broken
 
 
-def test_a_set_that_was_given_up_is_silenced_first() -> None:
+def test_host_rules_require_silence_before_another_set() -> None:
     """One plays a set, the last finger lifts before the other does, and for the next finger both
     play another one: right where the first was told to be silent in between, and only there."""
     for silences, broken in (((SILENT,), []), ((), ["commit"])):
@@ -84,7 +84,7 @@ def test_a_set_that_was_given_up_is_silenced_first() -> None:
         assert watched.broken == broken
 
 
-def test_a_disarm_is_not_what_a_stop_is() -> None:
+def test_host_rules_report_a_disarm_before_a_stop() -> None:
     """A stop is wished, and the amplifier is told to disarm first, along ten times the ramp."""
     watched = Watched()
     watched.host.operator_command(1.010, "stop")

@@ -53,7 +53,7 @@ class Watched:
         self.broken.append(invariant)
 
 
-def test_who_is_not_known_may_have_been_in_a_fault_before_a_stop() -> None:
+def test_reference_accepts_a_fault_from_an_unknown_state() -> None:
     """Armed, lost sight of, stopped: its watchdog may have run out while nobody looked."""
     watched = Watched()
     watched.grants(ARM, 1.0, ENABLED)
@@ -62,7 +62,7 @@ def test_who_is_not_known_may_have_been_in_a_fault_before_a_stop() -> None:
     assert watched.broken == []
 
 
-def test_a_fault_that_was_cleared_out_of_sight_is_not_latched() -> None:
+def test_reference_forgets_an_unobserved_fault() -> None:
     """In a fault, lost sight of, cleared and armed meanwhile, stopped: it has no fault any more."""
     watched = Watched()
     watched.grants(ARM, 1.0, ENABLED)
@@ -72,7 +72,7 @@ def test_a_fault_that_was_cleared_out_of_sight_is_not_latched() -> None:
     assert watched.broken == []
 
 
-def test_who_is_known_may_not() -> None:
+def test_reference_reports_an_early_watchdog_fault() -> None:
     """Ten milliseconds after Arm no watchdog of 250 ms has run out."""
     watched = Watched()
     watched.grants(ARM, 1.0, ENABLED)
@@ -81,7 +81,7 @@ def test_who_is_known_may_not() -> None:
 
 
 @pytest.mark.parametrize("state", [1, 3, ENABLED])
-def test_who_is_not_known_follows_a_stop_all_the_same(state: int) -> None:
+def test_reference_reports_an_ignored_stop(state: int) -> None:
     """From every state Stop leads to one that is latched."""
     watched = Watched()
     watched.grants(STOP, 1.0, state)
@@ -100,9 +100,7 @@ def test_who_is_not_known_follows_a_stop_all_the_same(state: int) -> None:
         (1.460, 0.2, ["silent"]),
     ],
 )
-def test_a_set_that_ends_by_itself_may_fade_from_its_end_on(
-    time: float, level: float, rules: list[str]
-) -> None:
+def test_reference_fades_at_the_end_of_a_set(time: float, level: float, rules: list[str]) -> None:
     """Taken at 1.100 to 1.102 s, it fades from 1.4 s on: 0.2 (1 + cos(pi/5)) / 2 after 10 ms."""
     watched = Watched(slack=0.02)
     watched.grants(ARM, 1.0, ENABLED)
@@ -112,7 +110,7 @@ def test_a_set_that_ends_by_itself_may_fade_from_its_end_on(
     assert watched.broken == rules
 
 
-def test_who_is_lost_sight_of_may_play_on_beyond_the_end_of_a_set() -> None:
+def test_reference_accepts_any_output_in_an_unknown_state() -> None:
     """What was to end at 1.4 s may have been followed by another while nobody looked."""
     watched = Watched()
     watched.grants(ARM, 1.0, ENABLED)
@@ -126,7 +124,9 @@ def test_who_is_lost_sight_of_may_play_on_beyond_the_end_of_a_set() -> None:
 @pytest.mark.parametrize(
     ("query", "says", "late"), [(DISARM, SWITCHED_ON, "latched"), (STATUS, ENABLED, "armed")]
 )
-def test_an_answer_may_be_older_than_a_stop_to_all(query: Request, says: int, late: str) -> None:
+def test_reference_accepts_a_reply_older_than_a_broadcast_stop(
+    query: Request, says: int, late: str
+) -> None:
     """Asked, then all of the bus are stopped, and only then the answer comes: of how it was before.
 
     Nobody answers the stop, so it counts within 10 ms; after that it is stopped.

@@ -70,7 +70,7 @@ def _check(name: str, meaning: Message | None) -> None:
         assert meaning.kind is named[0]
 
 
-def test_serial_examples() -> None:
+def test_serial_decoder_decodes_the_page() -> None:
     """Every frame of the page means what stands beside it."""
     decoder = SerialDecoder()
     seen = {}
@@ -96,7 +96,7 @@ def test_serial_examples() -> None:
 
 
 @pytest.mark.parametrize("transport", ["RTU", "TCP"])
-def test_modbus_examples(transport: str) -> None:
+def test_modbus_decoder_decodes_the_page(transport: str) -> None:
     """Every telegram of the page means what stands beside it, over both transports."""
     decoder = ModbusDecoder(over_tcp=transport == "TCP")
     seen = {}
@@ -117,7 +117,7 @@ def test_modbus_examples(transport: str) -> None:
     assert (status.status.state, status.status.fault) == (7, 1)
 
 
-def test_can_examples() -> None:
+def test_can_decoder_decodes_the_page() -> None:
     """The session of the page: sets whole and torn, classic and FD, the watchdog, the end."""
     decoder = CanDecoder("slcan", {1: 4})
     seen = [meaning for toward, frame in _can() for meaning in decoder.take(toward, frame)]
@@ -133,7 +133,7 @@ def test_can_examples() -> None:
 
 
 @pytest.mark.parametrize("place", range(1, 12))
-def test_a_flipped_bit_on_a_serial_line_is_seen(place: int) -> None:
+def test_serial_decoder_detects_a_flipped_bit(place: int) -> None:
     """No single flipped bit of a stop leaves a frame that means something else."""
     frame = bytes.fromhex("00042801070205 05B4C3FD8700")
     for bit in range(8):
@@ -143,7 +143,7 @@ def test_a_flipped_bit_on_a_serial_line_is_seen(place: int) -> None:
             assert isinstance(meaning, Damaged)
 
 
-def test_frames_come_in_pieces() -> None:
+def test_decoders_accept_any_pieces() -> None:
     """However the bytes are cut, the frames are the same, on lines and in the text of adapters."""
     serial = b"".join(data for _, toward, data in _serial() if toward == "amplifier")
     whole = SerialDecoder().feed("amplifier", 0.0, serial)
@@ -181,7 +181,7 @@ PLAN = {
 }
 
 
-def test_a_refusal_of_an_earlier_write_answers_who_reads_it() -> None:
+def test_modbus_decoder_matches_a_refusal_of_an_earlier_write() -> None:
     """A write damaged on its way leaves no tag; one refused now is not told under an older tag."""
     for told, is_answer in ((EARLIER, True), (EARLIER[:-2] + b"\0\x16", False)):
         decoder = ModbusDecoder(over_tcp=True)
@@ -196,7 +196,7 @@ def test_a_refusal_of_an_earlier_write_answers_who_reads_it() -> None:
 
 
 @pytest.mark.parametrize("are_on", [False, True])
-def test_a_refusal_of_an_earlier_write_is_wrong_where_nothing_damages(are_on: bool) -> None:
+def test_witness_reports_a_stale_refusal_unless_disturbed(are_on: bool) -> None:
     """Faults excuse it, and who goes on then asks nothing amid it; without faults it is told of."""
     witness = Witness(PLAN)
     if are_on:
@@ -217,7 +217,7 @@ def test_a_refusal_of_an_earlier_write_is_wrong_where_nothing_damages(are_on: bo
 
 @pytest.mark.parametrize(("over", "broken"), [(1.0, []), (0.4, ["garbage"])])
 @pytest.mark.parametrize("kind", ["serial", "modbus-rtu", "slcan", "socketcand"])
-def test_what_was_cut_amid_trouble_is_none_of_what_comes_later(
+def test_witness_excuses_a_frame_cut_while_disturbed(
     kind: str, over: float, broken: list[str]
 ) -> None:
     """A frame is cut at 1 s, which shows when the next comes at 4 s; trouble counts 0.5 s more."""
@@ -235,7 +235,7 @@ def test_what_was_cut_amid_trouble_is_none_of_what_comes_later(
     assert [violation.invariant for violation in witness.finish(4.001)] == broken
 
 
-def test_what_comes_again_from_another_unit_answers_nothing() -> None:
+def test_modbus_decoder_ignores_replies_of_another_unit() -> None:
     """Two units of one RTU line are asked who they are; the first says it twice, then the other.
 
     The page's Hello, once more with 2 for its unit.
@@ -258,7 +258,7 @@ def test_what_comes_again_from_another_unit_answers_nothing() -> None:
 
 
 @pytest.mark.parametrize(("over", "broken"), [(0.02, ["answer"]), (0.04, [])])
-def test_what_was_due_amid_trouble_is_not_owed_later(over: float, broken: list[str]) -> None:
+def test_witness_excuses_a_reply_due_while_disturbed(over: float, broken: list[str]) -> None:
     """A Ping at 0.5 s that nobody answers, and nothing more until 2 s; 0.5 s count as trouble yet.
 
     Its answer is due after 31 ms.
@@ -269,7 +269,7 @@ def test_what_was_due_amid_trouble_is_not_owed_later(over: float, broken: list[s
     assert [violation.invariant for violation in witness.finish(2.0)] == broken
 
 
-def test_a_late_answer_to_what_was_repeated_tells_nothing_new() -> None:
+def test_witness_accepts_a_late_reply_to_a_repeated_request() -> None:
     """A set asked for twice, then another: the first answer comes last, and no set is taken back.
 
     docs/reference/wire-modbus.md: Arm, and the Apply of token 513; the other one has token 514.
@@ -307,9 +307,7 @@ def test_a_late_answer_to_what_was_repeated_tells_nothing_new() -> None:
         (2, 18000, "phase of a knot must be -18000 to 17999, got 18000"),
     ],
 )
-def test_an_envelope_is_held_to_its_bounds_on_every_wire(
-    count: int, phase: int, problem: str
-) -> None:
+def test_decoders_check_the_bounds_of_envelopes(count: int, phase: int, problem: str) -> None:
     """The bounds of the page's table: an envelope beyond them is wrong, whichever wire it is on."""
     knots = [1000, phase] * count
     head = bytes.fromhex("2D 01 07 00")  # of the page's LoadEnvelope

@@ -43,7 +43,7 @@ def _wires(scenario: str) -> list[str]:
 @pytest.mark.parametrize(
     ("scenario", "wire"), [(name, wire) for name in SCENARIOS for wire in _wires(name)]
 )
-def test_the_chain_as_it_is_breaks_no_rule(scenario: str, wire: str) -> None:
+def test_witness_finds_nothing_in_the_chain(scenario: str, wire: str) -> None:
     """Every scenario passes clean on every wire on which it can be played."""
     outcome = play(wire, SCENARIOS[scenario])
     assert [str(one) for one in outcome.found] == []
@@ -52,7 +52,7 @@ def test_the_chain_as_it_is_breaks_no_rule(scenario: str, wire: str) -> None:
 
 
 @pytest.mark.parametrize("wire", WITNESSED)
-def test_two_amplifiers_break_no_rule(wire: str) -> None:
+def test_witness_finds_nothing_with_two_amplifiers(wire: str) -> None:
     """A day with two amplifiers, on one wire where the kind shares it, passes clean."""
     outcome = play(wire, witness_scenarios.day, amplifiers=("a", "b"))
     assert [str(one) for one in outcome.found] == []
@@ -61,7 +61,7 @@ def test_two_amplifiers_break_no_rule(wire: str) -> None:
 
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("wire", ["serial", "modbus-rtu", "slcan"])
-def test_noise_is_nobodys_fault(wire: str, seed: int) -> None:
+def test_witness_excuses_noise(wire: str, seed: int) -> None:
     """Lost and damaged frames on a line are borne by both sides as the pages say."""
     scenario = witness_scenarios.lossy if wire == "slcan" else witness_scenarios.rough
     outcome = play(wire, scenario, seed=seed)
@@ -69,14 +69,14 @@ def test_noise_is_nobodys_fault(wire: str, seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", [3, 8])
-def test_a_node_that_is_hardly_heard_is_not_looked_at_for_ever(seed: int) -> None:
+def test_chain_ends_with_a_hardly_reachable_node(seed: int) -> None:
     """Nothing asks itself again and again in one moment, which the loop here calls stuck."""
     outcome = play("slcan", witness_scenarios.rough, seed=seed)
     assert outcome.frames > 5
 
 
 @pytest.mark.parametrize("name", BUGS)
-def test_a_planted_bug_is_found(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_witness_finds_a_planted_bug(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """The rule that this bug breaks is found broken."""
     bug = BUGS[name]
     bug.plant(monkeypatch)
@@ -87,7 +87,7 @@ def test_a_planted_bug_is_found(name: str, monkeypatch: pytest.MonkeyPatch) -> N
     assert len(broken[0].sentence) > 20
 
 
-def test_the_page_lists_every_rule() -> None:
+def test_witness_page_lists_every_rule() -> None:
     """docs/reference/witness.md has a row for each rule, and no other."""
     page = (Path(__file__).parents[3] / "docs" / "reference" / "witness.md").read_text(
         encoding="utf-8"
@@ -96,7 +96,7 @@ def test_the_page_lists_every_rule() -> None:
     assert set(re.findall(r"^\| (\w+) \|", rules, flags=re.M)) - {"name"} == RULES
 
 
-def test_bugs_are_planted_everywhere() -> None:
+def test_planted_bugs_cover_every_rule() -> None:
     """Thirty at least, in controller, drivers and far ends alike, and every rule is among them."""
     assert len(BUGS) >= 30
     assert min(len(CONTROLLER), len(DRIVERS), len(FAR_ENDS)) >= 10

@@ -14,12 +14,12 @@ from drivers.statistics import WireCounters
 from modbus_session import ARMED, SET, ScriptedDevice
 from sim.far_ends.modbus.frames import (
     FRAME_TIMEOUT,
-    Request,
     RtuReader,
     TcpReader,
     rtu_frame,
     tcp_frame,
 )
+from sim.far_ends.modbus.frames import RequestAdu as FarEndRequest
 from sim.far_ends.modbus.unit import ModbusUnit
 
 
@@ -32,7 +32,7 @@ def asked_and_answered(is_rtu: bool) -> tuple[RequestAdu, bytes]:
     unit = ModbusUnit(ScriptedDevice())
     pdu = unit.reply(telegram.frame[1:-2] if is_rtu else telegram.frame[7:])
     assert pdu is not None
-    return telegram, rtu_frame(1, pdu) if is_rtu else tcp_frame(Request(1, b"", 300), pdu)
+    return telegram, rtu_frame(1, pdu) if is_rtu else tcp_frame(FarEndRequest(1, b"", 300), pdu)
 
 
 EXAMPLES = {is_rtu: asked_and_answered(is_rtu) for is_rtu in (True, False)}

@@ -14,7 +14,7 @@ from sim.far_ends.can_bus.bus import CanBus
 from sim.far_ends.can_bus.slcan_adapter import SlcanAdapter, SlcanEnd
 from sim.far_ends.can_bus.socketcand_server import SocketcandEnd
 
-PATIENCE = 5.0  # s; for a loaded machine, not an expectation
+TIMEOUT = 5.0  # s; for a loaded machine, not an expectation
 FRAME = CanFrame(0x181, bytes.fromhex("0102030405060708"))
 
 
@@ -45,7 +45,7 @@ class Member:
 
     async def hears(self, count: int) -> list[CanFrame]:
         """Wait for so many frames."""
-        async with asyncio.timeout(PATIENCE):
+        async with asyncio.timeout(TIMEOUT):
             while len(self.heard) < count:
                 self._arrived.clear()
                 await self._arrived.wait()
@@ -67,7 +67,7 @@ async def server(bus: CanBus) -> AsyncIterator[SocketcandEnd]:
     await end.close()
 
 
-async def test_python_can_s_socketcand_is_served(bus: CanBus, server: SocketcandEnd) -> None:
+async def test_socketcand_serves_python_can(bus: CanBus, server: SocketcandEnd) -> None:
     """Its own client opens the bus, sends, and hears what others send."""
     member = Member(bus)
 
@@ -88,7 +88,7 @@ async def test_python_can_s_socketcand_is_served(bus: CanBus, server: Socketcand
             CanFrame(0x7FF, data) for data in (b"", b"\x00", bytes(range(8)))
         ]
         member.send(FRAME)
-        received = await asyncio.to_thread(client.recv, PATIENCE)
+        received = await asyncio.to_thread(client.recv, TIMEOUT)
         assert received is not None
         assert (received.arbitration_id, bytes(received.data)) == (0x181, FRAME.data)
     finally:
@@ -103,7 +103,7 @@ class Talk:
 
     async def says(self, text: str) -> None:
         """The server says this next."""
-        async with asyncio.timeout(PATIENCE):
+        async with asyncio.timeout(TIMEOUT):
             assert await self.reader.readexactly(len(text)) == text.encode()
 
     async def ask(self, text: str, answer: str = "") -> None:
@@ -121,7 +121,7 @@ async def talk(server: SocketcandEnd) -> AsyncIterator[Talk]:
     talk.writer.close()
 
 
-async def test_a_session_with_socketcand_as_its_protocol_says(bus: CanBus, talk: Talk) -> None:
+async def test_socketcand_session(bus: CanBus, talk: Talk) -> None:
     """Greeting, open, raw mode, frames each way, echo; elements in pieces and in a row."""
     member = Member(bus)
     await talk.ask("< open can0 >", "< ok >")
@@ -130,7 +130,7 @@ async def test_a_session_with_socketcand_as_its_protocol_says(bus: CanBus, talk:
     await talk.ask("F >< send 7FF 0 >< echo >", "< echo >")
     assert member.heard == [CanFrame(0x123, b"\x01\xff"), CanFrame(0x7FF, b"")]
     member.send(FRAME)
-    async with asyncio.timeout(PATIENCE):
+    async with asyncio.timeout(TIMEOUT):
         text = (await talk.reader.readuntil(b">")).decode()
     assert text.startswith("< frame 181 ")
     assert text.endswith(" 0102030405060708 >")
@@ -144,35 +144,33 @@ async def test_a_session_with_socketcand_as_its_protocol_says(bus: CanBus, talk:
         *("a" * 2000, "< send 123 1 100 >", "\x00\xff< send"),
     ],
 )
-async def test_nonsense_sends_nothing_and_ends_nothing(
-    bus: CanBus, talk: Talk, nonsense: str
-) -> None:
+async def test_socketcand_ignores_malformed_frames(bus: CanBus, talk: Talk, nonsense: str) -> None:
     """Whatever is wrong with an element, no frame comes of it, and the next is understood."""
     member = Member(bus)
     await talk.ask("< open can0 >", "< ok >")
     await talk.ask("< rawmode >", "< ok >")
     await talk.ask(nonsense + " >")
-    async with asyncio.timeout(PATIENCE):
+    async with asyncio.timeout(TIMEOUT):
         talk.writer.write(b"< send 123 1 5 >< echo >")
         assert (await talk.reader.readuntil(b"< echo >")).endswith(b"< echo >")
     assert member.heard == [CanFrame(0x123, b"\x05")]
 
 
-async def test_a_bus_s_port_that_is_taken_is_named(server: SocketcandEnd) -> None:
+async def test_socketcand_refuses_a_port_in_use(server: SocketcandEnd) -> None:
     """LinkError with the port and what to do."""
-    words = f"port {server.port} cannot be listened on .*; choose another, or 0"
+    words = f"port {server.port}"
     with pytest.raises(LinkError, match=words):
         await SocketcandEnd(CanBus(), port=server.port).open()
 
 
-async def test_another_bus_is_refused(talk: Talk) -> None:
+async def test_socketcand_refuses_another_bus(talk: Talk) -> None:
     """There is one, and whoever asks for another is hung up on."""
     await talk.ask("< open vcan7 >", "< error could not open bus >")
-    async with asyncio.timeout(PATIENCE):
+    async with asyncio.timeout(TIMEOUT):
         assert await talk.reader.read() == b""
 
 
-async def test_a_client_that_reads_nothing_is_hung_up_on(bus: CanBus, talk: Talk) -> None:
+async def test_socketcand_disconnects_a_client_that_does_not_read(bus: CanBus, talk: Talk) -> None:
     """A flood of frames takes no memory: the connection ends, the bus goes on."""
     member = Member(bus)
     await talk.ask("< open can0 >", "< ok >")
@@ -196,7 +194,7 @@ async def adapter(bus: CanBus) -> AsyncIterator[SlcanEnd]:
 
 
 @pytest.mark.parametrize("is_fd", [False, True])
-async def test_python_can_s_slcan_is_served(bus: CanBus, adapter: SlcanEnd, is_fd: bool) -> None:
+async def test_slcan_serves_python_can(bus: CanBus, adapter: SlcanEnd, is_fd: bool) -> None:
     """Its own interface sets the bit rate, opens the channel, sends and hears."""
     member = Member(bus)
 
@@ -216,7 +214,7 @@ async def test_python_can_s_slcan_is_served(bus: CanBus, adapter: SlcanEnd, is_f
         assert await member.hears(1) == [sent]
         member.send(sent)
         received = None
-        async with asyncio.timeout(PATIENCE):
+        async with asyncio.timeout(TIMEOUT):
             while received is None:
                 received = await asyncio.to_thread(client.recv, 1.0)
         assert (received.arbitration_id, bytes(received.data)) == (sent.id, sent.data)
@@ -248,14 +246,14 @@ def answers(adapter_bus: CanBus, text: bytes) -> tuple[bytes, list[CanFrame]]:
         (b"O\r" + b"x" * 500, b"\r\x07", []),
     ],
 )
-def test_the_adapter_answers_as_lawicel_s_do(
+def test_slcan_replies_like_lawicel(
     bus: CanBus, text: bytes, written: bytes, sent: list[CanFrame]
 ) -> None:
     """CR for what was done, BELL for what makes no sense, z and Z for frames that were sent."""
     assert answers(bus, text) == (written, sent)
 
 
-async def test_a_host_may_come_and_go(bus: CanBus, adapter: SlcanEnd) -> None:
+async def test_slcan_host_may_reconnect(bus: CanBus, adapter: SlcanEnd) -> None:
     """The port outlives its users, and a closed channel passes nothing on."""
     member = Member(bus)
     for _ in range(3):

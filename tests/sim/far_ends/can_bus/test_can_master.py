@@ -18,7 +18,7 @@ from wires import far_side
 DATA_SHEET = Path(drivers.__file__).parent.parent / "docs" / "reference" / "era-amplifier.eds"
 HOST = 100
 WATCHDOG = 600  # ms; shorter than the heartbeats go on
-PATIENCE = 5.0  # s; for a loaded machine, not an expectation
+TIMEOUT = 5.0  # s; for a loaded machine, not an expectation
 
 
 class Master:
@@ -44,9 +44,9 @@ class Master:
     def session(self) -> tuple[float, ...]:
         """Start, arm, play two channels on SYNC, feed the watchdog; the levels as read back."""
         node = self.node
-        node.nmt.wait_for_heartbeat(PATIENCE)
+        node.nmt.wait_for_heartbeat(TIMEOUT)
         node.nmt.state = "OPERATIONAL"
-        node.nmt.wait_for_heartbeat(PATIENCE)
+        node.nmt.wait_for_heartbeat(TIMEOUT)
         assert node.nmt.state == "OPERATIONAL"
         order = struct.pack("<HHHBB", HOST, 0, WATCHDOG, 4, 1)  # arm
         node.sdo["order"].raw = int.from_bytes(order, "little")
@@ -64,12 +64,12 @@ class Master:
 
     def wait_for_emergency(self) -> tuple[int, int]:
         """Code and error register of the next."""
-        error = self.node.emcy.wait(timeout=PATIENCE)
+        error = self.node.emcy.wait(timeout=TIMEOUT)
         assert error is not None
         return error.code, error.register
 
 
-async def test_a_master_of_others_drives_it(coarse_rig: Rig) -> None:
+async def test_node_is_driven_by_a_canopen_master(coarse_rig: Rig) -> None:
     """By data sheet and page alone: it plays as told, and without heartbeats it says 8130."""
     async with far_side(Wire(kind="socketcand"), coarse_rig) as far:
         master = await asyncio.to_thread(Master, far.url)
@@ -77,7 +77,7 @@ async def test_a_master_of_others_drives_it(coarse_rig: Rig) -> None:
             levels = await asyncio.to_thread(master.session)
             assert levels == pytest.approx((0.25, 0.0, 0.0, 0.5))
             waiting = asyncio.create_task(asyncio.to_thread(master.wait_for_emergency))
-            async with asyncio.timeout(PATIENCE):
+            async with asyncio.timeout(TIMEOUT):
                 while (  # noqa: ASYNC110  time passes only for who asks
                     far.device.status().fault is not Fault.WATCHDOG
                 ):

@@ -72,7 +72,7 @@ def apply(token: int, count: int, sequence: int, *, ramp: int = 0, action: int =
     return struct.pack("<HHHBB", token, ramp, 0, action | count << 3, sequence).hex()
 
 
-def test_before_it_is_started_it_takes_no_orders() -> None:
+def test_node_ignores_requests_before_start() -> None:
     """Pre-operational after boot-up: heartbeat and objects, but nothing that moves."""
     bench = Bench()
     assert bench.said == [CanFrame(0x701, b"\x00")]
@@ -85,7 +85,7 @@ def test_before_it_is_started_it_takes_no_orders() -> None:
     assert bench.tell(ORDER, "7F00 0000 FA00 04 01")[-1].id == ANSWER
 
 
-def test_a_set_is_played_at_its_sync_and_not_before(bench: Bench) -> None:
+def test_node_applies_a_set_at_sync(bench: Bench) -> None:
     """Two commands and their order change nothing until SYNC; the answer says exact."""
     for channel in (0, 2):
         assert bench.tell(0x201 + 0x100 * channel, command(channel, 2)) == []
@@ -113,7 +113,7 @@ def test_a_set_is_played_at_its_sync_and_not_before(bench: Bench) -> None:
         ),
     ],
 )
-def test_a_torn_set_is_not_played_and_is_told(bench: Bench, send: Callable[[Bench], None]) -> None:
+def test_node_refuses_an_incomplete_set(bench: Bench, send: Callable[[Bench], None]) -> None:
     """Whatever is missing or of another sequence number: torn, nothing plays, nothing is left."""
     bench.tell(0x201, command(0, 2))
     send(bench)
@@ -127,7 +127,7 @@ def test_a_torn_set_is_not_played_and_is_told(bench: Bench, send: Callable[[Benc
     "next_order", [(ORDER, apply(0, 0, 3, action=0)), (0x480, apply(8, 0, 0, action=3))]
 )
 @pytest.mark.parametrize("has_order", [False, True])
-def test_what_has_lost_its_sync_is_never_played_nor_told(
+def test_node_discards_a_set_without_sync(
     bench: Bench, next_order: tuple[int, str], has_order: bool
 ) -> None:
     """A set, with its order or without, then another order before a SYNC: none of it is left."""
@@ -139,7 +139,7 @@ def test_what_has_lost_its_sync_is_never_played_nor_told(
     assert not any(bench.levels)
 
 
-def test_what_has_lost_its_sync_makes_no_later_set_whole(bench: Bench) -> None:
+def test_node_does_not_complete_a_set_with_earlier_commands(bench: Bench) -> None:
     """The numbers have begun again, and a command of two is lost: not the old one in its place."""
     bench.tell(0x201, command(0, 2))
     bench.tell(ORDER, apply(0, 0, 3, action=0))
@@ -159,7 +159,7 @@ def test_what_has_lost_its_sync_makes_no_later_set_whole(bench: Bench) -> None:
         (command(0, 2), apply(9, 1, 2, ramp=1001), BAD_VALUE, 255),
     ],
 )
-def test_a_set_that_cannot_be_played_is_refused(
+def test_node_refuses_an_invalid_set(
     bench: Bench, frame: str, order: str, result: int, channel: int
 ) -> None:
     """Out of range, an unknown bit, the wrong channel, no token: the reason and the channel."""
@@ -170,7 +170,7 @@ def test_a_set_that_cannot_be_played_is_refused(
     assert not any(bench.levels)
 
 
-def test_a_broadcast_plays_what_its_token_names(bench: Bench) -> None:
+def test_node_commits_by_broadcast(bench: Bench) -> None:
     """Staged under 9: a commit of 8 to all leaves it, one of 9 plays it, and nobody answers."""
     bench.tell(0x201, command(0, 2))
     bench.tell(ORDER, apply(9, 1, 2, action=2))
@@ -191,7 +191,7 @@ def test_a_broadcast_plays_what_its_token_names(bench: Bench) -> None:
         (0x480, "0000 FFFF 0000 06 00", AmplifierState.QUICK_STOP_ACTIVE),
     ],
 )
-def test_silence_is_never_refused_for_its_ramp(
+def test_node_accepts_any_ramp_for_silencing(
     bench: Bench, id: int, order: str, state: AmplifierState
 ) -> None:
     """A stop, a disarm and a broadcast stop along 65.5 s are carried out along the longest ramp."""
@@ -203,7 +203,7 @@ def test_silence_is_never_refused_for_its_ramp(
     assert all(frame.data[1] >> 4 == 0 for frame in said if frame.id == ANSWER)
 
 
-def test_the_host_s_heartbeat_feeds_and_no_other_does(bench: Bench) -> None:
+def test_node_watchdog_is_fed_by_the_host_heartbeat_only(bench: Bench) -> None:
     """127 armed it: its heartbeat is a sign of life, that of 126 and a status are none."""
     for feeding, id in ((False, 0x77E), (True, 0x77F)):
         bench.device.asked.clear()
@@ -219,7 +219,7 @@ def test_the_host_s_heartbeat_feeds_and_no_other_does(bench: Bench) -> None:
 
 
 @pytest.mark.parametrize("nmt", ["02 01", "80 01", "82 01", "02 00"])
-def test_out_of_operation_it_is_stopped(bench: Bench, nmt: str) -> None:
+def test_node_stops_when_leaving_operational(bench: Bench, nmt: str) -> None:
     """Stop, pre-operational, reset communication: a host that is not heard must not be needed."""
     bench.tell(0x201, command(0, 2))
     bench.tell(ORDER, apply(9, 1, 2))
@@ -231,7 +231,7 @@ def test_out_of_operation_it_is_stopped(bench: Bench, nmt: str) -> None:
     assert bench.tell(ORDER, "0000 0000 0000 00 05") == []
 
 
-def test_stopped_it_is_deaf_to_objects_and_says_so(bench: Bench) -> None:
+def test_node_stopped_ignores_sdo(bench: Bench) -> None:
     """NMT stopped: no SDO, but a heartbeat with that state."""
     bench.tell(0x000, "02 01")
     assert bench.tell(0x601, "40 00 10 00 00000000") == []
@@ -240,7 +240,7 @@ def test_stopped_it_is_deaf_to_objects_and_says_so(bench: Bench) -> None:
     assert bench.said == [CanFrame(0x701, b"\x04")]
 
 
-def test_a_reset_node_has_lost_everything(bench: Bench) -> None:
+def test_node_reset_discards_everything(bench: Bench) -> None:
     """Silent at once, disarmed, the host forgotten; a boot-up message."""
     bench.tell(0x201, command(0, 2))
     bench.tell(ORDER, apply(9, 1, 2))
@@ -251,7 +251,7 @@ def test_a_reset_node_has_lost_everything(bench: Bench) -> None:
     assert bench.tell(0x601, "40 16 10 01 00000000")[0].data[4:] == bytes(4)
 
 
-def test_a_fault_is_an_emergency_until_it_is_cleared(bench: Bench) -> None:
+def test_node_sends_emcy_for_a_fault_and_its_end(bench: Bench) -> None:
     """Code and register by the table of CiA 301, state, fault, channel; code 0 in the end."""
     bench.said.clear()
     bench.device.amplifier.trip(Fault.ARC, bench.device.now, channel=2)
@@ -265,7 +265,7 @@ def test_a_fault_is_an_emergency_until_it_is_cleared(bench: Bench) -> None:
     )
 
 
-def test_a_command_by_object_is_a_command(bench: Bench) -> None:
+def test_node_accepts_commands_by_sdo(bench: Bench) -> None:
     """2020sub1 and 2021 written by SDO, then SYNC: the same as by RPDO."""
     for index, data in ((0x2020, command(0, 2)), (0x2021, apply(9, 1, 2))):
         subindex = 1 if index == 0x2020 else 0
@@ -278,7 +278,7 @@ def test_a_command_by_object_is_a_command(bench: Bench) -> None:
     assert bench.levels[0] == pytest.approx(0.2)
 
 
-def test_frames_of_other_lengths_are_dropped(bench: Bench) -> None:
+def test_node_ignores_frames_of_other_lengths(bench: Bench) -> None:
     """Short orders and commands, a SYNC of two bytes, a heartbeat-like nothing: no answer."""
     for id in (ORDER, 0x201, 0x681, 0x000, 0x601, 0x080, 0x480):
         assert bench.tell(id, "01 02 03 04 05") == []

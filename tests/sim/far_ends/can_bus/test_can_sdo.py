@@ -63,7 +63,7 @@ class Memory(canopen.Network):
 
 
 @given(value=st.binary(max_size=1000))
-def test_what_is_written_is_read(value: bytes) -> None:
+def test_sdo_reads_what_was_written(value: bytes) -> None:
     """Any length, expedited or in segments, both ways."""
     memory = Memory()
     memory.client.download(INDEX, 1, value)
@@ -72,7 +72,7 @@ def test_what_is_written_is_read(value: bytes) -> None:
 
 
 @given(value=st.binary(min_size=1, max_size=1000))
-def test_a_block_is_taken_with_its_checksum(value: bytes) -> None:
+def test_sdo_block_download_checks_the_crc(value: bytes) -> None:
     """Block download of any length, up to two blocks of 127 segments."""
     memory = Memory()
     with memory.client.open(
@@ -82,7 +82,7 @@ def test_a_block_is_taken_with_its_checksum(value: bytes) -> None:
     assert memory.value == value
 
 
-def test_a_damaged_block_changes_nothing() -> None:
+def test_sdo_block_download_refuses_a_wrong_crc() -> None:
     """A wrong CRC at its end is an abort, and nothing is written."""
     memory = Memory()
     memory.server.receive(bytes.fromhex("C6 0021 01 07000000"))
@@ -94,7 +94,7 @@ def test_a_damaged_block_changes_nothing() -> None:
     assert memory.value == b""
 
 
-def test_a_lost_segment_of_a_block_is_sent_again() -> None:
+def test_sdo_block_download_repeats_a_lost_segment() -> None:
     """The acknowledgement names the last segment that came in order."""
     memory = Memory()
     memory.server.receive(bytes.fromhex("C2 0021 01 15000000"))
@@ -110,9 +110,7 @@ def test_a_lost_segment_of_a_block_is_sent_again() -> None:
 
 
 @pytest.mark.parametrize(("pause", "answer"), [(0.99, 0xA2), (1.01, 0x80)])
-def test_who_does_not_go_on_for_a_second_has_given_up(
-    clock: SimpleNamespace, pause: float, answer: int
-) -> None:
+def test_sdo_transfer_times_out(clock: SimpleNamespace, pause: float, answer: int) -> None:
     """A segment of a block is taken within a second; after it nobody knows what it belongs to."""
     memory = Memory()
     memory.server.receive(bytes.fromhex("C2 0021 01 07000000"))
@@ -121,7 +119,7 @@ def test_who_does_not_go_on_for_a_second_has_given_up(
     assert [memory.client.responses.get()[0] for _ in range(2)] == [0xA4, answer]
 
 
-def test_what_is_not_there_is_an_abort() -> None:
+def test_sdo_aborts_on_missing_objects() -> None:
     """An unknown object, and a length that no amplifier keeps."""
     memory = Memory()
     with pytest.raises(SdoAbortedError) as caught:
@@ -132,7 +130,7 @@ def test_what_is_not_there_is_an_abort() -> None:
 
 
 @given(frames=st.lists(st.binary(min_size=8, max_size=8), max_size=30))
-def test_any_frames_are_answered_or_not_but_never_more(frames: list[bytes]) -> None:
+def test_sdo_sends_at_most_one_reply(frames: list[bytes]) -> None:
     """No request brings more than one answer, none an exception, and the next read works."""
     memory = Memory()
     for frame in frames:
@@ -166,7 +164,7 @@ def node() -> canopen.RemoteNode:
     return remote
 
 
-def test_every_object_of_the_data_sheet_is_there(node: canopen.RemoteNode) -> None:
+def test_object_dictionary_matches_the_eds(node: canopen.RemoteNode) -> None:
     """`canopen` reads each by the EDS; the count in subindex 0 and the defaults agree with it."""
     read = 0
     for index, item in node.object_dictionary.items():
@@ -183,7 +181,7 @@ def test_every_object_of_the_data_sheet_is_there(node: canopen.RemoteNode) -> No
     assert read > 100
 
 
-def test_capabilities_read_by_the_data_sheet(node: canopen.RemoteNode) -> None:
+def test_capabilities_read_by_the_eds(node: canopen.RemoteNode) -> None:
     """By name and in their units: what the amplifier says of itself."""
     capabilities = node.sdo["capabilities"]
     assert capabilities["channels"].raw == 4
@@ -195,7 +193,7 @@ def test_capabilities_read_by_the_data_sheet(node: canopen.RemoteNode) -> None:
     assert node.sdo[0x1600][1].raw == 0x20200140
 
 
-def test_a_data_sheet_of_sixteen_channels(tmp_path: Path) -> None:
+def test_eds_of_sixteen_channels(tmp_path: Path) -> None:
     """Its RPDOs of channels 4 and on have the identifiers of the next nodes."""
     path = tmp_path / "sixteen.eds"
     path.write_text(eds_text(16), encoding="utf-8")

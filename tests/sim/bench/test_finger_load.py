@@ -126,9 +126,7 @@ def test_parse_finger_load_with_and_without_units() -> None:
     assert parse_finger_load("1500,0.5,0.0003", what="--finger-load") == wanted
 
 
-@pytest.mark.parametrize(
-    "text", ["heavy", "1,2", "1000,2,0.2 m", "-1000,2,0", "nan,2,0"]
-)
+@pytest.mark.parametrize("text", ["heavy", "1,2", "1000,2,0.2 m", "-1000,2,0", "nan,2,0"])
 def test_parse_finger_load_refuses_invalid_text(text: str) -> None:
     """The error names the option."""
     with pytest.raises(InputError, match="--finger-load"):

@@ -90,6 +90,6 @@ def test_fingers_off_the_plate_change_nothing(coarse_rig: Rig) -> None:
     for bad in [(0.4, 0.1), (float("nan"), 0.1), (0.1, -1e-3)]:
         with pytest.raises(InputError, match="finger c"):
             fingers.place({"b": (0.2, 0.2), "c": bad})
-    with pytest.raises(InputError, match="too many"):
+    with pytest.raises(InputError, match="32"):
         fingers.place({str(k): (0.1, 0.1) for k in range(33)})
     assert fingers.layout.positions == {"a": (0.1, 0.1)}

@@ -13,5 +13,5 @@ def require_gateway() -> None:
         if find_spec(name) is None:
             raise InputError(
                 f"the gateway needs {name}, which is not installed; "
-                "install it with  pip install 'era-haptics[gateway]'"
+                "install it in a checkout with  pip install -e '.[gateway]'"
             )

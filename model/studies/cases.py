@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import TypeAlias
 
 import numpy as np
@@ -60,7 +61,7 @@ class Cases:
         damping ratio, c / 2 sqrt(k_b m_plate / eras), stays.
         """
         positions = self.positions_of(case)
-        stay = self.names[case] == OWN or not all_alike(like)
+        stay = self.names[case] == OWN or not all_alike(tuple(like))
         eras = place_eras(like, positions) if stay else alike(like[0], positions)
         factor = float(self.stiffness_factors[case])
         damping = math.sqrt(factor * len(like) / len(positions))
@@ -70,6 +71,7 @@ class Cases:
         )
 
 
-def all_alike(eras: Sequence[Era]) -> bool:
+@cache
+def all_alike(eras: tuple[Era, ...]) -> bool:
     """Whether ERAs differ in nothing but their names and places."""
     return len({replace(era, name="", x=0.0, y=0.0) for era in eras}) == 1

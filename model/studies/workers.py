@@ -57,8 +57,8 @@ def on_cluster(address: str) -> Workers:
             from distributed import Client, KilledWorker, as_completed
         except ImportError as error:
             raise InputError(
-                "--cluster needs Dask, which is not installed; install era-haptics with the extra "
-                "`cluster`"
+                "--cluster needs Dask, which is not installed; install it in a checkout with  "
+                "pip install -e '.[cluster]'"
             ) from error
         try:
             # Dask has no type annotations.

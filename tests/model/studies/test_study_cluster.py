@@ -105,7 +105,7 @@ def _allow_failures(count, dask_scheduler):
 def test_without_dask_it_is_said_how_to_have_it(monkeypatch):
     """The extra to install, by its name."""
     monkeypatch.setitem(sys.modules, "distributed", None)
-    with pytest.raises(InputError, match="`cluster`"):
+    with pytest.raises(InputError, match=r"\[cluster\]"):
         dict(on_cluster("tcp://127.0.0.1:1")(None, {}))
 
 

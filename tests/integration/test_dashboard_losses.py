@@ -55,26 +55,26 @@ async def test_a_lost_link_is_one_event_with_what_has_come_of_it(tab: Page, tmp_
             bench.far.device.inject_fault(FaultWindow("hang"))
             await tab.until(f"{STATE} === 'COMM_LOST'")
             told = await tab.until(BANNER, lambda text: "watchdog" in text)
-            assert "Its watchdog silences it after 0.25\u00a0s, which nothing confirms" in told
+            assert "its watchdog silences it after 0.25\u00a0s, unconfirmed" in told
             assert "(since " in told
             assert "may still be energised" in told
             tile = await tab.until(TILE, lambda text: "no link" in text)
-            assert "What its channels play is unknown." in tile
+            assert "channels: unknown" in tile
             assert "%" not in tile
             assert "°C" not in tile
             assert await tab.evaluate("document.querySelector('.plate.unknown') !== null")
             ratios = await tab.evaluate(f"({PROBES}).contrasts()")
             assert [each for each in ratios if each[0] < 4.5] == []
-            retried = await tab.until(EVENTS, lambda events: "tried again 2" in events[0])
+            retried = await tab.until(EVENTS, lambda events: "retry 2" in events[0])
             assert retried[1:] == before
             assert "link lost: amplifier main: no answer" in retried[0]
-            assert "look at cables and supply" in retried[0]
+            assert "check cables and supply" in retried[0]
             bench.far.device.recover()
             await tab.until(f"{STATE} === 'READY_TO_SWITCH_ON'")
-            back = await tab.until(EVENTS, lambda events: "answer again" in events[0])
+            back = await tab.until(EVENTS, lambda events: "reconnected" in events[0])
             assert back[1:] == before
-            assert "tried again" not in back[0]
-            assert "look at cables" not in back[0]
+            assert "retry" not in back[0]
+            assert "check cables" not in back[0]
             assert "may still be energised" not in await tab.evaluate(BANNER)
             assert "%" in await tab.until(TILE, lambda text: "no link" not in text)
 
@@ -106,7 +106,7 @@ async def test_why_onsets_are_plain_is_said_for_as_long_as_they_are(
     with ScriptedDaemon(tmp_path) as daemon, gateway_process(tmp_path, daemon.socket) as gateway:
         await open_dashboard(tab, gateway, DESKTOP)
         for because, shown in (
-            ("loading took 50 ms", "Plain ramps in place of shaped onsets: loading took 50 ms"),
+            ("loading took 50 ms", "Plain ramps instead of shaped onsets: loading took 50 ms"),
             (None, ""),
         ):
             daemon.publish("latency", LatencyEvent(latency_ms=summary, plain_because=because))
@@ -122,17 +122,17 @@ async def test_the_banner_says_how_it_is_with_the_gateway_now(tab: Page, tmp_pat
     daemon = tmp_path / "none.sock"
     with gateway_process(tmp_path, daemon) as first:
         await tab.show(f"{first.url}#token={first.token}")
-        await until_said("The daemon does not answer")
+        await until_said("The daemon does not respond")
         listen = ("--listen", f"127.0.0.1:{first.port}")
         first.terminate()
     with gateway_process(tmp_path, daemon, *listen, token="another-token-than-before"):
         await until_said("The gateway refuses the token")
-        assert await tab.evaluate("!document.querySelector('#door').hidden")
-    await until_said("The gateway does not answer (since ")
-    assert await tab.evaluate("document.querySelector('#door').hidden")
+        assert await tab.evaluate("!document.querySelector('#login').hidden")
+    await until_said("The gateway does not respond (since ")
+    assert await tab.evaluate("document.querySelector('#login').hidden")
     with gateway_process(tmp_path, daemon, *listen):
-        await until_said("The daemon does not answer")
-    await until_said("The gateway does not answer")
+        await until_said("The daemon does not respond")
+    await until_said("The gateway does not respond")
 
 
 async def test_a_gateway_without_room_is_not_said_to_be_gone(tab: Page, tmp_path: Path) -> None:
@@ -140,8 +140,8 @@ async def test_a_gateway_without_room_is_not_said_to_be_gone(tab: Page, tmp_path
     with gateway_process(tmp_path, tmp_path / "none.sock") as gateway:
         others = [RawWebSocket(gateway) for _ in range(MAX_SESSIONS)]
         await tab.show(f"{gateway.url}#token={gateway.token}")
-        await tab.until(BANNER, lambda text: "does not let this page in" in text)
+        await tab.until(BANNER, lambda text: "too many clients" in text)
         others.pop().connection.close()
-        await tab.until(BANNER, lambda text: "daemon does not answer" in text)
+        await tab.until(BANNER, lambda text: "daemon does not respond" in text)
         for other in others:
             other.connection.close()

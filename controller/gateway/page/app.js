@@ -1,57 +1,57 @@
-// The dashboard: what the daemon says on the page, and what fingers and buttons say to the daemon.
+// The dashboard: shows the daemon's events, and sends fingers and buttons to the daemon.
 
-import { decodeField, FieldPicture } from "./field.js";
+import { Connection } from "./connection.js";
+import { decodeField, FieldView } from "./field.js";
 import { Fingers } from "./fingers.js";
-import { Link } from "./link.js";
-import { PlateOverlay, shown } from "./plate.js";
-import { addEvent, follow, showAmplifiers, showEffects, showLatency, STATES, timeOfDay } from "./side.js";
+import { fixed, PlateOverlay } from "./plate.js";
+import { addEvent, annotate, showAmplifiers, showEffects, showLatency, STATES, timeOfDay } from "./side.js";
 
 const TOPICS = ["hello", "state", "contacts", "pattern", "silence", "amplifiers", "latency", "log", "link", "field"];
 const LEASE_S = 5;
 const TOKEN_KEY = "era-haptics-token";
 const DISARMED = ["SWITCH_ON_DISABLED", "READY_TO_SWITCH_ON"];
 const LATCHED = ["QUICK_STOP_ACTIVE", "FAULT"];
-// States that are left at once: what led to them, or what follows, is told.
-const PASSING = ["SWITCHED_ON", "FAULT_REACTION_ACTIVE", "READY_TO_SWITCH_ON"];
-// Why there is no connection to the gateway, and what is done about it.
-const SHUT = {
-  refused: ["The gateway refuses the token of this page", "open the URL that it printed when it started"],
-  full: ["The gateway answers, but does not let this page in", "it is tried again"],
-  away: ["The gateway does not answer", "it is tried again"],
+// States that are left at once: the events before or after them are shown.
+const TRANSIENT = ["SWITCHED_ON", "FAULT_REACTION_ACTIVE", "READY_TO_SWITCH_ON"];
+// Why there is no connection to the gateway, and the remedy.
+const FAILURES = {
+  refused: ["The gateway refuses the token of this page", "open the URL that it printed at its start"],
+  full: ["The gateway responds but has too many clients", "retrying"],
+  unreachable: ["The gateway does not respond", "retrying"],
 };
 
 const at = (id) => document.getElementById(id);
 const log = at("log");
-let link;
-let lease = null;  // ends with a refusal to renew: states may be told later than the answer to arm
+let connection;
+let lease = null;  // until renewing is refused: the state may arrive later than the response to arm
 let state = null;
-let daemon;  // undefined until it is told; null while it is away
-let shutBecause = "away";
-let since = null;  // when the gateway, the daemon or a link to an amplifier was lost
-let watchdog;  // s; how long an amplifier plays on that hears nothing
-let gap = null;  // the event of a gateway or daemon that does not answer, until one does
-let loss = null;  // the event of a lost link, and how often it was tried again
+let daemon;  // result of hello; undefined before the first, null while disconnected
+let failure = "unreachable";
+let lostSince = null;  // when the gateway, the daemon or a link to an amplifier was lost
+let watchdog;  // s; after which an amplifier without commands silences itself
+let outage = null;  // the event of the loss of gateway or daemon, until reconnected
+let linkLoss = null;  // the event of a lost link, and the number of retries
 
 const overlay = new PlateOverlay(at("plate"), at("overlay"));
-const picture = new FieldPicture(at("field"), at("scale"), (low, high) => {
+const fieldView = new FieldView(at("field"), at("scale"), (low, high) => {
   at("scale-low").textContent = `${low}`;
   at("scale-high").textContent = `${high} m/s²`;
 });
-new Fingers(at("plate"), overlay, (touches) => link?.say("touch", { source: "page", touches }));
-window.eraHaptics = { get frames() { return picture.frames; } };  // for whoever measures the frame rate
+new Fingers(at("plate"), overlay, (touches) => connection?.notify("touch", { source: "page", touches }));
+window.eraHaptics = { get frames() { return fieldView.frames; } };  // for measuring the frame rate
 
-function complain(error) {
+function showError(error) {
   const remedy = error.remedy ?? null;
   at("problem").textContent = error.message;
   addEvent(log, "error", error.message, remedy && !error.message.includes(remedy) ? remedy : null);
 }
 
-async function ask(method, params) {
+async function call(method, params) {
   at("problem").textContent = "";
   try {
-    return await link.call(method, params);
+    return await connection.call(method, params);
   } catch (error) {
-    complain(error);
+    showError(error);
     return null;
   }
 }
@@ -59,23 +59,23 @@ async function ask(method, params) {
 async function stop() {
   lease = null;
   try {
-    if (!link) throw new Error("no token");
-    await link.stop();
+    if (!connection) throw new Error("no token");
+    await connection.stop();
     at("problem").textContent = "";
   } catch {
-    complain(new Error("The stop was not delivered. Switch the amplifiers off by hand."));
+    showError(new Error("The stop was not confirmed. Switch the amplifiers off by hand."));
   }
 }
 
 async function arm() {
-  const given = await ask("arm", { owner: "dashboard", lease_s: LEASE_S });
-  lease = given?.lease ?? null;
+  const granted = await call("arm", { owner: "dashboard", lease_s: LEASE_S });
+  lease = granted?.lease ?? null;
   showButtons();
 }
 
 setInterval(() => {
-  if (!lease || !link?.isOpen) return;
-  link.call("renew", { lease }).catch((error) => {
+  if (!lease || !connection?.isOpen) return;
+  connection.call("renew", { lease }).catch((error) => {
     if (error.code === 1002) {
       lease = null;
       showButtons();
@@ -85,118 +85,115 @@ setInterval(() => {
 
 function showButtons() {
   const isArmed = state === "OPERATION_ENABLED";
-  const isThere = state !== null && link?.isOpen;
-  at("arm").disabled = !isThere || isArmed || !DISARMED.includes(state);
-  at("disarm").disabled = !isThere || !isArmed;
-  at("clear").disabled = !isThere || !LATCHED.includes(state);
-  at("effects").disabled = !isThere || !isArmed;
+  const isConnected = state !== null && connection?.isOpen;
+  at("arm").disabled = !isConnected || isArmed || !DISARMED.includes(state);
+  at("disarm").disabled = !isConnected || !isArmed;
+  at("clear").disabled = !isConnected || !LATCHED.includes(state);
+  at("effects").disabled = !isConnected || !isArmed;
 }
 
-// What everybody should know before they look at anything else.
 function showBanner() {
-  const from = since ? ` (since ${timeOfDay(since)})` : "";
-  const unseen = "Amplifiers may still be energised.";
+  const since = lostSince ? ` (since ${timeOfDay(lostSince)})` : "";
+  const warning = "Amplifiers may still be energised.";
   let text = "";
-  if (!link?.isOpen) text = `${SHUT[shutBecause][0]}${shutBecause === "away" ? from : ""}. ${unseen}`;
-  else if (daemon === null) text = `The daemon does not answer${from}. ${unseen}`;
+  if (!connection?.isOpen) text = `${FAILURES[failure][0]}${failure === "unreachable" ? since : ""}. ${warning}`;
+  else if (daemon === null) text = `The daemon does not respond${since}. ${warning}`;
   else if (state === "COMM_LOST") {
-    text = `The link to an amplifier is lost${from}. `;
-    text += watchdog ? `Its watchdog silences it after ${watchdog}\u00a0s, which nothing confirms: it` : "It";
-    text += " may still be energised.";
-  } else if (daemon?.rig.simulated) text = "Simulated amplifiers: nothing vibrates but numbers.";
+    text = `The link to an amplifier is lost${since}. It may still be energised`;
+    text += watchdog ? `; its watchdog silences it after ${watchdog}\u00a0s, unconfirmed.` : ".";
+  } else if (daemon?.rig.simulated) text = "Simulated amplifiers: nothing vibrates.";
   at("banner").hidden = !text;
   at("banner").textContent = text;
   at("banner").classList.toggle("grave", !text.startsWith("Simulated"));
 }
 
 function showState(next, cause) {
-  if (next !== null) since = next === "COMM_LOST" ? since ?? new Date() : null;
+  if (next !== null) lostSince = next === "COMM_LOST" ? lostSince ?? new Date() : null;
   state = next;
   showBanner();
   at("state").textContent = STATES[state] ?? "not connected";
-  at("state").dataset.state = state ?? "away";
+  at("state").dataset.state = state ?? "disconnected";
   at("state").title = state ?? "";
   at("cause").textContent = at("cause").title = cause ?? "";
   at("plate").classList.toggle("unknown", state === null || state === "COMM_LOST");
   showButtons();
 }
 
-// As the daemon tells it when it is asked.
 function showStatus(status) {
   showState(status.state, status.cause);
   watchdog = status.watchdog_s;
   if (status.lost_for_s !== null) {
-    since = new Date(Date.now() - 1000 * status.lost_for_s);
-    tellLoss(status.cause, status.remedy);
+    lostSince = new Date(Date.now() - 1000 * status.lost_for_s);
+    showLinkLoss(status.cause, status.remedy);
   }
   showBanner();
 }
 
-function loseContact(what) {
-  since = new Date();
-  gap ??= addEvent(log, "error", what);
+function showOutage(message) {
+  lostSince = new Date();
+  outage ??= addEvent(log, "error", message);
 }
 
-// Nobody tells any more what is on the plate and how the amplifiers are.
-function forget(cause) {
+// Without events the state of plate and amplifiers is unknown.
+function showUnknown(cause) {
   showState(null, cause);
   overlay.show({ contacts: [], drive: {} });
-  picture.clear();
+  fieldView.clear();
   at("summary").textContent = "";
   showAmplifiers(at("amplifiers"), null, []);
-  loss = null;
+  linkLoss = null;
 }
 
-function tellLoss(cause, remedy) {
-  loss ??= { item: addEvent(log, "error", `link lost: ${cause}`, remedy), remedy, tries: 0 };
+function showLinkLoss(cause, remedy) {
+  linkLoss ??= { item: addEvent(log, "error", `link lost: ${cause}`, remedy), remedy, retries: 0 };
 }
 
 function summarise({ contacts, predicted_contrast_db, robust_contrast_db, predicted_level_db_sl, latency_ms }) {
   const parts = [];
-  if (predicted_level_db_sl !== null) parts.push(`target feels ${shown(predicted_level_db_sl)} dB SL`);
-  if (predicted_contrast_db !== null) parts.push(`${shown(predicted_contrast_db)} dB over the others`);
-  if (robust_contrast_db !== null) parts.push(`${shown(robust_contrast_db)} dB nine times in ten`);
-  parts.push(`${shown(latency_ms, 1)} ms from touch to wire`);
+  if (predicted_level_db_sl !== null) parts.push(`target: ${fixed(predicted_level_db_sl)} dB SL`);
+  if (predicted_contrast_db !== null) parts.push(`${fixed(predicted_contrast_db)} dB over the other fingers`);
+  if (robust_contrast_db !== null) parts.push(`${fixed(robust_contrast_db)} dB robust`);
+  parts.push(`${fixed(latency_ms, 1)} ms from touch to wire`);
   at("summary").textContent = `${contacts.length} ${contacts.length === 1 ? "finger" : "fingers"}: ${parts.join(", ")}`;
 }
 
-// Why fingers feel nothing, where that is for the state alone.
+// Why fingers feel nothing, if because of the state.
 function summariseSilence() {
   if (!overlay.contacts.length) at("summary").textContent = "";
-  else if (DISARMED.includes(state)) at("summary").textContent = "silent: arm, and touches are felt";
-  else if (LATCHED.includes(state)) at("summary").textContent = "silent: clear and arm, and touches are felt";
+  else if (DISARMED.includes(state)) at("summary").textContent = "silent: arm to feel touches";
+  else if (LATCHED.includes(state)) at("summary").textContent = "silent: clear, then arm to feel touches";
 }
 
 const HANDLERS = {
-  hello(said) {
-    if (daemon && !said) loseContact("the daemon does not answer");
-    daemon = said;
+  hello(next) {
+    if (daemon && !next) showOutage("the daemon does not respond");
+    daemon = next;
     if (daemon === null) {
-      forget("the gateway looks for the daemon");
+      showUnknown("the gateway is connecting to the daemon");
       return;
     }
-    if (gap) follow(gap, `${timeOfDay(new Date())} connected again`);
-    gap = null;
+    if (outage) annotate(outage, `${timeOfDay(new Date())} reconnected`);
+    outage = null;
     showBanner();
     overlay.setUp(daemon);
-    link.call("status").then(showStatus).catch(complain);
-    link.call("effects").then(({ effects }) => showEffects(at("effects-section"), at("effects"), effects, play)).catch(() => {});
+    connection.call("status").then(showStatus).catch(showError);
+    connection.call("effects").then(({ effects }) => showEffects(at("effects-section"), at("effects"), effects, play)).catch(() => {});
   },
   state({ old, new: next, cause, remedy }) {
-    const isNews = state !== null && old !== next && !PASSING.includes(next);
+    const isChange = state !== null && old !== next && !TRANSIENT.includes(next);
     showState(next, cause);
     summariseSilence();
     if (next === "COMM_LOST") {
-      tellLoss(cause, remedy);
+      showLinkLoss(cause, remedy);
       return;
     }
-    if (loss && next !== "NOT_READY") {
-      follow(loss.item, `${timeOfDay(new Date())} all amplifiers answer again, and are disarmed`, remedy);
-    } else if (isNews) {
-      const what = STATES[next] ?? next;
-      addEvent(log, next === "FAULT" ? "error" : "info", cause.startsWith(what) ? cause : `${what}: ${cause}`, remedy);
+    if (linkLoss && next !== "NOT_READY") {
+      annotate(linkLoss.item, `${timeOfDay(new Date())} all amplifiers reconnected, disarmed`, remedy);
+    } else if (isChange) {
+      const label = STATES[next] ?? next;
+      addEvent(log, next === "FAULT" ? "error" : "info", cause.startsWith(label) ? cause : `${label}: ${cause}`, remedy);
     }
-    loss = null;
+    linkLoss = null;
   },
   contacts({ contacts }) {
     overlay.show({ contacts });
@@ -216,79 +213,78 @@ const HANDLERS = {
   },
   latency({ latency_ms, plain_because }) {
     showLatency(at("latency-numbers"), at("latency"), latency_ms);
-    at("plain").textContent = plain_because ? `Plain ramps in place of shaped onsets: ${plain_because}` : "";
+    at("plain").textContent = plain_because ? `Plain ramps instead of shaped onsets: ${plain_because}` : "";
   },
   log({ level, message, cause, remedy }) {
     addEvent(log, level, cause ? `${message}: ${cause}` : message, remedy);
   },
   link({ event, message }) {
-    if (event !== "retry" || !loss) return;  // of the others the state tells
-    const times = ++loss.tries === 1 ? "once" : `${loss.tries} times`;
-    follow(loss.item, `tried again ${times}: ${message}`, loss.remedy);
+    if (event !== "retry" || !linkLoss) return;  // the state shows the others
+    annotate(linkLoss.item, `retry ${++linkLoss.retries}: ${message}`, linkLoss.remedy);
   },
 };
 
-// At the keyboard's finger or the newest of all.
+// Play an effect at the keyboard's finger, or at the newest one.
 function play(effect) {
   const { rig, cursor, contacts } = overlay;
   const { x_m, y_m } = cursor ?? contacts.at(-1) ?? { x_m: rig.length_m / 2, y_m: rig.width_m / 2 };
-  ask("play", { effect, x_m, y_m });
+  call("play", { effect, x_m, y_m });
 }
 
-function connected(isConnected) {
-  if (isConnected) {
-    shutBecause = "away";  // if it is lost again
-    since = null;
-    at("door").hidden = true;
-    at("main").hidden = false;
-    if (!gap) addEvent(log, "info", "connected to the gateway");
-    return;
-  }
-  if (link?.isHeard) loseContact("the gateway does not answer");
+function opened() {
+  failure = "unreachable";  // if it is lost again
+  lostSince = null;
+  at("login").hidden = true;
+  at("main").hidden = false;
+  if (!outage) addEvent(log, "info", "connected to the gateway");
+}
+
+function closed() {
+  if (connection?.wasOpen) showOutage("the gateway does not respond");
   lease = null;
   daemon = undefined;
-  forget(SHUT[shutBecause][1]);
+  showUnknown(FAILURES[failure][1]);
 }
 
-// There is a gateway that lets this page not in, or none.
-function shut(why) {
-  shutBecause = why;
-  forget(SHUT[why][1]);
-  if (why === "refused" || !link.wasOpen) showDoor(`${SHUT[why][0]}.`);
-  else at("door").hidden = true;
+function failed(why) {
+  failure = why;
+  showUnknown(FAILURES[why][1]);
+  if (why === "refused" || !connection.wasEverOpen) showLogin(`${FAILURES[why][0]}.`);
+  else at("login").hidden = true;
 }
 
-function showDoor(problem) {
-  at("door").hidden = false;
-  at("door-problem").textContent = problem;
+function showLogin(problem) {
+  at("login").hidden = false;
+  at("login-problem").textContent = problem;
 }
 
-function enter(token) {
-  link = new Link(token, TOPICS, {
-    connected,
-    shut,
+function connect(token) {
+  connection = new Connection(token, TOPICS, {
+    opened,
+    closed,
+    failed,
     event: ({ topic, data }) => HANDLERS[topic]?.(data),
-    field: (buffer) => picture.show(decodeField(buffer)),
+    field: (buffer) => fieldView.show(decodeField(buffer)),
   });
 }
 
-// Whoever leaves the page cannot stop any more.
-window.addEventListener("pagehide", () => lease && link.post("disarm").catch(() => {}));
+// A closed page cannot stop anything: disarm.
+window.addEventListener("pagehide", () => lease && connection.post("disarm").catch(() => {}));
 
 at("arm").addEventListener("click", arm);
 at("disarm").addEventListener("click", () => {
   lease = null;
-  ask("disarm");
+  call("disarm");
 });
-at("clear").addEventListener("click", () => ask("clear"));
+at("clear").addEventListener("click", () => call("clear"));
 at("stop").addEventListener("click", stop);
-at("motion").addEventListener("change", ({ target }) => picture.setMotion(target.checked));
-at("door").addEventListener("submit", (event) => {
+at("motion").addEventListener("change", ({ target }) => fieldView.setMotion(target.checked));
+at("login").addEventListener("submit", (event) => {
   event.preventDefault();
   sessionStorage.setItem(TOKEN_KEY, at("token").value.trim());
   location.reload();
 });
-// The space bar stops, wherever the focus is, and does nothing else.
+// The space bar stops, whatever has the focus, and does nothing else.
 window.addEventListener("keydown", (event) => {
   if (event.code !== "Space" || event.target.id === "token") return;
   event.preventDefault();
@@ -297,17 +293,17 @@ window.addEventListener("keydown", (event) => {
 }, { capture: true });
 window.addEventListener("keyup", (event) => event.code === "Space" && event.target.id !== "token" && event.preventDefault(), { capture: true });
 
-// The URL's token is kept by the tab alone, where nobody looks over a shoulder.
+// Move the token from the URL to the tab's storage, where it is not displayed.
 function takeToken() {
-  const given = new URLSearchParams(location.hash.slice(1)).get("token");
-  if (!given) return false;
+  const token = new URLSearchParams(location.hash.slice(1)).get("token");
+  if (!token) return false;
   history.replaceState(null, "", location.pathname);
-  sessionStorage.setItem(TOKEN_KEY, given);
+  sessionStorage.setItem(TOKEN_KEY, token);
   return true;
 }
 
 window.addEventListener("hashchange", () => takeToken() && location.reload());
 takeToken();
 const token = sessionStorage.getItem(TOKEN_KEY);
-if (token) enter(token);
-else showDoor("");
+if (token) connect(token);
+else showLogin("");

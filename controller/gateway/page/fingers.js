@@ -1,27 +1,27 @@
-// Fingers on the picture: pointers of every kind, and one that the keyboard moves.
+// Fingers on the plate's picture: pointers of every kind, and one moved by the keyboard.
 
-const REPEAT_MS = 50;  // the daemon lifts what it has not heard of for 150 ms
+const REPEAT_MS = 50;  // the daemon lifts fingers that are not repeated within 150 ms
 const STEP_M = 0.005;
 const KEYBOARD = -1;   // an id that no pointer has
 
 export class Fingers {
-  // say(touches) is called with all fingers whenever they change, and every 50 ms while any is down.
-  constructor(plate, overlay, say) {
+  // send(touches) is called with all fingers at every change, and every 50 ms while any is down.
+  constructor(plate, overlay, send) {
     this.overlay = overlay;
-    this.say = say;
-    this.down = new Map();
-    this.changed = false;
+    this.send = send;
+    this.positions = new Map();  // by id, of the fingers that are down
+    this.isMoveScheduled = false;
     plate.addEventListener("pointerdown", (event) => this.press(event, plate));
     plate.addEventListener("pointermove", (event) => this.move(event));
-    for (const kind of ["pointerup", "pointercancel", "lostpointercapture"]) {
-      plate.addEventListener(kind, (event) => this.lift(event.pointerId));
+    for (const type of ["pointerup", "pointercancel", "lostpointercapture"]) {
+      plate.addEventListener(type, (event) => this.lift(event.pointerId));
     }
     plate.addEventListener("contextmenu", (event) => event.preventDefault());
     plate.addEventListener("keydown", (event) => this.key(event));
-    plate.addEventListener("blur", () => this.leave());
+    plate.addEventListener("blur", () => this.removeCursor());
     window.addEventListener("blur", () => this.liftAll());
     document.addEventListener("visibilitychange", () => document.hidden && this.liftAll());
-    setInterval(() => this.down.size && this.tell(), REPEAT_MS);
+    setInterval(() => this.positions.size && this.report(), REPEAT_MS);
   }
 
   press(event, plate) {
@@ -29,29 +29,33 @@ export class Fingers {
     event.preventDefault();
     plate.focus({ preventScroll: true });
     plate.setPointerCapture(event.pointerId);
-    this.down.set(event.pointerId, this.overlay.place(event));
-    this.tell();
+    this.put(event.pointerId, this.overlay.position(event));
   }
 
   move(event) {
-    if (!this.down.has(event.pointerId)) return;
-    this.down.set(event.pointerId, this.overlay.place(event));
-    if (this.changed) return;
-    this.changed = true;
+    if (!this.positions.has(event.pointerId)) return;
+    this.positions.set(event.pointerId, this.overlay.position(event));
+    if (this.isMoveScheduled) return;
+    this.isMoveScheduled = true;
     requestAnimationFrame(() => {
-      this.changed = false;
-      if (this.down.size) this.tell();
+      this.isMoveScheduled = false;
+      if (this.positions.size) this.report();
     });
   }
 
+  put(id, position) {
+    this.positions.set(id, position);
+    this.report();
+  }
+
   lift(id) {
-    if (this.down.delete(id)) this.tell();
+    if (this.positions.delete(id)) this.report();
   }
 
   liftAll() {
-    if (!this.down.size) return;
-    this.down.clear();
-    this.tell();
+    if (!this.positions.size) return;
+    this.positions.clear();
+    this.report();
   }
 
   key(event) {
@@ -62,31 +66,27 @@ export class Fingers {
     event.preventDefault();
     this.cursor ??= { x_m: rig.length_m / 2, y_m: rig.width_m / 2 };
     if (step) {
-      const within = (value, most) => Math.min(most, Math.max(0, value));
+      const clamp = (value, max) => Math.min(max, Math.max(0, value));
       this.cursor = {
-        x_m: within(this.cursor.x_m + step[0] * STEP_M, rig.length_m),
-        y_m: within(this.cursor.y_m + step[1] * STEP_M, rig.width_m),
+        x_m: clamp(this.cursor.x_m + step[0] * STEP_M, rig.length_m),
+        y_m: clamp(this.cursor.y_m + step[1] * STEP_M, rig.width_m),
       };
-      if (this.down.has(KEYBOARD)) {
-        this.down.set(KEYBOARD, this.cursor);
-        this.tell();
-      }
-    } else if (event.key === "Enter" && !this.down.has(KEYBOARD)) {
-      this.down.set(KEYBOARD, this.cursor);
-      this.tell();
+      if (this.positions.has(KEYBOARD)) this.put(KEYBOARD, this.cursor);
+    } else if (event.key === "Enter" && !this.positions.has(KEYBOARD)) {
+      this.put(KEYBOARD, this.cursor);
     } else {
       this.lift(KEYBOARD);
     }
     this.overlay.showCursor(this.cursor);
   }
 
-  leave() {
+  removeCursor() {
     this.lift(KEYBOARD);
     this.cursor = undefined;
     this.overlay.showCursor(undefined);
   }
 
-  tell() {
-    this.say([...this.down].map(([id, place]) => ({ id, ...place })));
+  report() {
+    this.send([...this.positions].map(([id, position]) => ({ id, ...position })));
   }
 }

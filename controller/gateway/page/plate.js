@@ -1,10 +1,10 @@
-// What lies on the picture of the plate: ERAs, regions, and fingers with what each feels.
+// Drawn over the plate: ERAs, regions, and fingers with their predicted sensations.
 
 const SVG = "http://www.w3.org/2000/svg";
 const FINGERTIP_M = 0.0065;  // radius
-const SMALL_PX = 480;  // a plate that has no room for every label
-const SIZE = 12;  // of text, in pixels
-const ERA_SIDE = 12;  // of its square
+const SMALL_PX = 480;  // below it labels are shorter
+const TEXT_PX = 12;
+const ERA_PX = 12;
 
 function element(name, attributes, text) {
   const made = document.createElementNS(SVG, name);
@@ -13,9 +13,9 @@ function element(name, attributes, text) {
   return made;
 }
 
-const textWidth = (text) => 0.62 * SIZE * text.length;  // about, in pixels
+const textWidth = (text) => 0.62 * TEXT_PX * text.length;  // approximate, in pixels
 
-export const shown = (value, digits = 0) => (value === null || value === undefined ? "–" : value.toFixed(digits));
+export const fixed = (value, digits = 0) => (value === null || value === undefined ? "–" : value.toFixed(digits));
 
 export class PlateOverlay {
   constructor(plate, svg) {
@@ -28,7 +28,7 @@ export class PlateOverlay {
     new ResizeObserver(() => this.redraw()).observe(plate);
   }
 
-  // The rig and layout, as hello tells them.
+  // Take rig and layout of `hello`.
   setUp({ rig, layout }) {
     this.rig = rig;
     this.regions = layout?.regions ?? [];
@@ -48,56 +48,56 @@ export class PlateOverlay {
     this.redraw();
   }
 
-  // Where a pointer is on the plate [m], from its south-west corner.
-  place(event) {
+  // Position of a pointer [m], from the south-west corner of the plate.
+  position(event) {
     const box = this.plate.getBoundingClientRect();
-    const share = (value) => Math.min(1, Math.max(0, value));
+    const clamp = (value) => Math.min(1, Math.max(0, value));
     return {
-      x_m: share((event.clientX - box.left) / box.width) * this.rig.length_m,
-      y_m: (1 - share((event.clientY - box.top) / box.height)) * this.rig.width_m,
+      x_m: clamp((event.clientX - box.left) / box.width) * this.rig.length_m,
+      y_m: (1 - clamp((event.clientY - box.top) / box.height)) * this.rig.width_m,
     };
   }
 
   redraw() {
     if (!this.rig || !this.plate.clientWidth) return;
-    this.px = this.rig.length_m / this.plate.clientWidth;  // metres of one pixel
+    this.px = this.rig.length_m / this.plate.clientWidth;  // metres per pixel
     this.isSmall = this.plate.clientWidth < SMALL_PX;
     const [regions, eras, contacts, cursor] = this.layers;
-    this.taken = [];  // boxes that no text may cover; what comes first is placed first
+    this.occupied = [];  // boxes that no text may cover
     eras.replaceChildren(...this.rig.eras.flatMap((era) => this.era(era)));
-    this.taken.push(...this.contacts.map((contact) => this.ringBox(contact)));
+    this.occupied.push(...this.contacts.map((contact) => this.ringBox(contact)));
     contacts.replaceChildren(...this.contacts.flatMap((contact) => this.contact(contact)));
     regions.replaceChildren(...this.regions.flatMap((region) => this.region(region)));
     cursor.replaceChildren(...(this.cursor ? [this.circle(this.cursor, "cursor", FINGERTIP_M)] : []));
   }
 
-  up(y) {
+  flip(y) {
     return this.rig.width_m - y;
   }
 
   circle({ x_m, y_m }, name, radius) {
-    return element("circle", { class: name, cx: x_m, cy: this.up(y_m), r: radius });
+    return element("circle", { class: name, cx: x_m, cy: this.flip(y_m), r: radius });
   }
 
   label([x, y], text, name = "label") {
-    const size = SIZE * this.px;
+    const size = TEXT_PX * this.px;
     const room = textWidth(text) * this.px;
     const anchor = x < room / 2 ? "start" : x > this.rig.length_m - room / 2 ? "end" : "middle";
     const height = Math.min(this.rig.width_m - size / 2, Math.max(size, y));
     const left = x - { start: 0, middle: room / 2, end: room }[anchor];
-    const top = name === "label" ? height - size : height;  // a name hangs from its line
-    if (text) this.taken.push([left, top, left + room, top + 1.2 * size]);
+    const top = name === "label" ? height - size : height;  // names are aligned at their top
+    if (text) this.occupied.push([left, top, left + room, top + 1.2 * size]);
     return element("text", { class: name, x, y: height, "font-size": size, "text-anchor": anchor }, text);
   }
 
-  // The first of several places for a text where it covers nothing that is there already.
-  free(places, text, isHanging = false) {
-    const [room, size] = [textWidth(text) * this.px, SIZE * this.px];
-    return places.find(([x, y]) => {
+  // The first of several positions at which a text covers nothing.
+  firstFree(positions, text, isTopAligned = false) {
+    const [room, size] = [textWidth(text) * this.px, TEXT_PX * this.px];
+    return positions.find(([x, y]) => {
       const left = Math.min(this.rig.length_m - room, Math.max(0, x - room / 2));
-      const top = isHanging ? y : y - size;
-      const isOn = top >= 0 && top + size <= this.rig.width_m;
-      return isOn && this.taken.every((box) => left >= box[2] || left + room <= box[0] || top >= box[3] || top + size <= box[1]);
+      const top = isTopAligned ? y : y - size;
+      const isInside = top >= 0 && top + size <= this.rig.width_m;
+      return isInside && this.occupied.every((box) => left >= box[2] || left + room <= box[0] || top >= box[3] || top + size <= box[1]);
     });
   }
 
@@ -107,51 +107,50 @@ export class PlateOverlay {
     let middle;  // of its upper edge
     if (shape === "circle") {
       outline = this.circle({ x_m, y_m }, "region", radius_m);
-      bounds = [x_m - radius_m, this.up(y_m + radius_m), x_m + radius_m, this.up(y_m - radius_m)];
+      bounds = [x_m - radius_m, this.flip(y_m + radius_m), x_m + radius_m, this.flip(y_m - radius_m)];
     } else if (shape === "polygon") {
-      const corners = points_m.map(([x, y]) => [x, this.up(y)]);
+      const corners = points_m.map(([x, y]) => [x, this.flip(y)]);
       outline = element("polygon", { class: "region", points: corners.map((corner) => corner.join(",")).join(" ") });
       const [xs, ys] = [0, 1].map((axis) => corners.map((corner) => corner[axis]));
       bounds = [Math.min(...xs), Math.min(...ys), Math.max(...xs), Math.max(...ys)];
       const upper = xs.filter((_, index) => ys[index] === bounds[1]);
       middle = (Math.min(...upper) + Math.max(...upper)) / 2;
     } else {
-      outline = element("rect", { class: "region", x: x_m, y: this.up(y_m + height_m), width: width_m, height: height_m });
-      bounds = [x_m, this.up(y_m + height_m), x_m + width_m, this.up(y_m)];
+      outline = element("rect", { class: "region", x: x_m, y: this.flip(y_m + height_m), width: width_m, height: height_m });
+      bounds = [x_m, this.flip(y_m + height_m), x_m + width_m, this.flip(y_m)];
     }
-    const place = this.namePlace(bounds, middle ?? (bounds[0] + bounds[2]) / 2, name);
-    return place ? [outline, this.label(place, name, "label name")] : [outline];
+    const position = this.namePosition(bounds, middle ?? (bounds[0] + bounds[2]) / 2, name);
+    return position ? [outline, this.label(position, name, "label name")] : [outline];
   }
 
-  // Where a region's name covers no ERA and no finger's text: on the upper edge, for fingers that
-  // are put into the middle would hide it there, or on the lower one, anywhere in it, or just
-  // outside.
-  namePlace([left, top, right, bottom], middle, name) {
-    const [width, height, gap] = [textWidth(name) * this.px, SIZE * this.px, 4 * this.px];
+  // Position of a region's name: at its upper edge, where fingers hide it least, at its lower edge,
+  // anywhere in it, or just outside.
+  namePosition([left, top, right, bottom], middle, name) {
+    const [width, height, gap] = [textWidth(name) * this.px, TEXT_PX * this.px, 4 * this.px];
     const xs = [middle, left + gap + width / 2, right - gap - width / 2];
     const rows = [top + gap, bottom - gap - height];
     for (let y = top + gap + height; y < bottom - gap - height; y += height / 2) rows.push(y);
     rows.push(top - gap - height, bottom + gap);
-    return this.free(rows.flatMap((y) => xs.map((x) => [x, y])), name, true);
+    return this.firstFree(rows.flatMap((y) => xs.map((x) => [x, y])), name, true);
   }
 
-  // Where an ERA's square is drawn: wholly on the plate.
-  eraPlace({ x_m, y_m }) {
-    const half = (ERA_SIDE * this.px) / 2;
-    const inset = (value, most) => Math.min(most - half, Math.max(half, value));
-    return [inset(x_m, this.rig.length_m), inset(this.up(y_m), this.rig.width_m)];
+  // Centre of an ERA's square, which lies within the plate.
+  eraCentre({ x_m, y_m }) {
+    const half = (ERA_PX * this.px) / 2;
+    const inset = (value, max) => Math.min(max - half, Math.max(half, value));
+    return [inset(x_m, this.rig.length_m), inset(this.flip(y_m), this.rig.width_m)];
   }
 
   era(era) {
     const { name } = era;
     const tone = this.drive[name];
-    const side = ERA_SIDE * this.px;
-    const [x, y] = this.eraPlace(era);
+    const side = ERA_PX * this.px;
+    const [x, y] = this.eraCentre(era);
     const square = element("rect", {
       class: tone ? "era driven" : "era", x: x - side / 2, y: y - side / 2, width: side, height: side, "data-era": name,
     });
     const gap = 4 * this.px;
-    this.taken.push([x - side / 2 - gap, y - side / 2 - gap, x + side / 2 + gap, y + side / 2 + gap]);
+    this.occupied.push([x - side / 2 - gap, y - side / 2 - gap, x + side / 2 + gap, y + side / 2 + gap]);
     const parts = [name];
     if (tone && !this.isSmall) parts.push(`${tone.frequency_hz.toFixed(0)} Hz`);
     if (tone) parts.push(`${(100 * tone.level).toFixed(0)} %`);
@@ -165,7 +164,7 @@ export class PlateOverlay {
 
   ringBox({ x_m, y_m }) {
     const radius = this.ringRadius;
-    return [x_m - radius, this.up(y_m) - radius, x_m + radius, this.up(y_m) + radius];
+    return [x_m - radius, this.flip(y_m) - radius, x_m + radius, this.flip(y_m) + radius];
   }
 
   contact(contact) {
@@ -173,19 +172,19 @@ export class PlateOverlay {
     const ring = this.circle(contact, `contact ${role ?? ""}`, this.ringRadius);
     ring.setAttribute("data-role", role ?? "");
     const isKnown = (value) => value !== null && value !== undefined;
-    const above = isKnown(level_db_sl) ? `${shown(level_db_sl)} dB SL` : role === "quiet" ? "quiet" : "";
-    const below = role === "target" && isKnown(contrast_db) ? `${shown(contrast_db)} dB over others` : "";
+    const above = isKnown(level_db_sl) ? `${fixed(level_db_sl)} dB SL` : role === "quiet" ? "quiet" : "";
+    const below = role === "target" && isKnown(contrast_db) ? `${fixed(contrast_db)} dB over others` : "";
     return [ring, this.besideRing(contact, above, 0), this.besideRing(contact, below, 1)];
   }
 
-  // A text above a finger or below it, whichever is wanted first, or else on its left or right.
+  // A text above (0) or below (1) a finger, or if occupied on the other side, left or right.
   besideRing({ x_m, y_m }, text, first) {
-    const [away, line] = [this.ringRadius + 4 * this.px, 1.25 * SIZE * this.px];
-    const [x, y, aside] = [x_m, this.up(y_m), away + (textWidth(text) * this.px) / 2];
+    const [away, line] = [this.ringRadius + 4 * this.px, 1.25 * TEXT_PX * this.px];
+    const [x, y, aside] = [x_m, this.flip(y_m), away + (textWidth(text) * this.px) / 2];
     const above = [0, 1, 2].map((row) => [x, y - away - row * line]);
-    const below = [0, 1, 2].map((row) => [x, y + away + 0.75 * SIZE * this.px + row * line]);
+    const below = [0, 1, 2].map((row) => [x, y + away + 0.75 * TEXT_PX * this.px + row * line]);
     const besides = [0, 1, -1].flatMap((row) => [[x - aside, y + row * line], [x + aside, y + row * line]]);
-    const places = first ? [...below, ...above, ...besides] : [...above, ...below, ...besides];
-    return this.label(this.free(places, text) ?? places[0], text);
+    const positions = first ? [...below, ...above, ...besides] : [...above, ...below, ...besides];
+    return this.label(this.firstFree(positions, text) ?? positions[0], text);
   }
 }

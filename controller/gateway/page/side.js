@@ -1,6 +1,6 @@
-// What stands beside the plate: amplifiers, latencies, effects, events.
+// Beside the plate: amplifiers, latencies, effects, events.
 
-import { shown } from "./plate.js";
+import { fixed } from "./plate.js";
 
 export const STATES = {
   NOT_READY: "not ready", SWITCH_ON_DISABLED: "disarmed", READY_TO_SWITCH_ON: "disarmed",
@@ -9,8 +9,8 @@ export const STATES = {
 };
 
 const SVG = "http://www.w3.org/2000/svg";
-const MOST_EVENTS = 200;
-const OLD_REPLY_S = 1.5;  // thrice as long as between two looks at a disarmed amplifier
+const MAX_EVENTS = 200;
+const OLD_REPLY_S = 1.5;  // three times the interval of status reads while disarmed
 
 function element(name, text, className) {
   const made = document.createElement(name);
@@ -21,19 +21,19 @@ function element(name, text, className) {
 
 export const timeOfDay = (date) => date.toLocaleTimeString();
 
-function ageInWords(seconds) {
-  if (seconds < OLD_REPLY_S) return `${shown(1000 * seconds)} ms`;
-  return seconds < 120 ? `${shown(seconds)} s` : `${shown(seconds / 60)} min`;
+function ageText(seconds) {
+  if (seconds < OLD_REPLY_S) return `${fixed(1000 * seconds)} ms`;
+  return seconds < 120 ? `${fixed(seconds)} s` : `${fixed(seconds / 60)} min`;
 }
 
-// eras: those of the rig, for the names of what its channels move.
+// eras: of the rig, for the names of the channels.
 function tile(amplifier, eras) {
   const { name, state, fault, levels, temperature_c, high_voltage, high_voltage_v, reply_age_s, lost, closed_with_lost } = amplifier;
   const isFaulty = fault && fault !== "NONE";
   const made = element("article", undefined, lost || isFaulty ? "tile bad" : "tile");
   const title = element("h3");
-  const how = lost ? "no link" : closed_with_lost ? "closed with the lost one" : isFaulty ? `fault: ${fault.toLowerCase().replaceAll("_", " ")}` : STATES[state] ?? "unknown";
-  title.append(element("span", name), element("span", how));
+  const status = lost ? "no link" : closed_with_lost ? "closed with the lost one" : isFaulty ? `fault: ${fault.toLowerCase().replaceAll("_", " ")}` : STATES[state] ?? "unknown";
+  title.append(element("span", name), element("span", status));
   made.append(title);
   const channels = element("div", undefined, "channels");
   const eraOf = (channel) => eras.find((each) => each.amplifier === name && each.channel === channel)?.name;
@@ -45,33 +45,33 @@ function tile(amplifier, eras) {
     meter.ariaLabel = `channel ${channel}${eraOf(channel) ? `, ERA ${eraOf(channel)}` : ""}: ${percent}`;
     channels.append(element("span", eraOf(channel) ?? `channel ${channel}`), meter, element("span", percent));
   });
-  made.append(levels.length ? channels : element("p", "What its channels play is unknown.", "quiet"));
+  made.append(levels.length ? channels : element("p", "channels: unknown", "quiet"));
   const list = element("dl");
   const add = (key, value) => list.append(element("dt", key), element("dd", value));
-  if (temperature_c !== null) add("Temperature", `${shown(temperature_c)} °C`);
-  add("High voltage", high_voltage === null ? "unknown" : high_voltage_v === null ? (high_voltage ? "on" : "off") : `${shown(high_voltage_v)} V`);
-  add("Last reply", reply_age_s === null ? "none yet" : `${ageInWords(reply_age_s)} ago`);
+  if (temperature_c !== null) add("Temperature", `${fixed(temperature_c)} °C`);
+  add("High voltage", high_voltage === null ? "unknown" : high_voltage_v === null ? (high_voltage ? "on" : "off") : `${fixed(high_voltage_v)} V`);
+  add("Last reply", reply_age_s === null ? "none" : `${ageText(reply_age_s)} ago`);
   made.append(list);
   return made;
 }
 
-// amplifiers: null where nobody tells how they are.
-export function showAmplifiers(into, amplifiers, eras) {
+// amplifiers: null if unknown.
+export function showAmplifiers(container, amplifiers, eras) {
   const tiles = amplifiers?.map((amplifier) => tile(amplifier, eras));
-  into.replaceChildren(...(tiles ?? [element("p", "Unknown: nobody tells how they are.", "quiet")]));
+  container.replaceChildren(...(tiles ?? [element("p", "unknown", "quiet")]));
 }
 
-const threeDigits = (value) => shown(value, Math.max(0, 2 - Math.floor(Math.log10(Math.max(value, 1)))));
+const threeDigits = (value) => fixed(value, Math.max(0, 2 - Math.floor(Math.log10(Math.max(value, 1)))));
 
 export function showLatency(numbers, svg, { count, median, p99, p999, histogram }) {
-  // A share of fewer commands than it takes would say more than is known.
-  const within = [["99 %", p99, 100], ["99.9 %", p999, 1000]].filter(([, , least]) => count >= least);
+  // Percentiles need enough commands.
+  const percentiles = [["99 %", p99, 100], ["99.9 %", p999, 1000]].filter(([, , min]) => count >= min);
   numbers.textContent = count
-    ? [`median ${threeDigits(median)} ms`, ...within.map(([share, value]) => `${share} within ${threeDigits(value)} ms`), `of ${count} ${count === 1 ? "command" : "commands"}`].join(", ")
-    : "no touch has led to a command yet";
-  const most = Math.max(1, ...histogram.map(([, number]) => number));
+    ? [`median ${threeDigits(median)} ms`, ...percentiles.map(([share, value]) => `${share} within ${threeDigits(value)} ms`), `of ${count} ${count === 1 ? "command" : "commands"}`].join(", ")
+    : "no commands yet";
+  const max = Math.max(1, ...histogram.map(([, number]) => number));
   const width = 320 / Math.max(1, histogram.length);
-  const parts = [];  // bars end below the line of text at the top
+  const parts = [];
   const add = (name, attributes, text) => {
     const made = document.createElementNS(SVG, name);
     for (const [key, value] of Object.entries(attributes)) made.setAttribute(key, value);
@@ -79,9 +79,9 @@ export function showLatency(numbers, svg, { count, median, p99, p999, histogram 
     parts.push(made);
   };
   histogram.forEach(([upper, number], index) => {
-    const height = number ? Math.max(2, 64 * Math.log1p(number) / Math.log1p(most)) : 0;
+    const height = number ? Math.max(2, 64 * Math.log1p(number) / Math.log1p(max)) : 0;
     add("rect", { x: index * width + 1, y: 80 - height, width: Math.max(1, width - 2), height });
-    if (index === histogram.length - 1) {  // what is above its edge counts there
+    if (index === histogram.length - 1) {  // includes what is above its edge
       add("text", { x: 320, y: 96, "text-anchor": "end" }, `> ${histogram.at(-2)?.[0] ?? 0}`);
     } else if (index % Math.ceil(histogram.length / 6) === 0) {
       add("text", { x: (index + 1) * width, y: 96, "text-anchor": "middle" }, `${upper}`);
@@ -92,9 +92,9 @@ export function showLatency(numbers, svg, { count, median, p99, p999, histogram 
   svg.replaceChildren(...parts);
 }
 
-export function showEffects(section, into, effects, play) {
+export function showEffects(section, container, effects, play) {
   section.hidden = !effects.length;
-  into.replaceChildren(...effects.map(({ name, description }) => {
+  container.replaceChildren(...effects.map(({ name, description }) => {
     const button = element("button", name);
     button.type = "button";
     button.title = description;
@@ -103,8 +103,8 @@ export function showEffects(section, into, effects, play) {
   }));
 }
 
-// An event of the log, the newest first; all of it as text. One that is told again takes no other's
-// place. Its item is returned, for what follows from it.
+// Add an event to the log, newest first, or count it if it repeats the newest; returns its item, for
+// `annotate`.
 export function addEvent(log, level, message, remedy) {
   const newest = log.firstElementChild;
   const times = newest?.dataset.message === message ? Number(newest.dataset.times) + 1 : 1;
@@ -113,14 +113,14 @@ export function addEvent(log, level, message, remedy) {
   Object.assign(item.dataset, { message, times });
   const time = element("time", timeOfDay(new Date()));
   item.append(time, " ", element("span", times > 1 ? `${message} (${times} times)` : message, level));
-  follow(item, "", remedy);
+  annotate(item, "", remedy);
   log.prepend(item);
-  while (log.children.length > MOST_EVENTS) log.lastElementChild.remove();
+  while (log.children.length > MAX_EVENTS) log.lastElementChild.remove();
   return item;
 }
 
-// What has come of an event, and what is to be done now; in place of what was told of it before.
-export function follow(item, text, remedy) {
-  for (const old of item.querySelectorAll(".follows")) old.remove();
-  for (const each of [text, remedy]) if (each) item.append(element("span", each, "follows"));
+// Show the outcome of an event and its remedy, in place of earlier ones.
+export function annotate(item, outcome, remedy) {
+  for (const old of item.querySelectorAll(".note")) old.remove();
+  for (const each of [outcome, remedy]) if (each) item.append(element("span", each, "note"));
 }

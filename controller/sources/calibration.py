@@ -1,4 +1,4 @@
-"""From a sensor's coordinates to the plate's: turned, mirrored, shifted, scaled or sheared.
+"""Affine map from coordinates of a touch sensor to those of the plate.
 
 The matrix is that of libinput's LIBINPUT_CALIBRATION_MATRIX: x' = a x + b y + c, y' = d x + e y + f
 on coordinates 0..1 from the top left corner.
@@ -18,13 +18,13 @@ from model.structure.plate import Plate
 Row: TypeAlias = tuple[float, float, float]
 Point: TypeAlias = tuple[float, float]
 
-# A panel that is off by more than this [m] after the fit was not touched where the points say; a
-# fingertip's own radius is 6.5 mm.
-WORST_FIT = 0.005
-# Below this a matrix folds the sensor onto a line.
-_LEAST_AREA = 1e-3
+# m; with a larger residual a point was not touched where it should be (a fingertip's radius is
+# 6.5 mm).
+MAX_RESIDUAL = 0.005
+# Below this determinant the matrix is singular for practical purposes.
+_MIN_DETERMINANT = 1e-3
 
-_TURNS: dict[int, tuple[Row, Row]] = {
+_ROTATIONS: dict[int, tuple[Row, Row]] = {
     0: ((1, 0, 0), (0, 1, 0)),
     90: ((0, -1, 1), (1, 0, 0)),
     180: ((-1, 0, 1), (0, -1, 1)),
@@ -34,22 +34,21 @@ _TURNS: dict[int, tuple[Row, Row]] = {
 
 @dataclass(frozen=True)
 class TouchCalibration:
-    """Where on the plate a touch of the sensor lies; raises InputError on a matrix that folds."""
+    """Map from sensor to plate; raises InputError for a singular matrix."""
 
-    matrix: tuple[Row, Row] = _TURNS[0]
+    matrix: tuple[Row, Row] = _ROTATIONS[0]
 
     def __post_init__(self) -> None:
         numbers = [number for row in self.matrix for number in row]
         (a, b, _), (d, e, _) = self.matrix
-        if not all(map(math.isfinite, numbers)) or abs(a * e - b * d) < _LEAST_AREA:
+        if not all(map(math.isfinite, numbers)) or abs(a * e - b * d) < _MIN_DETERMINANT:
             raise InputError(
-                f"the touch calibration {self.matrix} folds the sensor onto a line or is not "
-                "finite; expected two rows of three numbers, (1, 0, 0) and (0, 1, 0) for a sensor "
-                "that fits the plate"
+                f"touch calibration must be a finite, invertible matrix, got {self.matrix}; give "
+                "(1, 0, 0) and (0, 1, 0) for a sensor aligned with the plate"
             )
 
     def place(self, touch: Touch) -> Touch:
-        """The touch in the plate's coordinates, 0..1 across it; not finite stays so."""
+        """Return the touch in coordinates 0..1 across the plate; NaN stays NaN."""
         (a, b, c), (d, e, f) = self.matrix
         return replace(
             touch,
@@ -59,17 +58,16 @@ class TouchCalibration:
 
 
 def turned(degrees: int = 0, *, mirror: str | None = None) -> TouchCalibration:
-    """For a sensor that is mounted turned clockwise by 0, 90, 180 or 270 degrees.
+    """Return the calibration of a sensor mounted turned clockwise by 0, 90, 180 or 270 degrees.
 
-    mirror: "x" where left and right are exchanged after that, "y" where top and bottom are.
-    Raises InputError on anything else.
+    mirror: "x" to swap left and right after that, "y" for top and bottom. Raises InputError.
     """
-    if degrees not in _TURNS or mirror not in (None, "x", "y"):
+    if degrees not in _ROTATIONS or mirror not in (None, "x", "y"):
         raise InputError(
-            f"a touch sensor is turned by {degrees} and mirrored {mirror}: expected 0, 90, 180 or "
-            "270 degrees, and x, y or nothing to mirror"
+            f"touch calibration must be turned by 0, 90, 180 or 270 degrees and mirrored in x, y "
+            f"or not at all, got {degrees} and {mirror}"
         )
-    x_row, y_row = _TURNS[degrees]
+    x_row, y_row = _ROTATIONS[degrees]
     if mirror == "x":
         x_row = _reversed(x_row)
     if mirror == "y":
@@ -78,47 +76,47 @@ def turned(degrees: int = 0, *, mirror: str | None = None) -> TouchCalibration:
 
 
 def fitted(touched: Sequence[Point], places: Sequence[Point], plate: Plate) -> TouchCalibration:
-    """From at least three points: what the sensor said (0..1) and where on the plate [m] that was.
+    """Fit a calibration by least squares to at least three points.
 
-    Least squares; places count from the plate's south-west corner, y upwards. Raises InputError if
-    the points lie on a line, or are off by more than 5 mm after the fit.
+    touched: sensor coordinates 0..1; places: on the plate [m] from its south-west corner, y
+    upwards. Raises InputError for points on a line or residuals above 5 mm.
     """
     if len(touched) != len(places) or len(touched) < 3:
         raise InputError(
-            f"{len(touched)} touches for {len(places)} places: a touch calibration needs at least "
-            "three points, each with a touch and a place, best near three corners"
+            "touch calibration must have at least three points, best near three corners, got "
+            f"{len(touched)} touches and {len(places)} places"
         )
     wanted = np.array([(x / plate.length, 1 - y / plate.width) for x, y in places])
     known = np.column_stack((np.array(touched, dtype=float), np.ones(len(touched))))
     if not (np.isfinite(known).all() and np.isfinite(wanted).all()):
-        raise InputError("a point of the touch calibration is not finite; touch it again")
+        raise InputError("points of the touch calibration must be finite; touch them again")
     if np.linalg.matrix_rank(known, tol=0.05) < 3:
         raise InputError(
-            "the points of the touch calibration lie on a line; touch three corners of the plate"
+            "points of the touch calibration must not lie on a line; touch three corners"
         )
     solution = np.linalg.lstsq(known, wanted, rcond=None)[0]
     error = (known @ solution - wanted) * (plate.length, plate.width)
     distances = np.hypot(error[:, 0], error[:, 1])
     worst = int(np.argmax(distances))
-    if distances[worst] > WORST_FIT:
+    if distances[worst] > MAX_RESIDUAL:
         raise InputError(
-            f"the touch calibration fits point {worst + 1} only to {distances[worst] * 1e3:.1f} mm "
-            f"(at most {WORST_FIT * 1e3:g} mm); look for a point that was touched elsewhere, or a "
-            "panel that is curved"
+            f"residual of touch calibration point {worst + 1} must be at most "
+            f"{MAX_RESIDUAL * 1e3:g} mm, got {distances[worst] * 1e3:.1f} mm; check where it was "
+            "touched, and whether the panel is curved"
         )
     (a, d), (b, e), (c, f) = solution.tolist()
     return TouchCalibration(((a, b, c), (d, e, f)))
 
 
 class CalibratedSource(TouchSource):
-    """A touch source in the plate's coordinates."""
+    """A touch source mapped to the coordinates of the plate."""
 
     def __init__(self, source: TouchSource, calibration: TouchCalibration) -> None:
         self._source = source
         self._calibration = calibration
 
     async def run(self, deliver: Callable[[TouchFrame], None]) -> None:
-        """Run the source and deliver its frames with every touch in its place."""
+        """Run the source and deliver its frames with mapped touches."""
         place = self._calibration.place
 
         def placed(frame: TouchFrame) -> None:
@@ -128,6 +126,6 @@ class CalibratedSource(TouchSource):
 
 
 def _reversed(row: Row) -> Row:
-    """The row of 1 - x' for the row of x'."""
+    """Return the row of 1 - x' for the row of x'."""
     a, b, c = row
     return (-a, -b, 1 - c)

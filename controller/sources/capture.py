@@ -4,8 +4,8 @@
     0.000000 2362756e646c6500...
     0.016667 2362756e646c6500...
 
-Seconds from the start and the datagram in hexadecimal; further lines that begin with # are
-comments. Datagrams are kept as they came, malformed ones too.
+Seconds from the start and the datagram in hexadecimal; further lines that start with # are
+comments. Malformed datagrams are kept as received.
 """
 
 import asyncio
@@ -20,7 +20,7 @@ from model.errors import InputError
 
 HEADER = "# era-haptics TUIO capture 1"
 _LINE = re.compile(r"(\d{1,9}(?:\.\d{1,9})?) ((?:[0-9a-f]{2})+)")
-_LARGEST_DATAGRAM = 65_507  # what fits into one UDP datagram over IPv4
+_MAX_DATAGRAM = 65_507  # bytes; UDP over IPv4
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,19 +32,19 @@ class Datagram:
 
 
 def read_capture(path: Path | str) -> list[Datagram]:
-    """Read a capture; raises InputError with file and line, and then nothing of it is used."""
+    """Read a capture; raises InputError with file and line."""
     path = Path(path)
     try:
         lines = path.read_text(encoding="ascii").splitlines()
     except UnicodeDecodeError as error:
-        raise InputError(f"{path}: not a text file, so no TUIO capture") from error
+        raise InputError(f"{path}: must be a TUIO capture, got a binary file") from error
     except OSError as error:
         raise InputError(
-            f"{path}: cannot be read ({error.strerror}); give the whole path, for a name "
-            "counts from the folder in which this was started, and look who may read it"
+            f"{path}: cannot be read ({error.strerror}); check the path, which is relative to the "
+            "working directory, and its permissions"
         ) from error
     if not lines or lines[0] != HEADER:
-        raise InputError(f"{path}, line 1: no TUIO capture; its first line must be {HEADER!r}")
+        raise InputError(f"{path}, line 1: must be {HEADER!r} for a TUIO capture")
     datagrams: list[Datagram] = []
     for number, line in enumerate(lines[1:], start=2):
         if line.startswith("#"):
@@ -52,31 +52,32 @@ def read_capture(path: Path | str) -> list[Datagram]:
         match = _LINE.fullmatch(line)
         if match is None:
             raise InputError(
-                f"{path}, line {number}: {line[:60]!r}; expected seconds, a space and the "
-                "datagram in lower-case hexadecimal"
+                f"{path}, line {number}: must be seconds, a space and the datagram in lower-case "
+                f"hexadecimal, got {line[:60]!r}"
             )
         datagram = Datagram(float(match.group(1)), bytes.fromhex(match.group(2)))
-        if len(datagram.payload) > _LARGEST_DATAGRAM:
+        if len(datagram.payload) > _MAX_DATAGRAM:
             raise InputError(
-                f"{path}, line {number}: {len(datagram.payload)} bytes do not fit into a datagram"
+                f"{path}, line {number}: datagram must have at most {_MAX_DATAGRAM} bytes, got "
+                f"{len(datagram.payload)}"
             )
         if datagrams and datagram.time < datagrams[-1].time:
-            raise InputError(f"{path}, line {number}: time runs backwards")
+            raise InputError(f"{path}, line {number}: times must not decrease")
         datagrams.append(datagram)
     if not datagrams:
-        raise InputError(f"{path}: the capture is empty")
+        raise InputError(f"{path}: capture must contain datagrams")
     return datagrams
 
 
 def write_capture(path: Path | str, datagrams: Iterable[Datagram]) -> None:
-    """Write a capture; times are kept to a microsecond. Raises InputError on an impossible one."""
+    """Write a capture, times to a microsecond; raises InputError for an invalid one."""
     lines = [HEADER]
     last = 0.0
     for datagram in datagrams:
         if not (math.isfinite(datagram.time) and datagram.time >= last and datagram.payload):
             raise InputError(
-                f"{path}: datagram {len(lines)} at {datagram.time} s: a capture holds datagrams "
-                "that are not empty, in order of time from 0 s"
+                f"{path}: datagrams must not be empty and must be in order of time from 0 s, got "
+                f"{len(datagram.payload)} bytes at {datagram.time} s as number {len(lines)}"
             )
         last = datagram.time
         lines.append(f"{datagram.time:.6f} {datagram.payload.hex()}")
@@ -84,40 +85,40 @@ def write_capture(path: Path | str, datagrams: Iterable[Datagram]) -> None:
 
 
 async def replay_capture(datagrams: Sequence[Datagram], host: str, port: int) -> None:
-    """Send datagrams to a UDP port at their own pace, on the event loop's clock.
+    """Send datagrams to a UDP port at their recorded pace, on the event loop's clock.
 
-    Raises LinkError if nobody listens there.
+    Raises LinkError if the port is closed.
     """
     loop = asyncio.get_running_loop()
     sender = _Sender()
     try:
         transport, _ = await loop.create_datagram_endpoint(lambda: sender, remote_addr=(host, port))
     except OSError as error:
-        raise _nobody_at(host, port, error) from error
+        raise _refusal(host, port, error) from error
     try:
         start = loop.time()
         for datagram in datagrams:
             await asyncio.sleep(max(0.0, start + datagram.time - loop.time()))
             if sender.refused is not None:
-                raise _nobody_at(host, port, sender.refused) from sender.refused
+                raise _refusal(host, port, sender.refused) from sender.refused
             transport.sendto(datagram.payload)
     finally:
         transport.close()
 
 
-def _nobody_at(host: str, port: int, problem: Exception) -> LinkError:
+def _refusal(host: str, port: int, problem: Exception) -> LinkError:
     return LinkError(
-        f"nobody listens on UDP {host}:{port} ({system_message(problem)}); look at the address, "
-        "and start the controller first"
+        f"cannot send to UDP {host}:{port} ({system_message(problem)}); check the address, and "
+        "start the controller first"
     )
 
 
 class _Sender(asyncio.DatagramProtocol):
-    """The UDP end of a replay; keeps the refusal that the network reported."""
+    """The UDP end of a replay; keeps an error that the network reported."""
 
     def __init__(self) -> None:
         self.refused: Exception | None = None
 
     def error_received(self, exc: Exception) -> None:
-        """Note that a datagram did not arrive."""
+        """Keep the error."""
         self.refused = exc

@@ -1,4 +1,4 @@
-"""From what touch sources say to the set of contacts on the plate, whatever they say."""
+"""The contacts on the plate, from any sequence of touch frames."""
 
 import math
 from collections import Counter
@@ -9,16 +9,16 @@ from typing import NamedTuple
 from controller.sources.touch import Touch, TouchFrame
 from model.structure.plate import Plate
 
-# A source repeats its frame every 100 ms at least; one that missed that by half is gone, and a
-# finger nobody sees must not be driven.
+# s; sources repeat their frames at least every 100 ms, and a contact that is not confirmed must not
+# be driven.
 CONTACT_TIMEOUT = 0.150
 
-# Ten fingers; more than that is a forearm, a spill or a broken panel.
+# Ten fingers; more are a forearm, a spill or a broken panel.
 MAX_CONTACTS = 10
 
 
 class ContactKey(NamedTuple):
-    """Which contact: the source that sees it, and the id that the source gave it."""
+    """Identifies a contact: its source and the id within that source."""
 
     source: str
     id: int
@@ -36,9 +36,9 @@ class Contact:
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """What a frame or a moment changed: contacts that came, moved and went, each as it is or was.
+    """Contacts that came down, moved and lifted, each as it is or was.
 
-    rejected: why touches of the frame were not taken, once per touch.
+    rejected: a reason for each touch that was not accepted.
     """
 
     down: tuple[Contact, ...] = ()
@@ -47,23 +47,23 @@ class Change:
     rejected: tuple[str, ...] = ()
 
     def __bool__(self) -> bool:
-        """Whether the set of contacts or a place in it is another now."""
+        """Whether any contact changed."""
         return bool(self.down or self.moved or self.up)
 
 
 class ContactTracker:
-    """The contacts on one plate, from any sequence of frames; depends on nothing else.
+    """The contacts on one plate; a pure function of the frames and times it is given.
 
-    x = X L and y = (1 - Y) W, since touch sensors count Y downwards. Rejected and counted are
-    touches that are not finite, off the plate (outside 0..1), there twice in a frame (the last one
-    holds) or beyond the tenth contact; a contact whose touch is rejected is lifted.
+    x = X L and y = (1 - Y) W, since touch sensors count Y downwards. Touches are rejected and
+    counted that are not finite, off the plate (outside 0..1), duplicated in a frame (the last one
+    counts) or beyond the tenth contact; a contact whose touch is rejected is lifted.
     """
 
     def __init__(self, plate: Plate) -> None:
         self.rejected: Counter[str] = Counter()
         self._plate = plate
         self._contacts: dict[ContactKey, Contact] = {}
-        self._heard: dict[str, float] = {}
+        self._last_frame: dict[str, float] = {}
 
     @property
     def contacts(self) -> tuple[Contact, ...]:
@@ -72,11 +72,11 @@ class ContactTracker:
 
     @property
     def next_expiry(self) -> float | None:
-        """When [s] the first source with contacts is overdue, if nothing is heard until then."""
-        return min(self._heard.values()) + CONTACT_TIMEOUT if self._heard else None
+        """When [s] the first source with contacts times out unless a frame of it arrives."""
+        return min(self._last_frame.values()) + CONTACT_TIMEOUT if self._last_frame else None
 
     def update(self, frame: TouchFrame) -> Change:
-        """Take over a frame: it replaces all that its source has said before."""
+        """Apply a frame, which replaces the previous one of its source."""
         rejected: list[str] = []
         places: dict[ContactKey, tuple[float, float]] = {}
         if math.isfinite(frame.time):
@@ -100,25 +100,27 @@ class ContactTracker:
             elif known != contact:
                 moved.append(contact)
         if any(key.source == frame.source for key in self._contacts):
-            self._heard[frame.source] = frame.time
+            self._last_frame[frame.source] = frame.time
         else:
-            self._heard.pop(frame.source, None)
+            self._last_frame.pop(frame.source, None)
         self.rejected.update(rejected)
         return Change(tuple(down), tuple(moved), up, tuple(rejected))
 
     def expire(self, now: float) -> Change:
-        """Lift all contacts of sources that were not heard for the lease; now [s]."""
-        for source, heard in list(self._heard.items()):
-            if heard + CONTACT_TIMEOUT <= now:  # as next_expiry puts it, to the last bit
-                del self._heard[source]
-            else:  # news from the future is news from now
-                self._heard[source] = min(heard, now)
-        return Change(up=self._lift(key for key in self._contacts if key.source not in self._heard))
+        """Lift the contacts of all sources that have timed out at now [s]."""
+        for source, received in list(self._last_frame.items()):
+            if received + CONTACT_TIMEOUT <= now:  # the sum of next_expiry, to the last bit
+                del self._last_frame[source]
+            else:  # a frame from the future counts from now
+                self._last_frame[source] = min(received, now)
+        return Change(
+            up=self._lift(key for key in self._contacts if key.source not in self._last_frame)
+        )
 
     def _places(
         self, source: str, touches: tuple[Touch, ...], rejected: list[str]
     ) -> dict[ContactKey, tuple[float, float]]:
-        """Places [m] of the touches that can be contacts."""
+        """Return the places [m] of the touches that can be contacts."""
         last = {touch.id: touch for touch in touches}
         rejected += ["twice"] * (len(touches) - len(last))
         places = {}
@@ -135,5 +137,5 @@ class ContactTracker:
         return places
 
     def _lift(self, keys: Iterable[ContactKey]) -> tuple[Contact, ...]:
-        """Forget contacts."""
+        """Remove contacts and return them."""
         return tuple(self._contacts.pop(key) for key in tuple(keys))

@@ -1,11 +1,10 @@
-"""Datagrams as they come in: all that have arrived at once, each with when it did.
+"""UDP datagrams with their times of arrival, several per turn of the event loop.
 
-An event loop's own endpoint reads one datagram in a turn, and knows only when it did so: a command
-would be decided by what is old by then, and the time that a datagram has waited would not be seen.
-Here a turn takes what is there and hands it on: a few all at once, for what came together is
-decided together, of many as much as a quarter of a millisecond allows. The system says when each
-came, where it does that (Linux). Where more come than can be handed on, the newest are what counts:
-the system would keep the oldest. Where the loop watches no sockets (Windows), its endpoint serves.
+The event loop's own endpoint reads one datagram per turn and knows only when it did so: decisions
+would use outdated touches, and waiting times would stay invisible. Here one turn reads all that has
+arrived and hands on a few at once, of many as much as a quarter of a millisecond allows. On Linux
+the kernel timestamps each. In a flood the newest are kept; the kernel would keep the oldest. Where
+the loop cannot watch sockets (Windows), its own endpoint is used.
 """
 
 import asyncio
@@ -18,17 +17,17 @@ from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from typing import NamedTuple, TypeAlias
 
-TURN = 0.00025  # s; as long as everybody else waits for a sender that floods
-MANY = 16  # that wait: more than a panel sends in a turn; now those are left out that are moot
-_MOST = 512  # that are read in a turn, and that wait; the oldest go first
+MAX_TURN = 0.00025  # s; longest delay of other tasks by a flood
+MANY = 16  # waiting datagrams: more than a panel sends per turn; superseded ones are dropped
+_MAX_WAITING = 512  # also read per turn; the oldest are dropped
 
 Peer: TypeAlias = tuple[str, int]
 Received: TypeAlias = Callable[[bytes, Peer, float], None]
-"""Told of a datagram, the host and port it came from, and when [s], by the event loop's clock."""
+"""Called with a datagram, its sender's host and port, and its arrival [s] by the loop's clock."""
 
 
 class Datagram(NamedTuple):
-    """What came, from where, and when [s]."""
+    """A datagram, its sender and its arrival [s]."""
 
     data: bytes
     peer: Peer
@@ -36,26 +35,26 @@ class Datagram(NamedTuple):
 
 
 Thin: TypeAlias = Callable[[Sequence[Datagram]], Iterable[Datagram]]
-"""Which of the datagrams that wait, in their order, are not made moot by a later one."""
+"""Returns the waiting datagrams, in order, that no later one supersedes."""
 
 _TIMESTAMPS = 35  # SO_TIMESTAMPNS and SCM_TIMESTAMPNS of Linux, which Python does not name
 _TIMESPEC = struct.Struct("@ll")
-_LOOKS, _AT_ONCE = 3, 0.00005  # s; two clocks that are read further apart are read again
-_LONGEST_WAIT = 1.0  # s; a system's clock that was set meanwhile must not make touches old
+_CLOCK_READS, _MAX_READ_TIME = 3, 0.00005  # s; clocks read further apart are read again
+_MAX_AGE = 1.0  # s; a step of the system clock must not make touches old
 
 
 class Datagrams:
     """Listens on a UDP port until it is closed; see `listen`."""
 
     def __init__(
-        self, line: socket.socket, received: Received, *, largest: int, thin: Thin
+        self, line: socket.socket, received: Received, *, max_size: int, thin: Thin
     ) -> None:
         self._line = line
         self._received = received
         self._thin = thin
-        self._waiting: deque[Datagram] = deque(maxlen=_MOST)
+        self._waiting: deque[Datagram] = deque(maxlen=_MAX_WAITING)
         self._is_due = False
-        self._most = largest + 1  # so that a larger one is known by its size
+        self._buffer_size = max_size + 1  # so that a larger one shows by its size
         self._loop = asyncio.get_running_loop()
         self._latest = self._loop.time()
         self._transport: asyncio.DatagramTransport | None = None
@@ -66,7 +65,7 @@ class Datagrams:
         return int(self._line.getsockname()[1])
 
     async def begin(self) -> None:
-        """Listen from now on."""
+        """Start to listen."""
         if sys.platform == "linux":
             with contextlib.suppress(OSError):
                 self._line.setsockopt(socket.SOL_SOCKET, _TIMESTAMPS, 1)
@@ -78,7 +77,7 @@ class Datagrams:
             )
 
     def close(self) -> None:
-        """Listen no more."""
+        """Stop to listen."""
         if self._transport is not None:
             self._transport.close()
             return
@@ -86,25 +85,25 @@ class Datagrams:
         self._line.close()
 
     def _readable(self) -> None:
-        """Take what has arrived; reading costs a tenth of what understanding does."""
+        """Read what has arrived; reading costs a tenth of decoding."""
         ahead = _ahead(self._loop.time)
-        for _ in range(_MOST):
+        for _ in range(_MAX_WAITING):
             try:
-                data, ancillary, _, peer = self._line.recvmsg(self._most, _ANCILLARY)
-            except OSError:  # there is nothing more, or what was sent from here was refused
+                data, ancillary, _, peer = self._line.recvmsg(self._buffer_size, _ANCILLARY)
+            except OSError:  # nothing more, or an ICMP error
                 break
             at = (str(peer[0]), int(peer[1]))
             self._waiting.append(Datagram(data, at, self._arrival(ancillary, ahead)))
         if len(self._waiting) > MANY:
-            self._waiting = deque(self._thin(self._waiting), maxlen=_MOST)
+            self._waiting = deque(self._thin(self._waiting), maxlen=_MAX_WAITING)
         if not self._is_due:
             self._hand_on()
 
     def _hand_on(self) -> None:
-        """Hand on what waits, of many until the turn is over; the rest follows in the next ones."""
+        """Hand on what waits, of many for one turn at a time."""
         self._is_due = False
-        end = time.perf_counter() + TURN
-        while self._waiting and self._line.fileno() >= 0:  # whoever receives may close it
+        end = time.perf_counter() + MAX_TURN
+        while self._waiting and self._line.fileno() >= 0:  # the callback may close it
             self._received(*self._waiting.popleft())
             if len(self._waiting) > MANY and time.perf_counter() >= end:
                 break
@@ -113,28 +112,28 @@ class Datagrams:
             self._loop.call_soon(self._hand_on)
 
     def _arrival(self, ancillary: list[tuple[int, int, bytes]], ahead: float) -> float:
-        """When a datagram arrived, never before the one that was read before it.
+        """Return the arrival of a datagram, never before the previous one.
 
-        ahead [s]: how far the loop's clock is before the system's.
+        ahead [s]: offset of the loop's clock to the system clock.
         """
         now = arrived = self._loop.time()
         for level, kind, content in ancillary:
             if (level, kind) == (socket.SOL_SOCKET, _TIMESTAMPS) and len(content) == _TIMESPEC.size:
                 seconds, nanoseconds = _TIMESPEC.unpack(content)
                 arrived = seconds + nanoseconds * 1e-9 + ahead
-        if not now - _LONGEST_WAIT <= arrived <= now:
+        if not now - _MAX_AGE <= arrived <= now:
             arrived = now
         self._latest = max(self._latest, arrived)
         return self._latest
 
 
 def _ahead(clock: Callable[[], float]) -> float:
-    """How far a clock is before the system's [s]; looked again where something came in between."""
+    """Return the offset [s] of a clock to the system clock."""
     ahead = 0.0
-    for _ in range(_LOOKS):
+    for _ in range(_CLOCK_READS):
         before = clock()
         ahead = before - time.time()
-        if clock() - before < _AT_ONCE:
+        if clock() - before < _MAX_READ_TIME:
             break
     return ahead
 
@@ -143,12 +142,12 @@ _ANCILLARY = 64  # bytes; room for a timestamp and its header
 
 
 async def listen(
-    host: str, port: int, received: Received, *, largest: int, thin: Thin = tuple
+    host: str, port: int, received: Received, *, max_size: int, thin: Thin = tuple
 ) -> Datagrams:
     """Listen on a host and UDP port, 0 for any that is free; raises OSError.
 
-    largest: bytes of the longest datagram; of one that is longer a byte more is handed on. thin:
-    asked what may be left out where many wait.
+    max_size: bytes of the longest datagram; longer ones are cut to one byte more. thin: drops
+    superseded datagrams where many wait.
     """
     loop = asyncio.get_running_loop()
     found = await loop.getaddrinfo(host, port, type=socket.SOCK_DGRAM)
@@ -157,7 +156,7 @@ async def listen(
     try:
         line.setblocking(False)
         line.bind(address)
-        made = Datagrams(line, received, largest=largest, thin=thin)
+        made = Datagrams(line, received, max_size=max_size, thin=thin)
         await made.begin()
     except BaseException:
         line.close()
@@ -166,12 +165,12 @@ async def listen(
 
 
 class _Endpoint(asyncio.DatagramProtocol):
-    """What stands in where the loop watches no sockets."""
+    """Endpoint for loops that cannot watch sockets."""
 
     def __init__(self, received: Received, loop: asyncio.AbstractEventLoop) -> None:
         self._received = received
         self._loop = loop
 
     def datagram_received(self, data: bytes, addr: tuple[str, int]) -> None:
-        """Hand one datagram on."""
+        """Hand a datagram on."""
         self._received(data, (addr[0], addr[1]), self._loop.time())

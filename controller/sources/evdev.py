@@ -8,46 +8,46 @@ from typing import Protocol
 from urllib.parse import parse_qsl
 
 from controller.sources.input_device import InputDevice, InputEvent
-from controller.sources.playing import REPEAT
+from controller.sources.playing import REPEAT_INTERVAL
 from controller.sources.slots import Range, SlotReader, SlotState
 from controller.sources.touch import Touch, TouchFrame, TouchSource
 from model.errors import InputError
 
-# How long [s] a panel that was pulled out is waited for, longer each time.
-_FIRST_PAUSE, _LONGEST_PAUSE = 0.5, 5.0
+# Between attempts to reopen an unplugged panel [s], doubled each time.
+_FIRST_PAUSE, _MAX_PAUSE = 0.5, 5.0
 
 _logger = logging.getLogger(__name__)
 
 
 class Panel(Protocol):
-    """What the source needs of an input device; see `InputDevice`."""
+    """The part of `InputDevice` that the source needs."""
 
     x_range: Range
     y_range: Range
 
     @property
     def current_slot(self) -> int:
-        """The slot that the next event is about."""
+        """The slot of the next event."""
 
     def fileno(self) -> int:
-        """What a selector waits for."""
+        """Return the descriptor for a selector."""
 
     def slots(self) -> dict[int, SlotState]:
-        """What every slot holds now."""
+        """Return the state of every slot."""
 
     def read(self) -> list[InputEvent]:
-        """Events that are there now."""
+        """Return the pending events."""
 
     def close(self) -> None:
-        """Let go of it."""
+        """Close the device."""
 
 
 class EvdevSource(TouchSource):
     """Follows the panel at `evdev:PATH` or `evdev:PATH?grab=yes`, such as evdev:/dev/input/event5.
 
-    While fingers rest, a panel says nothing; then the kernel is asked every 50 ms what its slots
-    hold, which also shows at once that a panel is gone. One that is pulled out is waited for.
-    Raises InputError on a URL that says something else, and when `open` or `run` finds no panel.
+    A panel is silent while fingers rest, so the kernel's slots are polled every 50 ms, which also
+    detects an unplugged panel at once. It is reopened when it is back. Raises InputError for any
+    other URL, and in `open` or `run` if there is no panel.
     """
 
     def __init__(self, url: str, *, open_panel: Callable[..., Panel] = InputDevice) -> None:
@@ -55,8 +55,8 @@ class EvdevSource(TouchSource):
         grab = dict(parse_qsl(options, keep_blank_values=True))
         if not url.startswith("evdev:") or not path or grab not in ({}, {"grab": "yes"}):
             raise InputError(
-                f"touch source {url}: expected evdev:PATH of an input device, and ?grab=yes to "
-                "keep its touches from other programs, such as evdev:/dev/input/event5?grab=yes"
+                "touch source must be evdev:PATH of an input device, or evdev:PATH?grab=yes to "
+                f"keep its touches from other programs, got {url}"
             )
         self._name = f"evdev:{path}"
         self._path = path
@@ -65,7 +65,7 @@ class EvdevSource(TouchSource):
         self._panel: Panel | None = None
 
     async def open(self) -> None:
-        """Open the device, unless it is; `run` does it by itself. Raises InputError."""
+        """Open the device if it is not open; `run` does so too. Raises InputError."""
         if self._panel is None:
             self._panel = self._open(self._path, grab=self._grab)
 
@@ -82,20 +82,20 @@ class EvdevSource(TouchSource):
                     if error.errno != errno.ENODEV:
                         raise
                     self._deliver(deliver, ())
-                    _logger.warning("%s is gone, its touches are lifted", self._name)
+                    _logger.warning("%s: unplugged, lifting its touches", self._name)
                 finally:
                     self._panel.close()
                     self._panel = None
             await asyncio.sleep(pause)
-            pause = min(2 * pause, _LONGEST_PAUSE)
+            pause = min(2 * pause, _MAX_PAUSE)
             try:
                 self._panel = self._open(self._path, grab=self._grab)
             except InputError:
                 continue  # not plugged in again yet
-            _logger.warning("%s is there again", self._name)
+            _logger.warning("%s: reconnected", self._name)
 
     async def _follow(self, panel: Panel, deliver: Callable[[TouchFrame], None]) -> None:
-        """Deliver what a panel says until it is gone; raises OSError then."""
+        """Deliver the frames of a panel until it is unplugged; raises OSError then."""
         loop = asyncio.get_running_loop()
         reader = SlotReader(panel.x_range, panel.y_range)
         reader.adopt(panel.slots(), current=panel.current_slot)
@@ -105,7 +105,7 @@ class EvdevSource(TouchSource):
         try:
             while True:
                 try:
-                    async with asyncio.timeout(REPEAT if reader.touches else None):
+                    async with asyncio.timeout(REPEAT_INTERVAL if reader.touches else None):
                         await readable.wait()
                 except TimeoutError:
                     reader.adopt(panel.slots(), current=panel.current_slot)

@@ -31,7 +31,7 @@ _OTHER = re.compile(r"[A-Z]: .*|#.*|\s*")
 
 @dataclass(frozen=True)
 class _Event:
-    """One event: when [s] on the recording's clock, and on which line it stands."""
+    """One event with its line, and its time [s] by the clock of the recording."""
 
     line: int
     time: float
@@ -43,16 +43,16 @@ class _Event:
 def read_evemu(path: Path | str) -> list[TouchFrame]:
     """Read a recording as one frame per report of the panel, times from 0 s at its first event.
 
-    Axis ranges come from the recording's own header or, where it has none, from the .desc beside
-    it. Contacts that were down before the recording began have negative ids; a contact that came
-    and went within one report gets a frame of its own at the same time; after lost events
-    (SYN_DROPPED) every contact counts as lifted. Raises InputError with file and line.
+    Axis ranges come from the header of the recording, else from the .desc file beside it. Contacts
+    that were down before it started have negative ids; a contact that comes and goes within one
+    report gets a frame of its own at the same time; lost events (SYN_DROPPED) lift every contact.
+    Raises InputError with file and line.
     """
     path = Path(path)
     header, events = _parse(path)
     for description in (path.with_suffix(".desc"), path.with_suffix("").with_suffix(".desc")):
         if description != path and description.is_file():
-            # Its values are those of another moment than the recording's first.
+            # Its values are not those at the start of the recording.
             ranges = {
                 key: limit for key, limit in _parse(description)[0].items() if key[1] != "Value"
             }
@@ -64,12 +64,12 @@ def read_evemu(path: Path | str) -> list[TouchFrame]:
     )
     frames = _frames(path, events, reader)
     if not frames:
-        raise InputError(f"{path}: no touch report in it; expected an evemu recording of a panel")
+        raise InputError(f"{path}: must be an evemu recording with touch reports; record it again")
     return frames
 
 
 def _frames(path: Path, events: list[_Event], reader: SlotReader) -> list[TouchFrame]:
-    """Frames of a recording's events."""
+    """Convert the events of a recording to frames."""
     frames: list[TouchFrame] = []
     for event in events:
         try:
@@ -83,7 +83,7 @@ def _frames(path: Path, events: list[_Event], reader: SlotReader) -> list[TouchF
 
 
 def _parse(path: Path) -> tuple[dict[tuple[int, str], int], list[_Event]]:
-    """What the header says of an axis (its code, and Value, Min or Max) and all events."""
+    """Return the header (axis code and Value, Min or Max) and all events."""
     header: dict[tuple[int, str], int] = {}
     events: list[_Event] = []
     code: int | None = None
@@ -92,12 +92,12 @@ def _parse(path: Path) -> tuple[dict[tuple[int, str], int], list[_Event]]:
             time, kind, event_code, value = match.group(1, 2, 3, 4)
             event = _Event(number, float(time), int(kind, 16), int(event_code, 16), int(value))
             if events and event.time < events[-1].time:
-                raise InputError(f"{path}, line {number}: time runs backwards")
+                raise InputError(f"{path}, line {number}: times must not decrease")
             events.append(event)
         elif line.startswith("E:"):
             raise InputError(
-                f"{path}, line {number}: not an event: {line[:60]!r}; "
-                "expected `E: seconds.micros type code value`"
+                f"{path}, line {number}: event must be `E: seconds.micros type code value`, got "
+                f"{line[:60]!r}"
             )
         elif match := _AXIS.fullmatch(line):
             axis = int(match.group(1), 16)
@@ -109,52 +109,54 @@ def _parse(path: Path) -> tuple[dict[tuple[int, str], int], list[_Event]]:
             header[code, match.group(1)] = int(match.group(2))
         elif not _OTHER.fullmatch(line):
             raise InputError(
-                f"{path}, line {number}: {line[:60]!r} does not belong in an evemu recording"
+                f"{path}, line {number}: must be a line of an evemu recording, got {line[:60]!r}"
             )
     return header, events
 
 
 def _lines(path: Path) -> Iterator[tuple[int, str]]:
-    """Numbered lines of a text file."""
+    """Yield the numbered lines of a text file."""
     try:
         with path.open(encoding="utf-8") as file:
             for number, line in enumerate(file, start=1):
                 yield number, line.rstrip("\r\n")
     except UnicodeDecodeError as error:
-        raise InputError(f"{path}: not a text file, so no evemu recording") from error
+        raise InputError(f"{path}: must be an evemu recording, got a binary file") from error
     except OSError as error:
         raise InputError(
-            f"{path}: cannot be read ({error.strerror}); give the whole path, for a name "
-            "counts from the folder in which this was started, and look who may read it"
+            f"{path}: cannot be read ({error.strerror}); check the path, which is relative to the "
+            "working directory, and its permissions"
         ) from error
 
 
 def _axis(path: Path, header: dict[tuple[int, str], int], code: int, name: str) -> tuple[int, int]:
-    """The range of an axis; raises InputError if the header does not say it."""
+    """Return the range of an axis; raises InputError if the header lacks it."""
     try:
         low, high = header[code, "Min"], header[code, "Max"]
     except KeyError as error:
         raise InputError(
-            f"{path}: the range of {name} is not in its header, nor in a .desc file beside it; "
-            "record with evemu-record, which writes it, or put the device's .desc there"
+            f"{path}: range of {name} is missing in the header and in a .desc file beside it; "
+            "record with evemu-record, which writes it, or add the .desc file of the device"
         ) from error
     if low >= high:
-        raise InputError(f"{path}: the range of {name} is {low} to {high}, which is none")
+        raise InputError(
+            f"{path}: minimum of {name} must be below its maximum, got {low} and {high}"
+        )
     return low, high
 
 
 class EvemuSource(TouchSource):
-    """Replays the recording at `evemu:PATH` at its own pace, on the event loop's clock.
+    """Replays the recording at `evemu:PATH` at its pace, on the event loop's clock.
 
-    Ends with the recording; contacts that it leaves down are lifted then. Raises InputError.
+    Ends with the recording and lifts the remaining contacts. Raises InputError.
     """
 
     def __init__(self, url: str) -> None:
         path = url.removeprefix("evemu:")
         if path == url or not path:
-            raise InputError(f"touch source {url}: expected evemu:PATH of a recording (.events)")
+            raise InputError(f"touch source must be evemu:PATH of a recording (.events), got {url}")
         self.frames = read_evemu(path)
 
     async def run(self, deliver: Callable[[TouchFrame], None]) -> None:
-        """Deliver the recording's frames, each again every 50 ms while it has touches."""
+        """Deliver the frames of the recording at its pace."""
         await play(self.frames, deliver)

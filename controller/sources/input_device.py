@@ -1,4 +1,4 @@
-"""A touch panel as the Linux kernel shows it: an input device that reports slots.
+"""A touch panel as an input device of Linux that reports slots.
 
 Requests and structures are those of the kernel's include/uapi/linux/input.h, with the layout of
 request numbers that x86, Arm and RISC-V share (asm-generic/ioctl.h).
@@ -34,16 +34,16 @@ def _request(direction: int, number: int, size: int) -> int:
 
 
 def get_axis(axis: int) -> int:
-    """EVIOCGABS: range and value of an axis."""
+    """Return the request EVIOCGABS: range and value of an axis."""
     return _request(_READ, 0x40 + axis, _AXIS.size)
 
 
 def get_slots(size: int) -> int:
-    """EVIOCGMTSLOTS: an axis' code in, its value in every slot out, in a buffer of a size."""
+    """Return the request EVIOCGMTSLOTS: an axis in every slot, for a buffer of a size."""
     return _request(_READ, 0x0A, size)
 
 
-GRAB = _request(_WRITE, 0x90, _INT.size)  # EVIOCGRAB: from now on nobody else hears of it
+GRAB = _request(_WRITE, 0x90, _INT.size)  # EVIOCGRAB: exclusive access
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class InputEvent:
 
 
 def parse_events(data: bytes) -> Iterator[InputEvent]:
-    """The whole events in what was read of a device; the kernel never splits one."""
+    """Yield the complete events in data read from a device; the kernel never splits one."""
     whole = len(data) // _EVENT.size * _EVENT.size
     for _, _, kind, code, value in _EVENT.iter_unpack(data[:whole]):
         yield InputEvent(kind, code, value)
@@ -65,8 +65,8 @@ def parse_events(data: bytes) -> Iterator[InputEvent]:
 class InputDevice:
     """An open panel at a path such as /dev/input/event5 or one under /dev/input/by-id.
 
-    grab: keep its touches from every other program, such as a desktop that would click by them.
-    Raises InputError where it cannot be opened or is no panel of type B.
+    grab: keep its touches from other programs, such as a desktop. Raises InputError if it cannot be
+    opened or is no panel of type B.
     """
 
     def __init__(self, path: str, *, grab: bool = False) -> None:
@@ -85,28 +85,28 @@ class InputDevice:
             self.close()
             if error.errno == errno.EBUSY:
                 raise InputError(
-                    f"touch source {path}: another program has grabbed this panel; stop that one "
-                    f"(`sudo fuser -v {path}` tells which)"
+                    f"touch source {path}: grabbed by another program; stop that one "
+                    f"(`sudo fuser -v {path}` names it)"
                 ) from error
             raise InputError(
-                f"touch source {path}: no touch panel that reports slots ({error.strerror}); "
-                "`libinput list-devices` or `evtest` tell which devices there are"
+                f"touch source {path}: must be a touch panel that reports slots "
+                f"({error.strerror}); `libinput list-devices` or `evtest` list the devices"
             ) from error
         except InputError:
             self.close()
             raise
 
     def fileno(self) -> int:
-        """What a selector waits for."""
+        """Return the descriptor for a selector."""
         return self._descriptor
 
     @property
     def current_slot(self) -> int:
-        """The slot that the next event is about; raises OSError when the device is gone."""
+        """The slot of the next event; raises OSError if the device is unplugged."""
         return self._axis(ABS_MT_SLOT)[0]
 
     def slots(self) -> dict[int, SlotState]:
-        """What every slot holds now; raises OSError when the device is gone."""
+        """Return the state of every slot; raises OSError if the device is unplugged."""
         ids, xs, ys = (
             self._of_slots(axis)
             for axis in (ABS_MT_TRACKING_ID, ABS_MT_POSITION_X, ABS_MT_POSITION_Y)
@@ -114,7 +114,7 @@ class InputDevice:
         return {slot: SlotState(*state) for slot, state in enumerate(zip(ids, xs, ys, strict=True))}
 
     def read(self) -> list[InputEvent]:
-        """Events that are there now, none if there are none; raises OSError when it is gone."""
+        """Return the pending events; raises OSError if the device is unplugged."""
         try:
             data = os.read(self._descriptor, _EVENT.size * _EVENTS_AT_ONCE)
         except BlockingIOError:
@@ -124,27 +124,27 @@ class InputDevice:
         return list(parse_events(data))
 
     def close(self) -> None:
-        """Let go of it."""
+        """Close the device."""
         os.close(self._descriptor)
 
     def _axis(self, axis: int) -> tuple[int, int, int]:
-        """Value, minimum and maximum of an axis."""
+        """Return value, minimum and maximum of an axis."""
         raw = fcntl.ioctl(self._descriptor, get_axis(axis), bytes(_AXIS.size))
         value, low, high, *_ = _AXIS.unpack(raw)
         return value, low, high
 
     def _range(self, axis: int) -> Range:
-        """The range of an axis; raises InputError if it has none."""
+        """Return the range of an axis; raises InputError if it is empty."""
         _, low, high = self._axis(axis)
         if low >= high:
             raise InputError(
-                f"touch source {self.path}: axis {axis:#x} ranges from {low} to {high}, which is "
-                "no range: this is no touch panel that reports slots (multi-touch type B)"
+                f"touch source {self.path}: minimum of axis {axis:#x} must be below its maximum, "
+                f"got {low} and {high}; choose a panel that reports slots (multi-touch type B)"
             )
         return low, high
 
     def _of_slots(self, axis: int) -> tuple[int, ...]:
-        """The value of an axis in every slot."""
+        """Return the value of an axis in every slot."""
         layout = struct.Struct(f"{1 + self._slot_count}i")
         question = layout.pack(axis, *([0] * self._slot_count))
         _, *values = layout.unpack(fcntl.ioctl(self._descriptor, get_slots(layout.size), question))
@@ -152,12 +152,12 @@ class InputDevice:
 
 
 def _advice(error: OSError, path: str) -> str:
-    """Why it cannot be opened, and what to do."""
+    """Return why a device cannot be opened, and the remedy."""
     if error.errno == errno.EACCES:
         return (
-            "you may not read it; add yourself to the group of the device (most often "
+            "no permission to read; add yourself to the group of the device (usually "
             "`sudo usermod -aG input $USER`, then log in again) or install a udev rule"
         )
     if error.errno == errno.ENOENT:
-        return "there is no such device; `ls -l /dev/input/by-id` shows those that are plugged in"
+        return "no such device; `ls -l /dev/input/by-id` lists those that are plugged in"
     return f"{path} cannot be opened: {error.strerror}"

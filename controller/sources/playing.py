@@ -1,4 +1,4 @@
-"""Recorded touch frames, delivered again at their own pace."""
+"""Playback of recorded touch frames at their recorded pace."""
 
 import asyncio
 from collections.abc import Callable, Sequence
@@ -6,28 +6,28 @@ from dataclasses import replace
 
 from controller.sources.touch import TouchFrame
 
-# A panel at rest says nothing, but a contact without news counts as lifted.
-REPEAT = 0.05
+# s; a panel at rest is silent, but contacts time out without frames.
+REPEAT_INTERVAL = 0.05
 
 
 async def play(
     frames: Sequence[TouchFrame], deliver: Callable[[TouchFrame], None], *, speed: float = 1.0
 ) -> None:
-    """Deliver frames, times counted from 0 s, on the event loop's clock; at least one.
+    """Deliver frames, of which there is at least one, times from 0 s, on the event loop's clock.
 
-    Each comes again every 50 ms while it has touches; what is down in the end is lifted 50 ms
-    later. speed: how many times as fast as they were recorded.
+    A frame with touches is repeated every 50 ms; remaining touches are lifted 50 ms after the last
+    frame. speed: relative to the recording.
     """
     loop = asyncio.get_running_loop()
     start = loop.time()
     last: dict[str, TouchFrame] = {frame.source: frame for frame in frames}
-    end = max(frame.time for frame in frames) + REPEAT * speed
+    end = max(frame.time for frame in frames) + REPEAT_INTERVAL * speed
     lifted = [replace(frame, time=end, touches=()) for frame in last.values() if frame.touches]
     current: dict[str, TouchFrame] = {}
     for frame in (*frames, *lifted):
         due = start + frame.time / speed
-        while current and loop.time() + REPEAT < due:
-            await asyncio.sleep(REPEAT)
+        while current and loop.time() + REPEAT_INTERVAL < due:
+            await asyncio.sleep(REPEAT_INTERVAL)
             for held in current.values():
                 deliver(replace(held, time=loop.time()))
         await asyncio.sleep(max(0.0, due - loop.time()))

@@ -1,4 +1,4 @@
-"""Touch sources by the scheme of their URL, our own and those of installed plug-ins alike."""
+"""Touch sources by the scheme of their URL: built in or from installed plug-ins."""
 
 from collections.abc import Callable
 
@@ -17,8 +17,8 @@ _SOURCES: PluginRegistry[Callable[[str], TouchSource]] = PluginRegistry(
 
 
 def open_source(url: str) -> TouchSource:
-    """Make the touch source of a URL such as `tuio:127.0.0.1:3333` or `evemu:taps.events`.
+    """Create the touch source of a URL such as `tuio:127.0.0.1:3333` or `evemu:taps.events`.
 
-    Raises InputError on an unknown scheme, a plug-in that does not work or a URL that it refuses.
+    Raises InputError for an unknown scheme, a failing plug-in or a URL that it refuses.
     """
     return _SOURCES.make(url)

@@ -1,4 +1,4 @@
-"""Recorded TUIO streams as a touch source: a capture is read as its datagrams would be."""
+"""TUIO captures as a touch source."""
 
 import logging
 import math
@@ -17,16 +17,16 @@ _logger = logging.getLogger(__name__)
 
 
 class ReplaySource(TouchSource):
-    """Replays the TUIO capture at `replay:PATH` or, at another pace, `replay:PATH?speed=2`.
+    """Replays the TUIO capture at `replay:PATH`, or at another pace by `replay:PATH?speed=2`.
 
-    Ends with the capture; contacts that it leaves down are lifted then. Raises InputError where
-    there is no capture or no datagram of it says anything.
+    Ends with the capture and lifts the remaining contacts. Raises InputError for a file that is no
+    capture or contains no touches.
     """
 
     def __init__(self, url: str) -> None:
         path, _, options = url.removeprefix("replay:").partition("?")
         if not url.startswith("replay:") or not path:
-            raise InputError(f"touch source {url}: expected replay:PATH of a TUIO capture")
+            raise InputError(f"touch source must be replay:PATH of a TUIO capture, got {url}")
         self._speed = _speed(url, options)
         reader = TuioReader(RejectCounter(_logger))
         frames = [
@@ -35,15 +35,15 @@ class ReplaySource(TouchSource):
         ]
         self.frames = [frame for frame in frames if frame is not None]
         if not self.frames:
-            raise InputError(f"touch source {url}: no datagram of this capture tells of touches")
+            raise InputError(f"touch source {url}: capture must contain touches; record it again")
 
     async def run(self, deliver: Callable[[TouchFrame], None]) -> None:
-        """Deliver the capture's frames, each again every 50 ms while it has touches."""
+        """Deliver the frames of the capture at its pace."""
         await play(self.frames, deliver, speed=self._speed)
 
 
 def _speed(url: str, options: str) -> float:
-    """The pace that a URL asks for; raises InputError."""
+    """Return the speed option of a URL; raises InputError."""
     asked = dict(parse_qsl(options, keep_blank_values=True))
     try:
         speed = float(asked.pop("speed", "1"))
@@ -51,7 +51,6 @@ def _speed(url: str, options: str) -> float:
         speed = math.nan
     if asked or not 0.01 <= speed <= 100:
         raise InputError(
-            f"touch source {url}: expected nothing after the path but ?speed=N with N from 0.01 "
-            "to 100, such as ?speed=2 for twice as fast"
+            f"touch source {url}: options must be ?speed=N with N from 0.01 to 100, got ?{options}"
         )
     return speed

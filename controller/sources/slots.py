@@ -1,6 +1,6 @@
-"""Multi-touch protocol type B: which fingers are in which slots of a Linux touch panel.
+"""Multi-touch protocol type B: the contacts in the slots of a Linux touch panel.
 
-What the events mean is in the Linux kernel's Documentation/input/multi-touch-protocol.rst; the
+Events are described in the Linux kernel's Documentation/input/multi-touch-protocol.rst; the
 numbers are those of its input-event-codes.h.
 """
 
@@ -18,16 +18,16 @@ Range: TypeAlias = tuple[int, int]  # lowest and highest value of an axis
 
 
 class EventError(ValueError):
-    """An event that no panel of type B sends."""
+    """An event that is not of a panel of type B."""
 
 
 @dataclass(frozen=True)
 class Report:
-    """What a panel said until its SYN_REPORT.
+    """What a panel reported up to a SYN_REPORT.
 
-    states: all its touches, once for each state within the report; a contact that comes and goes
-    within it, or gives way to another in its slot, is seen so. is_partial: events were lost before
-    it, so that no contact is known any more.
+    states: all its touches, for each state within the report, so that a contact is seen that comes
+    and goes within it or is replaced in its slot. is_partial: events were lost before it, so that
+    all contacts are unknown.
     """
 
     states: tuple[tuple[Touch, ...], ...]
@@ -36,7 +36,7 @@ class Report:
 
 @dataclass(frozen=True)
 class SlotState:
-    """What the kernel itself says of a slot: the tracking id, below zero without a contact."""
+    """The kernel's state of a slot; tracking_id is negative without a contact."""
 
     tracking_id: int
     x: int
@@ -45,14 +45,14 @@ class SlotState:
 
 @dataclass
 class _Slot:
-    """What the events have said of one slot; None where they have not.
+    """The state of one slot; x and y are None until reported.
 
-    contact: the touch's id, None without a contact. certain: whether a tracking id said so; a
-    slot that moves without one has had its contact since before the first event.
+    contact: id of the touch, None without a contact. is_certain: whether a tracking id was
+    reported; a slot that moves without one has had its contact since before the first event.
     """
 
     contact: int | None = None
-    certain: bool = False
+    is_certain: bool = False
     x: float | None = None
     y: float | None = None
 
@@ -60,9 +60,9 @@ class _Slot:
 class SlotReader:
     """Events in, reports out; no device, no clock.
 
-    A contact appears when both its coordinates are known. What a slot still knows of its last
-    contact holds for the next one, since the kernel leaves out values that did not change.
-    Contacts that were down before the first event have negative ids.
+    A contact appears once both its coordinates are known. A slot keeps the coordinates of its last
+    contact, since the kernel omits values that did not change. Contacts that were down before the
+    first event have negative ids.
     """
 
     def __init__(self, x_range: Range, y_range: Range, *, first_slot: int = 0) -> None:
@@ -70,14 +70,14 @@ class SlotReader:
         self._y_range = y_range
         self._slots: dict[int, _Slot] = {}
         self._current = first_slot
-        self._nameless = 0
-        self._pending: list[tuple[Touch, ...]] = []  # states of this report that would go unseen
-        self._retold: set[int] = set()  # slots whose contact has changed within this report
+        self._anonymous = 0
+        self._pending: list[tuple[Touch, ...]] = []  # intermediate states of this report
+        self._changed: set[int] = set()  # slots whose contact has changed within this report
         self._dropped = False
 
     @property
     def touches(self) -> tuple[Touch, ...]:
-        """All contacts whose place is known, by slot."""
+        """All contacts with known coordinates, by slot."""
         return tuple(
             Touch(slot.contact, slot.x, slot.y)
             for _, slot in sorted(self._slots.items())
@@ -85,16 +85,16 @@ class SlotReader:
         )
 
     def take(self, kind: int, code: int, value: int) -> Report | None:
-        """Follow one event (EV_..., its code and value); the report that it ends, or None.
+        """Process one event (EV_..., code and value); return the report that it completes, or None.
 
-        Raises EventError on events of type A and on a slot below zero.
+        Raises EventError for events of type A and negative slots.
         """
         if kind == EV_ABS:
             self._take_axis(code, value)
         elif kind == EV_SYN and code == SYN_MT_REPORT:
             raise EventError(
-                "multi-touch protocol type A (SYN_MT_REPORT); "
-                "only panels that report slots (type B) can be read"
+                "multi-touch protocol must be type B (slots), got type A (SYN_MT_REPORT); use "
+                "another panel"
             )
         elif kind == EV_SYN and code == SYN_DROPPED:
             self._dropped = True
@@ -103,12 +103,12 @@ class SlotReader:
         return None
 
     def adopt(self, slots: Mapping[int, SlotState], *, current: int) -> None:
-        """Begin anew from what the kernel says of every slot, and which one comes next."""
+        """Replace all state by the kernel's, with the slot of the next event."""
         self._current = current
         self._slots = {
             number: _Slot(
                 contact=state.tracking_id if state.tracking_id >= 0 else None,
-                certain=True,
+                is_certain=True,
                 x=_share(state.x, self._x_range),
                 y=_share(state.y, self._y_range),
             )
@@ -116,30 +116,30 @@ class SlotReader:
         }
 
     def _report(self) -> Report:
-        """The report that ends now."""
-        if self._dropped:  # what came since is a part of a report
+        """Complete the current report."""
+        if self._dropped:  # the events since then are incomplete
             self._slots.clear()
         report = Report((*self._pending, self.touches), is_partial=self._dropped)
-        self._pending, self._retold, self._dropped = [], set(), False
+        self._pending, self._changed, self._dropped = [], set(), False
         return report
 
     def _take_axis(self, code: int, value: int) -> None:
-        """Follow one EV_ABS event."""
+        """Process one EV_ABS event."""
         slot = self._slots.setdefault(self._current, _Slot())
         if code == ABS_MT_SLOT:
             if value < 0:
-                raise EventError(f"slot {value} is below zero")
+                raise EventError(f"slot must not be negative, got {value}")
             self._current = value
         elif code == ABS_MT_TRACKING_ID:
-            if self._current in self._retold and not self._dropped:
+            if self._current in self._changed and not self._dropped:
                 self._pending.append(self.touches)
-            self._retold.add(self._current)
+            self._changed.add(self._current)
             slot.contact = value if value >= 0 else None
-            slot.certain = True
+            slot.is_certain = True
         elif code in (ABS_MT_POSITION_X, ABS_MT_POSITION_Y):
-            if slot.contact is None and not slot.certain:
-                self._nameless += 1
-                slot.contact = -self._nameless  # tracking ids are never negative
+            if slot.contact is None and not slot.is_certain:
+                self._anonymous += 1
+                slot.contact = -self._anonymous  # tracking ids are never negative
             if code == ABS_MT_POSITION_X:
                 slot.x = _share(value, self._x_range)
             else:
@@ -147,6 +147,6 @@ class SlotReader:
 
 
 def _share(value: int, limits: Range) -> float:
-    """Where a value lies in its axis' range, 0..1 within it."""
+    """Return a value relative to the range of its axis, 0..1 within it."""
     low, high = limits
     return (value - low) / (high - low)

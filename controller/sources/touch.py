@@ -1,4 +1,4 @@
-"""What every touch source delivers: all touches that it sees, at one moment."""
+"""Interface of touch sources: frames of all touches at one moment."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class Touch:
-    """One finger as its source sees it.
+    """One finger as reported by its source.
 
-    id: the source's own, constant from down to up; x, y: 0..1 across the sensor, origin at the top
-    left corner, y downwards (TUIO's and most panels' convention). Not checked: may be NaN.
+    id: constant from down to up; x, y: 0..1 across the sensor from its top left corner, y downwards
+    (the convention of TUIO and most panels). Not validated: may be NaN.
     """
 
     id: int
@@ -20,9 +20,9 @@ class Touch:
 
 @dataclass(frozen=True, slots=True)
 class TouchFrame:
-    """All touches a source sees at a moment; a touch that is no longer in it has been lifted.
+    """All touches of a source at one moment; a touch missing from it has been lifted.
 
-    time: when the news arrived, by the event loop's clock [s].
+    time: of arrival, by the event loop's clock [s].
     """
 
     source: str
@@ -31,11 +31,11 @@ class TouchFrame:
 
 
 class TouchSource(ABC):
-    """Where touches come from; a source repeats its frame at least every 100 ms while touched."""
+    """Source of touch frames, repeated at least every 100 ms while there are touches."""
 
     @abstractmethod
     async def run(self, deliver: Callable[[TouchFrame], None]) -> None:
         """Deliver frames until cancelled or, for a recording, until its end.
 
-        Malformed input is counted and logged, never raised.
+        Malformed input must be counted and logged, not raised.
         """

@@ -1,8 +1,8 @@
 """TUIO 1.1 cursors (/tuio/2Dcur) over UDP: what touch tables and their simulators send.
 
-A bundle says who sends (source), which session ids are down (alive), where those are that changed
-(set) and its number (fseq); see tuio.org, "TUIO 1.1 Protocol Specification". A bundle counts as a
-whole or, if anything in it is malformed, not at all.
+A bundle has the name of its sender (source), the session ids that are down (alive), the positions
+of those that changed (set) and a sequence number (fseq); see tuio.org, "TUIO 1.1 Protocol
+Specification". A bundle with any malformed message is ignored as a whole.
 """
 
 import asyncio
@@ -25,12 +25,12 @@ DEFAULT_HOST = "127.0.0.1"
 DEFAULT_PORT = 3333  # registered for TUIO
 
 # Room for some 140 cursors; senders keep below 4 KiB so that a datagram is not fragmented.
-_LARGEST_DATAGRAM = 8 * 1024
-_LONGEST_NAME = 100
-_MOST_SENDERS = 16
+_MAX_DATAGRAM = 8 * 1024
+_MAX_NAME = 100
+_MAX_SENDERS = 16
 _SOURCE = b"source\0\0"  # as OSC writes that text
-# The reference client takes a number that fell by more than 100 for a sender that began anew. One
-# that began anew within its first 100 frames is known by the pause: reordering is never this late.
+# Like the reference client, a sequence number that falls by more than 100 is a restarted sender. A
+# restart within the first 100 frames shows by the pause: reordered frames are never this late.
 _LATE_FRAMES = 100
 _LATE_SECONDS = 0.5
 
@@ -39,7 +39,7 @@ _logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class _Bundle:
-    """What one bundle says; None where it does not say it."""
+    """The messages of one bundle; None where missing."""
 
     source: str | None = None
     alive: tuple[int, ...] | None = None
@@ -49,11 +49,11 @@ class _Bundle:
 
 @dataclass
 class _Sender:
-    """What one sender has said so far."""
+    """The state of one sender."""
 
-    heard: float
+    last_heard: float
     sequence: int = 0
-    numbered: float = -math.inf  # when that sequence number came
+    numbered: float = -math.inf  # when that sequence number arrived
     alive: tuple[int, ...] = ()
     positions: dict[int, tuple[float, float]] = field(default_factory=dict)
 
@@ -61,29 +61,29 @@ class _Sender:
 class TuioReader:
     """Datagrams in, touch frames out; no socket, no clock.
 
-    Several senders are kept apart: by the name in their source message and their host, or without
-    one by host and port. Nothing is ever raised: what cannot be used is counted in `tally`.
+    Senders are distinguished by the name in their source message and their host, or without a name
+    by host and port. Never raises: unusable datagrams are counted in `rejects`.
     """
 
-    def __init__(self, tally: RejectCounter) -> None:
-        self.tally = tally
+    def __init__(self, rejects: RejectCounter) -> None:
+        self.rejects = rejects
         self._senders: dict[str, _Sender] = {}
 
     def read(self, datagram: bytes, peer: tuple[str, int], *, now: float) -> TouchFrame | None:
-        """The frame that a datagram of a peer completes at time now [s], or None.
+        """Return the frame that a datagram completes at now [s], or None.
 
-        A cursor that is alive but was never set is left out; positions may be NaN.
+        A cursor that is alive but was never set is omitted; positions may be NaN.
         """
-        if len(datagram) > _LARGEST_DATAGRAM:
-            self.tally.count("oversized", f"{len(datagram)} bytes from {peer[0]}:{peer[1]}")
+        if len(datagram) > _MAX_DATAGRAM:
+            self.rejects.count("oversized", f"{len(datagram)} bytes from {peer[0]}:{peer[1]}")
             return None
         try:
             bundle = _read_bundle(datagram)
         except OscError as error:
-            self.tally.count("malformed", f"datagram from {peer[0]}:{peer[1]}: {error}")
+            self.rejects.count("malformed", f"datagram from {peer[0]}:{peer[1]}: {error}")
             return None
         if bundle == _Bundle(source=bundle.source):
-            return None  # other TUIO profiles, or a bundle that says nothing
+            return None  # another TUIO profile, or an empty bundle
         name = f"tuio:{peer[0]}:{peer[1]}"
         if bundle.source is not None:
             name = f"tuio:{peer[0]}/{bundle.source}"
@@ -92,8 +92,8 @@ class TuioReader:
             return None
         for x, y in bundle.positions.values():
             if not (math.isfinite(x) and math.isfinite(y)):
-                self.tally.count("not_finite", f"{name} sent a cursor at ({x}, {y})")
-        sender.heard = now
+                self.rejects.count("not_finite", f"{name} sent a cursor at ({x}, {y})")
+        sender.last_heard = now
         if bundle.alive is not None:
             sender.alive = tuple(dict.fromkeys(bundle.alive))
         known = sender.positions | bundle.positions
@@ -102,19 +102,19 @@ class TuioReader:
         return TouchFrame(name, now, touches)
 
     def _sender(self, name: str, now: float) -> _Sender | None:
-        """The state of a sender, a new one if it is unknown, None if there are too many."""
+        """Return the state of a sender, a new one if it is unknown, None if there are too many."""
         if name not in self._senders:
-            if len(self._senders) >= _MOST_SENDERS:
-                oldest = min(self._senders, key=lambda known: self._senders[known].heard)
-                if now - self._senders[oldest].heard < _LATE_SECONDS:
-                    self.tally.count("too_many_senders", f"{name} is not listened to")
+            if len(self._senders) >= _MAX_SENDERS:
+                oldest = min(self._senders, key=lambda known: self._senders[known].last_heard)
+                if now - self._senders[oldest].last_heard < _LATE_SECONDS:
+                    self.rejects.count("too_many_senders", f"{name} is ignored")
                     return None
                 del self._senders[oldest]
-            self._senders[name] = _Sender(heard=now)
+            self._senders[name] = _Sender(last_heard=now)
         return self._senders[name]
 
     def _is_late(self, sequence: int | None, sender: _Sender, name: str, *, now: float) -> bool:
-        """Whether a frame was overtaken by a newer one; notes the number of one that was not.
+        """Whether a newer frame has arrived before; stores the number otherwise.
 
         Bundles without a number and redundant ones (-1) are never late; a frame split over
         several bundles repeats its number.
@@ -124,9 +124,9 @@ class TuioReader:
         behind = sender.sequence - sequence
         if behind > 0:
             if behind <= _LATE_FRAMES and now - sender.numbered < _LATE_SECONDS:
-                self.tally.count("late", f"frame {sequence} of {name} after {sender.sequence}")
+                self.rejects.count("late", f"frame {sequence} of {name} after {sender.sequence}")
                 return True
-            sender.alive, sender.positions = (), {}  # a sender that began anew
+            sender.alive, sender.positions = (), {}  # a restarted sender
         sender.sequence, sender.numbered = sequence, now
         return False
 
@@ -139,7 +139,7 @@ def _read_bundle(datagram: bytes) -> _Bundle:
     sequence: int | None = None
     for arguments in osc_messages(datagram, address=ADDRESS):
         match arguments:
-            case ("source", str(name)) if len(name) <= _LONGEST_NAME:
+            case ("source", str(name)) if len(name) <= _MAX_NAME:
                 source = name
             case ("alive", *ids) if all(isinstance(id, int) for id in ids):
                 alive = tuple(int(id) for id in ids)
@@ -148,36 +148,36 @@ def _read_bundle(datagram: bytes) -> _Bundle:
             case ("fseq", int(number)):
                 sequence = number
             case _:
-                raise OscError(f"arguments that TUIO 1.1 does not know: {arguments!s:.80}")
+                raise OscError(f"arguments must be those of TUIO 1.1, got {arguments!s:.80}")
     return _Bundle(source, alive, positions, sequence)
 
 
-def without_moot(waiting: Sequence[Datagram]) -> list[Datagram]:
-    """Those that wait, in their order, without what a sender's newest bundle makes moot.
+def without_superseded(waiting: Sequence[Datagram]) -> list[Datagram]:
+    """Return waiting datagrams without those that the newest bundle of their sender supersedes.
 
-    It does where it places every cursor that is alive: whatever came before says nothing more.
+    It does if it has the position of every cursor that is alive.
     """
     is_complete: dict[tuple[Peer, bytes], bool] = {}
     kept = []
     for each in reversed(waiting):
-        sender = (each.peer, _named_in(each.data))
+        sender = (each.peer, _source_name(each.data))
         if sender not in is_complete:
-            is_complete[sender] = len(is_complete) < _MOST_SENDERS and _says_all(each.data)
+            is_complete[sender] = len(is_complete) < _MAX_SENDERS and _is_complete_bundle(each.data)
         elif is_complete[sender]:
             continue
         kept.append(each)
     return kept[::-1]
 
 
-def _named_in(datagram: bytes) -> bytes:
-    """The name in a datagram's source message as it stands there, without reading the rest."""
+def _source_name(datagram: bytes) -> bytes:
+    """Return the raw name in the source message of a datagram without decoding the rest."""
     _, found, rest = datagram.partition(_SOURCE)
     return rest.partition(b"\0")[0] if found else b""
 
 
-def _says_all(datagram: bytes) -> bool:
-    """Whether a bundle says which cursors are alive, and where every one of them is."""
-    if len(datagram) > _LARGEST_DATAGRAM:
+def _is_complete_bundle(datagram: bytes) -> bool:
+    """Whether a bundle has all cursors that are alive, with their positions."""
+    if len(datagram) > _MAX_DATAGRAM:
         return False
     try:
         bundle = _read_bundle(datagram)
@@ -187,7 +187,7 @@ def _says_all(datagram: bytes) -> bool:
 
 
 def tuio_datagram(frame: TouchFrame, sequence: int) -> bytes:
-    """A frame as a sender of the frame's source name would put it on the wire, fully repeated."""
+    """Encode a frame as a sender with the name of its source would, with all positions."""
     bundle = OscBundleBuilder(IMMEDIATELY)
     messages: list[tuple[str | int | float, ...]] = [
         ("source", frame.source),
@@ -207,27 +207,27 @@ def tuio_datagram(frame: TouchFrame, sequence: int) -> bytes:
 class TuioSource(TouchSource):
     """Listens for TUIO at `tuio:HOST:PORT`, `tuio:PORT` or `tuio:` (127.0.0.1:3333).
 
-    Port 0 takes any free one. A touch table on another machine reaches it only if HOST is written
-    out: TUIO knows no password. Raises InputError on a URL that says something else.
+    Port 0 is any free one. A touch table on another machine needs an explicit HOST, because TUIO
+    has no authentication. Raises InputError for any other URL.
     """
 
     def __init__(self, url: str) -> None:
         self.host, self._port = _host_and_port(url)
-        self.tally = RejectCounter(_logger)
+        self.rejects = RejectCounter(_logger)
         self._url = url
         self._line: Datagrams | None = None
-        self._reader = TuioReader(self.tally)
+        self._reader = TuioReader(self.rejects)
         self._deliver: Callable[[TouchFrame], None] | None = None
 
     @property
     def port(self) -> int:
-        """The UDP port that is bound; before `open` the one that was asked for."""
+        """The UDP port: the bound one, before `open` the requested one."""
         return self._port if self._line is None else self._line.port
 
     async def open(self) -> None:
-        """Bind the port, unless it is; `run` does it by itself. Raises InputError if it is taken.
+        """Bind the port if it is not bound; `run` does so too. Raises InputError if it is taken.
 
-        What arrives before `run` is dropped.
+        Datagrams are dropped until `run`.
         """
         if self._line is not None:
             return
@@ -236,13 +236,13 @@ class TuioSource(TouchSource):
                 self.host,
                 self._port,
                 self._received,
-                largest=_LARGEST_DATAGRAM,
-                thin=without_moot,
+                max_size=_MAX_DATAGRAM,
+                thin=without_superseded,
             )
         except OSError as error:
             raise InputError(
-                f"touch source {self._url}: cannot listen on UDP {self.host}:{self._port} "
-                f"({error.strerror}); another program may use it: stop that or name another port"
+                f"touch source {self._url}: cannot bind UDP {self.host}:{self._port} "
+                f"({error.strerror}); stop the program that uses it, or choose another port"
             ) from error
 
     async def run(self, deliver: Callable[[TouchFrame], None]) -> None:
@@ -258,7 +258,7 @@ class TuioSource(TouchSource):
                 self._line = None
 
     def _received(self, datagram: bytes, peer: Peer, arrived: float) -> None:
-        """Read one datagram; the frame's time is that of its arrival."""
+        """Decode a datagram and deliver its frame with the time of arrival."""
         if self._deliver is None:
             return
         frame = self._reader.read(datagram, peer, now=arrived)
@@ -267,7 +267,7 @@ class TuioSource(TouchSource):
 
 
 def _host_and_port(url: str) -> tuple[str, int]:
-    """Host and port of `tuio:HOST:PORT`; raises InputError."""
+    """Return host and port of `tuio:HOST:PORT`; raises InputError."""
     rest = url.removeprefix("tuio:").removeprefix("//")
     host, _, port = rest.rpartition(":")
     number = int(port) if port.isascii() and port.isdecimal() and len(port) < 6 else -1
@@ -275,7 +275,7 @@ def _host_and_port(url: str) -> tuple[str, int]:
         number = DEFAULT_PORT
     if not url.startswith("tuio:") or not 0 <= number < 65536:
         raise InputError(
-            f"touch source {url}: expected tuio:HOST:PORT with a port from 0 to 65535, "
-            "such as tuio:127.0.0.1:3333"
+            "touch source must be tuio:HOST:PORT with a port from 0 to 65535, such as "
+            f"tuio:127.0.0.1:3333, got {url}"
         )
     return host.strip("[]") or DEFAULT_HOST, number

@@ -29,7 +29,7 @@ class JsonTouch(TouchSource):
         if not host or not (port.isascii() and port.isdecimal() and 0 < int(port) < 65536):
             raise InputError(f"touch source {url}: write jsontouch:HOST:PORT")
         self._host, self._port = host, int(port)
-        self.tally = RejectCounter(logging.getLogger(__name__))  # and log once a second
+        self.rejects = RejectCounter(logging.getLogger(__name__))  # and log once a second
 
     async def run(self, deliver: Callable[[TouchFrame], None]) -> None:
         """Deliver a frame a datagram until cancelled; malformed ones are counted, never raised."""
@@ -38,12 +38,12 @@ class JsonTouch(TouchSource):
             try:
                 touches = tuple(Touch(int(id), float(x), float(y)) for id, x, y in json.loads(data))
             except (ValueError, TypeError, OverflowError, RecursionError) as error:
-                self.tally.count("malformed", f"datagram from {peer[0]}: {error}")
+                self.rejects.count("malformed", f"datagram from {peer[0]}: {error}")
                 return
             deliver(TouchFrame(f"{peer[0]}:{peer[1]}", arrived, touches))
 
         try:
-            line = await listen(self._host, self._port, received, largest=LONGEST)
+            line = await listen(self._host, self._port, received, max_size=LONGEST)
         except OSError as error:
             raise InputError(
                 f"jsontouch: cannot listen on {self._host}:{self._port} ({error.strerror}); "

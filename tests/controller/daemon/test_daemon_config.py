@@ -209,7 +209,7 @@ def test_a_calibration_by_points(folder: Path) -> None:
         ("{points: [{shown: [0, 0], at: [0, 0]}]}", "calibration.points", "at least 3"),
         ("{turned: 90, points: [A, B, C]}", "calibration", "only one of"),
         ("{points: [A, B, {shown: [0.2, 0.2], at: [0.2, 0.2]}]}", "calibration", "on a line"),
-        ("{points: [A, B, C, {shown: [0.1, 0.2], at: [0.1, 0.1]}]}", "calibration", "fits point"),
+        ("{points: [A, B, C, {shown: [0.1, 0.2], at: [0.1, 0.1]}]}", "calibration", "point 2"),
         ("{points: [A, B, {shown: [0.2 s, 0], at: [0, 0]}]}", "points[2].shown[0]", "length"),
     ],
 )

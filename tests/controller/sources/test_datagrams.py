@@ -37,7 +37,7 @@ async def receiving() -> AsyncIterator[Send]:
         async with asyncio.timeout(20):
             return [await received.get() for _ in datagrams]
 
-    line = await listen("127.0.0.1", 0, take, largest=100)
+    line = await listen("127.0.0.1", 0, take, max_size=100)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
         sender.bind(("127.0.0.1", 0))
         try:
@@ -95,7 +95,7 @@ async def test_whoever_receives_may_close() -> None:
         lines[0].close()
         done.set()
 
-    lines.append(await listen("127.0.0.1", 0, take, largest=100))
+    lines.append(await listen("127.0.0.1", 0, take, max_size=100))
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
         for datagram in (b"1", b"2"):
             sender.sendto(datagram, ("127.0.0.1", lines[0].port))

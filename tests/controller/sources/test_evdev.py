@@ -223,7 +223,7 @@ def test_events_are_whole() -> None:
 
 @pytest.mark.parametrize(
     ("path", "words"),
-    [("/dev/null", "no touch panel"), ("/dev/input/event987", "no such device")],
+    [("/dev/null", "evtest"), ("/dev/input/event987", "by-id")],
 )
 def test_what_is_no_panel(path: str, words: str) -> None:
     """A file that is no panel, and none at all: an error that says so, and no open descriptor."""
@@ -252,7 +252,7 @@ def test_a_panel_that_another_program_keeps_to_itself(monkeypatch: pytest.Monkey
     kernel(monkeypatch, width=1000, grab=OSError(errno.EBUSY, "Device or resource busy"))
     InputDevice("/dev/null").close()
     before = sorted(Path("/proc/self/fd").iterdir())
-    with pytest.raises(InputError, match=r"/dev/null: another program.*`sudo fuser -v /dev/null`"):
+    with pytest.raises(InputError, match=r"/dev/null: .*`sudo fuser -v /dev/null`"):
         InputDevice("/dev/null", grab=True)
     assert sorted(Path("/proc/self/fd").iterdir()) == before
 
@@ -260,7 +260,7 @@ def test_a_panel_that_another_program_keeps_to_itself(monkeypatch: pytest.Monkey
 def test_an_axis_without_a_range_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
     """As of devices that name the axis and do not fill it in; nobody divides by its width."""
     kernel(monkeypatch, width=0)
-    with pytest.raises(InputError, match=r"/dev/null: axis 0x35 ranges from 0 to 0, which is no"):
+    with pytest.raises(InputError, match=r"/dev/null: .*0x35.*0 and 0"):
         InputDevice("/dev/null")
 
 
@@ -269,5 +269,5 @@ def test_an_axis_without_a_range_is_none(monkeypatch: pytest.MonkeyPatch) -> Non
 )
 def test_urls_that_say_something_else(url: str) -> None:
     """They are refused with what is expected."""
-    with pytest.raises(InputError, match="expected evdev:PATH"):
+    with pytest.raises(InputError, match=r"evdev:PATH.grab=yes"):
         open_source(url)

@@ -10,13 +10,13 @@ from controller.sources.reject_counter import RejectCounter
 def test_counts_all_but_logs_once_a_second(caplog: pytest.LogCaptureFixture) -> None:
     """A thousand bad datagrams within a second are all counted and make one line, as do later."""
     now = 0.0
-    tally = RejectCounter(logging.getLogger("bad input"), clock=lambda: now)
+    rejects = RejectCounter(logging.getLogger("bad input"), clock=lambda: now)
     for _ in range(1000):
-        tally.count("malformed", "ends too early")
-    assert tally.counts == {"malformed": 1000}
+        rejects.count("malformed", "ends too early")
+    assert rejects.counts == {"malformed": 1000}
     assert len(caplog.records) == 1
     now = 1.0
-    tally.count("late", "frame 3")
+    rejects.count("late", "frame 3")
     assert len(caplog.records) == 2
-    assert "1000 since the last report" in caplog.records[1].getMessage()
+    assert "new=1000" in caplog.records[1].getMessage()
     assert "late 1, malformed 1000" in caplog.records[1].getMessage()

@@ -65,12 +65,12 @@ def test_another_pace(tmp_path: Path) -> None:
 def test_options_that_say_nothing(tmp_path: Path, options: str) -> None:
     """They are refused with what is expected."""
     write(tmp_path / "taps.tuio", (0.0, ()))
-    with pytest.raises(InputError, match=r"expected nothing after the path but \?speed=N"):
+    with pytest.raises(InputError, match=r"\?speed=N"):
         open_source(f"replay:{tmp_path}/taps.tuio?{options}")
 
 
 def test_capture_without_touches(tmp_path: Path) -> None:
     """Datagrams that are no TUIO leave nothing to replay, which is said."""
     write_capture(tmp_path / "noise.tuio", [Datagram(0.0, b"noise")])
-    with pytest.raises(InputError, match="no datagram of this capture tells of touches"):
+    with pytest.raises(InputError, match=r"noise.tuio"):
         open_source(f"replay:{tmp_path}/noise.tuio")

@@ -67,7 +67,7 @@ def touches(frame: TouchFrame | None) -> list[tuple[int, float, float]]:
 
 def counts(reader: TuioReader) -> dict[str, int]:
     """What the reader has counted."""
-    return dict(reader.tally.counts)
+    return dict(reader.rejects.counts)
 
 
 def test_golden_bundle(reader: TuioReader) -> None:
@@ -284,7 +284,7 @@ async def test_over_udp() -> None:
         received = await delivered.get()
     running.cancel()
     await asyncio.gather(running, return_exceptions=True)
-    assert source.tally.counts == {"malformed": 1}
+    assert source.rejects.counts == {"malformed": 1}
     assert received.time == asyncio.get_running_loop().time()
     assert touches(received) == [(1, 0.25, 0.5)]
 

@@ -12,7 +12,7 @@ from pythonosc.osc_message_builder import OscMessageBuilder
 from controller.sources.datagrams import MANY, Datagram, Peer, listen
 from controller.sources.reject_counter import RejectCounter
 from controller.sources.touch import Touch, TouchFrame
-from controller.sources.tuio import TuioReader, tuio_datagram, without_moot
+from controller.sources.tuio import TuioReader, tuio_datagram, without_superseded
 
 HERE, THERE = ("127.0.0.1", 5001), ("127.0.0.1", 5002)
 
@@ -51,7 +51,7 @@ def test_the_newest_complete_bundle_of_each_sender_is_enough() -> None:
     all_of_it = waiting(
         (full("a", 1), HERE), (full("b", 1), HERE), (full("a", 2), THERE), (full("a"), HERE)
     )
-    assert without_moot(all_of_it) == all_of_it[1:]
+    assert without_superseded(all_of_it) == all_of_it[1:]
 
 
 def test_what_a_later_bundle_does_not_repeat_is_kept() -> None:
@@ -59,8 +59,8 @@ def test_what_a_later_bundle_does_not_repeat_is_kept() -> None:
     all_of_it = waiting(
         (full("a", 1, 2), HERE), (partial("a", [1, 2], {1: 0.1}), HERE), (b"no bundle", HERE)
     )
-    assert without_moot(all_of_it) == all_of_it
-    assert without_moot(all_of_it[:2]) == all_of_it[:2]
+    assert without_superseded(all_of_it) == all_of_it
+    assert without_superseded(all_of_it[:2]) == all_of_it[:2]
 
 
 bundles = st.builds(
@@ -81,7 +81,7 @@ def test_who_reads_the_rest_knows_the_same(said: list[tuple[bytes, Peer]]) -> No
     """
     said = [(data, peer) for data, peer in said if (peer == HERE) == (b"a\0\0\0" in data)]
     frames: list[dict[str, tuple[Touch, ...]]] = []
-    for each in (waiting(*said), without_moot(waiting(*said))):
+    for each in (waiting(*said), without_superseded(waiting(*said))):
         reader = TuioReader(RejectCounter(logging.getLogger(__name__)))
         frames.append({})
         for data, peer, arrived in each:
@@ -102,7 +102,7 @@ async def test_of_a_queue_the_newest_is_handed_on_first_of_all() -> None:
         if data == up:
             done.set()
 
-    line = await listen("127.0.0.1", 0, take, largest=8192, thin=without_moot)
+    line = await listen("127.0.0.1", 0, take, max_size=8192, thin=without_superseded)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
         for number in range(200):
             sender.sendto(full("a", number), ("127.0.0.1", line.port))

@@ -4,7 +4,7 @@ Time is passed in; no clock is read. Channels drive the ERAs by the rig's wiring
 full stroke, with the imperfections given.
 """
 
-from collections import OrderedDict, deque
+from collections import deque
 from collections.abc import Collection, Mapping
 from functools import lru_cache
 from typing import Protocol
@@ -86,7 +86,9 @@ class Bench:
         self._moving: list[Output] = [()] * len(rig.eras)
         self._delayed: list[deque[tuple[float, Output]]] = [deque() for _ in rig.eras]
         self._noise = [draw_noise(seed=imperfections.seed, number=n) for n in range(len(rig.eras))]
-        self._shapes: OrderedDict[bytes, FloatArray] = OrderedDict()
+        self._shapes_at = lru_cache(_MAX_SHAPES)(
+            lambda points: self._plant.reduced.at(np.frombuffer(points).reshape(-1, 2))
+        )
         self._played: deque[tuple[Tone, float]] = deque()  # with the time of its end [s]
 
     @property
@@ -107,13 +109,7 @@ class Bench:
 
         Valid until fingers that load the plate change.
         """
-        key = points.tobytes()
-        if key not in self._shapes:
-            while len(self._shapes) >= _MAX_SHAPES:
-                self._shapes.popitem(last=False)
-            self._shapes[key] = self._plant.reduced.at(points)
-        self._shapes.move_to_end(key)
-        return self._shapes[key]
+        return self._shapes_at(points.tobytes())
 
     def exchange(self, amplifier: str, request: Request, *, now: float) -> Reply:
         """The reply of an amplifier to a request at a time [s]."""
@@ -140,7 +136,7 @@ class Bench:
                 [load.at(*at) for name, at in positions.items() if name not in observers]
             )
             if self._plant.reduced is not before:
-                self._shapes.clear()
+                self._shapes_at.cache_clear()
         self.fingers.place(positions, reduced=self._plant.reduced)
 
     def records(self, since: float, until: float) -> tuple[dict[str, Record], list[float]]:

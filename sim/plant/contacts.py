@@ -5,11 +5,9 @@ extended by the static vectors of the point, and the small system diagonalised a
 cached. Structural damping remains that of the plate on its ERAs.
 """
 
-from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
-from typing import TypeVar
 
 import numpy as np
 
@@ -27,9 +25,6 @@ BLOCK = 256  # samples per table of exponentials
 _KEEP_LIFTED = 0.2
 _MAX_LIFTED = 8  # points; a sliding finger leaves many
 _MAX_SOLVED = 32  # sets of contacts, of about a megabyte each
-
-_Key = TypeVar("_Key")
-_Value = TypeVar("_Value")
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,12 +59,11 @@ class LoadedPlateCache:
         self._loads = tuple(loads)
         self._lifted: dict[Position, float] = {}  # by point: when [s]
         self._resting: tuple[Position, ...] = ()
-        self._reduced: OrderedDict[tuple[Position, ...], ReducedPlate] = OrderedDict({(): reduced})
-        self._solved: OrderedDict[tuple[object, ...], LoadedPlate] = OrderedDict()
+        self._solved = lru_cache(_MAX_SOLVED)(self._solve)
+        self._reduced_at = lru_cache(_MAX_SOLVED)(self._reduce)
 
     def under(self, contacts: Sequence[PointLoad], *, time: float) -> LoadedPlate:
         """The plate under these contacts from a time [s]; calls must be in order of time."""
-        contacts = tuple(contacts)
         resting = tuple(sorted({(contact.x, contact.y) for contact in contacts}))
         for point in self._resting:
             self._lifted.pop(point, None)
@@ -81,26 +75,18 @@ class LoadedPlateCache:
             if time - when < _KEEP_LIFTED and point not in resting
         ][-_MAX_LIFTED:]
         self._lifted = {point: self._lifted[point] for point in recent}
-        points = (*resting, *sorted(recent))
-        key = (points, contacts)
-        if key not in self._solved:
-            _insert(self._solved, key, self._solve(points, contacts))
-        self._solved.move_to_end(key)
-        return self._solved[key]
+        return self._solved((*resting, *sorted(recent)), tuple(contacts))
 
     def _solve(self, points: tuple[Position, ...], contacts: tuple[PointLoad, ...]) -> LoadedPlate:
         if not points:
-            return LoadedPlate(
-                contacts, self._unloaded, _solve_unloaded(self._unloaded, self._eras, self._loads)
-            )
+            unloaded = _solve_unloaded(self._unloaded, self._eras, self._loads)
+            return LoadedPlate(contacts, self._unloaded, unloaded)
         reduced = self._reduced_at(points)
         plate = plate_in_time(reduced, self._eras, loads=self._loads, contacts=contacts)
         return LoadedPlate(contacts, reduced, plate)
 
-    def _reduced_at(self, points: tuple[Position, ...]) -> ReducedPlate:
-        if points not in self._reduced:
-            _insert(self._reduced, points, self._unloaded.with_forces_at(np.array(points)))
-        return self._reduced[points]
+    def _reduce(self, points: tuple[Position, ...]) -> ReducedPlate:
+        return self._unloaded.with_forces_at(np.array(points))
 
 
 @lru_cache(maxsize=2)  # successive benches of one rig share it
@@ -108,9 +94,3 @@ def _solve_unloaded(
     reduced: ReducedPlate, eras: tuple[Era, ...], loads: tuple[PointLoad, ...]
 ) -> PlateInTime:
     return plate_in_time(reduced, eras, loads=loads)
-
-
-def _insert(cache: OrderedDict[_Key, _Value], key: _Key, value: _Value) -> None:
-    while len(cache) >= _MAX_SOLVED:
-        cache.popitem(last=False)
-    cache[key] = value

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from model.arrays import FloatArray
+from model.arrays import ComplexArray, FloatArray
 from sim.plant.finger import Record
 
 
@@ -27,18 +27,29 @@ def feel(record: Record, frequencies: Sequence[float]) -> Felt:
     unknowns the result is the minimum-norm solution.
     """
     times, samples = record.times, record.accelerations
+    count, points = len(frequencies), len(record.points)
     if not len(times):
-        nothing = np.zeros(len(record.points))
-        return Felt(
-            record.points, tuple(frequencies), np.zeros((len(frequencies), len(nothing))), nothing
-        )
-    angles = 2 * np.pi * np.outer(times - times[0], np.asarray(frequencies, dtype=float))
-    basis = np.hstack([np.sin(angles), np.cos(angles)])
+        amplitude, peak = np.zeros((count, points)), np.zeros(points)
+    else:
+        amplitude = np.abs(fit_tones(times - times[0], samples, frequencies))
+        peak = np.abs(samples).max(axis=0)
+    return Felt(record.points, tuple(frequencies), amplitude, peak)
+
+
+def fit_tones(
+    times: FloatArray,
+    samples: FloatArray,
+    frequencies: Sequence[float],
+    *,
+    with_offset: bool = False,
+) -> ComplexArray:
+    """Complex amplitudes a (f, p) of Im[a exp(i omega t)] in samples (n, p), by least squares.
+
+    frequencies [Hz]; with_offset: fit a constant, too.
+    """
+    angles = 2 * np.pi * np.outer(times, np.asarray(frequencies, dtype=float))
+    offset = np.ones((len(times), int(with_offset)))
+    basis = np.hstack([np.sin(angles), np.cos(angles), offset])
     fit = np.linalg.lstsq(basis, samples, rcond=None)[0]
-    sine, cosine = np.split(fit, 2)
-    return Felt(
-        points=record.points,
-        frequencies=tuple(frequencies),
-        amplitude=np.hypot(sine, cosine),
-        peak=np.abs(samples).max(axis=0),
-    )
+    count = len(frequencies)
+    return np.asarray(fit[:count] + 1j * fit[count : 2 * count])

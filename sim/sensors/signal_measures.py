@@ -10,6 +10,7 @@ from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
 from model.finger.contrast import contrast_db
 from model.transients.measures import FIRST
+from sim.plant.felt import fit_tones
 from sim.sensors.recording import Recording
 
 # T60 is fitted from -5 dB, as in ISO 3382-1, down to the noise: at least -25 dB, at most -45 dB.
@@ -38,10 +39,7 @@ def tone_phasors(recording: Recording, frequencies: Sequence[float]) -> ComplexA
             f"{count} tones need {2 * count + 1} samples, got {len(recording.samples)}: "
             "record longer"
         )
-    angles = 2 * np.pi * np.outer(recording.times, np.asarray(frequencies, dtype=float))
-    basis = np.hstack([np.sin(angles), np.cos(angles), np.ones((len(angles), 1))])
-    found = np.linalg.lstsq(basis, recording.samples, rcond=None)[0]
-    return np.asarray(found[:count] + 1j * found[count : 2 * count])
+    return fit_tones(recording.times, recording.samples, frequencies, with_offset=True)
 
 
 def spectrum(recording: Recording) -> Spectrum:

@@ -66,7 +66,7 @@ async def test_sim_backend_refuses_unchecked_sets() -> None:
 
 
 async def test_sim_backend_closed_raises_link_error() -> None:
-    """Before open and after close there is nobody to ask."""
+    """Before open and after close."""
     backend = SimulatedBackend(URL)
     with pytest.raises(LinkError, match="not open"):
         await backend.exchange(GetCaps(), timeout=1)

@@ -521,7 +521,10 @@ FAR_ENDS: dict[str, Bug] = {
         "plays", _reports(lambda one: replace(one, levels=(0.0,) * len(one.levels)))
     ),
     "an incomplete set is played": Bug(
-        "commit", wrapped(SetBuffer, "command_set", _incomplete), scenarios.torn, wire="slcan"
+        "commit",
+        wrapped(SetBuffer, "command_set", _incomplete),
+        scenarios.incomplete_set,
+        wire="slcan",
     ),
     "it takes sets while it is disarmed": Bug(
         "enabled",

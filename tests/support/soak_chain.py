@@ -358,7 +358,7 @@ class _Run:
             self.running.cancel()
 
     def _reopen(self) -> None:
-        """A loss while disarmed shows when somebody asks; the control loop goes on all the same."""
+        """A loss while disarmed shows at the next request; the control loop continues."""
         if self.running is not None:
             self.note("reopen")
             self.is_reopening = True
@@ -414,8 +414,8 @@ class _Run:
             amplifiers={name: Amplifier(_backend(url)) for name, url in self.urls.items()},
             observer=Observer(
                 pattern_applied=self._applied,
-                refused=lambda why: self.note("told refused", why),
-                link_lost=lambda what: self.note("told lost", what),
+                refused=lambda why: self.note("observer refused", why),
+                link_lost=lambda what: self.note("observer lost", what),
             ),
         )
 
@@ -425,7 +425,7 @@ class _Run:
         self.note("pattern", f"{applied.latency:.9f}", drive)
 
     async def _end(self) -> None:
-        """Close everything; then nothing plays, and nobody is left."""
+        """Close everything; then nothing plays and no task is left."""
         self.is_ending = True
         self.witness.operator_command("disarm")
         if self.controller is not None:

@@ -48,7 +48,7 @@ Sense = Callable[[str, SimulatedAmplifier, Sequence[float]], None]
 
 
 class TouchState:
-    """Whether somebody touches, by the frames alone; times [s]."""
+    """Whether the plate is touched, by the frames alone; times [s]."""
 
     def __init__(self) -> None:
         self._until: dict[str, float] = {}
@@ -69,7 +69,7 @@ class TouchState:
         self.last = max(self._until.values(), default=-math.inf)
 
     def is_touched(self, now: float) -> bool:
-        """Whether somebody does."""
+        """Whether it is touched at a time."""
         return now < self.last
 
 
@@ -99,7 +99,7 @@ class Checks:
         self._arming = arming
         self._fed = dict.fromkeys(bench.amplifiers, -math.inf)
         self.sense: Sense = lambda name, amplifier, levels: None
-        """Is told of every amplifier, and what level its channels have, when it is looked at."""
+        """Called with every amplifier and the levels of its channels at each check."""
         self._starving: dict[str, asyncio.TimerHandle] = {}
         self._releasing: asyncio.TimerHandle | None = None
         self._is_closed = False
@@ -149,7 +149,7 @@ class Checks:
             self._token[name] = 0
             self._faulted.pop(name, None)
             if not self._arming() and self._plan.is_calm(now - self._begin - 1, now - self._begin):
-                self.violate(f"{name} was armed by nobody")
+                self.violate(f"{name} was armed without a request")
         token = amplifier.status(max(now, self._bench.time)).token
         if token != self._token[name]:
             self._token[name] = token
@@ -187,7 +187,7 @@ class Checks:
         )
 
     def _expect_silence(self, name: str) -> None:
-        """Look when the watchdog of an amplifier must have silenced it, if nobody feeds it."""
+        """Check when the watchdog of an amplifier must have silenced it."""
         due = self._fed[name] + WATCHDOG + 1e-6
         if self._loop.time() >= due:
             self._starving.pop(name, None)

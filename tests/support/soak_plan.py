@@ -156,7 +156,7 @@ def _calm(dice: random.Random, begin: float, length: float, amplifiers: int) -> 
 
 
 def _rough(dice: random.Random, begin: float, length: float, amplifiers: int) -> list[Action]:
-    """Touches, faults, and an operator who arms again."""
+    """Touches, faults, and an operator who rearms."""
     actions: list[Action] = [*_touch_sequences(dice, begin, length)]
     for _ in range(dice.randint(1, 6)):
         at = begin + dice.uniform(0, length)

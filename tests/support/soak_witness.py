@@ -1,4 +1,4 @@
-"""The witness in a soak run: it is shown every piece of bytes, and told what people do.
+"""The witness in a soak run, with all bytes, touches and operator commands.
 
 What it knows comes from the wires, the touches, the operator and the faults of the plan; nothing
 from the controller but when it opens its links and closes them.
@@ -61,7 +61,7 @@ class SoakWitness:
         self.closes()
 
     def seen(self, link: str, toward: str, data: bytes) -> None:
-        """Bytes go out; what comes to a link that no host has open is heard by nobody."""
+        """Pass bytes on, unless no host has the link open."""
         if link in self._open:
             self._witness.bytes(link, toward, self._loop.time(), data)  # type: ignore[arg-type]
 

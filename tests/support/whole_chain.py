@@ -27,7 +27,7 @@ from touch_stream import Stream, play_stream
 
 POLL = 0.01  # s
 ATTEMPTS = 8
-PROMPT = 0.1  # s; from the touch to the pattern that is told, on a machine that has time for it
+PROMPT = 0.1  # s; from touch to pattern event, on an idle machine
 FREQUENCY_LIMITS, LEVEL_LIMIT = (40.0, 500.0), 1.0  # Hz; of the example's rig, written by hand
 
 Polls: TypeAlias = list[tuple[float, list[float]]]

@@ -39,7 +39,7 @@ async def day(chain: Chain) -> None:
 
 
 async def hung(chain: Chain) -> None:
-    """The control loop hangs while a finger is felt; somebody looks on, clears and arms again."""
+    """The control loop stalls during a touch; a client polls the status, clears and rearms."""
     await chain.arm()
     chain.touch(1)
     await chain.rest(0.1)
@@ -122,7 +122,7 @@ async def _unanswerable(chain: Chain) -> None:
 
 
 async def reopened(chain: Chain) -> None:
-    """Everything is closed, opened again, and somebody arms it."""
+    """Everything is closed, opened again and armed."""
     await chain.arm()
     await chain.rest(0.05)
     await chain.reopen()
@@ -233,7 +233,7 @@ async def foreign_answer(chain: Chain) -> None:
     await chain.rest(0.05)
 
 
-async def torn(chain: Chain) -> None:
+async def incomplete_set(chain: Chain) -> None:
     """On CAN the frame of one channel is lost."""
     lost = asyncio.Event()
 
@@ -255,7 +255,7 @@ async def torn(chain: Chain) -> None:
 
 
 async def slow_touch(chain: Chain) -> None:
-    """A finger comes, and somebody looks on, while the answer to a heartbeat is on its way."""
+    """A finger comes and a client polls the status while a heartbeat's reply is in flight."""
     asked = asyncio.Event()
 
     def look(toward: str, data: bytes) -> bytes:

@@ -1,6 +1,6 @@
 """The whole chain in virtual time, with a witness on its wires: controller, drivers, far ends.
 
-A scenario is played as a person would: fingers come and go, somebody arms, stops and clears, the
+A scenario is a sequence of touches and operator commands: arm, stop, clear, the
 control loop hangs. What each touch must give is known by hand from the rig below.
 """
 
@@ -105,7 +105,7 @@ def make_rig(amplifiers: Sequence[str], limits: Limits) -> Rig:
 
 
 def plan_for(wire: str, urls: Mapping[str, str], links: Mapping[str, str]) -> dict[str, Any]:
-    """What the witness is told: written by hand, not taken from the rig."""
+    """The witness's configuration, independent of the rig."""
     channel = {"frequency_hz": [40, 500], "level": 0.5, "slew_per_s": 100}
     return {
         "wires": dict.fromkeys(links.values(), wire),
@@ -198,7 +198,7 @@ class Chain:
         self.witness.set_stalled(self.loop.time())
 
     def touch_beside(self) -> None:
-        """The source tells of a touch beside the plate, which nobody feels."""
+        """Deliver a touch beside the plate."""
         touches = (Touch(9, 1.3, 0.5),)
         self.controller.deliver(TouchFrame("test", self.loop.time(), touches))
 
@@ -275,7 +275,7 @@ Scenario = Callable[[Chain], Awaitable[None]]
 
 @dataclass(frozen=True)
 class Outcome:
-    """What the witness found among so many frames, and what was raised to whoever asked."""
+    """Violations, frames seen, and errors raised to the caller."""
 
     found: list[Violation]
     frames: int

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 
 from drivers import clock
 from drivers.codec.can_bus.frame import CanFrame
-from drivers.errors import LinkError
 from sim.far_ends.can_bus.bus import LENGTHS, CanBus
+from sim.transport.loopback import listen, port_of
 
 BUS_NAME = "can0"
 _MAX_LENGTH = 512  # characters of an element; a CAN FD frame has 220
@@ -35,15 +35,8 @@ class SocketcandEnd:
 
     async def open(self) -> None:
         """Listen; raises LinkError where the port is in use."""
-        loop = asyncio.get_running_loop()
-        try:
-            self._server = await loop.create_server(self._make_client, "127.0.0.1", self.port)
-        except OSError as error:
-            raise LinkError(
-                f"port {self.port}: cannot listen: {error.strerror or error}; choose another, or 0 "
-                "for any"
-            ) from error
-        self.port = self._server.sockets[0].getsockname()[1]
+        self._server = await listen(self._make_client, self.port)
+        self.port = port_of(self._server)
 
     def unplug(self) -> None:
         """Stop listening and close all connections."""

@@ -14,7 +14,6 @@ from collections.abc import Sequence
 from typing import cast
 
 from drivers import clock
-from drivers.errors import LinkError
 from drivers.protocol.definition import PROTOCOL
 from sim.bench.simulated_device import SimulatedDevice
 from sim.far_ends.modbus.frames import (
@@ -28,10 +27,10 @@ from sim.far_ends.modbus.frames import (
 )
 from sim.far_ends.modbus.unit import ModbusUnit
 from sim.transport.line import TwoWayLine
+from sim.transport.loopback import HOST, listen, port_of
 from sim.transport.pseudo_terminal import make_terminal
 
 _MAP = PROTOCOL.modbus
-_HOST = "127.0.0.1"
 _ANY_UNIT = 255
 _MAX_CONNECTIONS = 16
 _MAX_UNSENT = 16384  # bytes; then a client that does not read is disconnected
@@ -212,22 +211,14 @@ class ModbusTcpEnd:
     def urls(self) -> dict[str, str]:
         """The URL of each amplifier by name, after `start`."""
         return {
-            device.name: f"modbus+tcp://{_HOST}:{self._port}/{device.number}"
+            device.name: f"modbus+tcp://{HOST}:{self._port}/{device.number}"
             for device in self._units.devices
         }
 
     async def start(self) -> None:
         """Listen; raises LinkError where the port is in use."""
-        try:
-            self._server = await asyncio.get_running_loop().create_server(
-                lambda: _Connection(self, self._units), _HOST, self._port
-            )
-        except OSError as error:
-            raise LinkError(
-                f"port {self._port}: cannot listen: {error.strerror or error}; choose another, "
-                "or 0 for any"
-            ) from error
-        self._port = self._server.sockets[0].getsockname()[1]
+        self._server = await listen(lambda: _Connection(self, self._units), self._port)
+        self._port = port_of(self._server)
         self._units.devices[0].on_plug(self._plug)
 
     async def close(self) -> None:

@@ -59,7 +59,7 @@ def test_temperature_falls_when_silent() -> None:
 
 
 def test_temperature_derates_above_70_and_trips_above_85() -> None:
-    """Half of the level, told by Achieved too; then silent in 5 ms, latched until it is cool."""
+    """Half of the level, in Achieved too; then silent in 5 ms, latched until cool."""
     amplifier = armed()
     amplifier.handle(Apply(playing(1, 0.8)), 0.0)
     amplifier.set_temperature(71.0, 1.0)
@@ -110,7 +110,7 @@ def test_high_voltage_is_on_while_armed_and_discharges() -> None:
 
 @pytest.mark.parametrize("fault", [Fault.OVER_VOLTAGE, Fault.ARC, Fault.CHANNEL])
 def test_fault_silences_and_latches(fault: Fault) -> None:
-    """Silent within 5 ms, high voltage off, listed with its channel, told to listeners in order."""
+    """Silent within 5 ms, high voltage off, recorded with its channel; listeners in order."""
     amplifier = armed()
     events: list[tuple[AmplifierEvent, float]] = []
     amplifier.listeners.append(lambda event, time: events.append((event, time)))
@@ -121,8 +121,8 @@ def test_fault_silences_and_latches(fault: Fault) -> None:
     assert (now.state, now.fault, now.levels) == (AmplifierState.FAULT, fault, (0.0,) * 4)
     listed = amplifier.handle(GetFaults(), 2.0)
     assert listed == FaultList((FaultRecord(fault, 2, 1.0),))
-    told = [event for event, _ in events]
-    assert told == [
+    reported = [event for event, _ in events]
+    assert reported == [
         AmplifierEvent(AmplifierState.FAULT_REACTION_ACTIVE, fault, 2),
         AmplifierEvent(AmplifierState.FAULT, fault),
     ]

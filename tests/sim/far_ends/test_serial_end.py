@@ -154,7 +154,7 @@ async def test_serial_end_host_may_reconnect(end: SerialEnd) -> None:
 
 
 async def test_serial_end_survives_a_host_that_does_not_read(end: SerialEnd) -> None:
-    """Replies that nobody takes are dropped and counted; requests are still carried out."""
+    """Unread replies are dropped and counted; requests are still executed."""
     fd = os.open(
         end.urls["main"].removeprefix("serial://").partition("?")[0], os.O_RDWR | os.O_NOCTTY
     )

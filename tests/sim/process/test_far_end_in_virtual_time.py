@@ -6,11 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivers.amplifier import Amplifier
-from drivers.command import CommandSet, DriveCommand
-from drivers.guard import Guard, GuardLimits
-from drivers.registry import open_backend
+from drivers.command import DriveCommand
 from far_end_process import far_end_process
+from playing import playing
 from rig_files import write_rig
 from sim.sensors.recording_file import read_recording
 
@@ -32,13 +30,8 @@ async def test_simulation_in_virtual_time_advances_only_by_steps(tmp_path: Path)
         noisy = {"at_m": [0.2, 0.1], "noise_m_s2_rthz": 0.01, "resolution_m_s2": 0.5}
         assert (await far_end.ask("sensors", sensors={"P1": noisy}))["ok"]
         assert (await far_end.ask("record", file=str(file)))["ok"]
-        amplifier = Amplifier(open_backend(far_end.urls["main"]), reply_timeout=5.0)
-        await amplifier.open()
-        try:
-            await amplifier.arm(0.5)
-            guard = Guard(GuardLimits(40, 500, 1), amplifier.capabilities)
-            wanted = CommandSet(1, (DriveCommand(0, 110.0, 0.5),), ramp=0.0, valid_for=0.0)
-            await amplifier.apply(guard.check(wanted))
+        tone = DriveCommand(0, 110.0, 0.5)
+        async with playing(far_end.urls["main"], tone, watchdog=0.5) as amplifier:
             assert await far_end.ask("step", seconds=0.4) == {"ok": True, "time_s": 0.4}
             assert (await far_end.ask("state"))["amplifiers"]["main"]["levels"][0] == 0.5
             assert (await far_end.ask("move", finger="1", at_m=[0.05, 0.05]))["ok"]
@@ -72,8 +65,6 @@ async def test_simulation_in_virtual_time_advances_only_by_steps(tmp_path: Path)
             assert "amplifier" in unknown["error"]
             assert "share" in (await far_end.ask("inject_fault", fault="drop", share=2))["error"]
             assert "seconds" in (await far_end.ask("step", seconds=-1))["error"]
-        finally:
-            await amplifier.close()
         assert not file.exists()
         finished = await far_end.ask("finish")
         assert finished == {"file": str(file), "seconds": 1.0, "is_full": False}
@@ -86,22 +77,16 @@ async def test_simulation_in_virtual_time_advances_only_by_steps(tmp_path: Path)
 
 async def test_simulation_applies_a_fault_within_a_step_at_its_time(tmp_path: Path) -> None:
     """Half a second into a step of 0.8 s the fault silences the amplifier, not before."""
-    async with far_end_process(
-        write_rig(tmp_path / "rig.yaml"), "--serial", "--virtual-time", "--sensor", "P1=0.0,0.0"
-    ) as far_end:
-        amplifier = Amplifier(open_backend(far_end.urls["main"]), reply_timeout=5.0)
-        await amplifier.open()
-        try:
-            await amplifier.arm(2.0)
-            guard = Guard(GuardLimits(40, 500, 1), amplifier.capabilities)
-            wanted = CommandSet(1, (DriveCommand(0, 110.0, 0.5),), ramp=0.0, valid_for=0.0)
-            await amplifier.apply(guard.check(wanted))
-            await far_end.ask("inject_fault", fault="over_temperature", lasts=1.0)
-            await far_end.ask("step", seconds=0.8)
-            assert (await far_end.ask("state"))["amplifiers"]["main"]["fault"] == "OVER_TEMPERATURE"
-            signals = await far_end.ask("signals", since_s=0.3, until_s=0.8)
-        finally:
-            await amplifier.close()
+    async with (
+        far_end_process(
+            write_rig(tmp_path / "rig.yaml"), "--serial", "--virtual-time", "--sensor", "P1=0.0,0.0"
+        ) as far_end,
+        playing(far_end.urls["main"], DriveCommand(0, 110.0, 0.5), watchdog=2.0),
+    ):
+        await far_end.ask("inject_fault", fault="over_temperature", lasts=1.0)
+        await far_end.ask("step", seconds=0.8)
+        assert (await far_end.ask("state"))["amplifiers"]["main"]["fault"] == "OVER_TEMPERATURE"
+        signals = await far_end.ask("signals", since_s=0.3, until_s=0.8)
     strength = np.abs(np.reshape(signals["sensors"]["P1"]["m_s2"], (5, 1000))).max(axis=1)
     assert strength[1] == pytest.approx(strength[0], rel=0.1)  # 0.3 to 0.5 s
     assert strength[3] < 0.5 * strength[1]  # from 0.6 s on it only rings down

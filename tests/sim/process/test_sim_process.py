@@ -11,10 +11,10 @@ import pytest
 
 from drivers.amplifier import Amplifier
 from drivers.backends.serial_line.backend import SerialBackend
-from drivers.command import CommandSet, DriveCommand
-from drivers.guard import Guard, GuardLimits
+from drivers.command import DriveCommand
 from drivers.protocol.messages import AmplifierState
 from model.rig.file import example_rig_path
+from playing import playing
 
 ROOT = example_rig_path().parent.parent
 TIMEOUT = 30  # s; for a loaded machine, not an expectation
@@ -52,16 +52,11 @@ async def test_sim_serves_until_a_signal(number: signal.Signals) -> None:
             assert line.startswith("main: serial:///dev/")
             assert line.endswith("?baud=921600\n")
             assert control.is_socket()
-            amplifier = Amplifier(SerialBackend(line.split()[1]), reply_timeout=5.0)
-            await amplifier.open()
-            await amplifier.arm(2.0)
-            guard = Guard(GuardLimits(40, 500, 1), amplifier.capabilities)
-            wanted = CommandSet(1, (DriveCommand(2, 110.0, 0.25),), ramp=0.0, valid_for=0.0)
-            await amplifier.apply(guard.check(wanted))
-            status = await amplifier.status()
+            tone = DriveCommand(2, 110.0, 0.25)
+            async with playing(line.split()[1], tone, watchdog=2.0) as amplifier:
+                status = await amplifier.status()
             assert (status.state, status.token) == (AmplifierState.OPERATION_ENABLED, 1)
             assert status.levels == (0, 0, 0.25, 0)
-            await amplifier.close()
         finally:
             process.send_signal(number)
             ending = await wait(process)

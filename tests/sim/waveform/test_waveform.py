@@ -78,8 +78,8 @@ def test_level_adds_tones_of_one_frequency_coherently() -> None:
     t = 0.2
     most = 0.0
     for share in range(1000):
-        told = [(tone.amplitude(t), t + share / 110_000 - tone.origin) for tone in playing]
-        moved = sum((a * cmath.exp(2j * math.pi * 110 * since)).imag for a, since in told)
+        reported = [(tone.amplitude(t), t + share / 110_000 - tone.origin) for tone in playing]
+        moved = sum((a * cmath.exp(2j * math.pi * 110 * since)).imag for a, since in reported)
         most = max(most, moved)
     assert level_of(playing, t) == pytest.approx(most, rel=1e-4)
 

@@ -54,8 +54,8 @@ class Watched:
     ("closed", "broken"),
     [
         ((), ["commit"]),
-        (("east",), ["commit"]),  # who has lost the other can silence the one that plays
-        (("west", "east"), []),  # it died: nobody is there to tell anybody anything
+        (("east",), ["commit"]),  # a host that lost one can silence the other
+        (("west", "east"), []),  # no host is left
     ],
 )
 def test_host_rules_require_a_set_on_all_amplifiers(
@@ -72,7 +72,7 @@ def test_host_rules_require_a_set_on_all_amplifiers(
 
 def test_host_rules_require_silence_before_another_set() -> None:
     """One plays a set, the last finger lifts before the other does, and for the next finger both
-    play another one: right where the first was told to be silent in between, and only there."""
+    play another one: only if the first was silenced in between."""
     for silences, broken in (((SILENT,), []), ((), ["commit"])):
         watched = Watched()
         watched.host.check_request(watched.sessions["west"], 1.010, SET)
@@ -85,7 +85,7 @@ def test_host_rules_require_silence_before_another_set() -> None:
 
 
 def test_host_rules_report_a_disarm_before_a_stop() -> None:
-    """A stop is wished, and the amplifier is told to disarm first, along ten times the ramp."""
+    """A stop is requested, but a disarm with ten times the ramp is sent first."""
     watched = Watched()
     watched.host.operator_command(1.010, "stop")
     watched.host.check_request(watched.sessions["west"], 1.011, DISARM)

@@ -1,4 +1,4 @@
-"""What one amplifier must be doing by the table of states, and what is said where it is not."""
+"""The reference model of an amplifier."""
 
 import pytest
 
@@ -54,7 +54,7 @@ class Watched:
 
 
 def test_reference_accepts_a_fault_from_an_unknown_state() -> None:
-    """Armed, lost sight of, stopped: its watchdog may have run out while nobody looked."""
+    """Armed, state unknown, stopped: its watchdog may have expired meanwhile."""
     watched = Watched()
     watched.grants(ARM, 1.0, ENABLED)
     watched.amplifier.forget_state()
@@ -63,7 +63,7 @@ def test_reference_accepts_a_fault_from_an_unknown_state() -> None:
 
 
 def test_reference_forgets_an_unobserved_fault() -> None:
-    """In a fault, lost sight of, cleared and armed meanwhile, stopped: it has no fault any more."""
+    """In a fault, state unknown, cleared and armed meanwhile, stopped."""
     watched = Watched()
     watched.grants(ARM, 1.0, ENABLED)
     watched.amplifier.event_received(FAULT, WATCHDOG, 2.0)
@@ -111,7 +111,7 @@ def test_reference_fades_at_the_end_of_a_set(time: float, level: float, rules: l
 
 
 def test_reference_accepts_any_output_in_an_unknown_state() -> None:
-    """What was to end at 1.4 s may have been followed by another while nobody looked."""
+    """The set that ended at 1.4 s may have been followed by another."""
     watched = Watched()
     watched.grants(ARM, 1.0, ENABLED)
     watched.amplifier.request_granted(BRIEF, Reply(1, 3), 1.1, 1.102)

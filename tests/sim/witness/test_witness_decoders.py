@@ -118,7 +118,7 @@ def test_modbus_decoder_decodes_the_page(transport: str) -> None:
 
 
 def test_can_decoder_decodes_the_page() -> None:
-    """The session of the page: sets whole and torn, classic and FD, the watchdog, the end."""
+    """The session of the page: complete and incomplete sets, classic and FD, watchdog, end."""
     decoder = CanDecoder("slcan", {1: 4})
     seen = [meaning for toward, frame in _can() for meaning in decoder.take(toward, frame)]
     assert not any(isinstance(meaning, Damaged) for meaning in seen)
@@ -127,7 +127,7 @@ def test_can_decoder_decodes_the_page() -> None:
     assert [bool(one.problem) for one in sets] == [False, False, True, False, False]
     assert sets[0].commands == sets[4].commands == SET  # classic frames, and one CAN FD frame
     refusals = [one.refusal for one in seen if isinstance(one, Reply) and one.refusal]
-    assert refusals == [15, 5]  # torn, WRONG_STATE
+    assert refusals == [15, 5]  # incomplete set, WRONG_STATE
     assert StateEvent(address=1, state=7, fault=1) in seen
     assert seen[-1] == BootUp(1)
 
@@ -182,13 +182,13 @@ PLAN = {
 
 
 def test_modbus_decoder_matches_a_refusal_of_an_earlier_write() -> None:
-    """A write damaged on its way leaves no tag; one refused now is not told under an older tag."""
-    for told, is_answer in ((EARLIER, True), (EARLIER[:-2] + b"\0\x16", False)):
+    """A damaged write leaves no tag; a refusal of this write must carry its tag."""
+    for refusal, is_answer in ((EARLIER, True), (EARLIER[:-2] + b"\0\x16", False)):
         decoder = ModbusDecoder(over_tcp=True)
         decoder.feed("amplifier", 0.0, PING)
         decoder.feed("host", 0.001, REFUSED)
         ((_, request),) = decoder.feed("amplifier", 0.002, WHY)
-        ((_, answer),) = decoder.feed("host", 0.003, told)
+        ((_, answer),) = decoder.feed("host", 0.003, refusal)
         assert isinstance(request, Request)
         assert isinstance(answer, Reply)
         assert answer.problem == "tag 21, expected 22"
@@ -197,7 +197,7 @@ def test_modbus_decoder_matches_a_refusal_of_an_earlier_write() -> None:
 
 @pytest.mark.parametrize("are_on", [False, True])
 def test_witness_reports_a_stale_refusal_unless_disturbed(are_on: bool) -> None:
-    """Faults excuse it, and who goes on then asks nothing amid it; without faults it is told of."""
+    """While disturbed it is excused, and the next request violates nothing."""
     witness = Witness(PLAN)
     if are_on:
         witness.faults(0.0, "line", are_on=True)
@@ -236,7 +236,7 @@ def test_witness_excuses_a_frame_cut_while_disturbed(
 
 
 def test_modbus_decoder_ignores_replies_of_another_unit() -> None:
-    """Two units of one RTU line are asked who they are; the first says it twice, then the other.
+    """Two units of one RTU line are identified; the first replies twice, then the other.
 
     The page's Hello, once more with 2 for its unit.
     """
@@ -259,7 +259,7 @@ def test_modbus_decoder_ignores_replies_of_another_unit() -> None:
 
 @pytest.mark.parametrize(("over", "broken"), [(0.02, ["answer"]), (0.04, [])])
 def test_witness_excuses_a_reply_due_while_disturbed(over: float, broken: list[str]) -> None:
-    """A Ping at 0.5 s that nobody answers, and nothing more until 2 s; 0.5 s count as trouble yet.
+    """A Ping at 0.5 s without reply, then nothing until 2 s; 0.5 s is still disturbed.
 
     Its answer is due after 31 ms.
     """

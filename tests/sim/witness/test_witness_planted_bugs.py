@@ -35,7 +35,7 @@ NOT_OVER_RTU = {"slow_stop", "slow_lift", "slow_touch"}
 def _wires(scenario: str) -> list[str]:
     if scenario in SERIAL_ONLY:
         return ["serial"]
-    if scenario == "torn":
+    if scenario == "incomplete_set":
         return ["slcan"]
     return [wire for wire in WITNESSED if not (scenario in NOT_OVER_RTU and wire == "modbus-rtu")]
 

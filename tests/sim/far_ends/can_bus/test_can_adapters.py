@@ -26,7 +26,7 @@ def message(frame: CanFrame) -> can.Message:
 
 
 class Member:
-    """Somebody on the bus; `heard` is what came."""
+    """A member of the bus, with the frames `heard`."""
 
     def __init__(self, bus: CanBus) -> None:
         self.heard: list[CanFrame] = []
@@ -54,7 +54,7 @@ class Member:
 
 @pytest.fixture
 def bus() -> CanBus:
-    """Nobody is on it yet."""
+    """A bus without members."""
     return CanBus()
 
 
@@ -164,7 +164,7 @@ async def test_socketcand_refuses_a_port_in_use(server: SocketcandEnd) -> None:
 
 
 async def test_socketcand_refuses_another_bus(talk: Talk) -> None:
-    """There is one, and whoever asks for another is hung up on."""
+    """A client that opens another bus is disconnected."""
     await talk.ask("< open vcan7 >", "< error could not open bus >")
     async with asyncio.timeout(TIMEOUT):
         assert await talk.reader.read() == b""
@@ -241,7 +241,7 @@ def answers(adapter_bus: CanBus, text: bytes) -> tuple[bytes, list[CanFrame]]:
         (b"S6\rL\rt1230\r", b"\r\r\x07", []),  # listening only
         (b"O\rS6\r", b"\r\x07", []),  # the bit rate of an open channel
         (b"O\rt1233AABB\rt12391\rq\rt8000\r", b"\r\x07\x07\x07\x07", []),
-        (b"O\rT000001230\rr1230\r", b"\rZ\rz\r", []),  # nobody here has such identifiers
+        (b"O\rT000001230\rr1230\r", b"\rZ\rz\r", []),  # no receiver has such identifiers
         (b"V\rN\r", b"V1013\rNE0A1\r", []),
         (b"O\r" + b"x" * 500, b"\r\x07", []),
     ],

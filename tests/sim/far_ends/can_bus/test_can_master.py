@@ -70,7 +70,7 @@ class Master:
 
 
 async def test_node_is_driven_by_a_canopen_master(coarse_rig: Rig) -> None:
-    """By data sheet and page alone: it plays as told, and without heartbeats it says 8130."""
+    """By EDS and page alone: it plays a set, and sends EMCY 8130 without heartbeats."""
     async with far_side(Wire(kind="socketcand"), coarse_rig) as far:
         master = await asyncio.to_thread(Master, far.url)
         try:
@@ -78,7 +78,7 @@ async def test_node_is_driven_by_a_canopen_master(coarse_rig: Rig) -> None:
             assert levels == pytest.approx((0.25, 0.0, 0.0, 0.5))
             waiting = asyncio.create_task(asyncio.to_thread(master.wait_for_emergency))
             async with asyncio.timeout(TIMEOUT):
-                while (  # noqa: ASYNC110  time passes only for who asks
+                while (  # noqa: ASYNC110  only polling advances the time
                     far.device.status().fault is not Fault.WATCHDOG
                 ):
                     await asyncio.sleep(0.01)

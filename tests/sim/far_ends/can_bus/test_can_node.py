@@ -79,7 +79,7 @@ def test_node_ignores_requests_before_start() -> None:
     assert bench.tell(ORDER, "7F00 0000 FA00 04 01") == []
     assert bench.state is AmplifierState.SWITCH_ON_DISABLED
     assert len(bench.tell(0x601, "40 00 10 00 00000000")) == 1
-    bench.tell(0x000, "01 02")  # somebody else
+    bench.tell(0x000, "01 02")  # another node
     assert bench.tell(ORDER, "7F00 0000 FA00 04 01") == []
     bench.tell(0x000, "01 00")  # all
     assert bench.tell(ORDER, "7F00 0000 FA00 04 01")[-1].id == ANSWER
@@ -114,7 +114,7 @@ def test_node_applies_a_set_at_sync(bench: Bench) -> None:
     ],
 )
 def test_node_refuses_an_incomplete_set(bench: Bench, send: Callable[[Bench], None]) -> None:
-    """Whatever is missing or of another sequence number: torn, nothing plays, nothing is left."""
+    """Missing frames or another sequence number: result incomplete, no output, nothing kept."""
     bench.tell(0x201, command(0, 2))
     send(bench)
     assert bench.result() == TORN
@@ -171,7 +171,7 @@ def test_node_refuses_an_invalid_set(
 
 
 def test_node_commits_by_broadcast(bench: Bench) -> None:
-    """Staged under 9: a commit of 8 to all leaves it, one of 9 plays it, and nobody answers."""
+    """A broadcast commit of 8 leaves the staged set 9, one of 9 plays it; no replies."""
     bench.tell(0x201, command(0, 2))
     bench.tell(ORDER, apply(9, 1, 2, action=2))
     assert bench.result() == 0

@@ -26,7 +26,7 @@ DOCS = Path(drivers.__file__).parent.parent / "docs" / "reference"
 
 @pytest.fixture(autouse=True, scope="module")
 def clock() -> Iterator[SimpleNamespace]:
-    """Stands still but by hand: who waits for a busy machine is no client that has given up."""
+    """A clock advanced by hand, so that a busy machine causes no timeout."""
     stopped = SimpleNamespace(time=0.0)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sdo, "clock", SimpleNamespace(now=lambda: stopped.time))
@@ -111,7 +111,7 @@ def test_sdo_block_download_repeats_a_lost_segment() -> None:
 
 @pytest.mark.parametrize(("pause", "answer"), [(0.99, 0xA2), (1.01, 0x80)])
 def test_sdo_transfer_times_out(clock: SimpleNamespace, pause: float, answer: int) -> None:
-    """A segment of a block is taken within a second; after it nobody knows what it belongs to."""
+    """A segment after more than a second belongs to no transfer."""
     memory = Memory()
     memory.server.receive(bytes.fromhex("C2 0021 01 07000000"))
     clock.time += pause

@@ -76,8 +76,8 @@ class Connection(asyncio.Protocol):
         *lines, self._rest = (self._rest + data).split(b"\n")
         self._lines.extend(lines)
         self._waiting_bytes += sum(map(len, lines))
-        longest = max(map(len, (*lines, self._rest)))
-        if longest >= MAX_LINE_LENGTH:
+        line_length = max(map(len, (*lines, self._rest)))
+        if line_length >= MAX_LINE_LENGTH:
             self.refuse(RpcError(ErrorCode.PARSE, f"line longer than {MAX_LINE_LENGTH} bytes"))
             return
         if self._waiting_bytes > _MAX_READ_AHEAD and self._transport is not None:

@@ -100,11 +100,11 @@ class ApiServer:
         """Accept a client, if necessary in place of the one that has been idle for longest."""
         if len(self._connections) >= MAX_CONNECTIONS:
             idle = [c for c in self._connections if not self._is_protected(c) and not c.pending]
-            longest = min(idle, key=lambda each: each.received_at, default=None)
-            if longest is None or self._clock() - longest.received_at < IDLE_TIMEOUT:
+            oldest = min(idle, key=lambda each: each.received_at, default=None)
+            if oldest is None or self._clock() - oldest.received_at < IDLE_TIMEOUT:
                 return False
-            self._connections.discard(longest)
-            longest.abort()
+            self._connections.discard(oldest)
+            oldest.abort()
         self._connections.add(connection)
         return True
 
@@ -117,9 +117,9 @@ class ApiServer:
             self._waiting.append(connection)
         if not self._is_turn_scheduled:
             self._is_turn_scheduled = True
-            asyncio.get_running_loop().call_soon(self._turn)
+            asyncio.get_running_loop().call_soon(self._serve_turn)
 
-    def _turn(self) -> None:
+    def _serve_turn(self) -> None:
         """Serve one line of each waiting client, round and round, until the turn's time is up."""
         self._is_turn_scheduled = False
         end = time.perf_counter() + MAX_TURN_TIME
@@ -140,7 +140,7 @@ class ApiServer:
             # wakes, such as the control loop for a touch, run first.
             self._is_turn_scheduled = True
             loop = asyncio.get_running_loop()
-            loop.call_soon(loop.call_soon, self._turn)
+            loop.call_soon(loop.call_soon, self._serve_turn)
 
     def _serve(self, connection: Connection, line: bytes) -> None:
         """Serve one line, or start to."""

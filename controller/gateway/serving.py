@@ -151,6 +151,6 @@ async def _signals(server: uvicorn.Server) -> AsyncIterator[None]:
 def _allow_many_descriptors() -> None:
     """Raise the limit of open files, so that idle connections do not use them up."""
     _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    most = 65_536 if hard == resource.RLIM_INFINITY else hard
+    limit = 65_536 if hard == resource.RLIM_INFINITY else hard
     with contextlib.suppress(OSError, ValueError):
-        resource.setrlimit(resource.RLIMIT_NOFILE, (most, hard))
+        resource.setrlimit(resource.RLIMIT_NOFILE, (limit, hard))

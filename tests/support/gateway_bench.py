@@ -1,6 +1,6 @@
-"""The gateway as a process before a scripted or a real daemon, and clients that say what they like.
+"""The gateway as a process, with a scripted or a real daemon, and raw HTTP and WebSocket clients.
 
-Everything here blocks: a test is one thread, the scripted daemon another, the gateway a process.
+All of it blocks: the test is one thread, the scripted daemon another, the gateway a process.
 """
 
 import asyncio
@@ -54,7 +54,7 @@ TOKEN = "a-token-of-these-tests-only"
 
 
 class ScriptedDaemon:
-    """The daemon's API over a thread of its own, whose methods only note that they were asked."""
+    """The daemon's API in a thread of its own; its methods only record their calls."""
 
     def __init__(self, folder: Path) -> None:
         self.socket = folder / "era.sock"
@@ -62,9 +62,9 @@ class ScriptedDaemon:
         self._rig_text = write_rig(folder / "rig.yaml").read_text(encoding="utf-8")
         self._loop = asyncio.new_event_loop()
         self._serving = threading.Event()
-        self._over = asyncio.Event()
-        self._answers = asyncio.Event()
-        self._answers.set()
+        self._finished = asyncio.Event()
+        self._may_arm = asyncio.Event()
+        self._may_arm.set()
         self._thread = threading.Thread(target=self._loop.run_until_complete, args=(self._serve(),))
 
     def __enter__(self) -> "ScriptedDaemon":
@@ -73,27 +73,27 @@ class ScriptedDaemon:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._loop.call_soon_threadsafe(self._over.set)
+        self._loop.call_soon_threadsafe(self._finished.set)
         self._thread.join()
         self._loop.close()
         self.socket.unlink()
 
     def publish(self, topic: Topic, event: Message) -> None:
-        """Tell whoever has subscribed."""
+        """Send an event to all subscribers."""
         self._loop.call_soon_threadsafe(self._hub.publish, topic, lambda: event)
 
     @contextmanager
     def holding(self) -> Iterator[None]:
-        """Within it `arm` gets no answer."""
-        self._loop.call_soon_threadsafe(self._answers.clear)
+        """Within it `arm` stays pending."""
+        self._loop.call_soon_threadsafe(self._may_arm.clear)
         try:
             yield
         finally:
-            self._loop.call_soon_threadsafe(self._answers.set)
+            self._loop.call_soon_threadsafe(self._may_arm.set)
 
     @property
     def methods(self) -> list[str]:
-        """What was asked, without parameters."""
+        """The methods called."""
         return [method for method, _ in self.calls]
 
     async def _serve(self) -> None:
@@ -110,8 +110,8 @@ class ScriptedDaemon:
         bound.bind(str(self.socket))
         await server.open(bound)
         self._serving.set()
-        await self._over.wait()
-        self._answers.set()
+        await self._finished.wait()
+        self._may_arm.set()
         self._hub.close()
         await server.close()
 
@@ -119,17 +119,17 @@ class ScriptedDaemon:
         def handle(client: Connection, params: Message) -> object:
             if name == "subscribe" and isinstance(params, SubscribeParams):
                 self._hub.subscribe(client, params.topics)
-            if name not in ("hello", "subscribe"):  # those are the gateway's own
+            if name not in ("hello", "subscribe"):  # called by the gateway itself
                 self.calls.append((name, params))
-            return self._arm() if name == "arm" else self._answer(name)
+            return self._arm() if name == "arm" else self._result(name)
 
         return handle
 
     async def _arm(self) -> Message:
-        await self._answers.wait()
+        await self._may_arm.wait()
         return ArmResult(lease="a-lease", lease_s=5.0)
 
-    def _answer(self, name: str) -> Message:
+    def _result(self, name: str) -> Message:
         match name:
             case "hello":
                 return self._hello()
@@ -203,7 +203,7 @@ def _status() -> StatusResult:
 
 @dataclass
 class GatewayProcess:
-    """A gateway that serves."""
+    """A running gateway."""
 
     process: "subprocess.Popen[str]"
     url: str
@@ -213,12 +213,12 @@ class GatewayProcess:
 
     @property
     def host(self) -> str:
-        """Host and port, as in a Host header."""
+        """Host and port, as in the Host header."""
         return self.url.partition("://")[2].partition("/")[0]
 
     @property
     def port(self) -> int:
-        """Where it listens."""
+        """The port it listens on."""
         return int(self.host.rpartition(":")[2])
 
     def connect(self) -> socket.socket:
@@ -228,11 +228,11 @@ class GatewayProcess:
         return plain if self.context is None else self.context.wrap_socket(plain)
 
     def log(self) -> str:
-        """What it has written to standard error."""
+        """Its standard error so far."""
         return self.errors.read_text(encoding="utf-8")
 
     def terminate(self) -> int:
-        """Tell it to end; its exit status."""
+        """Send SIGTERM; its exit status."""
         self.process.terminate()
         return self.process.wait(PATIENCE)
 
@@ -241,7 +241,7 @@ class GatewayProcess:
 def gateway_process(
     folder: Path, daemon: Path, *options: str, token: str | None = TOKEN
 ) -> Iterator[GatewayProcess]:
-    """`era gateway` on a free port of the loopback; token: None for one of its own."""
+    """`era gateway` on a free port of the loopback; token: None for a random one."""
     if token is not None:
         file = folder / "token"
         file.write_text(token, encoding="ascii")
@@ -271,16 +271,16 @@ def gateway_process(
 
 
 def wait_for_daemon(gateway: GatewayProcess) -> None:
-    """Wait until the gateway has found its daemon."""
+    """Wait until the gateway is connected to its daemon."""
     wait_for(lambda: http(gateway, "/api/v1/hello", body=b'{"client": "test"}').status == 200)
 
 
 @contextmanager
 def real_daemon(folder: Path, more: str = "") -> Iterator[Path]:
-    """`era daemon` over a simulated amplifier, its socket; more: further lines of its file."""
+    """The socket of `era daemon` with a simulated amplifier; more: further lines of its file."""
     save_table(daemon_table(), folder / "table.npz")
     config = write_daemon(folder, {}, f"table: table.npz\n{more}")
-    made = folder / "era.sock"
+    daemon_socket = folder / "era.sock"
     with (
         (folder / "daemon.log").open("a", encoding="utf-8") as log,
         subprocess.Popen(
@@ -292,9 +292,9 @@ def real_daemon(folder: Path, more: str = "") -> Iterator[Path]:
     ):
         try:
             raise_priority(process.pid)
-            wait_for(lambda: made.is_socket() or process.poll() is not None)
+            wait_for(lambda: daemon_socket.is_socket() or process.poll() is not None)
             assert process.poll() is None, (folder / "daemon.log").read_text()
-            yield made
+            yield daemon_socket
         finally:
             process.terminate()
             try:
@@ -304,21 +304,21 @@ def real_daemon(folder: Path, more: str = "") -> Iterator[Path]:
 
 
 def raise_priority(process: int) -> None:
-    """Let a process go before others, as the daemon's systemd unit does, where that is allowed."""
+    """Raise a process's priority as the daemon's systemd unit does, if permitted."""
     with contextlib.suppress(PermissionError):
         os.setpriority(os.PRIO_PROCESS, process, -10)
 
 
-def wait_for(holds: Callable[[], object], *, patience: float = PATIENCE) -> None:
-    """Wait until something holds; fails when the patience [s] is over."""
-    end = time.monotonic() + patience
-    while not holds():
-        assert time.monotonic() < end, "it never came to hold"
+def wait_for(condition: Callable[[], object], *, timeout: float = PATIENCE) -> None:
+    """Wait until a condition holds; fails after a timeout [s]."""
+    end = time.monotonic() + timeout
+    while not condition():
+        assert time.monotonic() < end, "timeout"
         time.sleep(0.01)
 
 
 def wait_for_state(era: Client, *states: str) -> str:
-    """Wait until the daemon is in one of these states; which one."""
+    """Wait until the daemon is in one of these states, and return it."""
     end = time.monotonic() + PATIENCE
     while (state := era.status().state) not in states:
         assert time.monotonic() < end, f"the daemon stays in {state}"
@@ -331,7 +331,7 @@ ARM = b'{"owner": "me", "lease_s": 5}'
 
 @dataclass(frozen=True)
 class HttpResponse:
-    """An answer over HTTP; status 0 where the connection was closed without one."""
+    """A response over HTTP; status 0 if the connection was closed without one."""
 
     status: int
     headers: str
@@ -350,7 +350,7 @@ def http(
     more: Sequence[str] = (),
     length: int | None = None,
 ) -> HttpResponse:
-    """Ask for something that would be granted but for what the caller makes different."""
+    """Send a request that would be granted but for the given changes."""
     lines = [f"{method} {target} HTTP/1.1", "Connection: close"]
     lines += [f"Host: {each}" for each in ([gateway.host] if host is None else host)]
     lines += [f"Authorization: Bearer {each}" for each in ([TOKEN] if token is None else token)]
@@ -359,17 +359,17 @@ def http(
     return raw(gateway, "\r\n".join(lines).encode("latin-1") + b"\r\n\r\n" + body)
 
 
-def raw(gateway: GatewayProcess, said: bytes) -> HttpResponse:
-    """Send bytes as they are; what comes back until the gateway closes."""
+def raw(gateway: GatewayProcess, data: bytes) -> HttpResponse:
+    """Send bytes; the response until the gateway closes."""
     with gateway.connect() as connection:
-        heard = b""
-        # It may close while we still talk; what it said before counts.
+        received = b""
+        # It may close before it has received everything.
         with contextlib.suppress(ConnectionError):
-            connection.sendall(said)
+            connection.sendall(data)
         with contextlib.suppress(ConnectionError):
             while part := connection.recv(1 << 16):
-                heard += part
-    head, _, rest = heard.partition(b"\r\n\r\n")
+                received += part
+    head, _, rest = received.partition(b"\r\n\r\n")
     status = head[9:12]
     return HttpResponse(int(status) if status.isdigit() else 0, head.decode("latin-1"), rest)
 
@@ -383,7 +383,7 @@ def upgrade(
     protocols: Sequence[str] = ("era-haptics.v1", f"era-haptics.token.{TOKEN}"),
     more: Sequence[str] = (),
 ) -> bytes:
-    """The handshake of a WebSocket."""
+    """The handshake request of a WebSocket."""
     lines = [f"GET {target} HTTP/1.1", f"Host: {host or gateway.host}", "Upgrade: websocket"]
     lines += ["Connection: Upgrade", "Sec-WebSocket-Version: 13"]
     lines += ["Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ=="]  # of RFC 6455
@@ -393,7 +393,7 @@ def upgrade(
 
 
 class RawWebSocket:
-    """A WebSocket whose frames are made by hand, by RFC 6455, section 5."""
+    """A WebSocket client that sends any frames, by RFC 6455, section 5."""
 
     def __init__(self, gateway: GatewayProcess) -> None:
         self.connection = gateway.connect()
@@ -413,16 +413,16 @@ class RawWebSocket:
         self.connection.close()
 
     def send(self, payload: bytes, *, first: int = 0x81, is_masked: bool = True) -> None:
-        """One frame; first: its first byte, FIN and text unless said otherwise."""
+        """Send a frame; first: its first byte, by default FIN and text."""
         self.connection.sendall(frame(payload, first=first, is_masked=is_masked))
 
     def call(self, method: str, params: object, *, id: int = 1) -> None:
-        """A request."""
-        said = {"jsonrpc": "2.0", "id": id, "method": method, "params": params}
-        self.send(json.dumps(said).encode())
+        """Send a request."""
+        request = {"jsonrpc": "2.0", "id": id, "method": method, "params": params}
+        self.send(json.dumps(request).encode())
 
     def next(self) -> tuple[int, bytes]:
-        """Opcode and payload of the next frame; (8, b"") where the connection just ends."""
+        """Opcode and payload of the next frame; (8, b"") at the end of the connection."""
         try:
             head = self._take(2)
             size = head[1] & 0x7F
@@ -435,15 +435,15 @@ class RawWebSocket:
             return 8, b""
 
     def response(self, id: int | None = 1) -> dict[str, object]:
-        """The answer with an id; what else comes before it is passed over."""
+        """The response with an id; frames before it are skipped."""
         while True:
             opcode, payload = self.next()
             assert opcode != 8, payload
-            if opcode == 1 and "id" in (said := json.loads(payload)) and said["id"] == id:
-                return dict(said)
+            if opcode == 1 and (content := json.loads(payload)).get("id", ...) == id:
+                return dict(content)
 
     def close_code(self) -> int:
-        """With which code the gateway ends it; 0 where it gives none."""
+        """The code that the gateway closes with; 0 if without a close frame."""
         while True:
             opcode, payload = self.next()
             if opcode == 8:
@@ -460,7 +460,7 @@ class RawWebSocket:
 
 
 def frame(payload: bytes, *, first: int = 0x81, is_masked: bool = True) -> bytes:
-    """A frame of a WebSocket as a client sends it, masked with zeros."""
+    """A client's frame, masked with zeros."""
     mask, key = (0x80, bytes(4)) if is_masked else (0, b"")
     if len(payload) < 126:
         size = bytes([mask | len(payload)])

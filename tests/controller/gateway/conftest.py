@@ -1,4 +1,4 @@
-"""What tests of the gateway share: a daemon that only notes what it is asked."""
+"""Fixtures of the gateway's tests."""
 
 from collections.abc import Iterator
 
@@ -9,6 +9,6 @@ from gateway_bench import ScriptedDaemon
 
 @pytest.fixture(scope="module")
 def daemon(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ScriptedDaemon]:
-    """One for all tests of a module."""
+    """A daemon that records its calls, for all tests of a module."""
     with ScriptedDaemon(tmp_path_factory.mktemp("daemon")) as made:
         yield made

@@ -1,4 +1,4 @@
-"""Names for the array types that signatures use, and the points of a lattice."""
+"""Array types of signatures, and the points of a lattice."""
 
 from typing import TypeAlias
 

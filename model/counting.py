@@ -1,6 +1,6 @@
-"""How many there are of something, in a sentence: `1 cell`, `2 cells`."""
+"""Numbers with their nouns: `1 cell`, `2 cells`."""
 
 
 def counted(number: int, thing: str, *, plural: str | None = None) -> str:
-    """The number with its noun; plural: where it is not the noun with an s."""
+    """Format a number with its noun; plural: where it is not the noun with an s."""
     return f"{number} {thing if number == 1 else plural or f'{thing}s'}"

@@ -1,10 +1,10 @@
-"""Quantities and shares as people read them."""
+"""Formatting of quantities and shares."""
 
 _USUAL = {"m": (1e3, "mm"), "Pa": (1e-9, "GPa"), "N/m": (1e-3, "kN/m"), "kg": (1e3, "g")}
 
 
 def in_usual_unit(value: float, unit: str, *, digits: int = 3) -> str:
-    """A value of an SI unit, none included, with the unit that plates are told in: `17 kN/m`."""
+    """Format a value of an SI unit, or of none, in the unit usual for plates: `17 kN/m`."""
     factor, usual = _USUAL.get(unit, (1.0, unit))
     shown = f"{value * factor:.{digits}g}"
     if "e+" in shown:  # a plate of a metre is 1000 mm
@@ -13,5 +13,5 @@ def in_usual_unit(value: float, unit: str, *, digits: int = 3) -> str:
 
 
 def percent(share: float) -> str:
-    """A share as `12 %`; below a tenth with two digits, `1.2 %`."""
+    """Format a share as `12 %`; below a tenth with two digits, `1.2 %`."""
     return f"{100 * share:.0f} %" if share > 0.1 else f"{100 * share:.2g} %"

@@ -153,7 +153,7 @@ class Bench:
         )
 
     def _left(self, excitation: Excitation, bases: Bases) -> float:
-        return self.clock("level left", lambda: self.transients.left_db(excitation, bases))
+        return self.clock("level left", lambda: self.transients.residual_db(excitation, bases))
 
     def _contrast(self, case: Case, bases: Bases) -> float:
         return self.clock(

@@ -20,7 +20,7 @@ from controller.loop.selection import Prediction
 from controller.sources.contacts import Change, Contact, ContactKey
 from drivers import clock
 from drivers.errors import LinkError
-from model.transients.measures import FIRST
+from model.transients.measures import ONSET_WINDOW
 
 STEADY_WINDOW = 0.25
 """Length [s] of the measured end of a pattern: settled, and it separates tones 10 Hz apart."""
@@ -150,10 +150,10 @@ class TouchRecorder:
     async def _measure_onset(self, playing: _Playing) -> dict[str, FingerVibration]:
         """Vibration over the first 100 ms of a pattern; empty if it ended earlier."""
         since = playing.applied.time
-        await asyncio.sleep(max(0.0, since + FIRST + MARGIN - clock.now()))
-        if playing.until < since + FIRST:
+        await asyncio.sleep(max(0.0, since + ONSET_WINDOW + MARGIN - clock.now()))
+        if playing.until < since + ONSET_WINDOW:
             return {}
-        return await self._plate.vibration(since, since + FIRST)
+        return await self._plate.vibration(since, since + ONSET_WINDOW)
 
     def _move_sensors(self, contacts: tuple[Contact, ...]) -> None:
         """Make the plate's sensors follow the fingers."""

@@ -1,1 +1,1 @@
-"""Finite elements: the plate on a mesh, its matrices, and direct answers from them."""
+"""Finite elements: mesh, matrices, and direct solutions of the plate."""

@@ -1,4 +1,4 @@
-"""From one element to the whole plate: sparse stiffness and mass, and what holds them."""
+"""Assembly of the plate's sparse stiffness and mass matrices."""
 
 import math
 from collections.abc import Sequence
@@ -17,7 +17,7 @@ from model.structure.plate import Plate
 
 @dataclass(frozen=True)
 class PlateMatrices:
-    """Stiffness and mass of the free plate, CSC, (dof, dof), with the mesh that they belong to.
+    """Stiffness and mass of the free plate, CSC, (dof, dof), with its mesh.
 
     Degree of freedom 3 * node is the deflection, the next two are the rotations.
     """
@@ -33,16 +33,16 @@ class PlateMatrices:
         return DOF_PER_NODE * self.mesh.node_count
 
     def deflection_at(self, points: FloatArray) -> sparse.csr_array:
-        """Maps the degrees of freedom to deflections at points [m] (n, 2): sparse (n, dof)."""
+        """Map of the degrees of freedom to deflections at points [m] (n, 2), sparse (n, dof)."""
         pick = sparse.csr_array(np.array([[1.0, 0.0, 0.0]]))
         return sparse.csr_array(sparse.kron(self.mesh.interpolation(points), pick, format="csr"))
 
 
 @dataclass(frozen=True)
 class ElementMatrices:
-    """Stiffness and mass of every element of a mesh, as few as there are sizes of elements.
+    """Stiffness and mass of each size of element of a mesh, (sizes, n, n).
 
-    stiffness, mass: (sizes, n, n); size: which of them an element has, (elements,).
+    size (elements,): index of each element's matrices.
     """
 
     stiffness: FloatArray
@@ -51,15 +51,15 @@ class ElementMatrices:
 
 
 def element_matrices(plate: Plate, mesh: Mesh) -> ElementMatrices:
-    """One matrix for the elements of a plain mesh, four where it has strips along its edges.
+    """Compute the matrices of one size of element, or of four with strips along the edges.
 
     Raises InputError for a mesh of another plate.
     """
     sides = ((plate.length, mesh.length), (plate.width, mesh.width))
     if not all(math.isclose(*side) for side in sides):
         raise InputError(
-            f"the mesh lies over {mesh.length:g} x {mesh.width:g} m, the plate is "
-            f"{plate.length:g} x {plate.width:g} m; make the mesh for this plate"
+            f"mesh: must cover the plate of {plate.length:g} x {plate.width:g} m, got "
+            f"{mesh.length:g} x {mesh.width:g} m; make the mesh for this plate"
         )
     widths = [(size, mesh.strip) if mesh.strip else (size,) for size in mesh.element_size]
     sizes = [(dx, dy) for dy in widths[1] for dx in widths[0]]
@@ -78,7 +78,7 @@ def element_dofs(mesh: Mesh) -> IntArray:
 
 
 def assemble(plate: Plate, mesh: Mesh) -> PlateMatrices:
-    """Assemble the free plate."""
+    """Assemble stiffness and mass of the free plate."""
     elements = element_matrices(plate, mesh)
     dofs = element_dofs(mesh)
     size = DOF_PER_NODE * mesh.node_count

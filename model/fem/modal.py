@@ -31,17 +31,17 @@ class Modes:
 def shift_invert_modes(
     stiffness: sparse.csc_array, mass: sparse.csc_array, count: int, *, shift: float
 ) -> tuple[FloatArray, FloatArray]:
-    """The lowest eigenpairs: omega² ascending (count,) and mass-normalised vectors (dof, count).
+    """Solve K phi = omega² M phi for the lowest eigenpairs by shift-invert Lanczos.
 
-    shift [rad²/s²]: above zero, of the order of the lowest omega² wanted; stiffness + shift * mass
-    is then positive definite even where the free plate's rigid-body modes leave stiffness alone
-    singular.
+    Returns omega² ascending (count,) and vectors (dof, count) of unit modal mass. shift [rad²/s²]:
+    above zero, of the order of the lowest elastic omega²; K + shift M is then positive definite
+    although K is singular for a free plate.
     """
     size = stiffness.shape[0]
     if count >= size:
         raise InputError(
-            f"{count} modes asked of a mesh with {size} free degrees of freedom; "
-            "ask for fewer modes or use a finer mesh"
+            f"modes must be fewer than the mesh's {size} free degrees of freedom, got {count}; "
+            "take fewer modes or a finer mesh"
         )
     factor = factorise(stiffness + shift * mass)
     eigenvalues, vectors = eigsh(
@@ -57,11 +57,11 @@ def shift_invert_modes(
     return eigenvalues[order], vectors[:, order]
 
 
-def _nothing_held(matrices: PlateMatrices) -> IntArray:
+def _no_dofs(matrices: PlateMatrices) -> IntArray:
     return np.array([], dtype=np.int64)
 
 
-def _edges_held(matrices: PlateMatrices) -> IntArray:
+def _edge_deflections(matrices: PlateMatrices) -> IntArray:
     """Deflection on all four edges; rotations stay free (soft simple support)."""
     mesh = matrices.mesh
     node = np.arange(mesh.node_count).reshape(mesh.rows, mesh.columns)
@@ -70,11 +70,11 @@ def _edges_held(matrices: PlateMatrices) -> IntArray:
 
 
 SUPPORTS: dict[str, Callable[[PlateMatrices], IntArray]] = {
-    "free": _nothing_held,
-    "eras": _nothing_held,
-    "simply-supported": _edges_held,
+    "free": _no_dofs,
+    "eras": _no_dofs,
+    "simply-supported": _edge_deflections,
 }
-"""Degrees of freedom held at zero, by the name of the support; "eras" adds springs and bolts."""
+"""Fixed degrees of freedom by the name of the support; "eras" adds springs and bolts."""
 
 
 def modes(
@@ -85,25 +85,24 @@ def modes(
     eras: Sequence[Era] = (),
     loads: Sequence[PointLoad] = (),
 ) -> Modes:
-    """The lowest `count` modes without damping; only the elastic ones where the plate is free.
+    """Solve for the lowest `count` undamped modes; of a free plate only the elastic ones.
 
-    support: a name in SUPPORTS; with "eras" each ERA adds its stiffness and bolt mass where it
-    holds the plate. loads are there whatever holds it.
+    support: a name in SUPPORTS; with "eras" each ERA adds its stiffness and bolt mass. loads act
+    with any support. Raises InputError for a count below 1 or above what the mesh has.
     """
     if count < 1:
-        raise InputError(f"{count} modes asked for; at least one is needed")
+        raise InputError(f"modes must be 1 or more, got {count}")
     stiffness, mass = matrices.stiffness, matrices.mass
-    attached = [*loads]
+    attachments = [*loads]
     if support == "eras":
-        attached += [PointLoad(era.x, era.y, era.stiffness, mass=era.bolt_mass) for era in eras]
-    if attached:
-        touch = matrices.deflection_at(load_positions(attached))
-        springs = sparse.diags_array(np.array([load.stiffness for load in attached]))
-        masses = sparse.diags_array(np.array([load.mass for load in attached]))
-        stiffness = sparse.csc_array(stiffness + touch.T @ springs @ touch)
-        mass = sparse.csc_array(mass + touch.T @ masses @ touch)
-    held = SUPPORTS[support](matrices)
-    free = np.setdiff1d(np.arange(matrices.dof), held)
+        attachments += [PointLoad(era.x, era.y, era.stiffness, mass=era.bolt_mass) for era in eras]
+    if attachments:
+        interpolation = matrices.deflection_at(load_positions(attachments))
+        springs = sparse.diags_array(np.array([load.stiffness for load in attachments]))
+        masses = sparse.diags_array(np.array([load.mass for load in attachments]))
+        stiffness = sparse.csc_array(stiffness + interpolation.T @ springs @ interpolation)
+        mass = sparse.csc_array(mass + interpolation.T @ masses @ interpolation)
+    free = np.setdiff1d(np.arange(matrices.dof), SUPPORTS[support](matrices))
     rigid = RIGID_BODY_MODES if support == "free" else 0
     eigenvalues, vectors = shift_invert_modes(
         sparse.csc_array(stiffness[free][:, free]),

@@ -1,9 +1,8 @@
 """The four symmetry classes of a rectangular plate, each solved on a quarter of it.
 
-A uniform free rectangle is its own mirror image in both of its middle lines. Every field on it is
-the sum of four that are even or odd about these lines, and the plate does not couple them: in place
-of one problem there are four of a quarter of the size, whose bands are half as wide. Mirrored along
-x, the deflection and beta_y keep their sign in an even field and beta_x changes it.
+Every field on a uniform free rectangle is the sum of four fields, even or odd about its middle
+lines, that are not coupled: four problems of a quarter of the size with half the bandwidth.
+Mirrored along x, the deflection and beta_y of an even field keep their sign and beta_x changes it.
 """
 
 from dataclasses import dataclass
@@ -21,19 +20,19 @@ from model.fem.mesh import Mesh
 CLASSES = tuple(product((1, -1), (1, -1)))
 """Parity about the middle along x and along y: 1 even, -1 odd."""
 
-# How each degree of freedom of a node turns in an even field, mirrored along x and along y.
-_TURN_X = np.array([1, -1, 1])
-_TURN_Y = np.array([1, 1, -1])
+# Sign of each degree of freedom of a node in the mirror image of an even field.
+_SIGN_X = np.array([1, -1, 1])
+_SIGN_Y = np.array([1, 1, -1])
 
 
 @dataclass(frozen=True, eq=False)
 class SymmetryClass:
-    """Fields of one parity, and how the whole plate's degrees of freedom follow from a quarter's.
+    """Fields of one parity: the whole plate's degrees of freedom from a quarter's.
 
-    place: (dof,) which of the quarter's degrees of freedom each of the plate's follows, and sign:
-    (dof,) how: 1, -1, or 0 for what is zero by symmetry (place is then meaningless). size: how many
-    a quarter has. A field of the whole plate is sign * quarter[place] / 2, so that stiffness and
-    mass of the quarter are those of the whole.
+    A field of the whole plate is sign * quarter[place] / 2, so that stiffness and mass of the
+    quarter are those of the whole. place (dof,): indices into the quarter's degrees of freedom;
+    sign (dof,): 1, -1, or 0 for a degree of freedom that is zero by symmetry (place is then
+    meaningless); size: number of the quarter's degrees of freedom.
     """
 
     mesh: Mesh
@@ -42,8 +41,8 @@ class SymmetryClass:
     size: int
 
     @cached_property
-    def spread(self) -> sparse.csr_array:
-        """Deflection at every node of the plate from a quarter's field, (node_count, size)."""
+    def expansion(self) -> sparse.csr_array:
+        """Map of a quarter's field to the deflection at all nodes, (node_count, size)."""
         place, sign = self.place[::DOF_PER_NODE], self.sign[::DOF_PER_NODE]
         rows = np.flatnonzero(sign)
         shape = (self.mesh.node_count, self.size)
@@ -52,7 +51,7 @@ class SymmetryClass:
     def assemble(
         self, elements: ElementMatrices, shift: float
     ) -> tuple[sparse.coo_array, sparse.coo_array]:
-        """Stiffness + shift * mass and the mass, (size, size), entries not yet summed."""
+        """Assemble K + shift M and M of the quarter, (size, size), entries not yet summed."""
         count_x, count_y = self.mesh.element_counts
         weight_x, weight_y = _quarter_weights(count_x), _quarter_weights(count_y)
         column, row = np.meshgrid(np.arange(len(weight_x)), np.arange(len(weight_y)))
@@ -64,7 +63,7 @@ class SymmetryClass:
 
         def whole(matrices: FloatArray) -> sparse.coo_array:
             a, b = np.nonzero(matrices.any(axis=0))
-            # What is zero by symmetry adds zeros somewhere near.
+            # Degrees of freedom that are zero by symmetry add zeros within the band.
             values = matrices[:, a, b][size] * sign[:, a] * sign[:, b] * weight[:, None]
             places = (place[:, a].ravel(), place[:, b].ravel())
             return sparse.coo_array((values.ravel(), places), shape=(self.size, self.size))
@@ -73,17 +72,17 @@ class SymmetryClass:
 
 
 def symmetry_class(mesh: Mesh, parity: tuple[int, int]) -> SymmetryClass:
-    """One of the four classes; parity is one of CLASSES."""
+    """Make one of the four classes; parity is one of CLASSES."""
     fold_x, side_x = _fold(mesh.columns)
     fold_y, side_y = _fold(mesh.rows)
-    # The shorter side runs first: the band is then at its narrowest.
+    # Numbered along the shorter side first: smallest bandwidth.
     quarter_x, quarter_y = (mesh.columns + 1) // 2, (mesh.rows + 1) // 2
     if quarter_x >= quarter_y:
         node = fold_x * quarter_y + fold_y[:, None]
     else:
         node = fold_y[:, None] * quarter_x + fold_x
-    sign_x = _sign(side_x, parity[0] * _TURN_X)
-    sign_y = _sign(side_y, parity[1] * _TURN_Y)
+    sign_x = _sign(side_x, parity[0] * _SIGN_X)
+    sign_y = _sign(side_y, parity[1] * _SIGN_Y)
     sign = (sign_y[:, None, :] * sign_x[None, :, :]).reshape(-1)
     dof = (DOF_PER_NODE * node[:, :, None] + np.arange(DOF_PER_NODE)).reshape(-1)
 
@@ -94,22 +93,24 @@ def symmetry_class(mesh: Mesh, parity: tuple[int, int]) -> SymmetryClass:
 
 
 def _fold(count: int) -> tuple[IntArray, IntArray]:
-    """Of each node of a row: its mirror image in the first half, and on which side it lies.
+    """Index of each node of a row folded into the first half, and its side, (count,) each.
 
-    Both (count,); the side is 1 before the middle, 0 on it, -1 beyond.
+    The side is 1 before the middle, 0 on it, -1 beyond.
     """
     index = np.arange(count)
     mirrored = count - 1 - index
     return np.minimum(index, mirrored), np.sign(mirrored - index)
 
 
-def _sign(side: IntArray, turn: IntArray) -> IntArray:
-    """Signs (nodes, 3) of a row: turned beyond the middle, zero on it where it would turn."""
-    return np.where(side[:, None] == 1, 1, np.where(side[:, None] == -1, turn, (turn + 1) // 2))
+def _sign(side: IntArray, mirror_sign: IntArray) -> IntArray:
+    """Signs (nodes, 3) of a row: mirror_sign beyond the middle, on it 0 where mirror_sign is -1."""
+    on_middle = (mirror_sign + 1) // 2
+    side = side[:, None]
+    return np.where(side == 1, 1, np.where(side == -1, mirror_sign, on_middle))
 
 
 def _quarter_weights(count: int) -> FloatArray:
-    """Weights of a row's elements in the half that is summed: the middle one is its own image."""
+    """Weights of a row's elements in the half that is summed: 1/2 for one across the middle."""
     weights = np.ones((count + 1) // 2)
     if count % 2:
         weights[-1] = 0.5

@@ -1,1 +1,1 @@
-"""A finger on the plate: where it touches, how it loads, what it feels and what tells it apart."""
+"""A finger on the plate: contact area, load, detection thresholds and contrast."""

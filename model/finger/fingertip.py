@@ -26,7 +26,7 @@ UNIT_DISC = _unit_disc()
 
 
 def fingertip_points(x: float, y: float, plate: Plate) -> FloatArray:
-    """Points [m] of the plate under a fingertip centred at x, y; those off the plate are left out.
+    """Points [m] of the plate under a fingertip centred at x, y; those off the plate are excluded.
 
     (n, 2) with n up to 19; at a corner a quarter of the disc remains. The centre must be on it.
     """

@@ -1,4 +1,4 @@
-"""The cells of the plate that a target finger is told by."""
+"""Grid of target cells over the plate."""
 
 from dataclasses import dataclass
 
@@ -22,7 +22,7 @@ class Grid:
     ny: int
 
     def __post_init__(self) -> None:
-        """Refuse a grid without cells or too large to keep."""
+        """Refuse a grid without cells or with too many."""
         if not (is_whole(self.nx) and is_whole(self.ny)):
             raise InputError(f"grid {self}: cells are counted in whole numbers, as in Grid(12, 9)")
         if not (1 <= self.nx <= 200 and 1 <= self.ny <= 200):

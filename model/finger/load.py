@@ -1,4 +1,4 @@
-"""What a resting fingertip does to the plate: a mass, a spring and a damper at its centre.
+"""Load of a resting fingertip on the plate: a mass, a spring and a damper at its centre.
 
 1 kN/m, 2 N s/m and 0.2 g for a finger that presses lightly. What is measured has this order and
 spreads widely from finger to finger: for sideways motion 1 kN/m, 1 N s/m and 0.1 g are in use (DOI
@@ -24,7 +24,7 @@ class FingerLoad:
     mass: float = 0.0002
 
     def __post_init__(self) -> None:
-        """Refuse what no finger has."""
+        """Refuse values that are not finite or negative."""
         for what, unit in (("stiffness", "N/m"), ("damping", "N s/m"), ("mass", "kg")):
             expect_number(getattr(self, what), what=f"{what} of a finger", unit=unit)
         self.at(0.0, 0.0)
@@ -35,12 +35,12 @@ class FingerLoad:
 
 
 def finger_loads(contacts: Iterable[tuple[float, float]]) -> tuple[PointLoad, ...]:
-    """What fingers at contacts [m] do to the plate."""
+    """Loads of light fingers at contacts [m]."""
     return tuple(FingerLoad().at(x, y) for x, y in contacts)
 
 
 def parse_finger_load(text: str, *, what: str) -> FingerLoad:
-    """What a finger does from `light` or its stiffness, damping and mass, `1 kN/m,2 N s/m,0.2 g`.
+    """Parse `light` or stiffness, damping and mass of a finger, `1 kN/m,2 N s/m,0.2 g`.
 
     Bare numbers are N/m, N s/m and kg; what names the option in the error.
     """

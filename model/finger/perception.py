@@ -1,4 +1,4 @@
-"""What people feel: detection thresholds at the fingertip, and levels above them in dB SL."""
+"""Detection thresholds at the fingertip, and levels above them in dB SL."""
 
 import csv
 from functools import cache

@@ -1,1 +1,1 @@
-"""The plate in its modes: solved once, then answered for in a few dozen coordinates."""
+"""Modal reduction of the plate: solved once, then a few dozen coordinates."""

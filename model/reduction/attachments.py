@@ -1,7 +1,4 @@
-"""What the modes that were left out add where forces act on the free plate.
-
-Solved with each symmetry class's factors when a point is first asked for, and kept.
-"""
+"""Contribution of the truncated modes at points of attachment, solved on demand and cached."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,18 +10,22 @@ from model.arrays import FloatArray
 from model.fem.mesh import Mesh
 from model.reduction.class_modes import ClassModes
 
-# Solves for each point. A field then converges with their number, a receptance between attachments
-# with twice that, since it can be had from inner products of what was solved.
 TERMS = 4
+"""Solves for each point.
 
-# Memory for solved points [bytes]; beyond it the oldest are forgotten.
-KEPT_BYTES = 512 << 20
-KEPT_RASTERS = 4  # and sets of points that answers were asked for
+A field has this many terms, a receptance between attachments twice as many, from inner products.
+"""
+
+MAX_CACHE_BYTES = 512 << 20
+"""Memory for solved points; beyond it the oldest are dropped."""
+
+MAX_CACHED_RASTERS = 4
+"""Sets of observed points whose interpolation is cached."""
 
 
 @dataclass(frozen=True, eq=False)
 class Attachments:
-    """Points where forces act on a free plate, with what has been solved for them.
+    """Points where forces act on a free plate, with their residual vectors.
 
     shapes: (n, r) of the modes; residuals: by symmetry class, (n, TERMS, size); moments: (2 TERMS,
     n, n) receptances of all truncated modes together with their u / u_c to the power 1, 2, ...
@@ -48,9 +49,9 @@ class _Solved:
 
 
 class AttachmentSolver:
-    """Solves for points of one plate, and remembers.
+    """Solver for points of attachment on one plate, with a cache.
 
-    scale: u_c, 1 / (lambda + shift) of the lowest mode left out [s²/rad²].
+    scale: u_c, 1 / (lambda + shift) of the lowest truncated mode [s²/rad²].
     """
 
     def __init__(self, mesh: Mesh, classes: Sequence[ClassModes], *, scale: float) -> None:
@@ -61,8 +62,8 @@ class AttachmentSolver:
         self._observed: dict[bytes, tuple[FloatArray, tuple[sparse.csr_array, ...]]] = {}
 
     def solve(self, points: FloatArray) -> Attachments:
-        """Solve for forces at points [m] (n, 2), as far as they have not been solved for."""
-        known = self._known(points)
+        """Solve for forces at points [m] (n, 2), from the cache where possible."""
+        known = self._solutions(points)
         shapes = [
             np.array([each[number].force for each in known]).reshape(len(known), -1) @ part.vectors
             for number, part in enumerate(self._classes)
@@ -74,15 +75,15 @@ class AttachmentSolver:
             for number, part in enumerate(self._classes)
         )
         moments = self._between(known, known)
-        self._forget()
+        self._trim_cache()
         return Attachments(np.hstack(shapes), residuals, moments)
 
     def moments(self, points: FloatArray, others: FloatArray) -> FloatArray:
-        """As the moments of attachments at points (n, 2), with others (m, 2): (2 TERMS, n, m)."""
-        return self._between(self._known(points), self._known(others))
+        """Moments between points (n, 2) and others (m, 2), (2 TERMS, n, m)."""
+        return self._between(self._solutions(points), self._solutions(others))
 
-    def _known(self, points: FloatArray) -> "list[tuple[_Solved, ...]]":
-        """What is solved for points [m] (n, 2), by point and class."""
+    def _solutions(self, points: FloatArray) -> "list[tuple[_Solved, ...]]":
+        """Solutions for points [m] (n, 2), by point and class."""
         keys = [(float(x), float(y)) for x, y in np.asarray(points, dtype=float).reshape(-1, 2)]
         unknown = [key for key in dict.fromkeys(keys) if key not in self._solved]
         if unknown:
@@ -109,7 +110,7 @@ class AttachmentSolver:
         return moments
 
     def basis(self, attached: Attachments, points: FloatArray) -> FloatArray:
-        """Deflection at points by modes and by residual vectors, (p, r + TERMS n).
+        """Deflection at points of modes and residual vectors, (p, r + TERMS n).
 
         Residual vectors come term by term, each for all attachments.
         """
@@ -120,23 +121,23 @@ class AttachmentSolver:
         return np.hstack([shapes, extra])
 
     def _observe(self, points: FloatArray) -> tuple[FloatArray, tuple[sparse.csr_array, ...]]:
-        """Mode shapes at points (p, r), and by class the map to deflections there; kept a while."""
+        """Mode shapes at points (p, r), and by class the map to deflections there; cached."""
         key = points.tobytes()
         if key not in self._observed:
             interpolation = self._mesh.interpolation(points)
             maps = tuple(
-                sparse.csr_array(interpolation @ part.symmetry.spread) for part in self._classes
+                sparse.csr_array(interpolation @ part.symmetry.expansion) for part in self._classes
             )
             pairs = zip(maps, self._classes, strict=True)
             shapes = np.hstack([each @ part.vectors for each, part in pairs])
-            if len(self._observed) >= KEPT_RASTERS:
+            if len(self._observed) >= MAX_CACHED_RASTERS:
                 self._observed.clear()
             self._observed[key] = shapes, maps
         return self._observed[key]
 
     def _solve_for(self, points: list[tuple[float, float]]) -> None:
         interpolation = self._mesh.interpolation(np.array(points))
-        forces = [(interpolation @ part.symmetry.spread).toarray() for part in self._classes]
+        forces = [(interpolation @ part.symmetry.expansion).toarray() for part in self._classes]
         solved = [
             part.residuals(force, terms=TERMS, scale=self._scale)
             for part, force in zip(self._classes, forces, strict=True)
@@ -149,8 +150,8 @@ class AttachmentSolver:
                 for force, residual in zip(forces, solved, strict=True)
             )
 
-    def _forget(self) -> None:
-        """Drop the oldest solved points where they take too much memory."""
+    def _trim_cache(self) -> None:
+        """Drop the oldest solved points beyond MAX_CACHE_BYTES."""
         size = 8 * (2 * TERMS + 1) * sum(part.symmetry.size for part in self._classes)
-        while len(self._solved) * size > KEPT_BYTES:
+        while len(self._solved) * size > MAX_CACHE_BYTES:
             del self._solved[next(iter(self._solved))]

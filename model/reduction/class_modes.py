@@ -1,4 +1,4 @@
-"""The modes of one symmetry class of the free plate, with the factors that they were found by."""
+"""Modes of one symmetry class of the free plate, with the factorisation used for them."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -15,7 +15,7 @@ from model.fem.symmetry import SymmetryClass
 
 @dataclass(frozen=True, eq=False)
 class ClassModes:
-    """One symmetry class: its factors, and its modes up to the cut-off.
+    """One symmetry class: its factorised matrix, and its modes up to the cut-off.
 
     solve: (K + shift M) x = f; mass M (n, n); eigenvalues omega² (r,) [rad²/s²] and vectors Phi
     (n, r) with Phi^T M Phi = I; next_eigenvalue: of the lowest truncated mode.
@@ -34,16 +34,16 @@ class ClassModes:
         return np.asarray(self.mass @ self.vectors)
 
     def residuals(self, forces: FloatArray, *, terms: int, scale: float) -> FloatArray:
-        """What the truncated modes make of forces (m, n): (2, m, terms, n), second: times the mass.
+        """Residual vectors of forces (m, n), and M times them: (2, m, terms, n).
 
-        The j-th term is their sum of phi (phi . force) (u / scale)^j, u = 1 / (lambda + shift), j
-        from 1 on.
+        The j-th term is the sum of phi (phi . force) (u / scale)^j over the truncated modes,
+        u = 1 / (lambda + shift), j from 1 on.
         """
         result = np.empty((2, len(forces), terms, forces.shape[1]))
         force = forces.T
         for term in range(terms):
             deflection = self.solve(force) / scale
-            # The kept modes' share is taken out; once leaves rounding behind, twice is enough.
+            # Orthogonalise to the kept modes, twice because of rounding.
             for _ in range(2):
                 deflection -= self.vectors @ (self._mass_weighted_modes.T @ deflection)
             force = self.mass @ deflection
@@ -54,9 +54,9 @@ class ClassModes:
 def solve_class(
     symmetry: SymmetryClass, elements: ElementMatrices, *, shift: float, cut: float, count: int
 ) -> ClassModes:
-    """All modes of a class below the cut [rad²/s²].
+    """Solve for all modes of a class below the cut [rad²/s²].
 
-    count: how many to look for at first; more where they do not reach the cut.
+    count: number of modes to compute at first; more where they do not reach the cut.
     """
     shifted, unsummed = symmetry.assemble(elements, shift)
     solve, mass = factorise_definite(shifted), sparse.csr_array(unsummed)
@@ -80,7 +80,7 @@ def solve_class(
 def _lowest(
     solve: Solve, mass: sparse.csr_array, count: int, *, shift: float
 ) -> tuple[FloatArray, FloatArray]:
-    """The lowest eigenpairs; all of them where that is no more work."""
+    """The lowest eigenpairs; all of them where that costs no more."""
     size = mass.shape[0]
     if count >= size / 2:
         inverse = solve(np.eye(size))

@@ -1,10 +1,10 @@
-"""The free plate, solved once, answering for everything that is attached to it at points.
+"""The free plate, solved once for all ERAs, fingers and masses that may be attached at points.
 
-Modes of the free plate up to twice the highest frequency, found in each symmetry class by one
-factorisation; what the truncated modes add (`model.reduction.truncation`) takes a few more solves
-with the same factors for each point that a force acts at, done when a point is first asked for and
-kept. ERAs, bolts, point masses and fingers are then a correction of low rank (Woodbury identity): a
-solve as small as their number for each frequency, whatever the mesh.
+Modes of the free plate up to twice the highest frequency come from one factorisation for each
+symmetry class; the contribution of the truncated modes (`model.reduction.truncation`) takes a few
+more solves with the same factors for each point of attachment, cached. Attachments are then a
+low-rank correction (`model.reduction.low_rank`): for each frequency a system as small as their
+number, independent of the mesh.
 """
 
 import math
@@ -29,15 +29,15 @@ from model.structure.dynamic_stiffness import attached_stiffness, drive_forces
 from model.structure.plate import Plate
 from model.structure.point_load import PointLoad, load_positions
 
-# Modes are kept up to this multiple of the highest frequency asked for.
 FREQUENCY_MARGIN = 2.0
+"""Modes are kept up to this multiple of frequency_max."""
 
 
 @dataclass(frozen=True, eq=False)
 class FreePlate:
     """Modes and factors of one plate on one mesh; see `solve_free_plate`.
 
-    frequency_max [Hz]: up to where it answers; shift [rad²/s²]: of the factors.
+    frequency_max [Hz]: upper limit of the response; shift [rad²/s²]: of the factorisations.
     """
 
     plate: Plate
@@ -53,12 +53,12 @@ class FreePlate:
 
     @cached_property
     def attachments(self) -> AttachmentSolver:
-        """What has been solved for the points where forces act."""
+        """Solver for the points where forces act, with its cache."""
         return AttachmentSolver(self.mesh, self.classes, scale=self.largest_truncated)
 
     @property
     def largest_truncated(self) -> float:
-        """1 / (lambda + shift) of the lowest mode left out [s²/rad²]."""
+        """1 / (lambda + shift) of the lowest truncated mode [s²/rad²]."""
         return 1 / (min(part.next_eigenvalue for part in self.classes) + self.shift)
 
     def acceleration(
@@ -97,9 +97,9 @@ class FreePlate:
     ) -> tuple[ComplexArray, ComplexArray]:
         """Receptances [m/N] between places [m] (c, 2), (f, c, c), and to points (p, 2), (f, c, p).
 
-        Of the free plate under its loads: what a study of many layouts of ERAs at these places
-        needs, each of them then being a solve as small as its number of ERAs. Raises InputError as
-        `respond` does.
+        Of the free plate with its loads. A study of many layouts of ERAs at these places then
+        solves a system as small as its number of ERAs for each. Raises InputError as
+        `acceleration`.
         """
         omega = self._omega(frequencies)
         attached = self.attachments.solve(np.vstack([places, load_positions(loads)]))
@@ -138,13 +138,13 @@ class FreePlate:
         return np.asarray(modal + np.tensordot(weights, attached.moments, axes=1))
 
     def _omega(self, frequencies: FloatArray) -> FloatArray:
-        """omega [rad/s] of frequencies [Hz] that can be answered; InputError for others."""
+        """omega [rad/s] of frequencies [Hz]; raises InputError for those out of range."""
         frequencies = np.asarray(frequencies, dtype=float)
         check_frequencies(self.plate, self.mesh, frequencies)
         if len(frequencies) and frequencies.max() > self.frequency_max * (1 + 1e-9):
             raise InputError(
-                f"the plate was solved up to {self.frequency_max:g} Hz and cannot answer at "
-                f"{frequencies.max():g} Hz; solve it with a higher frequency_max"
+                f"frequency must be at most {self.frequency_max:g} Hz, to which the plate was "
+                f"solved, got {frequencies.max():g} Hz; solve it with a higher frequency_max"
             )
         return 2 * np.pi * frequencies
 
@@ -161,11 +161,11 @@ def _apply(basis: FloatArray, coordinates: ComplexArray) -> ComplexArray:
 
 
 def solve_free_plate(plate: Plate, mesh: Mesh, *, frequency_max: float = 500.0) -> FreePlate:
-    """Solve the free plate once on a mesh, for answers up to a frequency [Hz]."""
+    """Solve the free plate on a mesh, for responses up to a frequency [Hz]."""
     if not (math.isfinite(frequency_max) and frequency_max > 0):
-        raise InputError(f"frequency_max is {frequency_max} Hz, must be above zero")
-    # Above nothing, since rigid motion could not be factored, and well below the modes left out: it
-    # takes from how fast their sum converges.
+        raise InputError(f"frequency_max must be above zero, got {frequency_max} Hz")
+    # Above zero, since K alone is singular, and well below the truncated modes, whose sum converges
+    # more slowly for a larger shift.
     shift = (2 * math.pi * min(plate.lowest_bending_frequency, frequency_max / 3)) ** 2
     cut = FREQUENCY_MARGIN * frequency_max
     elements = element_matrices(plate, mesh)
@@ -183,10 +183,10 @@ def solve_free_plate(plate: Plate, mesh: Mesh, *, frequency_max: float = 500.0) 
 
 
 def _class_count(plate: Plate, frequency: float) -> int:
-    """About how many modes a symmetry class has up to a frequency [Hz], and a few more.
+    """Number of modes to compute for a symmetry class up to a frequency [Hz].
 
     Area term of the mode count of a thin plate, pi S / wavelength², and a quarter more for its
-    edges; a quarter of that for each class.
+    edges; a quarter of that for each class, and four more.
     """
     area_term = math.pi * plate.length * plate.width / plate.bending_wavelength(frequency) ** 2
     return math.ceil(1.25 * area_term / 4) + 4

@@ -1,18 +1,16 @@
-"""Mass, damping and stiffness of the plate on its ERAs, in the coordinates of the free plate.
+"""Mass, damping and stiffness matrices of the plate on its ERAs, in reduced coordinates.
 
 M = I + sum m_b phi phi^T, K = diag(omega²) + sum k_b phi phi^T, C = C_s + sum c phi phi^T; phi are
-the free plate's shapes at an ERA. What else the plate carries adds to M in the same way, and a
-finger in contact adds its mass, stiffness and damping where it rests.
+the free plate's shapes at an ERA. Point masses and fingers add to M, K and C in the same way.
 
 Structural damping. The frequency domain uses a hysteretic stiffness (1 + i eta) diag(omega²),
 which no causal equation in time has. C_s is its viscous equivalent: in the modes psi_j, omega_j of
 the plate *on its ERAs*, C_s,jk = eta psi_j^T diag(omega²) psi_k / sqrt(omega_j omega_k). That is
-positive semidefinite, and at every resonance of the supported plate it takes exactly the power that
-the hysteretic one takes; a ratio eta/2 on the modes of the *free* plate would not, because the
-springs' share of a mode's energy has no loss. It is the plate's own: contacts do not change it.
-What is left differs off resonance: with eta = 1 % the steady accelerations of the paper's plate
-differ by at most 0.5 % (relative L2 over the plate, 40 to 500 Hz), in proportion to eta; deep nulls
-are moved a little, not filled.
+positive semidefinite, and at every resonance of the supported plate it dissipates exactly the power
+of the hysteretic one; a ratio eta/2 on the modes of the *free* plate would not, because the energy
+in the springs has no loss. Contacts do not change it. The two differ off resonance: with eta = 1 %
+the steady accelerations of the paper's plate differ by at most 0.5 % (relative L2 over the plate,
+40 to 500 Hz), in proportion to eta; deep nulls move a little, they are not filled.
 """
 
 from collections.abc import Sequence
@@ -36,7 +34,7 @@ class Reduced(Protocol):
 
     @property
     def plate(self) -> Plate:
-        """What it is made of."""
+        """The plate."""
 
     @property
     def omega(self) -> FloatArray:
@@ -64,7 +62,7 @@ def modal_matrices(
     fixed += loads
     phi = reduced.at(load_positions([*fixed, *contacts])) if held is None else held
     elastic = np.diag(reduced.omega**2)
-    M, C, K = _attached(phi[: len(fixed)], fixed)
+    M, C, K = _contribution(phi[: len(fixed)], fixed)
     M += np.eye(len(elastic))
     K += elastic
     squares, psi = linalg.eigh(K, M)
@@ -72,14 +70,14 @@ def modal_matrices(
     viscous = reduced.plate.loss_factor * (psi.T @ elastic @ psi) / np.sqrt(np.outer(omega, omega))
     back = M @ psi
     C += back @ viscous @ back.T
-    added = _attached(phi[len(fixed) :], contacts)
+    added = _contribution(phi[len(fixed) :], contacts)
     return M + added[0], C + added[1], K + added[2]
 
 
-def _attached(
+def _contribution(
     phi: FloatArray, loads: Sequence[PointLoad]
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """What loads with these shapes (n, r) add to M, C and K."""
+    """Contribution of loads with these shapes (n, r) to M, C and K."""
     mass = (phi.T * [load.mass for load in loads]) @ phi
     damping = (phi.T * [load.damping for load in loads]) @ phi
     return mass, damping, (phi.T * [load.stiffness for load in loads]) @ phi

@@ -1,9 +1,9 @@
-"""The plate in a few dozen coordinates, for solving it in time.
+"""The plate in a few dozen coordinates, for its solution in time.
 
-Modes of the free plate, and for every attachment three static vectors with what the modes already
-carry taken out: the truncated modes' answer to a force there, and how it grows with omega. Without
-them the modes converge slowly near a point force. Where a force comes or goes while the plate
-vibrates, it is reduced anew, and its motion is carried over.
+Modes of the free plate, and for every attachment three static vectors, orthogonal to them: the
+response of the truncated modes to a force there, and its growth with omega. Without these the modes
+converge slowly near a point force. Where an attachment comes or goes while the plate vibrates, the
+plate is reduced again and its motion is projected.
 """
 
 from dataclasses import dataclass
@@ -24,10 +24,10 @@ _SAME = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class Origin:
-    """What a plate was reduced from: the solved free plate, for forces at points (n, 2) [m].
+    """Source of a reduction: the solved free plate and the points of attachment (n, 2) [m].
 
-    moments: what the truncated modes add between those points (`model.reduction.attachments`);
-    mixture (STATIC_VECTORS n, s): its static coordinates by the residual vectors of the points.
+    moments: of the truncated modes between those points (`model.reduction.attachments`);
+    mixture (STATIC_VECTORS n, s): static coordinates by the residual vectors of the points.
     """
 
     free: FreePlate
@@ -36,8 +36,8 @@ class Origin:
     mixture: FloatArray
 
     def moments_with(self, other: "Origin") -> FloatArray:
-        """The same between its points and another's, (m, n, k)."""
-        # Most are among its own, as when a finger comes or goes: no need to solve for them again.
+        """Moments between its points and another's, (m, n, k)."""
+        # Most are shared, as when a finger comes or goes, and need no solve.
         same = (self.points[:, None] == other.points).all(axis=2)
         moments = self.moments[:, :, same.argmax(axis=0)]
         missing = ~same.any(axis=0)
@@ -49,11 +49,11 @@ class Origin:
 
 @dataclass(frozen=True, eq=False)
 class ReducedPlate:
-    """The free plate in coordinates where its mass is the identity and its stiffness is diagonal.
+    """The free plate in coordinates with M = I and K = diag(omega²).
 
-    omega: (r,) [rad/s], the rigid-body modes 0, the last ones pseudo-modes that carry the static
+    omega: (r,) [rad/s], 0 for rigid-body modes, the last ones pseudo-modes of the static
     corrections; shapes: (node_count, r) deflection at the nodes [1/sqrt(kg)]; origin: None where
-    the coordinates are all that is known.
+    only the coordinates are known.
     """
 
     plate: Plate
@@ -66,20 +66,19 @@ class ReducedPlate:
         """Shapes at points [m] (p, 2) of the plate, (p, r)."""
         return np.asarray(self.mesh.interpolation(points) @ self.shapes)
 
-    def with_forces_at(self, points: FloatArray) -> "ReducedPlate":
-        """The same plate, ready for forces at further points [m] (n, 2).
+    def with_attachments_at(self, points: FloatArray) -> "ReducedPlate":
+        """Reduce the same plate for further points of attachment [m] (n, 2).
 
-        Itself where its origin is not known: forces then reach it by the shapes it has.
+        Returns itself where its origin is not known: its shapes are then all there is.
         """
         if self.origin is None or not len(points):
             return self
         return reduce_free_plate(self.origin.free, np.vstack([self.origin.points, points]))
 
-    def carried_over_from(self, other: "ReducedPlate") -> FloatArray:
-        """Its coordinates are this (r, other's r) times those of another reduction, mass-weighted.
+    def projection_from(self, other: "ReducedPlate") -> FloatArray:
+        """M-orthogonal projection of another reduction's coordinates onto its own, (r, other's r).
 
-        Nothing is lost where it answers for all points of the other; what it has no coordinates for
-        is left out. Both must come from one free plate.
+        Exact where it has all points of the other. Both must come from one free plate.
         """
         if self.origin is None or other.origin is None:
             return np.eye(len(self.omega))
@@ -94,9 +93,9 @@ class ReducedPlate:
 def reduce_plate(
     plate: Plate, mesh: Mesh, attachments: FloatArray, *, frequency_max: float = 500.0
 ) -> ReducedPlate:
-    """Solve the free plate once, for forces at the attachments [m] (n, 2).
+    """Solve and reduce a plate for forces at the attachments [m] (n, 2).
 
-    frequency_max [Hz]: up to where the response shall hold; modes well above it are kept.
+    frequency_max [Hz]: upper limit of the response.
     """
     return reduce_free_plate(
         solve_free_plate(plate, mesh, frequency_max=frequency_max), attachments
@@ -104,7 +103,7 @@ def reduce_plate(
 
 
 def reduce_free_plate(free: FreePlate, attachments: FloatArray) -> ReducedPlate:
-    """Reduce a free plate that has been solved, for forces at the attachments [m] (n, 2)."""
+    """Reduce a solved free plate for forces at the attachments [m] (n, 2)."""
     attached = free.attachments.solve(attachments)
     basis = free.attachments.basis(attached, free.mesh.nodes)
     modes = len(free.eigenvalues)
@@ -115,9 +114,9 @@ def reduce_free_plate(free: FreePlate, attachments: FloatArray) -> ReducedPlate:
     strength, mix = linalg.eigh(mass * np.outer(size, size))
     apart = strength > _SAME * strength[-1]
     mix = size[:, None] * mix[:, apart] / np.sqrt(strength[apart])
-    inverse_u, turn = linalg.eigh(mix.T @ shifted @ mix)
+    inverse_u, rotation = linalg.eigh(mix.T @ shifted @ mix)
     omega = np.sqrt(inverse_u / free.largest_truncated - free.shift)
-    mixture = mix @ turn
+    mixture = mix @ rotation
     return ReducedPlate(
         free.plate,
         free.mesh,
@@ -128,10 +127,10 @@ def reduce_free_plate(free: FreePlate, attachments: FloatArray) -> ReducedPlate:
 
 
 def _products(moments: FloatArray, *, power: int) -> FloatArray:
-    """Products of static vectors a and b with mass (power 1) or stiffness + shift * mass (0).
+    """Products of static vectors a and b with M (power 1) or K + shift M (power 0).
 
-    They are known already: sums over the truncated modes of phi phi u^(a + b + power), (n, m) for
-    each pair of vectors, (STATIC_VECTORS n, STATIC_VECTORS m).
+    Sums over the truncated modes of phi phi u^(a + b + power), (n, m) for each pair of vectors:
+    (STATIC_VECTORS n, STATIC_VECTORS m).
     """
     a = np.arange(STATIC_VECTORS)
     several = moments[np.add.outer(a, a) + power].transpose(0, 2, 1, 3)

@@ -1,16 +1,15 @@
-"""What the modes beyond the highest kept one add to a receptance, from a few solves.
+"""Contribution of the truncated modes to a receptance, from a few static solves.
 
-A truncated mode of eigenvalue lambda answers at frequency omega with 1 / (1 + i eta)(lambda - z),
-z = omega² / (1 + i eta). The solved static problem with the shift sigma answers with
-u = 1 / (lambda + sigma) in its place, solved twice with u², and so on; and all the truncated modes
-have u within (0, u_c], u_c being that of the lowest of them. So the wanted u / (1 - s u),
-s = z + sigma, is approximated over that interval by a polynomial in u without constant term, the
-best of which comes from Chebyshev's: each mode's share is then wrong by the factor
+A truncated mode of eigenvalue lambda has the receptance 1 / (1 + i eta)(lambda - z),
+z = omega² / (1 + i eta). A static solve with the shift sigma gives u = 1 / (lambda + sigma) in its
+place, two solves u², and so on; all truncated modes have u within (0, u_c], u_c that of the lowest.
+So u / (1 - s u), s = z + sigma, is approximated on that interval by a polynomial in u without
+constant term. The optimum follows from Chebyshev's; its relative error for each mode is
 
     T_k(t(u)) / T_k(t(1 / s)),    t(u) = 2 u / u_c - 1,
 
-exactly. A Taylor series, the usual residual flexibility and its higher terms, converges with
-s u_c per term; this one about four times faster.
+exactly. A Taylor series, the usual residual flexibility with its higher terms, gains a factor of
+1 / |s u_c| with each term; this polynomial about four times as much.
 """
 
 import numpy as np

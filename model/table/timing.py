@@ -53,7 +53,7 @@ class Timing:
             contrast = self._transients.contrast_db(
                 self._onset(pattern), targets=question.targets, quiet=question.quiet
             )
-        left = self._transients.left_db(pattern.excitation, self._ending(pattern))
+        left = self._transients.residual_db(pattern.excitation, self._ending(pattern))
         return replace(pattern, transient_contrast_db=contrast, left_after_db=left)
 
     def _onset(self, pattern: Pattern) -> Bases:

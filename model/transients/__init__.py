@@ -1,1 +1,1 @@
-"""The plate in time: onsets and endings, predicted exactly and shaped to stay quiet."""
+"""The plate in time: exact prediction and shaping of onsets and endings."""

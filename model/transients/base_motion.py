@@ -1,4 +1,4 @@
-"""How the base of an ERA moves, in pieces that the plate's equations can be solved for exactly."""
+"""Motion of an ERA's base in terms for which the plate's equations are solved exactly."""
 
 import cmath
 import math
@@ -22,7 +22,7 @@ class Term:
 def fade(
     amplitude: complex, *, omega: float, start: float, ramp: float, gains: tuple[float, float]
 ) -> tuple[Term, ...]:
-    """A tone whose gain goes from the first to the second along a raised cosine, and stays there.
+    """Terms of a tone whose gain goes from the first to the second along a raised cosine.
 
     amplitude: complex [m], its phase that at start; omega [rad/s]; start, ramp [s]. The raised
     cosine is three exponentials: at omega and at omega +- pi / ramp; a ramp of 0 is a jump.

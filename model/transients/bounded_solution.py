@@ -1,4 +1,4 @@
-"""The smallest value of a quadratic form over complex numbers none of which may exceed a bound."""
+"""Minimum of a quadratic form of complex unknowns with bounded magnitudes."""
 
 import numpy as np
 from scipy import linalg
@@ -13,10 +13,10 @@ _STEPS = 30
 
 
 def bounded_solution(A: ComplexArray, b: ComplexArray, bound: FloatArray) -> ComplexArray:
-    """x (n,) of least x^H A x - 2 Re b^H x with |x_i| <= bound_i, A Hermitian positive definite.
+    """Minimise x^H A x - 2 Re b^H x with |x_i| <= bound_i, A Hermitian positive definite.
 
-    The unbounded solution where it keeps the bounds; otherwise by alternating directions (ADMM:
-    Boyd and others, 2011, section 5), which ends on a point that keeps them exactly.
+    The unbounded solution where it satisfies the bounds; otherwise by alternating directions (ADMM:
+    Boyd and others, 2011, section 5), whose result satisfies them exactly.
     """
     x: ComplexArray = linalg.solve(A, b, assume_a="pos", check_finite=False)
     if (np.abs(x) <= bound).all():
@@ -25,17 +25,17 @@ def bounded_solution(A: ComplexArray, b: ComplexArray, bound: FloatArray) -> Com
     inverse = np.linalg.inv(A + penalty * np.eye(len(A)))
     offset = inverse @ b
     inverse *= penalty
-    kept = _within(x, bound)
-    pull = np.zeros_like(x)
+    feasible = _within(x, bound)
+    dual = np.zeros_like(x)
     for _ in range(_STEPS):
-        x = offset + inverse @ (kept - pull)
-        ahead = _RELAXATION * x + (1 - _RELAXATION) * kept + pull
-        kept = _within(ahead, bound)
-        pull = ahead - kept
-    return kept
+        x = offset + inverse @ (feasible - dual)
+        relaxed = _RELAXATION * x + (1 - _RELAXATION) * feasible + dual
+        feasible = _within(relaxed, bound)
+        dual = relaxed - feasible
+    return feasible
 
 
 def _within(x: ComplexArray, bound: FloatArray) -> ComplexArray:
     size = np.abs(x)
-    # One in 1e12 less, so that rounding never puts a knot beyond its bound.
+    # Reduced by 1e-12, so that rounding never exceeds the bound.
     return x * np.where(size > bound, (1 - 1e-12) * bound / np.maximum(size, 1e-300), 1.0)

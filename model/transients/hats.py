@@ -1,13 +1,12 @@
-"""The plate's answers to hats: what knots of an envelope do, in closed form.
+"""Responses of the plate to hat functions, the basis of piecewise linear envelopes, in closed form.
 
-A hat is a drive that rises from nothing to an ERA's full stroke in one step and falls again in the
-next, at a carrier exp(s t). An envelope that is linear between knots is a sum of hats, one for each
-knot; the plate's answer to a hat that begins later is the same answer, later. So one answer for
-each ERA serves all knots. Answers are demodulated: without the factor exp(s t), as the envelopes
-themselves are.
+A hat is a drive at a carrier exp(s t) that rises from zero to an ERA's full stroke in one step and
+falls to zero in the next. An envelope linear between knots is a sum of hats, one for each knot, and
+the responses to hats differ only by a shift in time: one response for each ERA serves all knots.
+Responses are demodulated: without the factor exp(s t), as the envelopes are.
 
-A ramp t / step from time 0 on is answered by z(t) = a0 + a1 t - a0 exp((lambda - s) t) in the
-coordinates of `PlateInTime`; a hat is the second difference of that.
+The response to a ramp t / step from time 0 on is z(t) = a0 + a1 t - a0 exp((lambda - s) t) in the
+coordinates of `PlateInTime`; that to a hat is its second difference.
 """
 
 import numpy as np
@@ -17,7 +16,7 @@ from model.transients.time_response import PlateInTime
 
 
 def steady_states(plate: PlateInTime, omega: float) -> ComplexArray:
-    """State z of the plate at omega [rad/s], steady, each ERA alone at full stroke, (eras, 2 r)."""
+    """Steady state z of the plate at omega [rad/s], each ERA alone at full stroke, (eras, 2 r)."""
     count = len(plate.eras)
     strokes = np.array([era.stroke for era in plate.eras], dtype=complex)
     carrier = np.full(count, 1j * omega)
@@ -29,8 +28,8 @@ def hat_accelerations(
 ) -> ComplexArray:
     """Acceleration of the reduced coordinates after a hat on each ERA began, (n, eras, r).
 
-    omega [rad/s]; step [s]: from a hat's begin to its top. n = steps * samples moments, those in
-    the middle of each share of a step, for at knots the force jumps.
+    omega [rad/s]; step [s]: from a hat's begin to its top. n = steps * samples times, at the middle
+    of each interval, since the force jumps at knots.
     """
     s = 1j * omega
     times = step * (np.arange(steps * samples) + 0.5) / samples
@@ -47,10 +46,10 @@ def hat_accelerations(
 
 
 def ending_states(plate: PlateInTime, omega: float, *, step: float, steps: int) -> ComplexArray:
-    """State z when an ending of so many steps is over, from what leads to it, (2 r, steps, eras).
+    """State z at the end of an ending of so many steps, (2 r, steps, eras), ERAs at full stroke.
 
-    First, of each ERA at full stroke: the tone that had been steady until the ending began and
-    then fell to nothing within one step; after that a hat whose top is after step 1, 2, ...
+    First for the tone that was steady before and falls to zero within one step; then for a hat
+    whose top is after step 1, 2, ...
     """
     s = 1j * omega
     a0, a1 = _ramps(plate, s, step)

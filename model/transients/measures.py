@@ -1,8 +1,4 @@
-"""What fingers feel while a vibration starts, and what is left of it after it ended.
-
-Two measures: contrast of the peaks over the first 100 ms, and the vibration of the whole plate in
-the 100 ms after the end.
-"""
+"""Measures of onsets and endings: transient contrast, and the residual vibration of the plate."""
 
 import math
 from collections import defaultdict
@@ -20,23 +16,23 @@ from model.transients.hats import mean_square, steady_states
 from model.transients.time_response import PlateInTime
 from model.vibration.excitation import Excitation
 
-FIRST = 0.100
-"""The time [s] from the first motion over which an onset is judged."""
+ONSET_WINDOW = 0.100
+"""Time [s] from the first motion over which an onset is measured."""
 
-AFTER = 0.100
-"""The time [s] after the last motion of a base over which an ending is judged."""
+ENDING_WINDOW = 0.100
+"""Time [s] after the last motion of a base over which an ending is measured."""
 
 SAMPLE_RATE = 8000.0
-"""Sixteen samples [Hz] to a period of 500 Hz, so that a peak is found within 2 %."""
+"""Sixteen samples to a period of 500 Hz [Hz], so that a peak is found within 2 %."""
 
 
 class Transients:
-    """Predicts onsets and endings of a plate on its ERAs."""
+    """Predictions of onsets and endings of a plate on its ERAs."""
 
     def __init__(self, plate: PlateInTime) -> None:
         self._plate = plate
-        self._mean_square = mean_square(plate, AFTER)
-        times = np.arange(round(FIRST * SAMPLE_RATE)) / SAMPLE_RATE
+        self._mean_square = mean_square(plate, ENDING_WINDOW)
+        times = np.arange(round(ONSET_WINDOW * SAMPLE_RATE)) / SAMPLE_RATE
         table = np.exp(np.outer(times, plate.eigenvalues))
         self._table = np.hstack([table.real, table.imag])
 
@@ -67,11 +63,10 @@ class Transients:
         targets: Sequence[tuple[float, float]],
         quiet: Sequence[tuple[float, float]],
     ) -> float:
-        """Contrast [dB] of the targets while they still felt an excitation to the end of it.
+        """Contrast [dB] of the targets' steady vibration to the ending at quiet fingers.
 
-        Mean steady peak acceleration over a target's points, at the target where it is least, to
-        the loudest peak at a quiet point until 100 ms after the ending, whose bases move as told
-        from time 0 on; positions in m.
+        Steady peak acceleration at the targets to the loudest peak at a quiet point from time 0,
+        when the bases begin the ending, until 100 ms after it; positions in m.
         """
         plate = self._plate.reduced.plate
         discs = [fingertip_points(*each, plate) for each in targets]
@@ -87,7 +82,7 @@ class Transients:
             for frequency, field in by_frequency.items()
         )
         over = max((term.end for base in ending for term in base), default=0.0)
-        felt = self.acceleration(ending, at_quiet, duration=over + AFTER, after=excitation)
+        felt = self.acceleration(ending, at_quiet, duration=over + ENDING_WINDOW, after=excitation)
         ends = np.cumsum([len(disc) for disc in discs])[:-1]
         return float(contrast_db(np.split(np.asarray(steady), ends), np.abs(felt).max(axis=0)))
 
@@ -96,7 +91,7 @@ class Transients:
         bases: Bases,
         points: FloatArray,
         *,
-        duration: float = FIRST,
+        duration: float = ONSET_WINDOW,
         after: Excitation | None = None,
     ) -> FloatArray:
         """Acceleration [m/s²] at points [m] (p, 2) from time 0 on, every 1 / SAMPLE_RATE, (n, p).
@@ -104,7 +99,7 @@ class Transients:
         after: the excitation that had been steady before; None for rest.
         """
         shapes = self._plate.reduced.at(points)
-        drive = _Drive(self._plate, bases)
+        drive = _ForcedResponse(self._plate, bases)
         z = np.zeros(len(self._plate.eigenvalues), dtype=complex)
         for state in self._steady(after or {}).values():
             z += state
@@ -124,12 +119,12 @@ class Transients:
             z = z * np.exp(self._plate.eigenvalues * (until - since))
         return felt
 
-    def left_db(self, excitation: Excitation, ending: Bases) -> float:
-        """What is left [dB] in the 100 ms after an excitation ended as the bases say from time 0.
+    def residual_db(self, excitation: Excitation, ending: Bases) -> float:
+        """Residual vibration [dB] in the 100 ms after an ending that begins at time 0.
 
-        Root mean square acceleration over the whole plate relative to the steady one; mean over the
-        phases at which the end comes. The bases must come to rest, and each ERA must end at the
-        frequency it had.
+        Root mean square acceleration over the whole plate relative to the steady one, mean over the
+        phase at which the ending begins. The bases must come to rest, and each ERA must keep its
+        frequency.
         """
         over = max((term.end for base in ending for term in base), default=0.0)
         frequencies = {tone.frequency for tone in excitation.values()}
@@ -139,7 +134,7 @@ class Transients:
         power = 0.0
         for number, (era, base) in enumerate(zip(self._plate.eras, ending, strict=True)):
             alone = tuple(base if other == number else () for other in range(len(ending)))
-            drive = _Drive(self._plate, alone)
+            drive = _ForcedResponse(self._plate, alone)
             tone = excitation.get(era.name)
             frequency = tone.frequency if tone else min(frequencies)
             z = steady.get(era.name, still)
@@ -157,7 +152,7 @@ class Transients:
         return 10 * math.log10(remaining / power)
 
     def _steady(self, excitation: Excitation) -> dict[str, ComplexArray]:
-        """State (2 r,) at time 0, from which phases count, that each tone alone keeps up."""
+        """Steady state (2 r,) of each tone alone at time 0, the reference of phases."""
         states = {}
         for number, era in enumerate(self._plate.eras):
             tone = excitation.get(era.name)
@@ -167,8 +162,8 @@ class Transients:
         return states
 
 
-class _Drive:
-    """The particular solutions of all terms of all bases, those of one time and omega together."""
+class _ForcedResponse:
+    """Particular solutions of all terms of all bases, summed for each time and omega."""
 
     def __init__(self, plate: PlateInTime, bases: Bases) -> None:
         together: dict[tuple[float, float, float], list[tuple[int, Term]]] = defaultdict(list)
@@ -195,7 +190,7 @@ class _Drive:
         return list(pairwise(inside))
 
     def change(self, time: float) -> ComplexArray:
-        """By how much the free vibration (2 r,) changes where terms start or end at a time [s]."""
+        """Change of the free vibration (2 r,) where terms start or end at a time [s]."""
         sign = (self._end == time).astype(float) - (self._start == time)
         rows = np.flatnonzero(sign)
         tau = time - self._start[rows]
@@ -203,10 +198,12 @@ class _Drive:
         return np.asarray(size @ self._a0[rows] + (size * tau) @ self._a1[rows])
 
     def forced(self, times: FloatArray, since: float, shapes: ComplexArray) -> FloatArray:
-        """Acceleration (n, p) of the terms that hold from a time [s] on; shapes (2 r, p)."""
+        """Acceleration (n, p) of the terms active from a time [s] on; shapes (2 r, p)."""
         rows = np.flatnonzero((self._start <= since) & (since < self._end))
         s = self._s[rows, None]
         b0, b1 = self._a0[rows] @ shapes, self._a1[rows] @ shapes
         tau = times[:, None] - self._start[rows]
-        turn = np.exp(self._s[rows] * tau)
-        return np.asarray((turn @ (s**2 * b0 + 2 * s * b1) + (turn * tau) @ (s**2 * b1)).imag)
+        phase_factor = np.exp(self._s[rows] * tau)
+        return np.asarray(
+            (phase_factor @ (s**2 * b0 + 2 * s * b1) + (phase_factor * tau) @ (s**2 * b1)).imag
+        )

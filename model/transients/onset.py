@@ -1,10 +1,10 @@
-"""How much of its contrast a drive has while it starts along a plain ramp, worked out ahead.
+"""Contrast of a drive while it starts along a plain ramp, from precomputed responses.
 
-A ramp of one frequency is answered by the plate's own modes too, and their ringing knows nothing
-of the balance at a quiet finger. The answer to the ramp of each ERA alone is known in closed form;
-what a drive does is a weighted sum of these. Peaks are those of its envelope, the magnitude of the
-answer to the complex exponential, at moments a few milliseconds apart: within some tenths of a
-decibel of what `model.transients.measures` finds sample by sample, at a hundredth of the work.
+A ramp also excites the plate's own modes, whose ringing is not balanced at a quiet finger. The
+response to the ramp of each ERA alone is known in closed form, and that of a drive is their
+weighted sum. Peaks are those of its envelope, the magnitude of the complex response, at times a few
+milliseconds apart: within some tenths of a decibel of `model.transients.measures`, sample by
+sample, at a hundredth of the work.
 """
 
 from collections.abc import Sequence
@@ -14,13 +14,13 @@ from numpy.typing import NDArray
 
 from model.arrays import ComplexArray, FloatArray, IntArray
 from model.finger.contrast import contrast_ratio
-from model.transients.measures import FIRST
+from model.transients.measures import ONSET_WINDOW
 from model.transients.time_response import PlateInTime
 
-MOMENTS = 12
-"""How often an onset is looked at; not evenly, so that no beat goes unseen at all of them."""
+TIME_COUNT = 12
+"""Times at which an onset is evaluated; uneven, so that they do not all miss a beat."""
 
-AT_ONCE = 32  # frequencies that are solved together: some ten megabytes
+BATCH = 32  # frequencies solved together: some ten megabytes
 
 
 class RampedOnsets:
@@ -28,11 +28,11 @@ class RampedOnsets:
 
     def __init__(self, plate: PlateInTime, frequencies: FloatArray, *, ramp: float) -> None:
         """Solve them: frequencies (f,) [Hz], ramp [s]."""
-        # Towards the end, where the target has its full level; the first is half way up the ramp.
-        times = FIRST - (FIRST - ramp / 2) * np.linspace(1, 0, MOMENTS) ** 1.2
+        # Denser towards the end, where the target has its full level; the first is mid-ramp.
+        times = ONSET_WINDOW - (ONSET_WINDOW - ramp / 2) * np.linspace(1, 0, TIME_COUNT) ** 1.2
         self._eras = len(plate.eras)
-        shares = np.split(2 * np.pi * frequencies, range(AT_ONCE, len(frequencies), AT_ONCE))
-        parts = [_ramp_answers(plate, omega, times, ramp) for omega in shares]
+        shares = np.split(2 * np.pi * frequencies, range(BATCH, len(frequencies), BATCH))
+        parts = [_ramp_responses(plate, omega, times, ramp) for omega in shares]
         self._parts = np.concatenate(parts, dtype=np.complex64, casting="same_kind")
 
     def contrast(
@@ -49,15 +49,15 @@ class RampedOnsets:
         """
         n = len(frequencies)
         parts = self._parts.take(frequencies, axis=0).reshape(n, self._eras, -1)
-        answers = (weights[:, None, :] @ parts).reshape(n * MOMENTS, -1)
-        rows = np.concatenate([answers.real, answers.imag])
-        real, imaginary = (rows @ np.concatenate([*targets, quiet]).T).reshape(2, n, MOMENTS, -1)
+        responses = (weights[:, None, :] @ parts).reshape(n * TIME_COUNT, -1)
+        rows = np.concatenate([responses.real, responses.imag])
+        real, imaginary = (rows @ np.concatenate([*targets, quiet]).T).reshape(2, n, TIME_COUNT, -1)
         peaks = np.sqrt(np.maximum.reduce(real * real + imaginary * imaginary, axis=1))
         *felt, loudest = np.split(peaks, np.cumsum([len(shapes) for shapes in targets]), axis=1)
         return contrast_ratio(felt, loudest).astype(float)
 
 
-def _ramp_answers(
+def _ramp_responses(
     plate: PlateInTime, omega: FloatArray, times: FloatArray, ramp: float
 ) -> ComplexArray:
     """Acceleration of the reduced coordinates to each ERA's ramp alone, (f, eras, n, r).
@@ -76,10 +76,10 @@ def _ramp_answers(
     accelerations = states @ plate.displacement.T * (s**2).reshape(f, eras, 3, 1)
 
     rising = times < ramp
-    turns = share * np.exp(1j * np.outer(times, [0, side, -side]))  # (n, 3)
-    turns[~rising] = [1, 0, 0]
-    forced = turns @ accelerations
-    # What the plate's own modes have at the begin of the ramp, and anew at its end.
+    phase_factors = share * np.exp(1j * np.outer(times, [0, side, -side]))  # (n, 3)
+    phase_factors[~rising] = [1, 0, 0]
+    forced = phase_factors @ accelerations
+    # Free vibration from the begin of the ramp, and from its end.
     begin = -(share @ states)
     left = (share * [1, -1, -1]) @ states - states[:, :, 0]
     rates = plate.eigenvalues - 1j * omega[:, None]

@@ -5,9 +5,9 @@ raised cosine, each quiet fingertip stays still, from the first millisecond unti
 settled.
 
 Ending. The plate's mean square over the time after the last knot is a quadratic form of its state
-then, so of the knots; its least value is the brake. That does not depend on who touches the plate,
-nor on the carrier's phase at the moment of the end. Where quiet fingers are known, they are kept
-quiet while the brake lasts, too: stopping the plate takes other vibrations than the pattern's.
+then, and so of the knots; the brake minimises it. It depends neither on the contacts nor on the
+carrier's phase at that moment. Known quiet fingers are kept quiet during the brake, too: stopping
+the plate takes other vibrations than the pattern's.
 
 Both are robust against errors of the ERAs (`model.transients.knots`), and no knot ever exceeds the
 stroke (`model.transients.bounded_solution`).
@@ -25,7 +25,7 @@ from model.finger.grid import Grid
 from model.transients.envelope import Envelope, Envelopes
 from model.transients.hats import mean_square
 from model.transients.knots import Carrier, ending_knots, onset_knots, solve_carrier
-from model.transients.measures import AFTER
+from model.transients.measures import ENDING_WINDOW
 from model.transients.time_response import PlateInTime
 from model.vibration.excitation import Excitation
 from model.vibration.peak import base_amplitudes
@@ -39,18 +39,18 @@ Position = tuple[float, float]
 
 
 class Shaper:
-    """Finds onsets and endings for a plate on its ERAs.
+    """Shaping of onsets and endings for a plate on its ERAs.
 
-    What does not depend on the contacts is worked out once for each frequency and kept.
+    Everything that does not depend on the contacts is computed once for each frequency.
     """
 
     def __init__(self, plate: PlateInTime) -> None:
         self._plate = plate
-        self._after = mean_square(plate, AFTER)
+        self._after = mean_square(plate, ENDING_WINDOW)
         self._carriers: dict[float, Carrier] = {}
 
     def prepare(self, frequency: float) -> None:
-        """Work out ahead what belongs to a frequency [Hz]."""
+        """Compute in advance everything for a frequency [Hz] that does not depend on contacts."""
         self._carrier(frequency)
 
     def onset(
@@ -66,12 +66,17 @@ class Shaper:
         fingers the plate beyond 50 mm of the targets takes their place. An ERA that the excitation
         leaves silent helps where there is one frequency only.
         """
-        felt = self._fingertips(targets)
-        still = self._fingertips(quiet) if quiet else self._surroundings(targets)
+        target_rows = self._fingertips(targets)
+        quiet_rows = self._fingertips(quiet) if quiet else self._surroundings(targets)
         envelopes: dict[str, Envelope] = {}
         for frequency, amplitudes, active in self._groups(excitation, helped=True):
             knots = onset_knots(
-                self._carrier(frequency), amplitudes, active, felt=felt, still=still, rise=RISE
+                self._carrier(frequency),
+                amplitudes,
+                active,
+                target_rows=target_rows,
+                quiet_rows=quiet_rows,
+                rise=RISE,
             )
             envelopes.update(self._envelopes(frequency, np.vstack([0 * knots[0], knots]), active))
         return envelopes
@@ -86,15 +91,19 @@ class Shaper:
         """Envelopes that lead from an excitation to silence and bring the whole plate to rest.
 
         With targets and quiet fingers [m] the quiet ones are kept quiet meanwhile. Silent ERAs stay
-        so: an ending belongs to what plays, whatever comes next.
+        silent.
         """
         both = bool(targets and quiet)
-        felt = self._fingertips(targets) if both else None
-        still = self._fingertips(quiet) if both else None
+        target_rows = self._fingertips(targets) if both else None
+        quiet_rows = self._fingertips(quiet) if both else None
         envelopes: dict[str, Envelope] = {}
         for frequency, amplitudes, active in self._groups(excitation, helped=False):
             knots = ending_knots(
-                self._carrier(frequency), amplitudes, active, felt=felt, still=still
+                self._carrier(frequency),
+                amplitudes,
+                active,
+                target_rows=target_rows,
+                quiet_rows=quiet_rows,
             )
             envelopes.update(self._envelopes(frequency, knots, active))
         return envelopes
@@ -115,9 +124,9 @@ class Shaper:
     def _groups(
         self, excitation: Excitation, *, helped: bool
     ) -> list[tuple[float, ComplexArray, IntArray]]:
-        """Per frequency [Hz]: amplitudes (eras,) in strokes, and which ERAs play it.
+        """Per frequency [Hz]: amplitudes (eras,) in strokes, and the indices of ERAs that play it.
 
-        helped: whether those that the excitation leaves silent do where there is one frequency.
+        helped: silent ERAs play too where there is one frequency.
         """
         eras = self._plate.eras
         frequencies, phasors = base_amplitudes(excitation, eras)
@@ -130,11 +139,10 @@ class Shaper:
         ]
 
     def _fingertips(self, positions: Sequence[Position]) -> FloatArray:
-        """Few rows (d, r) that a vibration under fingertips comes down to.
+        """Rows (d, r) whose sum of squares is the mean square under the fingertips, summed.
 
-        The sum of their squares is the mean square over a fingertip's points, summed over the
-        fingertips: polynomials of second order, orthonormal there, hold all that a bending wave
-        much longer than the fingertip does.
+        Coefficients of polynomials of second order, orthonormal over a fingertip's points: enough
+        for bending waves much longer than the fingertip.
         """
         rows = []
         for x, y in positions:
@@ -145,7 +153,7 @@ class Shaper:
         return np.concatenate(rows)
 
     def _surroundings(self, targets: Sequence[Position]) -> FloatArray:
-        """The same for the plate beyond 50 mm of all targets, or all of it where that is none."""
+        """The same for the plate beyond 50 mm of all targets; all of a plate too small for it."""
         centres = _SURROUNDINGS.centres(self._plate.reduced.plate)
         shapes = self._plate.reduced.at(centres[is_around(centres, targets)])
         return np.asarray(np.linalg.qr(shapes, mode="r")) / math.sqrt(len(shapes))

@@ -1,4 +1,4 @@
-"""The plate in time: its equations of motion, taken apart so that they are solved exactly.
+"""The plate in time: its equations of motion in modal form, solved exactly.
 
     M q'' + C q' + K q = sum over ERAs of phi (k_b y + c y')
 
@@ -29,11 +29,11 @@ from model.structure.actuator import Era
 from model.structure.point_load import PointLoad, load_positions
 from model.transients.base_motion import Term
 
-_ANSWERED_MAX = 1024  # unit answers that are kept, some kilobytes each
+_MAX_CACHED_SOLUTIONS = 1024  # unit solutions that are kept, some kilobytes each
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Answer:
+class ParticularSolution:
     """The particular solution q(t) = Im[(b0 + b1 tau) exp(i omega tau)], tau = t - term.start.
 
     b0, b1: (r,).
@@ -46,9 +46,11 @@ class Answer:
     def state(self, time: float) -> FloatArray:
         """Displacement and velocity (2 r,) at a time [s]."""
         tau = time - self.term.start
-        turn = np.exp(1j * self.term.omega * tau)
+        phase_factor = np.exp(1j * self.term.omega * tau)
         q = self.b0 + self.b1 * tau
-        return np.concatenate([q * turn, (self.b1 + 1j * self.term.omega * q) * turn]).imag
+        return np.concatenate(
+            [q * phase_factor, (self.b1 + 1j * self.term.omega * q) * phase_factor]
+        ).imag
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,32 +73,32 @@ class PlateInTime:
         """Displacement of the reduced coordinates in each eigenvector, (r, 2 r)."""
         return self.vectors[: len(self.vectors) // 2]
 
-    def answers(self, era: int, terms: Sequence[Term]) -> list[Answer]:
-        """The particular solutions for terms of one ERA's base, one each."""
-        answers = []
+    def particular_solutions(self, era: int, terms: Sequence[Term]) -> list[ParticularSolution]:
+        """Particular solutions for terms of one ERA's base, one each."""
+        solutions = []
         for term in terms:
-            still, growing = self._unit_answers(era, term.omega)
-            answers.append(
-                Answer(term, still * term.c0 + growing * term.c1, still * term.c1)
+            still, growing = self._unit_solutions(era, term.omega)
+            solutions.append(
+                ParticularSolution(term, still * term.c0 + growing * term.c1, still * term.c1)
                 if term.c1
-                else Answer(term, still * term.c0, np.zeros_like(still))
+                else ParticularSolution(term, still * term.c0, np.zeros_like(still))
             )
-        return answers
+        return solutions
 
-    def _unit_answers(self, era: int, omega: float) -> tuple[ComplexArray, ComplexArray]:
+    def _unit_solutions(self, era: int, omega: float) -> tuple[ComplexArray, ComplexArray]:
         """b0 (r,) each for a base that moves with c0 = 1 m, and with c1 = 1 m/s."""
         key = (era, omega)
-        if key not in self._answered:
+        if key not in self._solved:
             a0, _ = self.particular([era] * 2, np.full(2, 1j * omega), [1.0, 0.0], [0.0, 1.0])
             still, growing = a0 @ self.displacement.T
-            if len(self._answered) >= _ANSWERED_MAX:
-                self._answered.clear()
-            self._answered[key] = still, growing
-        return self._answered[key]
+            if len(self._solved) >= _MAX_CACHED_SOLUTIONS:
+                self._solved.clear()
+            self._solved[key] = still, growing
+        return self._solved[key]
 
     @cached_property
-    def _answered(self) -> dict[tuple[int, float], tuple[ComplexArray, ComplexArray]]:
-        # A table has few frequencies, and so have the ramps that their fades take.
+    def _solved(self) -> dict[tuple[int, float], tuple[ComplexArray, ComplexArray]]:
+        # A table and its ramps have few frequencies.
         return {}
 
     def particular(
@@ -197,7 +199,7 @@ def plate_in_time(
 
 
 def _inverse(vectors: ComplexArray) -> ComplexArray:
-    """Of eigenvectors; not a number where two of them are one."""
+    """Inverse of the eigenvectors; nan where they are dependent."""
     try:
         return np.asarray(np.linalg.inv(vectors))
     except np.linalg.LinAlgError:

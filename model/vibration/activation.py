@@ -1,4 +1,4 @@
-"""Which ERAs are driven, and how strongly the plate then vibrates over all frequencies.
+"""Activation sets, and statistics of the plate's vibration over all frequencies.
 
 The paper's measure of a layout: at each frequency in turn the ERAs of an activation set are driven
 together, at full stroke and in phase; the peak accelerations of all frequencies are added up at
@@ -20,11 +20,11 @@ STATISTICS = ("minimum", "lower quartile", "median", "upper quartile", "maximum"
 MEDIAN = STATISTICS.index("median")
 
 ActivationSet = tuple[int, ...]
-"""Numbers of the ERAs that are driven."""
+"""Indices of the driven ERAs."""
 
 
 def activation_sets(era_count: int) -> tuple[ActivationSet, ...]:
-    """Every ERA alone, then every pair, then all together where they are more than two."""
+    """List every ERA alone, every pair, and all together where they are more than two."""
     alone = [(era,) for era in range(era_count)]
     everything = [tuple(range(era_count))] if era_count > 2 else []
     return (*alone, *combinations(range(era_count), 2), *everything)

@@ -1,4 +1,4 @@
-"""How far a mesh is from converged: natural frequencies and response, beside a finer mesh."""
+"""Discretisation error of natural frequencies and response, against a finer mesh."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -20,22 +20,22 @@ MAP_FREQUENCIES = (110.0, 250.0)
 
 MODE_COUNT = 12
 
-# The coarsest MITC4 mesh that is looked at; on the paper's plate up to 500 Hz it is the paper's own
-# 12x9. Each next one has twice as many elements along both sides.
+# The coarsest MITC4 mesh of a study; on the paper's plate up to 500 Hz it is the paper's 12x9. Each
+# next one has twice as many elements along both sides.
 _COARSEST_PER_WAVELENGTH = 6.5
 _DOUBLINGS = 3
 
-# Below this share of the plate's lowest bending frequency a natural frequency is rounding: on one
-# ERA or two the plate can tilt freely.
-_HELD = 1e-4
+# Relative to the plate's lowest bending frequency, below which a natural frequency is rounding of
+# free tilting on one or two ERAs.
+_MIN_FREQUENCY_RATIO = 1e-4
 
-# A raster for comparing responses, finer than half a wave of any frequency that has been asked for.
+# Raster for comparing responses, finer than half a wavelength.
 _RASTER = (49, 37)
 
 
 @dataclass(frozen=True)
 class MeshError:
-    """How wrong a mesh is, relative to the reference.
+    """Discretisation error of a mesh, relative to the reference.
 
     frequency: of the natural frequencies that are compared, signed, (n,); response: of the
     acceleration field at each frequency, relative L2 over the plate, the worst driven ERA, (f,).
@@ -51,7 +51,7 @@ class MeshError:
 class Convergence:
     """Errors of several meshes against a reference mesh, response at frequencies (f,) [Hz].
 
-    natural_frequencies: the lowest on the ERAs [Hz], but for motion that nothing holds, (n,).
+    natural_frequencies: the lowest on the ERAs [Hz] without unsupported motion, (n,).
     """
 
     reference: Mesh
@@ -61,7 +61,7 @@ class Convergence:
 
 
 def meshes_to_compare(rig: Rig) -> tuple[Mesh, ...]:
-    """Four MITC4 meshes, the automatic one, and the rig's own where it is none of these."""
+    """List four MITC4 meshes, the automatic one, and the rig's own."""
     plate, high = rig.plate, rig.limits.frequency_max
     size = plate.bending_wavelength(high) / _COARSEST_PER_WAVELENGTH
     nx, ny = (max(1, math.ceil(side / size)) for side in (plate.length, plate.width))
@@ -94,34 +94,34 @@ def study_convergence(
     """Solve a rig on each mesh and on the reference.
 
     frequencies (f,) [Hz] up to the rig's limit. Raises InputError for those that a mesh cannot
-    carry. progress hears how many meshes of how many are solved, the reference first.
+    resolve. progress is called with the number of solved meshes, the reference first, and of all.
     """
     high = rig.limits.frequency_max
-    asked = np.asarray(frequencies, dtype=float)
-    if (asked > high).any():
+    checked = np.asarray(frequencies, dtype=float)
+    if (checked > high).any():
         raise InputError(
-            f"{asked.max():g} Hz is above the rig's limits.frequency of {high:g} Hz, for "
-            "which its meshes are made; ask for lower frequencies or raise the limit"
+            f"frequencies must be at most the rig's limits.frequency of {high:g} Hz, got "
+            f"{checked.max():g} Hz; take lower frequencies or raise the limit"
         )
     reference = reference_mesh(rig.plate, frequency_max=high)
     exact = _natural_frequencies(rig, reference)
-    held = exact > _HELD * rig.plate.lowest_bending_frequency
-    exact_response = _response(rig, reference, asked)
+    supported = exact > _MIN_FREQUENCY_RATIO * rig.plate.lowest_bending_frequency
+    exact_response = _response(rig, reference, checked)
     size = np.linalg.norm(exact_response, axis=2)
     errors = []
     for done, mesh in enumerate(meshes, start=1):
         progress(done, 1 + len(meshes))
-        difference = np.linalg.norm(_response(rig, mesh, asked) - exact_response, axis=2)
+        difference = np.linalg.norm(_response(rig, mesh, checked) - exact_response, axis=2)
         errors.append(
             MeshError(
                 mesh,
                 dof=3 * mesh.node_count,
-                frequency=_natural_frequencies(rig, mesh)[held] / exact[held] - 1,
+                frequency=_natural_frequencies(rig, mesh)[supported] / exact[supported] - 1,
                 response=(difference / size).max(axis=1),
             )
         )
     progress(1 + len(meshes), 1 + len(meshes))
-    return Convergence(reference, asked, exact[held], tuple(errors))
+    return Convergence(reference, checked, exact[supported], tuple(errors))
 
 
 def _natural_frequencies(rig: Rig, mesh: Mesh) -> FloatArray:

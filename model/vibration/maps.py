@@ -15,8 +15,8 @@ from model.rig.rig import Rig
 from model.vibration.excitation import Excitation
 from model.vibration.peak import find_nulls, peak_acceleration, tone_amplitudes
 
-MOST_POINTS = 1_000_000
-"""Of a map: finer than any screen, and some hundred bytes of memory each."""
+MAX_POINTS = 1_000_000
+"""More would be finer than any screen, at some hundred bytes of memory each."""
 
 
 @dataclass(frozen=True)
@@ -54,10 +54,10 @@ def plate_map(
     mesh = rig.mesh
     columns, rows = raster or mesh.raster
     if columns < 2 or rows < 2:
-        raise InputError(f"a map of {columns}x{rows} points is none; 2x2 is the least")
-    if columns * rows > MOST_POINTS:
+        raise InputError(f"map: points must be 2x2 or more, got {columns}x{rows}")
+    if columns * rows > MAX_POINTS:
         raise InputError(
-            f"a map of {columns}x{rows} points is too large; {MOST_POINTS} points are the most"
+            f"map: points must be at most {MAX_POINTS}, got {columns}x{rows}; take a coarser one"
         )
     x = np.linspace(0, rig.plate.length, columns)
     y = np.linspace(0, rig.plate.width, rows)

@@ -1,4 +1,4 @@
-"""What an excitation makes the plate do: peak acceleration, and where nothing moves.
+"""Peak acceleration of an excitation, and its nulls.
 
 ERAs at the same frequency add as complex numbers; only magnitudes of different frequencies add
 (paper Eq. 28). Magnitudes added within a frequency would wipe out the nodal lines.
@@ -17,16 +17,16 @@ G = 9.8
 """Standard gravity as the paper rounds it [m/s²]; used only where accelerations are shown in g."""
 
 NULL_SHARE = 0.1
-"""A null lies below this share of the map's maximum."""
+"""A null is below this share of the map's maximum."""
 
 
 def base_amplitudes(excitation: Excitation, eras: Sequence[Era]) -> tuple[FloatArray, ComplexArray]:
-    """Distinct frequencies (f,) [Hz], and how each ERA's base moves at them, (f, eras) [m].
+    """Distinct frequencies (f,) [Hz], and phasors of each ERA's base at them, (f, eras) [m].
 
-    Raises InputError where nothing is driven, or an ERA that is not there.
+    Raises InputError where no ERA is driven, or an unknown one.
     """
     if not excitation:
-        raise InputError("no ERA is driven; name at least one")
+        raise InputError("excitation: must drive at least one ERA")
     names = [era.name for era in eras]
     unknown = [name for name in excitation if name not in names]
     if unknown:

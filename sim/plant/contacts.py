@@ -86,7 +86,7 @@ class LoadedPlateCache:
         return LoadedPlate(contacts, reduced, plate)
 
     def _reduce(self, points: tuple[Position, ...]) -> ReducedPlate:
-        return self._unloaded.with_forces_at(np.array(points))
+        return self._unloaded.with_attachments_at(np.array(points))
 
 
 @lru_cache(maxsize=2)  # successive benches of one rig share it

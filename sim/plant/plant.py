@@ -14,7 +14,7 @@ from model.reduction.reduced_plate import ReducedPlate
 from model.structure.actuator import Era
 from model.structure.point_load import PointLoad
 from model.transients.base_motion import Term
-from model.transients.time_response import Answer
+from model.transients.time_response import ParticularSolution
 from sim.plant.contacts import BLOCK, LoadedPlate, LoadedPlateCache
 
 SAMPLE_RATE = 10_000.0
@@ -43,7 +43,7 @@ class Plant:
         self._plates = LoadedPlateCache(reduced, eras, loads)
         self._now: LoadedPlate = self._plates.under((), time=time)
         self._free = np.zeros(len(self._now.plate.decay), dtype=complex)
-        self._particular: list[list[Answer]] = [[] for _ in eras]
+        self._particular: list[list[ParticularSolution]] = [[] for _ in eras]
 
     @property
     def reduced(self) -> ReducedPlate:
@@ -69,7 +69,9 @@ class Plant:
         # Unchanged terms continue; only the others are exchanged.
         known = {solution.term: solution for solution in self._particular[era]}
         wanted = _united([term for term in terms if term.end > self.time])
-        new = self._now.plate.answers(era, [term for term in wanted if term not in known])
+        new = self._now.plate.particular_solutions(
+            era, [term for term in wanted if term not in known]
+        )
         gone = [solution for term, solution in known.items() if term not in wanted]
         self._particular[era] = [
             *(solution for term, solution in known.items() if term in wanted),
@@ -89,10 +91,10 @@ class Plant:
         before = self._now.reduced
         self._now = self._plates.under(contacts, time=self.time)
         if self._now.reduced is not before:
-            carried = self._now.reduced.carried_over_from(before)
+            carried = self._now.reduced.projection_from(before)
             q, v = carried @ q, carried @ v
         self._particular = [
-            self._now.plate.answers(era, [solution.term for solution in solutions])
+            self._now.plate.particular_solutions(era, [solution.term for solution in solutions])
             for era, solutions in enumerate(self._particular)
         ]
         remainder = np.concatenate([q, v])
@@ -132,12 +134,12 @@ class Plant:
             self._pass(boundary)
         self._coast(to_time)
 
-    def _active(self) -> list[Answer]:
+    def _active(self) -> list[ParticularSolution]:
         return [
             solution for solutions in self._particular for solution in self._active_of(solutions)
         ]
 
-    def _active_of(self, solutions: Sequence[Answer]) -> list[Answer]:
+    def _active_of(self, solutions: Sequence[ParticularSolution]) -> list[ParticularSolution]:
         return [
             solution
             for solution in solutions
@@ -153,7 +155,9 @@ class Plant:
         }
         return sorted(moment for moment in moments if self.time < moment <= to_time)
 
-    def _exchange(self, before: Sequence[Answer], after: Sequence[Answer]) -> None:
+    def _exchange(
+        self, before: Sequence[ParticularSolution], after: Sequence[ParticularSolution]
+    ) -> None:
         """Replace particular solutions; displacement and velocity stay continuous."""
         if before or after:
             jump = np.zeros(self._now.plate.free_state.shape[0])
@@ -224,7 +228,7 @@ def _united(terms: Sequence[Term]) -> list[Term]:
 class _ForcedResponse:
     """Forced accelerations at points of shapes (q, r)."""
 
-    def __init__(self, active: Sequence[Answer], points: FloatArray) -> None:
+    def __init__(self, active: Sequence[ParticularSolution], points: FloatArray) -> None:
         self._starts = np.array([solution.term.start for solution in active])
         self._omegas = np.array([solution.term.omega for solution in active])
         r = points.shape[1]

@@ -20,7 +20,7 @@ from model.rig.rig import Rig
 from model.table.pattern import ONSET_RAMP
 from model.table.question import Question
 from model.transients.envelope import Envelopes, ramped_onset, shaped
-from model.transients.measures import FIRST
+from model.transients.measures import ONSET_WINDOW
 from model.vibration.excitation import Excitation
 from model.vibration.peak import base_amplitudes, peak_acceleration
 from sim.plant.felt import Felt, feel
@@ -74,7 +74,7 @@ class Playback:
     def transient_contrast_db(self) -> float | None:
         """Contrast [dB] of the peaks over the first 100 ms; None where a finger is alone."""
         first = [
-            np.abs(record.accelerations[record.times <= FIRST]).max(axis=0)
+            np.abs(record.accelerations[record.times <= ONSET_WINDOW]).max(axis=0)
             for record in (*self.targets, *self.quiet)
         ]
         return self._contrast(first)

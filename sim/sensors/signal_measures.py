@@ -9,7 +9,7 @@ import numpy as np
 from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
 from model.finger.contrast import contrast_db
-from model.transients.measures import FIRST
+from model.transients.measures import ONSET_WINDOW
 from sim.plant.felt import fit_tones
 from sim.sensors.recording import Recording
 
@@ -73,7 +73,7 @@ def transient_contrast_db(
     recording: Recording, *, onset: float, target: Sequence[str], quiet: Sequence[str]
 ) -> float:
     """Contrast [dB] of the peaks in the first 100 ms after an onset [s]."""
-    peak = np.abs(recording.during(onset, onset + FIRST).samples).max(axis=0)
+    peak = np.abs(recording.during(onset, onset + ONSET_WINDOW).samples).max(axis=0)
     return _contrast(recording, peak, target, quiet)
 
 

@@ -136,7 +136,7 @@ def test_the_classes_hold_every_mode_of_the_plate(free):
 def test_a_frequency_that_it_was_not_solved_for_is_refused(free, frequency):
     """Nothing, or less than nothing, or more than was solved for, has no answer."""
     eras = random_eras(np.random.default_rng(0), 3)
-    with pytest.raises(InputError, match=r"above zero|solved up to 500 Hz"):
+    with pytest.raises(InputError, match=r"^frequency must be"):
         free.acceleration(eras, np.array([100.0, frequency]), free.mesh.nodes)
 
 
@@ -145,7 +145,7 @@ def test_a_frequency_beyond_the_mesh_is_refused():
     plate = Plate(LENGTH, WIDTH, 0.0015, ALUMINIUM)
     free = solve_free_plate(plate, Mesh(6, 5, LENGTH, WIDTH))
     eras = random_eras(np.random.default_rng(0), 3)
-    with pytest.raises(InputError, match=r"3\.6 elements in a bending wavelength at 450 Hz"):
+    with pytest.raises(InputError, match=r"3\.6 elements .* 450 Hz; use"):
         free.acceleration(eras, np.array([450.0]), free.mesh.nodes)
 
 
@@ -153,9 +153,9 @@ def test_the_mesh_of_another_plate_is_refused():
     """A plate 1 cm longer than its mesh is an error, not the answer of the shorter one."""
     mesh = Mesh(12, 9, LENGTH, WIDTH)
     longer = Plate(LENGTH + 0.01, WIDTH, 0.0015, ALUMINIUM)
-    with pytest.raises(InputError, match=r"over 0\.3048 x 0\.2286 m, the plate is 0\.3148 x"):
+    with pytest.raises(InputError, match=r"^mesh: .*0\.3148 x.*0\.3048 x"):
         solve_free_plate(longer, mesh)
-    with pytest.raises(InputError, match="make the mesh for this plate"):
+    with pytest.raises(InputError, match=r"^mesh: "):
         assemble(longer, mesh)
 
 
@@ -163,9 +163,9 @@ def test_points_off_the_plate_are_refused(free):
     """An ERA or an observed point beyond the edge is an error, not an extrapolation."""
     eras = random_eras(np.random.default_rng(0), 3)
     beyond = np.array([[LENGTH + 0.01, 0.1]])
-    with pytest.raises(InputError, match="is not on the plate"):
+    with pytest.raises(InputError, match=r"not on the plate"):
         free.acceleration(eras, np.array([100.0]), beyond)
-    with pytest.raises(InputError, match="is not on the plate"):
+    with pytest.raises(InputError, match=r"not on the plate"):
         free.acceleration((replace(eras[0], x=-0.01),), np.array([100.0]), free.mesh.nodes)
 
 
@@ -198,8 +198,8 @@ def test_what_is_forgotten_is_solved_again(monkeypatch):
     layouts = [random_eras(np.random.default_rng(seed), 4) for seed in (0, 1, 0)]
     plates = [solve_free_plate(plate, MESHES["19x15"]) for _ in range(2)]
     keeping = [plates[0].acceleration(eras, frequencies, plates[0].mesh.nodes) for eras in layouts]
-    monkeypatch.setattr("model.reduction.attachments.KEPT_BYTES", 0)
-    monkeypatch.setattr("model.reduction.attachments.KEPT_RASTERS", 1)
+    monkeypatch.setattr("model.reduction.attachments.MAX_CACHE_BYTES", 0)
+    monkeypatch.setattr("model.reduction.attachments.MAX_CACHED_RASTERS", 1)
     for eras, kept in zip(layouts, keeping, strict=True):
         again = plates[1].acceleration(eras, frequencies, plates[1].mesh.nodes)
         np.testing.assert_allclose(again, kept, rtol=1e-9)

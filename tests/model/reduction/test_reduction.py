@@ -57,16 +57,16 @@ def test_motion_is_carried_over_to_a_plate_with_other_forces():
     Which is the same seen from either side, and exact at the points that both answer for.
     """
     small = reduce_plate(PLATE, MESH, np.array(CORNERS))
-    large = small.with_forces_at(np.array(INSIDE))
-    other = small.with_forces_at(np.array([[0.2, 0.1]]))
-    up, down = large.carried_over_from(small), small.carried_over_from(large)
+    large = small.with_attachments_at(np.array(INSIDE))
+    other = small.with_attachments_at(np.array([[0.2, 0.1]]))
+    up, down = large.projection_from(small), small.projection_from(large)
     np.testing.assert_allclose(up.T @ up, np.eye(len(small.omega)), atol=1e-9)
     np.testing.assert_allclose(down, up.T, atol=1e-9)
     np.testing.assert_allclose(
         large.at(MESH.nodes) @ up, small.at(MESH.nodes), atol=1e-8 * np.abs(small.shapes).max()
     )
-    across = other.carried_over_from(large)
-    np.testing.assert_allclose(across, large.carried_over_from(other).T, atol=1e-9)
-    through_small = other.carried_over_from(small) @ down
+    across = other.projection_from(large)
+    np.testing.assert_allclose(across, large.projection_from(other).T, atol=1e-9)
+    through_small = other.projection_from(small) @ down
     np.testing.assert_allclose(across @ up, through_small @ up, atol=1e-9)
     assert np.linalg.norm(across - through_small) > 0.1

@@ -71,7 +71,7 @@ def test_one_motion_has_one_answer_whichever_way_its_phasor_turns(
     """Im[c exp(i w t)] is Im[-conj(c) exp(-i w t)]: quick ramps of low tones are made of both."""
     reduced = reduce_plate(coarse_rig.plate, coarse_rig.mesh, era_positions(coarse_rig.eras))
     plate, omega, c = plate_in_time(reduced, uneven.eras), 2 * math.pi * 150.0, 6e-5 + 3e-5j
-    forwards, back = plate.answers(
+    forwards, back = plate.particular_solutions(
         1, [Term(0.0, math.inf, omega, c), Term(0.0, math.inf, -omega, -c.conjugate())]
     )
     expected = forwards.state(0.0123)

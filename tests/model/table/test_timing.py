@@ -47,7 +47,7 @@ def test_without_envelopes_the_measures_are_those_of_the_ramp(rig, table, solved
     ending = ramped_ending(pattern.excitation, rig.eras, ramp=0.040)
     contrast = solved.contrast_db(onset, targets=QUESTION.targets, quiet=QUESTION.quiet)
     assert pattern.transient_contrast_db == pytest.approx(contrast, abs=0.1)
-    left = solved.left_db(pattern.excitation, ending)
+    left = solved.residual_db(pattern.excitation, ending)
     assert pattern.left_after_db == pytest.approx(left, abs=0.1)
 
 
@@ -62,7 +62,7 @@ def test_envelopes_are_part_of_the_pattern_and_measured_with_it(rig, table, solv
         shaped(pattern.onset, rig.eras), targets=QUESTION.targets, quiet=QUESTION.quiet
     )
     assert pattern.transient_contrast_db == pytest.approx(contrast, abs=0.1)
-    left = solved.left_db(pattern.excitation, shaped(pattern.ending, rig.eras))
+    left = solved.residual_db(pattern.excitation, shaped(pattern.ending, rig.eras))
     assert pattern.left_after_db == pytest.approx(left, abs=0.2)
     assert pattern.transient_contrast_db > plain.transient_contrast_db + 3
     assert pattern.left_after_db < plain.left_after_db - 10

@@ -90,9 +90,9 @@ def test_a_brake_leaves_less_than_stopping_or_fading(setup, frequency):
     """After 40 ms at least 6 dB less is left than after a ramp as long, and than without any."""
     rig, _, shaper, transients = setup
     excitation = random_excitation(rig, frequency, np.random.default_rng(7))
-    braked = transients.left_db(excitation, shaped(shaper.ending(excitation), rig.eras))
+    braked = transients.residual_db(excitation, shaped(shaper.ending(excitation), rig.eras))
     for ramp in (0.0, 0.04):
-        left = transients.left_db(excitation, ramped_ending(excitation, rig.eras, ramp=ramp))
+        left = transients.residual_db(excitation, ramped_ending(excitation, rig.eras, ramp=ramp))
         assert braked < left - 6
 
 
@@ -113,7 +113,7 @@ def test_a_brake_survives_gain_and_phase_errors(setup):
                 for (name, tone), e in zip(sorted(excitation.items()), errors, strict=True)
             }
             ending = wrong(shaper.ending(excitation), errors)
-            left.append(transients.left_db(off, shaped(ending, rig.eras)))
+            left.append(transients.residual_db(off, shaped(ending, rig.eras)))
         assert np.median(left) < wanted
 
 
@@ -180,7 +180,7 @@ def test_what_is_found_trusts_no_era_more_than_it_may(setup, monkeypatch):
                 name: Tone(tone.frequency, tone.amplitude * abs(e), tone.phase + np.angle(e))
                 for (name, tone), e in zip(sorted(low.items()), errors, strict=True)
             }
-            left.append(transients.left_db(off, shaped(wrong(ending, errors), rig.eras)))
+            left.append(transients.residual_db(off, shaped(wrong(ending, errors), rig.eras)))
     assert np.median(contrast[:40]) > np.median(contrast[40:]) + 0.2
     assert np.median(left[:40]) < np.median(left[40:]) - 1
 
@@ -227,7 +227,7 @@ def test_an_ending_that_knows_the_quiet_finger_keeps_it_quiet(setup):
         if frequency > 150:
             assert peaks[0] < 0.7 * peaks[2]
         limit = -30 if frequency < 150 else -40
-        assert transients.left_db(excitation, knowing) < limit
+        assert transients.residual_db(excitation, knowing) < limit
 
 
 def test_mirrored_contacts_get_mirrored_envelopes(setup):
@@ -291,7 +291,7 @@ def test_the_steps_of_a_wire_cost_nothing(setup):
         for each in (onset, on_the_wire(onset))
     ]
     left = [
-        transients.left_db(excitation, shaped(each, rig.eras))
+        transients.residual_db(excitation, shaped(each, rig.eras))
         for each in (ending, on_the_wire(ending))
     ]
     assert on_the_wire(onset) != onset
@@ -307,8 +307,8 @@ def test_an_era_plays_the_frequency_it_has(setup):
     ending = shaper.ending(excitation)
     assert {name: each.frequency for name, each in onset.items()} == {"SW": 110.8, "NE": 217.0}
     assert onset["NE"].knots[-1] == pytest.approx(6e-5 * np.exp(1j))
-    braked = transients.left_db(excitation, shaped(ending, rig.eras))
-    stopped = transients.left_db(excitation, ramped_ending(excitation, rig.eras, ramp=0.0))
+    braked = transients.residual_db(excitation, shaped(ending, rig.eras))
+    stopped = transients.residual_db(excitation, ramped_ending(excitation, rig.eras, ramp=0.0))
     assert braked < stopped - 3
 
 

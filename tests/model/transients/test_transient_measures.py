@@ -174,7 +174,7 @@ def test_what_is_left_is_what_sampling_the_plate_gives(plate):
             ** 2
         ).mean()
     expected = 10 * math.log10(left / steady)
-    found = transients.left_db({"SE": tone}, ramped_ending({"SE": tone}, rig.eras, ramp=ramp))
+    found = transients.residual_db({"SE": tone}, ramped_ending({"SE": tone}, rig.eras, ramp=ramp))
     assert found == pytest.approx(expected, abs=0.1)
 
 
@@ -184,9 +184,10 @@ def test_tones_of_two_frequencies_leave_the_sum_of_their_powers(plate):
     transients = Transients(in_time)
     low, high = {"SW": Tone(90.0, 1e-4)}, {"NE": Tone(300.0, 1e-4)}
     alone = [
-        transients.left_db(each, ramped_ending(each, rig.eras, ramp=0.02)) for each in (low, high)
+        transients.residual_db(each, ramped_ending(each, rig.eras, ramp=0.02))
+        for each in (low, high)
     ]
-    both = transients.left_db(low | high, ramped_ending(low | high, rig.eras, ramp=0.02))
+    both = transients.residual_db(low | high, ramped_ending(low | high, rig.eras, ramp=0.02))
     assert min(alone) < both < max(alone)
 
 

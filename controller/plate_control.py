@@ -1,4 +1,4 @@
-"""The control socket of a simulated plate, for whoever asks: JSON objects, one a line, in order."""
+"""Client of the control socket of a simulated plate: JSON objects, one per line, in order."""
 
 import asyncio
 import contextlib
@@ -8,88 +8,88 @@ from typing import Any
 
 from drivers.errors import LinkError
 
-_LINE_MAX = 1 << 20  # bytes of an answer; what ten fingers felt takes a fiftieth of it
-_PATIENCE = 30.0  # s; a far end on a busy machine
+_MAX_LINE = 1 << 20  # bytes of a reply; the signals of ten fingers take a fiftieth of it
+_REPLY_TIMEOUT = 30.0  # s; long enough for a busy machine
 
 
 class PlateControl:
-    """A simulated plate by its control socket; connects when it is first asked something.
+    """A connection to a simulated plate, opened by the first request.
 
-    For a plate within this process is there only once its amplifier is open. remedy: what to do
-    where it does not answer, for whoever reads the error.
+    A plate within this process exists only once its amplifier is open. remedy: added to the error
+    if it does not reply.
     """
 
     def __init__(self, path: Path, *, remedy: str) -> None:
         self._path = path
         self._remedy = remedy
         self._streams: tuple[asyncio.StreamReader, asyncio.StreamWriter] | None = None
-        self._turn = asyncio.Lock()
+        self._lock = asyncio.Lock()
 
     async def close(self) -> None:
-        """Hang up; a further question connects again."""
+        """Close the connection; a further request reopens it."""
         streams, self._streams = self._streams, None
         if streams is not None:
             streams[1].close()
             with contextlib.suppress(OSError):
                 await streams[1].wait_closed()
 
-    async def ask(self, question: dict[str, Any]) -> dict[str, Any]:
-        """The answer to one line of control; LinkError where there is none, or an error in it."""
-        async with self._turn:
+    async def ask(self, request: dict[str, Any]) -> dict[str, Any]:
+        """Return the reply to a request; raises LinkError if there is none or it is an error."""
+        async with self._lock:
             try:
-                answer = await self._answer_to(json.dumps(question).encode() + b"\n")
+                reply = await self._reply_to(json.dumps(request).encode() + b"\n")
             except BaseException:
-                await self.close()  # the answer would be taken for that of the next question
+                await self.close()  # a late reply must not be taken for the next one
                 raise
-        if "error" in answer:
-            raise LinkError(f"the simulated plate refused {question['op']}: {answer['error']}")
-        return answer
+        if "error" in reply:
+            raise LinkError(f"simulated plate: {request['op']} refused: {reply['error']}")
+        return reply
 
-    async def _answer_to(self, question: bytes) -> dict[str, Any]:
+    async def _reply_to(self, request: bytes) -> dict[str, Any]:
         if self._streams is None:
             self._streams = await self._connect()
         reader, writer = self._streams
         try:
-            async with asyncio.timeout(_PATIENCE):
-                writer.write(question)
+            async with asyncio.timeout(_REPLY_TIMEOUT):
+                writer.write(request)
                 await writer.drain()
                 line = await reader.readuntil()
         except TimeoutError:
             raise LinkError(
-                f"the simulated plate at {self._path} does not answer within {_PATIENCE:g} s; "
+                f"simulated plate at {self._path}: no reply within {_REPLY_TIMEOUT:g} s; "
                 f"{self._remedy}"
             ) from None
         except asyncio.LimitOverrunError:
-            line = await reader.read(_LINE_MAX)
+            line = await reader.read(_MAX_LINE)
         except (OSError, EOFError) as error:
             raise LinkError(
-                f"the simulated plate at {self._path} has hung up, so its process has ended; "
+                f"simulated plate at {self._path}: closed the connection, its process has ended; "
                 f"{self._remedy}"
             ) from error
-        answer = _object(line)
-        if answer is None:
-            said = line[:40].decode(errors="replace")
+        reply = _object(line)
+        if reply is None:
+            start = line[:40].decode(errors="replace")
             raise LinkError(
-                f"what listens at {self._path} is no simulated plate: it answers {said!r}...; give "
-                "the path that `era sim` was given with --control"
+                f"{self._path}: must be the control socket of a simulated plate, got the reply "
+                f"{start!r}...; give the path of `era sim --control`"
             )
-        return answer
+        return reply
 
     async def _connect(self) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
         try:
-            return await asyncio.open_unix_connection(str(self._path), limit=_LINE_MAX)
+            return await asyncio.open_unix_connection(str(self._path), limit=_MAX_LINE)
         except OSError as error:
             raise LinkError(
-                f"no simulated plate listens at {self._path} ({error.strerror or error}); "
+                f"simulated plate at {self._path}: cannot connect ({error.strerror or error}); "
                 f"{self._remedy}"
             ) from error
 
 
 def _object(line: bytes) -> dict[str, Any] | None:
-    """The object in a line of a plate; None where no plate says such a thing."""
+    """Decode a reply; None if it is not one of a plate."""
     try:
-        answer = json.loads(line)
+        reply = json.loads(line)
     except ValueError:
         return None
-    is_object = isinstance(answer, dict) and isinstance(answer.get("error", ""), str)
-    return answer if is_object else None
+    is_object = isinstance(reply, dict) and isinstance(reply.get("error", ""), str)
+    return reply if is_object else None

@@ -14,16 +14,16 @@ if TYPE_CHECKING:
     from model.diagnosis.observation import Observation
     from model.rig.rig import Rig
 
-rig_app = typer.Typer(no_args_is_help=True, help="A rig and what it really is.")
+rig_app = typer.Typer(no_args_is_help=True, help="Check a rig.")
 
-NOT_WELL = 1
-_REPLY_TIMEOUT = 0.5  # s; nobody feels a check that is late, and silence is the watchdog's task
-_LEVEL_MAX = 0.2  # a check is no demonstration
+FAILED = 1
+_REPLY_TIMEOUT = 0.5  # s; a check may be slow, and silence is the task of the watchdog
+_MAX_LEVEL = 0.2  # more than any check needs
 
 
 @rig_app.callback()
 def _group() -> None:
-    """Keeps `check` a command of its own while it is the only one."""
+    """Keep `check` a command of its own while it is the only one."""
 
 
 @rig_app.command()
@@ -39,29 +39,44 @@ def check(
     ] = None,
     without_phases: Annotated[
         bool,
-        typer.Option("--without-phases", help="The file's phases are not those of the drive."),
+        typer.Option(
+            "--without-phases",
+            help="Ignore the phases of the file, which do not refer to the drive.",
+        ),
     ] = False,
     url: Annotated[
         list[str] | None,
-        typer.Option(metavar="NAME=URL", help="Where an amplifier is, if not where the rig says."),
+        typer.Option(
+            metavar="NAME=URL", help="URL of an amplifier instead of the one in the rig file."
+        ),
     ] = None,
     frequencies: Annotated[
         str | None,
-        typer.Option(metavar="LO:HI:STEP", help="Twelve over the rig's range unless given."),
+        typer.Option(
+            metavar="LO:HI:STEP", help="Frequencies; default: twelve over the range of the rig."
+        ),
     ] = None,
-    grid: Annotated[str, typer.Option(metavar="NxM", help="Sensors on the plate.")] = "4x3",
+    grid: Annotated[str, typer.Option(metavar="NxM", help="Grid of sensors on the plate.")] = "4x3",
     noise: Annotated[
-        float, typer.Option(metavar="M/S2/RTHZ", help="Of the simulated sensors.")
+        float, typer.Option(metavar="M/S2/RTHZ", help="Noise density of the simulated sensors.")
     ] = 0.005,
-    level: Annotated[float, typer.Option(help="Of every tone, 0 to 0.2 of full stroke.")] = 0.05,
-    settle: Annotated[float, typer.Option(metavar="S", help="Before each is measured.")] = 0.8,
-    listen: Annotated[float, typer.Option(metavar="S", help="While it is measured.")] = 0.2,
-    mesh: Annotated[str | None, typer.Option(metavar="NxM", help="In place of the rig's.")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="One JSON object, nothing else.")] = False,
+    level: Annotated[
+        float, typer.Option(help="Level of every tone, 0 to 0.2 of full stroke.")
+    ] = 0.05,
+    settle: Annotated[
+        float, typer.Option(metavar="S", help="Settling time before each measurement.")
+    ] = 0.8,
+    listen: Annotated[float, typer.Option(metavar="S", help="Duration of each measurement.")] = 0.2,
+    mesh: Annotated[
+        str | None, typer.Option(metavar="NxM", help="Mesh instead of the one in the rig file.")
+    ] = None,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print one JSON object and nothing else.")
+    ] = False,
 ) -> None:
-    """Say whether a rig is what its file says. Exit status 1 if it is not.
+    """Check whether a rig is wired and built as its file says.
 
-    Drives each channel, or reads what it did.
+    Drives each channel, or reads measured responses. Exit status 1 if the check fails.
     """
     import time
 
@@ -71,15 +86,15 @@ def check(
 
     if (sensors is None) == (measured is None):
         raise InputError(
-            "what do sensors say? Give one of --sensors SOCKET (the control socket of an `era sim` "
-            "with this plate, whose channels are then driven) and --measured FILE"
+            "give either --sensors SOCKET (the control socket of an `era sim` with this plate, to "
+            "drive its channels) or --measured FILE"
         )
     rig = load_rig(rig_file, mesh=mesh)
     started = time.perf_counter()
     if measured is not None:
         observation = _from_file(rig, measured, has_phases=not without_phases)
     else:
-        assert sensors is not None  # noqa: S101  one of both is given
+        assert sensors is not None  # noqa: S101  one of them is given
         observation = _live(
             rig,
             sensors,
@@ -114,7 +129,7 @@ def check(
             )
         )
     if not verdict.is_well:
-        raise typer.Exit(NOT_WELL)
+        raise typer.Exit(FAILED)
 
 
 def _from_file(rig: "Rig", path: Path, *, has_phases: bool) -> "Observation":
@@ -132,12 +147,13 @@ def _frequencies(rig: "Rig", text: str | None) -> list[float]:
 
     low, high = rig.limits.frequency_min, rig.limits.frequency_max
     if text is None:
-        # Not up to the very limits, and no round numbers, on which mains hum lies.
+        # Inside the limits, and no multiples of the mains frequency.
         return [round(float(f), 1) for f in np.linspace(low + 17.3, high - 13.1, 12)]
     found = [float(f) for f in parse_frequencies(text)]
     if not all(low <= f <= high for f in found):
         raise InputError(
-            f"--frequencies {text}: the rig's limits.frequency are {low:g} to {high:g} Hz"
+            f"--frequencies must be within {low:g} to {high:g} Hz, limits.frequency of the rig, "
+            f"got {text}"
         )
     return found
 
@@ -157,16 +173,18 @@ def _live(
 ) -> "Observation":
     import asyncio
 
-    from controller.diagnosis.drive import Drive
+    from controller.diagnosis.channel_sweep import ChannelSweep
     from controller.diagnosis.sensors import simulated_sensors
     from drivers.amplifier import Amplifier
     from drivers.registry import open_backend
     from model.config.points import parse_pair
 
-    if not 0 < level <= _LEVEL_MAX:
-        raise InputError(f"--level {level:g}: take one above 0 and at most {_LEVEL_MAX:g}")
+    if not 0 < level <= _MAX_LEVEL:
+        raise InputError(f"--level must be above 0 and at most {_MAX_LEVEL:g}, got {level:g}")
     if not (0 <= settle <= 60 and 0.02 <= listen <= 8):
-        raise InputError("--settle takes 0 to 60 s, --listen 0.02 to 8 s")
+        raise InputError(
+            f"--settle must be 0 to 60 s and --listen 0.02 to 8 s, got {settle:g} and {listen:g} s"
+        )
     nx, ny = parse_pair(grid, what="--grid")
     plate = rig.plate
     points = [
@@ -188,7 +206,7 @@ def _live(
                 name: Amplifier(open_backend(at[name]), reply_timeout=_REPLY_TIMEOUT)
                 for name in rig.amplifiers
             }
-            drive = Drive(
+            sweep = ChannelSweep(
                 rig,
                 amplifiers,
                 sensors,
@@ -197,7 +215,7 @@ def _live(
                 listen=listen,
                 on_step=on_step,
             )
-            return await drive.run(frequencies)
+            return await sweep.run(frequencies)
 
     try:
         return asyncio.run(measure())
@@ -206,13 +224,13 @@ def _live(
 
 
 def _urls(rig: "Rig", texts: list[str]) -> dict[str, str]:
-    """The URL of each amplifier: the rig's, or what an option says."""
+    """Return the URL of each amplifier: of the rig, or of an option."""
     found = dict(rig.amplifiers)
     for text in texts:
         name, equals, url = text.partition("=")
         if not equals or name not in found:
             raise InputError(
-                f"--url {text}: write NAME=URL; the rig has {', '.join(rig.amplifiers)}"
+                f"--url must be NAME=URL with one of {', '.join(rig.amplifiers)}, got {text}"
             )
         found[name] = url
     return found

@@ -1,1 +1,1 @@
-"""Driving a rig's channels in turn and listening to what the plate does."""
+"""Driving the channels of a rig one by one while sensors measure the plate."""

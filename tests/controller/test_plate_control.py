@@ -53,7 +53,7 @@ async def test_a_question_that_is_refused_leaves_the_connection_to_the_next(
     """What the plate says is told with what was asked; the next answer is the next question's."""
     answers = saying(b'{"error": "finger is 1; it must be a text"}\n', b'{"time_s": 1.5}\n')
     async with listening(tmp_path / "sock", answers) as control:
-        with pytest.raises(LinkError, match="the simulated plate refused touch: finger is 1; it"):
+        with pytest.raises(LinkError, match=r"touch.*finger is 1"):
             await control.ask({"op": "touch"})
         assert await control.ask({"op": "state"}) == {"time_s": 1.5}
 
@@ -62,7 +62,7 @@ async def test_a_question_that_is_refused_leaves_the_connection_to_the_next(
 async def test_a_plate_that_ends_is_told_and_asked_anew(tmp_path: Path, answer: bytes) -> None:
     """With what to do; the next question is for whoever listens there then."""
     async with listening(tmp_path / "sock", saying(answer)) as control:
-        with pytest.raises(LinkError, match=f"plate at {tmp_path}/sock has hung up.*; start it ag"):
+        with pytest.raises(LinkError, match=f"{tmp_path}/sock.*; start it again"):
             await control.ask(HELLO)
     async with listening(tmp_path / "again", saying(b'{"version": 2}\n')):
         (tmp_path / "again").rename(tmp_path / "sock")
@@ -74,7 +74,7 @@ async def test_a_plate_that_hangs_is_waited_for_so_long(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Its answer, should it still come, is not taken for that of the next question."""
-    monkeypatch.setattr(plate_control, "_PATIENCE", 0.02)
+    monkeypatch.setattr(plate_control, "_REPLY_TIMEOUT", 0.02)
     late = asyncio.Event()
 
     async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
@@ -84,10 +84,10 @@ async def test_a_plate_that_hangs_is_waited_for_so_long(
         writer.write(json.dumps({"answer": asked["op"]}).encode() + b"\n")
 
     async with listening(tmp_path / "sock", serve) as control:
-        with pytest.raises(LinkError, match=r"does not answer within 0.02 s; start it again"):
+        with pytest.raises(LinkError, match=r"0.02 s; start it again"):
             await control.ask({"op": "felt"})
         late.set()
-        monkeypatch.setattr(plate_control, "_PATIENCE", 20.0)
+        monkeypatch.setattr(plate_control, "_REPLY_TIMEOUT", 20.0)
         assert await control.ask({"op": "state"}) == {"answer": "state"}
 
 
@@ -97,14 +97,14 @@ async def test_a_plate_that_hangs_is_waited_for_so_long(
         b'{"jsonrpc": "2.0", "id": null, "error": {"code": -32600}}\n',
         b"HTTP/1.1 400 Bad Request\n",
         b"[1]\n",
-        b"x" * (plate_control._LINE_MAX + 1),
+        b"x" * (plate_control._MAX_LINE + 1),
     ],
     ids=["the daemon", "a web server", "no object", "no line"],
 )
 async def test_what_is_no_plate_is_told_by_what_it_says(tmp_path: Path, said: bytes) -> None:
     """A path is easily mistaken for another's; no more is shown than makes it known."""
     async with listening(tmp_path / "sock", saying(said)) as control:
-        with pytest.raises(LinkError, match=r"/sock is no simulated plate: it answers '") as caught:
+        with pytest.raises(LinkError, match=r"/sock: .*--control") as caught:
             await control.ask(HELLO)
     assert len(str(caught.value)) < 300
 
@@ -113,6 +113,6 @@ async def test_an_older_plate_has_no_sensors(tmp_path: Path) -> None:
     """Version 1 of the lines of control knew none; no sensor is asked for."""
     old = saying(b'{"protocol": "era-sim-control", "version": 1, "clock": "wall"}\n')
     async with listening(tmp_path / "sock", old):
-        with pytest.raises(LinkError, match="older version, without sensors; end it and start"):
+        with pytest.raises(LinkError, match="restart"):
             async with simulated_sensors(tmp_path / "sock", [(0.1, 0.1)], noise=0.0):
                 pass

@@ -139,12 +139,12 @@ async def test_what_cannot_be_checked_is_said(tmp_path: Path) -> None:
     rig = write_rig(tmp_path / "rig.yaml", mesh=MESH)
     nobody = ("--sensors", str(tmp_path / "no"))
     for kind, words, options in (
-        (InputError, "what do sensors say", ()),
-        (InputError, "what do sensors say", (*nobody, "--measured", "x.csv")),
-        (LinkError, "no simulated plate listens", nobody),
+        (InputError, "--measured FILE", ()),
+        (InputError, "--measured FILE", (*nobody, "--measured", "x.csv")),
+        (LinkError, str(tmp_path / "no"), nobody),
         (InputError, "--level", (*nobody, "--level", "0.5")),
         (InputError, "limits.frequency", (*nobody, "--frequencies", "10,20")),
-        (InputError, "--url side=x", (*nobody, "--url", "side=x")),
+        (InputError, "got side=x", (*nobody, "--url", "side=x")),
         (InputError, "x.csv", ("--measured", "x.csv")),
     ):
         with pytest.raises(kind, match=words):

@@ -1,6 +1,6 @@
-"""Each channel of a rig in turn, a small tone at a time, and what sensors say meanwhile.
+"""A sweep over the channels of a rig: small tones on each in turn, measured by sensors.
 
-All goes the way of every pattern: routed by the rig's wiring, through the guard, over the wire.
+Tones take the path of every pattern: routed by the wiring, checked by the guard, over the wire.
 """
 
 import math
@@ -22,16 +22,16 @@ from model.diagnosis.observation import Observation, Pair
 from model.rig.rig import Rig
 from model.vibration.excitation import Excitation, Tone
 
-RAMP = 0.05  # s; neither begin nor end of a tone strikes the plate
-_PAIRED = 3  # frequencies at which channels are driven in pairs
-_CHANGED = 0.02  # of a level: more than any amplifier rounds
+RAMP = 0.05  # s; long enough not to excite the plate at onset or end
+_PAIR_FREQUENCIES = 3  # at which channels are driven in pairs
+_LEVEL_TOLERANCE = 0.02  # relative; more than any amplifier rounds
 
 
-class Drive:
-    """The amplifiers of a rig, open and armed within `run`.
+class ChannelSweep:
+    """A sweep over the channels of a rig; its amplifiers are open and armed within `run`.
 
     level: of every tone, 0..1 of full stroke; settle, listen [s]: before and while sensors are
-    read; on_step is told of every tone.
+    read; on_step: called with a description of every tone.
     """
 
     def __init__(
@@ -56,7 +56,7 @@ class Drive:
         self._ramp = RAMP
 
     async def run(self, frequencies: Sequence[float]) -> Observation:
-        """Measure at frequencies [Hz]; ends silent and disarmed, whatever happens.
+        """Measure at frequencies [Hz]; always ends silent and disarmed.
 
         Raises DriverError.
         """
@@ -73,14 +73,14 @@ class Drive:
                 for row, frequency in enumerate(frequencies):
                     self._on_step(f"ERA {era.name}, {frequency:g} Hz")
                     values[row, number] = await self._respond([number], frequency)
-            for first, second in self._neighbours():
-                for frequency in _spread(frequencies, _PAIRED):
+            for first, second in self._neighbour_pairs():
+                for frequency in _evenly_chosen(frequencies, _PAIR_FREQUENCIES):
                     names = f"{rig.eras[first].name} and {rig.eras[second].name}"
                     self._on_step(f"ERAs {names}, {frequency:g} Hz")
                     found = await self._respond([first, second], frequency)
                     pairs.append(Pair(frequency, (first, second), found))
             await self._play({})
-            await self._pass(self._ramp)
+            await self._wait(self._ramp)
         finally:
             await self._group.close(self._silence())
         return Observation(
@@ -93,8 +93,8 @@ class Drive:
             floor=floor,
         )
 
-    def _neighbours(self) -> list[tuple[int, int]]:
-        """Pairs of channels on one amplifier, all round: one dead channel does not part them."""
+    def _neighbour_pairs(self) -> list[tuple[int, int]]:
+        """Return pairs of channels of one amplifier in a ring, robust against one dead channel."""
         pairs: list[tuple[int, int]] = []
         for amplifier in self._rig.amplifiers:
             own = [
@@ -108,30 +108,30 @@ class Drive:
         return pairs
 
     async def _floor(self, frequencies: Sequence[float]) -> FloatArray:
-        """What sensors read in silence, as a response would be [1/s²] (s,)."""
+        """Measure the noise floor in units of a response [1/s²] (s,)."""
         self._on_step("silence")
-        await self._pass(self._listen)
+        await self._wait(self._listen)
         now = await self._sensors.time()
         heard = [
             np.abs(await self._sensors.tone(f, since=now - self._listen, until=now))
-            for f in _spread(frequencies, _PAIRED)
+            for f in _evenly_chosen(frequencies, _PAIR_FREQUENCIES)
         ]
         stroke = min(era.stroke for era in self._rig.eras)
         return np.asarray(np.sqrt(np.mean(np.square(heard), axis=0)) / (self._level * stroke))
 
     async def _respond(self, numbers: Sequence[int], frequency: float) -> ComplexArray:
-        """Acceleration per displacement asked for (s,) [1/s²], once the plate has settled."""
+        """Measure acceleration per commanded displacement (s,) [1/s²] in the steady state."""
         eras = [self._rig.eras[number] for number in numbers]
         stroke = min(era.stroke for era in eras)
         wanted = {era.name: Tone(frequency, self._level * stroke) for era in eras}
         frequency = await self._play(wanted) or frequency
-        await self._pass(self._ramp + self._settle + self._listen)
+        await self._wait(self._ramp + self._settle + self._listen)
         now = await self._sensors.time()
         heard = await self._sensors.tone(frequency, since=now - self._listen, until=now)
         return np.asarray(heard / (self._level * stroke))
 
     async def _play(self, excitation: Excitation) -> float | None:
-        """Play it on all amplifiers; the frequency [Hz] that they really play, None for silence."""
+        """Play on all amplifiers; return the achieved frequency [Hz], None for silence."""
         self._token = token_after(self._token)
         wanted = route(excitation, self._rig, token=self._token, ramp=RAMP)
         self._ramp = max(commands.ramp for commands in wanted.values())
@@ -146,17 +146,17 @@ class Drive:
                     continue
                 found = plays.get(asked.channel)
                 level = 0.0 if found is None else found.level
-                if found is None or not math.isclose(asked.level, level, rel_tol=_CHANGED):
+                if found is None or not math.isclose(asked.level, level, rel_tol=_LEVEL_TOLERANCE):
                     raise CommandRefused(
-                        f"amplifier {name} plays level {level:g} on channel {asked.channel} in "
-                        f"place of {asked.level:g}: let it cool down, or choose a level that it "
-                        "plays with --level, then check again"
+                        f"amplifier {name}: level of channel {asked.channel} must be "
+                        f"{asked.level:g}, got {level:g}; let it cool down, or choose another "
+                        "--level"
                     )
                 frequency = found.frequency
         return frequency
 
     def _silence(self) -> dict[str, SafeCommandSet]:
-        """Silence for every amplifier that has a guard yet."""
+        """Return silent sets for every amplifier that has a guard."""
         channels: dict[str, list[int]] = {name: [] for name in self._guards}
         for wired in self._rig.wiring.values():
             channels.get(wired.amplifier, []).append(wired.number)
@@ -166,16 +166,16 @@ class Drive:
             for name, guard in self._guards.items()
         }
 
-    async def _pass(self, seconds: float) -> None:
-        """Let time pass, and keep the amplifiers' watchdogs fed."""
+    async def _wait(self, seconds: float) -> None:
+        """Wait, feeding the watchdogs of the amplifiers."""
         while seconds > 0:
-            step = min(self._sensors.beat, seconds)
+            step = min(self._sensors.max_wait, seconds)
             await self._sensors.wait(step)
             await self._group.heartbeat()
             seconds -= step
 
 
-def _spread(frequencies: Sequence[float], count: int) -> list[float]:
-    """Some of the frequencies, from all over the range."""
+def _evenly_chosen(frequencies: Sequence[float], count: int) -> list[float]:
+    """Return some of the frequencies, evenly over the range."""
     at = np.linspace(0, len(frequencies) - 1, min(count, len(frequencies)) + 2)[1:-1]
     return [frequencies[round(float(index))] for index in at]

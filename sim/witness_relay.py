@@ -107,8 +107,8 @@ async def _tcp_relay(endpoint: WireEndpoint, name: str, witness: Witness) -> Asy
         if not open_now:
             witness.closed(name, time.monotonic())
 
-    def shown(toward: Direction, data: bytes) -> None:
-        witness.bytes(name, toward, time.monotonic(), data)
+    def shown(direction: Direction, data: bytes) -> None:
+        witness.bytes(name, direction, time.monotonic(), data)
 
     async def open_back(front: "_Half") -> None:
         try:
@@ -149,12 +149,12 @@ class _Half(asyncio.Protocol):
 
     def __init__(
         self,
-        toward: Direction,
+        direction: Direction,
         shown: Callable[[Direction, bytes], None],
         opened: Callable[["_Half"], None],
         closed: Callable[["_Half"], None],
     ) -> None:
-        self._toward: Direction = toward
+        self._direction: Direction = direction
         self._shown = shown
         self._opened = opened
         self._closed = closed
@@ -183,7 +183,7 @@ class _Half(asyncio.Protocol):
             self._early += data
             return
         self._other._transport.write(data)
-        self._shown(self._toward, data)
+        self._shown(self._direction, data)
 
     def connection_lost(self, exc: Exception | None) -> None:
         """Close the other half, too."""

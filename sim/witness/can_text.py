@@ -5,6 +5,7 @@
 """
 
 import re
+from abc import ABC, abstractmethod
 from typing import NamedTuple
 
 from sim.witness.decoded import Direction
@@ -36,11 +37,13 @@ class Text(NamedTuple):
     is_damaged: bool
 
 
-class SocketcandText:
-    """Splits elements `< ... >` of one direction."""
+class _AdapterText(ABC):
+    """Splits the text of one direction at its delimiters."""
+
+    delimiter: re.Pattern[bytes]
 
     def __init__(self, direction: Direction) -> None:
-        self._toward: Direction = direction
+        self._direction: Direction = direction
         self._rest = b""
 
     @property
@@ -50,18 +53,29 @@ class SocketcandText:
 
     def feed(self, data: bytes) -> list[Text]:
         """Decode bytes; returns the complete frames."""
-        *elements, self._rest = re.split(rb"(?<=>)", self._rest + data)
+        *pieces, self._rest = self.delimiter.split(self._rest + data)
         self._rest = self._rest[-_MAX_LENGTH:]
-        return [self._text(element.strip()) for element in elements]
+        return [self._decode(piece) for piece in map(bytes.strip, pieces) if piece]
 
-    def _text(self, element: bytes) -> Text:
-        sent, fd_sent = (_SEND, _FD_SEND) if self._toward == "amplifier" else (_FRAME, _FD_FRAME)
-        found = sent.fullmatch(element) or fd_sent.fullmatch(element)
+    @abstractmethod
+    def _decode(self, piece: bytes) -> Text:
+        """Decode one line or element."""
+
+
+class SocketcandText(_AdapterText):
+    """Elements `< ... >`."""
+
+    delimiter = re.compile(rb"(?<=>)")
+
+    def _decode(self, piece: bytes) -> Text:
+        to_amplifier = self._direction == "amplifier"
+        sent, fd_sent = (_SEND, _FD_SEND) if to_amplifier else (_FRAME, _FD_FRAME)
+        found = sent.fullmatch(piece) or fd_sent.fullmatch(piece)
         if found is None:
             words = (b"send", b"fdsend", b"frame", b"fdframe")
-            return Text(element, None, element[2:].split(b" ")[0] in words)
+            return Text(piece, None, piece[2:].split(b" ")[0] in words)
         is_fd = found.re is fd_sent
-        if self._toward == "amplifier":
+        if to_amplifier:
             data = bytes(int(byte, 16) for byte in found[3].split())
             good = len(data) == int(found[2])
         else:
@@ -69,34 +83,21 @@ class SocketcandText:
             good = len(digits) % 2 == 0
             data = bytes.fromhex(digits.decode()) if good else b""
         good = good and len(data) in (LENGTHS if is_fd else LENGTHS[:9])
-        return Text(element, CanFrame(int(found[1], 16), data, is_fd) if good else None, not good)
+        return Text(piece, CanFrame(int(found[1], 16), data, is_fd) if good else None, not good)
 
 
-class SlcanText:
-    """Splits lines of one direction, ended by CR, or BELL for refusals."""
+class SlcanText(_AdapterText):
+    """Lines ended by CR, or BELL for refusals."""
 
-    def __init__(self, direction: Direction) -> None:
-        self._rest = b""
+    delimiter = re.compile(rb"[\r\a]")
 
-    @property
-    def has_partial_frame(self) -> bool:
-        """Whether the last bytes begin a frame."""
-        return bool(self._rest)
-
-    def feed(self, data: bytes) -> list[Text]:
-        """Decode bytes; returns the complete frames."""
-        *lines, self._rest = re.split(rb"[\r\a]", self._rest + data)
-        self._rest = self._rest[-_MAX_LENGTH:]
-        return [_slcan(line) for line in lines if line]
-
-
-def _slcan(line: bytes) -> Text:
-    found = _SLCAN.fullmatch(line)
-    if found is None:
-        return Text(line, None, line[:1] in b"tdb")
-    data = bytes.fromhex(found[4].decode())
-    is_fd = found[1] != b"t"
-    length = LENGTHS[int(found[3], 16)]
-    if len(data) != length or (length > 8 and not is_fd):
-        return Text(line, None, True)
-    return Text(line, CanFrame(int(found[2], 16), data, is_fd), False)
+    def _decode(self, piece: bytes) -> Text:
+        found = _SLCAN.fullmatch(piece)
+        if found is None:
+            return Text(piece, None, piece[:1] in b"tdb")
+        data = bytes.fromhex(found[4].decode())
+        is_fd = found[1] != b"t"
+        length = LENGTHS[int(found[3], 16)]
+        if len(data) != length or (length > 8 and not is_fd):
+            return Text(piece, None, True)
+        return Text(piece, CanFrame(int(found[2], 16), data, is_fd), False)

@@ -1,7 +1,8 @@
 """Modbus ADUs in a stream of bytes, TCP and RTU, from docs/reference/wire-modbus.md."""
 
 import struct
-from typing import NamedTuple, Protocol
+from abc import ABC, abstractmethod
+from typing import NamedTuple
 
 from sim.witness.decoded import Direction
 
@@ -27,19 +28,8 @@ class Adu(NamedTuple):
     pdu: bytes | None
 
 
-class Splitter(Protocol):
+class Splitter(ABC):
     """Splits the stream of one direction into ADUs."""
-
-    @property
-    def has_partial_frame(self) -> bool:
-        """Whether the last bytes begin a frame."""
-
-    def feed(self, time: float, data: bytes) -> list[Adu]:
-        """Decode bytes; returns the complete frames."""
-
-
-class TcpSplitter:
-    """Splits TCP ADUs by their header: transaction, 0, length, unit."""
 
     def __init__(self) -> None:
         self._buffer = b""
@@ -48,6 +38,14 @@ class TcpSplitter:
     def has_partial_frame(self) -> bool:
         """Whether the last bytes begin a frame."""
         return bool(self._buffer)
+
+    @abstractmethod
+    def feed(self, time: float, data: bytes) -> list[Adu]:
+        """Decode bytes; returns the complete frames."""
+
+
+class TcpSplitter(Splitter):
+    """Splits TCP ADUs by their header: transaction, 0, length, unit."""
 
     def feed(self, time: float, data: bytes) -> list[Adu]:
         """Decode bytes; returns the complete frames."""
@@ -66,18 +64,13 @@ class TcpSplitter:
         return found
 
 
-class RtuSplitter:
+class RtuSplitter(Splitter):
     """Splits RTU ADUs, whose function determines the length; CRC-16, low byte first."""
 
     def __init__(self, direction: Direction) -> None:
-        self._toward: Direction = direction
-        self._buffer = b""
+        super().__init__()
+        self._direction: Direction = direction
         self._last = 0.0
-
-    @property
-    def has_partial_frame(self) -> bool:
-        """Whether the last bytes begin a frame."""
-        return bool(self._buffer)
 
     def feed(self, time: float, data: bytes) -> list[Adu]:
         """Decode bytes; returns the complete frames."""
@@ -121,15 +114,15 @@ class RtuSplitter:
     def _size(self, data: bytes) -> int:
         """Size of the ADU that begins with these bytes; 0 where it is invalid."""
         function = data[1]
-        if self._toward == "host" and function & 0x80:
+        if self._direction == "host" and function & 0x80:
             return 5
-        if function in _SIZES[self._toward]:
-            return _SIZES[self._toward][function]
-        if self._toward == "host" and function == 43:
+        if function in _SIZES[self._direction]:
+            return _SIZES[self._direction][function]
+        if self._direction == "host" and function == 43:
             return _identification_size(data)
-        if function not in _COUNTS[self._toward]:
+        if function not in _COUNTS[self._direction]:
             return 0
-        at, around = _COUNTS[self._toward][function]
+        at, around = _COUNTS[self._direction][function]
         size = around + data[at] if len(data) > at else around
         return size if size <= _MAX_LENGTH else 0
 

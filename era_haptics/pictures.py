@@ -14,7 +14,7 @@ from model.figures.drawing import map_figure
 from model.figures.fingertips import draw_fingertip, draw_level_scale, draw_levels
 from model.table.pattern import Pattern
 from model.table.table import LocalizationTable
-from sim.plant.finger import Record
+from sim.plant.fingers import Record
 from sim.plant.playback import Playback
 
 

@@ -11,7 +11,7 @@ from drivers.codec.can_bus.frame import CanFrame, cob_id
 from drivers.codec.can_bus.requests import encode_request
 from drivers.guard import SafeCommandSet
 from drivers.protocol.messages import Apply, Arm
-from sim.far_ends.can_bus.sets import Action, RequestFrame, SetBuffer
+from sim.far_ends.can_bus.set_buffer import Action, RequestFrame, SetBuffer
 
 CALM = 2.0  # s; the longest watchdog
 

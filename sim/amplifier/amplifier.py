@@ -39,10 +39,10 @@ from drivers.protocol.messages import (
     Stop,
 )
 from sim.amplifier.channels import Channels
-from sim.amplifier.heat import DERATE_ABOVE, DERATED, FAULT_ABOVE, GOOD_BELOW, Heat
 from sim.amplifier.quantiser import RefusedSet
-from sim.amplifier.sets import Sets
+from sim.amplifier.set_store import SetStore
 from sim.amplifier.states import ENABLED, next_state
+from sim.amplifier.thermal_model import DERATE_ABOVE, DERATED, FAULT_ABOVE, GOOD_BELOW, ThermalState
 from sim.waveform.output import Output
 
 SILENCING_RAMP = 0.005  # s; a fault must be silent 5 ms after the watchdog expires
@@ -93,14 +93,14 @@ class SimulatedAmplifier:
         self.state = AmplifierState.SWITCH_ON_DISABLED
         self.fault = Fault.NONE
         self.listeners: list[Callable[[AmplifierEvent, float], None]] = []
-        self._heat = Heat(since=-math.inf)
+        self._heat = ThermalState(since=-math.inf)
         self._faults: deque[tuple[Fault, int | None, float]] = deque(maxlen=_FAULTS_KEPT)
         self._start()
 
     def _start(self) -> None:
         """Reset all but the temperature and the fault history."""
         self._channels = Channels(self.capabilities.channels)
-        self._sets = Sets(self.capabilities)
+        self._sets = SetStore(self.capabilities)
         self._watchdog = 0.0
         self._fed = 0.0
         self._vibration_end = math.inf
@@ -183,7 +183,7 @@ class SimulatedAmplifier:
 
     def set_temperature(self, temperature: float, moment: float) -> None:
         """Set the temperature [°C], with its consequences."""
-        self._heat = Heat(moment, temperature, self._heat.final)
+        self._heat = ThermalState(moment, temperature, self._heat.final)
         if temperature > DERATE_ABOVE and not self._is_derated:
             self._too_warm(moment)
         if temperature > FAULT_ABOVE:
@@ -191,7 +191,7 @@ class SimulatedAmplifier:
 
     def restart(self, moment: float) -> None:
         """Power-cycle: silent at once, disarmed, without sets and envelopes."""
-        self._heat = Heat(moment, self._heat.at(moment))
+        self._heat = ThermalState(moment, self._heat.at(moment))
         self.fault = Fault.NONE
         self._start()
         self._enter(AmplifierState.SWITCH_ON_DISABLED, moment)

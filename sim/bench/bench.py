@@ -25,7 +25,7 @@ from model.transients.base_motion import Term
 from sim.amplifier.amplifier import SimulatedAmplifier
 from sim.plant.base_motion import terms_of
 from sim.plant.felt import Felt, feel
-from sim.plant.finger import KEPT, Fingers, Position, Record
+from sim.plant.fingers import KEPT, Fingers, Position, Record
 from sim.plant.imperfections import ChannelErrors, Imperfections, delayed, draw_noise, realised
 from sim.plant.plant import SAMPLE_RATE, Plant
 from sim.waveform.output import Output, Tone

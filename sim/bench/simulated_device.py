@@ -19,7 +19,7 @@ from drivers.protocol.messages import (
     Request,
     Status,
 )
-from sim.amplifier.heat import AMBIENT, DERATE_ABOVE, FAULT_ABOVE
+from sim.amplifier.thermal_model import AMBIENT, DERATE_ABOVE, FAULT_ABOVE
 from sim.bench.bench import Bench
 from sim.faults.fault_window import Faults, FaultWindow
 

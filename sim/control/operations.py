@@ -43,7 +43,7 @@ import json
 from collections.abc import Mapping
 
 from model.errors import InputError
-from sim.control import faults, fingers, sensors
+from sim.control import fault_operations, finger_operations, sensor_operations
 from sim.control.context import SimulationContext
 from sim.control.responses import (
     Deferred,
@@ -136,8 +136,8 @@ def _step(context: SimulationContext, request: Request, now: float) -> Deferred:
 _OPERATIONS: Mapping[str, Operation] = {
     "hello": _hello,
     "state": _state,
-    **fingers.OPERATIONS,
-    **sensors.OPERATIONS,
-    **faults.OPERATIONS,
+    **finger_operations.OPERATIONS,
+    **sensor_operations.OPERATIONS,
+    **fault_operations.OPERATIONS,
     "step": _step,
 }

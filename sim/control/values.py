@@ -4,7 +4,7 @@ import math
 from typing import Any, TypeGuard
 
 from model.errors import InputError
-from sim.plant.finger import Position
+from sim.plant.fingers import Position
 
 
 def parse_window(request: dict[str, Any]) -> tuple[float, float]:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from model.arrays import ComplexArray, FloatArray
-from sim.plant.finger import Record
+from sim.plant.fingers import Record
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from model.structure.actuator import Era
 from model.structure.point_load import PointLoad
 from model.transients.base_motion import Term
 from model.transients.time_response import ParticularSolution
-from sim.plant.contacts import BLOCK, LoadedPlate, LoadedPlateCache
+from sim.plant.loaded_plates import BLOCK, LoadedPlate, LoadedPlateCache
 
 SAMPLE_RATE = 10_000.0
 """Default sampling rate [Hz]: peaks at 500 Hz are sampled to within 1.3 %."""

@@ -24,7 +24,7 @@ from model.transients.measures import ONSET_WINDOW
 from model.vibration.excitation import Excitation
 from model.vibration.peak import base_amplitudes, peak_acceleration
 from sim.plant.felt import Felt, feel
-from sim.plant.finger import Record
+from sim.plant.fingers import Record
 from sim.plant.plant import SAMPLE_RATE, Plant
 
 STEADY = 0.25

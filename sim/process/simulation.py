@@ -15,14 +15,14 @@ from drivers.operation.steady import no_long_collections
 from model.finger.load import FingerLoad
 from model.rig.rig import Rig
 from sim.bench.bench import Bench
-from sim.bench.real_time import keep_time
+from sim.bench.bench_clock import keep_time
 from sim.bench.simulated_device import SimulatedDevice
 from sim.control.context import SimulationContext, finish_recording
 from sim.control.server import control_socket
 from sim.far_ends.wire_assignment import WireAssignment
 from sim.far_ends.wires import open_wires
 from sim.faults.fault_file import FaultFile
-from sim.plant.finger import Position
+from sim.plant.fingers import Position
 from sim.plant.plant import SAMPLE_RATE
 from sim.process.virtual_time import SteppedLoop
 from sim.sensors.accelerometer import Accelerometer

@@ -44,9 +44,9 @@ from drivers.protocol.messages import AmplifierState, Apply, Disarm, Hello, Iden
 from sim.amplifier import amplifier as simulated
 from sim.amplifier.amplifier import SimulatedAmplifier
 from sim.amplifier.channels import Channels, PlayableSet
-from sim.amplifier.sets import Sets
+from sim.amplifier.set_store import SetStore
 from sim.far_ends.can_bus.requests import RequestHandler
-from sim.far_ends.can_bus.sets import SetBuffer
+from sim.far_ends.can_bus.set_buffer import SetBuffer
 from sim.far_ends.serial_end import SerialEnd
 from witnessed_chain import Chain
 
@@ -418,7 +418,7 @@ def _plays_on(carry_out: Any, amplifier: Any, request: Any, *args: Any) -> Any:
         del amplifier._silence
 
 
-def _forgetful(stage: Any, sets: Sets, *args: Any, **kwargs: Any) -> Any:
+def _forgetful(stage: Any, sets: SetStore, *args: Any, **kwargs: Any) -> Any:
     tokens, sets.tokens = sets.tokens, deque()
     try:
         return stage(sets, *args, **kwargs)
@@ -496,7 +496,9 @@ FAR_ENDS: dict[str, Bug] = {
     "a fault silences one channel only": Bug(
         "silent", wrapped(Channels, "silence", _on_first_channel), scenarios.arc
     ),
-    "a stale set is played": Bug("token", wrapped(Sets, "stage", _forgetful), scenarios.late_copy),
+    "a stale set is played": Bug(
+        "token", wrapped(SetStore, "stage", _forgetful), scenarios.late_copy
+    ),
     "a damaged frame is carried out": Bug("damage", _unchecked, scenarios.noise),
     "the high voltage stays on": Bug(
         "high_voltage",

@@ -15,7 +15,7 @@ from sim.bench.simulated_device import SimulatedDevice
 from sim.far_ends.can_bus.objects import CANOPEN, IDS, ObjectDictionary
 from sim.far_ends.can_bus.requests import RequestHandler
 from sim.far_ends.can_bus.sdo import SdoServer
-from sim.far_ends.can_bus.sets import NO_CHANNEL, Action
+from sim.far_ends.can_bus.set_buffer import NO_CHANNEL, Action
 
 _NMT = CANOPEN["nmt"]
 _NMT_STATES = CANOPEN["nmt_states"]

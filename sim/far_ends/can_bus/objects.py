@@ -12,7 +12,7 @@ from typing import Any
 from drivers.protocol.definition import PROTOCOL, Quantity
 from drivers.protocol.messages import FaultList, GetFaults, LoadEnvelope, Nak
 from sim.bench.simulated_device import SimulatedDevice
-from sim.far_ends.can_bus.domains import ABORTS, envelope_of, faults_domain
+from sim.far_ends.can_bus.domain_objects import ABORTS, envelope_of, faults_domain
 from sim.far_ends.can_bus.sdo import (
     BAD_LENGTH,
     NO_OBJECT,

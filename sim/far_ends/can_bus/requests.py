@@ -27,9 +27,9 @@ from drivers.protocol.messages import (
 )
 from sim.bench.simulated_device import SimulatedDevice
 from sim.far_ends.can_bus.bus import LENGTHS
-from sim.far_ends.can_bus.domains import achieved_domain
+from sim.far_ends.can_bus.domain_objects import achieved_domain
 from sim.far_ends.can_bus.objects import IDS, ObjectDictionary, channel_ids, sent_ids
-from sim.far_ends.can_bus.sets import (
+from sim.far_ends.can_bus.set_buffer import (
     INCOMPLETE_SET,
     NO_CHANNEL,
     SETS,

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from drivers.protocol.messages import Identity
 from sim.far_ends.modbus.pdu import ILLEGAL_ADDRESS, ILLEGAL_VALUE, ModbusException
-from sim.far_ends.modbus.words import MAP, text_bytes
+from sim.far_ends.modbus.registers import MAP, text_bytes
 
 IDENTIFY = 43
 _READ = 0x0E  # MEI type

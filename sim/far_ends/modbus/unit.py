@@ -47,7 +47,7 @@ from sim.far_ends.modbus.pdu import (
     registers_read,
     to_write,
 )
-from sim.far_ends.modbus.words import (
+from sim.far_ends.modbus.registers import (
     MAP,
     NO_CHANNEL,
     RefusedWrite,

@@ -22,7 +22,7 @@ from drivers.protocol.messages import (
     NakCode,
 )
 from sim.amplifier.amplifier import SimulatedAmplifier
-from sim.amplifier.heat import Heat
+from sim.amplifier.thermal_model import ThermalState
 
 
 def playing(token: int, level: float) -> CommandSet:
@@ -92,7 +92,7 @@ def test_temperature_derates_above_70_and_trips_above_85() -> None:
 @pytest.mark.parametrize("threshold", [70.0, 85.0])
 def test_temperature_crosses_a_threshold_at_its_time(threshold: float) -> None:
     """From 64 °C in a place of 90 °C; one that is not on the way is never reached."""
-    heat = Heat(since=3.0, temperature=64.0, final=90.0)
+    heat = ThermalState(since=3.0, temperature=64.0, final=90.0)
     assert heat.when(threshold) == pytest.approx(3 + 120 * math.log(26 / (90 - threshold)))
     assert heat.when(95.0) == math.inf
     assert heat.when(60.0) == math.inf

@@ -17,7 +17,7 @@ from model.rig.rig import Rig
 from model.structure.point_load import PointLoad
 from sim.bench.bench import Bench
 from sim.sensors.accelerometer import Accelerometer
-from sim.sensors.on_bench import Accelerometers
+from sim.sensors.bench_accelerometers import Accelerometers
 
 A, B = (0.1, 0.07), (0.29, 0.2)
 FREQUENCY = 210.0

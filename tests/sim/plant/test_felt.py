@@ -9,7 +9,7 @@ from model.finger.fingertip import fingertip_points
 from model.reduction.reduced_plate import ReducedPlate
 from model.rig.rig import Rig
 from sim.plant.felt import feel
-from sim.plant.finger import Fingers, Record
+from sim.plant.fingers import Fingers, Record
 
 
 def flat_plate(rig: Rig) -> ReducedPlate:

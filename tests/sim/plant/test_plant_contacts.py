@@ -195,7 +195,7 @@ def test_contacts_are_solved_once(
     plant = Plant(reduced, coarse_rig.eras)
     plant.set_contacts(FINGERS[:1])
     plant.set_contacts([])
-    monkeypatch.setattr("sim.plant.contacts.plate_in_time", None)
+    monkeypatch.setattr("sim.plant.loaded_plates.plate_in_time", None)
     for _ in range(5):
         plant.skip(plant.time + 0.05)
         plant.set_contacts(FINGERS[:1])

@@ -20,7 +20,7 @@ from model.transients.envelope import Envelope, shaped
 from model.transients.measures import Transients
 from model.transients.time_response import plate_in_time
 from model.vibration.excitation import Tone
-from sim.plant.finger import Record
+from sim.plant.fingers import Record
 from sim.plant.playback import Playback, play
 
 TARGET, QUIET = (0.10, 0.03), (0.22, 0.16)

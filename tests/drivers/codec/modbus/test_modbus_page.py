@@ -15,8 +15,8 @@ from drivers.statistics import WireCounters
 from modbus_session import EXAMPLES, ScriptedDevice
 from sim.far_ends.modbus.frames import RequestAdu as Asked
 from sim.far_ends.modbus.frames import rtu_frame, tcp_frame
+from sim.far_ends.modbus.registers import checksum
 from sim.far_ends.modbus.unit import ModbusUnit
-from sim.far_ends.modbus.words import checksum
 
 PAGE = (Path(drivers.__file__).parent.parent / "docs" / "reference" / "wire-modbus.md").read_text(
     "utf-8"

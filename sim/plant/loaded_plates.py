@@ -16,7 +16,7 @@ from model.reduction.reduced_plate import ReducedPlate
 from model.structure.actuator import Era
 from model.structure.point_load import PointLoad
 from model.transients.time_response import PlateInTime, plate_in_time
-from sim.plant.finger import Position
+from sim.plant.fingers import Position
 
 BLOCK = 256  # samples per table of exponentials
 

@@ -7,7 +7,7 @@ from sim.control.context import SimulationContext
 from sim.control.responses import Operation, Request, Response, ResponseBuilder, ready
 from sim.control.values import parse_finger, parse_position, parse_window
 from sim.plant.felt import feel
-from sim.plant.finger import Position
+from sim.plant.fingers import Position
 
 
 def _fingers(context: SimulationContext, request: Request, now: float) -> ResponseBuilder:

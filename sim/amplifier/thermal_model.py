@@ -13,7 +13,7 @@ DERATED = 0.5  # of the level
 
 
 @dataclass(frozen=True, slots=True)
-class Heat:
+class ThermalState:
     """Temperature [°C], exponential from its value at `since` [s] to `final`."""
 
     since: float
@@ -32,6 +32,6 @@ class Heat:
             return math.inf
         return self.since + TIME_CONSTANT * math.log((before - after) / -after)
 
-    def driven(self, time: float, *, load: float) -> "Heat":
+    def driven(self, time: float, *, load: float) -> "ThermalState":
         """The state from a time [s], with the mean square level of all channels as load."""
-        return Heat(time, self.at(time), AMBIENT + RISE * load)
+        return ThermalState(time, self.at(time), AMBIENT + RISE * load)

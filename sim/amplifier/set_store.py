@@ -10,7 +10,7 @@ from sim.amplifier.quantiser import RefusedSet, quantise_envelope, quantise_set
 _TOKENS_REMEMBERED = 16  # late duplicates are older than a few exchanges at most
 
 
-class Sets:
+class SetStore:
     """The staged and the active set, and loaded envelopes by slot; RefusedSet changes nothing."""
 
     def __init__(self, capabilities: Capabilities) -> None:

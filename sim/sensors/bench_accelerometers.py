@@ -9,7 +9,7 @@ from model.arrays import FloatArray
 from model.config.points import in_metres
 from model.errors import InputError
 from sim.bench.bench import Bench
-from sim.plant.finger import KEPT
+from sim.plant.fingers import KEPT
 from sim.sensors.accelerometer import Accelerometer, positions, read_sensors
 from sim.sensors.recording import Recording
 

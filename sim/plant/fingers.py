@@ -1,6 +1,6 @@
 """Fingers as sensors: accelerations at the points of each fingertip, kept for ten seconds.
 
-The load of a finger on the plate is in `sim.plant.contacts`.
+The load of a finger on the plate is in `sim.plant.loaded_plates`.
 """
 
 import math

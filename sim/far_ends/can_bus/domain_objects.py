@@ -7,7 +7,7 @@ from drivers.command import Envelope, Knot
 from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.messages import Achieved, FaultRecord, NakCode
 from sim.far_ends.can_bus.sdo import BAD_LENGTH, SdoAbort
-from sim.far_ends.can_bus.sets import NO_CHANNEL
+from sim.far_ends.can_bus.set_buffer import NO_CHANNEL
 
 ABORTS = {NakCode[name]: code for name, code in PROTOCOL.canopen["aborts"].items()}
 _Q = PROTOCOL.quantities

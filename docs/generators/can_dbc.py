@@ -1,6 +1,6 @@
-"""The DBC file of an amplifier and its host, for bus monitors, written from protocol.yaml.
+"""The DBC file of an amplifier and its host, for bus monitors, from protocol.yaml.
 
-ASCII only: those who read such files do not agree on anything else.
+ASCII only, the common denominator of DBC readers.
 """
 
 from collections.abc import Iterator, Mapping
@@ -30,7 +30,7 @@ _VALUES: Mapping[str, Mapping[str, int]] = {
 
 @dataclass(frozen=True)
 class _Message:
-    """A frame with its fields; a field may stand for a quantity."""
+    """A frame with its fields."""
 
     id: int
     name: str
@@ -40,7 +40,7 @@ class _Message:
 
 
 def dbc_text(*, node: int = 1, channels: int = 4) -> str:
-    """What goes over the bus between the host and one amplifier with so many channels."""
+    """Return the frames between the host and one amplifier with a number of channels."""
     messages = list(_messages(node, channels))
     lines = ['VERSION "1"', "", "NS_ :", "", "BS_:", "", f"BU_: {_HOST} {_AMPLIFIER}", ""]
     for message in messages:
@@ -95,7 +95,7 @@ def _signal(field: Field, receiver: str) -> str:
 
 
 def _quantity(field: Field) -> Quantity | None:
-    """What a field's integer counts, where it is no plain number."""
+    """Return the quantity of a field, if any."""
     name = field.name.rstrip("0123456789").rstrip("_")
     if name == "channel":  # 255 is none
         return None

@@ -1,4 +1,4 @@
-"""The electronic data sheet (CiA 306) of an amplifier, written from protocol.yaml."""
+"""The electronic data sheet (CiA 306) of an amplifier, from protocol.yaml."""
 
 from collections.abc import Iterable, Mapping
 
@@ -14,7 +14,7 @@ _BAUD_RATES = (10, 20, 50, 125, 250, 500, 800, 1000)
 
 
 def eds_text(channels: int = 4) -> str:
-    """The data sheet of an amplifier with so many channels."""
+    """Return the data sheet of an amplifier with a number of channels."""
     objects: dict[int, list[str]] = {}
     for index, group in _by_index(entries(channels)).items():
         objects[index] = _object(index, group)

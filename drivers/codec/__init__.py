@@ -1,1 +1,1 @@
-"""Messages to bytes and back, a package for each kind of wire; without I/O."""
+"""Codecs between messages and bytes, a package for each kind of wire; no I/O."""

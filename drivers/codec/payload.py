@@ -1,7 +1,7 @@
-"""The pieces that payloads are made of: numbers in range, flags, short texts.
+"""Elements of payloads: numbers in range, flags, short texts.
 
-Everything is little-endian. Reading is total: bytes in range, or `Malformed` with the code that an
-amplifier answers with.
+Everything is little-endian. Reading yields values in range or raises `Malformed` with the code of
+an amplifier's Nak.
 """
 
 import struct
@@ -21,7 +21,7 @@ EnumT = TypeVar("EnumT", bound=IntEnum)
 
 
 class Malformed(FrameError):
-    """A payload that makes no message; code and channel are what an amplifier's Nak says."""
+    """An invalid payload; code and channel are those of an amplifier's Nak."""
 
     def __init__(self, text: str, *, code: NakCode, channel: int | None = None) -> None:
         super().__init__(text)
@@ -30,38 +30,38 @@ class Malformed(FrameError):
 
 
 class Record:
-    """Numbers that always stand one after the other, written and read at once."""
+    """Consecutive numbers, packed and read at once."""
 
     def __init__(self, *quantities: Quantity) -> None:
         self.quantities = quantities
         self.layout = struct.Struct("<" + "".join(each.struct_code for each in quantities))
 
     def pack(self, *values: float) -> bytes:
-        """Their values, each in its unit; CommandError for one out of range."""
+        """Pack values, each in its unit; CommandError for one out of range."""
         wanted = zip(self.quantities, values, strict=True)
         return self.layout.pack(*[quantity.to_wire(value) for quantity, value in wanted])
 
 
 class Cursor:
-    """Reads a payload from front to back; raises Malformed for what is missing or out of range."""
+    """Reads a payload from front to back; Malformed for missing or out-of-range values."""
 
     def __init__(self, payload: bytes) -> None:
         self._payload = payload
         self._at = 0
 
     def integer(self, quantity: Quantity) -> int:
-        """A whole number."""
+        """Read an integer."""
         value = self._raw(quantity.struct_code)
         if not quantity.holds(value):
             raise _out_of_range(quantity, value)
         return value
 
     def record(self, record: Record) -> tuple[int, ...]:
-        """All whole numbers of a record."""
+        """Read the integers of a record."""
         at = self._at
         self._at += record.layout.size
         if self._at > len(self._payload):
-            raise Malformed("the payload ends too early", code=NakCode.BAD_LENGTH)
+            raise Malformed("payload is too short", code=NakCode.BAD_LENGTH)
         values: tuple[int, ...] = record.layout.unpack_from(self._payload, at)
         for quantity, value in zip(record.quantities, values, strict=True):
             if not quantity.minimum <= value <= quantity.maximum:
@@ -69,16 +69,16 @@ class Cursor:
         return values
 
     def number(self, quantity: Quantity) -> float:
-        """A value in its unit."""
+        """Read a value in its unit."""
         return quantity.from_wire(self.integer(quantity))
 
     def nearest(self, quantity: Quantity) -> float:
-        """A value in its unit, the nearest in range: for what must never be refused."""
+        """Read a value in its unit, clipped into range: for what must never be refused."""
         value = self._raw(quantity.struct_code)
         return quantity.from_wire(min(max(value, quantity.minimum), quantity.maximum))
 
     def one_of(self, kind: type[EnumT]) -> EnumT:
-        """A member of an enumeration, one byte."""
+        """Read a member of an enumeration, one byte."""
         value = self._raw("B")
         try:
             return kind(value)
@@ -86,14 +86,14 @@ class Cursor:
             raise Malformed(f"unknown {kind.__name__} {value}", code=NakCode.BAD_VALUE) from None
 
     def flags(self, known: int) -> int:
-        """A byte in which only the known bits may be set."""
+        """Read a byte in which only the known bits may be set."""
         value = self._raw("B")
         if value & ~known:
-            raise Malformed(f"reserved flags set: {value:#04x}", code=NakCode.BAD_VALUE)
+            raise Malformed(f"reserved flags must be 0, got {value:#04x}", code=NakCode.BAD_VALUE)
         return value
 
     def optional_channel(self) -> int | None:
-        """A channel, or None for 255."""
+        """Read a channel, None for 255."""
         value = self._raw("B")
         if value == _NO_CHANNEL:
             return None
@@ -102,35 +102,37 @@ class Cursor:
         return value
 
     def text(self) -> str:
-        """A text: its length in bytes, then UTF-8 without control characters."""
+        """Read a text: its length in bytes, then UTF-8 without control characters."""
         length = self._raw("B")
         if length > _TEXT_MAX:
-            raise Malformed(f"a text of {length} bytes is too long", code=NakCode.BAD_VALUE)
-        return read_text(self._take(length), "a text")
+            raise Malformed(
+                f"text must have at most {_TEXT_MAX} bytes, got {length}", code=NakCode.BAD_VALUE
+            )
+        return read_text(self._take(length), "text")
 
     def byte(self) -> int:
-        """Any byte."""
+        """Read any byte."""
         return self._raw("B")
 
     def end(self) -> None:
-        """Nothing must be left."""
+        """Require the end of the payload."""
         if self._at != len(self._payload):
             extra = len(self._payload) - self._at
-            raise Malformed(f"{extra} bytes too many", code=NakCode.BAD_LENGTH)
+            raise Malformed(f"payload is {extra} bytes too long", code=NakCode.BAD_LENGTH)
 
     def _raw(self, struct_code: str) -> int:
         layout = _LAYOUTS[struct_code]
         at = self._at
         self._at += layout.size
         if self._at > len(self._payload):
-            raise Malformed("the payload ends too early", code=NakCode.BAD_LENGTH)
+            raise Malformed("payload is too short", code=NakCode.BAD_LENGTH)
         value: int = layout.unpack_from(self._payload, at)[0]
         return value
 
     def _take(self, length: int) -> bytes:
         piece = self._payload[self._at : self._at + length]
         if len(piece) < length:
-            raise Malformed("the payload ends too early", code=NakCode.BAD_LENGTH)
+            raise Malformed("payload is too short", code=NakCode.BAD_LENGTH)
         self._at += length
         return piece
 
@@ -138,35 +140,35 @@ class Cursor:
 def _out_of_range(quantity: Quantity, value: int) -> Malformed:
     code = {"channel": NakCode.BAD_CHANNEL, "token": NakCode.BAD_TOKEN}.get(quantity.name)
     return Malformed(
-        f"{quantity.name} {value} is not within {quantity.minimum}..{quantity.maximum}",
+        f"{quantity.name} must be {quantity.minimum} to {quantity.maximum}, got {value}",
         code=code or NakCode.BAD_VALUE,
     )
 
 
 def read_text(raw: bytes, name: str) -> str:
-    """What a far end calls itself, for terminals of ours; name: what it is, for Malformed."""
+    """Decode a printable text; name: for the message of Malformed."""
     try:
         text = raw.decode("utf-8")
     except UnicodeDecodeError:
-        raise Malformed(f"{name} is not UTF-8", code=NakCode.BAD_VALUE) from None
+        raise Malformed(f"{name} must be UTF-8", code=NakCode.BAD_VALUE) from None
     if not text.isprintable():
-        raise Malformed(f"{name} has control characters", code=NakCode.BAD_VALUE)
+        raise Malformed(f"{name} must not have control characters", code=NakCode.BAD_VALUE)
     return text
 
 
 def pack(*pairs: tuple[Quantity, float]) -> bytes:
-    """Values in their units, one after the other; CommandError for one out of range."""
+    """Pack values in their units; CommandError for one out of range."""
     return b"".join(
         [_LAYOUTS[quantity.struct_code].pack(quantity.to_wire(value)) for quantity, value in pairs]
     )
 
 
 def pack_text(text: str) -> bytes:
-    """A text, cut to what fits; see `Cursor.text`."""
+    """Pack a text, truncated to its longest length; see `Cursor.text`."""
     raw = text.encode()[:_TEXT_MAX].decode(errors="ignore").encode()
     return bytes([len(raw)]) + raw
 
 
 def pack_optional_channel(channel: int | None) -> bytes:
-    """A channel, or 255 for none."""
+    """Pack a channel, 255 for None."""
     return bytes([_NO_CHANNEL]) if channel is None else pack((_CHANNEL, channel))

@@ -141,7 +141,7 @@ class ModbusEnds:
         for answer in self._host.feed(data, telegram):
             if not answer.exception and exchanges.is_of(answer.registers, tag=_TAG):
                 try:
-                    exchanges.condition(request, answer.registers)
+                    exchanges.reported_state(request, answer.registers)
                     replies.append(exchanges.decode_reply(request, answer.registers))
                 except FrameError:
                     continue

@@ -19,7 +19,7 @@ from drivers.backends.hardware import Worker, make_worker
 from drivers.backends.urls.can_bus import CanUrl
 from drivers.backends.wire_backend import WireBackend
 from drivers.codec.can_bus.frame import CANOPEN, CanFrame, cob_id
-from drivers.codec.can_bus.replies import UNASKED, CanReply, plain_reply
+from drivers.codec.can_bus.replies import UNSOLICITED, CanReply, plain_reply
 from drivers.codec.can_bus.requests import (
     PdoRequest,
     encode_broadcast,
@@ -254,7 +254,7 @@ class CanBackend(WireBackend):
         self._on_event(event)
 
     def _received(self, answer: CanReply) -> None:
-        if answer.sequence == UNASKED:
+        if answer.sequence == UNSOLICITED:
             self._notify(answer.event)
             return
         if not self._pending.take(answer):

@@ -67,7 +67,7 @@ class ModbusBackend(WireBackend):
         self._tag = number_below(_TAGS)
         self._can_read_back = True
         self._channels = exchanges.CHANNELS_MAX
-        self._last_condition: tuple[AmplifierState, Fault] | None = None
+        self._last_state: tuple[AmplifierState, Fault] | None = None
         self._loss: str | None = None  # until reopened, even if others have joined the line again
         self._is_asking = False
 
@@ -103,7 +103,7 @@ class ModbusBackend(WireBackend):
         """Open the line, or join it if open in this process; raises LinkError."""
         if self._line is not None:
             return
-        self._last_condition = None
+        self._last_state = None
         self._loss = None
         line = modbus_line(self._url)
         await line.join(self._url.unit, self._lost)
@@ -236,12 +236,12 @@ class ModbusBackend(WireBackend):
 
     def _report_change(self, request: Request, answer: ModbusResponse) -> None:
         """Report a change of state or fault as an event."""
-        condition = exchanges.condition(request, answer.registers)
-        if condition is None or condition == self._last_condition:
+        state = exchanges.reported_state(request, answer.registers)
+        if state is None or state == self._last_state:
             return
-        before, self._last_condition = self._last_condition, condition
+        before, self._last_state = self._last_state, state
         if before is not None:
-            self._on_event(AmplifierEvent(*condition))
+            self._on_event(AmplifierEvent(*state))
 
     def _opened(self) -> ModbusLine:
         if self._line is None or self._loss is not None:

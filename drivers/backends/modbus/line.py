@@ -86,7 +86,7 @@ class ModbusLine(SharedLine[Port]):
             request = self._make(read, write, unit=unit)
             self._request, self._accept = request, accept
             self._answer = asyncio.get_running_loop().create_future()
-            on_line = self._time_of(len(request.frame) + _RTU_OVERHEAD + request.answer_size)
+            on_line = self._time_of(len(request.frame) + _RTU_OVERHEAD + request.response_size)
             on_line += 2 * self._gap  # before the response, and at the end of the request
             try:
                 self._send(request.frame)

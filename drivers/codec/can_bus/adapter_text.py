@@ -1,7 +1,6 @@
-"""CAN frames as text: LAWICEL's lines of serial adapters, and the elements of socketcand; no I/O.
+"""CAN frames as text: slcan lines of serial adapters, and elements of socketcand; no I/O.
 
-Readers take bytes as they come and give the frames that are whole. What makes no frame is skipped;
-the next one that does is understood.
+Readers take bytes and yield complete frames; invalid text is skipped.
 """
 
 import re
@@ -9,7 +8,7 @@ from collections.abc import Iterator
 
 from drivers.codec.can_bus.frame import CanFrame
 
-_MAX_LENGTH = 512  # characters without an end; a CAN FD frame has half of it
+_MAX_LENGTH = 512  # characters without a terminator; twice a CAN FD frame
 _FD_LENGTHS = (0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64)
 _CLASSIC_MAX = 8
 _ELEMENT = re.compile(
@@ -18,18 +17,18 @@ _ELEMENT = re.compile(
 )
 _LINE = re.compile(rb"([tdb])([0-9A-Fa-f]{3})([0-9A-Fa-f])((?:[0-9A-Fa-f]{2})*)")
 _LINE_END = re.compile(rb"[\r\x07]")
-_STAMP = 4  # digits after the data, from adapters that were once told to send them
+_STAMP = 4  # digits of a timestamp, if the adapter is configured to send it
 
 
 def slcan_line(frame: CanFrame) -> bytes:
-    """The command that has a serial adapter send a frame."""
+    """Encode the command with which a serial adapter sends a frame."""
     kind = "b" if frame.fd else "t"
     length = _FD_LENGTHS.index(len(frame.data))
     return f"{kind}{frame.id:03X}{length:X}{frame.data.hex().upper()}\r".encode()
 
 
 def socketcand_element(frame: CanFrame) -> bytes:
-    """The element that has socketcand send a frame; CAN FD needs a daemon that knows it."""
+    """Encode the element with which socketcand sends a frame; not every version supports CAN FD."""
     data = frame.data.hex(" ")
     if frame.fd:
         return f"< fdsend {frame.id:03X} 00 {len(frame.data)} {data} >".encode()
@@ -37,13 +36,13 @@ def socketcand_element(frame: CanFrame) -> bytes:
 
 
 class SlcanReader:
-    """Frames from what a serial adapter writes."""
+    """Reads frames from a serial adapter."""
 
     def __init__(self) -> None:
         self._rest = b""
 
     def feed(self, data: bytes) -> Iterator[CanFrame]:
-        """Those that are whole now; frames with 29-bit identifiers and remote ones are left out."""
+        """Yield complete frames; 29-bit identifiers and remote frames are skipped."""
         *lines, rest = _LINE_END.split(self._rest + data)
         self._rest = rest if len(rest) <= _MAX_LENGTH else b""
         for line in lines:
@@ -59,13 +58,13 @@ class SlcanReader:
 
 
 class SocketcandReader:
-    """Frames from what socketcand sends in raw mode."""
+    """Reads frames from socketcand in raw mode."""
 
     def __init__(self) -> None:
         self._rest = b""
 
     def feed(self, data: bytes) -> Iterator[CanFrame]:
-        """Those that are whole now; other elements and long identifiers are left out."""
+        """Yield complete frames; other elements and 29-bit identifiers are skipped."""
         *elements, rest = (self._rest + data).split(b">")
         self._rest = rest if len(rest) <= _MAX_LENGTH else b""
         for element in elements:
@@ -78,7 +77,7 @@ class SocketcandReader:
 
 
 def _frame(identifier: bytes, text: bytes, *, is_fd: bool) -> CanFrame | None:
-    """The frame with this identifier and these data in hexadecimal, or None where it is none."""
+    """Decode a frame from hexadecimal text; None if it is invalid."""
     number, data = int(identifier, 16), bytes.fromhex(text.decode())
     lengths = _FD_LENGTHS if is_fd else _FD_LENGTHS[: _CLASSIC_MAX + 1]
     if number > 0x7FF or len(data) not in lengths:

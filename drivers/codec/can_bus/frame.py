@@ -1,7 +1,7 @@
-"""CAN frames as values, and the fields that their eight bytes hold.
+"""CAN frames, and the fields of their eight bytes.
 
-Where the fields lie stands in protocol.yaml; every number is little-endian. Packing and unpacking
-is all that happens here: what the numbers mean is in `orders`, `answers` and `objects`.
+The layouts are from protocol.yaml; every number is little-endian. `requests`, `replies` and
+`objects` interpret the numbers.
 """
 
 from collections.abc import Mapping
@@ -26,7 +26,7 @@ class CanFrame:
 
 @dataclass(frozen=True, slots=True)
 class Field:
-    """Some bits of a block: first [bit, from the lowest of byte 0], bits; signed ones exist."""
+    """A field of a block: first bit, counted from the lowest of byte 0, and number of bits."""
 
     name: str
     first: int
@@ -35,7 +35,7 @@ class Field:
 
 
 class BlockLayout:
-    """How the fields of one kind of block lie in its eight bytes."""
+    """Layout of the fields in a block of eight bytes."""
 
     def __init__(self, name: str) -> None:
         self.name = name
@@ -50,7 +50,7 @@ class BlockLayout:
         self._unused = ~used
 
     def pack(self, **values: int) -> bytes:
-        """A block; fields that are not named are 0. Every value must fit into its bits."""
+        """Pack a block; fields not given are 0. ValueError for a value that does not fit."""
         block = 0
         for name, value in values.items():
             field = self.fields[name]
@@ -61,7 +61,7 @@ class BlockLayout:
         return block.to_bytes(BLOCK, "little")
 
     def unpack(self, block: bytes) -> dict[str, int] | None:
-        """The fields of a block, or None where it has another length or unused bits are set."""
+        """Unpack a block; None for another length, or if unused bits are set."""
         whole = int.from_bytes(block, "little")
         if len(block) != BLOCK or whole & self._unused:
             return None
@@ -75,15 +75,15 @@ class BlockLayout:
 
 
 LAYOUTS: Mapping[str, BlockLayout] = {name: BlockLayout(name) for name in CANOPEN["frames"]}
-"""The blocks of protocol.yaml by their names."""
+"""Layouts by name."""
 
 
 def cob_id(kind: str, node: int = 0) -> int:
-    """The identifier of a kind of frame (a key of `cob_ids`) of a node."""
+    """Return the COB-ID of a kind of frame (a key of `cob_ids`) of a node."""
     return int(CANOPEN["cob_ids"][kind]) + node
 
 
 def command_id(node: int, channel: int) -> int:
-    """The identifier of the RPDO that carries the command of a channel."""
+    """Return the COB-ID of the RPDO with the command of a channel."""
     each = int(CANOPEN["channels_per_node"])
     return cob_id("command", node + channel // each) + 0x100 * (channel % each)

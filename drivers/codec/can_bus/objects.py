@@ -1,4 +1,4 @@
-"""The object dictionary of an amplifier, and what its objects mean as messages; no I/O."""
+"""The object dictionary of an amplifier, and its objects as messages; no I/O."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -33,7 +33,7 @@ TEXTS = ("vendor", "product", "serial_number", "firmware")
 class Entry:
     """One subindex of an object: type u8..u64, i16, text or domain; access ro, wo, rw or const.
 
-    alone: the object has no other; quantity: whose integer it holds, where it is one.
+    alone: the only subindex; quantity: of its integer, if any.
     """
 
     index: int
@@ -47,12 +47,12 @@ class Entry:
 
 
 def index_of(name: str) -> int:
-    """The index of an object of protocol.yaml."""
+    """Return the index of an object of protocol.yaml."""
     return int(_OBJECTS[name]["index"])
 
 
 def entries(channels: int) -> Iterator[Entry]:
-    """Every subindex, those with the counts aside, of an amplifier with so many channels."""
+    """Yield every subindex except the counts, for a number of channels."""
     for name, declared in _OBJECTS.items():
         index = index_of(name)
         access, mappable = str(declared["access"]), bool(declared.get("pdo"))
@@ -96,42 +96,43 @@ def _entry(
 
 
 def capability_entries() -> tuple[Entry, ...]:
-    """Those that say what an amplifier can play, in their order; each is a field of its name."""
+    """Return the entries of the capabilities, in order; each has the name of a field."""
     return tuple(entry for entry in entries(0) if entry.index == index_of("capabilities"))
 
 
 def read_integer(entry: Entry, data: bytes) -> int:
-    """The integer of an entry; FrameError where it has another length or is out of range."""
+    """Decode the integer of an entry; FrameError for a wrong length or value."""
     if len(data) != _WIDTHS[entry.type]:
-        raise FrameError(f"{entry.name} has {len(data)} bytes and not {_WIDTHS[entry.type]}")
+        raise FrameError(f"{entry.name} must have {_WIDTHS[entry.type]} bytes, got {len(data)}")
     value = int.from_bytes(data, "little", signed=entry.type.startswith("i"))
     if entry.quantity is not None and not entry.quantity.holds(value):
         raise FrameError(
-            f"{entry.name} {value} is not within {entry.quantity.minimum}..{entry.quantity.maximum}"
+            f"{entry.name} must be {entry.quantity.minimum} to {entry.quantity.maximum}, got "
+            f"{value}"
         )
     return value
 
 
 def unpack_identity(texts: Mapping[str, bytes], version: int) -> Identity:
-    """Who it is, by the texts of its object dictionary; FrameError for what is no text."""
+    """Decode an identity from its texts; FrameError for an invalid text."""
     read = {name: read_text(texts[name].rstrip(b"\0"), name) for name in TEXTS}
     return Identity(**read, protocol_version=version)
 
 
 def unpack_capabilities(values: Mapping[str, int]) -> Capabilities:
-    """What it can play, from the integers of `capability_entries` by their names."""
+    """Decode capabilities from the integers of `capability_entries`, by name."""
     fields: dict[str, float] = {}
     for entry in capability_entries():
         value, quantity = values[entry.name], entry.quantity
         if quantity is not None and quantity.per_unit > 1:
             fields[entry.name] = quantity.from_wire(value)
-        elif entry.name != "protocol_version":  # which is told with the identity
+        elif entry.name != "protocol_version":  # a part of the identity
             fields[entry.name] = value
-    return Capabilities(**fields, events=True)  # type: ignore[arg-type]  # by their own names
+    return Capabilities(**fields, events=True)  # type: ignore[arg-type]  # by name
 
 
 def unpack_faults(data: bytes) -> FaultList:
-    """The faults in their domain: fault, channel and age each, newest first; raises FrameError."""
+    """Decode faults: fault, channel and age each, newest first; raises FrameError."""
     cursor = Cursor(data)
     record = 2 + _WIDTHS[_Q.age.wire]
     return FaultList(
@@ -147,7 +148,7 @@ def unpack_faults(data: bytes) -> FaultList:
 
 
 def unpack_achieved(data: bytes) -> Achieved:
-    """What a set plays, in its domain; raises FrameError."""
+    """Decode an achieved set; raises FrameError."""
     cursor = Cursor(data)
     token = cursor.integer(_Q.token)
     count = cursor.integer(_Q.channel_count)
@@ -157,7 +158,7 @@ def unpack_achieved(data: bytes) -> Achieved:
         values = LAYOUTS["command"].unpack(data[begin : begin + BLOCK])
         slots = data[begin + BLOCK : begin + each]
         if values is None or len(slots) < 2:
-            raise FrameError(f"what a set plays makes no sense: {data.hex(' ')}")
+            raise FrameError(f"invalid achieved set: {data.hex(' ')}")
         checked = (
             (_Q.level, values["level"]),
             (_Q.phase, values["phase"]),
@@ -165,7 +166,7 @@ def unpack_achieved(data: bytes) -> Achieved:
             (_Q.envelope_slot, slots[1]),
         )
         if not all(quantity.holds(value) for quantity, value in checked):
-            raise FrameError(f"what a set plays is out of range: {data.hex(' ')}")
+            raise FrameError(f"achieved set out of range: {data.hex(' ')}")
         commands.append(
             DriveCommand(
                 channel=values["channel"],
@@ -182,7 +183,7 @@ def unpack_achieved(data: bytes) -> Achieved:
 
 
 def pack_envelope(request: LoadEnvelope) -> bytes:
-    """The domain of an envelope; TypeError for one that has not passed a guard."""
+    """Encode an envelope; TypeError for one that has not passed a guard."""
     require_safe(request)
     envelope = request.envelope
     head = pack((_Q.envelope_step, envelope.step), (_Q.envelope_knots, len(envelope.knots)))
@@ -192,5 +193,5 @@ def pack_envelope(request: LoadEnvelope) -> bytes:
 
 
 def nak_of_abort(abort: int) -> NakCode | None:
-    """Why an amplifier refused, by its SDO abort code; None for a code of CANopen's own."""
+    """Return the refusal of an SDO abort code; None for one of CANopen itself."""
     return _NAKS.get(abort)

@@ -1,4 +1,4 @@
-"""Replies and events from the frames in which an amplifier tells them on CAN; no I/O."""
+"""Replies and events from CAN frames; no I/O."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -16,7 +16,7 @@ from drivers.protocol.messages import (
     Status,
 )
 
-UNASKED = 0  # the sequence number of what an amplifier says by itself
+UNSOLICITED = 0  # sequence number of events
 _Q = PROTOCOL.quantities
 _ACTIONS: Mapping[str, int] = CANOPEN["actions"]
 _INCOMPLETE_SET: int = CANOPEN["torn"]
@@ -28,10 +28,10 @@ _NAKS = {code.value: code for code in NakCode}
 
 @dataclass(frozen=True, slots=True)
 class CanReply:
-    """What an amplifier says to an order, or, with sequence 0, by itself.
+    """Reply to a request, or with sequence 0 an event.
 
-    refusal: None where it was carried out; exact: a set plays to the last step as it was asked for.
-    status is there in the answers to all orders but those about sets, unless they were refused.
+    refusal: None if carried out; exact: the set plays exactly as requested. status: in replies to
+    all requests except those about sets, unless refused.
     """
 
     sequence: int
@@ -46,16 +46,16 @@ class CanReply:
 
     @property
     def event(self) -> AmplifierEvent:
-        """What it tells where nobody asked."""
+        """The event, if unsolicited."""
         return AmplifierEvent(self.state, self.fault, self.channel)
 
 
 @dataclass
 class CanReplyReader:
-    """Puts the frames of one amplifier's answers together.
+    """Assembles the replies of one amplifier from frames.
 
-    An answer in several frames is whole when the last, the answer itself, has come with the
-    sequence number of the others; what is not is dropped.
+    A reply is complete with its last frame, the answer, if all its frames have the same sequence
+    number; incomplete ones are discarded.
     """
 
     node: int
@@ -64,7 +64,7 @@ class CanReplyReader:
 
     @property
     def ids(self) -> tuple[int, ...]:
-        """The identifiers of the frames that belong here."""
+        """COB-IDs of the frames of replies."""
         each = CANOPEN["channels_per_node"]
         groups = range(_Q.channel_count.maximum // each)
         return (
@@ -74,9 +74,9 @@ class CanReplyReader:
         )
 
     def feed(self, frame: CanFrame) -> CanReply | None:
-        """Take a frame with one of `ids`; an Answer once it is whole, else None.
+        """Take a frame with one of `ids`; returns a reply once it is complete.
 
-        Raises FrameError for a frame that makes no sense.
+        Raises FrameError for an invalid frame.
         """
         if frame.id == cob_id("answer", self.node):
             return self._answer(frame.data)
@@ -97,19 +97,21 @@ class CanReplyReader:
         values = _unpack("answer", data[:BLOCK])
         sequence, action, result = values["sequence"], values["action"], values["result"]
         if values["state"] not in _STATES or values["fault"] not in _FAULTS:
-            raise FrameError(f"an answer names state {values['state']}, fault {values['fault']}")
+            raise FrameError(
+                f"unknown state {values['state']} or fault {values['fault']} in a reply"
+            )
         if result not in (0, _INCOMPLETE_SET) and result not in _NAKS:
-            raise FrameError(f"an answer has the result {result}")
+            raise FrameError(f"unknown result {result} in a reply")
         channel = values["channel"]
         if channel != _NO_CHANNEL and not _Q.channel.holds(channel):
-            raise FrameError(f"an answer names channel {channel}")
+            raise FrameError(f"invalid channel {channel} in a reply")
         about_set = action in (_ACTIONS["apply"], _ACTIONS["stage"], _ACTIONS["commit"])
         status = None
-        if sequence != UNASKED and not result and not about_set:
+        if sequence != UNSOLICITED and not result and not about_set:
             status = self._status(values)
             if status is None:
                 return None
-        blamed = None if channel == _NO_CHANNEL else channel
+        faulty = None if channel == _NO_CHANNEL else channel
         return CanReply(
             sequence=sequence,
             action=action,
@@ -117,13 +119,13 @@ class CanReplyReader:
             fault=_FAULTS[values["fault"]],
             token=values["active_token"],
             exact=bool(values["exact"]),
-            refusal=_refusal(result, _STATES[values["state"]], blamed),
-            channel=blamed,
+            refusal=_refusal(result, _STATES[values["state"]], faulty),
+            channel=faulty,
             status=status,
         )
 
     def _status(self, answer: dict[str, int]) -> Status | None:
-        """The status that came with an answer; None where a frame of it is missing."""
+        """Return the status of a reply; None if a frame of it is missing."""
         condition = self._condition
         each = CANOPEN["channels_per_node"]
         if condition.get("sequence") != answer["sequence"]:
@@ -139,7 +141,7 @@ class CanReplyReader:
             and _Q.temperature.holds(condition["temperature"])
             and _Q.watchdog_left.holds(answer["watchdog_left"])
         ):
-            raise FrameError("a status has numbers out of range")
+            raise FrameError("values of a status are out of range")
         return Status(
             state=_STATES[answer["state"]],
             fault=_FAULTS[answer["fault"]],
@@ -153,7 +155,7 @@ class CanReplyReader:
 
 
 def decode_emergency(data: bytes) -> AmplifierEvent:
-    """The event in an EMCY message; raises FrameError."""
+    """Decode an EMCY message; raises FrameError."""
     values = _unpack("emergency", data)
     channel = values["channel"]
     if (
@@ -161,7 +163,7 @@ def decode_emergency(data: bytes) -> AmplifierEvent:
         or values["fault"] not in _FAULTS
         or not (channel == _NO_CHANNEL or _Q.channel.holds(channel))
     ):
-        raise FrameError(f"an emergency that makes no sense: {data.hex(' ')}")
+        raise FrameError(f"invalid emergency: {data.hex(' ')}")
     return AmplifierEvent(
         _STATES[values["state"]],
         _FAULTS[values["fault"]],
@@ -170,7 +172,7 @@ def decode_emergency(data: bytes) -> AmplifierEvent:
 
 
 def plain_reply(answer: CanReply) -> Reply | None:
-    """The reply that an answer holds by itself; None where it is about a set that was taken."""
+    """Return refusal or status; None for an accepted set."""
     return answer.refusal or answer.status
 
 
@@ -179,8 +181,8 @@ def _refusal(result: int, state: AmplifierState, channel: int | None) -> Nak | N
         return None
     if result != _INCOMPLETE_SET:
         return Nak(_NAKS[result], channel)
-    # A frame of the set was lost: the amplifier has done nothing, and can be asked again, unless it
-    # says at once that it would refuse the whole set as well.
+    # A frame of the set was lost and nothing applied: it can be repeated, unless the state shows
+    # that the complete set would be refused too.
     is_armed = state is AmplifierState.OPERATION_ENABLED
     return Nak(NakCode.BUSY if is_armed else NakCode.WRONG_STATE, channel)
 
@@ -188,5 +190,5 @@ def _refusal(result: int, state: AmplifierState, channel: int | None) -> Nak | N
 def _unpack(layout: str, data: bytes) -> dict[str, int]:
     values = LAYOUTS[layout].unpack(data)
     if values is None:
-        raise FrameError(f"a frame that is no {layout}: {data.hex(' ')}")
+        raise FrameError(f"invalid {layout} frame: {data.hex(' ')}")
     return values

@@ -1,10 +1,9 @@
-"""Requests as the frames that carry them on CAN; no I/O.
+"""Time-critical requests as CAN frames; no I/O.
 
-A request that moves something is an *order*: a PDO that the amplifier answers with a PDO of the
-same sequence number (see `answers`). The commands of a set go before their order, one PDO a
-channel, under its sequence number, and sets take effect at the SYNC that follows: whole or, where a
-frame is missing, not at all. On CAN FD the order and its commands are one frame. What can wait (who
-is there, what it can play, faults, envelopes) is read and written as `objects`.
+A request is an *order* PDO, and its reply a PDO with the same sequence number (see `replies`). The
+commands of a set precede its order, one PDO per channel with the same sequence number, and take
+effect at the SYNC that follows: all or, if a frame is missing, none. On CAN FD the order and its
+commands are one frame. Identity, capabilities, faults and envelopes are SDO transfers (`objects`).
 """
 
 from collections.abc import Mapping
@@ -35,44 +34,44 @@ _ACTIONS: Mapping[str, int] = CANOPEN["actions"]
 _OPERATIONAL: int = CANOPEN["nmt_states"]["OPERATIONAL"]
 _FD_BLOCKS = 8
 _FD_LENGTHS = (8, 12, 16, 20, 24, 32, 48, 64)
-_FILLING = b"\xff"  # a block of these is no command: its level would be out of range
+_FILLING = b"\xff"  # filler; its level is out of range
 
 SYNC = CanFrame(cob_id("sync"), b"")
 
 
-def action_of(order: PdoRequest) -> int:
-    """Which action an order asks for; a Ping asks for the status, its heartbeat goes before it."""
-    name = type(order).__name__.lower()
+def action_of(request: PdoRequest) -> int:
+    """Return the action code of a request; a Ping is a heartbeat and the action status."""
+    name = type(request).__name__.lower()
     return _ACTIONS.get(name, _ACTIONS["status"])
 
 
 def host_number(node: int) -> int:
-    """The number under which the host sends its heartbeat to one amplifier."""
+    """Return the node number of the host's heartbeat to one amplifier."""
     return int(CANOPEN["host_base"]) - node
 
 
 def encode_request(
-    order: PdoRequest, *, node: int, sequence: int, fd: bool = False
+    request: PdoRequest, *, node: int, sequence: int, fd: bool = False
 ) -> tuple[CanFrame, ...]:
-    """The frames of an order to a node; TypeError for a set that has not passed a guard.
+    """Encode a request to a node; TypeError for a set that has not passed a guard.
 
-    sequence: 1..255. fd: as CAN FD, which is answered in one frame of the same kind.
+    sequence: 1..255. fd: as CAN FD; the reply then is one CAN FD frame.
     """
-    require_safe(order)
-    match order:
+    require_safe(request)
+    match request:
         case Ping():
             beat = CanFrame(cob_id("heartbeat", host_number(node)), bytes([_OPERATIONAL]))
-            return (beat, _order(order, node, sequence, fd=fd))
+            return (beat, _order(request, node, sequence, fd=fd))
         case Arm(watchdog=watchdog):
             time = _Q.watchdog.to_wire(watchdog)
-            return (_order(order, node, sequence, fd=fd, token=host_number(node), time=time),)
+            return (_order(request, node, sequence, fd=fd, token=host_number(node), time=time),)
         case Disarm(ramp=ramp) | Stop(ramp=ramp):
-            return (_order(order, node, sequence, fd=fd, ramp=_Q.ramp.to_wire(ramp)),)
+            return (_order(request, node, sequence, fd=fd, ramp=_Q.ramp.to_wire(ramp)),)
         case Commit(token=token):
-            return (_order(order, node, sequence, fd=fd, token=_Q.token.to_wire(token)), SYNC)
+            return (_order(request, node, sequence, fd=fd, token=_Q.token.to_wire(token)), SYNC)
         case Apply(command_set=wanted) | Stage(command_set=wanted):
             head = _order(
-                order,
+                request,
                 node,
                 sequence,
                 fd=fd,
@@ -85,11 +84,11 @@ def encode_request(
             together = _in_fd_frames if fd else _in_classic_frames
             return (*shapes, *together(head, wanted.commands, node, sequence), SYNC)
         case _:
-            return (_order(order, node, sequence, fd=fd),)
+            return (_order(request, node, sequence, fd=fd),)
 
 
 def encode_broadcast(request: Broadcast) -> tuple[CanFrame, ...]:
-    """The frames of what every amplifier of the bus shall do; nobody answers."""
+    """Encode a request to every amplifier of the bus; there are no replies."""
     match request:
         case Commit(token=token):
             return (_order(request, 0, 0, token=_Q.token.to_wire(token)), SYNC)
@@ -98,7 +97,7 @@ def encode_broadcast(request: Broadcast) -> tuple[CanFrame, ...]:
 
 
 def wanted_commands(wanted: CommandSet) -> tuple[DriveCommand, ...]:
-    """The commands of a set as they read on the other side of the wire."""
+    """Return the commands of a set, quantised as on the wire."""
     return tuple(
         replace(
             command,
@@ -111,7 +110,7 @@ def wanted_commands(wanted: CommandSet) -> tuple[DriveCommand, ...]:
 
 
 def _order(
-    order: PdoRequest,
+    request: PdoRequest,
     node: int,
     sequence: int,
     *,
@@ -125,7 +124,7 @@ def _order(
         token=token,
         ramp=ramp,
         time=time,
-        action=action_of(order),
+        action=action_of(request),
         count=count,
         sequence=sequence,
     )
@@ -168,14 +167,14 @@ def _in_fd_frames(
 
 
 def _filled(blocks: list[bytes]) -> bytes:
-    """Blocks in a length that CAN FD has."""
+    """Join blocks and fill up to a CAN FD length."""
     data = b"".join(blocks)
     length = next(length for length in _FD_LENGTHS if length >= len(data))
     return data.ljust(length, _FILLING)
 
 
 def _slots(commands: tuple[DriveCommand, ...], node: int, sequence: int) -> list[CanFrame]:
-    """The envelopes that a set refers to: a frame for each four channels with any."""
+    """Encode the envelope slots of a set: a frame per four channels with any."""
     each = CANOPEN["channels_per_node"]
     groups: dict[int, dict[str, int]] = {}
     for command in commands:

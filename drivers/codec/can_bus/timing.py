@@ -1,4 +1,4 @@
-"""What CAN frames cost in time, by arithmetic."""
+"""Durations of CAN frames."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -7,8 +7,8 @@ from typing import final
 from drivers.codec.can_bus.frame import BLOCK, CanFrame
 from drivers.protocol.wire_times import WireTimes
 
-_FRAME_BITS = 47  # beside the data, with the pause after it
-_STUFFED_BITS = 34  # of these and the data, every fifth may be followed by one that is stuffed in
+_FRAME_BITS = 47  # besides the data, with the interframe space
+_STUFFED_BITS = 34  # of these and the data, one stuff bit per four at worst
 _FD_SLOW_BITS = 30  # arbitration, acknowledgement and pause of a CAN FD frame
 _FD_FAST_BITS = 37  # control and CRC
 _ENVELOPE_HEAD = 3  # bytes: step, count
@@ -19,22 +19,22 @@ _SEGMENT = 7  # bytes
 @final
 @dataclass(frozen=True)
 class CanTimes(WireTimes):
-    """On a bus at a bit rate, with the worst stuffing; fd: that of the data, 0 without CAN FD."""
+    """Durations with worst-case bit stuffing; fd: data bit rate, 0 without CAN FD."""
 
     bitrate: int
     fd: int = 0
 
     def frame(self, length: int) -> float:
-        """Of a frame with so many bytes of data."""
+        """Duration of a frame with a number of data bytes."""
         stuffing = (_STUFFED_BITS + 8 * length - 1) // 4
         return (_FRAME_BITS + 8 * length + stuffing) / self.bitrate
 
     def fd_frame(self, length: int) -> float:
-        """Of a CAN FD frame with so many bytes of data."""
+        """Duration of a CAN FD frame with a number of data bytes."""
         return _FD_SLOW_BITS / self.bitrate + (_FD_FAST_BITS + 8 * length) * 1.25 / self.fd
 
     def frames(self, frames: Iterable[CanFrame]) -> float:
-        """Of some frames one after the other."""
+        """Duration of consecutive frames."""
         return sum(
             self.fd_frame(len(frame.data)) if frame.fd else self.frame(len(frame.data))
             for frame in frames
@@ -52,9 +52,9 @@ class CanTimes(WireTimes):
         return self.frame(BLOCK) + self.frame(0)
 
     def loading(self, knots: int) -> float:
-        """See `WireTimes`; as an SDO block transfer with its answers.
+        """See `WireTimes`; an SDO block transfer with its replies.
 
-        Two frames begin it, two end it, one tells that the segments have come.
+        Two frames initiate it, two end it, one acknowledges the segments.
         """
         segments = -(-(_ENVELOPE_HEAD + _KNOT * knots) // _SEGMENT)
         return (segments + 5) * self.frame(8)

@@ -1,1 +1,1 @@
-"""The Modbus codec, the host's side: messages, their registers, telegrams."""
+"""Codec of Modbus for the host: messages, registers, ADUs."""

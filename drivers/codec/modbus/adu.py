@@ -1,8 +1,8 @@
-"""Modbus frames around register requests, over TCP and RTU; the one file that meets pymodbus.
+"""Modbus ADUs of register requests, over TCP and RTU; the only module that imports pymodbus.
 
-Its frames and messages are used, its client is not: over RTU that gives a late answer to the next
-request, a damaged answer makes it close a TCP connection, and what has half arrived is thrown away
-when the next request goes out. So what comes in is taken apart here; see `ResponseReader`.
+Its framers and PDUs are used, its client is not: over RTU it credits a late response to the next
+request, it closes a TCP connection after a damaged response, and it discards partial data when the
+next request goes out. Responses are therefore parsed by `ResponseReader`.
 """
 
 from dataclasses import dataclass
@@ -33,23 +33,23 @@ _WRITES = (5, 6, 15, 16)
 
 @dataclass(frozen=True)
 class RequestAdu:
-    """A request for one unit: its frame, and by what its answer is known.
+    """A request to one unit: its frame, and what identifies its response.
 
-    transaction: of a TCP frame, 0 for RTU; answer_size: of the PDU, in bytes.
+    transaction: of a TCP frame, 0 for RTU; response_size: of the response PDU [bytes].
     """
 
     unit: int
     transaction: int
     function: int
     frame: bytes
-    answer_size: int
+    response_size: int
     read: Read | None
     write: Write | None
 
 
 @dataclass(frozen=True)
 class ModbusResponse:
-    """What came back: the registers that were read, or the code of an exception."""
+    """A response: registers read, or the code of an exception."""
 
     registers: tuple[int, ...] = ()
     exception: int = 0
@@ -58,7 +58,7 @@ class ModbusResponse:
 def build_adu(
     read: Read | None, write: Write | None, *, unit: int, transaction: int, is_rtu: bool
 ) -> RequestAdu:
-    """The frame that writes, reads, or does both in one transaction; one of the two is given."""
+    """Build the request that writes, reads, or does both; at least one must be given."""
     pdu = _pdu(read, write)
     pdu.dev_id = unit
     pdu.transaction_id = transaction
@@ -69,7 +69,7 @@ def build_adu(
 
 def _pdu(read: Read | None, write: Write | None) -> ModbusPDU:
     if write is None:
-        assert read is not None  # noqa: S101  one of the two
+        assert read is not None  # noqa: S101  at least one
         return ReadInputRegistersRequest(address=read.address, count=read.count)
     registers = list(write.registers)
     if read is not None:
@@ -85,10 +85,10 @@ def _pdu(read: Read | None, write: Write | None) -> ModbusPDU:
 
 
 class ResponseReader:
-    """Finds the answer to a telegram in whatever arrives, and counts what is something else.
+    """Finds the response to a request in the received bytes, and counts everything else.
 
-    An answer has the unit, the function and the length that were asked for, over TCP the
-    transaction number, over RTU a good CRC, and echoes address and count of what was written.
+    A response has the unit, function and length of the request, over TCP its transaction number,
+    over RTU a valid CRC, and echoes address and count of a write.
     """
 
     def __init__(self, *, is_rtu: bool, counters: WireCounters) -> None:
@@ -97,26 +97,26 @@ class ResponseReader:
         self._buffer = bytearray()
 
     def clear(self) -> None:
-        """Forget what has half arrived."""
+        """Discard partial data."""
         if self._buffer:
             self._counters.crc_errors += 1
             self._buffer.clear()
 
     def feed(self, data: bytes, to: RequestAdu | None) -> list[ModbusResponse]:
-        """The answers to a telegram in these bytes; to: None where nothing was asked."""
+        """Return the responses to a request in these bytes; to: None without a request."""
         self._buffer += data
         split = self._next_rtu if self._is_rtu else self._next_tcp
         responses = []
         while (frame := split(to)) is not None:
             self._counters.frames_in += 1
             transaction, unit, pdu = frame
-            answer = None
+            response = None
             if to is not None and (transaction, unit) == (to.transaction, to.unit):
-                answer = _answer(pdu, to)
-            if answer is None:
+                response = _response(pdu, to)
+            if response is None:
                 self._counters.unexpected_frames += 1
             else:
-                responses.append(answer)
+                responses.append(response)
         return responses
 
     def _next_tcp(self, to: RequestAdu | None) -> tuple[int, int, bytes] | None:
@@ -126,7 +126,7 @@ class ResponseReader:
             int.from_bytes(self._buffer[at : at + 2], "big") for at in (0, 2, 4)
         )
         if protocol != 0 or not 2 <= length <= _LENGTH_MAX:
-            self.clear()  # nothing says where the next frame begins
+            self.clear()  # the begin of the next frame is unknown
             return None
         end = _MBAP - 1 + length
         if len(self._buffer) < end:
@@ -149,10 +149,10 @@ class ResponseReader:
         return None
 
     def _rtu_size(self, start: int, to: RequestAdu | None) -> int:
-        """How long a frame would be that begins here; 0 where none can.
+        """Return the length of a frame that begins here; 0 if none can.
 
-        After bytes that are none of a frame only the answer itself is looked for: anything may look
-        like the frame of somebody.
+        After invalid bytes only the response itself is accepted, since any bytes may look like the
+        frame of another unit.
         """
         unit, function, count = self._buffer[start : start + 3]
         if start and (to is None or unit != to.unit or function & ~_EXCEPTION != to.function):
@@ -161,12 +161,12 @@ class ResponseReader:
             return 5
         if function in _READS:
             size = 5 + count
-            return size if not start or (to is not None and size == to.answer_size + 3) else 0
+            return size if not start or (to is not None and size == to.response_size + 3) else 0
         return 8 if function in _WRITES else 0
 
 
-def _answer(pdu: bytes, to: RequestAdu) -> ModbusResponse | None:
-    """What a PDU answers to a telegram, if it does."""
+def _response(pdu: bytes, to: RequestAdu) -> ModbusResponse | None:
+    """Decode a PDU as the response to a request; None if it is not."""
     if not _has_form(pdu, to):
         return None
     try:
@@ -179,7 +179,7 @@ def _answer(pdu: bytes, to: RequestAdu) -> ModbusResponse | None:
         return ModbusResponse(exception=message.exception_code)
     if to.read is not None:
         return ModbusResponse(tuple(message.registers))
-    assert to.write is not None  # noqa: S101  one of the two
+    assert to.write is not None  # noqa: S101  at least one
     wanted = to.write.registers
     echo = tuple(message.registers) if len(wanted) == 1 else message.count
     is_echo = echo == (wanted if len(wanted) == 1 else len(wanted))
@@ -187,8 +187,8 @@ def _answer(pdu: bytes, to: RequestAdu) -> ModbusResponse | None:
 
 
 def _has_form(pdu: bytes, to: RequestAdu) -> bool:
-    """Whether function and lengths are those of an answer, or of an exception."""
+    """Whether function and length are those of a response or exception."""
     if pdu[0] == to.function | _EXCEPTION:
         return len(pdu) == 2
     is_long = to.read is None or pdu[1:2] == bytes([2 * to.read.count])
-    return pdu[0] == to.function and len(pdu) == to.answer_size and is_long
+    return pdu[0] == to.function and len(pdu) == to.response_size and is_long

@@ -1,7 +1,6 @@
-"""What stands in the register blocks of an amplifier, as a Modbus host reads them.
+"""Register blocks of an amplifier, decoded for a Modbus host.
 
-Reading is total: registers, as many as were asked for, become a message with every value in range,
-or FrameError.
+Decoding yields a message with every value in range or raises FrameError.
 """
 
 import struct
@@ -29,13 +28,13 @@ from drivers.protocol.messages import (
 
 _MAP = PROTOCOL.modbus
 _Q = PROTOCOL.quantities
-HEAD = len(_MAP["head"])  # registers that every block begins with
+HEAD = len(_MAP["head"])  # registers at the begin of every block
 CHANNEL_SIZE: int = _MAP["channel_registers"]
 FAULT_SIZE: int = _MAP["fault_registers"]
 TEXT_SIZE: int = _MAP["text_registers"]
 _NO_CHANNEL = 255
 
-# By register, as protocol.yaml says; those of channels and faults have their quantities' names.
+# By register, from protocol.yaml; registers of channels and faults have their quantities' names.
 _QUANTITIES: dict[str, Quantity] = vars(_Q) | {
     register: vars(_Q)[kind]
     for block in (*_MAP["input"].values(), *_MAP["holding"].values())
@@ -49,7 +48,7 @@ _EnumT = TypeVar("_EnumT", bound=IntEnum)
 def _fields(
     names: Collection[str], registers: Sequence[int]
 ) -> tuple[dict[str, int], Sequence[int]]:
-    """The named registers after the head, and what follows them."""
+    """Split off the named registers after the head."""
     end = HEAD + len(names)
     return dict(zip(names, registers[HEAD:end], strict=True)), registers[end:]
 
@@ -58,7 +57,7 @@ def _integer(name: str, register: int) -> int:
     quantity = _QUANTITIES[name]
     value = register - (1 << 16) if quantity.wire == "i16" and register >> 15 else register
     if not quantity.holds(value):
-        raise FrameError(f"{name} {value} is not within {quantity.minimum}..{quantity.maximum}")
+        raise FrameError(f"{name} must be {quantity.minimum} to {quantity.maximum}, got {value}")
     return value
 
 
@@ -69,7 +68,7 @@ def _number(name: str, register: int) -> float:
 def _channel_count(register: int, *, read: int) -> int:
     channels = _integer("channel_count", register)
     if channels > read:
-        raise FrameError(f"{channels} channels where {read} were read")
+        raise FrameError(f"channel count must be at most {read}, got {channels}")
     return channels
 
 
@@ -85,7 +84,7 @@ def _channel(register: int) -> int | None:
 
 
 def unpack_identity(registers: Sequence[int]) -> Identity:
-    """Who it is."""
+    """Decode an identity."""
     block = _MAP["input"]["identity"]
     found, rest = _fields(block["registers"], registers)
     texts = {
@@ -101,7 +100,7 @@ def _raw(registers: Sequence[int]) -> bytes:
 
 
 def unpack_capabilities(registers: Sequence[int]) -> Capabilities:
-    """What it can play."""
+    """Decode capabilities."""
     found, _ = _fields(_MAP["input"]["capabilities"]["registers"], registers)
     _integer("protocol_version", found.pop("protocol_version"))
     whole: dict[str, Any] = {
@@ -113,11 +112,11 @@ def unpack_capabilities(registers: Sequence[int]) -> Capabilities:
 
 
 def unpack_status(registers: Sequence[int]) -> Status:
-    """How it is."""
+    """Decode a status."""
     found, levels = _fields(_MAP["input"]["status"]["registers"], registers)
     channels = _channel_count(found["channel_count"], read=len(levels))
     if found["high_voltage"] > 1:
-        raise FrameError(f"high_voltage is {found['high_voltage']}, neither 0 nor 1")
+        raise FrameError(f"high_voltage must be 0 or 1, got {found['high_voltage']}")
     return Status(
         state=_one_of(AmplifierState, found["state"]),
         fault=_one_of(Fault, found["fault"]),
@@ -135,7 +134,7 @@ def _groups(registers: Sequence[int], size: int) -> Iterable[Sequence[int]]:
 
 
 def unpack_achieved(registers: Sequence[int]) -> Achieved:
-    """What it plays, or would; the channels that were named, in their order."""
+    """Decode an achieved set, in the order of its channels."""
     found, rest = _fields(_MAP["input"]["achieved"]["registers"], registers)
     _channel_count(found["channel_count"], read=len(rest) // CHANNEL_SIZE)
     commands = tuple(
@@ -165,7 +164,7 @@ def _command(channel: int, group: Sequence[int]) -> DriveCommand:
 
 
 def unpack_faults(registers: Sequence[int]) -> FaultList:
-    """What went wrong, as far as it was read; see `unpack_fault_count`."""
+    """Decode the faults that were read; see `unpack_fault_count`."""
     found, rest = _fields(_MAP["input"]["faults"]["registers"], registers)
     count = _integer("fault_count", found["fault_count"])
     records = list(_groups(rest, FAULT_SIZE))[:count]
@@ -182,13 +181,13 @@ def unpack_faults(registers: Sequence[int]) -> FaultList:
 
 
 def unpack_fault_count(registers: Sequence[int]) -> int:
-    """How many faults there are to be read."""
+    """Decode the number of faults."""
     found, _ = _fields(_MAP["input"]["faults"]["registers"], registers)
     return _integer("fault_count", found["fault_count"])
 
 
 def unpack_loaded(registers: Sequence[int]) -> Loaded:
-    """The envelope that was loaded last."""
+    """Decode the confirmation of a loaded envelope."""
     found, _ = _fields(_MAP["holding"]["envelope"]["registers"], registers)
     return Loaded(
         slot=_integer("slot", found["slot"]),
@@ -197,14 +196,14 @@ def unpack_loaded(registers: Sequence[int]) -> Loaded:
 
 
 def unpack_refusal(registers: Sequence[int]) -> tuple[Nak, int] | None:
-    """Why a write was refused, and its tag; None where none has been."""
+    """Decode the last refusal and its tag; None if there is none."""
     found, _ = _fields(_MAP["input"]["refusal"]["registers"], registers)
     if not found["nak"]:
         return None
     return Nak(_one_of(NakCode, found["nak"]), _channel(found["channel"])), found["refused_tag"]
 
 
-def unpack_condition(registers: Sequence[int]) -> tuple[AmplifierState, Fault]:
-    """With which a status and what was achieved begin."""
+def unpack_state(registers: Sequence[int]) -> tuple[AmplifierState, Fault]:
+    """Decode state and fault, with which a status and an achieved set begin."""
     found, _ = _fields(("state", "fault"), registers)
     return _one_of(AmplifierState, found["state"]), _one_of(Fault, found["fault"])

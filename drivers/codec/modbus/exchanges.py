@@ -1,9 +1,8 @@
-"""Messages to registers and back, for the host's side of Modbus.
+"""Messages to registers and back, for a Modbus host.
 
-An exchange is one block written and one read back, by FC23 in one transaction or by FC16 and FC4 in
-two; its tag, written with the one and read with the other, says what answers what, since an RTU
-frame carries no number. Identity and capabilities are only read, so that nothing is written to a
-device before it is known. Nothing here knows of frames.
+An exchange writes one block and reads one back, by FC23 in one transaction or by FC16 and FC4 in
+two. Its tag, written and read back, matches responses to requests, since RTU frames carry no
+number. Identity and capabilities are only read, so that nothing is written to an unknown device.
 """
 
 import binascii
@@ -43,12 +42,12 @@ _MAP = PROTOCOL.modbus
 _Q = PROTOCOL.quantities
 _CONTROLWORDS: Mapping[str, int] = _MAP["controlwords"]
 CHANNELS_MAX = _Q.channel_count.maximum
-RECORDS_FIRST = 4  # mostly there are fewer; where there are more they are asked for
+RECORDS_FIRST = 4  # usually fewer; further ones are read separately
 
 
 @dataclass(frozen=True, slots=True)
 class Write:
-    """Registers for consecutive addresses from here on."""
+    """Registers to write at consecutive addresses."""
 
     address: int
     registers: tuple[int, ...]
@@ -56,7 +55,7 @@ class Write:
 
 @dataclass(frozen=True, slots=True)
 class Read:
-    """So many registers from this address on."""
+    """A number of registers to read from an address on."""
 
     address: int
     count: int
@@ -64,7 +63,7 @@ class Read:
 
 @dataclass(frozen=True, slots=True)
 class Exchange:
-    """What a request is on this wire: a block that is read, and one that is written before."""
+    """A request on this wire: a block to read, and one to write before."""
 
     read: Read
     write: Write | None = None
@@ -73,9 +72,9 @@ class Exchange:
 def encode_request(
     request: Request, *, tag: int, channels: int = CHANNELS_MAX, records: int = RECORDS_FIRST
 ) -> Exchange:
-    """The exchange of a request; TypeError if a set in it has not passed a guard.
+    """Encode a request; TypeError if a set in it has not passed a guard.
 
-    tag: 1..65535; channels: how many of them are read; records: how many faults.
+    tag: 1..65535; channels, records: number of channels and faults to read.
     """
     require_safe(request)
     match request:
@@ -93,7 +92,7 @@ def encode_request(
             return Exchange(_read("status", beyond=channels), Write(_MAP["heartbeat"], (tag,)))
         case Arm() | Disarm() | Stop() | Clear():
             return Exchange(
-                _read("status", beyond=channels), _block("control", tag, _order(request))
+                _read("status", beyond=channels), _block("control", tag, _control(request))
             )
         case Stage(command_set=wanted) | Apply(command_set=wanted):
             commit = wanted.token if isinstance(request, Apply) else 0
@@ -111,38 +110,38 @@ def encode_request(
 
 
 def encode_broadcast(request: Broadcast) -> Write:
-    """What is written to all units; a commit is one register."""
+    """Encode a write to all units; a commit is one register."""
     if isinstance(request, Commit):
         address = _MAP["holding"]["set"]["address"] + HEAD
         return Write(address, (_Q.token.to_wire(request.token),))
-    return _block("control", 0, _order(request))
+    return _block("control", 0, _control(request))
 
 
 def decode_refusal(registers: Sequence[int], *, tag: int) -> Nak | None:
-    """The refusal of the write that carried this tag; None where it is that of another."""
+    """Decode the refusal of the write with this tag; None if it is of another."""
     refusal = blocks.unpack_refusal(registers)
     return refusal[0] if refusal is not None and refusal[1] == tag else None
 
 
 def refusal_read() -> Read:
-    """Where the amplifier says why it answered with an exception."""
+    """Return the block with the reason of the last exception."""
     return _read("refusal")
 
 
 def is_of(registers: Sequence[int], *, tag: int | None) -> bool:
-    """Whether a block that was read belongs to this tag; None: whether it is sound at all."""
+    """Whether a block has this tag (any for None) and a valid CRC."""
     if len(registers) < HEAD or (tag is not None and registers[0] != tag):
         return False
-    return registers[1] in (0, check_of(registers[HEAD:]))
+    return registers[1] in (0, crc_of(registers[HEAD:]))
 
 
-def check_of(registers: Sequence[int]) -> int:
-    """CRC-16 (polynomial 1021, from FFFF) of registers, high byte first; FFFF where that is 0."""
+def crc_of(registers: Sequence[int]) -> int:
+    """CRC-16 (polynomial 1021, initial FFFF) of registers, high byte first; FFFF instead of 0."""
     return binascii.crc_hqx(struct.pack(f">{len(registers)}H", *registers), 0xFFFF) or 0xFFFF
 
 
 def decode_reply(request: Request, registers: Sequence[int]) -> Reply:
-    """The reply in the block that the exchange of this request has read; raises FrameError."""
+    """Decode the reply to a request from its block; raises FrameError."""
     match request:
         case Hello():
             return blocks.unpack_identity(registers)
@@ -158,15 +157,17 @@ def decode_reply(request: Request, registers: Sequence[int]) -> Reply:
             return blocks.unpack_status(registers)
 
 
-def condition(request: Request, registers: Sequence[int]) -> tuple[AmplifierState, Fault] | None:
-    """State and fault where the block that was read tells them; raises FrameError."""
+def reported_state(
+    request: Request, registers: Sequence[int]
+) -> tuple[AmplifierState, Fault] | None:
+    """Decode state and fault if the block has them; raises FrameError."""
     if isinstance(request, Hello | GetCaps | GetFaults | LoadEnvelope):
         return None
-    return blocks.unpack_condition(registers)
+    return blocks.unpack_state(registers)
 
 
 def nak_of_exception(code: int) -> Nak | None:
-    """The refusal that an exception stands for where only one does."""
+    """Return the refusal of an exception code that stands for one only."""
     codes = [name for name, number in _MAP["exceptions"].items() if number == code]
     return Nak(NakCode[codes[0]]) if len(codes) == 1 else None
 
@@ -178,11 +179,11 @@ def _read(name: str, *, beyond: int = 0) -> Read:
 
 def _block(name: str, tag: int, registers: Sequence[int]) -> Write:
     address: int = _MAP["holding"][name]["address"]
-    return Write(address, (tag, check_of(registers), *registers))
+    return Write(address, (tag, crc_of(registers), *registers))
 
 
-def _order(request: Arm | Disarm | Stop | Clear) -> list[int]:
-    """Controlword, watchdog and ramp; those that do not belong to it are at their least."""
+def _control(request: Arm | Disarm | Stop | Clear) -> list[int]:
+    """Controlword, watchdog and ramp; unused ones are at their minimum."""
     watchdog = request.watchdog if isinstance(request, Arm) else _Q.watchdog.low
     ramp = request.ramp if isinstance(request, Disarm | Stop) else 0.0
     word = _CONTROLWORDS[type(request).__name__.upper()]

@@ -1,1 +1,1 @@
-"""The serial wire's codec: messages, their payloads, frames."""
+"""Codec of serial lines: messages, payloads, frames."""

@@ -1,9 +1,8 @@
 """Messages to frames and back, for both ends of a serial line.
 
-Each message has its layout as a pair of functions, pack and unpack (`sets` and `reports` have the
-longer ones). Decoding is total: any payload becomes a message with every value in range, or
-`Malformed`. Encoding a set or an envelope asks for what a guard made of it;
-decoding gives the plain one, which must pass a guard before it can be sent on.
+Each message has a layout of two functions, pack and unpack (longer ones in `sets` and `reports`).
+Decoding yields a message with every value in range or raises `Malformed`. Encoding requires sets
+and envelopes that have passed a guard; decoding yields plain ones.
 """
 
 from collections.abc import Callable
@@ -68,7 +67,7 @@ _Q = PROTOCOL.quantities
 
 @dataclass(frozen=True)
 class _Layout:
-    """How one message and its payload become each other."""
+    """Conversion between a message and its payload."""
 
     message: type[Any]
     pack: Callable[[Any], bytes]
@@ -157,7 +156,7 @@ _TYPE_OF = {request.message: code for code, (request, _) in _EXCHANGES.items()}
 
 
 def encode_request(request: Request, *, address: int, sequence: int) -> Frame:
-    """The frame of a request; TypeError if a set in it has not passed a guard."""
+    """Encode a request; TypeError if a set in it has not passed a guard."""
     require_safe(request)
     code = _TYPE_OF[type(request)]
     payload = _EXCHANGES[code][0].pack(request)
@@ -165,37 +164,37 @@ def encode_request(request: Request, *, address: int, sequence: int) -> Frame:
 
 
 def decode_request(frame: Frame) -> Request:
-    """The request in a frame; raises Malformed."""
+    """Decode a request; raises Malformed."""
     if frame.is_reply or frame.type not in _EXCHANGES:
-        raise Malformed(f"no request has type {frame.kind:#04x}", code=NakCode.UNKNOWN_TYPE)
+        raise Malformed(f"unknown request type {frame.kind:#04x}", code=NakCode.UNKNOWN_TYPE)
     request: Request = _decode(_EXCHANGES[frame.type][0], frame.payload)
     return request
 
 
 def encode_reply(reply: Reply, to: Frame) -> Frame:
-    """The frame that answers the request frame `to`; TypeError if this reply does not answer it."""
+    """Encode the reply to the request frame `to`; TypeError for a reply of another type."""
     if isinstance(reply, Nak):
         payload = bytes([to.type, reply.code]) + pack_optional_channel(reply.channel)
         kind = REPLY | _NAK
     else:
         layout = _EXCHANGES[to.type][1]
         if not isinstance(reply, layout.message):
-            raise TypeError(f"{type(reply).__name__} does not answer message type {to.type}")
+            raise TypeError(f"{type(reply).__name__} is not a reply to message type {to.type}")
         payload = layout.pack(reply)
         kind = REPLY | to.type
     return Frame(kind=kind, address=to.address, sequence=to.sequence, payload=payload)
 
 
 def decode_reply(frame: Frame, to: Frame) -> Reply:
-    """The reply in a frame that carries the sequence number of the request frame `to`.
+    """Decode the reply to the request frame `to`, which has its sequence number.
 
-    Raises Malformed, also where the frame answers another type of request.
+    Raises Malformed, also for a reply to another type of request.
     """
     if frame.kind == REPLY | _NAK:
         return _decode_nak(frame.payload, to)
     if frame.kind != REPLY | to.type:
         raise Malformed(
-            f"a request of type {to.type} was answered with type {frame.kind:#04x}",
+            f"reply to request type {to.type} has type {frame.kind:#04x}",
             code=NakCode.UNKNOWN_TYPE,
         )
     reply: Reply = _decode(_EXCHANGES[to.type][1], frame.payload)
@@ -203,18 +202,18 @@ def decode_reply(frame: Frame, to: Frame) -> Reply:
 
 
 def is_event(frame: Frame) -> bool:
-    """Whether a frame is no answer: its sequence number counts the amplifier's events."""
+    """Whether a frame is an event; its sequence number counts the amplifier's events."""
     return frame.kind == REPLY | _EVENT
 
 
 def encode_event(event: AmplifierEvent, *, address: int, sequence: int) -> Frame:
-    """The frame in which an amplifier speaks unasked."""
+    """Encode an unsolicited event."""
     payload = _EVENT_LAYOUT.pack(event)
     return Frame(kind=REPLY | _EVENT, address=address, sequence=sequence, payload=payload)
 
 
 def decode_event(frame: Frame) -> AmplifierEvent:
-    """The event in a frame for which `is_event` holds; raises Malformed."""
+    """Decode an event (see `is_event`); raises Malformed."""
     event: AmplifierEvent = _decode(_EVENT_LAYOUT, frame.payload)
     return event
 
@@ -226,7 +225,7 @@ def _decode_nak(payload: bytes, to: Frame) -> Nak:
     cursor.end()
     if refused != to.type:
         raise Malformed(
-            f"a request of type {to.type} was answered with a refusal of type {refused}",
+            f"reply to request type {to.type} is a refusal of type {refused}",
             code=NakCode.UNKNOWN_TYPE,
         )
     return nak

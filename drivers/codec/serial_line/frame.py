@@ -4,8 +4,8 @@
 
 Every integer is little-endian. The first byte holds the reply bit (7), the version (6, 5) and the
 message type (4..0). The CRC is that of zlib and Ethernet, over everything before it. COBS leaves no
-zero inside a frame, so a reader that lost its place finds it again at the next zero. The zero in
-front ends whatever noise came before; empty frames are nothing.
+zero inside a frame, so a reader resynchronizes at the next zero. The leading zero ends preceding
+noise; empty frames are ignored.
 """
 
 import struct
@@ -28,7 +28,7 @@ _STUFFED_MAX = _OVERHEAD + PROTOCOL.serial.payload_max + 1
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """A delimited and checked piece of the stream, its payload not yet understood.
+    """A delimited and checked frame with its raw payload.
 
     kind: message type, with the bit REPLY in replies; address 0..255; sequence 0..65535, which a
     reply repeats from its request.
@@ -46,13 +46,13 @@ class Frame:
 
     @property
     def is_reply(self) -> bool:
-        """Whether it answers a request."""
+        """Whether it is a reply."""
         return bool(self.kind & REPLY)
 
 
 @dataclass
 class FrameCounters:
-    """What a reader has seen: frames by their fate."""
+    """Frames by the result of their check."""
 
     good: int = 0
     bad_crc: int = 0
@@ -62,14 +62,17 @@ class FrameCounters:
 
     @property
     def crc_errors(self) -> int:
-        """Everything that was dropped."""
+        """All discarded frames."""
         return self.bad_crc + self.too_long + self.truncated + self.bad_version
 
 
 def encode_frame(frame: Frame) -> bytes:
-    """The bytes of a frame, delimiters included; ValueError for a payload that is too long."""
+    """Encode a frame with its delimiters; ValueError for a payload that is too long."""
     if len(frame.payload) > PROTOCOL.serial.payload_max:
-        raise ValueError(f"a payload of {len(frame.payload)} bytes does not fit into a frame")
+        raise ValueError(
+            f"payload must have at most {PROTOCOL.serial.payload_max} bytes, got "
+            f"{len(frame.payload)}"
+        )
     first = frame.kind | PROTOCOL.version << _VERSION_SHIFT
     body = _HEADER.pack(first, frame.address, frame.sequence) + frame.payload
     stuffed: bytes = cobs.encode(body + _CRC.pack(zlib.crc32(body)))
@@ -77,14 +80,14 @@ def encode_frame(frame: Frame) -> bytes:
 
 
 def frame_length(payload_length: int) -> int:
-    """Bytes on the line for a frame with a payload of this length, delimiters included."""
+    """Return the bytes of a frame with a payload of this length, delimiters included."""
     return payload_length + _OVERHEAD + 1 + 2
 
 
 class FrameReader:
-    """Cuts a stream of bytes into frames; what is no frame is counted and skipped.
+    """Splits a stream of bytes into frames; invalid pieces are counted and skipped.
 
-    Never holds more than one frame's bytes, whatever it is fed.
+    Buffers at most one frame.
     """
 
     def __init__(self) -> None:
@@ -93,7 +96,7 @@ class FrameReader:
         self._skipping = False
 
     def feed(self, data: bytes) -> list[Frame]:
-        """The frames that these bytes complete, in order; any bytes at all may come."""
+        """Return the frames that these bytes complete, in order."""
         frames = []
         *ended, rest = bytes(data).split(b"\0")
         for piece in ended:

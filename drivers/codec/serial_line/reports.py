@@ -1,6 +1,6 @@
-"""Payloads of what an amplifier tells of itself on a serial line: pairs of pack and unpack.
+"""Payloads of identity, capabilities, status and faults on a serial line: pack and unpack.
 
-Unpacking gives values that are in range, or raises Malformed.
+Unpacking yields values in range or raises Malformed.
 """
 
 from drivers.codec.payload import Cursor, pack, pack_optional_channel, pack_text
@@ -21,14 +21,14 @@ _EVENTS = 0x01
 
 
 def pack_identity(identity: Identity) -> bytes:
-    """The payload of an identity."""
+    """Pack an identity."""
     version = pack((_Q.protocol_version, identity.protocol_version))
     texts = (identity.vendor, identity.product, identity.serial_number, identity.firmware)
     return version + b"".join(pack_text(text) for text in texts)
 
 
 def unpack_identity(cursor: Cursor) -> Identity:
-    """Who answers."""
+    """Unpack an identity."""
     version = cursor.integer(_Q.protocol_version)
     return Identity(
         vendor=cursor.text(),
@@ -40,7 +40,7 @@ def unpack_identity(cursor: Cursor) -> Identity:
 
 
 def pack_capabilities(capabilities: Capabilities) -> bytes:
-    """The payload of capabilities."""
+    """Pack capabilities."""
     return pack(
         (_Q.channel_count, capabilities.channels),
         (_Q.frequency, capabilities.frequency_min),
@@ -60,7 +60,7 @@ def pack_capabilities(capabilities: Capabilities) -> bytes:
 
 
 def unpack_capabilities(cursor: Cursor) -> Capabilities:
-    """What it can play."""
+    """Unpack capabilities."""
     return Capabilities(
         channels=cursor.integer(_Q.channel_count),
         frequency_min=cursor.number(_Q.frequency),
@@ -81,7 +81,7 @@ def unpack_capabilities(cursor: Cursor) -> Capabilities:
 
 
 def pack_status(status: Status) -> bytes:
-    """The payload of a status."""
+    """Pack a status."""
     head = bytes([status.state, status.fault]) + pack((_Q.active_token, status.token))
     head += bytes([_HIGH_VOLTAGE if status.high_voltage else 0])
     head += pack(
@@ -94,7 +94,7 @@ def pack_status(status: Status) -> bytes:
 
 
 def unpack_status(cursor: Cursor) -> Status:
-    """How it is."""
+    """Unpack a status."""
     state = cursor.one_of(AmplifierState)
     fault = cursor.one_of(Fault)
     token = cursor.integer(_Q.active_token)
@@ -116,7 +116,7 @@ def unpack_status(cursor: Cursor) -> Status:
 
 
 def pack_faults(faults: FaultList) -> bytes:
-    """The payload of the newest faults, as many as fit."""
+    """Pack the newest faults, as many as fit."""
     newest = faults.faults[: _Q.fault_count.maximum]
     packed = pack((_Q.fault_count, len(newest)))
     for record in newest:
@@ -126,7 +126,7 @@ def pack_faults(faults: FaultList) -> bytes:
 
 
 def unpack_faults(cursor: Cursor) -> FaultList:
-    """What went wrong."""
+    """Unpack faults."""
     return FaultList(
         faults=tuple(
             FaultRecord(

@@ -1,6 +1,6 @@
-"""Payloads of sets and envelopes on a serial line, written down as pairs: pack and unpack.
+"""Payloads of sets and envelopes on a serial line: pack and unpack.
 
-Unpacking gives plain values, each in range, or Malformed is raised.
+Unpacking yields plain values in range or raises Malformed.
 """
 
 from drivers.codec.payload import Cursor, Malformed, Record, pack
@@ -12,7 +12,6 @@ _Q = PROTOCOL.quantities
 _KEEP_PHASE = 0x01
 _SKIP_ENDING = 0x02
 _ENVELOPES = 0x04  # onset and ending follow the command
-
 
 _FLAGS = Quantity("flags", "u8", 1, "", 0, _KEEP_PHASE | _SKIP_ENDING | _ENVELOPES)
 _COMMAND = Record(_Q.channel, _FLAGS, _Q.frequency, _Q.level, _Q.phase)
@@ -42,7 +41,7 @@ def _unpack_commands(cursor: Cursor) -> tuple[DriveCommand, ...]:
         channel, flags, frequency, level, phase = cursor.record(_COMMAND)
         if channel in seen:
             raise Malformed(
-                f"channel {channel} is named twice", code=NakCode.BAD_CHANNEL, channel=channel
+                f"channel {channel} occurs twice", code=NakCode.BAD_CHANNEL, channel=channel
             )
         seen.add(channel)
         onset, ending = cursor.record(_SLOTS) if flags & _ENVELOPES else (0, 0)
@@ -62,13 +61,13 @@ def _unpack_commands(cursor: Cursor) -> tuple[DriveCommand, ...]:
 
 
 def pack_set(command_set: CommandSet) -> bytes:
-    """The payload of a set."""
+    """Pack a set."""
     times = _TIMES.pack(command_set.token, command_set.ramp, command_set.valid_for)
     return times + _pack_commands(command_set.commands)
 
 
 def unpack_set(cursor: Cursor) -> CommandSet:
-    """The set of a payload, which must pass a guard before it can be sent on."""
+    """Unpack a set, which must pass a guard before it can be encoded."""
     token, ramp, valid_for = cursor.record(_TIMES)
     return CommandSet(
         token=token,
@@ -79,7 +78,7 @@ def unpack_set(cursor: Cursor) -> CommandSet:
 
 
 def pack_envelope(envelope: Envelope) -> bytes:
-    """The payload of an envelope."""
+    """Pack an envelope."""
     head = pack((_Q.envelope_slot, envelope.slot), (_Q.envelope_step, envelope.step))
     head += pack((_Q.envelope_knots, len(envelope.knots)))
     return head + b"".join(
@@ -88,7 +87,7 @@ def pack_envelope(envelope: Envelope) -> bytes:
 
 
 def unpack_envelope(cursor: Cursor) -> Envelope:
-    """The envelope of a payload, which must pass a guard before it can be sent on."""
+    """Unpack an envelope, which must pass a guard before it can be encoded."""
     slot = cursor.integer(_Q.envelope_slot)
     step = cursor.number(_Q.envelope_step)
     count = cursor.integer(_Q.envelope_knots)
@@ -99,10 +98,10 @@ def unpack_envelope(cursor: Cursor) -> Envelope:
 
 
 def pack_achieved(achieved: Achieved) -> bytes:
-    """The payload of what a set plays."""
+    """Pack an achieved set."""
     return pack((_Q.token, achieved.token)) + _pack_commands(achieved.commands)
 
 
 def unpack_achieved(cursor: Cursor) -> Achieved:
-    """What a set plays."""
+    """Unpack an achieved set."""
     return Achieved(token=cursor.integer(_Q.token), commands=_unpack_commands(cursor))

@@ -1,4 +1,4 @@
-"""What serial frames cost in time, by arithmetic."""
+"""Durations of serial frames."""
 
 from dataclasses import dataclass
 from typing import final
@@ -21,12 +21,12 @@ _STATUS_LENGTH = frame_length(12 + 2 * PROTOCOL.quantities.channel_count.maximum
 @final
 @dataclass(frozen=True)
 class SerialTimes(WireTimes):
-    """On a line at a speed [baud]."""
+    """Durations on a line at a speed [baud]."""
 
     baud: int = PROTOCOL.serial.baud
 
     def apply(self, channels: int) -> float:
-        """Of an apply of so many channels, without its answer."""
+        """Duration of an apply with this number of channels, without its reply."""
         return self._of(frame_length(_SET_HEAD + _COMMAND * channels))
 
     def round_trip(self, channels: int) -> float:
@@ -43,7 +43,7 @@ class SerialTimes(WireTimes):
         return self._of(frame_length(_ENVELOPE_HEAD + _KNOT * knots) + frame_length(_LOADED))
 
     def exchange(self, request_length: int) -> float:
-        """Of a request of so many bytes and of an answer as long, or a Status."""
+        """Duration of a request of this length and of a reply as long, or a Status."""
         return self._of(request_length + max(request_length, _STATUS_LENGTH))
 
     def _of(self, length: int) -> float:

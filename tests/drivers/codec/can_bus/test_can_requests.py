@@ -269,9 +269,9 @@ def test_objects_mean_what_they_say() -> None:
     )
     texts = {"vendor": b"Acme", "product": b"Quad\0", "serial_number": b"A", "firmware": b"1"}
     assert unpack_identity(texts, 1).product == "Quad"
-    with pytest.raises(FrameError, match="vendor has control characters"):
+    with pytest.raises(FrameError, match=r"vendor .*control characters"):
         unpack_identity({**texts, "vendor": b"A\nB"}, 1)
-    with pytest.raises(FrameError, match="product is not UTF-8"):
+    with pytest.raises(FrameError, match="product must be UTF-8"):
         unpack_identity({**texts, "product": b"\xff"}, 1)
     numbers = {
         **{"protocol_version": 1, "channels": 4, "frequency_min": 2000, "frequency_max": 60000},
@@ -286,9 +286,9 @@ def test_an_integer_of_another_length_or_out_of_range_is_told_by_name() -> None:
     """Channels are one byte, up to 16."""
     channels = next(entry for entry in capability_entries() if entry.name == "channels")
     assert read_integer(channels, b"\x10") == 16
-    with pytest.raises(FrameError, match="channels has 2 bytes and not 1"):
+    with pytest.raises(FrameError, match=r"channels .*got 2"):
         read_integer(channels, b"\x04\x00")
-    with pytest.raises(FrameError, match=r"channels 17 is not within 0\.\.16"):
+    with pytest.raises(FrameError, match=r"channels .*got 17"):
         read_integer(channels, b"\x11")
 
 

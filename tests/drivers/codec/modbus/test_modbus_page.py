@@ -222,7 +222,7 @@ def test_the_exceptions_are_those_of_the_definition() -> None:
     }
 
 
-@pytest.mark.parametrize("check_of", [exchanges.check_of, checksum])
+@pytest.mark.parametrize("check_of", [exchanges.crc_of, checksum])
 def test_the_check_is_that_of_the_page(check_of: Callable[[list[int]], int]) -> None:
     """CRC-16 with polynomial 1021 from FFFF, by its published value over the digits 1 to 8."""
     assert check_of([0x3132, 0x3334, 0x3536, 0x3738]) == 0xA12B

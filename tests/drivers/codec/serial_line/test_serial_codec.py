@@ -424,11 +424,11 @@ def test_texts_that_harm_a_terminal_are_malformed(raw: bytes, problem: str) -> N
 @pytest.mark.parametrize(
     ("asked", "payload", "problem"),
     [
-        (Hello(), "01 21", "a text of 33 bytes is too long"),
-        (GetStatus(), "04 00 0000 02", "reserved flags set: 0x02"),
+        (Hello(), "01 21", "got 33"),
+        (GetStatus(), "04 00 0000 02", "got 0x02"),
         (GetFaults(), "01 04 10 00000000", "channel 16 does not exist"),
-        (GetFaults(), "00 07", "1 bytes too many"),
-        (GetFaults(), "ff", "fault_count 255 is not within 0..32"),
+        (GetFaults(), "00 07", "1 bytes too long"),
+        (GetFaults(), "ff", "fault_count must be 0 to 32, got 255"),
     ],
 )
 def test_malformed_replies_say_what_is_wrong(asked: Request, payload: str, problem: str) -> None:
@@ -445,7 +445,7 @@ def test_a_reply_to_another_type_is_malformed() -> None:
     status = Status(AmplifierState.FAULT, Fault.ARC, 0, False, 25.0, 0.0, ())
     ping = Frame(kind=12, address=1, sequence=1, payload=b"")
     for reply in (status, Nak(NakCode.BUSY)):
-        with pytest.raises(Malformed, match="answered"):
+        with pytest.raises(Malformed, match=r"type (0x8c|12)"):
             decode_reply(encode_reply(reply, ping), request)
     with pytest.raises(TypeError, match="does not answer"):
         encode_reply(status, request)

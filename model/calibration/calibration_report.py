@@ -1,4 +1,4 @@
-"""A calibration as people read it, and as programs do."""
+"""Report of a calibration, as text and as JSON."""
 
 from typing import Any
 
@@ -11,7 +11,7 @@ from model.rig.rig import Rig
 
 
 def change_rows(calibration: Calibration) -> list[str]:
-    """A line for every value: before -> after with its standard error, or why it was left."""
+    """Lines of all parameters: before -> after with its standard error."""
     width = max(len(fitted.parameter.name) for fitted in calibration.parameters)
     return [
         f"{fitted.parameter.name:{width}}  {_change(fitted)}" for fitted in calibration.parameters
@@ -19,7 +19,7 @@ def change_rows(calibration: Calibration) -> list[str]:
 
 
 def gain_rows(calibration: Calibration) -> list[str]:
-    """A line for every ERA: its gains' median and range, and their standard error."""
+    """Lines of all ERAs: median and range of their gains, with standard error."""
     rows = []
     for number, era in enumerate(calibration.rig.eras):
         if era.name in calibration.dead_eras or not era.gains:
@@ -37,43 +37,36 @@ def gain_rows(calibration: Calibration) -> list[str]:
 
 
 def finding_rows(calibration: Calibration) -> list[str]:
-    """What was found wrong in the measurement, and what could not be found."""
-    rows = [f"sensor {name}: dead, left out" for name in calibration.dead_sensors]
+    """Lines of faults of the measurement, and of parameters that are not identified."""
+    rows = [f"sensor {name}: no signal, left out" for name in calibration.dead_sensors]
+    rows += [f"ERA {name}: no motion; gains unchanged" for name in calibration.dead_eras]
     rows += [
-        f"ERA {name}: dead, moves nothing; its gains are left as they were"
-        for name in calibration.dead_eras
-    ]
-    rows += [
-        f"sensor {scale.name}: scale {scale.scale:.4g} ± {scale.standard_error:.1g} of the others'"
+        f"sensor {scale.name}: scale {scale.scale:.4g} ± {scale.standard_error:.1g} of the others"
         for scale in calibration.scales
     ]
     if calibration.outlier_count:
         rows.append(
             f"{calibration.outlier_count} of {calibration.value_count} values left out as outliers"
         )
-    held = [p.parameter.name for p in calibration.parameters if not p.is_identified]
-    if held:
-        rows.append(f"not identified, held at the rig's own value: {', '.join(held)}")
+    fixed = [p.parameter.name for p in calibration.parameters if not p.is_identified]
+    if fixed:
+        rows.append(f"not identified, rig's value kept: {', '.join(fixed)}")
     return rows
 
 
 def check_row(calibration: Calibration) -> str:
-    """The self-check in one line."""
+    """Line of the self-check."""
     held_out = calibration.held_out
     if held_out is None:
-        return (
-            f"self-check: too few sensors to hold one out; error of the fit "
-            f"{percent(calibration.error)}"
-        )
+        return f"self-check: too few sensors; error of the fit {percent(calibration.error)}"
     return (
-        f"self-check: sensors {', '.join(held_out.sensors)} held out, predicted with an error of "
-        f"{percent(held_out.after)} (rms, relative to the response); by the old rig "
-        f"{percent(held_out.before)}"
+        f"self-check: held-out sensors {', '.join(held_out.sensors)} predicted within "
+        f"{percent(held_out.after)} rms of the response, by the old rig {percent(held_out.before)}"
     )
 
 
 def as_json(calibration: Calibration, before: Rig, files: list[str]) -> dict[str, Any]:
-    """All of it, units in the keys' names or beside the values."""
+    """All results for programs, units in the keys or beside the values."""
     held_out = calibration.held_out
     frequencies = calibration.frequencies
     return {
@@ -108,7 +101,7 @@ def as_json(calibration: Calibration, before: Rig, files: list[str]) -> dict[str
             for scale in calibration.scales
         },
         "sensors": list(calibration.sensors),
-        "frequencies_hz": frequencies.tolist(),
+        "drive_frequencies_hz": frequencies.tolist(),
         "values": calibration.value_count,
         "outliers": calibration.outlier_count,
         "fit_error": calibration.error,
@@ -134,8 +127,8 @@ def _change(fitted: FittedParameter) -> str:
     parameter = fitted.parameter
     before = in_usual_unit(parameter.prior, parameter.unit, digits=5)
     if fitted.standard_error is None:
-        return f"{before}  (not identified, held)"
-    note = "  (at the bound of what can be)" if fitted.at_bound else ""
+        return f"{before}  (not identified)"
+    note = "  (at its bound)" if fitted.at_bound else ""
     after = in_usual_unit(fitted.value, parameter.unit, digits=5)
     error = in_usual_unit(fitted.standard_error, parameter.unit, digits=2)
     share = f" ({100 * (fitted.value / parameter.prior - 1):+.1f} %)" if parameter.prior else ""

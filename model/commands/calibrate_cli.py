@@ -1,4 +1,4 @@
-"""`era calibrate`: a rig's values from responses measured on it."""
+"""`era calibrate`: fit a rig to responses measured on it."""
 
 import json
 import time
@@ -8,36 +8,39 @@ from typing import Annotated
 import typer
 
 from model.commands.next_line import next_line
+from model.commands.options import JsonOption, MeshOption, RigArgument
 from model.counting import counted
 from model.errors import InputError
 
-NOT_THIS_PLATE = 1  # exit status: the answer is no
+NO_FIT = 1  # exit status
 
 
 def calibrate(
-    rig_file: Annotated[Path, typer.Argument(metavar="RIG", help="The rig as it is believed.")],
+    rig_file: RigArgument,
     measured_file: Annotated[
         Path, typer.Argument(metavar="MEASURED", help="Responses, .uff, .unv or .csv.")
     ],
     output: Annotated[
-        Path, typer.Option("--output", "-o", metavar="RIG2.yaml", help="The new rig.")
+        Path, typer.Option("--output", "-o", metavar="RIG2.yaml", help="Rig file to write.")
     ],
-    mesh: Annotated[
-        str | None, typer.Option(metavar="NXxNY", help="Elements, in place of the rig's.")
-    ] = None,
+    mesh: MeshOption = None,
     all_scales: Annotated[
         bool, typer.Option("--scales", help="Estimate every sensor's scale, not only wrong ones.")
     ] = False,
     picture: Annotated[
         Path | None, typer.Option(metavar="FIT.png", help="Draw measured, before and after.")
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="One JSON object, nothing else.")] = False,
+    as_json: JsonOption = False,
 ) -> None:
-    """Fit a rig to measured frequency responses. Values with their uncertainty, and a new rig."""
+    """Fit a rig to measured responses.
+
+    Write a new rig, and print its values with their uncertainties.
+    """
     from model.calibration import calibration_report
     from model.calibration.calibrate import calibrate as fit
     from model.calibration.responses import responses_of
     from model.calibration.responses_file import read_functions
+    from model.files.array_file import whole_or_nothing
     from model.files.picture_name import check_picture
     from model.files.replacing import check_ending, check_place
     from model.rig.file import load_rig
@@ -46,7 +49,7 @@ def calibrate(
     check_ending(output, ".yaml", ".yml", what="a rig file")
     for taken in (rig_file, measured_file):
         if output.resolve() == taken.resolve():
-            raise InputError(f"{output}: the new rig would overwrite {taken}; choose another name")
+            raise InputError(f"--output must differ from {taken}; choose another name")
     if picture is not None:
         check_picture(picture)
     rig = load_rig(rig_file, mesh=mesh)
@@ -69,7 +72,8 @@ def calibrate(
             + [f"  {row}" for row in [*rows, *notes]]
         )
         text = calibrated_text(read_document(rig_file), rig, calibration, comment=comment)
-        _write(output, text)
+        with whole_or_nothing(output) as stream:
+            stream.write(text.encode())
         check_reads_back(load_rig(output, mesh=mesh), calibration, output)
         files.append(str(output))
     if picture is not None:
@@ -79,8 +83,8 @@ def calibrate(
         save_figure(calibration_figure(calibration), picture)
         files.append(str(picture))
     if as_json:
-        told = calibration_report.as_json(calibration, rig, files)
-        print(json.dumps({**told, "solve_time_s": elapsed}))
+        report = calibration_report.as_json(calibration, rig, files)
+        print(json.dumps(report | {"solve_time_s": elapsed}))
     else:
         print(
             f"{measured_file}: {counted(len(responses.sensors), 'sensor')}, "
@@ -94,19 +98,11 @@ def calibrate(
         print("\n".join(notes))
     if not calibration.is_good:
         typer.echo(
-            "The rig does not fit what was measured, and no new rig is written. Is it another "
-            "plate, are places or ERAs swapped, are phases not those of exp(+i omega t), or is "
-            "noise more than a quarter of the response?",
+            "era: the fit must predict the measurement within 25 %; no rig is written. Check that "
+            "it is this plate, places of sensors and ERAs, noise, and phases as exp(+i omega t)",
             err=True,
         )
-        raise typer.Exit(NOT_THIS_PLATE)
+        raise typer.Exit(NO_FIT)
     if not as_json:
         print(f"wrote {', '.join(files)}")
         print(next_line("era", "table", "build", output, "-o", output.with_suffix(".npz")))
-
-
-def _write(path: Path, text: str) -> None:
-    from model.files.array_file import whole_or_nothing
-
-    with whole_or_nothing(path) as stream:
-        stream.write(text.encode())

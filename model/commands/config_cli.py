@@ -1,4 +1,4 @@
-"""`era config`: begin a configuration file, and check one."""
+"""`era config`: create and check configuration files."""
 
 import json
 from pathlib import Path
@@ -9,15 +9,18 @@ import typer
 from model.commands.next_line import next_line
 from model.errors import InputError
 
-config_app = typer.Typer(help="Begin a configuration file, and check one.", no_args_is_help=True)
+config_app = typer.Typer(help="Create and check configuration files.", no_args_is_help=True)
 
 
 @config_app.command()
 def init(
-    file: Annotated[Path, typer.Argument(metavar="FILE.yaml", help="The file to make.")],
-    kind: Annotated[str, typer.Option(help="What it shall be: rig, daemon, layout.")] = "rig",
+    file: Annotated[Path, typer.Argument(metavar="FILE.yaml", help="File to create.")],
+    kind: Annotated[str, typer.Option(help="rig, daemon or layout.")] = "rig",
 ) -> None:
-    """Write a commented rig, daemon or layout to edit. Beside it lies its schema for editors."""
+    """Write a commented file to edit.
+
+    Write its schema for editors beside it.
+    """
     from model.config.kinds import kind_called
     from model.files.array_file import whole_or_nothing
     from model.files.replacing import check_ending
@@ -28,16 +31,19 @@ def init(
     _write_new(file, f"# yaml-language-server: $schema={schema.name}\n{made.example()}")
     with whole_or_nothing(schema) as stream:
         stream.write(json.dumps(made.schema(), indent=2).encode() + b"\n")
-    typer.echo(f"Wrote {file}, which is yours to edit, and {schema}")
+    typer.echo(f"wrote {file}, to be edited, and {schema}")
     typer.echo(next_line("era", "config", "check", file))
 
 
 @config_app.command()
 def check(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="The file to check.")],
-    as_json: Annotated[bool, typer.Option("--json", help="One JSON object on stdout.")] = False,
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="File to check.")],
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
-    """Say all that is wrong with a rig, daemon or layout file. Exit status 1 if anything is."""
+    """Check a rig, daemon or layout file.
+
+    List all errors; exit with 1 if there are any.
+    """
     from model.config.document import ConfigError, read_document
     from model.config.kinds import kind_of
 
@@ -62,11 +68,11 @@ def check(
 
 
 def _write_new(path: Path, text: str) -> None:
-    """Write a file that must not exist yet, whole or not at all."""
+    """Write a file that must not exist; leave none behind if that fails."""
     try:
         stream = path.open("x", encoding="utf-8")
     except FileExistsError as error:
-        raise InputError(f"{path} exists and is left as it is; choose another name") from error
+        raise InputError(f"{path} exists already; choose another name") from error
     except OSError as error:
         raise InputError(f"{path} cannot be written: {error.strerror}") from error
     try:

@@ -1,4 +1,4 @@
-"""What `--drive` says: ERA=HZ[@LEVEL[:PHASE_DEG]]."""
+"""The option `--drive ERA=HZ[@LEVEL[:PHASE_DEG]]`."""
 
 import math
 import re
@@ -23,7 +23,7 @@ def parse_drives(texts: Sequence[str], rig: Rig) -> Excitation:
         match = _FORM.fullmatch(text.strip())
         if match is None:
             raise InputError(
-                f"--drive {text!r} is not ERA=HZ[@LEVEL[:PHASE_DEG]], for instance "
+                f"--drive must be ERA=HZ[@LEVEL[:PHASE_DEG]], got {text!r}; for instance "
                 f"{names[0]}=110 or {names[0]}=110@0.5:90"
             )
         name = match["era"]
@@ -33,21 +33,21 @@ def parse_drives(texts: Sequence[str], rig: Rig) -> Excitation:
                 f"{did_you_mean(name, names)}it has {', '.join(names)}"
             )
         if name in excitation:
-            raise InputError(f"--drive {text!r}: {name} is driven twice; one tone per ERA")
+            raise InputError(f"--drive {text!r}: ERA {name} must have one tone, got two")
         frequency = _number(match["frequency"], text, what="frequency")
         level = _number(match["level"] or "1", text, what="level")
         phase = _number(match["phase"] or "0", text, what="phase")
         if not 0 <= level <= 1:
-            raise InputError(f"--drive {text!r}: level is {level:g}, must lie between 0 and 1")
+            raise InputError(f"--drive {text!r}: level must be between 0 and 1, got {level:g}")
         if frequency <= 0:
-            raise InputError(f"--drive {text!r}: frequency is {frequency:g} Hz, must be above zero")
+            raise InputError(f"--drive {text!r}: frequency must be positive, got {frequency:g} Hz")
         stroke = rig.era(name).stroke
         excitation[name] = Tone(frequency, level * stroke, math.radians(phase))
     return excitation
 
 
 def beyond_limits(excitation: Excitation, rig: Rig) -> str | None:
-    """What to be warned of where tones lie outside the rig's limits of frequency."""
+    """Return a warning if tones are outside the rig's frequency limits."""
     low, high = rig.limits.frequency_min, rig.limits.frequency_max
     beyond = [
         f"{era} at {tone.frequency:g} Hz"
@@ -57,19 +57,19 @@ def beyond_limits(excitation: Excitation, rig: Rig) -> str | None:
     if not beyond:
         return None
     return (
-        f"{', '.join(beyond)}: the rig's limits.frequency is {low:g} to {high:g} Hz, and no "
-        "amplifier is asked for anything else"
+        f"{', '.join(beyond)}: outside the rig's limits.frequency of {low:g} to {high:g} Hz, which "
+        "amplifiers are kept to"
     )
-
-
-_PLAIN = "hertz, a share of full stroke and degrees are plain numbers here, without a unit"
 
 
 def _number(text: str, drive: str, *, what: str) -> float:
     try:
         value = float(text)
     except ValueError:
-        raise InputError(f"--drive {drive!r}: {what} {text!r} is not a number; {_PLAIN}") from None
+        value = math.nan
     if not math.isfinite(value):
-        raise InputError(f"--drive {drive!r}: {what} {text!r} is not a finite number")
+        raise InputError(
+            f"--drive {drive!r}: {what} must be a finite number, got {text!r}, in hertz, "
+            "share of full stroke and degrees without a unit"
+        )
     return value

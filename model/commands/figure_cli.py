@@ -1,14 +1,13 @@
-"""`era figure`: the founding paper's figures, each with the numbers that are drawn in it."""
+"""`era figure`: the founding paper's figures."""
 
 import json
 import time
-from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from model.commands.next_line import next_line
-from model.commands.plate_cli import JsonOption, MeshOption, RigArgument
+from model.commands.options import FolderOption, JsonOption, MeshOption, RigArgument
 
 figure_app = typer.Typer()
 
@@ -19,13 +18,14 @@ def figure(
         str, typer.Argument(metavar="6|7|10|11|12|13|all", help="Number of the figure.")
     ],
     rig_file: RigArgument,
-    output: Annotated[
-        Path, typer.Option("--output", "-o", metavar="DIR", help="Folder to write into.")
-    ],
+    output: FolderOption,
     mesh: MeshOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Draw a figure of the founding paper for a rig. A CSV file of its numbers lies beside it."""
+    """Draw a figure of the founding paper.
+
+    Write a CSV file of its numbers beside it.
+    """
     from model.figures import save_figure
     from model.files.csv_file import write_columns
     from model.paper.catalogue import paper_figures

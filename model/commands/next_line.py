@@ -1,4 +1,4 @@
-"""The line that a run which wrote files ends with."""
+"""The last line of a command that wrote files."""
 
 import os
 import shlex
@@ -6,10 +6,10 @@ from pathlib import Path
 
 
 def next_line(*words: str | Path) -> str:
-    """A command to go on with, as a shell takes it: names with spaces stand in quotes."""
-    said = [str(word) for word in words]
+    """Format the next command for the shell, with quotes where they are needed."""
+    arguments = [str(word) for word in words]
     if os.name == "nt":
         from subprocess import list2cmdline
 
-        return f"Next: {list2cmdline(said)}"
-    return f"Next: {shlex.join(said)}"
+        return f"Next: {list2cmdline(arguments)}"
+    return f"Next: {shlex.join(arguments)}"

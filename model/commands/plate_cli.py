@@ -9,21 +9,13 @@ from typing import Annotated
 import typer
 
 from model.commands.next_line import next_line
+from model.commands.options import JsonOption, MeshOption, RigArgument
 
-plate_app = typer.Typer(help="The plate: natural frequencies and vibration maps.")
-
-RigArgument = Annotated[Path, typer.Argument(metavar="RIG", help="Rig file, e.g. RIG.yaml.")]
-MeshOption = Annotated[
-    str | None,
-    typer.Option(
-        metavar="NXxNY", help="Elements along x and y, in place of the rig's; or '12x9 ELEMENT'."
-    ),
-]
-JsonOption = Annotated[bool, typer.Option("--json", help="One JSON object, nothing else.")]
+plate_app = typer.Typer(help="Compute modes and vibration maps of a plate.")
 
 
 class Support(StrEnum):
-    """What holds the plate."""
+    """Boundary condition of the plate."""
 
     ERAS = "eras"
     SIMPLY_SUPPORTED = "simply-supported"
@@ -34,11 +26,14 @@ class Support(StrEnum):
 def modes(
     rig_file: RigArgument,
     mesh: MeshOption = None,
-    support: Annotated[Support, typer.Option(help="What holds the plate.")] = Support.ERAS,
-    count: Annotated[int, typer.Option("-n", min=1, help="How many modes.")] = 12,
+    support: Annotated[Support, typer.Option(help="Boundary condition.")] = Support.ERAS,
+    count: Annotated[int, typer.Option("-n", min=1, help="Number of modes.")] = 12,
     as_json: JsonOption = False,
 ) -> None:
-    """Natural frequencies of the undamped plate. Elastic modes only where it is free."""
+    """Compute natural frequencies.
+
+    The plate is undamped; rigid modes of a free plate are left out.
+    """
     from model.fem import modal
     from model.fem.assembly import assemble
     from model.rig.file import load_rig
@@ -67,12 +62,12 @@ def modes(
     element = "" if rig.mesh.element.name in str(rig.mesh) else f" {rig.mesh.element.name}"
     print(f"{rig_file}: {rig.mesh}{element}, {matrices.dof} dof, support: {support.value}")
     for number, frequency in enumerate(solved.natural_frequencies, start=1):
-        beyond = "  beyond what the mesh carries" if frequency > carried else ""
+        beyond = "  mesh too coarse" if frequency > carried else ""
         print(f"mode {number:3d}  {frequency:9.2f} Hz{beyond}")
     if solved.natural_frequencies[-1] > carried:
         print(
-            f"above {carried:.0f} Hz a bending wavelength has fewer than six nodes of this mesh: "
-            "those frequencies are far off; use a finer --mesh"
+            f"above {carried:.0f} Hz a bending wavelength has fewer than six nodes; use a finer "
+            "--mesh for those frequencies"
         )
     print(f"solved in {elapsed:.2f} s")
 
@@ -82,18 +77,18 @@ def plate_map(
     rig_file: RigArgument,
     drive: Annotated[
         list[str],
-        typer.Option(metavar="ERA=HZ[@LEVEL[:PHASE_DEG]]", help="A tone of one ERA; repeatable."),
+        typer.Option(metavar="ERA=HZ[@LEVEL[:PHASE_DEG]]", help="Tone of one ERA; repeatable."),
     ],
     mesh: MeshOption = None,
     points: Annotated[
-        str | None, typer.Option(metavar="XxY", help="Raster of the answer; default: the mesh's.")
+        str | None, typer.Option(metavar="XxY", help="Points of the map; default: the mesh's.")
     ] = None,
     output: Annotated[
-        Path | None, typer.Option("--output", "-o", metavar="MAP.png", help="Draw it.")
+        Path | None, typer.Option("--output", "-o", metavar="MAP.png", help="Picture to draw.")
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Peak acceleration all over the plate for any drive."""
+    """Compute peak acceleration over the plate for any drive."""
     import numpy as np
 
     from model.commands.drive_option import beyond_limits, parse_drives
@@ -153,11 +148,11 @@ def convergence(
     mesh: MeshOption = None,
     frequencies: Annotated[
         str | None,
-        typer.Option(metavar="LO:HI:STEP|LIST", help="Where to compare, in Hz; default 110,250."),
+        typer.Option(metavar="LO:HI:STEP|LIST", help="Frequencies in Hz; default: 110,250."),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """How wrong meshes are, against a finer one. In natural frequencies and in response."""
+    """Compare natural frequencies and responses of meshes with a finer one."""
     from model.commands.progress import progress_bar
     from model.config.points import parse_frequencies
     from model.rig.file import load_rig
@@ -168,10 +163,12 @@ def convergence(
     )
 
     rig = load_rig(rig_file, mesh=mesh)
-    asked = parse_frequencies(frequencies) if frequencies else default_frequencies(rig)
+    chosen = parse_frequencies(frequencies) if frequencies else default_frequencies(rig)
     started = time.perf_counter()
     with progress_bar("meshes") as progress:
-        study = study_convergence(rig, meshes_to_compare(rig), frequencies=asked, progress=progress)
+        study = study_convergence(
+            rig, meshes_to_compare(rig), frequencies=chosen, progress=progress
+        )
     elapsed = time.perf_counter() - started
     if as_json:
         rows = [
@@ -192,14 +189,14 @@ def convergence(
             "strip_m": study.reference.strip,
             "natural_frequencies_hz": study.natural_frequencies.tolist(),
         }
-        answer = {"reference": reference, "frequencies_hz": asked.tolist(), "meshes": rows}
+        answer = {"reference": reference, "drive_frequencies_hz": chosen.tolist(), "meshes": rows}
         print(json.dumps(answer | {"solve_time_s": elapsed}))
         return
-    print(f"{rig_file}: errors against {study.reference}, found in {elapsed:.1f} s")
-    print("natural frequencies: the worst of the lowest twelve, on the ERAs; response: relative L2")
-    print("of the acceleration over the plate, the worst of the ERAs driven alone")
+    print(f"{rig_file}: errors against {study.reference}, solved in {elapsed:.1f} s")
+    print("natural frequencies: maximum of the lowest twelve, on the ERAs; response: relative L2")
+    print("error of the acceleration over the plate, maximum over the ERAs driven alone")
     print()
-    heads = "".join(f"{f'at {frequency:g} Hz':>12}" for frequency in asked)
+    heads = "".join(f"{f'at {frequency:g} Hz':>12}" for frequency in chosen)
     print(f"{'mesh':>9}{'element':>9}{'strips':>8}{'dof':>8}{'nat. freq.':>12}{heads}")
     for error in study.errors:
         mesh_text = f"{error.mesh.nx}x{error.mesh.ny}"

@@ -1,15 +1,15 @@
-"""`era plate elements` and `era plate conformance`: what meshes are made of, and if it holds."""
+"""`era plate elements` and `era plate conformance`."""
 
 import json
 from typing import Annotated
 
 import typer
 
-from model.commands.plate_cli import JsonOption
+from model.commands.options import JsonOption
 
 
 def elements(as_json: JsonOption = False) -> None:
-    """The elements that a mesh can be made of, as in mesh: 12x9 Q3."""
+    """List the elements of meshes, as in mesh: 12x9 Q3."""
     from model.errors import InputError
     from model.fem.elements import element_names, element_of
 
@@ -17,7 +17,7 @@ def elements(as_json: JsonOption = False) -> None:
     for name in element_names():
         try:
             orders[name] = element_of(name).order
-        except InputError as error:  # of one plug-in; the others are as good as before
+        except InputError as error:  # of one plug-in; the others are listed
             problems.append(str(error))
     if as_json:
         rows = [{"name": name, "order": order} for name, order in orders.items()]
@@ -30,10 +30,13 @@ def elements(as_json: JsonOption = False) -> None:
 
 
 def conformance(
-    name: Annotated[str, typer.Argument(metavar="ELEMENT", help="As era plate elements lists it.")],
+    name: Annotated[str, typer.Argument(metavar="ELEMENT", help="Name from era plate elements.")],
     as_json: JsonOption = False,
 ) -> None:
-    """Check that a plate element keeps what every one must. Exit status 1 if it does not."""
+    """Check a plate element.
+
+    Exit with 1 if a requirement is not met.
+    """
     from model.fem.element_checks import CHECKS, COARSE, frequency_error, rate
     from model.fem.elements import element_of
 
@@ -42,13 +45,13 @@ def conformance(
     for check in CHECKS:
         problem = problems[check.name] = check.problem(element)
         if not as_json:
-            print(f"{'kept  ' if problem is None else 'BROKEN'}  {check.proves}.")
+            print(f"{'passed' if problem is None else 'FAILED'}  {check.proves}.")
             if problem is not None:
                 print(f"        {problem}")
         if problem is not None and check.name in ("nodes", "matrices"):
-            break  # the others would fall over it
-    broken = [problem for problem in problems.values() if problem is not None]
-    errors = [] if broken else [frequency_error(element, count) for count in (COARSE, 2 * COARSE)]
+            break  # the other checks need these
+    failed = [problem for problem in problems.values() if problem is not None]
+    errors = [] if failed else [frequency_error(element, count) for count in (COARSE, 2 * COARSE)]
     if as_json:
         rows = [
             {"check": check.name, "proves": check.proves, "problem": problems[check.name]}
@@ -59,7 +62,7 @@ def conformance(
             json.dumps(
                 {
                     "element": name,
-                    "kept": not broken,
+                    "kept": not failed,
                     "checks": rows,
                     "frequency_error": errors,
                     "rate": rate(*errors) if errors else None,
@@ -70,10 +73,10 @@ def conformance(
         if errors:
             coarse, fine = errors
             print(
-                f"lowest frequency of a thin plate: off by {coarse:.2g} with {COARSE}x{COARSE} "
-                f"elements, by {fine:.2g} with {2 * COARSE}x{2 * COARSE}, rate "
+                f"lowest frequency of a thin plate: error {coarse:.2g} with {COARSE}x{COARSE} "
+                f"elements, {fine:.2g} with {2 * COARSE}x{2 * COARSE}, rate "
                 f"{rate(coarse, fine):.1f}"
             )
-        print(f"{len(problems) - len(broken)} kept, {len(broken)} broken")
-    if broken:
+        print(f"{len(problems) - len(failed)} passed, {len(failed)} failed")
+    if failed:
         raise typer.Exit(1)

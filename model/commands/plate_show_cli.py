@@ -1,15 +1,15 @@
-"""`era plate materials` and `era plate show`: what plates are made of, a rig's plate above all."""
+"""`era plate materials` and `era plate show`."""
 
 import json
 import math
 import sys
 from typing import Any
 
-from model.commands.plate_cli import JsonOption, RigArgument
+from model.commands.options import JsonOption, RigArgument
 
 
 def materials(as_json: JsonOption = False) -> None:
-    """The materials known by name. With their numbers, and where these come from."""
+    """List the materials known by name, with their numbers and sources."""
     from model.errors import InputError
     from model.structure.materials import known_material, material_names
 
@@ -17,7 +17,7 @@ def materials(as_json: JsonOption = False) -> None:
     for name in material_names():
         try:
             known[name] = known_material(name)
-        except InputError as error:  # of one plug-in; the others are as good as before
+        except InputError as error:  # of one plug-in; the others are listed
             problems.append(str(error))
     if as_json:
         entries = [
@@ -40,13 +40,13 @@ def materials(as_json: JsonOption = False) -> None:
         print(f"    source  {one.source}")
         print(f"    spread  {one.spread}")
         print(f"    loss factor of the bare material, about  {one.loss_factor}")
-    print("Any other goes by its numbers: material: {E: 70 GPa, rho: 2700, nu: 0.33}")
+    print("Any other is given by numbers: material: {E: 70 GPa, rho: 2700, nu: 0.33}")
     for problem in problems:
         print(f"era: warning: {problem}", file=sys.stderr)
 
 
 def show(rig_file: RigArgument, as_json: JsonOption = False) -> None:
-    """What the plate is made of and how it bends. Of a laminate, between which bounds."""
+    """Show the plate's material and rigidity, for a laminate with bounds."""
     from model.quantities import in_usual_unit
     from model.rig.file import load_rig
     from model.rig.plate_summary import plate_summary
@@ -59,7 +59,7 @@ def show(rig_file: RigArgument, as_json: JsonOption = False) -> None:
     laminate = summary["laminate"]
     if laminate is not None:
         _print_laminate(laminate)
-    print("solved as one plate" if laminate is not None else "plate")
+    print("equivalent plate" if laminate is not None else "plate")
     print(
         f"    {1e3 * summary['thickness_m']:.4g} mm of {summary['material']}: "
         f"E {summary['E_pa'] / 1e9:.4g} GPa, rho {summary['rho_kg_m3']:.5g} kg/m³, "
@@ -89,7 +89,7 @@ def _print_laminate(laminate: dict[str, Any]) -> None:
     }
     for key, rigidity in laminate.get("rigidity_by_frequency_n_m", {}).items():
         rows[f"adhesive in shear at {_frequency(key)}"] = rigidity
-    print(f"    rigidity taken  {used:.4g} N m", end="")
+    print(f"    rigidity used  {used:.4g} N m", end="")
     at = laminate["bond_frequency_hz"]
     print("" if at is None else f", adhesive in shear at {at:g} Hz")
     for name, rigidity in rows.items():

@@ -1,24 +1,21 @@
-"""`era study`: which layout of ERAs, how many, how stiff."""
+"""`era study`: layouts, numbers and stiffnesses of ERAs compared."""
 
 import json
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from enum import StrEnum
-from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
 from model.commands.next_line import next_line
-from model.commands.plate_cli import JsonOption, MeshOption, RigArgument
+from model.commands.options import FolderOption, JsonOption, MeshOption, RigArgument
 from model.counting import counted
 
 study_app = typer.Typer()
 
 
 class Study(StrEnum):
-    """What is varied."""
+    """Quantity that is varied."""
 
     PLACEMENT = "placement"
     COUNT = "count"
@@ -26,7 +23,7 @@ class Study(StrEnum):
 
 
 class Driven(StrEnum):
-    """How many ERAs are active."""
+    """Number of active ERAs."""
 
     ONE = "1"
     TWO = "2"
@@ -38,15 +35,13 @@ def study(
     what: Annotated[
         Study,
         typer.Argument(
-            help="Where the rig's ERAs are; how many there are, one to six; how stiff they are.",
+            help="Vary places of the rig's ERAs; their number, one to six; their stiffness.",
             metavar="WHAT",
         ),
     ],
     rig_file: RigArgument,
-    output: Annotated[
-        Path, typer.Option("--output", "-o", metavar="DIR", help="Folder to write into.")
-    ],
-    layouts: Annotated[int, typer.Option(min=1, help="How many layouts.")] = 200,
+    output: FolderOption,
+    layouts: Annotated[int, typer.Option(min=1, help="Number of layouts.")] = 200,
     active: Annotated[
         Driven, typer.Option(help="Rank by the best single ERA, the best pair, or all ERAs.")
     ] = Driven.TWO,
@@ -54,17 +49,22 @@ def study(
         str, typer.Option(metavar="LO:HI:STEP", help="Frequencies in Hz, both ends included.")
     ] = "60:320:10",
     candidates: Annotated[
-        str, typer.Option(metavar="NXxNY", help="Raster of places, edges included.")
+        str, typer.Option(metavar="NXxNY", help="Candidate places, edges included.")
     ] = "13x13",
-    seed: Annotated[int, typer.Option(min=0, help="Of the random layouts.")] = 0,
-    workers: Annotated[int, typer.Option(min=1, max=256, help="Processes on this machine.")] = 1,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the random layouts.")] = 0,
+    workers: Annotated[int, typer.Option(min=1, max=256, help="Number of local processes.")] = 1,
     cluster: Annotated[
-        str | None, typer.Option(metavar="tcp://HOST:PORT", help="A Dask scheduler, instead.")
+        str | None,
+        typer.Option(metavar="tcp://HOST:PORT", help="Dask scheduler."),
     ] = None,
     mesh: MeshOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Compare layouts of ERAs by how strongly the plate vibrates. Resumes an interrupted study."""
+    """Rank layouts of ERAs by vibration.
+
+    Resume an interrupted study.
+    """
+    from model.commands.progress import progress_bar
     from model.config.document import read_document
     from model.config.points import parse_frequencies, parse_pair
     from model.errors import InputError
@@ -81,10 +81,10 @@ def study(
     rig = rig_of(document, mesh=mesh)
     if what is not Study.COUNT and active is Driven.TWO and len(rig.eras) < 2:
         raise InputError(
-            f"{rig_file} has one ERA, so there is no pair to drive; rank by it with --active 1"
+            f"{rig_file}: --active 2 needs at least two ERAs, got one; rank with --active 1"
         )
     if cluster is not None and workers != 1:
-        raise InputError("--workers is for this machine, --cluster for others; give one of them")
+        raise InputError("only one of --workers and --cluster can be given")
     started = time.perf_counter()
     cases = STUDIES[what](
         rig, layouts=layouts, seed=seed, raster=parse_pair(candidates, what="--candidates")
@@ -92,7 +92,14 @@ def study(
     problem = study_problem(rig, cases, parse_frequencies(frequencies))
     output.mkdir(parents=True, exist_ok=True)
     finished = FinishedCases(output, problem.digest)
-    with _progress(len(cases)) as advance:
+    done = 0
+    with progress_bar("layouts") as update:
+
+        def advance(count: int) -> None:
+            nonlocal done
+            done += count
+            update(done, len(cases))
+
         try:
             run = run_study(
                 problem,
@@ -103,7 +110,7 @@ def study(
             )
         except KeyboardInterrupt:
             typer.echo(
-                f"era: interrupted; finished cases are in {finished.path}, run the same command "
+                f"era: interrupted; finished cases are in {finished.path}; run the same command "
                 "to resume",
                 err=True,
             )
@@ -118,9 +125,9 @@ def study(
         "cases": len(cases),
         "solved": run.solved_count,
         "from_cache": run.cached_count,
-        "frequencies_hz": problem.frequencies.tolist(),
+        "drive_frequencies_hz": problem.frequencies.tolist(),
         "points": len(problem.points),
-        "mesh": str(rig.mesh),
+        "mesh_name": str(rig.mesh),
         **ranking_summary(rig, ranking),
         "time_s": elapsed,
         "files": files,
@@ -136,13 +143,13 @@ def study(
 
 
 def _show(summary: dict[str, Any]) -> None:
-    """The head of the ranking, the rig as it is, and what is recommended."""
+    """Print the head of the ranking, the present rig, and the recommendation."""
     from model.vibration.peak import G
 
     print(
         f"{counted(summary['cases'], 'case')} in {summary['time_s']:.1f} s "
-        f"({summary['from_cache']} of them kept from before), mesh {summary['mesh']}, "
-        f"{counted(len(summary['frequencies_hz']), 'frequency', plural='frequencies')}"
+        f"({summary['from_cache']} from an earlier run), mesh {summary['mesh_name']}, "
+        f"{counted(len(summary['drive_frequencies_hz']), 'frequency', plural='frequencies')}"
     )
     print(f"ranked by the median over the plate, {summary['driven']} driven")
     print("rank  layout                        stiffness   lowest   median  highest    unfelt")
@@ -161,16 +168,3 @@ def _show(summary: dict[str, Any]) -> None:
     if not recommended["supported"]:
         print("No layout supports the plate: put at least three ERAs under it, not in one line")
     print(f"Recommended{why}: {recommended['words']}")
-
-
-@contextmanager
-def _progress(total: int) -> Iterator[Callable[[int], None]]:
-    """A progress bar on standard error where that is a terminal; yields what moves it on."""
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemainingColumn
-
-    console = Console(stderr=True)
-    columns = (BarColumn(), MofNCompleteColumn(), "layouts", TimeRemainingColumn())
-    with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
-        task = bar.add_task("", total=total)
-        yield lambda count: bar.advance(task, count)

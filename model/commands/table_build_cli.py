@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from model.commands.next_line import next_line
-from model.commands.plate_cli import JsonOption, MeshOption, RigArgument
+from model.commands.options import JsonOption, MeshOption, RigArgument
 from model.counting import counted
 
 
@@ -19,23 +19,24 @@ def build(
         str | None,
         typer.Option(
             metavar="LO:HI:STEP",
-            help="Frequencies in Hz, both ends included; default 60:320:10 within limits.frequency "
-            "of the rig.",
+            help="Frequencies in Hz, both ends included; default: 60:320:10 within the rig's "
+            "limits.frequency.",
         ),
     ] = None,
     drive_mode: Annotated[
-        str, typer.Option("--mode", help="Drive mode: switched, graded, signed or phased.")
+        str, typer.Option("--mode", help="Default drive mode: switched, graded, signed or phased.")
     ] = "switched",
     grid: Annotated[
         str, typer.Option(metavar="NXxNY", help="Target cells along x and y.")
     ] = "12x9",
     mesh: MeshOption = None,
-    workers: Annotated[
-        int, typer.Option(min=1, max=256, help="Processes; for tables that take long.")
-    ] = 1,
+    workers: Annotated[int, typer.Option(min=1, max=256, help="Number of processes.")] = 1,
     as_json: JsonOption = False,
 ) -> None:
-    """Solve the plate and write its table. Goes on where an interrupted build stopped."""
+    """Solve the plate and write its table.
+
+    Resume an interrupted build.
+    """
     from model.commands.progress import progress_bar
     from model.config.points import parse_frequencies, parse_pair
     from model.drive_modes import DRIVE_MODES
@@ -50,21 +51,16 @@ def build(
     from model.table.table_parts import TableProblem
 
     if drive_mode not in DRIVE_MODES:
-        raise InputError(
-            f"unknown drive mode --mode {drive_mode!r}; known: {', '.join(DRIVE_MODES)}"
-        )
+        raise InputError(f"--mode must be one of {', '.join(DRIVE_MODES)}, got {drive_mode!r}")
     check_place(output, example="table.npz")
     check_ending(output, ".npz", what="a localization table")
     check_replaceable(output, is_own=begins_with(output, ZIP), what="localization table")
     rig = load_rig(rig_file, mesh=mesh)
     started = time.perf_counter()
-    cells = Grid(*parse_pair(grid, what="--grid"))
-    asked = (
-        default_drive_frequencies(rig.limits)
-        if frequencies is None
-        else parse_frequencies(frequencies)
+    chosen = (
+        parse_frequencies(frequencies) if frequencies else default_drive_frequencies(rig.limits)
     )
-    problem = TableProblem(rig, asked, cells)
+    problem = TableProblem(rig, chosen, Grid(*parse_pair(grid, what="--grid")))
     kept = KeptParts.beside(output, problem.digest)
     with progress_bar("parts") as progress:
         try:
@@ -72,12 +68,12 @@ def build(
                 problem, drive_mode=drive_mode, workers=workers, kept=kept, progress=progress
             )
         except KeyboardInterrupt:
-            done = (
-                f"what is done is kept in {kept.folder}, and the same command goes on from there"
+            state = (
+                f"finished parts are in {kept.folder}; run the same command to resume"
                 if kept.folder.is_dir()
-                else "nothing was done yet"
+                else "no part was finished"
             )
-            typer.echo(f"era: interrupted; {done}", err=True)
+            typer.echo(f"era: interrupted; {state}", err=True)
             raise
     table = built.table
     save_table(table, output)
@@ -85,31 +81,25 @@ def build(
     elapsed = time.perf_counter() - started
     error = 100 * float(table.discretisation_error.max())
     if as_json:
-        print(
-            json.dumps(
-                {
-                    "patterns": table.pattern_count,
-                    "cells": table.grid.cell_count,
-                    "frequencies_hz": table.frequencies.tolist(),
-                    "mesh": [table.mesh.nx, table.mesh.ny],
-                    "element": table.mesh.element.name,
-                    "discretisation_error_percent": error,
-                    "mode": table.drive_mode,
-                    "fingerprint": table.fingerprint,
-                    "code_version": table.code_version,
-                    "parts": built.part_count,
-                    "parts_reused": built.reused_count,
-                    "build_time_s": elapsed,
-                    "files": [str(output)],
-                }
-            )
-        )
+        answer = {
+            "patterns": table.pattern_count,
+            "cells": table.grid.cell_count,
+            "drive_frequencies_hz": table.frequencies.tolist(),
+            "mesh": [table.mesh.nx, table.mesh.ny],
+            "element": table.mesh.element.name,
+            "discretisation_error_percent": error,
+            "mode": table.drive_mode,
+            "fingerprint": table.fingerprint,
+            "code_version": table.code_version,
+            "parts": built.part_count,
+            "parts_reused": built.reused_count,
+            "build_time_s": elapsed,
+            "files": [str(output)],
+        }
+        print(json.dumps(answer))
         return
     if built.reused_count:
-        print(
-            f"reused {built.reused_count} of {built.part_count} parts that an interrupted build "
-            "had done"
-        )
+        print(f"reused {built.reused_count} of {built.part_count} parts of an interrupted build")
     print(
         f"{counted(table.pattern_count, 'pattern')} of "
         f"{counted(len(table.frequencies), 'frequency', plural='frequencies')} for "

@@ -1,50 +1,48 @@
-"""`era table query`: what to play so that one finger feels it and the others do not."""
+"""`era table query`: the pattern for a set of contacts."""
 
 import json
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
-from model.commands.plate_cli import JsonOption
+from model.commands.options import JsonOption, TableArgument
 
-table_app = typer.Typer(help="The localization table: felt by one finger, not by others.")
-
-TableArgument = Annotated[Path, typer.Argument(metavar="TABLE", help="A table file, e.g. T.npz.")]
+table_app = typer.Typer(help="Build, query and check localization tables.")
 
 
 def query(
     table_file: TableArgument,
     target: Annotated[
         list[str] | None,
-        typer.Option(metavar="X,Y", help="The finger to feel it, metres; repeatable."),
+        typer.Option(metavar="X,Y", help="Finger to feel it, metres; repeatable."),
     ] = None,
     quiet: Annotated[
-        list[str] | None, typer.Option(metavar="X,Y", help="A finger not to feel it; repeatable.")
+        list[str] | None, typer.Option(metavar="X,Y", help="Finger not to feel it; repeatable.")
     ] = None,
     drive_mode: Annotated[
         str | None,
-        typer.Option(
-            "--mode", help="Drive mode: switched, graded, signed or phased; default: the table's."
-        ),
+        typer.Option("--mode", help="switched, graded, signed or phased; default: the table's."),
     ] = None,
     level: Annotated[
-        float, typer.Option(metavar="DB_SL", help="Wanted level at the target, dB SL.")
+        float, typer.Option(metavar="DB_SL", help="Level at the target, dB SL.")
     ] = 20.0,
     eras: Annotated[
-        int, typer.Option(metavar="N", help="How many ERAs mode switched may drive.")
+        int, typer.Option(metavar="N", help="Maximum number of ERAs in mode switched.")
     ] = 2,
     envelopes: Annotated[
-        bool,
-        typer.Option("--envelopes", help="The amplifiers play envelopes: shape onset and ending."),
+        bool, typer.Option("--envelopes", help="Shape onset and ending by envelopes.")
     ] = False,
     batch: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Questions as JSON lines; answers one to a line."),
+        typer.Option(metavar="FILE", help="Questions as JSON lines; print one answer a line."),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Which ERAs make one finger feel it and the others not. At which frequencies and levels."""
+    """Find the pattern for target and quiet fingers.
+
+    Print frequency, level and phase of each ERA, and predicted levels and contrast.
+    """
     from model.config.points import parse_point
     from model.errors import InputError
     from model.table.file import load_table
@@ -53,13 +51,12 @@ def query(
 
     if batch is not None:
         if target or quiet:
-            raise InputError("--batch holds the contacts already; leave --target and --quiet out")
-        _answer_batch(table_file, batch)
+            raise InputError("--target and --quiet must be left out with --batch")
+        _query_batch(table_file, batch)
         return
     if not target:
         raise InputError(
-            "nobody is to feel anything: say who with --target X,Y, metres, or give many questions "
-            "with --batch FILE"
+            "at least one target is needed; give --target X,Y, metres, or --batch FILE"
         )
     question = Question(
         targets=tuple(parse_point(text, what="--target") for text in target),
@@ -74,47 +71,57 @@ def query(
     answer = query_as_json(table, question, prepared_timing(table))
     if as_json:
         print(json.dumps(answer))
-        return
+    else:
+        _print_answer(answer)
+
+
+def _print_answer(answer: dict[str, Any]) -> None:
     for era, tone in answer["drive"].items():
         print(
             f"{era:4s} {tone['frequency_hz']:7.2f} Hz  level {tone['level']:.4f}  "
             f"phase {tone['phase_deg']:.1f}°"
         )
-    print(f"level at the target      {answer['level_db_sl']:6.1f} dB SL")
+    rows = [("level at the target", answer["level_db_sl"], "dB SL")]
     if answer["contrast_db"] is not None:
-        unaware = "unaware" if answer["quiet_is_unaware"] else "may feel it"
-        print(f"contrast to the others   {answer['contrast_db']:6.1f} dB")
-        print(f"  in nine of ten plates  {answer['robust_contrast_db']:6.1f} dB or more")
-        print(f"  in the first 100 ms    {answer['transient_contrast_db']:6.1f} dB")
-        print(f"loudest quiet finger     {answer['quiet_level_db_sl']:6.1f} dB SL, {unaware}")
-        print(f"leaves them unaware up to{answer['usable_level_db_sl']:6.1f} dB SL")
+        awareness = "not felt" if answer["quiet_is_unaware"] else "may be felt"
+        rows += [
+            ("contrast to quiet fingers", answer["contrast_db"], "dB"),
+            ("  on nine of ten plates", answer["robust_contrast_db"], "dB or more"),
+            ("  in the first 100 ms", answer["transient_contrast_db"], "dB"),
+            ("loudest quiet finger", answer["quiet_level_db_sl"], f"dB SL, {awareness}"),
+            ("highest level not felt there", answer["usable_level_db_sl"], "dB SL"),
+        ]
     else:
-        print(f"to the plate around it   {answer['surroundings_contrast_db']:6.1f} dB")
-        print(f"  to 95 % of that plate  {answer['surroundings_contrast_95_db']:6.1f} dB or more")
-        print(f"half as strong or more on{1e4 * answer['area_above_half_m2']:6.0f} cm²")
-        print(f"of its energy within 5 cm{100 * answer['energy_share_near']:6.0f} %")
-    print(f"left after its end       {answer['left_after_db']:6.1f} dB")
-    print(f"found in {1000 * answer['solve_time_s']:.1f} ms")
+        rows += [
+            ("contrast to the plate around", answer["surroundings_contrast_db"], "dB"),
+            ("  to 95 % of that plate", answer["surroundings_contrast_95_db"], "dB or more"),
+            ("area above half the target", 1e4 * answer["area_above_half_m2"], "cm²"),
+            ("energy within 5 cm", 100 * answer["energy_share_near"], "%"),
+        ]
+    rows.append(("residual after the end", answer["left_after_db"], "dB"))
+    for name, value, unit in rows:
+        print(f"{name:28s} {value:6.1f} {unit}")
+    print(f"solved in {1000 * answer['solve_time_s']:.1f} ms")
 
 
-def _answer_batch(table_file: Path, batch: Path) -> None:
-    """Answer line by line as they are read; status 1 at the end if any had no answer."""
+def _query_batch(table_file: Path, batch: Path) -> None:
+    """Answer line by line; exit with 1 at the end if a line had no answer."""
     from model.errors import InputError
     from model.table.file import load_table
     from model.table.query import query_batch
 
     table = load_table(table_file)
-    failed = False
+    has_failed = False
     try:
         with batch.open(encoding="utf-8") as lines:
             for answer in query_batch(table, lines):
-                failed = failed or "error" in answer
+                has_failed = has_failed or "error" in answer
                 print(json.dumps(answer))
     except OSError as error:
         raise InputError(
-            f"--batch {batch} cannot be read: {error.strerror}; give a file with a question a line"
+            f"--batch {batch} cannot be read: {error.strerror}; give a file of JSON lines"
         ) from error
     except UnicodeDecodeError as error:
-        raise InputError(f"--batch {batch} is no text in UTF-8; save it as UTF-8") from error
-    if failed:
+        raise InputError(f"--batch {batch} must be UTF-8; save it as UTF-8") from error
+    if has_failed:
         raise typer.Exit(1)

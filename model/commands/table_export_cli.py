@@ -1,4 +1,4 @@
-"""`era table plot` and `era table export`: a table as pictures, and for other programs."""
+"""`era table plot` and `era table export`."""
 
 import json
 import time
@@ -9,19 +9,18 @@ from typing import Annotated
 import typer
 
 from model.commands.next_line import next_line
-from model.commands.plate_cli import JsonOption
-from model.commands.table_cli import TableArgument
+from model.commands.options import FolderOption, JsonOption, TableArgument
 
 
 class Format(StrEnum):
-    """What other programs read."""
+    """File format of other programs."""
 
     MAT = "mat"
     CSV = "csv"
 
 
 class Content(StrEnum):
-    """What the rows of a CSV file are."""
+    """Rows of a CSV file."""
 
     PATTERNS = "patterns"
     FIELDS = "fields"
@@ -29,12 +28,10 @@ class Content(StrEnum):
 
 def plot(
     table_file: TableArgument,
-    output: Annotated[
-        Path, typer.Option("--output", "-o", metavar="DIR", help="Folder to write into.")
-    ],
+    output: FolderOption,
     as_json: JsonOption = False,
 ) -> None:
-    """Draw weak cells, levels, contrast and an example answer."""
+    """Draw weak cells, levels, contrast and an answer."""
     from model.commands.progress import progress_bar
     from model.figures import save_figure
     from model.figures.table_pictures import table_figures
@@ -60,7 +57,7 @@ def plot(
 
 def export(
     table_file: TableArgument,
-    to: Annotated[Format, typer.Option("--format", help="For MATLAB and Octave, or as text.")],
+    to: Annotated[Format, typer.Option("--format", help="MATLAB and Octave, or text.")],
     output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="File to write.")],
     content: Annotated[
         Content | None,
@@ -68,14 +65,17 @@ def export(
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Write a table for other programs. docs/reference/table-file.md says what is in it."""
+    """Write a table for other programs.
+
+    docs/reference/table-file.md describes the content.
+    """
     from model.errors import InputError
     from model.files.replacing import check_ending, check_place
     from model.table.export import export_csv, export_mat
     from model.table.file import load_table
 
     if content is not None and to is Format.MAT:
-        raise InputError("--content is for CSV files; a .mat file holds everything")
+        raise InputError("--content must be left out with --format mat, which holds everything")
     check_place(output, example=f"table.{to.value}")
     check_ending(output, f".{to.value}", what=f"a file of --format {to.value}")
     table = load_table(table_file)
@@ -91,7 +91,7 @@ def export(
 
 
 def _reader(to: Format, output: Path) -> str:
-    """A line that opens the file."""
+    """Format a hint that opens the file."""
     if to is Format.MAT:
         return f"load('{output}') in MATLAB or Octave, scipy.io.loadmat in Python"
     return f"open {output} in a spreadsheet, or pandas.read_csv('{output}')"

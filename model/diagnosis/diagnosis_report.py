@@ -152,7 +152,7 @@ def as_json(verdict: Verdict) -> dict[str, Any]:
         },
         "bad_sensors": [{"sensor": name, "problem": why} for name, why in verdict.bad_sensors],
         "sensor_count": verdict.sensor_count,
-        "frequencies_hz": verdict.frequencies.tolist(),
+        "drive_frequencies_hz": verdict.frequencies.tolist(),
         "findings": verdict_rows(verdict),
     }
 

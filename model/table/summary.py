@@ -1,4 +1,4 @@
-"""What a table can do, in a handful of numbers."""
+"""Summary of a table: levels, dead zones, weak cells, contrast, origin."""
 
 import contextlib
 from collections.abc import Callable
@@ -17,8 +17,8 @@ from model.table.weak_cells import WeakCells, are_apart
 CONTACT_SETS = 200
 
 PAIRS = 20_000
-ALIKE = 0.95
-"""Two patterns are alike where their responses at the cells are correlated more than this."""
+MIN_SIMILARITY = 0.95
+"""Correlation of responses at the cells above which two patterns count as similar."""
 
 
 def summarize(
@@ -27,10 +27,9 @@ def summarize(
     *,
     progress: Callable[[int, int], None] = lambda done, of: None,
 ) -> dict[str, Any]:
-    """Provenance, levels that can be had, dead zones, weak cells, contrast, likeness of patterns.
+    """Summarize a table; contrast [dB]: median and tenth percentile over random contact sets.
 
-    Contrast: median and tenth percentile [dB] over random contact sets (seed 0). progress: called
-    with how many of these are done, of how many.
+    progress: called with the number of finished sets and the total.
     """
     available = table.available_level_db_sl
     known = np.isfinite(weak.tenth_db) | np.isneginf(weak.tenth_db)
@@ -38,7 +37,7 @@ def summarize(
         "mode": table.drive_mode,
         "plate_m": [table.plate.length, table.plate.width, table.plate.thickness],
         "eras": [era.name for era in table.eras],
-        "frequencies_hz": [float(table.frequencies[0]), float(table.frequencies[-1])],
+        "frequency_range_hz": [float(table.frequencies[0]), float(table.frequencies[-1])],
         "frequency_count": len(table.frequencies),
         "grid": str(table.grid),
         "cells": table.grid.cell_count,
@@ -54,8 +53,8 @@ def summarize(
         for name, percentile in (("median", 50), ("tenth_percentile", 10)):
             value = float(np.percentile(contrasts, percentile)) if len(contrasts) else None
             summary[f"contrast_{others}_quiet_{name}_db"] = value
-    summary["alike_pattern_pairs_share"] = alike_share(table)
-    summary["mesh"] = str(table.mesh)
+    summary["alike_pattern_pairs_share"] = similar_share(table)
+    summary["mesh_name"] = str(table.mesh)
     summary["discretisation_error_percent"] = 100 * float(table.discretisation_error.max())
     summary["reference_mesh"] = str(table.reference_mesh)
     summary["raster"] = f"{table.raster.nx}x{table.raster.ny}"
@@ -71,35 +70,33 @@ def contrast_distribution(
     rng: np.random.Generator,
     progress: Callable[[int, int], None] = lambda done, of: None,
 ) -> FloatArray:
-    """Predicted contrast [dB] of random contact sets, up to (CONTACT_SETS,).
+    """Contrast [dB] of random contact sets, up to (CONTACT_SETS,).
 
-    Sets whose target no pattern reaches are left out, and so are all on a plate too small for them.
-    progress: as for `summarize`, which asks for one, two and three others in turn.
+    Sets with an unreachable target are left out, and all on a plate too small for them. progress:
+    as for `summarize`, which takes one, two and three others in turn.
     """
     size = np.array([table.plate.length, table.plate.width])
     contrasts: list[float] = []
-    asked = 0
+    tried = 0
     for _ in range(50 * CONTACT_SETS):
         contacts = rng.uniform(0, size, (others + 1, 2))
         if not are_apart(contacts):
             continue
-        asked += 1
+        tried += 1
         target, *quiet = [(float(x), float(y)) for x, y in contacts]
         with contextlib.suppress(InputError):
             contrast = table.query(Question((target,), tuple(quiet))).contrast_db
             contrasts.append(np.nan if contrast is None else contrast)
         progress((others - 1) * CONTACT_SETS + len(contrasts), 3 * CONTACT_SETS)
-        # Where hardly a target is reached, the few that are must do.
-        if len(contrasts) == CONTACT_SETS or asked == 2 * CONTACT_SETS:
+        if len(contrasts) == CONTACT_SETS or tried == 2 * CONTACT_SETS:
             break
     return np.array(contrasts)
 
 
-def alike_share(table: LocalizationTable) -> float | None:
-    """Share of pairs of `switched` patterns that are alike, of a random sample of PAIRS.
+def similar_share(table: LocalizationTable) -> float | None:
+    """Share of similar pairs of `switched` patterns in a random sample of PAIRS.
 
-    The more of them, the less there is to choose from. None where there is only one pattern or
-    cell.
+    None for a single pattern or cell.
     """
     patterns = all_patterns(len(table.eras), len(table.frequencies))
     count = len(patterns.first)
@@ -116,4 +113,4 @@ def alike_share(table: LocalizationTable) -> float | None:
         return np.asarray(rows / np.linalg.norm(rows, axis=1, keepdims=True))
 
     correlation = (scaled(one) * scaled(other)).sum(axis=1)
-    return float((correlation > ALIKE).mean())
+    return float((correlation > MIN_SIMILARITY).mean())

@@ -1,13 +1,11 @@
-"""Whether a table tells the truth: a sample of it recomputed by other ways than made it.
+"""Verification of a table: a sample of it recomputed by other methods.
 
 - Content: fields on the raster, responses of the cells and modes of the plate, against the sparse
   direct solve on the table's own mesh, relative L2.
-- Answers: level and contrast predicted for random contacts, against the same solve.
-- Answers in time: the pattern is started from rest on the plate in time
-  (`model.transients.time_response`) and left on until nothing of its start remains; the amplitudes
-  that the fingertips then see. Contrast beyond 25 dB counts as 25: a quiet finger is then in a
-  null, where the two descriptions of damping, hysteretic and viscous, differ by more than is left
-  of the vibration.
+- Answers: level and contrast at random contacts, against the same solve.
+- Answers in time: amplitudes at the fingertips once the pattern, started from rest on the plate in
+  time (`model.transients.time_response`), has settled. Contrast beyond 25 dB counts as 25: in a
+  null, hysteretic and viscous damping differ by more than the vibration that is left.
 """
 
 import contextlib
@@ -52,7 +50,7 @@ RASTER_ERROR = 2e-4
 """Of a field between the points of the raster, relative to its root mean square over the plate."""
 
 TIME_TOLERANCE_DB = 1.0
-MOST_CONTRAST_IN_TIME_DB = 25.0
+MAX_CONTRAST_IN_TIME_DB = 25.0
 
 SAMPLED_FREQUENCIES = 3
 SAMPLED_CELLS = 3
@@ -66,14 +64,14 @@ _LONGEST = 20.0  # s
 
 @dataclass(frozen=True)
 class ContentCheck:
-    """What was recomputed of the table's content, and its error relative L2."""
+    """A kind of content with its error, relative L2."""
 
-    what: str
+    name: str
     error: float
 
     @property
-    def holds(self) -> bool:
-        """Whether it is within CONTENT_TOLERANCE."""
+    def is_passed(self) -> bool:
+        """Whether the error is within CONTENT_TOLERANCE."""
         return self.error <= CONTENT_TOLERANCE
 
 
@@ -94,12 +92,12 @@ class AnswerCheck:
     contrast_tolerance_db: float
 
     @property
-    def holds(self) -> bool:
-        """Whether all are within their tolerances; what is not a number is not."""
+    def is_passed(self) -> bool:
+        """Whether all are within their tolerances; NaN is not."""
         level = abs(self.direct_level_db_sl - self.pattern.level_db_sl)
         contrast = abs(self.direct_contrast_db - self.predicted_contrast_db)
         predicted, in_time = (
-            min(each, MOST_CONTRAST_IN_TIME_DB)
+            min(each, MAX_CONTRAST_IN_TIME_DB)
             for each in (self.predicted_contrast_db, self.contrast_in_time_db)
         )
         return (
@@ -116,16 +114,44 @@ class AnswerCheck:
 
 @dataclass(frozen=True)
 class Verification:
-    """All that was recomputed."""
+    """All recomputed content and answers."""
 
     content: tuple[ContentCheck, ...]
     answers: tuple[AnswerCheck, ...]
 
     @property
     def misses(self) -> int:
-        """How many do not hold."""
-        held = [check.holds for check in self.content] + [check.holds for check in self.answers]
-        return held.count(False)
+        """Number of failed checks."""
+        return [
+            *(check.is_passed for check in self.content),
+            *(answer.is_passed for answer in self.answers),
+        ].count(False)
+
+    def as_json(self) -> dict[str, Any]:
+        """All checks for programs."""
+        return {
+            "content": [
+                {"what": check.name, "relative_error": check.error, "holds": check.is_passed}
+                for check in self.content
+            ],
+            "answers": [
+                {
+                    "target_m": list(answer.question.targets[0]),
+                    "quiet_m": [list(place) for place in answer.question.quiet],
+                    "predicted_level_db_sl": answer.pattern.level_db_sl,
+                    "direct_level_db_sl": answer.direct_level_db_sl,
+                    "level_tolerance_db": answer.level_tolerance_db,
+                    "predicted_contrast_db": answer.predicted_contrast_db,
+                    "direct_contrast_db": answer.direct_contrast_db,
+                    "contrast_tolerance_db": answer.contrast_tolerance_db,
+                    "contrast_in_time_db": answer.contrast_in_time_db,
+                    "time_tolerance_db": answer.time_tolerance_db,
+                    "holds": answer.is_passed,
+                }
+                for answer in self.answers
+            ],
+            "misses": self.misses,
+        }
 
 
 def field_error(table: LocalizationTable, frequency: float) -> float:

@@ -1,14 +1,14 @@
-"""Where on the plate a target is told from other fingers, cell by cell, and where hardly.
+"""Contrast that the cells of a plate have to other fingers.
 
-For the centre of each cell as the target, the best contrast to another finger at random places (the
-same for all cells and every time, those at least 5 cm away). A cell is *feasible* where the median
-other finger is told from it by 12 dB at 20 dB SL: felt strongly, and what is turned down to be just
-felt well, at 12 dB SL, is then at the other's threshold. It is *weak* where more than one other
-finger in ten is not.
+For the centre of each cell as the target, contrast to another finger at random places, the same
+for all cells, at least 5 cm away. A cell is *feasible* if the median other finger leaves 12 dB at
+20 dB SL: turned down to 12 dB SL, which is felt well, the other finger is then at its threshold. It
+is *weak* if more than one other finger in ten leaves less.
 """
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,26 +20,28 @@ from model.finger.perception import FELT_DB_SL, STRONG_DB_SL
 from model.table.question import Question
 from model.table.table import LocalizationTable
 
-LEAST_DISTANCE = 0.05
-"""Fingers of a contact set are at least this far apart [m]: fingertips of two hands."""
+MIN_DISTANCE = 0.05
+"""Distance of the fingers of a contact set at least [m], as fingertips of two hands."""
 
 WANTED_CONTRAST_DB = FELT_DB_SL
 WANTED_LEVEL_DB_SL = STRONG_DB_SL
 
 STRATA = (4, 3)
-"""Another finger is tried at a random place in each of so many equal parts of a quarter of the
-plate, and at the mirror images of these places in both axes: the map of a symmetric plate is then
-symmetric, and depends less on what was drawn than with places drawn freely."""
+"""Strata of a quarter of the plate, one random place of the other finger in each.
 
-# A finer map takes longer and shows no more: weak places are as large as a quarter of a wave.
-_FINEST = Grid(16, 12)
+Their mirror images in both axes are used too, so that a symmetric plate has a symmetric map, with
+less variance than from places drawn freely.
+"""
+
+# Weak places are as large as a quarter of a wavelength.
+_MAX_GRID = Grid(16, 12)
 
 
 @dataclass(frozen=True, eq=False)
 class WeakCells:
-    """Contrast [dB] from each cell to the median other finger and to that of one in ten, (cells,).
+    """Median and tenth percentile of contrast [dB] from each cell to other fingers, (cells,).
 
-    -inf where the level is not reached either, NaN on a plate too small for two fingers.
+    -inf where the level is not reached, NaN on a plate too small for two fingers.
     """
 
     grid: Grid
@@ -49,24 +51,35 @@ class WeakCells:
 
     @property
     def feasible(self) -> NDArray[np.bool_]:
-        """Which cells can be told from the median other finger."""
+        """Mask of feasible cells."""
         return np.asarray(self.median_db >= WANTED_CONTRAST_DB)
 
     @property
     def weak(self) -> NDArray[np.bool_]:
-        """Which cells cannot be told from more than one other finger in ten."""
+        """Mask of weak cells."""
         return np.asarray(self.tenth_db < WANTED_CONTRAST_DB)
+
+    def as_json(self) -> dict[str, Any]:
+        """The map for programs; null where a contrast is not finite."""
+        return {
+            "grid": str(self.grid),
+            "centres_m": self.centres.tolist(),
+            "median_contrast_db": _finite(self.median_db),
+            "tenth_percentile_contrast_db": _finite(self.tenth_db),
+            "is_weak": self.weak.tolist(),
+            "is_feasible": self.feasible.tolist(),
+        }
 
 
 def are_apart(contacts: FloatArray) -> bool:
-    """Whether fingers at contacts (n, 2) [m], two or more, are all that far apart."""
+    """Whether all of two or more contacts (n, 2) [m] are MIN_DISTANCE apart."""
     gaps = np.linalg.norm(contacts[:, None] - contacts, axis=-1)
-    return bool(gaps[np.triu_indices(len(contacts), 1)].min() >= LEAST_DISTANCE)
+    return bool(gaps[np.triu_indices(len(contacts), 1)].min() >= MIN_DISTANCE)
 
 
 def map_grid(table: LocalizationTable) -> Grid:
-    """The cells that are asked about: the table's own, or fewer of a fine grid."""
-    return Grid(min(table.grid.nx, _FINEST.nx), min(table.grid.ny, _FINEST.ny))
+    """Grid of the map: the table's, or a coarser one in place of a fine one."""
+    return Grid(min(table.grid.nx, _MAX_GRID.nx), min(table.grid.ny, _MAX_GRID.ny))
 
 
 def find_weak_cells(
@@ -74,9 +87,9 @@ def find_weak_cells(
     *,
     progress: Callable[[int, int], None] = lambda done, of: None,
 ) -> WeakCells:
-    """Ask the table about each cell, in its own mode; cells of a fine grid are taken together.
+    """Query the table for each cell of `map_grid` in its default drive mode.
 
-    progress: called with how many cells are done, of how many.
+    progress: called with the number of finished cells and the total.
     """
     grid = map_grid(table)
     centres = grid.centres(table.plate)
@@ -88,17 +101,17 @@ def find_weak_cells(
     places = size * mirrored.reshape(-1, 2)
     found = np.full((2, len(centres)), np.nan)
     for cell, centre in enumerate(centres):
-        far = np.linalg.norm(places - centre, axis=1) >= LEAST_DISTANCE
+        far = np.linalg.norm(places - centre, axis=1) >= MIN_DISTANCE
         contrasts = [_contrast(table, centre, other) for other in places[far]]
         if contrasts:
-            # Of a sample with -inf in it nothing can be interpolated.
+            # A sample with -inf cannot be interpolated.
             found[:, cell] = np.percentile(contrasts, [50, 10], method="inverted_cdf")
         progress(cell + 1, len(centres))
     return WeakCells(grid, centres, *found)
 
 
 def text_map(weak: WeakCells) -> Iterator[str]:
-    """The plate as lines of text, the largest y first: the median contrast, * where it is weak."""
+    """Median contrast as lines of text, the largest y first, with * for weak cells."""
     shape = (weak.grid.ny, weak.grid.nx)
     rows = zip(weak.median_db.reshape(shape), weak.weak.reshape(shape), strict=True)
     for median, marks in reversed(list(rows)):
@@ -117,3 +130,7 @@ def _contrast(table: LocalizationTable, target: FloatArray, other: FloatArray) -
     except InputError:
         return -np.inf
     return -np.inf if contrast is None else contrast
+
+
+def _finite(values: FloatArray) -> list[float | None]:
+    return [value if np.isfinite(value) else None for value in values.tolist()]

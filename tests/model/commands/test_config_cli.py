@@ -24,21 +24,13 @@ def test_init_writes_a_rig_that_is_good(tmp_path: Path) -> None:
     assert result.stdout.splitlines()[-1] == f"Next: era config check {path}"
 
 
-@pytest.mark.parametrize(
-    ("name", "message"),
-    [
-        ("kept.yaml", "exists and is left"),
-        ("rig.txt", r"ends in \.yaml"),
-        ("no/rig.yaml", "cannot"),
-    ],
-)
-def test_init_refuses_what_it_should_not_write(tmp_path: Path, name: str, message: str) -> None:
+@pytest.mark.parametrize("name", ["kept.yaml", "rig.txt", "no/rig.yaml"])
+def test_init_refuses_names_that_it_cannot_write(tmp_path: Path, name: str) -> None:
     """A file that exists is left as it was; another ending or a missing folder is refused."""
     (tmp_path / "kept.yaml").write_text("mine", encoding="utf-8")
     result = RUNNER.invoke(config_app, ["init", str(tmp_path / name)])
     assert isinstance(result.exception, InputError)
-    with pytest.raises(InputError, match=message):
-        raise result.exception
+    assert name in str(result.exception)
     assert (tmp_path / "kept.yaml").read_text(encoding="utf-8") == "mine"
     assert [path.name for path in tmp_path.iterdir()] == ["kept.yaml"]
 

@@ -66,7 +66,7 @@ def test_a_laminate_is_shown_with_both_bounds():
 def test_the_text_says_how_uncertain_a_laminate_is():
     """Ratios of natural frequencies go with the root of the rigidities printed beside them."""
     text = shown("show", EXAMPLES / "glass_panel.yaml")
-    taken = float(re.search(r"rigidity taken  ([\d.]+) N m", text)[1])
+    taken = float(re.search(r"rigidity used  ([\d.]+) N m", text)[1])
     for bound in ("perfectly bonded", "freely sliding"):
         rigidity, ratio = re.search(rf"{bound}  ([\d.]+) N m: .* x ([\d.]+)", text).groups()
         assert float(ratio) == pytest.approx((float(rigidity) / taken) ** 0.5, abs=2e-3)

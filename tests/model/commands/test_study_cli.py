@@ -54,7 +54,7 @@ def test_a_study_recommends_a_rig_that_loads(tmp_path: Path, what: str) -> None:
         assert not name.endswith(".png") or Path(name).read_bytes().startswith(PNG)
 
 
-def test_what_no_study_changes_is_kept(tmp_path: Path) -> None:
+def test_study_keeps_what_it_does_not_vary(tmp_path: Path) -> None:
     """Bolt mass, measured gains and what else a rig says of its ERAs is in the recommended one."""
     data = read_document(Path(RIG)).data
     for era in data["eras"].values():
@@ -75,7 +75,7 @@ def test_what_no_study_changes_is_kept(tmp_path: Path) -> None:
         assert era.damping == before.damping
 
 
-def test_the_recommended_rig_does_what_was_promised(tmp_path: Path) -> None:
+def test_study_of_the_recommended_rig_finds_the_same_statistics(tmp_path: Path) -> None:
     """A study of the recommended rig finds its own layout with the same statistics."""
     first = study("placement", tmp_path / "a", "--layouts", "12")
     again = study("placement", tmp_path / "b", "--layouts", "1", rig=first["files"][0])
@@ -122,7 +122,7 @@ def test_more_eras_than_the_rig_has_get_channels_of_their_own(tmp_path: Path) ->
     assert len(set(rig.wiring.values())) == len(rig.eras)
 
 
-def test_people_read_a_ranking_and_one_next_step(tmp_path: Path) -> None:
+def test_study_prints_ranking_recommendation_and_next_command(tmp_path: Path) -> None:
     """How long it took, the ranking with units, the recommendation in words, files, Next."""
     result = RUNNER.invoke(
         study_app, ["placement", RIG, "-o", str(tmp_path), "--layouts", "5", *QUICK]
@@ -130,14 +130,13 @@ def test_people_read_a_ranking_and_one_next_step(tmp_path: Path) -> None:
     assert result.exit_code == 0
     lines = result.stdout.splitlines()
     assert lines[0].startswith("5 cases in ")
-    assert " s (0 of them kept" in lines[0]
     assert " g " in lines[3]
-    assert any(line.startswith("Recommended: 4 ERAs of 17 kN/m: ") for line in lines)
+    assert any(line.startswith("Recommended") and "4 ERAs" in line for line in lines)
     recommended = tmp_path / "recommended"
     assert lines[-1] == f"Next: era table build {recommended}.yaml -o {recommended}.npz"
 
 
-def test_why_the_best_is_not_recommended_is_said(tmp_path: Path) -> None:
+def test_study_says_why_the_best_is_not_recommended(tmp_path: Path) -> None:
     """Of these layouts one of six ERAs has the highest median, by less than a tenth."""
     few = ["--layouts", "24", "--seed", "2"]
     answer = RUNNER.invoke(study_app, ["count", RIG, "-o", str(tmp_path), *few, *QUICK]).stdout
@@ -157,10 +156,10 @@ def one_era_rig(folder: Path) -> str:
     return str(path)
 
 
-def test_a_pair_of_one_era_is_refused_and_a_way_out_told(tmp_path: Path) -> None:
+def test_study_of_one_era_needs_active_1(tmp_path: Path) -> None:
     """A rig of one ERA has no pair to rank by; with --active 1 it can be studied."""
     rig = one_era_rig(tmp_path)
-    with pytest.raises(InputError, match="rank by it with --active 1"):
+    with pytest.raises(InputError, match="--active 1"):
         study("placement", tmp_path / "out", rig=rig)
     answer = study("placement", tmp_path / "out", "--active", "1", "--layouts", "9", rig=rig)
     assert len(answer["recommended"]["at_m"]) == 1
@@ -181,7 +180,7 @@ def test_a_pair_of_one_era_is_refused_and_a_way_out_told(tmp_path: Path) -> None
     ],
     ids=lambda arguments: " ".join(arguments[::2]) if len(arguments) > 2 else arguments[0],
 )
-def test_bad_usage_is_refused(tmp_path: Path, arguments: list[str]) -> None:
+def test_study_refuses_bad_usage(tmp_path: Path, arguments: list[str]) -> None:
     """An unknown study and numbers that are none or out of range end with status 2."""
     result = RUNNER.invoke(study_app, [*arguments, "-o", str(tmp_path)])
     assert result.exit_code == 2
@@ -195,24 +194,24 @@ def test_bad_usage_is_refused(tmp_path: Path, arguments: list[str]) -> None:
         (["--frequencies", "60,9000"], "Hz"),
         (["--candidates", "1x1"], "2x2 to 100x100"),
         (["--candidates", "many"], "two numbers"),
-        (["--workers", "2", "--cluster", "tcp://127.0.0.1:1"], "one of them"),
+        (["--workers", "2", "--cluster", "tcp://127.0.0.1:1"], "--cluster"),
         (["--cluster", "nowhere"], "--cluster"),
     ],
 )
-def test_bad_input_is_told(tmp_path: Path, more: list[str], message: str) -> None:
+def test_study_refuses_bad_input(tmp_path: Path, more: list[str], message: str) -> None:
     """One clear error, before anything is solved."""
     with pytest.raises(InputError, match=message):
         study("placement", tmp_path, *more)
 
 
-def test_a_folder_that_cannot_be_is_told(tmp_path: Path) -> None:
+def test_study_names_a_folder_that_cannot_be_made(tmp_path: Path) -> None:
     """A file is where the folder should be: its name is in the error."""
     (tmp_path / "taken").write_text("mine", encoding="utf-8")
     with pytest.raises(OSError, match="taken"):
         study("placement", tmp_path / "taken", "--layouts", "2")
 
 
-def test_ctrl_c_leaves_a_study_that_goes_on(tmp_path: Path) -> None:
+def test_study_resumes_when_it_was_interrupted(tmp_path: Path) -> None:
     """SIGINT in the middle, with two workers: status 130, and a whole file to resume from."""
     command = [sys.executable, "-c", era_program()]
     arguments = ["study", "placement", RIG, "-o", str(tmp_path), "--layouts", "30000", *QUICK]

@@ -1,8 +1,7 @@
-"""`era table` as a user types it: build, show, verify, plot, export."""
+"""`era table` as a user types it."""
 
 import json
 import os
-import re
 import shlex
 import signal
 import subprocess
@@ -21,9 +20,9 @@ from model.cli import app
 from model.errors import InputError
 from model.rig.file import example_rig_path
 from model.table.file import load_table, save_table
+from model.table.pattern_choice import UnreachableLevel
 from same_code import era_program
 
-RUNNER = CliRunner()
 RIG = str(example_rig_path())
 QUICK = ["--mesh", "12x9", "--frequencies", "60,110,250", "--grid", "4x3"]
 PNG = b"\x89PNG\r\n\x1a\n"
@@ -31,7 +30,7 @@ PNG = b"\x89PNG\r\n\x1a\n"
 
 def table(*arguments: str | Path) -> Result:
     """Run `era table`; what it raises is raised here."""
-    result = RUNNER.invoke(app, ["table", *map(str, arguments)])
+    result = CliRunner().invoke(app, ["table", *map(str, arguments)])
     if isinstance(result.exception, Exception):
         raise result.exception
     return result
@@ -51,26 +50,22 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_build_says_what_it_made(tmp_path: Path) -> None:
-    """Patterns, cells, time, how wrong the mesh is, the file, one next step; nothing else is left.
-
-    66 patterns: 4 * 3 alone and 6 * 3² in pairs.
-    """
+def test_build_prints_numbers_file_and_next_command(tmp_path: Path) -> None:
+    """66 patterns, 4 * 3 alone and 6 * 3² in pairs, for 12 cells; no other file is left."""
     path = tmp_path / "t.npz"
     lines = table("build", RIG, "-o", path, *QUICK).stdout.splitlines()
-    assert lines[0].startswith("66 patterns of 3 frequencies for 12 cells, built in ")
+    assert lines[0].startswith("66 patterns of 3 frequencies for 12 cells")
     assert "12x9" in lines[1]
-    assert "% of a finer one" in lines[1]
-    assert lines[-2].startswith(f"wrote {path}")
+    assert str(path) in lines[-2]
     assert lines[-1] == f"Next: era table show {path}"
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_build_as_json(tmp_path: Path) -> None:
-    """Everything that made the table, units in the names."""
+def test_build_json_has_what_made_the_table(tmp_path: Path) -> None:
+    """Frequencies, mesh, mode and fingerprint, which are those of the file."""
     path = tmp_path / "t.npz"
     answer = as_json("build", RIG, "-o", path, "--mode", "phased", *QUICK)
-    assert answer["frequencies_hz"] == [60.0, 110.0, 250.0]
+    assert answer["drive_frequencies_hz"] == [60.0, 110.0, 250.0]
     assert (answer["patterns"], answer["cells"], answer["mode"]) == (66, 12, "phased")
     assert (answer["mesh"], answer["element"]) == ([12, 9], "MITC4")
     assert 10 < answer["discretisation_error_percent"] < 100  # the paper's mesh is a coarse one
@@ -80,19 +75,23 @@ def test_build_as_json(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "says"),
+    ("arguments", "named"),
     [
-        (["-o", "{tmp}/none/t.npz"], "folder that exists"),
-        (["-o", "{tmp}"], "name of a file"),
-        (["-o", "{tmp}/t.npz", "--mode", "loud"], "switched, graded, signed, phased"),
-        (["-o", "{tmp}/t.npz", "--grid", "many"], "12x9"),
-        (["-o", "{tmp}/t.npz", "--grid", "0x3"], "1x1 to 200x200"),
+        (["-o", "{tmp}/none/t.npz"], "--output"),
+        (["-o", "{tmp}"], "--output"),
+        (["-o", "{tmp}/t.yaml"], "t.npz"),
+        (["-o", "{tmp}/t.npz", "--mode", "loud"], "--mode"),
+        (["-o", "{tmp}/t.npz", "--grid", "many"], "--grid"),
+        (["-o", "{tmp}/t.npz", "--grid", "0x3"], "grid"),
+        (["-o", "{tmp}/t.npz", "--mesh", "big"], "mesh"),
         (["-o", "{tmp}/t.npz", "--frequencies", "600:700:10"], "limits"),
+        (["-o", "{tmp}/t.npz", "--frequencies", "60:320:1e-9"], "--frequencies"),
+        (["-o", "{tmp}/t.npz", "--frequencies", "sixty"], "--frequencies"),
     ],
 )
-def test_build_refuses_what_cannot_be(tmp_path: Path, arguments: list[str], says: str) -> None:
-    """A clear error, and nothing is left behind."""
-    with pytest.raises(InputError, match=says):
+def test_build_refuses_bad_options(tmp_path: Path, arguments: list[str], named: str) -> None:
+    """The option is named, and nothing is left behind."""
+    with pytest.raises(InputError, match=named):
         table("build", RIG, "--mesh", "12x9", *(each.format(tmp=tmp_path) for each in arguments))
     assert list(tmp_path.iterdir()) == []
 
@@ -100,8 +99,10 @@ def test_build_refuses_what_cannot_be(tmp_path: Path, arguments: list[str], says
 @pytest.mark.parametrize(
     ("ending", "status"), [(signal.SIGINT, 130), (signal.SIGKILL, -signal.SIGKILL)]
 )
-def test_an_ended_build_goes_on(tmp_path: Path, ending: signal.Signals, status: int) -> None:
-    """Ctrl-C or a kill in the middle, two workers; the same command then uses what was done."""
+def test_build_resumes_when_it_was_ended(
+    tmp_path: Path, ending: signal.Signals, status: int
+) -> None:
+    """Ctrl-C or a kill in the middle of two workers; the same command reuses finished parts."""
     path, folder = tmp_path / "t.npz", tmp_path / "t.npz.parts"
     long = ["--mesh", "12x9", "--frequencies", "60:320:4", "--grid", "48x36"]
     with subprocess.Popen(
@@ -116,41 +117,48 @@ def test_an_ended_build_goes_on(tmp_path: Path, ending: signal.Signals, status: 
             assert running.poll() is None
             time.sleep(0.01)
         os.killpg(running.pid, ending)
-        _, said = running.communicate(timeout=60)
+        _, printed = running.communicate(timeout=60)
     assert running.returncode == status
     assert not path.exists()
     if ending is signal.SIGINT:
-        assert "goes on from there" in said
-        assert "Traceback" not in said
+        assert str(folder) in printed
+        assert "Traceback" not in printed
     kept = len(list(folder.glob("[!.]*.part.npz")))
     assert kept >= 3
-    again = table("build", RIG, "-o", path, *long).stdout
-    assert f"reused {kept} of " in again
+    assert as_json("build", RIG, "-o", path, *long)["parts_reused"] == kept
     assert [left.name for left in tmp_path.iterdir()] == ["t.npz"]
 
 
-def test_show_as_text(built: Path) -> None:
-    """Cells, feasible share, dead zones, contrast, likeness, provenance, and the map of 4 by 3."""
+def test_build_interrupted_at_once_names_no_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """There is none to resume from."""
+
+    def interrupted(*arguments: object, **options: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("model.table.build.build_in_parts", interrupted)
+    result = CliRunner().invoke(app, ["table", "build", RIG, "-o", str(tmp_path / "t.npz"), *QUICK])
+    assert "interrupted" in result.stderr
+    assert ".parts" not in result.stderr
+
+
+def test_show_prints_summary_and_map(built: Path) -> None:
+    """Every row has a value, the map is 4 by 3, and each star of it is in the list."""
     lines = table("show", built, "--weak").stdout.splitlines()
-    text = "\n".join(lines)
-    for name in (
-        "feasible cells",
-        "dead zones           0 %",
-        "contrast to 3 others",
-        "patterns alike",
-        "12x9",
-        "fingerprint",
-    ):
-        assert name in text
+    rows = {line[:20].strip(): line[20:].strip() for line in lines}
+    assert rows["dead zones"].startswith("0 %")
+    for name in ("feasible cells", "contrast to 3 others", "mesh", "fingerprint"):
+        assert rows[name]
     start = next(number for number, line in enumerate(lines) if line.startswith("contrast in dB"))
-    assert [len(line.split()) for line in lines[start + 1 : start + 4]] == [4, 4, 4]
-    stars = sum(line.count("*") for line in lines[start + 1 : start + 4])
+    cells = lines[start + 1 : start + 4]
+    assert [len(line.split()) for line in cells] == [4, 4, 4]
+    stars = sum(line.count("*") for line in cells)
     assert sum(line.startswith("(0.") for line in lines) == stars > 0
-    assert re.fullmatch(r"judged in \d+\.\d s", lines[-2])
 
 
-def test_show_ends_with_a_question_that_can_be_asked(built: Path, tmp_path: Path) -> None:
-    """The next command as a shell takes it, a space in the table's name included, is answered."""
+def test_show_ends_with_a_query_that_has_an_answer(built: Path, tmp_path: Path) -> None:
+    """The next command is quoted for a shell, a space in the table's name included."""
     spaced = tmp_path / "my table.npz"
     spaced.write_bytes(built.read_bytes())
     era, group, *words = shlex.split(table("show", spaced).stdout.splitlines()[-1])[1:]
@@ -158,11 +166,11 @@ def test_show_ends_with_a_question_that_can_be_asked(built: Path, tmp_path: Path
     assert as_json(*words)["contrast_db"] > 0
 
 
-def test_show_as_json(built: Path) -> None:
-    """Shares, contrasts and the map with its centres."""
+def test_show_json_has_shares_and_map(built: Path) -> None:
+    """Shares, and the map with its centres."""
     answer = as_json("show", built)
-    assert answer["cells"] == 12
-    assert answer["patterns"] == 66
+    assert (answer["cells"], answer["patterns"], answer["mesh_name"]) == (12, 66, "12x9")
+    assert answer["frequency_range_hz"] == [60.0, 250.0]
     assert 0 <= answer["feasible_share"] <= 1
     assert 0 <= answer["alike_pattern_pairs_share"] < 0.5
     assert len(answer["map"]["centres_m"]) == len(answer["map"]["is_weak"]) == 12
@@ -170,86 +178,87 @@ def test_show_as_json(built: Path) -> None:
     assert answer["code_version"]
 
 
-def test_verify_confirms_a_true_table(built: Path) -> None:
-    """Status 0, a row for each sample, and how many hold."""
+def test_verify_passes_a_true_table_and_fails_a_false_one(built: Path, tmp_path: Path) -> None:
+    """One ERA's field a tenth stronger, its checksum right: status 1, as text and as JSON."""
     result = table("verify", built, RIG, "--samples", "3")
     assert result.exit_code == 0
-    rows = [line for line in result.stdout.splitlines() if line.endswith("holds")]
-    assert len(rows) == 6
-    assert "6 of 6 hold (seed 0)" in result.stdout
-
-
-def test_verify_finds_a_false_table_out(built: Path, tmp_path: Path) -> None:
-    """One ERA's field a tenth stronger, the checksum right: status 1, in JSON as well."""
+    assert sum(line.endswith("passed") for line in result.stdout.splitlines()) == 6
     true = load_table(built)
     stronger = true.acceleration.copy()
     stronger[:, :, 2] *= 1.1
-    save_table(replace(true, acceleration=stronger), tmp_path / "false.npz")
-    result = table("verify", tmp_path / "false.npz", RIG, "--samples", "3")
+    false = tmp_path / "false.npz"
+    save_table(replace(true, acceleration=stronger), false)
+    result = table("verify", false, RIG, "--samples", "3")
     assert result.exit_code == 1
-    assert "MISS" in result.stdout
     assert result.stdout.splitlines()[-1].startswith("Next: era table build")
-    told = table("verify", tmp_path / "false.npz", RIG, "--samples", "3", "--json")
-    assert told.exit_code == 1
-    assert json.loads(told.stdout)["misses"] > 0
+    result = table("verify", false, RIG, "--samples", "3", "--json")
+    assert result.exit_code == 1
+    assert json.loads(result.stdout)["misses"] > 0
 
 
-def test_verify_refuses_another_plate_first(built: Path, tmp_path: Path) -> None:
-    """A rig of another thickness: its fingerprint is told before anything is computed."""
+def test_verify_refuses_another_plate_and_swapped_files(built: Path, tmp_path: Path) -> None:
+    """A rig of another thickness; the rig in the table's place."""
     other = tmp_path / "other.yaml"
     other.write_text(Path(RIG).read_text().replace("1.5 mm", "1.6 mm"))
-    with pytest.raises(InputError, match="another plate"):
+    with pytest.raises(InputError, match="fingerprint"):
         table("verify", built, other)
-    with pytest.raises(InputError, match="the table comes first, then the rig"):
+    with pytest.raises(InputError, match=f"era table verify {built} {RIG}"):
         table("verify", RIG, built)
 
 
-def test_contacts_that_cannot_be_read_are_told_by_their_option(built: Path) -> None:
-    """No target at all, and one with a unit."""
-    with pytest.raises(InputError, match=r"with --target X,Y, metres, or .* --batch FILE"):
-        table("query", built, "--quiet", "0.1,0.1")
-    with pytest.raises(InputError, match=r"--target '9cm,8cm' .* metres without a unit"):
-        table("query", built, "--target", "9cm,8cm")
+@pytest.mark.parametrize(
+    ("options", "named"),
+    [
+        (["--quiet", "0.1,0.1"], "--target"),
+        (["--target", "9cm,8cm"], "--target"),
+        (["--target", "0.1"], "--target"),
+        (["--target", "0.1,nan"], "--target"),
+        (["--target", "0.9,0.1"], "target"),
+        (["--target", "0.1,0.1", "--quiet", "0.1,0.1"], "quiet"),
+        (["--target", "0.1,0.1", "--mode", "loud"], "mode"),
+        (["--batch", "b.jsonl", "--target", "0.1,0.1"], "--batch"),
+        (["--batch", "b.jsonl"], "--batch"),
+    ],
+)
+def test_query_names_the_option_that_is_wrong(built: Path, options: list[str], named: str) -> None:
+    """Contacts that cannot be read or are off the plate, unknown modes, files that are missing."""
+    with pytest.raises(InputError, match=named):
+        table("query", built, *options)
 
 
-def test_a_build_that_is_interrupted_at_once_names_no_folder(tmp_path: Path, monkeypatch) -> None:
-    """Nothing is kept yet, so nothing goes on."""
+def test_query_refuses_an_unreachable_level(built: Path) -> None:
+    """99 dB SL is beyond full stroke."""
+    with pytest.raises(UnreachableLevel):
+        table("query", built, "--target", "0.1,0.1", "--level", "99")
 
-    def interrupted(*arguments: object, **options: object) -> None:
-        raise KeyboardInterrupt
 
-    monkeypatch.setattr("model.table.build.build_in_parts", interrupted)
-    outcome = CliRunner().invoke(
-        app, ["table", "build", RIG, "-o", str(tmp_path / "t.npz"), *QUICK]
-    )
-    assert "interrupted; nothing was done yet" in outcome.stderr
-    assert ".parts" not in outcome.stderr
+def test_query_prints_levels_and_contrast(built: Path) -> None:
+    """One row per driven ERA, then measures; other ones without quiet fingers."""
+    contacts = ["--target", "0.08,0.06", "--quiet", "0.22,0.16"]
+    answer = as_json("query", built, *contacts)
+    lines = table("query", built, *contacts).stdout.splitlines()
+    assert [line.split()[0] for line in lines[: len(answer["drive"])]] == list(answer["drive"])
+    assert f"{answer['contrast_db']:.1f} dB" in lines[len(answer["drive"]) + 1]
+    alone = table("query", built, "--target", "0.08,0.06").stdout
+    assert "cm²" in alone
 
 
 def test_plot_writes_its_pictures(built: Path, tmp_path: Path) -> None:
-    """Four of them in a new folder; the names are told."""
+    """Four of them in a new folder, named in the answer; a command comes last."""
     folder = tmp_path / "new" / "pictures"
     answer = as_json("plot", built, "-o", folder)
     names = ["weak_cells", "levels", "contrast", "answer"]
     assert answer["files"] == [str(folder / f"{name}.png") for name in names]
     for file in answer["files"]:
         assert Path(file).read_bytes().startswith(PNG)
-
-
-def test_plot_says_how_long_it_took_what_it_wrote_and_what_is_next(
-    built: Path, tmp_path: Path
-) -> None:
-    """The time, a line for each of the four pictures, and a command."""
-    lines = table("plot", built, "-o", tmp_path).stdout.splitlines()
-    assert re.fullmatch(r"\d+\.\d s; wrote", lines[0])
-    assert {Path(line.strip()) for line in lines[1:5]} == set(tmp_path.glob("*.png"))
+    lines = table("plot", built, "-o", folder).stdout.splitlines()
+    assert {Path(line.strip()) for line in lines[1:5]} == set(folder.glob("*.png"))
     assert lines[5:] == [f"Next: era table show {built} --weak"]
 
 
 def test_export_writes_both_formats(built: Path, tmp_path: Path) -> None:
-    """The file and how to open it are told; --content is for CSV only."""
-    said = table("export", built, "--format", "mat", "-o", tmp_path / "t.mat").stdout
-    assert "loadmat" in said.splitlines()[-1]
+    """A .mat file, and .csv files of patterns or fields; --content is for .csv only."""
+    table("export", built, "--format", "mat", "-o", tmp_path / "t.mat")
     table("export", built, "--format", "csv", "-o", tmp_path / "t.csv")
     table("export", built, "--format", "csv", "--content", "fields", "-o", tmp_path / "f.csv")
     heads = [(tmp_path / name).read_text().split(",")[0] for name in ("t.csv", "f.csv")]
@@ -258,20 +267,22 @@ def test_export_writes_both_formats(built: Path, tmp_path: Path) -> None:
         table("export", built, "--format", "mat", "--content", "fields", "-o", tmp_path / "t.mat")
 
 
-def test_a_rig_is_not_taken_for_a_table_nor_replaced_by_one(tmp_path: Path) -> None:
-    """Neither build nor export writes over a file of another kind; asking says what it is not."""
+def test_table_commands_do_not_replace_or_read_other_files(built: Path, tmp_path: Path) -> None:
+    """Neither build nor export overwrites a file of another kind; a rig cannot be queried."""
     rig = tmp_path / "rig.yaml"
     rig.write_bytes(Path(RIG).read_bytes())
-    made = tmp_path / "t.npz"
-    table("build", RIG, "-o", made, *QUICK)
+    disguised = tmp_path / "rig.npz"
+    disguised.write_bytes(rig.read_bytes())
     for arguments in (
         ("build", RIG, "-o", rig, *QUICK),
-        ("export", made, "--format", "csv", "-o", rig),
-        ("export", made, "--format", "mat", "-o", tmp_path / "t.csv"),
+        ("build", RIG, "-o", disguised, *QUICK),
+        ("export", built, "--format", "csv", "-o", rig),
+        ("export", built, "--format", "mat", "-o", tmp_path / "t.csv"),
+        ("query", rig, "--target", "0.1,0.1"),
     ):
-        with pytest.raises(InputError, match=r"ends in \.(npz|csv|mat); try "):
+        with pytest.raises(InputError):
             table(*arguments)
-    with pytest.raises(InputError, match="give a file that era table build has written"):
-        table("query", rig, "--target", "0.1,0.1")
-    assert rig.read_bytes() == Path(RIG).read_bytes()
-    table("build", RIG, "-o", made, *QUICK)  # a table gives way to a newer one
+    assert rig.read_bytes() == disguised.read_bytes() == Path(RIG).read_bytes()
+    newer = tmp_path / "t.npz"
+    newer.write_bytes(built.read_bytes())
+    table("build", RIG, "-o", newer, *QUICK)  # replaces an older table

@@ -9,7 +9,7 @@ import pytest
 from model.errors import InputError
 from model.finger.grid import Grid
 from model.table.build import build_table
-from model.table.summary import alike_share, contrast_distribution, summarize
+from model.table.summary import contrast_distribution, similar_share, summarize
 from model.table.weak_cells import WeakCells, find_weak_cells, map_grid, text_map
 from paper_plate import make_paper_rig
 from small_table import small_table
@@ -185,9 +185,9 @@ def test_alike_patterns_are_counted(table):
     row = table.cell_sources[0]
     copies = np.tile(row, (len(table.cell_sources), 1))
     copies[-1] = 0  # nothing driven beside the first source
-    assert alike_share(replace(table, cell_sources=copies)) == 1.0
+    assert similar_share(replace(table, cell_sources=copies)) == 1.0
     rng = np.random.default_rng(0)
     noise = rng.uniform(0, 1, copies.shape).astype(np.float32)
-    assert alike_share(replace(table, cell_sources=noise)) < 0.02
+    assert similar_share(replace(table, cell_sources=noise)) < 0.02
     single = replace(table, grid=Grid(1, 1), cell_sources=noise[:, :1])
-    assert alike_share(single) is None
+    assert similar_share(single) is None

@@ -140,7 +140,7 @@ async def test_a_link_that_is_cut_leaves_silence_and_is_told(far: FarSide, kind:
         # Three unanswered requests of one heartbeat each, whatever the machine adds to that.
         assert asked.timeouts <= MAX_MISSED_HEARTBEATS
         assert time.monotonic() - cut < 10
-        with pytest.raises(LinkError, match="energised until its watchdog"):
+        with pytest.raises(LinkError, match="watchdog"):
             await link.amplifier.apply(link.tone())
         await eventually(lambda: far.silent_from() < math.inf)
         assert far.silent_from() - max(fed, fed_at(far)) <= WATCHDOG + REACTION + 1e-9
@@ -443,7 +443,7 @@ async def test_another_amplifier_is_refused(far: FarSide) -> None:
         await link.amplifier.close()
         own = far.amplifier.identity
         far.amplifier.identity = type(own)(own.vendor, own.product, "OTHER", own.firmware, 1)
-        with pytest.raises(LinkError, match="SIM-main, got OTHER"):
+        with pytest.raises(LinkError, match="OTHER"):
             await reconnect(link.amplifier, tries=3, pause=0.0)
         assert link.amplifier.is_lost
 

@@ -33,7 +33,7 @@ async def test_the_second_user_of_an_address_is_refused_and_the_first_undisturbe
     second = Amplifier(open_backend(far.url), reply_timeout=PATIENT)
     await first.open()
     await first.arm(2.0)
-    with pytest.raises(LinkError, match="already open in this program"):
+    with pytest.raises(LinkError):
         await second.open()
     assert (await first.heartbeat()).state is AmplifierState.OPERATION_ENABLED
     await first.close()
@@ -69,7 +69,7 @@ async def test_over_tcp_only_one_program_arms_and_any_may_stop(coarse_rig: Rig) 
             assert (await amplifier.status()).state is AmplifierState.SWITCH_ON_DISABLED
             assert (await amplifier.stop()).state is not AmplifierState.OPERATION_ENABLED
             await amplifier.clear()
-            with pytest.raises(LinkError, match="another program on this machine drives"):
+            with pytest.raises(LinkError, match=r"127\.0\.0\.1"):
                 await amplifier.arm(2.0)
         await amplifier.close()
         await amplifier.open()

@@ -40,7 +40,6 @@ async def test_a_second_daemon_is_refused_and_disturbs_nothing(tmp_path: Path) -
         (tmp_path / "other.yaml").write_text(text.replace("era.sock", "b.sock"), "utf-8")
         status, _, err = await run_era("daemon", tmp_path / "other.yaml")
         assert status == 3
-        assert "the daemon ends: " in err
         assert "Traceback" not in err
         assert (await era.status()).state == "OPERATION_ENABLED"
         await until(lambda: any(far.device.status().levels))
@@ -59,14 +58,14 @@ async def test_the_commands_do_what_they_say(tmp_path: Path) -> None:
             *(ERA, "arm", "--lease", "2", *map(str, where)), stdout=asyncio.subprocess.PIPE
         )
         assert arming.stdout is not None
-        assert b"armed until Ctrl-C" in await asyncio.wait_for(arming.stdout.readline(), PATIENCE)
+        assert await asyncio.wait_for(arming.stdout.readline(), PATIENCE)
         status, out, _ = await run_era("touch", "0.1,0.1", "0.25,0.2", "--for", 0.5, *where)
         assert status == 0
-        assert "target 20.0 dB SL" in out
-        assert "effect buzz" in out
+        assert "20.0 dB SL" in out
+        assert "buzz" in out
         status, _, err = await run_era("arm", "--once", *where)
         assert status == 1
-        assert "armed by 'era arm'" in err
+        assert "'era arm'" in err
         arming.send_signal(signal.SIGINT)
         assert await asyncio.wait_for(arming.wait(), PATIENCE) == 0
         async with await daemon.client() as era:
@@ -85,13 +84,12 @@ async def test_the_commands_do_what_they_say(tmp_path: Path) -> None:
         await asyncio.wait_for(arming.stdout.readline(), PATIENCE)
         async with await daemon.client() as era:
             await era.disarm()
-        _, told = await asyncio.wait_for(arming.communicate(), PATIENCE)
+        _, said = await asyncio.wait_for(arming.communicate(), PATIENCE)
         assert arming.returncode == 1
-        assert b"not armed any more, " in told
-        assert b"disarmed by 'test'" in told or b"all amplifiers are sound" in told
+        assert b"READY_TO_SWITCH_ON" in said or b"SWITCH_ON_DISABLED" in said
     status, _, err = await run_era("status", *where)
     assert status == 3
-    assert "no daemon runs at" in err
+    assert str(daemon.socket) in err
 
 
 async def test_systemd_hears_of_it_and_metrics_are_served(tmp_path: Path) -> None:
@@ -182,7 +180,7 @@ async def test_check_touches_no_amplifier(tmp_path: Path) -> None:
         path = write_daemon(tmp_path, {"main": far.url}, "table: table.npz\n")
         status, out, _ = await run_era("daemon", path, "--check")
         assert (status, far.device.status().token) == (0, 0)
-        assert "good" in out
+        assert str(path) in out
         (tmp_path / "table.npz").write_bytes(b"no table")
         status, _, err = await run_era("daemon", path, "--check")
         assert status == 2

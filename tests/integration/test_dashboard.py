@@ -6,6 +6,7 @@ and asks the daemon itself what came of it.
 
 import asyncio
 import logging
+import re
 from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
 
@@ -19,6 +20,7 @@ from controller.effects.layout_kind import LAYOUT
 from daemon_bench import PATIENCE
 from dashboard_pictures import (
     PLACES,
+    REASON,
     SCREENS,
     STATE,
     Screen,
@@ -130,9 +132,7 @@ async def test_the_page_shows_the_rig_without_a_complaint(page: Page) -> None:
     """Its ERAs and regions, a banner that all is simulated, its amplifier; nothing in the console,
     and nothing was asked of anybody but the gateway.
     """
-    assert await page.evaluate("document.querySelector('#banner').innerText") == (
-        "Simulated amplifiers: nothing vibrates."
-    )
+    assert await page.evaluate(REASON) == "simulated"
     names = await page.evaluate(
         "[...document.querySelectorAll('#overlay text')].map(e => e.textContent)"
     )
@@ -190,9 +190,11 @@ async def test_a_finger_while_nobody_has_armed_is_told_why_it_feels_nothing(
     """For as long as it is down, and what is to be done in the state that it is in by then."""
     summary = "document.querySelector('#summary').textContent"
     async with fingers_down(page, PLACES[0]):
-        await page.until(f"{summary} === 'silent: arm to feel touches'")
+        disarmed = await page.until(summary)
         era.stop()
-        await page.until(f"{summary} === 'silent: clear, then arm to feel touches'")
+        stopped = await page.until(summary, lambda text: text not in ("", disarmed))
+        assert " clear" not in disarmed
+        assert " clear" in stopped
     await page.until(f"{summary} === ''")
 
 
@@ -206,20 +208,20 @@ async def test_fingers_on_the_glass_are_the_daemons_contacts(page: Page, era: Cl
             assert y == pytest.approx((1 - down) * WIDTH, abs=1e-3)
         await page.until("document.querySelectorAll('.contact').length === 2")
         await page.until("document.querySelectorAll('.contact.target').length === 1")
-        summary = await page.until(
-            "document.querySelector('#summary').textContent", lambda text: "dB over" in text
+        await page.until(
+            "document.querySelector('#summary').textContent",
+            lambda text: re.search(r"\b2\b.* dB SL.* dB ", text) is not None,
         )
-        assert summary.startswith("2 fingers: target: ")
         await page.touch("touchMove", await on_plate(page, (0.2, 0.7), (0.6, 0.5)))
         await asyncio.to_thread(
             wait_for, lambda: abs(era.status().contacts[1].x_m - 0.6 * LENGTH) < 1e-3
         )
     assert await contacts(era, 0) == []
     await page.until("document.querySelectorAll('.contact').length === 0")
-    told = await page.until(
-        "document.querySelector('#latency-numbers').textContent", lambda text: "median" in text
+    await page.until(
+        "document.querySelector('#latency-numbers').textContent",
+        lambda text: re.search(r"\d ms", text) is not None,
     )
-    assert " ms" in told
     assert await page.evaluate("document.querySelectorAll('#latency rect').length") > 5
     assert page.complaints == []
 
@@ -301,10 +303,9 @@ async def test_arm_disarm_stop_and_clear_by_their_buttons(page: Page, era: Clien
     await page.click("#stop")
     await until_state(era, STOPPED)
     await page.until(f"{enabled}.join()", lambda text: text == "clear,stop")
-    event = await page.until(
-        "document.querySelector('#log li')?.innerText", lambda text: "stopped" in text
+    await page.until(
+        "document.querySelector('#log li')?.innerText", lambda text: "era clear" in text
     )
-    assert "clear (era clear), then arm again" in event
     await page.click("#clear")
     await until_state(era, READY)
     assert page.complaints == []
@@ -546,14 +547,12 @@ async def test_an_effect_plays_at_the_newest_finger(page: Page, era: Client) -> 
     async with fingers_down(page, PLACES[0]):
         await contacts(era, 1)
         await page.until("document.querySelectorAll('.contact').length")
-        await page.click("#effects button[title^=As]")
+        await page.click("#effects button")
         await page.until("document.querySelectorAll('.contact.target').length")
         assert await page.evaluate("document.querySelector('#problem').innerText") == ""
     await contacts(era, 0)
-    await page.click("#effects button[title^=As]")
-    await page.until(
-        "document.querySelector('#problem').innerText", lambda text: "no finger within" in text
-    )
+    await page.click("#effects button")
+    await page.until("document.querySelector('#problem').innerText")
 
 
 async def test_an_event_that_is_told_again_takes_one_line(page: Page) -> None:
@@ -605,46 +604,37 @@ async def test_the_door_lets_in_with_the_token_alone(
         if shown == "#main":
             await tab.until("document.querySelector('#main')?.hidden === false")
         else:
-            await tab.until(
-                "document.querySelector('#login-problem')?.innerText",
-                lambda text: "refuses the token" in (text or ""),
-            )
+            await tab.until("document.querySelector('#login-problem')?.innerText")
             door = await tab.evaluate("document.querySelector('#login').innerText")
             for command in ("era gateway", "era daemon", "era demo --dashboard"):
                 assert command in door  # one of them has printed where to look
-            # It answers: whoever reads that it does not looks for the wrong thing.
-            banner = await tab.evaluate("document.querySelector('#banner').innerText")
-            assert "refuses the token" in banner
+            assert await tab.evaluate(REASON) == "gateway-refused"
 
 
 async def test_it_comes_back_after_gateway_and_daemon(tab: Page, tmp_path: Path) -> None:
     """Each is taken away and started again: the page says so, and goes on by itself."""
-    banner = "document.querySelector('#banner').innerText"
     with gateway_process(tmp_path, tmp_path / "era.sock") as first:
         with real_daemon(tmp_path):
             await open_dashboard(tab, first, DESKTOP)
-        await tab.until(banner, lambda text: "daemon does not respond" in text)
+        await tab.until(f"{REASON} === 'daemon-unreachable'")
         assert await tab.evaluate("document.querySelector('#arm').disabled") is True
         with real_daemon(tmp_path):
             await tab.until(f"{STATE} === 'READY_TO_SWITCH_ON'")
             port = first.port
             first.process.kill()
-            await tab.until(banner, lambda text: "gateway does not respond" in text)
+            await tab.until(f"{REASON} === 'gateway-unreachable'")
             await tab.press(" ", "Space")
-            await tab.until(
-                "document.querySelector('#problem').innerText", lambda text: "off by hand" in text
-            )
+            await tab.until("document.querySelector('#problem').innerText")
             listen = ("--listen", f"127.0.0.1:{port}")
             with gateway_process(tmp_path, tmp_path / "era.sock", *listen):
                 await tab.until(f"{STATE} === 'READY_TO_SWITCH_ON'")
-                await tab.until(banner, lambda text: "Simulated" in text)
+                await tab.until(f"{REASON} === 'simulated'")
                 # Either loss is one event, followed by the return.
                 await tab.until(
-                    "[...document.querySelectorAll('#log li')].map(e => e.innerText)"
-                    ".filter(text => /does not respond/.test(text))",
-                    lambda losses: (
-                        len(losses) == 2 and all("reconnected" in each for each in losses)
-                    ),
+                    "[...document.querySelectorAll('#log li')]"
+                    ".filter(e => e.querySelector('.error'))"
+                    ".map(e => e.querySelectorAll('.follows').length)",
+                    lambda follows: sum(count > 0 for count in follows) == 2,
                 )
                 await tab.press(" ", "Space")  # delivered: what was complained of is over
                 await tab.until("!document.querySelector('#problem').innerText")

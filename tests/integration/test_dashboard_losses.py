@@ -1,6 +1,5 @@
 """The dashboard in a real browser when something is lost: what it still knows, and no more."""
 
-import json
 from collections.abc import AsyncIterator
 from itertools import pairwise
 from pathlib import Path
@@ -14,7 +13,7 @@ from controller.api.schema import DaemonStateName, LatencySummary
 from controller.api.topics import LatencyEvent, StateEvent
 from controller.gateway.app import MAX_SESSIONS
 from daemon_bench import running_daemon, until_state
-from dashboard_pictures import SCREENS, STATE, open_dashboard
+from dashboard_pictures import REASON, SCREENS, STATE, open_dashboard
 from gateway_bench import RawWebSocket, ScriptedDaemon, gateway_process
 from sim.faults.fault_window import FaultWindow
 
@@ -23,6 +22,7 @@ pytestmark = pytest.mark.asyncio(loop_scope="module")
 DESKTOP = SCREENS[0]
 BANNER = "document.querySelector('#banner').innerText"
 EVENTS = "[...document.querySelectorAll('#log li')].map(e => e.innerText)"
+FOLLOWS = "document.querySelectorAll('#log li:first-child .follows').length"
 TILE = "document.querySelector('.tile')?.innerText ?? ''"
 PROBES = (Path(dashboard_pictures.__file__).with_name("page_probes.js")).read_text(encoding="utf-8")
 
@@ -54,29 +54,26 @@ async def test_a_lost_link_is_one_event_with_what_has_come_of_it(tab: Page, tmp_
             before = await tab.evaluate(EVENTS)
             bench.far.device.inject_fault(FaultWindow("hang"))
             await tab.until(f"{STATE} === 'COMM_LOST'")
-            told = await tab.until(BANNER, lambda text: "watchdog" in text)
-            assert "its watchdog silences it after 0.25\u00a0s, unconfirmed" in told
-            assert "(since " in told
-            assert "may still be energised" in told
-            tile = await tab.until(TILE, lambda text: "no link" in text)
-            assert "channels: unknown" in tile
+            assert await tab.evaluate(REASON) == "link-lost"
+            await tab.until(BANNER, lambda text: "0.25\u00a0s" in text)
+            await tab.until("document.querySelector('.tile.bad') !== null")
+            tile = await tab.evaluate(TILE)
             assert "%" not in tile
             assert "°C" not in tile
             assert await tab.evaluate("document.querySelector('.plate.unknown') !== null")
             ratios = await tab.evaluate(f"({PROBES}).contrasts()")
             assert [each for each in ratios if each[0] < 4.5] == []
-            retried = await tab.until(EVENTS, lambda events: "retry 2" in events[0])
+            await tab.until(f"{FOLLOWS} > 1")
+            retried = await tab.evaluate(EVENTS)
             assert retried[1:] == before
-            assert "link lost: amplifier main: no answer" in retried[0]
-            assert "check cables and supply" in retried[0]
             bench.far.device.recover()
             await tab.until(f"{STATE} === 'READY_TO_SWITCH_ON'")
-            back = await tab.until(EVENTS, lambda events: "reconnected" in events[0])
+            back = await tab.evaluate(EVENTS)
             assert back[1:] == before
-            assert "retry" not in back[0]
-            assert "check cables" not in back[0]
-            assert "may still be energised" not in await tab.evaluate(BANNER)
-            assert "%" in await tab.until(TILE, lambda text: "no link" not in text)
+            assert await tab.evaluate(f"{FOLLOWS} === 1")
+            assert await tab.evaluate(REASON) == "simulated"
+            await tab.until("document.querySelector('.tile.bad') === null")
+            assert "%" in await tab.evaluate(TILE)
 
 
 async def test_a_daemon_that_ends_without_a_link_is_not_said_to_have_it_back(
@@ -93,8 +90,8 @@ async def test_a_daemon_that_ends_without_a_link_is_not_said_to_have_it_back(
         for (old, _), (new, cause) in pairwise(states):
             daemon.publish("state", StateEvent(old=old, new=new, cause=cause, remedy=None))
             events = await tab.until(EVENTS, lambda events, cause=cause: cause in events[0])
-    assert "not ready: told to end" in events[0]
-    assert events[1].endswith("link lost: amplifier main: cut")
+    assert "told to end" in events[0]
+    assert events[1].endswith("amplifier main: cut")
 
 
 async def test_why_onsets_are_plain_is_said_for_as_long_as_they_are(
@@ -106,33 +103,35 @@ async def test_why_onsets_are_plain_is_said_for_as_long_as_they_are(
     with ScriptedDaemon(tmp_path) as daemon, gateway_process(tmp_path, daemon.socket) as gateway:
         await open_dashboard(tab, gateway, DESKTOP)
         for because, shown in (
-            ("loading took 50 ms", "Plain ramps instead of shaped onsets: loading took 50 ms"),
+            ("loading took 50 ms", "loading took 50 ms"),
             (None, ""),
         ):
             daemon.publish("latency", LatencyEvent(latency_ms=summary, plain_because=because))
-            await tab.until(f"{plain} === {json.dumps(shown)}")
+            await tab.until(
+                plain, lambda text, shown=shown: text.endswith(shown) and bool(text) == bool(shown)
+            )
 
 
 async def test_the_banner_says_how_it_is_with_the_gateway_now(tab: Page, tmp_path: Path) -> None:
     """Refused for the token, gone, there with the right token again: whatever was before."""
 
-    async def until_said(words: str) -> None:
-        await tab.until(BANNER, lambda text: words in text)
+    async def until_shown(reason: str) -> None:
+        await tab.until(f"{REASON} === '{reason}'")
 
     daemon = tmp_path / "none.sock"
     with gateway_process(tmp_path, daemon) as first:
         await tab.show(f"{first.url}#token={first.token}")
-        await until_said("The daemon does not respond")
+        await until_shown("daemon-unreachable")
         listen = ("--listen", f"127.0.0.1:{first.port}")
         first.terminate()
     with gateway_process(tmp_path, daemon, *listen, token="another-token-than-before"):
-        await until_said("The gateway refuses the token")
+        await until_shown("gateway-refused")
         assert await tab.evaluate("!document.querySelector('#login').hidden")
-    await until_said("The gateway does not respond (since ")
+    await until_shown("gateway-unreachable")
     assert await tab.evaluate("document.querySelector('#login').hidden")
     with gateway_process(tmp_path, daemon, *listen):
-        await until_said("The daemon does not respond")
-    await until_said("The gateway does not respond")
+        await until_shown("daemon-unreachable")
+    await until_shown("gateway-unreachable")
 
 
 async def test_a_gateway_without_room_is_not_said_to_be_gone(tab: Page, tmp_path: Path) -> None:
@@ -140,8 +139,8 @@ async def test_a_gateway_without_room_is_not_said_to_be_gone(tab: Page, tmp_path
     with gateway_process(tmp_path, tmp_path / "none.sock") as gateway:
         others = [RawWebSocket(gateway) for _ in range(MAX_SESSIONS)]
         await tab.show(f"{gateway.url}#token={gateway.token}")
-        await tab.until(BANNER, lambda text: "too many clients" in text)
+        await tab.until(f"{REASON} === 'gateway-full'")
         others.pop().connection.close()
-        await tab.until(BANNER, lambda text: "daemon does not respond" in text)
+        await tab.until(f"{REASON} === 'daemon-unreachable'")
         for other in others:
             other.connection.close()

@@ -139,9 +139,9 @@ async def test_what_cannot_be_checked_is_said(tmp_path: Path) -> None:
     rig = write_rig(tmp_path / "rig.yaml", mesh=MESH)
     nobody = ("--sensors", str(tmp_path / "no"))
     for kind, words, options in (
-        (InputError, "--measured FILE", ()),
-        (InputError, "--measured FILE", (*nobody, "--measured", "x.csv")),
-        (LinkError, str(tmp_path / "no"), nobody),
+        (InputError, "--measured", ()),
+        (InputError, "--measured", (*nobody, "--measured", "x.csv")),
+        (LinkError, "--sensors|--measured", nobody),
         (InputError, "--level", (*nobody, "--level", "0.5")),
         (InputError, "limits.frequency", (*nobody, "--frequencies", "10,20")),
         (InputError, "got side=x", (*nobody, "--url", "side=x")),

@@ -36,6 +36,8 @@ SCREENS = (
     Screen("small_phone", 320, 568, is_phone=True),
 )
 STATE = "document.querySelector('#state')?.dataset.state"
+REASON = "document.querySelector('#banner')?.dataset.reason"
+"""Why the banner is shown."""
 PLACES = ((0.2, 0.7), (0.72, 0.74))
 """On the keypad and on the knob of the example's layout, as `on_plate` has it."""
 

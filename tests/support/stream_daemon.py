@@ -79,7 +79,7 @@ async def running_daemon(
     reading = asyncio.create_task(_read(process.stderr, log))
     try:
         end = time.monotonic() + PATIENCE
-        while not any("serving at" in line for line in log):
+        while not (folder / "era.sock").is_socket():
             if process.returncode is not None:
                 raise DidNotStart(process.returncode, log)
             assert time.monotonic() < end, log

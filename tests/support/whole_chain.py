@@ -28,6 +28,7 @@ from touch_stream import Stream, play_stream
 POLL = 0.01  # s
 ATTEMPTS = 8
 PROMPT = 0.1  # s; from touch to pattern event, on an idle machine
+LOADING_LOGGER = "controller.loop.loading_times"
 FREQUENCY_LIMITS, LEVEL_LIMIT = (40.0, 500.0), 1.0  # Hz; of the example's rig, written by hand
 
 Polls: TypeAlias = list[tuple[float, list[float]]]
@@ -95,7 +96,7 @@ class Chain:
             0 if self.witness is None else self.witness.frames,
             status,
             state,
-            any("from now on there are plain ramps" in line for line in self.daemon.log),
+            any(LOADING_LOGGER in line for line in self.daemon.log),
         )
 
     def _found(self, since: float) -> list[Violation]:

@@ -96,15 +96,25 @@ function showBanner() {
   const since = lostSince ? ` (since ${timeOfDay(lostSince)})` : "";
   const warning = "Amplifiers may still be energised.";
   let text = "";
-  if (!connection?.isOpen) text = `${FAILURES[failure][0]}${failure === "unreachable" ? since : ""}. ${warning}`;
-  else if (daemon === null) text = `The daemon does not respond${since}. ${warning}`;
-  else if (state === "COMM_LOST") {
+  let reason = "";
+  if (!connection?.isOpen) {
+    reason = `gateway-${failure}`;
+    text = `${FAILURES[failure][0]}${failure === "unreachable" ? since : ""}. ${warning}`;
+  } else if (daemon === null) {
+    reason = "daemon-unreachable";
+    text = `The daemon does not respond${since}. ${warning}`;
+  } else if (state === "COMM_LOST") {
+    reason = "link-lost";
     text = `The link to an amplifier is lost${since}. It may still be energised`;
     text += watchdog ? `; its watchdog silences it after ${watchdog}\u00a0s, unconfirmed.` : ".";
-  } else if (daemon?.rig.simulated) text = "Simulated amplifiers: nothing vibrates.";
+  } else if (daemon?.rig.simulated) {
+    reason = "simulated";
+    text = "Simulated amplifiers: nothing vibrates.";
+  }
   at("banner").hidden = !text;
   at("banner").textContent = text;
-  at("banner").classList.toggle("grave", !text.startsWith("Simulated"));
+  at("banner").dataset.reason = reason;
+  at("banner").classList.toggle("grave", reason !== "simulated");
 }
 
 function showState(next, cause) {

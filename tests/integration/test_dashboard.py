@@ -633,8 +633,8 @@ async def test_it_comes_back_after_gateway_and_daemon(tab: Page, tmp_path: Path)
                 await tab.until(
                     "[...document.querySelectorAll('#log li')]"
                     ".filter(e => e.querySelector('.error'))"
-                    ".map(e => e.querySelectorAll('.follows').length)",
-                    lambda follows: sum(count > 0 for count in follows) == 2,
+                    ".map(e => e.querySelectorAll('.note').length)",
+                    lambda notes: sum(count > 0 for count in notes) == 2,
                 )
                 await tab.press(" ", "Space")  # delivered: what was complained of is over
                 await tab.until("!document.querySelector('#problem').innerText")

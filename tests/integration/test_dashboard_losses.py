@@ -22,7 +22,7 @@ pytestmark = pytest.mark.asyncio(loop_scope="module")
 DESKTOP = SCREENS[0]
 BANNER = "document.querySelector('#banner').innerText"
 EVENTS = "[...document.querySelectorAll('#log li')].map(e => e.innerText)"
-FOLLOWS = "document.querySelectorAll('#log li:first-child .follows').length"
+NOTES = "document.querySelectorAll('#log li:first-child .note').length"
 TILE = "document.querySelector('.tile')?.innerText ?? ''"
 PROBES = (Path(dashboard_pictures.__file__).with_name("page_probes.js")).read_text(encoding="utf-8")
 
@@ -63,14 +63,14 @@ async def test_a_lost_link_is_one_event_with_what_has_come_of_it(tab: Page, tmp_
             assert await tab.evaluate("document.querySelector('.plate.unknown') !== null")
             ratios = await tab.evaluate(f"({PROBES}).contrasts()")
             assert [each for each in ratios if each[0] < 4.5] == []
-            await tab.until(f"{FOLLOWS} > 1")
+            await tab.until(f"{NOTES} > 1")
             retried = await tab.evaluate(EVENTS)
             assert retried[1:] == before
             bench.far.device.recover()
             await tab.until(f"{STATE} === 'READY_TO_SWITCH_ON'")
             back = await tab.evaluate(EVENTS)
             assert back[1:] == before
-            assert await tab.evaluate(f"{FOLLOWS} === 1")
+            assert await tab.evaluate(f"{NOTES} === 1")
             assert await tab.evaluate(REASON) == "simulated"
             await tab.until("document.querySelector('.tile.bad') === null")
             assert "%" in await tab.evaluate(TILE)

@@ -59,6 +59,8 @@ class ApiServer:
         is_protected: Callable[[Connection], bool],
         clock: Callable[[], float] = clock.now,
     ) -> None:
+        if handlers.keys() != METHODS.keys():
+            raise ValueError(f"handlers must be those of METHODS, got {', '.join(handlers)}")
         self._handlers = handlers
         self._on_disconnect = on_disconnect
         self._is_protected = is_protected

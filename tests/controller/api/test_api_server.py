@@ -406,3 +406,9 @@ async def test_hub_coalesces_contacts_pattern_and_silence(served: Served) -> Non
     topics = [(await wire.line())["params"]["topic"] for _ in range(4)]  # type: ignore[index]
     assert topics == ["log", "log", "log", "silence"]
     assert made == 1
+
+
+def test_server_needs_a_handler_for_every_method() -> None:
+    """A missing one is found when the server is made."""
+    with pytest.raises(ValueError, match="METHODS"):
+        ApiServer({}, on_disconnect=lambda client: None, is_protected=lambda client: False)

@@ -44,9 +44,10 @@ def witness(
     ] = 20.0,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
-    """Check the traffic of amplifiers against the documented protocol; exit status 1 on violations.
+    """Check the traffic of amplifiers against the protocol.
 
-    Print a relay URL for each amplifier, to be used in its place, and check until Ctrl-C.
+    Print a relay URL for each amplifier, to be used in its place, and check until Ctrl-C. Exit
+    status 1 on violations.
     """
     from sim.witness.endpoint import parse_endpoint
     from sim.witness.witness import Witness

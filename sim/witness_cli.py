@@ -212,16 +212,16 @@ def _print(found: list["Violation"], checker: "Witness", *, as_json: bool) -> No
     if as_json:
         listed = [
             {
-                "invariant": one.invariant,
-                "wire": one.wire,
-                "time_s": one.time,
-                "sentence": one.sentence,
-                "frames": list(one.frames),
+                "invariant": violation.invariant,
+                "wire": violation.wire,
+                "time_s": violation.time,
+                "sentence": violation.sentence,
+                "frames": list(violation.frames),
             }
-            for one in found
+            for violation in found
         ]
         print(json.dumps({"frames": checker.frames, "violations": listed}))
         return
-    for one in found:
-        print(one)
+    for violation in found:
+        print(violation)
     print(f"{counted(checker.frames, 'frame')}, {counted(len(found), 'violation')}")

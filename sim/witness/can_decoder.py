@@ -218,13 +218,13 @@ class _Node:
         status, levels = self.status, self.levels
         self.status, self.levels = None, {}
         result = what >> 4
-        high_voltage = temperature = said = None
+        high_voltage = temperature = reported = None
         if status is not None and status[0] == sequence:
             _, flag, degrees, _, count = struct.unpack_from("<BBhHB", status)
             high_voltage, temperature = bool(flag & 1), degrees * 0.1
-            said = _levels(levels, count & 0x1F, sequence)
+            reported = _levels(levels, count & 0x1F, sequence)
         kind = _ACTIONS[what & 7]
-        is_whole = said is not None or result or kind in SETS
+        is_whole = reported is not None or result or kind in SETS
         return Reply(
             self.number,
             (self.number, sequence, kind),
@@ -238,7 +238,7 @@ class _Node:
                 watchdog_left=value(q.WATCHDOG_LEFT, left, "watchdog_left"),
                 high_voltage=high_voltage,
                 temperature=temperature,
-                levels=said,
+                levels=reported,
             ),
         )
 

@@ -195,10 +195,10 @@ class ReferenceAmplifier:
 
     def _cleared(self, reply: Reply) -> None:
         """Apply Clear, which may leave the state as it is."""
-        said = reply.status
-        if said is None:
+        reported = reply.status
+        if reported is None:
             self.state = None
-        elif said.state in _OFF and not (self.state == _REACTING and self._is_reported):
+        elif reported.state in _OFF and not (self.state == _REACTING and self._is_reported):
             self.state, self._fault = 1, 0
             self._outputs.cause = "Clear"
 
@@ -246,73 +246,77 @@ class ReferenceAmplifier:
         self.status_reported(Status(state, fault), time, time)
         self.is_answered = was_answered
 
-    def _check_condition(self, said: Status, begin: float, end: float) -> None:
+    def _check_condition(self, reported: Status, begin: float, end: float) -> None:
         if self.state is None:
-            self._adopt(said, end)
+            self._adopt(reported, end)
         else:
-            self._check_state(said, end)
+            self._check_state(reported, end)
         before, until = self._token_before
-        was_earlier = end <= until and said.token == before  # than a broadcast commit
-        if said.token is not None and not was_earlier:
-            if self._token not in (None, said.token):
+        was_earlier = end <= until and reported.token == before  # than a broadcast commit
+        if reported.token is not None and not was_earlier:
+            if self._token not in (None, reported.token):
                 self._report(
                     "token",
                     end,
-                    f"{self._name} reports active set {said.token}, expected {self._token}",
+                    f"{self._name} reports active set {reported.token}, expected {self._token}",
                 )
-            self._token = said.token
-        if said.watchdog_left is not None:
-            self._check_left(said.watchdog_left, said.state, begin, end)
-        if said.levels is not None:
+            self._token = reported.token
+        if reported.watchdog_left is not None:
+            self._check_left(reported.watchdog_left, reported.state, begin, end)
+        if reported.levels is not None:
             may_be_off = self._may_trip(end)
-            self._outputs.check_levels(said.levels, begin, end, may_be_off=may_be_off)
-        if said.high_voltage is not None:
-            must = {_ENABLED: True, _FAULT: False, **dict.fromkeys(_OFF, False)}.get(said.state)
-            if must is not None and must != said.high_voltage:
+            self._outputs.check_levels(reported.levels, begin, end, may_be_off=may_be_off)
+        if reported.high_voltage is not None:
+            must = {_ENABLED: True, _FAULT: False, **dict.fromkeys(_OFF, False)}.get(reported.state)
+            if must is not None and must != reported.high_voltage:
                 what = "off" if must else "on"
                 self._report(
                     "high_voltage",
                     end,
-                    f"{self._name} reports high voltage {what} in {NAMES[said.state]}",
+                    f"{self._name} reports high voltage {what} in {NAMES[reported.state]}",
                 )
 
-    def _adopt(self, said: Status, time: float) -> None:
+    def _adopt(self, reported: Status, time: float) -> None:
         """Adopt a reported status where the state is unknown."""
-        self.state, self._fault, self._is_reported = said.state, said.fault, True
-        if said.state in _SILENT:
-            self._outputs.settle(NAMES[said.state])
+        self.state, self._fault, self._is_reported = reported.state, reported.fault, True
+        if reported.state in _SILENT:
+            self._outputs.settle(NAMES[reported.state])
         else:
             self._outputs.set_unknown(math.inf)
             self.watchdog.feed((-math.inf, time))
 
-    def _check_state(self, said: Status, end: float) -> None:
-        here, now = self.state, said.state
+    def _check_state(self, reported: Status, end: float) -> None:
+        here, now = self.state, reported.state
         trips = now in (_REACTING, _FAULT) and here not in (None, *_OFF, _REACTING, _FAULT)
         states, until = self._states_before
         if end <= until and any(now in _possible_states(state) for state in states):
             return  # reported before the broadcast stop
         if trips:
             self.last_fault = end
-            self._check_trip(said, end)
+            self._check_trip(reported, end)
         elif now not in _possible_states(here or 0):
             self._report(self._rule_against(now), end, self._state_problem(now))
-        elif now in _LATCHED and self._fault and said.fault != self._fault:
+        elif now in _LATCHED and self._fault and reported.fault != self._fault:
             self._report(
-                "latched", end, f"{self._name} reports fault {said.fault} instead of {self._fault}"
+                "latched",
+                end,
+                f"{self._name} reports fault {reported.fault} instead of {self._fault}",
             )
         if now in (_REACTING, _FAULT):
-            self._fault = said.fault
+            self._fault = reported.fault
         self._outputs.resolve_suspicions(is_enabled=now not in (_REACTING, _FAULT))
         self.state, self._is_reported = now, True
 
-    def _check_trip(self, said: Status, end: float) -> None:
+    def _check_trip(self, reported: Status, end: float) -> None:
         """Check a transition into a fault: the watchdog not before its time."""
         since = (min(self._last_status, end), end)
-        if said.fault == 1:
+        if reported.fault == 1:
             self.watchdog.check_trip(end)
             since = (min(max(self.watchdog.expiry[0], self._last_status), end), end)
-        elif said.fault == 0:
-            self._report("state", end, f"{self._name} is in {NAMES[said.state]} without a fault")
+        elif reported.fault == 0:
+            self._report(
+                "state", end, f"{self._name} is in {NAMES[reported.state]} without a fault"
+            )
         self._silence(since, SILENCING_RAMP, "a fault")
 
     def _rule_against(self, now: int) -> str:

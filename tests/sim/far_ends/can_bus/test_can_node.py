@@ -11,31 +11,31 @@ from drivers.codec.can_bus.frame import CanFrame
 from drivers.protocol.messages import AmplifierState, Fault, Ping
 from sim.far_ends.can_bus.node import CanNode
 
-ORDER, ANSWER, SYNC = 0x481, 0x181, CanFrame(0x080, b"")
-BAD_VALUE, BAD_CHANNEL, WRONG_STATE, BAD_TOKEN, TORN = 3, 4, 5, 6, 15
+REQUEST, ANSWER, SYNC = 0x481, 0x181, CanFrame(0x080, b"")
+BAD_VALUE, BAD_CHANNEL, WRONG_STATE, BAD_TOKEN, INCOMPLETE = 3, 4, 5, 6, 15
 
 
 class Bench:
-    """A node 1 with four channels, in operation and armed; `said` since it was last asked."""
+    """A node 1 with four channels, in operation and armed; `sent` since the last request."""
 
     def __init__(self) -> None:
         self.device = FakeDevice()
-        self.said: list[CanFrame] = []
+        self.sent: list[CanFrame] = []
         self.timers = Timers()
-        self.node = CanNode(self.device, 1, send=self.said.append)  # type: ignore[arg-type]
+        self.node = CanNode(self.device, 1, send=self.sent.append)  # type: ignore[arg-type]
         self.node.start(self.timers.call_later)
 
     def tell(self, id: int, data: str) -> list[CanFrame]:
         """Let the node hear a frame; what it says."""
-        self.said.clear()
+        self.sent.clear()
         self.node.receive(CanFrame(id, bytes.fromhex(data)))
-        return list(self.said)
+        return list(self.sent)
 
     def sync(self) -> CanFrame:
         """A SYNC, and the one answer to it."""
-        (answer,) = self.tell(SYNC.id, "")
-        assert answer.id == ANSWER
-        return answer
+        (reply,) = self.tell(SYNC.id, "")
+        assert reply.id == ANSWER
+        return reply
 
     def result(self) -> int:
         """What the answer to a SYNC says."""
@@ -57,7 +57,7 @@ def bench() -> Bench:
     """In operation and armed for 250 ms by host 127."""
     bench = Bench()
     bench.tell(0x000, "01 01")
-    bench.tell(ORDER, "7F00 0000 FA00 04 01")
+    bench.tell(REQUEST, "7F00 0000 FA00 04 01")
     assert bench.state is AmplifierState.OPERATION_ENABLED
     return bench
 
@@ -68,48 +68,48 @@ def command(channel: int, sequence: int, *, level: int = 2000, flags: int = 0) -
 
 
 def apply(token: int, count: int, sequence: int, *, ramp: int = 0, action: int = 1) -> str:
-    """The eight bytes of an order with a set."""
+    """The eight bytes of a request with a set."""
     return struct.pack("<HHHBB", token, ramp, 0, action | count << 3, sequence).hex()
 
 
 def test_node_ignores_requests_before_start() -> None:
     """Pre-operational after boot-up: heartbeat and objects, but nothing that moves."""
     bench = Bench()
-    assert bench.said == [CanFrame(0x701, b"\x00")]
-    assert bench.tell(ORDER, "7F00 0000 FA00 04 01") == []
+    assert bench.sent == [CanFrame(0x701, b"\x00")]
+    assert bench.tell(REQUEST, "7F00 0000 FA00 04 01") == []
     assert bench.state is AmplifierState.SWITCH_ON_DISABLED
     assert len(bench.tell(0x601, "40 00 10 00 00000000")) == 1
     bench.tell(0x000, "01 02")  # another node
-    assert bench.tell(ORDER, "7F00 0000 FA00 04 01") == []
+    assert bench.tell(REQUEST, "7F00 0000 FA00 04 01") == []
     bench.tell(0x000, "01 00")  # all
-    assert bench.tell(ORDER, "7F00 0000 FA00 04 01")[-1].id == ANSWER
+    assert bench.tell(REQUEST, "7F00 0000 FA00 04 01")[-1].id == ANSWER
 
 
 def test_node_applies_a_set_at_sync(bench: Bench) -> None:
-    """Two commands and their order change nothing until SYNC; the answer says exact."""
+    """Two commands and their request change nothing until SYNC; the reply is exact."""
     for channel in (0, 2):
         assert bench.tell(0x201 + 0x100 * channel, command(channel, 2)) == []
-    assert bench.tell(ORDER, apply(9, 2, 2)) == []
+    assert bench.tell(REQUEST, apply(9, 2, 2)) == []
     assert not any(bench.levels)
-    answer = bench.sync()
-    assert answer.data[:2] == bytes([2, 1 | 1 << 3])
+    reply = bench.sync()
+    assert reply.data[:2] == bytes([2, 1 | 1 << 3])
     assert bench.levels == pytest.approx((0.2, 0.0, 0.2, 0.0))
 
 
 @pytest.mark.parametrize(
     "send",
     [
-        lambda bench: bench.tell(ORDER, apply(9, 2, 2)),  # one command of two
-        lambda bench: (bench.tell(0x301, command(1, 1)), bench.tell(ORDER, apply(9, 2, 2))),
-        lambda bench: None,  # the order itself is lost
+        lambda bench: bench.tell(REQUEST, apply(9, 2, 2)),  # one command of two
+        lambda bench: (bench.tell(0x301, command(1, 1)), bench.tell(REQUEST, apply(9, 2, 2))),
+        lambda bench: None,  # the request itself is lost
         lambda bench: (
             bench.tell(0x301, command(1, 2, flags=4)),  # shaped, but no slots come
-            bench.tell(ORDER, apply(9, 2, 2)),
+            bench.tell(REQUEST, apply(9, 2, 2)),
         ),
         lambda bench: (
             bench.tell(0x681, "0500 0000 0000 00 01"),  # slots of another set
             bench.tell(0x301, command(1, 2, flags=4)),
-            bench.tell(ORDER, apply(9, 2, 2)),
+            bench.tell(REQUEST, apply(9, 2, 2)),
         ),
     ],
 )
@@ -117,40 +117,40 @@ def test_node_refuses_an_incomplete_set(bench: Bench, send: Callable[[Bench], No
     """Missing frames or another sequence number: result incomplete, no output, nothing kept."""
     bench.tell(0x201, command(0, 2))
     send(bench)
-    assert bench.result() == TORN
+    assert bench.result() == INCOMPLETE
     assert not any(bench.levels)
-    bench.tell(ORDER, apply(9, 1, 2))  # what came before the SYNC is forgotten
-    assert bench.result() == TORN
+    bench.tell(REQUEST, apply(9, 1, 2))  # what came before the SYNC is forgotten
+    assert bench.result() == INCOMPLETE
 
 
 @pytest.mark.parametrize(
-    "next_order", [(ORDER, apply(0, 0, 3, action=0)), (0x480, apply(8, 0, 0, action=3))]
+    "next_request", [(REQUEST, apply(0, 0, 3, action=0)), (0x480, apply(8, 0, 0, action=3))]
 )
-@pytest.mark.parametrize("has_order", [False, True])
+@pytest.mark.parametrize("has_request", [False, True])
 def test_node_discards_a_set_without_sync(
-    bench: Bench, next_order: tuple[int, str], has_order: bool
+    bench: Bench, next_request: tuple[int, str], has_request: bool
 ) -> None:
-    """A set, with its order or without, then another order before a SYNC: none of it is left."""
+    """Commands, with or without their request, then another request before SYNC."""
     bench.tell(0x201, command(0, 2))
-    if has_order:
-        bench.tell(ORDER, apply(9, 1, 2))
-    bench.tell(*next_order)
+    if has_request:
+        bench.tell(REQUEST, apply(9, 1, 2))
+    bench.tell(*next_request)
     assert bench.tell(SYNC.id, "") == []
     assert not any(bench.levels)
 
 
 def test_node_does_not_complete_a_set_with_earlier_commands(bench: Bench) -> None:
-    """The numbers have begun again, and a command of two is lost: not the old one in its place."""
+    """A reused sequence number does not replace a lost command by an old one."""
     bench.tell(0x201, command(0, 2))
-    bench.tell(ORDER, apply(0, 0, 3, action=0))
+    bench.tell(REQUEST, apply(0, 0, 3, action=0))
     bench.tell(0x301, command(1, 2))
-    bench.tell(ORDER, apply(9, 2, 2))
-    assert bench.result() == TORN
+    bench.tell(REQUEST, apply(9, 2, 2))
+    assert bench.result() == INCOMPLETE
     assert not any(bench.levels)
 
 
 @pytest.mark.parametrize(
-    ("frame", "order", "result", "channel"),
+    ("frame", "request_frame", "result", "channel"),
     [
         (command(0, 2, level=10001), apply(9, 1, 2), BAD_VALUE, 0),
         (command(0, 2, flags=8), apply(9, 1, 2), BAD_VALUE, 0),
@@ -160,20 +160,20 @@ def test_node_does_not_complete_a_set_with_earlier_commands(bench: Bench) -> Non
     ],
 )
 def test_node_refuses_an_invalid_set(
-    bench: Bench, frame: str, order: str, result: int, channel: int
+    bench: Bench, frame: str, request_frame: str, result: int, channel: int
 ) -> None:
-    """Out of range, an unknown bit, the wrong channel, no token: the reason and the channel."""
+    """Out of range, an unknown bit, the wrong channel, no token: reason and channel."""
     bench.tell(0x201, frame)
-    bench.tell(ORDER, order)
-    answer = bench.sync()
-    assert (answer.data[1] >> 4, answer.data[3]) == (result, channel)
+    bench.tell(REQUEST, request_frame)
+    reply = bench.sync()
+    assert (reply.data[1] >> 4, reply.data[3]) == (result, channel)
     assert not any(bench.levels)
 
 
 def test_node_commits_by_broadcast(bench: Bench) -> None:
     """A broadcast commit of 8 leaves the staged set 9, one of 9 plays it; no replies."""
     bench.tell(0x201, command(0, 2))
-    bench.tell(ORDER, apply(9, 1, 2, action=2))
+    bench.tell(REQUEST, apply(9, 1, 2, action=2))
     assert bench.result() == 0
     for token, level in ((8, 0.0), (9, 0.2)):
         bench.tell(0x480, apply(token, 0, 0, action=3))
@@ -184,23 +184,23 @@ def test_node_commits_by_broadcast(bench: Bench) -> None:
 
 
 @pytest.mark.parametrize(
-    ("id", "order", "state"),
+    ("id", "request_frame", "state"),
     [
-        (ORDER, "0000 FFFF 0000 06 02", AmplifierState.QUICK_STOP_ACTIVE),
-        (ORDER, "0000 FFFF 0000 05 02", AmplifierState.SWITCHED_ON),
+        (REQUEST, "0000 FFFF 0000 06 02", AmplifierState.QUICK_STOP_ACTIVE),
+        (REQUEST, "0000 FFFF 0000 05 02", AmplifierState.SWITCHED_ON),
         (0x480, "0000 FFFF 0000 06 00", AmplifierState.QUICK_STOP_ACTIVE),
     ],
 )
 def test_node_accepts_any_ramp_for_silencing(
-    bench: Bench, id: int, order: str, state: AmplifierState
+    bench: Bench, id: int, request_frame: str, state: AmplifierState
 ) -> None:
     """A stop, a disarm and a broadcast stop along 65.5 s are carried out along the longest ramp."""
     bench.tell(0x201, command(0, 1))
-    bench.tell(ORDER, apply(9, 1, 1))
+    bench.tell(REQUEST, apply(9, 1, 1))
     bench.sync()
-    said = bench.tell(id, order)
+    sent = bench.tell(id, request_frame)
     assert bench.state is state
-    assert all(frame.data[1] >> 4 == 0 for frame in said if frame.id == ANSWER)
+    assert all(frame.data[1] >> 4 == 0 for frame in sent if frame.id == ANSWER)
 
 
 def test_node_watchdog_is_fed_by_the_host_heartbeat_only(bench: Bench) -> None:
@@ -213,7 +213,7 @@ def test_node_watchdog_is_fed_by_the_host_heartbeat_only(bench: Bench) -> None:
     bench.tell(0x77F, "05")
     bench.device.pass_time(0.2)
     assert bench.state is AmplifierState.OPERATION_ENABLED
-    bench.tell(ORDER, "0000 0000 0000 00 05")
+    bench.tell(REQUEST, "0000 0000 0000 00 05")
     bench.device.pass_time(0.051)
     assert bench.device.amplifier.fault is Fault.WATCHDOG
 
@@ -222,28 +222,28 @@ def test_node_watchdog_is_fed_by_the_host_heartbeat_only(bench: Bench) -> None:
 def test_node_stops_when_leaving_operational(bench: Bench, nmt: str) -> None:
     """Stop, pre-operational, reset communication: a host that is not heard must not be needed."""
     bench.tell(0x201, command(0, 2))
-    bench.tell(ORDER, apply(9, 1, 2))
+    bench.tell(REQUEST, apply(9, 1, 2))
     bench.sync()
     bench.tell(0x000, nmt)
     assert bench.state is AmplifierState.QUICK_STOP_ACTIVE
     bench.device.pass_time(0.005)
     assert not any(bench.levels)
-    assert bench.tell(ORDER, "0000 0000 0000 00 05") == []
+    assert bench.tell(REQUEST, "0000 0000 0000 00 05") == []
 
 
 def test_node_stopped_ignores_sdo(bench: Bench) -> None:
     """NMT stopped: no SDO, but a heartbeat with that state."""
     bench.tell(0x000, "02 01")
     assert bench.tell(0x601, "40 00 10 00 00000000") == []
-    bench.said.clear()
+    bench.sent.clear()
     bench.timers.ring()
-    assert bench.said == [CanFrame(0x701, b"\x04")]
+    assert bench.sent == [CanFrame(0x701, b"\x04")]
 
 
 def test_node_reset_discards_everything(bench: Bench) -> None:
     """Silent at once, disarmed, the host forgotten; a boot-up message."""
     bench.tell(0x201, command(0, 2))
-    bench.tell(ORDER, apply(9, 1, 2))
+    bench.tell(REQUEST, apply(9, 1, 2))
     bench.sync()
     assert bench.tell(0x000, "81 01")[-1] == CanFrame(0x701, b"\x00")
     assert bench.state is AmplifierState.SWITCH_ON_DISABLED
@@ -253,15 +253,15 @@ def test_node_reset_discards_everything(bench: Bench) -> None:
 
 def test_node_sends_emcy_for_a_fault_and_its_end(bench: Bench) -> None:
     """Code and register by the table of CiA 301, state, fault, channel; code 0 in the end."""
-    bench.said.clear()
+    bench.sent.clear()
     bench.device.amplifier.trip(Fault.ARC, bench.device.now, channel=2)
     bench.device.pass_time(0.01)
-    assert bench.said == [
+    assert bench.sent == [
         CanFrame(0x081, bytes.fromhex("4023 03 46 02 000000")),
         CanFrame(0x081, bytes.fromhex("4023 03 47 FF 000000")),
     ]
     assert CanFrame(0x081, bytes.fromhex("0000 00 01 FF 000000")) in bench.tell(
-        ORDER, "0000 0000 0000 07 05"
+        REQUEST, "0000 0000 0000 07 05"
     )
 
 
@@ -280,6 +280,6 @@ def test_node_accepts_commands_by_sdo(bench: Bench) -> None:
 
 def test_node_ignores_frames_of_other_lengths(bench: Bench) -> None:
     """Short orders and commands, a SYNC of two bytes, a heartbeat-like nothing: no answer."""
-    for id in (ORDER, 0x201, 0x681, 0x000, 0x601, 0x080, 0x480):
+    for id in (REQUEST, 0x201, 0x681, 0x000, 0x601, 0x080, 0x480):
         assert bench.tell(id, "01 02 03 04 05") == []
     assert not any(bench.levels)

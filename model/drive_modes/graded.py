@@ -13,9 +13,8 @@ def _solve(R: Complex64Array, c: Complex64Array) -> Complex64Array:
     """Minimise w^T Re(R) w / 2 - Re(c) w over w >= 0, for many forms at once.
 
     Block principal pivoting (Judice and Pires, Comput. Oper. Res. 21 (1994) 587-596): solve for the
-    weights taken to be above zero, then exchange those that are on the wrong side, of those forms
-    that have any; few do after three times. It may circle; a few sweeps over the coordinates mend
-    what is left then.
+    weights assumed positive, then exchange those of the wrong sign, in the forms that have any; few
+    do after three iterations. It may cycle: a few coordinate sweeps follow for the forms left.
     """
     w = np.empty_like(c.real)
     left, form, pull = np.arange(len(w)), np.ascontiguousarray(R.real), c.real
@@ -39,7 +38,7 @@ def _solve(R: Complex64Array, c: Complex64Array) -> Complex64Array:
 
 
 def _swept(w: Float32Array, form: Float32Array, pull: Float32Array) -> Float32Array:
-    """Weights (n, eras) after the best for each ERA in turn, the others as they are."""
+    """Coordinate descent: optimise the weights (n, eras) of each ERA in turn."""
     for _ in range(SWEEPS):
         for era in range(w.shape[1]):
             others = (form[:, era] * w).sum(axis=1) - form[:, era, era] * w[:, era]
@@ -48,4 +47,4 @@ def _swept(w: Float32Array, form: Float32Array, pull: Float32Array) -> Float32Ar
 
 
 GRADED = Coherent(_solve, phases=(7, 5), ascents=4)
-"""Weights that cannot be negative reach some phases of a target better than their opposites."""
+"""With several starting phases of a target, since weights cannot be negative."""

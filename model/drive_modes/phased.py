@@ -1,7 +1,7 @@
 """The drive mode `phased`: any amplitude and phase, all ERAs at one frequency, robustly.
 
-The weights are R^-1 conj(h_target), see `model.drive_modes.coherent`. What a spring or damper at an
-ERA adds is a force where one acts anyway, so without errors what can be had does not depend on it.
+The weights are R^-1 conj(h_target), see `model.drive_modes.coherent`. A spring or damper at an ERA
+adds a force where the drive acts anyway: without errors the best contrast does not depend on it.
 """
 
 import numpy as np

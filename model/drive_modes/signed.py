@@ -9,8 +9,8 @@ from model.drive_modes.coherent import Coherent
 def _solve(R: Complex64Array, c: Complex64Array) -> Complex64Array:
     """Real weights for which |c^H w| is largest for its w^H R w, which then is w^T Re(R) w.
 
-    All targets may be turned by one phase; the best one is the top eigenvector of the form of real
-    and imaginary part of c, a half of the angle by hand.
+    A common phase of all targets is free; the best one follows from the top eigenvector of the form
+    of real and imaginary part of c, in closed form by half an angle.
     """
     parts = np.stack([c.real, c.imag], axis=-1)
     solved = np.linalg.solve(R.real, parts)

@@ -1,8 +1,8 @@
-"""What patterns of one or two ERAs are made of: sources, and the patterns as sums of them.
+"""Sources, and the patterns of one or two ERAs as sums of them.
 
 A source is an ERA at a frequency, or a pair of ERAs together at the same one. Two ERAs at one
-frequency add as complex numbers, at two frequencies their magnitudes add (paper Eq. 28): every
-pattern is one source or the sum of two, and what is known of the sources is known of all patterns.
+frequency add as complex numbers, at two frequencies their magnitudes add (paper Eq. 28), so that
+every pattern is one source or the sum of two.
 """
 
 from dataclasses import dataclass
@@ -32,7 +32,7 @@ class Patterns:
 
 @lru_cache(maxsize=8)
 def all_patterns(era_count: int, frequency_count: int) -> Patterns:
-    """Every pattern of so many ERAs and frequencies: 4482 of four ERAs and 27."""
+    """List every pattern of so many ERAs and frequencies: 4482 of four ERAs and 27."""
     f = np.arange(frequency_count)
     pairs = list(combinations(range(era_count), 2))
     together = era_count * frequency_count
@@ -55,7 +55,7 @@ def all_patterns(era_count: int, frequency_count: int) -> Patterns:
         second.append(np.where(same, nothing, other * frequency_count + f_other))
     found = Patterns(np.concatenate(index), np.concatenate(first), np.concatenate(second))
     for shared in (found.index, found.first, found.second):
-        shared.setflags(write=False)  # every table of this size has the same ones
+        shared.setflags(write=False)  # cached, and so shared
     return found
 
 

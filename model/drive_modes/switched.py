@@ -1,16 +1,16 @@
 """The drive mode `switched`: one or two ERAs at full stroke, each at a frequency of its own.
 
-The paper's idea: switching frequencies and activation sets moves the nulls about. Four ERAs and 27
+The paper's idea: switching frequencies and activation sets moves the nulls. Four ERAs and 27
 frequencies make 4 * 27 + 6 * 27² = 4482 patterns, six and 361 two millions. Every pattern is one
 source or the sum of two: an ERA at a frequency, or a pair of ERAs at the same one
 (`model.drive_modes.exact_search` drives more of them).
 
-Patterns are not gone through: the loudest quiet point is at least any mean of them, and of a sum of
-two sources a mean is the sum of theirs. So a pattern of contrast above c needs
+Patterns are not enumerated: the maximum over the quiet points is at least any weighted mean, and
+the mean of a sum of two sources is the sum of theirs. So a pattern of contrast above c needs
 
     sum over its sources of (target - c mean of quiet) > 0,
 
-one number for each source, which leaves few sources and fewer pairs.
+one number for each source, which excludes most sources and pairs.
 """
 
 from itertools import combinations
@@ -26,18 +26,21 @@ from model.drive_modes.sources import (
     sums_of_sources,
 )
 
-# A bound on the quiet maximum comes from this many of the quiet points.
 BOUND_POINTS = 12
-BATCH = 48  # patterns that are looked at in full together
-FEW_SOURCES = 500  # of these all sums are made faster than some of them are picked
+"""Quiet points from which the quiet maximum is bounded."""
+
+BATCH = 48
+"""Patterns evaluated together."""
+
+FEW_SOURCES = 500
+"""Up to this all sums are faster than a selection of them."""
 
 
 def find_switched(fields: Fields, min_score: float) -> DriveVector | None:
-    """The pattern of highest contrast that reaches the level; None where it is not above `least`.
+    """Find the pattern of highest contrast that reaches the level; None if not above min_score.
 
-    Contrast here is without errors, which can only lower it: at full stroke there is nothing to
-    trade against them. Exact: patterns are left out only where a bound says that they cannot be
-    better.
+    Contrast without errors, which can only lower it: at full stroke there is nothing to trade
+    against them. Exact: patterns are excluded by bounds only.
     """
     felt = [magnitudes_of_sources(field) for field in fields.targets]
     means = np.array([_mean(rows) for rows in felt])
@@ -63,7 +66,7 @@ def find_switched(fields: Fields, min_score: float) -> DriveVector | None:
 
     nothing = len(quiet) - 1
     contrast, best = min_score, (nothing, nothing)
-    # What one source can do is had at once, and leaves fewer pairs of them.
+    # Single sources are evaluated first: their contrast excludes pairs.
     alone = value(means[:, :-1], quiet[:-1], [rows[:-1] for rows in powers])
     if alone.max() > contrast:
         contrast, best = float(alone.max()), (int(alone.argmax()), nothing)
@@ -99,9 +102,9 @@ def find_switched(fields: Fields, min_score: float) -> DriveVector | None:
 
 
 def _may_be_better(fields: Fields, means: Float32Array, min_score: float) -> bool:
-    """Whether any pattern can have more contrast than `least`; means (targets, sources).
+    """Whether any pattern can have more contrast than min_score; means (targets, sources).
 
-    Some of the quiet points will mostly do to see that nothing can.
+    From a few of the quiet points, which mostly suffice to exclude all patterns.
     """
     step = max(1, fields.quiet.shape[2] // BOUND_POINTS)
     few = magnitudes_of_sources(np.ascontiguousarray(fields.quiet[:, :, ::step]))
@@ -150,9 +153,9 @@ def _drive(sources: tuple[int, int], fields: Fields) -> DriveVector:
 
 
 def max_sensation_switched(fields: Fields) -> float:
-    """How many times above threshold the targets can be made to feel it.
+    """Return the highest amplitude to threshold found at the lesser target.
 
-    Of the loudest patterns by a bound, and of one and the same for all targets.
+    Among the patterns of the largest bounds, the same pattern for all targets.
     """
     patterns = all_patterns(fields.era_count, fields.frequency_count)
     powers = _powers([magnitudes_of_sources(field) for field in fields.targets], fields)
@@ -171,16 +174,16 @@ def _powers(felt: list[Float32Array], fields: Fields) -> list[Float32Array]:
 
 
 def _mean(rows: Float32Array) -> Float32Array:
-    """The mean over points of (n, p), as a product: a fifth of the time that `mean` takes."""
+    """Mean over points of (n, p), as a product: in a fifth of the time of `mean`."""
     return np.asarray(rows @ _even_shares(rows))
 
 
 def _even_shares(rows: Float32Array) -> Float32Array:
-    """For a mean over points of (n, p) that all count the same, (p,)."""
+    """Equal weights of the points of (n, p), (p,)."""
     return np.full(rows.shape[1], 1 / rows.shape[1], dtype=rows.dtype)
 
 
 def _shares(quiet: Float32Array) -> Float32Array:
-    """For a mean over the quiet points: each counts as often as it is the loudest of a source."""
+    """Weights of the quiet points: the fraction of sources of which each is the loudest."""
     often = np.bincount(quiet.argmax(axis=1), minlength=quiet.shape[1])
     return np.asarray(often / len(quiet), dtype=quiet.dtype)

@@ -1,4 +1,4 @@
-"""From what a drive mode finds to physics: a tone for each ERA."""
+"""Conversion of a drive vector to physics: a tone for each ERA."""
 
 from collections.abc import Sequence
 
@@ -9,7 +9,7 @@ from model.drive_modes.fields import DriveVector
 from model.structure.actuator import Era
 from model.vibration.excitation import Excitation, Tone
 
-ROUNDING = 1e-6  # of single precision, in which drives are found
+ROUNDING = 1e-6  # of single precision
 
 
 def excitation_of(
@@ -17,7 +17,7 @@ def excitation_of(
 ) -> Excitation:
     """Tones by ERA, at a gain of up to 1; at each frequency the strongest has phase zero.
 
-    No phase is absolute. frequencies (f,) [Hz]: what the drive's indices stand for.
+    frequencies (f,) [Hz]: by the drive's indices.
     """
     tones = {}
     for index, weight in drive.tones():

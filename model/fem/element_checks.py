@@ -1,7 +1,7 @@
-"""What every plate element must keep, as checks that say what they prove.
+"""Conformance checks of plate elements.
 
-Run by `era plate conformance NAME` for any that is installed, and by the project's tests for its
-own. Each looks at the element's matrices alone, but the last, which solves a plate with them.
+Run by `era plate conformance NAME` for installed elements, and by the tests for the project's own.
+All but the last use the element's matrices only; the last solves a plate.
 """
 
 from collections.abc import Callable
@@ -18,23 +18,23 @@ from model.fem.mesh import Mesh
 from model.fem.modal import shift_invert_modes
 from model.structure.plate import Material, Plate
 
-DX, DY = 0.03, 0.02  # m; no square, for it would hide a mix-up of x and y
+DX, DY = 0.03, 0.02  # m; not square, so that a swap of x and y shows
 PLATE = Plate(0.3, 0.24, 0.002, Material("aluminium", E=70e9, rho=2700.0, nu=0.33))
-THIN = Plate(0.3, 0.24, 0.3e-3, PLATE.material)  # so thin that an element that locks shows it
-COARSE = 4  # elements a side of the coarser of the two meshes that are compared
+THIN = Plate(0.3, 0.24, 0.3e-3, PLATE.material)  # so thin that locking shows
+COARSE = 4  # elements a side of the coarser mesh
 
-LEAST_RATE = 1.8
-"""How fast a natural frequency must converge: nearly with the square of the element's size."""
+MIN_RATE = 1.8
+"""Least order of convergence of a natural frequency in the element size."""
 
-_SMALL = 1e-9  # what is only rounding, relative to what it is compared with
-_EXACT = 1e-7  # relative error of a frequency that is too small to tell a rate by
+_SMALL = 1e-9  # relative rounding error
+_EXACT = 1e-7  # relative error of a frequency below which no order can be measured
 
 Field: TypeAlias = Callable[[FloatArray, FloatArray], FloatArray | float]
 
 
 @dataclass(frozen=True)
 class ElementCheck:
-    """One thing that must hold: a name, what it proves, and what is wrong where it does not."""
+    """One check: its name, what it proves, and a function that returns the problem, if any."""
 
     name: str
     proves: str
@@ -42,29 +42,29 @@ class ElementCheck:
 
 
 def nodes(element: Element) -> str | None:
-    """Its nodes lie from -1 to 1 along a side, in order, and mirrored about the middle."""
+    """Its nodes ascend from -1 to 1 along a side, symmetric about the middle."""
     side = np.array(element.side)
     if len(side) < 2 or side[0] != -1 or side[-1] != 1 or (np.diff(side) <= 0).any():
-        return f"its side is {element.side}; it must begin with -1, rise, and end with 1"
+        return f"side must ascend from -1 to 1, got {element.side}"
     if np.abs(side + side[::-1]).max() > _SMALL:
-        return f"its side is {element.side}, which is not its own mirror image"
+        return f"side must be symmetric about 0, got {element.side}"
     return None
 
 
 def matrices(element: Element) -> str | None:
-    """Its matrices have three degrees of freedom a node, are symmetric, and any motion has mass."""
+    """Its matrices have three degrees of freedom a node and are symmetric, the mass definite."""
     size = DOF_PER_NODE * len(element.side) ** 2
     for name, matrix in _both(element).items():
         if matrix.shape != (size, size):
-            return f"its {name} has the shape {matrix.shape} instead of {(size, size)}"
+            return f"{name} must have the shape {(size, size)}, got {matrix.shape}"
         if np.abs(matrix - matrix.T).max() > _SMALL * np.abs(matrix).max():
-            return f"its {name} is not symmetric"
+            return f"{name} must be symmetric"
     least = np.linalg.eigvalsh(element.mass(PLATE, DX, DY))[0]
-    return None if least > 0 else f"a motion of it has the mass {least:g}"
+    return None if least > 0 else f"mass must be positive definite, got the eigenvalue {least:g}"
 
 
 def mirror(element: Element) -> str | None:
-    """It is its own mirror image along x and along y: plates are solved on a quarter of them."""
+    """Its matrices are symmetric under reflection along x and y, as a quarter plate requires."""
     count = len(element.side)
     number = np.arange(count**2).reshape(count, count)
     for along, order, turn in (
@@ -76,12 +76,12 @@ def mirror(element: Element) -> str | None:
         for name, matrix in _both(element).items():
             mirrored = matrix[np.ix_(place, place)] * np.outer(sign, sign)
             if np.abs(mirrored - matrix).max() > _SMALL * np.abs(matrix).max():
-                return f"its {name} changes when it is mirrored along {along}"
+                return f"{name} must be symmetric under reflection along {along}"
     return None
 
 
 def rigid_motions(element: Element) -> str | None:
-    """Moved as a rigid body it feels no force."""
+    """A rigid-body motion takes no force."""
     stiffness = element.stiffness(PLATE, DX, DY)
     for name, motion in {
         "moved up": _nodal(element, lambda x, y: 1.0, _zero, _zero),
@@ -90,19 +90,19 @@ def rigid_motions(element: Element) -> str | None:
     }.items():
         force = np.abs(stiffness @ motion).max()
         if force > _SMALL * np.abs(stiffness).max():
-            return f"{name} it feels a force of {force:.3g}"
+            return f"force must be zero when {name}, got {force:.3g}"
     return None
 
 
 def no_other_free_motion(element: Element) -> str | None:
-    """No other motion is free of force: nothing spurious can hide in it."""
+    """No other motion takes no force: there are no spurious modes."""
     energies = np.linalg.eigvalsh(element.stiffness(PLATE, DX, DY))
     free = int((energies <= _SMALL * energies[-1]).sum())
-    return None if free == 3 else f"{free} motions are free of force instead of 3"
+    return None if free == 3 else f"zero-energy motions must be 3, got {free}"
 
 
 def bending(element: Element) -> str | None:
-    """Bent evenly it has the energy of thin-plate theory: along x, along y, as a saddle, twisted.
+    """Constant curvature has the energy of thin-plate theory: along x, along y, saddle, twist.
 
     Per area D/2 for a unit curvature one way, D (1 - nu) for a saddle and for a twist of
     w = x y.
@@ -127,22 +127,22 @@ def bending(element: Element) -> str | None:
     for name, (w, beta_x, beta_y, expected) in shapes.items():
         wrong = _wrong_energy(element, _nodal(element, w, beta_x, beta_y), expected)
         if wrong:
-            return f"bent {name} {wrong}"
+            return f"bent {name}: {wrong}"
     return None
 
 
 def shear(element: Element) -> str | None:
-    """Sheared evenly, w = x without rotation, it has the energy kappa G h / 2 per area."""
+    """Constant shear, w = x without rotation, has the energy kappa G h / 2 per area."""
     _, rigidity, _ = rigidities(PLATE)
     for name, w in (("x", lambda x, y: x), ("y", lambda x, y: y)):
         wrong = _wrong_energy(element, _nodal(element, w, _zero, _zero), rigidity / 2)
         if wrong:
-            return f"sheared along {name} {wrong}"
+            return f"sheared along {name}: {wrong}"
     return None
 
 
 def inertia(element: Element) -> str | None:
-    """It weighs rho h dx dy, and tilted it has the rotary inertia rho h³ / 12 dx dy."""
+    """Its mass is rho h dx dy and its rotary inertia rho h³ / 12 dx dy."""
     density = PLATE.material.rho * PLATE.thickness
     mass = element.mass(PLATE, DX, DY)
     for name, motion, expected in (
@@ -152,22 +152,22 @@ def inertia(element: Element) -> str | None:
     ):
         found = float(motion @ mass @ motion) / (DX * DY)
         if abs(found - expected) > _SMALL * expected:
-            return f"moved {name} it has the inertia {found:.6g} per area instead of {expected:.6g}"
+            return f"inertia {name} must be {expected:.6g} per area, got {found:.6g}"
     return None
 
 
 def convergence(element: Element) -> str | None:
-    """Twice as many elements a side give a thin plate's lowest frequency nearly four times as well.
+    """A thin plate's lowest frequency converges nearly with the square of the element size.
 
-    Or better, or it is exact already. The plate is simply supported, a thousand times as long as
-    thick, and known in closed form; an element that locks fails here.
+    Or faster, or it is exact. The plate is simply supported, a thousand times as long as thick, and
+    known in closed form; an element that locks fails here.
     """
     coarse, fine = (frequency_error(element, count) for count in (COARSE, 2 * COARSE))
-    if abs(fine) < _EXACT or rate(coarse, fine) >= LEAST_RATE:
+    if abs(fine) < _EXACT or rate(coarse, fine) >= MIN_RATE:
         return None
     return (
-        f"the error goes from {coarse:.3%} to {fine:.3%} when elements are halved, with the power "
-        f"{rate(coarse, fine):.2f} of their size instead of {LEAST_RATE:g} at least"
+        f"order of convergence must be at least {MIN_RATE:g}, got {rate(coarse, fine):.2f} (error "
+        f"{coarse:.3%}, with halved elements {fine:.3%})"
     )
 
 
@@ -185,7 +185,7 @@ CHECKS = tuple(
         convergence,
     )
 )
-"""In the order in which they make sense: later ones take for granted what earlier ones prove."""
+"""In the order in which they build on each other."""
 
 
 def frequency_error(element: Element, count: int) -> float:
@@ -209,7 +209,7 @@ def frequency_error(element: Element, count: int) -> float:
 
 
 def rate(coarse: float, fine: float) -> float:
-    """With which power of the element's size an error falls that was halved sizes apart."""
+    """Order of convergence from errors with elements of one size and of half of it."""
     return float(np.log2(abs(coarse) / abs(fine)))
 
 
@@ -247,7 +247,7 @@ def _wrong_energy(element: Element, motion: FloatArray, expected: float) -> str 
     found = float(motion @ element.stiffness(PLATE, DX, DY) @ motion) / 2 / (DX * DY)
     if abs(found - expected) <= _SMALL * expected:
         return None
-    return f"it has the energy {found:.6g} per area instead of {expected:.6g}"
+    return f"the energy must be {expected:.6g} per area, got {found:.6g}"
 
 
 def _rotary(density: float) -> float:

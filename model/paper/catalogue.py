@@ -39,7 +39,7 @@ def paper_figures(rig: Rig, number: str) -> Iterator[PaperFigure]:
     """
     if number not in (*FIGURE_NUMBERS, "all"):
         raise InputError(
-            f"no figure {number!r}; those with results are {', '.join(FIGURE_NUMBERS)}, and all"
+            f"figure must be one of {', '.join(FIGURE_NUMBERS)} or all, got {number!r}"
         )
     for key, of_modes in _MODES.items():
         if number in (key, "all"):

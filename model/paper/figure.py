@@ -1,4 +1,4 @@
-"""A figure of the paper as it comes out here: the picture, its numbers, what it shows."""
+"""A reproduced figure of the paper: the picture, its numbers and findings."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field

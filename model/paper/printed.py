@@ -1,4 +1,4 @@
-"""What the founding paper prints: the numbers that its figures and tables are compared with."""
+"""Numbers printed in the founding paper, for comparison."""
 
 from model.rig.rig import Rig
 from model.structure.plate import Plate

@@ -19,10 +19,9 @@ Gain: TypeAlias = tuple[float, float, float]
 class Era:
     """One ERA under the plate; its base moves y(t) = amplitude sin(omega t + phase).
 
-    x, y: where it holds the plate [m]; stiffness k_b [N/m]; damping c [N s/m]; bolt_mass m_b [kg];
+    x, y: position of its bolt [m]; stiffness k_b [N/m]; damping c [N s/m]; bolt_mass m_b [kg];
     stroke: the largest base amplitude [m]. An ERA that is not driven still supports and damps.
-    gains: how its base really moves for what it is asked, as measured at frequencies that ascend;
-    none of them: exactly.
+    gains: measured complex gain of its base, at ascending frequencies; empty for a gain of 1.
     """
 
     name: str
@@ -35,38 +34,41 @@ class Era:
     gains: tuple[Gain, ...] = ()
 
     def __post_init__(self) -> None:
-        """Refuse values that no ERA can have."""
+        """Refuse values out of range."""
         for key in ("x", "y", "stiffness", "damping", "bolt_mass", "stroke"):
             if not math.isfinite(getattr(self, key)):
-                raise InputError(f"ERA {self.name}: {key} is {getattr(self, key)}, not a number")
+                raise InputError(f"ERA {self.name}: {key} must be finite, got {getattr(self, key)}")
         for key in ("stiffness", "stroke"):
             if getattr(self, key) <= 0:
                 raise InputError(
-                    f"ERA {self.name}: {key} is {getattr(self, key)}, must be above zero"
+                    f"ERA {self.name}: {key} must be above zero, got {getattr(self, key)}"
                 )
         for key in ("damping", "bolt_mass"):
             if getattr(self, key) < 0:
-                raise InputError(f"ERA {self.name}: {key} is {getattr(self, key)}, below zero")
+                raise InputError(
+                    f"ERA {self.name}: {key} must not be negative, got {getattr(self, key)}"
+                )
         # A file gives lists; only tuples can be compared and hashed with the rest.
         gains = tuple((float(f), float(size), float(phase)) for f, size, phase in self.gains)
         object.__setattr__(self, "gains", gains)
         for frequency, size, phase in gains:
             if not (math.isfinite(frequency + size + phase) and frequency > 0 and size > 0):
                 raise InputError(
-                    f"ERA {self.name}: gain {size} with phase {phase} at {frequency} Hz is none"
+                    f"ERA {self.name}: gains must be finite and above zero, got {size} with phase "
+                    f"{phase} at {frequency} Hz"
                 )
         for (low, *_), (high, *_) in pairwise(gains):
             if low >= high:
                 raise InputError(
-                    f"ERA {self.name}: the gain at {high} Hz stands after that at {low} Hz; "
-                    "frequencies must ascend"
+                    f"ERA {self.name}: frequencies of gains must ascend, got {high} Hz after "
+                    f"{low} Hz"
                 )
 
     def gain(self, frequencies: FloatArray) -> ComplexArray:
-        """Complex gain at frequencies [Hz], of their shape; 1 where none was measured.
+        """Complex gain at frequencies [Hz], of their shape; 1 without measured gains.
 
-        Straight lines between what was measured, constant outside of it. At negative frequencies,
-        such as the lower side of a quick ramp has, its conjugate: what the base does is real.
+        Linear between measured frequencies, constant outside. At negative frequencies, as in the
+        lower sideband of a fast ramp, the conjugate: the base's motion is real.
         """
         if not self.gains:
             return np.ones(np.shape(frequencies), dtype=complex)
@@ -79,5 +81,5 @@ class Era:
 def damping_from_ratio(
     ratio: float, *, stiffness: float, plate_mass: float, era_count: int
 ) -> float:
-    """Damping c = 2 zeta sqrt(k_b m_plate / n_eras) [N s/m] of an ERA that carries its share."""
+    """Damping c = 2 zeta sqrt(k_b m_plate / n_eras) [N s/m], referred to the plate's mass."""
     return 2 * ratio * math.sqrt(stiffness * plate_mass / era_count)

@@ -1,6 +1,6 @@
-"""A laminate, such as cover glass on adhesive on a panel, and the single plate that bends like it.
+"""A laminate, such as cover glass on adhesive on a panel, and its equivalent homogeneous plate.
 
-How stiff a laminate is depends on how its layers are joined:
+Its rigidity depends on how its layers are joined:
 
 - `full`: no slip. Classical laminate theory, stiffness integrals A, B, D over the thickness and
   D* = D - B A⁻¹ B (Jones, Mechanics of Composite Materials, 2nd ed., ch. 4; the reduction is
@@ -9,7 +9,7 @@ How stiff a laminate is depends on how its layers are joined:
 - `none`: layers slide on each other, their own rigidities add up. The lower bound.
 - `shear`: stiff layers joined by adhesives that shear (Ross, Ungar and Kerwin, in Structural
   Damping, ASME 1959, p. 49; Kerwin, J. Acoust. Soc. Am. 31 (1959) 952). The shorter the wave, the
-  more the adhesive gives way, so it holds at one frequency: the rigidity is that for a straight
+  more the adhesive shears, so it is valid at one frequency: the rigidity is that for a straight
   bending wave of that frequency, which solves D(k) k⁴ = m'' omega².
 
 Not modelled: edges (free ends let the layers slide more within a few centimetres), the adhesive's
@@ -45,9 +45,9 @@ class Layer:
     thickness: float
 
     def __post_init__(self) -> None:
-        """Refuse a thickness that is none."""
+        """Refuse a thickness that is not above zero."""
         if not (math.isfinite(self.thickness) and self.thickness > 0):
-            raise InputError(f"layer: thickness is {self.thickness} m, must be above zero")
+            raise InputError(f"layer: thickness must be above zero, got {self.thickness} m")
 
     @property
     def surface_density(self) -> float:
@@ -77,23 +77,23 @@ class Laminate:
     bond_frequency: float | None = None
 
     def __post_init__(self) -> None:
-        """Refuse a laminate that its kind of bond does not describe."""
+        """Refuse layers or a bond_frequency that do not fit the bond."""
         if not self.layers:
-            raise InputError("laminate: there are no layers; give at least one")
+            raise InputError("laminate: must have at least one layer")
         if self.bond is not Bond.SHEAR:
             if self.bond_frequency is not None:
-                raise InputError("laminate: bond_frequency goes with bond shear only; remove it")
+                raise InputError("laminate: bond_frequency must be left out unless bond is shear")
             return
         if len(self.layers) < 3 or len(self.layers) % 2 == 0:
             raise InputError(
-                f"laminate: bond shear needs 3, 5, 7, ... layers, every second one an adhesive, "
-                f"not {len(self.layers)}"
+                f"laminate: with bond shear layers must be 3, 5, 7, ..., every second one an "
+                f"adhesive, got {len(self.layers)}"
             )
         frequency = self.bond_frequency
         if frequency is None or not (math.isfinite(frequency) and frequency > 0):
             raise InputError(
-                "laminate: bond shear needs a bond_frequency above zero, at which the adhesive's "
-                "share is worked out; the middle of the range that is driven is a good one"
+                f"laminate: with bond shear bond_frequency must be above zero, got {frequency}; "
+                "take the middle of the driven range"
             )
 
     @property
@@ -138,14 +138,14 @@ def perfectly_bonded(layers: Sequence[Layer]) -> Bending:
 
 
 def freely_sliding(layers: Sequence[Layer]) -> Bending:
-    """Layers that only share their deflection: their rigidities add up."""
+    """Layers that share only their deflection: the sum of their rigidities."""
     rigidity = sum(layer.flexural_rigidity for layer in layers)
     coupling = sum(layer.material.nu * layer.flexural_rigidity for layer in layers)
     return Bending(rigidity, coupling / rigidity)
 
 
 def bonded_share(laminate: Laminate) -> float:
-    """How much of what bonding adds to the rigidity the bond gives: 1 full, 0 none.
+    """Fraction of the rigidity added by perfect bonding that the bond provides: 1 full, 0 none.
 
     With shear it follows from the adhesives' shear and the stiff layers' extension in a wave of
     bond_frequency; for three layers it is Kerwin's g / (1 + g), g = G / (h k²) (1/A1 + 1/A3).
@@ -238,5 +238,5 @@ def _rotary_inertia(laminate: Laminate) -> float:
 
 
 def _rounded(value: float) -> float:
-    """Twelve digits, so that rounding does not make another fingerprint of the same plate."""
+    """Round to twelve digits, so that the same plate has the same fingerprint."""
     return float(f"{value:.12g}")

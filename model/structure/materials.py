@@ -1,4 +1,4 @@
-"""Materials by name, each with where its numbers come from and how far real ones differ.
+"""Materials by name, each with the source of its numbers and their variation.
 
 An installed package adds one by an entry point of the group `era_haptics.materials` that leads to
 a `KnownMaterial` of that name; rig files, their schema and `era plate materials` follow.
@@ -13,9 +13,9 @@ from registry.plugins import Instance, PluginRegistry
 
 @dataclass(frozen=True)
 class KnownMaterial:
-    """A material with its papers.
+    """A material with its sources.
 
-    source: where E, rho and nu stand; spread: how much they vary between grades and measurements;
+    source: of E, rho and nu; spread: their variation between grades and measurements;
     loss_factor: order of the bare material's own (Cremer and Heckl, Structure-Borne Sound, 2nd ed.;
     of polycarbonate only an order). What is built in loses far more at its joints, so a rig's loss
     factor does not follow from its material.
@@ -84,12 +84,12 @@ _MATERIALS: PluginRegistry[KnownMaterial] = PluginRegistry(
 
 
 def material_names() -> tuple[str, ...]:
-    """All that go by a name, those of installed plug-ins too; none of these is loaded."""
+    """Names of all materials, those of plug-ins included; no plug-in is loaded."""
     return _MATERIALS.names()
 
 
 def known_material(name: str) -> KnownMaterial:
-    """The material of this name with its papers; raises InputError, with what may have been meant.
+    """Look up a material with its sources; raises InputError with a suggestion.
 
     Case does not matter, nor whether words are joined by hyphen, underscore or space.
     """
@@ -98,5 +98,5 @@ def known_material(name: str) -> KnownMaterial:
 
 
 def material(name: str) -> Material:
-    """The material of this name; raises InputError as `known_material` does."""
+    """Look up a material; raises InputError as `known_material`."""
     return known_material(name).material

@@ -1,4 +1,4 @@
-"""The touch plate: its material, sizes and what follows from them by hand."""
+"""The touch plate: its material, dimensions and closed-form properties."""
 
 import math
 from dataclasses import dataclass
@@ -19,14 +19,14 @@ class Material:
     nu: float
 
     def __post_init__(self) -> None:
-        """Refuse what no isotropic solid can be."""
+        """Refuse values of no isotropic solid."""
         for key, value in (("E", self.E), ("rho", self.rho)):
             if not (math.isfinite(value) and value > 0):
-                raise InputError(f"material {self.name}: {key} is {value}, must be above zero")
+                raise InputError(f"material {self.name}: {key} must be above zero, got {value}")
         if not -1 < self.nu < 0.5:
             raise InputError(
-                f"material {self.name}: nu is {self.nu}, must lie between -1 and 0.5 "
-                "(most solids: 0.2 to 0.45)"
+                f"material {self.name}: nu must be between -1 and 0.5, got {self.nu} (most solids: "
+                "0.2 to 0.45)"
             )
 
     @property
@@ -51,14 +51,14 @@ class Plate:
     loss_factor: float = 0.01
 
     def __post_init__(self) -> None:
-        """Refuse sizes that are no sizes."""
+        """Refuse dimensions out of range."""
         for key in ("length", "width", "thickness"):
             value = getattr(self, key)
             if not (math.isfinite(value) and value > 0):
-                raise InputError(f"plate: {key} is {value} m, must be above zero")
+                raise InputError(f"plate: {key} must be above zero, got {value} m")
         if not (math.isfinite(self.loss_factor) and 0 <= self.loss_factor < 1):
             raise InputError(
-                f"plate: loss_factor is {self.loss_factor}, must lie between 0 and 1 (0.01 is 1 %)"
+                f"plate: loss_factor must be between 0 and 1, got {self.loss_factor} (0.01 is 1 %)"
             )
 
     @property
@@ -75,7 +75,7 @@ class Plate:
     def lowest_bending_frequency(self) -> float:
         """Lowest frequency [Hz] of a strip of the plate's longer side on two simple supports.
 
-        The order of magnitude of the plate's own lowest modes, whatever holds it.
+        The order of magnitude of the plate's lowest modes for any support.
         """
         surface_density = self.material.rho * self.thickness
         side = max(self.length, self.width)

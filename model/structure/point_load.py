@@ -1,4 +1,4 @@
-"""What touches the plate at a point and is not driven: a mass, a resting finger."""
+"""Passive loads of the plate at a point: a mass, a resting finger."""
 
 import math
 from collections.abc import Sequence
@@ -21,13 +21,13 @@ class PointLoad:
     mass: float = 0.0
 
     def __post_init__(self) -> None:
-        """Refuse what is no place, and loads that give energy."""
+        """Refuse values that are not finite, and loads that add energy."""
         for key in ("x", "y", "stiffness", "damping", "mass"):
             value = getattr(self, key)
             if not math.isfinite(value):
-                raise InputError(f"point load: {key} is {value}, not a number")
+                raise InputError(f"point load: {key} must be finite, got {value}")
             if key not in ("x", "y") and value < 0:
-                raise InputError(f"point load: {key} is {value}, below zero")
+                raise InputError(f"point load: {key} must not be negative, got {value}")
 
 
 def load_positions(loads: Sequence[PointLoad]) -> FloatArray:

@@ -1,4 +1,4 @@
-"""A point mass: something small that the plate carries and that moves with it."""
+"""A point mass: a small object fixed to the plate."""
 
 import math
 from dataclasses import dataclass
@@ -10,8 +10,7 @@ from model.errors import InputError
 class PointMass:
     """A mass [kg] on the plate at x, y [m]: a camera, a connector, a bracket.
 
-    It follows the deflection there; its extent, its rotary inertia and whatever is springy in its
-    mounting are not modelled.
+    It follows the deflection; its extent, rotary inertia and elastic mounting are not modelled.
     """
 
     x: float
@@ -19,9 +18,9 @@ class PointMass:
     mass: float
 
     def __post_init__(self) -> None:
-        """Refuse what is no place or no mass."""
+        """Refuse values that are not finite, and negative mass."""
         for key in ("x", "y", "mass"):
             if not math.isfinite(getattr(self, key)):
-                raise InputError(f"point mass: {key} is {getattr(self, key)}, not a number")
+                raise InputError(f"point mass: {key} must be finite, got {getattr(self, key)}")
         if self.mass < 0:
-            raise InputError(f"point mass: mass is {self.mass} kg, below zero")
+            raise InputError(f"point mass: mass must not be negative, got {self.mass} kg")

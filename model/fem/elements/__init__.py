@@ -1,7 +1,7 @@
-"""Plate elements, a file each; a mesh names the one that it is made of.
+"""Plate elements, a file each.
 
 An installed package adds one by an entry point of the group `era_haptics.elements` that leads to
-an `Element` of that name; `model.fem.element_checks` says what it must keep.
+an `Element` of that name; it must pass `model.fem.element_checks`.
 """
 
 from operator import attrgetter
@@ -37,10 +37,10 @@ _ELEMENTS: PluginRegistry[Element] = PluginRegistry(
 
 
 def element_names() -> tuple[str, ...]:
-    """All that a mesh can be made of, those of installed plug-ins too; none of these is loaded."""
+    """Names of all elements, those of plug-ins included; no plug-in is loaded."""
     return _ELEMENTS.names()
 
 
 def element_of(name: str) -> Element:
-    """The element of this name; raises InputError, with what may have been meant."""
+    """Look up an element; raises InputError with a suggestion."""
     return _ELEMENTS.find(name)

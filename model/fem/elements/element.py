@@ -1,4 +1,4 @@
-"""What a plate element is: where its nodes lie and what its matrices are."""
+"""Plate elements: node positions and matrices."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -19,7 +19,7 @@ ElementMatrix = Callable[[Plate, float, float], FloatArray]
 class Element:
     """A rectangle of (order + 1)² nodes with the degrees of freedom w, beta_x, beta_y at each.
 
-    side: where the nodes lie along a side, from -1 to 1, (order + 1,); the same along x and y.
+    side: node positions along a side, from -1 to 1, (order + 1,); the same along x and y.
     Nodes are numbered row by row from the lower left, x running first; the deflection is the tensor
     product of the Lagrange polynomials of the side. stiffness(plate, dx, dy) [N/m, N, N m] and
     mass(plate, dx, dy) [kg, kg m, kg m²] give the matrices (3 n, 3 n) of a dx by dy rectangle [m];

@@ -1,9 +1,9 @@
 """Q3 to Q5: Reissner-Mindlin rectangles of high order on Gauss-Lobatto nodes, fully integrated.
 
-From the third order on the polynomials are rich enough that thin plates do not lock and nothing
-has to be assumed of the shear. Every integral over the rectangle is the product of an integral
-along x and one along y. With elements narrow enough at a free edge they also follow the layer, as
-wide as the plate is thick, that keeps elements of low order from converging faster than linearly
+From the third order on thin plates do not lock and no shear strain needs to be assumed. Every
+integral over the rectangle is the product of an integral along x and one along y. Narrow elements
+at a free edge also resolve the boundary layer, as wide as the plate is thick, that limits elements
+of low order to linear convergence
 (Babuška and Li, Comput. Methods Appl. Mech. Engrg. 100 (1992) 249-273; Häggblad and Bathe, Int. J.
 Num. Meth. Eng. 30 (1990) 981-1011).
 """
@@ -42,7 +42,7 @@ def _stiffness(side: tuple[float, ...], plate: Plate, dx: float, dy: float) -> F
     n = len(side) ** 2
     total = np.zeros((n, 3, n, 3))
 
-    # The product of an integral along x and one along y, as a matrix over the element's nodes.
+    # kron(A, B)_ij: integral of A along y times integral of B along x, over the element's nodes.
     area = np.kron(value, value) * dx * dy / 4
     along_x = np.kron(value, slope) * dy / dx
     along_y = np.kron(slope, value) * dx / dy

@@ -1,8 +1,8 @@
 """MITC4: the four-node Reissner-Mindlin rectangle with assumed transverse shear strain.
 
-Bathe and Dvorkin, Int. J. Num. Meth. Eng. 21 (1985) 367-383. Full integration of the shear would
-lock; one point would leave spurious modes where ERAs hold the plate. The assumed strain does
-neither. It is the element of the founding paper.
+Bathe and Dvorkin, Int. J. Num. Meth. Eng. 21 (1985) 367-383. Full integration of the shear locks,
+one-point integration leaves spurious modes on ERAs; the assumed strain does neither. It is the
+element of the founding paper.
 """
 
 import numpy as np

@@ -86,7 +86,7 @@ def contrast_by_hand(given, drive_index, weights):
 @pytest.mark.parametrize("is_alone", [False, True])
 @pytest.mark.parametrize("targets", [1, 2])
 @pytest.mark.parametrize("wanted", [1e-6, 1.4, 2.0])
-def test_switched_finds_the_best_of_all_patterns(is_alone, targets, wanted, monkeypatch):
+def test_find_switched_equals_brute_force(is_alone, targets, wanted, monkeypatch):
     """One or two ERAs of three at five frequencies, every pattern tried by hand."""
     monkeypatch.setattr(switched_mode, "BATCH", 3)
     monkeypatch.setattr(switched_mode, "BOUND_POINTS", 1)  # so that bounds mislead
@@ -106,7 +106,7 @@ def test_switched_finds_the_best_of_all_patterns(is_alone, targets, wanted, monk
 
 @pytest.mark.parametrize("few", [0, 10_000])
 @pytest.mark.parametrize("targets", [1, 2])
-def test_switched_says_whether_something_is_better(few, targets, monkeypatch):
+def test_find_switched_returns_only_better_patterns(few, targets, monkeypatch):
     """Just below its best contrast it finds that, just above nothing, of few sources and many."""
     monkeypatch.setattr(switched_mode, "FEW_SOURCES", few)
     for seed in range(8):
@@ -119,7 +119,7 @@ def test_switched_says_whether_something_is_better(few, targets, monkeypatch):
         assert found_alone("switched", given, 1.001 * contrast) is None
 
 
-def test_what_a_drive_does_is_equation_28():
+def test_evaluate_follows_equation_28():
     """Peak, level and contrast of a drive at two frequencies, by hand."""
     given = random_fields(1)
     drive = DriveVector(np.array([2, 0, 2]), np.array([0.5j, 1.0, -0.25], dtype=np.complex64))
@@ -129,7 +129,7 @@ def test_what_a_drive_does_is_equation_28():
     assert evaluation.sensation == pytest.approx(felt, rel=1e-5)
 
 
-def test_what_a_quiet_finger_feels_of_two_tones_is_their_power():
+def test_evaluate_adds_sensations_of_tones_as_squares():
     """Multiples of threshold add as squares: 3 at one frequency and 4 at another are felt as 5."""
     quiet = np.zeros((2, 2, 1), dtype=np.complex64)
     quiet[0, 0], quiet[1, 1] = 3.0, 40.0j
@@ -149,7 +149,7 @@ def test_what_a_quiet_finger_feels_of_two_tones_is_their_power():
         ([1.99, 1.9], []),  # the best is none of them: it has several frequencies
     ],
 )
-def test_what_is_near_the_best_is_within_three_decibels(scores, near):
+def test_alternatives_are_within_three_decibels(scores, near):
     """The best first, four at the most; none where the best drive is not among them."""
     frequencies = np.arange(10, 10 + len(scores))
     choice = Choice(
@@ -165,7 +165,7 @@ def test_what_is_near_the_best_is_within_three_decibels(scores, near):
     assert found.score == pytest.approx([scores[place] for place in near])
 
 
-def test_the_forms_of_the_quiet_points_are_their_power_with_errors():
+def test_quiet_forms_are_the_expected_power():
     """For any weights: |w h|² and a hundredth of each ERA's own, at some of the frequencies too."""
     given = random_fields(3)
     assert given.quiet_forms.dtype == np.float32
@@ -180,7 +180,7 @@ def test_the_forms_of_the_quiet_points_are_their_power_with_errors():
             assert (w.conj() @ R @ w).real == pytest.approx(power, rel=1e-5)
 
 
-def test_phased_for_one_quiet_point_is_the_closed_form():
+def test_phased_equals_closed_form_for_one_quiet_point():
     """With one point at the target and one quiet, the best score is sqrt(h^H R^-1 h)."""
     for seed in range(5):
         given = random_fields(seed, quiet=1, points=1)
@@ -193,7 +193,7 @@ def test_phased_for_one_quiet_point_is_the_closed_form():
         assert evaluate(given, drive).score == pytest.approx(best, rel=1e-3)
 
 
-def test_phased_for_a_lone_finger_is_the_closed_form():
+def test_phased_equals_closed_form_for_a_lone_finger():
     """What is around it counts by its mean power, so at every frequency it is h^H R^-1 h."""
     for seed in range(5):
         given = random_fields(seed, points=1, is_alone=True)
@@ -207,7 +207,7 @@ def test_phased_for_a_lone_finger_is_the_closed_form():
         assert evaluate(given, drive).score == pytest.approx(best, rel=1e-3)
 
 
-def test_signed_for_a_lone_finger_is_the_top_eigenvector():
+def test_signed_equals_top_eigenvector_for_a_lone_finger():
     """Around it a mean counts: for real weights the best of w^T Re(h h^H) w by w^T Re(R) w."""
     for seed in range(10):
         given = random_fields(seed, quiet=20, points=1, is_alone=True, eras=4)
@@ -223,7 +223,7 @@ def test_signed_for_a_lone_finger_is_the_top_eigenvector():
 
 
 @pytest.mark.parametrize(("mode", "lowest"), [("signed", -1.0), ("graded", 0.0)])
-def test_real_weights_are_the_best_of_a_fine_grid(mode, lowest):
+def test_real_weights_equal_grid_search(mode, lowest):
     """One quiet point and one target whose phases fit nothing: every direction of weights tried."""
     side = np.linspace(lowest, 1.0, 61)
     grid = np.array([[1.0, a, b] for a in side for b in side])
@@ -260,7 +260,7 @@ def refined(given, frequency, start, free):
         ("graded", 4, np.abs),
     ],
 )
-def test_a_general_optimiser_finds_nothing_better(mode, count, free):
+def test_weights_are_not_improved_by_nelder_mead(mode, count, free):
     """On the plate, from several starts, Nelder-Mead gains no more than 2 % (0.17 dB)."""
     for number, places in enumerate(contact_sets(3, fingers=3, seed=4)):
         given = fields_on_plate(places, level=-60.0).at(np.array([2, 9, 16]))
@@ -273,7 +273,7 @@ def test_a_general_optimiser_finds_nothing_better(mode, count, free):
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_modes_keep_to_what_they_may(seed):
+def test_weights_satisfy_the_constraints_of_their_mode(seed):
     """Switched: full stroke; graded: real and not below zero; signed: real; none above 1."""
     given = random_fields(seed)
     switched, graded, signed, phased = (found_alone(mode, given, 0.0) for mode in DRIVE_MODES)
@@ -286,7 +286,7 @@ def test_modes_keep_to_what_they_may(seed):
 
 
 @pytest.mark.parametrize("level", [12.0, 60.0])
-def test_more_freedom_is_never_worse(level):
+def test_find_drives_is_never_worse_in_a_richer_mode(level):
     """On the paper's plate each mode's robust score is at least that of the mode before it.
 
     At 60 dB SL the level holds the best weights back, and poorer modes find better ones by chance;
@@ -309,7 +309,7 @@ def test_more_freedom_is_never_worse(level):
     assert (held_back > 10) == (level > 50.0)
 
 
-def test_more_frequencies_and_eras_are_never_worse():
+def test_find_drives_is_never_worse_with_more_frequencies_or_eras():
     """Every second frequency, or one ERA less, has no better best; phased to half a decibel."""
     for places in contact_sets(10, fingers=3, seed=3):
         given = fields_on_plate(places)
@@ -332,7 +332,7 @@ def test_more_frequencies_and_eras_are_never_worse():
                     assert 20 * np.log10(evaluation.score) <= most + slack
 
 
-def test_the_phased_optimum_does_not_depend_on_what_holds_the_plate(monkeypatch):
+def test_phased_optimum_is_independent_of_mounts_without_errors(monkeypatch):
     """Without errors: half the stiffness and four times the damping, the same best contrast."""
     monkeypatch.setattr(coherent, "ERROR_SHARE", 1e-3)
     monkeypatch.setattr(fields, "ERROR_SHARE", 1e-3)
@@ -365,7 +365,7 @@ def test_max_sensation_is_reached_and_not_exceeded(mode):
         assert find_drives(replace(given, wanted=1.1 * most), mode) is None
 
 
-def test_two_tones_may_be_louder_than_any_drive_at_one_frequency():
+def test_max_sensation_includes_two_tones():
     """Each of two ERAs moves the target at a frequency of its own: both are felt sqrt(2) as much.
 
     Richer modes have one frequency, and what `switched` can do.
@@ -384,7 +384,7 @@ def test_max_sensation_of_phased_is_the_sum_of_magnitudes():
     assert DRIVE_MODES["phased"].max_sensation(given) == pytest.approx(sums.max(), rel=1e-4)
 
 
-def test_two_targets_and_a_quiet_point_are_all_served():
+def test_find_drives_reaches_two_targets():
     """Four ERAs, two targets, one quiet point, next to no errors to fear: both targets feel it."""
     for seed in (0, 2, 6, 16, 17):  # the last three need their phases brought into line
         given = random_fields(seed, targets=2, quiet=1, points=1, eras=4)
@@ -418,7 +418,7 @@ def test_two_targets_and_a_quiet_point_are_all_served():
         (0.01, 45.0, "signed"),
     ],
 )
-def test_what_an_amplifier_can_play_follows_from_its_steps(level_step, phase_step, richest):
+def test_playable_drive_modes_follow_from_steps(level_step, phase_step, richest):
     """On and off only; levels; signs; phases; phases too coarse to cancel with."""
     modes = playable_drive_modes(level_step=level_step, phase_step=phase_step)
     assert modes == tuple(DRIVE_MODES)[: list(DRIVE_MODES).index(richest) + 1]

@@ -17,7 +17,7 @@ MESHES = [Mesh(12, 9, LENGTH, WIDTH), Mesh(4, 3, LENGTH, WIDTH, ELEMENTS["MITC4"
 
 
 @pytest.mark.parametrize("mesh", MESHES, ids=str)
-def test_interpolation_gives_back_what_the_element_can_carry(mesh):
+def test_interpolation_is_exact_for_polynomials_of_the_element(mesh):
     """Every polynomial up to the element's order, along both sides, comes out at any point."""
     points = np.random.default_rng(0).uniform(0, [LENGTH, WIDTH], (60, 2))
     points[0] = [LENGTH, WIDTH]
@@ -32,7 +32,7 @@ def test_interpolation_gives_back_what_the_element_can_carry(mesh):
 
 
 @pytest.mark.parametrize("mesh", MESHES, ids=str)
-def test_every_element_lists_its_nodes_row_by_row(mesh):
+def test_connectivity_lists_nodes_row_by_row(mesh):
     """The first and last node of an element are its lower left and upper right corner."""
     x, y = mesh.lines
     lower_left = mesh.nodes[mesh.connectivity[:, 0]]
@@ -42,7 +42,7 @@ def test_every_element_lists_its_nodes_row_by_row(mesh):
     np.testing.assert_allclose(upper_right, [(a, b) for b in y[1:] for a in x[1:]], atol=1e-15)
 
 
-def test_strips_lie_along_every_edge():
+def test_mesh_strips_lie_along_every_edge():
     """Strips of 3 mm are the first and last elements; those between share the rest evenly."""
     mesh = Mesh(4, 3, 0.3, 0.2, ELEMENTS["Q5"], 0.003)
     x, y = mesh.lines
@@ -56,7 +56,7 @@ def test_mesh_round_trips_through_json(mesh):
     assert Mesh.from_dict(json.loads(json.dumps(mesh.to_dict()))) == mesh
 
 
-def test_the_automatic_mesh_follows_the_wave():
+def test_auto_mesh_follows_the_bending_wavelength():
     """At twice the frequency the wave is 1.41 times shorter, at four times half as long."""
     plate = Plate(LENGTH, WIDTH, 0.0015, ALUMINIUM)
     low, high = (Mesh.auto(plate, frequency_max=f) for f in (500.0, 2000.0))
@@ -65,13 +65,13 @@ def test_the_automatic_mesh_follows_the_wave():
     assert low.strip == high.strip == 0.003
 
 
-def test_a_thick_plate_needs_no_strips():
+def test_auto_mesh_has_no_strips_when_plate_is_thick():
     """Where the edge's layer is as wide as an element, the element follows it already."""
     assert Mesh.auto(Plate(0.2, 0.1, 0.02, ALUMINIUM), frequency_max=500.0).strip == 0
 
 
 @pytest.mark.parametrize("kind", [("MITC4", 12, 9), ("Q3", 4, 3)])
-def test_a_mesh_carries_six_nodes_to_a_wavelength(kind):
+def test_highest_frequency_has_six_nodes_to_a_wavelength(kind):
     """Nodes an inch apart carry waves of 152.4 mm, which are those of 631.85 Hz."""
     element, nx, ny = kind
     mesh = Mesh(nx, ny, LENGTH, WIDTH, ELEMENTS[element])
@@ -81,7 +81,7 @@ def test_a_mesh_carries_six_nodes_to_a_wavelength(kind):
 
 
 @pytest.mark.parametrize("sides", [(0.3048, 0.2286), (0.7, 0.1), (0.05, 0.06)])
-def test_the_coarsest_mesh_carries_its_frequency_and_no_coarser_one_does(sides):
+def test_coarsest_mesh_is_the_coarsest_that_resolves_its_frequency(sides):
     """Its elements are short enough along both sides; one fewer along either is too long."""
     plate = Plate(*sides, 0.0015, ALUMINIUM)
     for frequency in (40.0, 500.0, 1637.0):
@@ -96,7 +96,7 @@ def test_the_coarsest_mesh_carries_its_frequency_and_no_coarser_one_does(sides):
     assert (again.nx, again.ny) == (12, 9)
 
 
-def test_a_mesh_says_its_strips_in_three_digits():
+def test_mesh_prints_strips_in_three_digits():
     """Twice the thickness of a laminate's equivalent plate is a long number."""
     mesh = Mesh(4, 3, LENGTH, WIDTH, ELEMENTS["Q5"], 0.003127438)
     assert str(mesh) == "4x3 Q5 with strips of 3.13 mm"

@@ -34,7 +34,7 @@ def peaks(figure: PaperFigure) -> dict[str, np.ndarray]:
     }
 
 
-def test_every_figure_with_results_is_there(figures):
+def test_paper_figures_lists_all_with_results(figures):
     """Figures 6, 7, 10, 11 (twice, as in the paper), 12 and 13 (maps and study)."""
     assert set(figures) == {
         "figure_6",
@@ -49,7 +49,7 @@ def test_every_figure_with_results_is_there(figures):
     assert FIGURE_NUMBERS == ("6", "7", "10", "11", "12", "13")
 
 
-def test_figure_6_has_the_papers_table_1(figures):
+def test_figure_6_reproduces_table_1(figures):
     """On the paper's mesh its five frequencies to the last digit; Eq. 29 beside them."""
     table = figures["figure_6"].tables[""]
     # Half up, as the paper rounds: 110.945 is 110.95.
@@ -61,7 +61,7 @@ def test_figure_6_has_the_papers_table_1(figures):
     np.testing.assert_allclose(table["model_fine_hz"], table["comsol_hz"], rtol=0.005)
 
 
-def test_figure_7_has_the_papers_table_2(figures):
+def test_figure_7_reproduces_table_2(figures):
     """On its ERAs too; the fine mesh comes to the COMSOL column within 0.5 %."""
     table = figures["figure_7"].tables[""]
     assert [f"{value:.2f}" for value in table["model_12x9_hz"]] == [
@@ -70,7 +70,7 @@ def test_figure_7_has_the_papers_table_2(figures):
     np.testing.assert_allclose(table["model_fine_hz"], table["comsol_hz"], rtol=0.005)
 
 
-def test_mode_1_simply_supported_is_a_half_wave_each_way(figures):
+def test_figure_6_shapes_are_half_waves(figures):
     """sin(pi x / L) sin(pi y / b); mode 5 has two half waves along both sides."""
     shapes = figures["figure_6"].tables["_shapes"]
     x, y = np.asarray(shapes["x_m"]) / 0.3048, np.asarray(shapes["y_m"]) / 0.2286
@@ -80,7 +80,7 @@ def test_mode_1_simply_supported_is_a_half_wave_each_way(figures):
         np.testing.assert_allclose(shape * np.sign(shape @ by_hand), by_hand, atol=0.02)
 
 
-def test_two_active_eras_beat_one_in_every_layout(figures):
+def test_figure_11_best_pair_exceeds_best_single_era(figures):
     """Section 3.2: the best pair has a higher median than the best single ERA, in each layout."""
     gain = figures["figure_11_boxplots"].findings["median_two_to_one_era_ratio"]
     assert len(gain) >= 5
@@ -88,7 +88,7 @@ def test_two_active_eras_beat_one_in_every_layout(figures):
 
 
 @pytest.mark.parametrize(("name", "sets"), [("figure_10", 4), ("figure_11_boxplots", 6)])
-def test_box_plots_have_every_activation_set_beside_them(figures, name, sets):
+def test_box_plots_list_every_activation_set(figures, name, sets):
     """Seven layouts, each with its four ERAs or six pairs; quartiles in order, above zero."""
     table = figures[name].tables[""]
     assert len(table["layout"]) == 7 * sets
@@ -102,7 +102,7 @@ def test_box_plots_have_every_activation_set_beside_them(figures, name, sets):
     assert five.min() > 0
 
 
-def test_the_symmetry_of_the_corners_is_in_the_numbers(figures):
+def test_figure_10_is_symmetric_for_corner_eras(figures):
     """Each corner ERA alone gives the same statistics, for the plate mirrors."""
     table = figures["figure_10"].tables[""]
     medians = [
@@ -113,7 +113,7 @@ def test_the_symmetry_of_the_corners_is_in_the_numbers(figures):
     np.testing.assert_allclose(medians, medians[0], rtol=1e-6)
 
 
-def test_edge_and_diagonal_pairs_have_nearly_the_same_maximum(figures):
+def test_figure_11_edge_and_diagonal_maxima_agree(figures):
     """Section 3.2, 110 Hz: a negligible change in maximum, about 1 %, but other nulls."""
     edge, diagonal = peaks(figures["figure_11_maps"]).values()
     assert edge.max() / diagonal.max() == pytest.approx(1.0, abs=0.015)
@@ -121,7 +121,7 @@ def test_edge_and_diagonal_pairs_have_nearly_the_same_maximum(figures):
     assert np.corrcoef(edge, diagonal)[0, 1] < 0.99
 
 
-def test_the_switched_patterns_leave_hardly_a_spot_still(figures):
+def test_figure_12_patterns_together_leave_few_nulls(figures):
     """Section 3.3: together the six leave under 5 % of the plate below 30 % of their maxima."""
     maps = peaks(figures["figure_12"])
     assert len(maps) == 6
@@ -131,21 +131,21 @@ def test_the_switched_patterns_leave_hardly_a_spot_still(figures):
     assert all((peak < 0.3 * peak.max()).mean() > 0.2 for peak in maps.values())
 
 
-def test_swapped_frequencies_turn_the_pattern_by_half_a_turn(figures):
+def test_figure_12_swapped_frequencies_rotate_the_map(figures):
     """300 and 100 Hz exchanged between opposite corners: the same map, rotated."""
     maps = peaks(figures["figure_12"])
     there, back = maps["peak_300_100_hz_m_s2"], maps["peak_100_300_hz_m_s2"]
     np.testing.assert_allclose(there, back[::-1], rtol=1e-5, atol=1e-5 * there.max())
 
 
-def test_twice_the_stiffness_raises_the_map_and_keeps_it(figures):
+def test_figure_13_doubled_stiffness_scales_the_map(figures):
     """Section 3.3, 250 Hz, 8 to 16 kN/m: 1.5 to 1.8 times the maximum, correlation above 0.98."""
     soft, stiff = peaks(figures["figure_13_maps"]).values()
     assert 1.5 < stiff.max() / soft.max() < 1.8
     assert np.corrcoef(soft, stiff)[0, 1] > 0.98
 
 
-def test_the_stiffness_study_holds_the_stiffness_pair(figures):
+def test_figure_13_study_contains_the_maps(figures):
     """At 8 and 16 kN/m the study's maxima are those of the two maps, at 17 kN/m it is the map."""
     study = figures["figure_13_stiffness"].tables[""]
     stiffness = np.asarray(study["stiffness_n_m"])
@@ -161,7 +161,7 @@ def test_the_stiffness_study_holds_the_stiffness_pair(figures):
 
 
 @pytest.mark.parametrize("name", ["figure_11_maps", "figure_12", "figure_13_maps"])
-def test_all_maps_of_a_figure_share_one_colour_scale(figures, name):
+def test_maps_share_one_colour_scale(figures, name):
     """From 0 to the largest value of all of them, and the colour bar says its unit."""
     *maps, bar = figures[name].figure.axes
     (limits,) = {axes.collections[0].get_clim() for axes in maps}
@@ -170,7 +170,7 @@ def test_all_maps_of_a_figure_share_one_colour_scale(figures, name):
     assert bar.get_ylabel().endswith("/ g")
 
 
-def test_switched_pairs_are_in_the_titles(figures):
+def test_figure_12_titles_name_the_pairs(figures):
     """Each map of Figure 12 says which ERA has which frequency, in the paper's order."""
     titles = [axes.get_title() for axes in figures["figure_12"].figure.axes[:6]]
     assert titles[0] == "(a) SW 320 Hz, NE 320 Hz"
@@ -178,7 +178,7 @@ def test_switched_pairs_are_in_the_titles(figures):
     assert titles[5] == "(f) SW 150 Hz, NE 150 Hz"
 
 
-def test_active_eras_are_red_and_the_others_green(figures):
+def test_figure_11_marks_active_eras(figures):
     """Figure 11 (a): SW and SE are driven, NE and NW only hold."""
     axes = figures["figure_11_maps"].figure.axes[0]
     marks = {
@@ -196,7 +196,7 @@ def test_active_eras_are_red_and_the_others_green(figures):
     }
 
 
-def test_every_figure_can_be_drawn(figures):
+def test_figures_render_without_a_display(figures):
     """As PNG without a display, at least 1000 pixels wide at 150 dots an inch."""
     for made in figures.values():
         FigureCanvasAgg(made.figure)
@@ -204,7 +204,7 @@ def test_every_figure_can_be_drawn(figures):
         assert made.figure.get_figwidth() * 150 >= 1000
 
 
-def test_another_plate_has_no_printed_columns():
+def test_figures_of_another_plate_have_no_printed_columns():
     """Only the paper's plate can be compared with what the paper prints."""
     rig = make_paper_rig(12, 9)
     thick = replace(rig, plate=replace(rig.plate, thickness=0.002))
@@ -214,7 +214,7 @@ def test_another_plate_has_no_printed_columns():
     assert list(made.tables[""]) == ["mode", "model_12x9_hz", "model_fine_hz"]
 
 
-def test_the_papers_mesh_and_eq_29_for_the_papers_plate():
+def test_paper_mesh_and_thin_plate_frequencies():
     """12 x 9 elements of an inch; Eq. 29 gives the analytical column of Table 1."""
     plate = make_paper_rig(12, 9).plate
     assert str(paper_mesh(plate)) == "12x9"
@@ -224,20 +224,20 @@ def test_the_papers_mesh_and_eq_29_for_the_papers_plate():
 
 
 @pytest.mark.parametrize("number", ["1", "8", "14", "", "figure_6"])
-def test_a_figure_without_results_is_refused(number):
+def test_paper_figures_refuses_an_unknown_number(number):
     """Figures 1 to 5, 8 and 9 are sketches; others are not there."""
-    with pytest.raises(InputError, match="those with results are 6, 7, 10"):
+    with pytest.raises(InputError, match=r"^figure .* 6, 7, 10"):
         list(paper_figures(make_paper_rig(12, 9), number))
 
 
-def test_a_pair_of_one_era_is_refused():
+def test_figure_12_refuses_a_rig_of_one_era():
     """Figure 12 drives a diagonal pair; a rig of one ERA has none."""
     rig = make_paper_rig(12, 9)
     with pytest.raises(InputError, match="two ERAs are needed"):
         list(paper_figures(replace(rig, eras=rig.eras[:1]), "12"))
 
 
-def test_a_mesh_too_coarse_for_320_hz_is_refused():
+def test_figure_12_refuses_a_mesh_too_coarse():
     """Three by two elements carry no wave of 320 Hz."""
     rig = make_paper_rig(12, 9)
     coarse = replace(rig, mesh=Mesh(3, 2, rig.plate.length, rig.plate.width))

@@ -58,7 +58,7 @@ def random_loads(rng: np.random.Generator) -> tuple[PointLoad, ...]:
     return (*fingers, PointLoad(rng.uniform(0, LENGTH), rng.uniform(0, WIDTH), mass=0.02))
 
 
-def test_any_layout_at_any_frequency_agrees_with_the_direct_solve(free):
+def test_acceleration_equals_direct_solve_for_any_layout(free):
     """One solved plate is within 1e-4 (relative L2) of a direct solve.
 
     One to six ERAs of any stiffness, bolts, fingers, a mass; frequencies anywhere up to 500 Hz and
@@ -78,7 +78,7 @@ def test_any_layout_at_any_frequency_agrees_with_the_direct_solve(free):
         assert error.max() < 1e-4
 
 
-def test_below_all_bending_modes_it_agrees_too():
+def test_acceleration_equals_direct_solve_below_all_bending_modes():
     """A block 20 mm thick only rocks on its ERAs up to 500 Hz: rigid modes alone are kept."""
     plate = Plate(0.3, 0.2, 0.02, ALUMINIUM)
     mesh = Mesh(3, 3, 0.3, 0.2, ELEMENTS["Q4"])
@@ -91,7 +91,7 @@ def test_below_all_bending_modes_it_agrees_too():
     assert error.max() < 1e-4
 
 
-def test_without_damping_between_resonances_it_still_agrees():
+def test_acceleration_equals_direct_solve_without_damping():
     """A plate and ERAs that lose nothing leave no damping to hide behind."""
     plate = Plate(LENGTH, WIDTH, 0.0015, ALUMINIUM, loss_factor=0.0)
     mesh = MESHES["24x18"]
@@ -112,7 +112,7 @@ def test_without_damping_between_resonances_it_still_agrees():
     [(1.0, 0.02, (60, 3)), (0.05, 0.4, (4, 40)), (0.03, 0.03, (1, 1)), (0.03, 0.03, (2, 1))],
     ids=["bar", "standing bar", "one element", "two elements"],
 )
-def test_bars_and_the_smallest_meshes_agree_too(length, width, mesh):
+def test_acceleration_equals_direct_solve_for_bars_and_small_meshes(length, width, mesh):
     """Many modes in a row, as of a bar, or hardly any degrees of freedom: neither breaks it."""
     plate = Plate(length, width, 0.002, ALUMINIUM)
     mesh = Mesh(*mesh, length, width)
@@ -124,7 +124,7 @@ def test_bars_and_the_smallest_meshes_agree_too(length, width, mesh):
     assert error.max() < 1e-4
 
 
-def test_the_classes_hold_every_mode_of_the_plate(free):
+def test_symmetry_classes_contain_every_mode(free):
     """The four quarters' modes are those of the whole plate, found without its symmetry."""
     whole = modes(assemble(free.plate, free.mesh), 15, support="free").natural_frequencies
     quarters = np.sort(np.sqrt(free.eigenvalues)) / (2 * np.pi)
@@ -133,14 +133,14 @@ def test_the_classes_hold_every_mode_of_the_plate(free):
 
 
 @pytest.mark.parametrize("frequency", [0.0, -10.0, float("nan"), 501.0])
-def test_a_frequency_that_it_was_not_solved_for_is_refused(free, frequency):
+def test_acceleration_refuses_frequencies_out_of_range(free, frequency):
     """Nothing, or less than nothing, or more than was solved for, has no answer."""
     eras = random_eras(np.random.default_rng(0), 3)
     with pytest.raises(InputError, match=r"^frequency must be"):
         free.acceleration(eras, np.array([100.0, frequency]), free.mesh.nodes)
 
 
-def test_a_frequency_beyond_the_mesh_is_refused():
+def test_acceleration_refuses_a_frequency_too_high_for_the_mesh():
     """Six nodes to a wavelength are the least: the wave at 450 Hz is 180 mm, an element 51 mm."""
     plate = Plate(LENGTH, WIDTH, 0.0015, ALUMINIUM)
     free = solve_free_plate(plate, Mesh(6, 5, LENGTH, WIDTH))
@@ -149,7 +149,7 @@ def test_a_frequency_beyond_the_mesh_is_refused():
         free.acceleration(eras, np.array([450.0]), free.mesh.nodes)
 
 
-def test_the_mesh_of_another_plate_is_refused():
+def test_solve_free_plate_refuses_the_mesh_of_another_plate():
     """A plate 1 cm longer than its mesh is an error, not the answer of the shorter one."""
     mesh = Mesh(12, 9, LENGTH, WIDTH)
     longer = Plate(LENGTH + 0.01, WIDTH, 0.0015, ALUMINIUM)
@@ -159,7 +159,7 @@ def test_the_mesh_of_another_plate_is_refused():
         assemble(longer, mesh)
 
 
-def test_points_off_the_plate_are_refused(free):
+def test_acceleration_refuses_points_off_the_plate(free):
     """An ERA or an observed point beyond the edge is an error, not an extrapolation."""
     eras = random_eras(np.random.default_rng(0), 3)
     beyond = np.array([[LENGTH + 0.01, 0.1]])
@@ -169,7 +169,7 @@ def test_points_off_the_plate_are_refused(free):
         free.acceleration((replace(eras[0], x=-0.01),), np.array([100.0]), free.mesh.nodes)
 
 
-def test_receptances_are_what_a_direct_solve_gives(free):
+def test_receptances_equal_direct_solve(free):
     """Deflection per unit force between places and to points, a mass and a finger on the plate."""
     places = np.array([[0.0, 0.0], [0.21, 0.07], [0.11, WIDTH]])
     points = free.mesh.nodes[::5]
@@ -191,7 +191,7 @@ def test_receptances_are_what_a_direct_solve_gives(free):
             assert np.linalg.norm(quick - exact) < 2e-6 * np.linalg.norm(exact)
 
 
-def test_what_is_forgotten_is_solved_again(monkeypatch):
+def test_acceleration_is_independent_of_the_cache_size(monkeypatch):
     """A plate that may keep no solved point answers as one that keeps them all."""
     plate = Plate(LENGTH, WIDTH, 0.0015, ALUMINIUM)
     frequencies = np.array([60.0, 470.0])

@@ -64,12 +64,12 @@ async def amplifier(backend: Backend) -> AsyncIterator[Amplifier]:
 
 
 @pytest.mark.parametrize("check", CHECKS, ids=[check.name for check in CHECKS])
-async def test_the_contract_is_kept(check: Check, amplifier: Amplifier) -> None:
+async def test_conformance_check_passes(check: Check, amplifier: Amplifier) -> None:
     """Every check of `era amp conformance`; each says itself what it proves."""
     assert (await run_check(check, amplifier)).problem is None
 
 
-async def test_a_lost_host_may_come_back(backend: Backend) -> None:
+async def test_backend_can_be_reopened(backend: Backend) -> None:
     """The same wire can be opened, used, closed and opened again."""
     for _ in range(2):
         amplifier = Amplifier(backend, reply_timeout=REPLY_TIMEOUT)
@@ -79,10 +79,10 @@ async def test_a_lost_host_may_come_back(backend: Backend) -> None:
         await amplifier.close()
 
 
-async def test_no_backend_takes_what_no_guard_has_seen(
+async def test_backend_refuses_unchecked_sets_and_envelopes(
     amplifier: Amplifier, backend: Backend
 ) -> None:
-    """A plain set or envelope is a TypeError at the backend itself, before it is on the wire."""
+    """TypeError before anything is sent."""
     plain = CommandSet(1, (DriveCommand(0, 110.0, 0.5),), ramp=0.0, valid_for=0.0)
     shape = Envelope(1, 0.005, (Knot(0.5, 0.0),))
     sent = backend.counters.frames_out
@@ -92,7 +92,9 @@ async def test_no_backend_takes_what_no_guard_has_seen(
     assert backend.counters.frames_out == sent
 
 
-async def test_the_backend_says_what_it_counts(amplifier: Amplifier, backend: Backend) -> None:
+async def test_backend_counts_frames_and_times_round_trips(
+    amplifier: Amplifier, backend: Backend
+) -> None:
     """Requests and their replies are counted, a round trip is timed, nothing is called damaged."""
     before = amplifier.statistics
     for _ in range(5):

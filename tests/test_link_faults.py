@@ -111,7 +111,7 @@ def fed_at(far: FarSide) -> float:
     return far.amplifier._fed
 
 
-async def test_a_host_that_is_gone_leaves_silence(far: FarSide) -> None:
+async def test_amplifier_falls_silent_when_the_host_is_gone(far: FarSide) -> None:
     """Silent within the watchdog time + 5 ms of the last sign of life, then a latched fault."""
     async with Link(far) as link:
         await link.amplifier.arm(WATCHDOG)
@@ -125,7 +125,7 @@ async def test_a_host_that_is_gone_leaves_silence(far: FarSide) -> None:
 
 
 @pytest.mark.parametrize("kind", ["unplug", "hang", "drop"])
-async def test_a_link_that_is_cut_leaves_silence_and_is_told(far: FarSide, kind: FaultKind) -> None:
+async def test_cut_link_is_silent_and_detected(far: FarSide, kind: FaultKind) -> None:
     """Silent as above; the host knows after three heartbeats at most, and does nothing any more."""
     async with Link(far, reply_timeout=HEARTBEAT, watched=True) as link:
         await link.amplifier.arm(WATCHDOG)
@@ -151,7 +151,7 @@ async def test_a_link_that_is_cut_leaves_silence_and_is_told(far: FarSide, kind:
         assert (status.state, status.levels) == (AmplifierState.FAULT, (0.0,) * 4)
 
 
-async def test_a_wire_that_is_pulled_out_is_told_within_60_ms(far: FarSide) -> None:
+async def test_unplugged_wire_is_detected_within_60_ms(far: FarSide) -> None:
     """Also while nothing is asked; a busy machine can only add to it, so the best try counts."""
     now = asyncio.get_running_loop().time
     took = []
@@ -169,7 +169,7 @@ async def test_a_wire_that_is_pulled_out_is_told_within_60_ms(far: FarSide) -> N
 
 
 @pytest.mark.parametrize("name", WIRES)
-def test_a_wire_comes_back_once_nothing_holds_it_out(name: str, coarse_rig: Rig) -> None:
+def test_wire_recovers_after_overlapping_faults(name: str, coarse_rig: Rig) -> None:
     """It is pulled out for 0.2 s, and 0.1 s later for 0.3 s: it is there again after 0.4 s."""
 
     async def is_there(host: Link) -> bool:
@@ -224,7 +224,7 @@ def in_virtual_time(
 
 @pytest.mark.parametrize("kind", ["hang", "drop"])
 @pytest.mark.parametrize("name", [*WIRES, *SLOW_WIRES])
-def test_an_amplifier_that_is_silent_is_told_within_three_heartbeats(
+def test_silent_amplifier_is_detected_within_three_heartbeats(
     name: str, kind: FaultKind, coarse_rig: Rig
 ) -> None:
     """150 ms from the moment that is worst: it hangs, or is cut off, right after it has answered.
@@ -245,7 +245,7 @@ def test_an_amplifier_that_is_silent_is_told_within_three_heartbeats(
 
 
 @pytest.mark.parametrize("name", [*WIRES, *SLOW_WIRES])
-def test_a_loss_in_the_middle_of_a_set_is_told_as_soon_as_the_rig_check_says(
+def test_loss_during_a_set_is_detected_within_loss_detection_time(
     name: str, coarse_rig: Rig
 ) -> None:
     """Right after an answer it hangs, and four channels are asked of it next: within the time by
@@ -271,7 +271,7 @@ def test_a_loss_in_the_middle_of_a_set_is_told_as_soon_as_the_rig_check_says(
 
 
 @pytest.mark.parametrize("name", [*WIRES, *SLOW_WIRES])
-def test_a_slow_wire_is_no_lost_one(name: str, coarse_rig: Rig) -> None:
+def test_slow_wire_is_not_lost(name: str, coarse_rig: Rig) -> None:
     """Sets and heartbeats that take all the time of the wire are waited for, and none repeated."""
 
     async def use(host: Link) -> None:
@@ -286,7 +286,7 @@ def test_a_slow_wire_is_no_lost_one(name: str, coarse_rig: Rig) -> None:
     in_virtual_time(name, coarse_rig, use)
 
 
-async def test_each_token_is_applied_once_under_loss(far: FarSide) -> None:
+async def test_token_is_applied_once_under_frame_loss(far: FarSide) -> None:
     """With 20 % of all telegrams lost each way, what is confirmed was played, and once only."""
     played: list[int] = []  # in the order of their commits, by the amplifier itself
     commit = far.amplifier._commit
@@ -326,7 +326,7 @@ async def test_each_token_is_applied_once_under_loss(far: FarSide) -> None:
 
 
 @pytest.mark.parametrize("kind", ["corrupt", "truncate", "duplicate", "delay"])
-async def test_nothing_is_credited_to_another_request(far: FarSide, kind: FaultKind) -> None:
+async def test_reply_is_never_credited_to_another_request(far: FarSide, kind: FaultKind) -> None:
     """Every answer belongs to its request, whatever befalls a third of the telegrams."""
     patience = 0.5 if kind == "duplicate" else 0.03
     async with Link(far, reply_timeout=patience) as link:
@@ -350,7 +350,7 @@ async def test_nothing_is_credited_to_another_request(far: FarSide, kind: FaultK
         assert (await link.amplifier.stop()).state is AmplifierState.QUICK_STOP_ACTIVE
 
 
-async def test_a_damaged_set_is_counted_and_changes_nothing(far: FarSide) -> None:
+async def test_damaged_set_is_counted_and_not_played(far: FarSide) -> None:
     """Damaged on its way to the amplifier it is not played; damaged answers are counted."""
     async with Link(far, reply_timeout=0.03) as host:
         await host.amplifier.arm(2.0)
@@ -371,7 +371,7 @@ async def test_a_damaged_set_is_counted_and_changes_nothing(far: FarSide) -> Non
             assert seen.crc_errors + seen.unexpected_frames > 0
 
 
-async def test_one_good_telegram_resynchronises(far: FarSide) -> None:
+async def test_one_valid_frame_resynchronizes(far: FarSide) -> None:
     """After a damaged one the very next is understood."""
     async with Link(far, reply_timeout=2.0) as link:
         for _ in range(5):
@@ -385,7 +385,7 @@ async def test_one_good_telegram_resynchronises(far: FarSide) -> None:
             assert link.amplifier.statistics.timeouts == before
 
 
-async def test_a_torn_set_changes_nothing(far: FarSide) -> None:
+async def test_incomplete_set_is_not_played(far: FarSide) -> None:
     """A set of which a part is lost is not played, and neither is half of it."""
     async with Link(far, reply_timeout=0.03) as link:
         await link.amplifier.arm(2.0)
@@ -403,7 +403,7 @@ async def test_a_torn_set_changes_nothing(far: FarSide) -> None:
         assert status.levels == pytest.approx((0.4, 0.0, 0.0, 0.0), abs=1e-4)
 
 
-async def test_a_storm_of_refusals_is_not_answered_with_one(far: FarSide) -> None:
+async def test_refusals_do_not_multiply_requests(far: FarSide) -> None:
     """A host that beats 20 times a second sends at most 50 frames in it."""
     async with Link(far) as link:
         await link.amplifier.arm(2.0)
@@ -419,7 +419,7 @@ async def test_a_storm_of_refusals_is_not_answered_with_one(far: FarSide) -> Non
         assert (await link.amplifier.heartbeat()).state is AmplifierState.OPERATION_ENABLED
 
 
-async def test_a_reboot_is_noticed_and_nothing_is_armed(far: FarSide) -> None:
+async def test_reboot_is_detected_and_does_not_rearm(far: FarSide) -> None:
     """Silent at once; afterwards the host finds it disarmed, and sets are refused."""
     async with Link(far) as link:
         await link.amplifier.arm(2.0)
@@ -437,7 +437,7 @@ async def test_a_reboot_is_noticed_and_nothing_is_armed(far: FarSide) -> None:
             await link.amplifier.apply(link.tone())
 
 
-async def test_another_amplifier_is_refused(far: FarSide) -> None:
+async def test_reopening_refuses_another_serial_number(far: FarSide) -> None:
     """Whoever answers after a loss must have the serial number of before."""
     async with Link(far) as link:
         await link.amplifier.close()
@@ -449,7 +449,7 @@ async def test_another_amplifier_is_refused(far: FarSide) -> None:
 
 
 @pytest.mark.parametrize("kind", ["arc", "over_voltage", "channel"])
-async def test_a_fault_of_the_amplifier_silences_and_latches(far: FarSide, kind: FaultKind) -> None:
+async def test_amplifier_fault_silences_and_latches(far: FarSide, kind: FaultKind) -> None:
     """Within 5 ms, high voltage off, and nothing plays until it is cleared."""
     async with Link(far) as link:
         await link.amplifier.arm(2.0)
@@ -469,7 +469,7 @@ async def test_a_fault_of_the_amplifier_silences_and_latches(far: FarSide, kind:
         assert (await link.amplifier.arm(2.0)).state is AmplifierState.OPERATION_ENABLED
 
 
-async def test_warmth_derates_and_then_trips(far: FarSide) -> None:
+async def test_over_temperature_derates_and_then_trips(far: FarSide) -> None:
     """Half of the level first, which reading back shows, then a latched fault until it is cool."""
     async with Link(far) as link:
         await link.amplifier.arm(2.0)
@@ -486,7 +486,7 @@ async def test_warmth_derates_and_then_trips(far: FarSide) -> None:
         assert (await link.amplifier.clear()).state is AmplifierState.SWITCH_ON_DISABLED
 
 
-async def test_a_hung_host_that_goes_on_replays_nothing(far: FarSide) -> None:
+async def test_resumed_host_replays_nothing(far: FarSide) -> None:
     """A host that is stopped for longer than the watchdog finds a fault, and its set refused."""
     async with Link(far) as link:
         await link.amplifier.arm(WATCHDOG)
@@ -505,7 +505,7 @@ def in_use() -> tuple[int, int, int]:
     return len(list(Path("/dev/fd").iterdir())), len(threads), len(asyncio.all_tasks())
 
 
-async def test_a_hundred_replugs_leak_nothing(far: FarSide) -> None:
+async def test_hundred_replugs_leak_nothing(far: FarSide) -> None:
     """Unplug, notice, plug in, reopen: descriptors, threads and tasks are as many as before."""
     async with Link(far) as link:
         before: tuple[int, int, int] | None = None

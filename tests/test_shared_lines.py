@@ -69,7 +69,9 @@ def tone(amplifier: Amplifier, level: float, token: int) -> SafeCommandSet:
     return guard.check(wanted)
 
 
-async def test_each_answers_for_itself(amplifiers: dict[str, Amplifier]) -> None:
+async def test_amplifiers_on_one_line_reply_for_themselves(
+    amplifiers: dict[str, Amplifier],
+) -> None:
     """Asked at the same time, each gives its own identity and level; they share a bus."""
     found = {name: one.identity.serial_number for name, one in amplifiers.items()}
     assert found == {"east": "SIM-east", "west": "SIM-west"}
@@ -82,7 +84,7 @@ async def test_each_answers_for_itself(amplifiers: dict[str, Amplifier]) -> None
     assert (await west.status()).levels[0] == pytest.approx(0.4)
 
 
-async def test_they_may_be_opened_at_once(far: FarSide) -> None:
+async def test_amplifiers_on_one_line_open_concurrently(far: FarSide) -> None:
     """Who comes while another opens their wire waits for it, and each answers for itself."""
     both = {
         name: Amplifier(open_backend(patient(url)), reply_timeout=1.0)
@@ -94,7 +96,7 @@ async def test_they_may_be_opened_at_once(far: FarSide) -> None:
         await amplifier.close()
 
 
-async def test_one_may_be_opened_while_the_other_is_closed(
+async def test_amplifier_opens_while_another_closes(
     far: FarSide, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The port that the one still closes, which may take a while, is not in the other's way."""
@@ -120,7 +122,7 @@ async def test_one_may_be_opened_while_the_other_is_closed(
     await east.close()
 
 
-async def test_a_close_that_is_cancelled_is_a_close(far: FarSide) -> None:
+async def test_cancelled_close_closes(far: FarSide) -> None:
     """Given up half way, it holds neither the wire nor the amplifier's number back for good."""
     amplifier = Amplifier(open_backend(patient(far.url)), reply_timeout=1.0)
     await amplifier.open()
@@ -134,7 +136,9 @@ async def test_a_close_that_is_cancelled_is_a_close(far: FarSide) -> None:
     await other.close()
 
 
-async def test_one_comes_back_while_the_other_is_left_lost(wire: Wire, two_amplifiers: Rig) -> None:
+async def test_one_amplifier_reopens_while_the_other_stays_lost(
+    wire: Wire, two_amplifiers: Rig
+) -> None:
     """After a loss of the wire each is lost until it is opened itself, in any order."""
     async with far_side(replace(wire, unpluggable=True), two_amplifiers) as far:
         east, west = (
@@ -164,7 +168,7 @@ async def test_one_comes_back_while_the_other_is_left_lost(wire: Wire, two_ampli
         await west.close()
 
 
-async def test_one_commit_is_played_by_all_at_one_moment(
+async def test_broadcast_commit_starts_all_together(
     far: FarSide, amplifiers: dict[str, Amplifier]
 ) -> None:
     """What is staged waits; after the broadcast, whose time is known, both play it, from moments
@@ -183,7 +187,7 @@ async def test_one_commit_is_played_by_all_at_one_moment(
 
 
 @pytest.mark.parametrize("silence", [Amplifier.stop, Amplifier.disarm])
-async def test_a_stop_waits_for_no_other_that_is_stuck(
+async def test_stop_does_not_wait_for_a_stuck_amplifier(
     far: FarSide,
     amplifiers: dict[str, Amplifier],
     silence: Callable[[Amplifier, float], Awaitable[Status]],
@@ -209,7 +213,7 @@ async def test_a_stop_waits_for_no_other_that_is_stuck(
     raise AssertionError(f"stopped after {', '.join(f'{1e3 * one:.0f} ms' for one in took)}")
 
 
-async def test_one_stop_silences_all(amplifiers: dict[str, Amplifier]) -> None:
+async def test_broadcast_stop_silences_all(amplifiers: dict[str, Amplifier]) -> None:
     """A broadcast stop needs no answer and latches in both."""
     for amplifier in amplifiers.values():
         await amplifier.apply(tone(amplifier, 0.3, 1))

@@ -22,7 +22,7 @@ NOTHING = 0.1  # s; of the half second that one try takes
 
 @pytest.mark.parametrize("wire", WIRES)
 @pytest.mark.parametrize("how", ["cancelled", "closed"])
-def test_it_waits_for_no_try_that_is_left(wire: str, how: str, coarse_rig: Rig) -> None:
+def test_opening_ends_at_once_when_abandoned(wire: str, how: str, coarse_rig: Rig) -> None:
     """Cancelled, as a daemon does that is told to end, or closed by somebody else meanwhile."""
 
     async def give_up(url: str, *, after: float) -> float:

@@ -146,9 +146,7 @@ SENDING: dict[str, Callable[[Chain], Coroutine[Any, Any, object]]] = {
 
 @pytest.mark.parametrize("line", LINES)
 @pytest.mark.parametrize("what", SENDING)
-def test_what_waits_for_the_line_is_not_sent_before_a_stop(
-    line: str, what: str, coarse_rig: Rig
-) -> None:
+def test_queued_request_is_superseded_by_a_stop(line: str, what: str, coarse_rig: Rig) -> None:
     """West is on the line and east's request waits for it: then east's stop is what comes next,
     and what waited is refused without ever having been sent."""
 
@@ -170,9 +168,7 @@ def test_what_waits_for_the_line_is_not_sent_before_a_stop(
 
 @pytest.mark.parametrize("line", LINES)
 @pytest.mark.parametrize("what", ["stage", "heartbeat"])
-def test_what_is_hurried_while_it_waits_for_the_line_is_not_sent(
-    line: str, what: str, coarse_rig: Rig
-) -> None:
+def test_abort_unsent_drops_a_queued_request(line: str, what: str, coarse_rig: Rig) -> None:
     """The last finger lifted while east's request waited for west's answer: it is given up at once,
     so that what comes next on the line is what silences."""
 
@@ -192,7 +188,7 @@ def test_what_is_hurried_while_it_waits_for_the_line_is_not_sent(
 
 
 @pytest.mark.parametrize("line", LINES)
-def test_a_stop_whose_turn_is_to_come_keeps_the_line_free(line: str, coarse_rig: Rig) -> None:
+def test_queued_stop_reserves_the_line(line: str, coarse_rig: Rig) -> None:
     """West waits for its own answer and east for the line when west's stop is wished: the stop is
     next, and east's request comes after it, once, and is answered."""
 
@@ -212,7 +208,7 @@ def test_a_stop_whose_turn_is_to_come_keeps_the_line_free(line: str, coarse_rig:
 @pytest.mark.parametrize("line", LINES)
 @pytest.mark.parametrize("whose", ["east", "west"])
 @pytest.mark.parametrize("silencing", [Stop, Disarm, Apply])
-def test_at_whatever_moment_it_is_wished_it_comes_next(
+def test_stop_class_request_is_the_next_frame_at_any_moment(
     line: str, whose: str, silencing: type[Request], coarse_rig: Rig
 ) -> None:
     """While sets and heartbeats follow each other on the line, what silences one amplifier is the
@@ -260,7 +256,7 @@ def test_at_whatever_moment_it_is_wished_it_comes_next(
 
 
 @pytest.mark.parametrize("whose", ["east", "west"])
-def test_between_two_frames_of_rtu_it_is_not_too_late(whose: str, coarse_rig: Rig) -> None:
+def test_stop_preempts_a_request_in_the_rtu_gap(whose: str, coarse_rig: Rig) -> None:
     """What has its turn but waits for the line to be silent for 3.5 characters gives way to a stop
     of its own amplifier for good, and to that of another until it is out."""
 
@@ -284,7 +280,7 @@ def test_between_two_frames_of_rtu_it_is_not_too_late(whose: str, coarse_rig: Ri
 
 @pytest.mark.parametrize("line", LINES)
 @pytest.mark.parametrize("what", ["disarm", "silent set"])
-def test_a_stop_goes_before_what_else_silences(line: str, what: str, coarse_rig: Rig) -> None:
+def test_stop_precedes_other_stop_class_requests(line: str, what: str, coarse_rig: Rig) -> None:
     """A disarm or a silent set that waits for the line lets a stop of its own amplifier, or of the
     other, go first, and follows it."""
 
@@ -312,7 +308,7 @@ def test_a_stop_goes_before_what_else_silences(line: str, what: str, coarse_rig:
     on_a_line(line, coarse_rig, use)
 
 
-def test_a_stop_to_all_is_said_again_where_an_answer_may_have_run_into_it(coarse_rig: Rig) -> None:
+def test_broadcast_stop_is_repeated_after_a_possible_collision(coarse_rig: Rig) -> None:
     """At once, and once more when the line is theirs, 8 ms later at most; on a free line once."""
 
     async def use(chain: Chain) -> None:
@@ -336,7 +332,7 @@ def test_a_stop_to_all_is_said_again_where_an_answer_may_have_run_into_it(coarse
     on_a_line("serial", coarse_rig, use)
 
 
-def test_on_can_a_stop_does_not_wait_for_who_listens_before_arming(coarse_rig: Rig) -> None:
+def test_stop_preempts_an_arm_that_listens_on_can(coarse_rig: Rig) -> None:
     """An arm that listens for another host's heartbeats, up to 60 ms, gives way and is refused."""
 
     async def use(chain: Chain) -> None:
@@ -355,7 +351,7 @@ def test_on_can_a_stop_does_not_wait_for_who_listens_before_arming(coarse_rig: R
 
 
 @pytest.mark.parametrize("line", LINES)
-def test_a_stop_that_is_given_up_lets_the_others_go_on(line: str, coarse_rig: Rig) -> None:
+def test_cancelled_stop_releases_the_line(line: str, coarse_rig: Rig) -> None:
     """Who wished it is cancelled before its turn has come: what waits on the line is sent all the
     same, and the next requests find it free."""
 
@@ -375,7 +371,7 @@ def test_a_stop_that_is_given_up_lets_the_others_go_on(line: str, coarse_rig: Ri
 
 
 @pytest.mark.parametrize("line", LINES)
-def test_who_is_cancelled_as_it_gives_way_is_cancelled(line: str, coarse_rig: Rig) -> None:
+def test_cancellation_during_preemption_is_a_cancellation(line: str, coarse_rig: Rig) -> None:
     """A request that its caller gives up in the very moment in which it gives way ends as
     cancelled, not as refused: time-outs of callers keep their meaning."""
 
@@ -398,7 +394,7 @@ def test_who_is_cancelled_as_it_gives_way_is_cancelled(line: str, coarse_rig: Ri
 @pytest.mark.parametrize("line", LINES)
 @pytest.mark.parametrize("silencing", [Disarm, Apply])
 @pytest.mark.parametrize("first", [None, Nak(NakCode.BUSY)], ids=["no answer", "busy"])
-def test_a_stop_goes_before_the_repetition_of_what_else_silences(
+def test_stop_precedes_retries_of_stop_class_requests(
     line: str, silencing: type[Request], first: Reply | None, coarse_rig: Rig
 ) -> None:
     """Where a disarm or a silent set has to be repeated, a stop that was wished meanwhile is out
@@ -440,9 +436,7 @@ def test_a_stop_goes_before_the_repetition_of_what_else_silences(
 
 
 @pytest.mark.parametrize("line", LINES)
-def test_who_joins_a_line_waits_for_the_answer_that_is_owed_there(
-    line: str, coarse_rig: Rig
-) -> None:
+def test_joining_amplifier_waits_for_a_pending_reply(line: str, coarse_rig: Rig) -> None:
     """East had the line for itself and is being asked when west is opened: west's first request
     goes out after east's answer, for two on one pair of wires would spoil each other."""
 

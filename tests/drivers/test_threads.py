@@ -11,7 +11,7 @@ import pytest
 from drivers.threads import in_thread
 
 
-async def test_what_it_gives_and_raises_is_what_work_does() -> None:
+async def test_in_thread_returns_and_raises_as_its_work() -> None:
     """The result, and the very exception, from a thread of that name."""
     assert await in_thread(lambda: threading.current_thread().name, name="opening") == "opening"
     problem = OSError("no such port")
@@ -24,7 +24,7 @@ async def test_what_it_gives_and_raises_is_what_work_does() -> None:
     assert raised.value is problem
 
 
-async def test_what_was_given_up_is_undone_once() -> None:
+async def test_cancelled_work_is_undone_once() -> None:
     """Who waits is cancelled at once; what is opened afterwards is closed, by its own thread."""
     may_open, closed, closings = threading.Event(), threading.Event(), []
 
@@ -48,7 +48,7 @@ async def test_what_was_given_up_is_undone_once() -> None:
     assert closings == ["port"]
 
 
-async def test_what_comes_in_the_moment_of_the_cancellation_is_undone() -> None:
+async def test_result_at_the_moment_of_cancellation_is_undone() -> None:
     """It is there already, but whoever is cancelled has not taken it over yet."""
     closed = threading.Event()
     loop = asyncio.get_running_loop()
@@ -71,7 +71,7 @@ async def test_what_comes_in_the_moment_of_the_cancellation_is_undone() -> None:
     assert await asyncio.to_thread(closed.wait, 20)
 
 
-def test_what_comes_after_the_event_loop_has_ended_is_undone() -> None:
+def test_result_after_the_end_of_the_loop_is_undone() -> None:
     """There is nobody left to be told of it, so the thread that opened it closes it."""
     may_open, closed = threading.Event(), threading.Event()
 
@@ -88,7 +88,7 @@ def test_what_comes_after_the_event_loop_has_ended_is_undone() -> None:
     assert closed.wait(20)
 
 
-def test_a_program_ends_though_work_hangs() -> None:
+def test_program_ends_while_work_hangs() -> None:
     """Its end does not wait for a thread that waits for ever, unlike asyncio's own pool."""
     program = """
 import asyncio, threading

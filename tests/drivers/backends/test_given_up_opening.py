@@ -52,10 +52,10 @@ def _open_adapter() -> Coroutine[Any, Any, object]:
     ],
     ids=["port", "adapter"],
 )
-async def test_what_is_opened_too_late_is_given_back(
+async def test_device_opened_after_a_cancellation_is_closed(
     monkeypatch: pytest.MonkeyPatch, place: str, begin: Callable[[], Coroutine[Any, Any, object]]
 ) -> None:
-    """Who is cancelled does not wait for it, and no other program finds it taken for ever."""
+    """The cancelled task does not wait for it."""
     slow = _Slow()
     monkeypatch.setattr(place, slow.make)
     task = asyncio.create_task(begin())

@@ -81,12 +81,12 @@ async def _adapter() -> Port | Adapter:
 
 
 @pytest.mark.parametrize("begin", [_port, _adapter])
-async def test_closing_waits_for_no_device_that_hangs(
+async def test_close_does_not_wait_for_a_device_that_hangs(
     begin: Callable[[], Awaitable[Port | Adapter]],
     hanging: _Hanging,
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    """It goes on beside, and the log says so."""
+    """It continues in its thread, with a log line."""
     opened = await begin()
     opened.close()
     with caplog.at_level(logging.WARNING, "drivers"):
@@ -95,10 +95,10 @@ async def test_closing_waits_for_no_device_that_hangs(
     assert "still closing" in caplog.text
 
 
-async def test_what_an_adapter_has_once_it_was_closed_is_old(
+async def test_frames_after_close_are_discarded(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """It hung, and the bus has been opened anew: a heartbeat of before is told to nobody."""
+    """A frame of an adapter that hung while the bus was reopened."""
     device, heard = _Late(), list[CanFrame]()
     monkeypatch.setattr(adapter, "open_bus", lambda url: device)
     monkeypatch.setattr(threads, "CLOSE_TIMEOUT", 0.05)

@@ -71,7 +71,7 @@ def the_line() -> Line:
     return shared_line(Line, "key", Line)
 
 
-async def test_the_first_opens_and_the_last_closes() -> None:
+async def test_first_user_opens_and_last_user_closes() -> None:
     """In between it is one line, whoever comes and goes; afterwards the next gets another."""
     line = the_line()
     await line.join(1, lambda _: None)
@@ -84,7 +84,7 @@ async def test_the_first_opens_and_the_last_closes() -> None:
     assert the_line() is not line
 
 
-async def test_a_number_is_for_one() -> None:
+async def test_number_in_use_is_refused() -> None:
     """Who comes second is told what to do, and the first is not disturbed."""
     line = the_line()
     await line.join(1, lambda _: None)
@@ -94,7 +94,7 @@ async def test_a_number_is_for_one() -> None:
     await line.leave(1)
 
 
-async def test_one_that_cannot_be_opened_is_as_if_nobody_had_come() -> None:
+async def test_failed_opening_leaves_no_user() -> None:
     """The same number may try again, on a line made anew."""
     line = the_line()
     line.fails = True
@@ -107,7 +107,7 @@ async def test_one_that_cannot_be_opened_is_as_if_nobody_had_come() -> None:
     await again.leave(1)
 
 
-async def test_who_comes_while_it_closes_waits_and_opens_it_anew() -> None:
+async def test_join_during_close_reopens() -> None:
     """The system gives a port out once: it is open again only after it was closed."""
     line = the_line()
     await line.join(1, lambda _: None)
@@ -127,7 +127,7 @@ async def test_who_comes_while_it_closes_waits_and_opens_it_anew() -> None:
     await line.leave(2)
 
 
-async def test_who_comes_before_it_is_closed_keeps_it_open() -> None:
+async def test_join_before_close_keeps_it_open() -> None:
     """The last was about to close it, and waited for somebody who opens or closes it as well."""
     line = the_line()
     await line.join(1, lambda _: None)
@@ -142,7 +142,7 @@ async def test_who_comes_before_it_is_closed_keeps_it_open() -> None:
     await line.leave(2)
 
 
-async def test_a_loss_is_told_once_to_each_and_over_for_who_comes_back() -> None:
+async def test_loss_is_reported_once_per_user_and_ends_with_join() -> None:
     """Another loss is told to who was back only, and who is not back may send nothing meanwhile."""
     told: list[tuple[int, str]] = []
     line = the_line()
@@ -165,7 +165,7 @@ async def test_a_loss_is_told_once_to_each_and_over_for_who_comes_back() -> None
     await line.leave(2)
 
 
-async def test_who_was_about_to_come_when_it_was_lost_is_told_of_the_next_loss() -> None:
+async def test_user_joining_during_a_loss_is_notified_of_the_next() -> None:
     """It waited for its turn to open the line, and opens it anew: that is another line for it."""
     line, told = the_line(), list[str]()
     await line.join(1, lambda _: None)
@@ -181,7 +181,7 @@ async def test_who_was_about_to_come_when_it_was_lost_is_told_of_the_next_loss()
     await line.leave(2)
 
 
-async def test_nothing_is_sent_while_it_is_being_opened_anew() -> None:
+async def test_nothing_is_sent_while_reopening() -> None:
     """Neither as if it were open nor with an error that nobody expects; afterwards it goes out."""
     line = the_line()
     await line.join(1, lambda _: None)
@@ -253,7 +253,7 @@ WAITING = {
 
 
 @pytest.mark.parametrize("kind", WAITING)
-async def test_what_waited_while_the_line_was_lost_is_not_sent_when_others_open_it(
+async def test_request_queued_before_a_loss_is_not_sent_after_reopening(
     kind: type[WireBackend],
 ) -> None:
     """An amplifier that was lost is armed by nobody before it was opened anew."""
@@ -278,7 +278,7 @@ async def test_what_waited_while_the_line_was_lost_is_not_sent_when_others_open_
 
 
 @pytest.mark.parametrize("kind", WAITING)
-async def test_who_asks_before_it_is_open_is_told(kind: type[WireBackend]) -> None:
+async def test_request_before_opening_is_a_link_error(kind: type[WireBackend]) -> None:
     """In the words of the wire, and what to do."""
     url, _ = WAITING[kind]
     with pytest.raises(LinkError, match=r"/dev/none.* is not open; open the amplifier first"):

@@ -9,7 +9,7 @@ import pytest
 from drivers.backends.waiting import reply_within
 
 
-async def test_a_reply_in_time_is_returned_and_a_missing_one_is_not_waited_for() -> None:
+async def test_reply_within_returns_a_reply_or_times_out() -> None:
     """What is there is given at once; what does not come is a TimeoutError, and the future over."""
     loop = asyncio.get_running_loop()
     there: asyncio.Future[str] = loop.create_future()
@@ -21,7 +21,7 @@ async def test_a_reply_in_time_is_returned_and_a_missing_one_is_not_waited_for()
     assert missing.done()
 
 
-async def test_what_came_while_this_process_was_held_up_counts() -> None:
+async def test_reply_counts_when_the_process_was_delayed() -> None:
     """A reply that lay in the pipe when the time was over is no missing one."""
     loop = asyncio.get_running_loop()
     reply: asyncio.Future[bytes] = loop.create_future()
@@ -39,7 +39,7 @@ async def test_what_came_while_this_process_was_held_up_counts() -> None:
         os.close(writing)
 
 
-async def test_a_reader_thread_that_was_held_up_too_gets_a_moment() -> None:
+async def test_reply_counts_when_the_reader_thread_was_delayed() -> None:
     """After a hold-up a reply that is posted a little later still counts."""
     loop = asyncio.get_running_loop()
     reply: asyncio.Future[str] = loop.create_future()
@@ -51,7 +51,7 @@ async def test_a_reader_thread_that_was_held_up_too_gets_a_moment() -> None:
     assert await waiting == "late"
 
 
-async def test_who_is_cancelled_does_not_wait_on() -> None:
+async def test_cancelled_wait_ends_at_once() -> None:
     """Cancelling ends the wait and the future."""
     reply: asyncio.Future[str] = asyncio.get_running_loop().create_future()
     waiting = asyncio.create_task(reply_within(reply, 60.0))

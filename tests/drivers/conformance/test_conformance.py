@@ -219,7 +219,7 @@ MISTAKES: list[tuple[Answer, str]] = [
 @pytest.mark.parametrize(
     ("answer", "name"), MISTAKES, ids=[answer.__name__ for answer, _ in MISTAKES]
 )
-async def test_a_mistake_is_found(
+async def test_check_fails_for_its_mistake_only(
     answer: Answer, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The check it is for says what happened instead; an honest amplifier passes that check."""
@@ -234,8 +234,8 @@ async def test_a_mistake_is_found(
     assert outcomes[1].problem is None
 
 
-def test_what_only_looks_comes_first() -> None:
-    """Nothing is driven before everything that can be looked at was."""
+def test_reading_checks_come_first() -> None:
+    """Nothing is driven before."""
     drives = [check.drives for check in CHECKS]
     assert drives == sorted(drives)
     assert drives.count(False) >= 4

@@ -87,7 +87,7 @@ def adapter() -> Iterator[Adapter]:
     adapter.close()
 
 
-def test_an_adapter_is_listened_to_and_left_closed(adapter: Adapter) -> None:
+def test_adapter_listens_and_is_closed(adapter: Adapter) -> None:
     """Its version, and the amplifiers' nodes that beat there, not the host's; L and no other
     opening, closed at the end, and not a frame of ours on the bus."""
     assert ask_for_slcan(adapter.port) == SlcanAdapter("1013", nodes=(1, 5))
@@ -95,7 +95,7 @@ def test_an_adapter_is_listened_to_and_left_closed(adapter: Adapter) -> None:
     assert {frame.id for frame in adapter.on_bus} == {0x701, 0x705, 0x77F, 0x181}
 
 
-def test_another_device_gets_two_characters(adapter: Adapter) -> None:
+def test_other_device_receives_two_characters(adapter: Adapter) -> None:
     """Whatever else it says or does not say: nothing is sent but V and CR."""
     for answer in (b"", b"?\r", b"Version 2\r", b"V10"):
         adapter.said = b""
@@ -104,7 +104,7 @@ def test_another_device_gets_two_characters(adapter: Adapter) -> None:
         assert adapter.said == b"V\r"
 
 
-def test_an_adapter_that_cannot_only_listen_is_not_opened(adapter: Adapter) -> None:
+def test_adapter_without_listen_only_mode_is_not_opened(adapter: Adapter) -> None:
     """It refuses L: it is named, and O is never tried."""
     usual = adapter.receive
     adapter.receive = lambda data: usual(data.replace(b"L\r", b"nonsense\r"))
@@ -116,7 +116,7 @@ def test_an_adapter_that_cannot_only_listen_is_not_opened(adapter: Adapter) -> N
 
 
 @pytest.mark.parametrize("is_wanted", [True, False])
-def test_discover_asks_for_adapters_only_if_told_to(
+def test_discover_probes_adapters_on_request_only(
     adapter: Adapter, is_wanted: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """With --slcan the port is named with the URLs of what was heard, and no other protocol is

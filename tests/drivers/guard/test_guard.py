@@ -23,8 +23,8 @@ def with_command(**changes: object) -> CommandSet:
     return replace(GOOD, commands=(replace(GOOD.commands[0], **changes),))
 
 
-def test_a_good_set_passes_unchanged() -> None:
-    """What is within the limits comes through as it is."""
+def test_guard_passes_a_valid_set_unchanged() -> None:
+    """Within the limits."""
     safe = GUARD.check(GOOD)
     assert type(safe) is SafeCommandSet
     assert (safe.token, safe.commands) == (GOOD.token, GOOD.commands)
@@ -63,7 +63,7 @@ def test_guard_refuses_an_invalid_set(bad: CommandSet, reason: str) -> None:
     assert [command.channel for command in safe.commands] == [0, 1, 2, 3]
 
 
-def test_the_channel_to_blame_is_named() -> None:
+def test_refusal_has_the_channel() -> None:
     """CommandRefused carries the channel to blame."""
     with pytest.raises(CommandRefused) as caught:
         GUARD.check(with_command(level=2.0))
@@ -86,7 +86,7 @@ NUMBERS = st.one_of(st.floats(), st.integers(), st.none(), st.text(max_size=3))
     | st.none(),
     NUMBERS,
 )
-def test_whatever_comes_the_loop_gets_something_safe(wanted: CommandSet, ramp: float) -> None:
+def test_check_or_silence_always_returns_a_safe_set(wanted: CommandSet, ramp: float) -> None:
     """Any garbage becomes a set that can be encoded and that keeps every limit."""
     safe, reason = GUARD.check_or_silence(wanted, ramp=ramp)
     sent = decode_request(encode_request(Apply(safe), address=1, sequence=1))
@@ -99,7 +99,7 @@ def test_whatever_comes_the_loop_gets_something_safe(wanted: CommandSet, ramp: f
     assert reason is None or safe.is_silent
 
 
-def test_a_broken_set_is_silence_whatever_it_raises() -> None:
+def test_check_or_silence_turns_any_exception_into_silence() -> None:
     """An exception of any kind inside a set becomes silence too."""
 
     class Broken(CommandSet):
@@ -115,14 +115,14 @@ def test_a_broken_set_is_silence_whatever_it_raises() -> None:
     assert str(reason) == "ZeroDivisionError: broken"
 
 
-def test_silence_without_a_token_takes_another_than_the_last() -> None:
+def test_silence_takes_a_new_token() -> None:
     """A token that was played already would make the amplifier ignore the silence."""
     for last, following in ((41, 42), (65535, 1)):
         GUARD.check(replace(GOOD, token=last))
         assert GUARD.silence(0, [0], ramp=0.01).token == following
 
 
-def test_a_silent_channel_may_have_any_frequency() -> None:
+def test_silent_channel_may_have_any_frequency() -> None:
     """At level zero the frequency does not matter, and none is sent that could be refused."""
     safe = GUARD.check(with_command(level=0.0, frequency=0.0))
     assert safe.commands[0].frequency == 40.0
@@ -141,7 +141,7 @@ def test_a_silent_channel_may_have_any_frequency() -> None:
         (GuardLimits(40.0, 500.0, 0.8), {}, GuardLimits(40.0, 500.0, 0.8)),
     ],
 )
-def test_limits_are_the_least_of_all(
+def test_limits_in_force_are_the_least(
     limits: GuardLimits, capabilities: dict[str, float], expected: GuardLimits
 ) -> None:
     """Configuration, amplifier and the built-in ceiling: the tightest of the three holds."""
@@ -164,7 +164,7 @@ def test_limits_that_leave_nothing_are_refused(limits: GuardLimits) -> None:
         Guard(limits, CAPABILITIES)
 
 
-def test_nobody_else_makes_a_safe_command() -> None:
+def test_only_the_guard_makes_safe_sets() -> None:
     """Neither the constructor nor a changed copy nor a subclass gets past the guard."""
     safe = GUARD.check(GOOD)
     with pytest.raises(TypeError):

@@ -41,7 +41,7 @@ def playing(
     return CommandSet(token, commands, ramp=ramp, valid_for=valid_for)
 
 
-def test_a_level_rises_no_faster_than_allowed() -> None:
+def test_slew_limits_the_rise_of_a_level() -> None:
     """At 10 a second, 0.5 takes 50 ms; falling and staying cost nothing; a new tone starts anew."""
     strict = guard(slew=10.0)
     for ramp in (0.0, 0.049):
@@ -56,7 +56,7 @@ def test_a_level_rises_no_faster_than_allowed() -> None:
     assert strict.silence(6, [0], ramp=0.0).is_silent
 
 
-def test_knots_rise_no_faster_than_allowed() -> None:
+def test_slew_limits_the_rise_of_knots() -> None:
     """Within an envelope, from its begin, and from its last knot to the command's level."""
     strict = guard(slew=10.0)
     with pytest.raises(CommandRefused, match=r"slot 1: .*0\.2"):
@@ -70,7 +70,7 @@ def test_knots_rise_no_faster_than_allowed() -> None:
         strict.check(playing(3, 0.2, onset=2))
 
 
-def test_the_power_of_all_channels_is_limited() -> None:
+def test_power_limits_the_squared_levels() -> None:
     """Squares of the levels add up; those of envelopes count where they are higher."""
     strict = guard(power=0.5)
     strict.check(playing(1, 0.5, 0.5))
@@ -82,7 +82,7 @@ def test_the_power_of_all_channels_is_limited() -> None:
             strict.check(playing(3, 0.1, **{which: 1}))
 
 
-def test_an_amplifier_cannot_widen_what_the_wire_can_say() -> None:
+def test_protocol_bounds_reported_capabilities() -> None:
     """One that claims 40 channels and ramps of 5 s: at most 16, and 1 s, as the protocol has it."""
     boasting = replace(CAPABILITIES, channels=40, ramp_max=5.0)
     wide = Guard(GuardLimits(40.0, 500.0, 0.8), boasting, clock=Clock())
@@ -95,7 +95,7 @@ def test_an_amplifier_cannot_widen_what_the_wire_can_say() -> None:
     assert wide.silence(2, range(40), ramp=5.0).ramp == 1.0
 
 
-def test_vibration_ends_when_its_time_is_over() -> None:
+def test_on_time_shortens_valid_for() -> None:
     """2 s without a pause: the set ends by itself by then, and the next one comes too late."""
     clock = Clock()
     strict = guard(clock, on_time=2.0)
@@ -112,7 +112,7 @@ def test_vibration_ends_when_its_time_is_over() -> None:
     assert strict.check(playing(7, 0.5)).valid_for == 2.0
 
 
-def test_a_vibration_that_goes_on_has_begun_when_it_began() -> None:
+def test_on_time_counts_from_the_begin_of_a_vibration() -> None:
     """Of 2 s of on-time, a set every half second leaves half a second less each time."""
     clock = Clock()
     strict = guard(clock, on_time=2.0)
@@ -121,12 +121,12 @@ def test_a_vibration_that_goes_on_has_begun_when_it_began() -> None:
         clock.now += 0.5
 
 
-def test_no_set_lasts_longer_than_it_can_be_told_to() -> None:
+def test_valid_for_is_bounded_by_the_protocol() -> None:
     """With an hour of on-time it ends after the 60 s that a wire can say, and is to be renewed."""
     assert guard(on_time=3600.0).check(playing(1, 0.5)).valid_for == 60.0
 
 
-def test_an_onset_that_leads_to_silence_vibrates_too() -> None:
+def test_onset_to_silence_counts_as_vibration() -> None:
     """An ERA that helps at an onset only: its time counts, as that of a level does."""
     clock = Clock()
     strict = guard(clock, on_time=2.0, rate=2.0)
@@ -139,7 +139,7 @@ def test_an_onset_that_leads_to_silence_vibrates_too() -> None:
         strict.check(playing(4, 0.0, onset=1))
 
 
-def test_what_has_ended_by_itself_counts_until_then() -> None:
+def test_ended_vibration_counts_until_its_end() -> None:
     """Of 2 s in ten, one second is used by a set that ended by itself, seen late."""
     clock = Clock()
     strict = guard(clock, duty=0.2)
@@ -148,7 +148,7 @@ def test_what_has_ended_by_itself_counts_until_then() -> None:
     assert strict.check(playing(2, 0.5)).valid_for == pytest.approx(1.0)
 
 
-def test_a_share_of_the_time_is_silent() -> None:
+def test_duty_limits_the_vibration_time() -> None:
     """A tenth of ten seconds: 1 s, then a rest until the window has moved on."""
     clock = Clock()
     strict = guard(clock, duty=0.1)
@@ -161,7 +161,7 @@ def test_a_share_of_the_time_is_silent() -> None:
     assert strict.check(playing(4, 0.5)).valid_for == pytest.approx(0.5)
 
 
-def test_sets_come_no_faster_than_allowed() -> None:
+def test_rate_limits_sets_per_second() -> None:
     """Ten a second: ten at once are let through, the eleventh not, one more after 0.1 s."""
     clock = Clock()
     strict = guard(clock, rate=10.0)
@@ -180,7 +180,7 @@ def test_sets_come_no_faster_than_allowed() -> None:
     strict.check(playing(14, 0.5))
 
 
-def test_without_limits_nothing_is_shortened() -> None:
+def test_valid_for_is_unchanged_without_limits() -> None:
     """A set that lasts until the next stays one."""
     assert guard().check(playing(1, 0.5)).valid_for == 0.0
 
@@ -206,13 +206,13 @@ def test_limits_that_leave_nothing_are_refused(name: str, value: float) -> None:
         (Envelope(1, 0.005, (Knot(0.1, math.inf),)), "knot 0"),
     ],
 )
-def test_envelopes_out_of_range_are_refused(envelope: Envelope, problem: str) -> None:
+def test_envelope_out_of_range_is_refused(envelope: Envelope, problem: str) -> None:
     """Slot, step, number of knots, and every knot's level and phase."""
     with pytest.raises(CommandRefused, match=problem):
         guard().check_envelope(envelope)
 
 
-def test_a_set_may_only_refer_to_what_the_guard_has_seen() -> None:
+def test_set_must_refer_to_loaded_slots() -> None:
     """What is in a slot decides about slew and power, so it must be known; until it is emptied."""
     known = guard()
     with pytest.raises(CommandRefused, match="empty slot 3"):
@@ -224,7 +224,7 @@ def test_a_set_may_only_refer_to_what_the_guard_has_seen() -> None:
         known.check(playing(3, 0.5, ending=3))
 
 
-def test_it_says_when_everything_has_settled() -> None:
+def test_settled_after_covers_ramps_and_envelopes() -> None:
     """The ramp, or the longest envelope that may play, each a step longer than its knots."""
     known = guard()
     assert known.check(playing(1, 0.5, ramp=0.02)).settled_after == 0.02
@@ -233,7 +233,7 @@ def test_it_says_when_everything_has_settled() -> None:
     assert known.silence(3, [0], ramp=0.01).settled_after == 0.01
 
 
-def test_only_a_guard_makes_what_is_safe() -> None:
+def test_safe_types_cannot_be_made_or_subclassed() -> None:
     """Neither can be made by hand, nor be derived from."""
     with pytest.raises(TypeError):
         SafeEnvelope(1, 0.005, ())

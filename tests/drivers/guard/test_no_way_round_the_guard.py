@@ -60,7 +60,7 @@ def names(file: Path) -> set[str]:
     return found
 
 
-def test_there_is_something_to_walk() -> None:
+def test_source_scan_finds_the_guard() -> None:
     """The walk sees the guard, the amplifier and the control loop."""
     seen = {file.name for file in FILES}
     assert {"guard.py", "amplifier.py", "exchanges.py", "loop.py"} <= seen
@@ -68,14 +68,14 @@ def test_there_is_something_to_walk() -> None:
 
 
 @pytest.mark.parametrize("file", [file for file in FILES if file != GUARD], ids=str)
-def test_nobody_else_makes_a_safe_command(file: Path) -> None:
+def test_only_the_guard_makes_safe_sets(file: Path) -> None:
     """No call of SafeCommandSet or SafeEnvelope, no key, no forging around a constructor."""
     made = [name for name, _ in calls(file) if name in ("SafeCommandSet", "SafeEnvelope")]
     assert made == []
     assert names(file).isdisjoint({"_KEY", "__new__", "__class__", "__setattr__", "pickle", "copy"})
 
 
-def test_nothing_aside_makes_one() -> None:
+def test_other_packages_make_no_safe_sets() -> None:
     """Neither the simulation nor the model nor what notebooks import calls for one."""
     made = [file for file in ASIDE for name, _ in calls(file) if name.startswith("Safe")]
     assert ASIDE
@@ -83,7 +83,7 @@ def test_nothing_aside_makes_one() -> None:
 
 
 @pytest.mark.parametrize("file", FILES, ids=str)
-def test_what_plays_is_sent_by_the_amplifier_only(file: Path) -> None:
+def test_only_the_amplifier_sends_sets(file: Path) -> None:
     """Requests that carry a set or an envelope are made of checked ones, or by a decoder.
 
     In `Amplifier` they are made of what its own check let through; in the codecs only by what

@@ -44,7 +44,7 @@ def users() -> Users:
     return Users(Turns())
 
 
-async def test_silence_goes_before_what_was_just_handed_the_turn(users: Users) -> None:
+async def test_stop_class_precedes_a_request_at_its_turn(users: Users) -> None:
     """An ordinary request that has the turn but has not run yet gives it back, keeps its place
     before the others, and gets it next."""
     tasks = [users.take(name) for name in ("first", "second", "third")]
@@ -60,7 +60,7 @@ async def test_silence_goes_before_what_was_just_handed_the_turn(users: Users) -
     assert users.order == ["first", "stop", "second", "third"]
 
 
-async def test_a_stop_goes_before_what_else_silences(users: Users) -> None:
+async def test_stop_precedes_other_stop_class_requests(users: Users) -> None:
     """Silent sets and disarms that wait, with their longer ramps, come after it, in their order."""
     tasks = [users.take("first")]
     await settle()
@@ -74,7 +74,7 @@ async def test_a_stop_goes_before_what_else_silences(users: Users) -> None:
     assert users.order == ["first", "stop", "zero", "disarm"]
 
 
-async def test_an_apply_that_was_just_handed_the_turn_gives_way_for_good() -> None:
+async def test_apply_at_its_turn_is_superseded() -> None:
     """It was superseded before any of it was sent; the silence comes, and what was behind it."""
     users = Users(Turns())
     first, apply = users.take("first"), users.take("apply", RequestPriority.APPLY)
@@ -92,7 +92,7 @@ async def test_an_apply_that_was_just_handed_the_turn_gives_way_for_good() -> No
     assert users.order == ["first", "stop", "behind"]
 
 
-async def test_a_link_that_was_kept_free_for_nothing_is_handed_on(users: Users) -> None:
+async def test_released_reservation_passes_the_turn_on(users: Users) -> None:
     """Where what silences was given up, those who have waited meanwhile come; also the new."""
     users.turns.keep_free("west", RequestPriority.SILENCE)
     early = users.take("early")
@@ -107,7 +107,7 @@ async def test_a_link_that_was_kept_free_for_nothing_is_handed_on(users: Users) 
     assert users.order == ["early", "late"]
 
 
-async def test_of_two_stops_the_one_that_is_given_up_keeps_the_line_no_less_free() -> None:
+async def test_second_reservation_does_not_end_the_first() -> None:
     """Who stops an amplifier that another is already stopping, and whose stop never comes, takes
     nothing from the other's: others wait until that has come, too."""
     line = LineTurns()
@@ -128,7 +128,7 @@ async def test_of_two_stops_the_one_that_is_given_up_keeps_the_line_no_less_free
     assert said == ["stop", "other"]
 
 
-async def test_what_an_amplifier_still_has_to_say_ends_with_its_own_stop() -> None:
+async def test_exchange_is_refused_while_its_amplifier_is_stopped() -> None:
     """The second half of an exchange that takes two is refused while its amplifier is about to be
     silenced, instead of waiting for it; that of another waits."""
     line = LineTurns()

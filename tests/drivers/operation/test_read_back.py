@@ -14,7 +14,7 @@ def after(*reports: tuple[float, tuple[float, ...]], settled_from: float = 1.0) 
     return expected
 
 
-def test_levels_that_agree_are_no_fault() -> None:
+def test_equal_levels_are_no_fault() -> None:
     """However long, and up to a hundredth of full stroke."""
     near = (0.509, 0.009, 0.191, 0.0)
     expected = after((1.0, WANTED), (9.0, near))
@@ -22,7 +22,7 @@ def test_levels_that_agree_are_no_fault() -> None:
     assert not is_fault(expected, 9.0)
 
 
-def test_levels_that_differ_for_100_ms_are_a_fault() -> None:
+def test_levels_differing_for_100_ms_are_a_fault() -> None:
     """Counted from the first report that differs; one that agrees in between starts anew."""
     expected = after((2.0, DERATED), (2.05, DERATED), (2.0999, DERATED))
     assert not is_fault(expected, 2.0999)
@@ -31,12 +31,12 @@ def test_levels_that_differ_for_100_ms_are_a_fault() -> None:
     assert not is_fault(expected, 2.15)
 
 
-def test_a_channel_that_was_not_named_must_be_silent() -> None:
+def test_channel_without_a_command_must_be_silent() -> None:
     """A level where none was commanded differs, too."""
     assert is_fault(after((2.0, (0.5, 0.3, 0.2, 0.0)), (2.2, (0.5, 0.3, 0.2, 0.0))), 2.2)
 
 
-def test_what_still_fades_is_no_fault() -> None:
+def test_ramp_is_no_fault() -> None:
     """Before the set has settled, levels are on their way."""
     expected = after((0.0, DERATED), (0.5, DERATED), (0.99, DERATED))
     assert not is_fault(expected, 0.99)

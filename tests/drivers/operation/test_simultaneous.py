@@ -37,7 +37,7 @@ def in_virtual_time(work: Callable[[], Coroutine[Any, Any, None]]) -> None:
         loop.close()
 
 
-def test_all_arrive_together_and_the_slowest_goes_first() -> None:
+def test_commits_arrive_together() -> None:
     """6.5, 2 and 0 ms on the wire: sent at once, after 4.5 and after 6.5 ms."""
 
     async def work() -> None:
@@ -50,7 +50,7 @@ def test_all_arrive_together_and_the_slowest_goes_first() -> None:
     in_virtual_time(work)
 
 
-def test_equal_wires_wait_for_nothing() -> None:
+def test_equal_wires_commit_at_once() -> None:
     """They go out in one go, without the loop being left in between."""
 
     async def work() -> None:
@@ -66,7 +66,7 @@ def test_equal_wires_wait_for_nothing() -> None:
     in_virtual_time(work)
 
 
-def test_the_time_of_a_commit_is_arithmetic() -> None:
+def test_commit_time_of_each_wire() -> None:
     """Frames of the vendor pages: 13 bytes; 19 bytes and the silence; an order and a SYNC."""
     serial = SerialBackend("serial:///dev/ttyUSB0?baud=115200")
     assert serial.wire_times.commit() == pytest.approx(13 * 10 / 115_200)
@@ -78,7 +78,7 @@ def test_the_time_of_a_commit_is_arithmetic() -> None:
     assert can.wire_times.commit() == pytest.approx((135 + 55) / 500_000)
 
 
-def test_a_rest_that_the_clock_cannot_count_is_waited_for() -> None:
+def test_remainder_below_clock_resolution_ends() -> None:
     """2 ms and 0.4 ps to wait, on a clock whose steps are 0.9 ps: it goes out after 2 ms."""
 
     async def work() -> None:

@@ -10,7 +10,7 @@ def is_looked_at(thing: object) -> bool:
     return any(one is thing for one in gc.get_objects())
 
 
-def test_what_is_loaded_is_left_out_as_long_as_it_is_asked_for() -> None:
+def test_present_objects_are_frozen_during_the_context() -> None:
     """What was there before is not looked at, what comes later is; afterwards both are."""
     before = [object()]
     assert is_looked_at(before)

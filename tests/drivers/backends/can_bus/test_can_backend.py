@@ -157,7 +157,7 @@ async def eventually(condition: Callable[[], object]) -> None:
             await asyncio.sleep(0.002)
 
 
-def test_the_time_on_the_bus_is_known_beforehand() -> None:
+def test_wire_times_of_can() -> None:
     """Four channels at 500 kbit/s, worst stuffing: six frames of 135 bits, a SYNC of 55."""
     backend = CanBackend("can+socketcan://can0#1")
     assert backend.wire_times.round_trip(4) == pytest.approx((6 * 135 + 55) / 500_000)
@@ -174,15 +174,15 @@ def test_the_time_on_the_bus_is_known_beforehand() -> None:
         ("can+socketcan://no-such-can#1", "ip link"),
     ],
 )
-async def test_a_bus_that_is_not_there_is_told_with_what_to_do(url: str, words: str) -> None:
-    """Neither a traceback nor ten seconds of trying."""
+async def test_open_fails_with_a_remedy_when_there_is_no_bus(url: str, words: str) -> None:
+    """A LinkError within seconds."""
     async with asyncio.timeout(PATIENCE):
         with pytest.raises(LinkError, match=words):
             await CanBackend(url).open()
 
 
-async def test_on_a_virtual_bus_the_whole_session_works(virtual: Virtual) -> None:
-    """Identify, arm, play, beat, read faults, stop and clear within one process."""
+async def test_whole_session_on_a_virtual_bus(virtual: Virtual) -> None:
+    """Identify, arm, play, heartbeat, faults, stop and clear in one process."""
     async with opened(virtual.url()) as amplifier:
         assert amplifier.identity.serial_number == "SIM-main"
         await amplifier.arm(2.0)
@@ -195,8 +195,8 @@ async def test_on_a_virtual_bus_the_whole_session_works(virtual: Virtual) -> Non
         assert (await amplifier.clear()).state is AmplifierState.SWITCH_ON_DISABLED
 
 
-async def test_the_heartbeat_is_sent_by_the_call_and_by_nothing_else(virtual: Virtual) -> None:
-    """As many host heartbeats as calls, however long one waits between them."""
+async def test_host_heartbeat_is_sent_by_calls_only(virtual: Virtual) -> None:
+    """As many host heartbeats as calls, whatever the time between them."""
     async with opened(virtual.url()) as amplifier:
         await amplifier.arm(2.0)
         for _ in range(3):
@@ -209,8 +209,8 @@ async def test_the_heartbeat_is_sent_by_the_call_and_by_nothing_else(virtual: Vi
 
 
 @pytest.mark.parametrize("kind", ["slcan", "virtual"])
-async def test_over_can_fd_a_set_is_one_frame(kind: str, coarse_rig: Rig) -> None:
-    """The set in one frame of 48 bytes; status, set and faults come as they do in classic ones."""
+async def test_set_is_one_frame_over_can_fd(kind: str, coarse_rig: Rig) -> None:
+    """48 bytes; status, set and faults as over classic CAN."""
     async with virtual_side(coarse_rig) as virtual, far_side(Wire(kind="slcan"), coarse_rig) as far:
         url = virtual.url(options="?fd=2000000")
         if kind == "slcan":
@@ -225,8 +225,8 @@ async def test_over_can_fd_a_set_is_one_frame(kind: str, coarse_rig: Rig) -> Non
             assert [(frame.id, len(frame.data), frame.fd) for frame in sets] == [(0x481, 48, True)]
 
 
-async def test_what_is_not_played_as_asked_is_read_back(virtual: Virtual) -> None:
-    """An amplifier that is warm plays half, and says so in the answer and the achieved levels."""
+async def test_achieved_set_is_read_when_it_differs(virtual: Virtual) -> None:
+    """A warm amplifier plays half of the level and reports it."""
     async with opened(virtual.url()) as amplifier:
         await amplifier.arm(2.0)
         virtual.far.device.inject_fault(FaultWindow("over_temperature", lasts=60.0))
@@ -237,10 +237,10 @@ async def test_what_is_not_played_as_asked_is_read_back(virtual: Virtual) -> Non
 
 
 @pytest.mark.parametrize("takes_blocks", [True, False])
-async def test_envelopes_are_loaded_in_blocks_or_segments(
+async def test_envelope_is_loaded_in_blocks_or_segments(
     virtual: Virtual, takes_blocks: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """131 bytes: by block transfer, or in segments where the amplifier refuses blocks."""
+    """131 bytes: by block transfer, or in segments if the amplifier refuses blocks."""
     if not takes_blocks:
         from sim.far_ends.can_bus import sdo
 
@@ -260,10 +260,10 @@ async def test_envelopes_are_loaded_in_blocks_or_segments(
 
 
 @pytest.mark.parametrize("ends", ["refused", "taken"])
-async def test_what_a_node_missed_of_an_envelope_is_sent_again(
+async def test_envelope_is_reloaded_when_a_segment_is_lost(
     virtual: Virtual, ends: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """All of it, and so nothing is missing in what is kept; whatever the node makes of the end."""
+    """Completely, whether the node refuses or accepts the end of the transfer."""
     from sim.far_ends.can_bus import sdo
 
     end, passing = sdo.SdoServer._block_segment, virtual.gateway._pass
@@ -295,10 +295,10 @@ async def test_what_a_node_missed_of_an_envelope_is_sent_again(
         assert amplifier.statistics.retries == 1
 
 
-async def test_a_node_without_an_object_is_told_with_what_to_do(
+async def test_missing_object_is_a_frame_error(
     virtual: Virtual, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What it says itself, and that its firmware is to blame."""
+    """With the abort code and a remedy."""
     from sim.far_ends.can_bus import sdo
 
     def has_none(server: sdo.SdoServer, data: bytes) -> None:
@@ -310,10 +310,10 @@ async def test_a_node_without_an_object_is_told_with_what_to_do(
             await amplifier.faults()
 
 
-async def test_a_node_that_tells_nothing_of_itself_is_no_answer(
+async def test_silent_or_slow_node_is_a_timeout(
     virtual: Virtual, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Nor is one that takes too long over all of it: each says what to check."""
+    """Each with what to check."""
     backend = CanBackend(virtual.url(node=5))
     await backend.open()
     with pytest.raises(LinkTimeout, match=r"node 5 .*has this number"):
@@ -324,7 +324,7 @@ async def test_a_node_that_tells_nothing_of_itself_is_no_answer(
     await backend.close()
 
 
-async def test_an_object_that_was_given_up_for_its_time_is_asked_for_again(
+async def test_sdo_timeout_of_the_node_is_retried(
     virtual: Virtual, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A node that waited too long for a frame of a busy host says so (0504 0000 h, CiA 301)."""
@@ -366,7 +366,7 @@ class Telling(CanBackend):
 
 
 @pytest.mark.parametrize("how", ["silent", "boot-up", "stopped", "bus-off"])
-async def test_an_amplifier_that_is_gone_is_told_unasked(virtual: Virtual, how: str) -> None:
+async def test_lost_node_is_detected_without_a_request(virtual: Virtual, how: str) -> None:
     """Within three of its heartbeats, without a request on the way; nothing works afterwards."""
     told: list[str] = []
     amplifier = Amplifier(Telling(virtual.url(), told), reply_timeout=0.5)
@@ -397,7 +397,7 @@ async def test_an_amplifier_that_is_gone_is_told_unasked(virtual: Virtual, how: 
         await amplifier.close()
 
 
-async def test_a_boot_up_is_noticed_before_the_first_heartbeat(virtual: Virtual) -> None:
+async def test_boot_up_is_detected_before_the_first_heartbeat(virtual: Virtual) -> None:
     """An amplifier that starts anew right after it was identified is not the one that was."""
     amplifier = Amplifier(CanBackend(virtual.url(options="?heartbeat=10000")), reply_timeout=0.5)
     await amplifier.open()
@@ -451,8 +451,8 @@ async def served(*says: bytes) -> tuple[str | None, int]:
         (b"< hi >< frame 701 1.0 05 >", b"< frame 701 1.5 05 >< ok >", b"< ok >< frame 701 2 05 >"),
     ],
 )
-async def test_a_server_may_pass_frames_on_at_once(says: tuple[bytes, ...]) -> None:
-    """The bus is open, whatever others say on it meanwhile; closed, nothing is left."""
+async def test_socketcand_frames_may_arrive_during_the_handshake(says: tuple[bytes, ...]) -> None:
+    """The bus opens; closed again, nothing leaks."""
     assert await served(*says) == (None, 0)
 
 
@@ -466,17 +466,17 @@ async def test_a_server_may_pass_frames_on_at_once(says: tuple[bytes, ...]) -> N
         (b"<" * 5000,),
     ],
 )
-async def test_a_server_that_opens_no_bus_is_told(
+async def test_open_fails_when_socketcand_does_not_open_the_bus(
     says: tuple[bytes, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """One that is silent, stuck, another one, or has no such bus: an error, and nothing is left."""
+    """Silent, stuck or another server, or no such bus: a LinkError, and nothing leaks."""
     monkeypatch.setattr("drivers.backends.can_bus.interfaces._CONNECT_TIMEOUT", 0.1)
     problem, left = await served(*says)
     assert "check address and port" in (problem or "")
     assert left == 0
 
 
-async def test_a_server_that_hangs_up_is_noticed_at_once(coarse_rig: Rig) -> None:
+async def test_closed_socketcand_connection_is_detected_at_once(coarse_rig: Rig) -> None:
     """Without a request, and long before three heartbeats of ten seconds."""
     async with far_side(Wire(kind="socketcand"), coarse_rig) as far:
         url = far.url.replace("#", "?heartbeat=10000#")
@@ -489,8 +489,8 @@ async def test_a_server_that_hangs_up_is_noticed_at_once(coarse_rig: Rig) -> Non
             await amplifier.close()
 
 
-async def test_two_amplifiers_of_one_number_are_refused(virtual: Virtual) -> None:
-    """A second, different answer to who is there: neither is talked to."""
+async def test_open_refuses_two_nodes_of_one_number(virtual: Virtual) -> None:
+    """Two different replies to an identify request."""
     other = replace(virtual.far.amplifier.identity, serial_number="TWIN")
     device = type("Twin", (), {})()
     for name in ("capabilities", "faults", "is_answering", "listen", "status", "exchange"):
@@ -513,8 +513,8 @@ async def test_two_amplifiers_of_one_number_are_refused(virtual: Virtual) -> Non
     await amplifier.close()
 
 
-async def test_a_late_answer_is_no_second_amplifier(virtual: Virtual) -> None:
-    """What is told of another object, while a second amplifier is listened for, is of the first."""
+async def test_late_sdo_reply_is_not_a_second_node(virtual: Virtual) -> None:
+    """A reply about another object during the check for a second node is ignored."""
     late = CanFrame(0x581, bytes.fromhex("4F 01 10 00 00 00 00 00"))  # of the error register
 
     def hear(frame: CanFrame) -> None:
@@ -534,8 +534,8 @@ def test_sequence_numbers_run_from_1_to_255() -> None:
     assert numbers[:255] == numbers[255:510]
 
 
-async def test_a_channel_that_it_has_not_is_not_sent(virtual: Virtual) -> None:
-    """Its frame would be a command for the next node: refused here, and nothing goes out."""
+async def test_unknown_channel_is_refused_before_sending(virtual: Virtual) -> None:
+    """Its COB-ID would be a command to the next node."""
     async with opened(virtual.url()) as amplifier:
         await amplifier.arm(2.0)
         guard = Guard(LIMITS, replace(amplifier.capabilities, channels=16))
@@ -546,8 +546,8 @@ async def test_a_channel_that_it_has_not_is_not_sent(virtual: Virtual) -> None:
         assert amplifier.statistics.frames_out == before
 
 
-async def test_a_second_host_does_not_arm(virtual: Virtual) -> None:
-    """Another program's heartbeat for this amplifier is heard before arming."""
+async def test_arm_refuses_when_another_host_is_heard(virtual: Virtual) -> None:
+    """Its heartbeat for this amplifier precedes arming."""
     async with opened(virtual.url()) as amplifier:
         virtual.gateway.say(CanFrame(0x77F, b"\x05"))
         await asyncio.sleep(0.02)
@@ -555,8 +555,8 @@ async def test_a_second_host_does_not_arm(virtual: Virtual) -> None:
             await amplifier.arm(2.0)
 
 
-async def test_events_are_told(virtual: Virtual) -> None:
-    """Emergencies and changes of state without a fault, each once."""
+async def test_events_are_reported_once(virtual: Virtual) -> None:
+    """Emergencies, and changes of state without a fault."""
     events: list[AmplifierEvent] = []
     amplifier = Amplifier(CanBackend(virtual.url()), reply_timeout=0.5)
     amplifier.listen(events.append)
@@ -579,8 +579,8 @@ async def test_events_are_told(virtual: Virtual) -> None:
         await amplifier.close()
 
 
-async def test_a_late_answer_is_nobody_s(virtual: Virtual) -> None:
-    """An answer of another sequence number, action or token changes nothing, and is counted."""
+async def test_reply_must_match_sequence_action_and_token(virtual: Virtual) -> None:
+    """Others change nothing and are counted."""
     backend = CanBackend(virtual.url())
     amplifier = Amplifier(backend, reply_timeout=0.5)
     await amplifier.open()
@@ -625,8 +625,8 @@ async def test_exception_of_a_frame_callback_is_logged(
     assert str(record.exc_info[1]) == "a bug"
 
 
-async def test_a_flooded_bus_is_borne(virtual: Virtual) -> None:
-    """Thousands of frames of others and of broken answers between request and reply."""
+async def test_exchange_works_on_a_flooded_bus(virtual: Virtual) -> None:
+    """Thousands of foreign frames and invalid replies between request and reply."""
     backend = CanBackend(virtual.url())
     amplifier = Amplifier(backend, reply_timeout=PATIENCE)
     await amplifier.open()
@@ -644,8 +644,8 @@ async def test_a_flooded_bus_is_borne(virtual: Virtual) -> None:
         await amplifier.close()
 
 
-async def test_whoever_asks_only_looks(virtual: Virtual) -> None:
-    """Status and faults of an amplifier that nobody has started leave the outputs alone."""
+async def test_status_and_faults_do_not_drive_outputs(virtual: Virtual) -> None:
+    """Only the status action is sent."""
     async with opened(virtual.url()) as amplifier:
         await amplifier.status()
         await amplifier.faults()
@@ -655,8 +655,8 @@ async def test_whoever_asks_only_looks(virtual: Virtual) -> None:
 
 @pytest.mark.parametrize("kind", ["socketcand", "slcan", "virtual"])
 @pytest.mark.skipif(not Path("/proc/self/fd").exists(), reason="counts descriptors by /proc")
-async def test_a_hundred_openings_leak_nothing(kind: str, coarse_rig: Rig) -> None:
-    """Descriptors, threads and tasks are as many as before, also where a request was given up."""
+async def test_hundred_openings_leak_nothing(kind: str, coarse_rig: Rig) -> None:
+    """Descriptors, threads and tasks stay constant, also with cancelled requests."""
 
     def counts() -> tuple[int, int, int]:
         descriptors = len(list(Path("/proc/self/fd").iterdir()))
@@ -685,10 +685,8 @@ async def test_a_hundred_openings_leak_nothing(kind: str, coarse_rig: Rig) -> No
         assert counts()[1] == 0
 
 
-async def test_an_adapter_that_takes_no_more_for_a_moment_is_not_lost(
-    coarse_rig: Rig, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A write that times out half-way is a missing answer: it is asked again, and understood."""
+async def test_partial_write_is_retried(coarse_rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A write timeout half-way is a missing reply: the request is repeated and understood."""
     async with far_side(Wire(kind="slcan"), coarse_rig) as far, opened(far.url) as amplifier:
         await amplifier.arm(2.0)
         write_all = "drivers.backends.can_bus.interfaces.write_all"

@@ -26,7 +26,7 @@ class Network(canopen.Network):
         self.on_send()
 
 
-def test_a_transfer_that_waits_when_its_node_is_closed_never_begins() -> None:
+def test_queued_transfer_does_not_start_after_close() -> None:
     """The job was taken before, and its turn comes afterwards: the bus may be another's by then."""
     network = Network()
     client = ObjectClient(network, 1, ThreadWorker("era-test"))
@@ -36,7 +36,7 @@ def test_a_transfer_that_waits_when_its_node_is_closed_never_begins() -> None:
     assert network.sent == 0
 
 
-def test_a_transfer_that_is_given_up_tries_nothing_again() -> None:
+def test_cancelled_transfer_is_not_retried() -> None:
     """After one that was broken off it would read an object up to five times until it is told."""
     network = Network()
     client = ObjectClient(network, 1, ThreadWorker("era-test"))

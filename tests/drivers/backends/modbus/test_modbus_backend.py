@@ -80,8 +80,8 @@ async def backend(far: Peer) -> AsyncIterator[ModbusBackend]:
     await backend.close()
 
 
-async def test_a_slow_line_behind_a_gateway_is_waited_for() -> None:
-    """Told of 9600 baud, it waits for what they take: 0.13 s for a set of four and its answer."""
+async def test_timeout_includes_the_line_behind_a_gateway() -> None:
+    """At 9600 baud 0.13 s for a set of four and its response."""
     async with peer(is_rtu=False) as far:
         backend = ModbusBackend(f"{far.url}?baud=9600")
         assert backend.wire_times.round_trip(4) == pytest.approx(0.12948, abs=1e-5)
@@ -115,19 +115,17 @@ async def test_a_slow_line_behind_a_gateway_is_waited_for() -> None:
     ],
     ids=lambda value: type(value).__name__,
 )
-async def test_every_request_is_one_transaction(
+async def test_request_is_one_transaction(
     far: Peer, backend: ModbusBackend, request_: Request, expected: Reply
 ) -> None:
-    """A block written and one read back, by function 23; identity and capabilities only read."""
+    """A block written and one read back by FC23; identity and capabilities are only read."""
     assert await backend.exchange(request_, timeout=PATIENCE) == expected
     assert far.functions == [4 if isinstance(request_, Hello | GetCaps) else 23]
     assert backend.last_sent > 0
 
 
-async def test_more_faults_than_usual_are_read_in_two_steps(
-    far: Peer, backend: ModbusBackend
-) -> None:
-    """All of them come, newest first, up to as many as fit into a read."""
+async def test_many_faults_are_read_in_two_transactions(far: Peer, backend: ModbusBackend) -> None:
+    """All of them, newest first, up to the most that fit into a read."""
     records = tuple(FaultRecord(Fault.ARC, number % 4, float(number)) for number in range(32))
     for count, reads in ((4, 1), (5, 2), (30, 2)):
         far.requests.clear()
@@ -139,8 +137,10 @@ async def test_more_faults_than_usual_are_read_in_two_steps(
     assert answer == FaultList(records[:30])
 
 
-async def test_without_function_23_it_goes_on_with_two(far: Peer, backend: ModbusBackend) -> None:
-    """Exception 1 to the first one is remembered: from then on 16 (or 6) and 4."""
+async def test_fc16_and_fc4_replace_fc23_when_unsupported(
+    far: Peer, backend: ModbusBackend
+) -> None:
+    """Exception 1 to the first request is remembered: from then on 16 (or 6) and 4."""
     far.answer = lambda request: (
         bytes([0x97, 1]) if request.pdu[0] == 23 else far.unit.reply(request.pdu)
     )
@@ -156,10 +156,10 @@ REFUSALS = [code for code in NakCode if code is not NakCode.UNKNOWN_TYPE]  # tha
 
 @pytest.mark.parametrize("combined", [True, False], ids=["function 23", "functions 16 and 4"])
 @pytest.mark.parametrize("code", REFUSALS, ids=lambda code: code.name)
-async def test_every_refusal_is_told_with_its_reason(
+async def test_refusal_has_its_reason(
     far: Peer, backend: ModbusBackend, code: NakCode, combined: bool
 ) -> None:
-    """Whatever exception it came as; busy is taken at its word, the others are read."""
+    """Whatever the exception; BUSY is unambiguous, the others are read."""
     backend._can_read_back = combined
     far.device.answer = lambda _: Nak(code, 2)
     nak = await backend.exchange(Apply(SET), timeout=PATIENCE)
@@ -168,18 +168,16 @@ async def test_every_refusal_is_told_with_its_reason(
     assert far.functions == [23 if combined else 16, 4][: 1 if is_busy else 2]
 
 
-async def test_a_gateway_without_an_amplifier_is_no_answer(
-    far: Peer, backend: ModbusBackend
-) -> None:
-    """Exceptions 10 and 11 count as a timeout, and say that it is the gateway that speaks."""
+async def test_gateway_exception_is_a_timeout(far: Peer, backend: ModbusBackend) -> None:
+    """Exceptions 10 and 11; the error names the gateway."""
     for code in (10, 11):
         far.answer = lambda request, code=code: bytes([request.pdu[0] | 0x80, code])
         with pytest.raises(LinkTimeout, match="gateway"):
             await backend.exchange(Ping(), timeout=PATIENCE)
 
 
-async def test_no_answer_is_a_timeout(far: Peer, backend: ModbusBackend) -> None:
-    """A silent amplifier gives LinkTimeout with the unit; the line stays usable."""
+async def test_missing_reply_is_a_timeout(far: Peer, backend: ModbusBackend) -> None:
+    """With a remedy; the line stays usable."""
     far.answer = lambda _: None
     with pytest.raises(LinkTimeout, match="unit 1"):
         await backend.exchange(Ping(), timeout=SHORT)
@@ -187,10 +185,10 @@ async def test_no_answer_is_a_timeout(far: Peer, backend: ModbusBackend) -> None
     assert await backend.exchange(Ping(), timeout=PATIENCE) == ARMED
 
 
-async def test_a_late_answer_is_not_credited_to_the_next_request(
+async def test_late_response_is_not_credited_to_the_next_request(
     far: Peer, backend: ModbusBackend
 ) -> None:
-    """A status that comes after its time is dropped; the next one gets its own, behind it."""
+    """It is discarded and counted; the next request gets its own response."""
     late: list[bytes] = []
 
     def answer(request: object) -> bytes | None:
@@ -213,10 +211,10 @@ async def test_a_late_answer_is_not_credited_to_the_next_request(
     assert backend.counters.unexpected_frames == 3
 
 
-async def test_a_late_refusal_is_not_credited_to_the_next_request(
+async def test_late_exception_is_not_credited_to_the_next_request(
     far: Peer, backend: ModbusBackend
 ) -> None:
-    """Over RTU an exception carries no tag: the refusal's own shows that it is of another write."""
+    """An RTU exception has no tag; the tag of the refusal block shows the write it belongs to."""
     late: list[bytes] = []
 
     def answer(request: object) -> bytes | None:
@@ -241,17 +239,15 @@ async def test_a_late_refusal_is_not_credited_to_the_next_request(
     assert await backend.exchange(Arm(0.25), timeout=PATIENCE) == ARMED
 
 
-async def test_numbers_begin_again_after_the_last(far: Peer, backend: ModbusBackend) -> None:
-    """Transactions and tags have 16 bits: the next after the last of them is understood as well."""
+async def test_transaction_numbers_and_tags_wrap(far: Peer, backend: ModbusBackend) -> None:
+    """After 16 bits."""
     backend._opened()._transaction = backend._tag = 0xFFFF - 1
     for _ in range(3):
         assert await backend.exchange(Arm(0.25), timeout=PATIENCE) == ARMED
 
 
-async def test_an_exception_without_a_refusal_is_no_answer(
-    far: Peer, backend: ModbusBackend
-) -> None:
-    """An exception before anything was refused: what was written is asked for again."""
+async def test_exception_without_a_refusal_is_a_timeout(far: Peer, backend: ModbusBackend) -> None:
+    """The write is repeated by the link."""
 
     def answer(request: object) -> bytes | None:
         pdu = far.requests[-1].pdu
@@ -274,13 +270,8 @@ def off_by(place: int, bit: int = 1) -> Callable[[bytes], bytes]:
 
 
 @pytest.mark.parametrize("place", range(12))
-async def test_an_answer_that_is_none_is_dropped(
-    far: Peer, backend: ModbusBackend, place: int
-) -> None:
-    """Transaction, protocol, length, unit, function, count, tag or check is wrong; the next is not.
-
-    Over RTU any flipped bit is found by the CRC; over TCP by what the frame says of itself.
-    """
+async def test_damaged_response_is_discarded(far: Peer, backend: ModbusBackend, place: int) -> None:
+    """A wrong transaction, protocol, length, unit, function, count, tag or CRC; not the next."""
     spoil = off_by(place)
 
     def answer(request: object) -> bytes | None:
@@ -303,8 +294,8 @@ async def test_an_answer_that_is_none_is_dropped(
 
 
 @pytest.mark.parametrize("place", [-4, -3, -2, -1])
-async def test_an_echo_of_another_write_is_dropped(place: int) -> None:
-    """Function 16 echoes address and count: where they are others, that write was not confirmed."""
+async def test_echo_of_another_write_is_discarded(place: int) -> None:
+    """FC16 echoes address and count: others do not confirm the write."""
     async with peer(is_rtu=False) as far:
         link = modbus_line(ModbusUrl.parse(far.url))
         await link.join(1, lambda _: None)
@@ -324,8 +315,8 @@ async def test_an_echo_of_another_write_is_dropped(place: int) -> None:
         await link.leave(1)
 
 
-async def test_an_answer_out_of_range_is_refused(far: Peer, backend: ModbusBackend) -> None:
-    """A state that does not exist, with a good check, is the amplifier's mistake: FrameError."""
+async def test_response_out_of_range_is_a_frame_error(far: Peer, backend: ModbusBackend) -> None:
+    """A valid CRC, but an unknown state or too many channels."""
     await backend.exchange(GetCaps(), timeout=PATIENCE)
     far.device.answer = lambda _: replace(ARMED, state=9)  # type: ignore[arg-type]
     with pytest.raises(FrameError, match="AmplifierState 9"):
@@ -342,8 +333,8 @@ async def test_an_answer_out_of_range_is_refused(far: Peer, backend: ModbusBacke
         await backend.exchange(Apply(SET), timeout=PATIENCE)
 
 
-async def test_a_hang_up_is_told_at_once(far: Peer, backend: ModbusBackend) -> None:
-    """LinkError to who asks, and to who listens where nobody does; closing is safe afterwards."""
+async def test_closed_connection_is_detected_at_once(far: Peer, backend: ModbusBackend) -> None:
+    """LinkError to requests, and the loss callback without one; closing is safe afterwards."""
     far.answer = lambda _: far.hang_up()
     with pytest.raises(LinkError, match=r"was lost.*open the amplifier again"):
         await backend.exchange(Ping(), timeout=PATIENCE)
@@ -359,8 +350,8 @@ async def test_a_hang_up_is_told_at_once(far: Peer, backend: ModbusBackend) -> N
     assert "was lost" in await asyncio.wait_for(lost, PATIENCE)
 
 
-async def test_nobody_there_says_so(far: Peer) -> None:
-    """LinkError that names the address and what to check."""
+async def test_open_fails_with_a_remedy(far: Peer) -> None:
+    """Refused connection, missing port, not a port, not open."""
     with pytest.raises(LinkError, match=r"127\.0\.0\.1:1: .*refused; check"):
         await ModbusBackend("modbus+tcp://127.0.0.1:1/1").open()
     with pytest.raises(LinkError, match="no such port"):
@@ -371,8 +362,8 @@ async def test_nobody_there_says_so(far: Peer) -> None:
         await ModbusBackend(far.url).exchange(Ping(), timeout=SHORT)
 
 
-async def test_a_serial_port_is_for_one_program() -> None:
-    """Who finds it in use is told so, and the first goes on undisturbed."""
+async def test_serial_port_is_exclusive() -> None:
+    """A second program gets LinkError; the first is not disturbed."""
     terminal = PseudoTerminal(lambda _: None)
     first = ModbusBackend(f"modbus+rtu://{terminal.port}#1")
     await first.open()
@@ -388,8 +379,8 @@ async def test_a_serial_port_is_for_one_program() -> None:
     terminal.close()
 
 
-async def test_units_of_one_line_share_it(far: Peer) -> None:
-    """One connection for all, one telegram at a time; it closes with the last who uses it."""
+async def test_units_share_one_connection(far: Peer) -> None:
+    """One request at a time; the last user closes it."""
     first, second = ModbusBackend(far.url), ModbusBackend(far.url[:-1] + "2")
     await first.open()
     await second.open()
@@ -423,10 +414,10 @@ async def test_units_of_one_line_share_it(far: Peer) -> None:
     await second.close()
 
 
-async def test_a_broadcast_goes_to_unit_0_and_waits_for_nobody(
+async def test_broadcast_goes_to_unit_0_without_a_response(
     far: Peer, backend: ModbusBackend
 ) -> None:
-    """The commit is one register, the stop a control block; the next request is answered."""
+    """A commit is one register, a stop a control block."""
     await backend.broadcast(Commit(513))
     await backend.broadcast(Stop(0.005))
     assert await backend.exchange(Ping(), timeout=PATIENCE) == ARMED
@@ -437,10 +428,10 @@ async def test_a_broadcast_goes_to_unit_0_and_waits_for_nobody(
     assert far.device.heard == [Commit(513), Stop(0.005)]
 
 
-async def test_what_is_cancelled_leaves_its_answer_the_time_to_come(
+async def test_next_request_waits_for_the_response_to_a_cancelled_one(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Over RTU the next telegram waits until the abandoned answer was there, over TCP not."""
+    """Over RTU; not over TCP."""
     monkeypatch.setattr(line_of_modbus, "_REACTION", 60.0)
     for is_rtu in (True, False):
         async with peer(is_rtu=is_rtu) as far:
@@ -462,10 +453,8 @@ async def test_what_is_cancelled_leaves_its_answer_the_time_to_come(
             await backend.close()
 
 
-async def test_events_are_what_answers_show_to_have_changed(
-    far: Peer, backend: ModbusBackend
-) -> None:
-    """One a change of state or fault, none for the first answer, and none for looking on."""
+async def test_changes_between_responses_are_events(far: Peer, backend: ModbusBackend) -> None:
+    """One per change of state or fault, none for the first response."""
     told: list[AmplifierEvent] = []
     backend.listen(told.append, lambda _: None)
     for status in (ARMED, ARMED, TRIPPED, TRIPPED, ARMED):
@@ -477,7 +466,7 @@ async def test_events_are_what_answers_show_to_have_changed(
     ]
 
 
-def test_wire_time_is_arithmetic() -> None:
+def test_wire_times_of_modbus() -> None:
     """Four channels: 57 bytes out and 49 back, 11 bits each, and twice 3.5 characters of silence.
 
     By hand: 106 * 11 / 115200 = 10.12 ms and two gaps of 1.75 ms, the standard's least; at
@@ -500,8 +489,8 @@ def test_wire_time_is_arithmetic() -> None:
 
 
 @pytest.mark.parametrize("framer", [FramerType.SOCKET, FramerType.RTU], ids=["TCP", "RTU"])
-async def test_a_server_that_is_not_ours_understands_the_frames(framer: FramerType) -> None:
-    """pymodbus's own server takes each function that is sent, and its answers are understood."""
+async def test_pymodbus_server_accepts_the_requests(framer: FramerType) -> None:
+    """An independent implementation answers each function that is used."""
     device = SimDevice(
         1, simdata=[SimData(0, values=list(range(100)), datatype=DataType.REGISTERS)]
     )
@@ -528,8 +517,8 @@ async def test_a_server_that_is_not_ours_understands_the_frames(framer: FramerTy
     await server.shutdown()
 
 
-async def test_two_amplifiers_of_one_unit_are_refused() -> None:
-    """Over RTU two different answers to one Hello; one that came twice is no second amplifier."""
+async def test_open_refuses_two_amplifiers_of_one_unit() -> None:
+    """Over RTU: two different responses to one Hello; a repeated one is accepted."""
     async with peer(is_rtu=True) as far:
         second = ScriptedDevice()
         second.answer = lambda request: (
@@ -595,8 +584,8 @@ class _NotedPort:
         self._happened.append("gone")
 
 
-async def test_a_lost_port_is_given_back_before_it_is_opened_again() -> None:
-    """Also where only one of two amplifiers on it comes back: the system gives it out once."""
+async def test_lost_port_is_closed_before_it_is_reopened() -> None:
+    """Also if only one of two amplifiers on it is reopened."""
     ports = _Ports()
     HARDWARE_PROVIDER.set(ports)
     east, west = (ModbusBackend(f"modbus+rtu:///dev/none?baud=115200#{unit}") for unit in (1, 2))

@@ -15,7 +15,7 @@ from drivers.errors import LinkError, LinkTimeout
 MEGABYTE = 1 << 20
 
 
-async def test_an_address_that_does_not_answer_is_told_with_what_to_check(
+async def test_connection_timeout_has_a_remedy(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Nobody takes the connection nor refuses it, as where a router drops what is sent there."""
@@ -28,7 +28,7 @@ async def test_an_address_that_does_not_answer_is_told_with_what_to_check(
             )
 
 
-async def test_of_the_addresses_of_a_name_the_first_that_answers_is_taken(
+async def test_first_address_that_accepts_is_used(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """The amplifier listens on the second only, as where a name has an IPv6 address, too."""
@@ -46,7 +46,7 @@ async def test_of_the_addresses_of_a_name_the_first_that_answers_is_taken(
         await asyncio.sleep(0)
 
 
-async def test_an_address_of_one_network_only_is_asked_for_there(
+async def test_link_local_address_keeps_its_zone(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """As amplifiers without a router have, by RFC 4007: without the zone nobody could call it."""
@@ -56,7 +56,7 @@ async def test_an_address_of_one_network_only_is_asked_for_there(
     assert await stream._addresses("amplifier.test") == ["fe80::1%3", "fd00::1", "192.0.2.1"]
 
 
-def test_a_name_that_nobody_can_tell_holds_up_no_end() -> None:
+def test_unresolved_name_does_not_delay_the_end_of_the_program() -> None:
     """The connection is given up after a second, and the program ends though the question hangs."""
     program = """
 import asyncio, socket, threading
@@ -78,7 +78,7 @@ except LinkError as problem:
     assert "amplifier.test:502: no connection" in ran.stdout
 
 
-async def test_a_peer_that_reads_no_more_is_told_before_the_memory_is_full() -> None:
+async def test_blocked_connection_is_a_timeout_before_memory_fills() -> None:
     """What it does not take fills the system's buffers, then ours; closing throws it away."""
     with socket.create_server(("127.0.0.1", 0)) as listening:
         port = listening.getsockname()[1]

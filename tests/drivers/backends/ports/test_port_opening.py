@@ -43,7 +43,7 @@ class _Port:
 @pytest.mark.parametrize(
     ("device", "parity"), [("/dev/ttyUSB9", serial.PARITY_ODD), ("/dev/pts/9", serial.PARITY_NONE)]
 )
-async def test_modbus_asks_an_adapter_for_low_latency_and_its_parity(
+async def test_open_port_sets_low_latency_and_parity(
     monkeypatch: pytest.MonkeyPatch, device: str, parity: str
 ) -> None:
     """USB adapters hold bytes back for 16 ms else; a pseudo-terminal has no parity."""

@@ -25,7 +25,7 @@ def ends() -> Iterator[tuple[serial.Serial, int]]:
     os.close(far)
 
 
-def test_what_was_taken_is_no_time_out(
+def test_taken_bytes_are_not_a_timeout(
     ends: tuple[serial.Serial, int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A process that is held up while it writes has written all the same."""
@@ -35,14 +35,14 @@ def test_what_was_taken_is_no_time_out(
     assert os.read(far, 100) == b"all of it"
 
 
-def test_a_port_that_takes_no_more_is_told(ends: tuple[serial.Serial, int]) -> None:
+def test_blocked_port_is_a_timeout(ends: tuple[serial.Serial, int]) -> None:
     """Nobody reads at the other end, so its buffer fills up."""
     port, _ = ends
     with pytest.raises(serial.SerialTimeoutException):
         write_all(port, bytes(1 << 20))
 
 
-async def test_a_line_that_is_stuck_is_told_with_what_to_look_at(
+async def test_blocked_line_is_a_timeout_with_a_remedy(
     ends: tuple[serial.Serial, int],
 ) -> None:
     """As a timeout, which is asked again and then counts as a loss."""
@@ -54,7 +54,7 @@ async def test_a_line_that_is_stuck_is_told_with_what_to_look_at(
     await watched.wait_closed()
 
 
-def test_a_port_that_is_closed_is_told(ends: tuple[serial.Serial, int]) -> None:
+def test_closed_port_is_a_link_error(ends: tuple[serial.Serial, int]) -> None:
     """As an error of the system, which is what a lost one gives, too."""
     port, _ = ends
     port.close()

@@ -49,8 +49,8 @@ async def backend(far_end: FarEnd) -> AsyncIterator[SerialBackend]:
     await backend.close()
 
 
-async def test_a_request_gets_its_reply(backend: SerialBackend, far_end: FarEnd) -> None:
-    """Requests go out with rising sequence numbers to the address; replies and Naks come back."""
+async def test_request_gets_its_reply(backend: SerialBackend, far_end: FarEnd) -> None:
+    """Sequence numbers rise; replies and Naks are returned."""
     assert await backend.exchange(Hello(), timeout=PATIENCE) == IDENTITY
     far_end.answer = lambda request, frame: Nak(NakCode.BUSY)
     assert await backend.exchange(Ping(), timeout=PATIENCE) == Nak(NakCode.BUSY)
@@ -60,15 +60,15 @@ async def test_a_request_gets_its_reply(backend: SerialBackend, far_end: FarEnd)
     assert backend.last_sent > 0
 
 
-async def test_no_answer_is_a_timeout(backend: SerialBackend, far_end: FarEnd) -> None:
-    """A far end that stays silent gives LinkTimeout with what to check."""
+async def test_missing_reply_is_a_timeout(backend: SerialBackend, far_end: FarEnd) -> None:
+    """With a remedy; the line stays usable."""
     far_end.answer = lambda request, frame: None
     with pytest.raises(LinkTimeout, match=r"address 1 .*921600 baud"):
         await backend.exchange(Ping(), timeout=SHORT)
 
 
-async def test_a_slow_line_has_its_time_on_top(far_end: FarEnd) -> None:
-    """At 300 baud a Ping and its answer take 2 s on the line, whatever the amplifier may take."""
+async def test_timeout_includes_the_time_on_a_slow_line(far_end: FarEnd) -> None:
+    """At 300 baud a Ping and its reply take 2 s."""
     backend = SerialBackend(f"{far_end.url}?baud=300")
     await backend.open()
     far_end.answer = lambda request, frame: None
@@ -80,10 +80,8 @@ async def test_a_slow_line_has_its_time_on_top(far_end: FarEnd) -> None:
     await backend.close()
 
 
-async def test_late_and_foreign_replies_are_dropped(
-    backend: SerialBackend, far_end: FarEnd
-) -> None:
-    """A late reply, one from another address and an echo are counted, never credited."""
+async def test_unexpected_replies_are_discarded(backend: SerialBackend, far_end: FarEnd) -> None:
+    """A late reply, one of another address and an echo are counted and never credited."""
     far_end.answer = lambda request, frame: None
     with pytest.raises(LinkTimeout):
         await backend.exchange(GetStatus(), timeout=SHORT)
@@ -110,7 +108,7 @@ async def test_late_and_foreign_replies_are_dropped(
 
 
 async def test_noise_before_a_reply_is_skipped(backend: SerialBackend, far_end: FarEnd) -> None:
-    """Garbage and a damaged copy in front of a reply cost nothing but a count."""
+    """Garbage and a damaged copy are only counted."""
 
     def answer(request: object, frame: Frame) -> bytes:
         good = encode_frame(encode_reply(STATUS, frame))
@@ -123,10 +121,8 @@ async def test_noise_before_a_reply_is_skipped(backend: SerialBackend, far_end: 
     assert backend.counters.crc_errors == 2
 
 
-async def test_a_wrong_answer_is_the_far_ends_fault(
-    backend: SerialBackend, far_end: FarEnd
-) -> None:
-    """The right sequence number with the wrong type or a bad payload is FrameError."""
+async def test_invalid_reply_is_a_frame_error(backend: SerialBackend, far_end: FarEnd) -> None:
+    """The right sequence number with another type or an invalid payload."""
     far_end.answer = lambda request, frame: encode_frame(
         Frame(kind=0x81, address=1, sequence=frame.sequence, payload=b"")
     )
@@ -136,8 +132,8 @@ async def test_a_wrong_answer_is_the_far_ends_fault(
         await backend.exchange(Hello(), timeout=PATIENCE)
 
 
-async def test_an_unplugged_line_fails_what_waits_and_what_comes(far_end: FarEnd) -> None:
-    """When the adapter vanishes the waiting exchange fails at once, and later ones too."""
+async def test_unplugged_line_fails_pending_and_later_requests(far_end: FarEnd) -> None:
+    """Nothing leaks."""
     before = open_files()
     backend = SerialBackend(far_end.url)
     await backend.open()
@@ -154,8 +150,8 @@ async def test_an_unplugged_line_fails_what_waits_and_what_comes(far_end: FarEnd
     assert open_files() <= before
 
 
-async def test_closing_ends_the_reader_and_what_waits(far_end: FarEnd) -> None:
-    """Close leaves no thread and no descriptor, and a waiting exchange gets LinkError."""
+async def test_close_ends_reader_and_pending_requests(far_end: FarEnd) -> None:
+    """No thread or descriptor remains."""
     before = open_files()
     far_end.answer = lambda request, frame: None
     backend = SerialBackend(far_end.url)
@@ -170,8 +166,8 @@ async def test_closing_ends_the_reader_and_what_waits(far_end: FarEnd) -> None:
     assert open_files() <= before
 
 
-async def test_a_line_is_opened_by_one_only(far_end: FarEnd, backend: SerialBackend) -> None:
-    """Whoever opens the port a second time is told that it is in use, within a program too."""
+async def test_port_is_exclusive(far_end: FarEnd, backend: SerialBackend) -> None:
+    """Within a program and between programs."""
     with pytest.raises(LinkError, match="already open in this program"):
         await SerialBackend(far_end.url).open()
     script = (
@@ -185,23 +181,23 @@ async def test_a_line_is_opened_by_one_only(far_end: FarEnd, backend: SerialBack
     assert b"in use by another program" in errors
 
 
-async def test_a_line_has_one_speed(far_end: FarEnd, backend: SerialBackend) -> None:
-    """A second amplifier at another is refused with both, and the first is not disturbed."""
+async def test_port_refuses_a_second_speed(far_end: FarEnd, backend: SerialBackend) -> None:
+    """The first amplifier is not disturbed."""
     with pytest.raises(LinkError, match=r"921600 .*got 9600"):
         await SerialBackend(f"{far_end.url}?baud=9600&address=2").open()
     assert await backend.exchange(Hello(), timeout=PATIENCE) == IDENTITY
 
 
-async def test_a_missing_port_says_what_to_do() -> None:
-    """One paragraph: which port, why, and what to do."""
+async def test_missing_port_has_a_remedy() -> None:
+    """The error names the port."""
     with pytest.raises(LinkError, match=r"/dev/no-such-port.*plug in"):
         await SerialBackend("serial:///dev/no-such-port").open()
 
 
-async def test_a_forbidden_port_says_what_to_do(
+async def test_forbidden_port_has_a_remedy(
     far_end: FarEnd, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Without permission the remedy is the group that owns the port."""
+    """The group that owns the port."""
 
     def forbidden(*args: object, **kwargs: object) -> None:
         raise serial.SerialException(errno.EACCES, "could not open port: Permission denied")
@@ -211,8 +207,8 @@ async def test_a_forbidden_port_says_what_to_do(
         await SerialBackend(far_end.url).open()
 
 
-async def test_a_serial_server_works_and_its_end_is_noticed() -> None:
-    """The same over TCP: replies come, and a server that hangs up is a lost line."""
+async def test_serial_server_replies_and_its_end_is_a_loss() -> None:
+    """Over TCP."""
     loop = asyncio.get_running_loop()
     listener = socket.create_server(("127.0.0.1", 0))
     listener.setblocking(False)
@@ -239,16 +235,16 @@ async def test_a_serial_server_works_and_its_end_is_noticed() -> None:
     assert reader_threads() == []
 
 
-async def test_a_server_that_is_not_there_says_what_to_do() -> None:
-    """A refused connection is a sentence about the server, not about dialout."""
+async def test_missing_serial_server_has_a_remedy() -> None:
+    """About the server, not about permissions."""
     with socket.create_server(("127.0.0.1", 0)) as listener:
         port = listener.getsockname()[1]
     with pytest.raises(LinkError, match="check the address"):
         await SerialBackend(f"serial://127.0.0.1:{port}").open()
 
 
-async def test_two_amplifiers_of_one_address_are_refused(far_end: FarEnd) -> None:
-    """Two different replies to one Hello; one that came twice is no second amplifier."""
+async def test_open_refuses_two_amplifiers_at_one_address(far_end: FarEnd) -> None:
+    """Two different replies to one Hello; a repeated one is accepted."""
     other = replace(IDENTITY, serial_number="B-18")
 
     def both(request: object, frame: Frame) -> bytes:

@@ -86,8 +86,8 @@ def redirector(far_end: FarEnd) -> Iterator[Redirector]:
     redirector.close()
 
 
-async def test_frames_to_a_server_go_out_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Also those that follow one which is not acknowledged yet: Nagle's algorithm is off."""
+async def test_connection_to_a_server_disables_nagle(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A frame must not wait for the acknowledgement of the one before."""
     made: list[socket.socket] = []
     connect = socket.create_connection
 
@@ -103,8 +103,8 @@ async def test_frames_to_a_server_go_out_at_once(monkeypatch: pytest.MonkeyPatch
         await backend.close()
 
 
-async def test_an_amplifier_behind_rfc2217(far_end: FarEnd, redirector: Redirector) -> None:
-    """The speed of the URL is set at the server's port, and requests get their replies."""
+async def test_amplifier_behind_rfc2217(far_end: FarEnd, redirector: Redirector) -> None:
+    """The speed is set at the server's port."""
     backend = SerialBackend(f"rfc2217://127.0.0.1:{redirector.address}?baud=115200")
     amplifier = Amplifier(backend, reply_timeout=5.0)
     await amplifier.open()
@@ -115,10 +115,8 @@ async def test_an_amplifier_behind_rfc2217(far_end: FarEnd, redirector: Redirect
     assert not [one for one in threading.enumerate() if one.name.startswith("era-serial")]
 
 
-async def test_a_server_that_hangs_up_is_a_lost_line(
-    far_end: FarEnd, redirector: Redirector
-) -> None:
-    """Noticed without a request on its way, and told by the next."""
+async def test_closed_server_is_a_loss(far_end: FarEnd, redirector: Redirector) -> None:
+    """Detected without a request, and raised by the next."""
     backend = SerialBackend(f"rfc2217://127.0.0.1:{redirector.address}?baud=115200")
     amplifier = Amplifier(backend, reply_timeout=5.0)
     await amplifier.open()

@@ -18,7 +18,7 @@ def element(request: pytest.FixtureRequest) -> Element:
     return request.param
 
 
-def test_rigidities_of_a_section_by_hand():
+def test_rigidities_equal_hand_calculation():
     """2 mm of E = 70 GPa, rho = 2700 kg/m³, nu = 0.33; the checks of elements stand on these.
 
     D = E h³ / (12 (1 - nu²)) = 560 / 10.6932 = 52.3697 N m, kappa G h = 5/6 of 70 GPa / 2.66 times
@@ -31,7 +31,7 @@ def test_rigidities_of_a_section_by_hand():
     np.testing.assert_allclose(inertia, np.diag([5.4, 1.8e-6, 1.8e-6]), rtol=1e-12)
 
 
-def test_shape_functions_are_one_at_their_node_and_zero_at_the_others(element):
+def test_shape_functions_are_nodal(element):
     """And everywhere they add up to one."""
     nodes = np.array(element.side)
     np.testing.assert_allclose(element.shape(nodes), np.eye(len(nodes)), atol=1e-12)
@@ -40,6 +40,6 @@ def test_shape_functions_are_one_at_their_node_and_zero_at_the_others(element):
 
 
 @pytest.mark.parametrize(("name", "side"), [("Q3", 0.2**0.5), ("Q4", (3 / 7) ** 0.5)])
-def test_nodes_of_high_order_are_those_of_gauss_and_lobatto(name, side):
+def test_high_order_nodes_are_gauss_lobatto(name, side):
     """Abramowitz and Stegun, Table 25.6: the outermost inner nodes are 0.2^½ and (3/7)^½."""
     assert ELEMENTS[name].side[-2] == pytest.approx(side, rel=1e-14)

@@ -15,7 +15,7 @@ from model.fem.elements.mitc4 import MITC4, _curvature, _shear, rigidities
 RUNNER = CliRunner()
 
 
-def test_our_own_elements_keep_all() -> None:
+def test_own_elements_pass_all_checks() -> None:
     """Of each element not one check finds anything."""
     found = {
         (name, check.name): check.problem(element)
@@ -82,7 +82,7 @@ def fault(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> tu
     return check, element
 
 
-def test_a_fault_is_found(fault: tuple[str, Element]) -> None:
+def test_check_finds_its_fault(fault: tuple[str, Element]) -> None:
     """The check for it says what is wrong, and the command ends with status 1."""
     name, element = fault
     (check,) = (check for check in CHECKS if check.name == name)
@@ -93,13 +93,13 @@ def test_a_fault_is_found(fault: tuple[str, Element]) -> None:
     assert f"BROKEN  {check.proves}.\n        {problem}\n" in result.stdout
 
 
-def test_there_is_a_fault_for_every_check() -> None:
+def test_every_check_has_a_fault() -> None:
     """Each check of elements is seen to fail, by an element made wrong for it; none is left out."""
     assert FAULTS.keys() == {check.name for check in CHECKS}
 
 
 @pytest.mark.parametrize(("name", "expected"), [("MITC4", 2.0), ("Q3", 4.0), ("Q4", 6.0)])
-def test_rates_are_those_of_theory(name: str, expected: float) -> None:
+def test_elements_converge_with_theoretical_rates(name: str, expected: float) -> None:
     """A frequency errs as the energy does (Strang and Fix, ch. 6).
 
     By h² where rotations are linear; by h^2(p - 1) where slopes and rotations of order p are made

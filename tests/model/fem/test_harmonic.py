@@ -11,7 +11,7 @@ from model.structure.actuator import Era
 from paper_plate import make_paper_rig
 
 
-def test_far_below_resonance_the_plate_rides_on_its_base(coarse_rig):
+def test_direct_acceleration_is_rigid_far_below_resonance(coarse_rig):
     """All ERAs together at 1 Hz move the plate with the stroke: acceleration omega² alpha."""
     points = coarse_rig.mesh.nodes
     matrices = assemble(coarse_rig.plate, coarse_rig.mesh)
@@ -20,7 +20,7 @@ def test_far_below_resonance_the_plate_rides_on_its_base(coarse_rig):
     np.testing.assert_allclose(-together / ((2 * np.pi) ** 2 * 100e-6), 1.0, rtol=5e-3)
 
 
-def test_a_thick_plate_on_soft_eras_answers_like_one_mass_on_springs(coarse_rig):
+def test_direct_acceleration_of_a_rigid_plate_equals_mass_on_springs(coarse_rig):
     """Driven evenly, a plate 20 mm thick follows the one-mass transmissibility by hand."""
     plate = replace(coarse_rig.plate, thickness=0.020)
     soft = tuple(Era(e.name, e.x, e.y, 500.0, 2.0, 0.003, 1e-4) for e in coarse_rig.eras)
@@ -33,7 +33,7 @@ def test_a_thick_plate_on_soft_eras_answers_like_one_mass_on_springs(coarse_rig)
     np.testing.assert_allclose(response[0].sum(axis=0), by_hand, rtol=2e-3)
 
 
-def test_the_response_is_reciprocal(fine_rig):
+def test_direct_acceleration_is_reciprocal(fine_rig):
     """What SW's force does at NE, NE's does at SW; with equal ERAs the matrix is symmetric."""
     points = era_positions(fine_rig.eras)
     free = solve_free_plate(fine_rig.plate, fine_rig.mesh)
@@ -41,7 +41,7 @@ def test_the_response_is_reciprocal(fine_rig):
     np.testing.assert_allclose(at_eras, at_eras.transpose(0, 2, 1), rtol=1e-9)
 
 
-def test_the_corner_layout_mirrors(fine_rig):
+def test_direct_acceleration_is_symmetric_for_corner_eras(fine_rig):
     """SW's response on the plate is SE's mirrored, since the plate is symmetric."""
     mesh = fine_rig.mesh
     matrices = assemble(fine_rig.plate, mesh)
@@ -50,7 +50,7 @@ def test_the_corner_layout_mirrors(fine_rig):
     np.testing.assert_allclose(west, east[:, ::-1], rtol=1e-6, atol=1e-6 * np.abs(west).max())
 
 
-def test_damping_limits_the_resonance(coarse_rig):
+def test_damping_limits_direct_acceleration_at_resonance(coarse_rig):
     """At a resonance the response falls as damping grows, and stays finite."""
     peaks = []
     for ratio in (0.02, 0.05, 0.1):

@@ -41,31 +41,31 @@ def frequencies(rig, count, support):
     return modes(matrices, count, support=support, eras=rig.eras).natural_frequencies
 
 
-def test_table_1_of_the_paper_to_the_last_digit(coarse_rig):
+def test_modes_reproduce_table_1(coarse_rig):
     """Simply supported on the paper's mesh, all five printed frequencies come out."""
     solved = frequencies(coarse_rig, 5, "simply-supported")
     assert [f"{np.floor(100 * f + 0.5) / 100:.2f}" for f in solved] == TABLE_1
 
 
-def test_table_2_of_the_paper_to_the_last_digit(coarse_rig):
+def test_modes_reproduce_table_2(coarse_rig):
     """On four corner ERAs all five printed frequencies come out."""
     assert [f"{f:.2f}" for f in frequencies(coarse_rig, 5, "eras")] == TABLE_2
 
 
-def test_the_papers_mesh_has_390_degrees_of_freedom(coarse_rig):
+def test_paper_mesh_has_390_degrees_of_freedom(coarse_rig):
     """The paper says 390 DoF for 12 x 9 elements."""
     assert assemble(coarse_rig.plate, coarse_rig.mesh).dof == 390
 
 
 @pytest.mark.parametrize("support", CONVERGED)
-def test_a_finer_mesh_approaches_the_converged_frequencies(support):
+def test_modes_of_a_finer_mesh_approach_converged_frequencies(support):
     """Twelve modes come within 0.5 % of converged at 96x72, whatever holds the plate."""
     solved = frequencies(make_paper_rig(96, 72), 12, support)
     np.testing.assert_allclose(solved, CONVERGED[support], rtol=0.005)
 
 
 @pytest.mark.parametrize("support", CONVERGED)
-def test_the_automatic_mesh_is_converged(support):
+def test_modes_of_the_auto_mesh_are_converged(support):
     """Twelve modes of its 10x8 elements of order 5 are within 0.02 %, whatever holds the plate."""
     rig = make_paper_rig(12, 9)
     matrices = assemble(rig.plate, Mesh.auto(rig.plate, frequency_max=500.0))
@@ -74,7 +74,7 @@ def test_the_automatic_mesh_is_converged(support):
 
 
 @pytest.mark.parametrize("thickness", [1e-3, 1e-4])
-def test_high_order_does_not_lock_on_thin_plates(thickness):
+def test_high_order_elements_do_not_lock(thickness):
     """Simply supported, 2000 times as long as thick: thin-plate frequencies within 0.1 %."""
     plate = Plate(LENGTH, WIDTH, thickness, ALUMINIUM)
     scale = np.sqrt(plate.flexural_rigidity / (2700 * thickness)) / (2 * np.pi)
@@ -86,7 +86,7 @@ def test_high_order_does_not_lock_on_thin_plates(thickness):
     np.testing.assert_allclose(solved, thin, rtol=1e-3)
 
 
-def test_a_point_mass_lowers_the_free_plates_modes_as_by_hand():
+def test_point_mass_lowers_free_modes_as_by_hand():
     """A small mass m where a mode's shape is phi lowers omega² by the share m phi² (Rayleigh)."""
     rig = make_paper_rig(12, 9)
     matrices = assemble(rig.plate, rig.mesh)
@@ -97,7 +97,7 @@ def test_a_point_mass_lowers_the_free_plates_modes_as_by_hand():
     np.testing.assert_allclose(share, 1e-6 * corner**2, rtol=1e-3)
 
 
-def test_frequencies_converge_with_the_square_of_the_element_size():
+def test_mitc4_frequencies_converge_quadratically():
     """Simply supported, halving the elements cuts the error against thin-plate theory by four.
 
     Paper Eq. 29; these meshes are too coarse to see the layer, as wide as the plate is thick, in
@@ -110,7 +110,7 @@ def test_frequencies_converge_with_the_square_of_the_element_size():
 
 
 @pytest.mark.parametrize("support", CONVERGED)
-def test_every_refinement_comes_closer_from_above(support):
+def test_refinement_lowers_frequencies(support):
     """Consistent mass and compatible bending leave every frequency too high, ever less so."""
     errors = [
         frequencies(make_paper_rig(nx, ny), 5, support) - CONVERGED[support][:5]
@@ -128,7 +128,7 @@ def test_mode_shapes_have_unit_modal_mass(coarse_rig):
     np.testing.assert_allclose(np.abs(up), coarse_rig.plate.mass**-0.5, rtol=1e-4)
 
 
-def test_a_bolt_mass_lowers_a_rigid_plate_on_springs_as_by_hand(coarse_rig):
+def test_bolt_mass_lowers_rigid_modes_as_by_hand(coarse_rig):
     """Soft ERAs with heavy bolts: the heave mode is sqrt(4 k / (m_plate + 4 m_bolt)) / 2 pi."""
     heavy = tuple(
         Era(era.name, era.x, era.y, 10.0, 0.0, 0.05, era.stroke) for era in coarse_rig.eras
@@ -138,7 +138,7 @@ def test_a_bolt_mass_lowers_a_rigid_plate_on_springs_as_by_hand(coarse_rig):
     assert np.abs(solved.natural_frequencies / heave - 1).min() < 1e-3
 
 
-def test_an_era_between_nodes_acts_through_the_shape_functions():
+def test_era_between_nodes_acts_through_shape_functions():
     """Moving an ERA across an element changes the frequency smoothly, without a step at nodes."""
     rig = make_paper_rig(12, 9)
     matrices = assemble(rig.plate, rig.mesh)
@@ -152,7 +152,7 @@ def test_an_era_between_nodes_acts_through_the_shape_functions():
 
 
 @pytest.mark.parametrize("count", [0, 10_000])
-def test_an_impossible_number_of_modes_is_refused(coarse_rig, count):
+def test_modes_refuses_an_impossible_count(coarse_rig, count):
     """No modes, or more than the mesh has degrees of freedom, is bad input."""
     with pytest.raises(InputError, match=f"^modes .*got {count}"):
         frequencies(coarse_rig, count, "eras")

@@ -178,24 +178,6 @@ def test_figure_12_titles_name_the_pairs(figures):
     assert titles[5] == "(f) SW 150 Hz, NE 150 Hz"
 
 
-def test_figure_11_marks_active_eras(figures):
-    """Figure 11 (a): SW and SE are driven, NE and NW only hold."""
-    axes = figures["figure_11_maps"].figure.axes[0]
-    marks = {
-        (round(float(line.get_xdata()[0]), 2), round(float(line.get_ydata()[0]), 2)): (
-            line.get_color()
-        )
-        for line in axes.lines
-        if line.get_marker() == "o"
-    }
-    assert marks == {
-        (0.0, 0.0): "#d62728",
-        (30.48, 0.0): "#d62728",
-        (30.48, 22.86): "#2ca02c",
-        (0.0, 22.86): "#2ca02c",
-    }
-
-
 def test_figures_render_without_a_display(figures):
     """As PNG without a display, at least 1000 pixels wide at 150 dots an inch."""
     for made in figures.values():

@@ -19,7 +19,7 @@ INSIDE = [(0.051, 0.017), (0.29, 0.08), (0.12, WIDTH)]
 
 
 @pytest.mark.parametrize("places", [CORNERS, INSIDE, [*INSIDE, INSIDE[0]]])
-def test_it_answers_as_the_whole_plate_does(places):
+def test_reduced_plate_response_equals_direct_solve(places):
     """Its equations, solved frequency by frequency, are within 3e-5.
 
     Relative L2 over the plate, against the direct solve of the same mesh.
@@ -43,7 +43,7 @@ def test_it_answers_as_the_whole_plate_does(places):
         assert error.max() < 3e-5
 
 
-def test_it_is_small():
+def test_reduced_plate_has_few_coordinates():
     """Some two dozen modes, and three vectors for each attachment."""
     reduced = reduce_plate(PLATE, MESH, np.array(INSIDE))
     modes = (reduced.omega < 2 * np.pi * 1000).sum()
@@ -51,7 +51,7 @@ def test_it_is_small():
     assert len(reduced.omega) == modes + 3 * len(INSIDE)
 
 
-def test_motion_is_carried_over_to_a_plate_with_other_forces():
+def test_projection_carries_motion_to_another_reduction():
     """To more points nothing is lost; to fewer, or others, it is the mass-weighted projection.
 
     Which is the same seen from either side, and exact at the points that both answer for.

@@ -23,13 +23,13 @@ def modes_of(rig: Rig, *, frequency_max: float) -> SupportedModes:
     return supported_modes(reduced, rig.eras, frequency_max=frequency_max)
 
 
-def test_natural_frequencies_are_the_papers(coarse_rig: Rig) -> None:
+def test_supported_modes_reproduce_table_2(coarse_rig: Rig) -> None:
     """On the paper's mesh its Table 2 comes out, every printed digit, and nothing beyond it."""
     found = modes_of(coarse_rig, frequency_max=170.0).natural_frequencies
     assert [f"{frequency:.2f}" for frequency in found] == TABLE_2
 
 
-def test_a_rigid_plate_is_damped_as_by_hand() -> None:
+def test_damping_ratio_of_a_rigid_plate_as_by_hand() -> None:
     """Bouncing has the ratio zeta asked for, tilting nearly sqrt(3) times that.
 
     Mass m on four corners of k and c = 2 zeta sqrt(k m / 4): bouncing 4 c / (2 sqrt(4 k m)).
@@ -50,7 +50,7 @@ def test_a_rigid_plate_is_damped_as_by_hand() -> None:
     np.testing.assert_allclose(found.natural_frequencies[0], bouncing, rtol=1e-3)
 
 
-def test_shapes_have_modal_mass_one() -> None:
+def test_supported_mode_shapes_have_unit_modal_mass() -> None:
     """Of a rigid plate that bounces, mass 1 is a deflection of 1 / sqrt(m) everywhere."""
     rig = make_paper_rig(12, 9)
     plate = replace(rig.plate, thickness=0.03)

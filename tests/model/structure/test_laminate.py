@@ -73,7 +73,7 @@ def wave_rigidity(layers, frequency):
     return density * target / low**4
 
 
-def test_two_equal_layers_bonded_are_one_of_twice_the_thickness():
+def test_bonded_equal_layers_equal_one_layer():
     """D = E (2h)³ / 12 (1 - nu²), nu the material's."""
     bent = perfectly_bonded([Layer(GLASS, 1e-3), Layer(GLASS, 1e-3)])
     assert bent.rigidity == pytest.approx(70e9 * 8e-9 / (12 * 0.96), rel=1e-12)
@@ -91,7 +91,7 @@ def test_sliding_layers_add_their_rigidities():
     assert mixed.nu == pytest.approx((0.3 * steel + 0.2 * glass) / (steel + glass), rel=1e-12)
 
 
-def test_a_symmetric_sandwich_is_as_by_hand():
+def test_symmetric_sandwich_as_by_hand():
     """D = 2/3 [Q_f (h³ - c³) + Q_c c³], c and h half the core's and the whole thickness."""
     faces, core = 70e9 / (1 - 0.33**2), 70e6 / (1 - 0.33**2)
     c, h = 5e-3, 6e-3
@@ -101,7 +101,7 @@ def test_a_symmetric_sandwich_is_as_by_hand():
     assert bent.nu == pytest.approx(0.33, rel=1e-12)
 
 
-def test_a_bimetal_strip_is_as_by_hand():
+def test_bimetal_strip_as_by_hand():
     """Timoshenko's strip of two metals (J. Opt. Soc. Am. 11 (1925) 233), widened to a plate.
 
     With the same nu in both, D = [E1² h1⁴ + E2² h2⁴ + 2 E1 E2 h1 h2 (2 h1² + 2 h2² + 3 h1 h2)] /
@@ -114,7 +114,7 @@ def test_a_bimetal_strip_is_as_by_hand():
     assert perfectly_bonded(layers).rigidity == pytest.approx(by_hand, rel=1e-12)
 
 
-def test_bonded_layers_of_different_nu_are_the_matrices_of_laminate_theory():
+def test_bonded_layers_equal_laminate_theory():
     """D* = D - B A⁻¹ B with the full 3x3 matrices, from any reference plane."""
     layers = [Layer(STEEL, 0.5e-3), Layer(GLASS, 2e-3), Layer(FOAM, 1e-3)]
     A, B, D = (np.zeros((3, 3)) for _ in range(3))
@@ -139,7 +139,7 @@ def test_bonded_layers_of_different_nu_are_the_matrices_of_laminate_theory():
 
 
 @pytest.mark.parametrize(("bond", "frequency"), [("full", None), ("none", None), ("shear", 150.0)])
-def test_turning_a_laminate_over_changes_nothing(bond, frequency):
+def test_bending_is_independent_of_the_order_of_faces(bond, frequency):
     """The order of the layers, read from either face, is the same plate."""
     up = bending(Laminate(PANEL, Bond(bond), frequency))
     down = bending(Laminate(PANEL[::-1], Bond(bond), frequency))
@@ -148,7 +148,7 @@ def test_turning_a_laminate_over_changes_nothing(bond, frequency):
 
 
 @pytest.mark.parametrize(("bond", "frequency"), [("full", None), ("none", None), ("shear", 150.0)])
-def test_the_equivalent_plate_has_the_laminates_rigidity_nu_and_mass(bond, frequency):
+def test_equivalent_plate_keeps_rigidity_nu_and_mass(bond, frequency):
     """What the solver is given carries D*, nu and the surface density, by hand 6.45 kg/m²."""
     laminate = Laminate(PANEL, Bond(bond), frequency)
     plate = of_plate(laminate, loss_factor=0.02)
@@ -159,7 +159,7 @@ def test_the_equivalent_plate_has_the_laminates_rigidity_nu_and_mass(bond, frequ
     assert (plate.length, plate.width, plate.loss_factor) == (0.4, 0.25, 0.02)
 
 
-def test_one_layer_is_that_plate():
+def test_equivalent_plate_of_one_layer_is_that_layer():
     """Thickness, E, rho and nu come back, whatever the bond."""
     for bond in (Bond.FULL, Bond.NONE):
         plate = of_plate(Laminate((Layer(ALUMINIUM, 1.5e-3),), bond))
@@ -170,7 +170,7 @@ def test_one_layer_is_that_plate():
         )
 
 
-def test_the_equivalent_thickness_keeps_rotary_inertia():
+def test_equivalent_plate_keeps_rotary_inertia():
     """Bonded glass: rho H³ / 12 of the whole; sliding: of each; a sandwich: faces at their arms."""
     three = (Layer(GLASS, 1e-3),) * 3
     assert of_plate(Laminate(three)).thickness == pytest.approx(3e-3, rel=1e-9)
@@ -183,7 +183,7 @@ def test_the_equivalent_thickness_keeps_rotary_inertia():
 
 @pytest.mark.parametrize("modulus", [0.1e6, 1e6, 10e6, 1e9])
 @pytest.mark.parametrize("frequency", [40.0, 150.0, 500.0])
-def test_shear_of_the_adhesive_agrees_with_elasticity(modulus, frequency):
+def test_shear_bond_equals_elasticity(modulus, frequency):
     """Within 0.2 % for adhesives from gel to epoxy; the bounds are a factor of 3 apart."""
     adhesive = Material("adhesive", E=modulus, rho=1000.0, nu=0.49)
     layers = (PANEL[0], Layer(adhesive, 0.2e-3), PANEL[2])
@@ -191,7 +191,7 @@ def test_shear_of_the_adhesive_agrees_with_elasticity(modulus, frequency):
     assert bent.rigidity == pytest.approx(wave_rigidity(layers, frequency), rel=0.002)
 
 
-def test_shear_of_two_adhesives_agrees_with_elasticity():
+def test_shear_bond_of_two_adhesives_equals_elasticity():
     """Cover, sensor and display glass on two different adhesives, within 0.2 %."""
     other = Material("other", E=3e6, rho=1000.0, nu=0.49)
     layers = (*PANEL, Layer(other, 0.1e-3), Layer(GLASS, 1.1e-3))
@@ -199,7 +199,7 @@ def test_shear_of_two_adhesives_agrees_with_elasticity():
     assert bent.rigidity == pytest.approx(wave_rigidity(layers, 150.0), rel=0.002)
 
 
-def test_shear_is_kerwins_for_three_layers():
+def test_shear_bond_equals_kerwin_for_three_layers():
     """At the wavenumber that it belongs to, D = D1 + D3 + d² A1 A3 / (A1 + A3) g / (1 + g)."""
     frequency = 150.0
     rigidity = bending(Laminate(PANEL, Bond.SHEAR, frequency)).rigidity
@@ -212,7 +212,7 @@ def test_shear_is_kerwins_for_three_layers():
     assert rigidity == pytest.approx(by_hand, rel=1e-4)  # the adhesive's own stretch is left out
 
 
-def test_shear_reaches_both_bounds():
+def test_shear_bond_reaches_both_bounds():
     """An adhesive as stiff as glass bonds, one without stiffness lets slide."""
     firm = (PANEL[0], Layer(Material("firm", 70e9, 1000.0, 0.2), 0.2e-3), PANEL[2])
     loose = (PANEL[0], Layer(Material("loose", 1.0, 1000.0, 0.2), 0.2e-3), PANEL[2])
@@ -225,7 +225,7 @@ def test_shear_reaches_both_bounds():
     )
 
 
-def test_the_example_panel_is_plausible():
+def test_example_panel_equals_thin_plate():
     """Simply supported, its lowest modes are those of a thin plate of the stack's own rigidity.
 
     f = pi/2 (m²/a² + n²/b²) sqrt(D / m''), D by elasticity through the thickness and m'' = 6.306

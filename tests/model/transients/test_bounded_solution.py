@@ -21,7 +21,7 @@ def value(A, b, x):
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_within_a_percent_of_what_a_general_optimiser_finds(seed):
+def test_bounded_solution_equals_a_general_optimiser(seed):
     """No bound is exceeded, and the value is that of SLSQP within 1 % of what is to be gained."""
     A, b = random_form(seed, 6)
     found = bounded_solution(A, b, np.ones(6))
@@ -37,7 +37,7 @@ def test_within_a_percent_of_what_a_general_optimiser_finds(seed):
     assert value(A, b, found) <= 0.99 * general.fun
 
 
-def test_bounds_out_of_the_way_change_nothing():
+def test_bounded_solution_is_unbounded_when_bounds_are_inactive():
     """Where the free solution keeps the bounds, it is the answer."""
     A, b = random_form(9, 7)
     free = np.linalg.solve(A, b)

@@ -25,7 +25,7 @@ def motion(terms: tuple[Term, ...], time: float) -> float:
     )
 
 
-def test_the_base_moves_along_straight_lines_between_knots():
+def test_envelope_terms_are_linear_between_knots():
     """Half way between knots the complex amplitude is their mean, at its carrier's phase."""
     envelope = Envelope(100.0, 0j, (2e-5 + 1e-5j, -4e-5j), step=0.005)
     terms = envelope.terms()
@@ -39,7 +39,7 @@ def test_the_base_moves_along_straight_lines_between_knots():
         assert envelope.amplitude(np.array([time]))[0] == pytest.approx(amplitude)
 
 
-def test_an_envelope_to_nothing_ends():
+def test_envelope_terms_end_when_the_last_knot_is_zero():
     """From a tone's own amplitude it begins as that tone, and after its last knot all is still."""
     terms = Envelope(70.0, 3e-5, (3e-5, 0j), step=0.004).terms()
     tone = 3e-5 * math.sin(2 * math.pi * 70.0 * 0.001)
@@ -47,7 +47,7 @@ def test_an_envelope_to_nothing_ends():
     assert motion(terms, 0.0081) == 0.0
 
 
-def test_a_ramp_is_a_raised_cosine_up_and_down():
+def test_ramped_onset_and_ending_are_raised_cosines():
     """Half way through a ramp, up or down, the amplitude is half, and none or all at its ends."""
     rig = make_paper_rig(2, 2)
     excitation = {"SE": Tone(50.0, 1e-4, 0.3)}
@@ -61,7 +61,7 @@ def test_a_ramp_is_a_raised_cosine_up_and_down():
         assert motion(down[se], time) == pytest.approx((1 - share) * tone, abs=1e-17)
 
 
-def test_bases_follow_the_order_of_the_rig():
+def test_shaped_bases_follow_the_order_of_the_rig():
     """An envelope moves the base of the ERA that it is named for and no other."""
     rig = make_paper_rig(2, 2)
     bases = shaped({"NE": Envelope(90.0, 0j, (1e-5 + 0j,))}, rig.eras)

@@ -12,7 +12,7 @@ from model.vibration.excitation import Tone
 from plate_in_time import make_plate_in_time
 
 
-def test_the_form_of_an_ending_is_the_mean_square_of_what_it_does():
+def test_while_ending_is_the_mean_square_of_the_response():
     """For knots at random, the form's value is that of the sampled vibration, mean over phases."""
     rig, plate = make_plate_in_time()
     frequency = 217.0

@@ -18,7 +18,7 @@ from paper_table import FREQUENCIES, contact_sets, smooth_table
 
 
 @pytest.mark.parametrize(("ramp", "within"), [(0.020, 0.5), (0.040, 0.25)])
-def test_the_contrast_of_an_onset_is_that_of_every_sample(ramp, within):
+def test_ramped_onset_contrast_equals_sampled_contrast(ramp, within):
     """Twelve moments of an envelope, against 800 samples of the motion, root mean square in dB.
 
     Random drives, one or two targets, over all frequencies.
@@ -53,7 +53,7 @@ def test_the_contrast_of_an_onset_is_that_of_every_sample(ramp, within):
 
 
 @pytest.mark.parametrize("mode", ["graded", "signed", "phased"])
-def test_a_plain_ramp_takes_the_pattern_of_the_better_onset(mode):
+def test_pattern_of_the_better_onset_is_chosen_for_a_plain_ramp(mode):
     """Never more than 3 dB of the score for it; in the mean more is had, with phases 1 dB."""
     table = smooth_table()
     timing = Timing(table)
@@ -98,7 +98,7 @@ def plain_with(pattern, excitation):
         ((), (170.0, 400.0)),
     ],
 )
-def test_a_decibel_of_the_score_counts_as_much_as_three_of_the_onset(softer, frequencies):
+def test_choice_weighs_score_three_times_as_much_as_onset(softer, frequencies):
     """Of the drives nearly as good none is ahead in score and a third of the transient contrast.
 
     That is worked out sample by sample; the table's own prediction may be wrong by half a decibel.
@@ -144,7 +144,7 @@ def test_a_decibel_of_the_score_counts_as_much_as_three_of_the_onset(softer, fre
 
 
 @pytest.mark.parametrize("mode", ["switched", "signed", "phased"])
-def test_amplifiers_with_envelopes_get_the_best_steady_pattern(mode):
+def test_best_steady_pattern_is_chosen_with_envelopes(mode):
     """A shaped onset needs no choice: what is answered is the drive of the best robust score."""
     table = smooth_table()
     for places in contact_sets(6, fingers=3, seed=22):

@@ -64,7 +64,7 @@ def wrong(envelopes: Envelopes, errors) -> Envelopes:
 
 
 @pytest.mark.parametrize("frequency", FREQUENCIES)
-def test_no_knot_exceeds_the_stroke(setup, frequency):
+def test_knots_do_not_exceed_the_stroke(setup, frequency):
     """At full stroke, resonance or not, onset and brake stay within it and join the pattern."""
     rig, _, shaper, _ = setup
     rng = np.random.default_rng(int(frequency))
@@ -86,7 +86,7 @@ def test_no_knot_exceeds_the_stroke(setup, frequency):
 
 
 @pytest.mark.parametrize("frequency", FREQUENCIES)
-def test_a_brake_leaves_less_than_stopping_or_fading(setup, frequency):
+def test_brake_has_less_residual_vibration_than_stop_or_ramp(setup, frequency):
     """After 40 ms at least 6 dB less is left than after a ramp as long, and than without any."""
     rig, _, shaper, transients = setup
     excitation = random_excitation(rig, frequency, np.random.default_rng(7))
@@ -96,7 +96,7 @@ def test_a_brake_leaves_less_than_stopping_or_fading(setup, frequency):
         assert braked < left - 6
 
 
-def test_a_brake_survives_gain_and_phase_errors(setup):
+def test_brake_is_robust_to_gain_and_phase_errors(setup):
     """With 5 % and 5 degrees off, the median over seeds is 40 dB down (30 dB below 150 Hz)."""
     rig, _, shaper, transients = setup
     for frequency, wanted in [(110.8, -30.0), (146.2, -30.0), (305.0, -40.0), (411.0, -40.0)]:
@@ -126,7 +126,7 @@ PAIRS = [
 
 
 @pytest.mark.parametrize(("target", "quiet", "frequency"), PAIRS)
-def test_a_shaped_onset_keeps_most_of_the_steady_contrast(setup, target, quiet, frequency):
+def test_shaped_onset_keeps_most_of_the_steady_contrast(setup, target, quiet, frequency):
     """In the first 100 ms and with errors: 6 dB more than a 20 ms ramp, 6 dB off steady at most."""
     rig, plate, shaper, transients = setup
     weights = robust_weights(plate, frequency, target, quiet)
@@ -159,7 +159,7 @@ def test_a_shaped_onset_keeps_most_of_the_steady_contrast(setup, target, quiet, 
     assert np.median(realised) > np.median(steady) - 6
 
 
-def test_what_is_found_trusts_no_era_more_than_it_may(setup, monkeypatch):
+def test_shaping_includes_the_errors_of_the_eras(setup, monkeypatch):
     """With errors the robust onset and brake do better than those that know of no errors."""
     rig, plate, shaper, transients = setup
     target, quiet, frequency = PAIRS[2]
@@ -185,7 +185,7 @@ def test_what_is_found_trusts_no_era_more_than_it_may(setup, monkeypatch):
     assert np.median(left[:40]) < np.median(left[40:]) - 1
 
 
-def test_a_target_follows_its_ramp(setup):
+def test_shaped_onset_target_follows_its_ramp(setup):
     """A target has nothing at first, half its amplitude within 35 ms, and most of it by 60 ms."""
     rig, plate, shaper, transients = setup
     for target, quiet, frequency in PAIRS[1:]:
@@ -201,7 +201,7 @@ def test_a_target_follows_its_ramp(setup):
         assert np.abs(felt[280:480]).max() > 0.65 * steady
 
 
-def test_an_ending_that_knows_the_quiet_finger_keeps_it_quiet(setup):
+def test_ending_keeps_known_quiet_finger_quiet(setup):
     """Its peaks are lower than if the ending did not know it, above 150 Hz lower than in a ramp.
 
     In a few periods of a low frequency a plate is not stopped that quietly, but it is stopped.
@@ -230,7 +230,7 @@ def test_an_ending_that_knows_the_quiet_finger_keeps_it_quiet(setup):
         assert transients.residual_db(excitation, knowing) < limit
 
 
-def test_mirrored_contacts_get_mirrored_envelopes(setup):
+def test_shaping_is_symmetric_for_mirrored_contacts(setup):
     """On a symmetric plate, west and east swap with the contacts."""
     rig, _, shaper, _ = setup
     swap = {"SW": "SE", "SE": "SW", "NE": "NW", "NW": "NE"}
@@ -253,7 +253,7 @@ def test_mirrored_contacts_get_mirrored_envelopes(setup):
         )
 
 
-def test_half_the_level_is_half_the_envelope_where_no_bound_is_met(setup):
+def test_shaping_is_linear_in_level_when_bounds_are_inactive(setup):
     """Far below the stroke shaping is linear in the pattern."""
     rig, _, shaper, _ = setup
     weights = np.array([0.02, 0.01j, -0.015, 0.005 + 0.01j])
@@ -268,7 +268,7 @@ def test_half_the_level_is_half_the_envelope_where_no_bound_is_met(setup):
             )
 
 
-def test_the_steps_of_a_wire_cost_nothing(setup):
+def test_quantised_envelopes_keep_contrast_and_residual(setup):
     """Levels in 1e-4 and phases in 0.01 degrees change contrast and rest by under 0.1 dB."""
     rig, plate, shaper, transients = setup
     target, quiet, frequency = PAIRS[0]
@@ -299,7 +299,7 @@ def test_the_steps_of_a_wire_cost_nothing(setup):
     assert left[1] == pytest.approx(left[0], abs=0.1)
 
 
-def test_an_era_plays_the_frequency_it_has(setup):
+def test_envelopes_keep_the_frequency_of_each_era(setup):
     """With two frequencies each ERA keeps its own, and one that is silent stays silent."""
     rig, _, shaper, transients = setup
     excitation = {"SW": Tone(110.8, 8e-5), "NE": Tone(217.0, 6e-5, 1.0)}
@@ -312,7 +312,7 @@ def test_an_era_plays_the_frequency_it_has(setup):
     assert braked < stopped - 3
 
 
-def test_a_silent_era_helps_where_there_is_one_frequency(setup):
+def test_silent_era_plays_in_onset_of_one_frequency(setup):
     """It joins in for the onset, and is silent again at its end; the brake is the others' alone."""
     rig, _, shaper, _ = setup
     excitation = {"SW": Tone(110.8, 8e-5), "NE": Tone(110.8, 6e-5, 1.0)}
@@ -324,7 +324,7 @@ def test_a_silent_era_helps_where_there_is_one_frequency(setup):
     assert set(ending) == set(excitation)
 
 
-def test_around_a_lone_finger_the_plate_takes_the_quiet_fingers_place(setup):
+def test_onset_of_a_lone_finger_keeps_the_surroundings_quiet(setup):
     """Without quiet fingers the rest of the plate moves less during the onset than with a ramp."""
     rig, _, shaper, transients = setup
     target = (0.05, 0.18)

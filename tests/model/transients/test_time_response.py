@@ -29,7 +29,7 @@ class ThreeMasses:
 
 
 @pytest.mark.parametrize("mass", [0.0, 3.0])
-def test_a_plate_that_is_damped_critically_says_so(mass: float) -> None:
+def test_plate_in_time_refuses_critical_damping(mass: float) -> None:
     """c = 2 sqrt(k m): two eigenvectors are one, and nothing must be computed with their inverse.
 
     With 1 + 3 kg and twice the damping as well, there the numbers make it singular altogether.

@@ -32,7 +32,7 @@ def resting(_time: float) -> tuple[float, float]:
     return 0.0, 0.0
 
 
-def test_the_answer_to_a_hat_is_that_of_a_stepping_solver(few_modes):
+def test_hat_response_equals_time_stepping(few_modes):
     """Closed form, back on its carrier, follows Runge-Kutta through rise, fall and ringing."""
     rig, plate = few_modes
     omega = 2 * math.pi * 90.0
@@ -53,7 +53,7 @@ def test_the_answer_to_a_hat_is_that_of_a_stepping_solver(few_modes):
     np.testing.assert_allclose(found, stepped, atol=1e-5 * np.abs(stepped).max())
 
 
-def test_predicted_vibration_is_that_of_a_stepping_solver(few_modes):
+def test_acceleration_equals_time_stepping(few_modes):
     """A ramped tone and an envelope at another frequency together follow Runge-Kutta."""
     rig, plate = few_modes
     envelope = Envelope(120.0, 0j, (3e-5 + 2e-5j, -1e-5j, 5e-5 + 0j))
@@ -89,7 +89,7 @@ def test_predicted_vibration_is_that_of_a_stepping_solver(few_modes):
     np.testing.assert_allclose(found, expected, atol=1e-5 * np.abs(expected).max())
 
 
-def test_vibrations_of_several_eras_add_up(plate):
+def test_acceleration_superposes_eras(plate):
     """Linear: what two ERAs do together is the sum of what each does alone."""
     rig, in_time = plate
     transients = Transients(in_time)
@@ -103,7 +103,7 @@ def test_vibrations_of_several_eras_add_up(plate):
     np.testing.assert_allclose(felt[2], felt[0] + felt[1], atol=1e-9 * np.abs(felt[2]).max())
 
 
-def test_a_steady_vibration_stays_what_it_is(plate):
+def test_acceleration_stays_steady_after_steady_state(plate):
     """A tone that goes on after having been steady neither grows nor fades."""
     rig, in_time = plate
     tone = Tone(110.0, 6e-5, 0.9)
@@ -116,7 +116,7 @@ def test_a_steady_vibration_stays_what_it_is(plate):
     np.testing.assert_allclose(felt[period:], felt[:-period], atol=1e-6 * np.abs(felt).max())
 
 
-def test_contrast_is_that_of_the_peaks(plate):
+def test_contrast_db_equals_sampled_peaks(plate):
     """Mean peak over the target's points to the largest at a quiet point, within 100 ms."""
     rig, in_time = plate
     transients = Transients(in_time)
@@ -131,7 +131,7 @@ def test_contrast_is_that_of_the_peaks(plate):
     assert len(at_target) == 0.1 * SAMPLE_RATE
 
 
-def test_of_two_targets_the_lesser_counts(plate):
+def test_contrast_db_is_that_of_the_lesser_target(plate):
     """Contrast of an onset and of an end is that of the target which has less, as in the steady."""
     rig, in_time = plate
     transients = Transients(in_time)
@@ -153,7 +153,7 @@ def test_of_two_targets_the_lesser_counts(plate):
         assert measure(*targets) == pytest.approx(min(alone), abs=1e-9)
 
 
-def test_what_is_left_is_what_sampling_the_plate_gives(plate):
+def test_residual_db_equals_sampled_plate(plate):
     """Root mean square over plate, 100 ms and four phases agrees with the closed form."""
     rig, in_time = plate
     transients = Transients(in_time)
@@ -178,7 +178,7 @@ def test_what_is_left_is_what_sampling_the_plate_gives(plate):
     assert found == pytest.approx(expected, abs=0.1)
 
 
-def test_tones_of_two_frequencies_leave_the_sum_of_their_powers(plate):
+def test_residual_db_adds_powers_of_two_frequencies(plate):
     """What is left of two tones lies between what is left of each, weighted by their powers."""
     rig, in_time = plate
     transients = Transients(in_time)
@@ -191,7 +191,7 @@ def test_tones_of_two_frequencies_leave_the_sum_of_their_powers(plate):
     assert min(alone) < both < max(alone)
 
 
-def test_contrast_of_an_end_is_that_of_its_peaks(plate):
+def test_ending_contrast_db_equals_sampled_peaks(plate):
     """What the target felt steadily, by sampling, to the loudest quiet peak from the end on."""
     rig, in_time = plate
     transients = Transients(in_time)

@@ -31,7 +31,7 @@ def free_plate():
     ("eras", "sets"),
     [(1, 1), (2, 3), (3, 7), (4, 11)],
 )
-def test_sets_are_each_alone_each_pair_and_all(eras, sets):
+def test_activation_sets_are_singles_pairs_and_all(eras, sets):
     """One ERA: itself; two: each and both; four: 4 alone, 6 pairs, all."""
     every = activation_sets(eras)
     assert len(every) == len(set(every)) == sets
@@ -40,7 +40,7 @@ def test_sets_are_each_alone_each_pair_and_all(eras, sets):
     assert every[-1] == tuple(range(eras))
 
 
-def test_within_a_frequency_eras_add_as_complex_numbers():
+def test_cumulative_statistics_add_eras_as_complex_numbers():
     """Two ERAs in opposition leave a null, which magnitudes added would fill."""
     acceleration = np.array([[[1.0 + 2j, 3.0], [-1.0 - 2j, 3.0]], [[2.0, 1j], [0.0, 0.0]]])
     first, _, both = cumulative_statistics(acceleration)[:, [0, 4]]  # least and most of two points
@@ -48,7 +48,7 @@ def test_within_a_frequency_eras_add_as_complex_numbers():
     np.testing.assert_allclose(first, [3 + 1, 5**0.5 + 2])
 
 
-def test_statistics_are_those_of_the_sum_over_frequencies():
+def test_cumulative_statistics_sum_over_frequencies():
     """Row by row against numpy's percentiles of Eq. 28 written out as loops."""
     rng = np.random.default_rng(1)
     acceleration = rng.normal(size=(5, 3, 40)) + 1j * rng.normal(size=(5, 3, 40))
@@ -65,17 +65,17 @@ def test_statistics_are_those_of_the_sum_over_frequencies():
     assert len(STATISTICS) == 6
 
 
-def test_without_a_threshold_nothing_is_called_unfelt():
+def test_unfelt_share_is_zero_without_threshold():
     """The share is only told where it was asked for."""
     assert cumulative_statistics(np.ones((1, 1, 2), dtype=complex))[0, -1] == 0
 
 
-def test_felt_is_twelve_decibels_above_detection():
+def test_felt_acceleration_is_twelve_decibels_above_detection():
     """At 250 Hz 0.247 m/s² are just detected (reference data); 12 dB more is 3.981 times that."""
     assert felt_acceleration(np.array([250.0]))[0] == pytest.approx(0.247 * 3.981, rel=1e-3)
 
 
-def test_points_stand_for_equal_areas():
+def test_equal_area_points_are_cell_centres():
     """24 x 18 cell centres on the paper's plate, half an inch apart, half of that off the edges."""
     plate = make_paper_rig(12, 9).plate
     points = equal_area_points(plate, frequency_max=320.0)
@@ -89,7 +89,7 @@ def test_points_stand_for_equal_areas():
 
 
 @pytest.mark.parametrize("layout", FOUR_ERA_LAYOUTS, ids=lambda layout: layout.name)
-def test_the_points_are_as_good_as_is_said_of_them(free_plate, layout):
+def test_equal_area_points_have_the_stated_accuracy(free_plate, layout):
     """Against 96 x 72 cells: medians within 3 %, quartiles 8 %, maxima at most 12 % low."""
     plate = free_plate.plate
     eras = alike(make_paper_rig(12, 9).eras[0], layout.positions(plate))

@@ -26,7 +26,7 @@ def study():
     )
 
 
-def test_the_papers_own_mesh_is_among_those_compared(study):
+def test_meshes_to_compare_include_the_papers(study):
     """12x9 and its doublings of MITC4, and the automatic mesh once, though it is the rig's."""
     assert [str(error.mesh) for error in study.errors] == [
         "12x9",
@@ -37,12 +37,12 @@ def test_the_papers_own_mesh_is_among_those_compared(study):
     ]
 
 
-def test_frequency_errors_are_those_of_the_paper(study):
+def test_frequency_errors_equal_those_of_the_paper(study):
     """On 12x9 the errors are the paper's Table 2 against converged values, to its last digit."""
     np.testing.assert_allclose(study.errors[0].frequency[:5], PAPER / CONVERGED - 1, atol=2e-4)
 
 
-def test_the_automatic_mesh_keeps_its_promise(study):
+def test_auto_mesh_has_the_stated_accuracy(study):
     """Frequencies within 0.1 %, acceleration at 110 Hz and 250 Hz within 1 % for every drive."""
     automatic = study.errors[-1]
     assert np.abs(automatic.frequency).max() < 1e-3
@@ -50,14 +50,14 @@ def test_the_automatic_mesh_keeps_its_promise(study):
     assert automatic.dof < study.errors[3].dof / 2
 
 
-def test_another_element_converges_to_the_same_field(study):
+def test_mitc4_converges_to_the_same_field(study):
     """MITC4 knows nothing of the reference's element, yet comes ever closer to its answer."""
     errors = np.array([error.response for error in study.errors[:4]])
     assert (np.diff(errors, axis=0) < 0).all()
     assert errors[-1].max() < 0.04
 
 
-def test_eras_within_the_plate_converge_too():
+def test_response_converges_for_eras_within_the_plate():
     """A force within an element bends it sharply; the automatic mesh is still within 1 %."""
     rig = make_paper_rig(12, 9)
     inside = zip(rig.eras, [(0.051, 0.017), (0.29, 0.08), (0.12, 0.1), (0.2, 0.15)], strict=True)
@@ -69,7 +69,7 @@ def test_eras_within_the_plate_converge_too():
 
 
 @pytest.mark.parametrize(("count", "free"), [(1, 2), (2, 1)])
-def test_motion_that_nothing_holds_is_not_compared(count, free):
+def test_unsupported_motion_is_not_compared(count, free):
     """On one ERA the plate can tilt both ways, on two about their line: 0 Hz has no error."""
     rig = make_paper_rig(12, 9)
     few = replace(rig, eras=rig.eras[:count])
@@ -80,7 +80,7 @@ def test_motion_that_nothing_holds_is_not_compared(count, free):
 
 
 @pytest.mark.parametrize(("limit", "asked"), [(500.0, [110, 250]), (200.0, [110]), (80.0, [80])])
-def test_without_being_told_it_looks_where_the_paper_does(limit, asked):
+def test_default_frequencies_are_those_of_the_papers_maps(limit, asked):
     """At 110 Hz and 250 Hz, as far as the rig's limit allows."""
     rig = make_paper_rig(12, 9)
     limited = replace(rig, limits=replace(rig.limits, frequency_max=limit))

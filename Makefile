@@ -18,7 +18,7 @@ demo: .venv/installed
 	$(BIN)/era demo
 
 test: lint
-	$(BIN)/pytest -m 'not alone' --numprocesses 2 --dist loadfile --no-loadscope-reorder
+	$(BIN)/pytest -m 'not alone' --numprocesses auto --dist loadfile --no-loadscope-reorder
 	$(BIN)/pytest -m alone
 
 lint: .venv/installed-test

@@ -1,4 +1,4 @@
-"""What all tests share: one thread for linear algebra, the paper's plate, what is begun first."""
+"""What all tests share: one thread for linear algebra, the paper's plate, the order of files."""
 
 import os
 from pathlib import Path
@@ -11,7 +11,7 @@ import pytest  # noqa: E402
 from model.rig.rig import Rig  # noqa: E402
 from paper_plate import make_paper_rig  # noqa: E402
 
-DEAREST = (
+SLOWEST = (
     "test_soak.py",
     "test_demo.py",
     "test_tutorials.py",
@@ -25,26 +25,28 @@ DEAREST = (
     "test_daemon_process.py",
     "test_diagnosis.py",
     "test_plate_commands.py",
-    "test_errors_read.py",
+    "test_dashboard_losses.py",
+    "test_rig_check_over_wires.py",
+    "test_errors.py",
     "test_studies.py",
     "test_examples.py",
     "test_calibration.py",
     "test_wheel.py",
 )
-"""Begun in this order, before all others: one that began last would go on when a core is idle."""
+"""Run in this order before all others: one that started last would leave the other cores idle."""
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
-    """Of those that run alone, leave out files that hold none: reading all takes ten seconds."""
+    """Skip files without a test that runs alone: importing all takes ten seconds."""
     if config.option.markexpr != "alone" or collection_path.suffix != ".py":
         return None
     return True if "mark.alone" not in collection_path.read_text("utf-8") else None
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """The dearest files first; the order within each file stays."""
-    place = {name: number for number, name in enumerate(DEAREST)}
-    items.sort(key=lambda item: place.get(item.path.name, len(DEAREST)))
+    """Run the slowest files first; the order within each file stays."""
+    place = {name: number for number, name in enumerate(SLOWEST)}
+    items.sort(key=lambda item: place.get(item.path.name, len(SLOWEST)))
 
 
 @pytest.fixture(scope="session")

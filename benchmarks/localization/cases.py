@@ -15,7 +15,7 @@ from model.rig.file import load_rig
 from model.table.build import build_table
 from model.table.question import Question
 from model.table.table import LocalizationTable
-from model.vibration.excitation import GAIN_ERROR, PHASE_ERROR
+from model.vibration.excitation import random_gains
 
 RIG = Path(__file__).parents[2] / "examples" / "paper_plate.yaml"
 FREQUENCIES = np.linspace(40.0, 500.0, 27)
@@ -86,8 +86,7 @@ class Errors:
 
     @classmethod
     def draw(cls, draws: int, *, eras: int, rng: np.random.Generator) -> "Errors":
-        gain = 1 + GAIN_ERROR * rng.standard_normal((draws, eras))
-        return cls(gain * np.exp(1j * PHASE_ERROR * rng.standard_normal((draws, eras))))
+        return cls(random_gains(rng, draws=draws, eras=eras))
 
     def contrast_db(self, fields: Fields, weights: ComplexArray) -> FloatArray:
         """Contrast of weights (f, eras) in every draw, (draws,); of several targets the least."""

@@ -14,7 +14,6 @@ from benchmarks.transients.cases import (
     case_of,
     quantised,
     with_errors,
-    wrong,
 )
 from model.fem.assembly import era_positions
 from model.reduction.reduced_plate import reduce_plate
@@ -26,7 +25,7 @@ from model.transients.envelope import Bases, ramped_ending, ramped_onset, shaped
 from model.transients.measures import Transients
 from model.transients.shaping import Shaper
 from model.transients.time_response import PlateInTime, plate_in_time
-from model.vibration.excitation import Excitation
+from model.vibration.excitation import Excitation, random_gains
 
 T = TypeVar("T")
 Columns = dict[str, list[float]]
@@ -68,7 +67,7 @@ class Bench:
         for patterns in cases:
             case = patterns[0]
             excitation = case.excitation(self.rig)
-            errors = wrong(self._rng, len(self.rig.eras), self._draws)
+            errors = random_gains(self._rng, draws=self._draws, eras=len(self.rig.eras))
             columns["steady"].append(case.steady_db(case.weights))
             columns["steady, realised"].append(
                 float(np.median([case.steady_db(case.weights * each) for each in errors]))
@@ -115,7 +114,7 @@ class Bench:
         for case in cases:
             level = 1.0 if full else case.felt_level
             excitation = case.excitation(self.rig, level)
-            errors = wrong(self._rng, len(eras), self._draws)
+            errors = random_gains(self._rng, draws=self._draws, eras=len(eras))
             for name, ramp in (("stopped", 0.0), ("20 ms ramp", 0.02), ("40 ms ramp", 0.04)):
                 bases = ramped_ending(excitation, eras, ramp=ramp)
                 left[name].append(self._left(excitation, bases))

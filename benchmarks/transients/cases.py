@@ -127,11 +127,6 @@ def case_of(excitation: Excitation, patterns: list[Case], rig: Rig) -> Case:
     return replace(same, weights=weights)
 
 
-def wrong(rng: np.random.Generator, eras: int, draws: int) -> ComplexArray:
-    gains = 1 + GAIN_ERROR * rng.standard_normal((draws, eras))
-    return np.asarray(gains * np.exp(1j * PHASE_ERROR * rng.standard_normal((draws, eras))))
-
-
 def with_errors(envelopes: Envelopes, rig: Rig, errors: ComplexArray) -> Envelopes:
     return {
         era.name: replace(

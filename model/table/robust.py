@@ -28,7 +28,7 @@ from model.structure.point_load import PointLoad
 from model.table.pattern import Pattern
 from model.table.question import Point, Question
 from model.table.table import LocalizationTable
-from model.vibration.excitation import GAIN_ERROR, PHASE_ERROR, Excitation
+from model.vibration.excitation import Excitation, random_gains
 from model.vibration.peak import base_amplitudes
 
 STIFFNESS_RANGE = 0.10
@@ -56,13 +56,12 @@ def draw_ensemble(era_count: int) -> Ensemble:
     """MEMBERS plates on so many ERAs, the same ones every time."""
     rng = np.random.default_rng(0)
     each = (MEMBERS, era_count)
-    gain = 1 + GAIN_ERROR * rng.standard_normal(each)
-    phase = PHASE_ERROR * rng.standard_normal(each)
+    drive = random_gains(rng, draws=MEMBERS, eras=era_count)
     return Ensemble(
         thickness=rng.uniform(1 - THICKNESS_RANGE, 1 + THICKNESS_RANGE, MEMBERS),
         damping=DAMPING_FACTOR ** rng.uniform(-1, 1, MEMBERS),
         stiffness=rng.uniform(1 - STIFFNESS_RANGE, 1 + STIFFNESS_RANGE, each),
-        drive=gain * np.exp(1j * phase),
+        drive=drive,
     )
 
 

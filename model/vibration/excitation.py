@@ -6,11 +6,21 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Self, TypeAlias
 
+import numpy as np
+
+from model.arrays import ComplexArray
+
 GAIN_ERROR = 0.05
 """Standard deviation of the relative error of an ERA's amplitude."""
 
 PHASE_ERROR = math.radians(5)
 """Standard deviation of the error of an ERA's phase [rad]."""
+
+
+def random_gains(rng: np.random.Generator, *, draws: int, eras: int) -> ComplexArray:
+    """Draw complex gains of ERAs with GAIN_ERROR and PHASE_ERROR, normal, (draws, eras)."""
+    gain = 1 + GAIN_ERROR * rng.standard_normal((draws, eras))
+    return np.asarray(gain * np.exp(1j * PHASE_ERROR * rng.standard_normal((draws, eras))))
 
 
 @dataclass(frozen=True)

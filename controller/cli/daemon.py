@@ -1,4 +1,4 @@
-"""`era daemon`, and its clients: `era status`, `arm`, `disarm`, `stop`, `touch`, `watch`."""
+"""`era daemon` and its clients: `status`, `arm`, `disarm`, `stop`, `clear`, `touch`, `watch`."""
 
 import json
 import re
@@ -33,28 +33,28 @@ EXIT_STATUS: dict[type[BaseException], int] = {
     LinkError: 3,
     FrameError: 3,
 }
-"""Exit status of the errors that these commands raise on purpose."""
+"""Exit status by error class."""
 
 Socket = Annotated[
     Path | None,
-    typer.Option("--socket", metavar="PATH", help="Where the daemon listens, if not as usual."),
+    typer.Option("--socket", metavar="PATH", help="Socket of the daemon; default: the usual path."),
 ]
-Json = Annotated[bool, typer.Option("--json", help="One JSON object, nothing else.")]
+Json = Annotated[bool, typer.Option("--json", help="Print one JSON object and nothing else.")]
 
 DASHBOARD = "127.0.0.1:8137"
-"""Where the page is served unless another place is named; the gateway's own default, too."""
+"""Default address of the page, as of `era gateway`."""
 
-_WATCHED = ["state", "contacts", "pattern", "silence", "link", "log"]
-"""What `era watch` tells unless it is told what: amplifiers and latency would come without end."""
+_DEFAULT_TOPICS = ["state", "contacts", "pattern", "silence", "link", "log"]
+"""Of `era watch`; amplifiers and latency are published without end."""
 
-_REPEAT = 0.05  # s; a touch that is not repeated for 150 ms is lifted
+_REPEAT_INTERVAL = 0.05  # s; a touch that is not repeated for 150 ms is lifted
 
 
 class _DashboardCommand(TyperCommand):
-    """Lets `--dashboard` stand without a place."""
+    """Makes the value of `--dashboard` optional."""
 
     def parse_args(self, context: Any, arguments: list[str]) -> list[str]:
-        """Put the usual place behind a `--dashboard` that is not followed by one."""
+        """Insert the default address after a `--dashboard` without one."""
         filled = []
         for argument, following in zip_longest(arguments, arguments[1:], fillvalue=""):
             filled.append(argument)
@@ -66,20 +66,24 @@ class _DashboardCommand(TyperCommand):
 @app.command(cls=_DashboardCommand)
 def daemon(
     config: Annotated[
-        Path, typer.Argument(metavar="CONFIG", help="era config init FILE --kind daemon makes one.")
+        Path,
+        typer.Argument(
+            metavar="CONFIG", help="Daemon file; create one by era config init FILE --kind daemon."
+        ),
     ],
     check: Annotated[
-        bool, typer.Option("--check", help="Check the file and all it names; touch no amplifier.")
+        bool,
+        typer.Option("--check", help="Check the file and all files it names, without amplifiers."),
     ] = False,
     dashboard: Annotated[
         str | None,
         typer.Option(
             metavar="[HOST:PORT]",
-            help=f"Serve the page there, or at {DASHBOARD}, by a process of its own.",
+            help=f"Serve the page from a separate process; default: {DASHBOARD}.",
         ),
     ] = None,
 ) -> None:
-    """Drive a plate by touches, all day; starts disarmed."""
+    """Run the daemon that drives a plate; starts disarmed."""
     from controller.daemon.run import check_daemon, run_daemon
 
     if check:
@@ -90,25 +94,25 @@ def daemon(
 
 @app.command()
 def status(socket: Socket = None, as_json: Json = False) -> None:
-    """How the daemon, amplifiers and plate are. Exit status 0 in FAULT and COMM_LOST, too."""
+    """Show daemon, amplifiers and contacts. Exit status 0 in FAULT and COMM_LOST too."""
     with _client(socket) as era:
-        told = era.status()
-    typer.echo(told.model_dump_json() if as_json else show_status(told))
+        status = era.status()
+    typer.echo(status.model_dump_json() if as_json else show_status(status))
 
 
 @app.command()
 def arm(
     lease: Annotated[
-        float, typer.Option(metavar="S", min=1, max=60, help="How long without being renewed.")
+        float, typer.Option(metavar="S", min=1, max=60, help="Lease without renewal.")
     ] = 10.0,
-    owner: Annotated[str, typer.Option(help="Who arms; others are told.")] = "era arm",
+    owner: Annotated[str, typer.Option(help="Name shown to other clients.")] = "era arm",
     once: Annotated[
-        bool, typer.Option("--once", help="Do not stay and renew: disarmed when the lease is over.")
+        bool, typer.Option("--once", help="Exit at once and let the lease expire.")
     ] = False,
     socket: Socket = None,
     as_json: Json = False,
 ) -> None:
-    """High voltage on: touches are felt. Stays and renews the lease; Ctrl-C disarms."""
+    """Switch the high voltage on. Stays and renews the lease; Ctrl-C disarms."""
     with _client(socket) as era:
         granted = era.arm(owner, lease_s=lease)
         try:
@@ -128,38 +132,38 @@ def arm(
 
 @app.command()
 def disarm(socket: Socket = None, as_json: Json = False) -> None:
-    """Silent along a short ramp, then high voltage off."""
+    """Ramp to silence, then switch the high voltage off."""
     with _client(socket) as era:
         era.disarm()
-        _tell_state(era, as_json=as_json)
+        _print_state(era, as_json=as_json)
 
 
 @app.command()
 def stop(socket: Socket = None, as_json: Json = False) -> None:
-    """Quick stop of everything; stays until era clear. No emergency stop: see the manual."""
+    """Quick-stop all amplifiers, latched until era clear. Not an emergency stop."""
     with _client(socket) as era:
         era.stop()
-        _tell_state(era, as_json=as_json)
+        _print_state(era, as_json=as_json)
 
 
 @app.command()
 def clear(socket: Socket = None, as_json: Json = False) -> None:
-    """Acknowledge a stop, or a fault whose cause is gone. Stays disarmed."""
+    """Acknowledge a stop, or a fault whose cause has gone. Stays disarmed."""
     with _client(socket) as era:
         era.clear()
-        _tell_state(era, as_json=as_json)
+        _print_state(era, as_json=as_json)
 
 
 @app.command()
 def touch(
     at: Annotated[list[str], typer.Argument(metavar="X,Y ...", help="Fingers on the plate [m].")],
     duration: Annotated[
-        float, typer.Option("--for", metavar="S", min=0, max=3600, help="How long.")
+        float, typer.Option("--for", metavar="S", min=0, max=3600, help="Duration.")
     ] = 1.0,
     socket: Socket = None,
     as_json: Json = False,
 ) -> None:
-    """Put fingers on the plate for a while. The last one is felt, the others are kept quiet."""
+    """Put fingers on the plate for a while. The last one is the target, the others are quiet."""
     from model.config.points import parse_point
 
     places = [parse_point(text, what="era touch") for text in at]
@@ -167,13 +171,13 @@ def touch(
         _check_places(places, era.hello("era").rig)
         era.touch(places, source="era touch")
         end = time.monotonic() + duration
-        time.sleep(min(duration, 2 * _REPEAT))
-        told = era.status()
+        time.sleep(min(duration, 2 * _REPEAT_INTERVAL))
+        status = era.status()
         while (left := end - time.monotonic()) > 0:
             era.touch(places, source="era touch")
-            time.sleep(min(left, _REPEAT))
+            time.sleep(min(left, _REPEAT_INTERVAL))
         era.touch([], source="era touch")
-    typer.echo(told.model_dump_json() if as_json else show_status(told))
+    typer.echo(status.model_dump_json() if as_json else show_status(status))
 
 
 @app.command()
@@ -182,40 +186,44 @@ def watch(
         list[str] | None,
         typer.Argument(
             metavar="[TOPIC ...]",
-            help=f"{', '.join(_WATCHED)} if none is named; also amplifiers, latency, layout.",
+            help=f"Default: {', '.join(_DEFAULT_TOPICS)}; also amplifiers, latency, layout.",
         ),
     ] = None,
-    rate: Annotated[float, typer.Option(min=1, max=60, help="Of amplifiers and latency, Hz.")] = 1,
+    rate: Annotated[
+        float, typer.Option(min=1, max=60, help="Rate of amplifiers and latency [Hz].")
+    ] = 1,
     socket: Socket = None,
-    as_json: Annotated[bool, typer.Option("--json", help="A JSON object a line.")] = False,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print one JSON object per line.")
+    ] = False,
 ) -> None:
-    """Tell what happens as it happens, until Ctrl-C."""
+    """Print events until Ctrl-C."""
     from typing import cast
 
     from controller.api.schema import Topic
     from controller.api.topics import TOPICS
 
-    wanted = topics or _WATCHED
+    wanted = topics or _DEFAULT_TOPICS
     unknown = [topic for topic in wanted if topic not in TOPICS]
     if unknown:
         raise InputError(
-            f"there is no topic {unknown[0]!r}; {did_you_mean(unknown[0], TOPICS)}"
-            f"known are {', '.join(TOPICS)}"
+            f"unknown topic {unknown[0]!r}; {did_you_mean(unknown[0], TOPICS)}"
+            f"choose from {', '.join(TOPICS)}"
         )
     with _client(socket) as era:
         era.subscribe(*cast("list[Topic]", wanted), rate_hz=rate)
         now = era.status()
-        for told in era.events():
+        for event in era.events():
             if as_json:
-                said = {"topic": told.topic, "time_s": told.time, "lost": told.lost}
-                typer.echo(json.dumps({**said, "data": told.data}))
+                head = {"topic": event.topic, "time_s": event.time, "lost": event.lost}
+                typer.echo(json.dumps({**head, "data": event.data}))
             else:
-                typer.echo(show_event(told, ahead=now.unix_time_s - now.time_s))
+                typer.echo(show_event(event, ahead=now.unix_time_s - now.time_s))
 
 
 @contextmanager
 def _client(socket: Path | None) -> "Iterator[Client]":
-    """A connection; what the daemon refuses becomes an error with the exit status it deserves."""
+    """Connect; translate refusals of the daemon to errors with their exit status."""
     from controller.api.client import Client
     from controller.api.jsonrpc import ErrorCode, RpcError
 
@@ -231,7 +239,7 @@ def _client(socket: Path | None) -> "Iterator[Client]":
 
 
 def _renew(era: "Client", lease: str) -> None:
-    """Keep a lease; where it was ended, say by what."""
+    """Renew a lease; raises CommandRefused with the cause if it has ended."""
     from controller.api.jsonrpc import ErrorCode, RpcError
 
     try:
@@ -239,98 +247,100 @@ def _renew(era: "Client", lease: str) -> None:
     except RpcError as error:
         if error.code is not ErrorCode.LEASE:
             raise
-        told = era.status()
-        remedy = f"; {told.remedy}" if told.remedy else ""
-        raise CommandRefused(f"not armed any more, {told.state}: {told.cause}{remedy}") from error
+        status = era.status()
+        remedy = f"; {status.remedy}" if status.remedy else ""
+        raise CommandRefused(f"disarmed, {status.state}: {status.cause}{remedy}") from error
 
 
 def _check_places(places: "list[tuple[float, float]]", rig: "RigSummary") -> None:
-    """Refuse fingers beyond the plate, which the daemon would only count."""
+    """Refuse fingers beyond the plate, which the daemon would only reject and count."""
     from model.config.points import in_metres
 
     for x, y in places:
         if not (0 <= x <= rig.length_m and 0 <= y <= rig.width_m):
             raise InputError(
-                f"era touch {x:g},{y:g} is beyond the plate, which is {rig.length_m:g} m by "
-                f"{rig.width_m:g} m"
+                f"era touch must be on the plate of {rig.length_m:g} m by {rig.width_m:g} m, got "
+                f"{x:g},{y:g}"
                 + (
                     in_metres(x, y, length=rig.length_m, width=rig.width_m)
-                    or "; places count from its south-west corner"
+                    or "; coordinates start at its south-west corner"
                 )
             )
 
 
-def _tell_state(era: "Client", *, as_json: bool) -> None:
-    told = era.status()
+def _print_state(era: "Client", *, as_json: bool) -> None:
+    status = era.status()
     if as_json:
-        typer.echo(json.dumps({"state": told.state, "cause": told.cause, "remedy": told.remedy}))
+        typer.echo(
+            json.dumps({"state": status.state, "cause": status.cause, "remedy": status.remedy})
+        )
     else:
-        typer.echo(f"{told.state}: {told.cause}")
+        typer.echo(f"{status.state}: {status.cause}")
 
 
-def show_event(told: "Notification", *, ahead: float) -> str:
-    """What has happened, for people to read; ahead: of the wall clock before the daemon's [s]."""
+def show_event(event: "Notification", *, ahead: float) -> str:
+    """Format an event; ahead: offset of the wall clock to the daemon's [s]."""
     from drivers.cli import in_words
 
-    at = datetime.fromtimestamp(told.time + ahead).isoformat(timespec="milliseconds")[11:]
-    lost = f"  ({told.lost} lost)" if told.lost else ""
-    return f"{at}  {told.topic:10s} {in_words(told.data)}{lost}"
+    at = datetime.fromtimestamp(event.time + ahead).isoformat(timespec="milliseconds")[11:]
+    lost = f"  ({event.lost} lost)" if event.lost else ""
+    return f"{at}  {event.topic:10s} {in_words(event.data)}{lost}"
 
 
-def show_status(told: "StatusResult") -> str:
-    """A status for people to read."""
-    lines = [f"{told.state}: {told.cause}"]
-    if told.remedy:
-        lines.append(f"  what to do: {told.remedy}")
-    if told.lost_for_s is not None:
-        watchdog = f"its watchdog silences it after {told.watchdog_s:g} s without commands"
+def show_status(status: "StatusResult") -> str:
+    """Format a status."""
+    lines = [f"{status.state}: {status.cause}"]
+    if status.remedy:
+        lines.append(f"  remedy: {status.remedy}")
+    if status.lost_for_s is not None:
+        watchdog = f"its watchdog silences it after {status.watchdog_s:g} s without commands"
         lines.append(
-            f"  ASSUME ENERGISED: an amplifier that was lost may still be playing; {watchdog}"
-            if told.assume_energised
-            else f"  out of reach for {told.lost_for_s:.1f} s: {watchdog}, which nothing confirms"
+            f"  ASSUME ENERGISED: a lost amplifier may still be playing; {watchdog}"
+            if status.assume_energised
+            else f"  unreachable for {status.lost_for_s:.1f} s: {watchdog}, unconfirmed"
         )
-    if told.armed_by is not None and told.lease_left_s is not None:
-        lines.append(f"  armed by {told.armed_by}, {told.lease_left_s:.1f} s left")
-    for contact in told.contacts:
+    if status.armed_by is not None and status.lease_left_s is not None:
+        lines.append(f"  armed by {status.armed_by}, {status.lease_left_s:.1f} s left")
+    for contact in status.contacts:
         level = "" if contact.level_db_sl is None else f" {contact.level_db_sl:.1f} dB SL"
         contrast = "" if contact.contrast_db is None else f", contrast {contact.contrast_db:.1f} dB"
         effect = "" if contact.effect is None else f", effect {contact.effect}"
         lines.append(
             f"  finger {contact.source} {contact.id} at {contact.x_m:.3f}, {contact.y_m:.3f} m: "
-            f"{contact.role or 'nothing is played'}{level}{contrast}{effect}"
+            f"{contact.role or 'not driven'}{level}{contrast}{effect}"
         )
-    if told.silent_because is not None and told.contacts:
-        lines.append(f"  silent: {told.silent_because}")
-    elif told.contacts and told.state == "READY_TO_SWITCH_ON":
-        lines.append("  silent: nobody has armed it; era arm does")
-    if told.plain_because is not None:
-        lines.append(f"  plain ramps: {told.plain_because}")
-    for era, tone in told.drive.items():
+    if status.silent_because is not None and status.contacts:
+        lines.append(f"  silent: {status.silent_because}")
+    elif status.contacts and status.state == "READY_TO_SWITCH_ON":
+        lines.append("  silent: not armed; arm with era arm")
+    if status.plain_because is not None:
+        lines.append(f"  plain ramps: {status.plain_because}")
+    for era, tone in status.drive.items():
         lines.append(
             f"  ERA {era}: {tone.frequency_hz:g} Hz, level {tone.level:.3f}, {tone.phase_deg:g} deg"
         )
-    for amplifier in told.amplifiers:
+    for amplifier in status.amplifiers:
         parts = [amplifier.state] if amplifier.state else []
         if amplifier.lost:
             parts.append("LOST")
         if amplifier.closed_with_lost:
-            parts.append("closed with the lost one")
+            parts.append("closed because another was lost")
         if amplifier.fault not in (None, "NONE"):
             parts.append(f"fault {amplifier.fault}")
         if amplifier.temperature_c is not None:
             parts.append(f"{amplifier.temperature_c:.1f} degC")
         if amplifier.reply_age_s is not None:
-            parts.append(f"heard {amplifier.reply_age_s:.2f} s ago")
+            parts.append(f"last reply {amplifier.reply_age_s:.2f} s ago")
         else:
-            parts.append("never heard")
+            parts.append("no reply yet")
         lines.append(f"  amplifier {amplifier.name} ({amplifier.url}): {', '.join(parts)}")
-    latency = told.latency_ms
+    latency = status.latency_ms
     if latency.median is not None:
         lines.append(
             f"  latency of {counted(latency.count, 'command')}: median {latency.median:.2f} ms, "
             f"99 % {latency.p99:.2f} ms, 99.9 % {latency.p999:.2f} ms"
         )
-    for reason, count in told.rejected_touches.items():
+    for reason, count in status.rejected_touches.items():
         lines.append(f"  rejected touches, {reason.replace('_', ' ')}: {count}")
-    lines.append(f"  up for {told.uptime_s:.0f} s")
+    lines.append(f"  up for {status.uptime_s:.0f} s")
     return "\n".join(lines)

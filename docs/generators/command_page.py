@@ -12,7 +12,7 @@ from pathlib import Path
 import typer
 from typer.core import TyperGroup
 
-from controller.cli.main import put_together
+from controller.cli.main import load_commands
 from page_part import insert
 
 WRITER = "docs/generators/command_page.py"
@@ -23,7 +23,7 @@ def own_commands() -> TyperGroup:
     """Those that come with era-haptics."""
     entries = entry_points(group="era_haptics.commands")
     own = [entry for entry in entries if entry.dist and entry.dist.name == _DISTRIBUTION]
-    return put_together(own, debug=False)[0]
+    return load_commands(own, debug=False)[0]
 
 
 def command_reference() -> str:

@@ -113,7 +113,7 @@ def test_a_command_runs_and_its_status_is_zero(
         ("refused", 1, ""),
         ("worse", 2, "era: error: rig.yaml:3: plate.length: is missing; add it\n"),
         ("unplugged", 3, "era: error: the line is gone; plug it in\n"),
-        ("file", 2, "era: error: /no/such/file: there is no folder /no/such; make it"),
+        ("file", 2, "era: error: /no/such/file: no such folder /no/such; create it"),
         (
             "bug",
             70,
@@ -262,7 +262,7 @@ def test_linear_algebra_gets_one_thread_unless_told_otherwise(
 LOADED = """
 import contextlib, io, sys
 from importlib.metadata import entry_points, packages_distributions
-from controller.cli.main import put_together
+from controller.cli.main import load_commands
 from controller.cli.main import run
 
 points = entry_points(group="era_haptics.commands")
@@ -271,7 +271,7 @@ if "all" in sys.argv:
         yield path
         for name, part in getattr(command, "commands", {}).items():
             yield from help_of(part, [*path, name])
-    paths = list(help_of(put_together(points, debug=True)[0], []))
+    paths = list(help_of(load_commands(points, debug=True)[0], []))
 else:
     paths = [[]]
 with contextlib.redirect_stdout(io.StringIO()):

@@ -48,7 +48,7 @@ async def test_a_touch_beyond_the_plate_is_refused(tmp_path: Path) -> None:
     async with running_daemon(tmp_path) as bench, await bench.client() as era:
         await until_state(era, "READY_TO_SWITCH_ON")
         for place in ("0.31,0.1", "0.1,-0.001"):
-            with pytest.raises(InputError, match=r"which is 0\.3048 m by 0\.2286 m"):
+            with pytest.raises(InputError, match=r"0\.3048 m by 0\.2286 m"):
                 await asyncio.to_thread(beyond, place)
         await asyncio.to_thread(beyond, "0.3048,0")
         with pytest.raises(InputError, match="era touch 'a' is not X,Y"):
@@ -66,7 +66,7 @@ async def test_a_status_says_that_touches_wait_for_somebody_to_arm(tmp_path: Pat
             if status.contacts:
                 break
             await asyncio.sleep(0.01)
-        assert "  silent: nobody has armed it; era arm does\n" in show_status(status)
+        assert "  silent: not armed; arm with era arm\n" in show_status(status)
         await era.arm("me", lease_s=30)
         assert "era arm does" not in show_status(await era.status())
 
@@ -106,16 +106,16 @@ async def test_a_status_says_what_is_known_of_a_lost_amplifier(tmp_path: Path) -
         await until_state(era, "COMM_LOST")
         lost = await era.status()
     assert "READY_TO_SWITCH_ON" in before
-    assert "out of reach" not in before
+    assert "unreachable" not in before
     (line,) = [line for line in show_status(lost).splitlines() if "serial://" in line]
-    assert re.search(r"\): LOST, heard [\d.]+ s ago$", line)
+    assert re.search(r"\): LOST, last reply [\d.]+ s ago$", line)
     watchdog = "its watchdog silences it after 0.25 s without commands"
     for is_energised, told in (
         (
             True,
-            f"  ASSUME ENERGISED: an amplifier that was lost may still be playing; {watchdog}\n",
+            f"  ASSUME ENERGISED: a lost amplifier may still be playing; {watchdog}\n",
         ),
-        (False, f"  out of reach for 12.0 s: {watchdog}, which nothing confirms\n"),
+        (False, f"  unreachable for 12.0 s: {watchdog}, unconfirmed\n"),
     ):
         update = {"lost_for_s": 12.0, "assume_energised": is_energised}
         assert told in show_status(lost.model_copy(update=update))

@@ -106,11 +106,11 @@ async def conform(url):
 
 outcomes = asyncio.run(conform(url))
 for outcome in outcomes:
-    print("kept  " if outcome.problem is None else "BROKEN", outcome.check.proves)
+    print("passed" if outcome.problem is None else "FAILED", outcome.check.proves)
     if outcome.problem:
         print("       ", outcome.problem)
 
 # %%
 far_end.terminate()
 far_end.communicate(timeout=10)
-print(sum(outcome.problem is None for outcome in outcomes), "of", len(outcomes), "kept")
+print(sum(outcome.problem is None for outcome in outcomes), "of", len(outcomes), "passed")

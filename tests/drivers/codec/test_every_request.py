@@ -1,7 +1,8 @@
-"""Every request that there is, through the codec of every wire: none can be forgotten on one."""
+"""Every request through the codec of every wire."""
 
+from collections.abc import Callable
 from dataclasses import replace
-from typing import get_args
+from typing import Any, get_args
 
 import pytest
 
@@ -9,8 +10,7 @@ from drivers.codec.can_bus.objects import pack_envelope
 from drivers.codec.can_bus.requests import PdoRequest, action_of
 from drivers.codec.can_bus.requests import encode_request as encode_can_request
 from drivers.codec.modbus import exchanges
-from drivers.codec.serial_line.exchanges import decode_request, encode_request
-from drivers.codec.serial_line.frame import FrameReader, encode_frame
+from drivers.codec.serial_line.exchanges import encode_request
 from drivers.command import CommandSet, DriveCommand, Envelope, Knot
 from drivers.guard import Guard, GuardLimits
 from drivers.protocol.messages import (
@@ -72,23 +72,27 @@ def request_of_each_kind(request: pytest.FixtureRequest) -> Request:
     return EXAMPLES[request.param]
 
 
-def test_on_a_serial_line_it_arrives_as_it_was_sent(request_of_each_kind: Request) -> None:
-    """Through bytes; what a guard let through arrives as the plain set or envelope that it was."""
-    asked = request_of_each_kind
-    data = encode_frame(encode_request(asked, address=1, sequence=9))
-    (frame,) = FrameReader().feed(data)
-    arrived = decode_request(frame)
-    assert type(arrived) is type(asked)
-    match arrived:
-        case Stage(command_set=found) | Apply(command_set=found):
-            assert found == _PLAIN
-        case LoadEnvelope(envelope=envelope):
-            assert (envelope.slot, envelope.step, len(envelope.knots)) == (5, 0.005, 1)
-        case _:
-            assert arrived == asked
+UNCHECKED = (Stage(_PLAIN), Apply(_PLAIN), LoadEnvelope(Envelope(5, 0.005, (Knot(0.1, 90.0),))))
+ENCODERS: dict[str, Callable[[Any], object]] = {
+    "serial": lambda request: encode_request(request, address=1, sequence=1),
+    "modbus": lambda request: exchanges.encode_request(request, tag=1),
+    "can": lambda request: (
+        pack_envelope(request)
+        if isinstance(request, LoadEnvelope)
+        else encode_can_request(request, node=1, sequence=1)
+    ),
+}
 
 
-def test_on_modbus_it_reads_a_block_and_says_whose_answer_it_is(
+@pytest.mark.parametrize("wire", ENCODERS)
+def test_encoder_refuses_unchecked_sets_and_envelopes(wire: str) -> None:
+    """TypeError for whatever has not passed a guard."""
+    for request in UNCHECKED:
+        with pytest.raises(TypeError, match="Safe"):
+            ENCODERS[wire](request)
+
+
+def test_modbus_exchange_reads_a_block_and_writes_its_tag(
     request_of_each_kind: Request,
 ) -> None:
     """Each brings a block back; all but those that never change write their tag first."""
@@ -101,13 +105,13 @@ def test_on_modbus_it_reads_a_block_and_says_whose_answer_it_is(
         assert exchange.write.registers[0] == 4711
 
 
-def test_no_two_requests_are_the_same_on_modbus() -> None:
+def test_modbus_exchanges_differ() -> None:
     """What is written and read tells them apart."""
     seen = {repr(exchanges.encode_request(each, tag=1)) for each in EXAMPLES.values()}
     assert len(seen) == len(get_args(Request))
 
 
-def test_on_can_it_is_an_order_or_an_object(request_of_each_kind: Request) -> None:
+def test_can_request_is_an_order_or_an_sdo_transfer(request_of_each_kind: Request) -> None:
     """An order carries its sequence number in its last byte, on CAN FD as well."""
     asked = request_of_each_kind
     if isinstance(asked, LoadEnvelope):
@@ -122,7 +126,7 @@ def test_on_can_it_is_an_order_or_an_object(request_of_each_kind: Request) -> No
             assert order.fd is fd
 
 
-def test_no_two_orders_ask_for_the_same_but_a_heartbeat_and_a_look() -> None:
+def test_can_actions_differ_except_ping_and_status() -> None:
     """A Ping asks how it is, as GetStatus does, after the host's heartbeat."""
     orders = [each for each in EXAMPLES.values() if isinstance(each, get_args(PdoRequest))]
     assert len({action_of(each) for each in orders}) == len(orders) - 1

@@ -56,8 +56,8 @@ def accepted(answers: list[ModbusResponse]) -> list[Status]:
 
 
 @given(is_rtu=st.booleans(), cuts=st.lists(st.integers(0, 40)), garbage=st.binary(max_size=12))
-def test_any_split_and_anything_before_it(is_rtu: bool, cuts: list[int], garbage: bytes) -> None:
-    """However the stream is cut, the answer is found; over RTU behind any garbage as well."""
+def test_response_is_found_in_any_pieces(is_rtu: bool, cuts: list[int], garbage: bytes) -> None:
+    """Over RTU behind any garbage too."""
     stream = (garbage if is_rtu else b"") + EXAMPLES[is_rtu][1]
     edges = sorted({0, len(stream), *(cut for cut in cuts if cut < len(stream))})
     pieces = [stream[a:b] for a, b in pairwise(edges)]
@@ -66,7 +66,7 @@ def test_any_split_and_anything_before_it(is_rtu: bool, cuts: list[int], garbage
 
 
 @given(is_rtu=st.booleans(), data=st.data())
-def test_flipped_bits_are_no_answer(is_rtu: bool, data: st.DataObject) -> None:
+def test_response_with_flipped_bits_is_discarded(is_rtu: bool, data: st.DataObject) -> None:
     """One to three flipped bits anywhere, and nothing is accepted.
 
     CRC-16 finds any three in a frame as short as this, RTU's own and the check of a block.
@@ -85,7 +85,7 @@ def test_flipped_bits_are_no_answer(is_rtu: bool, data: st.DataObject) -> None:
 
 
 @given(is_rtu=st.booleans(), stream=st.lists(st.binary(max_size=300), max_size=6))
-def test_any_bytes_are_borne(is_rtu: bool, stream: list[bytes]) -> None:
+def test_any_bytes_leave_the_reader_usable(is_rtu: bool, stream: list[bytes]) -> None:
     """Whatever comes: no exception but FrameError, and the buffer does not grow without end."""
     reader = ResponseReader(is_rtu=is_rtu, counters=WireCounters())
     for piece in stream:
@@ -101,7 +101,7 @@ def test_any_bytes_are_borne(is_rtu: bool, stream: list[bytes]) -> None:
 
 
 @pytest.mark.parametrize("reader_type", [RtuReader, TcpReader])
-def test_what_was_cut_off_is_gone_before_the_host_asks_again(
+def test_truncated_request_does_not_merge_with_the_next(
     reader_type: type[RtuReader] | type[TcpReader],
 ) -> None:
     """A set that ends early, and 50 ms later a whole one: nothing of the one is in the other.

@@ -45,11 +45,13 @@ async def _drive(url: str) -> None:
         wanted = CommandSet(1, (DriveCommand(0, 110.0, 0.4, 90.0),), ramp=0.01, valid_for=0.0)
         assert (await amplifier.arm()).state is AmplifierState.OPERATION_ENABLED
         assert (await amplifier.apply(guard.check(wanted))).commands[0].level == 0.4
-        await asyncio.sleep(0.02)
         await amplifier.heartbeat()
         assert (await amplifier.stop()).state is AmplifierState.QUICK_STOP_ACTIVE
-        await asyncio.sleep(0.02)  # its ramp, after which it can be cleared
-        assert (await amplifier.clear()).state is AmplifierState.SWITCH_ON_DISABLED
+        async with asyncio.timeout(5):
+            while True:  # it can be cleared once its ramp is over
+                if (await amplifier.clear()).state is AmplifierState.SWITCH_ON_DISABLED:
+                    break
+                await asyncio.sleep(0.002)
     finally:
         await amplifier.close()
 

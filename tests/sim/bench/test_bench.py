@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from drivers.command import CommandSet, DriveCommand
-from drivers.protocol.messages import Achieved, Apply, Arm, Fault, Ping
+from bench_driving import keep_alive, play
+from drivers.command import DriveCommand
+from drivers.protocol.messages import Arm, Fault
 from model.fem.assembly import assemble
 from model.fem.harmonic import direct_acceleration
 from model.finger.fingertip import fingertip_points
@@ -18,19 +19,6 @@ from sim.bench.bench import Bench
 START = 98765.4321  # as large as a clock may be
 
 
-def play(bench: Bench, token: int, *commands: DriveCommand, now: float, ramp: float = 0.02) -> None:
-    """Apply a set that lasts until the next one."""
-    reply = bench.exchange("main", Apply(CommandSet(token, commands, ramp, 0.0)), now=now)
-    assert isinstance(reply, Achieved)
-
-
-def keep_alive(bench: Bench, since: float, until: float) -> None:
-    """Advance with heartbeats, as a host does."""
-    for now in np.arange(since, until, 0.05):
-        bench.exchange("main", Ping(), now=float(now))
-    bench.advance(until)
-
-
 def test_bench_felt_vibration_agrees_with_the_model(coarse_rig: Rig) -> None:
     """Steady state of two ERAs at two frequencies, against the sparse direct solve, within 1 %."""
     bench = Bench(coarse_rig, now=START)
@@ -38,13 +26,13 @@ def test_bench_felt_vibration_agrees_with_the_model(coarse_rig: Rig) -> None:
     bench.exchange("main", Arm(0.25), now=START)
     play(
         bench,
-        1,
         DriveCommand(0, 110.0, 1.0),
         DriveCommand(2, 110.0, 0.5, phase=180.0),
         DriveCommand(3, 230.0, 0.7),
         now=START + 0.01,
+        ramp=0.02,
     )
-    keep_alive(bench, START + 0.05, START + 4.0)
+    keep_alive(bench, START + 4.0, every=0.05)
     felt = bench.felt(START + 3.5, START + 4.0)
     matrices = assemble(coarse_rig.plate, coarse_rig.mesh)
     for name, (x, y) in {"a": (0.08, 0.06), "b": (0.25, 0.2)}.items():
@@ -69,8 +57,8 @@ def test_bench_includes_point_masses(coarse_rig: Rig) -> None:
     bench = Bench(heavy, now=START)
     bench.place_fingers({"a": (0.08, 0.06)}, now=START)
     bench.exchange("main", Arm(0.25), now=START)
-    play(bench, 1, DriveCommand(1, 210.0, 1.0), now=START + 0.01)
-    keep_alive(bench, START + 0.05, START + 4.0)
+    play(bench, DriveCommand(1, 210.0, 1.0), now=START + 0.01, token=1, ramp=0.02)
+    keep_alive(bench, START + 4.0, every=0.05)
     (felt,) = bench.felt(START + 3.5, START + 4.0)["a"].amplitude
     assert np.linalg.norm(felt - np.abs(laden)) < 0.01 * np.linalg.norm(felt)
     assert np.linalg.norm(felt - np.abs(bare)) > 0.3 * np.linalg.norm(felt)
@@ -82,7 +70,7 @@ def test_bench_watchdog_silences_at_its_time(coarse_rig: Rig) -> None:
     for bench in (prompt, late):
         bench.place_fingers({"a": (0.1, 0.1)}, now=START)
         bench.exchange("main", Arm(0.25), now=START)
-        play(bench, 1, DriveCommand(1, 110.0, 1.0), now=START + 0.1)
+        play(bench, DriveCommand(1, 110.0, 1.0), now=START + 0.1, token=1, ramp=0.02)
     for step in range(1, 401):
         prompt.advance(START + 0.1 + step * 0.005)
     for bench in (prompt, late):
@@ -101,8 +89,10 @@ def test_bench_frequencies_of_a_window(coarse_rig: Rig) -> None:
     bench = Bench(coarse_rig, now=0.0)
     bench.place_fingers({"a": (0.1, 0.1)}, now=0.0)
     bench.exchange("main", Arm(2.0), now=0.0)
-    play(bench, 1, DriveCommand(0, 110.0, 1.0), DriveCommand(1, 200.0, 0.0), now=0.1)
-    play(bench, 2, DriveCommand(0, 150.0, 1.0), now=0.5)
+    play(
+        bench, DriveCommand(0, 110.0, 1.0), DriveCommand(1, 200.0, 0.0), now=0.1, token=1, ramp=0.02
+    )
+    play(bench, DriveCommand(0, 150.0, 1.0), now=0.5, token=2, ramp=0.02)
     bench.advance(1.0)
 
     def frequencies(since: float, until: float) -> tuple[float, ...]:
@@ -120,7 +110,7 @@ def test_bench_skips_a_long_pause(coarse_rig: Rig) -> None:
     bench = Bench(coarse_rig, now=0.0)
     bench.place_fingers({"a": (0.1, 0.1)}, now=0.0)
     bench.exchange("main", Arm(0.25), now=0.0)
-    play(bench, 1, DriveCommand(1, 110.0, 1.0), now=0.1)
+    play(bench, DriveCommand(1, 110.0, 1.0), now=0.1, token=1, ramp=0.02)
     bench.advance(86_400.0)
     felt = bench.felt(86_400.0 - 9.9, 86_400.0)
     assert felt["a"].peak.max() < 1e-9
@@ -131,6 +121,6 @@ def test_bench_ignores_an_earlier_time(coarse_rig: Rig) -> None:
     """A request stamped before the present is taken now."""
     bench = Bench(coarse_rig, now=10.0)
     bench.exchange("main", Arm(0.25), now=10.0)
-    play(bench, 1, DriveCommand(1, 110.0, 1.0), now=9.0)
+    play(bench, DriveCommand(1, 110.0, 1.0), now=9.0, token=1, ramp=0.02)
     assert bench.time == 10.0
     assert bench.amplifiers["main"].status(10.02).levels[1] == pytest.approx(1.0)

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from drivers.command import CommandSet, DriveCommand
-from drivers.protocol.messages import Apply, Arm, Ping
+from bench_driving import keep_alive, play
+from drivers.command import DriveCommand
 from model.arrays import FloatArray
 from model.errors import InputError
 from model.fem.assembly import assemble
@@ -21,6 +21,7 @@ from sim.sensors.bench_accelerometers import Accelerometers
 
 A, B = (0.1, 0.07), (0.29, 0.2)
 FREQUENCY = 210.0
+FULL_STROKE = DriveCommand(1, FREQUENCY, 1.0)
 
 
 def expected(rig: Rig, loads: tuple[PointLoad, ...]) -> FloatArray:
@@ -29,20 +30,6 @@ def expected(rig: Rig, loads: tuple[PointLoad, ...]) -> FloatArray:
     matrices = assemble(rig.plate, rig.mesh)
     answer = direct_acceleration(matrices, rig.eras, np.array([FREQUENCY]), points, loads=loads)
     return np.asarray(np.abs(answer[0, 1]))
-
-
-def driven(bench: Bench, until: float) -> None:
-    """Keep the amplifier fed until a time [s]."""
-    for now in np.arange(bench.time, until, 1.0):
-        bench.exchange("main", Ping(), now=float(now))
-    bench.advance(until)
-
-
-def play(bench: Bench) -> None:
-    """One ERA at full stroke from now on."""
-    bench.exchange("main", Arm(2.0), now=bench.time)
-    wanted = CommandSet(1, (DriveCommand(1, FREQUENCY, 1.0),), 0.02, 0.0)
-    bench.exchange("main", Apply(wanted), now=bench.time)
 
 
 def apart(found: FloatArray, truth: FloatArray) -> float:
@@ -55,10 +42,10 @@ def test_bench_fingers_load_the_plate(coarse_rig: Rig) -> None:
     load = FingerLoad(2000.0, 3.0, 0.005)
     bench = Bench(coarse_rig, now=0.0, finger_load=load)
     bench.place_fingers({"a": A}, now=0.0)
-    play(bench)
+    play(bench, FULL_STROKE, now=bench.time, ramp=0.02, watchdog=2.0)
     for positions in ({"a": A}, {"a": A, "b": B}, {"a": A}):
         bench.place_fingers(positions, now=bench.time)
-        driven(bench, bench.time + 4)
+        keep_alive(bench, bench.time + 4)
         truth = expected(coarse_rig, tuple(load.at(*at) for at in positions.values()))
         (amplitude,) = bench.felt(bench.time - 0.5, bench.time)["a"].amplitude
         assert apart(amplitude, truth) < 0.005
@@ -72,8 +59,8 @@ def test_bench_observers_have_no_weight(coarse_rig: Rig) -> None:
     bare.place_fingers({"a": A, "b": B}, now=0.0)
     observed.place_fingers({"a": A, "b": B}, now=0.0, observers={"a", "b"})
     for bench in (bare, observed):
-        play(bench)
-        driven(bench, 4.0)
+        play(bench, FULL_STROKE, now=bench.time, ramp=0.02, watchdog=2.0)
+        keep_alive(bench, 4.0)
         (amplitude,) = bench.felt(3.5, 4.0)["a"].amplitude
         assert apart(amplitude, expected(coarse_rig, ())) < 0.01
 
@@ -84,10 +71,10 @@ def test_bench_sensors_read_through_a_touch(coarse_rig: Rig) -> None:
     bench = Bench(coarse_rig, now=0.0, finger_load=load)
     sensors = Accelerometers(bench)
     sensors.place([Accelerometer("P1", 0.2, 0.03)])
-    play(bench)
-    driven(bench, 1.0)
+    play(bench, FULL_STROKE, now=bench.time, ramp=0.02, watchdog=2.0)
+    keep_alive(bench, 1.0)
     bench.place_fingers({"b": B}, now=1.0)
-    driven(bench, 4.0)
+    keep_alive(bench, 4.0)
     recording = sensors.read(0.0, 4.0)
     np.testing.assert_allclose(np.diff(recording.times), 1e-4, rtol=1e-6)
     late = recording.times > 3.5
@@ -141,7 +128,7 @@ def test_bench_heavier_finger_is_another_contact(coarse_rig: Rig) -> None:
     for load, truth in ((FingerLoad(), light), (heavy, heavier)):
         bench = Bench(coarse_rig, now=0.0, finger_load=load)
         bench.place_fingers({"a": A}, now=0.0)
-        play(bench)
-        driven(bench, 4.0)
+        play(bench, FULL_STROKE, now=bench.time, ramp=0.02, watchdog=2.0)
+        keep_alive(bench, 4.0)
         (amplitude,) = bench.felt(3.5, 4.0)["a"].amplitude
         assert apart(amplitude, truth) < 0.01

@@ -12,9 +12,9 @@ from typing import Any
 
 import pytest
 
-from drivers.command import CommandSet, DriveCommand
+from bench_driving import play
+from drivers.command import DriveCommand
 from drivers.errors import LinkError
-from drivers.protocol.messages import Apply, Arm
 from model.rig.rig import Rig
 from sim.bench.bench import Bench
 from sim.control.context import SimulationContext
@@ -46,9 +46,7 @@ def test_control_places_fingers_and_returns_felt_and_state(coarse_rig: Rig) -> N
     bench = Bench(coarse_rig, now=5.0)
     placed = ask(bench, 5.1, op="fingers", fingers={"7": [0.1, 0.08], "x": [0, 0]})
     assert placed == {"ok": True, "time_s": 5.1}
-    bench.exchange("main", Arm(2.0), now=5.2)
-    wanted = CommandSet(9, (DriveCommand(0, 110.0, 0.5),), ramp=0.0, valid_for=0.0)
-    bench.exchange("main", Apply(wanted), now=5.2)
+    play(bench, DriveCommand(0, 110.0, 0.5), now=5.2, token=9, watchdog=2.0)
     felt = ask(bench, 6.0, op="felt", since_s=5.5, until_s=6.0)["fingers"]
     assert felt.keys() == {"7", "x"}
     assert felt["7"]["frequencies_hz"] == [110.0]

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
+from bench_driving import ask, keep_alive
 from drivers.command import CommandSet, DriveCommand
-from drivers.protocol.messages import Apply, Arm, Nak, Ping, Request, Stop
+from drivers.protocol.messages import Apply, Arm, Stop
 from model.arrays import FloatArray
 from model.errors import InputError
 from model.rig.rig import Channel, Rig
@@ -28,20 +29,6 @@ def two_amplifiers(coarse_rig: Rig) -> Rig:
         for number, era in enumerate(coarse_rig.eras)
     }
     return replace(coarse_rig, wiring=wiring, amplifiers={"left": "sim://", "right": "sim://"})
-
-
-def ask(bench: Bench, name: str, request: Request, now: float) -> None:
-    """Hand over what must be carried out."""
-    reply = bench.exchange(name, request, now=now)
-    assert not isinstance(reply, Nak), reply
-
-
-def keep_alive(bench: Bench, until: float) -> None:
-    """Let time pass as under a host that feeds the watchdogs."""
-    while (now := bench.time + 1) < until:
-        for name in bench.amplifiers:
-            ask(bench, name, Ping(), now)
-    bench.advance(until)
 
 
 def played(

@@ -3,8 +3,8 @@
 import numpy as np
 from rich.console import Console
 
-from drivers.command import CommandSet, DriveCommand
-from drivers.protocol.messages import Apply, Arm
+from bench_driving import play
+from drivers.command import DriveCommand
 from model.rig.rig import Rig
 from sim.bench.bench import Bench
 from sim.control.context import SimulationContext
@@ -40,9 +40,7 @@ def test_view_shows_eras_fingers_and_peaks_in_place(coarse_rig: Rig) -> None:
     # 0.25 of 0.3048 m from the left, 0.05 of 0.2286 m from below.
     assert rows[-1 - int(0.05 / 0.2286 * len(rows))].index("O") == int(0.25 / 0.3048 * 28)
     assert set("".join(rows)) == {"E", "O", " "}
-    bench.exchange("main", Arm(2.0), now=0.1)
-    wanted = CommandSet(9, (DriveCommand(0, 40.0, 0.5),), ramp=0.0, valid_for=0.0)
-    bench.exchange("main", Apply(wanted), now=0.1)
+    play(bench, DriveCommand(0, 40.0, 0.5), now=0.1, watchdog=2.0)
     bench.advance(1.0)
     bench.advance(1.3)
     moving = shown(context, plate)

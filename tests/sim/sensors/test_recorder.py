@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivers.command import CommandSet, DriveCommand
-from drivers.protocol.messages import Apply, Arm
+from bench_driving import play
+from drivers.command import DriveCommand
 from full_disk import full_disk
 from model.errors import InputError
 from model.rig.rig import Rig
@@ -15,12 +15,7 @@ from sim.sensors.accelerometer import Accelerometer
 from sim.sensors.recorder import Recorder
 from sim.sensors.recording_file import read_recording
 
-
-def play(bench: Bench, *, now: float) -> None:
-    """SW at 110 Hz, half its stroke."""
-    bench.exchange("main", Arm(2.0), now=now)
-    wanted = CommandSet(9, (DriveCommand(0, 110.0, 0.5),), ramp=0.0, valid_for=0.0)
-    bench.exchange("main", Apply(wanted), now=now)
+HALF_STROKE = DriveCommand(0, 110.0, 0.5)
 
 
 @pytest.mark.parametrize("ending", ["csv", "wav", "uff"])
@@ -32,7 +27,7 @@ def test_recorder_records_sensors_and_fingers_without_gaps(
     bench.place_fingers({"7": (0.1, 0.08)}, now=3.0)
     path = tmp_path / f"run.{ending}"
     recorder = Recorder(bench, path, sensors=[Accelerometer("P1", 0.1, 0.08)], fingers=["7"])
-    play(bench, now=3.01)
+    play(bench, HALF_STROKE, now=3.01, watchdog=2.0)
     for now in (3.0101, 3.11, 3.5):
         bench.advance(now)
     recorder.stop()
@@ -60,7 +55,7 @@ def test_recorder_follows_moved_fingers_and_zeroes_lifted_ones(
     bench.place_fingers({"a": (0.1, 0.08), "b": (0.2, 0.1)}, now=0.0)
     path = tmp_path / "run.csv"
     recorder = Recorder(bench, path, sensors=[], fingers=["a", "b"])
-    play(bench, now=0.0)
+    play(bench, HALF_STROKE, now=0.0, watchdog=2.0)
     bench.advance(0.1)
     bench.place_fingers({"b": (0.02, 0.02)}, now=0.1)
     bench.advance(0.2)

@@ -1,15 +1,15 @@
 """Formatting of quantities and shares."""
 
-_USUAL = {"m": (1e3, "mm"), "Pa": (1e-9, "GPa"), "N/m": (1e-3, "kN/m"), "kg": (1e3, "g")}
+_DISPLAY_UNITS = {"m": (1e3, "mm"), "Pa": (1e-9, "GPa"), "N/m": (1e-3, "kN/m"), "kg": (1e3, "g")}
 
 
-def in_usual_unit(value: float, unit: str, *, digits: int = 3) -> str:
+def in_display_unit(value: float, unit: str, *, digits: int = 3) -> str:
     """Format a value of an SI unit, or of none, in the unit usual for plates: `17 kN/m`."""
-    factor, usual = _USUAL.get(unit, (1.0, unit))
+    factor, shown_unit = _DISPLAY_UNITS.get(unit, (1.0, unit))
     shown = f"{value * factor:.{digits}g}"
     if "e+" in shown:  # a plate of a metre is 1000 mm
         shown = f"{value * factor:.0f}"
-    return f"{shown} {usual}".strip()
+    return f"{shown} {shown_unit}".strip()
 
 
 def percent(share: float) -> str:

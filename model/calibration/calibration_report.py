@@ -6,7 +6,7 @@ import numpy as np
 
 from model.calibration.calibration_result import Calibration, FittedParameter
 from model.counting import counted
-from model.quantities import in_usual_unit, percent
+from model.quantities import in_display_unit, percent
 from model.rig.rig import Rig
 
 
@@ -125,11 +125,11 @@ def _known(errors: np.ndarray[Any, np.dtype[np.float64]]) -> list[float]:
 
 def _change(fitted: FittedParameter) -> str:
     parameter = fitted.parameter
-    before = in_usual_unit(parameter.prior, parameter.unit, digits=5)
+    before = in_display_unit(parameter.prior, parameter.unit, digits=5)
     if fitted.standard_error is None:
         return f"{before}  (not identified)"
     note = "  (at its bound)" if fitted.at_bound else ""
-    after = in_usual_unit(fitted.value, parameter.unit, digits=5)
-    error = in_usual_unit(fitted.standard_error, parameter.unit, digits=2)
+    after = in_display_unit(fitted.value, parameter.unit, digits=5)
+    error = in_display_unit(fitted.standard_error, parameter.unit, digits=2)
     share = f" ({100 * (fitted.value / parameter.prior - 1):+.1f} %)" if parameter.prior else ""
     return f"{before} -> {after} ± {error}{share}{note}"

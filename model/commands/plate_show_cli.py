@@ -27,7 +27,7 @@ def materials(as_json: JsonOption = False) -> None:
                 "rho_kg_m3": one.material.rho,
                 "nu": one.material.nu,
                 "source": one.source,
-                "spread": one.spread,
+                "spread": one.variation,
                 "loss_factor": one.loss_factor,
             }
             for name, one in known.items()
@@ -38,7 +38,7 @@ def materials(as_json: JsonOption = False) -> None:
         numbers = one.material
         print(f"{name}: E {numbers.E / 1e9:g} GPa, rho {numbers.rho:g} kg/m³, nu {numbers.nu:g}")
         print(f"    source  {one.source}")
-        print(f"    spread  {one.spread}")
+        print(f"    variation  {one.variation}")
         print(f"    loss factor of the bare material, about  {one.loss_factor}")
     print("Any other is given by numbers: material: {E: 70 GPa, rho: 2700, nu: 0.33}")
     for problem in problems:
@@ -47,7 +47,7 @@ def materials(as_json: JsonOption = False) -> None:
 
 def show(rig_file: RigArgument, as_json: JsonOption = False) -> None:
     """Show the plate's material and rigidity, for a laminate with bounds."""
-    from model.quantities import in_usual_unit
+    from model.quantities import in_display_unit
     from model.rig.file import load_rig
     from model.rig.plate_summary import plate_summary
 
@@ -66,7 +66,7 @@ def show(rig_file: RigArgument, as_json: JsonOption = False) -> None:
         f"nu {summary['nu']:.3g}, loss factor {summary['loss_factor']:g}"
     )
     print(f"    flexural rigidity  {summary['flexural_rigidity_n_m']:.4g} N m")
-    bare = in_usual_unit(summary["mass_kg"], "kg", digits=4)
+    bare = in_display_unit(summary["mass_kg"], "kg", digits=4)
     print(f"    mass  {bare} ({summary['surface_density_kg_m2']:.4g} kg/m²)")
     for key, wavelength in summary["bending_wavelength_m"].items():
         print(f"    bending wavelength at {_frequency(key)}  {100 * wavelength:.3g} cm")

@@ -7,7 +7,7 @@ from model.diagnosis.causes import Explanation
 from model.diagnosis.plate_match import FITS
 from model.diagnosis.polarity import EVEN
 from model.diagnosis.verdict import UNLIKELY, ChannelVerdict, State, Verdict
-from model.quantities import in_usual_unit, percent
+from model.quantities import in_display_unit, percent
 
 _TO_DO: dict[State, str] = {
     "dead": "check its supply, its cable and the amplifier's channel",
@@ -66,8 +66,8 @@ def plate_rows(verdict: Verdict) -> list[str]:
     for number, each in enumerate(good):
         unit = each.cause.unit
         rows.append(
-            f"  {'or ' if number else ''}{each.cause.key} {in_usual_unit(each.value, unit)} "
-            f"and not {in_usual_unit(each.expected, unit)} would explain it: "
+            f"  {'or ' if number else ''}{each.cause.key} {in_display_unit(each.value, unit)} "
+            f"and not {in_display_unit(each.expected, unit)} would explain it: "
             f"{percent(each.match.error)} unexplained, likelihood {percent(each.share)}"
         )
     if good:

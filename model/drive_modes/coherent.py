@@ -228,13 +228,13 @@ def _mean_form(fields: Fields, shares: Float32Array) -> Complex64Array:
 
 def _expected_power(fields: Fields, weights: Complex64Array) -> Float32Array:
     """Expected power at the quiet points (n, q) of weights (n, eras): |w h|² + sigma² |w|² |h|²."""
-    wrong = np.vecmat(_squared(weights), fields.quiet_power)
-    right = _squared((weights[:, None, :] @ fields.quiet)[:, 0])
+    wrong = np.vecmat(_power(weights), fields.quiet_power)
+    right = _power((weights[:, None, :] @ fields.quiet)[:, 0])
     return np.asarray(right + np.float32(ERROR_SHARE**2) * wrong)
 
 
-def _squared(values: Complex64Array) -> Float32Array:
-    """The squared magnitude."""
+def _power(values: Complex64Array) -> Float32Array:
+    """Squared magnitude."""
     magnitude = np.abs(values)
     return np.asarray(magnitude * magnitude)
 

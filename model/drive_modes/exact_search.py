@@ -83,7 +83,7 @@ def sensation_found(fields: Fields, *, eras_at_most: int) -> float:
     ]
     means = np.array([power.mean(axis=-1) for power in powers])
     places = {mask: place for place, mask in enumerate(masks)}
-    most = 0.0
+    highest = 0.0
     for groups in groupings(fields.era_count, eras_at_most):
         if len(groups) > fields.frequency_count:
             continue
@@ -96,8 +96,8 @@ def sensation_found(fields: Fields, *, eras_at_most: int) -> float:
             felt = [
                 each + power[place, frequency] for each, power in zip(felt, powers, strict=True)
             ]
-        most = max(most, min(float(np.sqrt(each).mean()) for each in felt))
-    return most
+        highest = max(highest, min(float(np.sqrt(each).mean()) for each in felt))
+    return highest
 
 
 def pattern_count(era_count: int, frequency_count: int, *, eras_at_most: int) -> int:
@@ -130,7 +130,7 @@ def groupings(era_count: int, eras_at_most: int) -> tuple[tuple[int, ...], ...]:
 
 
 def group_masks(era_count: int, eras_at_most: int) -> list[int]:
-    """Every group of so many ERAs at the most, as bit masks."""
+    """Every group of so many ERAs at the highest, as bit masks."""
     return [mask for mask in range(1, 1 << era_count) if mask.bit_count() <= eras_at_most]
 
 
@@ -154,9 +154,9 @@ class _Search:
         self._fields = fields
         self._deadline = deadline
         self._eras_at_most = eras_at_most
-        self.group_masks = group_masks(fields.era_count, eras_at_most)
-        self._quiet = group_magnitudes(fields.quiet, self.group_masks)
-        self._targets = [group_magnitudes(target, self.group_masks) for target in fields.targets]
+        self._masks = group_masks(fields.era_count, eras_at_most)
+        self._quiet = group_magnitudes(fields.quiet, self._masks)
+        self._targets = [group_magnitudes(target, self._masks) for target in fields.targets]
         self._powers = [(target / fields.threshold[:, None]) ** 2 for target in self._targets]
         # By group and frequency. The least of several targets is at most their mean.
         self._peak = mean_target_peak(self._targets)
@@ -173,12 +173,12 @@ class _Search:
         """Start from the best of two ERAs, then enumerate the groupings, largest bound first."""
         if self._eras_at_most >= 2:
             self._start()
-        places = {mask: place for place, mask in enumerate(self.group_masks)}
+        places = {mask: place for place, mask in enumerate(self._masks)}
         left = [
             tuple(places[mask] for mask in groups)
             for groups in groupings(self._fields.era_count, self._eras_at_most)
         ]
-        padded = np.full((len(left), self._fields.era_count), len(self.group_masks))
+        padded = np.full((len(left), self._fields.era_count), len(self._masks))
         for row, groups in enumerate(left):
             padded[row, : len(groups)] = groups
         bound = self.contrast
@@ -241,12 +241,12 @@ class _Search:
             group = groups[depth]
             own = np.column_stack([self._peak[group], self._loud[group], self._power[group]])
             front = sums[start : start + step, None, :] + own
-            promising = front[:, :, 0] - self.contrast * front[:, :, 1] + gain > 0
-            promising &= front[:, :, 2] + power >= self._fields.wanted**2
+            is_possible = front[:, :, 0] - self.contrast * front[:, :, 1] + gain > 0
+            is_possible &= front[:, :, 2] + power >= self._fields.wanted**2
             for earlier in range(depth):
                 taken = chosen[start : start + step, earlier, None] == np.arange(count)
-                promising &= ~taken
-            row, frequency = np.nonzero(promising)
+                is_possible &= ~taken
+            row, frequency = np.nonzero(is_possible)
             if len(row):
                 further = np.column_stack([chosen[start + row], frequency])
                 self._descend(groups, further, front[row, frequency])
@@ -284,7 +284,7 @@ class _Search:
         index = np.full(self._fields.era_count, SILENT)
         for group, frequency in zip(groups, frequencies, strict=True):
             for era in range(len(index)):
-                if self.group_masks[group] >> era & 1:
+                if self._masks[group] >> era & 1:
                     index[era] = frequency
         return DriveVector(index, (index != SILENT).astype(np.complex64))
 

@@ -125,13 +125,13 @@ def _pairs(gain: Float32Array, fields: Fields) -> tuple[IntArray, IntArray]:
     """Patterns of two ERAs at two frequencies whose gains (sources,) have a sum above zero."""
     count = fields.frequency_count
     of_era = gain[: fields.era_count * count].reshape(-1, count)
-    most = of_era.max(axis=1)
+    highest = of_era.max(axis=1)
     ones, others = [], []
     for one, other in combinations(range(fields.era_count), 2):
-        if most[one] + most[other] <= 0:
+        if highest[one] + highest[other] <= 0:
             continue
-        first = np.flatnonzero(of_era[one] > -most[other])
-        second = np.flatnonzero(of_era[other] > -most[one])
+        first = np.flatnonzero(of_era[one] > -highest[other])
+        second = np.flatnonzero(of_era[other] > -highest[one])
         sums = of_era[one][first, None] + of_era[other][second]
         row, column = np.nonzero((sums > 0) & (first[:, None] != second))
         ones.append(one * count + first[row])
@@ -160,8 +160,8 @@ def max_sensation_switched(fields: Fields) -> float:
     patterns = all_patterns(fields.era_count, fields.frequency_count)
     powers = _powers([magnitudes_of_sources(field) for field in fields.targets], fields)
     means = np.array([_mean(rows) for rows in powers])
-    most = sums_of_sources(means, fields.era_count).min(axis=0)
-    loudest = np.argsort(-most)[:BATCH]
+    highest = sums_of_sources(means, fields.era_count).min(axis=0)
+    loudest = np.argsort(-highest)[:BATCH]
     one, other = patterns.first[loudest], patterns.second[loudest]
     felt = np.min([np.sqrt(rows[one] + rows[other]).mean(axis=1) for rows in powers], axis=0)
     return float(felt.max())

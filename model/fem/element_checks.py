@@ -67,12 +67,12 @@ def mirror(element: Element) -> str | None:
     """Its matrices are symmetric under reflection along x and y, as a quarter plate requires."""
     count = len(element.side)
     number = np.arange(count**2).reshape(count, count)
-    for along, order, turn in (
+    for along, order, signs in (
         ("x", number[:, ::-1], np.array([1.0, -1.0, 1.0])),
         ("y", number[::-1], np.array([1.0, 1.0, -1.0])),
     ):
         place = (DOF_PER_NODE * order.reshape(-1, 1) + np.arange(DOF_PER_NODE)).ravel()
-        sign = np.tile(turn, count**2)
+        sign = np.tile(signs, count**2)
         for name, matrix in _both(element).items():
             mirrored = matrix[np.ix_(place, place)] * np.outer(sign, sign)
             if np.abs(mirrored - matrix).max() > _SMALL * np.abs(matrix).max():

@@ -223,8 +223,8 @@ def _share_in_shear(layers: Sequence[Layer], frequency: float) -> float:
     def excess(wavenumber: float) -> float:
         return (loose + share(wavenumber) * gain) * wavenumber**4 / inertia - 1
 
-    longest, shortest = ((inertia / rigidity) ** 0.25 for rigidity in (loose + gain, loose))
-    return share(float(brentq(excess, 0.999 * longest, 1.001 * shortest)))
+    low, high = ((inertia / rigidity) ** 0.25 for rigidity in (loose + gain, loose))
+    return share(float(brentq(excess, 0.999 * low, 1.001 * high)))
 
 
 def _rotary_inertia(laminate: Laminate) -> float:

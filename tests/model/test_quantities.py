@@ -2,7 +2,7 @@
 
 import pytest
 
-from model.quantities import in_usual_unit, percent
+from model.quantities import in_display_unit, percent
 
 
 @pytest.mark.parametrize(
@@ -23,7 +23,7 @@ def test_a_quantity_is_told_in_the_unit_of_plates(
     value: float, unit: str, digits: int, told: str
 ) -> None:
     """Giga, kilo and milli where plates have them; any other unit as it is, and none without."""
-    assert in_usual_unit(value, unit, digits=digits) == told
+    assert in_display_unit(value, unit, digits=digits) == told
 
 
 @pytest.mark.parametrize(

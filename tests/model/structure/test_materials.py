@@ -33,7 +33,7 @@ def test_material_has_the_printed_numbers(name):
 def test_known_materials_have_sources():
     """All of them are checked above, and each has its source and variation."""
     assert KNOWN_MATERIALS.keys() == PRINTED.keys()
-    assert all(known.source and known.spread for known in KNOWN_MATERIALS.values())
+    assert all(known.source and known.variation for known in KNOWN_MATERIALS.values())
 
 
 @pytest.mark.parametrize(

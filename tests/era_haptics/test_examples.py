@@ -100,7 +100,7 @@ def test_the_ten_lines_of_the_page(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     (tmp_path / "examples").mkdir()
     shutil.copy(EXAMPLES / "paper_plate.yaml", tmp_path / "examples")
     monkeypatch.chdir(tmp_path)
-    (lines,) = re.findall(r"^```python\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL)
+    lines = re.findall(r"^```python\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL)[0]
     assert len(lines.split("\n\n")[1].splitlines()) == 10
     (tmp_path / "page.py").write_text(lines, "utf-8")
     ran = runpy.run_path("page.py")

@@ -1,4 +1,4 @@
-"""What code hands over where no type checker looks: another kind of value is told in words."""
+"""Checks of arguments of the Python API, whose callers may not use a type checker."""
 
 import os
 from numbers import Integral, Real
@@ -6,19 +6,21 @@ from pathlib import Path
 
 from model.errors import InputError
 
-_LONGEST = 40
+_MAX_LENGTH = 40
 
 
-def expect(value: object, kind: type, *, what: str, made_by: str) -> None:
-    """Raise InputError for a value of another kind; made_by: code that makes one."""
-    if not isinstance(value, kind):
-        raise InputError(f"{what} is {shown(value)}, not a {kind.__name__}; {made_by} makes one")
+def expect(value: object, cls: type, *, what: str, made_by: str) -> None:
+    """Raise InputError for a value of another class; made_by: code that makes one."""
+    if not isinstance(value, cls):
+        raise InputError(
+            f"{what} must be a {cls.__name__}, got {shown(value)}; make one with {made_by}"
+        )
 
 
 def expect_number(value: object, *, what: str, unit: str) -> None:
-    """Raise InputError for what is no plain number."""
+    """Raise InputError for anything but a real number."""
     if not isinstance(value, Real):
-        raise InputError(f"{what} is {shown(value)}, not a number; give plain {unit}")
+        raise InputError(f"{what} must be a number of {unit}, got {shown(value)}")
 
 
 def is_whole(value: object) -> bool:
@@ -27,15 +29,15 @@ def is_whole(value: object) -> bool:
 
 
 def expect_path(value: object, *, what: str) -> Path:
-    """The path that text or a path means; InputError for anything else."""
+    """A path from text or a path; raises InputError for anything else."""
     if not isinstance(value, str | os.PathLike):
-        raise InputError(f"{what} is {shown(value)}, not the name of a file; give text or a Path")
+        raise InputError(f"{what} must be text or a Path, got {shown(value)}")
     return Path(value)
 
 
 def shown(value: object) -> str:
-    """Text and numbers as they are, anything else by its kind."""
+    """Text and numbers as they are, other values by their class."""
     if value is None or isinstance(value, str | Real):
         text = repr(value)
-        return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}..."
+        return text if len(text) <= _MAX_LENGTH else f"{text[:_MAX_LENGTH]}..."
     return f"a {type(value).__name__}"

@@ -1,33 +1,33 @@
-"""The one error the model raises on purpose, and the words of all errors."""
+"""The error class of the model, and wording of errors of libraries."""
 
 from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:  # a command that checks nothing does not wait for it
+if TYPE_CHECKING:  # slow to import
     from pydantic import ValidationError
 
 
 class InputError(ValueError):
-    """Input that cannot be used; the message says what, where and what to do about it."""
+    """Invalid input; the message says what, where and the remedy."""
 
 
 def in_our_words(message: str) -> str:
-    """What the libraries that check values say of one, in the words of all other errors."""
+    """Reword a message of pydantic or typer like all other errors."""
     for theirs, ours in _WORDS.items():
         message = message.replace(theirs, ours)
     return message
 
 
 def first_problem(error: "ValidationError") -> tuple[str, str]:
-    """Where the first of the values is that were refused, "" for the whole; and what is wrong."""
+    """The place of the first invalid value, "" for the whole, and what is wrong with it."""
     first = error.errors()[0]
     return ".".join(str(part) for part in first["loc"]), in_our_words(first["msg"])
 
 
 _WORDS = {
     "Value error, ": "",
-    "Field required": "is missing",
-    "Extra inputs are not permitted": "is unknown",
-    "Input should be a valid string": "must be a text",
+    "Field required": "missing",
+    "Extra inputs are not permitted": "unknown key",
+    "Input should be a valid string": "must be text",
     "Input should be ": "must be ",
     "String should have ": "must have ",
     "List should have ": "must have ",

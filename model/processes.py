@@ -1,4 +1,4 @@
-"""Work shared out among processes of this machine, each with one thread for linear algebra."""
+"""Tasks on worker processes of this machine, each with one thread for linear algebra."""
 
 import logging
 import multiprocessing
@@ -14,8 +14,8 @@ from model.errors import InputError
 
 _logger = logging.getLogger(__name__)
 
-# A pool whose processes die again and again is out of memory, not out of luck.
-_MOST_POOLS = 4
+# More failures in a row mean that memory is short.
+_MAX_POOLS = 4
 
 _THREAD_COUNTS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 
@@ -23,7 +23,7 @@ Shared = TypeVar("Shared")
 Task = TypeVar("Task")
 Result = TypeVar("Result")
 
-_in_worker: tuple[Callable[[Any, Any], Any], Any]  # in a worker process: what its tasks need
+_in_worker: tuple[Callable[[Any, Any], Any], Any]  # set by _start_worker
 
 
 def on_processes(
@@ -32,24 +32,26 @@ def on_processes(
     shared: Shared,
     tasks: Mapping[int, Task],
 ) -> Iterator[tuple[int, Result]]:
-    """Every task's number with its result as soon as it is there, in any order.
+    """Yield numbers of tasks with their results in the order in which they are done.
 
-    solve: a function of a module; shared goes to each process once. A process that dies is
-    replaced, and its task solved again; InputError if that does not help.
+    solve: a function of a module; shared: its first argument, sent to each process once. After a
+    process has died, unfinished tasks are solved again by new ones. Raises InputError if they keep
+    dying.
     """
     for variable in _THREAD_COUNTS:
         os.environ.setdefault(variable, "1")  # read by numpy when a new process loads it
     pending = dict(tasks)
-    for _ in range(_MOST_POOLS):
+    for _ in range(_MAX_POOLS):
         try:
             for number, result in _solve_in_pool(count, solve, shared, pending):
                 del pending[number]
                 yield number, result
             return
         except BrokenProcessPool:
-            _logger.warning("a worker process died; starting anew with what is left")
+            _logger.warning("worker process died, restarting with %d tasks left", len(pending))
     raise InputError(
-        f"worker processes died {_MOST_POOLS} times; perhaps memory is short: give fewer --workers"
+        f"worker processes died {_MAX_POOLS} times; perhaps they are short of memory: use fewer "
+        "--workers"
     )
 
 
@@ -62,11 +64,11 @@ def _solve_in_pool(
     pool = ProcessPoolExecutor(
         min(count, len(tasks)) or 1,
         mp_context=multiprocessing.get_context("spawn"),
-        initializer=_begin,
+        initializer=_start_worker,
         initargs=(solve, shared),
     )
     try:
-        with _interrupts_held_back():
+        with _interrupts_blocked():
             numbers = {pool.submit(_run, task): number for number, task in tasks.items()}
         for future in as_completed(numbers):
             yield numbers[future], future.result()
@@ -75,10 +77,10 @@ def _solve_in_pool(
 
 
 @contextmanager
-def _interrupts_held_back() -> Iterator[None]:
-    """Start processes that Ctrl-C does not reach, not even while they are still loading.
+def _interrupts_blocked() -> Iterator[None]:
+    """Block SIGINT while processes start: they inherit the mask, also while they load.
 
-    They inherit what is blocked here; a Ctrl-C meanwhile arrives afterwards.
+    A Ctrl-C in the meantime is delivered afterwards.
     """
     if not hasattr(signal, "pthread_sigmask"):  # Windows
         yield
@@ -90,8 +92,8 @@ def _interrupts_held_back() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def _begin(solve: Callable[[Any, Any], Any], shared: Any) -> None:
-    """Take what all tasks need, once; leave Ctrl-C to the process that started this one."""
+def _start_worker(solve: Callable[[Any, Any], Any], shared: Any) -> None:
+    """Keep what all tasks need; ignore Ctrl-C, which the parent process handles."""
     global _in_worker
     _in_worker = solve, shared
     signal.signal(signal.SIGINT, signal.SIG_IGN)

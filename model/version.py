@@ -14,7 +14,7 @@ Increase it with every change of figures beyond rounding, then record the new fi
 
 @cache
 def code_version() -> str:
-    """Version of the distribution, and the beginning of a SHA-256 over the source of the model."""
+    """The version of the distribution and the start of a SHA-256 over the source of the model."""
     digest = hashlib.sha256()
     pending = [resources.files("model")]
     while pending:

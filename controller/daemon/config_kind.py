@@ -9,7 +9,7 @@ from controller.daemon.config import is_daemon_document, load_daemon_config
 from controller.daemon.config_sections import DaemonSection
 from drivers.rig_check import check_links
 from model.config.document import Document
-from model.config.kinds import Good
+from model.config.kinds import CheckedFile
 
 
 class DaemonKind:
@@ -19,7 +19,7 @@ class DaemonKind:
         """Whether a document is a daemon's file."""
         return is_daemon_document(document)
 
-    def check(self, path: Path) -> Good:
+    def check(self, path: Path) -> CheckedFile:
         """Check a file and the files that it names; return a one-line summary."""
         config = load_daemon_config(path)
         rig = config.rig
@@ -32,7 +32,7 @@ class DaemonKind:
             f"{', '.join(source.name for source in config.touch) or 'the API only'}; "
             f"socket {config.socket}{hint}"
         )
-        return Good(line, warnings)
+        return CheckedFile(line, warnings)
 
     def example(self) -> str:
         """A commented example with every key."""

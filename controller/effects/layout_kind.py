@@ -6,7 +6,7 @@ from typing import Any
 from controller.effects.layout_file import LayoutSection, is_layout_document, load_layout
 from controller.effects.registry import effect_kind, effect_kinds
 from model.config.document import Document
-from model.config.kinds import Good
+from model.config.kinds import CheckedFile
 
 
 class LayoutKind:
@@ -16,10 +16,10 @@ class LayoutKind:
         """Whether a document is a surface layout."""
         return is_layout_document(document)
 
-    def check(self, path: Path) -> Good:
+    def check(self, path: Path) -> CheckedFile:
         """Read a layout; raises ConfigError. Its fit on a plate shows in the daemon's file."""
         layout = load_layout(path, None)
-        return Good(
+        return CheckedFile(
             f"good: regions {', '.join(region.name for region in layout.regions) or 'none'}; "
             f"effects {', '.join(layout.effects)}; elsewhere {layout.elsewhere or 'nothing'}. "
             "Check the daemon's file that names it to see whether it fits the plate"

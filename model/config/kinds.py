@@ -1,7 +1,7 @@
-"""Kinds of configuration files that `era config` knows: rigs, and what other packages bring.
+"""Kinds of configuration files for `era config`: rigs, and those of other packages.
 
-A kind is an entry point of the group `era_haptics.config_kinds`: an object as `ConfigKind`, under
-its name. Files say what they are by their keys, so that nobody has to.
+A kind is an entry point of the group `era_haptics.config_kinds` that leads to a `ConfigKind`. The
+keys of a file determine its kind.
 """
 
 from collections.abc import Sequence
@@ -13,12 +13,12 @@ from model.config.document import Document
 from model.errors import InputError
 from registry.plugins import Instance, PluginRegistry
 
-USUAL = "rig"
+DEFAULT_KIND = "rig"
 
 
 @dataclass(frozen=True)
-class Good:
-    """A file that can be used: what it is, in a line, and what to be warned of."""
+class CheckedFile:
+    """A valid configuration file: one line about it, and warnings."""
 
     line: str
     warnings: Sequence[str] = ()
@@ -29,16 +29,16 @@ class ConfigKind(Protocol):
     """One kind of configuration file."""
 
     def recognises(self, document: Document) -> bool:
-        """Whether this document is meant to be one."""
+        """Whether a document is of this kind."""
 
-    def check(self, path: Path) -> Good:
-        """Read one with all that it names; raises ConfigError for one that cannot be used."""
+    def check(self, path: Path) -> CheckedFile:
+        """Check a file and the files that it names; raises ConfigError."""
 
     def example(self) -> str:
-        """A commented one to begin with."""
+        """A commented file to start from."""
 
     def schema(self) -> dict[str, Any]:
-        """Its JSON schema, for editors."""
+        """The JSON schema for editors."""
 
 
 _KINDS: PluginRegistry[ConfigKind] = PluginRegistry(
@@ -47,13 +47,13 @@ _KINDS: PluginRegistry[ConfigKind] = PluginRegistry(
 
 
 def kind_called(name: str) -> ConfigKind:
-    """The kind of a name; raises InputError for none."""
+    """The kind of a name; raises InputError for an unknown one."""
     return _KINDS.find(name)
 
 
 def kind_of(document: Document) -> ConfigKind:
-    """The kind that a document is meant to be: a rig, unless another kind knows it for its own."""
+    """The kind of a document: a rig unless another kind recognises it."""
     for name in _KINDS.names():
-        if name != USUAL and (kind := kind_called(name)).recognises(document):
+        if name != DEFAULT_KIND and (kind := kind_called(name)).recognises(document):
             return kind
-    return kind_called(USUAL)
+    return kind_called(DEFAULT_KIND)

@@ -1,4 +1,4 @@
-"""The shape of a configuration file: sections as pydantic models, every error found at once."""
+"""Sections of configuration files as pydantic models; all problems are reported at once."""
 
 import re
 from collections.abc import Mapping
@@ -18,7 +18,7 @@ from registry.suggestions import did_you_mean
 
 
 class Section(BaseModel):
-    """A mapping in a configuration file: no unknown keys, nothing converted behind one's back."""
+    """A mapping in a configuration file: strict types, no unknown keys."""
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
 
@@ -29,9 +29,9 @@ PartT = TypeVar("PartT", bound=Section)
 
 @dataclass(frozen=True)
 class Quantity:
-    """Annotates a float field that is written with a unit or in SI; bounds in SI.
+    """Annotation of a float field written with a unit or in SI; bounds in SI.
 
-    above and below exclude the bound itself, least and most include it.
+    above and below exclude the bound, least and most include it.
     """
 
     dimension: Dimension
@@ -41,7 +41,7 @@ class Quantity:
     below: float = float("inf")
 
     def read(self, value: object) -> float:
-        """The value in SI units; raises InputError if it is none, or out of bounds."""
+        """Convert to SI units; raises ValueError for another dimension or a value out of bounds."""
         result = quantity(value, self.dimension)
         if self.above < result < self.below and self.least <= result <= self.most:
             return result
@@ -56,7 +56,7 @@ class Quantity:
             if abs(limit) != float("inf")
         ]
         bare = f"; a bare number is in {self.dimension.unit}" if self.dimension.unit else ""
-        raise ValueError(f"{value} is out of range, must be {' and '.join(limits)}{bare}")
+        raise ValueError(f"must be {' and '.join(limits)}, got {value}{bare}")
 
     def __get_pydantic_core_schema__(
         self, source: object, handler: GetCoreSchemaHandler
@@ -84,7 +84,7 @@ class Validation(Generic[SectionT]):
                 self._problems.append(_problem(document, root, details))
 
     def part(self, path: KeyPath, section: type[PartT]) -> PartT | None:
-        """A section if it is in order by itself, so that checks across sections need not wait."""
+        """A section if it is valid by itself, for checks across sections; else None."""
         try:
             return section.model_validate(self._document.value(path))
         except (KeyError, ValidationError):
@@ -93,7 +93,7 @@ class Validation(Generic[SectionT]):
     def nested(
         self, path: KeyPath, section: type[PartT], *, without: str | None = None
     ) -> PartT | None:
-        """A section that its parent leaves open, but for one of its keys; problems are noted."""
+        """Validate a section that its parent leaves open, without one of its keys."""
         value = self.mapping(path)
         try:
             return section.model_validate({k: v for k, v in value.items() if k != without})
@@ -103,14 +103,14 @@ class Validation(Generic[SectionT]):
             return None
 
     def field(self, path: tuple[str, ...], section: type[Section]) -> Any:
-        """One field of a section if that is in order, whatever its neighbours are; else None."""
+        """One field of a section if it is valid, whatever its neighbours are; else None."""
         try:
             return _field_reader(section, path[-1]).validate_python(self._document.value(path))
         except (KeyError, ValidationError):
             return None
 
     def mapping(self, path: KeyPath) -> Mapping[str, Value]:
-        """A mapping as it stands in the file, unchecked; empty if there is none."""
+        """A mapping of the file, unchecked; empty if missing."""
         try:
             value = self._document.value(path)
         except KeyError:
@@ -118,7 +118,7 @@ class Validation(Generic[SectionT]):
         return value if isinstance(value, dict) else {}
 
     def add(self, path: KeyPath, message: str) -> None:
-        """Note a problem at a key."""
+        """Add a problem at a key."""
         self._problems.append(self._document.problem(path, message))
 
     def finish(self) -> SectionT:
@@ -138,57 +138,59 @@ def _field_reader(section: type[Section], name: str) -> TypeAdapter[Any]:
 def _problem(
     document: Document, root: type[Section], details: ErrorDetails, *, below: KeyPath = ()
 ) -> Problem:
-    """A pydantic error in our words, of a section that lies below a path."""
-    # pydantic marks an error in a mapping's key, not its value, by a last entry "[key]".
+    """Convert a pydantic error of a section below a path."""
+    # pydantic marks an error in the key of a mapping by a last entry "[key]".
     path = tuple(part for part in details["loc"] if part != "[key]")
     context = details.get("ctx", {})
     match details["type"]:
         case "missing":
-            message = "is missing; add it"
+            message = "missing; add it"
         case "extra_forbidden":
             message = _unknown_key(str(path[-1]), _section_at(root, path[:-1]))
         case "value_error":
             message = str(context["error"])
         case "model_type" | "dict_type":
-            message = f"must be a mapping, `key: value` each on a line, not {_shown(details)}"
+            message = f"must be a mapping of `key: value` lines, got {_shown(details)}"
         case "list_type" | "tuple_type":
-            message = f"must be a list in brackets, not {_shown(details)}"
+            message = f"must be a list in brackets, got {_shown(details)}"
         case "int_type" | "int_from_float":
-            message = f"must be a whole number, not {_shown(details)}"
+            message = f"must be a whole number, got {_shown(details)}"
         case "string_type":
-            message = f"must be a text, not {_shown(details)}{_in_quotes(details)}"
+            message = f"must be text, got {_shown(details)}{_in_quotes(details)}"
         case "greater_than_equal":
-            message = f"must be {context['ge']} or more, not {_shown(details)}"
+            message = f"must be at least {context['ge']}, got {_shown(details)}"
         case "less_than_equal":
-            message = f"must be {context['le']} or less, not {_shown(details)}"
+            message = f"must be at most {context['le']}, got {_shown(details)}"
         case "literal_error" | "enum":
             message = _no_choice(details, context["expected"])
         case "string_too_short":
-            message = "is empty; write something, or leave the key out"
+            message = "must not be empty; write text, or remove the key"
         case "string_too_long":
             bound = counted(context["max_length"], "character")
-            message = f"{_shown(details)} is too long; write {bound} at most"
+            message = f"must have at most {bound}, got {_shown(details)}"
         case "too_short" | "too_long":
             bound = f"at least {context['min_length']}" if "min_length" in context else ""
             bound = bound or f"at most {context['max_length']}"
             count = context["actual_length"]
-            message = f"has {count} {'entry' if count == 1 else 'entries'}, must have {bound}"
+            message = (
+                f"must have {bound} {'entry' if bound.endswith(' 1') else 'entries'}, got {count}"
+            )
         case _:
-            message = f"{in_our_words(details['msg'])}, not {_shown(details)}"
+            message = f"{in_our_words(details['msg'])}, got {_shown(details)}"
     return document.problem((*below, *path), message)
 
 
 def _in_quotes(details: ErrorDetails) -> str:
-    """What to do about a name that YAML takes for a number, a truth value or a date."""
+    """Remedy for text that YAML takes for a number or a boolean."""
     given = details["input"]
     return "" if given is None or isinstance(given, dict | list) else "; write it in quotes"
 
 
 def _no_choice(details: ErrorDetails, expected: str) -> str:
-    """pydantic lists what is expected as `'x', 'y' or 'z'`."""
+    """Message for a value that is not among the choices, `'x', 'y' or 'z'` by pydantic."""
     choices = expected.replace("'", "")
     meant = did_you_mean(str(details["input"]), re.findall(r"'([^']+)'", expected))
-    return f"must be {choices}, not {_shown(details)}" + (f"; {meant.strip()}" if meant else "")
+    return f"must be {choices}, got {_shown(details)}" + (f"; {meant.strip()}" if meant else "")
 
 
 def _shown(details: ErrorDetails) -> str:
@@ -198,11 +200,11 @@ def _shown(details: ErrorDetails) -> str:
 
 def _unknown_key(key: str, section: type[Section]) -> str:
     known = list(section.model_fields)
-    return f"unknown key; {did_you_mean(key, known)}known here are: {', '.join(known)}"
+    return f"unknown key; {did_you_mean(key, known)}known are {', '.join(known)}"
 
 
 def _section_at(root: type[Section], path: KeyPath) -> type[Section]:
-    """The section whose keys stand below a path."""
+    """The section at a path."""
     kind: Any = root
     for part in path:
         if get_origin(kind) in (dict, list):

@@ -1,4 +1,4 @@
-"""Values with a unit, as people write them: `12 in`, `1.5 mm`, `70 GPa`, or an SI number."""
+"""Values with a unit, such as `12 in`, `1.5 mm` or `70 GPa`, and bare SI numbers."""
 
 import math
 import re
@@ -35,9 +35,9 @@ RATE = Dimension("a rate", "1/s", "50 Hz")
 SLEW = Dimension("a rise of the level", "1/s", "2 %/ms")
 RATIO = Dimension("a plain number", "", "0.05 or 5 %")
 
-# A number is split from its unit here, so that nothing is ever evaluated and every text is short:
-# pint on its own would work out `9**9**9 m`.
-_LONGEST = 40
+# The number is split from its unit here and texts are short, so that nothing is evaluated: pint
+# by itself would compute `9**9**9 m`.
+_MAX_LENGTH = 40
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d{1,2})?"
 _FACTOR = r"[A-Za-zµμΩ%]+(?:(?:\^|\*\*)-?\d|[²³])?"
 _UNIT = rf"{_FACTOR}(?:(?:\s*[*/·]\s*|\s+){_FACTOR}){{0,4}}"
@@ -47,8 +47,8 @@ _QUANTITY = re.compile(rf"\s*({_NUMBER})\s*({_UNIT})?\s*", re.ASCII)
 def quantity(value: object, dimension: Dimension) -> float:
     """The value in the dimension's SI unit; a bare number is one already.
 
-    `12 in` is exactly 0.3048. Raises InputError for another dimension, an unknown unit, what is no
-    number, and NaN or infinity.
+    `12 in` is exactly 0.3048. Raises InputError for another dimension, an unknown unit, anything
+    but a number, and NaN or infinity.
     """
     if isinstance(value, str):
         result = _parse(value, dimension)
@@ -63,9 +63,9 @@ def quantity(value: object, dimension: Dimension) -> float:
 
 def _parse(text: str, dimension: Dimension) -> float:
     """The value of a text `NUMBER [UNIT]`."""
-    match = _QUANTITY.fullmatch(text) if len(text) <= _LONGEST else None
+    match = _QUANTITY.fullmatch(text) if len(text) <= _MAX_LENGTH else None
     if match is None:
-        raise _refusal(text, dimension, "is no number with a unit")
+        raise _refusal(text, dimension, "is not a number with a unit")
     number, unit = match.groups()
     if unit is None:
         return _to_float(number, dimension)
@@ -73,10 +73,10 @@ def _parse(text: str, dimension: Dimension) -> float:
 
 
 def _factor(text: str, unit: str, dimension: Dimension) -> Decimal:
-    """How many SI units of the dimension one of these units is, exactly where it is exact.
+    """The factor from a unit to the SI unit of a dimension.
 
-    The base units must be the same ones, not just of the same dimension: revolutions per minute
-    and rad/s have the dimension of Hz, but are not that many Hz.
+    The base units must be the same, not just the dimension: revolutions per minute and rad/s have
+    the dimension of Hz.
     """
     import pint
 
@@ -87,7 +87,7 @@ def _factor(text: str, unit: str, dimension: Dimension) -> Decimal:
     except pint.UndefinedUnitError as error:
         raise _refusal(text, dimension, f"has the unknown unit {unit}") from error
     except (pint.PintError, ArithmeticError, AttributeError, TypeError, ValueError) as error:
-        raise _refusal(text, dimension, f"has a unit that cannot be read: {unit}") from error
+        raise _refusal(text, dimension, f"has the invalid unit {unit}") from error
     if base != expected:
         raise _refusal(text, dimension, f"is not {dimension.name}")
     return Decimal(str(factor))
@@ -95,9 +95,9 @@ def _factor(text: str, unit: str, dimension: Dimension) -> Decimal:
 
 @cache
 def _registry() -> "pint.UnitRegistry[Decimal]":
-    """Pint's units, with factors as decimals: 12 in is then 0.3048 m and not 0.30479999999999996.
+    """Pint's units with decimal factors, so that 12 in is 0.3048 m and not 0.30479999999999996.
 
-    Made when the first unit is met, for it takes a tenth of a second.
+    Made for the first unit, since it takes a tenth of a second.
     """
     import pint
 
@@ -105,7 +105,7 @@ def _registry() -> "pint.UnitRegistry[Decimal]":
 
 
 def _to_float(value: float | str | Decimal, dimension: Dimension) -> float:
-    """The nearest double; an integer that is too large for one is refused."""
+    """The nearest double; raises InputError for an integer that is too large."""
     try:
         return float(value)
     except OverflowError as error:
@@ -113,15 +113,15 @@ def _to_float(value: float | str | Decimal, dimension: Dimension) -> float:
 
 
 def _refusal(value: object, dimension: Dimension, why: str) -> InputError:
-    """The error for a value, with what should stand in its place."""
+    """The error for a value, with what to write instead."""
     text = shown(value)
-    text = text if len(text) <= _LONGEST else f"{text[:_LONGEST]}..."
+    text = text if len(text) <= _MAX_LENGTH else f"{text[:_MAX_LENGTH]}..."
     bare = f"a bare number in {dimension.unit}" if dimension.unit else "a bare number"
     return InputError(f"{text} {why}; write {bare}, or for example {dimension.example}")
 
 
 def shown(value: object) -> str:
-    """A value of a file as it stands there, not as Python writes it."""
+    """A value as it is written in a file."""
     if value is None:
         return "nothing"
     return str(value).lower() if isinstance(value, bool) else repr(value)

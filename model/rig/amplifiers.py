@@ -1,7 +1,6 @@
-"""What is wrong with how a rig reaches its amplifiers, as those say who know wires.
+"""Checks of a rig's amplifiers by packages that know wires.
 
-Nothing here knows any: a check is an entry point of the group `era_haptics.rig_checks`, a callable
-as `RigCheck`.
+A check is an entry point of the group `era_haptics.rig_checks` that leads to a `RigCheck`.
 """
 
 from collections import Counter
@@ -20,12 +19,12 @@ from registry.plugins import Instance, PluginRegistry
 
 @runtime_checkable
 class RigCheck(Protocol):
-    """Looks at URLs and opens nothing."""
+    """Checks URLs without opening any."""
 
     def __call__(
         self, urls: Mapping[str, str], *, channels: Mapping[str, int], limits: Mapping[str, float]
     ) -> tuple[Mapping[str, str], Sequence[str]]:
-        """What is wrong, by the amplifier's name, and what to be warned of.
+        """Errors by the amplifier's name, and warnings.
 
         channels: number wired by amplifier; limits: of the rig, by the names of `Limits`.
         """
@@ -37,24 +36,24 @@ _CHECKS: PluginRegistry[RigCheck] = PluginRegistry(
 
 
 def check_amplifiers(document: Document, rig: Rig | None) -> tuple[list[Problem], list[str]]:
-    """Problems and warnings; rig: what the document became, if it did."""
+    """Problems and warnings; rig: of the document, None if it is invalid."""
     urls = _urls(document)
     wired = Counter(channel.amplifier for channel in rig.wiring.values()) if rig else Counter()
     limits = rig.limits if rig else limits_of(LimitsSection())
     problems: list[Problem] = []
     warnings: list[str] = []
     for name in _CHECKS.names():
-        wrong, told = _CHECKS.find(name)(urls, channels=wired, limits=asdict(limits))
+        wrong, warned = _CHECKS.find(name)(urls, channels=wired, limits=asdict(limits))
         problems += [
             document.problem(("amplifiers", amplifier, "url"), what)
             for amplifier, what in wrong.items()
         ]
-        warnings += told
+        warnings += warned
     return problems, warnings
 
 
 def _urls(document: Document) -> dict[str, str]:
-    """Every URL that is a text; `sim://` is an amplifier over this rig itself."""
+    """All URLs that are text; `sim://` becomes a simulated amplifier over this rig."""
     amplifiers = document.data.get("amplifiers")
     urls = {}
     for name, amplifier in amplifiers.items() if isinstance(amplifiers, dict) else ():

@@ -1,4 +1,4 @@
-"""What is wrong with a rig between its sections, each of which may be in order by itself."""
+"""Checks of a rig across its sections."""
 
 import math
 
@@ -14,7 +14,7 @@ from registry.suggestions import did_you_mean
 
 
 def check_across(validation: Validation[RigSection], *, mesh_given: bool) -> None:
-    """Note what is wrong between sections, as far as these are in order by themselves."""
+    """Add problems between sections that are valid by themselves."""
     plate = _check_plate(validation)
     if plate is not None and not mesh_given:
         limits = validation.field(("limits", "frequency"), LimitsSection)
@@ -29,24 +29,25 @@ def check_across(validation: Validation[RigSection], *, mesh_given: bool) -> Non
     for name in names:
         if {"damping", "damping_ratio"} <= validation.mapping(("eras", name)).keys():
             validation.add(
-                ("eras", name, "damping"), "stands beside damping_ratio; keep one of the two"
+                ("eras", name, "damping"),
+                "must not be given with damping_ratio; remove one of the two",
             )
 
 
 def _check_plate(validation: Validation[RigSection]) -> Plate | None:
-    """The plate if all about it is in order; thickness and material, or layers, make it one."""
+    """The plate if its section is valid: thickness and material, or layers."""
     given = {key for key, value in validation.mapping(("plate",)).items() if value is not None}
     if not given:
         return None
     if "layers" in given:
         for key in sorted({"thickness", "material"} & given):
-            validation.add(("plate", key), "stands beside layers; keep one of the two")
+            validation.add(("plate", key), "must not be given with layers; remove one of the two")
     else:
         for key in ("thickness", "material"):
             if key not in given:
-                validation.add(("plate", key), "is missing; add it, or layers for a laminate")
+                validation.add(("plate", key), "missing; add it, or layers for a laminate")
         for key in sorted({"bond", "bond_frequency"} & given):
-            validation.add(("plate", key), "goes with layers only; remove it")
+            validation.add(("plate", key), "is for layers only; remove it")
     section = validation.part(("plate",), PlateSection)
     if section is None or (section.layers is None and not {"thickness", "material"} <= given):
         return None
@@ -59,7 +60,8 @@ def _check_plate(validation: Validation[RigSection]) -> Plate | None:
     if thickness > min(plate.length, plate.width):
         validation.add(
             ("plate", "thickness" if laminate is None else "layers"),
-            f"{thickness:g} m is more than the plate is wide; is it in mm? write {thickness:g} mm",
+            f"must be less than the plate's sides, got {thickness:g} m; if in mm, write "
+            f"{thickness:g} mm",
         )
     return plate
 
@@ -79,7 +81,7 @@ def _check_mesh(validation: Validation[RigSection], plate: Plate, *, frequency_m
             ("mesh",),
             f"{mesh} is too coarse for bending waves at {frequency_max:g} Hz (limits.frequency): "
             f"at least {coarsest} is needed, {MIN_NODES_PER_WAVELENGTH / mesh.element.order:g} "
-            "elements a wavelength; auto takes a mesh that is accurate",
+            f"elements a wavelength, got {mesh}; auto chooses an accurate mesh",
         )
 
 
@@ -95,7 +97,8 @@ def _check_places(
         for other, taken in placed.items():
             if math.dist(taken, place) < SAME_POINT:
                 validation.add(
-                    ("eras", name, "at"), f"is where ERA {other} is already; move one of them"
+                    ("eras", name, "at"),
+                    f"must be unique, got the place of ERA {other}; move one",
                 )
         placed[name] = place
 
@@ -115,8 +118,8 @@ def _check_on_plate(
     ):
         validation.add(
             key,
-            f"({x:g}, {y:g}) m is off the plate, which reaches from (0, 0) to "
-            f"({plate.length:g}, {plate.width:g}) m; move the {what} onto it",
+            f"must be on the plate, from (0, 0) to ({plate.length:g}, {plate.width:g}) m, got "
+            f"({x:g}, {y:g}) m; move the {what}",
         )
 
 
@@ -131,7 +134,7 @@ def _check_wiring(validation: Validation[RigSection], names: tuple[str, ...]) ->
             validation.add(
                 ("eras", name, "amplifier"),
                 f"unknown amplifier {amplifier}; {did_you_mean(amplifier, amplifiers)}"
-                f"known under amplifiers: {known}",
+                f"known are {known}",
             )
         if amplifier is None or channel is None:
             continue
@@ -139,6 +142,6 @@ def _check_wiring(validation: Validation[RigSection], names: tuple[str, ...]) ->
         if other != name:
             validation.add(
                 ("eras", name, "channel"),
-                f"{channel} of amplifier {amplifier} drives ERA {other} already; "
-                "give each ERA its own channel",
+                f"must be unique, got {channel} of amplifier {amplifier} as ERA {other}; give each "
+                "ERA its own channel",
             )

@@ -1,4 +1,4 @@
-"""Reading a rig from its file, and refusing every rig that could not work."""
+"""Reading a rig from its file."""
 
 from pathlib import Path
 from typing import Any
@@ -14,13 +14,13 @@ from model.rig.sections import RigSection
 
 
 def load_rig(path: Path | str, *, mesh: str | None = None) -> Rig:
-    """Read a rig file; mesh, `auto` or NXxNY, stands in place of the file's own.
+    """Read a rig file; mesh: `auto` or NXxNY, replaces that of the file.
 
-    Raises ConfigError with every problem of the file; InputError for a mesh that is none. A mesh
-    asked for here may be as coarse as is wanted: how wrong it then is may be the question.
+    Raises ConfigError with all problems of the file; InputError for an invalid mesh. The mesh given
+    here may be coarser than a file's, to study its error.
     """
     if mesh is not None and not isinstance(mesh, str):
-        raise InputError(f"mesh is {shown(mesh)}; give text, such as mesh='48x36', or 'auto'")
+        raise InputError(f"mesh must be text such as '48x36' or 'auto', got {shown(mesh)}")
     return rig_of(read_document(expect_path(path, what="path")), mesh=mesh)
 
 
@@ -52,15 +52,15 @@ def rig_of(document: Document, *, mesh: str | None = None) -> Rig:
 
 
 def rig_schema() -> dict[str, Any]:
-    """The JSON schema of a rig file, for editors."""
+    """The JSON schema of a rig file for editors."""
     schema = {"$schema": "https://json-schema.org/draft/2020-12/schema"}
     return schema | RigSection.model_json_schema() | {"title": "A rig of era-haptics"}
 
 
 def example_rig_path() -> Path:
-    """Where the commented rig of the paper's plate lies.
+    """The path of the commented rig of the paper's plate.
 
-    A wheel carries it in the model's data; a checkout has it in its examples only.
+    A wheel has it in the model's data, a checkout in its examples.
     """
     here = Path(__file__).parents[1]
     installed = here / "data" / "paper_plate.yaml"

@@ -1,10 +1,10 @@
-"""Rigs, as `era config` deals with them."""
+"""Rig files as a kind of configuration of `era config`."""
 
 from pathlib import Path
 from typing import Any
 
 from model.config.document import ConfigError, Document, Problem, read_document
-from model.config.kinds import Good
+from model.config.kinds import CheckedFile
 from model.rig.amplifiers import check_amplifiers
 from model.rig.file import example_rig_path, rig_of, rig_schema
 from model.rig.rig import Rig
@@ -18,11 +18,8 @@ class RigKind:
         """A rig has a plate."""
         return "plate" in document.data
 
-    def check(self, path: Path) -> Good:
-        """A good rig in one line, so that a value that is only unlikely catches the eye.
-
-        With what others that know amplifiers say of its URLs.
-        """
+    def check(self, path: Path) -> CheckedFile:
+        """Check a rig and its amplifiers; return its values in a line, to show unlikely ones."""
         document = read_document(path)
         problems: list[Problem] = []
         rig = None
@@ -38,14 +35,14 @@ class RigKind:
         problems += [problem for problem in wrong if problem.key not in known]
         if rig is None or problems:
             raise ConfigError(document.source, problems)
-        return Good(_summary(rig), warnings)
+        return CheckedFile(_summary(rig), warnings)
 
     def example(self) -> str:
         """The paper's plate."""
         return example_rig_path().read_text(encoding="utf-8")
 
     def schema(self) -> dict[str, Any]:
-        """For editors."""
+        """The JSON schema for editors."""
         return rig_schema()
 
 

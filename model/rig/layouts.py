@@ -1,7 +1,7 @@
-"""Where ERAs can stand under a plate: layouts by name, and the raster that studies choose from.
+"""Layouts of ERAs by name, and the raster of places for studies.
 
-The drawings of the paper's layouts (its Figures 8 and 9) are lost, so these are our own. Places are
-fractions of the plate's length and width: a layout fits every plate.
+The drawings of the paper's layouts (its Figures 8 and 9) are not available, so these are our own.
+Places are fractions of the plate's length and width, so that a layout fits every plate.
 """
 
 from collections.abc import Sequence
@@ -16,12 +16,12 @@ from model.structure.actuator import Era
 from model.structure.plate import Plate
 
 Place = tuple[float, float]
-"""Where an ERA stands, as fractions (of the length, of the width), 0 to 1."""
+"""Place of an ERA as fractions of the length and the width, 0 to 1."""
 
 
 @dataclass(frozen=True)
 class Layout:
-    """Where the ERAs of a rig stand."""
+    """Places of the ERAs of a rig."""
 
     name: str
     places: tuple[Place, ...]
@@ -40,7 +40,7 @@ FOUR_ERA_LAYOUTS = (
     Layout("trapezoid", ((0, 0), (1, 0), (3 / 4, 1), (1 / 4, 1))),
     Layout("diagonal", ((0, 0), (1 / 3, 1 / 3), (2 / 3, 2 / 3), (1, 1))),
 )
-"""Seven ways to stand four ERAs under a plate; the first is the paper's own, of its Table 2."""
+"""Layouts of four ERAs; the first is that of the paper's Table 2."""
 
 _OTHERS = (
     Layout("centre", ((1 / 2, 1 / 2),)),
@@ -53,13 +53,13 @@ _OTHERS = (
 
 
 def named_layouts(era_count: int) -> tuple[Layout, ...]:
-    """The layouts that have a name, of this many ERAs; empty where there are none."""
+    """The named layouts with a number of ERAs."""
     layouts = (*FOUR_ERA_LAYOUTS, *_OTHERS)
     return tuple(layout for layout in layouts if len(layout.places) == era_count)
 
 
 def alike(era: Era, positions: FloatArray) -> tuple[Era, ...]:
-    """ERAs like one of them at positions [m] (n, 2), by the names E1, E2, ..."""
+    """Copies of an ERA at positions [m] (n, 2), named E1, E2, ..."""
     return tuple(
         replace(era, name=f"E{number}", x=float(x), y=float(y))
         for number, (x, y) in enumerate(positions, start=1)
@@ -79,7 +79,7 @@ def candidate_places(nx: int, ny: int) -> FloatArray:
     13x13, every twelfth of a side, holds all named layouts.
     """
     if not (2 <= nx <= 100 and 2 <= ny <= 100):
-        raise InputError(f"candidates {nx}x{ny}: 2x2 to 100x100 places are possible")
+        raise InputError(f"candidates must be 2x2 to 100x100 places, got {nx}x{ny}")
     x, y = np.meshgrid(np.linspace(0, 1, nx), np.linspace(0, 1, ny))
     return np.column_stack([x.ravel(), y.ravel()])
 
@@ -101,7 +101,7 @@ def diagonal_pair(eras: Sequence[Era]) -> tuple[int, int]:
 
 def _pairs(eras: Sequence[Era]) -> list[tuple[int, int]]:
     if len(eras) < 2:
-        raise InputError(f"two ERAs are needed to drive a pair; this rig has {len(eras)}")
+        raise InputError(f"driving a pair needs two ERAs, got {len(eras)} in this rig")
     return list(combinations(range(len(eras)), 2))
 
 

@@ -1,4 +1,4 @@
-"""From the sections of a rig file to the values that the model computes with."""
+"""Conversion of the sections of a rig file to values of the model."""
 
 import math
 import re
@@ -13,8 +13,8 @@ from model.structure.laminate import Laminate, Layer, equivalent_plate
 from model.structure.plate import Material, Plate
 from model.structure.point_mass import PointMass
 
-_MOST_ELEMENTS_PER_SIDE = 1000
-_MOST_AUTO_NODES = 300_000  # a million degrees of freedom: minutes, and most of a machine's memory
+_MAX_ELEMENTS_PER_SIDE = 1000
+_MAX_AUTO_NODES = 300_000  # a million degrees of freedom: minutes, and most of a machine's memory
 
 
 def plate_of(section: PlateSection) -> Plate:
@@ -24,7 +24,7 @@ def plate_of(section: PlateSection) -> Plate:
         return equivalent_plate(
             laminate, length=section.length, width=section.width, loss_factor=section.loss_factor
         )
-    assert section.thickness is not None  # noqa: S101  model.rig.checks has seen to both
+    assert section.thickness is not None  # noqa: S101  see model.rig.checks
     assert section.material is not None  # noqa: S101
     return Plate(
         length=section.length,
@@ -36,7 +36,7 @@ def plate_of(section: PlateSection) -> Plate:
 
 
 def laminate_of(section: PlateSection) -> Laminate | None:
-    """What the plate is made of, if of layers."""
+    """The laminate of the plate; None without layers."""
     if section.layers is None:
         return None
     layers = (Layer(_material(layer.material), layer.thickness) for layer in section.layers)
@@ -44,7 +44,7 @@ def laminate_of(section: PlateSection) -> Laminate | None:
 
 
 def era_of(name: str, section: EraSection, plate: Plate, *, era_count: int) -> Era:
-    """An ERA under the plate, which it shares with others."""
+    """An ERA; era_count: of the rig, for the damping from a ratio."""
     damping = section.damping
     if damping is None:
         damping = damping_from_ratio(
@@ -73,21 +73,21 @@ def mass_of(section: MassSection, plate: Plate) -> PointMass:
 
 
 def limits_of(section: LimitsSection) -> Limits:
-    """What no command may exceed; no limit where none is given."""
+    """The limits of commands; infinite where none is given."""
     low, high = section.frequency
     given = section.model_dump(exclude={"frequency"}, exclude_none=True)
     return Limits(frequency_min=low, frequency_max=high, **given)
 
 
 def mesh_of(text: str, plate: Plate, *, frequency_max: float) -> Mesh:
-    """The mesh `auto`, good up to a frequency [Hz], or one as parse_mesh reads it."""
+    """The mesh `auto`, accurate up to a frequency [Hz], or that of `parse_mesh`."""
     if text != "auto":
         return parse_mesh(text, plate)
     mesh = Mesh.auto(plate, frequency_max=frequency_max)
-    if mesh.node_count > _MOST_AUTO_NODES:
+    if mesh.node_count > _MAX_AUTO_NODES:
         raise InputError(
-            f"auto: this plate would need {mesh} elements up to {frequency_max:g} Hz, more than "
-            f"{_MOST_AUTO_NODES} nodes; check its sizes, or lower limits.frequency"
+            f"auto must have at most {_MAX_AUTO_NODES} nodes, got {mesh} elements up to "
+            f"{frequency_max:g} Hz; check the plate's sizes, or lower limits.frequency"
         )
     return mesh
 
@@ -95,19 +95,18 @@ def mesh_of(text: str, plate: Plate, *, frequency_max: float) -> Mesh:
 def parse_mesh(text: str, plate: Plate) -> Mesh:
     """The mesh `NXxNY`, or `NXxNY ELEMENT`, over a plate.
 
-    Raises InputError for what is none, for an element that nobody knows, and beyond all reason.
+    Raises InputError for other text, an unknown element, and too many elements.
     """
     match = re.fullmatch(r"\s*(\d{1,6})\s*[xX×]\s*(\d{1,6})(?:\s+(\S{1,40}))?\s*", text, re.ASCII)
     if match is None:
         raise InputError(
-            f"mesh {text[:40]!r} is not understood; write the number of elements along x and y, "
-            "for example 48x36, and if wanted an element's name after them: 12x9 Q3"
+            f"mesh must be NXxNY with an optional element, for example 48x36 or 12x9 Q3, got "
+            f"{text[:40]!r}"
         )
     nx, ny = int(match[1]), int(match[2])
-    if not 1 <= min(nx, ny) <= max(nx, ny) <= _MOST_ELEMENTS_PER_SIDE:
+    if not 1 <= min(nx, ny) <= max(nx, ny) <= _MAX_ELEMENTS_PER_SIDE:
         raise InputError(
-            f"mesh {nx}x{ny} cannot be used; each side takes 1 to {_MOST_ELEMENTS_PER_SIDE}"
-            " elements"
+            f"mesh must have 1 to {_MAX_ELEMENTS_PER_SIDE} elements a side, got {nx}x{ny}"
         )
     element = element_of(match[3]) if match[3] else PAPER_ELEMENT
     return Mesh(nx=nx, ny=ny, length=plate.length, width=plate.width, element=element)
@@ -118,6 +117,6 @@ def _material(section: MaterialSection) -> Material:
 
 
 def _onto(plate: Plate, place: tuple[float, float]) -> tuple[float, float]:
-    """A place on the plate's edge, off which rounding may have put it."""
+    """A place clipped to the plate, off whose edge rounding may have put it."""
     x, y = place
     return min(max(x, 0.0), plate.length), min(max(y, 0.0), plate.width)

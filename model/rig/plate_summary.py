@@ -1,4 +1,4 @@
-"""What a rig's plate is, in numbers: what it is made of, and how it bends."""
+"""Numbers of a rig's plate: materials, rigidity, bending wavelengths."""
 
 from dataclasses import replace
 from typing import Any

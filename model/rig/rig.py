@@ -1,4 +1,4 @@
-"""A rig: one plate, the ERAs under it, and which amplifier channel drives which ERA."""
+"""A rig: a plate, its ERAs, and the amplifier channel of each ERA."""
 
 import hashlib
 import json
@@ -16,13 +16,13 @@ from model.structure.plate import Plate
 from model.structure.point_load import PointLoad
 from model.structure.point_mass import PointMass
 
-# Two bolts cannot be closer [m].
+# m; two bolts cannot be closer
 SAME_POINT = 1e-6
 
 
 @dataclass(frozen=True)
 class Channel:
-    """Where an ERA is wired: an amplifier by its name in the rig, and the channel's number."""
+    """The wiring of an ERA: an amplifier by its name in the rig, and the number of its channel."""
 
     amplifier: str
     number: int
@@ -30,11 +30,11 @@ class Channel:
 
 @dataclass(frozen=True)
 class Limits:
-    """What no command may exceed: mechanical frequencies [Hz] and level (1 is full stroke).
+    """Limits of commands: mechanical frequency [Hz] and level (1 is full stroke).
 
-    slew [1/s]: how fast a level may rise. For each amplifier by itself: power, the sum of the
-    squared levels of its channels; on_time [s], how long it may vibrate without a pause; duty,
-    which share of any ten seconds; rate [1/s], how many command sets that are not silent.
+    slew [1/s]: highest rise of a level. Per amplifier: power: sum of the squared levels of its
+    channels; on_time [s]: longest vibration without a pause; duty: share of any ten seconds; rate
+    [1/s]: command sets that are not silent.
     """
 
     frequency_min: float
@@ -49,10 +49,10 @@ class Limits:
 
 @dataclass(frozen=True)
 class Rig:
-    """Everything that is fixed once the hardware is built.
+    """A plate on its ERAs, with wiring and limits.
 
-    wiring: a channel per ERA, by the ERA's name; amplifiers: URL by name; masses: what the plate
-    carries; laminate: what the plate, then an equivalent one, is made of, for showing.
+    wiring: channel by the name of the ERA; amplifiers: URL by name; masses: on the plate; laminate:
+    of which the plate is the equivalent, for display.
     """
 
     plate: Plate
@@ -65,28 +65,30 @@ class Rig:
     laminate: Laminate | None = None
 
     def __post_init__(self) -> None:
-        """Refuse ERAs and masses off the plate, and two ERAs at one point or of one name."""
+        """Check that ERAs and masses are on the plate, and places and names of ERAs unique."""
         for what, place in (
             *((f"ERA {era.name}", (era.x, era.y)) for era in self.eras),
             *(("point mass", (mass.x, mass.y)) for mass in self.masses),
         ):
             if not self.plate.contains(*place):
                 raise InputError(
-                    f"{what} at ({place[0]:g}, {place[1]:g}) m is off the plate, which reaches "
-                    f"from (0, 0) to ({self.plate.length:g}, {self.plate.width:g}) m"
+                    f"{what} must be on the plate, from (0, 0) to ({self.plate.length:g}, "
+                    f"{self.plate.width:g}) m, got ({place[0]:g}, {place[1]:g}) m"
                 )
         for number, era in enumerate(self.eras):
             for other in self.eras[:number]:
                 if era.name == other.name:
-                    raise InputError(f"two ERAs have the name {era.name}; rename one")
+                    raise InputError(
+                        f"names of ERAs must be unique, got {era.name} twice; rename one"
+                    )
                 if math.dist((era.x, era.y), (other.x, other.y)) < SAME_POINT:
                     raise InputError(
-                        f"ERAs {other.name} and {era.name} are both at ({era.x:g}, {era.y:g}) m; "
-                        "move one of them"
+                        f"ERAs must be at different places, got {other.name} and {era.name} at "
+                        f"({era.x:g}, {era.y:g}) m; move one of them"
                     )
 
     def era(self, name: str) -> Era:
-        """The ERA of this name; KeyError if the rig has none."""
+        """The ERA of a name; raises KeyError for an unknown one."""
         for era in self.eras:
             if era.name == name:
                 return era
@@ -94,7 +96,7 @@ class Rig:
 
     @property
     def loads(self) -> tuple[PointLoad, ...]:
-        """What the plate carries, as what is attached to it."""
+        """The masses as point loads."""
         return tuple(PointLoad(mass.x, mass.y, mass=mass.mass) for mass in self.masses)
 
     @property
@@ -145,7 +147,7 @@ def _with_floats(value: object) -> object:
 
 
 def _as_floats(value: Any) -> Any:
-    """Numbers as floats wherever they are: 1 is the same stiffness as 1.0."""
+    """Convert all numbers to floats, so that 1 and 1.0 give one fingerprint."""
     if isinstance(value, Mapping):
         return {key: _as_floats(entry) for key, entry in value.items()}
     if isinstance(value, list | tuple):

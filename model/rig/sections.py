@@ -1,6 +1,6 @@
-"""What may stand in a rig file: its sections, keys, defaults and bounds.
+"""The sections of a rig file: keys, defaults and bounds.
 
-Bounds are wide: they are there to catch a value in the wrong unit, not to teach engineering.
+Bounds are wide: they catch values in the wrong unit.
 """
 
 import re
@@ -36,10 +36,10 @@ from model.structure.materials import material, material_names
 
 
 class _MaterialByName:
-    """Annotates a material that may be given by its name."""
+    """Annotation of a material that may be given by name."""
 
     def read(self, value: object) -> object:
-        """The numbers of a named material; anything else as it is."""
+        """Replace the name of a material by its numbers."""
         if not isinstance(value, str):
             return value
         known = material(value)
@@ -58,14 +58,15 @@ class _MaterialByName:
 
 def _identifier(text: str) -> str:
     if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_-]{0,31}", text):
-        raise ValueError("is no name; use a letter, then letters, digits, - and _, 32 at most")
+        raise ValueError("must be a letter followed by at most 31 letters, digits, - and _")
     return text
 
 
 def _url(text: str) -> str:
     if not re.fullmatch(r"[a-z][a-z0-9+.-]*://[!-~]{0,250}", text):
         raise ValueError(
-            f"{text[:40]!r} is no URL; write for example sim:// or serial:///dev/ttyUSB0?baud=921600"
+            "must be a URL, for example sim:// or serial:///dev/ttyUSB0?baud=921600, got "
+            f"{text[:40]!r}"
         )
     return text
 
@@ -73,7 +74,7 @@ def _url(text: str) -> str:
 def _ascending(bounds: tuple[float, float]) -> tuple[float, float]:
     low, high = bounds
     if low >= high:
-        raise ValueError(f"goes from {low:g} to {high:g} Hz; give the lower frequency first")
+        raise ValueError(f"must be the lower and the higher frequency, got {low:g} and {high:g} Hz")
     return bounds
 
 
@@ -81,11 +82,11 @@ def _gains(rows: list[tuple[float, float, float]]) -> list[tuple[float, float, f
     for frequency, size, phase in rows:
         if not (0 < frequency < 1e5 and 1e-3 <= size <= 1e3 and -360 <= phase <= 360):
             raise ValueError(
-                f"[{frequency:g}, {size:g}, {phase:g}] is no gain; write [frequency in Hz, "
-                "magnitude from 0.001 to 1000, phase from -360 to 360 degrees]"
+                "must be rows of [frequency in Hz, magnitude 0.001 to 1000, phase -360 to 360 "
+                f"degrees], got [{frequency:g}, {size:g}, {phase:g}]"
             )
     if any(low[0] >= high[0] for low, high in pairwise(rows)):
-        raise ValueError("has frequencies that do not ascend; sort its rows by the first number")
+        raise ValueError("frequencies must ascend; sort the rows by the first number")
     return rows
 
 
@@ -118,9 +119,9 @@ class LayerSection(Section):
 
 
 class PlateSection(Section):
-    """The plate: thickness and material, or in their place layers from one face to the other.
+    """The plate: thickness and material, or layers from one face to the other.
 
-    loss_factor: the paper prints none; 1 % is the usual order of a metal panel.
+    loss_factor: not printed in the paper; 1 % is usual for a metal panel.
     """
 
     model_config = ConfigDict(
@@ -140,7 +141,7 @@ class PlateSection(Section):
 
 
 class EraSection(Section):
-    """One ERA. The paper prints neither damping nor stroke; the defaults are our assumptions."""
+    """One ERA. Defaults of damping and stroke are assumed, the paper prints neither."""
 
     at: Place
     stiffness: Annotated[float, Quantity(STIFFNESS, above=0, most=1e12)]
@@ -154,22 +155,22 @@ class EraSection(Section):
 
 
 class MassSection(Section):
-    """Something small that the plate carries."""
+    """A point mass on the plate."""
 
     at: Place
     mass: Annotated[float, Quantity(MASS, least=0, most=10)]
 
 
 class AmplifierSection(Section):
-    """How an amplifier is reached."""
+    """The URL of an amplifier."""
 
     url: Annotated[str, AfterValidator(_url)]
 
 
 class LimitsSection(Section):
-    """What no command may exceed: frequencies between which skin feels vibration well, level.
+    """Limits of commands, see `Limits`; the default frequencies are those that skin feels well.
 
-    The others are without limit unless given; see `Limits` for what they count.
+    The others are unlimited by default.
     """
 
     frequency: Annotated[

@@ -1,4 +1,4 @@
-"""What a study compares: layouts of ERAs, each with a stiffness."""
+"""Cases of a study: layouts of ERAs, each with a stiffness."""
 
 import math
 from collections.abc import Sequence
@@ -14,10 +14,10 @@ from model.rig.layouts import alike, place_eras
 from model.structure.actuator import Era
 
 VACANT = -1
-"""Stands after the last ERA of a layout in an array that holds larger ones too."""
+"""Padding after the last ERA of a layout."""
 
 OWN = "own"
-"""Name of the layout that the rig has now."""
+"""Name of the rig's own layout."""
 
 Numbers: TypeAlias = NDArray[np.int32]
 

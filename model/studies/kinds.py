@@ -1,42 +1,41 @@
-"""The three studies: what each of them compares."""
+"""The three studies and their cases."""
 
 from collections.abc import Callable
 
 import numpy as np
 
-from model.counting import counted
 from model.errors import InputError
 from model.rig.rig import Rig
 from model.studies.cases import Cases, all_alike
 from model.studies.pool import LayoutPool
 
 STIFFNESS_FACTORS = 2.0 ** np.arange(-4, 5)
-"""A stiffness study multiplies the stiffness of the rig's ERAs by 1/16 to 16."""
+"""Factors of a stiffness study on the stiffness of the rig's ERAs."""
 
-MOST_ERAS = 6
-"""A count study goes from one ERA to so many."""
+MAX_ERAS = 6
+"""The largest number of ERAs of a count study."""
 
 
 def placement_cases(rig: Rig, *, layouts: int, seed: int, raster: tuple[int, int]) -> Cases:
     """The rig's ERAs in other places: its own layout, those with a name, random ones."""
     if layouts < 1:
-        raise InputError(f"{layouts} layouts are none to study; ask for one at least")
+        raise InputError(f"number of layouts must be at least 1, got {layouts}")
     pool = LayoutPool(rig, raster)
     pool.add(len(rig.eras), layouts, np.random.default_rng(seed), own=True)
     return pool.cases()
 
 
 def count_cases(rig: Rig, *, layouts: int, seed: int, raster: tuple[int, int]) -> Cases:
-    """One to MOST_ERAS ERAs like the rig's, the layouts shared out evenly among the counts."""
+    """One to MAX_ERAS ERAs like the rig's, with equal numbers of layouts for each count."""
     if not all_alike(rig.eras):
         raise InputError(
-            "the rig's ERAs differ, so more or fewer of them cannot be told; give all of them the "
-            "same stiffness, damping, bolt_mass and stroke for a study of their count"
+            "ERAs must be alike for a study of their count; give all of them the same stiffness, "
+            "damping, bolt_mass and stroke"
         )
-    most = max(MOST_ERAS, len(rig.eras))
+    most = max(MAX_ERAS, len(rig.eras))
     if layouts < most:
         raise InputError(
-            f"{counted(layouts, 'layout')} cannot compare 1 to {most} ERAs; ask for at least {most}"
+            f"number of layouts must be at least {most} to compare 1 to {most} ERAs, got {layouts}"
         )
     pool = LayoutPool(rig, raster)
     rng = np.random.default_rng(seed)
@@ -63,4 +62,4 @@ STUDIES: dict[str, Callable[..., Cases]] = {
     "count": count_cases,
     "stiffness": stiffness_cases,
 }
-"""What each study compares, by its name."""
+"""The cases of each study by its name."""

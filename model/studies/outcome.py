@@ -1,4 +1,4 @@
-"""What a study leaves behind: its files, and its summary."""
+"""The files and the summary of a study."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -17,8 +17,8 @@ from model.studies.recommended import in_words, rig_yaml
 from model.studies.solve import DRIVE_NAMES, DRIVES
 from model.vibration.activation import STATISTICS
 
-SHOWN = 10
-"""So many cases of the ranking are in a summary; all are in the CSV file."""
+MAX_SHOWN = 10
+"""Number of ranked cases in a summary; the CSV file has all."""
 
 
 def write_outcome(
@@ -26,7 +26,7 @@ def write_outcome(
 ) -> list[Path]:
     """Write the recommended rig, the CSV of all cases and the box plots; the rig comes first.
 
-    data: what the rig's file says. Raises OSError where the folder cannot be written.
+    data: of the rig's file. Raises OSError if the folder cannot be written.
     """
     recommended = folder / "recommended.yaml"
     text = rig_yaml(data, rig, ranking, ranking.recommended)
@@ -40,9 +40,9 @@ def write_outcome(
 
 
 def ranking_summary(rig: Rig, ranking: Ranking) -> dict[str, Any]:
-    """How cases were ranked, the head of the ranking, the rig as it is, and what to build."""
+    """The start of the ranking, the rig's own layout, and the recommended case."""
     ranks = {int(case): rank for rank, case in enumerate(ranking.order, start=1)}
-    shown = [int(case) for case in ranking.order[:SHOWN]]
+    shown = [int(case) for case in ranking.order[:MAX_SHOWN]]
     if ranking.own is not None and ranking.own not in shown:
         shown.append(ranking.own)
     best = ranking.recommended
@@ -59,7 +59,7 @@ def ranking_summary(rig: Rig, ranking: Ranking) -> dict[str, Any]:
 
 
 def case_summary(rig: Rig, ranking: Ranking, case: int) -> dict[str, object]:
-    """One case as JSON takes it: where its ERAs are, which are driven, and its statistics."""
+    """One case for JSON: places of its ERAs, which are driven, and statistics."""
     eras = ranking.cases.eras_of(case, rig.eras)
     driven = ranking.results.active_eras(case, ranking.drive)
     statistics = ranking.results.statistics[case, ranking.drive]
@@ -78,7 +78,7 @@ def case_summary(rig: Rig, ranking: Ranking, case: int) -> dict[str, object]:
 
 
 def all_columns(ranking: Ranking) -> Columns:
-    """Every case and drive, one a row."""
+    """Columns with a row for each case and drive."""
     cases, results = ranking.cases, ranking.results
     at = [
         " ".join(f"({x:.6g};{y:.6g})" for x, y in cases.positions_of(case).tolist())

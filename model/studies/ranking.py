@@ -1,4 +1,4 @@
-"""Which case is best, and which to recommend."""
+"""Ranking of the cases of a study, and the recommended one."""
 
 from dataclasses import dataclass
 
@@ -13,15 +13,15 @@ from model.studies.solve import CaseResults
 from model.vibration.activation import MEDIAN
 
 GOOD_ENOUGH = 0.9
-"""Fewer or softer ERAs are recommended where they reach this share of the best median."""
+"""Share of the best median at which fewer or softer ERAs are recommended."""
 
 
 @dataclass(frozen=True)
 class Ranking:
-    """Cases by the median over the plate of what a drive makes of them, the best first.
+    """Cases by the median over the plate under a drive, the best first.
 
-    drive: number in DRIVES; order (n,) numbers of the cases that can be driven so; supported (n,)
-    whether the ERAs of each case support the plate, without which it cannot be built.
+    drive: number in DRIVES; order (n,): cases that have ERAs enough for it; supported (n,):
+    whether the ERAs of each case support the plate.
     """
 
     cases: Cases
@@ -32,7 +32,7 @@ class Ranking:
 
     @property
     def medians(self) -> FloatArray:
-        """Median cumulative peak acceleration [m/s²] of every case, NaN where it has none."""
+        """Median cumulative peak acceleration [m/s²] of each case, NaN for too few ERAs."""
         return np.asarray(self.results.statistics[:, self.drive, MEDIAN])
 
     @property
@@ -52,7 +52,7 @@ class Ranking:
 
     @property
     def own(self) -> int | None:
-        """The rig as it is, if it is among the ranked cases."""
+        """The rig's own layout, if it is among the ranked cases."""
         for case in self.order:
             if self.cases.names[case] == OWN and self.cases.stiffness_factors[case] == 1:
                 return int(case)

@@ -1,4 +1,4 @@
-"""A case that a study recommends: in words, and as a rig file to paste."""
+"""The recommended case of a study in words, and as a rig file."""
 
 from collections.abc import Mapping
 from copy import deepcopy
@@ -11,7 +11,7 @@ from model.studies.ranking import Ranking
 
 
 def in_words(rig: Rig, ranking: Ranking, case: int) -> str:
-    """One case in a sentence: where the ERAs stand, how stiff they are, which to drive."""
+    """One case in words: places and stiffness of the ERAs, and which to drive."""
     eras = ranking.cases.eras_of(case, rig.eras)
     places = "; ".join(f"{era.name} {place_in_words(era.x, era.y, rig.plate)}" for era in eras)
     driven = [eras[era].name for era in ranking.results.active_eras(case, ranking.drive)]
@@ -22,7 +22,7 @@ def in_words(rig: Rig, ranking: Ranking, case: int) -> str:
 
 
 def place_in_words(x: float, y: float, plate: Plate) -> str:
-    """A place [m] as one would tell it: `at the corner (0, 0)`, `on the edge y = 0, 30 % along`."""
+    """A place [m] in words: `at the corner (0, 0)`, `on the edge y = 0, 30 % along`."""
     along, across = x / plate.length, y / plate.width
     at_x_end, at_y_end = (min(share, 1 - share) < 1e-6 for share in (along, across))
     millimetres = f"({1000 * x:.0f}, {1000 * y:.0f}) mm"
@@ -36,9 +36,9 @@ def place_in_words(x: float, y: float, plate: Plate) -> str:
 
 
 def rig_yaml(data: Mapping[str, Value], rig: Rig, ranking: Ranking, case: int) -> str:
-    """A rig file like the one that was studied (its data), with the ERAs of one case.
+    """The text of the studied rig file (its data) with the ERAs of one case.
 
-    ERAs keep the wiring of the rig's; more of them go on with the channels of its first amplifier.
+    ERAs keep the wiring of the rig's; further ones get the next channels of its first amplifier.
     """
     wiring = list(rig.wiring.values())
     first = wiring[0].amplifier
@@ -47,8 +47,7 @@ def rig_yaml(data: Mapping[str, Value], rig: Rig, ranking: Ranking, case: int) -
     assert isinstance(before, dict)  # noqa: S101 - the rig was read from this data
     eras: dict[str, Value] = {}
     for number, era in enumerate(ranking.cases.eras_of(case, rig.eras)):
-        # One that was given a new name is like the first, in what no study changes too.
-        # A copy, or the file would say `as above` by an alias, which rig files do not know.
+        # A renamed ERA has the other keys of the first. Copied, since aliases are not allowed.
         section = deepcopy(before.get(era.name, next(iter(before.values()))))
         assert isinstance(section, dict)  # noqa: S101
         channel = wiring[number] if number < len(wiring) else None

@@ -1,4 +1,4 @@
-"""From cases to statistics: the part of a study that workers share out among them."""
+"""Statistics of the cases of a study, solved by its workers."""
 
 import hashlib
 import json
@@ -25,7 +25,7 @@ from model.vibration.activation import (
 )
 
 DRIVES = ("1", "2", "all")
-"""How many ERAs are active: of each case the best single one and the best pair, and all of them."""
+"""Numbers of active ERAs: the best single one, the best pair, and all of a case."""
 
 
 DRIVE_NAMES = {"1": "best single ERA", "2": "best pair of ERAs", "all": "all ERAs"}
@@ -33,10 +33,10 @@ DRIVE_NAMES = {"1": "best single ERA", "2": "best pair of ERAs", "all": "all ERA
 
 @dataclass(frozen=True)
 class StudyProblem:
-    """All that the statistics of a case depend on but the case itself.
+    """What the statistics of all cases depend on.
 
-    positions (c, 2) [m]: where ERAs may stand; frequencies (f,) [Hz]; code_version: of the code
-    that made the problem.
+    positions (c, 2) [m]: possible places of ERAs; frequencies (f,) [Hz]; code_version: of the
+    code that made it.
     """
 
     rig: Rig
@@ -52,7 +52,7 @@ class StudyProblem:
 
     @property
     def digest(self) -> str:
-        """SHA-256 over everything in it but the positions, of which a case names its own."""
+        """SHA-256 over all but the positions, which are part of the cases."""
         digest = hashlib.sha256()
         mesh = json.dumps(self.rig.mesh.to_dict(), sort_keys=True)
         for text in (self.rig.fingerprint, mesh, self.code_version):
@@ -67,7 +67,7 @@ class StudyProblem:
 
 @dataclass(frozen=True)
 class CaseResults:
-    """What came out: statistics (n, 3, 6), a row for each of DRIVES; NaN where it has too few ERAs.
+    """Statistics (n, 3, 6) of n cases, a row for each of DRIVES; NaN for too few ERAs.
 
     active: (n, 3), bit k set where ERA k of the case is driven.
     """
@@ -98,7 +98,7 @@ def study_problem(rig: Rig, cases: Cases, frequencies: FloatArray) -> StudyProbl
 
 
 def solve_cases(receptances: Receptances, eras: tuple[Era, ...], cases: Cases) -> CaseResults:
-    """Statistics of every case, its ERAs like those of the rig; no case depends on another."""
+    """Solve cases with ERAs like those of the rig; none depends on another."""
     felt = felt_acceleration(receptances.frequencies)
     results = empty_results(len(cases))
     rooms: dict[int, ComplexArray] = {}
@@ -115,7 +115,7 @@ def solve_cases(receptances: Receptances, eras: tuple[Era, ...], cases: Cases) -
             rows = [row for row, members in enumerate(sets) if len(members) == size]
             if not rows:
                 continue
-            # Equal by symmetry is equal: the first then, not the one that rounding favours.
+            # Of sets that are equal by symmetry the first, not the one that rounding favours.
             best = max(rows, key=lambda row: float(f"{every[row, MEDIAN]:.9g}"))
             results.statistics[case, drive] = every[best]
             results.active[case, drive] = sum(1 << era for era in sets[best])

@@ -190,7 +190,7 @@ def test_study_refuses_bad_usage(tmp_path: Path, arguments: list[str]) -> None:
     ("more", "message"),
     [
         (["--frequencies", "0:100:10"], "LO:HI:STEP"),
-        (["--frequencies", "60,110,60"], "60 Hz more than once"),
+        (["--frequencies", "60,110,60"], "60 Hz twice"),
         (["--frequencies", "60,9000"], "Hz"),
         (["--candidates", "1x1"], "2x2 to 100x100"),
         (["--candidates", "many"], "two numbers"),

@@ -105,7 +105,7 @@ amplifiers: {m: {url: "sim://"}}
     rig = load_rig(path)
     assert rig.eras[0].gains == ((50.0, 0.9, math.pi / 2), (60.0, 1.0, 0.0))
     assert rig.eras[1].gains == ()
-    for row, said in (("[60, 0, 0]", "is no gain"), ("[40, 1, 0]", "ascend")):
+    for row, said in (("[60, 0, 0]", "magnitude"), ("[40, 1, 0]", "ascend")):
         path.write_text(text.replace("[60, 1, 0]", row))
         with pytest.raises(InputError, match=rf"rig\.yaml:5: eras\.A\.gains: .*{said}"):
             load_rig(path)

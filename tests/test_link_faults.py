@@ -327,7 +327,7 @@ async def test_token_is_applied_once_under_frame_loss(far: FarSide) -> None:
 
 @pytest.mark.parametrize("kind", ["corrupt", "truncate", "duplicate", "delay"])
 async def test_reply_is_never_credited_to_another_request(far: FarSide, kind: FaultKind) -> None:
-    """Every answer belongs to its request, whatever befalls a third of the telegrams."""
+    """Every answer belongs to its request, while a third of the frames is disturbed."""
     patience = 0.5 if kind == "duplicate" else 0.03
     async with Link(far, reply_timeout=patience) as link:
         await link.amplifier.arm(2.0)
@@ -438,7 +438,7 @@ async def test_reboot_is_detected_and_does_not_rearm(far: FarSide) -> None:
 
 
 async def test_reopening_refuses_another_serial_number(far: FarSide) -> None:
-    """Whoever answers after a loss must have the serial number of before."""
+    """The amplifier that responds after a loss must have the serial number of before."""
     async with Link(far) as link:
         await link.amplifier.close()
         own = far.amplifier.identity

@@ -61,7 +61,7 @@ def held_by_another_program(name: str) -> Iterator[None]:
 
 
 async def test_over_tcp_only_one_program_arms_and_any_may_stop(coarse_rig: Rig) -> None:
-    """Whoever has the right to arm keeps it while it lives; asking and stopping need none."""
+    """The right to arm belongs to one process while it lives; reading and stopping need none."""
     async with far_side(WIRES["modbus+tcp"], coarse_rig) as far:
         amplifier = Amplifier(open_backend(far.url), reply_timeout=PATIENT)
         with held_by_another_program(far.url.removeprefix("modbus+tcp://")):

@@ -126,7 +126,7 @@ BUGS: dict[str, tuple[Any, str, Any, Plan, str]] = {
         "after the last finger",
     ),
     "a choice that fails": (Selector, "select", lambda *_: 1 / 0, held(), "logged"),
-    "an answer nobody takes": (
+    "an answer that is not taken": (
         ModbusLine,
         "_received",
         lambda link, data: None,

@@ -92,7 +92,7 @@ def test_entry_points_lead_into_the_wheel(wheel: Path) -> None:
 
 
 def test_sdist_makes_the_same_wheel(wheel: Path, sdist: Path, tmp_path: Path) -> None:
-    """Byte for byte, so whoever builds it for a distribution has what the index has."""
+    """Byte for byte, so a distribution's build equals the published one."""
     with tarfile.open(sdist) as archive:
         archive.extractall(tmp_path, filter="data")
     root = next(tmp_path.iterdir())

@@ -145,7 +145,7 @@ def test_a_reader_takes_ports_that_are_free(tmp_path: Path) -> None:
 
 
 def test_readers_know_every_port_that_pages_name() -> None:
-    """One that was not replaced would be taken, one day, by somebody else on this machine."""
+    """One that was not replaced could be taken by another program."""
     docs = Path(__file__).parents[2] / "docs"
     pages = [*docs.glob("tutorials/*.md"), *docs.glob("how-to/*.md")]
     named = {

@@ -31,7 +31,7 @@ def home() -> Iterator[Path]:
     ],
 )
 def test_a_reader_sees_what_the_page_shows(page: str, tmp_path: Path, home: Path) -> None:
-    """Whoever types a tutorial from an empty folder beside the examples gets what it says."""
+    """A tutorial typed from an empty folder beside the examples prints what it shows."""
     folder = tmp_path / "my_plate"
     folder.mkdir()
     (tmp_path / "examples").symlink_to(ROOT / "examples")

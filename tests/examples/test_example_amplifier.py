@@ -39,7 +39,7 @@ def amplifier_at(serial: ModuleType, now: list[float]) -> Any:
 
 
 def test_it_is_silent_5_ms_after_its_watchdog(serial: ModuleType) -> None:
-    """Along a raised cosine from when it bites, however late anybody looks; the fault latches."""
+    """Along a raised cosine from when it bites, however late it is read; the fault latches."""
     now = [1000.0]
     amplifier = amplifier_at(serial, now)
     amplifier.arm(WATCHDOG)

@@ -32,7 +32,7 @@ def line(number: int, told: dict[str, Any]) -> bytes:
 
 
 class FarEnd:
-    """Answers as it is told."""
+    """Answers as scripted."""
 
     def __init__(self) -> None:
         self.answers: Answers = lambda number: line(number, STATUS)

@@ -41,7 +41,7 @@ async def stopped_by_somebody_else(daemon: DaemonProcess) -> None:
 
 
 async def test_two_thousand_idle_and_ten_that_do_not_read(tmp_path: Path) -> None:
-    """It plays on without a gap, memory stays bounded, and somebody new can still stop it."""
+    """It plays on without a gap, memory stays bounded, and a new client can still stop it."""
     async with far_end(tmp_path) as far, daemon_process(tmp_path, far) as daemon:
         journal = Journal(far)
         async with await daemon.client() as era, holding(era):
@@ -63,7 +63,7 @@ async def test_two_thousand_idle_and_ten_that_do_not_read(tmp_path: Path) -> Non
 
 @pytest.mark.parametrize("kind", ["garbage", "asking"])
 async def test_clients_that_flood(tmp_path: Path, kind: str) -> None:
-    """Nonsense of all kinds, or requests without end: it plays on, and anybody can stop it."""
+    """Nonsense of all kinds, or requests without end: it plays on, and any client can stop it."""
     async with far_end(tmp_path) as far, daemon_process(tmp_path, far) as daemon:
         journal = Journal(far)
         async with await daemon.client() as era, holding(era):
@@ -76,4 +76,4 @@ async def test_clients_that_flood(tmp_path: Path, kind: str) -> None:
             assert resident(daemon.process.pid) - before < GROWTH
         assert not daemon.said("Traceback")
         assert not daemon.said("no json")
-        assert len(daemon.log) < 200  # nobody fills the disk by talking nonsense
+        assert len(daemon.log) < 200  # invalid requests do not fill the disk

@@ -1,4 +1,4 @@
-"""What befalls the daemon's process: paused, starved, out of disk or descriptors, clocks that jump.
+"""Disturbances of the daemon's process: paused, starved, without disk or descriptors, clock jumps.
 
 Over a pseudo-terminal to a far end in the test's process, whose amplifier's clock is that of all.
 Silence is asked for each time; that it plays on, where that is meant, only of the best of some
@@ -105,8 +105,8 @@ def descriptors(pid: int) -> list[int]:
 async def test_paused_for_longer_than_the_watchdog_nothing_old_is_replayed(tmp_path: Path) -> None:
     """SIGSTOP: silent in time; resumed, not one set is sent, whatever has queued up meanwhile.
 
-    Neither what was being played, nor the touches that came over UDP and the socket while nobody
-    read, nor once somebody has acknowledged and armed again: those fingers are gone.
+    Neither what was being played, nor the touches that came over UDP and the socket while none
+    was read, nor after it was acknowledged and armed again: those fingers are gone.
     """
     port = free_port()
     async with far_end(tmp_path) as far, daemon_process(tmp_path, far, panel(port)) as daemon:
@@ -241,7 +241,7 @@ async def test_a_starved_daemon_plays_on_or_is_silent_but_replays_nothing(tmp_pa
 
 
 async def test_without_descriptors_it_plays_on_and_is_stopped(tmp_path: Path) -> None:
-    """None is left while armed, and clients queue up: it plays on, and whoever is in stops it."""
+    """None is left while armed, and clients queue up: it plays on, and a client stops it."""
     async with held(tmp_path, "dumps: {folder: dumps}\n") as test:
         limit = max(descriptors(test.pid)) + 1
         before = limited(test.pid, resource.RLIMIT_NOFILE, limit)
@@ -267,7 +267,7 @@ async def test_without_descriptors_it_plays_on_and_is_stopped(tmp_path: Path) ->
 
 
 async def test_hangups_in_a_loop_change_nothing(tmp_path: Path) -> None:
-    """Two hundred SIGHUPs: it plays on, reads fewer times than it is told to, and the last counts.
+    """Two hundred SIGHUPs: it plays on, reads fewer times than it is asked to, and the last counts.
 
     What has changed just before the last one is taken over; no descriptor is left open.
     """

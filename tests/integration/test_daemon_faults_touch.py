@@ -28,7 +28,7 @@ LEASE = 0.150  # s; without news a finger counts as lifted
 
 
 class Panel:
-    """A daemon with a TUIO panel, and whoever sends to it."""
+    """A daemon with a TUIO panel, and a sender to it."""
 
     def __init__(self, daemon: DaemonProcess, era: AsyncClient, port: int) -> None:
         self.daemon, self.era, self.far = daemon, era, daemon.far

@@ -127,14 +127,14 @@ async def test_systemd_hears_of_it_and_metrics_are_served(tmp_path: Path) -> Non
 
 
 async def _get(port: int, path: str, *, host: str = "localhost") -> str:
-    """A page, as soon as somebody serves it."""
+    """Get a page as soon as it is served."""
     end = time.monotonic() + PATIENCE
     while True:
         try:
             reader, writer = await asyncio.open_connection("127.0.0.1", port)
             break
         except OSError:
-            assert time.monotonic() < end, "nobody serves the page"
+            assert time.monotonic() < end, "the page is not served"
             await asyncio.sleep(0.05)
     writer.write(f"GET {path} HTTP/1.0\r\nHost: {host}\r\n\r\n".encode())
     text = (await asyncio.wait_for(reader.read(), PATIENCE)).decode()
@@ -144,7 +144,7 @@ async def _get(port: int, path: str, *, host: str = "localhost") -> str:
 
 
 async def test_the_dashboard_is_a_process_that_ends_with_the_daemon(tmp_path: Path) -> None:
-    """`--dashboard` prints where the page is; killed, the daemon leaves nobody behind."""
+    """`--dashboard` prints where the page is; killed, the daemon leaves no process behind."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
@@ -163,7 +163,7 @@ async def test_the_dashboard_is_a_process_that_ends_with_the_daemon(tmp_path: Pa
 
 
 async def _serves(port: int) -> bool:
-    """Whether anybody takes connections, some time later."""
+    """Whether connections are accepted, some time later."""
     await asyncio.sleep(0.05)
     try:
         _, writer = await asyncio.open_connection("127.0.0.1", port)

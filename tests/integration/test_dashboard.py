@@ -130,7 +130,7 @@ async def arm(page: Page, era: Client) -> None:
 
 async def test_the_page_shows_the_rig_without_a_complaint(page: Page) -> None:
     """Its ERAs and regions, a banner that all is simulated, its amplifier; nothing in the console,
-    and nothing was asked of anybody but the gateway.
+    and every request goes to the gateway.
     """
     assert await page.evaluate(REASON) == "simulated"
     names = await page.evaluate(
@@ -385,7 +385,7 @@ async def test_text_stands_out_from_its_ground(page: Page, era: Client, is_dark:
 
 
 async def test_everything_has_a_role_and_a_name_in_a_sensible_order(page: Page) -> None:
-    """As a screen reader is told, and as Tab goes: to the plate, the buttons, stop, then beside."""
+    """For a screen reader, and in the order of Tab: plate, buttons, stop, then beside."""
     await page.until(
         "document.querySelector('meter')?.ariaLabel", lambda name: "ERA" in (name or "")
     )

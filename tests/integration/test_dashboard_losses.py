@@ -135,7 +135,7 @@ async def test_the_banner_says_how_it_is_with_the_gateway_now(tab: Page, tmp_pat
 
 
 async def test_a_gateway_without_room_is_not_said_to_be_gone(tab: Page, tmp_path: Path) -> None:
-    """It answers; whoever reads that it does not looks for the wrong thing."""
+    """The banner tells a full gateway from an unreachable one."""
     with gateway_process(tmp_path, tmp_path / "none.sock") as gateway:
         others = [RawWebSocket(gateway) for _ in range(MAX_SESSIONS)]
         await tab.show(f"{gateway.url}#token={gateway.token}")

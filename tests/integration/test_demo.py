@@ -143,7 +143,7 @@ def test_a_far_end_that_dies_is_reported_in_a_paragraph(capture, environment, tm
 
 
 def test_no_far_end_outlives_a_demonstration_that_is_killed(capture, environment, tmp_path):
-    """After SIGKILL, which nobody can handle, the amplifiers' process ends by itself."""
+    """After SIGKILL of the command, the amplifiers' process ends by itself."""
     with subprocess.Popen(
         [str(ERA), "demo", "--touches", str(capture), "--out", str(tmp_path)],
         env=environment,
@@ -164,7 +164,7 @@ def test_no_far_end_outlives_a_demonstration_that_is_killed(capture, environment
 
 
 def is_running(pid):
-    """Whether a process is there and is more than an entry that nobody has collected."""
+    """Whether a process exists and is no zombie."""
     try:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
     except FileNotFoundError:

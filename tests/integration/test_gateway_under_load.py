@@ -274,7 +274,7 @@ def test_whoever_trickles_or_does_not_read_is_left(gateway: GatewayProcess) -> N
 
 def test_a_flood_of_requests_costs_nobody_else(gateway: GatewayProcess, watched: Watch) -> None:
     """Ten thousand requests in a second over WebSockets, HTTP and touches beside: who floods is
-    told to ask less often or left, and a stop of somebody else is answered meanwhile.
+    asked to slow down or disconnected, and a stop of another client is answered meanwhile.
     """
     before = watched.looks
     over = threading.Event()

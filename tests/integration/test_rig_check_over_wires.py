@@ -1,7 +1,7 @@
 """`era rig check` against far ends that are processes on real wires, with a known fault each.
 
 The rig is the same each time; what is wrong is in the file that the far end simulates. Time is
-virtual there, for what is told does not depend on it.
+virtual there, since the findings do not depend on it.
 """
 
 import asyncio
@@ -135,16 +135,16 @@ def test_responses_of_a_real_plate_are_read_from_a_file(tmp_path: Path, ending: 
 
 
 async def test_what_cannot_be_checked_is_said(tmp_path: Path) -> None:
-    """No sensors, both kinds, nobody at the socket, levels and frequencies that are none."""
+    """No sensors, both kinds, no listener, levels and frequencies out of range."""
     rig = write_rig(tmp_path / "rig.yaml", mesh=MESH)
-    nobody = ("--sensors", str(tmp_path / "no"))
+    unserved = ("--sensors", str(tmp_path / "no"))
     for kind, words, options in (
         (InputError, "--measured", ()),
-        (InputError, "--measured", (*nobody, "--measured", "x.csv")),
-        (LinkError, "--sensors|--measured", nobody),
-        (InputError, "--level", (*nobody, "--level", "0.5")),
-        (InputError, "limits.frequency", (*nobody, "--frequencies", "10,20")),
-        (InputError, "got side=x", (*nobody, "--url", "side=x")),
+        (InputError, "--measured", (*unserved, "--measured", "x.csv")),
+        (LinkError, "--sensors|--measured", unserved),
+        (InputError, "--level", (*unserved, "--level", "0.5")),
+        (InputError, "limits.frequency", (*unserved, "--frequencies", "10,20")),
+        (InputError, "got side=x", (*unserved, "--url", "side=x")),
         (InputError, "x.csv", ("--measured", "x.csv")),
     ):
         with pytest.raises(kind, match=words):

@@ -178,7 +178,7 @@ def test_the_plate_answers_the_same_through_every_wire(
 ) -> None:
     """Within what rounding levels to 1e-4 and phases to 0.01 degrees may change.
 
-    All wires round alike: drives are told alike to the last digit.
+    All wires round alike: drives agree to the last digit.
     """
     for mine, yours in zip(played[wire].heard, played["serial"].heard, strict=True):
         assert [told["drive"] for told in mine.told] == [told["drive"] for told in yours.told]

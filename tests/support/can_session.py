@@ -48,7 +48,7 @@ class Step:
 
 
 class Timers:
-    """The heartbeat's timer, which goes off when it is told to."""
+    """The heartbeat's timer, fired by the test."""
 
     def __init__(self) -> None:
         self._due: list[object] = []
@@ -117,12 +117,14 @@ class Session:
         yield self._asked(
             "Commit token 515, to every amplifier of the bus", *encode_broadcast(Commit(515))
         )
-        torn = encode_request(
+        incomplete = encode_request(
             Apply(self.guard.check(CommandSet(516, _COMMANDS, ramp=0.0, valid_for=0.0))),
             node=NODE,
             sequence=8,
         )
-        yield self._asked("Apply token 516, but the frame of channel 3 is lost", torn[0], *torn[2:])
+        yield self._asked(
+            "Apply token 516, but the frame of channel 3 is lost", incomplete[0], *incomplete[2:]
+        )
         shape = self.guard.check_envelope(Envelope(5, 0.005, (Knot(0.1, 90.0), Knot(1.0, -0.01))))
         assert (
             pack_envelope(LoadEnvelope(shape))
@@ -134,7 +136,7 @@ class Session:
         yield self._ordered("Apply token 518, as CAN FD", Apply(self._next(518)), 10, fd=True)
         yield self._ordered("Status, as CAN FD", GetStatus(), 11, fd=True)
         self.device.pass_time(0.3)
-        yield self._heard("Nobody is heard for 250 ms: an emergency, and one more once silent")
+        yield self._heard("No host is heard for 250 ms: an emergency, and one more once silent")
         yield self._ordered("Arm, but it has to be cleared first", Arm(0.25), 12)
         yield self._ordered("Clear", Clear(), 13)
         yield self._ordered("Stop, ramp 5 ms", Stop(0.005), 14)

@@ -179,7 +179,7 @@ async def armed(era: AsyncClient) -> None:
 
 
 async def play(era: AsyncClient, far: FarSide) -> None:
-    """Armed, and heard for the finger that somebody holds down: again where it has been lost."""
+    """Arm and wait until a resting finger is played for; arm again after a loss."""
     end = time.monotonic() + STARTING
     while time.monotonic() < end:
         await armed(era)
@@ -214,7 +214,7 @@ async def plays_on(
 ) -> float:
     """The widest gap [s] of a while without any loss; best of some, for a machine that is busy.
 
-    what: befalls it meanwhile, by which the figure is told.
+    what: the disturbance, named in the printed figure.
     """
 
     async def attempt() -> float:

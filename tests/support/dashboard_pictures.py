@@ -102,7 +102,7 @@ async def _take_one(
         await page.until("document.querySelectorAll('.contact').length === 2")
         await page.until("document.querySelectorAll('.contact.target').length")
         await page.until("document.querySelector('#summary').textContent.includes('22 dB SL')")
-        await asyncio.sleep(0.3)  # for the field, which is solved after it is told
+        await asyncio.sleep(0.3)  # the field is solved after the event
         name = f"dashboard_{screen.name}_{'dark' if is_dark else 'light'}"
         await page.screenshot(folder / f"{name}.png")
         if screen.is_phone:

@@ -59,7 +59,7 @@ def _is_over() -> bool:
 
 def _tuio(port: str, rate: str, seconds: str) -> None:
     chance = random.Random(3)
-    count = 997  # frames that are told apart, again and again
+    count = 997  # distinguishable frames, repeated
 
     def frame(number: int) -> bytes:
         fingers = 1 + number % 3

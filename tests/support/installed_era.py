@@ -42,7 +42,7 @@ class InstalledEra:
 
     @contextlib.contextmanager
     def running(self, *arguments: str) -> Iterator[subprocess.Popen[str]]:
-        """An `era` that goes on until the end of the block, where it is told to end and must."""
+        """Run an `era` until the end of the block, where it is terminated."""
         with subprocess.Popen(
             [self.python.with_name("era"), *arguments],
             cwd=self.folder,

@@ -86,7 +86,7 @@ async def kill_daemons(
     seed: int,
     tell: Callable[[Kill], None] | None,
 ) -> list[Kill]:
-    """So many daemons, one after the other, at the same amplifiers; tell is told of each."""
+    """Kill so many daemons, one after the other, at the same amplifiers; tell: called for each."""
     name, wire, changes = place
     chance = random.Random(seed)
     with tempfile.TemporaryDirectory(prefix="era-kills-") as made:
@@ -147,14 +147,14 @@ async def _kill(wire: str, daemon: DaemonProcess, journal: Journal) -> Kill:
 
 
 async def _live(daemon: DaemonProcess, chance: random.Random, armed: asyncio.Event) -> None:
-    """What happens to a daemon all day, in a hurry, until it is dead."""
+    """A daemon's usual events in quick succession, until it is killed."""
     with contextlib.suppress(ConnectionError, Unreachable, AssertionError):
         await daemon.serves()
         async with await daemon.client() as era:
             while True:
                 try:
                     await _once(era, chance, armed)
-                except RpcError:  # lost, or in a fault: as anybody would, acknowledge and go on
+                except RpcError:  # lost, or in a fault: acknowledge and continue
                     await asyncio.sleep(0.02)
 
 

@@ -2,7 +2,7 @@
 
 The bytes on these lines are those that backends and far ends write; a piece of them may arrive in
 two, and each takes a moment, by the loop's own chance. Blocking code runs in greenlets, so that
-there is no thread whose turn anybody would have to guess.
+there is no thread whose order is undefined.
 """
 
 import asyncio
@@ -88,7 +88,7 @@ class MemoryMachine(HardwareProvider):
         return cast(Adapter, client)
 
     def make_worker(self) -> "GreenletWorker":
-        """Somebody for jobs that block."""
+        """An executor for jobs that block."""
         return GreenletWorker()
 
     def below(self, limit: int) -> int:
@@ -96,7 +96,7 @@ class MemoryMachine(HardwareProvider):
         return self._loop.dice.randrange(limit)
 
     def kill_host(self) -> None:
-        """As when the host's process dies: its ports are closed, and nobody there is told."""
+        """Close the host's ports without notice, as when its process dies."""
         for port in tuple(self._open.values()):
             port.close()
 
@@ -190,7 +190,7 @@ class MemoryTerminal(Terminal):
         self.unplug()
 
     def write(self, data: bytes) -> None:
-        """To the host; what nobody reads is dropped when the port is opened, so at once here."""
+        """Send to the host; unread bytes are dropped when the port is opened, so at once here."""
         port = self._machine.opened(self._name)
         if self.is_plugged and port is not None:
             self._machine.deliver(self._name, "host", data, port.outward)
@@ -225,7 +225,7 @@ class MemoryPort:
         self._machine.later(_NOTICED, self._notice)
 
     def close(self) -> None:
-        """Nothing is told any more."""
+        """Stop reporting."""
         if not self._is_closed:
             self._is_closed = self.outward.is_cut = True
             if not self._is_hung_up:

@@ -34,7 +34,7 @@ class Peer(asyncio.Protocol):
         self._arrived = asyncio.Event()
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Somebody has come."""
+        """A client has connected."""
         self._transport = cast(asyncio.Transport, transport)
         self._reader = RtuReader() if self.is_rtu else TcpReader()
         self.connections += 1

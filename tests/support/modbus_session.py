@@ -95,7 +95,7 @@ EXAMPLES: dict[str, Example] = {
 
 
 class ScriptedDevice:
-    """An amplifier that says what it is told to say, and remembers what it was asked."""
+    """An amplifier with scripted replies that records its requests."""
 
     name = "main"
 

@@ -1,4 +1,4 @@
-"""Somebody who follows a page to the letter: types, edits, opens terminals and ends them."""
+"""Follow a page to the letter: type, edit, open terminals and end them."""
 
 import os
 import re
@@ -30,7 +30,7 @@ _TERMINAL = re.compile(r"/dev/pts/\d+")
 
 
 def free_ports() -> dict[str, str]:
-    """For every port that pages name one that nobody holds just now."""
+    """Find a free port for every port that pages name."""
     with ExitStack() as held:
         here = {}
         for port, kind in PORTS.items():
@@ -167,7 +167,7 @@ class Reader:
         if theirs is None or ours is None:
             return shown
         if theirs[0] not in self._swaps:
-            # As long as we hold it, the system gives its name to nobody else once it is closed.
+            # While it is held open, the system does not reuse its name.
             self._held.append(os.open(ours[0], os.O_RDWR | os.O_NOCTTY))
         self._swaps[theirs[0]] = ours[0]
         return shown.replace(theirs[0], ours[0])

@@ -21,7 +21,7 @@ class Situation:
     """What is so from one change of the fingers to the next [s] of the stream.
 
     fingers: places by id, in order of arrival; target: the id of the one to feel it, None where
-    nobody is there; from_rest: whether the plate was silent before.
+    no finger is there; from_rest: whether the plate was silent before.
     """
 
     begin: float
@@ -81,7 +81,7 @@ async def play_stream(
 ) -> None:
     """Send a capture to a UDP port at its own pace.
 
-    changed is told of each, with its time on time.monotonic() [s], before it is sent.
+    changed: called for each before it is sent, with its time on time.monotonic() [s].
     """
     due = list(stream.changes)
     loop = asyncio.get_running_loop()

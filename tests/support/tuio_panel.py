@@ -4,7 +4,7 @@ import socket
 
 
 def free_port() -> int:
-    """A UDP port that nobody listens at."""
+    """Find a free UDP port."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
         free.bind(("127.0.0.1", 0))
         return int(free.getsockname()[1])

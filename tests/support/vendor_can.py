@@ -1,4 +1,4 @@
-"""A CAN amplifier as somebody else would build it: from docs/reference/wire-can.md, the sections of
+"""A CAN amplifier built independently, from docs/reference/wire-can.md, the sections of
 docs/reference/wire-protocol.md that it names, and from nothing else of this project.
 
 Four channels, classic frames, no envelopes, no faults but the watchdog's. It talks through

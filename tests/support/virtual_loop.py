@@ -55,7 +55,7 @@ class VirtualLoop(BaseEventLoop):
         """What the machine's clock has does not matter."""
 
     def select(self, timeout: float | None) -> list[Any]:
-        """Nobody from outside has anything to say: go to the next moment."""
+        """There is no external input: advance to the next timer."""
         self._turns += 1
         if self._turns > _TURNS_MAX:
             self._turns = 0
@@ -71,7 +71,7 @@ class VirtualLoop(BaseEventLoop):
         """There are none."""
 
     def _write_to_self(self) -> None:
-        """Nobody has to be woken."""
+        """No thread has to be woken."""
 
     def run_in_executor(self, executor: Any, func: Callable[..., T], *args: Any) -> Any:
         """At once: there are no threads."""
@@ -93,7 +93,7 @@ class VirtualLoop(BaseEventLoop):
     async def create_connection(
         self, factory: Any, host: Any = None, port: Any = 0, **_: Any
     ) -> Any:
-        """Connect to who listens; ConnectionRefusedError where nobody does."""
+        """Connect to a listener; raises ConnectionRefusedError without one."""
         await asyncio.sleep(self.dice.uniform(*_LATENCY))
         server = self._servers.get(port)
         if server is None:
@@ -109,12 +109,12 @@ class VirtualLoop(BaseEventLoop):
         return ours, host_side
 
     def kill_hosts(self) -> None:
-        """As when a process dies: who has connected is cut off, and nobody there is told."""
+        """Cut all connections off without notice, as when a process dies."""
         for transport in self._hosts:
             transport.die()
 
     def forget_server(self, port: int) -> None:
-        """Nobody listens there any more."""
+        """Stop listening."""
         self._servers.pop(port, None)
 
 
@@ -133,7 +133,7 @@ class _Socket:
 
 
 class _Server:
-    """Somebody who listens."""
+    """A listener."""
 
     def __init__(self, loop: VirtualLoop, port: int, factory: Callable[[], Any]) -> None:
         self.factory = factory
@@ -192,7 +192,7 @@ class MemoryTransport(asyncio.Transport):
         self.close()
 
     def die(self) -> None:
-        """The other side is hung up on, this one is told nothing."""
+        """Hang up on the other side without notice to this one."""
         if not self._is_closed:
             self._is_closed = True
             self._later(self.peer._hang_up)

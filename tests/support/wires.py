@@ -76,7 +76,7 @@ class FarSide:
 
 @asynccontextmanager
 async def far_side(wire: Wire, rig: Rig, *, seed: int = 0) -> AsyncIterator[FarSide]:
-    """The amplifiers of a rig behind a wire, without faults until a test lets them befall."""
+    """The amplifiers of a rig behind a wire, without faults until a test injects them."""
     bench = Bench(rig, now=clock.now())
     devices: Sequence[SimulatedDevice] = [
         SimulatedDevice(bench, name, number=number, faults=Faults(begin=clock.now(), seed=seed))

@@ -1,4 +1,4 @@
-"""The controller's share of the `era` command: demo, rig check."""
+"""`era demo` and the group `era rig`."""
 
 import json
 from pathlib import Path
@@ -25,7 +25,7 @@ EXIT_STATUS: dict[type[BaseException], int] = {
     LinkError: 3,
     FrameError: 3,
 }
-"""Exit status of the errors that these commands raise on purpose."""
+"""Exit status by error class."""
 
 
 @app.callback()
@@ -38,20 +38,25 @@ def demo(
     wire: Annotated[
         str,
         typer.Option(
-            help="serial (a pseudo-terminal), modbus (TCP), can (socketcand) or sim (no wire)."
+            help="Wire: serial (a pseudo-terminal), modbus (TCP), can (socketcand) or sim (none)."
         ),
     ] = "serial",
     touches: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="A TUIO capture, or an evemu recording (.events)."),
+        typer.Option(metavar="FILE", help="TUIO capture, or evemu recording (.events)."),
     ] = None,
     out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for the picture.")] = Path("out"),
-    as_json: Annotated[bool, typer.Option("--json", help="One JSON object, nothing else.")] = False,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print one JSON object and nothing else.")
+    ] = False,
     dashboard: Annotated[
-        bool, typer.Option("--dashboard", help="Touch it yourself, on a page in the browser.")
+        bool,
+        typer.Option(
+            "--dashboard", help="Serve a page in the browser to touch the plate yourself."
+        ),
     ] = False,
 ) -> None:
-    """Recorded touches in, felt vibrations out. The whole chain over a simulated plate."""
+    """Play recorded touches on a simulated plate; measure contrast."""
     import asyncio
     import time
 
@@ -66,11 +71,9 @@ def demo(
     from model.table.table_cache import cached_table
 
     if wire not in WIRES:
-        raise InputError(f"--wire {wire}: there is no such wire; choose one of {', '.join(WIRES)}")
+        raise InputError(f"--wire must be one of {', '.join(WIRES)}, got {wire}")
     if dashboard and (touches is not None or as_json):
-        raise InputError(
-            "--dashboard takes its touches from the page; leave --touches and --json out"
-        )
+        raise InputError("--dashboard takes its touches from the page; omit --touches and --json")
     recorded = read_touches(touches or example_touches_path())
     rig_file = example_rig_path()
     rig = load_rig(rig_file)
@@ -150,7 +153,7 @@ def _number(value: float | None) -> str:
 
 
 def _summary(rows: "list[TouchRow]") -> str:
-    """How well prediction and measurement agree over the touches that reached the steady state."""
+    """Compare prediction and measurement over the touches that reached the steady state."""
     differences = [
         abs(row.played.predicted_contrast_db - row.played.measured_contrast_db)
         for row in rows

@@ -16,13 +16,13 @@ _logger = logging.getLogger(__name__)
 
 
 class LoadingTimes:
-    """Follows how long [s] loading envelopes takes; `longest` is still in time.
+    """Follows how long [s] loading envelopes takes; at most `max_duration` is in time.
 
     Times [s] are arguments and never decrease.
     """
 
-    def __init__(self, longest: float) -> None:
-        self._longest = longest
+    def __init__(self, max_duration: float) -> None:
+        self._max_duration = max_duration
         self._slow_in_a_row = 0
         self._in_time_in_a_row = 0
         self._pause = FIRST_PAUSE  # the next
@@ -32,7 +32,7 @@ class LoadingTimes:
     def note(self, duration: float, *, now: float) -> None:
         """Note that a loading took so long [s]."""
         self._last = duration
-        if duration <= self._longest:
+        if duration <= self._max_duration:
             self._slow_in_a_row = 0
             self._in_time_in_a_row += 1
             if self._in_time_in_a_row >= MAX_SLOW:
@@ -55,6 +55,6 @@ class LoadingTimes:
             return None
         return (
             f"loading envelopes took {1000 * self._last:.0f} ms, more than the "
-            f"{1000 * self._longest:.0f} ms that a touch may wait; retrying in {left:.0f} s; use a "
-            "faster wire, or allow a longer wait"
+            f"{1000 * self._max_duration:.0f} ms that a touch may wait; retrying in {left:.0f} s; "
+            "use a faster wire, or allow a longer wait"
         )

@@ -1,6 +1,6 @@
-"""From physics to electricity: which amplifier channel plays what, by the rig's wiring.
+"""Routing: from excitations (physics) to command sets (electricity), by the wiring of the rig.
 
-`sim/plant/plant.py` translates the other way by the same wiring.
+`sim/plant/plant.py` translates back by the same wiring.
 """
 
 import math
@@ -25,21 +25,20 @@ def route(
     playing: Mapping[str, DriveCommand] | None = None,
     onset: Envelopes | None = None,
 ) -> dict[str, CommandSet]:
-    """One command set per amplifier of the rig, by its name, all under the same token.
+    """Return a command set for every amplifier of the rig, by name, all under one token.
 
-    Every wired channel is named: level = amplitude / stroke, phase in degrees within (-180, 180];
-    level 0 where the ERA is not driven. ramp [s] as in `CommandSet`; it becomes as
-    long as the rig's limit of slew asks for, on all amplifiers alike. playing: what ERAs
-    play now, as `drive_of_eras` tells it; a frequency that only ERAs play which play it already
-    runs on undisturbed in time. onset: envelopes in the slots of `controller.loop.envelopes`;
-    one may lead an ERA to silence that is not driven. Nothing else is limited here, that is the
-    guard's; raises InputError if the excitation names an ERA the rig has not.
+    Every wired channel has a command: level = amplitude / stroke, phase in degrees within
+    (-180, 180], level 0 for an ERA that is not driven. ramp [s]: lengthened to the rig's slew
+    limit, on all amplifiers alike. playing: what each ERA plays now (`drive_of_eras`); a frequency
+    keeps its phase if all its ERAs play it already. onset: envelopes in the slots of
+    `controller.loop.envelopes`; one may lead an ERA that is not driven to silence. All other limits
+    belong to the guard. Raises InputError for an ERA that the rig does not have.
     """
     unknown = sorted(excitation.keys() - rig.wiring.keys())
     if unknown:
         raise InputError(
-            f"the pattern drives {', '.join(unknown)}, which the rig does not have; "
-            "build a table for this rig"
+            f"pattern must drive ERAs of the rig, got {', '.join(unknown)}; build a table for this "
+            "rig"
         )
     restarted = _restarted(excitation, playing or {})
     drive = {name: _drive(excitation, rig, name, restarted=restarted) for name in rig.wiring}
@@ -47,14 +46,14 @@ def route(
         slots = onset_slots(rig)
         for name, envelope in onset.items():
             drive[name] = replace(drive[name], frequency=envelope.frequency, onset=slots[name])
-    highest = max((command.level for command in drive.values()), default=0.0)
-    slowest = highest / rig.limits.slew  # from rest: what plays now only makes it shorter
-    ramp = slowest if slowest > ramp else ramp  # not finite stays so, for the guard to refuse
+    max_level = max((command.level for command in drive.values()), default=0.0)
+    min_ramp = max_level / rig.limits.slew  # from rest, the longest case
+    ramp = min_ramp if min_ramp > ramp else ramp  # the guard refuses NaN
     return _sets(drive, rig, token=token, ramp=ramp)
 
 
 def drive_of_eras(played: Mapping[str, Achieved | CommandSet], rig: Rig) -> dict[str, DriveCommand]:
-    """Which ERA plays what, by its name, from what amplifiers play; silent ones are left out."""
+    """Return what each ERA plays, by name, from what amplifiers play; without silent ones."""
     playing = {
         (amplifier, command.channel): command
         for amplifier, several in played.items()
@@ -69,7 +68,7 @@ def drive_of_eras(played: Mapping[str, Achieved | CommandSet], rig: Rig) -> dict
 
 
 def goes_on(excitation: Excitation, playing: Mapping[str, DriveCommand]) -> bool:
-    """Whether any tone of an excitation runs on from what ERAs play now."""
+    """Whether any tone of an excitation continues what ERAs play now."""
     restarted = _restarted(excitation, playing)
     return any(tone.frequency not in restarted for tone in excitation.values())
 
@@ -82,7 +81,7 @@ def route_again(
     ramp: float,
     ending: Envelopes,
 ) -> dict[str, CommandSet]:
-    """The sets, by amplifier, that go on with what ERAs play and give it endings."""
+    """Return the sets, by amplifier, that continue what ERAs play and add endings."""
     drive = {name: _silent(channel.number, rig) for name, channel in rig.wiring.items()}
     slots = ending_slots(rig)
     for name, command in playing.items():
@@ -92,9 +91,9 @@ def route_again(
 
 
 def route_end(rig: Rig, *, token: int, ramp: float) -> dict[str, CommandSet]:
-    """The sets, by amplifier, by which all ERAs fall silent, each along its ending if it has one.
+    """Return the sets, by amplifier, that silence all ERAs along their endings.
 
-    ramp [s]: for those without.
+    ramp [s]: for those without an ending.
     """
     drive = {
         name: replace(_silent(channel.number, rig), skip_ending=False)
@@ -106,7 +105,7 @@ def route_end(rig: Rig, *, token: int, ramp: float) -> dict[str, CommandSet]:
 def _sets(
     drive: Mapping[str, DriveCommand], rig: Rig, *, token: int, ramp: float
 ) -> dict[str, CommandSet]:
-    """One command set per amplifier, by its name, of what every ERA is to play, by its own."""
+    """Return the command set of every amplifier, by name, from the command of every ERA."""
     wired: dict[str, list[DriveCommand]] = {name: [] for name in rig.amplifiers}
     for name, channel in rig.wiring.items():
         wired[channel.amplifier].append(drive[name])
@@ -122,9 +121,9 @@ def _sets(
 
 
 def _restarted(excitation: Excitation, playing: Mapping[str, DriveCommand]) -> set[float]:
-    """Frequencies [Hz] whose phases must count from the commit, for an ERA joins in with them.
+    """Return the frequencies [Hz] that restart at the commit, because an ERA joins them.
 
-    ERAs that play one frequency count its phase from one moment, else their field is another.
+    All ERAs of one frequency must count its phase from one moment, or their field differs.
     """
     return {
         tone.frequency
@@ -134,7 +133,7 @@ def _restarted(excitation: Excitation, playing: Mapping[str, DriveCommand]) -> s
 
 
 def _drive(excitation: Excitation, rig: Rig, name: str, *, restarted: set[float]) -> DriveCommand:
-    """What one ERA's channel shall play."""
+    """Return the command of the channel of one ERA."""
     number = rig.wiring[name].number
     tone = excitation.get(name)
     if tone is None:
@@ -149,10 +148,10 @@ def _drive(excitation: Excitation, rig: Rig, name: str, *, restarted: set[float]
 
 
 def _silent(number: int, rig: Rig) -> DriveCommand:
-    """Nothing for a channel, from whatever it plays along the ramp.
+    """Return the command that silences a channel along the ramp.
 
-    A silent channel has a frequency too, on every wire; this one is always allowed. A brake is one
-    of all ERAs: what falls silent while others play fades.
+    Silent channels also have a frequency on every wire; this one is always allowed. Endings belong
+    to all ERAs together, so a channel that falls silent while others play skips its own.
     """
     return DriveCommand(
         channel=number, frequency=rig.limits.frequency_min, level=0.0, skip_ending=True
@@ -160,7 +159,7 @@ def _silent(number: int, rig: Rig) -> DriveCommand:
 
 
 def _wrapped_degrees(phase: float) -> float:
-    """A phase [rad] in degrees within (-180, 180]."""
-    # Not finite stays so, for the guard to refuse.
+    """Convert a phase [rad] to degrees within (-180, 180]."""
+    # Not finite stays so; the guard refuses it.
     degrees = math.degrees(math.remainder(phase, math.tau)) if math.isfinite(phase) else phase
     return 180.0 if degrees == -180.0 else degrees

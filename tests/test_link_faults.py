@@ -165,7 +165,7 @@ async def test_unplugged_wire_is_detected_within_60_ms(far: FarSide) -> None:
                 return
             far.device.recover()
             await reconnect(host.amplifier, tries=200)
-    raise AssertionError(f"told after {', '.join(f'{1e3 * one:.0f} ms' for one in took)}")
+    raise AssertionError(f"detected after {', '.join(f'{1e3 * one:.0f} ms' for one in took)}")
 
 
 @pytest.mark.parametrize("name", WIRES)
@@ -287,7 +287,7 @@ def test_slow_wire_is_not_lost(name: str, coarse_rig: Rig) -> None:
 
 
 async def test_token_is_applied_once_under_frame_loss(far: FarSide) -> None:
-    """With 20 % of all telegrams lost each way, what is confirmed was played, and once only."""
+    """With 20 % of all frames lost each way, confirmed sets were played exactly once."""
     played: list[int] = []  # in the order of their commits, by the amplifier itself
     commit = far.amplifier._commit
 
@@ -311,7 +311,7 @@ async def test_token_is_applied_once_under_frame_loss(far: FarSide) -> None:
                 await link.again()
                 far.device.inject_fault(FaultWindow("drop", share=0.2))
                 continue
-            except CommandRefused:  # a wire on which a set takes several telegrams
+            except CommandRefused:  # a wire on which a set takes several frames
                 continue
             assert achieved.token == safe.token
             assert achieved.commands[0].level == pytest.approx(safe.commands[0].level)
@@ -327,7 +327,7 @@ async def test_token_is_applied_once_under_frame_loss(far: FarSide) -> None:
 
 @pytest.mark.parametrize("kind", ["corrupt", "truncate", "duplicate", "delay"])
 async def test_reply_is_never_credited_to_another_request(far: FarSide, kind: FaultKind) -> None:
-    """Every answer belongs to its request, while a third of the frames is disturbed."""
+    """Every reply belongs to its request while a third of the frames has a fault."""
     patience = 0.5 if kind == "duplicate" else 0.03
     async with Link(far, reply_timeout=patience) as link:
         await link.amplifier.arm(2.0)

@@ -132,7 +132,7 @@ def test_a_refused_drive_is_disarmed(background: BackgroundFarEnd) -> None:
 
 
 def test_a_drive_that_the_amplifier_ends_is_no_success(background: BackgroundFarEnd) -> None:
-    """A fault in the middle of a drive is told, and the amplifier is disarmed all the same."""
+    """A fault during a drive is reported, and the amplifier is disarmed."""
     usual = background.end.answer
     arc = replace(STATUS, state=AmplifierState.FAULT, fault=Fault.ARC)
     background.end.answer = lambda request, frame: (
@@ -155,7 +155,7 @@ def test_a_drive_that_the_amplifier_ends_is_no_success(background: BackgroundFar
     ],
 )
 def test_a_bad_drive_never_arms(background: BackgroundFarEnd, options: list[str]) -> None:
-    """What nobody can drive is bad input, and leaves the amplifier as it was."""
+    """An invalid drive is bad input and does not change the amplifier."""
     result = CliRunner().invoke(app, ["amp", "drive", background.end.url, *options])
     assert isinstance(result.exception, CommandError)
     assert not any(isinstance(request, Arm) for request in background.end.requests)
@@ -246,7 +246,7 @@ def test_discover_suggests_no_group_that_may_not_either(
 
 
 def test_discover_says_why_a_port_could_not_be_asked(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A port that cannot be opened is told with the reason, one where nobody answers without."""
+    """A port that cannot be opened has a reason; a missing reply has none."""
     monkeypatch.setattr(
         "drivers.discovery.search.comports", lambda: [ListPortInfo("/dev/no-such-port")]
     )

@@ -1,4 +1,4 @@
-"""Who gives up opening an amplifier that does not answer waits for nothing, over every wire.
+"""Abandoned opening of a silent amplifier, over every wire.
 
 In virtual time, so that it can be at any moment between two tries.
 """
@@ -23,7 +23,7 @@ NOTHING = 0.1  # s; of the half second that one try takes
 @pytest.mark.parametrize("wire", WIRES)
 @pytest.mark.parametrize("how", ["cancelled", "closed"])
 def test_opening_ends_at_once_when_abandoned(wire: str, how: str, coarse_rig: Rig) -> None:
-    """Cancelled, as a daemon does that is told to end, or closed by somebody else meanwhile."""
+    """Cancelled, as by a daemon that ends, or closed meanwhile."""
 
     async def give_up(url: str, *, after: float) -> float:
         """How long [s] it took."""

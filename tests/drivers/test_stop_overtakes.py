@@ -1,7 +1,7 @@
-"""A stop goes before whatever is not on the wire yet, on lines that amplifiers share, too.
+"""A stop precedes every request that is not on the wire yet, also on shared lines.
 
-In virtual time, so that it can come at any moment between two frames; what is told is what the
-amplifiers were asked, in its order.
+In virtual time, so that it can come at any moment between two frames; requests are
+recorded in the order in which the amplifiers receive them.
 """
 
 import asyncio
@@ -46,7 +46,7 @@ MOMENTS = [number * 0.0005 for number in range(1, 30)]  # s; one of them is in e
 
 
 class Chain:
-    """Two armed amplifiers, east and west, and all that they were told since.
+    """Two armed amplifiers, east and west, and the requests that they received.
 
     sent_at: when [s] the host has put a frame on the line since.
     """
@@ -123,7 +123,7 @@ def note(
     exchange: Callable[[Request], Reply | None],
     request: Request,
 ) -> Reply | None:
-    """Keep what an amplifier is told, and let it answer; on Modbus all answers hold its status."""
+    """Record a request and let the amplifier reply; on Modbus all replies hold its status."""
     if not isinstance(request, GetStatus):
         asked.append((name, request))
     return exchange(request)
@@ -189,8 +189,8 @@ def test_abort_unsent_drops_a_queued_request(line: str, what: str, coarse_rig: R
 
 @pytest.mark.parametrize("line", LINES)
 def test_queued_stop_reserves_the_line(line: str, coarse_rig: Rig) -> None:
-    """West waits for its own answer and east for the line when west's stop is wished: the stop is
-    next, and east's request comes after it, once, and is answered."""
+    """West waits for a reply and east for the line when west is stopped: the stop is next, and
+    east's request follows once, with its reply."""
 
     async def use(chain: Chain) -> None:
         beat = asyncio.create_task(chain.west.heartbeat())
@@ -236,7 +236,7 @@ def test_stop_class_request_is_the_next_frame_at_any_moment(
                 await (amplifier.stop(0.0) if silencing is Stop else amplifier.disarm(0.0))
             await asyncio.gather(*others, return_exceptions=True)
             name, request = chain.asked[sent]
-            assert (name, type(request)) == (whose, silencing), f"wished after {moment} s"
+            assert (name, type(request)) == (whose, silencing), f"requested after {moment} s"
             assert not isinstance(request, Apply) or request.command_set.token == 1000 + number
             tokens_of_applies = [
                 request.command_set.token
@@ -352,7 +352,7 @@ def test_stop_preempts_an_arm_that_listens_on_can(coarse_rig: Rig) -> None:
 
 @pytest.mark.parametrize("line", LINES)
 def test_cancelled_stop_releases_the_line(line: str, coarse_rig: Rig) -> None:
-    """Who wished it is cancelled before its turn has come: what waits on the line is sent all the
+    """Its caller is cancelled before its turn: what waits on the line is sent all the
     same, and the next requests find it free."""
 
     async def use(chain: Chain) -> None:
@@ -397,7 +397,7 @@ def test_cancellation_during_preemption_is_a_cancellation(line: str, coarse_rig:
 def test_stop_precedes_retries_of_stop_class_requests(
     line: str, silencing: type[Request], first: Reply | None, coarse_rig: Rig
 ) -> None:
-    """Where a disarm or a silent set has to be repeated, a stop that was wished meanwhile is out
+    """Where a disarm or a silent set has to be repeated, a stop requested meanwhile is out
     8 ms later at the latest, and 10 ms where an answer is owed; the repetition follows it."""
 
     async def use(chain: Chain) -> None:

@@ -49,7 +49,7 @@ async def test_cancelled_work_is_undone_once() -> None:
 
 
 async def test_result_at_the_moment_of_cancellation_is_undone() -> None:
-    """It is there already, but whoever is cancelled has not taken it over yet."""
+    """The result exists, but the cancelled task has not received it."""
     closed = threading.Event()
     loop = asyncio.get_running_loop()
 
@@ -72,7 +72,7 @@ async def test_result_at_the_moment_of_cancellation_is_undone() -> None:
 
 
 def test_result_after_the_end_of_the_loop_is_undone() -> None:
-    """There is nobody left to be told of it, so the thread that opened it closes it."""
+    """The thread that opened it closes it."""
     may_open, closed = threading.Event(), threading.Event()
 
     async def give_up() -> None:

@@ -3,8 +3,11 @@
 Unpacking yields values in range or raises Malformed.
 """
 
+from collections.abc import Mapping
+from typing import Any
+
 from drivers.codec.payload import Cursor, pack, pack_optional_channel, pack_text
-from drivers.protocol.definition import PROTOCOL
+from drivers.protocol.definition import PROTOCOL, Quantity
 from drivers.protocol.messages import (
     AmplifierState,
     Capabilities,
@@ -18,6 +21,22 @@ from drivers.protocol.messages import (
 _Q = PROTOCOL.quantities
 _HIGH_VOLTAGE = 0x01
 _EVENTS = 0x01
+_CAPABILITIES: Mapping[str, Quantity] = {  # in the order of the payload; a flags byte follows
+    "channels": _Q.channel_count,
+    "frequency_min": _Q.frequency,
+    "frequency_max": _Q.frequency,
+    "frequency_step": _Q.frequency,
+    "level_max": _Q.level,
+    "level_step": _Q.level,
+    "phase_step": _Q.phase_step,
+    "ramp_max": _Q.ramp,
+    "watchdog_min": _Q.watchdog,
+    "watchdog_max": _Q.watchdog,
+    "envelope_knots": _Q.envelope_knots,
+    "envelope_slots": _Q.envelope_slots,
+    "envelope_step_min": _Q.envelope_step,
+    "envelope_step_max": _Q.envelope_step,
+}
 
 
 def pack_identity(identity: Identity) -> bytes:
@@ -41,43 +60,17 @@ def unpack_identity(cursor: Cursor) -> Identity:
 
 def pack_capabilities(capabilities: Capabilities) -> bytes:
     """Pack capabilities."""
-    return pack(
-        (_Q.channel_count, capabilities.channels),
-        (_Q.frequency, capabilities.frequency_min),
-        (_Q.frequency, capabilities.frequency_max),
-        (_Q.frequency, capabilities.frequency_step),
-        (_Q.level, capabilities.level_max),
-        (_Q.level, capabilities.level_step),
-        (_Q.phase_step, capabilities.phase_step),
-        (_Q.ramp, capabilities.ramp_max),
-        (_Q.watchdog, capabilities.watchdog_min),
-        (_Q.watchdog, capabilities.watchdog_max),
-        (_Q.envelope_knots, capabilities.envelope_knots),
-        (_Q.envelope_slots, capabilities.envelope_slots),
-        (_Q.envelope_step, capabilities.envelope_step_min),
-        (_Q.envelope_step, capabilities.envelope_step_max),
-    ) + bytes([_EVENTS if capabilities.events else 0])
+    numbers = [(quantity, getattr(capabilities, name)) for name, quantity in _CAPABILITIES.items()]
+    return pack(*numbers) + bytes([_EVENTS if capabilities.events else 0])
 
 
 def unpack_capabilities(cursor: Cursor) -> Capabilities:
     """Unpack capabilities."""
-    return Capabilities(
-        channels=cursor.integer(_Q.channel_count),
-        frequency_min=cursor.number(_Q.frequency),
-        frequency_max=cursor.number(_Q.frequency),
-        frequency_step=cursor.number(_Q.frequency),
-        level_max=cursor.number(_Q.level),
-        level_step=cursor.number(_Q.level),
-        phase_step=cursor.number(_Q.phase_step),
-        ramp_max=cursor.number(_Q.ramp),
-        watchdog_min=cursor.number(_Q.watchdog),
-        watchdog_max=cursor.number(_Q.watchdog),
-        envelope_knots=cursor.integer(_Q.envelope_knots),
-        envelope_slots=cursor.integer(_Q.envelope_slots),
-        envelope_step_min=cursor.number(_Q.envelope_step),
-        envelope_step_max=cursor.number(_Q.envelope_step),
-        events=bool(cursor.flags(_EVENTS)),
-    )
+    values: dict[str, Any] = {
+        name: cursor.integer(quantity) if quantity.per_unit == 1 else cursor.number(quantity)
+        for name, quantity in _CAPABILITIES.items()
+    }
+    return Capabilities(**values, events=bool(cursor.flags(_EVENTS)))
 
 
 def pack_status(status: Status) -> bytes:

@@ -1,4 +1,4 @@
-"""A device that hangs while it is closed holds up nobody who stops, ends or opens again."""
+"""A device that hangs in close delays neither stopping, ending nor reopening."""
 
 import asyncio
 import logging
@@ -26,7 +26,7 @@ class _Hanging:
         self._read, self._write = os.pipe()
 
     def fileno(self) -> int:
-        """Of a pipe into which nobody writes."""
+        """Descriptor of a pipe without a writer."""
         return self._read
 
     def recv(self, timeout: float) -> None:
@@ -64,7 +64,7 @@ class _Late(_Hanging):
         self.may_close.set()
 
     def recv(self, timeout: float) -> can.Message:  # type: ignore[override]
-        """Blocks longer than it was told to."""
+        """Block longer than the timeout."""
         self.may_read.wait(20)
         return can.Message(arbitration_id=0x701, is_extended_id=False, data=[5])
 

@@ -72,7 +72,7 @@ def the_line() -> Line:
 
 
 async def test_first_user_opens_and_last_user_closes() -> None:
-    """In between it is one line, whoever comes and goes; afterwards the next gets another."""
+    """In between it is one line for all users; afterwards a new one."""
     line = the_line()
     await line.join(1, lambda _: None)
     assert the_line() is line
@@ -85,7 +85,7 @@ async def test_first_user_opens_and_last_user_closes() -> None:
 
 
 async def test_number_in_use_is_refused() -> None:
-    """Who comes second is told what to do, and the first is not disturbed."""
+    """The second user gets a remedy, and the first is not disturbed."""
     line = the_line()
     await line.join(1, lambda _: None)
     with pytest.raises(LinkError, match=r"place 1 on the line.*already open"):
@@ -128,7 +128,7 @@ async def test_join_during_close_reopens() -> None:
 
 
 async def test_join_before_close_keeps_it_open() -> None:
-    """The last was about to close it, and waited for somebody who opens or closes it as well."""
+    """The last user waited to close it while another opened or closed it."""
     line = the_line()
     await line.join(1, lambda _: None)
     async with line._changing:
@@ -143,46 +143,46 @@ async def test_join_before_close_keeps_it_open() -> None:
 
 
 async def test_loss_is_reported_once_per_user_and_ends_with_join() -> None:
-    """Another loss is told to who was back only, and who is not back may send nothing meanwhile."""
-    told: list[tuple[int, str]] = []
+    """The next loss is reported to users that have joined again only; others cannot send."""
+    losses: list[tuple[int, str]] = []
     line = the_line()
     for number in (1, 2):
-        await line.join(number, lambda what, number=number: told.append((number, what)))
+        await line.join(number, lambda what, number=number: losses.append((number, what)))
     line.lose("pulled out")
     line.lose("pulled out again")
-    assert told == [(1, "pulled out"), (2, "pulled out")]
+    assert losses == [(1, "pulled out"), (2, "pulled out")]
     with pytest.raises(LinkError, match="pulled out"):
         line.raise_if_lost(1)
     await line.leave(1)
-    await line.join(1, lambda what: told.append((1, what)))
+    await line.join(1, lambda what: losses.append((1, what)))
     assert line.happened == ["opened", "gave up: pulled out", "closed", "opened"]
     line.raise_if_lost(1)
     with pytest.raises(LinkError, match="place 2 has not been reopened"):
         line.raise_if_lost(2)
     line.lose("burnt")
-    assert told[2:] == [(1, "burnt")]
+    assert losses[2:] == [(1, "burnt")]
     await line.leave(1)
     await line.leave(2)
 
 
 async def test_user_joining_during_a_loss_is_notified_of_the_next() -> None:
     """It waited for its turn to open the line, and opens it anew: that is another line for it."""
-    line, told = the_line(), list[str]()
+    line, losses = the_line(), list[str]()
     await line.join(1, lambda _: None)
     async with line._changing:
-        coming = asyncio.create_task(line.join(2, told.append))
+        coming = asyncio.create_task(line.join(2, losses.append))
         await asyncio.sleep(0)
         line.lose("pulled out")
     await coming
     line.raise_if_lost(2)
     line.lose("burnt")
-    assert told == ["pulled out", "burnt"]
+    assert losses == ["pulled out", "burnt"]
     await line.leave(1)
     await line.leave(2)
 
 
 async def test_nothing_is_sent_while_reopening() -> None:
-    """Neither as if it were open nor with an error that nobody expects; afterwards it goes out."""
+    """A LinkError meanwhile; afterwards it is sent."""
     line = the_line()
     await line.join(1, lambda _: None)
     line.lose("pulled out")
@@ -256,7 +256,7 @@ WAITING = {
 async def test_request_queued_before_a_loss_is_not_sent_after_reopening(
     kind: type[WireBackend],
 ) -> None:
-    """An amplifier that was lost is armed by nobody before it was opened anew."""
+    """A lost amplifier is not armed before it is reopened."""
     url, requests = WAITING[kind]
     machine = _Machine()
     HARDWARE_PROVIDER.set(machine)

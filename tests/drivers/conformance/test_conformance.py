@@ -1,4 +1,4 @@
-"""The contract against amplifiers that break it: each mistake is found by the check it is for."""
+"""Conformance checks against amplifiers with one mistake each."""
 
 import time
 from collections.abc import Callable
@@ -33,12 +33,12 @@ Answer = Callable[[SimulatedAmplifier, Request, float], Reply]
 
 
 def honest(amplifier: SimulatedAmplifier, request: Request, now: float) -> Reply:
-    """As the protocol says."""
+    """Reply as specified."""
     return amplifier.handle(request, now)
 
 
 class Flawed(Backend):
-    """A simulated amplifier in this process whose answers somebody may have tampered with."""
+    """A simulated amplifier in this process with altered replies."""
 
     def __init__(self, answer: Answer) -> None:
         self._amplifier = SimulatedAmplifier("main", channels=4)
@@ -151,7 +151,7 @@ def keeps_empty_slots(amplifier: SimulatedAmplifier, request: Request, now: floa
 
 
 def has_no_serial_number(amplifier: SimulatedAmplifier, request: Request, now: float) -> Reply:
-    """One of many that nobody can tell apart."""
+    """No serial number."""
     reply = amplifier.handle(request, now)
     return replace(reply, serial_number="") if isinstance(reply, Identity) else reply
 

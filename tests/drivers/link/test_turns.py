@@ -17,7 +17,7 @@ async def settle() -> None:
 
 
 class Users:
-    """Those who take turns, and in which order they had them."""
+    """Users of turns, and the order of their turns."""
 
     def __init__(self, turns: Turns) -> None:
         self.turns = turns
@@ -27,7 +27,7 @@ class Users:
     def take(
         self, name: str, kind: RequestPriority = RequestPriority.ORDINARY
     ) -> "asyncio.Task[None]":
-        """Somebody who keeps the turn until told to end."""
+        """Keep the turn until its event is set."""
         self.ends[name] = asyncio.Event()
 
         async def use() -> None:
@@ -40,7 +40,7 @@ class Users:
 
 @pytest.fixture
 def users() -> Users:
-    """Nobody has the turn yet."""
+    """No user has the turn."""
     return Users(Turns())
 
 

@@ -1,4 +1,4 @@
-"""Garbage collections that hold nobody up."""
+"""Avoidance of long garbage collections."""
 
 import gc
 

@@ -153,7 +153,7 @@ SHAPE = Envelope(7, 0.005, tuple(Knot(0.01 * number, 10.0 * number) for number i
 async def eventually(condition: Callable[[], object]) -> None:
     """Wait for what comes by itself."""
     async with asyncio.timeout(PATIENCE):
-        while not condition():  # noqa: ASYNC110  what is waited for tells nobody
+        while not condition():  # noqa: ASYNC110  there is no notification
             await asyncio.sleep(0.002)
 
 
@@ -349,9 +349,9 @@ async def test_sdo_timeout_of_the_node_is_retried(
 class Telling(CanBackend):
     """A backend whose losses are noted as well."""
 
-    def __init__(self, url: str, told: list[str]) -> None:
+    def __init__(self, url: str, losses: list[str]) -> None:
         super().__init__(url)
-        self._told_losses = told
+        self._losses = losses
 
     def listen(
         self, on_event: Callable[[AmplifierEvent], None], on_loss: Callable[[str], None]
@@ -359,7 +359,7 @@ class Telling(CanBackend):
         """Note and pass on."""
 
         def note(what: str) -> None:
-            self._told_losses.append(what)
+            self._losses.append(what)
             on_loss(what)
 
         super().listen(on_event, note)
@@ -368,8 +368,8 @@ class Telling(CanBackend):
 @pytest.mark.parametrize("how", ["silent", "boot-up", "stopped", "bus-off"])
 async def test_lost_node_is_detected_without_a_request(virtual: Virtual, how: str) -> None:
     """Within three of its heartbeats, without a request on the way; nothing works afterwards."""
-    told: list[str] = []
-    amplifier = Amplifier(Telling(virtual.url(), told), reply_timeout=0.5)
+    losses: list[str] = []
+    amplifier = Amplifier(Telling(virtual.url(), losses), reply_timeout=0.5)
     await amplifier.open()
     try:
         await amplifier.arm(2.0)
@@ -387,10 +387,10 @@ async def test_lost_node_is_detected_without_a_request(virtual: Virtual, how: st
                 virtual.gateway.virtual.send(
                     can.Message(arbitration_id=0x40, is_error_frame=True, data=bytes(8))
                 )
-        await eventually(lambda: told)
+        await eventually(lambda: losses)
         if how == "silent":
             assert loop.time() - begin >= 0.09  # not for a heartbeat or two that are late
-        assert len(told) == 1
+        assert len(losses) == 1
         with pytest.raises(LinkError):
             await amplifier.heartbeat()
     finally:
@@ -527,7 +527,7 @@ async def test_late_sdo_reply_is_not_a_second_node(virtual: Virtual) -> None:
 
 
 def test_sequence_numbers_run_from_1_to_255() -> None:
-    """255 numbers and then the first again: 0 is nobody's."""
+    """255 numbers, then 1 again: 0 is for events."""
     pending = PendingRequests()
     numbers = [pending.next_sequence() for _ in range(3 * 255)]
     assert sorted(numbers) == sorted([*range(1, 256)] * 3)

@@ -1,4 +1,4 @@
-"""Transfers of objects that nobody waits for any more: they end, and nothing more is sent."""
+"""Cancelled SDO transfers end and send nothing more."""
 
 from collections.abc import Callable
 
@@ -13,7 +13,7 @@ TIMEOUT = 0.01  # s; of a node that never answers
 
 
 class Network(canopen.Network):
-    """A bus on which nobody answers; `sent` counts, and `on_send` is called with each frame."""
+    """A bus without replies; `sent` counts frames, and `on_send` is called with each."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -37,7 +37,7 @@ def test_queued_transfer_does_not_start_after_close() -> None:
 
 
 def test_cancelled_transfer_is_not_retried() -> None:
-    """After one that was broken off it would read an object up to five times until it is told."""
+    """After an aborted one it would read an object up to five times."""
     network = Network()
     client = ObjectClient(network, 1, ThreadWorker("era-test"))
     with pytest.raises(LinkTimeout):

@@ -455,12 +455,12 @@ async def test_next_request_waits_for_the_response_to_a_cancelled_one(
 
 async def test_changes_between_responses_are_events(far: Peer, backend: ModbusBackend) -> None:
     """One per change of state or fault, none for the first response."""
-    told: list[AmplifierEvent] = []
-    backend.listen(told.append, lambda _: None)
+    events: list[AmplifierEvent] = []
+    backend.listen(events.append, lambda _: None)
     for status in (ARMED, ARMED, TRIPPED, TRIPPED, ARMED):
         far.device.answer = lambda _, status=status: status
         await backend.exchange(GetStatus(), timeout=PATIENCE)
-    assert told == [
+    assert events == [
         AmplifierEvent(AmplifierState.FAULT, Fault.WATCHDOG),
         AmplifierEvent(AmplifierState.OPERATION_ENABLED, Fault.NONE),
     ]

@@ -49,7 +49,7 @@ async def test_first_address_that_accepts_is_used(
 async def test_link_local_address_keeps_its_zone(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """As amplifiers without a router have, by RFC 4007: without the zone nobody could call it."""
+    """As without a router, by RFC 4007: the zone is a part of the address."""
     of_name = ("fe80::1", 0, 0, 3), ("fd00::1", 0, 0, 0), ("192.0.2.1", 0)
     found = [(0, 0, 0, "", address) for address in of_name]
     monkeypatch.setattr(stream.socket, "getaddrinfo", lambda *args, **kwargs: found)

@@ -31,7 +31,7 @@ class _Port:
         """Nothing is there."""
 
     def fileno(self) -> int:
-        """Of a pipe into which nobody writes."""
+        """Descriptor of a pipe without a writer."""
         return self._read
 
     def close(self) -> None:

@@ -93,7 +93,7 @@ def test_lines_that_are_no_frame_are_skipped(line: bytes) -> None:
 
 
 def test_a_time_stamp_is_left_out() -> None:
-    """Four digits behind the data, from adapters that were told to send them."""
+    """Four digits after the data, from adapters that are configured to send them."""
     assert list(SlcanReader().feed(b"t18180102030405060708ABCD\r")) == [FRAME]
 
 

@@ -81,8 +81,8 @@ async def test_its_watchdog_is_told_by_an_emergency(amplifier: Amplifier) -> Non
     """Nobody beats: a latched fault, which the host hears of unasked."""
     came = asyncio.Event()
     amplifier.listen(
-        lambda told: (
-            came.set() if told == AmplifierEvent(AmplifierState.FAULT, Fault.WATCHDOG) else None
+        lambda event: (
+            came.set() if event == AmplifierEvent(AmplifierState.FAULT, Fault.WATCHDOG) else None
         )
     )
     await amplifier.arm(0.1)

@@ -183,7 +183,7 @@ def test_can_fd_status_is_one_frame() -> None:
     [
         (0x40, Nak(NakCode.BAD_CHANNEL, 9)),
         (0x50, Nak(NakCode.WRONG_STATE, 9)),
-        (0xF0, Nak(NakCode.BUSY, 9)),  # torn: ask again
+        (0xF0, Nak(NakCode.BUSY, 9)),  # incomplete set: repeat
     ],
 )
 def test_refusal_has_code_and_channel(result: int, nak: Nak) -> None:
@@ -203,8 +203,8 @@ def test_unsolicited_reply_and_emergency_are_events() -> None:
     """Sequence 0, and EMCY."""
     (answer,) = feed((0x181, bytes([0, 0, 5, 0xFF, 0, 0, 0, 0])))
     assert answer.event == AmplifierEvent(AmplifierState.QUICK_STOP_ACTIVE, Fault.NONE)
-    told = decode_emergency(bytes.fromhex("4023 03 46 02 000000"))
-    assert told == AmplifierEvent(AmplifierState.FAULT_REACTION_ACTIVE, Fault.ARC, 2)
+    event = decode_emergency(bytes.fromhex("4023 03 46 02 000000"))
+    assert event == AmplifierEvent(AmplifierState.FAULT_REACTION_ACTIVE, Fault.ARC, 2)
 
 
 @pytest.mark.parametrize(

@@ -26,13 +26,13 @@ from sim.far_ends.modbus.unit import ModbusUnit
 def asked_and_answered(is_rtu: bool) -> tuple[RequestAdu, bytes]:
     """A heartbeat with tag 4711 and the frame that answers it."""
     exchange = exchanges.encode_request(Ping(), tag=4711, channels=4)
-    telegram = build_adu(
+    request = build_adu(
         exchange.read, exchange.write, unit=1, transaction=0 if is_rtu else 300, is_rtu=is_rtu
     )
     unit = ModbusUnit(ScriptedDevice())
-    pdu = unit.reply(telegram.frame[1:-2] if is_rtu else telegram.frame[7:])
+    pdu = unit.reply(request.frame[1:-2] if is_rtu else request.frame[7:])
     assert pdu is not None
-    return telegram, rtu_frame(1, pdu) if is_rtu else tcp_frame(FarEndRequest(1, b"", 300), pdu)
+    return request, rtu_frame(1, pdu) if is_rtu else tcp_frame(FarEndRequest(1, b"", 300), pdu)
 
 
 EXAMPLES = {is_rtu: asked_and_answered(is_rtu) for is_rtu in (True, False)}
@@ -42,8 +42,8 @@ def read(is_rtu: bool, *pieces: bytes) -> tuple[list[ModbusResponse], WireCounte
     """What the host finds in some pieces of bytes, and what it counts."""
     counters = WireCounters()
     reader = ResponseReader(is_rtu=is_rtu, counters=counters)
-    telegram = EXAMPLES[is_rtu][0]
-    return [one for piece in pieces for one in reader.feed(piece, telegram)], counters
+    request = EXAMPLES[is_rtu][0]
+    return [one for piece in pieces for one in reader.feed(piece, request)], counters
 
 
 def accepted(answers: list[ModbusResponse]) -> list[Status]:

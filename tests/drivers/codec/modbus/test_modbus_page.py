@@ -47,7 +47,7 @@ def exchange_of(name: str, number: int) -> Exchange:
     )
 
 
-def telegram(
+def adu(
     read: Read | None, write: Write | None, number: int, wire: str, unit: int = 1
 ) -> RequestAdu:
     """What the host sends; number: of the transaction, where there is one."""
@@ -79,8 +79,10 @@ def plain(request: Request) -> Request:
 def test_the_page_shows_every_message() -> None:
     """A request and a reply of every message over both wires, and nothing that is not checked."""
     pairs = [f"{name} {part}" for name in (*EXAMPLES, *BESIDE) for part in ("request", "reply")]
-    told = [f"{name} request" for name in BROADCASTS]
-    assert set(FRAMES) == {f"{name}, {wire}" for name in pairs + told for wire in ("RTU", "TCP")}
+    broadcasts = [f"{name} request" for name in BROADCASTS]
+    assert set(FRAMES) == {
+        f"{name}, {wire}" for name in pairs + broadcasts for wire in ("RTU", "TCP")
+    }
     assert {type(example.request) for example in EXAMPLES.values()} == set(Request.__args__)
 
 
@@ -89,7 +91,7 @@ def test_the_page_shows_every_message() -> None:
 def test_the_request_is_what_the_host_sends(name: str, number: int, wire: str) -> None:
     """The host's own encoder, to the byte."""
     exchange = exchange_of(name, number)
-    sent = telegram(exchange.read, exchange.write, number, wire)
+    sent = adu(exchange.read, exchange.write, number, wire)
     assert sent.frame == FRAMES[f"{name} request, {wire}"]
 
 
@@ -98,7 +100,7 @@ def test_the_request_is_what_the_host_sends(name: str, number: int, wire: str) -
 def test_the_host_understands_the_reply(name: str, number: int, wire: str) -> None:
     """The frame, coming byte by byte, becomes the message that the page speaks of."""
     exchange, example = exchange_of(name, number), EXAMPLES[name]
-    sent = telegram(exchange.read, exchange.write, number, wire)
+    sent = adu(exchange.read, exchange.write, number, wire)
     reader = ResponseReader(is_rtu=wire == "RTU", counters=WireCounters())
     data = FRAMES[f"{name} reply, {wire}"]
     (answer,) = [one for byte in data for one in reader.feed(bytes([byte]), sent)]
@@ -128,7 +130,7 @@ def test_the_reason_of_a_refusal_can_be_read(wire: str) -> None:
     device.tell(EXAMPLES[name])
     unit = ModbusUnit(device)
     unit.reply(pdu_of(FRAMES[f"{name} request, {wire}"], wire))
-    sent = telegram(exchanges.refusal_read(), None, number, wire)
+    sent = adu(exchanges.refusal_read(), None, number, wire)
     assert sent.frame == FRAMES[f"Refusal request, {wire}"]
     pdu = unit.reply(pdu_of(sent.frame, wire))
     assert pdu == pdu_of(FRAMES[f"Refusal reply, {wire}"], wire)
@@ -147,7 +149,7 @@ def test_without_function_23_it_takes_two(wire: str) -> None:
     unit = ModbusUnit(device)
     steps = {"FC16 Apply": (None, exchange.write), "FC4 Apply": (exchange.read, None)}
     for number, (name, (read, write)) in enumerate(steps.items(), start=20):
-        sent = telegram(read, write, number, wire)
+        sent = adu(read, write, number, wire)
         assert sent.frame == FRAMES[f"{name} request, {wire}"]
         pdu = unit.reply(pdu_of(sent.frame, wire))
         assert pdu == pdu_of(FRAMES[f"{name} reply, {wire}"], wire)
@@ -162,7 +164,7 @@ def test_without_function_23_it_takes_two(wire: str) -> None:
 def test_broadcasts_are_heard(name: str, wire: str) -> None:
     """What the host sends to unit 0 is on the page, and every unit carries it out."""
     number, request = BROADCASTS[name]
-    sent = telegram(None, exchanges.encode_broadcast(request), number, wire, unit=0)
+    sent = adu(None, exchanges.encode_broadcast(request), number, wire, unit=0)
     assert sent.frame == FRAMES[f"{name} request, {wire}"]
     device = ScriptedDevice()
     ModbusUnit(device).handle_broadcast(pdu_of(sent.frame, wire))

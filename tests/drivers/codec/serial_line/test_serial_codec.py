@@ -92,7 +92,7 @@ ENVELOPES = st.builds(
 )
 # A second between any two sets: how many there may be in one is not the question here.
 GUARD = Guard(GuardLimits(20.0, 600.0, 1.0), WIDE, clock=itertools.count().__next__)
-# Another, for one that is told of an empty envelope takes no set that refers to its slot.
+# Another one, since an empty envelope makes a guard refuse sets that refer to its slot.
 LOADER = Guard(GuardLimits(20.0, 600.0, 1.0), WIDE)
 for _slot in range(1, 64):
     GUARD.check_envelope(Envelope(_slot, 0.005, (Knot(0.5, 0.0),)))

@@ -22,7 +22,7 @@ _VALUES: Mapping[str, Mapping[str, int]] = {
     "action": CANOPEN["actions"],
     "state": PROTOCOL.states,
     "fault": PROTOCOL.faults,
-    "result": {"DONE": 0, **PROTOCOL.naks, "TORN": CANOPEN["torn"]},
+    "result": {"DONE": 0, **PROTOCOL.naks, "INCOMPLETE_SET": CANOPEN["incomplete_set"]},
     "nmt_state": CANOPEN["nmt_states"],
     "nmt_command": CANOPEN["nmt"],
 }

@@ -17,7 +17,8 @@ NODE = 1
 BOOT_UP, STOPPED, OPERATIONAL, PRE_OPERATIONAL = 0, 4, 5, 127
 STATUS, APPLY, STAGE, COMMIT, ARM, DISARM, STOP, CLEAR = range(8)
 DISARMED, SWITCHED_ON, ARMED, STOPPED_QUICKLY, REACTING, FAULTY = 1, 3, 4, 5, 6, 7
-DONE, BAD_VALUE, BAD_CHANNEL, WRONG_STATE, BAD_TOKEN, NO_ENVELOPE, TORN = 0, 3, 4, 5, 6, 9, 15
+DONE, BAD_VALUE, BAD_CHANNEL, WRONG_STATE, BAD_TOKEN, NO_ENVELOPE = 0, 3, 4, 5, 6, 9
+INCOMPLETE_SET = 15
 NO_CHANNEL = 255
 CHANNELS = 4
 LOWEST, HIGHEST = 2000, 60000  # 0.01 Hz
@@ -201,7 +202,7 @@ class VendorAmplifier:
         self.commands, self.order = {}, None
         if order is None:
             for data in list(commands.values())[:1]:
-                self._answer(bits(data, 56, 8), APPLY, TORN, now)
+                self._answer(bits(data, 56, 8), APPLY, INCOMPLETE_SET, now)
             return
         action, sequence = bits(order, 48, 3), bits(order, 56, 8)
         result, channel = self._set(order, commands, now)
@@ -215,7 +216,7 @@ class VendorAmplifier:
         action, token = bits(order, 48, 3), bits(order, 0, 16)
         mine = {c: data for c, data in commands.items() if data[7] == order[7]}
         if action != COMMIT and len(mine) != bits(order, 51, 5):
-            return TORN, NO_CHANNEL
+            return INCOMPLETE_SET, NO_CHANNEL
         if self.state != ARMED:
             return WRONG_STATE, NO_CHANNEL
         if token == 0:

@@ -19,7 +19,7 @@ from drivers.protocol.messages import (
 UNSOLICITED = 0  # sequence number of events
 _Q = PROTOCOL.quantities
 _ACTIONS: Mapping[str, int] = CANOPEN["actions"]
-_INCOMPLETE_SET: int = CANOPEN["torn"]
+_INCOMPLETE_SET: int = CANOPEN["incomplete_set"]
 _NO_CHANNEL: int = CANOPEN["no_channel"]
 _STATES = {state.value: state for state in AmplifierState}
 _FAULTS = {fault.value: fault for fault in Fault}
